@@ -1,0 +1,45 @@
+"""Outcomes as small integers that survive `vmap`; each member carries the sentence a user reads."""
+
+import enum
+
+
+class _Described(enum.IntEnum):
+    """An integer enumeration whose members carry a message."""
+
+    message: str
+
+    def __new__(cls, value: int, message: str):
+        """Attach `message` to the member of this integer value."""
+        member = int.__new__(cls, value)
+        member._value_ = value
+        member.message = message
+        return member
+
+
+class PressStatus(_Described):
+    """What became of one press of the tool."""
+
+    OK = 0, "solved"
+    NO_CONTACT = 1, "the tool does not touch: no force"
+    PAST_FOLD = 2, "past the fold of the softening law (k_3 < 0): no stable equilibrium"
+    NEGATIVE_LOCAL = 3, "coupling 'total': the skeleton moves further than the tool presses"
+    NON_FINITE = 4, "an input or a result is not finite"
+
+
+class FitStatus(_Described):
+    """What became of one lane (one specimen from one start) of a fit."""
+
+    CONVERGED = 0, "converged"
+    AT_BOUND = 1, "converged with a parameter on its bound"
+    UNIDENTIFIABLE = 2, "converged, but the data leave a combination of parameters undetermined"
+    MAX_ITERATIONS = 3, "not converged within the allowed iterations"
+    STALLED = 4, "no step lowers the cost, yet the gradient is not small"
+    INFEASIBLE_START = 5, "the model gives no finite residual at the start"
+    NON_FINITE = 6, "the residual or its Jacobian became non-finite"
+    BAD_DATA = 7, "the measurements could not be used"
+    TOO_FEW_DATA = 8, "fewer usable samples than free parameters"
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the estimate is a minimum that may be read (with its warnings)."""
+        return self <= FitStatus.UNIDENTIFIABLE
