@@ -1,0 +1,1 @@
+"""Readers of measured curves, one file format each; `identify.measurements` is the door."""

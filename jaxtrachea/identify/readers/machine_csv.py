@@ -1,0 +1,147 @@
+"""Machine CSV: some lines about the test, then a table; one trial per file, named by the file."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxtrachea.identify.readers.checks import bad
+from jaxtrachea.identify.readers.records import (
+    BadCurve,
+    Fault,
+    RawCurve,
+    ReadOptions,
+    identify_file,
+)
+from jaxtrachea.identify.readers.text import (
+    Line,
+    Table,
+    find_roles,
+    is_comment,
+    read_lines,
+    read_rows,
+    require_roles,
+    resolve_unit,
+    role_values,
+    split_cells,
+)
+from jaxtrachea.units import column_unit, is_unit
+
+# A header further down than this is no header.
+MAX_PREAMBLE = 500
+
+
+def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
+    """Read the one curve of a machine file; whatever is wrong with it costs this curve only.
+
+    Repeated rows and initial offsets are left as they are.
+
+    Args:
+        path: the file.
+        options: columns, units and naming.
+
+    Returns:
+        One record.
+
+    Raises:
+        DataError: the file is unreadable, its name does not fit the pattern, or its units
+            contradict the options.
+    """
+    who = identify_file(path, options)
+    trial = who.trial or "1"
+    source = str(path)
+    try:
+        table, roles = _table(path, read_lines(path), options)
+        rows = np.array(table.lines, dtype=np.int64)
+        if rows.size:
+            source = f"{path}:{rows[0]}-{rows[-1]}"
+        values = {}
+        for role in ("displacement", "force", "sigma"):
+            if role in roles:
+                unit = resolve_unit(
+                    role,
+                    table.units[roles[role]],
+                    options,
+                    f"{path}: column {table.names[roles[role]]!r}",
+                )
+                values[role] = role_values(table, role, roles[role], range(len(table.rows)), unit)
+        joints = [role for role in roles if role.startswith("joint_")]
+        columns = [
+            role_values(
+                table,
+                role,
+                roles[role],
+                range(len(table.rows)),
+                resolve_unit(role, table.units[roles[role]], options, f"{path}: column {role!r}"),
+            )
+            for role in joints
+        ]
+    except Fault as fault:
+        return [bad(who.specimen, trial, source, fault)]
+    return [
+        RawCurve(
+            who.specimen,
+            trial,
+            source,
+            values["displacement"],
+            values["force"],
+            rows,
+            s=who.s,
+            phi=who.phi,
+            sigma=values.get("sigma"),
+            joint_rings=np.array([int(r[6:]) - 1 for r in joints]) if joints else None,
+            joint_displacement=np.stack(columns, axis=1) if joints else None,
+        )
+    ]
+
+
+def _table(path: Path, lines: list[Line], options: ReadOptions) -> tuple[Table, dict[str, int]]:
+    """Find the header: the first line, by any delimiter, that names displacement and force."""
+    lines = [line for line in lines if not is_comment(line)]
+    if not lines:
+        raise Fault("empty", "the file is empty", "export it again")
+    reason: Fault | None = None
+    for at, line in enumerate(lines[:MAX_PREAMBLE]):
+        for delimiter in "\t;,":
+            if delimiter not in line.text:
+                continue
+            try:
+                cells = split_cells(line.text, delimiter)
+                while cells and cells[-1] == "":
+                    cells.pop()
+                names, units = (
+                    map(list, zip(*map(column_unit, cells), strict=True)) if cells else ([], [])
+                )
+                roles = find_roles(names, options)
+                require_roles(roles, names)
+            except Fault as fault:
+                # An ambiguous header is still the header; any other line is part of the preamble.
+                reason = fault if fault.kind == "ambiguous" else reason
+                continue
+            at, units = _units_row(lines, at, delimiter, units)
+            numbers, rows = read_rows(lines[at + 1 :], len(names), delimiter)
+            return Table(path, names, units, line.number, numbers, rows, delimiter), roles
+    if reason is not None:
+        raise reason
+    raise Fault(
+        "column_missing",
+        f"no header line names {options.columns.get('displacement', 'displacement')!r}"
+        f" and {options.columns.get('force', 'force')!r} in the first {MAX_PREAMBLE} lines",
+        "name the columns in columns.displacement and columns.force",
+    )
+
+
+def _units_row(
+    lines: list[Line], at: int, delimiter: str, units: list[str | None]
+) -> tuple[int, list[str | None]]:
+    """Some machines put the units in a row of their own below the names: ``(s),(mm),(N)``."""
+    if at + 1 >= len(lines) or any(units):
+        return at, units
+    cells = split_cells(lines[at + 1].text, delimiter)
+    bare = [cell.strip("()[] ") for cell in cells]
+    if len(cells) != len(units) or not any(bare):
+        return at, units
+    bracketed = all(cell[:1] in ("(", "[") for cell in cells if cell)
+    # A number is no units row, although "1" alone would pass for a dimensionless unit.
+    if not bracketed and not all(not b or (is_unit(b) and not b[0].isdigit()) for b in bare):
+        return at, units
+    return at + 1, [b or None for b in bare]

@@ -1,0 +1,289 @@
+"""What all text files share: encoding, lines, cells, numbers, and which column plays which role."""
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jaxtrachea.identify.readers.records import JOINT, DataError, Fault, ReadOptions, role_dimension
+from jaxtrachea.units import UnitError, column_unit, convert, unit_factor
+
+MAX_TEXT_BYTES = 256 * 2**20
+# Column names understood without `ReadOptions.columns`, in lower case.
+ALIASES = {
+    "specimen": ("specimen",),
+    "trial": ("trial",),
+    "s": ("s", "s_c"),
+    "phi": ("phi", "phi_c"),
+    "displacement": ("displacement", "compression", "indentation", "compressive displacement"),
+    "force": ("force", "load", "compressive load", "compressive force"),
+    "sigma": ("sigma", "force_sigma", "force_noise"),
+}
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a text file and its number, counted from 1."""
+
+    number: int
+    text: str
+
+
+def read_lines(path: Path) -> list[Line]:
+    """All lines of a text file that hold something, with their numbers.
+
+    UTF-8 (with or without byte-order mark) and UTF-16 with one are decoded; other bytes are taken
+    for Latin-1, in which many instruments write µ and °. Unix, DOS and old Mac line ends.
+
+    Raises:
+        DataError: the file is too large, unreadable or binary.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_TEXT_BYTES:
+            raise DataError(
+                f"{path}: {size} bytes of text, at most {MAX_TEXT_BYTES} are read;"
+                " split it or use HDF5"
+            )
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(
+            f"{path}: cannot be read ({error.strerror}); check the permissions"
+        ) from None
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        text = data.decode("utf-16", errors="replace")
+    else:
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError:
+            text = data.decode("latin-1")
+    if "\0" in text:
+        raise DataError(
+            f"{path}: holds zero bytes, so it is no text table; export it as CSV or HDF5"
+        )
+    lines = re.split(r"\r\n|\n|\r", text)
+    return [Line(i, line) for i, line in enumerate(lines, 1) if line.strip()]
+
+
+def is_comment(line: Line) -> bool:
+    """Whether a line is a ``#`` comment."""
+    return line.text.lstrip().startswith("#")
+
+
+def split_cells(text: str, delimiter: str) -> list[str]:
+    """Cells of one line, stripped; quotes as in CSV.
+
+    Raises:
+        Fault: an unbalanced quote.
+    """
+    if '"' not in text:
+        return [cell.strip() for cell in text.split(delimiter)]
+    try:
+        rows = list(csv.reader([text], delimiter=delimiter, strict=True, skipinitialspace=True))
+    except csv.Error as error:
+        raise Fault(
+            "unparsable", f"quotes do not match ({error})", "close every quote on its line"
+        ) from None
+    return [cell.strip() for cell in rows[0]]
+
+
+def guess_delimiter(header: str) -> str:
+    """Tab, semicolon or comma, whichever comes first in that order."""
+    return next((d for d in "\t;" if d in header), ",")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A header and rows of as many cells.
+
+    Attributes:
+        path: the file.
+        names: column names without units.
+        units: column units, None where the header gives none.
+        header_line: line number of the header.
+        lines: line number of each row.
+        rows: the cells.
+        delimiter: what separates them.
+    """
+
+    path: Path
+    names: list[str]
+    units: list[str | None]
+    header_line: int
+    lines: list[int]
+    rows: list[list[str]]
+    delimiter: str
+
+    def column(self, index: int) -> list[str]:
+        """Cells of one column."""
+        return [row[index] for row in self.rows]
+
+
+def read_rows(
+    lines: Sequence[Line], width: int, delimiter: str
+) -> tuple[list[int], list[list[str]]]:
+    """Cells of the rows of a table; empty cells beyond the header are dropped.
+
+    Raises:
+        Fault: a row that has not `width` cells ("ragged"), or unbalanced quotes.
+    """
+    numbers, rows = [], []
+    for line in lines:
+        if is_comment(line):
+            continue
+        try:
+            cells = split_cells(line.text, delimiter)
+        except Fault as fault:
+            raise Fault(fault.kind, f"line {line.number}: {fault.message}", fault.cure) from None
+        if not any(cells):
+            continue
+        while len(cells) > width and cells[-1] == "":
+            cells.pop()
+        if len(cells) != width:
+            cure = "complete or remove the row"
+            if delimiter == "," and len(cells) > width:
+                cure += "; decimal commas need ; or tab between the columns"
+            raise Fault(
+                "ragged", f"line {line.number} has {len(cells)} cells, the header has {width}", cure
+            )
+        numbers.append(line.number)
+        rows.append(cells)
+    return numbers, rows
+
+
+def find_roles(names: Sequence[str], options: ReadOptions) -> dict[str, int]:
+    """Which column plays which role: by `ReadOptions.columns`, else by the names in `ALIASES`.
+
+    Args:
+        names: column names without units.
+        options: explicit names.
+
+    Returns:
+        Role -> column index, for the roles found.
+
+    Raises:
+        Fault: a named column is absent ("column_missing") or a role has several ("ambiguous").
+    """
+    lower = [name.lower() for name in names]
+    found: dict[str, int] = {}
+    for role in {**ALIASES, **options.columns}:
+        wanted = options.columns.get(role)
+        if wanted is None:
+            hits = [i for i, name in enumerate(lower) if name in ALIASES[role]]
+        else:
+            full = {wanted.strip(), column_unit(wanted)[0]}
+            hits = [i for i, name in enumerate(names) if name in full]
+            if not hits:
+                raise _no_column(wanted, role, names)
+        if len(hits) > 1:
+            several = ", ".join(repr(names[i]) for i in hits)
+            raise Fault(
+                "ambiguous",
+                f"{several} can all be the {role}",
+                f"name the one meant in columns.{role}",
+            )
+        if hits:
+            found[role] = hits[0]
+    for i, name in enumerate(lower):
+        match = JOINT.fullmatch(name)
+        if match and i not in found.values():
+            role = f"joint_{int(match[1])}"
+            if int(match[1]) < 1 or role in found:
+                raise Fault(
+                    "ambiguous", f"column {names[i]!r}: ring below 1 or given twice", "count from 1"
+                )
+            found[role] = i
+    return found
+
+
+def _no_column(wanted: str, role: str, names: Sequence[str]) -> Fault:
+    return Fault(
+        "column_missing",
+        f"no column {wanted!r} for the {role}; the columns are {', '.join(map(repr, names))}",
+        f"name it in columns.{role}",
+    )
+
+
+def require_roles(roles: dict[str, int], names: Sequence[str]) -> None:
+    """Refuse a table without displacement or force."""
+    for role in ("displacement", "force"):
+        if role not in roles:
+            raise _no_column(role, role, names)
+
+
+def resolve_unit(role: str, found: str | None, options: ReadOptions, place: str) -> str:
+    """The unit of a role, from the file or from the options, which must not contradict.
+
+    Args:
+        role: e.g. ``"force"`` or ``"joint_7"``.
+        found: the unit the file gives, or None.
+        options: units for files that give none.
+        place: for messages, e.g. ``"column 'Load'"``.
+
+    Raises:
+        Fault: no unit ("unit_missing") or an unknown one ("unit_unknown").
+        DataError: file and options contradict each other.
+    """
+    general = "joint" if role.startswith("joint_") else role
+    given = options.units.get(role, options.units.get(general))
+    unit = given if found is None else found
+    if unit is None:
+        raise Fault(
+            "unit_missing",
+            f"{place} has no unit",
+            f"write it in the file, or give units.{general} if it has none",
+        )
+    try:
+        factor = unit_factor(unit, role_dimension(role))
+    except UnitError as error:
+        raise Fault(
+            "unit_unknown", f"{place}: {error}", "write one of the accepted units"
+        ) from None
+    if given is not None and unit_factor(given, role_dimension(role)) != factor:
+        raise DataError(
+            f"{place} is in {found} but units.{general} says {given}; remove the wrong one"
+        )
+    return unit
+
+
+def numbers(cells: Sequence[str], lines: Sequence[int], name: str, delimiter: str) -> np.ndarray:
+    """Numbers of one column; empty cells become NaN.
+
+    A comma counts as the decimal sign where it does not separate the columns, unless another
+    cell of the column has a point: then one of the two separates thousands, and both are refused.
+
+    Raises:
+        Fault: a cell is no number ("unparsable").
+    """
+    values = np.full(len(cells), np.nan)
+    pointed = delimiter == "," or any("." in cell for cell in cells)
+    for i, cell in enumerate(cells):
+        if not cell:
+            continue
+        if not pointed and _DECIMAL_COMMA.fullmatch(cell):
+            cell = cell.replace(",", ".")
+        try:
+            # float() takes 1_000, which no instrument means.
+            values[i] = float("_" if "_" in cell else cell)
+        except ValueError:
+            cure = "write numbers as 1.5 or 1.5e-3, and leave a missing value empty"
+            if "," in cell:
+                cure = "use one decimal sign throughout and no thousands separator"
+            raise Fault(
+                "unparsable", f"line {lines[i]}: {name} {cell!r} is not a number", cure
+            ) from None
+    return values
+
+
+def role_values(
+    table: Table, role: str, index: int, picked: Sequence[int], unit: str
+) -> np.ndarray:
+    """Numbers of some rows of a role's column, in internal units (mm, N, rad, s)."""
+    cells = [table.rows[i][index] for i in picked]
+    lines = [table.lines[i] for i in picked]
+    values = numbers(cells, lines, table.names[index], table.delimiter)
+    return convert(values, unit, role_dimension(role))
