@@ -1,7 +1,7 @@
 """Small numerical pieces shared by every room: guarded functions and tiny linear solves.
 
-Everything here keeps the dtype of its input, is smooth where it says so, and is guarded *before* the
-singular operation, so that derivatives stay finite.
+Everything here keeps the dtype of its input, is smooth where it says so, and is guarded *before*
+the singular operation, so that derivatives stay finite.
 """
 
 import jax
@@ -15,29 +15,29 @@ def epsilon(dtype) -> float:
 
 
 def positive_part(x: Float[Array, "*n"], width: Float[Array, ""]) -> Float[Array, "*n"]:
-    r"""Smooth positive part: exactly 0 for `x <= -width`, exactly `x` for `x >= width`, C2 between.
+    r"""Smooth positive part: exactly 0 for `x <= 0`, exactly `x` for `x >= width`, C2 and rising.
 
-    p(x) = (x + w)^3 (3 w - x) / (16 w^3) inside the blend; `width = 0` gives `max(x, 0)`.
+    w t^3 (6 - 8 t + 3 t^2) with t = x / w inside the blend; `width = 0` gives `max(x, 0)`.
 
     Args:
         x: any shape.
-        width: half-width of the blend, same unit as `x`, not negative.
+        width: width of the blend, same unit as `x`, not negative.
     """
     sharp = width <= 0
     w = jnp.where(sharp, 1, width).astype(x.dtype)
-    t = jnp.clip(x / w, -1, 1)
-    blend = w * (1 + t) ** 3 * (3 - t) / 16
-    inside = jnp.abs(x) < jnp.where(sharp, 0, w)
-    return jnp.where(inside, blend, jnp.maximum(x, 0))
+    t = jnp.clip(x / w, 0, 1)
+    blend = w * t**3 * (6 + t * (3 * t - 8))
+    return jnp.where((x < w) & ~sharp, blend, jnp.maximum(x, 0))
 
 
 @jax.custom_jvp
 def cubic_ratio(u: Float[Array, "*n"]) -> Float[Array, "*n"]:
     r"""Root g of g + (4/27) u g^3 = 1 on the branch through g(0) = 1.
 
-    The scaled form of a depressed cubic d + b d^3 = t with d = t g(u), u = 27/4 b t^2: one formula for
-    a hardening (u > 0), linear (u = 0) and softening (u < 0) law, without the 0/0 of the hyperbolic
-    closed form at b -> 0. The branch ends in a fold at u = -1, g = 3/2; below it the result is NaN.
+    The scaled form of a depressed cubic d + b d^3 = t with d = t g(u), u = 27/4 b t^2: one formula
+    for a hardening (u > 0), linear (u = 0) and softening (u < 0) law, without the 0/0 of the
+    hyperbolic closed form at b -> 0. The branch ends in a fold at u = -1, g = 3/2; below it the
+    result is NaN.
 
     The derivative is implicit, dg/du = -(4/27) g^3 / (1 + (4/9) u g^2), to any order.
     """
@@ -78,6 +78,6 @@ def solve_2x2(
     r2: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Solve [[a, b], [b, c]] x = r for a symmetric positive definite matrix, by elimination."""
-    l = b / a
-    x2 = (r2 - l * r1) / (c - l * b)
+    pivot = b / a
+    x2 = (r2 - pivot * r1) / (c - pivot * b)
     return (r1 - b * x2) / a, x2

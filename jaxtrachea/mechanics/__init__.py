@@ -1,1 +1,1 @@
-
+"""Force law, ligament beam, rings and their equilibrium."""

@@ -309,9 +309,9 @@ def _back_substitute(side: _Side, s, held, V, M):
 def _influence(beam: Beam, s):
     """Influence coefficients of one cantilever of length s: unit forces at rings, V and M at tip.
 
-    Returns the (n + 2, n + 2) matrix of displacements int m_p m_q / EI dx (+ shear) and the (n + 1,
-    n + 2) matrix of rotations at the rings and the tip, each integral exact by Simpson's rule span by
-    span. Rows of rings beyond the tip are those of a ring at the tip; mask them.
+    Returns the (n + 2, n + 2) matrix of displacements int m_p m_q / EI dx (+ shear) and the
+    (n + 1, n + 2) matrix of rotations at the rings and the tip, each integral exact by Simpson's
+    rule span by span. Rows of rings beyond the tip are those of a ring at the tip; mask them.
     """
     ends = jnp.concatenate([jnp.zeros_like(beam.x[:1]), jnp.minimum(beam.x, s), s[None]])
     low, high = ends[:-1], ends[1:]
@@ -345,7 +345,7 @@ def _dense_side(beam: Beam, s, held):
 def deflect_dense(
     beam: Beam, s_c: Float[Array, ""], force: Float[Array, ""], *, split: Split = "continuous"
 ) -> Deflection:
-    """The paper's own algorithm: all redundant reactions from one dense system per side.
+    """The paper's own algorithm: all redundant reactions of a side from one dense system.
 
     Same arguments and result as `deflect` with `form="reactions"`. Loses digits where rings are much
     stiffer than the ligament (docs/model.md has the table).

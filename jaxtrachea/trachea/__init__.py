@@ -1,1 +1,1 @@
-
+"""What is there at rest: geometry, material."""

@@ -1,7 +1,6 @@
 """What is there at rest: length, ring positions and cross-section of a ring-supported tube."""
 
 import math
-from typing import Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,8 +11,8 @@ from jaxtyping import Array, ArrayLike, Float
 class Geometry(eqx.Module):
     """A straight tube held at both ends and supported by C-rings.
 
-    Coordinates as in docs/model.md: `s` runs along the centreline from 0 (carina, end A) to `length`
-    (larynx, end B); rings span |phi| <= `half_angle` about the anterior midline.
+    Coordinates as in docs/model.md: `s` runs along the centreline from 0 (carina, end A) to
+    `length` (larynx, end B); rings span |phi| <= `half_angle` about the anterior midline.
 
     Attributes:
         length: mm.
@@ -44,12 +43,12 @@ class Geometry(eqx.Module):
         half_angle: float = 2 * math.pi / 3,
         ring_height: float = 4.0,
         dtype=None,
-    ) -> Self:
+    ) -> "Geometry":
         """Build a geometry from Python numbers, checking it on the way.
 
         Args:
             length: mm, positive.
-            ring_positions: s of each ring, mm; at least one, strictly increasing, inside (0, length).
+            ring_positions: s of each ring, mm; strictly increasing, inside (0, length).
             radius: mm, positive.
             half_angle: rad, in (pi/2, pi) for a ring open behind.
             ring_height: mm, positive.

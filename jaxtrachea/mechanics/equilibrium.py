@@ -1,0 +1,77 @@
+"""Local indentation and skeleton deflection together (normal press).
+
+The only place where contact force and deflection are solved for at once. Both couplings are closed
+forms up to one scaled cubic whose derivative is implicit (`_numerics.cubic_ratio`).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxtrachea._numerics import cubic_ratio
+from jaxtrachea.mechanics.force_law import Law, duffing, fold_depth
+from jaxtrachea.status import PressStatus
+
+
+class Equilibrium(NamedTuple):
+    """Solved press, one entry per tool displacement.
+
+    Attributes:
+        depth: local indentation d, mm.
+        force: contact force, N. NaN where `status` says there is no stable solution.
+        status: a `PressStatus` as int8.
+    """
+
+    depth: Float[Array, "*n"]
+    force: Float[Array, "*n"]
+    status: Int[Array, "*n"]
+
+
+def press_series(
+    displacement: Float[Array, "*n"], compliance: Float[Array, ""], law: Law
+) -> Equilibrium:
+    """Series coupling: displacement = local indentation + skeleton deflection.
+
+    (1 + c k_1) d + c k_3 d^3 = D, solved as d = delta g(u) with delta = D / (1 + c k_1) and
+    u = 27/4 c k_3 / (1 + c k_1) delta^2. Unique for k_3 >= 0; for k_3 < 0 stable up to the fold of
+    the coupled problem, u = -1, beyond which depth and force are NaN.
+
+    Args:
+        displacement: D after first touch, mm; any shape.
+        compliance: c, deflection of the skeleton at C per unit force, mm/N, not negative.
+        law: local law; k_1 > 0.
+    """
+    stiffening = 1 + compliance * law.k_1
+    delta = displacement / stiffening
+    u = 6.75 * (compliance * law.k_3 / stiffening) * delta * delta
+    depth = delta * cubic_ratio(u)
+    force = duffing(depth, law)
+    return Equilibrium(depth, force, _status(displacement, force, u <= -1))
+
+
+def press_total(
+    displacement: Float[Array, "*n"], compliance: Float[Array, ""], law: Law
+) -> Equilibrium:
+    """Total coupling, as printed in the paper: F = Duffing(D) with D the whole displacement of C.
+
+    The local part is D - c F and can come out negative (status NEGATIVE_LOCAL). Force-displacement
+    data then say nothing about the skeleton. NaN past the law's own fold.
+
+    Args: as `press_series`.
+    """
+    folded = jnp.abs(displacement) >= fold_depth(law)
+    force = duffing(displacement, law)
+    depth = displacement - compliance * force
+    negative = depth * displacement < 0
+    status = _status(displacement, force, folded)
+    status = jnp.where((status == PressStatus.OK) & negative, PressStatus.NEGATIVE_LOCAL, status)
+    hide = lambda v: jnp.where(folded, jnp.nan, v)  # noqa: E731
+    return Equilibrium(hide(depth), hide(force), status.astype(jnp.int8))
+
+
+def _status(displacement, force, folded):
+    """PAST_FOLD, NO_CONTACT, NON_FINITE or OK."""
+    status = jnp.where(displacement == 0, PressStatus.NO_CONTACT, PressStatus.OK)
+    status = jnp.where(jnp.isfinite(force), status, PressStatus.NON_FINITE)
+    return jnp.where(folded, PressStatus.PAST_FOLD, status).astype(jnp.int8)

@@ -1,0 +1,158 @@
+"""The forward model: the only place that knows the order of the rooms."""
+
+import dataclasses
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxtrachea._numerics import positive_part
+from jaxtrachea.mechanics import beam as _beam
+from jaxtrachea.mechanics import equilibrium, force_law
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the model includes; static, it selects the program that is compiled.
+
+    Attributes:
+        coupling: `series` (tool displacement = local indentation + skeleton deflection) or `total`
+            (as printed: the local law takes the whole displacement).
+        split: `continuous` (deflection and rotation agree at C) or `independent` (paper eq. 3).
+        form: `recursion`, or `reactions` for the paper's dense force method.
+        shear: the ligament also deforms in shear (needs `Material.GA_L`).
+        local: one law everywhere (`uniform`), or `two-material`: a law of its own on the rings
+            (needs `Material.k_1_ring`; `k_3_ring` if it also hardens there).
+        contact: `unilateral` (no force before first touch) or `bonded` (press or draw, odd law).
+        onset_width: width of the smooth first touch, mm; no force before touch, none changed after.
+        transition: distance from a ring's centre at which the ligament's own local law is reached,
+            mm; None: half the smallest distance between two rings.
+    """
+
+    coupling: Literal["series", "total"] = "series"
+    split: _beam.Split = "continuous"
+    form: _beam.Form = "recursion"
+    shear: bool = False
+    local: Literal["uniform", "two-material"] = "uniform"
+    contact: Literal["unilateral", "bonded"] = "unilateral"
+    onset_width: float = 1e-3
+    transition: float | None = None
+
+
+class Press(NamedTuple):
+    """A normal press at one contact position, along any number of tool displacements.
+
+    Attributes:
+        force: contact force, N; shape of the displacement.
+        depth: local indentation, mm; same shape.
+        skeleton: deflection of C by the skeleton, mm; same shape.
+        joints: deflection of the ligament at each ring, mm; shape (*n, rings).
+        reactions: force of each ring against the load, N; shape (*n, rings).
+        compliance: deflection of C per unit force, mm/N; scalar.
+        status: a `PressStatus` per displacement.
+    """
+
+    force: Float[Array, "*n"]
+    depth: Float[Array, "*n"]
+    skeleton: Float[Array, "*n"]
+    joints: Float[Array, "*n rings"]
+    reactions: Float[Array, "*n rings"]
+    compliance: Float[Array, ""]
+    status: Int[Array, "*n"]
+
+
+def ligament_beam(geometry: Geometry, material: Material, options: Options) -> _beam.Beam:
+    """The ligament as a `Beam` on the rings, scalars spread over spans and rings.
+
+    Raises:
+        ValueError: `options.shear` without `material.GA_L`.
+    """
+    x = geometry.ring_positions
+    spans = (x.shape[0] + 1,)
+    GA = None
+    if options.shear:
+        if material.GA_L is None:
+            raise ValueError("options.shear needs Material.GA_L (N); it is None")
+        GA = jnp.broadcast_to(material.GA_L, spans)
+    EI, k = jnp.broadcast_to(material.EI_L, spans), jnp.broadcast_to(material.k_M, x.shape)
+    return _beam.Beam(x, geometry.length, EI, k, GA)
+
+
+def local_law(
+    geometry: Geometry, material: Material, s_c: Float[Array, ""], options: Options
+) -> force_law.Law:
+    """The local contact law at s_c.
+
+    Raises:
+        ValueError: `two-material` without `material.k_1_ring`.
+    """
+    ligament = force_law.Law(material.k_1, material.k_3)
+    if options.local == "uniform":
+        return ligament
+    if material.k_1_ring is None:
+        raise ValueError("options.local='two-material' needs Material.k_1_ring (N/mm); it is None")
+    on_ring = material.k_3 if material.k_3_ring is None else material.k_3_ring
+    x = geometry.ring_positions
+    if options.transition is not None:
+        transition = jnp.asarray(options.transition, x.dtype)
+    else:
+        ends = jnp.concatenate([-x[:1], x, 2 * geometry.length - x[-1:]])
+        transition = jnp.min(jnp.diff(ends)) / 2
+    weight = force_law.ring_weight(s_c, x, transition)
+    return force_law.blend(ligament, force_law.Law(material.k_1_ring, on_ring), weight)
+
+
+def touch(
+    displacement: Float[Array, "*n"], onset: Float[Array, ""], options: Options
+) -> Float[Array, "*n"]:
+    """Displacement after first touch: exactly 0 before it if unilateral, then smooth."""
+    if options.contact == "bonded":
+        return displacement - onset
+    return positive_part(displacement - onset, jnp.asarray(options.onset_width, displacement.dtype))
+
+
+def press(
+    geometry: Geometry,
+    material: Material,
+    s_c: Float[Array, ""],
+    displacement: Float[Array, "*n"],
+    options: Options = Options(),  # noqa: B008 (frozen)
+    *,
+    onset: Float[Array, ""] | None = None,
+) -> Press:
+    """Press the tool along the inward normal at (s_c, phi = 0) and solve for force and skeleton.
+
+    Small deflections; rings are springs k_M (paper: the cartilage is taken as rigid against the
+    muscle); the skeleton is linear, so at finite strain the arch's flattening is not seen
+    (docs/model.md). Off the midline or oblique: not in this function.
+
+    Args:
+        geometry: the tube at rest.
+        material: stiffness values; floating dtype of the result follows the arrays.
+        s_c: contact position, mm, in [0, length].
+        displacement: tool displacement along the inward normal, mm; any shape.
+        options: what is modelled (static).
+        onset: tool displacement at first touch, mm; 0 if None.
+
+    Returns:
+        The `Press`; rows without a stable solution are NaN with a status, others are untouched.
+    """
+    onset = jnp.zeros((), displacement.dtype) if onset is None else onset
+    beam = ligament_beam(geometry, material, options)
+    unit = _beam.deflect(beam, s_c, jnp.ones_like(s_c), split=options.split, form=options.form)
+    law = local_law(geometry, material, s_c, options)
+    solve = {"series": equilibrium.press_series, "total": equilibrium.press_total}[options.coupling]
+    solved = solve(touch(displacement, onset, options), unit.w_C, law)
+    per_ring = lambda v: solved.force[..., None] * v  # noqa: E731
+    shape = (*displacement.shape, *unit.w.shape)
+    return Press(
+        force=solved.force,
+        depth=solved.depth,
+        skeleton=unit.w_C * solved.force,
+        joints=per_ring(jnp.broadcast_to(unit.w, shape)),
+        reactions=per_ring(jnp.broadcast_to(unit.reaction, shape)),
+        compliance=unit.w_C,
+        status=solved.status,
+    )

@@ -1,0 +1,46 @@
+"""The mechanical parameters of a trachea as one pytree."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def _array():
+    """A field whose Python numbers become arrays (one door, so that jit does not retrace)."""
+    return eqx.field(converter=jnp.asarray)
+
+
+def _optional():
+    """As `_array`, or None."""
+    return eqx.field(default=None, converter=lambda v: None if v is None else jnp.asarray(v))
+
+
+class Material(eqx.Module):
+    """Stiffness of ligament, rings and local contact: everything that is identified.
+
+    A scalar holds for all spans or rings; an array gives each its own. None: not part of the model
+    (no shear flexibility; the ring's local law is that of the ligament).
+
+    Attributes:
+        EI_L: bending stiffness E_L I_L of the ligament, N mm^2; scalar or (rings + 1,).
+        k_M: stiffness of the muscular mat under each ring, N/mm; scalar or (rings,).
+        k_1: linear local contact stiffness m_0 omega_0^2, N/mm.
+        k_3: cubic local contact stiffness 3/4 m_0 beta_0^2 eps, N/mm^3.
+        GA_L: shear stiffness kappa G A of the ligament, N; scalar or (rings + 1,), or None.
+        k_1_ring: `k_1` where the tool rests on a ring, N/mm, or None.
+        k_3_ring: `k_3` where the tool rests on a ring, N/mm^3, or None.
+        EA_L: axial stiffness E_L A_L, N; scalar or (rings + 1,), or None.
+        k_A: axial spring of the carina end, N/mm; None: rigid.
+        k_B: axial spring of the larynx end, N/mm; None: rigid.
+    """
+
+    EI_L: Float[Array, "..."] = _array()
+    k_M: Float[Array, "..."] = _array()
+    k_1: Float[Array, ""] = _array()
+    k_3: Float[Array, ""] = _array()
+    GA_L: Float[Array, "..."] | None = _optional()
+    k_1_ring: Float[Array, ""] | None = _optional()
+    k_3_ring: Float[Array, ""] | None = _optional()
+    EA_L: Float[Array, "..."] | None = _optional()
+    k_A: Float[Array, ""] | None = _optional()
+    k_B: Float[Array, ""] | None = _optional()
