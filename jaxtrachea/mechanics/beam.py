@@ -347,8 +347,8 @@ def deflect_dense(
 ) -> Deflection:
     """The paper's own algorithm: all redundant reactions of a side from one dense system.
 
-    Same arguments and result as `deflect` with `form="reactions"`. Loses digits where rings are much
-    stiffer than the ligament (docs/model.md has the table).
+    Same arguments and result as `deflect` with `form="reactions"`. Loses digits where rings are
+    much stiffer than the ligament (docs/beam_accuracy.md has the table).
     """
     mirrored = Beam(
         (beam.length - beam.x)[::-1],
