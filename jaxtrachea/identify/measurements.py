@@ -173,7 +173,7 @@ def _sniff_hdf5(path: Path) -> str:
     with opened(path) as file:
         if "schema" in file.attrs:
             return "hdf5"
-        if "0" in file:
+        if any(name.isdecimal() for name in file):
             return "afmformats"
     raise DataError(
         f"{path}: HDF5 of no known layout; expected root attribute schema ="

@@ -33,8 +33,9 @@ def finish(raw: RawCurve, options: ReadOptions) -> Curve | BadCurve:
 
 
 def bad(specimen: str, trial: str, source: str, fault: Fault) -> BadCurve:
-    """The record of a fault, its message headed by the place."""
-    return BadCurve(specimen, trial, source, fault.kind, f"{source}: {fault.message}", fault.cure)
+    """The record of a fault, its message headed by the place and kept on one line."""
+    message = " ".join(f"{source}: {fault.message}".split())
+    return BadCurve(specimen, trial, source, fault.kind, message, fault.cure)
 
 
 def _finish(raw: RawCurve, options: ReadOptions) -> Curve:

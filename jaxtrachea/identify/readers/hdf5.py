@@ -80,7 +80,7 @@ def _check_schema(path: Path, file: Any) -> None:
         )
     if not isinstance(version, (int, np.integer)) or version != SCHEMA_VERSION:
         raise DataError(
-            f"{path}: schema_version is {version!r}, this program reads {SCHEMA_VERSION};"
+            f"{path}: schema_version is {version}, this program reads {SCHEMA_VERSION};"
             " update the program or the file"
         )
     if not hasattr(file.get("specimens"), "items"):

@@ -6,6 +6,7 @@ and anything of the kind refuses the file; links other than hard ones are never 
 """
 
 import math
+import mmap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,6 +42,7 @@ def opened(path: Path) -> Iterator[Any]:
     import h5py
 
     try:
+        _check_heaps(path)
         file = h5py.File(path, "r")
     except (OSError, RuntimeError, ValueError) as error:
         raise _damaged(path, error) from None
@@ -64,6 +66,35 @@ def _damaged(path: Path, error: Exception) -> DataError:
         f"{path}: not a readable HDF5 file, truncated or damaged ({reason});"
         " copy or export it again"
     )
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuse a file whose damage would make the library loop for ever over a text attribute.
+
+    Global heap collections ("GCOL") hold variable-length text as a chain of objects, each with its
+    size; the library steps from one to the next and never arrives if the free space claims size 0.
+    Layout: HDF5 File Format Specification 3.0, section III.E, with lengths of 8 bytes.
+
+    Raises:
+        OSError: such a chain, or a file that cannot be read.
+    """
+    if path.stat().st_size == 0:
+        raise OSError("the file is empty")
+    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        # Collections do not overlap, which bounds the steps; a file made of overlaps is refused.
+        steps = len(data) // 16
+        start = data.find(b"GCOL\1\0\0\0")
+        while start >= 0:
+            end = min(start + int.from_bytes(data[start + 8 : start + 16], "little"), len(data))
+            at = start + 16
+            while at + 16 <= end:
+                steps -= 1
+                size = int.from_bytes(data[at + 8 : at + 16], "little")
+                free = data[at : at + 2] == b"\0\0"
+                if steps < 0 or (free and size < 16):
+                    raise OSError(f"global heap at byte {start} is damaged")
+                at += size if free else 16 + (size + 7) // 8 * 8
+            start = data.find(b"GCOL\1\0\0\0", start + 4)
 
 
 class _Audit:
@@ -165,7 +196,7 @@ def numeric(group: Any, name: str) -> np.ndarray:
         Fault: no such dataset ("column_missing"), or its bytes are damaged ("unreadable").
     """
     dataset = group.get(name)
-    if dataset is None or not hasattr(dataset, "dtype"):
+    if dataset is None or hasattr(dataset, "items"):
         raise Fault(
             "column_missing",
             f"no dataset {name!r}; there are {', '.join(map(repr, group)) or 'none'}",
@@ -175,7 +206,7 @@ def numeric(group: Any, name: str) -> np.ndarray:
         raise Fault("shape", f"dataset {name!r} has no shape", "store a vector")
     try:
         return np.asarray(dataset[()], dtype=np.float64)
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, ValueError, TypeError) as error:
         raise Fault(
             "unreadable", f"dataset {name!r} is damaged ({error})", "copy the file again"
         ) from None
