@@ -191,6 +191,7 @@ def test_first_line_state(tmp_path):
         ('{"s": 17}\n' + TIDY, {}, "s stands in|17 has no unit"),
         ('{"s": "17 mm"}\n' + TIDY, {}, "s stands in the first line and in a column"),
         ('{"s": \n' + TIDY, {}, "line 1: not a JSON object"),
+        ('{"s":' * 100_000 + "\n" + TIDY, {}, "line 1: not a JSON object"),
         (TIDY, {"columns": {"force": "kraft"}}, "no column 'kraft' for the force"),
         (b"specimen\0,displacement", {}, "zero bytes"),
     ],
@@ -830,6 +831,11 @@ def test_afm_all_segments(tmp_path):
     assert read(afm_file(tmp_path / "c.h5"), loading="all").curves[0].force.size == 4
 
 
+def test_afm_named_column_is_not_replaced_by_another(tmp_path):
+    found = read(afm_file(tmp_path / "c.h5"), columns={"displacement": "height (piezo)"})
+    assert {b.kind for b in found.bad} == {"column_missing"}
+
+
 def test_afm_tip_position_needs_no_spring(tmp_path):
     tip = (np.array([3e-6, 2e-6, 1e-6, 3e-6]), "m")
     path = afm_file(tmp_path / "c.h5", spring=None, **{"tip position": tip})
@@ -879,6 +885,8 @@ def test_afm_sample_tab():
     assert got.force.size == 3147
 
 
-def test_afm_tab_without_metadata(tmp_path):
-    text = "# BEGIN METADATA\n# {\n# END METADATA\n# force\theight (measured)\n0\t0\n1\t1\n"
+@pytest.mark.parametrize("metadata", ["{", "[1]", '{"spring constant": "soft"}'])
+def test_afm_tab_without_metadata(tmp_path, metadata):
+    head = f"# BEGIN METADATA\n# {metadata}\n# END METADATA\n"
+    text = head + "# force\theight (measured)\n0\t0\n1\t1\n"
     assert only_bad(read(put(tmp_path, text, "x.tab"))).kind == "metadata_missing"

@@ -145,10 +145,12 @@ def _tab_head(path: Path, lines: list[Line]) -> tuple[list[str], Mapping[str, An
     begin, end = texts.index("BEGIN METADATA"), texts.index("END METADATA")
     try:
         metadata = json.loads("\n".join(texts[begin + 1 : end]))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise Fault(
             "metadata_missing", f"the metadata are no JSON ({error})", "export the file again"
         ) from None
+    if not isinstance(metadata, dict):
+        raise Fault("metadata_missing", "the metadata are no JSON object", "export the file again")
     for i in range(end + 1, len(lines)):
         if lines[i].text.startswith("#") and texts[i]:
             names, first = _split_glued(texts[i].split("\t"))
@@ -180,24 +182,7 @@ def _curve(
     """Force and tip displacement of one curve, from its columns in file units."""
     who, trial, source = place
     force = _column(options.columns.get("force", "force"), "force", columns, units, source, options)
-    tip = options.columns.get("displacement", "tip position")
-    if "height" in tip or tip not in columns:
-        height = tip if "height" in tip else "height (measured)"
-        length = _column(height, "displacement", columns, units, source, options)
-        spring = metadata.get("spring constant")
-        if not isinstance(spring, (int, float, np.number)) or not 0 < spring < np.inf:
-            raise Fault(
-                "metadata_missing",
-                f"spring constant is {spring!r}; the bending cannot be taken out of the height",
-                'export with metadata "spring constant" (N/m), or with a column "tip position"',
-            )
-        position = length + force / convert(float(spring), "N/m", "stiffness")
-    else:
-        position = _column(tip, "displacement", columns, units, source, options)
-    if position.shape != force.shape:
-        raise Fault(
-            "shape", f"force {force.shape} and height {position.shape} differ", "export again"
-        )
+    position = _tip_position(force, columns, units, metadata, source, options)
     keep = np.ones(force.shape, dtype=bool)
     if "segment" in columns and options.loading != "all":
         if columns["segment"].shape != force.shape:
@@ -208,6 +193,34 @@ def _curve(
     return RawCurve(
         who.specimen, trial, source, displacement, force, rows, row_word, s=who.s, phi=who.phi
     )
+
+
+def _tip_position(
+    force: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+    units: Mapping[str, str | None],
+    metadata: Mapping[str, Any],
+    source: str,
+    options: ReadOptions,
+) -> np.ndarray:
+    """Position of the tip, mm, falling towards the sample: h + F/k, or as the file gives it."""
+    default = "tip position" if "tip position" in columns else "height (measured)"
+    name = options.columns.get("displacement", default)
+    length = _column(name, "displacement", columns, units, source, options)
+    if length.shape != force.shape:
+        raise Fault(
+            "shape", f"force {force.shape} and {name} {length.shape} differ", "export again"
+        )
+    if "height" not in name:
+        return length
+    spring = metadata.get("spring constant")
+    if not isinstance(spring, (int, float, np.number)) or not 0 < spring < 1e9:
+        raise Fault(
+            "metadata_missing",
+            f"spring constant is {spring!r}; the bending cannot be taken out of the height",
+            'export with metadata "spring constant" (N/m), or with a column "tip position"',
+        )
+    return length + force / convert(float(spring), "N/m", "stiffness")
 
 
 def _column(

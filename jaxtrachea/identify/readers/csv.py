@@ -74,7 +74,7 @@ def _state(lines: list[Line]) -> tuple[dict, list[Line]]:
         return {}, lines
     try:
         state = json.loads(lines[0].text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(
             f"line {lines[0].number}: not a JSON object ({error}); correct it"
         ) from None

@@ -54,29 +54,10 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
         rows = np.array(table.lines, dtype=np.int64)
         if rows.size:
             source = f"{path}:{rows[0]}-{rows[-1]}"
-        values = {}
-        for role in ("displacement", "force", "sigma"):
-            if role in roles:
-                unit = resolve_unit(
-                    role,
-                    table.units[roles[role]],
-                    options,
-                    f"{path}: column {table.names[roles[role]]!r}",
-                )
-                values[role] = role_values(table, role, roles[role], range(len(table.rows)), unit)
-        joints = [role for role in roles if role.startswith("joint_")]
-        columns = [
-            role_values(
-                table,
-                role,
-                roles[role],
-                range(len(table.rows)),
-                resolve_unit(role, table.units[roles[role]], options, f"{path}: column {role!r}"),
-            )
-            for role in joints
-        ]
+        values = _values(table, roles, options)
     except Fault as fault:
         return [bad(who.specimen, trial, source, fault)]
+    joints = [role for role in values if role.startswith("joint_")]
     return [
         RawCurve(
             who.specimen,
@@ -89,9 +70,20 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
             phi=who.phi,
             sigma=values.get("sigma"),
             joint_rings=np.array([int(r[6:]) - 1 for r in joints]) if joints else None,
-            joint_displacement=np.stack(columns, axis=1) if joints else None,
+            joint_displacement=np.stack([values[r] for r in joints], axis=1) if joints else None,
         )
     ]
+
+
+def _values(table: Table, roles: dict[str, int], options: ReadOptions) -> dict[str, np.ndarray]:
+    """Columns by role in mm and N; position columns are not looked for in a machine file."""
+    values = {}
+    for role, i in roles.items():
+        if role in ("displacement", "force", "sigma") or role.startswith("joint_"):
+            place = f"{table.path}: column {table.names[i]!r}"
+            unit = resolve_unit(role, table.units[i], options, place)
+            values[role] = role_values(table, role, i, range(len(table.rows)), unit)
+    return values
 
 
 def _table(path: Path, lines: list[Line], options: ReadOptions) -> tuple[Table, dict[str, int]]:

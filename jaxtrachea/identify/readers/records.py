@@ -69,8 +69,9 @@ class BadCurve:
         trial: name of the trial.
         source: file, and lines or group, it came from.
         kind: short code: "empty", "too_few_points", "unparsable", "ragged", "column_missing",
-            "unit_missing", "unit_unknown", "shape", "non_finite", "bad_sigma", "position",
-            "absurd_scale", "non_monotone", "no_signal", "sign", "metadata_missing", "unreadable".
+            "ambiguous", "unit_missing", "unit_unknown", "shape", "non_finite", "bad_sigma",
+            "position", "absurd_scale", "non_monotone", "no_signal", "sign", "metadata_missing",
+            "unreadable".
         message: one line: file, place, what was found and what expected.
         cure: one line.
     """
