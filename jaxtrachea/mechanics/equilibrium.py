@@ -47,7 +47,7 @@ def press_series(
     u = 6.75 * (compliance * law.k_3 / stiffening) * delta * delta
     depth = delta * cubic_ratio(u)
     force = duffing(depth, law)
-    return Equilibrium(depth, force, _status(displacement, force, u <= -1))
+    return Equilibrium(depth, force, _status(displacement, depth + force, u <= -1))
 
 
 def press_total(
@@ -60,18 +60,18 @@ def press_total(
 
     Args: as `press_series`.
     """
-    folded = jnp.abs(displacement) >= fold_depth(law)
+    folded = (jnp.abs(displacement) >= fold_depth(law)) & (law.k_3 < 0)
     force = duffing(displacement, law)
     depth = displacement - compliance * force
     negative = depth * displacement < 0
-    status = _status(displacement, force, folded)
+    status = _status(displacement, depth + force, folded)
     status = jnp.where((status == PressStatus.OK) & negative, PressStatus.NEGATIVE_LOCAL, status)
     hide = lambda v: jnp.where(folded, jnp.nan, v)  # noqa: E731
     return Equilibrium(hide(depth), hide(force), status.astype(jnp.int8))
 
 
-def _status(displacement, force, folded):
+def _status(displacement, result, folded):
     """PAST_FOLD, NO_CONTACT, NON_FINITE or OK."""
     status = jnp.where(displacement == 0, PressStatus.NO_CONTACT, PressStatus.OK)
-    status = jnp.where(jnp.isfinite(force), status, PressStatus.NON_FINITE)
+    status = jnp.where(jnp.isfinite(result), status, PressStatus.NON_FINITE)
     return jnp.where(folded, PressStatus.PAST_FOLD, status).astype(jnp.int8)

@@ -1,0 +1,92 @@
+"""Local contact law: the paper's symbols, the fold, and the blend between ring and ligament."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrachea.mechanics.force_law import (
+    Law,
+    blend,
+    duffing,
+    fold_depth,
+    from_duffing,
+    ring_weight,
+)
+
+DTYPES = ["float32", "float64"]
+RINGS = np.array([10.0, 20.0, 32.0])
+
+
+def law(k_1, k_3, dtype="float64"):
+    return Law(jnp.asarray(k_1, dtype), jnp.asarray(k_3, dtype))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_duffing(dtype):
+    d = jnp.linspace(-2, 2, 9, dtype=dtype)
+    force = jax.jit(duffing)(d, law(0.3, 0.05, dtype))
+    assert force.dtype == dtype
+    expected = 0.3 * np.asarray(d, float) + 0.05 * np.asarray(d, float) ** 3
+    np.testing.assert_allclose(force, expected, rtol=4 * np.finfo(dtype).eps, atol=1e-30)
+    np.testing.assert_array_equal(force, -force[::-1])
+
+
+def test_from_duffing():
+    """|F| = m_0 |omega_0^2 d + 3/4 beta_0^2 eps d^3| (paper eq. 1); m_0 merely scales."""
+    m_0, omega, beta = 0.02, 15.0, 8.0
+    d = jnp.asarray(1.7)
+    force = duffing(d, from_duffing(jnp.asarray(m_0), jnp.asarray(omega), jnp.asarray(beta)))
+    np.testing.assert_allclose(force, m_0 * (omega * 1.7 + 0.75 * beta * 1.7**3), rtol=1e-14)
+    doubled = from_duffing(jnp.asarray(2 * m_0), jnp.asarray(omega / 2), jnp.asarray(beta / 2))
+    np.testing.assert_allclose(duffing(d, doubled), force, rtol=1e-14)
+
+
+@pytest.mark.parametrize("k_3", [-1e-30, -0.02, -1e10])
+def test_fold_is_where_the_law_peaks(k_3):
+    folded = law(0.5, k_3)
+    d = fold_depth(folded)
+    np.testing.assert_allclose(d, np.sqrt(0.5 / (-3 * k_3)), rtol=1e-14)
+    slope = jax.grad(duffing)(d, folded)
+    assert abs(float(slope)) < 1e-14
+    assert np.isfinite(jax.grad(lambda k: fold_depth(Law(jnp.asarray(0.5), k)))(folded.k_3))
+
+
+@pytest.mark.parametrize("k_3", [0.0, 1e-30, 4.0])
+def test_no_fold(k_3):
+    assert fold_depth(law(0.5, k_3)) == jnp.inf
+    assert jax.grad(lambda k: fold_depth(Law(jnp.asarray(0.5), k)))(jnp.asarray(k_3)) == 0
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_ring_weight_limits(dtype):
+    """1 on a ring's centre, exactly 0 from `transition` on, between 0 and 1 elsewhere."""
+    x = jnp.asarray(RINGS, dtype)
+    weight = jax.jit(jax.vmap(lambda s, width: ring_weight(s, x, width), (0, None)))
+    for width in (5.0, 9.0):  # rings apart; neighbourhoods that overlap
+        s = jnp.linspace(0, 42, 421, dtype=dtype)
+        w = np.asarray(weight(s, jnp.asarray(width, dtype)))
+        assert w.dtype == dtype
+        assert np.all((w >= 0) & (w <= 1))
+        np.testing.assert_array_equal(weight(x, jnp.asarray(width, dtype)), 1)
+        distance = np.min(np.abs(np.asarray(s)[:, None] - RINGS), axis=1)
+        assert np.all(w[distance >= width + 1e-3] == 0)
+        assert np.all(w[distance < 0.99 * width] > 0)
+
+
+def test_ring_weight_is_c2():
+    """Left and right limits of value, slope and curvature, at centres and at the rim."""
+    x, width = jnp.asarray(RINGS), jnp.asarray(5.0)
+    f = lambda s: ring_weight(s, x, width)  # noqa: E731
+    for tolerance in (1e-8, 1e-8, 1e-7):
+        for s in (5.0, 10.0, 15.0, 25.0, 27.0, 37.0):
+            left, at, right = (f(jnp.asarray(s + e)) for e in (-1e-9, 0.0, 1e-9))
+            np.testing.assert_allclose([left, right], [at, at], atol=tolerance)
+        f = jax.grad(f)
+
+
+def test_blend():
+    soft, stiff = law(0.2, 0.01), law(3.0, -0.5)
+    for weight, expected in ((0.0, soft), (1.0, stiff), (0.25, law(0.9, -0.1175))):
+        got = blend(soft, stiff, jnp.asarray(weight))
+        np.testing.assert_allclose(got, expected, rtol=1e-14)

@@ -1,0 +1,172 @@
+"""The forward model: options, their errors, and the rooms put together in the right order."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrachea.mechanics import beam, equilibrium, force_law
+from jaxtrachea.model import Options, ligament_beam, local_law, press, touch
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.geometry import table_1
+from jaxtrachea.trachea.material import Material
+
+DTYPES = ["float32", "float64"]
+VALUES = {"EI_L": 1.862, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02}
+MORE = {"GA_L": 1.1, "k_1_ring": 0.9, "k_3_ring": 0.05}
+D = np.array([-0.5, 0.0, 0.2, 1.0, 3.0])
+
+
+def material(dtype="float64", **changes):
+    return Material(**{n: jnp.asarray(v, dtype) for n, v in (VALUES | changes).items()})
+
+
+@functools.cache
+def run(options):
+    return jax.jit(lambda g, m, s, d, onset: press(g, m, s, d, options, onset=onset))
+
+
+def pressed(options, dtype="float64", s=44.0, displacement=D, onset=0.0, **changes):
+    args = (jnp.asarray(v, dtype) for v in (s, displacement, onset))
+    return run(options)(table_1(dtype=dtype), material(dtype, **changes), *args)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(
+    "options",
+    [
+        Options(),
+        Options(coupling="total", split="independent", form="reactions"),
+        Options(shear=True, local="two-material", contact="bonded", transition=4.0),
+    ],
+    ids=["default", "paper", "everything"],
+)
+def test_shapes_dtypes_and_consistency(options, dtype):
+    got = pressed(options, dtype, **(MORE if options.shear else {}))
+    assert {v.dtype for v in got if v.dtype != jnp.int8} == {jnp.dtype(dtype)}
+    assert got.force.shape == got.depth.shape == got.status.shape == (5,)
+    assert got.joints.shape == got.reactions.shape == (5, 15)
+    rtol = 50 * np.finfo(dtype).eps
+    np.testing.assert_allclose(got.skeleton, got.compliance * got.force, rtol=rtol)
+    np.testing.assert_allclose(got.reactions, VALUES["k_M"] * got.joints, rtol=rtol)
+    moved = np.where((D > 0) | (options.contact == "bonded"), D, 0)
+    # First touch changes nothing beyond `onset_width`.
+    np.testing.assert_allclose(got.depth + got.skeleton, moved, rtol=rtol, atol=rtol)
+
+
+def test_is_the_rooms_in_order():
+    got = pressed(Options(), onset=0.1)
+    g, m, s = table_1(), material(), jnp.asarray(44.0)
+    b = ligament_beam(g, m, Options())
+    c = beam.contact_compliance(b, s)
+    law = force_law.Law(m.k_1, m.k_3)
+    alone = equilibrium.press_series(jnp.maximum(jnp.asarray(D) - 0.1, 0), c, law)
+    np.testing.assert_allclose(got.force, alone.force, rtol=1e-12)
+    joints = beam.deflect(b, s, alone.force[4]).w
+    np.testing.assert_allclose(got.joints[4], joints, rtol=1e-10, atol=1e-14)
+
+
+@pytest.mark.parametrize("coupling", ["series", "total"])
+def test_no_contact_no_force(coupling):
+    """Exactly zero up to the onset, whatever the skeleton."""
+    d = np.array([-1e9, -1.0, 0.0, 0.299999, 0.3, 0.4])
+    got = pressed(Options(coupling=coupling), displacement=d, onset=0.3)
+    for v in (got.force, got.depth, got.skeleton, got.joints, got.reactions):
+        np.testing.assert_array_equal(v[:5], 0)
+    np.testing.assert_array_equal(got.status[:5], PressStatus.NO_CONTACT)
+    assert got.force[5] > 0
+
+
+@pytest.mark.parametrize("coupling", ["series", "total"])
+def test_bonded_is_odd(coupling):
+    d = np.array([-2.0, -0.3, 0.3, 2.0])
+    got = pressed(Options(coupling=coupling, contact="bonded"), displacement=d + 0.1, onset=0.1)
+    np.testing.assert_allclose(got.force, -got.force[::-1], rtol=1e-12)
+    assert got.force[3] > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [(Options(shear=True), "GA_L"), (Options(local="two-material"), "k_1_ring")],
+)
+def test_missing_values_are_named(options, name):
+    with pytest.raises(ValueError, match=name):
+        pressed(options)
+
+
+def test_two_material():
+    """On a ring the ring's own law, mid-span the ligament's; `k_3` holds on rings if not given."""
+    options, g = Options(local="two-material"), table_1()
+    m = material(**MORE)
+    on, off = (local_law(g, m, jnp.asarray(s), options) for s in (50.0, 55.0))
+    np.testing.assert_allclose(on, (0.9, 0.05), rtol=1e-14)
+    np.testing.assert_allclose(off, (0.3, 0.02), rtol=1e-14)
+    plain = local_law(g, material(k_1_ring=0.9), jnp.asarray(50.0), options)
+    np.testing.assert_allclose(plain, (0.9, 0.02), rtol=1e-14)
+
+
+def test_two_material_single_ring_has_a_transition():
+    """With one ring the transition is measured to the ends: finite, not the infinity of no pair."""
+    from jaxtrachea.trachea.geometry import Geometry
+
+    g = Geometry.create(100.0, [30.0])
+    law = local_law(g, material(**MORE), jnp.asarray(95.0), Options(local="two-material"))
+    np.testing.assert_allclose(law, (0.3, 0.02))
+
+
+def test_shear_softens():
+    one, two = pressed(Options()), pressed(Options(shear=True), **MORE)
+    assert two.compliance > one.compliance
+    stiff = pressed(Options(shear=True), **(MORE | {"GA_L": 1e12}))
+    np.testing.assert_allclose(stiff.compliance, one.compliance, rtol=1e-9)
+
+
+def test_per_ring_values():
+    """Scalars spread over rings and spans are the arrays written out."""
+    one = pressed(Options())
+    two = pressed(Options(), k_M=np.full(15, 0.1), EI_L=np.full(16, 1.862))
+    np.testing.assert_array_equal(one.joints, two.joints)
+
+
+def test_touch_is_smooth_and_local():
+    width, d = 0.2, jnp.linspace(-1, 1, 401)
+    y = touch(d, jnp.asarray(0.1), Options(onset_width=width))
+    np.testing.assert_array_equal(y[d <= 0.1], 0)
+    beyond = d >= 0.1 + width
+    np.testing.assert_allclose(y[beyond], d[beyond] - 0.1, rtol=1e-14)
+    np.testing.assert_array_equal(touch(d, jnp.asarray(0.1), Options(contact="bonded")), d - 0.1)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_units(unit):
+    """Every length in another unit: displacements rescale, forces stay."""
+    import equinox as eqx
+
+    g = table_1()
+    lengths = lambda v: (v.length, v.ring_positions, v.radius, v.ring_height)  # noqa: E731
+    h = eqx.tree_at(lengths, g, tuple(v * unit for v in lengths(g)))
+    m = material()
+    n = Material(m.EI_L * unit**2, m.k_M / unit, m.k_1 / unit, m.k_3 / unit**3)
+    s, d, zero = jnp.asarray(44.0), jnp.asarray(D), jnp.zeros(())
+    one = run(Options(onset_width=0.0))(g, m, s, d, zero)
+    two = run(Options(onset_width=0.0))(h, n, s * unit, d * unit, zero)
+    np.testing.assert_allclose(two.force, one.force, rtol=1e-11)
+    np.testing.assert_allclose(two.depth, one.depth * unit, rtol=1e-11)
+    tolerance = 1e-12 * unit * np.max(np.abs(one.joints))
+    np.testing.assert_allclose(two.joints, one.joints * unit, rtol=1e-9, atol=tolerance)
+
+
+@pytest.mark.parametrize("coupling", ["series", "total"])
+def test_bad_specimen_in_a_batch(coupling):
+    """One specimen NaN, one past its fold: flagged; the others keep every bit."""
+    one = jax.jit(jax.vmap(lambda EI, k_3: pressed(Options(coupling=coupling), EI_L=EI, k_3=k_3)))
+    EI, k_3 = jnp.full(4, 1.862), jnp.full(4, 0.001)
+    good, bad = one(EI, k_3), one(EI.at[0].set(jnp.nan), k_3.at[2].set(-1e6))
+    keep = jnp.asarray([1, 3])
+    for p, q in zip(good, bad, strict=True):
+        np.testing.assert_array_equal(p[keep], q[keep])
+    assert np.all(bad.status[0, 2:] == PressStatus.NON_FINITE)
+    assert np.all(bad.status[2, 2:] == PressStatus.PAST_FOLD)
+    assert np.all(np.isnan(bad.force[2, 2:]))
