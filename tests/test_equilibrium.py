@@ -58,7 +58,7 @@ def test_series_closed_form(k_3, dtype):
 
 @pytest.mark.parametrize("c", [0.0, 1e-9, 2.0, 1e9])
 def test_series_limits_of_compliance(c):
-    """Rigid skeleton: the law itself. Endlessly soft one: the force of the skeleton alone, D / c."""
+    """Rigid skeleton: the law itself. Endlessly soft one: the skeleton alone, D / c."""
     D, local = jnp.asarray([0.1, 2.0]), law(0.4, 0.02)
     got = series(D, scalar(c), local)
     if c < 1e-6:
@@ -123,7 +123,8 @@ def test_zero_displacement(press):
 
 @pytest.mark.parametrize("press", [series, total])
 @pytest.mark.parametrize(
-    ("c", "k_1", "D"), [(np.nan, 0.3, 1.0), (1.0, np.nan, 1.0), (1.0, 0.3, np.nan), (1.0, 0.3, np.inf)]
+    ("c", "k_1", "D"),
+    [(np.nan, 0.3, 1.0), (1.0, np.nan, 1.0), (1.0, 0.3, np.nan), (1.0, 0.3, np.inf)],
 )
 def test_non_finite_inputs_are_flagged(c, k_1, D, press):
     """No status OK beside a number that is not one."""

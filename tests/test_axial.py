@@ -1,0 +1,79 @@
+"""Axial response: against a one-dimensional bar FEM."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrachea.mechanics.axial import stretch
+
+DTYPES = ["float32", "float64"]
+X, LENGTH = np.array([10.0, 25.0, 40.0, 70.0]), 100.0
+POSITIONS = [0.0, 1e-3, 7.0, 25.0, 55.0, 70.0, 99.0, 100.0]
+SPRINGS = [(None, None), (2.0, None), (None, 0.05), (0.3, 1e4)]
+jitted = jax.jit(stretch)
+
+
+def fem(EA, s_c, force, k_A, k_B):
+    """Bars between clamps, rings and C; springs at the ends (rigid: 1e12 times the bars)."""
+    nodes = np.unique(np.concatenate([[0.0, LENGTH, s_c], X]))
+    K = np.zeros((nodes.size, nodes.size))
+    for e, (low, high) in enumerate(zip(nodes, nodes[1:], strict=False)):
+        stiffness = EA[np.searchsorted(X, low, side="right")] / (high - low)
+        K[e : e + 2, e : e + 2] += stiffness * np.array([[1, -1], [-1, 1]])
+    free = np.ones(nodes.size, bool)
+    for end, spring in ((0, k_A), (-1, k_B)):
+        if spring is None:
+            free[end] = False
+        else:
+            K[end, end] += spring
+    f = np.where(nodes == s_c, force, 0.0)
+    u = np.zeros(nodes.size)
+    u[free] = np.linalg.solve(K[np.ix_(free, free)], f[free])
+    at_A = k_A * u[0] if k_A is not None else -(K[0] @ u - f[0])
+    return u[nodes == s_c][0], u[np.searchsorted(nodes, X)], at_A
+
+
+@pytest.mark.parametrize("springs", SPRINGS)
+@pytest.mark.parametrize("s_c", POSITIONS)
+def test_against_bar_fem(s_c, springs):
+    EA = np.array([4.0, 0.5, 8.0, 2.0, 1.0])
+    u_C, u, force_A = fem(EA, s_c, 0.7, *springs)
+    end = {n: jnp.asarray(v) for n, v in zip(("k_A", "k_B"), springs, strict=True) if v is not None}
+    got = jitted(*map(jnp.asarray, (X, LENGTH, EA, s_c, 0.7)), **end)
+    scale = 1e-12 * (abs(u_C) + np.max(np.abs(u)))
+    np.testing.assert_allclose(got.u_C, u_C, atol=scale)
+    np.testing.assert_allclose(got.u, u, atol=scale)
+    if springs[0] is not None or s_c > 0:
+        np.testing.assert_allclose(got.force_A, abs(force_A), rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(got.force_A + got.force_B, 0.7, rtol=1e-14)
+
+
+def uniform(s_c, dtype="float64"):
+    cast = lambda v: jnp.asarray(v, dtype)  # noqa: E731
+    return jitted(cast(X), cast(LENGTH), cast(np.full(5, 3.9)), cast(s_c), cast(0.5))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_paper_formulas(dtype):
+    """F_AC : F_BC = L_BC : L_AC and D_x = F / (E_L A_L (1/L_AC + 1/L_BC)) (paper eq. 2)."""
+    got = uniform(30.0, dtype)
+    assert all(v.dtype == dtype for v in got)
+    rtol = 10 * np.finfo(dtype).eps
+    np.testing.assert_allclose(got.force_A / got.force_B, 70 / 30, rtol=rtol)
+    np.testing.assert_allclose(got.u_C, 0.5 / (3.9 * (1 / 30 + 1 / 70)), rtol=rtol)
+    # Linear from C to each fixed end.
+    expected = np.where(X <= 30, X / 30, (100 - X) / 70) * float(got.u_C)
+    np.testing.assert_allclose(got.u, expected, rtol=rtol)
+
+
+def test_contact_on_a_ring_and_vmap():
+    """C on a ring moves with it, and the response is continuous there."""
+    s = jnp.asarray([25.0 - 1e-9, 25.0, 25.0 + 1e-9])
+    EA = jnp.asarray([4.0, 0.5, 8.0, 2.0, 1.0])
+    got = jax.vmap(stretch, (None, None, None, 0, None))(
+        jnp.asarray(X), jnp.asarray(LENGTH), EA, s, jnp.asarray(1.0)
+    )
+    np.testing.assert_allclose(got.u[1, 1], got.u_C[1], rtol=1e-14)
+    np.testing.assert_allclose(got.u_C, got.u_C[1], rtol=1e-9)
+    np.testing.assert_allclose(got.u, jnp.broadcast_to(got.u[1], (3, 4)), rtol=1e-9)

@@ -1,0 +1,117 @@
+"""Hard cases of the whole press (docs/model.md), value and gradient, in both dtypes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrachea.model import Options, press
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+
+DTYPES = ["float32", "float64"]
+LENGTH = 100.0
+D = np.array([0.0, 0.3, 2.0])
+BASE = {"EI_L": 1.862, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02, "s": 42.0}
+
+#: name: (changes, number of rings, expected status of the two presses that touch)
+CASES = {
+    "plain": ({}, 9, PressStatus.OK),
+    "k -> 0": ({"k_M": 1e-12}, 9, PressStatus.OK),
+    "k -> inf": ({"k_M": 1e12}, 9, PressStatus.OK),
+    "on a ring": ({"s": 40.0}, 9, PressStatus.OK),
+    "on a rigid ring": ({"s": 40.0, "k_M": 1e12}, 9, PressStatus.OK),
+    "at the carina": ({"s": 0.0}, 9, PressStatus.OK),
+    "beside the carina": ({"s": 1e-4}, 9, PressStatus.OK),
+    "at the larynx": ({"s": LENGTH}, 9, PressStatus.OK),
+    "one ring": ({}, 1, PressStatus.OK),
+    "one ring, on it": ({"s": 50.0}, 1, PressStatus.OK),
+    "200 rings": ({}, 200, PressStatus.OK),
+    "200 rigid rings": ({"k_M": 1e9}, 200, PressStatus.OK),
+    "k_3 = 0": ({"k_3": 0.0}, 9, PressStatus.OK),
+    "k_3 tiny": ({"k_3": 1e-30}, 9, PressStatus.OK),
+    "k_3 huge": ({"k_3": 1e25}, 9, PressStatus.OK),
+    "softening": ({"k_3": -1e-4}, 9, PressStatus.OK),
+    "past the fold": ({"k_3": -1e4}, 9, PressStatus.PAST_FOLD),
+    "no local stiffness": ({"k_1": 1e-12, "k_3": 0.0}, 9, PressStatus.OK),
+    "rigid local law": ({"k_1": 1e12}, 9, PressStatus.OK),
+    "soft ligament": ({"EI_L": 1e-9}, 9, PressStatus.OK),
+    "stiff ligament": ({"EI_L": 1e9}, 9, PressStatus.OK),
+    "NaN ligament": ({"EI_L": np.nan}, 9, PressStatus.NON_FINITE),
+}
+
+
+def _press(v, rings):
+    dtype = v["s"].dtype
+    x = np.asarray(LENGTH / (rings + 1) * np.arange(1, rings + 1), dtype)
+    g = Geometry(*(jnp.asarray(a, dtype) for a in (LENGTH, x, 11.0, 2.0, 4.0)))
+    m = Material(v["EI_L"], v["k_M"], v["k_1"], v["k_3"])
+    return press(g, m, v["s"], jnp.asarray(D, dtype), Options())
+
+
+def _value_and_gradient(v, rings):
+    def total(v):
+        got = _press(v, rings)
+        return jnp.sum(jnp.where(got.status == PressStatus.OK, got.force, 0)), got
+
+    return jax.value_and_grad(total, has_aux=True)(v)
+
+
+_run = jax.jit(_value_and_gradient, static_argnums=1)
+
+
+def solved(name, dtype):
+    changes, rings, status = CASES[name]
+    v = {n: jnp.asarray(a, dtype) for n, a in (BASE | changes).items()}
+    (_, got), gradient = _run(v, rings)
+    return got, gradient, status
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", CASES)
+def test_value_and_gradient(name, dtype):
+    """The right status; where it says OK, finite numbers that add up, and a finite gradient."""
+    got, gradient, status = solved(name, dtype)
+    np.testing.assert_array_equal(got.status[1:], status)
+    if status != PressStatus.OK:
+        assert np.all(np.isnan(got.force[1:]))
+        return
+    assert got.status[0] == PressStatus.NO_CONTACT
+    assert got.force[0] == 0
+    assert all(np.all(np.isfinite(v)) for v in got)
+    assert got.force[2] > got.force[1] > 0
+    np.testing.assert_allclose(
+        got.depth + got.skeleton, D, rtol=1e-4 if dtype == "float32" else 1e-10
+    )
+    assert all(np.isfinite(v) for v in gradient.values())
+
+
+@pytest.mark.parametrize("name", [n for n, c in CASES.items() if c[2] == PressStatus.OK])
+def test_float32_agrees_with_float64(name):
+    one, two = (solved(name, dtype)[0] for dtype in DTYPES)
+    np.testing.assert_allclose(one.force, two.force, rtol=2e-5)
+    np.testing.assert_allclose(one.compliance, two.compliance, rtol=2e-5)
+    peak = float(jnp.max(jnp.abs(two.reactions)))
+    np.testing.assert_allclose(one.reactions, two.reactions, atol=3e-5 * peak, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_bad_rows_do_not_touch_their_neighbours(dtype):
+    """NaN and folded specimens in a batch are flagged; the good ones keep every bit."""
+    rows = [CASES[n][0] for n in ("plain", "NaN ligament", "on a ring", "past the fold")]
+    stack = lambda rows: {  # noqa: E731
+        n: jnp.asarray([(BASE | r)[n] for r in rows], dtype) for n in BASE
+    }
+    run = jax.jit(jax.vmap(lambda v: _value_and_gradient(v, 9)))
+    (_, mixed), gradients = run(stack(rows))
+    (_, clean), others = run(stack([rows[0], {}, rows[2], {}]))
+    keep = jnp.asarray([0, 2])
+    for p, q in zip(mixed, clean, strict=True):
+        np.testing.assert_array_equal(p[keep], q[keep])
+    for n in BASE:
+        np.testing.assert_array_equal(gradients[n][keep], others[n][keep])
+    np.testing.assert_array_equal(
+        mixed.status[:, 2],
+        [PressStatus.OK, PressStatus.NON_FINITE, PressStatus.OK, PressStatus.PAST_FOLD],
+    )
