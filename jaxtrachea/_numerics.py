@@ -45,21 +45,22 @@ def cubic_ratio(u: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def _cubic_root(u):
+    """Root of `cubic_ratio`: a start within 5 % (u > 0) or 1e-4 (u < 0), then Halley steps."""
     beyond_fold = u <= -1
-    v = jnp.where(beyond_fold, jnp.zeros_like(u), u)
+    v = jnp.where(beyond_fold, 0, u)
     positive = jnp.maximum(v, 0)
-    negative = jnp.minimum(v, 0)
-    # Starts within a few per cent of the root; then Newton on the convex side.
-    soft = jnp.sqrt(jnp.maximum(1 + negative, 0))
-    start_negative = 1.5 - soft * (0.8164966 - 0.3164966 * soft)
-    s = jnp.cbrt(1 + positive)
-    start_positive = 1.8898816 / (s + 0.8898816)
-    g = jnp.where(v < 0, start_negative, start_positive)
-    for _ in range(4):
-        residual = g + (4 / 27) * v * g**3 - 1
-        slope = 1 + (4 / 9) * v * g**2
-        curvature = (8 / 9) * v * g
-        g = g - 2 * residual * slope / (2 * slope * slope - residual * curvature)
+    # Interpolates g^-3 = 1 + 4u/9 + ... at zero and 4u/27 + ... at infinity.
+    inverse_cube = 1 + (4 * positive + 8 * positive / (1 + 0.041 * positive)) / 27
+    start_hard = jnp.exp(jnp.log(inverse_cube) / -3)
+    e = jnp.sqrt(jnp.maximum(1 + jnp.minimum(v, 0), 0))
+    tail = 0.65760339 + e * (-0.48829214 + e * (0.2662296 - 0.06957457 * e))
+    start_soft = 1.5 - e * (0.8660254 - e * tail)
+    g = jnp.where(v < 0, start_soft, start_hard)
+    for _ in range(3):
+        vg = v * g
+        residual = g * (1 + (4 / 27) * vg * g) - 1
+        slope = 1 + (4 / 9) * vg * g
+        g = g - residual * slope / (slope * slope - residual * (4 / 9) * vg)
     return jnp.where(beyond_fold, jnp.nan, g)
 
 
@@ -81,3 +82,33 @@ def solve_2x2(
     pivot = b / a
     x2 = (r2 - pivot * r1) / (c - pivot * b)
     return (r1 - b * x2) / a, x2
+
+
+def solve_spd(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solve a symmetric positive definite system by Cholesky factors.
+
+    Up to 8 unknowns the elimination is written out: under `vmap` it is then one elementwise program
+    over all lanes, where a library call would be made per lane. A matrix that is not positive
+    definite gives NaN.
+    """
+    n = rhs.shape[0]
+    if n > 8:
+        return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), rhs)
+    rows: list[list[Array]] = []
+    y: list[Array] = []
+    for i in range(n):
+        row: list[Array] = []
+        for j in range(i):
+            rest = matrix[i, j] - sum(
+                (row[m] * rows[j][m] for m in range(j)), jnp.zeros_like(rhs[0])
+            )
+            row.append(rest / rows[j][j])
+        pivot = matrix[i, i] - sum((v * v for v in row), jnp.zeros_like(rhs[0]))
+        row.append(jnp.sqrt(pivot))
+        y.append((rhs[i] - sum((row[m] * y[m] for m in range(i)), jnp.zeros_like(rhs[0]))) / row[i])
+        rows.append(row)
+    x: list[Array] = [rhs[0]] * n
+    for i in reversed(range(n)):
+        below = sum((rows[m][i] * x[m] for m in range(i + 1, n)), jnp.zeros_like(rhs[0]))
+        x[i] = (y[i] - below) / rows[i][i]
+    return jnp.stack(x)

@@ -1,0 +1,271 @@
+"""One fit from problem to result: starts, noise levels, best start, what may be believed."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+
+from jaxtrachea.identify import descent
+from jaxtrachea.identify.problem import Lane, Problem
+from jaxtrachea.identify.solve import Solved, Tolerances, levenberg_marquardt
+from jaxtrachea.identify.uncertainty import Information, Uncertainty, analyse, informations
+from jaxtrachea.status import FitStatus
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How to solve.
+
+    Attributes:
+        method: `levenberg-marquardt`, or optax's `lbfgs` / `adam` on the same cost.
+        starts: starts per lane; the first is the initial guess, the others are drawn around it.
+        decades: starts are drawn up to this many decades from the guess (log scale; with linear
+            scale up to this many times 10 steps), inside the bounds.
+        seed: of the drawn starts.
+        chunk: lanes computed together.
+        tolerances: when a lane is done.
+        float32: compute in single precision (results are float64 all the same).
+    """
+
+    method: Literal["levenberg-marquardt", "lbfgs", "adam"] = "levenberg-marquardt"
+    starts: int = 4
+    decades: float = 1.0
+    seed: int = 0
+    chunk: int = 256
+    tolerances: Tolerances = Tolerances()
+    float32: bool = False
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FitResult:
+    """Estimates of every lane; leading axis = lanes of the problem, P unknowns each.
+
+    Attributes:
+        problem: what was fitted.
+        theta: estimate in scaled coordinates; (lanes, P).
+        value: estimate in the parameter's unit; (lanes, P).
+        standard_error: in the parameter's unit (delta method); (lanes, P).
+        lower: 95 % interval, transformed from scaled coordinates; (lanes, P).
+        upper: (lanes, P).
+        relative_se: standard error over the value (scale `log`: of the logarithm); (lanes, P).
+        at_bound: (lanes, P).
+        status: `FitStatus`; (lanes,).
+        iterations: of the best start; (lanes,).
+        cost: half the weighted sum of squares (or of rho); (lanes,).
+        converged_starts: starts that ended in the best minimum; (lanes,).
+        sigma: standard deviation of force (N) and markers (mm), given or estimated; (lanes, 2).
+        rms: root mean square residual of force (N) and markers (mm); (lanes, 2).
+        samples: observed entries; (lanes,).
+        uncertainty: `Uncertainty` of each lane.
+    """
+
+    problem: Problem
+    theta: np.ndarray
+    value: np.ndarray
+    standard_error: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    relative_se: np.ndarray
+    at_bound: np.ndarray
+    status: np.ndarray
+    iterations: np.ndarray
+    cost: np.ndarray
+    converged_starts: np.ndarray
+    sigma: np.ndarray
+    rms: np.ndarray
+    samples: np.ndarray
+    uncertainty: tuple[Uncertainty, ...]
+
+    @property
+    def lanes(self) -> int:
+        """Number of lanes."""
+        return len(self.status)
+
+
+def fit(
+    problem: Problem,
+    settings: Settings = Settings(),  # noqa: B008 (frozen)
+    progress: Callable[[int, int], None] | None = None,
+) -> FitResult:
+    """Fit every lane from every start and keep the best; failed lanes are rows with a status.
+
+    Args:
+        problem: from `problem.build`.
+        settings: how to solve.
+        progress: called with (jobs finished since the last call, jobs in all).
+
+    Returns:
+        The `FitResult`. It never raises for a lane's sake.
+    """
+    lanes = problem.lanes.lower.shape[0]
+    jobs = np.repeat(np.arange(lanes), settings.starts)
+    sigma = first_sigma(problem)
+    starts = draw_starts(problem, settings)
+    solved = _solve(problem, settings, jobs, starts, sigma[jobs], progress)
+    best, agree = _best(solved, lanes, settings.starts)
+    solved = Solved(*(v[best] for v in solved))
+    every = np.arange(lanes)
+    for _ in range(_noise_rounds(problem)):
+        info = informations(problem, every, solved.theta, sigma)
+        sigma = next_sigma(problem, info, sigma)
+        again = _solve(problem, settings, every, solved.theta, sigma, None)
+        solved = again._replace(iterations=solved.iterations + again.iterations)
+    info = informations(problem, every, solved.theta, sigma)
+    sigma = next_sigma(problem, info, sigma)
+    info = informations(problem, every, solved.theta, sigma)
+    return _conclude(problem, solved, info, sigma, agree)
+
+
+def _solve(problem, settings, jobs, starts, sigma, progress) -> Solved:
+    report = None if progress is None else lambda done: progress(done, len(jobs))
+    common = {"tolerances": settings.tolerances, "chunk": settings.chunk, "progress": report}
+    common["dtype"] = np.float32 if settings.float32 else np.float64
+    if settings.method == "levenberg-marquardt":
+        return levenberg_marquardt(problem, jobs, starts, sigma, **common)
+    return descent.descend(problem, jobs, starts, sigma, method=settings.method, **common)
+
+
+def _noise_rounds(problem: Problem) -> int:
+    """Re-weightings: needed where an estimated sigma changes the estimate, not only its error."""
+    both = problem.lanes.joints is not None
+    estimated = not (problem.noise_given[0] and (problem.noise_given[1] or not both))
+    return 4 if estimated and (both or problem.loss != "linear") else 0
+
+
+def first_sigma(problem: Problem) -> np.ndarray:
+    """Standard deviations to begin with: 1 where given, else 2 % of the peak; (lanes, 2)."""
+    lanes = problem.lanes
+    peak = lambda v: np.maximum(np.abs(v).reshape(len(v), -1).max(axis=1), 1e-300)  # noqa: E731
+    force = np.ones(len(lanes.s_c)) if problem.noise_given[0] else 0.02 * peak(lanes.force)
+    joints = np.ones(len(lanes.s_c))
+    if lanes.joints is not None and not problem.noise_given[1]:
+        joints = 0.02 * peak(lanes.joints)
+    return np.stack([force, joints], axis=1)
+
+
+def next_sigma(problem: Problem, info: Information, sigma: np.ndarray) -> np.ndarray:
+    """Standard deviations from the residuals, where they are not given.
+
+    Mean square, less the share of the unknowns; with a robust loss 1.4826 times the median.
+    """
+    total = info.counts.sum(axis=1, keepdims=True)
+    share = np.maximum(1 - problem.lanes.active.sum(axis=1)[:, None] / np.maximum(total, 1), 0.05)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        estimate = np.sqrt(info.squares / (info.counts * share))
+        if problem.loss != "linear":
+            estimate = 1.4826 * info.spread
+    keep = np.array(problem.noise_given)[None] | ~np.isfinite(estimate) | (info.counts == 0)
+    floor = 1e-9 * first_sigma(problem)
+    return np.where(keep, sigma, np.maximum(estimate, floor))
+
+
+def draw_starts(problem: Problem, settings: Settings) -> np.ndarray:
+    """Starts of every lane in scaled coordinates: the guess, then a Latin hypercube around it.
+
+    Returns:
+        (lanes * starts, P), lane by lane.
+    """
+    rng = np.random.default_rng(settings.seed)
+    lanes, P = problem.lanes.lower.shape
+    guess = np.zeros((lanes, P))
+    reach = np.zeros((lanes, P))
+    for lane, unknowns in enumerate(problem.unknowns):
+        for i, (p, _, _) in enumerate(unknowns):
+            guess[lane, i] = p.to_scaled(p.value)
+            reach[lane, i] = settings.decades * (np.log(10) if p.scale == "log" else 10.0)
+    low = np.maximum(problem.lanes.lower, guess - reach)
+    high = np.minimum(problem.lanes.upper, guess + reach)
+    others = settings.starts - 1
+    strata = (
+        rng.permuted(np.tile(np.arange(others), (P, 1)), axis=1).T if others else np.zeros((0, P))
+    )
+    unit = (strata + rng.uniform(size=(others, P))) / max(others, 1)
+    drawn = low[:, None] + unit[None] * (high - low)[:, None]
+    return np.concatenate([guess[:, None], drawn], axis=1).reshape(-1, P)
+
+
+def _best(solved: Solved, lanes: int, starts: int) -> tuple[np.ndarray, np.ndarray]:
+    """Job with the lowest cost of each lane (converged ones first), and how many starts agree."""
+    cost = solved.cost.reshape(lanes, starts)
+    converged = (solved.status == FitStatus.CONVERGED).reshape(lanes, starts)
+    low = np.nanmin(np.where(np.isfinite(cost), cost, np.inf), axis=1, keepdims=True)
+    near = cost <= low * (1 + 1e-6) + 1e-300
+    rank = np.where(near & converged, -1.0, np.where(np.isfinite(cost), cost, np.inf))
+    best = np.argmin(rank, axis=1)
+    return np.arange(lanes) * starts + best, np.sum(near & converged, axis=1)
+
+
+def _conclude(problem, solved: Solved, info: Information, sigma, agree) -> FitResult:
+    """Standard errors, intervals and final statuses of all lanes."""
+    lanes, P = solved.theta.shape
+    value, relative = np.full((lanes, P), np.nan), np.ones((lanes, P))
+    low, high, se = value.copy(), value.copy(), value.copy()
+    relative_se = value.copy()
+    at_bound = np.zeros((lanes, P), bool)
+    status = solved.status.copy()
+    uncertainties = []
+    both = problem.lanes.joints is None or problem.noise_given[1]
+    given = problem.noise_given[0] and both
+    for lane, unknowns in enumerate(problem.unknowns):
+        at_bound[lane] = _on_bound(problem.lanes, lane, solved.theta[lane], info.gradient[lane])
+        theta = solved.theta[lane]
+        for i, (p, _, _) in enumerate(unknowns):
+            value[lane, i] = p.from_scaled(theta[i])
+            if p.scale == "linear":
+                relative[lane, i] = max(abs(theta[i]), 1e-3)
+        held = at_bound[lane] | (problem.lanes.active[lane] == 0)
+        one = Information(*(v[lane] for v in info))
+        u = analyse(one, relative[lane], held, noise_given=given)
+        uncertainties.append(u)
+        for i, (p, _, _) in enumerate(unknowns):
+            slope = value[lane, i] if p.scale == "log" else p.step
+            se[lane, i] = u.se[i] * slope
+            relative_se[lane, i] = u.se[i] / relative[lane, i]
+            with np.errstate(over="ignore"):
+                ends = (theta[i] + side * u.half_width * u.se[i] for side in (-1, 1))
+                low[lane, i], high[lane, i] = (_unscale(p, end) for end in ends)
+        status[lane] = _final_status(status[lane], u, at_bound[lane], one, held)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rms = np.sqrt(info.squares / info.counts)
+    unit = _precision_unit(problem)
+    return FitResult(
+        problem=problem, theta=solved.theta, value=value, standard_error=se, lower=low, upper=high,
+        relative_se=relative_se, at_bound=at_bound, status=status, iterations=solved.iterations,
+        cost=solved.cost, converged_starts=agree, sigma=sigma * unit, rms=rms * unit,
+        samples=info.counts.sum(axis=1), uncertainty=tuple(uncertainties),
+    )  # fmt: skip
+
+
+def _unscale(p, theta: float) -> float:
+    if not np.isfinite(theta):
+        return theta if p.scale == "linear" else (0.0 if theta < 0 else theta)
+    return float(np.exp(min(theta, 700.0))) if p.scale == "log" else theta * p.step
+
+
+def _on_bound(lanes: Lane, lane: int, theta, gradient) -> np.ndarray:
+    low = (theta <= lanes.lower[lane]) & (gradient > 0)
+    high = (theta >= lanes.upper[lane]) & (gradient < 0)
+    return (low | high) & (lanes.active[lane] > 0)
+
+
+def _final_status(status, u: Uncertainty, at_bound, info: Information, held) -> int:
+    if not FitStatus(status).succeeded:
+        return int(status)
+    if np.sum(info.counts) < np.sum(~held):
+        return int(FitStatus.TOO_FEW_DATA)
+    if not np.isfinite(u.condition):
+        return int(FitStatus.UNIDENTIFIABLE)
+    return int(FitStatus.AT_BOUND if np.any(at_bound) else FitStatus.CONVERGED)
+
+
+def _precision_unit(problem: Problem) -> np.ndarray:
+    """Given sigma that one unit of whitened residual stands for (median); (lanes, 2)."""
+
+    def median(precision):
+        flat = precision.reshape(len(precision), -1)
+        return np.array([1 / np.median(row[row > 0]) if np.any(row > 0) else 1.0 for row in flat])
+
+    lanes = problem.lanes
+    joints = np.ones(len(lanes.s_c)) if lanes.joints is None else median(lanes.joint_precision)
+    return np.stack([median(lanes.precision), joints], axis=1)

@@ -1,0 +1,382 @@
+"""From curves to a least-squares problem: lanes of padded arrays and one residual definition.
+
+A *lane* is the smallest set of curves that share unknowns: the whole study if any parameter is
+shared, one specimen otherwise, one trial if all free parameters belong to trials. Lanes have equal
+shapes (curves of unequal length are padded with weight zero), so that one compiled program fits any
+number of them at once. The same residual serves the fit, its uncertainty and the plots.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxtrachea.identify.measurements import Curve
+from jaxtrachea.identify.parameters import DEFAULTS, Parameter
+from jaxtrachea.model import Options, Press, press
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+
+
+class Lane(NamedTuple):
+    """Everything of one lane (or, with a leading axis, of many); T trials of N samples.
+
+    `index` says for each trial and free column which unknown it reads (-1: keeps `value`). Weights
+    are square roots of what multiplies a squared residual; zero marks padding and missing samples.
+
+    Attributes:
+        s_c: contact position, mm; (T,).
+        displacement: mm; (T, N).
+        force: N; (T, N).
+        precision: 1 / sigma of each force sample, or 1 where the noise is estimated; (T, N).
+        joints: marker displacement, mm; (T, N, rings); None without markers.
+        joint_precision: as `precision`; None without markers.
+        balance: weight of each trial against the others; (T,).
+        value: value of every model parameter, used where it is not free; (T, J).
+        index: (T, J).
+        lower: bounds of the unknowns in scaled coordinates; (P,).
+        upper: (P,).
+        active: whether the unknown exists in this lane; (P,).
+    """
+
+    s_c: Float[Array, "*l T"]
+    displacement: Float[Array, "*l T N"]
+    force: Float[Array, "*l T N"]
+    precision: Float[Array, "*l T N"]
+    joints: Float[Array, "*l T N rings"] | None
+    joint_precision: Float[Array, "*l T N rings"] | None
+    balance: Float[Array, "*l T"]
+    value: Float[Array, "*l T J"]
+    index: Int[Array, "*l T J"]
+    lower: Float[Array, "*l P"]
+    upper: Float[Array, "*l P"]
+    active: Float[Array, "*l P"]
+
+
+class Residual(NamedTuple):
+    """Whitened differences model - data of one lane and the weights they enter the cost with.
+
+    Attributes:
+        value: (T, m); force samples, then markers.
+        jacobian: d value / d (free columns, scaled); (T, Jf, m).
+        weight: balance weight of each entry; (T, m).
+    """
+
+    value: Float[Array, "T m"]
+    jacobian: Float[Array, "T Jf m"]
+    weight: Float[Array, "T m"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
+    """A study ready to be fitted.
+
+    Attributes:
+        geometry: the tube, float64 numpy.
+        options: the model (static).
+        parameters: all parameters of the model, free and fixed, in column order.
+        lanes: stacked arrays with the leading axis `lanes`, numpy.
+        curves: for each lane, its curves in trial order.
+        unknowns: for each lane, the (parameter, specimen or "", trial or "") of every unknown.
+        loss: `linear`, `huber`, `soft_l1` or `cauchy`.
+        loss_scale: residual, in standard deviations, where the loss turns robust.
+        noise_given: whether sigma of (force, markers) is known.
+    """
+
+    geometry: Geometry
+    options: Options
+    parameters: tuple[Parameter, ...]
+    lanes: Lane
+    curves: tuple[tuple[Curve, ...], ...]
+    unknowns: tuple[tuple[tuple[Parameter, str, str], ...], ...]
+    loss: str
+    loss_scale: float
+    noise_given: tuple[bool, bool]
+
+    @property
+    def free_columns(self) -> tuple[int, ...]:
+        """Columns of the parameter table that are fitted."""
+        return tuple(j for j, p in enumerate(self.parameters) if not p.fixed)
+
+    @property
+    def size(self) -> int:
+        """Unknowns per lane, padding included."""
+        return self.lanes.lower.shape[1]
+
+    def lane_name(self, lane: int) -> tuple[str, str]:
+        """Specimen and trial of a lane; "(all)" where it spans several."""
+        one = lambda names: names.pop() if len(names) == 1 else "(all)"  # noqa: E731
+        curves = self.curves[lane]
+        return one({c.specimen for c in curves}), one({c.trial for c in curves})
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise:
+    """Standard deviations; None: estimated from the residuals.
+
+    Attributes:
+        force: N; a curve's own per-sample sigma comes before it.
+        joints: mm.
+    """
+
+    force: float | None = None
+    joints: float | None = None
+
+
+def group(curves: Sequence[Curve], parameters: Sequence[Parameter]) -> list[list[Curve]]:
+    """Divide curves into lanes by the widest scope among the free parameters."""
+    scopes = {p.scope for p in parameters if not p.fixed}
+    if "shared" in scopes:
+        return [list(curves)]
+    lanes: dict[tuple[str, str], list[Curve]] = {}
+    for curve in curves:
+        key = (curve.specimen, "" if "specimen" in scopes else curve.trial)
+        lanes.setdefault(key, []).append(curve)
+    return list(lanes.values())
+
+
+def build(
+    curves: Sequence[Curve],
+    geometry: Geometry,
+    options: Options,
+    parameters: Sequence[Parameter],
+    *,
+    noise: Noise = Noise(),  # noqa: B008 (frozen)
+    balance: str = "curve",
+    loss: str = "linear",
+    loss_scale: float = 1.345,
+    tool_radius: float | None = None,
+) -> Problem:
+    """Put curves and parameters together.
+
+    Args:
+        curves: at least one; `s_c` set wherever the skeleton enters.
+        geometry: the tube at rest (converted to float64).
+        options: what the model includes.
+        parameters: those of `parameters.in_model`, in that order.
+        noise: known standard deviations.
+        balance: `curve` (every curve weighs the same, however long) or `sample`.
+        loss: see `Problem`.
+        loss_scale: see `Problem`.
+        tool_radius: mm; markers closer to the contact are held by the tool and left out. None: all
+            are used.
+
+    Raises:
+        ValueError: no curve, no free parameter, a marker on a ring that does not exist, a curve
+            without a contact position where one is needed, with specimen and trial named.
+    """
+    if not curves:
+        raise ValueError("no usable curve; nothing to fit")
+    if all(p.fixed for p in parameters):
+        raise ValueError("every parameter is fixed; free at least one")
+    for curve in curves:
+        _check_curve(curve, geometry, options)
+    groups = group(curves, parameters)
+    unknowns = [_unknowns(lane, parameters) for lane in groups]
+    sizes = _Sizes(
+        trials=max(map(len, groups)),
+        samples=max(len(c.force) for c in curves),
+        rings=geometry.rings,
+        unknowns=max(map(len, unknowns)),
+        joints=any(c.joint_displacement is not None for c in curves),
+    )
+    mean_length = float(np.mean([len(c.force) for c in curves]))
+    reach = -1.0 if tool_radius is None else tool_radius
+    lanes = [
+        _lane(lane, names, parameters, geometry, noise, balance, mean_length, reach, sizes)
+        for lane, names in zip(groups, unknowns, strict=True)
+    ]
+    stacked = jax.tree.map(lambda *arrays: np.stack(arrays), *lanes)
+    known = noise.force is not None or all(c.sigma is not None for c in curves)
+    return Problem(
+        geometry=jax.tree.map(lambda v: np.asarray(v, np.float64), geometry),
+        options=options,
+        parameters=tuple(parameters),
+        lanes=stacked,
+        curves=tuple(map(tuple, groups)),
+        unknowns=tuple(map(tuple, unknowns)),
+        loss=loss,
+        loss_scale=loss_scale,
+        noise_given=(known, noise.joints is not None),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sizes:
+    trials: int
+    samples: int
+    rings: int
+    unknowns: int
+    joints: bool
+
+
+def _check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
+    where = f"specimen {curve.specimen!r} trial {curve.trial!r}"
+    length, rings = float(geometry.length), geometry.rings
+    if curve.s_c is None:
+        if options.coupling == "series":
+            raise ValueError(
+                f"{where}: no contact position; give a column s, or data.s for all curves "
+                "(coupling = 'total' needs none)"
+            )
+    elif not 0 <= curve.s_c <= length:
+        raise ValueError(f"{where}: contact at s = {curve.s_c:g} mm, tube spans 0 to {length:g} mm")
+    if options.coupling == "series" and abs(curve.phi_c) > 1e-6:
+        raise ValueError(
+            f"{where}: contact at phi = {np.degrees(curve.phi_c):.3g} deg; this model presses on "
+            "the anterior midline (phi = 0) only"
+        )
+    if curve.joint_rings is not None and np.any(curve.joint_rings >= rings):
+        raise ValueError(f"{where}: marker on ring {curve.joint_rings.max() + 1} of {rings}")
+
+
+def _unknowns(lane: list[Curve], parameters) -> list[tuple[Parameter, str, str]]:
+    """Distinct unknowns of a lane, in parameter order."""
+    names: dict[tuple[Parameter, str, str], None] = {}
+    for p in parameters:
+        if not p.fixed:
+            for curve in lane:
+                names.setdefault(_key(p, curve))
+    return list(names)
+
+
+def _key(p: Parameter, curve: Curve) -> tuple[Parameter, str, str]:
+    specimen = "" if p.scope == "shared" else curve.specimen
+    return p, specimen, curve.trial if p.scope == "trial" else ""
+
+
+def _lane(
+    curves, unknowns, parameters, geometry, noise, balance, mean_length, reach, sizes
+) -> Lane:
+    """One lane as padded float64 arrays."""
+    T, N, J, P = sizes.trials, sizes.samples, len(parameters), sizes.unknowns
+    lane = Lane(
+        s_c=np.full(T, float(geometry.length) / 2),
+        displacement=np.zeros((T, N)),
+        force=np.zeros((T, N)),
+        precision=np.zeros((T, N)),
+        joints=np.zeros((T, N, sizes.rings)) if sizes.joints else None,
+        joint_precision=np.zeros((T, N, sizes.rings)) if sizes.joints else None,
+        balance=np.ones(T),
+        value=np.tile([p.value for p in parameters], (T, 1)).astype(np.float64),
+        index=np.full((T, J), -1, np.int32),
+        lower=np.zeros(P),
+        upper=np.zeros(P),
+        active=np.zeros(P),
+    )
+    place = {key: i for i, key in enumerate(unknowns)}
+    for i, (p, _, _) in enumerate(unknowns):
+        lane.lower[i], lane.upper[i], lane.active[i] = p.to_scaled(p.lower), p.to_scaled(p.upper), 1
+    for t, curve in enumerate(curves):
+        n = len(curve.force)
+        lane.s_c[t] = lane.s_c[t] if curve.s_c is None else curve.s_c
+        lane.displacement[t, :n], lane.force[t, :n] = curve.displacement, curve.force
+        sigma = curve.sigma if curve.sigma is not None else noise.force
+        lane.precision[t, :n] = 1.0 if sigma is None else 1 / np.asarray(sigma)
+        lane.balance[t] = np.sqrt(mean_length / n) if balance == "curve" else 1.0
+        for j, p in enumerate(parameters):
+            if not p.fixed:
+                lane.index[t, j] = place[_key(p, curve)]
+        if curve.joint_displacement is not None:
+            _fill_joints(lane, t, curve, geometry, noise, reach)
+    return lane
+
+
+def _fill_joints(lane: Lane, t: int, curve: Curve, geometry: Geometry, noise: Noise, reach) -> None:
+    """Place the markers of one curve; unobserved ones and those under the tool weigh nothing."""
+    seen = np.isfinite(curve.joint_displacement)
+    x = np.asarray(geometry.ring_positions)[curve.joint_rings]
+    if curve.s_c is not None:
+        seen &= np.abs(x - curve.s_c) > reach
+    n = len(curve.force)
+    lane.joints[t, :n, curve.joint_rings] = np.where(seen, curve.joint_displacement, 0).T
+    weight = 1.0 if noise.joints is None else 1 / noise.joints
+    lane.joint_precision[t, :n, curve.joint_rings] = np.where(seen, weight, 0).T
+
+
+def predict(
+    values: Mapping[str, Float[Array, ""]],
+    geometry: Geometry,
+    options: Options,
+    s_c: Float[Array, ""],
+    displacement: Float[Array, " N"],
+) -> tuple[Float[Array, " N"], Press]:
+    """Measured force along one curve (load-cell offset included) and the press behind it."""
+    one = jnp.ones((), displacement.dtype)
+    material = Material(
+        EI_L=values.get("EI_L", one),
+        k_M=values.get("k_M", one),
+        k_1=values["k_1"],
+        k_3=values["k_3"],
+        GA_L=values.get("GA_L"),
+        k_1_ring=values.get("k_1_ring"),
+        k_3_ring=values.get("k_3_ring"),
+    )
+    pressed = press(geometry, material, s_c, displacement, options, onset=values["onset"])
+    return pressed.force + values["force_offset"], pressed
+
+
+def residual(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Residual:
+    """Residuals of one lane and their Jacobian by forward mode, trial by trial.
+
+    Args:
+        problem: static description.
+        theta: unknowns in scaled coordinates.
+        lane: the lane's arrays (no leading axis).
+    """
+    dtype = lane.force.dtype
+    names = [p.name for p in problem.parameters]
+    columns = problem.free_columns
+    index = lane.index[:, columns]
+    free = jnp.where(index >= 0, theta[jnp.maximum(index, 0)], 0)
+    geometry = jax.tree.map(lambda v: jnp.asarray(v, dtype), problem.geometry)
+
+    def one(free, lane):
+        values = {name: lane.value[j] for j, name in enumerate(names)}
+        for column, scaled in zip(columns, free, strict=True):
+            p = problem.parameters[column]
+            values[p.name] = jnp.exp(scaled) if p.scale == "log" else scaled * p.step
+        force, pressed = predict(values, geometry, problem.options, lane.s_c, lane.displacement)
+        r = jnp.where(lane.precision > 0, force - lane.force, 0) * lane.precision
+        if lane.joints is not None:
+            difference = jnp.where(lane.joint_precision > 0, pressed.joints - lane.joints, 0)
+            r = jnp.concatenate([r, (difference * lane.joint_precision).ravel()])
+        return r
+
+    def with_jacobian(free, lane):
+        value, tangent = jax.linearize(lambda free: one(free, lane), free)
+        return value, jax.vmap(tangent)(jnp.eye(len(columns), dtype=dtype))
+
+    per_trial = lane._replace(lower=None, upper=None, active=None, index=None)
+    value, jacobian = jax.vmap(with_jacobian)(free, per_trial)
+    weight = jnp.broadcast_to(lane.balance[:, None], value.shape)
+    return Residual(value, jacobian, weight)
+
+
+def observations(lane: Lane) -> tuple[Float[Array, "T m"], int]:
+    """Which entries of the residual are observed (1 or 0), and how many of them are forces."""
+    seen = lane.precision > 0
+    if lane.joint_precision is not None:
+        markers = (lane.joint_precision > 0).reshape(*seen.shape[:-1], -1)
+        seen = jnp.concatenate([seen, markers], axis=-1)
+    return seen.astype(lane.force.dtype), lane.force.shape[-1]
+
+
+def default_parameters(
+    names: Sequence[str], changes: Mapping[str, Mapping[str, object]]
+) -> tuple[Parameter, ...]:
+    """Table rows for `names` with the user's changes.
+
+    Raises:
+        ValueError: a change names a parameter that the chosen model does not contain.
+    """
+    unknown = [name for name in changes if name not in names]
+    if unknown:
+        raise ValueError(
+            f"parameters.{unknown[0]}: not part of this model, which has {', '.join(names)}"
+        )
+    return tuple(dataclasses.replace(DEFAULTS[n], **changes.get(n, {})) for n in names)

@@ -1,0 +1,200 @@
+"""What the data say about each unknown: standard errors, correlation, flat combinations, verdicts.
+
+Everything is local, from the Jacobian at the estimate (Gauss-Newton information matrix); profile
+likelihood and bootstrap, which are not, are separate. With curve weights or a robust loss the
+covariance is the sandwich kappa A^-1 B A^-1 (Huber 1981, ch. 7); otherwise it reduces to the usual
+s^2 (J^T J)^-1.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.special import stdtrit
+
+from jaxtrachea.identify.problem import Lane, Problem, observations, residual
+from jaxtrachea.identify.solve import assemble, entry_scale, robust
+
+#: Relative standard error up to which a parameter counts as identifiable, and as weakly so.
+IDENTIFIABLE, WEAK = 0.1, 0.5
+#: Smallest ratio of singular values of the scaled Jacobian that float64 can tell from zero.
+SINGULAR = 1e-7
+
+
+class Information(NamedTuple):
+    """One lane at its estimate; m entries of the residual, P unknowns.
+
+    Attributes:
+        bread: sum of b^2 J^T J (b: curve weight), whitened; (P, P).
+        meat: sum of b^4 J^T J; (P, P).
+        gradient: of the cost; (P,).
+        squares: sum of squared residuals of force (N^2) and markers (mm^2) in units of the given
+            precision; (2,).
+        counts: observed entries of each; (2,).
+        spread: median absolute residual of each, same units; (2,).
+        psi2: mean of psi(z)^2 over observed entries.
+        dpsi: mean of psi'(z).
+    """
+
+    bread: Float[Array, "P P"]
+    meat: Float[Array, "P P"]
+    gradient: Float[Array, " P"]
+    squares: Float[Array, "2"]
+    counts: Float[Array, "2"]
+    spread: Float[Array, "2"]
+    psi2: Float[Array, ""]
+    dpsi: Float[Array, ""]
+
+
+def information(
+    problem: Problem, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
+) -> Information:
+    """Information matrices and residual statistics of one lane."""
+    r = residual(problem, theta, lane)
+    seen, forces = observations(lane)
+    scale = entry_scale(lane, sigma)
+    z = r.value * scale[None]
+    J = r.jacobian * (scale[None] * seen)[:, None]
+    b2 = (lane.balance * lane.balance)[:, None, None]
+    _, slope = robust(problem.loss, z * z, problem.loss_scale)
+    psi = lambda z: z * robust(problem.loss, z * z, problem.loss_scale)[1]  # noqa: E731
+    _, dpsi = jax.jvp(psi, (z,), (jnp.ones_like(z),))
+    index = lane.index[:, problem.free_columns]
+    size = theta.shape[0]
+    gram = lambda w: assemble(jnp.einsum("tim,tjm->tij", J * w, J), index, size)  # noqa: E731
+    gradient = jnp.einsum("tim,tm->ti", J * b2, z * slope)
+    total = jnp.sum(seen)
+    kinds = jnp.arange(seen.shape[1]) < forces
+    by_kind = lambda v: jnp.stack([jnp.sum(v[:, :forces]), jnp.sum(v[:, forces:])])  # noqa: E731
+    spread = lambda k: jnp.nanmedian(  # noqa: E731
+        jnp.where((seen > 0) & (kinds == k)[None], jnp.abs(r.value), jnp.nan)
+    )
+    return Information(
+        bread=gram(b2),
+        meat=gram(b2 * b2),
+        gradient=assemble(gradient, index, size),
+        squares=by_kind(r.value**2 * seen),
+        counts=by_kind(seen),
+        spread=jnp.stack([spread(True), spread(False)]),
+        psi2=jnp.sum(psi(z) ** 2 * seen) / total,
+        dpsi=jnp.sum(dpsi * seen) / total,
+    )
+
+
+def informations(
+    problem: Problem, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, chunk: int = 256
+) -> Information:
+    """`information` of many lanes, on the host; leading axis = order of `lanes`."""
+    chunk = min(chunk, len(lanes))
+    run = _compiled(problem)
+    parts = []
+    for first in range(0, len(lanes), chunk):
+        of = np.minimum(np.arange(first, first + chunk), len(lanes) - 1)
+        lane = jax.tree.map(lambda v, row=lanes[of]: v[row], problem.lanes)
+        part = run(jnp.asarray(theta[of]), lane, jnp.asarray(sigma[of]))
+        left = len(lanes) - first
+        parts.append(jax.tree.map(lambda v, left=left: np.asarray(v)[:left], part))
+    return jax.tree.map(lambda *v: np.concatenate(v), *parts)
+
+
+@functools.lru_cache(maxsize=32)
+def _compiled(problem: Problem):
+    return jax.jit(jax.vmap(functools.partial(information, problem)))
+
+
+class Uncertainty(NamedTuple):
+    """Local uncertainty of one lane's unknowns, numpy; NaN where an unknown is held on a bound.
+
+    Attributes:
+        se: standard error in scaled coordinates; inf where undetermined; (P,).
+        correlation: (P, P).
+        condition: ratio of the largest to the smallest singular value of the Jacobian in relative
+            coordinates (a change of 1 = 100 %); inf if singular.
+        flat: unit vector, in relative coordinates, of the least determined combination; (P,).
+        flat_se: its standard error (relative).
+        half_width: of the 95 % interval, in standard errors (Student's t).
+    """
+
+    se: np.ndarray
+    correlation: np.ndarray
+    condition: float
+    flat: np.ndarray
+    flat_se: float
+    half_width: float
+
+
+def analyse(
+    info: Information, relative: np.ndarray, held: np.ndarray, *, noise_given: bool
+) -> Uncertainty:
+    """Turn the information of one lane into standard errors and directions.
+
+    Args:
+        info: of this lane, numpy.
+        relative: change of each scaled coordinate that makes a relative change of 1; (P,).
+        held: unknowns that are absent or on a bound; (P,).
+        noise_given: whether sigma is known, so that residuals do not scale the covariance.
+    """
+    P = len(held)
+    free = np.flatnonzero(~held)
+    se, correlation = np.full(P, np.nan), np.full((P, P), np.nan)
+    flat = np.zeros(P)
+    total = float(np.sum(info.counts))
+    dof = total - len(free)
+    half = float(stdtrit(dof, 0.975)) if dof > 0 and not noise_given else 1.959963984540054
+    usable = len(free) and np.all(np.isfinite(info.bread)) and dof >= 0
+    if not usable:
+        return Uncertainty(se, correlation, np.inf, flat, np.inf, half)
+    kappa = 1.0 if noise_given else float(info.psi2) * total / max(dof, 1)
+    kappa /= max(float(info.dpsi), 1e-3) ** 2
+    u = relative[free]
+    bread = info.bread[np.ix_(free, free)] * u[:, None] * u[None]
+    meat = info.meat[np.ix_(free, free)] * u[:, None] * u[None]
+    eigenvalues, vectors = np.linalg.eigh(bread)
+    singular = np.sqrt(np.maximum(eigenvalues, 0))
+    lost = singular <= SINGULAR * singular[-1] if singular[-1] > 0 else np.ones(len(free), bool)
+    inverse = vectors[:, ~lost] / eigenvalues[~lost] @ vectors[:, ~lost].T
+    covariance = kappa * inverse @ meat @ inverse
+    variance = np.diag(covariance).copy()
+    variance[np.any(np.abs(vectors[:, lost]) > 1e-3, axis=1)] = np.inf
+    se[free] = np.sqrt(variance) * u
+    with np.errstate(invalid="ignore", divide="ignore"):
+        root = np.sqrt(np.diag(covariance))
+        correlation[np.ix_(free, free)] = covariance / root[:, None] / root[None]
+    v = vectors[:, 0]
+    flat[free] = v * np.sign(v[np.argmax(np.abs(v))])
+    flat_se = np.inf if lost[0] else float(np.sqrt(v @ covariance @ v))
+    condition = np.inf if lost[0] else float(singular[-1] / singular[0])
+    return Uncertainty(se, correlation, condition, flat, flat_se, half)
+
+
+def verdict(relative_se: float, held: bool) -> str:
+    """One plain word for a parameter: identifiable, weak, not identifiable, at bound."""
+    if held:
+        return "at bound"
+    if relative_se <= IDENTIFIABLE:
+        return "identifiable"
+    return "weak" if relative_se <= WEAK else "not identifiable"
+
+
+def describe_flat(names: list[str], flat: np.ndarray, flat_se: float) -> str:
+    """The least determined combination in words, as changes that belong together.
+
+    Args:
+        names: unknowns, in the order of `flat`.
+        flat: direction in relative coordinates, see `Uncertainty.flat`.
+        flat_se: relative standard error along it.
+    """
+    if not np.any(flat):
+        return "no free parameter"
+    order = np.argsort(-np.abs(flat))
+    main = [i for i in order if abs(flat[i]) >= 0.1 * abs(flat[order[0]])]
+    step = 0.1 / abs(flat[order[0]])
+    moves = ", ".join(f"{names[i]} {100 * step * flat[i]:+.3g} %" for i in main)
+    if not np.isfinite(flat_se):
+        return f"{moves} together change no curve at all: only the remaining combinations are known"
+    if flat_se > WEAK:
+        return f"{moves} together change the curves by less than the noise"
+    return f"least determined: {moves} together, known to {100 * flat_se:.2g} %"
