@@ -359,8 +359,9 @@ def test_units(scale):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("form", ["recursion", "reactions"])
-@pytest.mark.parametrize("split", ["continuous", "independent"])
+@pytest.mark.parametrize(
+    ("split", "form"), [("continuous", "recursion"), ("independent", "reactions")]
+)
 def test_dtype_jit_vmap(split, form, dtype):
     """Plain, jitted and mapped calls agree and keep the dtype."""
     b, one = table_1(dtype=dtype), jnp.asarray(1.0, dtype)

@@ -30,8 +30,10 @@ def _compiled(f, key):
     unravel = key.unravel
     flat = lambda v: ravel_pytree(f(unravel(v)))[0]  # noqa: E731
     # One scan over evaluations, one over columns: compiled once for all points.
-    differences = jax.jit(lambda points: jax.lax.map(flat, points))
-    return jax.jit(jax.jacfwd(flat)), jax.jit(jax.jacrev(flat)), differences
+    differences = lambda points: jax.lax.map(flat, points)  # noqa: E731
+    quick = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
+    programs = (jax.jacfwd(flat), jax.jacrev(flat), differences)
+    return tuple(jax.jit(p, compiler_options=quick) for p in programs)
 
 
 class _Key:
