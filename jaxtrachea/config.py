@@ -1,0 +1,215 @@
+"""TOML specifications: what the user writes, validated, in internal units.
+
+Every problem is reported with its dotted key, what was found and what is expected. Nothing here
+opens a measurement file or imports JAX; the rooms below turn these records into objects.
+"""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from jaxtrachea.units import parse_quantity
+
+
+class SpecError(ValueError):
+    """A specification that cannot be used; the message has one line per problem."""
+
+
+def _quantity(dimension: str):
+    """A field read as a quantity with its unit ("9 mm"), kept as a float in internal units."""
+
+    def read(value: Any) -> Any:
+        if isinstance(value, bool):
+            raise ValueError(f"expected a {dimension} with its unit")
+        return parse_quantity(value, dimension)
+
+    return BeforeValidator(read)
+
+
+Length = Annotated[float, _quantity("length")]
+Force = Annotated[float, _quantity("force")]
+Angle = Annotated[float, _quantity("angle")]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DataSection(_Section):
+    """[data]: which files, and how to read them (docs/measurements.md)."""
+
+    files: list[str] = Field(min_length=1)
+    format: Literal["auto", "tidy", "machine", "hdf5", "afmformats"] = "auto"
+    columns: dict[str, str] = {}
+    units: dict[str, str] = {}
+    specimen: str | None = None
+    s: str | None = None
+    phi: str | None = None
+    displacement_min: Length | None = None
+    displacement_max: Length | None = None
+    loading: Literal["require-monotone", "loading", "all"] = "require-monotone"
+    force_sign: Literal[1, -1] = 1
+    displacement_sign: Literal[1, -1] = 1
+    tool_radius: Length | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_file(cls, data: Any) -> Any:
+        if isinstance(data, dict) and isinstance(data.get("files"), str):
+            return {**data, "files": [data["files"]]}
+        return data
+
+
+class EvenRings(_Section):
+    """Evenly spaced rings."""
+
+    count: int = Field(ge=1, le=2000)
+    first: Length
+    last: Length
+
+
+class TracheaSection(_Section):
+    """[trachea]: the tube at rest; Table 1 of the paper unless length and rings are given."""
+
+    preset: Literal["table-1"] | None = None
+    length: Length | None = None
+    rings: EvenRings | list[Length] | None = None
+    radius: Length = 11.3
+    half_angle: Angle = 2.0943951023931953
+    ring_height: Length = 4.0
+
+    @model_validator(mode="after")
+    def _complete(self) -> "TracheaSection":
+        if (self.length is None) != (self.rings is None):
+            raise ValueError("give both length and rings, or neither (preset 'table-1')")
+        if self.preset is not None and self.length is not None:
+            raise ValueError("preset and length exclude each other; remove one")
+        return self
+
+
+class ModelSection(_Section):
+    """[model]: what the forward model includes; see `jaxtrachea.model.Options`."""
+
+    coupling: Literal["series", "total"] = "series"
+    split: Literal["continuous", "independent"] = "continuous"
+    form: Literal["recursion", "reactions"] = "recursion"
+    shear: bool = False
+    local: Literal["uniform", "two-material"] = "uniform"
+    contact: Literal["unilateral", "bonded"] = "unilateral"
+    onset_width: Length = 1e-3
+    transition: Length | None = None
+
+
+class ParameterSection(_Section):
+    """[parameters.NAME]: `fixed`, or free with any of `initial`, `bounds`, `scale`, `scope`.
+
+    Numbers are in the parameter's own unit (EI_L N mm^2, GA_L N, k_M, k_1, k_1_ring N/mm, k_3,
+    k_3_ring N/mm^3, onset mm, force_offset N), or quantities with a unit.
+    """
+
+    fixed: float | str | None = None
+    initial: float | str | None = None
+    bounds: tuple[float | str, float | str] | None = None
+    scale: Literal["log", "linear"] | None = None
+    scope: Literal["shared", "specimen", "trial"] | None = None
+
+    @model_validator(mode="after")
+    def _either(self) -> "ParameterSection":
+        free = ("initial", "bounds", "scale", "scope")
+        if self.fixed is not None and any(getattr(self, name) is not None for name in free):
+            raise ValueError("fixed excludes initial, bounds, scale and scope")
+        return self
+
+
+class NoiseSection(_Section):
+    """[noise]: standard deviation of each kind of observation, or "estimate"."""
+
+    force: Literal["estimate"] | Force = "estimate"
+    joints: Literal["estimate"] | Length = "estimate"
+
+
+class FitSection(_Section):
+    """[fit]: how to weigh and solve; see `jaxtrachea.identify.fit.Settings`."""
+
+    method: Literal["levenberg-marquardt", "lbfgs", "adam"] = "levenberg-marquardt"
+    balance: Literal["curve", "sample"] = "curve"
+    loss: Literal["linear", "huber", "soft_l1", "cauchy"] = "linear"
+    loss_scale: float = Field(1.345, gt=0)
+    starts: int = Field(4, ge=1, le=10_000)
+    start_decades: float = Field(1.0, ge=0, le=10)
+    seed: int = 0
+    max_iterations: int = Field(200, ge=1)
+    tolerance: float = Field(1e-10, gt=0, lt=0.1)
+    chunk: int = Field(256, ge=1)
+    precision: Literal["float64", "float32"] = "float64"
+
+
+class FitSpec(_Section):
+    """A whole fit specification."""
+
+    title: str = ""
+    data: DataSection
+    trachea: TracheaSection = TracheaSection()
+    model: ModelSection = ModelSection()
+    parameters: dict[str, ParameterSection] = {}
+    noise: NoiseSection = NoiseSection()
+    fit: FitSection = FitSection()
+
+
+def load_fit_spec(path: Path) -> FitSpec:
+    """Read and validate a fit specification.
+
+    Raises:
+        SpecError: missing file, broken TOML (line and column), unknown key, wrong value; one line
+            per problem with its dotted key.
+    """
+    try:
+        with path.open("rb") as stream:
+            content = tomllib.load(stream)
+    except OSError as error:
+        reason = error.strerror or "cannot be read"
+        raise SpecError(f"{path}: {reason}; expected a TOML fit specification") from None
+    except UnicodeDecodeError as error:
+        raise SpecError(f"{path}: not UTF-8 (byte {error.start}); save it as UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SpecError(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise SpecError(f"{path}: not valid TOML: nested too deeply") from None
+    try:
+        return FitSpec.model_validate(content)
+    except ValidationError as error:
+        raise SpecError("\n".join(f"{path}: {line}" for line in _lines(error))) from None
+
+
+def _lines(error: ValidationError) -> list[str]:
+    """One line per problem: dotted key, what is wrong, what was found."""
+    lines: dict[str, None] = {}
+    for problem in error.errors():
+        parts = [p for p in problem["loc"] if not _is_branch(p)]
+        key = ".".join(str(p) for p in parts) or "(top level)"
+        text = problem["msg"].removeprefix("Value error, ")
+        if problem["type"] == "extra_forbidden":
+            text = f"unknown key; {_known(parts)}"
+        elif problem["type"] == "missing":
+            text = "missing"
+        elif not isinstance(problem["input"], dict | list):
+            text = f"{text} (found {problem['input']!r})"
+        lines.setdefault(f"{key}: {text}")
+    return list(lines)
+
+
+def _is_branch(part) -> bool:
+    """Names that pydantic adds for the branches of a union."""
+    return isinstance(part, str) and ("[" in part or part in ("EvenRings", "float", "str"))
+
+
+def _known(parts) -> str:
+    """What the section that holds an unknown key accepts."""
+    section: Any = FitSpec
+    for part in parts[:-1]:
+        fields = getattr(section, "model_fields", {})
+        section = fields[part].annotation if part in fields else ParameterSection
+    names = getattr(section, "model_fields", ParameterSection.model_fields)
+    return f"expected one of {', '.join(names)}"

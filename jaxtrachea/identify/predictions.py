@@ -1,0 +1,140 @@
+"""The fitted model at the measured points, for plots, residual tables and cross-validation."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtrachea.identify.fit import FitResult, Settings, fit
+from jaxtrachea.identify.problem import Lane, Problem, residual
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Prediction:
+    """Model minus data in units; NaN where nothing was observed.
+
+    Attributes:
+        force: N; (lanes, trials, samples).
+        joints: mm; (lanes, trials, samples, rings), or None.
+    """
+
+    force: np.ndarray
+    joints: np.ndarray | None
+
+    def worst(self, result: FitResult) -> str:
+        """The largest force residual in words."""
+        size = np.where(np.isfinite(self.force), np.abs(self.force), -1)
+        lane, trial, sample = np.unravel_index(np.argmax(size), size.shape)
+        curves = result.problem.curves[lane]
+        if size[lane, trial, sample] < 0:
+            return "none, no finite prediction"
+        curve = curves[trial]
+        value = self.force[lane, trial, sample]
+        return (
+            f"{value:+.3g} N at {curve.displacement[sample]:.3g} mm in {curve.specimen} "
+            f"{curve.trial}, where {curve.force[sample]:.4g} N were measured"
+        )
+
+
+def predictions(problem: Problem, theta: np.ndarray, chunk: int = 256) -> Prediction:
+    """Residuals of all lanes at `theta` (lanes, P), in N and mm."""
+    run = _compiled(problem)
+    count = len(theta)
+    parts = []
+    for first in range(0, count, chunk):
+        of = np.arange(first, min(first + chunk, count))
+        lane = jax.tree.map(lambda v, of=of: v[of], problem.lanes)
+        parts.append(np.asarray(run(jnp.asarray(theta[of]), lane)))
+    value = np.concatenate(parts)
+    lanes = problem.lanes
+    samples = lanes.force.shape[-1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        force = np.where(lanes.precision > 0, value[..., :samples] / lanes.precision, np.nan)
+        joints = None
+        if lanes.joints is not None:
+            markers = value[..., samples:].reshape(lanes.joints.shape) / lanes.joint_precision
+            joints = np.where(lanes.joint_precision > 0, markers, np.nan)
+    return Prediction(force, joints)
+
+
+@functools.lru_cache(maxsize=8)
+def _compiled(problem: Problem):
+    def value(theta, lane: Lane):
+        return residual(problem, theta, lane).value
+
+    return jax.jit(jax.vmap(value))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Errors of curves that took no part in the fit that predicts them.
+
+    Attributes:
+        lane: lane of each, in the original problem.
+        trial: index of the left-out trial.
+        force: rms force residual over the curve's peak force.
+        joints: rms of marker residual over tool displacement (beyond half the largest one); NaN
+            without markers.
+        ratio: measured over predicted force in the least-squares sense, minus 1 (for linear data:
+            the relative error of the compliance).
+        result: the fits, one lane per left-out curve.
+    """
+
+    lane: np.ndarray
+    trial: np.ndarray
+    force: np.ndarray
+    joints: np.ndarray
+    ratio: np.ndarray
+    result: FitResult
+
+
+def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOut:
+    """Fit every lane once without each of its curves, and predict that curve.
+
+    Args:
+        problem: lanes with two curves or more are used.
+        settings: as for `fit`.
+        progress: as for `fit`.
+
+    Raises:
+        ValueError: no lane has two curves, or an unknown belongs to a trial (a curve left out could
+            then not be predicted).
+    """
+    if any(p.scope == "trial" and not p.fixed for p in problem.parameters):
+        raise ValueError("leaving a curve out needs parameters that do not belong to one trial")
+    pairs = [(k, t) for k, c in enumerate(problem.curves) if len(c) > 1 for t in range(len(c))]
+    if not pairs:
+        raise ValueError("leaving a curve out needs a specimen with at least two curves")
+    lane, trial = (np.array(v) for v in zip(*pairs, strict=True))
+    lanes = jax.tree.map(lambda v: v[lane], problem.lanes)
+    rows = np.arange(len(lane))
+    precision = lanes.precision.copy()
+    precision[rows, trial] = 0
+    joint_precision = None
+    if lanes.joint_precision is not None:
+        joint_precision = lanes.joint_precision.copy()
+        joint_precision[rows, trial] = 0
+    held_back = dataclasses.replace(
+        problem,
+        lanes=lanes._replace(precision=precision, joint_precision=joint_precision),
+        curves=tuple(problem.curves[k] for k in lane),
+        unknowns=tuple(problem.unknowns[k] for k in lane),
+    )
+    result = fit(held_back, settings, progress)
+    whole = dataclasses.replace(held_back, lanes=lanes)
+    seen = predictions(whole, result.theta)
+    force = seen.force[rows, trial]
+    data = lanes.force[rows, trial]
+    model = data + np.nan_to_num(force)
+    peak = np.max(np.abs(data), axis=1)
+    ratio = np.sum(data * model, axis=1) / np.sum(model * model, axis=1) - 1
+    joints = np.full(len(lane), np.nan)
+    if seen.joints is not None:
+        D = np.abs(lanes.displacement[rows, trial])
+        moved = D > 0.5 * np.max(D, axis=1, keepdims=True)
+        share = seen.joints[rows, trial] / np.where(moved, D, np.nan)[:, :, None]
+        joints = np.sqrt(np.nanmean(share**2, axis=(1, 2)))
+    rms = np.sqrt(np.nanmean(force**2, axis=1)) / peak
+    return LeftOut(lane, trial, rms, joints, ratio, result)

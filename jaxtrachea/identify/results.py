@@ -1,0 +1,253 @@
+"""Write what a fit found: HDF5, CSV, provenance. Nothing that exists is overwritten."""
+
+import csv
+import datetime
+import hashlib
+import json
+import os
+import platform
+import sys
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.measurements import BadCurve
+from jaxtrachea.identify.uncertainty import describe_flat, verdict
+from jaxtrachea.status import FitStatus
+
+SCHEMA = "jaxtrachea-results"
+SCHEMA_VERSION = 1
+
+
+class OutputExists(FileExistsError):
+    """The output directory holds files already."""
+
+
+def new_directory(wanted: Path | None, default: Path) -> Path:
+    """The directory to write into: `wanted` if it is new or empty, else a free numbered `default`.
+
+    Raises:
+        OutputExists: `wanted` exists and is not empty, or is a file.
+    """
+    if wanted is not None:
+        if wanted.exists() and (not wanted.is_dir() or any(wanted.iterdir())):
+            raise OutputExists(
+                f"{wanted} exists and is not empty; nothing was written. "
+                "Choose another --out, or remove it yourself"
+            )
+        wanted.mkdir(parents=True, exist_ok=True)
+        return wanted
+    for n in range(1, 10_000):
+        path = default if n == 1 else default.with_name(f"{default.name}-{n}")
+        try:
+            path.mkdir(parents=True, exist_ok=False)
+        except FileExistsError:
+            continue
+        return path
+    raise OutputExists(f"{default} and its numbered successors exist; give --out")
+
+
+def unknown_label(result: FitResult, lane: int, i: int) -> str:
+    """Name of an unknown: k_M, or onset[t03], or k_M[T01] where a lane holds several of them."""
+    unknowns = result.problem.unknowns[lane]
+    p, specimen, trial = unknowns[i]
+    same = [u for u in unknowns if u[0].name == p.name]
+    if len(same) == 1:
+        return p.name
+    several = len({u[1] for u in same}) > 1
+    where = "/".join(filter(None, (specimen if several else "", trial)))
+    return f"{p.name}[{where}]"
+
+
+def flat_sentence(result: FitResult, lane: int) -> str:
+    """The least determined combination of a lane in words."""
+    names = [unknown_label(result, lane, i) for i in range(len(result.problem.unknowns[lane]))]
+    u = result.uncertainty[lane]
+    return describe_flat(names, u.flat, u.flat_se)
+
+
+def lane_rows(result: FitResult) -> Iterator[dict[str, object]]:
+    """One row per lane for summary.csv; trial-wise unknowns are left to parameters.csv."""
+    for lane in range(result.lanes):
+        specimen, trial = result.problem.lane_name(lane)
+        status = FitStatus(int(result.status[lane]))
+        peak = max(float(np.max(np.abs(c.force))) for c in result.problem.curves[lane])
+        row: dict[str, object] = {
+            "specimen": specimen,
+            "trial": trial,
+            "status": status.name.lower(),
+            "message": status.message,
+            "iterations": int(result.iterations[lane]),
+            "starts_agreeing": int(result.converged_starts[lane]),
+            "samples": int(result.samples[lane]),
+            "cost": float(result.cost[lane]),
+            "rms_force_N": float(result.rms[lane, 0]),
+            "rms_over_peak": float(result.rms[lane, 0]) / peak if peak > 0 else float("nan"),
+            "sigma_force_N": float(result.sigma[lane, 0]),
+            "rms_joints_mm": float(result.rms[lane, 1]),
+            "condition": float(result.uncertainty[lane].condition),
+        }
+        for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+            label = unknown_label(result, lane, i)
+            if label != p.name:
+                continue
+            row |= {f"{label} [{p.unit}]": float(result.value[lane, i])}
+            row |= {f"{label} se": float(result.standard_error[lane, i])}
+            row |= {f"{label} low95": float(result.lower[lane, i])}
+            row |= {f"{label} high95": float(result.upper[lane, i])}
+            row |= {f"{label} verdict": verdict_of(result, lane, i)}
+        yield row
+
+
+def verdict_of(result: FitResult, lane: int, i: int) -> str:
+    """Identifiable, weak, not identifiable, at bound, or "failed" where there is no estimate."""
+    if not FitStatus(int(result.status[lane])).succeeded:
+        return "failed"
+    return verdict(float(result.relative_se[lane, i]), bool(result.at_bound[lane, i]))
+
+
+def bad_row(bad: BadCurve) -> dict[str, object]:
+    """Row of summary.csv for a curve that could not be used."""
+    return {
+        "specimen": bad.specimen,
+        "trial": bad.trial,
+        "status": FitStatus.BAD_DATA.name.lower(),
+        "message": f"{bad.kind}: {bad.source}: {bad.message}; {bad.cure}",
+    }
+
+
+def parameter_rows(result: FitResult) -> Iterator[dict[str, object]]:
+    """One row per lane and unknown for parameters.csv."""
+    for lane in range(result.lanes):
+        lane_specimen, _ = result.problem.lane_name(lane)
+        for i, (p, specimen, trial) in enumerate(result.problem.unknowns[lane]):
+            yield {
+                "specimen": specimen or lane_specimen,
+                "trial": trial or "(all)",
+                "parameter": p.name,
+                "unit": p.unit,
+                "value": float(result.value[lane, i]),
+                "se": float(result.standard_error[lane, i]),
+                "low95": float(result.lower[lane, i]),
+                "high95": float(result.upper[lane, i]),
+                "relative_se": float(result.relative_se[lane, i]),
+                "verdict": verdict_of(result, lane, i),
+            }
+
+
+def write_csv(path: Path, rows: list[dict[str, object]]) -> None:
+    """Write rows that may have different keys; missing cells are empty."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    with _whole(path, newline="") as stream:
+        writer = csv.DictWriter(stream, columns, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+class _whole:  # noqa: N801
+    """Open a text file that appears under its name only when it is complete."""
+
+    def __init__(self, path: Path, **kwargs):
+        self.path, self.part = path, path.with_name(path.name + ".part")
+        self.stream = self.part.open("w", encoding="utf-8", **kwargs)
+
+    def __enter__(self):
+        return self.stream
+
+    def __exit__(self, kind, value, traceback):
+        self.stream.close()
+        if kind is None:
+            os.replace(self.part, self.path)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, complete or not at all."""
+    with _whole(path) as stream:
+        stream.write(text)
+
+
+def write_hdf5(path: Path, result: FitResult, provenance: dict) -> None:
+    """Write all numbers of a fit; the schema is described in docs/results.md.
+
+    Args:
+        path: new file.
+        result: the fit.
+        provenance: stored as JSON in the root attribute of that name.
+    """
+    part = path.with_name(path.name + ".part")
+    text = h5py.string_dtype()
+    problem = result.problem
+    with h5py.File(part, "w") as file:
+        file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
+        file.attrs["provenance"] = json.dumps(provenance)
+        lanes = file.create_group("lanes")
+        names = [problem.lane_name(lane) for lane in range(result.lanes)]
+        lanes.create_dataset("specimen", data=[n[0] for n in names], dtype=text)
+        lanes.create_dataset("trial", data=[n[1] for n in names], dtype=text)
+        codes = lanes.create_dataset("status", data=result.status.astype(np.int8))
+        codes.attrs["meaning"] = json.dumps({int(s): s.message for s in FitStatus})
+        for name in ("iterations", "cost", "converged_starts", "samples"):
+            lanes.create_dataset(name, data=getattr(result, name))
+        for name, unit in (("sigma", "N, mm"), ("rms", "N, mm")):
+            lanes.create_dataset(name, data=getattr(result, name)).attrs["unit"] = unit
+        u = result.uncertainty
+        lanes.create_dataset("condition", data=[v.condition for v in u])
+        unknowns = file.create_group("unknowns")
+        for field, pick in (("parameter", 0), ("specimen", 1), ("trial", 2)):
+            cells = [[_cell(problem.unknowns[lane], i, pick) for i in range(problem.size)]
+                     for lane in range(result.lanes)]  # fmt: skip
+            unknowns.create_dataset(field, data=cells, dtype=text)
+        arrays = ("value", "standard_error", "lower", "upper", "relative_se", "theta", "at_bound")
+        for name in arrays:
+            unknowns.create_dataset(name, data=getattr(result, name), compression="gzip")
+        correlation = np.stack([v.correlation for v in u])
+        unknowns.create_dataset("correlation", data=correlation, compression="gzip")
+        unknowns.create_dataset("flat", data=np.stack([v.flat for v in u]), compression="gzip")
+        units = {p.name: p.unit for p in problem.parameters}
+        unknowns.attrs["units"] = json.dumps(units)
+        fixed = {p.name: p.value for p in problem.parameters if p.fixed}
+        unknowns.attrs["fixed"] = json.dumps(fixed)
+    os.replace(part, path)
+
+
+def _cell(unknowns, i: int, pick: int) -> str:
+    if i >= len(unknowns):
+        return ""
+    return unknowns[i][0].name if pick == 0 else unknowns[i][pick]
+
+
+def provenance(
+    spec: Path, inputs: dict[str, str], device: str, dtype: str, timings: dict[str, float]
+) -> dict[str, object]:
+    """Everything needed to repeat a run: versions, device, dtype, SHA-256 of every input.
+
+    Args:
+        spec: the specification file.
+        inputs: SHA-256 by measurement file.
+        device: as JAX names it.
+        dtype: of the computation.
+        timings: seconds by phase.
+    """
+    versions = {"python": platform.python_version(), "platform": platform.platform()}
+    for name in ("jaxtrachea", "jax", "jaxlib", "numpy", "scipy", "equinox", "optax", "h5py"):
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "not installed"
+    return {
+        "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "versions": versions,
+        "device": device,
+        "dtype": dtype,
+        "specification": {
+            "file": spec.name,
+            "sha256": hashlib.sha256(spec.read_bytes()).hexdigest(),
+        },
+        "inputs": {Path(name).name: digest for name, digest in inputs.items()},
+        "seconds": {name: round(value, 3) for name, value in timings.items()},
+    }

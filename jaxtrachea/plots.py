@@ -1,0 +1,156 @@
+"""The figures of a fit (matplotlib, imported only here)."""
+
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.predictions import Prediction
+from jaxtrachea.identify.results import unknown_label
+from jaxtrachea.report import ONE_BY_ONE
+
+_STYLE = {
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "font.size": 9,
+    "legend.frameon": False,
+    "legend.fontsize": 7,
+    "figure.dpi": 130,
+}
+
+
+def draw_all(folder: Path, result: FitResult, prediction: Prediction) -> list[Path]:
+    """Write fit.png, residuals.png and correlation.png; returns their paths."""
+    with plt.rc_context(_STYLE):
+        figures = {
+            "fit": draw_fit(result, prediction),
+            "residuals": draw_residuals(result, prediction),
+            "correlation": draw_correlation(result),
+        }
+        paths = []
+        for name, figure in figures.items():
+            paths.append(folder / f"{name}.png")
+            figure.savefig(paths[-1], bbox_inches="tight")
+            plt.close(figure)
+    return paths
+
+
+def _panels(result: FitResult) -> list[int]:
+    """Lanes drawn one by one: the first ones, or of many those with the best to worst residual."""
+    if result.lanes <= ONE_BY_ONE:
+        return list(range(result.lanes))
+    order = np.argsort(np.nan_to_num(result.rms[:, 0], nan=np.inf))
+    return [int(order[i]) for i in np.linspace(0, result.lanes - 1, ONE_BY_ONE).astype(int)]
+
+
+def _grid(count: int, height: float = 2.7):
+    columns = min(3, count)
+    rows = -(-count // columns)
+    size = (max(4.6, 3.6 * columns), height * rows + 0.6)
+    figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    for axis in axes.flat[count:]:
+        axis.set_visible(False)
+    return figure, axes.flat
+
+
+def _title(result: FitResult, lane: int) -> str:
+    specimen, trial = result.problem.lane_name(lane)
+    return specimen if trial == "(all)" else f"{specimen} {trial}"
+
+
+def draw_fit(result: FitResult, prediction: Prediction):
+    """Data (dots) and fitted force (line) against displacement; markers in a second row of axes."""
+    shown = _panels(result)
+    with_joints = prediction.joints is not None and result.lanes <= 3
+    figure, axes = _grid(len(shown) * (2 if with_joints else 1), 3.2 if with_joints else 2.7)
+    axes = iter(axes)
+    for lane in shown:
+        axis = next(axes)
+        curves = result.problem.curves[lane]
+        colours = plt.get_cmap("viridis")(np.linspace(0.05, 0.9, len(curves)))
+        for t, (curve, colour) in enumerate(zip(curves, colours, strict=True)):
+            n = len(curve.force)
+            model = curve.force + np.nan_to_num(prediction.force[lane, t, :n], nan=np.nan)
+            step = max(1, n // 60)
+            label = curve.trial if len(curves) <= 12 else None
+            axis.plot(curve.displacement[::step], curve.force[::step], ".", color=colour, ms=4)
+            axis.plot(curve.displacement, model, "-", color=colour, lw=1.2, label=label)
+        axis.set(title=_title(result, lane), xlabel="displacement [mm]", ylabel="force [N]")
+        if 1 < len(curves) <= 12:
+            axis.legend(ncols=2, title="dots: measured, lines: model", title_fontsize=7)
+        if with_joints:
+            _draw_joints(next(axes), result, prediction, lane, colours)
+    return figure
+
+
+def _draw_joints(axis, result, prediction, lane, colours) -> None:
+    """Ligament deflection along the tube at the last sample, per unit of tool displacement."""
+    x = np.asarray(result.problem.geometry.ring_positions)
+    for t, (curve, colour) in enumerate(zip(result.problem.curves[lane], colours, strict=True)):
+        if curve.joint_displacement is None:
+            continue
+        last = len(curve.force) - 1
+        D = curve.displacement[last]
+        model = (result.problem.lanes.joints[lane, t, last] + prediction.joints[lane, t, last]) / D
+        axis.plot(x[curve.joint_rings], curve.joint_displacement[last] / D, "o", color=colour, ms=3)
+        axis.plot(x, model, "-", color=colour, lw=1)
+    axis.set(
+        title="joints at the largest displacement",
+        xlabel="s [mm]",
+        ylabel="joint / tool displacement",
+    )
+
+
+def draw_residuals(result: FitResult, prediction: Prediction):
+    """Force residuals, model - data, against displacement, and their distribution."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained",
+                                         width_ratios=(2, 1))  # fmt: skip
+    pooled = []
+    for lane in range(result.lanes):
+        for t, curve in enumerate(result.problem.curves[lane]):
+            n = len(curve.force)
+            peak = np.max(np.abs(curve.force))
+            r = 100 * prediction.force[lane, t, :n] / (peak if peak > 0 else 1)
+            pooled.append(r)
+            if lane < 200:
+                left.plot(curve.displacement, r, lw=0.7, alpha=0.6)
+    left.axhline(0, color="k", lw=0.6)
+    left.set(
+        xlabel="displacement [mm]", ylabel="(model - data) / peak [%]", title="force residuals"
+    )
+    values = np.concatenate(pooled)
+    right.hist(values[np.isfinite(values)], bins=60, color="0.4")
+    right.set(xlabel="residual / peak [%]", ylabel="samples")
+    return figure
+
+
+def draw_correlation(result: FitResult):
+    """Correlation of the estimates: of the lane, or the mean over lanes."""
+    names = [unknown_label(result, 0, i) for i in range(len(result.problem.unknowns[0]))]
+    shown = min(len(names), 30)
+    with np.errstate(invalid="ignore"):
+        stack = np.stack([u.correlation[:shown, :shown] for u in result.uncertainty])
+        known = np.isfinite(stack)
+        mean = np.where(known, stack, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    mean = np.where(known.any(axis=0), mean, np.nan)
+    size = 1.6 + 0.55 * shown
+    figure, axis = plt.subplots(figsize=(size + 1, size), layout="constrained")
+    image = axis.imshow(mean, vmin=-1, vmax=1, cmap="RdBu_r")
+    axis.grid(visible=False)
+    axis.set_xticks(range(shown), names[:shown], rotation=60, ha="right")
+    axis.set_yticks(range(shown), names[:shown])
+    for i in range(shown):
+        for j in range(shown):
+            if np.isfinite(mean[i, j]) and shown <= 12:
+                dark = "w" if abs(mean[i, j]) > 0.6 else "k"
+                axis.text(j, i, f"{mean[i, j]:.2f}", ha="center", va="center", color=dark, size=7)
+    axis.set_title("correlation" + (f", mean of {result.lanes} lanes" if result.lanes > 1 else ""))
+    figure.colorbar(image, shrink=0.8)
+    return figure

@@ -1,0 +1,161 @@
+"""Tables, plots and the written report of a fit."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.measurements import BadCurve
+from jaxtrachea.identify.predictions import LeftOut, Prediction
+from jaxtrachea.identify.results import flat_sentence, unknown_label, verdict_of
+from jaxtrachea.status import FitStatus
+
+#: Lanes that are listed and drawn one by one; beyond it, distributions are shown.
+ONE_BY_ONE = 12
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number for people: `digits` significant ones, a dash for NaN."""
+    return "–" if np.isnan(value) else f"{value:.{digits}g}"
+
+
+def estimate_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
+    """Lane, parameter, value, standard error, 95 % interval, verdict."""
+    rows = []
+    for lane in lanes:
+        specimen, trial = result.problem.lane_name(lane)
+        name = specimen if trial == "(all)" else f"{specimen} {trial}"
+        for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+            low, high = result.lower[lane, i], result.upper[lane, i]
+            rows.append(
+                [
+                    name,
+                    f"{unknown_label(result, lane, i)} [{p.unit}]",
+                    number(result.value[lane, i]),
+                    number(result.standard_error[lane, i], 2),
+                    "–" if np.isnan(low) else f"{number(low)} … {number(high)}",
+                    verdict_of(result, lane, i),
+                ]
+            )
+    return rows
+
+
+ESTIMATE_HEAD = ["specimen", "parameter", "value", "std. error", "95 % interval", "verdict"]
+
+
+def spread_rows(result: FitResult) -> list[list[str]]:
+    """Over all succeeded lanes: parameter, lanes, median, quartiles, median standard error."""
+    good = [k for k in range(result.lanes) if FitStatus(int(result.status[k])).succeeded]
+    columns: dict[str, list[tuple[float, float, str]]] = {}
+    for lane in good:
+        for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+            entry = (
+                result.value[lane, i],
+                result.relative_se[lane, i],
+                verdict_of(result, lane, i),
+            )
+            columns.setdefault(f"{p.name} [{p.unit}]", []).append(entry)
+    rows = []
+    for name, entries in columns.items():
+        values = np.array([e[0] for e in entries])
+        low, mid, high = np.quantile(values, [0.25, 0.5, 0.75])
+        relative = np.array([e[1] for e in entries])
+        known = np.isfinite(relative)
+        se = f"{100 * np.median(relative[known]):.2g} %" if known.any() else "–"
+        share = 100 * np.mean([e[2] == "identifiable" for e in entries])
+        quartiles = f"{number(low)} … {number(high)}"
+        rows.append([name, str(len(values)), number(mid), quartiles, se, f"{share:.0f} %"])
+    return rows
+
+
+SPREAD_HEAD = ["parameter", "estimates", "median", "quartiles", "median rel. se", "identifiable"]
+
+
+def quality_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
+    """Lane, status, iterations, samples, rms residuals, condition number."""
+    rows = []
+    for lane in lanes:
+        specimen, trial = result.problem.lane_name(lane)
+        peak = max(float(np.max(np.abs(c.force))) for c in result.problem.curves[lane])
+        status = FitStatus(int(result.status[lane]))
+        rows.append(
+            [
+                specimen if trial == "(all)" else f"{specimen} {trial}",
+                status.name.lower(),
+                str(int(result.iterations[lane])),
+                str(int(result.samples[lane])),
+                f"{number(result.rms[lane, 0], 3)} N",
+                f"{100 * result.rms[lane, 0] / peak:.2g} %" if peak > 0 else "–",
+                f"{number(result.rms[lane, 1], 3)} mm" if np.isfinite(result.rms[lane, 1]) else "–",
+                number(result.uncertainty[lane].condition, 2),
+            ]
+        )
+    return rows
+
+
+QUALITY_HEAD = ["specimen", "outcome", "iter", "n", "rms F", "of peak", "rms joints", "cond"]
+LEFT_OUT_HEAD = ["specimen", "left out", "force / model", "rms force / peak", "rms joints / D"]
+
+
+def left_out_rows(result: FitResult, left_out: LeftOut) -> list[list[str]]:
+    """Specimen, curve left out, its errors; the last row is the root mean square."""
+    rows = []
+    errors = (left_out.ratio, left_out.force, left_out.joints)
+    for k, t, *values in zip(left_out.lane, left_out.trial, *errors, strict=True):
+        curve = result.problem.curves[k][t]
+        rows.append([curve.specimen, curve.trial, *map(_percent, values)])
+    mean = [np.sqrt(np.mean(v**2)) for v in errors]
+    return [*rows, ["(root mean square)", "", *map(_percent, mean)]]
+
+
+def _percent(value: float) -> str:
+    return "–" if np.isnan(value) else f"{100 * value:.2f} %"
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    line = lambda cells: "| " + " | ".join(str(c).replace("|", "\\|") for c in cells) + " |"  # noqa: E731
+    return "\n".join([line(head), line(["---"] * len(head)), *map(line, rows)])
+
+
+def report_text(
+    title: str,
+    result: FitResult,
+    bad: Sequence[BadCurve],
+    prediction: Prediction,
+    left_out: Sequence[Sequence[str]] | None,
+) -> str:
+    """The whole report.md."""
+    shown = list(range(min(result.lanes, ONE_BY_ONE)))
+    failed = [k for k in range(result.lanes) if not FitStatus(int(result.status[k])).succeeded]
+    parts = [f"# {title or 'Fit'}", ""]
+    parts += [
+        f"{result.lanes} lanes, {result.lanes - len(failed)} succeeded, {len(failed)} failed; "
+        f"{len(bad)} curves could not be used. All numbers: `results.h5`; one row per lane: "
+        "`summary.csv`; one row per estimate: `parameters.csv`.",
+        "",
+        "## Estimates",
+        "",
+    ]
+    if result.lanes <= ONE_BY_ONE:
+        parts.append(markdown_table(ESTIMATE_HEAD, estimate_rows(result, shown)))
+    else:
+        parts.append(markdown_table(SPREAD_HEAD, spread_rows(result)))
+    fixed = [f"{p.name} = {p.value:g} {p.unit}" for p in result.problem.parameters if p.fixed]
+    parts += ["", f"Fixed: {', '.join(fixed) or 'none'}.", "", "## What the data determine", ""]
+    parts += [f"- {result.problem.lane_name(k)[0]}: {flat_sentence(result, k)}." for k in shown]
+    parts += ["", "Identifiable: relative standard error up to 10 %; weak: up to 50 %. Standard "
+              "errors are local (Gauss-Newton); they say nothing of what the model leaves out.",
+              "", "## Quality", ""]  # fmt: skip
+    parts.append(markdown_table(QUALITY_HEAD, quality_rows(result, [*shown, *failed][:50])))
+    worst = prediction.worst(result)
+    parts += ["", f"Largest residual: {worst}.", ""]
+    if left_out is not None:
+        parts += ["## Leaving one curve out", "", markdown_table(LEFT_OUT_HEAD, left_out), ""]
+    parts += ["![data and fit](fit.png)", "", "![residuals](residuals.png)", "",
+              "![correlation](correlation.png)", ""]  # fmt: skip
+    if bad:
+        parts += ["## Curves that could not be used", ""]
+        rows = [[b.specimen, b.trial, b.kind, b.message, b.cure] for b in bad]
+        parts += [markdown_table(["specimen", "trial", "kind", "what", "cure"], rows), ""]
+    return "\n".join(parts)
