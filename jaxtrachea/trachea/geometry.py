@@ -1,6 +1,7 @@
 """What is there at rest: length, ring positions and cross-section of a ring-supported tube."""
 
 import math
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -37,7 +38,7 @@ class Geometry(eqx.Module):
     def create(
         cls,
         length: float,
-        ring_positions: ArrayLike,
+        ring_positions: ArrayLike | Sequence[float],
         *,
         radius: float = 11.3,
         half_angle: float = 2 * math.pi / 3,
