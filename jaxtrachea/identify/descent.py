@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from jaxtrachea.identify.problem import Lane, Problem, residual
+from jaxtrachea.identify.problem import Lane, Problem, residual_value
 from jaxtrachea.identify.solve import Solved, Tolerances, entry_scale, robust
 from jaxtrachea.status import FitStatus
 
@@ -30,10 +30,9 @@ def cost(
         lane: arrays of the lane.
         sigma: standard deviation of force and markers in units of the lane's precision.
     """
-    r = residual(problem, theta, lane)
-    z = r.value * entry_scale(lane, sigma)[None]
+    z = residual_value(problem, theta, lane) * entry_scale(lane, sigma)[None]
     rho, _ = robust(problem.loss, z * z, problem.loss_scale)
-    return 0.5 * jnp.sum(rho * r.weight**2)
+    return 0.5 * jnp.sum(rho * (lane.balance * lane.balance)[:, None])
 
 
 def descend(
@@ -55,8 +54,7 @@ def descend(
     when the relative change of its cost over such a block is below `tolerances.cost` per step.
     """
     block = {"lbfgs": 10, "adam": 100}[method]
-    one = functools.partial(_descend, problem, method, learning_rate, block, tolerances)
-    run = jax.jit(jax.vmap(one))
+    run = _compiled(problem.program, method, learning_rate, block, tolerances)
     cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype)  # noqa: E731
     parts = []
     for first in range(0, len(jobs), chunk):
@@ -71,6 +69,12 @@ def descend(
             progress(len(parts[-1][0]))
     theta, value, status, iterations = (np.concatenate(v) for v in zip(*parts, strict=True))
     return Solved(theta.astype(float), value.astype(float), status.astype(int), iterations)
+
+
+@functools.lru_cache(maxsize=8)
+def _compiled(problem: Problem, method, learning_rate, block, tolerances):
+    one = functools.partial(_descend, problem, method, learning_rate, block, tolerances)
+    return jax.jit(jax.vmap(one))
 
 
 def _descend(problem, method, learning_rate, block, tolerances, start, lane, sigma):

@@ -233,7 +233,7 @@ def _conclude(problem, solved: Solved, info: Information, sigma, agree) -> FitRe
         problem=problem, theta=solved.theta, value=value, standard_error=se, lower=low, upper=high,
         relative_se=relative_se, at_bound=at_bound, status=status, iterations=solved.iterations,
         cost=solved.cost, converged_starts=agree, sigma=sigma * unit, rms=rms * unit,
-        samples=info.counts.sum(axis=1), uncertainty=tuple(uncertainties),
+        samples=np.asarray(info.counts).sum(axis=1), uncertainty=tuple(uncertainties),
     )  # fmt: skip
 
 

@@ -7,8 +7,9 @@ number of them at once. The same residual serves the fit, its uncertainty and th
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -107,11 +108,39 @@ class Problem:
         """Unknowns per lane, padding included."""
         return self.lanes.lower.shape[1]
 
+    @property
+    def program(self) -> "Problem":
+        """This problem without its data: the same object for all that compile to one program."""
+        leaves, tree = jax.tree.flatten(self.geometry)
+        numbers = tuple((np.shape(v), tuple(np.ravel(v).tolist())) for v in leaves)
+        columns = tuple(
+            dataclasses.replace(p, description="", value=1.0, lower=1.0, upper=2.0, scope="shared")
+            for p in self.parameters
+        )
+        return _program(tree, numbers, self.options, columns, self.loss, self.loss_scale)
+
     def lane_name(self, lane: int) -> tuple[str, str]:
         """Specimen and trial of a lane; "(all)" where it spans several."""
         one = lambda names: names.pop() if len(names) == 1 else "(all)"  # noqa: E731
         curves = self.curves[lane]
         return one({c.specimen for c in curves}), one({c.trial for c in curves})
+
+
+@functools.lru_cache(maxsize=64)
+def _program(tree, numbers, options, parameters, loss, loss_scale) -> Problem:
+    leaves = [np.reshape(np.array(v, np.float64), shape) for shape, v in numbers]
+    arrays: dict[str, Any] = dict.fromkeys(Lane._fields, np.zeros((0, 0)))
+    return Problem(
+        geometry=jax.tree.unflatten(tree, leaves),
+        options=options,
+        parameters=parameters,
+        lanes=Lane(**arrays),
+        curves=(),
+        unknowns=(),
+        loss=loss,
+        loss_scale=loss_scale,
+        noise_given=(False, False),
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,48 +283,49 @@ def _lane(
 ) -> Lane:
     """One lane as padded float64 arrays."""
     T, N, J, P = sizes.trials, sizes.samples, len(parameters), sizes.unknowns
-    lane = Lane(
-        s_c=np.full(T, float(geometry.length) / 2),
-        displacement=np.zeros((T, N)),
-        force=np.zeros((T, N)),
-        precision=np.zeros((T, N)),
-        joints=np.zeros((T, N, sizes.rings)) if sizes.joints else None,
-        joint_precision=np.zeros((T, N, sizes.rings)) if sizes.joints else None,
-        balance=np.ones(T),
-        value=np.tile([p.value for p in parameters], (T, 1)).astype(np.float64),
-        index=np.full((T, J), -1, np.int32),
-        lower=np.zeros(P),
-        upper=np.zeros(P),
-        active=np.zeros(P),
-    )
+    joints = np.zeros((T, N, sizes.rings)) if sizes.joints else None
+    lane: dict[str, Any] = {
+        "s_c": np.full(T, float(geometry.length) / 2),
+        "displacement": np.zeros((T, N)),
+        "force": np.zeros((T, N)),
+        "precision": np.zeros((T, N)),
+        "joints": joints,
+        "joint_precision": None if joints is None else joints.copy(),
+        "balance": np.ones(T),
+        "value": np.tile([p.value for p in parameters], (T, 1)).astype(np.float64),
+        "index": np.full((T, J), -1, np.int32),
+        "lower": np.zeros(P),
+        "upper": np.zeros(P),
+        "active": np.zeros(P),
+    }
     place = {key: i for i, key in enumerate(unknowns)}
     for i, (p, _, _) in enumerate(unknowns):
-        lane.lower[i], lane.upper[i], lane.active[i] = p.to_scaled(p.lower), p.to_scaled(p.upper), 1
+        lane["lower"][i], lane["upper"][i] = p.to_scaled(p.lower), p.to_scaled(p.upper)
+        lane["active"][i] = 1
     for t, curve in enumerate(curves):
         n = len(curve.force)
-        lane.s_c[t] = lane.s_c[t] if curve.s_c is None else curve.s_c
-        lane.displacement[t, :n], lane.force[t, :n] = curve.displacement, curve.force
+        if curve.s_c is not None:
+            lane["s_c"][t] = curve.s_c
+        lane["displacement"][t, :n], lane["force"][t, :n] = curve.displacement, curve.force
         sigma = curve.sigma if curve.sigma is not None else noise.force
-        lane.precision[t, :n] = 1.0 if sigma is None else 1 / np.asarray(sigma)
-        lane.balance[t] = np.sqrt(mean_length / n) if balance == "curve" else 1.0
+        lane["precision"][t, :n] = 1.0 if sigma is None else 1 / np.asarray(sigma)
+        lane["balance"][t] = np.sqrt(mean_length / n) if balance == "curve" else 1.0
         for j, p in enumerate(parameters):
             if not p.fixed:
-                lane.index[t, j] = place[_key(p, curve)]
-        if curve.joint_displacement is not None:
-            _fill_joints(lane, t, curve, geometry, noise, reach)
-    return lane
+                lane["index"][t, j] = place[_key(p, curve)]
+        if curve.joint_displacement is not None and curve.joint_rings is not None:
+            weight = 1.0 if noise.joints is None else 1 / noise.joints
+            seen, at = _seen_joints(curve, geometry, reach), curve.joint_rings
+            lane["joints"][t, :n, at] = np.where(seen, curve.joint_displacement, 0).T
+            lane["joint_precision"][t, :n, at] = np.where(seen, weight, 0).T
+    return Lane(**lane)
 
 
-def _fill_joints(lane: Lane, t: int, curve: Curve, geometry: Geometry, noise: Noise, reach) -> None:
-    """Place the markers of one curve; unobserved ones and those under the tool weigh nothing."""
-    seen = np.isfinite(curve.joint_displacement)
+def _seen_joints(curve: Curve, geometry: Geometry, reach: float) -> np.ndarray:
+    """Which markers of a curve count: observed, and not under the tool; (N, M)."""
+    seen = np.isfinite(np.asarray(curve.joint_displacement))
     x = np.asarray(geometry.ring_positions)[curve.joint_rings]
-    if curve.s_c is not None:
-        seen &= np.abs(x - curve.s_c) > reach
-    n = len(curve.force)
-    lane.joints[t, :n, curve.joint_rings] = np.where(seen, curve.joint_displacement, 0).T
-    weight = 1.0 if noise.joints is None else 1 / noise.joints
-    lane.joint_precision[t, :n, curve.joint_rings] = np.where(seen, weight, 0).T
+    return seen if curve.s_c is None else seen & (np.abs(x - curve.s_c) > reach)
 
 
 def predict(
@@ -328,33 +358,43 @@ def residual(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Residua
         theta: unknowns in scaled coordinates.
         lane: the lane's arrays (no leading axis).
     """
-    dtype = lane.force.dtype
-    names = [p.name for p in problem.parameters]
-    columns = problem.free_columns
-    index = lane.index[:, columns]
-    free = jnp.where(index >= 0, theta[jnp.maximum(index, 0)], 0)
-    geometry = jax.tree.map(lambda v: jnp.asarray(v, dtype), problem.geometry)
 
-    def one(free, lane):
-        values = {name: lane.value[j] for j, name in enumerate(names)}
-        for column, scaled in zip(columns, free, strict=True):
-            p = problem.parameters[column]
-            values[p.name] = jnp.exp(scaled) if p.scale == "log" else scaled * p.step
-        force, pressed = predict(values, geometry, problem.options, lane.s_c, lane.displacement)
-        r = jnp.where(lane.precision > 0, force - lane.force, 0) * lane.precision
-        if lane.joints is not None:
-            difference = jnp.where(lane.joint_precision > 0, pressed.joints - lane.joints, 0)
-            r = jnp.concatenate([r, (difference * lane.joint_precision).ravel()])
-        return r
+    def with_jacobian(free, trial):
+        value, tangent = jax.linearize(lambda free: _of_trial(problem, free, trial), free)
+        return value, jax.vmap(tangent)(jnp.eye(free.shape[0], dtype=free.dtype))
 
-    def with_jacobian(free, lane):
-        value, tangent = jax.linearize(lambda free: one(free, lane), free)
-        return value, jax.vmap(tangent)(jnp.eye(len(columns), dtype=dtype))
-
-    per_trial = lane._replace(lower=None, upper=None, active=None, index=None)
-    value, jacobian = jax.vmap(with_jacobian)(free, per_trial)
+    value, jacobian = jax.vmap(with_jacobian)(*_by_trial(problem, theta, lane))
     weight = jnp.broadcast_to(lane.balance[:, None], value.shape)
     return Residual(value, jacobian, weight)
+
+
+def residual_value(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Float[Array, "T m"]:
+    """`residual` without its Jacobian."""
+    one = functools.partial(_of_trial, problem)
+    return jax.vmap(one)(*_by_trial(problem, theta, lane))
+
+
+def _by_trial(problem: Problem, theta, lane: Lane):
+    """Free values of each trial, (T, Jf), and the lane's arrays that have a trial axis."""
+    index = lane.index[:, problem.free_columns]
+    free = jnp.where(index >= 0, theta[jnp.maximum(index, 0)], 0)
+    return free, lane._replace(lower=None, upper=None, active=None, index=None)
+
+
+def _of_trial(problem: Problem, free, trial):
+    """Whitened residual of one trial."""
+    names = [p.name for p in problem.parameters]
+    geometry = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), problem.geometry)
+    values = {name: trial.value[j] for j, name in enumerate(names)}
+    for column, scaled in zip(problem.free_columns, free, strict=True):
+        p = problem.parameters[column]
+        values[p.name] = jnp.exp(scaled) if p.scale == "log" else scaled * p.step
+    force, pressed = predict(values, geometry, problem.options, trial.s_c, trial.displacement)
+    r = jnp.where(trial.precision > 0, force - trial.force, 0) * trial.precision
+    if trial.joints is not None:
+        difference = jnp.where(trial.joint_precision > 0, pressed.joints - trial.joints, 0)
+        r = jnp.concatenate([r, (difference * trial.joint_precision).ravel()])
+    return r
 
 
 def observations(lane: Lane) -> tuple[Float[Array, "T m"], int]:

@@ -1,10 +1,12 @@
 """Batched Levenberg-Marquardt: lanes x starts in one compiled program, refilled as lanes finish.
 
-MINPACK's tests of convergence (More 1978, doi:10.1007/BFb0067700), Nielsen's damping
-(IMM-REP-1999-05) of equal strength in all unknowns, whose coordinates are scaled already (in the
-curved valleys of this model it converges where Marquardt's running diagonal stalls), and an active
-set for bounds: an unknown on its bound whose gradient points outwards is held, steps are clipped to
-the box. A robust loss enters as a reweighting by rho'(r^2).
+MINPACK's tests of convergence and trust region (More 1978, doi:10.1007/BFb0067700): a step is as
+long as the radius allows, in coordinates that are scaled already. Each step bends along the curve
+that a second directional derivative predicts (geodesic acceleration, Transtrum and Sethna 2012,
+arXiv:1201.5885): the valleys of this model are narrow and curved, since stiffness of skeleton and
+contact nearly trade off, and straight steps crawl in them. Bounds by an active set: an unknown on
+its bound whose gradient points outwards is held, steps are clipped to the box. A robust loss enters
+as a reweighting by rho'(r^2).
 
 A chunk of lanes takes a few iterations at a time; lanes that are done leave and waiting ones take
 their place, so that a slow lane holds up nobody and one program serves any number of lanes. Each
@@ -21,17 +23,27 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import epsilon, solve_spd
-from jaxtrachea.identify.problem import Lane, Problem, observations, residual
+from jaxtrachea.identify.problem import (
+    Lane,
+    Problem,
+    observations,
+    residual,
+    residual_value,
+)
 from jaxtrachea.status import FitStatus
 
 RUNNING = -1
+#: First radius of the trust region, in scaled coordinates (log: a factor of 7).
+_FIRST_RADIUS = 2.0
+#: Part of the step after which the residual's curvature along it is looked up.
+_LOOK = 0.1
 
 
 class Tolerances(NamedTuple):
     """When a lane is done; all relative.
 
     Attributes:
-        cost: predicted and actual reduction of the cost in one step.
+        cost: predicted and actual change of the cost in one step.
         step: step against the size of the unknowns.
         gradient: cosine between the residual and any column of the Jacobian.
         iterations: at most.
@@ -40,27 +52,44 @@ class Tolerances(NamedTuple):
     cost: float = 1e-10
     step: float = 1e-10
     gradient: float = 1e-10
-    iterations: int = 100
+    iterations: int = 200
 
 
-class Normal(NamedTuple):
-    """Cost and normal equations of one lane: gradient (P,), Gauss-Newton Hessian (P, P)."""
+class Point(NamedTuple):
+    """One lane evaluated: residual and Jacobian as in `Residual`, cost and normal equations.
 
+    Attributes:
+        value: (T, m).
+        jacobian: (T, Jf, m).
+        cost: half the weighted sum of rho.
+        gradient: of the cost; (P,).
+        hessian: Gauss-Newton; (P, P).
+    """
+
+    value: Float[Array, "T m"]
+    jacobian: Float[Array, "T Jf m"]
     cost: Float[Array, ""]
     gradient: Float[Array, " P"]
     hessian: Float[Array, "P P"]
 
 
 class State(NamedTuple):
-    """One lane under way."""
+    """One lane under way; `radius` bounds the length of the next step."""
 
     theta: Float[Array, " P"]
-    normal: Normal
-    damping: Float[Array, ""]
-    growth: Float[Array, ""]
-    scale: Float[Array, ""]
+    point: Point
+    radius: Float[Array, ""]
     iteration: Int[Array, ""]
     status: Int[Array, ""]
+
+
+class _Step(NamedTuple):
+    """A proposed step: where it leads, the way there, its straight part and what that promises."""
+
+    trial: Float[Array, " P"]
+    delta: Float[Array, " P"]
+    straight: Float[Array, ""]
+    predicted: Float[Array, ""]
 
 
 class Solved(NamedTuple):
@@ -109,25 +138,30 @@ def residual_size(lane: Lane) -> int:
     return size if lane.joints is None else size * (1 + lane.joints.shape[-1])
 
 
-def normal_equations(
+def _weights(problem: Problem, value, lane: Lane, sigma):
+    """Loss rho and weight of each squared residual, robust reweighting included; (T, m) each."""
+    scale = entry_scale(lane, sigma)[None]
+    rho, slope = robust(problem.loss, (value * scale) ** 2, problem.loss_scale)
+    b2 = (lane.balance * lane.balance)[:, None]
+    return b2 * rho, b2 * slope * scale * scale
+
+
+def evaluate(
     problem: Problem, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
-) -> Normal:
-    """Cost, gradient and Gauss-Newton Hessian of one lane; cost O(trials) in the Jacobian."""
+) -> Point:
+    """Residual, cost and normal equations of one lane; cost O(trials) in the Jacobian."""
     # The barrier keeps XLA from computing the residual anew inside each sum below.
     r = jax.lax.optimization_barrier(residual(problem, theta, lane))
-    scale = entry_scale(lane, sigma)
-    z = r.value * scale[None]
-    rho, slope = robust(problem.loss, z * z, problem.loss_scale)
-    b2 = r.weight * r.weight
-    J = r.jacobian * scale[None, None]
-    weighted = J * (b2 * slope)[:, None]
-    gradient = jnp.sum(weighted * z[:, None], axis=-1)
-    hessian = jnp.einsum("tim,tjm->tij", weighted, J)
+    rho, weight = _weights(problem, r.value, lane, sigma)
+    weighted = r.jacobian * weight[:, None]
     index = lane.index[:, problem.free_columns]
-    return Normal(
-        cost=0.5 * jnp.sum(b2 * rho),
-        gradient=assemble(gradient, index, theta.shape[0]),
-        hessian=assemble(hessian, index, theta.shape[0]),
+    size = theta.shape[0]
+    return Point(
+        value=r.value,
+        jacobian=r.jacobian,
+        cost=0.5 * jnp.sum(rho),
+        gradient=assemble(jnp.sum(weighted * r.value[:, None], axis=-1), index, size),
+        hessian=assemble(jnp.einsum("tim,tjm->tij", weighted, r.jacobian), index, size),
     )
 
 
@@ -153,55 +187,99 @@ def _held(theta, gradient, lane: Lane):
     return low | high | (lane.active == 0)
 
 
-def _step(state: State, lane: Lane):
-    """Damped Gauss-Newton step inside the box, and the reduction it predicts."""
-    g, H = state.normal.gradient, state.normal.hessian
-    held = _held(state.theta, g, lane)
-    damped = H + state.damping * state.scale * jnp.eye(g.shape[0], dtype=g.dtype)
-    free = ~held
-    system = jnp.where(free[:, None] & free[None], damped, jnp.eye(g.shape[0], dtype=g.dtype))
-    delta = solve_spd(system, jnp.where(free, -g, 0))
-    trial = jnp.clip(state.theta + delta, lane.lower, lane.upper)
-    delta = trial - state.theta
-    predicted = -jnp.sum(delta * (g + 0.5 * jnp.sum(H * delta[None], axis=1)))
-    return trial, delta, predicted
+def _within(radius, hessian, gradient, free):
+    """Step of the trust region, |step| <= radius up to 20 %, and the damped matrix behind it.
+
+    Three Newton steps on 1 / |step(damping)| = 1 / radius (Hebden, More): from below, without
+    overshoot, and near enough.
+    """
+    eye = jnp.eye(gradient.shape[0], dtype=gradient.dtype)
+    matrix = jnp.where(free[:, None] & free[None], hessian, eye)
+    rhs = jnp.where(free, -gradient, 0)
+    largest = jnp.max(jnp.where(free, jnp.diagonal(hessian), 0))
+    floor = 64 * epsilon(gradient.dtype) * jnp.where(largest > 0, largest, 1)
+    damping = floor
+    for _ in range(3):
+        damped = matrix + damping * eye
+        step = solve_spd(damped, rhs)
+        squared = jnp.sum(step * step)
+        bend = jnp.sum(step * solve_spd(damped, step))
+        length = jnp.sqrt(squared)
+        newton = damping + squared / bend * (length / radius - 1)
+        # Not positive definite to rounding: damp more.
+        newton = jnp.where(jnp.isfinite(newton), newton, 100 * damping)
+        damping = jnp.where(length <= 1.05 * radius, damping, jnp.maximum(newton, floor))
+    damped = matrix + damping * eye
+    step = solve_spd(damped, rhs)
+    return step * jnp.minimum(1, 1.2 * radius / _length(step)), damped
+
+
+def _length(v):
+    """Euclidean length, not below the smallest normal number."""
+    return jnp.sqrt(jnp.maximum(jnp.sum(v * v), jnp.finfo(v.dtype).tiny))
+
+
+def _step(problem: Problem, state: State, lane: Lane, sigma) -> _Step:
+    """Step of the trust region inside the box, bent by the residual's curvature along it."""
+    point, theta = state.point, state.theta
+    g, H = point.gradient, point.hessian
+    free = ~_held(theta, g, lane)
+    straight, damped = _within(state.radius, H, g, free)
+    inside = lambda delta: jnp.clip(theta + delta, lane.lower, lane.upper) - theta  # noqa: E731
+    straight = inside(straight)
+    predicted = -jnp.sum(straight * (g + 0.5 * jnp.sum(H * straight[None], axis=1)))
+    index = lane.index[:, problem.free_columns]
+    along = jnp.where(index >= 0, straight[jnp.maximum(index, 0)], 0)
+    ahead = residual_value(problem, theta + _LOOK * straight, lane)
+    linear = jnp.sum(point.jacobian * along[..., None], axis=1)
+    curvature = 2 / _LOOK * ((ahead - point.value) / _LOOK - linear)
+    _, weight = _weights(problem, point.value, lane, sigma)
+    pull = assemble(
+        jnp.sum(point.jacobian * (weight * curvature)[:, None], axis=-1), index, g.shape[0]
+    )
+    bend = 0.5 * solve_spd(damped, jnp.where(free, -pull, 0))
+    # Of no use where the expansion fails, nor where the step is so short that its difference is
+    # rounding.
+    length = _length(straight)
+    useful = (_length(bend) <= 0.375 * length) & (length > epsilon(g.dtype) ** 0.25)
+    delta = inside(straight + jnp.where(useful & jnp.all(jnp.isfinite(bend)), bend, 0))
+    return _Step(theta + delta, delta, length, predicted)
 
 
 def iterate(
     problem: Problem, tolerances: Tolerances, state: State, lane: Lane, sigma: Float[Array, "2"]
 ) -> State:
     """One iteration of one lane. The first one only evaluates the start (cost is inf before)."""
-    fresh = jnp.isinf(state.normal.cost)
-    trial, delta, predicted = _step(state, lane)
-    trial = jnp.where(fresh, state.theta, trial)
-    new = normal_equations(problem, trial, lane, sigma)
+    old = state.point
+    fresh = jnp.isinf(old.cost)
+    step = _step(problem, state, lane, sigma)
+    trial = jnp.where(fresh, state.theta, step.trial)
+    new = evaluate(problem, trial, lane, sigma)
     finite = jnp.isfinite(new.cost) & jnp.all(jnp.isfinite(new.hessian))
     finite &= jnp.all(jnp.isfinite(new.gradient))
-    actual = state.normal.cost - new.cost
+    actual = old.cost - new.cost
     accept = finite & (fresh | (actual > 0))
-    ratio = jnp.where(accept & ~fresh, actual / jnp.where(predicted > 0, predicted, 1), 0)
-    shrink = jnp.clip(1 - (2 * ratio - 1) ** 3, 0.1, 2)
-    damping = jnp.where(accept, state.damping * jnp.where(fresh, 1, shrink), state.damping)
-    damping = jnp.where(accept, damping, damping * state.growth)
-    growth = jnp.where(accept, 2, state.growth * 2)
+    ratio = jnp.where(accept, actual / jnp.where(step.predicted > 0, step.predicted, jnp.inf), 0)
+    shorter = jnp.where(finite, 0.25, 0.1) * jnp.minimum(state.radius, step.straight)
+    longer = jnp.maximum(state.radius, 2 * step.straight)
+    radius = jnp.where(ratio < 0.25, shorter, jnp.where(ratio > 0.75, longer, state.radius))
     pick = lambda a, b: jnp.where(accept, a, b)  # noqa: E731
-    normal = jax.tree.map(pick, new, state.normal)
+    point = jax.tree.map(pick, new, old)
     theta = pick(trial, state.theta)
-    scale = jnp.max(jnp.diagonal(normal.hessian))
-    scale = jnp.where(scale > 0, scale, 1)
-    moved = State(theta, normal, damping, growth, scale, state.iteration + 1, state.status)
-    done = _status(tolerances, state, moved, lane, sigma, fresh, accept, delta, actual, predicted)
+    radius = jnp.where(fresh, state.radius, radius)
+    moved = State(theta, point, radius, state.iteration + 1, state.status)
+    done = _status(tolerances, old.cost, moved, lane, sigma, fresh, finite, step, actual)
     running = state.status == RUNNING
     moved = moved._replace(status=done)
     return jax.tree.map(lambda a, b: jnp.where(running, a, b).astype(b.dtype), moved, state)
 
 
-def _status(tolerances, old, new, lane, sigma, fresh, accept, delta, actual, predicted):
+def _status(tolerances, old_cost, new, lane, sigma, fresh, finite, step, actual):
     """RUNNING, or why this lane is done."""
     dtype = new.theta.dtype
     small = lambda tolerance: max(tolerance, 4 * epsilon(dtype))  # noqa: E731
-    cost = new.normal.cost
-    g, diagonal = new.normal.gradient, jnp.diagonal(new.normal.hessian)
+    cost = new.point.cost
+    g, diagonal = new.point.gradient, jnp.diagonal(new.point.hessian)
     free = ~_held(new.theta, g, lane)
     cosine = jnp.where(
         free & (diagonal > 0), jnp.abs(g) / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 0
@@ -210,9 +288,9 @@ def _status(tolerances, old, new, lane, sigma, fresh, accept, delta, actual, pre
     scale = entry_scale(lane, sigma)[: lane.force.shape[-1]]
     data = jnp.sum((lane.force * lane.precision * lane.balance[:, None] * scale[None]) ** 2)
     exact = cost <= 0.5 * data * (10 * epsilon(dtype)) ** 2
-    tiny = small(tolerances.cost) * old.normal.cost
-    settled = accept & ~fresh & (actual <= tiny) & (predicted <= tiny)
-    length = jnp.sqrt(jnp.sum(delta**2))
+    tiny = small(tolerances.cost) * old_cost
+    settled = finite & ~fresh & (jnp.abs(actual) <= tiny) & (step.predicted <= tiny)
+    length = jnp.sqrt(jnp.sum(step.delta**2))
     short = ~fresh & (length <= small(tolerances.step) * jnp.sqrt(jnp.sum(new.theta**2) + 1))
     nearly_flat = jnp.max(cosine) <= 1e3 * small(tolerances.gradient) ** 0.5 * jnp.sqrt(2 * cost)
     converged = flat | exact | settled | (short & nearly_flat)
@@ -220,24 +298,29 @@ def _status(tolerances, old, new, lane, sigma, fresh, accept, delta, actual, pre
     status = jnp.where(~converged & short, FitStatus.STALLED, status)
     out = (status == RUNNING) & (new.iteration >= tolerances.iterations)
     status = jnp.where(out, FitStatus.MAX_ITERATIONS, status)
-    return jnp.where(fresh & ~accept, FitStatus.INFEASIBLE_START, status).astype(jnp.int8)
+    return jnp.where(fresh & ~finite, FitStatus.INFEASIBLE_START, status).astype(jnp.int8)
 
 
-def fresh_state(theta: Float[Array, " P"]) -> State:
+def fresh_state(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> State:
     """A lane before its first evaluation."""
     size, dtype = theta.shape[0], theta.dtype
-    one = jnp.ones((), dtype)
-    normal = Normal(
-        jnp.full((), jnp.inf, dtype), jnp.zeros(size, dtype), jnp.eye(size, dtype=dtype)
+    trials, entries = lane.force.shape[0], residual_size(lane)
+    point = Point(
+        value=jnp.zeros((trials, entries), dtype),
+        jacobian=jnp.zeros((trials, len(problem.free_columns), entries), dtype),
+        cost=jnp.full((), jnp.inf, dtype),
+        gradient=jnp.zeros(size, dtype),
+        hessian=jnp.eye(size, dtype=dtype),
     )
     status = jnp.asarray(RUNNING, jnp.int8)
-    return State(theta, normal, 1e-3 * one, 2 * one, one, jnp.asarray(0, jnp.int32), status)
+    radius = jnp.asarray(_FIRST_RADIUS, dtype)
+    return State(theta, point, radius, jnp.asarray(0, jnp.int32), status)
 
 
 def _advance(problem, tolerances, rounds, lanes, jobs, sigma, start, refill, state):
     """Put fresh lanes where asked, then up to `rounds` iterations of the whole chunk."""
     lane = jax.tree.map(lambda v: v[jobs], lanes)
-    new = jax.vmap(fresh_state)(start)
+    new = jax.vmap(functools.partial(fresh_state, problem))(start, lane)
     put = lambda a, b: jnp.where(refill.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: E731
     state = jax.tree.map(put, new, state)
     one = jax.vmap(functools.partial(iterate, problem, tolerances))
@@ -286,9 +369,8 @@ def levenberg_marquardt(
     chunk = min(chunk, 1 << max(0, (total - 1).bit_length()))
     cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype)  # noqa: E731
     lanes = jax.device_put(jax.tree.map(cast, problem.lanes))
-    advance = _compiled(problem, tolerances, rounds)
-    state = jax.vmap(fresh_state)(jnp.zeros((chunk, problem.size), dtype))
-    state = state._replace(status=jnp.full(chunk, FitStatus.CONVERGED, jnp.int8))
+    advance = _compiled(problem.program, tolerances, rounds)
+    state = _idle(problem, lanes, chunk, dtype)
     out = Solved(
         np.zeros((total, problem.size)), np.full(total, np.inf), np.zeros(total, int),
         np.zeros(total, int),
@@ -313,12 +395,21 @@ def levenberg_marquardt(
         rows = owner[done]
         if len(rows):
             out.theta[rows] = np.asarray(state.theta)[done]
-            out.cost[rows] = np.asarray(state.normal.cost)[done]
+            out.cost[rows] = np.asarray(state.point.cost)[done]
             out.status[rows] = status[done]
             out.iterations[rows] = np.asarray(state.iteration)[done]
             owner[done] = -1
         if progress is not None:
             progress(len(rows))
+
+
+def _idle(problem, lanes, chunk, dtype) -> State:
+    """A chunk of places nobody works at."""
+    lane = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), lanes)
+    theta = jax.ShapeDtypeStruct((problem.size,), dtype)
+    one = jax.eval_shape(functools.partial(fresh_state, problem), theta, lane)
+    state = jax.tree.map(lambda v: jnp.zeros((chunk, *v.shape), v.dtype), one)
+    return state._replace(status=jnp.full(chunk, FitStatus.CONVERGED, jnp.int8))
 
 
 @functools.lru_cache(maxsize=32)

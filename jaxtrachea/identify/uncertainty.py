@@ -89,7 +89,7 @@ def informations(
 ) -> Information:
     """`information` of many lanes, on the host; leading axis = order of `lanes`."""
     chunk = min(chunk, len(lanes))
-    run = _compiled(problem)
+    run = _compiled(problem.program)
     parts = []
     for first in range(0, len(lanes), chunk):
         of = np.minimum(np.arange(first, first + chunk), len(lanes) - 1)
