@@ -1,4 +1,4 @@
-"""Strict settings for the whole suite: float64 on, no silent rank or dtype promotion, shapes checked."""
+"""Strict settings for the whole suite: float64, no silent rank or dtype promotion, shapes checked."""
 
 import os
 
@@ -11,5 +11,5 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-with install_import_hook("jaxtrachea", "beartype.beartype"):
-    import jaxtrachea  # noqa: F401
+# For the whole session: modules that a test imports later are checked as well.
+install_import_hook("jaxtrachea", "beartype.beartype")

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxtrachea.mechanics import beam as room
+from jaxtrachea.mechanics import reactions
 from jaxtrachea.mechanics.beam import Beam, add_span, contact_compliance, deflect
 
 # float64: measured 2e-14; float32: 8e-6 (joints, 200 rings, k = 1e-9 N/mm), else 4e-6.
@@ -158,7 +159,7 @@ def test_cantilever_reference_agrees_with_fem():
 def test_cantilever_dense_keeps_few_digits():
     """`reactions` errs by 2e-10 of the largest reaction; R_1, 11 decades down, keeps 3 digits."""
     b = beam_of(10.0 * np.arange(1, 16), 155.0, np.full(16, 1.86), np.full(15, 0.1))
-    _, R, _ = room._dense_side(b, b.length, jnp.ones(15, bool))
+    _, R, _ = reactions._dense_side(b, b.length, jnp.ones(15, bool))
     error = np.abs(0.1 * R[:, 0] - np.array(CANTILEVER_R))
     assert error.max() < 1e-9 * max(CANTILEVER_R)
     assert 1e-6 < error[0] / abs(CANTILEVER_R[0]) < 0.1

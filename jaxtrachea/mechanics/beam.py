@@ -5,9 +5,7 @@ and resting on spring supports, the rings. Two forms of the same force method ar
 
 - `recursion` (default): the tip compliance of the part between the clamp and a node is carried from
   node to node; every ring releases one redundant reaction, so no matrix is formed. O(n).
-- `reactions`: the paper's dense system (delta + I/k) R = Delta for all redundants at once, with the
-  printed influence coefficients corrected (docs/model.md). O(n^3) and less accurate; kept as the
-  reference of the paper's own algorithm.
+- `reactions`: the paper's dense system for all redundants at once (`mechanics.reactions`).
 
 Signs: deflection w and load F point the same way (inward for a press); a reaction R_i is positive
 when the ring pushes back against F; theta = dw/ds. Valid for small deflections and slopes.
@@ -17,69 +15,25 @@ Units: mm, N, N mm^2 (bending stiffness), N (shear stiffness kappa G A), N/mm (r
 
 from typing import Literal, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-Split = Literal["continuous", "independent"]
+from jaxtrachea.mechanics.compliance import (
+    Beam,
+    Compliance,
+    Deflection,
+    Split,
+    add_span,
+    add_support,
+    divide_load,
+    force_shares,
+    join,
+    sides,
+)
+from jaxtrachea.mechanics.reactions import deflect_dense
+
 Form = Literal["recursion", "reactions"]
-
-
-class Beam(eqx.Module):
-    """A straight beam clamped at both ends, on n spring supports.
-
-    Attributes:
-        x: support positions, mm, strictly increasing in (0, length); shape (n,).
-        length: mm.
-        EI: bending stiffness of each span, N mm^2, positive; shape (n + 1,).
-        k: stiffness of each support, N/mm, not negative; shape (n,).
-        GA: shear stiffness kappa G A of each span, N; shape (n + 1,). None: no shear flexibility
-            (Bernoulli-Euler, as in the paper).
-    """
-
-    x: Float[Array, " n"]
-    length: Float[Array, ""]
-    EI: Float[Array, " spans"]
-    k: Float[Array, " n"]
-    GA: Float[Array, " spans"] | None = None
-
-
-class Compliance(NamedTuple):
-    """Tip compliance [[a, b], [b, c]] of a cantilever: (w, theta) = G (V, M).
-
-    a: mm/N; b: 1/N (deflection per moment = rotation per force); c: 1/(N mm); det = a c - b^2,
-    1/N^2. Any common shape. The determinant is carried because with it spans, supports and the
-    parallel combination of two sides need sums of positive terms only: nothing cancels.
-    """
-
-    a: Float[Array, "*s"]
-    b: Float[Array, "*s"]
-    c: Float[Array, "*s"]
-    det: Float[Array, "*s"]
-
-
-class Deflection(NamedTuple):
-    """Response of the beam to a force at C.
-
-    Attributes:
-        w_C: deflection of C, mm. With `independent` the two beams disagree there; this is then the
-            deflection conjugate to the force, sum(share^2 * compliance) * F.
-        theta_C: rotation of C, rad (`independent`: that of beam AC).
-        w: deflection of the beam at each support, mm; shape (n,).
-        theta: rotation of the section at each support, rad; shape (n,).
-        reaction: force of each support against the load, N; shape (n,).
-        force_A: part of the force carried by beam AC, N.
-        moment_A: moment that beam BC exerts on AC at C, N mm (0 for `independent`).
-    """
-
-    w_C: Float[Array, ""]
-    theta_C: Float[Array, ""]
-    w: Float[Array, " n"]
-    theta: Float[Array, " n"]
-    reaction: Float[Array, " n"]
-    force_A: Float[Array, ""]
-    moment_A: Float[Array, ""]
 
 
 class _Side(NamedTuple):
@@ -99,28 +53,6 @@ class _Side(NamedTuple):
     after: Compliance
     passed: Float[Array, "*side n"]
     free: tuple[Float[Array, "*side spans"], Float[Array, "*side spans"]] | None
-
-
-def add_span(g: Compliance, h, EI, GA=None) -> Compliance:
-    """Tip compliance after a span of length h: bending exactly, shear if GA is given."""
-    a, b, c, det = g
-    f = h / EI
-    det = det + f * (a + h * (b + h * (c / 3 + f / 12)))
-    a = a + h * (2 * b + h * (c + f / 3))
-    if GA is not None:
-        a = a + h / GA
-        det = det + (h / GA) * (c + f)
-    return Compliance(a, b + h * (c + f / 2), c + f, det)
-
-
-def add_support(g: Compliance, k) -> Compliance:
-    """Tip compliance after a support of stiffness k at the tip (one redundant released).
-
-    c - k b^2 q is written as (c + k det) q, which subtracts nothing.
-    """
-    a, b, c, det = g
-    q = 1 / (1 + k * a)
-    return Compliance(a * q, b * q, c * q + (k * q) * det, det * q)
 
 
 def _sweep(h, EI, k, GA, load) -> _Side:
@@ -173,7 +105,7 @@ class _Tips(NamedTuple):
     count: Int[Array, "2"]
 
 
-def _reach(sides: _Side, beam: Beam, s_c) -> _Tips:
+def _reach(swept: _Side, beam: Beam, s_c) -> _Tips:
     """Add the last span of each side, up to C. A ring exactly at C belongs to side A."""
     count_A = jnp.sum(beam.x <= s_c)
     count = jnp.stack([count_A, beam.x.shape[0] - count_A])
@@ -186,51 +118,8 @@ def _reach(sides: _Side, beam: Beam, s_c) -> _Tips:
         free = None if free is None else (free[0] + h * free[1], free[1])
         return add_span(g, h, EI, GA), free
 
-    g, free = jax.vmap(one)(sides, last, count)
+    g, free = jax.vmap(one)(swept, last, count)
     return _Tips(g, free, jnp.stack([s_c, beam.length - s_c]), last, count)
-
-
-def _side(tree, i):
-    return jax.tree.map(lambda v: v[i], tree)
-
-
-class _Joint(NamedTuple):
-    """Two sides joined at C, for a unit force there: G_A (G_A + S G_B S)^-1 S G_B S and its parts.
-
-    S = diag(1, -1) mirrors side B. V, M: load on each side in its own signs; w, theta: motion of C;
-    `inverse`: entries of the symmetric (G_A + S G_B S)^-1. Products are divided by a_A + a_B before
-    they are summed, to stay within the range of float32.
-    """
-
-    w: Float[Array, ""]
-    theta: Float[Array, ""]
-    V: Float[Array, "2"]
-    M: Float[Array, "2"]
-    inverse: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]
-
-
-def _join(A: Compliance, B: Compliance) -> _Joint:
-    """Deflection and rotation agree at C; every result but theta is a sum of positive terms."""
-    scale = A.a + B.a
-    a_A, a_B, b_A, b_B = A.a / scale, B.a / scale, A.b / scale, B.b / scale
-    det_A, det_B = A.det / scale, B.det / scale
-    det = det_A + det_B + a_A * B.c + a_B * A.c + 2 * b_A * B.b
-    V_A = (det_B + a_B * A.c + b_A * B.b) / det
-    V_B = (det_A + a_A * B.c + b_A * B.b) / det
-    M = -(b_A * B.a + A.a * b_B) / det
-    return _Joint(
-        w=(a_A * det_B + a_B * det_A) * (scale / det),
-        theta=(A.b * det_B - B.b * det_A) / det,
-        V=jnp.stack([V_A, V_B]),
-        M=jnp.stack([M, M]),
-        inverse=((A.c + B.c) / scale / det, (b_B - b_A) / det, 1 / det),
-    )
-
-
-def _force_shares(s):
-    """Paper eq. 3: F_AC : F_BC = L_BC^3 : L_AC^3."""
-    cubes = (s / jnp.sum(s)) ** 3
-    return cubes[::-1] / jnp.sum(cubes)
 
 
 def contact_compliance(
@@ -249,13 +138,13 @@ def contact_compliance(
     Returns:
         Compliance, mm/N, of the shape of `s_c`.
     """
-    sides = _sweep_both(beam)
+    swept = _sweep_both(beam)
 
     def one(s):
-        tips = _reach(sides, beam, s)
+        tips = _reach(swept, beam, s)
         if split == "independent":
-            return jnp.sum(_force_shares(tips.s) ** 2 * tips.g.a)
-        return _join(_side(tips.g, 0), _side(tips.g, 1)).w
+            return jnp.sum(force_shares(tips.s) ** 2 * tips.g.a)
+        return join(*sides(tips.g)).w
 
     return one(s_c) if s_c.ndim == 0 else jax.vmap(one)(s_c)
 
@@ -293,36 +182,13 @@ def deflect(
         if ring_load is not None:
             raise ValueError("ring_load is not part of form='reactions'; use form='recursion'")
         return deflect_dense(beam, s_c, force, split=split)
-    sides = _sweep_both(beam, ring_load)
-    tips = _reach(sides, beam, s_c)
-    w_C, theta_C, V, M = _split_load(tips, force, split)
-    w, theta, R = jax.vmap(_back_substitute)(sides, tips.last, tips.count, V, M)
+    swept = _sweep_both(beam, ring_load)
+    tips = _reach(swept, beam, s_c)
+    w_C, theta_C, V, M = divide_load(tips.g, tips.s, force, split, tips.free)
+    w, theta, R = jax.vmap(_back_substitute)(swept, tips.last, tips.count, V, M)
     in_A = beam.x <= s_c
-    join = lambda v, sign: jnp.where(in_A, v[0], sign * v[1][::-1])  # noqa: E731
-    return Deflection(w_C, theta_C, join(w, 1), join(theta, -1), join(R, 1), V[0], M[0])
-
-
-def _split_load(tips: _Tips, force, split):
-    """Motion (w, theta) of C; force and moment there on both sides (A, B), in their own signs."""
-    g, free = tips.g, tips.free
-    if split == "independent":
-        shares = _force_shares(tips.s)
-        V = shares * force
-        w, theta = g.a * V, g.b * V
-        if free is not None:
-            w, theta = w + free[0], theta + free[1]
-        return jnp.sum(shares * w), theta[0], V, jnp.zeros_like(V)
-    joint = _join(_side(g, 0), _side(g, 1))
-    w, theta, V, M = (v * force for v in joint[:4])
-    if free is not None:
-        # Misfit of the free motions at C, closed by a force and a moment between the two sides.
-        gap_w, gap_theta = free[0][1] - free[0][0], -free[1][1] - free[1][0]
-        vv, vm, mm = joint.inverse
-        dV, dM = vv * gap_w + vm * gap_theta, vm * gap_w + mm * gap_theta
-        w = w + free[0][0] + g.a[0] * dV + g.b[0] * dM
-        theta = theta + free[1][0] + g.b[0] * dV + g.c[0] * dM
-        V, M = V + jnp.stack([dV, -dV]), M + jnp.stack([dM, dM])
-    return w, theta, V, M
+    both = lambda v, sign: jnp.where(in_A, v[0], sign * v[1][::-1])  # noqa: E731
+    return Deflection(w_C, theta_C, both(w, 1), both(theta, -1), both(R, 1), V[0], M[0])
 
 
 def _back_substitute(side: _Side, last, count, V, M):
@@ -352,69 +218,3 @@ def _back_substitute(side: _Side, last, count, V, M):
     rings = (h, k, passed, load, after, free)
     _, out = jax.lax.scan(step, (V, M), rings, reverse=True)
     return out
-
-
-def _influence(beam: Beam, s):
-    """Influence coefficients of one cantilever of length s: unit forces at rings, V and M at tip.
-
-    Returns the (n + 2, n + 2) matrix of displacements int m_p m_q / EI dx (+ shear) and the
-    (n + 1, n + 2) matrix of rotations at the rings and the tip, each integral exact by Simpson's
-    rule span by span. Rows of rings beyond the tip are those of a ring at the tip; mask them.
-    """
-    ends = jnp.concatenate([jnp.zeros_like(beam.x[:1]), jnp.minimum(beam.x, s), s[None]])
-    low, high = ends[:-1], ends[1:]
-    points = jnp.stack([low, (low + high) / 2, high])
-    at = ends[1:]
-    arm = jnp.maximum(at[:, None, None] - points[None], 0)
-    m = jnp.concatenate([arm, jnp.ones_like(arm[:1])])
-    weight = jnp.array([1, 4, 1], s.dtype)[:, None] * ((high - low) / (6 * beam.EI))[None]
-    displacement = jnp.einsum("pts,qts,ts->pq", m, m, weight)
-    before = (at[:, None] >= high[None]).astype(s.dtype)
-    if beam.GA is not None:
-        cut = jnp.concatenate([before, jnp.zeros_like(before[:1])])
-        displacement = displacement + jnp.einsum("ps,qs,s->pq", cut, cut, (high - low) / beam.GA)
-    return displacement, jnp.einsum("ps,qts,ts->pq", before, m, weight)
-
-
-def _dense_side(beam: Beam, s, held):
-    """Redundants of one cantilever for unit V and M at its tip: (delta + I/k) R = Delta."""
-    n = beam.x.shape[0]
-    displacement, rotation = _influence(beam, s)
-    both = held[:, None] & held[None]
-    flexibility = jnp.where(both, displacement[:n, :n], 0)
-    flexibility = flexibility + jnp.diag(1 / jnp.where(held, beam.k, 1))
-    load = jnp.where(held[:, None], displacement[:n, n:], 0)
-    R = jnp.linalg.solve(flexibility, load)
-    tip = displacement[n:, n:] - load.T @ R
-    theta = rotation[:n, n:] - jnp.where(held[None], rotation[:n, :n], 0) @ R
-    det = tip[0, 0] * tip[1, 1] - tip[0, 1] ** 2
-    return Compliance(tip[0, 0], tip[0, 1], tip[1, 1], det), R, theta
-
-
-def deflect_dense(
-    beam: Beam, s_c: Float[Array, ""], force: Float[Array, ""], *, split: Split = "continuous"
-) -> Deflection:
-    """The paper's own algorithm: all redundant reactions of a side from one dense system.
-
-    Same arguments and result as `deflect` with `form="reactions"`. Loses digits where rings are
-    much stiffer than the ligament (docs/beam_accuracy.md has the table).
-    """
-    mirrored = Beam(
-        (beam.length - beam.x)[::-1],
-        beam.length,
-        beam.EI[::-1],
-        beam.k[::-1],
-        None if beam.GA is None else beam.GA[::-1],
-    )
-    in_A = beam.x <= s_c
-    s = jnp.stack([s_c, beam.length - s_c])
-    held = jnp.stack([in_A, ~in_A[::-1]])
-    stacked = jax.tree.map(lambda v, w: jnp.stack([v, w]), beam, mirrored)
-    g, R, theta = jax.vmap(_dense_side)(stacked, s, held)
-    count = jnp.sum(held, axis=1)
-    w_C, theta_C, V, M = _split_load(_Tips(g, None, s, jnp.zeros_like(s), count), force, split)
-    tip = jnp.stack([V, M], axis=1)
-    R, theta = jnp.einsum("sip,sp->si", R, tip), jnp.einsum("sip,sp->si", theta, tip)
-    R = jnp.where(in_A, R[0], R[1][::-1])
-    theta = jnp.where(in_A, theta[0], -theta[1][::-1])
-    return Deflection(w_C, theta_C, R / beam.k, theta, R, V[0], M[0])

@@ -59,9 +59,11 @@ def compare(got, solution):
 
 @functools.cache
 def _solver(form):
-    one = lambda b, s: deflect(b, s, jnp.ones_like(s), form=form)  # noqa: E731
-    per_k = Beam(x=None, length=None, EI=None, k=0)
-    return jax.jit(jax.vmap(jax.vmap(one, (None, 0)), (per_k, None)))
+    def one(x, length, EI, k, s):
+        return deflect(Beam(x, length, EI, k), s, jnp.ones_like(s), form=form)
+
+    shared = (None, None, None)
+    return jax.jit(jax.vmap(jax.vmap(one, (*shared, None, 0)), (*shared, 0, None)))
 
 
 def measure(name, dtype, form="recursion"):
@@ -71,8 +73,8 @@ def measure(name, dtype, form="recursion"):
     ks = sorted({k for k, _ in solved})
     stiffness = np.array(ks)[:, None] * np.ones(len(x), np.float32)
     bending = np.full(len(x) + 1, EI, np.float32)
-    beam = Beam(*(jnp.asarray(v, dtype) for v in (x, length, bending, stiffness)))
-    got = _solver(form)(beam, jnp.asarray(positions, dtype))
+    arrays = (jnp.asarray(v, dtype) for v in (x, length, bending, stiffness, positions))
+    got = _solver(form)(*arrays)
     worst = {q: {} for q in QUANTITIES}
     for i, k in enumerate(ks):
         for j, s in enumerate(positions):
