@@ -1,4 +1,4 @@
-"""Strict settings for the whole suite: float64, no silent rank or dtype promotion, shapes checked."""
+"""Strict settings for the whole suite: float64, no silent promotion, shapes checked."""
 
 import os
 
