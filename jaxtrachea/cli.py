@@ -1,6 +1,7 @@
 """The command line: check, fit. The only room that turns errors into messages and exit codes.
 
-Exit codes: 0 everything converged, 1 some lane failed or some curve could not be used, 2 bad input.
+Exit codes: 0 everything converged, 1 some lane failed or some curve could not be used, 2 bad input,
+130 stopped by the user. What is heavy is imported inside the commands.
 """
 
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -23,85 +25,131 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Identify the mechanics of a trachea from force-displacement curves.",
 )
-out, err = Console(), Console(stderr=True)
+#: Rows of a terminal table; the files hold all.
+MANY = 40
 
 SpecArgument = Annotated[Path, typer.Argument(help="TOML specification of the fit.")]
 DataOption = Annotated[
     Path | None, typer.Option("--data", help="Folder the data paths start from (default: SPEC's).")
 ]
+OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
+LeaveOption = Annotated[
+    bool, typer.Option("--leave-one-out", help="Also predict every curve from the others.")
+]
 
 
 class _Stop(Exception):
-    """End the command with a message and an exit code."""
-
-    def __init__(self, message: str, code: int = 2):
-        super().__init__(message)
-        self.code = code
+    """Bad input: end the command with a message and exit code 2."""
 
 
 def main() -> None:
     """Entry point: every expected error becomes one message on stderr and an exit code."""
     try:
-        code = app(standalone_mode=False)
+        code = app(prog_name="jaxtrachea", standalone_mode=False)
     except _Stop as stop:
-        err.print(f"[bold red]error:[/] {escape(str(stop))}", highlight=False, soft_wrap=True)
-        code = stop.code
+        code = _complain(str(stop))
     except typer.Exit as stop:
         code = stop.exit_code
-    except typer.Abort:
-        err.print("stopped")
+    except (typer.Abort, KeyboardInterrupt):
         code = 130
     except Exception as error:
+        # Usage errors come from click or from typer's own copy of it, whichever is installed.
         usage = getattr(error, "format_message", None)
         if usage is None:
             raise
-        err.print(f"[bold red]error:[/] {escape(usage())}", highlight=False, soft_wrap=True)
-        code = 2
-    except KeyboardInterrupt:
-        err.print("stopped")
-        code = 130
+        code = _complain(usage())
+    if code == 130:  # some versions of typer turn Ctrl-C into this exit code themselves
+        _to_stderr("stopped; nothing was written")
     sys.exit(code or 0)
 
 
+def _to_stderr(text: str) -> None:
+    Console(stderr=True).print(text, highlight=False, soft_wrap=True)
+
+
+def _complain(message: str) -> int:
+    _to_stderr(f"[bold red]error:[/] {escape(message)}")
+    return 2
+
+
+@app.callback(invoke_without_command=True)
+def _options(
+    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+) -> None:
+    if version:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.command()
+def check(spec: SpecArgument, data: DataOption = None) -> None:
+    """Read everything, fit nothing, say what was found."""
+    _, measurements, problem = _load(spec, data)
+    out = Console()
+    curves = measurements.curves
+    out.print(_curve_table(curves))
+    if len(curves) > MANY:
+        out.print(f"... and {len(curves) - MANY} more")
+    out.print(_parameter_table(problem.parameters))
+    fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in problem.parameters if p.fixed)
+    out.print(f"Fixed: {fixed or 'none'}", highlight=False)
+    lanes, bad = len(problem.curves), len(measurements.bad)
+    out.print(f"{lanes} lane(s) of up to {problem.size} unknowns, {bad} bad curves")
+    raise typer.Exit(1 if bad else 0)
+
+
+@app.command()
+def fit(
+    spec: SpecArgument,
+    data: DataOption = None,
+    out_dir: OutOption = None,
+    leave_one_out: LeaveOption = False,
+) -> None:
+    """Fit, write results.h5, tables, report, plots."""
+    from jaxtrachea.identify.output import OutputExists, new_output
+
+    clock = [time.perf_counter()]
+    loaded, measurements, problem = _load(spec, data)
+    if leave_one_out:
+        _can_leave_out(problem)
+    clock.append(time.perf_counter())
+    default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
+    try:
+        with new_output(out_dir, default) as folder:
+            result, left_out = _run(loaded, problem, leave_one_out)
+            clock.append(time.perf_counter())
+            _write(folder, spec, loaded, measurements, result, left_out, clock)
+    except OutputExists as error:
+        raise _Stop(str(error)) from None
+    except OSError as error:
+        where = out_dir or default
+        raise _Stop(
+            f"{where}: cannot be written ({error.strerror}); choose another --out"
+        ) from None
+    _print_result(result, folder.parent)
+    failed = any(not _succeeded(result, lane) for lane in range(result.lanes))
+    raise typer.Exit(1 if failed or measurements.bad else 0)
+
+
 def _load(path: Path, data: Path | None):
-    """Specification and measurements; input errors become `_Stop`."""
+    """Specification, measurements and problem; input errors become `_Stop`."""
     from jaxtrachea.config import SpecError, load_fit_spec
     from jaxtrachea.identify.measurements import DataError
-    from jaxtrachea.identify.study import read_data
+    from jaxtrachea.identify.study import problem_of, read_data
 
     try:
         spec = load_fit_spec(path)
-        return spec, read_data(spec, path.parent if data is None else data)
-    except (SpecError, DataError) as error:
-        raise _Stop(str(error)) from None
-
-
-def _problem(spec, measurements):
-    from jaxtrachea.config import SpecError
-    from jaxtrachea.identify.study import problem_of
-
-    try:
-        return problem_of(spec, measurements)
+        measurements = read_data(spec, path.parent if data is None else data)
+        _print_bad(measurements)
+        if not measurements.curves:
+            raise _Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
+        _use_float64()
+        return spec, measurements, problem_of(spec, measurements)
     except SpecError as error:
+        text = str(error)
+        raise _Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
+    except DataError as error:
         raise _Stop(str(error)) from None
-
-
-def _table(title: str, head, rows) -> Table:
-    table = Table(title=title, title_justify="left", header_style="bold")
-    for i, name in enumerate(head):
-        table.add_column(name, justify="left" if i == 0 else "right", overflow="fold")
-    for row in rows:
-        table.add_row(*map(escape, row))
-    return table
-
-
-def _print_bad(measurements) -> None:
-    for bad in measurements.bad[:20]:
-        name = escape(f"{bad.specimen} {bad.trial}")
-        text = escape(f"{bad.kind}: {bad.source}: {bad.message}; {bad.cure}")
-        err.print(f"[yellow]not usable:[/] {name}: {text}", highlight=False, soft_wrap=True)
-    if len(measurements.bad) > 20:
-        err.print(f"... and {len(measurements.bad) - 20} more, see summary.csv")
 
 
 def _use_float64() -> None:
@@ -110,90 +158,21 @@ def _use_float64() -> None:
     jax.config.update("jax_enable_x64", True)
 
 
-@app.callback(invoke_without_command=True)
-def _options(
-    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
-) -> None:
-    if version:
-        out.print(__version__)
-        raise typer.Exit
+def _print_bad(measurements) -> None:
+    for bad in measurements.bad[:20]:
+        text = f"{bad.specimen} {bad.trial}: {bad.kind}: {bad.source}: {bad.message}; {bad.cure}"
+        _to_stderr(f"[yellow]not usable:[/] {escape(text)}")
+    if len(measurements.bad) > 20:
+        _to_stderr(f"... and {len(measurements.bad) - 20} more")
 
 
-@app.command()
-def check(spec: SpecArgument, data: DataOption = None) -> None:
-    """Read everything, fit nothing, say what was found."""
-    loaded, measurements = _load(spec, data)
-    _print_bad(measurements)
-    if not measurements.curves:
-        raise _Stop("no usable curve")
-    _use_float64()
-    problem = _problem(loaded, measurements)
-    curves = measurements.curves
-    rows = []
-    for curve in curves[:40]:
-        where = "–" if curve.s_c is None else f"{curve.s_c:.4g}"
-        markers = 0 if curve.joint_displacement is None else curve.joint_displacement.shape[1]
-        spans = [f"{v.min():.4g} … {v.max():.4g}" for v in (curve.displacement, curve.force)]
-        rows.append([curve.specimen, curve.trial, where, str(len(curve.force)), *spans,
-                     str(markers)])  # fmt: skip
-    head = ["specimen", "trial", "s [mm]", "samples", "displacement [mm]", "force [N]", "markers"]
-    out.print(_table(f"{len(curves)} usable curves", head, rows))
-    if len(curves) > 40:
-        out.print(f"... and {len(curves) - 40} more")
-    free = [p for p in problem.parameters if not p.fixed]
-    rows = [
-        [p.name, p.unit, p.description, f"{p.value:g}", f"{p.lower:g} … {p.upper:g}", p.scale,
-         p.scope] for p in free
-    ]  # fmt: skip
-    head = ["parameter", "unit", "what", "initial", "bounds", "scale", "scope"]
-    out.print(_table("Free parameters", head, rows))
-    fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in problem.parameters if p.fixed)
-    out.print(f"Fixed: {fixed or 'none'}", highlight=False)
-    lanes = len(problem.curves)
-    out.print(
-        f"{lanes} lane(s) of up to {problem.size} unknowns, {len(measurements.bad)} bad curves"
-    )
-    raise typer.Exit(1 if measurements.bad else 0)
-
-
-@app.command()
-def fit(
-    spec: SpecArgument,
-    data: DataOption = None,
-    out_dir: Annotated[
-        Path | None, typer.Option("--out", help="New folder for the results.")
-    ] = None,
-    leave_one_out: Annotated[
-        bool, typer.Option("--leave-one-out", help="Also predict every curve from the others.")
-    ] = False,
-) -> None:
-    """Fit the parameters; write results.h5, summary.csv, parameters.csv, report.md and plots."""
-    clock = {"start": time.perf_counter()}
-    loaded, measurements = _load(spec, data)
-    _print_bad(measurements)
-    if not measurements.curves:
-        raise _Stop("no usable curve; nothing was fitted and nothing written")
-    _use_float64()
-    problem = _problem(loaded, measurements)
-    folder = _folder(out_dir, Path("out") / f"{spec.parent.name}-{spec.stem}")
-    clock["read"] = time.perf_counter()
-    result, left_out = _run(loaded, problem, leave_one_out)
-    clock["fit"] = time.perf_counter()
-    _write(folder, spec, loaded, measurements, result, left_out, clock)
-    _print_result(result, folder)
-    failed = any(not _succeeded(s) for s in result.status)
-    raise typer.Exit(1 if failed or measurements.bad else 0)
-
-
-def _folder(wanted: Path | None, default: Path) -> Path:
-    from jaxtrachea.identify.results import OutputExists, new_directory
+def _can_leave_out(problem) -> None:
+    from jaxtrachea.identify.predictions import curves_to_leave_out
 
     try:
-        return new_directory(wanted, default)
-    except OutputExists as error:
-        raise _Stop(str(error)) from None
-    except OSError as error:
-        raise _Stop(f"{wanted or default}: {error.strerror}; choose another --out") from None
+        curves_to_leave_out(problem)
+    except ValueError as error:
+        raise _Stop(f"--leave-one-out: {error}") from None
 
 
 def _run(spec, problem, leave_out: bool):
@@ -204,24 +183,20 @@ def _run(spec, problem, leave_out: bool):
     settings = settings_of(spec)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
                TimeElapsedColumn())  # fmt: skip
-    with Progress(*columns, console=err, transient=False) as bar:
-        task = bar.add_task("fitting", total=None)
-        result = run_fit(
-            problem, settings, lambda done, of: bar.update(task, advance=done, total=of)
-        )
-        left_out = None
-        if leave_out:
-            second = bar.add_task("leaving curves out", total=None)
-            report = lambda done, of: bar.update(second, advance=done, total=of)  # noqa: E731
-            try:
-                left_out = leave_one_out(problem, settings, report)
-            except ValueError as error:
-                raise _Stop(f"--leave-one-out: {error}") from None
-    return result, left_out
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+
+        def counted(text):
+            task = bar.add_task(text, total=None)
+            return lambda done, of: bar.update(task, advance=done, total=of)
+
+        result = run_fit(problem, settings, counted("fitting"))
+        if not leave_out:
+            return result, None
+        return result, leave_one_out(problem, settings, counted("leaving curves out"))
 
 
-def _write(folder, spec, loaded, measurements, result, left_out, clock) -> None:
-    """All files of one run."""
+def _write(folder: Path, spec: Path, loaded, measurements, result, left_out, clock) -> None:
+    """All files of one run; `clock`: when reading began, ended, and the fit ended."""
     import json
 
     import jax
@@ -229,10 +204,9 @@ def _write(folder, spec, loaded, measurements, result, left_out, clock) -> None:
     from jaxtrachea import report
     from jaxtrachea.identify import results
     from jaxtrachea.identify.predictions import predictions
-
-    seen = predictions(result.problem, result.theta)
     from jaxtrachea.plots import draw_all
 
+    seen = predictions(result.problem, result.theta)
     rows = [*results.lane_rows(result), *map(results.bad_row, measurements.bad)]
     results.write_csv(folder / "summary.csv", rows)
     results.write_csv(folder / "parameters.csv", list(results.parameter_rows(result)))
@@ -240,8 +214,8 @@ def _write(folder, spec, loaded, measurements, result, left_out, clock) -> None:
     table = None if left_out is None else report.left_out_rows(result, left_out)
     text = report.report_text(loaded.title or spec.stem, result, measurements.bad, seen, table)
     results.write_text(folder / "report.md", text)
-    timings = {"read": clock["read"] - clock["start"], "fit": clock["fit"] - clock["read"]}
-    timings["write"] = time.perf_counter() - clock["fit"]
+    ends = [*clock, time.perf_counter()]
+    timings = dict(zip(("read", "fit", "write"), map(float.__sub__, ends[1:], ends), strict=False))
     made = results.provenance(
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
     )
@@ -249,26 +223,67 @@ def _write(folder, spec, loaded, measurements, result, left_out, clock) -> None:
     results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
 
 
+def _succeeded(result, lane: int) -> bool:
+    from jaxtrachea.identify.results import succeeded
+
+    return succeeded(result, lane)
+
+
 def _print_result(result, folder: Path) -> None:
     from jaxtrachea import report
-    from jaxtrachea.identify.results import flat_sentence
+    from jaxtrachea.identify.results import flat_sentence, lane_label
 
+    out = Console()
     lanes = range(result.lanes)
     if result.lanes <= report.ONE_BY_ONE:
         rows = report.estimate_rows(result, lanes)
         out.print(_table("Estimates", report.ESTIMATE_HEAD, rows))
         out.print(_table("Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)))
         for lane in lanes:
-            name = result.problem.lane_name(lane)[0]
-            out.print(escape(f"{name}: {flat_sentence(result, lane)}"), highlight=False)
+            text = f"{lane_label(result, lane)}: {flat_sentence(result, lane)}"
+            out.print(escape(text), highlight=False)
     else:
         out.print(_table("Estimates over lanes", report.SPREAD_HEAD, report.spread_rows(result)))
-        good = sum(map(_succeeded, result.status))
+        good = sum(_succeeded(result, lane) for lane in lanes)
         out.print(f"{good} of {result.lanes} lanes succeeded")
-    out.print(f"written to {folder}", highlight=False, soft_wrap=True)
+    out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)
 
 
-def _succeeded(status) -> bool:
-    from jaxtrachea.status import FitStatus
+def _table(title: str, head, rows) -> Table:
+    """A table that breaks lines between words only, and leaves out an only specimen's name."""
+    named = head[0] != "specimen" or len({row[0] for row in rows}) > 1
+    if not named:
+        title, head, rows = f"{title}: {rows[0][0]}", head[1:], [row[1:] for row in rows]
+    table = Table(
+        title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
+    for i, name in enumerate(head):
+        words = " ".join([name, *(row[i] for row in rows)]).split()
+        side = "left" if i == 0 else "right"
+        table.add_column(
+            escape(name), justify=side, min_width=max(map(len, words)), overflow="fold"
+        )
+    for row in rows:
+        table.add_row(*map(escape, row))
+    return table
 
-    return FitStatus(int(status)).succeeded
+
+def _curve_table(curves) -> Table:
+    rows = []
+    for curve in curves[:MANY]:
+        where = "–" if curve.s_c is None else f"{curve.s_c:.4g}"
+        markers = 0 if curve.joint_displacement is None else curve.joint_displacement.shape[1]
+        spans = [f"{v.min():.3g} … {v.max():.3g}" for v in (curve.displacement, curve.force)]
+        row = [curve.specimen, curve.trial, where, str(len(curve.force)), *spans, str(markers)]
+        rows.append(row)
+    head = ["specimen", "trial", "s [mm]", "n", "D [mm]", "F [N]", "markers"]
+    return _table(f"{len(curves)} usable curves", head, rows)
+
+
+def _parameter_table(parameters) -> Table:
+    head = ["free parameter", "what", "initial", "bounds", "scale", "scope"]
+    rows = [
+        [f"{p.name} [{p.unit}]", p.description, f"{p.value:g}", f"{p.lower:g} … {p.upper:g}",
+         p.scale, p.scope] for p in parameters if not p.fixed
+    ]  # fmt: skip
+    return _table("Free parameters", head, rows)

@@ -8,7 +8,17 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+import numpy as np
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 from jaxtrachea.units import parse_quantity
 
@@ -17,24 +27,49 @@ class SpecError(ValueError):
     """A specification that cannot be used; the message has one line per problem."""
 
 
-def _quantity(dimension: str):
-    """A field read as a quantity with its unit ("9 mm"), kept as a float in internal units."""
+def _quantity(dimension: str, *, positive: bool = False, word: str | None = None):
+    """A field read as a quantity with its unit ("9 mm"), kept as a float in internal units.
+
+    Args:
+        dimension: of the quantity.
+        positive: refuse zero and below.
+        word: a text allowed instead of a quantity.
+    """
 
     def read(value: Any) -> Any:
-        if isinstance(value, bool):
+        if word is not None and value == word:
+            return value
+        if isinstance(value, bool) or not isinstance(value, str | int | float):
             raise ValueError(f"expected a {dimension} with its unit")
-        return parse_quantity(value, dimension)
+        with np.errstate(over="ignore"):  # infinity is refused with the key's name
+            number = parse_quantity(value, dimension)
+        if positive and number <= 0:
+            raise ValueError(f"expected a positive {dimension}")
+        return number
 
     return BeforeValidator(read)
 
 
+def _number_or_quantity(value: Any) -> Any:
+    """Checked against the parameter's unit later, in `identify.study`."""
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise ValueError("expected a number, or a quantity with its unit")
+    if isinstance(value, int) and abs(value) > 1e300:
+        raise ValueError("expected a finite number")
+    return value
+
+
 Length = Annotated[float, _quantity("length")]
-Force = Annotated[float, _quantity("force")]
+PositiveLength = Annotated[float, _quantity("length", positive=True)]
 Angle = Annotated[float, _quantity("angle")]
+Estimate = Literal["estimate"]
+ForceNoise = Annotated[Estimate | float, _quantity("force", positive=True, word="estimate")]
+LengthNoise = Annotated[Estimate | float, _quantity("length", positive=True, word="estimate")]
+Number = Annotated[Any, BeforeValidator(_number_or_quantity)]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class DataSection(_Section):
@@ -52,7 +87,7 @@ class DataSection(_Section):
     loading: Literal["require-monotone", "loading", "all"] = "require-monotone"
     force_sign: Literal[1, -1] = 1
     displacement_sign: Literal[1, -1] = 1
-    tool_radius: Length | None = None
+    tool_radius: PositiveLength | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -66,19 +101,27 @@ class EvenRings(_Section):
     """Evenly spaced rings."""
 
     count: int = Field(ge=1, le=2000)
-    first: Length
-    last: Length
+    first: PositiveLength
+    last: PositiveLength
+
+
+#: Names of the two ways to write `trachea.rings`; pydantic puts them into the place of an error.
+_EVEN, _LISTED = "evenly spaced", "listed"
+Rings = Annotated[
+    Annotated[EvenRings, Tag(_EVEN)] | Annotated[list[PositiveLength], Tag(_LISTED)],
+    Discriminator(lambda value: _EVEN if isinstance(value, dict | EvenRings) else _LISTED),
+]
 
 
 class TracheaSection(_Section):
     """[trachea]: the tube at rest; Table 1 of the paper unless length and rings are given."""
 
     preset: Literal["table-1"] | None = None
-    length: Length | None = None
-    rings: EvenRings | list[Length] | None = None
-    radius: Length = 11.3
+    length: PositiveLength | None = None
+    rings: Rings | None = None
+    radius: PositiveLength = 11.3
     half_angle: Angle = 2.0943951023931953
-    ring_height: Length = 4.0
+    ring_height: PositiveLength = 4.0
 
     @model_validator(mode="after")
     def _complete(self) -> "TracheaSection":
@@ -98,8 +141,8 @@ class ModelSection(_Section):
     shear: bool = False
     local: Literal["uniform", "two-material"] = "uniform"
     contact: Literal["unilateral", "bonded"] = "unilateral"
-    onset_width: Length = 1e-3
-    transition: Length | None = None
+    onset_width: PositiveLength = 1e-3
+    transition: PositiveLength | None = None
 
 
 class ParameterSection(_Section):
@@ -109,9 +152,9 @@ class ParameterSection(_Section):
     k_3_ring N/mm^3, onset mm, force_offset N), or quantities with a unit.
     """
 
-    fixed: float | str | None = None
-    initial: float | str | None = None
-    bounds: tuple[float | str, float | str] | None = None
+    fixed: Number | None = None
+    initial: Number | None = None
+    bounds: tuple[Number, Number] | None = Field(None, strict=False)
     scale: Literal["log", "linear"] | None = None
     scope: Literal["shared", "specimen", "trial"] | None = None
 
@@ -126,8 +169,8 @@ class ParameterSection(_Section):
 class NoiseSection(_Section):
     """[noise]: standard deviation of each kind of observation, or "estimate"."""
 
-    force: Literal["estimate"] | Force = "estimate"
-    joints: Literal["estimate"] | Length = "estimate"
+    force: ForceNoise = "estimate"
+    joints: LengthNoise = "estimate"
 
 
 class FitSection(_Section):
@@ -139,10 +182,10 @@ class FitSection(_Section):
     loss_scale: float = Field(1.345, gt=0)
     starts: int = Field(4, ge=1, le=10_000)
     start_decades: float = Field(1.0, ge=0, le=10)
-    seed: int = 0
-    max_iterations: int = Field(200, ge=1)
+    seed: int = Field(0, ge=0, lt=2**63)
+    max_iterations: int = Field(200, ge=1, le=1_000_000)
     tolerance: float = Field(1e-10, gt=0, lt=0.1)
-    chunk: int = Field(256, ge=1)
+    chunk: int = Field(256, ge=1, le=1_000_000)
     precision: Literal["float64", "float32"] = "float64"
 
 
@@ -177,6 +220,8 @@ def load_fit_spec(path: Path) -> FitSpec:
         raise SpecError(f"{path}: not valid TOML: {error}") from None
     except RecursionError:
         raise SpecError(f"{path}: not valid TOML: nested too deeply") from None
+    except ValueError as error:  # integers beyond what Python converts
+        raise SpecError(f"{path}: not valid TOML: {error}") from None
     try:
         return FitSpec.model_validate(content)
     except ValidationError as error:
@@ -187,29 +232,28 @@ def _lines(error: ValidationError) -> list[str]:
     """One line per problem: dotted key, what is wrong, what was found."""
     lines: dict[str, None] = {}
     for problem in error.errors():
-        parts = [p for p in problem["loc"] if not _is_branch(p)]
-        key = ".".join(str(p) for p in parts) or "(top level)"
-        text = problem["msg"].removeprefix("Value error, ")
+        parts = [part for part in problem["loc"] if part not in (_EVEN, _LISTED)]
+        key = ".".join(map(str, parts)) or "(top level)"
+        text = problem["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
         if problem["type"] == "extra_forbidden":
-            text = f"unknown key; {_known(parts)}"
+            text = f"unknown key; expected one of {', '.join(_known(parts))}"
         elif problem["type"] == "missing":
             text = "missing"
+        elif problem["type"] in ("model_type", "dict_type"):
+            text = f"expected a table {{ key = value, ... }} (found {problem['input']!r})"
         elif not isinstance(problem["input"], dict | list):
-            text = f"{text} (found {problem['input']!r})"
+            found = repr(problem["input"])
+            text = f"{text} (found {found if len(found) < 80 else found[:76] + ' ...'})"
         lines.setdefault(f"{key}: {text}")
     return list(lines)
 
 
-def _is_branch(part) -> bool:
-    """Names that pydantic adds for the branches of a union."""
-    return isinstance(part, str) and ("[" in part or part in ("EvenRings", "float", "str"))
-
-
-def _known(parts) -> str:
-    """What the section that holds an unknown key accepts."""
+def _known(parts: list) -> list[str]:
+    """Keys of the section that holds the unknown key `parts`."""
     section: Any = FitSpec
     for part in parts[:-1]:
-        fields = getattr(section, "model_fields", {})
-        section = fields[part].annotation if part in fields else ParameterSection
-    names = getattr(section, "model_fields", ParameterSection.model_fields)
-    return f"expected one of {', '.join(names)}"
+        field = section.model_fields.get(part)
+        section = {"parameters": ParameterSection, "rings": EvenRings}.get(
+            part, field.annotation if field else section
+        )
+    return list(section.model_fields)

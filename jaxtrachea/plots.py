@@ -1,17 +1,14 @@
-"""The figures of a fit (matplotlib, imported only here)."""
+"""The figures of a fit (matplotlib, imported only here, and without a global backend)."""
 
 from pathlib import Path
 
 import matplotlib as mpl
-
-mpl.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.predictions import Prediction
-from jaxtrachea.identify.results import unknown_label
+from jaxtrachea.identify.results import lane_label, unknown_label
 from jaxtrachea.report import ONE_BY_ONE
 
 _STYLE = {
@@ -28,7 +25,7 @@ _STYLE = {
 
 def draw_all(folder: Path, result: FitResult, prediction: Prediction) -> list[Path]:
     """Write fit.png, residuals.png and correlation.png; returns their paths."""
-    with plt.rc_context(_STYLE):
+    with mpl.rc_context(_STYLE):
         figures = {
             "fit": draw_fit(result, prediction),
             "residuals": draw_residuals(result, prediction),
@@ -38,7 +35,6 @@ def draw_all(folder: Path, result: FitResult, prediction: Prediction) -> list[Pa
         for name, figure in figures.items():
             paths.append(folder / f"{name}.png")
             figure.savefig(paths[-1], bbox_inches="tight")
-            plt.close(figure)
     return paths
 
 
@@ -54,15 +50,11 @@ def _grid(count: int, height: float = 2.7):
     columns = min(3, count)
     rows = -(-count // columns)
     size = (max(4.6, 3.6 * columns), height * rows + 0.6)
-    figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
     for axis in axes.flat[count:]:
         axis.set_visible(False)
     return figure, axes.flat
-
-
-def _title(result: FitResult, lane: int) -> str:
-    specimen, trial = result.problem.lane_name(lane)
-    return specimen if trial == "(all)" else f"{specimen} {trial}"
 
 
 def draw_fit(result: FitResult, prediction: Prediction):
@@ -74,15 +66,15 @@ def draw_fit(result: FitResult, prediction: Prediction):
     for lane in shown:
         axis = next(axes)
         curves = result.problem.curves[lane]
-        colours = plt.get_cmap("viridis")(np.linspace(0.05, 0.9, len(curves)))
+        colours = mpl.colormaps["viridis"](np.linspace(0.05, 0.9, len(curves)))
         for t, (curve, colour) in enumerate(zip(curves, colours, strict=True)):
             n = len(curve.force)
-            model = curve.force + np.nan_to_num(prediction.force[lane, t, :n], nan=np.nan)
+            model = curve.force + prediction.force[lane, t, :n]
             step = max(1, n // 60)
             label = curve.trial if len(curves) <= 12 else None
             axis.plot(curve.displacement[::step], curve.force[::step], ".", color=colour, ms=4)
             axis.plot(curve.displacement, model, "-", color=colour, lw=1.2, label=label)
-        axis.set(title=_title(result, lane), xlabel="displacement [mm]", ylabel="force [N]")
+        axis.set(title=lane_label(result, lane), xlabel="displacement [mm]", ylabel="force [N]")
         if 1 < len(curves) <= 12:
             axis.legend(ncols=2, title="dots: measured, lines: model", title_fontsize=7)
         if with_joints:
@@ -110,8 +102,8 @@ def _draw_joints(axis, result, prediction, lane, colours) -> None:
 
 def draw_residuals(result: FitResult, prediction: Prediction):
     """Force residuals, model - data, against displacement, and their distribution."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained",
-                                         width_ratios=(2, 1))  # fmt: skip
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     pooled = []
     for lane in range(result.lanes):
         for t, curve in enumerate(result.problem.curves[lane]):
@@ -141,7 +133,8 @@ def draw_correlation(result: FitResult):
         mean = np.where(known, stack, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     mean = np.where(known.any(axis=0), mean, np.nan)
     size = 1.6 + 0.55 * shown
-    figure, axis = plt.subplots(figsize=(size + 1, size), layout="constrained")
+    figure = Figure(figsize=(size + 1, size), layout="constrained")
+    axis = figure.subplots()
     image = axis.imshow(mean, vmin=-1, vmax=1, cmap="RdBu_r")
     axis.grid(visible=False)
     axis.set_xticks(range(shown), names[:shown], rotation=60, ha="right")

@@ -6,8 +6,15 @@ import numpy as np
 
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
-from jaxtrachea.identify.predictions import LeftOut, Prediction
-from jaxtrachea.identify.results import flat_sentence, unknown_label, verdict_of
+from jaxtrachea.identify.predictions import LeftOut, Prediction, rms
+from jaxtrachea.identify.results import (
+    flat_sentence,
+    lane_label,
+    peak_force,
+    succeeded,
+    unknown_label,
+    verdict_of,
+)
 from jaxtrachea.status import FitStatus
 
 #: Lanes that are listed and drawn one by one; beyond it, distributions are shown.
@@ -23,13 +30,11 @@ def estimate_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
     """Lane, parameter, value, standard error, 95 % interval, verdict."""
     rows = []
     for lane in lanes:
-        specimen, trial = result.problem.lane_name(lane)
-        name = specimen if trial == "(all)" else f"{specimen} {trial}"
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
             low, high = result.lower[lane, i], result.upper[lane, i]
             rows.append(
                 [
-                    name,
+                    lane_label(result, lane),
                     f"{unknown_label(result, lane, i)} [{p.unit}]",
                     number(result.value[lane, i]),
                     number(result.standard_error[lane, i], 2),
@@ -45,15 +50,11 @@ ESTIMATE_HEAD = ["specimen", "parameter", "value", "std. error", "95 % interval"
 
 def spread_rows(result: FitResult) -> list[list[str]]:
     """Over all succeeded lanes: parameter, lanes, median, quartiles, median standard error."""
-    good = [k for k in range(result.lanes) if FitStatus(int(result.status[k])).succeeded]
     columns: dict[str, list[tuple[float, float, str]]] = {}
-    for lane in good:
+    for lane in filter(lambda k: succeeded(result, k), range(result.lanes)):
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
-            entry = (
-                result.value[lane, i],
-                result.relative_se[lane, i],
-                verdict_of(result, lane, i),
-            )
+            verdict = verdict_of(result, lane, i)
+            entry = (float(result.value[lane, i]), float(result.relative_se[lane, i]), verdict)
             columns.setdefault(f"{p.name} [{p.unit}]", []).append(entry)
     rows = []
     for name, entries in columns.items():
@@ -68,20 +69,19 @@ def spread_rows(result: FitResult) -> list[list[str]]:
     return rows
 
 
-SPREAD_HEAD = ["parameter", "estimates", "median", "quartiles", "median rel. se", "identifiable"]
+SPREAD_HEAD = ["parameter", "n", "median", "quartiles", "rel. error", "identifiable"]
 
 
 def quality_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
     """Lane, status, iterations, samples, rms residuals, condition number."""
     rows = []
     for lane in lanes:
-        specimen, trial = result.problem.lane_name(lane)
-        peak = max(float(np.max(np.abs(c.force))) for c in result.problem.curves[lane])
+        peak = peak_force(result, lane)
         status = FitStatus(int(result.status[lane]))
         rows.append(
             [
-                specimen if trial == "(all)" else f"{specimen} {trial}",
-                status.name.lower(),
+                lane_label(result, lane),
+                status.name.lower().replace("_", " "),
                 str(int(result.iterations[lane])),
                 str(int(result.samples[lane])),
                 f"{number(result.rms[lane, 0], 3)} N",
@@ -104,7 +104,7 @@ def left_out_rows(result: FitResult, left_out: LeftOut) -> list[list[str]]:
     for k, t, *values in zip(left_out.lane, left_out.trial, *errors, strict=True):
         curve = result.problem.curves[k][t]
         rows.append([curve.specimen, curve.trial, *map(_percent, values)])
-    mean = [np.sqrt(np.mean(v**2)) for v in errors]
+    mean = [float(rms(v)) for v in errors]
     return [*rows, ["(root mean square)", "", *map(_percent, mean)]]
 
 
@@ -114,7 +114,11 @@ def _percent(value: float) -> str:
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table."""
-    line = lambda cells: "| " + " | ".join(str(c).replace("|", "\\|") for c in cells) + " |"  # noqa: E731
+
+    def line(cells):
+        plain = (" ".join(str(cell).split()).replace("|", "\\|") for cell in cells)
+        return f"| {' | '.join(plain)} |"
+
     return "\n".join([line(head), line(["---"] * len(head)), *map(line, rows)])
 
 
@@ -126,36 +130,49 @@ def report_text(
     left_out: Sequence[Sequence[str]] | None,
 ) -> str:
     """The whole report.md."""
-    shown = list(range(min(result.lanes, ONE_BY_ONE)))
-    failed = [k for k in range(result.lanes) if not FitStatus(int(result.status[k])).succeeded]
-    parts = [f"# {title or 'Fit'}", ""]
-    parts += [
+    failed = [k for k in range(result.lanes) if not succeeded(result, k)]
+    parts = [
+        f"# {title or 'Fit'}",
         f"{result.lanes} lanes, {result.lanes - len(failed)} succeeded, {len(failed)} failed; "
         f"{len(bad)} curves could not be used. All numbers: `results.h5`; one row per lane: "
-        "`summary.csv`; one row per estimate: `parameters.csv`.",
-        "",
-        "## Estimates",
-        "",
+        "`summary.csv`; one row per estimate: `parameters.csv` (docs/results.md).",
+        *_estimates(result),
+        "## Quality",
+        _quality(result, failed),
+        f"Largest residual: {prediction.worst(result)}.",
     ]
-    if result.lanes <= ONE_BY_ONE:
-        parts.append(markdown_table(ESTIMATE_HEAD, estimate_rows(result, shown)))
-    else:
-        parts.append(markdown_table(SPREAD_HEAD, spread_rows(result)))
-    fixed = [f"{p.name} = {p.value:g} {p.unit}" for p in result.problem.parameters if p.fixed]
-    parts += ["", f"Fixed: {', '.join(fixed) or 'none'}.", "", "## What the data determine", ""]
-    parts += [f"- {result.problem.lane_name(k)[0]}: {flat_sentence(result, k)}." for k in shown]
-    parts += ["", "Identifiable: relative standard error up to 10 %; weak: up to 50 %. Standard "
-              "errors are local (Gauss-Newton); they say nothing of what the model leaves out.",
-              "", "## Quality", ""]  # fmt: skip
-    parts.append(markdown_table(QUALITY_HEAD, quality_rows(result, [*shown, *failed][:50])))
-    worst = prediction.worst(result)
-    parts += ["", f"Largest residual: {worst}.", ""]
     if left_out is not None:
-        parts += ["## Leaving one curve out", "", markdown_table(LEFT_OUT_HEAD, left_out), ""]
-    parts += ["![data and fit](fit.png)", "", "![residuals](residuals.png)", "",
-              "![correlation](correlation.png)", ""]  # fmt: skip
+        parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, left_out)]
+    names = {"fit": "data and fit", "residuals": "residuals", "correlation": "correlation"}
+    parts += [f"![{text}]({name}.png)" for name, text in names.items()]
     if bad:
-        parts += ["## Curves that could not be used", ""]
         rows = [[b.specimen, b.trial, b.kind, b.message, b.cure] for b in bad]
-        parts += [markdown_table(["specimen", "trial", "kind", "what", "cure"], rows), ""]
-    return "\n".join(parts)
+        head = ["specimen", "trial", "kind", "what", "cure"]
+        parts += ["## Curves that could not be used", markdown_table(head, rows)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _estimates(result: FitResult) -> list[str]:
+    """Values with their errors, and what the data leave open."""
+    shown = range(min(result.lanes, ONE_BY_ONE))
+    if result.lanes <= ONE_BY_ONE:
+        table = markdown_table(ESTIMATE_HEAD, estimate_rows(result, shown))
+    else:
+        table = markdown_table(SPREAD_HEAD, spread_rows(result))
+    fixed = [f"{p.name} = {p.value:g} {p.unit}" for p in result.problem.parameters if p.fixed]
+    flat = [f"- {lane_label(result, k)}: {flat_sentence(result, k)}." for k in shown]
+    return [
+        "## Estimates",
+        table,
+        f"Fixed: {', '.join(fixed) or 'none'}.",
+        "## What the data determine",
+        "\n".join(flat),
+        "Identifiable: relative standard error up to 10 %; weak: up to 50 %. Standard errors are "
+        "local (Gauss-Newton); they say nothing of what the model leaves out.",
+    ]
+
+
+def _quality(result: FitResult, failed: list[int]) -> str:
+    """The first lanes and those that failed."""
+    lanes = list(dict.fromkeys([*range(min(result.lanes, ONE_BY_ONE)), *failed]))[:50]
+    return markdown_table(QUALITY_HEAD, quality_rows(result, lanes))

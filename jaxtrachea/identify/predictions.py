@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.identify.fit import FitResult, Settings, fit
-from jaxtrachea.identify.problem import Lane, Problem, residual
+from jaxtrachea.identify.problem import Lane, Problem, residual_value
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Prediction:
 
 def predictions(problem: Problem, theta: np.ndarray, chunk: int = 256) -> Prediction:
     """Residuals of all lanes at `theta` (lanes, P), in N and mm."""
-    run = _compiled(problem)
+    run = _compiled(problem.program)
     count = len(theta)
     parts = []
     for first in range(0, count, chunk):
@@ -62,7 +62,7 @@ def predictions(problem: Problem, theta: np.ndarray, chunk: int = 256) -> Predic
 @functools.lru_cache(maxsize=8)
 def _compiled(problem: Problem):
     def value(theta, lane: Lane):
-        return residual(problem, theta, lane).value
+        return residual_value(problem, theta, lane)
 
     return jax.jit(jax.vmap(value))
 
@@ -90,6 +90,25 @@ class LeftOut:
     result: FitResult
 
 
+def curves_to_leave_out(problem: Problem) -> list[tuple[int, int]]:
+    """Lane and trial of every curve that the others of its lane can predict.
+
+    Raises:
+        ValueError: no lane has two curves, or an unknown belongs to a trial (a curve left out could
+            then not be predicted).
+    """
+    own = [p.name for p in problem.parameters if p.scope == "trial" and not p.fixed]
+    if own:
+        raise ValueError(
+            f"{', '.join(own)} belongs to single trials, which no other curve can tell; fix it, or "
+            "give it the scope 'specimen' or 'shared'"
+        )
+    pairs = [(k, t) for k, c in enumerate(problem.curves) if len(c) > 1 for t in range(len(c))]
+    if not pairs:
+        raise ValueError("needs at least two curves that share their parameters; found none")
+    return pairs
+
+
 def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOut:
     """Fit every lane once without each of its curves, and predict that curve.
 
@@ -99,42 +118,42 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
         progress: as for `fit`.
 
     Raises:
-        ValueError: no lane has two curves, or an unknown belongs to a trial (a curve left out could
-            then not be predicted).
+        ValueError: as `curves_to_leave_out`.
     """
-    if any(p.scope == "trial" and not p.fixed for p in problem.parameters):
-        raise ValueError("leaving a curve out needs parameters that do not belong to one trial")
-    pairs = [(k, t) for k, c in enumerate(problem.curves) if len(c) > 1 for t in range(len(c))]
-    if not pairs:
-        raise ValueError("leaving a curve out needs a specimen with at least two curves")
-    lane, trial = (np.array(v) for v in zip(*pairs, strict=True))
+    lane, trial = (np.array(v) for v in zip(*curves_to_leave_out(problem), strict=True))
     lanes = jax.tree.map(lambda v: v[lane], problem.lanes)
     rows = np.arange(len(lane))
-    precision = lanes.precision.copy()
-    precision[rows, trial] = 0
-    joint_precision = None
-    if lanes.joint_precision is not None:
-        joint_precision = lanes.joint_precision.copy()
-        joint_precision[rows, trial] = 0
+
+    def without(precision):
+        held = precision.copy()
+        held[rows, trial] = 0
+        return held
+
+    joint_precision = None if lanes.joint_precision is None else without(lanes.joint_precision)
     held_back = dataclasses.replace(
         problem,
-        lanes=lanes._replace(precision=precision, joint_precision=joint_precision),
+        lanes=lanes._replace(precision=without(lanes.precision), joint_precision=joint_precision),
         curves=tuple(problem.curves[k] for k in lane),
         unknowns=tuple(problem.unknowns[k] for k in lane),
     )
     result = fit(held_back, settings, progress)
-    whole = dataclasses.replace(held_back, lanes=lanes)
-    seen = predictions(whole, result.theta)
-    force = seen.force[rows, trial]
-    data = lanes.force[rows, trial]
-    model = data + np.nan_to_num(force)
-    peak = np.max(np.abs(data), axis=1)
-    ratio = np.sum(data * model, axis=1) / np.sum(model * model, axis=1) - 1
+    seen = predictions(dataclasses.replace(held_back, lanes=lanes), result.theta)
+    force, data = seen.force[rows, trial], lanes.force[rows, trial]
+    model = np.where(lanes.precision[rows, trial] > 0, data + force, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.sum(data * model, axis=1) / np.sum(model * model, axis=1) - 1
+        peak = rms(force) / np.max(np.abs(data), axis=1)
     joints = np.full(len(lane), np.nan)
     if seen.joints is not None:
         D = np.abs(lanes.displacement[rows, trial])
         moved = D > 0.5 * np.max(D, axis=1, keepdims=True)
         share = seen.joints[rows, trial] / np.where(moved, D, np.nan)[:, :, None]
-        joints = np.sqrt(np.nanmean(share**2, axis=(1, 2)))
-    rms = np.sqrt(np.nanmean(force**2, axis=1)) / peak
-    return LeftOut(lane, trial, rms, joints, ratio, result)
+        joints = rms(share.reshape(len(lane), -1))
+    return LeftOut(lane, trial, peak, joints, ratio, result)
+
+
+def rms(values: np.ndarray) -> np.ndarray:
+    """Root mean square along the last axis over what is not NaN; NaN if nothing is left."""
+    known = ~np.isnan(values)
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(np.where(known, values**2, 0).sum(axis=-1) / known.sum(axis=-1))

@@ -1,10 +1,9 @@
-"""Write what a fit found: HDF5, CSV, provenance. Nothing that exists is overwritten."""
+"""What a fit found, as rows and files: HDF5, CSV, provenance (docs/results.md)."""
 
 import csv
 import datetime
 import hashlib
 import json
-import os
 import platform
 import sys
 from collections.abc import Iterator
@@ -23,34 +22,6 @@ SCHEMA = "jaxtrachea-results"
 SCHEMA_VERSION = 1
 
 
-class OutputExists(FileExistsError):
-    """The output directory holds files already."""
-
-
-def new_directory(wanted: Path | None, default: Path) -> Path:
-    """The directory to write into: `wanted` if it is new or empty, else a free numbered `default`.
-
-    Raises:
-        OutputExists: `wanted` exists and is not empty, or is a file.
-    """
-    if wanted is not None:
-        if wanted.exists() and (not wanted.is_dir() or any(wanted.iterdir())):
-            raise OutputExists(
-                f"{wanted} exists and is not empty; nothing was written. "
-                "Choose another --out, or remove it yourself"
-            )
-        wanted.mkdir(parents=True, exist_ok=True)
-        return wanted
-    for n in range(1, 10_000):
-        path = default if n == 1 else default.with_name(f"{default.name}-{n}")
-        try:
-            path.mkdir(parents=True, exist_ok=False)
-        except FileExistsError:
-            continue
-        return path
-    raise OutputExists(f"{default} and its numbered successors exist; give --out")
-
-
 def unknown_label(result: FitResult, lane: int, i: int) -> str:
     """Name of an unknown: k_M, or onset[t03], or k_M[T01] where a lane holds several of them."""
     unknowns = result.problem.unknowns[lane]
@@ -63,11 +34,35 @@ def unknown_label(result: FitResult, lane: int, i: int) -> str:
     return f"{p.name}[{where}]"
 
 
+def lane_label(result: FitResult, lane: int) -> str:
+    """Specimen of a lane, and its trial if it holds a single one."""
+    specimen, trial = result.problem.lane_name(lane)
+    return specimen if trial == "(all)" else f"{specimen} {trial}"
+
+
+def succeeded(result: FitResult, lane: int) -> bool:
+    """Whether a lane has an estimate."""
+    return FitStatus(int(result.status[lane])).succeeded
+
+
+def peak_force(result: FitResult, lane: int) -> float:
+    """Largest measured force of a lane, N."""
+    return max(float(np.max(np.abs(c.force))) for c in result.problem.curves[lane])
+
+
 def flat_sentence(result: FitResult, lane: int) -> str:
     """The least determined combination of a lane in words."""
+    if not succeeded(result, lane):
+        return "no estimate"
     names = [unknown_label(result, lane, i) for i in range(len(result.problem.unknowns[lane]))]
     u = result.uncertainty[lane]
-    return describe_flat(names, u.flat, u.flat_se)
+    size = np.abs(u.flat[: len(names)])
+    if np.sum(size >= 0.1 * np.max(size)) != 1:
+        return describe_flat(names, u.flat, u.flat_se)
+    name = names[int(np.argmax(size))]
+    if not np.isfinite(u.flat_se):
+        return f"{name} changes no curve at all"
+    return f"least determined: {name} alone, known to {100 * u.flat_se:.2g} %"
 
 
 def lane_rows(result: FitResult) -> Iterator[dict[str, object]]:
@@ -75,7 +70,7 @@ def lane_rows(result: FitResult) -> Iterator[dict[str, object]]:
     for lane in range(result.lanes):
         specimen, trial = result.problem.lane_name(lane)
         status = FitStatus(int(result.status[lane]))
-        peak = max(float(np.max(np.abs(c.force))) for c in result.problem.curves[lane])
+        peak = peak_force(result, lane)
         row: dict[str, object] = {
             "specimen": specimen,
             "trial": trial,
@@ -95,17 +90,19 @@ def lane_rows(result: FitResult) -> Iterator[dict[str, object]]:
             label = unknown_label(result, lane, i)
             if label != p.name:
                 continue
-            row |= {f"{label} [{p.unit}]": float(result.value[lane, i])}
-            row |= {f"{label} se": float(result.standard_error[lane, i])}
-            row |= {f"{label} low95": float(result.lower[lane, i])}
-            row |= {f"{label} high95": float(result.upper[lane, i])}
-            row |= {f"{label} verdict": verdict_of(result, lane, i)}
+            row |= {
+                f"{label} [{p.unit}]": float(result.value[lane, i]),
+                f"{label} se": float(result.standard_error[lane, i]),
+                f"{label} low95": float(result.lower[lane, i]),
+                f"{label} high95": float(result.upper[lane, i]),
+                f"{label} verdict": verdict_of(result, lane, i),
+            }
         yield row
 
 
 def verdict_of(result: FitResult, lane: int, i: int) -> str:
     """Identifiable, weak, not identifiable, at bound, or "failed" where there is no estimate."""
-    if not FitStatus(int(result.status[lane])).succeeded:
+    if not succeeded(result, lane):
         return "failed"
     return verdict(float(result.relative_se[lane, i]), bool(result.at_bound[lane, i]))
 
@@ -142,32 +139,15 @@ def parameter_rows(result: FitResult) -> Iterator[dict[str, object]]:
 def write_csv(path: Path, rows: list[dict[str, object]]) -> None:
     """Write rows that may have different keys; missing cells are empty."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    with _whole(path, newline="") as stream:
+    with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, columns, restval="")
         writer.writeheader()
         writer.writerows(rows)
 
 
-class _whole:  # noqa: N801
-    """Open a text file that appears under its name only when it is complete."""
-
-    def __init__(self, path: Path, **kwargs):
-        self.path, self.part = path, path.with_name(path.name + ".part")
-        self.stream = self.part.open("w", encoding="utf-8", **kwargs)
-
-    def __enter__(self):
-        return self.stream
-
-    def __exit__(self, kind, value, traceback):
-        self.stream.close()
-        if kind is None:
-            os.replace(self.part, self.path)
-
-
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, complete or not at all."""
-    with _whole(path) as stream:
-        stream.write(text)
+    """Write a text file."""
+    path.write_text(text, encoding="utf-8")
 
 
 def write_hdf5(path: Path, result: FitResult, provenance: dict) -> None:
@@ -178,40 +158,45 @@ def write_hdf5(path: Path, result: FitResult, provenance: dict) -> None:
         result: the fit.
         provenance: stored as JSON in the root attribute of that name.
     """
-    part = path.with_name(path.name + ".part")
-    text = h5py.string_dtype()
-    problem = result.problem
-    with h5py.File(part, "w") as file:
+    with h5py.File(path, "x") as file:
         file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
         file.attrs["provenance"] = json.dumps(provenance)
-        lanes = file.create_group("lanes")
-        names = [problem.lane_name(lane) for lane in range(result.lanes)]
-        lanes.create_dataset("specimen", data=[n[0] for n in names], dtype=text)
-        lanes.create_dataset("trial", data=[n[1] for n in names], dtype=text)
-        codes = lanes.create_dataset("status", data=result.status.astype(np.int8))
-        codes.attrs["meaning"] = json.dumps({int(s): s.message for s in FitStatus})
-        for name in ("iterations", "cost", "converged_starts", "samples"):
-            lanes.create_dataset(name, data=getattr(result, name))
-        for name, unit in (("sigma", "N, mm"), ("rms", "N, mm")):
-            lanes.create_dataset(name, data=getattr(result, name)).attrs["unit"] = unit
-        u = result.uncertainty
-        lanes.create_dataset("condition", data=[v.condition for v in u])
-        unknowns = file.create_group("unknowns")
-        for field, pick in (("parameter", 0), ("specimen", 1), ("trial", 2)):
-            cells = [[_cell(problem.unknowns[lane], i, pick) for i in range(problem.size)]
-                     for lane in range(result.lanes)]  # fmt: skip
-            unknowns.create_dataset(field, data=cells, dtype=text)
-        arrays = ("value", "standard_error", "lower", "upper", "relative_se", "theta", "at_bound")
-        for name in arrays:
-            unknowns.create_dataset(name, data=getattr(result, name), compression="gzip")
-        correlation = np.stack([v.correlation for v in u])
-        unknowns.create_dataset("correlation", data=correlation, compression="gzip")
-        unknowns.create_dataset("flat", data=np.stack([v.flat for v in u]), compression="gzip")
-        units = {p.name: p.unit for p in problem.parameters}
-        unknowns.attrs["units"] = json.dumps(units)
-        fixed = {p.name: p.value for p in problem.parameters if p.fixed}
-        unknowns.attrs["fixed"] = json.dumps(fixed)
-    os.replace(part, path)
+        _write_lanes(file.create_group("lanes"), result)
+        _write_unknowns(file.create_group("unknowns"), result)
+
+
+def _write_lanes(group: h5py.Group, result: FitResult) -> None:
+    text = h5py.string_dtype()
+    names = [result.problem.lane_name(lane) for lane in range(result.lanes)]
+    group.create_dataset("specimen", data=[n[0] for n in names], dtype=text)
+    group.create_dataset("trial", data=[n[1] for n in names], dtype=text)
+    codes = group.create_dataset("status", data=result.status.astype(np.int8))
+    codes.attrs["meaning"] = json.dumps({int(s): s.message for s in FitStatus})
+    for name in ("iterations", "cost", "converged_starts", "samples"):
+        group.create_dataset(name, data=getattr(result, name))
+    for name in ("sigma", "rms"):
+        group.create_dataset(name, data=getattr(result, name)).attrs["unit"] = "N, mm"
+    group.create_dataset("condition", data=[u.condition for u in result.uncertainty])
+
+
+def _write_unknowns(group: h5py.Group, result: FitResult) -> None:
+    text, problem = h5py.string_dtype(), result.problem
+    for field, pick in (("parameter", 0), ("specimen", 1), ("trial", 2)):
+        cells = [[_cell(problem.unknowns[lane], i, pick) for i in range(problem.size)]
+                 for lane in range(result.lanes)]  # fmt: skip
+        group.create_dataset(field, data=cells, dtype=text)
+    arrays = {
+        name: getattr(result, name)
+        for name in ("value", "standard_error", "lower", "upper", "relative_se", "theta",
+                     "at_bound")
+    }  # fmt: skip
+    arrays["correlation"] = np.stack([u.correlation for u in result.uncertainty])
+    arrays["flat"] = np.stack([u.flat for u in result.uncertainty])
+    for name, data in arrays.items():
+        group.create_dataset(name, data=data, compression="gzip")
+    group.attrs["units"] = json.dumps({p.name: p.unit for p in problem.parameters})
+    fixed = {p.name: p.value for p in problem.parameters if p.fixed}
+    group.attrs["fixed"] = json.dumps(fixed)
 
 
 def _cell(unknowns, i: int, pick: int) -> str:

@@ -3,9 +3,17 @@
 import dataclasses
 from pathlib import Path
 
-from jaxtrachea.config import FitSpec, ParameterSection, SpecError, TracheaSection
+import numpy as np
+
+from jaxtrachea.config import EvenRings, FitSpec, ParameterSection, SpecError, TracheaSection
 from jaxtrachea.identify.fit import Settings
-from jaxtrachea.identify.measurements import Measurements, ReadOptions, read_measurements
+from jaxtrachea.identify.measurements import (
+    BadCurve,
+    DataError,
+    Measurements,
+    ReadOptions,
+    read_measurements,
+)
 from jaxtrachea.identify.parameters import DEFAULTS, Parameter, in_model
 from jaxtrachea.identify.problem import Noise, Problem, build
 from jaxtrachea.identify.solve import Tolerances
@@ -26,36 +34,92 @@ def find_files(spec: FitSpec, root: Path) -> list[Path]:
     """
     found: dict[Path, None] = {}
     for i, pattern in enumerate(spec.data.files):
-        path = Path(pattern)
-        base = Path(path.anchor) if path.is_absolute() else root
-        relative = str(path.relative_to(path.anchor)) if path.is_absolute() else pattern
         try:
-            matches = sorted(p for p in base.glob(relative) if p.is_file())
-        except (ValueError, NotImplementedError) as error:
-            raise SpecError(f"data.files.{i}: {pattern!r} is no usable path: {error}") from None
-        if not matches:
+            matches = _matches(root, pattern)
+        except (ValueError, NotImplementedError, IndexError, OSError) as error:
             raise SpecError(
-                f"data.files.{i}: {pattern!r} matches no file in {base}; "
-                "check the name, or say where the data are with --data"
+                f"data.files.{i}: {pattern!r} is no usable path ({_reason(error)}); name files, or a "
+                "pattern such as 'curves/*.csv'"
+            ) from None
+        files = [path for path in matches if path.is_file()]
+        if not files:
+            what = f"a folder; list the files in it, as in '{pattern}/*.csv'"
+            missing = "no file; check the name, or say where the data are with --data"
+            raise SpecError(
+                f"data.files.{i}: {pattern!r} matches in {root} {what if matches else missing}"
             )
-        found.update(dict.fromkeys(matches))
+        found.update(dict.fromkeys(files))
     return list(found)
+
+
+def _reason(error: Exception) -> str:
+    """Why, without repeating the path."""
+    return (isinstance(error, OSError) and error.strerror) or str(error)
+
+
+def _matches(root: Path, pattern: str) -> list[Path]:
+    """Files and folders that a path or pattern names; a name that exists is taken as it is."""
+    path = root / pattern
+    if pattern and path.exists():
+        return [path]
+    relative = path.relative_to(path.anchor) if Path(pattern).is_absolute() else pattern
+    return sorted((Path(path.anchor) if Path(pattern).is_absolute() else root).glob(str(relative)))
 
 
 def read_data(spec: FitSpec, root: Path) -> Measurements:
     """Read all files of a specification.
 
+    Of several files, one that cannot be read at all costs one `BadCurve` named after it.
+
     Raises:
         SpecError: no file, or reading options that contradict each other.
-        DataError: a file that spoils the whole study.
+        DataError: the only file cannot be read, or two files hold the same specimen and trial.
     """
-    d = spec.data
     names = {f.name for f in dataclasses.fields(ReadOptions)}
     try:
-        options = ReadOptions(**{k: v for k, v in d.model_dump().items() if k in names})
+        options = ReadOptions(**{k: v for k, v in spec.data.model_dump().items() if k in names})
     except ValueError as error:
         raise SpecError(f"data: {error}") from None
-    return read_measurements(find_files(spec, root), options)
+    files = find_files(spec, root)
+    if len(files) == 1:
+        return read_measurements(files, options)
+    parts = [_read_one(path, options) for path in files]
+    curves = [curve for part in parts for curve in part.curves]
+    bad = [curve for part in parts for curve in part.bad]
+    _refuse_twice(parts)
+    return Measurements(tuple(curves), tuple(bad), tuple(files))
+
+
+def _read_one(path: Path, options: ReadOptions) -> Measurements:
+    """One file of several; what spoils it becomes its only row."""
+    try:
+        return read_measurements([path], options)
+    except DataError as error:
+        text = str(error).removeprefix(f"{path}: ")
+        message, _, cure = text.rpartition("; ")
+        bad = BadCurve(
+            path.stem,
+            "(all)",
+            str(path),
+            "unreadable",
+            message or text,
+            cure if message else "repair the file or leave it out",
+        )
+        return Measurements((), (bad,), (path,))
+
+
+def _refuse_twice(parts: list[Measurements]) -> None:
+    """Refuse a specimen and trial that two files hold."""
+    seen: dict[tuple[str, str], str] = {}
+    for part in parts:
+        for curve in (*part.curves, *(b for b in part.bad if b.trial != "(all)")):
+            key = (curve.specimen, curve.trial)
+            if key in seen:
+                raise DataError(
+                    f"{curve.source}: specimen {key[0]!r} trial {key[1]!r} was already in "
+                    f"{seen[key]}; rename one, or give a specimen pattern that tells files apart"
+                )
+            seen[key] = curve.source
 
 
 def geometry_of(section: TracheaSection) -> Geometry:
@@ -64,22 +128,23 @@ def geometry_of(section: TracheaSection) -> Geometry:
     Raises:
         SpecError: impossible dimensions, with the key.
     """
-    if section.length is None or section.rings is None:
-        return table_1()
+    preset = table_1()
+    length = float(preset.length) if section.length is None else section.length
     rings = section.rings
-    if not isinstance(rings, list):
-        step = (rings.last - rings.first) / max(rings.count - 1, 1)
-        rings = [rings.first + i * step for i in range(rings.count)]
+    if rings is None:
+        rings = np.asarray(preset.ring_positions, np.float64)
+    if isinstance(rings, EvenRings):
+        rings = np.linspace(rings.first, rings.last, rings.count)
     try:
         return Geometry.create(
-            section.length,
+            length,
             rings,
             radius=section.radius,
             half_angle=section.half_angle,
             ring_height=section.ring_height,
         )
     except ValueError as error:
-        raise SpecError(f"trachea: {error}") from None
+        raise SpecError(f"trachea.{str(error).replace('ring_positions', 'rings')}") from None
 
 
 def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Parameter, ...]:
@@ -99,29 +164,54 @@ def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Par
 
 
 def _parameter(default: Parameter, section: ParameterSection | None) -> Parameter:
+    """One row of the table.
+
+    Raises:
+        SpecError: with the dotted key.
+    """
     if section is None:
         return default
-    number = lambda v: parse_quantity(v, default.dimension) if isinstance(v, str) else float(v)  # noqa: E731
-    key = f"parameters.{default.name}"
     try:
         if section.fixed is not None:
-            return dataclasses.replace(default, value=number(section.fixed), fixed=True)
-        changes = {"fixed": False}
-        if section.initial is not None:
-            changes["value"] = number(section.initial)
-        if section.bounds is not None:
-            changes["lower"], changes["upper"] = map(number, section.bounds)
-        for name in ("scale", "scope"):
-            if getattr(section, name) is not None:
-                changes[name] = getattr(section, name)
-        if section.bounds is None and section.scale == "log" and default.lower <= 0:
-            changes["lower"] = 1e-9
-        if section.bounds is not None and section.initial is None:
-            inside = min(max(default.value, changes["lower"]), changes["upper"])
-            changes["value"] = inside
-        return dataclasses.replace(default, **changes)
+            return _fixed(default, section.fixed)
+        return _free(default, section)
     except ValueError as error:
-        raise SpecError(f"{key}: {str(error).removeprefix(default.name + ': ')}") from None
+        text = str(error).removeprefix(f"{default.name}: ")
+        raise SpecError(f"parameters.{default.name}: {text}") from None
+
+
+def _number(default: Parameter, key: str, value: str | float | int) -> float:
+    """A value in the parameter's unit; a bare number is in it already."""
+    if not isinstance(value, str):
+        return float(value)
+    try:
+        return parse_quantity(value, default.dimension)
+    except ValueError as error:
+        raise ValueError(f"{key}: {error}") from None
+
+
+def _fixed(default: Parameter, given: str | float | int) -> Parameter:
+    value = _number(default, "fixed", given)
+    if default.scale == "log" and value <= 0:
+        raise ValueError(f"fixed: {value:g} {default.unit} is no stiffness; expected more than 0")
+    return dataclasses.replace(default, value=value, fixed=True)
+
+
+def _free(default: Parameter, section: ParameterSection) -> Parameter:
+    lower, upper = default.lower, default.upper
+    scale = section.scale or default.scale
+    if section.bounds is not None:
+        lower, upper = (_number(default, "bounds", v) for v in section.bounds)
+    elif scale == "log":
+        lower = max(lower, 1e-9)
+    if section.initial is not None:
+        value = _number(default, "initial", section.initial)
+    else:
+        value = min(max(default.value, lower), upper)
+    scope = section.scope or default.scope
+    return dataclasses.replace(
+        default, value=value, lower=lower, upper=upper, scale=scale, scope=scope, fixed=False
+    )
 
 
 def problem_of(spec: FitSpec, measurements: Measurements) -> Problem:
@@ -133,12 +223,8 @@ def problem_of(spec: FitSpec, measurements: Measurements) -> Problem:
     options = Options(**spec.model.model_dump())
     curves = measurements.curves
     joints = any(c.joint_displacement is not None for c in curves)
-    known = lambda v: None if v == "estimate" else v  # noqa: E731
-    noise = Noise(known(spec.noise.force), known(spec.noise.joints))
-    for name in ("force", "joints"):
-        sigma = getattr(noise, name)
-        if sigma is not None and not sigma > 0:
-            raise SpecError(f"noise.{name}: {sigma:g} is not a positive standard deviation")
+    given = (spec.noise.force, spec.noise.joints)
+    noise = Noise(*(None if sigma == "estimate" else sigma for sigma in given))
     try:
         return build(
             curves,
