@@ -37,12 +37,9 @@ Form = Literal["recursion", "reactions"]
 
 
 class _Side(NamedTuple):
-    """One side seen from its clamp, with the tip compliance at every node.
+    """One side seen from its clamp: spans, rings and loads in that order.
 
-    `h` are the spans in the order of the side. `after` holds n + 1 entries: at the clamp (zero),
-    then after each ring with that ring included; `passed` is the part 1 / (1 + k a) of a tip force
-    that gets past the ring. `free` is the motion (w, theta) of the same nodes under ring loads
-    alone, None without them.
+    `h`, `EI`, `GA`: n + 1 spans; `k`, `load`: n rings. None: without shear, without ring loads.
     """
 
     h: Float[Array, "*side spans"]
@@ -50,33 +47,54 @@ class _Side(NamedTuple):
     GA: Float[Array, "*side spans"] | None
     k: Float[Array, "*side n"]
     load: Float[Array, "*side n"] | None
-    after: Compliance
-    passed: Float[Array, "*side n"]
-    free: tuple[Float[Array, "*side spans"], Float[Array, "*side spans"]] | None
 
 
-def _sweep(h, EI, k, GA, load) -> _Side:
-    """Carry the compliance (and the free motion under ring loads) from the clamp over all rings."""
-    zero = jnp.zeros_like(h[0])
+class _Node(NamedTuple):
+    """Tip of a side: compliance, and motion (w, theta) under ring loads alone (None without)."""
 
-    def step(carry, ring):
-        g, free = carry
-        h_i, EI_i, GA_i, k_i, load_i = ring
-        g = add_span(g, h_i, EI_i, GA_i)
-        passed = 1 / (1 + k_i * g.a)
-        if load_i is not None:
-            w, theta = free[0] + h_i * free[1], free[1]
-            pull = (load_i - k_i * w) * passed
-            free = (w + g.a * pull, theta + g.b * pull)
-        g = add_support(g, k_i)
-        return (g, free), (g, free, passed)
+    g: Compliance
+    free: tuple[Float[Array, "*s"], Float[Array, "*s"]] | None
 
-    start = (Compliance(zero, zero, zero, zero), None if load is None else (zero, zero))
-    rings = (h[:-1], EI[:-1], None if GA is None else GA[:-1], k, load)
-    _, (after, free, passed) = jax.lax.scan(step, start, rings)
-    with_clamp = lambda v: jnp.concatenate([jnp.zeros_like(v[:1]), v])  # noqa: E731
-    after, free = jax.tree.map(with_clamp, (after, free))
-    return _Side(h, EI, GA, k, load, after, passed, free)
+
+def _add_span(node: _Node, h, EI, GA) -> _Node:
+    free = node.free
+    if free is not None:
+        free = (free[0] + h * free[1], free[1])
+    return _Node(add_span(node.g, h, EI, GA), free)
+
+
+def _sweep(side: _Side) -> tuple[_Node, _Node, Float[Array, " n"]]:
+    """Carry the compliance from the clamp over all rings.
+
+    Returns:
+        The node after the last ring; the nodes after every ring; the part 1 / (1 + k a) of a tip
+        force that gets past each ring.
+    """
+    zero = jnp.zeros_like(side.h[0])
+
+    def step(node, ring):
+        h, EI, GA, k, load = ring
+        g, free = _add_span(node, h, EI, GA)
+        passed = 1 / (1 + k * g.a)
+        if load is not None:
+            pull = (load - k * free[0]) * passed
+            free = (free[0] + g.a * pull, free[1] + g.b * pull)
+        node = _Node(add_support(g, k), free)
+        return node, (node, passed)
+
+    clamp = _Node(Compliance(zero, zero, zero, zero), None if side.load is None else (zero, zero))
+    GA = None if side.GA is None else side.GA[:-1]
+    last, (nodes, passed) = jax.lax.scan(step, clamp, (side.h[:-1], side.EI[:-1], GA, side.k,
+                                                       side.load))  # fmt: skip
+    return last, nodes, passed
+
+
+def _both_sides(beam: Beam, ring_load=None) -> _Side:
+    """The beam read from A and from B, stacked on a leading axis."""
+    both = lambda v: None if v is None else jnp.stack([v, v[::-1]])  # noqa: E731
+    # Span lengths before mirroring: length - x would cost short spans their digits.
+    h = both(jnp.diff(_ends(beam)))
+    return _Side(h, both(beam.EI), both(beam.GA), both(beam.k), both(ring_load))
 
 
 def _ends(beam: Beam):
@@ -84,42 +102,36 @@ def _ends(beam: Beam):
     return jnp.concatenate([jnp.zeros_like(beam.x[:1]), beam.x, beam.length[None]])
 
 
-def _sweep_both(beam: Beam, ring_load=None) -> _Side:
-    """Sweeps from A and from B, stacked on a leading axis; independent of the contact position."""
-    both = lambda v: None if v is None else jnp.stack([v, v[::-1]])  # noqa: E731
-    # Span lengths before mirroring: length - x would cost short spans their digits.
-    h = both(jnp.diff(_ends(beam)))
-    return jax.vmap(_sweep)(h, both(beam.EI), both(beam.k), both(beam.GA), both(ring_load))
+def _reach(beam: Beam, s_c) -> tuple[Int[Array, "2"], Float[Array, "2"], Float[Array, "2"]]:
+    """Rings on either side of C, distance to the last of them, and to the clamp.
 
-
-class _Tips(NamedTuple):
-    """Both sides at C: compliance, free motion, distance from the clamp and from the last ring.
-
-    `count` is the number of rings of each side.
+    A ring exactly at C belongs to side A.
     """
-
-    g: Compliance
-    free: tuple[Float[Array, "2"], Float[Array, "2"]] | None
-    s: Float[Array, "2"]
-    last: Float[Array, "2"]
-    count: Int[Array, "2"]
-
-
-def _reach(swept: _Side, beam: Beam, s_c) -> _Tips:
-    """Add the last span of each side, up to C. A ring exactly at C belongs to side A."""
-    count_A = jnp.sum(beam.x <= s_c)
-    count = jnp.stack([count_A, beam.x.shape[0] - count_A])
+    count = jnp.sum(beam.x <= s_c)
     ends = _ends(beam)
-    last = jnp.stack([s_c - ends[count_A], ends[count_A + 1] - s_c])
+    last = jnp.stack([s_c - ends[count], ends[count + 1] - s_c])
+    return jnp.stack([count, beam.x.shape[0] - count]), last, jnp.stack([s_c, beam.length - s_c])
 
-    def one(side, h, count):
-        at = lambda v: jax.lax.dynamic_index_in_dim(v, count, keepdims=False)  # noqa: E731
-        g, free, EI, GA = jax.tree.map(at, (side.after, side.free, side.EI, side.GA))
-        free = None if free is None else (free[0] + h * free[1], free[1])
-        return add_span(g, h, EI, GA), free
 
-    g, free = jax.vmap(one)(swept, last, count)
-    return _Tips(g, free, jnp.stack([s_c, beam.length - s_c]), last, count)
+def _up_to(side: _Side, count, last) -> _Side:
+    """The side cut off at C: the span that holds C shortened, everything beyond it zero."""
+    order = jnp.arange(side.h.shape[0])
+    h = jnp.where(order == count, last, jnp.where(order < count, side.h, 0))
+    held = order[:-1] < count
+    load = None if side.load is None else jnp.where(held, side.load, 0)
+    return side._replace(h=h, k=jnp.where(held, side.k, 0), load=load)
+
+
+def _tip(side: _Side, node: _Node) -> _Node:
+    """Add the last span."""
+    return _add_span(node, side.h[-1], side.EI[-1], None if side.GA is None else side.GA[-1])
+
+
+def _compliance_at(tips: Compliance, s, split: Split):
+    """Deflection of C per unit force from the tips of both sides, `s` away from their clamps."""
+    if split == "independent":
+        return jnp.sum(force_shares(s) ** 2 * tips.a)
+    return join(*sides(tips)).w
 
 
 def contact_compliance(
@@ -138,15 +150,23 @@ def contact_compliance(
     Returns:
         Compliance, mm/N, of the shape of `s_c`.
     """
-    swept = _sweep_both(beam)
+    both = _both_sides(beam)
+    if s_c.ndim == 0:
+        count, last, s = _reach(beam, s_c)
+        cut = jax.vmap(_up_to)(both, count, last)
+        tips = jax.vmap(lambda side: _tip(side, _sweep(side)[0]))(cut)
+        return _compliance_at(tips.g, s, split)
+    _, nodes, _ = jax.vmap(_sweep)(both)
+    with_clamp = lambda v: jnp.concatenate([jnp.zeros_like(v[:, :1]), v], axis=1)  # noqa: E731
+    nodes = jax.tree.map(with_clamp, nodes)
 
-    def one(s):
-        tips = _reach(swept, beam, s)
-        if split == "independent":
-            return jnp.sum(force_shares(tips.s) ** 2 * tips.g.a)
-        return join(*sides(tips.g)).w
+    def one(s_c):
+        count, last, s = _reach(beam, s_c)
+        at = lambda v: None if v is None else v[jnp.arange(2), count]  # noqa: E731
+        g = Compliance(*map(at, nodes.g))
+        return _compliance_at(add_span(g, last, at(both.EI), at(both.GA)), s, split)
 
-    return one(s_c) if s_c.ndim == 0 else jax.vmap(one)(s_c)
+    return jax.vmap(one)(s_c)
 
 
 def deflect(
@@ -182,39 +202,34 @@ def deflect(
         if ring_load is not None:
             raise ValueError("ring_load is not part of form='reactions'; use form='recursion'")
         return deflect_dense(beam, s_c, force, split=split)
-    swept = _sweep_both(beam, ring_load)
-    tips = _reach(swept, beam, s_c)
-    w_C, theta_C, V, M = divide_load(tips.g, tips.s, force, split, tips.free)
-    w, theta, R = jax.vmap(_back_substitute)(swept, tips.last, tips.count, V, M)
+    count, last, s = _reach(beam, s_c)
+    cut = jax.vmap(_up_to)(_both_sides(beam, ring_load), count, last)
+    end, nodes, passed = jax.vmap(_sweep)(cut)
+    tips = jax.vmap(_tip)(cut, end)
+    w_C, theta_C, V, M = divide_load(tips.g, s, force, split, tips.free)
+    w, theta, R = jax.vmap(_back_substitute)(cut, nodes, passed, V, M)
     in_A = beam.x <= s_c
     both = lambda v, sign: jnp.where(in_A, v[0], sign * v[1][::-1])  # noqa: E731
     return Deflection(w_C, theta_C, both(w, 1), both(theta, -1), both(R, 1), V[0], M[0])
 
 
-def _back_substitute(side: _Side, last, count, V, M):
-    """From the load (V, M) at C back to the clamp: w, theta and R at every support."""
-    order = jnp.arange(side.k.shape[0])
-    held = order < count
-    h = jnp.where(order == count - 1, last, side.h[1:])
-    h, k = jnp.where(held, h, 0), jnp.where(held, side.k, 0)
-    passed = jnp.where(held, side.passed, 1)
-    load = None if side.load is None else jnp.where(held, side.load, 0)
+def _back_substitute(side: _Side, nodes: _Node, passed, V, M):
+    """From the load (V, M) at the tip back to the clamp: w, theta and R at every support."""
 
     def step(tip, ring):
         V, M = tip
-        h_i, k_i, passed_i, load_i, g, free = ring
-        M = M + h_i * V
+        h, k, load, passed, (g, free) = ring
+        M = M + h * V
         w, theta = g.a * V + g.b * M, g.b * V + g.c * M
-        R = k_i * w
+        R = k * w
         # V - R, without losing what little gets past a stiff ring.
-        rest = passed_i * V - k_i * g.b * M
-        if load_i is not None:
-            from_loads = k_i * free[0] - load_i
+        rest = passed * V - k * g.b * M
+        if load is not None:
+            from_loads = k * free[0] - load
             w, theta = w + free[0], theta + free[1]
             R, rest = R + from_loads, rest - from_loads
         return (rest, M), (w, theta, R)
 
-    after, free = jax.tree.map(lambda v: v[1:], (side.after, side.free))
-    rings = (h, k, passed, load, after, free)
+    rings = (side.h[1:], side.k, side.load, passed, nodes)
     _, out = jax.lax.scan(step, (V, M), rings, reverse=True)
     return out

@@ -1,11 +1,12 @@
 """Local indentation and skeleton deflection together (normal press).
 
 The only place where contact force and deflection are solved for at once. Both couplings are closed
-forms up to one scaled cubic whose derivative is implicit (`_numerics.cubic_ratio`).
+forms up to one scaled cubic (`_numerics.cubic_ratio`); derivatives are those of the equilibrium.
 """
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -42,12 +43,36 @@ def press_series(
         compliance: c, deflection of the skeleton at C per unit force, mm/N, not negative.
         law: local law; k_1 > 0.
     """
-    stiffening = 1 + compliance * law.k_1
-    delta = displacement / stiffening
-    u = 6.75 * (compliance * law.k_3 / stiffening) * delta * delta
-    depth = delta * cubic_ratio(u)
+    depth = _series_depth(displacement, compliance, law.k_1, law.k_3)
     force = duffing(depth, law)
+    u = _scaled_cubic(displacement, compliance, law.k_1, law.k_3)[1]
     return Equilibrium(depth, force, _status(displacement, depth + force, u <= -1))
+
+
+def _scaled_cubic(displacement, compliance, k_1, k_3):
+    """The scaled displacement delta and the argument u of `press_series`."""
+    stiffening = 1 + compliance * k_1
+    delta = displacement / stiffening
+    return delta, 6.75 * (compliance * k_3 / stiffening) * delta * delta
+
+
+@jax.custom_jvp
+def _series_depth(displacement, compliance, k_1, k_3):
+    """Local indentation of `press_series`, with the derivative of the equilibrium d + c F = D."""
+    delta, u = _scaled_cubic(displacement, compliance, k_1, k_3)
+    return delta * cubic_ratio(u)
+
+
+@_series_depth.defjvp
+def _series_depth_jvp(primals, tangents):
+    displacement, compliance, k_1, k_3 = primals
+    d_displacement, d_compliance, d_k_1, d_k_3 = tangents
+    depth = _series_depth(*primals)
+    d2 = depth * depth
+    share = 1 / (1 + compliance * (k_1 + 3 * k_3 * d2))
+    force = depth * (k_1 + k_3 * d2)
+    d_law = compliance * depth * (d_k_1 + d2 * d_k_3)
+    return depth, share * (d_displacement - force * d_compliance - d_law)
 
 
 def press_total(
