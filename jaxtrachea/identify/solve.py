@@ -317,9 +317,8 @@ def fresh_state(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Stat
     return State(theta, point, radius, jnp.asarray(0, jnp.int32), status)
 
 
-def _advance(problem, tolerances, rounds, lanes, jobs, sigma, start, refill, state):
+def _advance(problem, tolerances, rounds, lane, sigma, start, refill, state):
     """Put fresh lanes where asked, then up to `rounds` iterations of the whole chunk."""
-    lane = jax.tree.map(lambda v: v[jobs], lanes)
     new = jax.vmap(functools.partial(fresh_state, problem))(start, lane)
     put = lambda a, b: jnp.where(refill.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: E731
     state = jax.tree.map(put, new, state)
@@ -334,6 +333,11 @@ def _advance(problem, tolerances, rounds, lanes, jobs, sigma, start, refill, sta
         return (i < rounds) & jnp.any(state.status == RUNNING)
 
     return jax.lax.while_loop(go, body, (0, state))[1]
+
+
+def chunk_size(total: int, most: int) -> int:
+    """Lanes computed together: few different sizes, so that few programs are compiled."""
+    return 1 if total == 1 else min(most, max(16, 1 << (total - 1).bit_length()))
 
 
 def levenberg_marquardt(
@@ -366,9 +370,9 @@ def levenberg_marquardt(
         The `Solved` jobs, in order. Failed jobs are rows with a status; they touch no other row.
     """
     total = len(jobs)
-    chunk = min(chunk, 1 << max(0, (total - 1).bit_length()))
+    chunk = chunk_size(total, chunk)
     cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype)  # noqa: E731
-    lanes = jax.device_put(jax.tree.map(cast, problem.lanes))
+    lanes = jax.tree.map(cast, problem.lanes)
     advance = _compiled(problem.program, tolerances, rounds)
     state = _idle(problem, lanes, chunk, dtype)
     out = Solved(
@@ -386,10 +390,8 @@ def levenberg_marquardt(
         if np.all(owner < 0):
             return out
         of = np.maximum(owner, 0)
-        state = advance(
-            lanes, jobs[of].astype(np.int32), sigma[of].astype(dtype), starts[of].astype(dtype),
-            refill, state,
-        )  # fmt: skip
+        lane = jax.tree.map(lambda v, row=jobs[of]: v[row], lanes)
+        state = advance(lane, sigma[of].astype(dtype), starts[of].astype(dtype), refill, state)
         status = np.asarray(state.status)
         done = (owner >= 0) & (status != RUNNING)
         rows = owner[done]

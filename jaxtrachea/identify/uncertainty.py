@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from scipy.special import stdtrit
 
 from jaxtrachea.identify.problem import Lane, Problem, observations, residual
-from jaxtrachea.identify.solve import assemble, entry_scale, robust
+from jaxtrachea.identify.solve import assemble, chunk_size, entry_scale, robust
 
 #: Relative standard error up to which a parameter counts as identifiable, and as weakly so.
 IDENTIFIABLE, WEAK = 0.1, 0.5
@@ -88,7 +88,7 @@ def informations(
     problem: Problem, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, chunk: int = 256
 ) -> Information:
     """`information` of many lanes, on the host; leading axis = order of `lanes`."""
-    chunk = min(chunk, len(lanes))
+    chunk = chunk_size(len(lanes), chunk)
     run = _compiled(problem.program)
     parts = []
     for first in range(0, len(lanes), chunk):

@@ -1,0 +1,392 @@
+"""Whole fits: what was put in comes out, intervals cover, a batch is its lanes one by one."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import synthetic
+from scipy.optimize import least_squares
+
+from jaxtrachea.identify.descent import descend
+from jaxtrachea.identify.fit import Settings, first_sigma, fit
+from jaxtrachea.identify.measurements import read_measurements
+from jaxtrachea.identify.problem import Noise, build
+from jaxtrachea.identify.solve import Tolerances, levenberg_marquardt
+from jaxtrachea.identify.uncertainty import describe_flat
+from jaxtrachea.status import FitStatus
+
+#: Truths that four curves with 1 % noise identify: a soft contact that hardens early.
+CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    truth = synthetic.draw(7, 20, 1.3, CLEAR)
+    force, _ = synthetic.forces(truth)
+    rng = np.random.default_rng(8)
+    sigma = 0.01 * np.abs(force).max((1, 2), keepdims=True)
+    return truth, force + sigma * rng.normal(size=force.shape), sigma
+
+
+def test_noise_free_data_give_back_the_parameters():
+    """1,000 draws from two decades in each parameter, noise-free.
+
+    A lane counts as recoverable if it reports success, a condition number up to 1e6 (its error is
+    then rounding, 1e-15 of the data, times the condition and a margin) and residuals that are
+    rounding: some lanes have a second minimum, and its residual tells.
+    """
+    truth = synthetic.draw(1, 1000, 10.0)
+    force, _ = synthetic.forces(truth)
+    result = fit(synthetic.problem(force), Settings(starts=4))
+    error = np.abs(result.value / truth - 1).max(1)
+    condition = np.array([u.condition for u in result.uncertainty])
+    peak = np.abs(force).max((1, 2))
+    succeeded = result.status <= FitStatus.UNIDENTIFIABLE
+    fitted = result.rms[:, 0] <= 1e-12 * peak
+    should = succeeded & (condition <= 1e6) & fitted
+    assert error[should].max() <= 1e-6
+    assert should.sum() >= 970
+    second = succeeded & (condition <= 1e6) & ~fitted
+    assert second.sum() <= 5
+    # Whatever is not recovered says so: by status, condition number or residual.
+    assert not np.any((error > 1e-6) & should)
+    assert (~succeeded).sum() <= 10
+
+
+def _coverage(count, given):
+    truth = synthetic.draw(3, count, 1.3, CLEAR)
+    force, _ = synthetic.forces(truth)
+    sigma = 0.01 * np.abs(force).max((1, 2), keepdims=True)
+    force = force + sigma * np.random.default_rng(4).normal(size=force.shape)
+    changes = {n: {"value": float(v)} for n, v in zip(synthetic.NAMES, CLEAR, strict=True)}
+    if given:
+        data = [
+            dataclasses.replace(c, sigma=np.full(50, sigma[int(c.specimen[1:]), 0, 0]))
+            for c in synthetic.curves(force)
+        ]
+        problem = build(
+            data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(**changes)
+        )
+    else:
+        problem = synthetic.problem(force, changes=changes)
+    result = fit(problem, Settings(starts=1))
+    assert np.all(result.status == FitStatus.CONVERGED)
+    return np.mean((result.lower <= truth) & (truth <= result.upper), axis=0)
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_intervals_cover(given):
+    """600 fits: 95 % within four binomial standard deviations, 0.95 -+ 4 sqrt(.95 .05 / 600)."""
+    covered = _coverage(600, given)
+    assert np.all(np.abs(covered - 0.95) <= 4 * np.sqrt(0.95 * 0.05 / 600)), covered
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [False, True])
+def test_intervals_cover_5000(given):
+    covered = _coverage(5000, given)
+    assert np.all((covered >= 0.93) & (covered <= 0.97)), covered
+
+
+@pytest.mark.parametrize("loss", ["linear", "huber"])
+def test_a_batch_is_its_lanes_one_by_one(noisy, loss):
+    """The same lane alone, in a batch, elsewhere in the chunk and among others: to 1e-8."""
+    _, force, _ = noisy
+    problem = synthetic.problem(force, loss=loss)
+    starts = np.tile([p.to_scaled(p.value) for p, _, _ in problem.unknowns[0]], (20, 1))
+    sigma = first_sigma(problem)
+    solve = lambda jobs: levenberg_marquardt(  # noqa: E731
+        problem, jobs, starts[jobs], sigma[jobs], tolerances=Tolerances(iterations=60)
+    )
+    batch = solve(np.arange(20))
+    order = np.random.default_rng(0).permutation(20)
+    np.testing.assert_array_equal(solve(order).theta, batch.theta[order])
+    one = solve(np.array([13]))
+    np.testing.assert_allclose(one.theta[0], batch.theta[13], rtol=0, atol=1e-8)
+    assert one.status[0] == batch.status[13]
+
+
+def _put(v, i, x):
+    v[i] = x
+    return v
+
+
+_SPOIL = {
+    1: lambda d, f: (d, _put(f, 7, np.nan)),
+    2: lambda d, f: (d[:1], f[:1]),
+    3: lambda d, f: (_put(d, 20, 0.5), f),
+    4: lambda d, f: (d, 0 * f),
+    5: lambda d, f: (d, 1e9 * f),
+}
+
+
+def test_bad_specimens_cost_only_themselves(tmp_path):
+    """100 specimens, 7 of them bad in 7 ways: the other 93 come out as without them."""
+    force, _ = synthetic.forces(synthetic.draw(5, 100, 1.3, CLEAR))
+    lines = ["specimen,trial,s [mm],displacement [mm],force [N]"]
+    good = [lines[0]]
+    for i in range(100):
+        for j in range(4):
+            d, f = synthetic.DEPTHS.copy(), force[i, j].copy()
+            if i in _SPOIL:
+                d, f = _SPOIL[i](d, f)
+            if i in (6, 7):
+                continue
+            rows = [
+                f"s{i:03d},t{j},{float(synthetic.S_C[j])!r},{a!r},{b!r}"
+                for a, b in zip(d.tolist(), f.tolist(), strict=True)
+            ]
+            lines += rows
+            good += rows if i not in _SPOIL else []
+    (tmp_path / "all.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "good.csv").write_text("\n".join(good) + "\n")
+    (tmp_path / "s006.csv").write_text("displacement,force\n0.1,0.2\n0.3,0.4\n")
+    (tmp_path / "s007.csv").write_text("")
+    read = read_measurements([tmp_path / n for n in ("all.csv", "s006.csv", "s007.csv")])
+    assert {b.specimen for b in read.bad} == {f"s{i:03d}" for i in range(1, 8)}
+    assert {b.kind for b in read.bad} >= {"non_finite", "too_few_points", "non_monotone", "empty"}
+    study = lambda curves: build(  # noqa: E731
+        curves, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters()
+    )
+    with_bad = fit(study(read.curves), Settings(starts=1))
+    without = fit(study(read_measurements([tmp_path / "good.csv"]).curves), Settings(starts=1))
+    assert with_bad.lanes == without.lanes == 93
+    for name in ("theta", "standard_error", "cost", "status", "lower", "upper", "iterations"):
+        np.testing.assert_array_equal(getattr(with_bad, name), getattr(without, name))
+
+
+def test_an_infeasible_start_is_a_status_and_disturbs_nobody(noisy):
+    """Softening so strong that the start lies past the fold for one specimen's deep curves."""
+    _, force, _ = noisy
+    changes = {"k_3": {"value": -0.05, "lower": -1.0, "upper": 1.0, "scale": "linear"}}
+    table = synthetic.parameters(**changes)
+    shallow = 0.1 * synthetic.DEPTHS
+    near, _ = synthetic.forces(synthetic.draw(2, 3, 1.1), displacement=shallow)
+    deep = synthetic.curves(force[:1])
+    rest = [
+        dataclasses.replace(c, specimen="x" + c.specimen)
+        for c in synthetic.curves(near, displacement=shallow)
+    ]
+    make = lambda data: build(data, synthetic.GEOMETRY, synthetic.OPTIONS, table)  # noqa: E731
+    together = fit(make([*rest[:4], *deep, *rest[4:]]), Settings(starts=1))
+    alone = fit(make(rest), Settings(starts=1))
+    assert together.status[1] == FitStatus.INFEASIBLE_START
+    assert np.all(alone.status <= FitStatus.UNIDENTIFIABLE)
+    np.testing.assert_allclose(together.theta[[0, 2, 3]], alone.theta, rtol=0, atol=1e-8)
+
+
+def test_same_optimum_and_errors_as_scipy(noisy):
+    """20 lanes against MINPACK's lmder with the same residual."""
+    _, force, _ = noisy
+    problem = synthetic.problem(force)
+    result = fit(problem, Settings(starts=1))
+
+    def scipy(i):
+        def residual(theta):
+            values = np.exp(theta)[None]
+            return (synthetic.forces(values)[0][0] - force[i]).ravel() / result.sigma[i, 0]
+
+        def jacobian(theta):
+            h = 1e-3
+
+            def five(e):
+                near = residual(theta + h * e) - residual(theta - h * e)
+                return (8 * near - residual(theta + 2 * h * e) + residual(theta - 2 * h * e)) / (
+                    12 * h
+                )
+
+            return np.stack([five(e) for e in np.eye(4)], axis=1)
+
+        return least_squares(
+            residual, result.theta[i] + 0.05, jacobian, method="lm", xtol=1e-14, ftol=1e-14,
+            gtol=1e-14,
+        )  # fmt: skip
+
+    for i in range(20):
+        found = scipy(i)
+        # A relative change of the cost of 1e-10 is sqrt(2e-10 * 98) = 1.4e-4 standard errors.
+        error = result.standard_error[i] / result.value[i]
+        assert np.all(np.abs(result.theta[i] - found.x) <= 2e-4 * error)
+        covariance = np.linalg.inv(found.jac.T @ found.jac) * 2 * found.cost / 196
+        np.testing.assert_allclose(error, np.sqrt(np.diag(covariance)), rtol=1e-4)
+
+
+def test_one_position_leaves_skeleton_undetermined():
+    """As on an elastic foundation (c ~ EI^-1/4 k_M^-3/4) only EI k_M^3 is seen from one place."""
+    force, _ = synthetic.forces(np.array([[100.0, 1.0, 2.0, 0.2]]), s_c=np.array([75.0]))
+    data = synthetic.curves(force, s_c=np.array([75.0]))
+    problem = build(data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters())
+    result = fit(problem, Settings(starts=2))
+    assert result.status[0] == FitStatus.UNIDENTIFIABLE
+    flat = result.uncertainty[0].flat
+    ratio = flat[0] / flat[1]
+    # Beam on discrete rings, not on a continuum: the exponents are near 1 and 3.
+    assert -4.5 < ratio < -2.0
+    assert np.all(np.isinf(result.standard_error[0, :2]))
+    assert np.all(np.isfinite(result.standard_error[0, 2:]))
+    words = describe_flat([p.name for p, _, _ in problem.unknowns[0]], flat, np.inf)
+    assert "EI_L" in words
+    assert "k_M" in words
+
+
+def test_a_bound_is_hit_and_said(noisy):
+    """k_1 cannot reach its optimum: estimate on the bound, flagged, without a standard error."""
+    truth, force, _ = noisy
+    upper = 0.8 * truth[:, 2].min()
+    problem = synthetic.problem(
+        force, changes={"k_1": {"value": 0.2, "lower": 0.1, "upper": upper}}
+    )
+    result = fit(problem, Settings(starts=1))
+    assert np.all(result.status == FitStatus.AT_BOUND)
+    np.testing.assert_allclose(result.value[:, 2], upper, rtol=1e-12)
+    assert result.at_bound[:, 2].all()
+    assert np.isnan(result.standard_error[:, 2]).all()
+    assert np.isfinite(result.standard_error[:, 3]).all()
+
+
+@pytest.mark.parametrize(("scope", "lanes", "unknowns"), [("shared", 1, 4), ("specimen", 3, 4)])
+def test_scopes_count_their_unknowns(scope, lanes, unknowns):
+    truth = np.tile(CLEAR, (3, 1))
+    force, _ = synthetic.forces(truth)
+    changes = {name: {"scope": scope} for name in synthetic.NAMES}
+    result = fit(synthetic.problem(force, changes=changes), Settings(starts=1))
+    assert result.value.shape == (lanes, unknowns)
+    np.testing.assert_allclose(result.value, np.tile(CLEAR, (lanes, 1)), rtol=1e-6)
+
+
+def test_shared_and_specimen_mix():
+    """Skeleton shared by three specimens, contact of each its own: 2 + 3 x 2 unknowns."""
+    truth = np.tile(CLEAR, (3, 1))
+    truth[:, 2] *= [0.8, 1.0, 1.2]
+    force, _ = synthetic.forces(truth)
+    changes = {name: {"scope": "shared"} for name in ("EI_L", "k_M")}
+    result = fit(synthetic.problem(force, changes=changes), Settings(starts=1))
+    assert result.value.shape == (1, 8)
+    names = [(p.name, specimen) for p, specimen, _ in result.problem.unknowns[0]]
+    value = dict(zip(names, result.value[0], strict=True))
+    np.testing.assert_allclose(value["EI_L", ""], CLEAR[0], rtol=1e-6)
+    k_1 = [value["k_1", f"s{i:04d}"] for i in range(3)]
+    np.testing.assert_allclose(k_1, truth[:, 2], rtol=1e-6)
+
+
+def test_onset_and_offset_of_each_trial_are_recovered():
+    """Each trial touches elsewhere and its load cell has another zero."""
+    onset, offset = np.array([0.31, 0.47, 0.22, 0.6]), np.array([0.05, -0.1, 0.2, 0.0])
+    force = np.stack(
+        [
+            synthetic.forces(CLEAR[None], S, synthetic.DEPTHS - d)[0][0, 0] + f
+            for S, d, f in zip(synthetic.S_C[:, None], onset, offset, strict=True)
+        ]
+    )[None]
+    changes = {
+        "onset": {"fixed": False, "value": 0.3, "lower": 0.0, "upper": 3.0},
+        "force_offset": {"fixed": False},
+    }
+    result = fit(synthetic.problem(force, changes=changes), Settings(starts=1))
+    assert result.value.shape == (1, 12)
+    value = {(p.name, t): v for (p, _, t), v in zip(result.problem.unknowns[0], result.value[0])}  # noqa: B905
+    np.testing.assert_allclose([value["onset", f"t{j}"] for j in range(4)], onset, atol=1e-5)
+    np.testing.assert_allclose(
+        [value["force_offset", f"t{j}"] for j in range(4)], offset, atol=1e-5
+    )
+
+
+def test_unequal_lengths_do_not_change_results():
+    """A short curve padded beside long ones gives what it gives alone."""
+    truth = synthetic.draw(11, 2, 1.2, CLEAR)
+    force, _ = synthetic.forces(truth)
+    force += 0.01 * np.random.default_rng(1).normal(size=force.shape)
+    long = synthetic.curves(force[:1])
+    short = [
+        dataclasses.replace(
+            c, specimen="short", displacement=c.displacement[:35], force=c.force[:35]
+        )
+        for c in synthetic.curves(force[1:])
+    ]
+    make = lambda data: build(  # noqa: E731
+        data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(), balance="sample"
+    )
+    both = fit(make([*long, *short]), Settings(starts=1))
+    alone = fit(make(short), Settings(starts=1))
+    np.testing.assert_allclose(both.theta[1], alone.theta[0], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(both.standard_error[1], alone.standard_error[0], rtol=1e-8)
+    assert both.samples.tolist() == [200, 140]
+
+
+def test_float32_agrees(noisy):
+    _, force, _ = noisy
+    double = fit(synthetic.problem(force), Settings(starts=1))
+    single = fit(synthetic.problem(force), Settings(starts=1, float32=True))
+    assert single.value.dtype == np.float64
+    # A thousandth, or a thirtieth of the standard error where the data say less than that.
+    allowed = np.maximum(1e-3, double.relative_se / 30)
+    assert np.all(np.abs(single.value / double.value - 1) <= allowed)
+
+
+def test_more_starts_never_cost_more(noisy):
+    _, force, _ = noisy
+    one = fit(synthetic.problem(force), Settings(starts=1))
+    four = fit(synthetic.problem(force), Settings(starts=4))
+    assert np.all(four.cost <= one.cost * (1 + 1e-6))
+    assert np.all((four.converged_starts >= 1) & (four.converged_starts <= 4))
+    np.testing.assert_allclose(four.value, one.value, rtol=1e-4)
+
+
+def test_markers_with_both_noise_levels_estimated():
+    """Forces with 2 % and ring deflections with 0.02 mm noise: both levels are found."""
+    force, joints = synthetic.forces(synthetic.draw(13, 10, 1.2, CLEAR))
+    rng = np.random.default_rng(2)
+    level = 0.02 * np.abs(force).max()
+    force = force + level * rng.normal(size=force.shape)
+    rings = np.array([3, 8, 10])
+    seen = joints[..., rings] + 0.02 * rng.normal(size=(*force.shape, 3))
+    data = [
+        dataclasses.replace(c, joint_rings=rings, joint_displacement=seen[i // 4, i % 4])
+        for i, c in enumerate(synthetic.curves(force))
+    ]
+    problem = build(data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(joints=True))
+    result = fit(problem, Settings(starts=1))
+    # 200 and 600 samples: sd of an estimated level 5 % and 3 %; four of them.
+    np.testing.assert_allclose(result.sigma[:, 0], level, rtol=0.2)
+    np.testing.assert_allclose(result.sigma[:, 1], 0.02, rtol=0.12)
+    force_only = fit(synthetic.problem(force), Settings(starts=1))
+    assert np.all(result.standard_error[:, 1] < force_only.standard_error[:, 1])
+
+
+@pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy"])
+def test_robust_losses_as_scipy(noisy, loss):
+    """Outliers in one lane; the same loss, scale and sigma in scipy give the same estimate."""
+    _, force, sigma = noisy
+    force, level = force[:1].copy(), float(sigma[0, 0, 0])
+    force[0, :, ::9] += 20 * level
+    problem = synthetic.problem(force, loss=loss, noise=Noise(force=level))
+    result = fit(problem, Settings(starts=1))
+    assert result.status[0] == FitStatus.CONVERGED
+
+    def residual(theta):
+        return (synthetic.forces(np.exp(theta)[None])[0][0] - force[0]).ravel() / level
+
+    other = least_squares(
+        residual, result.theta[0] + 0.02, "3-point", loss=loss, f_scale=1.345, xtol=1e-12,
+        ftol=1e-14, gtol=1e-10, x_scale="jac", max_nfev=500,
+    )  # fmt: skip
+    assert result.cost[0] <= other.cost * (1 + 1e-8)
+    np.testing.assert_allclose(result.theta[0], other.x, rtol=0, atol=1e-3)
+    plain = fit(synthetic.problem(force, noise=Noise(force=level)), Settings(starts=1))
+    truth = noisy[0][0]
+    stray = lambda r: np.abs(np.log(r.value[0] / truth)).max()  # noqa: E731
+    assert stray(result) < stray(plain)
+
+
+@pytest.mark.parametrize(("method", "blocks"), [("lbfgs", 60), ("adam", 100)])
+def test_descent_reaches_the_same_minimum(noisy, method, blocks):
+    _, force, _ = noisy
+    problem = synthetic.problem(force)
+    sigma = first_sigma(problem)[:2]
+    truth = np.log(noisy[0][:2])
+    best = levenberg_marquardt(problem, np.arange(2), truth, sigma)
+    other = descend(
+        problem, np.arange(2), truth, sigma, method=method, tolerances=Tolerances(iterations=blocks)
+    )
+    assert np.all(other.cost <= best.cost * (1 + 1e-3))
+    assert np.all(other.cost >= best.cost * (1 - 1e-9))
