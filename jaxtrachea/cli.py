@@ -215,7 +215,8 @@ def _write(folder: Path, spec: Path, loaded, measurements, result, left_out, clo
     text = report.report_text(loaded.title or spec.stem, result, measurements.bad, seen, table)
     results.write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
-    timings = dict(zip(("read", "fit", "write"), map(float.__sub__, ends[1:], ends), strict=False))
+    phases = ("read", "fit", "write")
+    timings = {name: ends[i + 1] - ends[i] for i, name in enumerate(phases)}
     made = results.provenance(
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
     )

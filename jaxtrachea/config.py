@@ -198,7 +198,7 @@ class FitSpec(_Section):
     model: ModelSection = ModelSection()
     parameters: dict[str, ParameterSection] = {}
     noise: NoiseSection = NoiseSection()
-    fit: FitSection = FitSection()
+    fit: FitSection = Field(default_factory=lambda: FitSection.model_validate({}))
 
 
 def load_fit_spec(path: Path) -> FitSpec:

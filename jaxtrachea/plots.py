@@ -1,6 +1,7 @@
 """The figures of a fit (matplotlib, imported only here, and without a global backend)."""
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtrachea.identify.predictions import Prediction
 from jaxtrachea.identify.results import lane_label, unknown_label
 from jaxtrachea.report import ONE_BY_ONE
 
-_STYLE = {
+_STYLE: dict[Any, object] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,

@@ -53,7 +53,7 @@ def predictions(problem: Problem, theta: np.ndarray, chunk: int = 256) -> Predic
     with np.errstate(invalid="ignore", divide="ignore"):
         force = np.where(lanes.precision > 0, value[..., :samples] / lanes.precision, np.nan)
         joints = None
-        if lanes.joints is not None:
+        if lanes.joints is not None and lanes.joint_precision is not None:
             markers = value[..., samples:].reshape(lanes.joints.shape) / lanes.joint_precision
             joints = np.where(lanes.joint_precision > 0, markers, np.nan)
     return Prediction(force, joints)
@@ -152,7 +152,7 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
     return LeftOut(lane, trial, peak, joints, ratio, result)
 
 
-def rms(values: np.ndarray) -> np.ndarray:
+def rms(values: np.ndarray) -> np.ndarray | np.floating:
     """Root mean square along the last axis over what is not NaN; NaN if nothing is left."""
     known = ~np.isnan(values)
     with np.errstate(invalid="ignore"):

@@ -38,8 +38,8 @@ def find_files(spec: FitSpec, root: Path) -> list[Path]:
             matches = _matches(root, pattern)
         except (ValueError, NotImplementedError, IndexError, OSError) as error:
             raise SpecError(
-                f"data.files.{i}: {pattern!r} is no usable path ({_reason(error)}); name files, or a "
-                "pattern such as 'curves/*.csv'"
+                f"data.files.{i}: {pattern!r} is no usable path ({_reason(error)}); "
+                "name files, or a pattern such as 'curves/*.csv'"
             ) from None
         files = [path for path in matches if path.is_file()]
         if not files:

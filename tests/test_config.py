@@ -1,0 +1,90 @@
+"""The specification and its page say the same; defaults and quantities are what they claim."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from jaxtrachea import config
+from jaxtrachea.config import FitSpec, SpecError, load_fit_spec
+from jaxtrachea.identify.parameters import DEFAULTS
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "fit_spec.md").read_text()
+SECTIONS = {
+    "## Top level": FitSpec,
+    "## [data]": config.DataSection,
+    "## [trachea]": config.TracheaSection,
+    "### trachea.rings": config.EvenRings,
+    "## [model]": config.ModelSection,
+    "## [parameters.NAME]": config.ParameterSection,
+    "## [noise]": config.NoiseSection,
+    "## [fit]": config.FitSection,
+}
+
+
+def rows(heading):
+    body = PAGE.partition(heading + "\n")[2]
+    body = re.split(r"^##", body, maxsplit=1, flags=re.M)[0]
+    return re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \| (.+) \|$", body, re.M)
+
+
+@pytest.mark.parametrize("heading", SECTIONS)
+def test_page_lists_every_key_with_its_default(heading):
+    fields, listed = SECTIONS[heading].model_fields, rows(heading)
+    assert [name for name, *_ in listed] == list(fields)
+    for name, unit, default, meaning in listed:
+        field = fields[name]
+        assert unit
+        assert meaning
+        if field.is_required():
+            assert default == "needed"
+        elif field.default is None:
+            assert default in ("none", "its own")
+        elif name == "half_angle":
+            assert math.isclose(field.default, math.radians(120))
+            assert default == "`120` deg"
+        elif isinstance(field.default, str):
+            assert default == f'`"{field.default}"`'
+        elif isinstance(field.default, bool | int | float):
+            assert default.split()[0].strip("`") == (
+                "1e-10" if name == "tolerance" else str(field.default).lower()
+            )
+
+
+def test_page_names_every_parameter_and_unit():
+    text = PAGE.partition("## [parameters.NAME]")[2].partition("|")[0]
+    for p in DEFAULTS.values():
+        assert re.search(rf"`{p.name}`[^.]*{re.escape(p.unit)}", text)
+
+
+def test_quantities_come_in_internal_units(tmp_path):
+    path = tmp_path / "spec.toml"
+    path.write_text(
+        '[data]\nfiles = "a.csv"\ndisplacement_max = "0.9 cm"\n'
+        '[trachea]\nlength = "0.16 m"\nrings = ["1 cm", "20 mm"]\nhalf_angle = "100 deg"\n'
+        '[noise]\nforce = "2 mN"\n[parameters]\nk_1 = { bounds = [1, "2 kN/m"] }\n'
+    )
+    spec = load_fit_spec(path)
+    assert spec.data.files == ["a.csv"]
+    assert spec.data.displacement_max == 9.0
+    assert (spec.trachea.length, spec.trachea.rings) == (160.0, [10.0, 20.0])
+    assert math.isclose(spec.trachea.half_angle, math.radians(100))
+    assert (spec.noise.force, spec.noise.joints) == (0.002, "estimate")
+    assert spec.parameters["k_1"].bounds == (1, "2 kN/m")
+
+
+def test_every_problem_is_reported_at_once(tmp_path):
+    path = tmp_path / "spec.toml"
+    path.write_text('x = 1\n[data]\nfiles = 3\n[trachea]\nradius = "1 N"\n')
+    with pytest.raises(SpecError) as error:
+        load_fit_spec(path)
+    lines = str(error.value).splitlines()
+    assert len(lines) == 3
+    assert all(line.startswith(f"{path}: ") for line in lines)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "fits").glob("*/*.toml")), ids=lambda p: p.name)
+def test_shipped_specifications_load(path):
+    assert load_fit_spec(path).title

@@ -1,0 +1,199 @@
+"""Rows and files of a fit, and their page; a study with a failed, a bad and a trial-wise lane."""
+
+import csv
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from jaxtrachea.identify import results
+from jaxtrachea.identify.fit import Settings, fit
+from jaxtrachea.identify.measurements import BadCurve, Curve
+from jaxtrachea.identify.output import OutputExists, new_directory, new_output
+from jaxtrachea.identify.parameters import DEFAULTS
+from jaxtrachea.identify.predictions import curves_to_leave_out, leave_one_out, predictions, rms
+from jaxtrachea.identify.problem import build
+from jaxtrachea.model import Options
+from jaxtrachea.plots import draw_all
+from jaxtrachea.report import left_out_rows, markdown_table, number, report_text
+from jaxtrachea.status import FitStatus
+from jaxtrachea.trachea.geometry import table_1
+
+PAGE = (Path(__file__).parents[1] / "docs" / "results.md").read_text()
+BAD = BadCurve("T9", "1", "x.csv", "non_finite", "line 3: force is nan", "leave it out")
+TOTAL = Options(coupling="total")
+
+
+def curves():
+    """Two specimens of two trials, k_1 D + 0.1 D^3 with k_1 = 1 and 2; trial b 2 % stiffer."""
+    depth = np.linspace(0.1, 2, 12)
+    for s, k_1 in (("T1", 1.0), ("T2", 2.0)):
+        for trial, factor in (("a", 1.0), ("b", 1.02)):
+            yield Curve(s, trial, None, 0.0, depth, factor * (k_1 * depth + 0.1 * depth**3))
+
+
+def problem(**changes):
+    names = ["k_1", "k_3", "onset", "force_offset"]
+    table = [dataclasses.replace(DEFAULTS[n], **changes.get(n, {})) for n in names]
+    return build(list(curves()), table_1(), TOTAL, table)
+
+
+@pytest.fixture(scope="module")
+def result():
+    """Specimen-wise k_1 and k_3, trial-wise offset."""
+    offset = {"fixed": False}
+    return fit(problem(force_offset=offset), Settings(starts=1))
+
+
+def columns(heading):
+    body = re.split(r"^## ", PAGE.partition(heading)[2], maxsplit=1, flags=re.M)[0]
+    return re.findall(r"^\| `([\w/]+)` \|", body, re.M)
+
+
+def test_page_names_every_column(result):
+    rows = list(results.lane_rows(result))
+    names = list(rows[0])
+    head = columns("## summary.csv")
+    assert names[: len(head)] == head
+    assert names[len(head) : len(head) + 5] == [
+        *("k_1 [N/mm]", "k_1 se", "k_1 low95", "k_1 high95", "k_1 verdict")
+    ]
+    assert list(next(results.parameter_rows(result))) == columns("## parameters.csv")
+
+
+def test_page_names_every_dataset(result, tmp_path):
+    results.write_hdf5(tmp_path / "r.h5", result, {"a": 1})
+    found = {}
+    with h5py.File(tmp_path / "r.h5") as file:
+        file.visititems(lambda name, item: found.__setitem__(name, getattr(item, "shape", None)))
+        assert json.loads(file.attrs["provenance"]) == {"a": 1}
+        assert (file.attrs["schema"], file.attrs["schema_version"]) == ("jaxtrachea-results", 1)
+        assert json.loads(file["unknowns"].attrs["units"])["k_3"] == "N/mm^3"
+    shapes = {name: shape for name, shape in found.items() if shape is not None}
+    assert sorted(shapes) == sorted(columns("## results.h5"))
+    assert shapes["unknowns/correlation"] == (2, 4, 4)
+    with pytest.raises(FileExistsError):
+        results.write_hdf5(tmp_path / "r.h5", result, {})
+
+
+def test_trialwise_unknowns_are_named_by_trial(result):
+    labels = [results.unknown_label(result, 0, i) for i in range(4)]
+    assert labels == ["k_1", "k_3", "force_offset[a]", "force_offset[b]"]
+    rows = list(results.parameter_rows(result))
+    assert [(r["specimen"], r["trial"]) for r in rows[:4]] == [
+        *(("T1", "(all)"), ("T1", "(all)"), ("T1", "a"), ("T1", "b"))
+    ]
+    assert not any("force_offset" in name for name in next(results.lane_rows(result)))
+
+
+def test_failed_lane_keeps_its_row_and_is_called_failed(result):
+    status = result.status.copy()
+    status[1] = FitStatus.MAX_ITERATIONS
+    failed = dataclasses.replace(result, status=status)
+    good, bad = results.lane_rows(failed)
+    assert (good["status"], bad["status"]) == ("converged", "max_iterations")
+    assert bad["message"] == FitStatus.MAX_ITERATIONS.message
+    assert bad["k_1 verdict"] == "failed"
+    assert results.flat_sentence(failed, 1) == "no estimate"
+    text = report_text("T", failed, [BAD], predictions(result.problem, result.theta), None)
+    assert "2 lanes, 1 succeeded, 1 failed; 1 curves could not be used" in text
+    assert "| T9 | 1 | non_finite | line 3: force is nan | leave it out |" in text
+    assert "max iterations" in text
+
+
+def flat(result, direction, error):
+    u = result.uncertainty[0]._replace(flat=np.array(direction), flat_se=error)
+    return results.flat_sentence(dataclasses.replace(result, uncertainty=(u,)), 0)
+
+
+def test_flat_combination_in_words(result):
+    assert flat(result, [1.0, 0, 0, 0], 0.067) == "least determined: k_1 alone, known to 6.7 %"
+    assert flat(result, [0, 1.0, 0.05, 0], np.inf) == "k_3 changes no curve at all"
+    several = flat(result, [0.8, -0.6, 0, 0], 0.2)
+    assert several == "least determined: k_1 +10 %, k_3 -7.5 % together, known to 20 %"
+
+
+def test_rows_with_different_keys_make_one_table(tmp_path, result):
+    rows = [*results.lane_rows(result), results.bad_row(BAD)]
+    results.write_csv(tmp_path / "s.csv", rows)
+    with (tmp_path / "s.csv").open(newline="") as stream:
+        *_, last = csv.DictReader(stream)
+    assert last["status"] == "bad_data"
+    assert last["message"] == "non_finite: x.csv: line 3: force is nan; leave it out"
+    assert last["k_1 [N/mm]"] == ""
+
+
+def test_leaving_out_predicts_from_the_other_trial():
+    """The trial left out is 2 % stiffer or softer than the one that predicts it; exact data."""
+    study = problem()
+    left_out = leave_one_out(study, Settings(starts=1))
+    assert curves_to_leave_out(study) == [(0, 0), (0, 1), (1, 0), (1, 1)]
+    assert np.allclose(left_out.ratio, [1 / 1.02 - 1, 0.02] * 2, atol=1e-6)
+    assert np.all(np.isnan(left_out.joints))
+    rows = left_out_rows(left_out.result, left_out)
+    assert rows[-1][2] == "1.98 %"
+    assert rows[-1][4] == "–"
+
+
+def test_predictions_are_model_minus_data(result):
+    seen = predictions(result.problem, result.theta)
+    for lane in range(2):
+        k_1, k_3, *offsets = result.value[lane]
+        for t, curve in enumerate(result.problem.curves[lane]):
+            model = k_1 * curve.displacement + k_3 * curve.displacement**3 + offsets[t]
+            # The smooth touch (1 micrometre) shifts the displacement by less than 1e-5 mm here.
+            assert np.allclose(seen.force[lane, t], model - curve.force, atol=1e-4)
+    assert "N were measured" in seen.worst(result)
+    nothing = dataclasses.replace(seen, force=np.full_like(seen.force, np.nan))
+    assert nothing.worst(result) == "none, no finite prediction"
+
+
+def test_plots_of_many_lanes_and_of_nothing_finite(result, tmp_path):
+    seen = predictions(result.problem, result.theta)
+    for name, one in (
+        ("all", seen),
+        ("none", dataclasses.replace(seen, force=np.full_like(seen.force, np.nan))),
+    ):
+        (tmp_path / name).mkdir()
+        paths = draw_all(tmp_path / name, result, one)
+        assert all(p.read_bytes()[:4] == b"\x89PNG" for p in paths)
+
+
+def test_rms_skips_what_is_not_there():
+    values = np.array([[3.0, np.nan, 4.0], [np.nan] * 3])
+    assert np.array_equal(rms(values), [np.sqrt(12.5), np.nan], equal_nan=True)
+
+
+def test_numbers_and_tables_for_people():
+    assert [number(v) for v in (1.23456, np.nan, np.inf, 1e6)] == ["1.235", "–", "inf", "1e+06"]
+    table = markdown_table(["a", "b"], [["x|y", "two\nlines"]])
+    assert table == "| a | b |\n| --- | --- |\n| x\\|y | two lines |"
+
+
+def test_output_folder_is_new_or_empty(tmp_path):
+    default = tmp_path / "out" / "fit"
+    assert [new_directory(None, default).name for _ in range(3)] == ["fit", "fit-2", "fit-3"]
+    assert new_directory(default, default) == default
+    (default / "x").touch()
+    with pytest.raises(OutputExists, match="not empty"):
+        new_directory(default, default)
+
+
+def test_output_appears_complete_or_not_at_all(tmp_path):
+    with new_output(tmp_path / "a" / "b", tmp_path) as staging:
+        (staging / "x").write_text("1")
+        assert not (tmp_path / "a" / "b" / "x").exists()
+    assert [p.name for p in (tmp_path / "a" / "b").iterdir()] == ["x"]
+
+    def fail():
+        with new_output(tmp_path / "c" / "d", tmp_path) as staging:
+            (staging / "x").write_text("1")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]

@@ -1,0 +1,231 @@
+"""A batch through the command line: a bad file costs its own row and touches no other number."""
+
+import csv
+import json
+
+import h5py
+import numpy as np
+import pytest
+from run_cli import run
+
+from jaxtrachea.config import SpecError, TracheaSection, load_fit_spec
+from jaxtrachea.identify.measurements import Curve, DataError, Measurements, write_hdf5
+from jaxtrachea.identify.parameters import DEFAULTS
+from jaxtrachea.identify.study import find_files, geometry_of, parameters_of, read_data
+from jaxtrachea.model import Options
+
+SPEC = """
+[data]
+files = ["T*.csv", "T*.h5"]
+[model]
+coupling = "series"
+[parameters]
+EI_L = { fixed = 1400 }
+[fit]
+starts = 1
+"""
+N = 100
+
+
+def curve(i):
+    """Ten points of a hardening curve with a little scatter, different for every specimen."""
+    rng = np.random.default_rng(i)
+    k_1, k_3, compliance = rng.uniform(0.5, 2), rng.uniform(0.05, 0.2), rng.uniform(0.4, 0.8)
+    depth = np.linspace(0, 2, 10)
+    force = k_1 * depth + k_3 * depth**3
+    return depth + compliance * force, force * (1 + 1e-3 * rng.standard_normal(10))
+
+
+def text(displacement, force, unit=" [N]"):
+    rows = [f"{d!r},{f!r}" for d, f in zip(displacement.tolist(), force.tolist(), strict=True)]
+    return "\n".join([f"displacement [mm],force{unit}", *rows, ""])
+
+
+def write_study(folder, bad):
+    """100 specimens as files, CSV and HDF5 in turn; those in `bad` damaged, each in its own way."""
+    damage = {
+        "non_finite": lambda D, F: text(D, np.where(np.arange(10) == 4, np.nan, F)),
+        "unit_missing": lambda D, F: text(D, F, ""),
+        "empty": lambda D, F: "",
+        "too_few_points": lambda D, F: text(D[:1], F[:1]),
+        "non_monotone": lambda D, F: text(D[[0, 1, 2, 3, 9, 5, 6, 7, 8, 4]], F),
+        "no_signal": lambda D, F: text(D, 0 * F),
+        "absurd_scale": lambda D, F: text(1e6 * D, F),
+    }
+    for i in range(N):
+        D, F = curve(i)
+        kind = dict(zip(bad, damage, strict=True)).get(i) if bad else None
+        if kind is not None:
+            (folder / f"T{i:03d}.csv").write_text(damage[kind](D, F))
+        elif i % 2:
+            (folder / f"T{i:03d}.csv").write_text(text(D, F))
+        else:
+            one = Curve(f"T{i:03d}", "1", None, 0.0, D, F)
+            write_hdf5(folder / f"T{i:03d}.h5", Measurements((one,), (), ()))
+    (folder / "spec.toml").write_text(SPEC.replace("[data]", '[data]\ns = "75 mm"'))
+    return list(damage)
+
+
+def table(path):
+    with path.open(newline="") as stream:
+        return {row["specimen"]: row for row in csv.DictReader(stream)}
+
+
+@pytest.fixture(scope="module")
+def batch(tmp_path_factory):
+    """Folder of the study with seven bad files, and the same without them; both fitted."""
+    with pytest.MonkeyPatch.context() as patch:
+        capsys = _Silent()
+        bad = [3, 17, 31, 45, 59, 73, 99]
+        ill, well = tmp_path_factory.mktemp("ill"), tmp_path_factory.mktemp("well")
+        kinds = write_study(ill, bad)
+        write_study(well, bad)
+        for i in bad:
+            (well / f"T{i:03d}.csv").unlink()
+        codes = [
+            run(patch, capsys, "fit", folder / "spec.toml", "--out", folder / "out")[0]
+            for folder in (ill, well)
+        ]
+    return (
+        ill / "out",
+        well / "out",
+        dict(zip([f"T{i:03d}" for i in bad], kinds, strict=True)),
+        codes,
+    )
+
+
+class _Silent:
+    """`capsys` for a fixture that lives longer than one test."""
+
+    out = err = ""
+
+    def readouterr(self):
+        return self
+
+
+def test_every_specimen_has_a_row_and_bad_ones_a_reason(batch):
+    ill, _, bad, codes = batch
+    rows = table(ill / "summary.csv")
+    assert codes == [1, 0]
+    assert sorted(rows) == [f"T{i:03d}" for i in range(N)]
+    failed = {name: row for name, row in rows.items() if row["status"] == "bad_data"}
+    assert set(failed) == set(bad)
+    for name, kind in bad.items():
+        assert kind.replace("_", " ").split()[0] in failed[name]["message"].replace("_", " ")
+        assert f"{name}.csv" in failed[name]["message"]
+    assert (ill / "report.md").read_text().count("| T") >= 7
+
+
+def test_good_rows_are_those_of_a_run_without_the_bad(batch):
+    ill, well, bad, _ = batch
+    for name in ("summary.csv", "parameters.csv"):
+        mine, alone = table(ill / name), table(well / name)
+        assert len(alone) == N - 7
+        assert {k: v for k, v in mine.items() if k not in bad} == alone
+    with h5py.File(ill / "results.h5") as a, h5py.File(well / "results.h5") as b:
+        for name in ("unknowns/value", "unknowns/standard_error", "lanes/cost", "lanes/specimen"):
+            assert np.array_equal(a[name][()], b[name][()])
+
+
+def test_batch_finds_the_values_behind_the_curves(batch):
+    """Every k_1 within four of its standard errors, none of which is above 10 %."""
+    for name, row in table(batch[1] / "summary.csv").items():
+        truth = np.random.default_rng(int(name[1:])).uniform(0.5, 2)
+        assert abs(float(row["k_1 [N/mm]"]) - truth) < 4 * float(row["k_1 se"])
+        assert float(row["k_1 se"]) < 0.1 * truth
+
+
+def test_provenance_names_every_input(batch):
+    made = json.loads((batch[0] / "provenance.json").read_text())
+    assert len(made["inputs"]) == N
+
+
+@pytest.fixture
+def two(tmp_path):
+    D, F = curve(1)
+    for name in "ab":
+        (tmp_path / f"{name}.csv").write_text(text(D, F))
+    (tmp_path / "spec.toml").write_text('[data]\nfiles = "*.csv"')
+    return tmp_path
+
+
+def test_same_specimen_in_two_files_is_refused(two):
+    text_ = "specimen," + (two / "a.csv").read_text().replace("\n", "\nT01,").removesuffix("T01,")
+    for name in "ab":
+        (two / f"{name}.csv").write_text(text_)
+    spec = load_fit_spec(two / "spec.toml")
+    with pytest.raises(DataError, match=r"'T01' trial '1' was already in .*a\.csv.*; rename one"):
+        read_data(spec, two)
+
+
+def test_unreadable_file_stops_only_a_study_of_itself(two):
+    (two / "b.csv").write_bytes(b"\0\0")
+    spec = load_fit_spec(two / "spec.toml")
+    measured = read_data(spec, two)
+    assert [c.specimen for c in measured.curves] == ["a"]
+    (bad,) = measured.bad
+    assert (bad.specimen, bad.kind, bad.source) == ("b", "unreadable", str(two / "b.csv"))
+    assert "zero bytes" in bad.message
+    assert bad.cure.startswith("export")
+    (two / "a.csv").unlink()
+    with pytest.raises(DataError, match="zero bytes"):
+        read_data(spec, two)
+
+
+def test_files_come_once_sorted_and_by_their_own_name(two):
+    (two / "c[1].csv").write_text("")
+    spec = load_fit_spec(two / "spec.toml")
+
+    def found(*files):
+        data = spec.data.model_copy(update={"files": list(files)})
+        paths = find_files(spec.model_copy(update={"data": data}), two)
+        return [p.resolve().name for p in paths]
+
+    assert found("b.csv", "*.csv") == ["b.csv", "a.csv", "c[1].csv"]
+    assert found("c[1].csv") == ["c[1].csv"]
+    assert found(f"{two}/*.csv", "a.csv") == ["a.csv", "b.csv", "c[1].csv"]
+    assert found(f"../{two.name}/a.csv") == ["a.csv"]
+
+
+def test_radius_counts_without_rings():
+    section = TracheaSection.model_validate({"radius": "9 mm", "half_angle": "100 deg"})
+    geometry = geometry_of(section)
+    assert float(geometry.radius) == 9.0
+    assert np.isclose(float(geometry.half_angle), np.radians(100))
+    assert geometry.rings == 15
+
+
+@pytest.mark.parametrize("count", [1, 2, 16])
+def test_even_rings(count):
+    rings = {"count": count, "first": "6 mm", "last": "114 mm"}
+    section = TracheaSection.model_validate({"length": "120 mm", "rings": rings})
+    assert np.allclose(geometry_of(section).ring_positions, np.linspace(6, 114, count), rtol=1e-15)
+
+
+def parameters(two, toml, options=Options()):  # noqa: B008
+    (two / "spec.toml").write_text(f'[data]\nfiles = "*.csv"\n[parameters]\n{toml}')
+    table = parameters_of(load_fit_spec(two / "spec.toml"), options, joints=False)
+    return {p.name: p for p in table}
+
+
+def test_parameters_take_quantities_bounds_and_scales(two):
+    made = parameters(
+        two,
+        'k_1 = { initial = "2 kN/m", bounds = [0.5, "4 N/mm"] }\nk_M = { bounds = [3, 5] }\n'
+        'k_3 = { scale = "log" }\nEI_L = { fixed = "1 N m^2" }\nonset = {}',
+    )
+    k_1 = made["k_1"]
+    assert (k_1.value, k_1.lower, k_1.upper, k_1.fixed) == (2.0, 0.5, 4.0, False)
+    assert made["k_M"].value == 3.0
+    assert made["k_3"].lower == 1e-9
+    assert (made["EI_L"].value, made["EI_L"].fixed) == (1e6, True)
+    assert not made["onset"].fixed
+    assert DEFAULTS["onset"].fixed
+
+
+def test_ring_hardening_is_free_only_if_named(two):
+    options = Options(local="two-material")
+    assert "k_3_ring" not in parameters(two, "k_1 = {}", options)
+    assert "k_3_ring" in parameters(two, "k_3_ring = {}", options)
+    with pytest.raises(SpecError, match=r"parameters\.k_3_ring: not seen by this model"):
+        parameters(two, "k_3_ring = {}")
