@@ -19,7 +19,8 @@ ORDER = [
     {"surface"},
     {"model"},
     {"identify"},
-    {"report", "viewer", "study"},
+    {"report"},
+    {"plots", "viewer", "study"},
     {"cli"},
     {"__main__"},
 ]

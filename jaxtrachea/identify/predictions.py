@@ -142,13 +142,13 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
     model = np.where(lanes.precision[rows, trial] > 0, data + force, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.sum(data * model, axis=1) / np.sum(model * model, axis=1) - 1
-        peak = rms(force) / np.max(np.abs(data), axis=1)
+        peak = np.asarray(rms(force)) / np.max(np.abs(data), axis=1)
     joints = np.full(len(lane), np.nan)
     if seen.joints is not None:
         D = np.abs(lanes.displacement[rows, trial])
         moved = D > 0.5 * np.max(D, axis=1, keepdims=True)
         share = seen.joints[rows, trial] / np.where(moved, D, np.nan)[:, :, None]
-        joints = rms(share.reshape(len(lane), -1))
+        joints = np.asarray(rms(share.reshape(len(lane), -1)))
     return LeftOut(lane, trial, peak, joints, ratio, result)
 
 
