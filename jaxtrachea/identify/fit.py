@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from jaxtrachea.identify import descent
-from jaxtrachea.identify.problem import Lane, Problem
+from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.solve import Solved, Tolerances, levenberg_marquardt
 from jaxtrachea.identify.uncertainty import Information, Uncertainty, analyse, informations
 from jaxtrachea.status import FitStatus
@@ -32,7 +32,7 @@ class Settings:
     starts: int = 4
     decades: float = 1.0
     seed: int = 0
-    chunk: int = 256
+    chunk: int = 64
     tolerances: Tolerances = Tolerances()
     float32: bool = False
 
@@ -198,74 +198,60 @@ def _best(solved: Solved, lanes: int, starts: int) -> tuple[np.ndarray, np.ndarr
 
 def _conclude(problem, solved: Solved, info: Information, sigma, agree) -> FitResult:
     """Standard errors, intervals and final statuses of all lanes."""
-    lanes, P = solved.theta.shape
-    value, relative = np.full((lanes, P), np.nan), np.ones((lanes, P))
-    low, high, se = value.copy(), value.copy(), value.copy()
-    relative_se = value.copy()
-    at_bound = np.zeros((lanes, P), bool)
-    status = solved.status.copy()
-    uncertainties = []
-    both = problem.lanes.joints is None or problem.noise_given[1]
-    given = problem.noise_given[0] and both
-    for lane, unknowns in enumerate(problem.unknowns):
-        at_bound[lane] = _on_bound(problem.lanes, lane, solved.theta[lane], info.gradient[lane])
-        theta = solved.theta[lane]
-        for i, (p, _, _) in enumerate(unknowns):
-            value[lane, i] = p.from_scaled(theta[i])
-            if p.scale == "linear":
-                relative[lane, i] = max(abs(theta[i]), 1e-3)
-        held = at_bound[lane] | (problem.lanes.active[lane] == 0)
-        one = Information(*(v[lane] for v in info))
-        u = analyse(one, relative[lane], held, noise_given=given)
-        uncertainties.append(u)
-        for i, (p, _, _) in enumerate(unknowns):
-            slope = value[lane, i] if p.scale == "log" else p.step
-            se[lane, i] = u.se[i] * slope
-            relative_se[lane, i] = u.se[i] / relative[lane, i]
-            with np.errstate(over="ignore"):
-                ends = (theta[i] + side * u.half_width * u.se[i] for side in (-1, 1))
-                low[lane, i], high[lane, i] = (_unscale(p, end) for end in ends)
-        status[lane] = _final_status(status[lane], u, at_bound[lane], one, held)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    lanes, theta = problem.lanes, solved.theta
+    log, step = _scales(problem)
+    both = lanes.joints is None or problem.noise_given[1]
+    at_bound = (theta <= lanes.lower) & (info.gradient > 0)
+    at_bound |= (theta >= lanes.upper) & (info.gradient < 0)
+    present = lanes.active > 0
+    at_bound &= present
+    held = at_bound | ~present
+    relative = np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))
+    u = analyse(info, relative, held, noise_given=problem.noise_given[0] and both)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        unscale = lambda v: np.where(present, np.where(log, np.exp(v), v * step), np.nan)  # noqa: E731
+        value = unscale(theta)
+        half = u.half_width[:, None] * u.se
         rms = np.sqrt(info.squares / info.counts)
+        standard_error = u.se * np.where(log, value, step)
     unit = _precision_unit(problem)
+    samples = np.sum(info.counts, axis=1)
+    status = _final_status(solved.status, u, at_bound, samples - np.sum(~held, axis=1))
     return FitResult(
-        problem=problem, theta=solved.theta, value=value, standard_error=se, lower=low, upper=high,
-        relative_se=relative_se, at_bound=at_bound, status=status, iterations=solved.iterations,
-        cost=solved.cost, converged_starts=agree, sigma=sigma * unit, rms=rms * unit,
-        samples=np.asarray(info.counts).sum(axis=1), uncertainty=tuple(uncertainties),
+        problem=problem, theta=theta, value=value, standard_error=standard_error,
+        lower=unscale(theta - half), upper=unscale(theta + half), relative_se=u.se / relative,
+        at_bound=at_bound, status=status, iterations=solved.iterations, cost=solved.cost,
+        converged_starts=agree, sigma=sigma * unit, rms=rms * unit, samples=samples,
+        uncertainty=tuple(Uncertainty(*row) for row in zip(*u, strict=True)),
     )  # fmt: skip
 
 
-def _unscale(p, theta: float) -> float:
-    if not np.isfinite(theta):
-        return theta if p.scale == "linear" else (0.0 if theta < 0 else theta)
-    return float(np.exp(min(theta, 700.0))) if p.scale == "log" else theta * p.step
+def _scales(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Which unknowns have a logarithmic scale, and the step of the others; (lanes, P) each."""
+    log = np.zeros(problem.lanes.lower.shape, bool)
+    step = np.ones(log.shape)
+    for lane, unknowns in enumerate(problem.unknowns):
+        for i, (p, _, _) in enumerate(unknowns):
+            log[lane, i], step[lane, i] = p.scale == "log", p.step
+    return log, step
 
 
-def _on_bound(lanes: Lane, lane: int, theta, gradient) -> np.ndarray:
-    low = (theta <= lanes.lower[lane]) & (gradient > 0)
-    high = (theta >= lanes.upper[lane]) & (gradient < 0)
-    return (low | high) & (lanes.active[lane] > 0)
-
-
-def _final_status(status, u: Uncertainty, at_bound, info: Information, held) -> int:
-    if not FitStatus(status).succeeded:
-        return int(status)
-    if np.sum(info.counts) < np.sum(~held):
-        return int(FitStatus.TOO_FEW_DATA)
-    if not np.isfinite(u.condition):
-        return int(FitStatus.UNIDENTIFIABLE)
-    return int(FitStatus.AT_BOUND if np.any(at_bound) else FitStatus.CONVERGED)
+def _final_status(status, u: Uncertainty, at_bound, dof) -> np.ndarray:
+    """What the solver said, and for what it solved: too few data, undetermined, on a bound."""
+    solved = status <= FitStatus.UNIDENTIFIABLE
+    fine = np.where(np.any(at_bound, axis=1), FitStatus.AT_BOUND, FitStatus.CONVERGED)
+    fine = np.where(np.isfinite(u.condition), fine, FitStatus.UNIDENTIFIABLE)
+    return np.where(solved, np.where(dof < 0, FitStatus.TOO_FEW_DATA, fine), status).astype(int)
 
 
 def _precision_unit(problem: Problem) -> np.ndarray:
     """Given sigma that one unit of whitened residual stands for (median); (lanes, 2)."""
 
-    def median(precision):
+    def typical(precision, given):
+        if precision is None or not given:
+            return np.ones(len(problem.lanes.s_c))
         flat = precision.reshape(len(precision), -1)
         return np.array([1 / np.median(row[row > 0]) if np.any(row > 0) else 1.0 for row in flat])
 
-    lanes = problem.lanes
-    joints = np.ones(len(lanes.s_c)) if lanes.joints is None else median(lanes.joint_precision)
-    return np.stack([median(lanes.precision), joints], axis=1)
+    lanes, (force, joints) = problem.lanes, problem.noise_given
+    return np.stack([typical(lanes.precision, force), typical(lanes.joint_precision, joints)], 1)

@@ -58,9 +58,9 @@ def flat_sentence(result: FitResult, lane: int) -> str:
     u = result.uncertainty[lane]
     size = np.abs(u.flat[: len(names)])
     if np.sum(size >= 0.1 * np.max(size)) != 1:
-        return describe_flat(names, u.flat, u.flat_se)
+        return describe_flat(names, u.flat, float(u.flat_se))
     name = names[int(np.argmax(size))]
-    if not np.isfinite(u.flat_se):
+    if not np.isfinite(float(u.flat_se)):
         return f"{name} changes no curve at all"
     return f"least determined: {name} alone, known to {100 * u.flat_se:.2g} %"
 

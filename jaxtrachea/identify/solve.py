@@ -347,8 +347,8 @@ def levenberg_marquardt(
     sigma: np.ndarray,
     *,
     tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
-    chunk: int = 256,
-    rounds: int = 8,
+    chunk: int = 64,
+    rounds: int = 4,
     progress: Callable[[int], None] | None = None,
     dtype=np.float64,
 ) -> Solved:

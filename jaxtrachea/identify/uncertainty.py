@@ -34,7 +34,7 @@ class Information(NamedTuple):
         squares: sum of squared residuals of force (N^2) and markers (mm^2) in units of the given
             precision; (2,).
         counts: observed entries of each; (2,).
-        spread: median absolute residual of each, same units; (2,).
+        spread: median absolute residual of each, same units, 0 with a linear loss; (2,).
         psi2: mean of psi(z)^2 over observed entries.
         dpsi: mean of psi'(z).
     """
@@ -69,9 +69,14 @@ def information(
     total = jnp.sum(seen)
     kinds = jnp.arange(seen.shape[1]) < forces
     by_kind = lambda v: jnp.stack([jnp.sum(v[:, :forces]), jnp.sum(v[:, forces:])])  # noqa: E731
-    spread = lambda k: jnp.nanmedian(  # noqa: E731
-        jnp.where((seen > 0) & (kinds == k)[None], jnp.abs(r.value), jnp.nan)
-    )
+
+    def spread(force):
+        # A sort, and the dearest part of all this: only where the noise is taken from it.
+        if problem.loss == "linear":
+            return jnp.zeros((), theta.dtype)
+        mine = (seen > 0) & (kinds == force)[None]
+        return jnp.nanmedian(jnp.where(mine, jnp.abs(r.value), jnp.nan))
+
     return Information(
         bread=gram(b2),
         meat=gram(b2 * b2),
@@ -106,7 +111,7 @@ def _compiled(problem: Problem):
 
 
 class Uncertainty(NamedTuple):
-    """Local uncertainty of one lane's unknowns, numpy; NaN where an unknown is held on a bound.
+    """Local uncertainty of a lane's unknowns, numpy; NaN where an unknown is held on a bound.
 
     Attributes:
         se: standard error in scaled coordinates; inf where undetermined; (P,).
@@ -120,54 +125,91 @@ class Uncertainty(NamedTuple):
 
     se: np.ndarray
     correlation: np.ndarray
-    condition: float
+    condition: np.ndarray
     flat: np.ndarray
-    flat_se: float
-    half_width: float
+    flat_se: np.ndarray
+    half_width: np.ndarray
 
 
 def analyse(
     info: Information, relative: np.ndarray, held: np.ndarray, *, noise_given: bool
 ) -> Uncertainty:
-    """Turn the information of one lane into standard errors and directions.
+    """Turn the information of all lanes into standard errors and directions.
 
     Args:
-        info: of this lane, numpy.
-        relative: change of each scaled coordinate that makes a relative change of 1; (P,).
-        held: unknowns that are absent or on a bound; (P,).
+        info: numpy, leading axis = lanes.
+        relative: change of each scaled coordinate that makes a relative change of 1; (lanes, P).
+        held: unknowns that are absent or on a bound; (lanes, P).
         noise_given: whether sigma is known, so that residuals do not scale the covariance.
+
+    Returns:
+        One record whose arrays have the leading axis of lanes.
     """
-    P = len(held)
-    free = np.flatnonzero(~held)
-    se, correlation = np.full(P, np.nan), np.full((P, P), np.nan)
-    flat = np.zeros(P)
-    total = float(np.sum(info.counts))
-    dof = total - len(free)
-    half = float(stdtrit(dof, 0.975)) if dof > 0 and not noise_given else 1.959963984540054
-    usable = len(free) and np.all(np.isfinite(info.bread)) and dof >= 0
-    if not usable:
-        return Uncertainty(se, correlation, np.inf, flat, np.inf, half)
-    kappa = 1.0 if noise_given else float(info.psi2) * total / max(dof, 1)
-    kappa /= max(float(info.dpsi), 1e-3) ** 2
-    u = relative[free]
-    bread = info.bread[np.ix_(free, free)] * u[:, None] * u[None]
-    meat = info.meat[np.ix_(free, free)] * u[:, None] * u[None]
-    eigenvalues, vectors = np.linalg.eigh(bread)
-    singular = np.sqrt(np.maximum(eigenvalues, 0))
-    lost = singular <= SINGULAR * singular[-1] if singular[-1] > 0 else np.ones(len(free), bool)
-    inverse = vectors[:, ~lost] / eigenvalues[~lost] @ vectors[:, ~lost].T
-    covariance = kappa * inverse @ meat @ inverse
-    variance = np.diag(covariance).copy()
-    variance[np.any(np.abs(vectors[:, lost]) > 1e-3, axis=1)] = np.inf
-    se[free] = np.sqrt(variance) * u
+    free = ~held
+    total = np.sum(info.counts, axis=1)
+    dof = total - np.sum(free, axis=1)
+    half = np.full(len(dof), 1.959963984540054)
+    if not noise_given:
+        half = np.where(dof > 0, stdtrit(np.maximum(dof, 1), 0.975), half)
+    usable = free.any(axis=1) & np.isfinite(info.bread).all(axis=(1, 2)) & (dof >= 0)
+    free = free & usable[:, None]
+    kappa = np.ones(len(dof)) if noise_given else np.asarray(info.psi2) * total / np.maximum(dof, 1)
+    kappa = kappa / np.maximum(info.dpsi, 1e-3) ** 2
+    unit = relative * free
+    values, vectors = _spectrum(_scaled(np.asarray(info.bread), unit), free)
+    inverse = np.einsum("lpk,lk,lqk->lpq", vectors, 1 / values, vectors)
+    meat = _scaled(np.asarray(info.meat), unit) * kappa[:, None, None]
+    covariance = inverse @ meat @ inverse
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    blind = np.any((np.abs(vectors) > 1e-3) & np.isinf(values)[:, None], axis=2)
     with np.errstate(invalid="ignore", divide="ignore"):
-        root = np.sqrt(np.diag(covariance))
-        correlation[np.ix_(free, free)] = covariance / root[:, None] / root[None]
-    v = vectors[:, 0]
-    flat[free] = v * np.sign(v[np.argmax(np.abs(v))])
-    flat_se = np.inf if lost[0] else float(np.sqrt(v @ covariance @ v))
-    condition = np.inf if lost[0] else float(singular[-1] / singular[0])
+        root = np.sqrt(variance)
+        correlation = covariance / root[:, :, None] / root[:, None]
+    se = np.where(free, np.where(blind, np.inf, np.sqrt(variance)) * relative, np.nan)
+    both = free[:, :, None] & free[:, None]
+    condition, flat, flat_se = _flattest(values, vectors, free, covariance)
+    correlation = np.where(both, correlation, np.nan)
     return Uncertainty(se, correlation, condition, flat, flat_se, half)
+
+
+def _scaled(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Matrices in relative coordinates; rows and columns of held unknowns are zero."""
+    product = unit[:, :, None] * unit[:, None]
+    return np.where(product != 0, matrix, 0) * product
+
+
+def _spectrum(matrix: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues and vectors of the free block; inf for a held direction or a singular one.
+
+    Held unknowns get a diagonal entry within the spectrum of the others, so that they neither mix
+    with them nor set its ends.
+    """
+    top = np.max(np.diagonal(matrix, axis1=1, axis2=2), axis=1)
+    top = np.where(top > 0, top, 1)[:, None]
+    eye = np.eye(matrix.shape[1])
+    values, vectors = np.linalg.eigh(matrix + eye * (~free * top)[:, :, None])
+    own = np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5
+    largest = np.max(np.where(own, values, 0), axis=1, keepdims=True)
+    keep = own & (values > SINGULAR**2 * largest)
+    return np.where(keep, values, np.inf), vectors
+
+
+def _flattest(values, vectors, free, covariance):
+    """Condition number, least determined direction and its standard error, of all lanes."""
+    lanes = np.arange(len(values))
+    own = np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5
+    singular = np.any(np.isinf(values) & own, axis=1) | ~free.any(axis=1)
+    order = np.where(own, np.where(np.isinf(values), -1, values), np.inf)
+    flattest = np.argmin(order, axis=1)
+    v = vectors[lanes, :, flattest] * free
+    sign = np.sign(v[lanes, np.argmax(np.abs(v), axis=1)])
+    flat = v * sign[:, None]
+    variance = np.einsum("lp,lpq,lq->l", flat, covariance, flat)
+    largest = np.max(np.where(own & np.isfinite(values), values, 0), axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        condition = np.sqrt(largest / values[lanes, flattest])
+    flat_se = np.where(singular, np.inf, np.sqrt(np.maximum(variance, 0)))
+    return np.where(singular, np.inf, condition), flat, flat_se
 
 
 def verdict(relative_se: float, held: bool) -> str:

@@ -76,7 +76,7 @@ def _sweep(side: _Side) -> tuple[_Node, _Node, Float[Array, " n"]]:
         h, EI, GA, k, load = ring
         g, free = _add_span(node, h, EI, GA)
         passed = 1 / (1 + k * g.a)
-        if load is not None:
+        if load is not None and free is not None:
             pull = (load - k * free[0]) * passed
             free = (free[0] + g.a * pull, free[1] + g.b * pull)
         node = _Node(add_support(g, k), free)
@@ -91,10 +91,12 @@ def _sweep(side: _Side) -> tuple[_Node, _Node, Float[Array, " n"]]:
 
 def _both_sides(beam: Beam, ring_load=None) -> _Side:
     """The beam read from A and from B, stacked on a leading axis."""
-    both = lambda v: None if v is None else jnp.stack([v, v[::-1]])  # noqa: E731
+    both = lambda v: jnp.stack([v, v[::-1]])  # noqa: E731
     # Span lengths before mirroring: length - x would cost short spans their digits.
     h = both(jnp.diff(_ends(beam)))
-    return _Side(h, both(beam.EI), both(beam.GA), both(beam.k), both(ring_load))
+    GA = None if beam.GA is None else both(beam.GA)
+    load = None if ring_load is None else both(ring_load)
+    return _Side(h, both(beam.EI), GA, both(beam.k), load)
 
 
 def _ends(beam: Beam):
@@ -162,9 +164,10 @@ def contact_compliance(
 
     def one(s_c):
         count, last, s = _reach(beam, s_c)
-        at = lambda v: None if v is None else v[jnp.arange(2), count]  # noqa: E731
-        g = Compliance(*map(at, nodes.g))
-        return _compliance_at(add_span(g, last, at(both.EI), at(both.GA)), s, split)
+        at = lambda v: v[jnp.arange(2), count]  # noqa: E731
+        GA = None if both.GA is None else at(both.GA)
+        tips = add_span(jax.tree.map(at, nodes.g), last, at(both.EI), GA)
+        return _compliance_at(tips, s, split)
 
     return jax.vmap(one)(s_c)
 
