@@ -33,7 +33,7 @@ def curve(i):
     k_1, k_3, compliance = rng.uniform(0.5, 2), rng.uniform(0.05, 0.2), rng.uniform(0.4, 0.8)
     depth = np.linspace(0, 2, 10)
     force = k_1 * depth + k_3 * depth**3
-    return depth + compliance * force, force * (1 + 1e-3 * rng.standard_normal(10))
+    return depth + compliance * force, force + 1e-3 * force[-1] * rng.standard_normal(10)
 
 
 def text(displacement, force, unit=" [N]"):
@@ -124,15 +124,16 @@ def test_good_rows_are_those_of_a_run_without_the_bad(batch):
         assert {k: v for k, v in mine.items() if k not in bad} == alone
     with h5py.File(ill / "results.h5") as a, h5py.File(well / "results.h5") as b:
         for name in ("unknowns/value", "unknowns/standard_error", "lanes/cost", "lanes/specimen"):
-            assert np.array_equal(a[name][()], b[name][()])
+            np.testing.assert_array_equal(a[name][()], b[name][()])
 
 
 def test_batch_finds_the_values_behind_the_curves(batch):
-    """Every k_1 within four of its standard errors, none of which is above 10 %."""
+    """95 % intervals hold k_1 in 95 % of specimens, less three binomial deviations (2.3 %)."""
+    held = []
     for name, row in table(batch[1] / "summary.csv").items():
         truth = np.random.default_rng(int(name[1:])).uniform(0.5, 2)
-        assert abs(float(row["k_1 [N/mm]"]) - truth) < 4 * float(row["k_1 se"])
-        assert float(row["k_1 se"]) < 0.1 * truth
+        held.append(float(row["k_1 low95"]) < truth < float(row["k_1 high95"]))
+    assert np.mean(held) > 0.88
 
 
 def test_provenance_names_every_input(batch):
