@@ -4,20 +4,50 @@ Forward: `press(geometry, material, s_c, displacement, options)`. Identification
 `jaxtrachea.identify`; from the command line: `jaxtrachea check SPEC`, `jaxtrachea fit SPEC`.
 Units: mm, N, MPa, rad. The package never changes JAX's configuration; fits want float64
 (`jax.config.update("jax_enable_x64", True)`).
+
+Names are loaded when they are first used, so that the command line answers before JAX is imported.
 """
 
-from jaxtrachea.mechanics.beam import Beam as Beam
-from jaxtrachea.mechanics.beam import contact_compliance as contact_compliance
-from jaxtrachea.mechanics.beam import deflect as deflect
-from jaxtrachea.mechanics.force_law import Law as Law
-from jaxtrachea.mechanics.force_law import duffing as duffing
-from jaxtrachea.model import Options as Options
-from jaxtrachea.model import Press as Press
-from jaxtrachea.model import press as press
-from jaxtrachea.status import FitStatus as FitStatus
-from jaxtrachea.status import PressStatus as PressStatus
-from jaxtrachea.trachea.geometry import Geometry as Geometry
-from jaxtrachea.trachea.geometry import table_1 as table_1
-from jaxtrachea.trachea.material import Material as Material
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxtrachea.mechanics.beam import Beam as Beam
+    from jaxtrachea.mechanics.beam import contact_compliance as contact_compliance
+    from jaxtrachea.mechanics.beam import deflect as deflect
+    from jaxtrachea.mechanics.force_law import Law as Law
+    from jaxtrachea.mechanics.force_law import duffing as duffing
+    from jaxtrachea.model import Options as Options
+    from jaxtrachea.model import Press as Press
+    from jaxtrachea.model import press as press
+    from jaxtrachea.status import FitStatus as FitStatus
+    from jaxtrachea.status import PressStatus as PressStatus
+    from jaxtrachea.trachea.geometry import Geometry as Geometry
+    from jaxtrachea.trachea.geometry import table_1 as table_1
+    from jaxtrachea.trachea.material import Material as Material
 
 __version__ = "0.1.0"
+
+_HOME = {
+    "mechanics.beam": ("Beam", "contact_compliance", "deflect"),
+    "mechanics.force_law": ("Law", "duffing"),
+    "model": ("Options", "Press", "press"),
+    "status": ("FitStatus", "PressStatus"),
+    "trachea.geometry": ("Geometry", "table_1"),
+    "trachea.material": ("Material",),
+}
+_MODULE = {name: module for module, names in _HOME.items() for name in names}
+
+
+def __getattr__(name: str):
+    """Load a public name on first use."""
+    if name not in _MODULE:
+        raise AttributeError(f"module 'jaxtrachea' has no attribute {name!r}")
+    value = getattr(import_module(f"jaxtrachea.{_MODULE[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """The public names."""
+    return sorted([*_MODULE, "__version__"])

@@ -491,8 +491,8 @@ def test_ecoflex_window():
 
 def test_round_trip(tmp_path):
     plain = curve("T02", "a/b", s_c=None, sigma=None, joint_rings=None, joint_displacement=None)
-    long = curve("Z %", ".", displacement=np.linspace(0, 5, 2000), force=np.linspace(0, 1, 2000))
-    long = Curve(long.specimen, long.trial, 1.0, 0.0, long.displacement, long.force, source="µ")
+    depths, forces = np.linspace(0, 5, 2000), np.linspace(0, 1, 2000)
+    long = Curve("Z %", ".", 1.0, 0.0, depths, forces, source="µ")
     wrote = (curve("Z %", "1"), plain, curve("A", "2"), long)
     path = tmp_path / "m.h5"
     write_hdf5(path, Measurements(wrote, (), ()), attrs={"licence": "CC0"})

@@ -90,7 +90,7 @@ def information(
 
 
 def informations(
-    problem: Problem, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, chunk: int = 256
+    problem: Problem, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, chunk: int = 64
 ) -> Information:
     """`information` of many lanes, on the host; leading axis = order of `lanes`."""
     chunk = chunk_size(len(lanes), chunk)
