@@ -52,9 +52,13 @@ def diagonal(d: Vector) -> Matrix:
 
 
 def solve(A: Matrix, B: Matrix) -> Matrix:
-    """A^-1 B for a positive definite A, scaled by its trace to stay within the range of float32."""
-    scale = trace(A)
-    A = A / scale
+    """A^-1 B for a positive definite A, scaled by its trace to stay within the range of float32.
+
+    A = 0 (a clamp or a rigid ring, where B is 0 as well) gives B.
+    """
+    size = trace(A)
+    scale = jnp.where(size > 0, size, 1)
+    A = jnp.where(size > 0, A / scale, jnp.eye(2, dtype=A.dtype))
     return mul(adj(A), B / scale) / det(A)
 
 

@@ -204,12 +204,6 @@ def _reach(sides: _Side, beam: SpatialBeam, s_c) -> _Reach:
     return _Reach(jax.vmap(one)(sides, last, count), last, count)
 
 
-def _inside(beam: SpatialBeam, s_c):
-    """(s_c, 1), or (some position inside, 0) with C on a clamp, where nothing moves."""
-    inside = (s_c > 0) & (s_c < beam.length)
-    return jnp.where(inside, s_c, beam.length / 2), inside.astype(s_c.dtype)
-
-
 def _side(tree, i):
     return jax.tree.map(lambda v: v[i], tree)
 
@@ -266,9 +260,8 @@ def contact_compliance(beam: SpatialBeam, s_c: Float[Array, "*m"]) -> Float[Arra
     sides = _sweep_both(beam)
 
     def one(s):
-        s, moves = _inside(beam, s)
         tips = _reach(sides, beam, s).tips
-        return moves * _motion_matrices(_side(tips, 0), _side(tips, 1))[0]
+        return _motion_matrices(_side(tips, 0), _side(tips, 1))[0]
 
     return one(s_c) if s_c.ndim == 0 else jax.vmap(one)(s_c)
 
@@ -286,7 +279,7 @@ def deflect(
 
     Args:
         beam: the beam and its rings.
-        s_c: contact position, mm, in (0, length).
+        s_c: contact position, mm, in [0, length].
         force: (F_y, F_z), N.
         ring_load: further forces on the rings themselves, N; shape (n, 2). `reaction` is still the
             force between ring and beam: w_i = C_i (R_i + ring_load_i) / integrity_i.
