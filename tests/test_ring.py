@@ -83,8 +83,9 @@ def frame_of(segments, phi_c, load, **changes):
     "changes", [{}, {"k_t": 0.0}, {"k_t": 1e3}, {"EI": 2.0, "half_angle": 2.6}]
 )
 def test_frame_of_bars_converges(phi_c, changes):
-    """The chords come nearer to the arc with the square of their length; 400 leave 3e-5
-    (5e-5 of the longer arc).
+    """The chords come nearer to the arc with the square of their length.
+
+    400 leave 3e-5 (5e-5 of the longer arc).
 
     What stays is the frame's axial strain (1e4 EI mm^-2): I / A R^2 = 1e-6 of the bending.
     """

@@ -126,10 +126,8 @@ def test_planes_of_their_own():
     x, length, stiffness, C, _ = tube(rng, 0.1, spread=1.0)
     diagonal = C * np.eye(2, dtype=np.float32)
     got = plain(beam_of((x, length, stiffness, diagonal)), *cast("float64", 63.0, [1.0, 0.0]))
-    flat = one_plane.Beam(*cast("float64", x, length, stiffness[:, 0], 1.0))
-    flat = one_plane.Beam(
-        flat.x, flat.length, flat.EI, 1 / jnp.asarray(diagonal[:, 0, 0], "float64")
-    )
+    k = 1 / diagonal[:, 0, 0].astype(float)
+    flat = one_plane.Beam(*cast("float64", x, length, stiffness[:, 0], k))
     alone = jax.jit(one_plane.deflect)(flat, *cast("float64", 63.0, 1.0))
     np.testing.assert_array_equal(got.w[:, 1], 0)
     np.testing.assert_allclose(got.w[:, 0], alone.w, atol=1e-13)
@@ -155,7 +153,7 @@ def test_energy_and_equilibrium(k):
     rng = np.random.default_rng(4)
     t, s, force = tube(rng, k, spread=1.0), np.float32(63), np.float32([0.8, -0.3])
     load = np.float32(0.1 * rng.normal(size=(N, 2)))
-    got = loaded(beam_of(t), *cast("float64", s, force, load))
+    got = jax.tree.map(np.asarray, loaded(beam_of(t), *cast("float64", s, force, load)))
     exact = spatial_fem.solve(*t[:4], s, force, ring_load=load)
     work = (np.sum(got.w_C * force.astype(float)) + np.sum(got.w * load.astype(float))) / 2
     np.testing.assert_allclose(work, float(exact.energy), rtol=1e-12)
@@ -163,8 +161,6 @@ def test_energy_and_equilibrium(k):
     np.testing.assert_allclose(np.sum(got.reaction, 0) + clamps, force, atol=1e-11)
     moved = np.einsum("npq,nq->np", t[3].astype(float), got.reaction + load)
     np.testing.assert_allclose(got.w, moved, atol=1e-12 * np.max(np.abs(got.w)))
-    passed = force - got.force_A
-    assert np.all(np.abs(passed) < 10 * np.abs(force))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -255,7 +255,7 @@ def ring_influence(
 ) -> Float[Array, "2 2"]:
     """Displacement of the ring at `phi` per unit load (P_y, P_z) at `phi_c`, mm/N.
 
-    Mapped over `phi` and applied to a load it gives the deformed shape of the ring; at -alpha, alpha
+    Mapped over `phi` and applied to a load it gives the shape of the ring; at -alpha, alpha
     the motion of U and V. Reciprocal: the influence of phi on phi_c is its transpose.
 
     Args:
