@@ -43,3 +43,11 @@ class FitStatus(_Described):
     def succeeded(self) -> bool:
         """Whether the estimate is a minimum that may be read (with its warnings)."""
         return self <= FitStatus.UNIDENTIFIABLE
+
+
+class RingStatus(_Described):
+    """Whether a cartilage ring can answer a load at an angle."""
+
+    OK = 0, "solved"
+    BEHIND_GAP = 1, "the angle lies behind the ends of the ring, where there is no cartilage"
+    NON_FINITE = 2, "an input or a result is not finite"
