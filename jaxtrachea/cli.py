@@ -135,15 +135,17 @@ def _load(path: Path, data: Path | None):
     """Specification, measurements and problem; input errors become `_Stop`."""
     from jaxtrachea.config import SpecError, load_fit_spec
     from jaxtrachea.identify.measurements import DataError
-    from jaxtrachea.identify.study import problem_of, read_data
+    from jaxtrachea.identify.study import problem_of, read_data, usable
 
     try:
         spec = load_fit_spec(path)
         measurements = read_data(spec, path.parent if data is None else data)
+        _use_float64()
+        if measurements.curves:
+            measurements = usable(spec, measurements)
         _print_bad(measurements)
         if not measurements.curves:
             raise _Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
-        _use_float64()
         return spec, measurements, problem_of(spec, measurements)
     except SpecError as error:
         text = str(error)

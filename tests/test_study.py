@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 from run_cli import run
 
-from jaxtrachea.config import SpecError, TracheaSection, load_fit_spec
+from jaxtrachea.config import FitSpec, SpecError, TracheaSection, load_fit_spec
 from jaxtrachea.identify.measurements import Curve, DataError, Measurements, write_hdf5
 from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.study import find_files, geometry_of, parameters_of, read_data
+from jaxtrachea.identify.study import (
+    find_files,
+    geometry_of,
+    parameters_of,
+    read_data,
+    usable,
+)
 from jaxtrachea.model import Options
 
 SPEC = """
@@ -230,3 +236,16 @@ def test_ring_hardening_is_free_only_if_named(two):
     assert "k_3_ring" in parameters(two, "k_3_ring = {}", options)
     with pytest.raises(SpecError, match=r"parameters\.k_3_ring: not seen by this model"):
         parameters(two, "k_3_ring = {}")
+
+
+def test_a_curve_outside_the_tube_costs_only_itself():
+    line = np.linspace(0, 1, 5)
+    curves = [Curve("T1", "1", 75.0, 0.0, line, line), Curve("T2", "1", 900.0, 0.0, line, line)]
+    spec = FitSpec.model_validate({"data": {"files": ["x.csv"]}})
+    left = usable(spec, Measurements(tuple(curves), (), ()))
+    assert [c.specimen for c in left.curves] == ["T1"]
+    (bad,) = left.bad
+    assert (bad.specimen, bad.kind) == ("T2", "position")
+    assert "900" in bad.message
+    with pytest.raises(SpecError, match="T2"):
+        usable(spec, Measurements((curves[1],), (), ()))

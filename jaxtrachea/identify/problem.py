@@ -203,7 +203,7 @@ def build(
     if all(p.fixed for p in parameters):
         raise ValueError("every parameter is fixed; free at least one")
     for curve in curves:
-        _check_curve(curve, geometry, options)
+        check_curve(curve, geometry, options)
     groups = group(curves, parameters)
     unknowns = [_unknowns(lane, parameters) for lane in groups]
     sizes = _Sizes(
@@ -243,7 +243,13 @@ class _Sizes:
     joints: bool
 
 
-def _check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
+def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
+    """Refuse a curve that the model cannot press.
+
+    Raises:
+        ValueError: no contact position, one outside the tube or off the midline, a marker on a ring
+            that does not exist; specimen and trial are named.
+    """
     where = f"specimen {curve.specimen!r} trial {curve.trial!r}"
     length, rings = float(geometry.length), geometry.rings
     if curve.s_c is None:

@@ -15,7 +15,7 @@ from jaxtrachea.identify.measurements import (
     read_measurements,
 )
 from jaxtrachea.identify.parameters import DEFAULTS, Parameter, in_model
-from jaxtrachea.identify.problem import Noise, Problem, build
+from jaxtrachea.identify.problem import Noise, Problem, build, check_curve
 from jaxtrachea.identify.solve import Tolerances
 from jaxtrachea.model import Options
 from jaxtrachea.trachea.geometry import Geometry, table_1
@@ -212,6 +212,30 @@ def _free(default: Parameter, section: ParameterSection) -> Parameter:
     return dataclasses.replace(
         default, value=value, lower=lower, upper=upper, scale=scale, scope=scope, fixed=False
     )
+
+
+def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
+    """The measurements with curves that this tube and model cannot press moved to the bad ones.
+
+    Raises:
+        SpecError: not one curve is left; the message is that of the first.
+    """
+    geometry, options = geometry_of(spec.trachea), Options(**spec.model.model_dump())
+    good, bad = [], list(measurements.bad)
+    reasons = []
+    for curve in measurements.curves:
+        try:
+            check_curve(curve, geometry, options)
+        except ValueError as error:
+            reasons.append(str(error))
+            text = reasons[-1].split(": ", 1)[-1]
+            cure = "correct the file, or the trachea and model sections"
+            bad.append(BadCurve(curve.specimen, curve.trial, curve.source, "position", text, cure))
+        else:
+            good.append(curve)
+    if reasons and not good:
+        raise SpecError(reasons[0])
+    return dataclasses.replace(measurements, curves=tuple(good), bad=tuple(bad))
 
 
 def problem_of(spec: FitSpec, measurements: Measurements) -> Problem:
