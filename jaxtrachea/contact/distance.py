@@ -10,11 +10,12 @@ Bounds: with the sharp shapes' signed distance phi*, in exact arithmetic,
     phi <= lower <= phi* <= upper,    phi* - phi <= log(N_A N_B) / beta at the lowest minimum.
 
 `lower` is the sharp support at the normal found and holds for every direction. `upper` is the
-distance of two points of the sharp cores less the radii; it is tight only where the cores are apart.
+distance of two points of the sharp cores less the radii; it is tight only where these are apart.
 
-Derivatives: the normal's by the implicit function theorem at the stopped solution, the distance's by
-Danskin's theorem; no loop is differentiated. Forward and reverse, any order. Where the minimum is
-flat (status FLAT) curvatures below 1e-6 of the size are lifted to that, to keep derivatives finite.
+Derivatives: the normal's by the implicit function theorem at the stopped solution, the distance's
+by Danskin's theorem; no loop is differentiated. Forward and reverse, any order. Where the minimum
+is flat (status FLAT) curvatures below 1e-6 of the size are lifted to that, to keep derivatives
+finite.
 
 Source: duality of distance and support functions, Gilbert, Johnson & Keerthi, "A fast procedure for
 computing the distance between complex objects in three-dimensional space", IEEE J. Robot. Autom. 4
@@ -156,7 +157,7 @@ def track(
 
 
 def direction_table(a: Shape, settings: Settings = STANDARD) -> Float[Array, " directions"]:
-    """Support of A, seen from its centre, over the coarse directions, mm; reusable for every pose."""
+    """Support of A about its centre over the coarse directions, mm; the same for every pose."""
     centre = jnp.mean(a.vertices, axis=1)
     return sharp_table(a.vertices - centre[:, None], settings.directions)
 

@@ -1,6 +1,6 @@
 r"""The search for the contact normal: smallest value of a smooth function on the unit sphere.
 
-With lengths divided by the size of the pair, the function is f(d) = h_A(d) + h_B(-d), |d| = 1. It has
+With lengths over the size of the pair, the function is f(d) = h_A(d) + h_B(-d), |d| = 1. It has
 one minimum when the shapes are apart and many when they overlap. A table of coarse directions gives
 the starts; from each, saddle-free Newton steps in the tangent plane follow the minimum while beta
 rises; the survivors finish with safeguarded steps. Fixed cost: no step depends on the outcome.

@@ -1,7 +1,7 @@
 r"""Convex shapes as rounded vertex clouds, and their smoothed support function.
 
-A shape is the convex hull of N vertices v_i, swept by a ball of radius r (one vertex: a sphere; two:
-a capsule; eight: a box). Its support function is smoothed by entropy (log-sum-exp):
+A shape is the convex hull of N vertices v_i, swept by a ball of radius r (one vertex: a sphere;
+two: a capsule; eight: a box). Its support function is smoothed by entropy (log-sum-exp):
 
     h(d) = (1/beta) log sum_i exp(beta v_i . d) + r,    |d| = 1,
     0 <= h(d) - (max_i v_i . d + r) <= log(N) / beta.
@@ -10,10 +10,10 @@ The smoothed shape therefore contains the sharp one and sticks out by at most lo
 boundary point with normal d is the gradient of h continued homogeneously,
 x(d) = sum_i p_i v_i + (H(p)/beta + r) d, with the softmax weights p and their entropy H(p).
 
-Source: smoothing of a maximum by its entropic conjugate, Nesterov, "Smooth minimization of non-smooth
-functions", Math. Program. 103 (2005), doi:10.1007/s10107-004-0552-5.
+Source: smoothing of a maximum by its entropic conjugate, Nesterov, "Smooth minimization of
+non-smooth functions", Math. Program. 103 (2005), doi:10.1007/s10107-004-0552-5.
 
-Vertices are stored as three rows (3, N): everything stays elementwise, one fused loop. Lengths in mm.
+Vertices are stored as three rows (3, N), so that everything stays elementwise. Lengths in mm.
 """
 
 import math
@@ -22,6 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -201,8 +202,7 @@ def cylinder(
 def padded(shape: Shape, count: int) -> Shape:
     """The same sharp shape with its vertices repeated in turn up to `count` of them.
 
-    For stacking shapes under `vmap`. The smoothed shape grows by up to log(count / n) / beta, within
-    the stated bound log(count) / beta.
+    For stacking shapes under `vmap`. The smoothed shape grows, within the bound log(count) / beta.
 
     Args:
         shape: a convex shape.
@@ -220,6 +220,6 @@ def padded(shape: Shape, count: int) -> Shape:
 def _shape(vertices, radius) -> Shape:
     """Common dtype and the check of the radius, where it is a number."""
     r = jnp.asarray(radius, vertices.dtype)
-    if not isinstance(r, jax.core.Tracer) and np.any(np.asarray(r) < 0):
+    if not isinstance(r, Tracer) and np.any(np.asarray(r) < 0):
         raise ValueError(f"radius: expected a length not below 0, found {radius}")
     return Shape(vertices, r)
