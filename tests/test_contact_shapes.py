@@ -213,7 +213,7 @@ def turning(w, t):
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.2e-4, 1.3e-4, 0.1])
 def test_rotation_derivatives_are_finite_and_right(angle):
-    """d/dt exp([w] t) = [w] exp([w] t), also across the end of the series; second derivative too."""
+    """d/dt exp([w] t) = [w] exp([w] t), also past the end of the series; second derivative too."""
     w = jnp.array([0.6, 0.0, 0.8])
     skew = np.cross(np.eye(3), w)
     value, first, second = turning(w, jnp.asarray(angle))

@@ -40,6 +40,7 @@ from jaxtrachea.contact.search import (
     Settings,
     eigenvalues,
     find_normal,
+    floor_of,
     model,
     newton_step,
     polish,
@@ -135,8 +136,9 @@ def track(
 ) -> Contact:
     """Signed distance by a few steps from a known direction, without a search.
 
-    For paths of small steps: give the normal of the pose before. It stays in the basin it is in; a
-    status other than OK asks for `signed_distance`.
+    For paths of small steps (turns of 0.01 rad; docs/contact.md has the rates): give the normal of
+    the pose before. It stays in the basin it is in; a status other than OK asks for
+    `signed_distance`.
 
     Args:
         a: shape A.
@@ -181,7 +183,7 @@ def _scaled(a: Shape, b: Shape, pose: Pose, settings: Settings, beta) -> _Scaled
 
 
 def _size(v_a, v_b, radius):
-    """Sum of both half-extents; for two bare points their distance, or 1 where they coincide."""
+    """Sum of both half-extents; for two bare points their distance, or 1 mm where they coincide."""
     centre_b = jnp.mean(v_b, axis=1)
     extent = _reach(v_a) + _reach(v_b - centre_b[:, None]) + radius
     apart = jnp.max(jnp.abs(centre_b))
@@ -216,8 +218,8 @@ def _normal_jvp(primals, tangents_):
     n = _normal(pair, d)
     _, (g1, g2) = jax.jvp(lambda p: model(p, n).gradient, (pair,), (pair_dot,))
     a, b, c = model(pair, n).hessian
-    low, _ = eigenvalues(jax.lax.stop_gradient((a, b, c)))
-    lift = jnp.maximum(FLOOR - low, 0)
+    fixed = jax.lax.stop_gradient((a, b, c))
+    lift = jnp.maximum(floor_of(fixed) - eigenvalues(fixed)[0], 0)
     u1, u2 = solve_2x2(a + lift, b, c + lift, -g1, -g2)
     e1, e2 = tangents(n)
     return n, e1 * u1 + e2 * u2
@@ -271,7 +273,7 @@ def _status(m: Model, low, beta, distance):
     """Converged by the value that one more Newton step would gain, in units of 1/beta."""
     u1, u2 = newton_step(m)
     gain = -0.5 * (m.gradient[0] * u1 + m.gradient[1] * u2)
-    status = jnp.where(low <= FLOOR, ContactStatus.FLAT, ContactStatus.OK)
+    status = jnp.where(low <= floor_of(m.hessian), ContactStatus.FLAT, ContactStatus.OK)
     status = jnp.where(gain * beta > TOLERANCE, ContactStatus.NOT_CONVERGED, status)
     finite = jnp.isfinite(distance)
     return jnp.where(finite, status, ContactStatus.NON_FINITE).astype(jnp.int8)

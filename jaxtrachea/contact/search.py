@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtrachea._numerics import epsilon
 from jaxtrachea.contact.shapes import heights, log_mean
 
 #: Sharpness times size at which annealing begins: the whole pair is then one smooth bowl.
@@ -51,8 +52,8 @@ class Settings:
     survivors: int = 2
     coarse_steps: int = 4
     fine_steps: int = 6
-    final_steps: int = 8
-    warm_steps: int = 6
+    final_steps: int = 12
+    warm_steps: int = 10
 
     def __post_init__(self):
         """Refuse settings that cannot work.
@@ -74,10 +75,16 @@ class Settings:
             )
 
 
-FAST = Settings(sharpness=300.0, directions=128, starts=3, fine_steps=4, final_steps=6)
+FAST = Settings(sharpness=300.0, directions=128, starts=3, fine_steps=4, final_steps=10)
 STANDARD = Settings()
 FINE = Settings(
-    sharpness=10_000.0, directions=512, starts=6, survivors=3, fine_steps=10, final_steps=12
+    sharpness=10_000.0,
+    directions=512,
+    starts=6,
+    survivors=3,
+    fine_steps=10,
+    final_steps=16,
+    warm_steps=16,
 )
 #: The named levels of accuracy; errors and times of each are in docs/contact.md.
 LEVELS = {"fast": FAST, "standard": STANDARD, "fine": FINE}
@@ -142,6 +149,12 @@ def eigenvalues(hessian):
     return middle - radius, middle + radius
 
 
+def floor_of(hessian):
+    """Smallest curvature to be told from none: FLOOR, or the rounding of the largest."""
+    _, high = eigenvalues(hessian)
+    return jnp.maximum(16 * epsilon(high.dtype) * high, FLOOR)
+
+
 def newton_step(m: Model):
     """-|H|^-1 g, downhill also at a saddle; |eigenvalues| not below FLOOR."""
     (g1, g2), (a, b, c) = m.gradient, m.hessian
@@ -179,13 +192,18 @@ def anneal(pair: Pair, d, first, steps: int):
 
 
 def polish(pair: Pair, d, steps: int):
-    """`steps` Newton steps at fixed sharpness that never raise f; the direction and its f."""
+    """`steps` Newton steps at fixed sharpness that do not raise f; the direction and its f.
+
+    A rise within rounding is let pass: close to the minimum f no longer tells two directions apart,
+    but the gradient does.
+    """
+    slack = 8 * epsilon(d.dtype) * (1 + jnp.max(jnp.abs(pair.b)))
 
     def body(carry, _):
         d, m, trust = carry
         new, length = _walk(d, newton_step(m), trust)
         m_new = model(pair, new)
-        better = m_new.value <= m.value
+        better = m_new.value <= m.value + slack
         taken = (new, m_new, jnp.minimum(1.5 * trust, WIDEST))
         kept = (d, m, 0.25 * length)
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), taken, kept), None

@@ -10,8 +10,9 @@ than 1e-6 of the size the polytope's value is stored, and counted in `coal_diffe
 
 Columns: `vertices` (pair, 2, 12, 3) and `count` (pair, 2), `radius` (pair, 2), all times 1/1024;
 `quaternion` (pair, 4), not normalised, and `translation` (pair, 3) take B into A's frame; `kind`
-(pair, 2): 0 sphere, 1 capsule, 2 box, 3 cloud; `group`: 0 apart, 1 within 1e-3 of the size, 2 overlap;
-`distance`, `normal` (from A to B), `unique` (no second normal gives a depth within 1e-3 of the size).
+(pair, 2): 0 sphere, 1 capsule, 2 box, 3 cloud; `group`: 0 apart, 1 within 1e-3 of the size, 2
+overlap; `distance`, `normal` (from A to B), `unique` (no second normal gives a depth within 1e-3 of
+the size).
 """
 
 import pathlib
