@@ -208,7 +208,8 @@ def test_rotation_vector_is_the_quaternion(w):
 @quick
 def turning(w, t):
     turn = lambda t: pose_from_vector(w * t, jnp.zeros(3)).rotation  # noqa: E731
-    return turn(t), jax.jacfwd(turn)(t), jax.jacfwd(jax.jacrev(turn))(t)
+    second = jax.jacfwd(jax.jacrev(turn))
+    return turn(t), jax.jacfwd(turn)(t), second(t), jax.jacfwd(jax.jacfwd(second))(t)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.2e-4, 1.3e-4, 0.1])
@@ -216,9 +217,11 @@ def test_rotation_derivatives_are_finite_and_right(angle):
     """d/dt exp([w] t) = [w] exp([w] t), also past the end of the series; second derivative too."""
     w = jnp.array([0.6, 0.0, 0.8])
     skew = np.cross(np.eye(3), w)
-    value, first, second = turning(w, jnp.asarray(angle))
+    value, first, second, fourth = turning(w, jnp.asarray(angle))
     np.testing.assert_allclose(first, skew @ value, atol=1e-12)
     np.testing.assert_allclose(second, skew @ skew @ value, atol=1e-7)
+    if angle in (0.0, 0.1):  # in between, closed form and series both lose digits at this order
+        np.testing.assert_allclose(fourth, skew @ skew @ skew @ skew @ value, atol=1e-6)
 
 
 def test_pose_is_a_pytree():

@@ -78,9 +78,7 @@ BALL = sphere(0.5)
 TRIANGLE = cloud([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
 LINE = cloud([[0.0, 0, -1], [0, 0, 0.2], [0, 0, 1], [0, 0, 0.5]])
 POINT = cloud([[0.0, 0, 0]] * 3)
-MESSY = cloud(
-    np.concatenate([np.asarray(CUBE.vertices.T)[[0, 1, 2, 3, 4, 5, 6, 7, 7]], [[0.1] * 3]])
-)
+MESSY = cloud(np.vstack([CUBE.vertices.T, CUBE.vertices.T[-1:], [[0.1] * 3]]))
 QUARTER = (0.0, np.pi / 2, 0.0)
 
 
@@ -163,16 +161,10 @@ def with_derivatives(dtype):
     """Contact, gradient (reverse) and Jacobian (forward) with respect to the pose, per lane."""
 
     def one(a, b, q, t, v):
-        moved = (
-            lambda v: (
-                Pose(q, t)
-                if v is None
-                else compose(  # noqa: E731
-                    Pose(jnp.eye(3, dtype=dtype), v[3:] + t),
-                    compose(pose_from_vector(v[:3], 0 * t), Pose(q, 0 * t)),
-                )
-            )
-        )
+        def moved(v):
+            turned = compose(pose_from_vector(v[:3], 0 * t), Pose(q, 0 * t))
+            return Pose(turned.rotation, v[3:] + t)
+
         solve = lambda v: signed_distance(a, b, moved(v))  # noqa: E731
         gradient = jax.grad(lambda v: solve(v).distance)(v)
         read = lambda v: (lambda c: (c.distance, c.normal, c.point_a, c.point_b))(solve(v))  # noqa: E731
@@ -299,7 +291,7 @@ def pairs(index, dtype, scale):
 
 
 def check_pairs(index, settings_, dtype, scale, missed):
-    """Bounds for every pair; at most `missed` overlapping ones in a basin that is not the lowest."""
+    """Bounds for every pair; at most `missed` overlapping ones in a basin not the lowest."""
     data = reference_pairs()
     batch, size = pairs(index, dtype, scale)
     c = lanes(settings_, dtype)(*batch)
@@ -410,11 +402,15 @@ def test_lanes_are_single_calls():
             np.testing.assert_allclose(x[i], y, rtol=1e-6, atol=1e-9)
 
 
-def test_a_table_changes_nothing():
-    there = place(PLACES["apart"])
-    table = quick(direction_table)(A)
-    shared = quick(lambda p, t: signed_distance(A, B, p, table=t))(there, table)
-    np.testing.assert_allclose(shared.distance, solve(A, B, there).distance, rtol=1e-13)
+def test_a_table_is_shared_between_poses():
+    """Of a box off its origin; a ball inside near its end leaves by the thin side, not ahead."""
+    half, off = jnp.array([3.0, 1.0, 0.3]), jnp.array([20.0, -30.0, 5.0])
+    there = Pose(jnp.eye(3), off + jnp.array([2.0, 0.0, 0.05]))
+    slab = Shape(box(half).vertices + off[:, None], jnp.asarray(0.0))
+    table = quick(direction_table)(slab)
+    shared = quick(lambda p, t: signed_distance(slab, BALL, p, table=t))(there, table)
+    np.testing.assert_allclose(shared.lower, -0.75, atol=1e-3)
+    np.testing.assert_allclose(shared.distance, solve(slab, BALL, there).distance, rtol=1e-12)
 
 
 def test_tracking_follows_a_path():

@@ -1,7 +1,7 @@
 """Time and error of the contact search at its named levels; writes the table in docs/contact.md.
 
-Run by hand on a quiet machine: `python tests/bench/contact.py [--quick]`. The 2,000 stored pairs of
-tests/reference/contact_pairs.npz serve for errors and for times. Times are the best of several runs.
+Run by hand on a quiet machine: `python tests/bench/contact.py [--quick]`. Errors are those
+of the 2,000 pairs in tests/reference/contact_pairs.npz; times are the best of several runs.
 """
 
 import argparse
