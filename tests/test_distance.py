@@ -21,7 +21,7 @@ from jaxtrachea.contact.pose import (
     pose_from_vector,
     transform,
 )
-from jaxtrachea.contact.search import FINE, LEVELS, STANDARD, Settings
+from jaxtrachea.contact.search import LEVELS, STANDARD, Settings
 from jaxtrachea.contact.shapes import (
     Shape,
     box,
@@ -216,7 +216,7 @@ def test_spheres_have_no_bias_and_derivatives_of_every_order():
 
     def gap(s):
         there = pose_from_vector(jnp.array([0.1, 0.2, 0.3]), start + s * step)
-        return signed_distance(sphere(0.3), sphere(0.4), there).distance
+        return track(sphere(0.3), sphere(0.4), there, start).distance
 
     def exact(s):
         return jnp.sqrt(jnp.sum((start + s * step) ** 2)) - 0.7
@@ -247,15 +247,15 @@ def lanes(settings_, dtype):
 
 
 def test_box_and_capsule_against_a_ball():
-    """Closed forms of the signed distance, balls all round and inside, at the finest level."""
+    """Closed forms of the signed distance, balls all round and inside."""
     p = np.random.default_rng(3).uniform(-2, 2, (200, 3))
     half, r = np.array([1.0, 0.7, 0.4]), 0.1
     first = [box(half, r)] * 100 + [capsule(1.2, 0.3)] * 100
     exact = np.append(box_distance(half, r, p[:100]), segment_distance(1.2, p[100:]) - 0.3) - 0.5
     at = poses(np.zeros((200, 3)), p, 1, "float64")
     second = stack([BALL] * 200, 12, 1, "float64")
-    c = lanes(FINE, "float64")(stack(first, 12, 1, "float64"), second, at)
-    bound = 2 * np.log(12) / FINE.sharpness * sizes(first, [BALL] * 200)
+    c = lanes(STANDARD, "float64")(stack(first, 12, 1, "float64"), second, at)
+    bound = 2 * np.log(12) / STANDARD.sharpness * sizes(first, [BALL] * 200)
     assert (c.distance <= exact + 1e-12).all()
     assert (c.distance >= exact - bound).all()
     assert (c.status == ContactStatus.OK).all()
@@ -285,7 +285,7 @@ def pairs(index, dtype, scale):
         made.append(Shape(cast(v.transpose(0, 2, 1)), cast(radius)))
     at = jax.vmap(pose_from_quaternion)(
         jnp.asarray(data["quaternion"][index], dtype),
-        jnp.asarray(data["translation"][index] * scale, dtype),
+        jnp.asarray(data["translation"][index].astype(float) * scale, dtype),
     )
     return (*made, at), size
 
@@ -324,7 +324,7 @@ def test_random_pairs_against_outside_numbers(dtype, scale):
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize(("dtype", "scale"), [("float64", 1e-3), ("float32", 1.0)])
 def test_all_random_pairs(level, dtype, scale):
-    missed = {"fast": 40, "standard": 10, "fine": 10}[level]
+    missed = {"fast": 6, "standard": 4, "fine": 2}[level]
     check_pairs(np.arange(2000), LEVELS[level], dtype, scale, missed)
 
 
@@ -344,6 +344,9 @@ PLACES = {
 
 def place(v):
     return pose_from_vector(v[:3], v[3:])
+
+
+cold_lanes = quick(jax.vmap(lambda v: signed_distance(A, B, place(v))))
 
 
 @few
@@ -394,9 +397,9 @@ def test_witness_points(name):
 
 
 def test_lanes_are_single_calls():
-    batch = jnp.stack(list(PLACES.values()))
-    together = quick(jax.vmap(lambda v: signed_distance(A, B, place(v))))(batch)
-    for i, v in enumerate(batch):
+    batch = jnp.tile(jnp.stack(list(PLACES.values())), (40, 1))
+    together = cold_lanes(batch)
+    for i, v in enumerate(batch[:3]):
         alone = solve(A, B, place(v))
         for x, y in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(x[i], y, rtol=1e-6, atol=1e-9)
@@ -416,8 +419,8 @@ def test_a_table_is_shared_between_poses():
 def test_tracking_follows_a_path():
     """From the normal of the step before, the whole path is the cold solution."""
     start, end = PLACES["apart"], PLACES["touching"]
-    path = jnp.stack([start + (end - start) * s for s in np.linspace(0, 1, 100)])
-    cold = quick(jax.vmap(lambda v: signed_distance(A, B, place(v))))(path)
+    path = jnp.stack([start + (end - start) * s for s in np.linspace(0, 1, 120)])
+    cold = cold_lanes(path)
 
     def step(normal, v):
         c = track(A, B, place(v), normal)
@@ -447,7 +450,8 @@ def derivatives():
 
     gradient = jax.grad(distance, (0, 1))
     both = lambda *w: (gradient(*w), jax.jacfwd(distance, (0, 1))(*w))  # noqa: E731
-    second = lambda *w: (jax.jacfwd(gradient)(*w), jax.jacrev(gradient)(*w))  # noqa: E731
+    by_pose = jax.grad(distance)
+    second = lambda *w: (jax.jacfwd(by_pose)(*w), jax.jacrev(by_pose)(*w))  # noqa: E731
     turning = lambda *w: (jax.jacfwd(normal)(*w), jax.jacrev(normal)(*w), normal(*w))  # noqa: E731
     return quick(distance), quick(both), quick(second), quick(turning)
 
@@ -474,10 +478,10 @@ def test_gradients(name):
         by_size, central(lambda s: distance(v, s, near), size, 1e-5), atol=1e-6
     )
     hessian, reverse = second(v, size, near)
-    np.testing.assert_allclose(reverse[0], hessian[0], atol=1e-9)
-    np.testing.assert_allclose(hessian[0], hessian[0].T, atol=1e-9)
+    np.testing.assert_allclose(reverse, hessian, atol=1e-9)
+    np.testing.assert_allclose(hessian, hessian.T, atol=1e-9)
     numeric = central(lambda u: both(u, size, near)[0][0], v, 1e-5)
-    np.testing.assert_allclose(hessian[0], numeric, atol=1e-5 * (1 + np.abs(numeric).max()))
+    np.testing.assert_allclose(hessian, numeric, atol=1e-5 * (1 + np.abs(numeric).max()))
     by_forward, by_reverse, _ = turning(v, near)
     np.testing.assert_allclose(by_reverse, by_forward, atol=1e-9)
     numeric = central(lambda u: turning(u, near)[2], v, 1e-6)
