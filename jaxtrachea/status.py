@@ -26,6 +26,15 @@ class PressStatus(_Described):
     NON_FINITE = 4, "an input or a result is not finite"
 
 
+class ContactStatus(_Described):
+    """What became of one distance between two convex shapes."""
+
+    OK = 0, "solved"
+    FLAT = 1, "solved, but the normal is not determined: the distance is level in its direction"
+    NOT_CONVERGED = 2, "the search stopped short of a minimum by more than its smoothing"
+    NON_FINITE = 3, "an input or a result is not finite"
+
+
 class FitStatus(_Described):
     """What became of one lane (one specimen from one start) of a fit."""
 

@@ -1,0 +1,1 @@
+"""Signed distance, contact points and normal of two convex shapes, with derivatives."""

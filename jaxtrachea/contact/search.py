@@ -1,0 +1,266 @@
+r"""The search for the contact normal: smallest value of a smooth function on the unit sphere.
+
+With lengths over the size of the pair, the function is f(d) = h_A(d) + h_B(-d), |d| = 1. It has
+one minimum when the shapes are apart and many when they overlap. A table of coarse directions gives
+the starts; from each, saddle-free Newton steps in the tangent plane follow the minimum while beta
+rises; the survivors finish with safeguarded steps. Fixed cost: no step depends on the outcome.
+
+Everything here works on numbers; derivatives are attached in `distance`.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxtrachea._numerics import epsilon
+from jaxtrachea.contact.shapes import heights, log_mean
+
+#: Sharpness times size at which annealing begins: the whole pair is then one smooth bowl.
+FIRST_SHARPNESS = 100.0
+#: Trust radius times sharpness (rad): the quadratic model holds over about one softmax width.
+TRUST = 30.0
+#: Longest step while annealing and longest trust radius, rad.
+LONGEST, WIDEST = 0.06, 0.5
+#: Smallest curvature taken at face value, relative to the size of the pair.
+FLOOR = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How sharp, and how much work. Static: not a pytree, hashable, a new one compiles anew.
+
+    Attributes:
+        sharpness: beta times the size of the pair. The distance comes out too small by at most
+            log(N_A N_B) / sharpness of that size; curvatures of sharp edges grow with it.
+        directions: in the coarse table, at least 16.
+        starts: local minima of the table followed up, the direction between the centres included.
+        survivors: of them, carried to full sharpness.
+        coarse_steps: Newton steps on every start while the sharpness rises.
+        fine_steps: on every survivor while it rises further.
+        final_steps: safeguarded steps at full sharpness.
+        warm_steps: safeguarded steps of `track`, which does nothing else.
+    """
+
+    sharpness: float = 1000.0
+    directions: int = 256
+    starts: int = 4
+    survivors: int = 2
+    coarse_steps: int = 4
+    fine_steps: int = 6
+    final_steps: int = 12
+    warm_steps: int = 10
+
+    def __post_init__(self):
+        """Refuse settings that cannot work.
+
+        Raises:
+            ValueError: naming the setting, what was expected and what was found.
+        """
+        least = {"directions": 16, "starts": 1, "survivors": 1, "coarse_steps": 0}
+        least |= {"fine_steps": 1, "final_steps": 1, "warm_steps": 1}
+        for name, low in least.items():
+            if getattr(self, name) < low:
+                raise ValueError(f"{name}: expected at least {low}, found {getattr(self, name)}")
+        if not self.sharpness > 0:
+            raise ValueError(f"sharpness: expected a positive number, found {self.sharpness}")
+        if not self.survivors <= self.starts <= self.directions:
+            raise ValueError(
+                "expected survivors <= starts <= directions, found "
+                f"{self.survivors}, {self.starts}, {self.directions}"
+            )
+
+
+FAST = Settings(sharpness=300.0, directions=128, starts=3, fine_steps=4, final_steps=10)
+STANDARD = Settings()
+FINE = Settings(
+    sharpness=10_000.0,
+    directions=512,
+    starts=6,
+    survivors=3,
+    fine_steps=10,
+    final_steps=16,
+    warm_steps=16,
+)
+#: The named levels of accuracy; errors and times of each are in docs/contact.md.
+LEVELS = {"fast": FAST, "standard": STANDARD, "fine": FINE}
+
+
+class Pair(NamedTuple):
+    """Vertices of both shapes in one frame, and the sharpness; all dimensionless.
+
+    Radii are constants on the sphere of directions and take no part in the search.
+    """
+
+    a: Float[Array, "3 n"]
+    b: Float[Array, "3 m"]
+    beta: Float[Array, ""]
+
+
+class Model(NamedTuple):
+    """f, its gradient and Hessian (entries 11, 12, 22) in the tangent plane at d."""
+
+    value: Float[Array, ""]
+    gradient: tuple[Float[Array, ""], Float[Array, ""]]
+    hessian: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]
+
+
+def tangents(d: Float[Array, "3"]):
+    """Two unit vectors that complete d to an orthonormal frame.
+
+    Duff et al., "Building an orthonormal basis, revisited", J. Comput. Graph. Tech. 6(1) (2017).
+    """
+    sign = jnp.where(d[2] >= 0, 1, -1).astype(d.dtype)
+    a = -1 / (sign + d[2])
+    b = d[0] * d[1] * a
+    first = jnp.stack([1 + sign * d[0] * d[0] * a, sign * b, -sign * d[0]])
+    return first, jnp.stack([b, sign + d[1] * d[1] * a, -d[1]])
+
+
+def _moments(vertices, beta, d, e1, e2):
+    """Support value, softmax means along (d, e1, e2), and beta times the tangent covariance."""
+    along, s1, s2 = heights(vertices, d), heights(vertices, e1), heights(vertices, e2)
+    value, p = log_mean(along, beta)
+    m1, m2 = jnp.sum(p * s1), jnp.sum(p * s2)
+    r1, r2 = s1 - m1, s2 - m2
+    spread = (jnp.sum(p * r1 * r1), jnp.sum(p * r1 * r2), jnp.sum(p * r2 * r2))
+    return value, jnp.sum(p * along), (m1, m2), tuple(beta * v for v in spread)
+
+
+def model(pair: Pair, d: Float[Array, "3"]) -> Model:
+    """Second-order model of f at d on the sphere: Hessian = beta cov - (mean . d) I."""
+    e1, e2 = tangents(d)
+    h_a, m_a, g_a, c_a = _moments(pair.a, pair.beta, d, e1, e2)
+    h_b, m_b, g_b, c_b = _moments(pair.b, pair.beta, -d, e1, e2)
+    bend = m_a + m_b
+    hessian = (c_a[0] + c_b[0] - bend, c_a[1] + c_b[1], c_a[2] + c_b[2] - bend)
+    return Model(h_a + h_b, (g_a[0] - g_b[0], g_a[1] - g_b[1]), hessian)
+
+
+def eigenvalues(hessian):
+    """Smaller and larger eigenvalue of a symmetric 2x2 matrix."""
+    a, b, c = hessian
+    middle = 0.5 * (a + c)
+    radius = jnp.sqrt(0.25 * (a - c) ** 2 + b * b)
+    return middle - radius, middle + radius
+
+
+def floor_of(hessian):
+    """Smallest curvature to be told from none: FLOOR, or the rounding of the largest."""
+    _, high = eigenvalues(hessian)
+    return jnp.maximum(16 * epsilon(high.dtype) * high, FLOOR)
+
+
+def newton_step(m: Model):
+    """-|H|^-1 g, downhill also at a saddle; |eigenvalues| not below FLOOR."""
+    (g1, g2), (a, b, c) = m.gradient, m.hessian
+    low, high = eigenvalues(m.hessian)
+    inverse_low = 1 / jnp.maximum(jnp.abs(low), FLOOR)
+    inverse_high = 1 / jnp.maximum(jnp.abs(high), FLOOR)
+    mean = 0.5 * (inverse_low + inverse_high)
+    # f(H) = mean I + slope (H - middle I); the smallest normal number keeps 0/0 away.
+    slope = (inverse_high - inverse_low) / jnp.maximum(high - low, jnp.finfo(a.dtype).tiny)
+    half = 0.5 * (a - c)
+    u1 = mean * g1 + slope * (half * g1 + b * g2)
+    u2 = mean * g2 + slope * (b * g1 - half * g2)
+    return -u1, -u2
+
+
+def _walk(d, step, trust):
+    """Move along a tangent step no longer than `trust`, back onto the sphere; and its length."""
+    e1, e2 = tangents(d)
+    length = jnp.sqrt(step[0] ** 2 + step[1] ** 2)
+    k = jnp.minimum(1, trust / jnp.maximum(length, jnp.finfo(d.dtype).tiny))
+    moved = d + (k * step[0]) * e1 + (k * step[1]) * e2
+    return moved / jnp.sqrt(jnp.sum(moved * moved)), jnp.minimum(length, trust)
+
+
+def anneal(pair: Pair, d, first, steps: int):
+    """`steps` Newton steps while the sharpness rises from `first` towards `pair.beta`."""
+    rate = jnp.log(pair.beta / first) / max(steps, 1)
+
+    def body(d, i):
+        beta = first * jnp.exp(rate * i)
+        m = model(pair._replace(beta=beta), d)
+        return _walk(d, newton_step(m), jnp.minimum(TRUST / beta, LONGEST))[0], None
+
+    return jax.lax.scan(body, d, jnp.arange(steps, dtype=d.dtype))[0]
+
+
+def polish(pair: Pair, d, steps: int):
+    """`steps` Newton steps at fixed sharpness that do not raise f; the direction and its f.
+
+    A rise within rounding is let pass: close to the minimum f no longer tells two directions apart,
+    but the gradient does.
+    """
+    slack = 8 * epsilon(d.dtype) * (1 + jnp.max(jnp.abs(pair.b)))
+
+    def body(carry, _):
+        d, m, trust = carry
+        new, length = _walk(d, newton_step(m), trust)
+        m_new = model(pair, new)
+        better = m_new.value <= m.value + slack
+        taken = (new, m_new, jnp.minimum(1.5 * trust, WIDEST))
+        kept = (d, m, 0.25 * length)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), taken, kept), None
+
+    start = (d, model(pair, d), jnp.minimum(TRUST / pair.beta, WIDEST))
+    (d, m, _), _ = jax.lax.scan(body, start, None, length=steps)
+    return d, m.value
+
+
+@functools.lru_cache(None)
+def coarse_directions(count: int):
+    """Fibonacci directions (count, 3) and the seven nearest neighbours of each (count, 7)."""
+    i = np.arange(count) + 0.5
+    polar, turn = np.arccos(1 - 2 * i / count), np.pi * (1 + 5**0.5) * i
+    d = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], 1)
+    return d, np.argsort(-d @ d.T, axis=1)[:, 1:8]
+
+
+def sharp_table(vertices: Float[Array, "3 n"], count: int) -> Float[Array, " count"]:
+    """max_i v_i . d over the coarse directions."""
+    x, y, z = jnp.asarray(coarse_directions(count)[0].T, vertices.dtype)[:, :, None]
+    u, v, w = vertices[:, None]
+    return jnp.max(x * u + y * v + z * w, axis=1)
+
+
+def starts(pair: Pair, table, centre, count: int):
+    """The `count - 1` lowest local minima of the table, and the direction between the centres."""
+    directions, neighbours = coarse_directions(table.shape[0])
+    f = table + sharp_table(-pair.b, table.shape[0])
+    lowest = jnp.all(f[:, None] <= f[neighbours], axis=1)
+    ranked = jnp.where(lowest, f, f + (jnp.max(f) - jnp.min(f)))
+    _, best = jax.lax.top_k(-ranked, count - 1)
+    return jnp.concatenate([jnp.asarray(directions, f.dtype)[best], centre[None]])
+
+
+def find_normal(pair: Pair, table, centre, settings: Settings) -> Float[Array, "3"]:
+    """Direction of the lowest minimum found.
+
+    Args:
+        pair: the two shapes.
+        table: max_i v_i . d of A over the coarse directions.
+        centre: unit vector from the centre of A to that of B.
+        settings: the work to be done.
+    """
+    s = settings
+    first = jnp.minimum(jnp.asarray(FIRST_SHARPNESS, pair.beta.dtype), pair.beta)
+    share = s.coarse_steps / (s.coarse_steps + s.fine_steps)
+    middle = first * (pair.beta / first) ** share
+    d = starts(pair, table, centre, s.starts)
+    rough = pair._replace(beta=middle)
+    d = jax.vmap(lambda d: anneal(rough, d, first, s.coarse_steps))(d)
+    sharp = jax.vmap(lambda d: jnp.max(heights(pair.a, d)) + jnp.max(heights(-pair.b, d)))(d)
+    _, best = jax.lax.top_k(-sharp, s.survivors)
+
+    def finish(d):
+        d = anneal(pair, d, middle, s.fine_steps)
+        return polish(pair, d, s.final_steps)
+
+    d, f = jax.vmap(finish)(d[best])
+    return d[jnp.argmin(f)]

@@ -1,0 +1,225 @@
+r"""Convex shapes as rounded vertex clouds, and their smoothed support function.
+
+A shape is the convex hull of N vertices v_i, swept by a ball of radius r (one vertex: a sphere;
+two: a capsule; eight: a box). Its support function is smoothed by entropy (log-sum-exp):
+
+    h(d) = (1/beta) log sum_i exp(beta v_i . d) + r,    |d| = 1,
+    0 <= h(d) - (max_i v_i . d + r) <= log(N) / beta.
+
+The smoothed shape therefore contains the sharp one and sticks out by at most log(N) / beta. Its
+boundary point with normal d is the gradient of h continued homogeneously,
+x(d) = sum_i p_i v_i + (H(p)/beta + r) d, with the softmax weights p and their entropy H(p).
+
+Source: smoothing of a maximum by its entropic conjugate, Nesterov, "Smooth minimization of
+non-smooth functions", Math. Program. 103 (2005), doi:10.1007/s10107-004-0552-5.
+
+Vertices are stored as three rows (3, N), so that everything stays elementwise. Lengths in mm.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+
+class Shape(eqx.Module):
+    """A convex hull of vertices, swept by a ball.
+
+    Interior, repeated, collinear or coplanar vertices are allowed.
+
+    Attributes:
+        vertices: mm, one row per coordinate; shape (3, n).
+        radius: of the ball, mm, not negative.
+    """
+
+    vertices: Float[Array, "3 n"]
+    radius: Float[Array, ""]
+
+
+class Support(eqx.Module):
+    """The smoothed support function in one direction d.
+
+    Attributes:
+        value: h(d), mm.
+        point: point of the smoothed boundary with normal d, mm; shape (3,).
+        core: softmax mean of the vertices, a point of the sharp hull without its radius, mm.
+    """
+
+    value: Float[Array, ""]
+    point: Float[Array, "3"]
+    core: Float[Array, "3"]
+
+
+def support(shape: Shape, direction: Float[Array, "3"], beta: Float[Array, ""]) -> Support:
+    """Smoothed support function, its boundary point and the softmax mean.
+
+    Args:
+        shape: a convex shape.
+        direction: unit vector; shape (3,).
+        beta: sharpness, 1/mm, positive. The bias is at most log(n) / beta.
+    """
+    along = heights(shape.vertices, direction)
+    value, weights = log_mean(along, beta)
+    core = jnp.sum(shape.vertices * weights[None], axis=1)
+    beyond = value - jnp.sum(weights * along) + shape.radius
+    return Support(value + shape.radius, core + beyond * direction, core)
+
+
+def heights(vertices: Float[Array, "3 n"], direction: Float[Array, "3"]) -> Float[Array, " n"]:
+    """v_i . d for every vertex."""
+    x, y, z = vertices
+    return x * direction[0] + y * direction[1] + z * direction[2]
+
+
+def log_mean(along: Float[Array, " n"], beta: Float[Array, ""]):
+    """(1/beta) log sum exp(beta x) and the softmax weights, without overflow."""
+    top = jax.lax.stop_gradient(jnp.max(along))
+    e = jnp.exp(beta * (along - top))
+    total = jnp.sum(e)
+    return top + jnp.log(total) / beta, e / total
+
+
+def sharp_support(shape: Shape, direction: Float[Array, "3"]) -> Float[Array, ""]:
+    """max_i v_i . d + r, mm: the support function without smoothing."""
+    return jnp.max(heights(shape.vertices, direction)) + shape.radius
+
+
+def cloud(points: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
+    """The hull of points, swept by a ball; every point is kept as a vertex.
+
+    Args:
+        points: mm; shape (n, 3) with n >= 1 (a list, numpy or JAX array; may be traced).
+        radius: mm, not negative.
+        dtype: of the shape; default the dtype of `points`, or JAX's default for numbers.
+
+    Raises:
+        ValueError: not an (n, 3) array, or a radius below zero.
+    """
+    vertices = jnp.asarray(points, dtype)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or vertices.shape[0] == 0:
+        raise ValueError(f"points: expected shape (n, 3) with n >= 1, found {vertices.shape}")
+    return _shape(vertices.T, radius)
+
+
+def hull(points: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
+    """The hull of points, keeping only its extreme points (the cost of a contact grows with n).
+
+    Works on numbers, not on traced values. Flat and collinear clouds keep all distinct points.
+
+    Args: as `cloud`.
+
+    Raises:
+        ValueError: as `cloud`.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    given = np.asarray(points, float)
+    if given.ndim != 2 or given.shape[1] != 3:
+        raise ValueError(f"points: expected shape (n, 3) with n >= 1, found {given.shape}")
+    given = np.unique(given, axis=0)
+    try:
+        given = given[np.sort(ConvexHull(given).vertices)]
+    except (QhullError, ValueError):  # fewer than four points, or all in one plane
+        pass
+    return cloud(given, radius, dtype)
+
+
+def sphere(radius: ArrayLike, dtype=None) -> Shape:
+    """A ball about the origin, exact.
+
+    Args:
+        radius: mm, not negative.
+        dtype: of the shape; default JAX's default.
+    """
+    r = jnp.asarray(radius, dtype)
+    return _shape(jnp.zeros((3, 1), jnp.result_type(r, float) if dtype is None else dtype), r)
+
+
+def capsule(half_length: ArrayLike, radius: ArrayLike, dtype=None) -> Shape:
+    """A segment along z from -half_length to half_length, swept by a ball.
+
+    Args:
+        half_length: of the straight part, mm.
+        radius: mm, not negative.
+        dtype: of the shape; default that of `half_length`.
+    """
+    end = jnp.asarray(half_length, dtype) * jnp.array([-1.0, 1.0], dtype)
+    zero = jnp.zeros_like(end)
+    return _shape(jnp.stack([zero, zero, end]), radius)
+
+
+def box(half_sizes: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
+    """A box about the origin, swept by a ball: half-sizes `half_sizes + radius` over all.
+
+    Args:
+        half_sizes: of the core, mm; shape (3,).
+        radius: rounding, mm, not negative. With 0 the smoothed edges are so sharp that derivatives
+            of the normal reach beta times the size: round what you differentiate.
+        dtype: of the shape; default that of `half_sizes`.
+    """
+    half = jnp.asarray(half_sizes, dtype)
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8)
+    return _shape(half[:, None] * jnp.asarray(signs, half.dtype), radius)
+
+
+def cylinder(
+    half_length: ArrayLike,
+    disc_radius: ArrayLike,
+    radius: ArrayLike = 0.0,
+    *,
+    sides: int = 24,
+    dtype=None,
+) -> Shape:
+    """A cylinder along z as a regular prism inscribed in it, swept by a ball.
+
+    The prism stays inside the cylinder by at most disc_radius (1 - cos(pi / sides)): 0.9 % of the
+    disc radius at 24 sides. Smoothing works the other way, by up to log(2 sides) / beta.
+
+    Args:
+        half_length: of the core, mm.
+        disc_radius: of the core, mm.
+        radius: rounding, mm, not negative.
+        sides: of the prism, at least 3.
+        dtype: of the shape; default that of `disc_radius`.
+
+    Raises:
+        ValueError: fewer than three sides, or a radius below zero.
+    """
+    if sides < 3:
+        raise ValueError(f"sides: expected at least 3, found {sides}")
+    r = jnp.asarray(disc_radius, dtype)
+    turn = 2 * math.pi / sides * np.arange(sides)
+    x, y = (jnp.tile(r * jnp.asarray(f(turn), r.dtype), 2) for f in (np.cos, np.sin))
+    z = jnp.repeat(jnp.asarray(half_length, r.dtype) * jnp.array([-1.0, 1.0], r.dtype), sides)
+    return _shape(jnp.stack([x, y, z]), radius)
+
+
+def padded(shape: Shape, count: int) -> Shape:
+    """The same sharp shape with its vertices repeated in turn up to `count` of them.
+
+    For stacking shapes under `vmap`. The smoothed shape grows, within the bound log(count) / beta.
+
+    Args:
+        shape: a convex shape.
+        count: number of vertices wanted, not below the present one.
+
+    Raises:
+        ValueError: `count` is below the number of vertices.
+    """
+    present = shape.vertices.shape[1]
+    if count < present:
+        raise ValueError(f"count: expected at least {present} (the vertices), found {count}")
+    return Shape(shape.vertices[:, np.arange(count) % present], shape.radius)
+
+
+def _shape(vertices, radius) -> Shape:
+    """Common dtype and the check of the radius, where it is a number."""
+    r = jnp.asarray(radius, vertices.dtype)
+    if not isinstance(r, Tracer) and np.any(np.asarray(r) < 0):
+        raise ValueError(f"radius: expected a length not below 0, found {radius}")
+    return Shape(vertices, r)

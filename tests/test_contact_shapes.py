@@ -1,0 +1,228 @@
+"""Shapes, their smoothed support functions, and rigid motions."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from jaxtrachea.contact.pose import (
+    Pose,
+    compose,
+    inverse,
+    pose_from_quaternion,
+    pose_from_vector,
+    relative,
+    transform,
+)
+from jaxtrachea.contact.shapes import (
+    Shape,
+    box,
+    capsule,
+    cloud,
+    cylinder,
+    hull,
+    padded,
+    sharp_support,
+    sphere,
+    support,
+)
+
+DTYPES = ["float32", "float64"]
+POINTS = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 1], [0.4, 0.4, 0.2], [2, 0, 0]], float)
+SHAPES = {
+    "sphere": sphere(1.5),
+    "point": sphere(0.0),
+    "capsule": capsule(2.0, 0.5),
+    "box": box([1.0, 2.0, 0.1], 0.2),
+    "cylinder": cylinder(1.0, 2.0, 0.1),
+    "cloud": cloud(POINTS, 0.3),
+    "flat": cloud([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]),
+}
+#: Exact support h(d) of the sharp shape.
+EXACT = {
+    "sphere": lambda d: 1.5,
+    "capsule": lambda d: 2 * abs(d[2]) + 0.5,
+    "box": lambda d: np.abs(d) @ [1, 2, 0.1] + 0.2,
+    "flat": lambda d: max(0, d[0], d[1]),
+}
+vectors = arrays(float, 3, elements=st.floats(-3, 3))
+few = settings(max_examples=40, deadline=None, derandomize=True)
+
+
+#: Most of the time here is compilation.
+quick = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+smoothed = quick(jax.vmap(support, (None, 0, None)))
+sharp = quick(jax.vmap(sharp_support, (None, 0)))
+
+
+def some_directions(count, seed):
+    d = np.random.default_rng(seed).normal(size=(count, 3))
+    return jnp.asarray(d / np.linalg.norm(d, axis=1)[:, None])
+
+
+def unit(v, dtype="float64"):
+    return jnp.asarray(np.asarray(v) / np.linalg.norm(v), dtype)
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_sharp_support_is_exact(name):
+    d = some_directions(100, 0)
+    exact = [EXACT[name](v) for v in np.asarray(d)]
+    np.testing.assert_allclose(sharp(SHAPES[name], d), exact, atol=1e-14)
+
+
+@pytest.mark.parametrize("beta", [1.0, 1e2, 1e6])
+@pytest.mark.parametrize("name", SHAPES)
+def test_smoothing_is_within_its_bound(name, beta):
+    """0 <= h - sharp <= log(n) / beta, and the softmax mean lies in the core."""
+    shape = SHAPES[name]
+    directions = some_directions(100, 1)
+    got = smoothed(shape, directions, jnp.asarray(beta))
+    excess = got.value - sharp(shape, directions)
+    assert excess.min() >= -1e-14
+    assert excess.max() <= np.log(shape.vertices.shape[1]) / beta + 1e-14
+    others = sharp(Shape(shape.vertices, 0 * shape.radius), directions)
+    assert jnp.max(got.core @ directions.T - others[None]) <= 1e-14
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_point_is_on_the_smoothed_boundary_with_that_normal(name):
+    """x(d) . d = h(d), and x(d) . e <= h(e) for every other direction."""
+    shape, beta = SHAPES[name], jnp.asarray(7.0)
+    d = some_directions(100, 2)
+    at = smoothed(shape, d, beta)
+    reached = at.point @ d.T
+    np.testing.assert_allclose(jnp.diag(reached), at.value, rtol=1e-13, atol=1e-13)
+    assert jnp.max(reached - at.value[None]) <= 1e-13
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_no_overflow_and_dtype(dtype):
+    shape = box([1e3, 1.0, 1e-3], 0.1, dtype)
+    got = support(shape, unit([1, 1, 1], dtype), jnp.asarray(1e6, dtype))
+    assert got.point.dtype == got.value.dtype == shape.radius.dtype == dtype
+    assert np.isfinite(np.asarray(got.point)).all()
+    for made in (sphere(1, dtype), capsule(1, 1, dtype), cylinder(1, 1, dtype=dtype)):
+        assert made.vertices.dtype == made.radius.dtype == dtype
+
+
+def test_constructors_differentiate():
+    def reach(size):
+        d, beta = unit([1, 2, 2]), jnp.asarray(1e6)
+        shapes = [
+            sphere(size),
+            capsule(size, size),
+            box(jnp.stack([size, size, size]), size),
+            cylinder(size, size),
+        ]
+        return jnp.stack([support(s, d, beta).value for s in shapes])
+
+    # Apart from the smoothing, each value is proportional to the size.
+    at = jnp.asarray(2.0)
+    np.testing.assert_allclose(quick(jax.jacfwd(reach))(at), quick(reach)(at) / 2, rtol=1e-5)
+
+
+def test_cylinder_is_inscribed():
+    sides = 24
+    angle = np.linspace(0, 2 * np.pi, 500)
+    shape = cylinder(3.0, 2.0, sides=sides)
+    d = jnp.asarray(np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1))
+    reach = sharp(shape, d)
+    assert reach.max() <= 2 + 1e-12
+    np.testing.assert_allclose(reach.min(), 2 * np.cos(np.pi / sides), rtol=1e-4)
+    np.testing.assert_allclose(sharp_support(shape, jnp.array([0.0, 0, 1])), 3)
+
+
+def test_hull_drops_what_is_inside():
+    assert hull(POINTS).vertices.shape == (3, 4)
+    flat = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0], [1, 1, 0]]
+    assert hull(flat).vertices.shape == (3, 4)
+    assert hull([[1, 2, 3]], 2.0).vertices.shape == (3, 1)
+
+
+def test_padded_is_the_same_sharp_shape():
+    shape = SHAPES["capsule"]
+    more = padded(shape, 8)
+    assert more.vertices.shape == (3, 8)
+    d, beta = unit([1, 1, 3]), jnp.asarray(50.0)
+    assert sharp_support(more, d) == sharp_support(shape, d)
+    extra = support(more, d, beta).value - support(shape, d, beta).value
+    np.testing.assert_allclose(extra, np.log(4) / 50, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: sphere(-1.0), "radius: expected a length not below 0, found -1.0"),
+        (lambda: cloud(np.zeros((3, 2))), r"expected shape \(n, 3\)"),
+        (lambda: cloud(np.zeros((0, 3))), "n >= 1"),
+        (lambda: hull(np.zeros(3)), r"expected shape \(n, 3\)"),
+        (lambda: cylinder(1.0, 1.0, sides=2), "sides: expected at least 3, found 2"),
+        (lambda: padded(SHAPES["box"], 4), "count: expected at least 8"),
+    ],
+)
+def test_misuse_is_named(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
+
+
+@quick
+def group_laws(w_1, t_1, w_2, t_2):
+    """Pairs of what must be equal."""
+    a, b = pose_from_vector(w_1, t_1), pose_from_vector(w_2, t_2)
+    points = jnp.asarray(POINTS.T)
+    return [
+        (a.rotation @ a.rotation.T, jnp.eye(3)),
+        (jnp.linalg.det(a.rotation), 1),
+        (transform(compose(a, b), points), transform(a, transform(b, points))),
+        (transform(inverse(a), transform(a, points)), points),
+        (transform(a, transform(relative(a, b), points)), transform(b, points)),
+    ]
+
+
+@few
+@given(vectors, vectors, vectors, vectors)
+def test_poses_form_a_group(w_1, t_1, w_2, t_2):
+    for left, right in group_laws(*(jnp.asarray(v) for v in (w_1, t_1, w_2, t_2))):
+        np.testing.assert_allclose(left, right, atol=1e-12)
+
+
+@few
+@given(vectors)
+def test_rotation_vector_is_the_quaternion(w):
+    angle = np.linalg.norm(w)
+    axis = w / angle if angle > 0 else w
+    q = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
+    zero = jnp.zeros(3)
+    by_vector = quick(pose_from_vector)(jnp.asarray(w), zero).rotation
+    by_quaternion = quick(pose_from_quaternion)(jnp.asarray(3 * q), zero).rotation
+    np.testing.assert_allclose(by_vector, by_quaternion, atol=1e-13)
+    np.testing.assert_allclose(by_vector @ w, w, atol=1e-13)
+
+
+@quick
+def turning(w, t):
+    turn = lambda t: pose_from_vector(w * t, jnp.zeros(3)).rotation  # noqa: E731
+    second = jax.jacfwd(jax.jacrev(turn))
+    return turn(t), jax.jacfwd(turn)(t), second(t), jax.jacfwd(jax.jacfwd(second))(t)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.2e-4, 1.3e-4, 0.1])
+def test_rotation_derivatives_are_finite_and_right(angle):
+    """d/dt exp([w] t) = [w] exp([w] t), also past the end of the series; second derivative too."""
+    w = jnp.array([0.6, 0.0, 0.8])
+    skew = np.cross(np.eye(3), w)
+    value, first, second, fourth = turning(w, jnp.asarray(angle))
+    np.testing.assert_allclose(first, skew @ value, atol=1e-12)
+    np.testing.assert_allclose(second, skew @ skew @ value, atol=1e-7)
+    if angle in (0.0, 0.1):  # in between, closed form and series both lose digits at this order
+        np.testing.assert_allclose(fourth, skew @ skew @ skew @ skew @ value, atol=1e-6)
+
+
+def test_pose_is_a_pytree():
+    assert len(jax.tree.leaves(Pose(jnp.eye(3), jnp.zeros(3)))) == 2

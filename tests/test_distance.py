@@ -1,0 +1,522 @@
+"""Signed distance: exact cases, outside numbers, laws, derivatives."""
+
+import dataclasses
+import functools
+import pathlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from jaxtrachea.contact.distance import direction_table, signed_distance, track
+from jaxtrachea.contact.pose import (
+    Pose,
+    compose,
+    inverse,
+    pose_from_quaternion,
+    pose_from_vector,
+    transform,
+)
+from jaxtrachea.contact.search import LEVELS, STANDARD, Settings
+from jaxtrachea.contact.shapes import (
+    Shape,
+    box,
+    capsule,
+    cloud,
+    cylinder,
+    padded,
+    sharp_support,
+    sphere,
+    support,
+)
+from jaxtrachea.status import ContactStatus
+
+DTYPES = ["float32", "float64"]
+#: Rounding, in units of the size of the pair: of the reference and of the search together.
+ROUNDING = {"float32": 3e-6, "float64": 1e-12}
+#: Most of the time here is compilation.
+quick = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+ZERO = (0.0, 0.0, 0.0)
+
+
+def stack(shapes, count, scale, dtype):
+    """Shapes of different kinds in one batch, in another unit of length."""
+    shapes = [padded(s, count) for s in shapes]
+    return jax.tree.map(lambda *v: jnp.asarray(np.stack(v) * scale, dtype), *shapes)
+
+
+def poses(vectors, translations, scale, dtype):
+    cast = lambda v: jnp.asarray(np.asarray(v, float), dtype)  # noqa: E731
+    return jax.vmap(pose_from_vector)(cast(vectors), cast(np.asarray(translations) * scale))
+
+
+def sizes(shapes_a, shapes_b):
+    """The size of each pair, as the settings define it."""
+    v = lambda s: np.asarray(s.vertices, float)  # noqa: E731
+    about = lambda v: v - v.mean(axis=1, keepdims=True)  # noqa: E731
+    reach = lambda s: np.linalg.norm(about(v(s)), axis=0).max()  # noqa: E731
+    return np.array(
+        [
+            reach(a) + reach(b) + float(a.radius) + float(b.radius)
+            for a, b in zip(shapes_a, shapes_b, strict=True)
+        ]
+    )
+
+
+# ---------------------------------------------------------------- exact cases
+
+CUBE = box([0.5, 0.5, 0.5])
+BIG = box([1.0, 1.0, 1.0])
+ROD = capsule(1.0, 0.5)
+NEEDLE = capsule(10.0, 0.01)
+PLATE = box([50.0, 50.0, 0.05])
+BALL = sphere(0.5)
+TRIANGLE = cloud([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+LINE = cloud([[0.0, 0, -1], [0, 0, 0.2], [0, 0, 1], [0, 0, 0.5]])
+POINT = cloud([[0.0, 0, 0]] * 3)
+MESSY = cloud(np.vstack([CUBE.vertices.T, CUBE.vertices.T[-1:], [[0.1] * 3]]))
+QUARTER = (0.0, np.pi / 2, 0.0)
+
+
+#: 1 - cosine of the tilt by smoothing: a few times 1 / sharpness, rad.
+TILT = 5e-6
+
+
+def along(*direction):
+    u = np.array(direction) / np.linalg.norm(direction)
+    return lambda n: n @ u > 1 - TILT
+
+
+def any_direction(n):
+    return True
+
+
+def face(n):
+    return np.abs(n).max() > 1 - TILT
+
+
+def across_y(n):
+    return abs(n[1]) > 1 - TILT
+
+
+def cone(*axes):
+    """No part against the outward axes, none along the others."""
+    out = np.zeros(3, bool)
+    out[list(axes)] = True
+    return lambda n: (n[out] > -1e-3).all() and (np.abs(n[~out]) < 1e-3).all()
+
+
+def facet(n):
+    """A facet of the prism: half way between two of its 24 vertices."""
+    return abs(np.sin(12 * (np.arctan2(n[1], n[0]) - np.pi / 24))) < 1e-3 and abs(n[2]) < 1e-3
+
+
+#: name: (A, B, rotation vector, translation, exact distance, law of the normal)
+HARD = {
+    "spheres apart": (sphere(1.0), sphere(2.0), ZERO, (5.0, 0, 0), 2, along(1, 0, 0)),
+    "spheres touching": (sphere(1.0), sphere(2.0), ZERO, (3.0, 0, 0), 0, along(1, 0, 0)),
+    "spheres concentric": (sphere(1.0), sphere(2.0), ZERO, ZERO, -3, any_direction),
+    "spheres nearly so": (sphere(1.0), sphere(2.0), ZERO, (1e-5, 0, 0), -2.99999, along(1, 0, 0)),
+    "spheres far apart": (sphere(1.0), sphere(2.0), ZERO, (300.0, 400, 0), 497, along(3, 4, 0)),
+    "rods parallel": (ROD, ROD, ZERO, (2.0, 0, 0), 1, along(1, 0, 0)),
+    "rods nearly parallel": (ROD, ROD, (1e-6, 0, 0), (2.0, 0, 0), 1, along(1, 0, 0)),
+    "rods crossing": (ROD, ROD, QUARTER, ZERO, -1, across_y),
+    "rods in line": (ROD, ROD, ZERO, (0, 0, 4.0), 1, along(0, 0, 1)),
+    "ball in cube": (BIG, BALL, ZERO, ZERO, -1.5, face),
+    "ball on vertex": (BIG, BALL, ZERO, (1.0, 1, 1), -0.5, cone(0, 1, 2)),
+    "ball on edge": (BIG, BALL, ZERO, (1.0, 1, 0), -0.5, cone(0, 1)),
+    "ball on face": (BIG, BALL, ZERO, (1.0, 0, 0), -0.5, along(1, 0, 0)),
+    "cubes coincident": (CUBE, CUBE, ZERO, ZERO, -1, face),
+    "cubes touching": (CUBE, CUBE, ZERO, (1.0, 0, 0), 0, along(1, 0, 0)),
+    "cubes 1e-6 apart": (CUBE, CUBE, ZERO, (1 + 1e-6, 0, 0), 1e-6, along(1, 0, 0)),
+    "cubes at vertices": (CUBE, CUBE, ZERO, (1.0, 1, 1), 0, cone(0, 1, 2)),
+    "cubes at edges": (CUBE, CUBE, ZERO, (1.0, 1, 0), 0, cone(0, 1)),
+    "plate and ball": (PLATE, sphere(1.0), ZERO, (10.0, -7, 2), 0.95, along(0, 0, 1)),
+    "plates turned": (PLATE, PLATE, (0, 0, np.pi / 6), (3.0, 2, 1), 0.9, along(0, 0, 1)),
+    "cube and needle": (CUBE, NEEDLE, ZERO, (2.0, 0, 0), 1.49, along(1, 0, 0)),
+    "needles crossed": (NEEDLE, NEEDLE, QUARTER, (0, 0.5, 0), 0.48, along(0, 1, 0)),
+    "triangle": (TRIANGLE, BALL, ZERO, (0.2, 0.2, 1), 0.5, along(0, 0, 1)),
+    "collinear": (LINE, BALL, ZERO, (2.0, 0, 0.3), 1.5, along(1, 0, 0)),
+    "points": (POINT, POINT, ZERO, (3.0, 4, 0), 5, along(3, 4, 0)),
+    "points coincident": (POINT, POINT, ZERO, ZERO, 0, any_direction),
+    "interior and doubled": (MESSY, BALL, ZERO, (2.0, 0, 0), 1, along(1, 0, 0)),
+    "prism round ball": (
+        cylinder(3.0, 2.0),
+        BALL,
+        ZERO,
+        ZERO,
+        -(2 * np.cos(np.pi / 24) + 0.5),
+        facet,
+    ),
+}
+MOST = 48  # vertices of the prism
+
+
+@functools.cache
+def with_derivatives(dtype):
+    """Contact, gradient (reverse) and Jacobian (forward) with respect to the pose, per lane."""
+
+    def one(a, b, q, t, v):
+        def moved(v):
+            turned = compose(pose_from_vector(v[:3], 0 * t), Pose(q, 0 * t))
+            return Pose(turned.rotation, v[3:] + t)
+
+        solve = lambda v: signed_distance(a, b, moved(v))  # noqa: E731
+        gradient = jax.grad(lambda v: solve(v).distance)(v)
+        read = lambda v: (lambda c: (c.distance, c.normal, c.point_a, c.point_b))(solve(v))  # noqa: E731
+        return solve(v), gradient, jax.jacfwd(read)(v)
+
+    return quick(jax.vmap(one))
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_hard_cases(dtype, scale):
+    """Exact - bound <= phi <= exact, the normal right, every value and derivative finite."""
+    a, b, turn, shift, exact, law = (list(v) for v in zip(*HARD.values(), strict=True))
+    size = np.maximum(sizes(a, b), 1e-30)
+    at = poses(turn, shift, scale, dtype)
+    zero = jnp.zeros((len(a), 6), dtype)
+    shapes = stack(a, MOST, scale, dtype), stack(b, MOST, scale, dtype)
+    c, gradient, jacobian = with_derivatives(dtype)(*shapes, at.rotation, at.translation, zero)
+    for leaf in jax.tree.leaves((c, gradient, jacobian)):
+        assert leaf.dtype in (dtype, "int8")
+        bad = ~np.isfinite(np.asarray(leaf)).reshape(len(a), -1).all(axis=1)
+        assert not bad.any(), [n for n, b in zip(HARD, bad, strict=True) if b]
+    size = np.where(size > 1e-20, size, np.linalg.norm(shift, axis=1))
+    size = np.where(size > 0, size, 1 / scale)  # coincident points have no size: 1 mm is taken
+    rounding = ROUNDING[dtype] * np.maximum(size, np.linalg.norm(shift, axis=1))
+    bound = 2 * np.log(MOST) / STANDARD.sharpness * size
+    got, lower, upper = (np.asarray(v, float) / scale for v in (c.distance, c.lower, c.upper))
+    normals = np.asarray(c.normal, float)
+    for i, name in enumerate(HARD):
+        assert exact[i] - bound[i] - rounding[i] <= got[i] <= exact[i] + rounding[i], name
+        assert got[i] - rounding[i] <= lower[i] <= exact[i] + rounding[i], name
+        assert exact[i] - rounding[i] <= upper[i], name
+        assert law[i](normals[i]), (name, normals[i])
+        assert c.status[i] in (ContactStatus.OK, ContactStatus.FLAT), (name, c.status[i])
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=ROUNDING[dtype])
+    # Moving B along the normal opens the gap by as much; forward and reverse agree.
+    np.testing.assert_allclose(gradient[:, 3:], c.normal, atol=50 * ROUNDING[dtype])
+    np.testing.assert_allclose(
+        jacobian[0], gradient, atol=50 * ROUNDING[dtype] * float(np.max(gradient) + 1)
+    )
+
+
+# ---------------------------------------------------------------- closed forms
+
+
+def test_spheres_have_no_bias_and_derivatives_of_every_order():
+    """Phi = |t| - r_A - r_B along a line, and its first three derivatives."""
+    start, step = jnp.array([1.0, 2.0, -0.5]), jnp.array([0.3, -1.0, 0.7])
+
+    def gap(s):
+        there = pose_from_vector(jnp.array([0.1, 0.2, 0.3]), start + s * step)
+        return track(sphere(0.3), sphere(0.4), there, start).distance
+
+    def exact(s):
+        return jnp.sqrt(jnp.sum((start + s * step) ** 2)) - 0.7
+
+    def orders(f):
+        first = jax.grad(f)
+        second = jax.jacfwd(first)
+        return quick(lambda s: (f(s), first(s), second(s), jax.jacfwd(second)(s)))(jnp.asarray(0.2))
+
+    np.testing.assert_allclose(orders(gap), orders(exact), rtol=1e-12)
+
+
+def box_distance(half, radius, p):
+    q = np.abs(p) - half
+    return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0) - radius
+
+
+def segment_distance(half, p):
+    return np.linalg.norm(p - np.clip(p[:, 2], -half, half)[:, None] * [0, 0, 1], axis=1)
+
+
+@functools.cache
+def lanes(settings_, dtype):
+    """One program per accuracy and dtype: a batch of pairs of 12 vertices."""
+    del dtype
+    one = lambda a, b, pose: signed_distance(a, b, pose, settings_)  # noqa: E731
+    return quick(jax.vmap(one))
+
+
+def test_box_and_capsule_against_a_ball():
+    """Closed forms of the signed distance, balls all round and inside."""
+    p = np.random.default_rng(3).uniform(-2, 2, (200, 3))
+    half, r = np.array([1.0, 0.7, 0.4]), 0.1
+    first = [box(half, r)] * 100 + [capsule(1.2, 0.3)] * 100
+    exact = np.append(box_distance(half, r, p[:100]), segment_distance(1.2, p[100:]) - 0.3) - 0.5
+    at = poses(np.zeros((200, 3)), p, 1, "float64")
+    second = stack([BALL] * 200, 12, 1, "float64")
+    c = lanes(STANDARD, "float64")(stack(first, 12, 1, "float64"), second, at)
+    bound = 2 * np.log(12) / STANDARD.sharpness * sizes(first, [BALL] * 200)
+    assert (c.distance <= exact + 1e-12).all()
+    assert (c.distance >= exact - bound).all()
+    assert (c.status == ContactStatus.OK).all()
+
+
+# ---------------------------------------------------------------- outside numbers
+
+
+@functools.cache
+def reference_pairs():
+    path = pathlib.Path(__file__).parent / "reference" / "contact_pairs.npz"
+    return dict(np.load(path))
+
+
+def pairs(index, dtype, scale):
+    """Stored pairs as a batch, their size (unscaled) and a priori bound over size."""
+    data = reference_pairs()
+    count, size = data["count"][index].astype(int), np.zeros(len(index))
+    made = []
+    for side in range(2):
+        v = data["vertices"][index, side] / 1024.0
+        v = np.stack([x[np.arange(12) % n] for x, n in zip(v, count[:, side], strict=True)])
+        radius = data["radius"][index, side] / 1024.0
+        true_mean = np.stack([x[:n].mean(axis=0) for x, n in zip(v, count[:, side], strict=True)])
+        size += np.linalg.norm(v - true_mean[:, None], axis=2).max(axis=1) + radius
+        cast = lambda x: jnp.asarray(x * scale, dtype)  # noqa: E731
+        made.append(Shape(cast(v.transpose(0, 2, 1)), cast(radius)))
+    at = jax.vmap(pose_from_quaternion)(
+        jnp.asarray(data["quaternion"][index], dtype),
+        jnp.asarray(data["translation"][index].astype(float) * scale, dtype),
+    )
+    return (*made, at), size
+
+
+def check_pairs(index, settings_, dtype, scale, missed):
+    """Bounds for every pair; at most `missed` overlapping ones in a basin not the lowest."""
+    data = reference_pairs()
+    batch, size = pairs(index, dtype, scale)
+    c = lanes(settings_, dtype)(*batch)
+    exact = data["distance"][index] / size
+    got, lower, upper = (
+        np.asarray(v, float) / scale / size for v in (c.distance, c.lower, c.upper)
+    )
+    rounding = ROUNDING[dtype] + 2e-9  # coal's own error where the cores do not overlap
+    assert (got <= exact + rounding).all()
+    assert (got <= lower + rounding).all()
+    assert (lower <= exact + rounding).all()
+    assert (exact <= upper + rounding).all()
+    # Padding repeats vertices: the mean that defines the size may move, by less than a tenth.
+    short = exact - got > 1.1 * 2 * np.log(12) / settings_.sharpness + rounding
+    assert short.sum() <= missed
+    assert not short[data["group"][index] < 2].any()
+    sure = data["unique"][index] & ~short & (exact < -0.02)
+    cosine = np.sum(np.asarray(c.normal, float) * data["normal"][index], axis=1)
+    assert np.median(1 - cosine[sure]) < 1e-2
+    assert (c.status == ContactStatus.NOT_CONVERGED).sum() <= missed
+    assert not (c.status == ContactStatus.NON_FINITE).any()
+
+
+@pytest.mark.parametrize(("dtype", "scale"), [("float64", 1.0), ("float32", 1e3)])
+def test_random_pairs_against_outside_numbers(dtype, scale):
+    check_pairs(np.arange(0, 2000, 8), STANDARD, dtype, scale, missed=2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize(("dtype", "scale"), [("float64", 1e-3), ("float32", 1.0)])
+def test_all_random_pairs(level, dtype, scale):
+    missed = {"fast": 6, "standard": 4, "fine": 2}[level]
+    check_pairs(np.arange(2000), LEVELS[level], dtype, scale, missed)
+
+
+# ---------------------------------------------------------------- laws
+
+A = box([1.0, 0.7, 0.4], 0.1)
+B = padded(capsule(0.8, 0.3), 8)
+solve = quick(signed_distance)
+short_vectors = arrays(float, 3, elements=st.floats(-2, 2))
+few = settings(max_examples=25, deadline=None, derandomize=True)
+PLACES = {
+    "apart": jnp.array([0.3, 0.2, 0.1, 1.5, 1.2, 0.4]),
+    "touching": jnp.array([0.3, 0.9, 0.1, 1.6, 0.2, 0.1]),
+    "overlap": jnp.array([0.5, -0.4, 0.2, 0.1, 0.2, 0.5]),
+}
+
+
+def place(v):
+    return pose_from_vector(v[:3], v[3:])
+
+
+cold_lanes = quick(jax.vmap(lambda v: signed_distance(A, B, place(v))))
+
+
+@few
+@given(short_vectors, short_vectors)
+def test_swapping_the_shapes(w, t):
+    there = quick(pose_from_vector)(jnp.asarray(w), jnp.asarray(t))
+    one, two = solve(A, B, there), solve(B, A, quick(inverse)(there))
+    if abs(one.distance - two.distance) > 1e-9:  # a tie or a missed basin: only ever in overlap
+        assert max(one.lower, two.lower) < 0
+        return
+    if one.curvature < 1e-3 or np.linalg.norm(one.normal + there.rotation @ two.normal) > 1e-6:
+        assert one.distance < 0 or one.curvature < 1e-3
+        return
+    np.testing.assert_allclose(transform(there, two.point_b[:, None])[:, 0], one.point_a, atol=1e-6)
+
+
+@few
+@given(short_vectors, short_vectors)
+def test_rigid_motion_of_the_frame_of_a(w, t):
+    """Turning and moving A's vertices with the pose turns and moves the answer."""
+    there = place(PLACES["apart"])
+    motion = quick(pose_from_vector)(jnp.asarray(w), jnp.asarray(100 * t))
+    moved = Shape(quick(transform)(motion, A.vertices), A.radius)
+    one, two = solve(A, B, there), solve(moved, B, quick(compose)(motion, there))
+    np.testing.assert_allclose(two.distance, one.distance, atol=1e-12)
+    np.testing.assert_allclose(two.normal, motion.rotation @ one.normal, atol=1e-9)
+    np.testing.assert_allclose(
+        two.point_a, quick(transform)(motion, one.point_a[:, None])[:, 0], atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_witness_points(name):
+    """On both smoothed boundaries, `distance` apart along the normal."""
+    there = place(PLACES[name])
+    c = solve(A, B, there)
+    np.testing.assert_allclose(c.point_b - c.point_a, c.distance * c.normal, atol=1e-12)
+    d = np.random.default_rng(4).normal(size=(300, 3))
+    d = jnp.asarray(np.vstack([d / np.linalg.norm(d, axis=1)[:, None], c.normal, -c.normal]))
+    moved = Shape(transform(there, B.vertices), B.radius)
+    for shape, point, tight in ((A, c.point_a, -2), (moved, c.point_b, -1)):
+        beta = jnp.asarray(1000.0 / sizes([A], [B])[0])
+        room = quick(jax.vmap(support, (None, 0, None)))(shape, d, beta).value - d @ point
+        assert room.min() > -1e-12
+        assert abs(room[tight]) < 1e-12
+        outside = d @ point - quick(jax.vmap(sharp_support, (None, 0)))(shape, d)
+        assert outside.max() <= np.log(8) / beta
+
+
+def test_lanes_are_single_calls():
+    batch = jnp.tile(jnp.stack(list(PLACES.values())), (40, 1))
+    together = cold_lanes(batch)
+    for i, v in enumerate(batch[:3]):
+        alone = solve(A, B, place(v))
+        for x, y in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(x[i], y, rtol=1e-6, atol=1e-9)
+
+
+def test_a_table_is_shared_between_poses():
+    """Of a box off its origin; a ball inside near its end leaves by the thin side, not ahead."""
+    half, off = jnp.array([3.0, 1.0, 0.3]), jnp.array([20.0, -30.0, 5.0])
+    there = Pose(jnp.eye(3), off + jnp.array([2.0, 0.0, 0.05]))
+    slab = Shape(box(half).vertices + off[:, None], jnp.asarray(0.0))
+    table = quick(direction_table)(slab)
+    shared = quick(lambda p, t: signed_distance(slab, BALL, p, table=t))(there, table)
+    np.testing.assert_allclose(shared.lower, -0.75, atol=1e-3)
+    np.testing.assert_allclose(shared.distance, solve(slab, BALL, there).distance, rtol=1e-12)
+
+
+def test_tracking_follows_a_path():
+    """From the normal of the step before, the whole path is the cold solution."""
+    start, end = PLACES["apart"], PLACES["touching"]
+    path = jnp.stack([start + (end - start) * s for s in np.linspace(0, 1, 120)])
+    cold = cold_lanes(path)
+
+    def step(normal, v):
+        c = track(A, B, place(v), normal)
+        return c.normal, c
+
+    _, warm = quick(lambda n, p: jax.lax.scan(step, n, p))(cold.normal[0], path)
+    np.testing.assert_allclose(warm.distance, cold.distance, atol=1e-12)
+    np.testing.assert_allclose(warm.normal, cold.normal, atol=1e-7)
+    assert (warm.status == ContactStatus.OK).all()
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+@functools.cache
+def derivatives():
+    """Warm programs: derivatives are attached where the search stopped, whichever search it was."""
+
+    def at(v, size, near):
+        return track(box(size, 0.1), B, place(v), near, beta=jnp.asarray(200.0))
+
+    def distance(*where):
+        return at(*where).distance
+
+    def normal(v, near):
+        return at(v, jnp.array([1.0, 0.7, 0.4]), near).normal
+
+    gradient = jax.grad(distance, (0, 1))
+    both = lambda *w: (gradient(*w), jax.jacfwd(distance, (0, 1))(*w))  # noqa: E731
+    by_pose = jax.grad(distance)
+    second = lambda *w: (jax.jacfwd(by_pose)(*w), jax.jacrev(by_pose)(*w))  # noqa: E731
+    turning = lambda *w: (jax.jacfwd(normal)(*w), jax.jacrev(normal)(*w), normal(*w))  # noqa: E731
+    return quick(distance), quick(both), quick(second), quick(turning)
+
+
+def central(f, v, step):
+    rows = [(f(v.at[i].add(step)) - f(v.at[i].add(-step))) / (2 * step) for i in range(v.size)]
+    return np.stack([np.asarray(r) for r in rows], axis=-1)
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_gradients(name):
+    """Pose and size of a box: reverse = forward = central differences; second = first of first."""
+    v, size = PLACES[name], jnp.array([1.0, 0.7, 0.4])
+    distance, both, second, turning = derivatives()
+    near = solve(A, B, place(v)).normal
+    (by_pose, by_size), forward = both(v, size, near)
+    np.testing.assert_allclose(forward[0], by_pose, atol=1e-11)
+    np.testing.assert_allclose(forward[1], by_size, atol=1e-11)
+    # Truncation 1e-10 times a third derivative of up to 1e3 and rounding 1e-15 / 1e-5.
+    np.testing.assert_allclose(
+        by_pose, central(lambda u: distance(u, size, near), v, 1e-5), atol=1e-6
+    )
+    np.testing.assert_allclose(
+        by_size, central(lambda s: distance(v, s, near), size, 1e-5), atol=1e-6
+    )
+    hessian, reverse = second(v, size, near)
+    np.testing.assert_allclose(reverse, hessian, atol=1e-9)
+    np.testing.assert_allclose(hessian, hessian.T, atol=1e-9)
+    numeric = central(lambda u: both(u, size, near)[0][0], v, 1e-5)
+    np.testing.assert_allclose(hessian, numeric, atol=1e-5 * (1 + np.abs(numeric).max()))
+    by_forward, by_reverse, _ = turning(v, near)
+    np.testing.assert_allclose(by_reverse, by_forward, atol=1e-9)
+    numeric = central(lambda u: turning(u, near)[2], v, 1e-6)
+    np.testing.assert_allclose(by_forward, numeric, atol=1e-5 * (1 + np.abs(numeric).max()))
+
+
+# ---------------------------------------------------------------- outcomes and misuse
+
+
+def test_outcomes():
+    here = place(PLACES["apart"])
+    nowhere = Pose(here.rotation, here.translation * jnp.nan)
+    assert solve(A, B, here).status == ContactStatus.OK
+    assert solve(A, B, nowhere).status == ContactStatus.NON_FINITE
+    level = quick(lambda t: signed_distance(sphere(1.0), BALL, Pose(jnp.eye(3), t)).status)
+    assert level(jnp.zeros(3)) == ContactStatus.FLAT
+    one_step = dataclasses.replace(STANDARD, warm_steps=1)
+    behind = quick(lambda d: track(A, B, here, d, one_step).status)(-solve(A, B, here).normal)
+    assert behind == ContactStatus.NOT_CONVERGED
+    assert all(member.message for member in ContactStatus)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Settings(directions=4), "directions: expected at least 16, found 4"),
+        (lambda: Settings(sharpness=0.0), "sharpness: expected a positive number"),
+        (lambda: Settings(starts=2, survivors=3), "expected survivors <= starts <= directions"),
+        (lambda: Settings(final_steps=0), "final_steps: expected at least 1, found 0"),
+        (
+            lambda: signed_distance(A, B, place(PLACES["apart"]), table=jnp.zeros(7)),
+            r"table: expected shape \(256,\), found \(7,\)",
+        ),
+    ],
+)
+def test_misuse_is_named(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
