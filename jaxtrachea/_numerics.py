@@ -71,6 +71,19 @@ def _cubic_ratio_jvp(primals, tangents):
     return g, -(4 / 27) * g**3 / (1 + (4 / 9) * u * g * g) * du
 
 
+def solve_2x2(
+    a: Float[Array, ""],
+    b: Float[Array, ""],
+    c: Float[Array, ""],
+    r1: Float[Array, ""],
+    r2: Float[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Solve [[a, b], [b, c]] x = r for a symmetric positive definite matrix, by elimination."""
+    pivot = b / a
+    x2 = (r2 - pivot * r1) / (c - pivot * b)
+    return (r1 - b * x2) / a, x2
+
+
 def solve_spd(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Array, " n"]:
     """Solve a symmetric positive definite system by Cholesky factors.
 

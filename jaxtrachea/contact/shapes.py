@@ -17,14 +17,18 @@ Vertices are stored as three rows (3, N), so that everything stays elementwise. 
 """
 
 import math
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.typing import ArrayLike
+from jax.typing import ArrayLike as _ArrayLike
 from jaxtyping import Array, Float
+
+#: Numbers, arrays and nested lists of them.
+ArrayLike = _ArrayLike | Sequence
 
 
 class Shape(eqx.Module):
@@ -37,8 +41,8 @@ class Shape(eqx.Module):
         radius: of the ball, mm, not negative.
     """
 
-    vertices: Float[Array, "3 n"]
-    radius: Float[Array, ""]
+    vertices: Float[Array, "*lanes 3 n"]
+    radius: Float[Array, "*lanes"]
 
 
 class Support(eqx.Module):
