@@ -4,8 +4,12 @@ Exit codes: 0 everything converged, 1 some lane failed or some curve could not b
 130 stopped by the user. What is heavy is imported inside the commands.
 """
 
+import contextlib
+import signal
 import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -115,10 +119,11 @@ def fit(
     clock.append(time.perf_counter())
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
     try:
-        with new_output(out_dir, default) as folder:
-            result, left_out = _run(loaded, problem, leave_one_out)
+        with _interrupts() as stop_if_asked, new_output(out_dir, default) as folder:
+            result, left_out = _run(loaded, problem, leave_one_out, stop_if_asked)
             clock.append(time.perf_counter())
             _write(folder, spec, loaded, measurements, result, left_out, clock)
+            stop_if_asked()
     except OutputExists as error:
         raise _Stop(str(error)) from None
     except OSError as error:
@@ -129,6 +134,34 @@ def fit(
     _print_result(result, folder.parent)
     failed = any(not _succeeded(result, lane) for lane in range(result.lanes))
     raise typer.Exit(1 if failed or measurements.bad else 0)
+
+
+@contextlib.contextmanager
+def _interrupts() -> Iterator[Callable[[], None]]:
+    """Remember Ctrl-C, since an exception raised inside a callback of jax can get lost there.
+
+    Yields:
+        What raises KeyboardInterrupt if one came; to be called between steps of the work.
+    """
+    asked = []
+
+    def remember(number, frame):
+        asked.append(number)
+        signal.default_int_handler(number, frame)
+
+    def stop_if_asked():
+        if asked:
+            raise KeyboardInterrupt
+
+    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not usual or threading.current_thread() is not threading.main_thread():
+        yield stop_if_asked
+        return
+    signal.signal(signal.SIGINT, remember)
+    try:
+        yield stop_if_asked
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _load(path: Path, data: Path | None):
@@ -177,7 +210,7 @@ def _can_leave_out(problem) -> None:
         raise _Stop(f"--leave-one-out: {error}") from None
 
 
-def _run(spec, problem, leave_out: bool):
+def _run(spec, problem, leave_out: bool, stop_if_asked: Callable[[], None]):
     from jaxtrachea.identify.fit import fit as run_fit
     from jaxtrachea.identify.predictions import leave_one_out
     from jaxtrachea.identify.study import settings_of
@@ -189,7 +222,12 @@ def _run(spec, problem, leave_out: bool):
 
         def counted(text):
             task = bar.add_task(text, total=None)
-            return lambda done, of: bar.update(task, advance=done, total=of)
+
+            def advance(done, of):
+                stop_if_asked()
+                bar.update(task, advance=done, total=of)
+
+            return advance
 
         result = run_fit(problem, settings, counted("fitting"))
         if not leave_out:

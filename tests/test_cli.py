@@ -1,5 +1,6 @@
 """Bad input: one line says where, what and the cure; no traceback, nothing written."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -284,14 +285,16 @@ def test_stopped_run_leaves_nothing(where, error, code, out, study, monkeypatch,
 
 
 def jaxtrachea_command(*arguments, **kwargs):
-    code = "import sys; from jaxtrachea.cli import main; sys.exit(main())"
+    # A shell that starts the suite in the background lets it ignore interrupts.
+    code = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from jaxtrachea.cli import main; sys.exit(main())"
+    )
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        # A shell that starts the suite in the background lets it ignore interrupts.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         **kwargs,
     )
 
@@ -312,6 +315,29 @@ def test_interrupt_in_a_real_process(study):
     assert process.returncode == 130, err
     assert "stopped; nothing was written" in err
     assert "Traceback" not in err
+    assert tree(study) == before
+
+
+def test_interrupt_that_was_swallowed(study, monkeypatch, capsys):
+    """An exception raised in a callback of jax's garbage collector is printed and forgotten."""
+    before = tree(study)
+
+    def fit(problem, settings, progress):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        progress(0, 1)
+        pytest.fail("went on after an interrupt")
+
+    monkeypatch.chdir(study)
+    monkeypatch.setattr("jaxtrachea.identify.fit.fit", fit)
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        code, _, err = run(monkeypatch, capsys, "fit", "spec.toml")
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    assert code == 130
+    assert "stopped; nothing was written" in err
     assert tree(study) == before
 
 
