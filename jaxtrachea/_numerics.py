@@ -45,23 +45,40 @@ def cubic_ratio(u: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def _cubic_root(u):
-    """Root of `cubic_ratio`: a start within 5 % (u > 0) or 1e-4 (u < 0), then Halley steps."""
+    """Root of `cubic_ratio`: a start within 5 %, then two steps of fourth order (Householder)."""
     beyond_fold = u <= -1
     v = jnp.where(beyond_fold, 0, u)
     positive = jnp.maximum(v, 0)
-    # Interpolates g^-3 = 1 + 4u/9 + ... at zero and 4u/27 + ... at infinity.
-    inverse_cube = 1 + (4 * positive + 8 * positive / (1 + 0.041 * positive)) / 27
-    start_hard = jnp.exp(jnp.log(inverse_cube) / -3)
+    # g^-3 = 1 + 4u/9 + ... at zero and 4u/27 + ... at infinity; within 3 % between.
+    near = jnp.minimum(positive, 1e12)
+    bend = (1 + 0.0194247 * near) / (1 + near * (0.121133 + 4.08816e-5 * near))
+    start_hard = _rough_inverse_cbrt(1 + (4 * positive + 8 * near * bend) / 27)
     e = jnp.sqrt(jnp.maximum(1 + jnp.minimum(v, 0), 0))
     tail = 0.65760339 + e * (-0.48829214 + e * (0.2662296 - 0.06957457 * e))
     start_soft = 1.5 - e * (0.8660254 - e * tail)
-    g = jnp.where(v < 0, start_soft, start_hard)
-    for _ in range(3):
-        vg = v * g
-        residual = g * (1 + (4 / 27) * vg * g) - 1
-        slope = 1 + (4 / 9) * vg * g
-        g = g - residual * slope / (slope * slope - residual * (4 / 9) * vg)
+    f_3 = (4 / 27) * v
+
+    def improve(_, g):
+        f_2 = 3 * f_3 * g
+        f_1 = 1 + f_2 * g
+        f = g * (1 + f_3 * g * g) - 1
+        return g - f * (f_1 * f_1 - f * f_2) / (f_1 * (f_1 * f_1 - 2 * f * f_2) + f * f * f_3)
+
+    # A loop, and not two steps written out: its result is stored, where XLA would otherwise compute
+    # the root anew inside whatever uses it.
+    g = jax.lax.fori_loop(0, 2, improve, jnp.where(v < 0, start_soft, start_hard))
     return jnp.where(beyond_fold, jnp.nan, g)
+
+
+def _rough_inverse_cbrt(x):
+    """x^(-1/3) within 3.5 % for x >= 1: a logarithm and an exponential read off the bits.
+
+    The bits of a floating-point number, taken as an integer, are a piecewise linear log2.
+    """
+    integer, mantissa, bias = {4: (jnp.int32, 23, 127), 8: (jnp.int64, 52, 1023)}[x.dtype.itemsize]
+    log = jax.lax.bitcast_convert_type(x, integer).astype(x.dtype)
+    third = log * (-1 / 3) + 4 / 3 * (bias - 0.049622) * 2.0**mantissa
+    return jax.lax.bitcast_convert_type(third.astype(integer), x.dtype)
 
 
 @cubic_ratio.defjvp

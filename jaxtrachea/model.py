@@ -113,6 +113,37 @@ def touch(
     return positive_part(displacement - onset, jnp.asarray(options.onset_width, displacement.dtype))
 
 
+def compliance(
+    geometry: Geometry, material: Material, s_c: Float[Array, "*m"], options: Options
+) -> Float[Array, "*m"]:
+    """Deflection of C per unit force at C, mm/N, at one or many contact positions.
+
+    Far cheaper than `press` where the joints are not asked for: many positions share one sweep
+    over the rings.
+    """
+    beam = ligament_beam(geometry, material, options)
+    if options.form == "recursion":
+        return _beam.contact_compliance(beam, s_c, split=options.split)
+    return jnp.vectorize(lambda s: unit_deflection(beam, s, options).w_C)(s_c)
+
+
+def unit_deflection(beam: _beam.Beam, s_c: Float[Array, ""], options: Options) -> _beam.Deflection:
+    """Everything that moves under a unit force at C."""
+    return _beam.deflect(beam, s_c, jnp.ones_like(s_c), split=options.split, form=options.form)
+
+
+def respond(
+    displacement: Float[Array, "*n"],
+    onset: Float[Array, ""],
+    compliance: Float[Array, ""],
+    law: force_law.Law,
+    options: Options,
+) -> equilibrium.Equilibrium:
+    """Force and local indentation for a skeleton of known compliance."""
+    solve = {"series": equilibrium.press_series, "total": equilibrium.press_total}[options.coupling]
+    return solve(touch(displacement, onset, options), compliance, law)
+
+
 def press(
     geometry: Geometry,
     material: Material,
@@ -140,11 +171,9 @@ def press(
         The `Press`; rows without a stable solution are NaN with a status, others are untouched.
     """
     onset = jnp.zeros((), displacement.dtype) if onset is None else onset
-    beam = ligament_beam(geometry, material, options)
-    unit = _beam.deflect(beam, s_c, jnp.ones_like(s_c), split=options.split, form=options.form)
+    unit = unit_deflection(ligament_beam(geometry, material, options), s_c, options)
     law = local_law(geometry, material, s_c, options)
-    solve = {"series": equilibrium.press_series, "total": equilibrium.press_total}[options.coupling]
-    solved = solve(touch(displacement, onset, options), unit.w_C, law)
+    solved = respond(displacement, onset, unit.w_C, law, options)
     per_ring = lambda v: solved.force[..., None] * v  # noqa: E731
     shape = (*displacement.shape, *unit.w.shape)
     return Press(

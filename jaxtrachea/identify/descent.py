@@ -14,8 +14,10 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from jaxtrachea.identify.problem import Lane, Problem, residual_value
-from jaxtrachea.identify.solve import Solved, Tolerances, entry_scale, robust
+from jaxtrachea.identify.cost import entry_scale, robust
+from jaxtrachea.identify.problem import Lane, Problem
+from jaxtrachea.identify.residual import residual_value
+from jaxtrachea.identify.solve import Solved, Tolerances
 from jaxtrachea.status import FitStatus
 
 

@@ -141,7 +141,8 @@ DEFAULTS = {
     )
 }
 
-_SKELETON = ("EI_L", "GA_L", "k_M")
+#: Parameters of the beam; all others act at the contact.
+SKELETON = ("EI_L", "GA_L", "k_M")
 
 
 def in_model(options: Options, *, joints: bool) -> list[str]:
@@ -152,7 +153,7 @@ def in_model(options: Options, *, joints: bool) -> list[str]:
     """
     names = []
     for name in DEFAULTS:
-        if name in _SKELETON and options.coupling == "total" and not joints:
+        if name in SKELETON and options.coupling == "total" and not joints:
             continue
         if name == "GA_L" and not options.shear:
             continue

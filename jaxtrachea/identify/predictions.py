@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.identify.fit import FitResult, Settings, fit
-from jaxtrachea.identify.problem import Lane, Problem, residual_value
+from jaxtrachea.identify.problem import Lane, Problem
+from jaxtrachea.identify.residual import residual_value
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,9 +1,9 @@
-"""From curves to a least-squares problem: lanes of padded arrays and one residual definition.
+"""From curves to a least-squares problem: lanes of padded arrays.
 
 A *lane* is the smallest set of curves that share unknowns: the whole study if any parameter is
 shared, one specimen otherwise, one trial if all free parameters belong to trials. Lanes have equal
 shapes (curves of unequal length are padded with weight zero), so that one compiled program fits any
-number of them at once. The same residual serves the fit, its uncertainty and the plots.
+number of them at once. What they are compared with is in `residual`.
 """
 
 import dataclasses
@@ -12,15 +12,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import DEFAULTS, Parameter
-from jaxtrachea.model import Options, Press, press
+from jaxtrachea.identify.parameters import DEFAULTS, SKELETON, Parameter
+from jaxtrachea.model import Options
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.material import Material
 
 
 class Lane(NamedTuple):
@@ -58,20 +56,6 @@ class Lane(NamedTuple):
     active: Float[Array, "*l P"]
 
 
-class Residual(NamedTuple):
-    """Whitened differences model - data of one lane and the weights they enter the cost with.
-
-    Attributes:
-        value: (T, m); force samples, then markers.
-        jacobian: d value / d (free columns, scaled); (T, Jf, m).
-        weight: balance weight of each entry; (T, m).
-    """
-
-    value: Float[Array, "T m"]
-    jacobian: Float[Array, "T Jf m"]
-    weight: Float[Array, "T m"]
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Problem:
     """A study ready to be fitted.
@@ -86,6 +70,7 @@ class Problem:
         loss: `linear`, `huber`, `soft_l1` or `cauchy`.
         loss_scale: residual, in standard deviations, where the loss turns robust.
         noise_given: whether sigma of (force, markers) is known.
+        one_beam: whether all trials of a lane press the same beam.
     """
 
     geometry: Geometry
@@ -97,6 +82,12 @@ class Problem:
     loss: str
     loss_scale: float
     noise_given: tuple[bool, bool]
+    one_beam: bool
+
+    @property
+    def free(self) -> tuple[Parameter, ...]:
+        """Parameters that are fitted, in column order."""
+        return tuple(p for p in self.parameters if not p.fixed)
 
     @property
     def free_columns(self) -> tuple[int, ...]:
@@ -117,7 +108,8 @@ class Problem:
             dataclasses.replace(p, description="", value=1.0, lower=1.0, upper=2.0, scope="shared")
             for p in self.parameters
         )
-        return _program(tree, numbers, self.options, columns, self.loss, self.loss_scale)
+        same = self.options, columns, self.loss, self.loss_scale, self.one_beam
+        return _program(tree, numbers, *same)
 
     def lane_name(self, lane: int) -> tuple[str, str]:
         """Specimen and trial of a lane; "(all)" where it spans several."""
@@ -127,7 +119,7 @@ class Problem:
 
 
 @functools.lru_cache(maxsize=64)
-def _program(tree, numbers, options, parameters, loss, loss_scale) -> Problem:
+def _program(tree, numbers, options, parameters, loss, loss_scale, one_beam) -> Problem:
     leaves = [np.reshape(np.array(v, np.float64), shape) for shape, v in numbers]
     arrays: dict[str, Any] = dict.fromkeys(Lane._fields, np.zeros((0, 0)))
     return Problem(
@@ -140,6 +132,7 @@ def _program(tree, numbers, options, parameters, loss, loss_scale) -> Problem:
         loss=loss,
         loss_scale=loss_scale,
         noise_given=(False, False),
+        one_beam=one_beam,
     )
 
 
@@ -231,6 +224,7 @@ def build(
         loss=loss,
         loss_scale=loss_scale,
         noise_given=(known, noise.joints is not None),
+        one_beam=all(map(_one_beam, unknowns)),
     )
 
 
@@ -277,6 +271,12 @@ def _unknowns(lane: list[Curve], parameters) -> list[tuple[Parameter, str, str]]
             for curve in lane:
                 names.setdefault(_key(p, curve))
     return list(names)
+
+
+def _one_beam(unknowns) -> bool:
+    """Whether no parameter of the beam occurs twice in a lane."""
+    names = [p.name for p, _, _ in unknowns if p.name in SKELETON]
+    return len(names) == len(set(names))
 
 
 def _key(p: Parameter, curve: Curve) -> tuple[Parameter, str, str]:
@@ -332,84 +332,6 @@ def _seen_joints(curve: Curve, geometry: Geometry, reach: float) -> np.ndarray:
     seen = np.isfinite(np.asarray(curve.joint_displacement))
     x = np.asarray(geometry.ring_positions)[curve.joint_rings]
     return seen if curve.s_c is None else seen & (np.abs(x - curve.s_c) > reach)
-
-
-def predict(
-    values: Mapping[str, Float[Array, ""]],
-    geometry: Geometry,
-    options: Options,
-    s_c: Float[Array, ""],
-    displacement: Float[Array, " N"],
-) -> tuple[Float[Array, " N"], Press]:
-    """Measured force along one curve (load-cell offset included) and the press behind it."""
-    one = jnp.ones((), displacement.dtype)
-    material = Material(
-        EI_L=values.get("EI_L", one),
-        k_M=values.get("k_M", one),
-        k_1=values["k_1"],
-        k_3=values["k_3"],
-        GA_L=values.get("GA_L"),
-        k_1_ring=values.get("k_1_ring"),
-        k_3_ring=values.get("k_3_ring"),
-    )
-    pressed = press(geometry, material, s_c, displacement, options, onset=values["onset"])
-    return pressed.force + values["force_offset"], pressed
-
-
-def residual(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Residual:
-    """Residuals of one lane and their Jacobian by forward mode, trial by trial.
-
-    Args:
-        problem: static description.
-        theta: unknowns in scaled coordinates.
-        lane: the lane's arrays (no leading axis).
-    """
-
-    def with_jacobian(free, trial):
-        value, tangent = jax.linearize(lambda free: _of_trial(problem, free, trial), free)
-        return value, jax.vmap(tangent)(jnp.eye(free.shape[0], dtype=free.dtype))
-
-    value, jacobian = jax.vmap(with_jacobian)(*_by_trial(problem, theta, lane))
-    weight = jnp.broadcast_to(lane.balance[:, None], value.shape)
-    return Residual(value, jacobian, weight)
-
-
-def residual_value(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Float[Array, "T m"]:
-    """`residual` without its Jacobian."""
-    one = functools.partial(_of_trial, problem)
-    return jax.vmap(one)(*_by_trial(problem, theta, lane))
-
-
-def _by_trial(problem: Problem, theta, lane: Lane):
-    """Free values of each trial, (T, Jf), and the lane's arrays that have a trial axis."""
-    index = lane.index[:, problem.free_columns]
-    free = jnp.where(index >= 0, theta[jnp.maximum(index, 0)], 0)
-    return free, lane._replace(lower=None, upper=None, active=None, index=None)
-
-
-def _of_trial(problem: Problem, free, trial):
-    """Whitened residual of one trial."""
-    names = [p.name for p in problem.parameters]
-    geometry = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), problem.geometry)
-    values = {name: trial.value[j] for j, name in enumerate(names)}
-    for column, scaled in zip(problem.free_columns, free, strict=True):
-        p = problem.parameters[column]
-        values[p.name] = jnp.exp(scaled) if p.scale == "log" else scaled * p.step
-    force, pressed = predict(values, geometry, problem.options, trial.s_c, trial.displacement)
-    r = jnp.where(trial.precision > 0, force - trial.force, 0) * trial.precision
-    if trial.joints is not None:
-        difference = jnp.where(trial.joint_precision > 0, pressed.joints - trial.joints, 0)
-        r = jnp.concatenate([r, (difference * trial.joint_precision).ravel()])
-    return r
-
-
-def observations(lane: Lane) -> tuple[Float[Array, "T m"], int]:
-    """Which entries of the residual are observed (1 or 0), and how many of them are forces."""
-    seen = lane.precision > 0
-    if lane.joint_precision is not None:
-        markers = (lane.joint_precision > 0).reshape(*seen.shape[:-1], -1)
-        seen = jnp.concatenate([seen, markers], axis=-1)
-    return seen.astype(lane.force.dtype), lane.force.shape[-1]
 
 
 def default_parameters(

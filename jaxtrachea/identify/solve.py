@@ -23,13 +23,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import epsilon, solve_spd
-from jaxtrachea.identify.problem import (
-    Lane,
-    Problem,
-    observations,
-    residual,
-    residual_value,
-)
+from jaxtrachea.identify.cost import Point, assemble, entry_scale, evaluate, weights
+from jaxtrachea.identify.problem import Lane, Problem
+from jaxtrachea.identify.residual import residual_value, size
 from jaxtrachea.status import FitStatus
 
 RUNNING = -1
@@ -53,24 +49,6 @@ class Tolerances(NamedTuple):
     step: float = 1e-10
     gradient: float = 1e-10
     iterations: int = 200
-
-
-class Point(NamedTuple):
-    """One lane evaluated: residual and Jacobian as in `Residual`, cost and normal equations.
-
-    Attributes:
-        value: (T, m).
-        jacobian: (T, Jf, m).
-        cost: half the weighted sum of rho.
-        gradient: of the cost; (P,).
-        hessian: Gauss-Newton; (P, P).
-    """
-
-    value: Float[Array, "T m"]
-    jacobian: Float[Array, "T Jf m"]
-    cost: Float[Array, ""]
-    gradient: Float[Array, " P"]
-    hessian: Float[Array, "P P"]
 
 
 class State(NamedTuple):
@@ -106,78 +84,6 @@ class Solved(NamedTuple):
     cost: np.ndarray
     status: np.ndarray
     iterations: np.ndarray
-
-
-def robust(name: str, z2: Float[Array, "*n"], scale: float) -> tuple[Array, Array]:
-    """rho(z^2) and rho'(z^2) of a loss, quadratic up to about `scale` standard deviations."""
-    s2 = scale * scale
-    u = z2 / s2
-    if name == "linear":
-        return z2, jnp.ones_like(z2)
-    if name == "huber":
-        root = jnp.sqrt(jnp.maximum(u, 1))
-        return s2 * jnp.where(u <= 1, u, 2 * root - 1), 1 / root
-    if name == "soft_l1":
-        root = jnp.sqrt(1 + u)
-        return s2 * 2 * (root - 1), 1 / root
-    if name == "cauchy":
-        return s2 * jnp.log1p(u), 1 / (1 + u)
-    raise ValueError(f"loss is {name!r}; expected linear, huber, soft_l1 or cauchy")
-
-
-def entry_scale(lane: Lane, sigma: Float[Array, "2"]) -> Float[Array, " m"]:
-    """1 / sigma of each residual entry: forces by sigma[0], markers by sigma[1]."""
-    _, forces = observations(lane)
-    count = residual_size(lane)
-    return jnp.where(jnp.arange(count) < forces, 1 / sigma[0], 1 / sigma[1])
-
-
-def residual_size(lane: Lane) -> int:
-    """Entries of the residual per trial (static)."""
-    size = lane.force.shape[-1]
-    return size if lane.joints is None else size * (1 + lane.joints.shape[-1])
-
-
-def _weights(problem: Problem, value, lane: Lane, sigma):
-    """Loss rho and weight of each squared residual, robust reweighting included; (T, m) each."""
-    scale = entry_scale(lane, sigma)[None]
-    rho, slope = robust(problem.loss, (value * scale) ** 2, problem.loss_scale)
-    b2 = (lane.balance * lane.balance)[:, None]
-    return b2 * rho, b2 * slope * scale * scale
-
-
-def evaluate(
-    problem: Problem, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
-) -> Point:
-    """Residual, cost and normal equations of one lane; cost O(trials) in the Jacobian."""
-    # The barrier keeps XLA from computing the residual anew inside each sum below.
-    r = jax.lax.optimization_barrier(residual(problem, theta, lane))
-    rho, weight = _weights(problem, r.value, lane, sigma)
-    weighted = r.jacobian * weight[:, None]
-    index = lane.index[:, problem.free_columns]
-    size = theta.shape[0]
-    return Point(
-        value=r.value,
-        jacobian=r.jacobian,
-        cost=0.5 * jnp.sum(rho),
-        gradient=assemble(jnp.sum(weighted * r.value[:, None], axis=-1), index, size),
-        hessian=assemble(jnp.einsum("tim,tjm->tij", weighted, r.jacobian), index, size),
-    )
-
-
-def assemble(parts: Array, index: Int[Array, "trials columns"], size: int) -> Array:
-    """Sum what each trial gives for its columns into the unknowns they read.
-
-    Args:
-        parts: (T, Jf) or (T, Jf, Jf).
-        index: unknown of each column, -1 where it reads none; (T, Jf).
-        size: number of unknowns.
-    """
-    place = jnp.where(index >= 0, index, size)
-    if parts.ndim == 2:
-        return jnp.zeros(size, parts.dtype).at[place].add(parts, mode="drop")
-    zero = jnp.zeros((size, size), parts.dtype)
-    return zero.at[place[:, :, None], place[:, None, :]].add(parts, mode="drop")
 
 
 def _held(theta, gradient, lane: Lane):
@@ -231,12 +137,10 @@ def _step(problem: Problem, state: State, lane: Lane, sigma) -> _Step:
     index = lane.index[:, problem.free_columns]
     along = jnp.where(index >= 0, straight[jnp.maximum(index, 0)], 0)
     ahead = residual_value(problem, theta + _LOOK * straight, lane)
-    linear = jnp.sum(point.jacobian * along[..., None], axis=1)
-    curvature = 2 / _LOOK * ((ahead - point.value) / _LOOK - linear)
-    _, weight = _weights(problem, point.value, lane, sigma)
-    pull = assemble(
-        jnp.sum(point.jacobian * (weight * curvature)[:, None], axis=-1), index, g.shape[0]
-    )
+    _, root = weights(problem, point.value, lane, sigma)
+    linear = jnp.einsum("tim,ti->tm", point.jacobian, along)
+    curvature = 2 / _LOOK * ((ahead - point.value) / _LOOK * root - linear)
+    pull = assemble(jnp.einsum("tim,tm->ti", point.jacobian, curvature), index, g.shape[0])
     bend = 0.5 * solve_spd(damped, jnp.where(free, -pull, 0))
     # Of no use where the expansion fails, nor where the step is so short that its difference is
     # rounding.
@@ -303,14 +207,14 @@ def _status(tolerances, old_cost, new, lane, sigma, fresh, finite, step, actual)
 
 def fresh_state(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> State:
     """A lane before its first evaluation."""
-    size, dtype = theta.shape[0], theta.dtype
-    trials, entries = lane.force.shape[0], residual_size(lane)
+    unknowns, dtype = theta.shape[0], theta.dtype
+    trials, entries = lane.force.shape[0], size(lane)
     point = Point(
         value=jnp.zeros((trials, entries), dtype),
         jacobian=jnp.zeros((trials, len(problem.free_columns), entries), dtype),
         cost=jnp.full((), jnp.inf, dtype),
-        gradient=jnp.zeros(size, dtype),
-        hessian=jnp.eye(size, dtype=dtype),
+        gradient=jnp.zeros(unknowns, dtype),
+        hessian=jnp.eye(unknowns, dtype=dtype),
     )
     status = jnp.asarray(RUNNING, jnp.int8)
     radius = jnp.asarray(_FIRST_RADIUS, dtype)

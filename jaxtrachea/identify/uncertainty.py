@@ -15,8 +15,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import stdtrit
 
-from jaxtrachea.identify.problem import Lane, Problem, observations, residual
-from jaxtrachea.identify.solve import assemble, chunk_size, entry_scale, robust
+from jaxtrachea.identify.cost import assemble, entry_scale, robust
+from jaxtrachea.identify.problem import Lane, Problem
+from jaxtrachea.identify.residual import observations, residual
+from jaxtrachea.identify.solve import chunk_size
 
 #: Relative standard error up to which a parameter counts as identifiable, and as weakly so.
 IDENTIFIABLE, WEAK = 0.1, 0.5

@@ -29,6 +29,22 @@ class Equilibrium(NamedTuple):
     status: Int[Array, "*n"]
 
 
+class Sensitivity(NamedTuple):
+    """Derivatives of the contact force, one entry per tool displacement.
+
+    Attributes:
+        displacement: N/mm.
+        compliance: N^2/mm.
+        k_1: mm.
+        k_3: mm^3.
+    """
+
+    displacement: Float[Array, "*n"]
+    compliance: Float[Array, "*n"]
+    k_1: Float[Array, "*n"]
+    k_3: Float[Array, "*n"]
+
+
 def press_series(
     displacement: Float[Array, "*n"], compliance: Float[Array, ""], law: Law
 ) -> Equilibrium:
@@ -73,6 +89,20 @@ def _series_depth_jvp(primals, tangents):
     force = depth * (k_1 + k_3 * d2)
     d_law = compliance * depth * (d_k_1 + d2 * d_k_3)
     return depth, share * (d_displacement - force * d_compliance - d_law)
+
+
+def sensitivity(depth: Float[Array, "*n"], compliance: Float[Array, ""], law: Law) -> Sensitivity:
+    """Derivatives of the contact force at a solved press (series coupling; total: compliance 0).
+
+    What `jax.jvp` of `press_series` gives, for callers that want every derivative from one depth.
+    """
+    d2 = depth * depth
+    slope = law.k_1 + 3 * law.k_3 * d2
+    share = 1 / (1 + compliance * slope)
+    passed = depth * share
+    return Sensitivity(
+        slope * share, -slope * (law.k_1 + law.k_3 * d2) * passed, passed, d2 * passed
+    )
 
 
 def press_total(

@@ -19,9 +19,10 @@ from scipy.optimize import least_squares
 from jaxtrachea.identify import fit, solve
 from jaxtrachea.identify.measurements import Curve
 from jaxtrachea.identify.parameters import in_model
-from jaxtrachea.identify.problem import Lane, build, default_parameters, predict
-from jaxtrachea.model import Options
+from jaxtrachea.identify.problem import Lane, build, default_parameters
+from jaxtrachea.model import Options, press
 from jaxtrachea.trachea.geometry import table_1
+from jaxtrachea.trachea.material import Material
 
 SPECIMENS, SAMPLE = 2000, 60
 NAMES = ("EI_L", "k_M", "k_1", "k_3")
@@ -154,10 +155,9 @@ def with_lmfit(model):
 def lane_residual(problem, theta, lane: Lane):
     """Our model's residual alone, for solvers that differentiate it themselves."""
     geometry = jax.tree.map(jnp.asarray, problem.geometry)
-    values = {n: jnp.exp(theta[i]) for i, n in enumerate(NAMES[:3])}
-    values["k_3"] = STEP_K_3 * theta[3]
-    values |= {"onset": jnp.zeros(()), "force_offset": jnp.zeros(())}
-    one = lambda s, d: predict(values, geometry, problem.options, s, d)[0]  # noqa: E731
+    EI_L, k_M, k_1 = jnp.exp(theta[:3])
+    material = Material(EI_L=EI_L, k_M=k_M, k_1=k_1, k_3=STEP_K_3 * theta[3])
+    one = lambda s, d: press(geometry, material, s, d, problem.options).force  # noqa: E731
     return (jax.vmap(one)(lane.s_c, lane.displacement) - lane.force).ravel()
 
 

@@ -1,0 +1,167 @@
+"""The residual is what `press` gives; its two-stage Jacobian is that of the value."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import synthetic
+
+from jaxtrachea.identify.measurements import Curve
+from jaxtrachea.identify.parameters import in_model
+from jaxtrachea.identify.problem import Noise, build, default_parameters
+from jaxtrachea.identify.residual import residual, residual_value
+from jaxtrachea.model import Options, press
+from jaxtrachea.trachea.material import Material
+
+FREE = {"fixed": False}
+TRIAL = {"fixed": False, "scope": "trial"}
+BOTH = {"onset": TRIAL, "force_offset": TRIAL}
+SHARED = {"fixed": False, "scope": "shared"}
+#: Options, with markers or without, and what is said of single parameters.
+CASES = {
+    "default": (Options(), False, {}),
+    "fixed skeleton": (Options(), False, {n: {"fixed": True} for n in ("EI_L", "k_M")}),
+    "fixed law": (Options(), True, {n: {"fixed": True} for n in ("k_1", "k_3")}),
+    "shear": (Options(shear=True), False, {}),
+    "two materials": (Options(local="two-material"), False, {}),
+    "dense": (Options(form="reactions"), False, {}),
+    "independent": (Options(split="independent"), True, {}),
+    "markers": (Options(shear=True, local="two-material"), True, {}),
+    "total": (Options(coupling="total"), False, {}),
+    "total, markers": (Options(coupling="total"), True, {}),
+    "onset and offset": (Options(onset_width=0.5), False, BOTH),
+    "all": (Options(shear=True, local="two-material"), True, BOTH),
+    "bonded": (Options(contact="bonded"), True, {"onset": FREE | {"scope": "specimen"}}),
+    "beam of a trial": (Options(), False, {"EI_L": TRIAL, "k_1": SHARED}),
+    "several beams": (Options(), False, {"k_1": SHARED, "k_M": FREE | {"scale": "linear"}}),
+}  # fmt: skip
+
+
+def study(name):
+    """Problem of two specimens, of three curves and two, of unequal length and varying sigma."""
+    options, markers, changes = CASES[name]
+    rng = np.random.default_rng(5)
+    found = []
+    for i, (s, n) in enumerate([(22.0, 7), (45.0, 5), (80.0, 6), (15.0, 7), (77.0, 4)]):
+        seen = {}
+        if markers:
+            moved = rng.normal(size=(n, 3))
+            moved[1, 2] = np.nan
+            seen = {"joint_rings": np.array([1, 6, 9]), "joint_displacement": moved}
+        sigma = rng.uniform(0.5, 2.0, n) if i % 2 else None
+        D, F = np.linspace(-0.2, 5.0, n), rng.normal(size=n)
+        found.append(Curve(f"s{i // 3}", f"t{i}", s, 0.0, D, F, sigma=sigma, **seen))
+    parameters = default_parameters(in_model(options, joints=markers), changes)
+    noise = Noise(force=0.3, joints=0.7)
+    return build(found, synthetic.GEOMETRY, options, parameters, noise=noise)
+
+
+def lane_and_point(problem, k, dtype=np.float64):
+    """Arrays of lane k and unknowns near the guess."""
+    cast = lambda v: v if v.dtype == np.int32 else v.astype(dtype)  # noqa: E731
+    lane = jax.tree.map(lambda v: jnp.asarray(cast(v[k])), problem.lanes)
+    rng = np.random.default_rng(k)
+    guess = [p.to_scaled(p.value) for p, _, _ in problem.unknowns[k]]
+    theta = np.zeros(problem.size)
+    theta[: len(guess)] = np.array(guess) + 0.3 * rng.normal(size=len(guess))
+    return lane, jnp.asarray(theta, dtype)
+
+
+@functools.cache
+def evaluated(name):
+    """Residual with Jacobian, residual alone, and its derivative by jax; of every lane."""
+    problem = study(name)
+
+    @jax.jit
+    def both(theta, lane):
+        value = functools.partial(residual_value, problem)
+        return residual(problem, theta, lane), value(theta, lane), jax.jacfwd(value)(theta, lane)
+
+    return [both(*reversed(lane_and_point(problem, k))) for k in range(len(problem.curves))]
+
+
+def pressed(problem, theta, k, t):
+    """Force and joints of trial t of lane k by the public `press`."""
+    curve = problem.curves[k][t]
+    values = {p.name: p.value for p in problem.parameters}
+    for (p, specimen, trial), scaled in zip(problem.unknowns[k], np.asarray(theta), strict=False):
+        if specimen in ("", curve.specimen) and trial in ("", curve.trial):
+            values[p.name] = p.from_scaled(float(scaled))
+    onset, offset = values.pop("onset"), values.pop("force_offset")
+    material = Material(**{"EI_L": 1.0, "k_M": 1.0} | values)
+    D = jnp.asarray(curve.displacement)
+    at = jnp.asarray(curve.s_c), jnp.asarray(onset)
+    force, joints = _press(problem.options, material, *at, jnp.pad(D, (0, 7 - len(D))))
+    return np.asarray(force)[: len(D)] + offset, np.asarray(joints)[: len(D)]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _press(options, material, s_c, onset, displacement):
+    out = press(synthetic.GEOMETRY, material, s_c, displacement, options, onset=onset)
+    return out.force, out.joints
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_is_model_minus_data(name):
+    problem = study(name)
+    for k, curves in enumerate(problem.curves):
+        lane, theta = lane_and_point(problem, k)
+        value = np.asarray(evaluated(name)[k][1])
+        samples = lane.force.shape[-1]
+        for t, curve in enumerate(curves):
+            n = len(curve.force)
+            force, joints = pressed(problem, theta, k, t)
+            sigma = 0.3 if curve.sigma is None else curve.sigma
+            expected = (force - curve.force) / sigma
+            np.testing.assert_allclose(value[t, :n], expected, rtol=1e-9, atol=1e-11)
+            assert np.all(value[t, n:samples] == 0)
+            if lane.joints is None:
+                continue
+            markers = value[t, samples:].reshape(samples, -1)
+            expected = (joints[:, curve.joint_rings] - curve.joint_displacement) / 0.7
+            expected = np.nan_to_num(expected)
+            np.testing.assert_allclose(
+                markers[:n, curve.joint_rings], expected, rtol=1e-9, atol=1e-11
+            )
+            assert np.count_nonzero(markers) <= n * 3
+        assert np.all(value[len(curves) :] == 0)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_jacobian_is_that_of_the_value(name):
+    problem = study(name)
+    for k, curves in enumerate(problem.curves):
+        lane, _ = lane_and_point(problem, k)
+        found, value, truth = evaluated(name)[k]
+        np.testing.assert_allclose(found.value, value, rtol=1e-12, atol=1e-12)
+        truth = np.asarray(truth)
+        index = np.asarray(lane.index)[:, problem.free_columns]
+        for t in range(len(curves)):
+            for column, unknown in enumerate(index[t]):
+                scale = np.abs(truth[t]).max()
+                np.testing.assert_allclose(
+                    found.jacobian[t, column], truth[t, :, unknown], rtol=1e-9, atol=1e-11 * scale
+                )
+            others = np.setdiff1d(np.arange(problem.size), index[t])
+            assert np.all(truth[t][:, others] == 0)
+
+
+@pytest.mark.parametrize("name", ["all", "several beams", "total, markers"])
+def test_float32_follows_float64(name):
+    problem = study(name)
+    both = jax.jit(residual, static_argnums=0)
+    for k in range(len(problem.curves)):
+        coarse = both(problem, *reversed(lane_and_point(problem, k, np.float32)))
+        for a, b in zip(
+            map(np.asarray, coarse), map(np.asarray, evaluated(name)[k][0]), strict=True
+        ):
+            assert a.dtype == np.float32
+            assert np.abs(a - b).max() <= 2e-5 * np.abs(b).max()
+
+
+def test_lanes_share_one_beam_only_where_they_have_one():
+    assert study("default").one_beam
+    assert not study("beam of a trial").one_beam
+    assert not study("several beams").one_beam
