@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
-from jaxtrachea.identify.predictions import LeftOut, Prediction, rms
+from jaxtrachea.identify.predictions import LeftOut, Prediction, lag_correlation, rms
 from jaxtrachea.identify.results import (
     flat_sentence,
     lane_label,
@@ -93,6 +93,8 @@ def quality_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
     return rows
 
 
+#: Correlation of neighbouring residuals from which the report doubts the standard errors.
+CORRELATED = 0.3
 QUALITY_HEAD = ["specimen", "outcome", "iter", "n", "rms F", "of peak", "rms joints", "cond"]
 LEFT_OUT_HEAD = ["specimen", "left out", "force / model", "rms force / peak", "rms joints / D"]
 
@@ -140,6 +142,7 @@ def report_text(
         "## Quality",
         _quality(result, failed),
         f"Largest residual: {prediction.worst(result)}.",
+        *_doubts(result, prediction),
     ]
     if left_out is not None:
         parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, left_out)]
@@ -170,6 +173,29 @@ def _estimates(result: FitResult) -> list[str]:
         "Identifiable: relative standard error up to 10 %; weak: up to 50 %. Standard errors are "
         "local (Gauss-Newton); they say nothing of what the model leaves out.",
     ]
+
+
+def _doubts(result: FitResult, prediction: Prediction) -> list[str]:
+    """What speaks against the standard errors of this fit."""
+    doubts = []
+    correlation = lag_correlation(prediction)
+    lanes = np.flatnonzero(correlation > CORRELATED)
+    if len(lanes):
+        r = float(np.median(correlation[lanes]))
+        factor = np.sqrt((1 + r) / max(1 - r, 1e-3))
+        doubts.append(
+            f"Neighbouring force residuals are correlated in {len(lanes)} of {result.lanes} lanes "
+            f"(median correlation {r:.2f}): the model misses the shape of these curves, or the "
+            "noise is not independent from sample to sample. The standard errors assume that it "
+            f"is; there they are too small, by a factor of about {factor:.2g} if it is noise."
+        )
+    bound = np.flatnonzero(result.at_bound.any(axis=1))
+    if len(bound):
+        doubts.append(
+            f"In {len(bound)} of {result.lanes} lanes an unknown ended on its bound. The errors of "
+            "the other unknowns there hold it fixed: they do not include its own uncertainty."
+        )
+    return doubts
 
 
 def _quality(result: FitResult, failed: list[int]) -> str:

@@ -15,7 +15,14 @@ from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.measurements import BadCurve, Curve
 from jaxtrachea.identify.output import OutputExists, new_directory, new_output
 from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.predictions import curves_to_leave_out, leave_one_out, predictions, rms
+from jaxtrachea.identify.predictions import (
+    Prediction,
+    curves_to_leave_out,
+    lag_correlation,
+    leave_one_out,
+    predictions,
+    rms,
+)
 from jaxtrachea.identify.problem import build
 from jaxtrachea.model import Options
 from jaxtrachea.plots import draw_all
@@ -197,3 +204,30 @@ def test_output_appears_complete_or_not_at_all(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         fail()
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_correlated_residuals_are_found():
+    """AR(1) noise of known coefficient, with gaps; and too few samples to say."""
+    rng = np.random.default_rng(3)
+    truth = np.array([0.0, 0.6, 0.95])
+    force = np.zeros((3, 4, 4000))
+    step = rng.normal(size=force.shape)
+    for i in range(1, force.shape[-1]):
+        force[..., i] = truth[:, None] * force[..., i - 1] + step[..., i]
+    force[:, :, ::50] = np.nan
+    np.testing.assert_allclose(lag_correlation(Prediction(force, None)), truth, atol=0.03)
+    assert np.isnan(lag_correlation(Prediction(force[:, :1, 1:9], None))).all()
+
+
+def test_report_doubts_what_it_should(result):
+    seen = predictions(result.problem, result.theta)
+    shape = seen.force.shape
+    bend = dataclasses.replace(seen, force=np.tile(np.linspace(1, 2, shape[-1]), (*shape[:2], 1)))
+    noise = dataclasses.replace(seen, force=np.tile([1.0, -1.0], (*shape[:2], shape[-1] // 2)))
+    text = report_text("T", result, [], bend, None)
+    assert "correlated in 2 of 2 lanes" in text
+    assert "on its bound" not in text
+    held = dataclasses.replace(result, at_bound=np.eye(2, result.at_bound.shape[1], dtype=bool))
+    text = report_text("T", held, [], noise, None)
+    assert "correlated" not in text
+    assert "In 2 of 2 lanes an unknown ended on its bound" in text

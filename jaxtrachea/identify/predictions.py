@@ -39,6 +39,20 @@ class Prediction:
         )
 
 
+def lag_correlation(prediction: Prediction) -> np.ndarray:
+    """Correlation of neighbouring force residuals along the curves of each lane; (lanes,).
+
+    About 0 for independent noise, near 1 where the model misses the shape of the curves; NaN with
+    fewer than 10 pairs. Not centred: a residual of one sign is correlated, too.
+    """
+    r = np.nan_to_num(prediction.force)
+    pair = np.isfinite(prediction.force[..., 1:]) & np.isfinite(prediction.force[..., :-1])
+    both = np.sum(r[..., 1:] * r[..., :-1] * pair, axis=(1, 2))
+    ends = 0.5 * np.sum((r[..., 1:] ** 2 + r[..., :-1] ** 2) * pair, axis=(1, 2))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(np.sum(pair, axis=(1, 2)) >= 10, both / ends, np.nan)
+
+
 def predictions(problem: Problem, theta: np.ndarray, chunk: int = 256) -> Prediction:
     """Residuals of all lanes at `theta` (lanes, P), in N and mm."""
     run = _compiled(problem.program)
