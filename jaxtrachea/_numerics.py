@@ -119,13 +119,13 @@ def solve_spd(matrix: Float[Array, "n n"], rhs: Float[Array, " n"]) -> Float[Arr
             rest = matrix[i, j] - sum(
                 (row[m] * rows[j][m] for m in range(j)), jnp.zeros_like(rhs[0])
             )
-            row.append(rest / rows[j][j])
+            row.append(rest * rows[j][j])
         pivot = matrix[i, i] - sum((v * v for v in row), jnp.zeros_like(rhs[0]))
-        row.append(jnp.sqrt(pivot))
-        y.append((rhs[i] - sum((row[m] * y[m] for m in range(i)), jnp.zeros_like(rhs[0]))) / row[i])
+        row.append(1 / jnp.sqrt(pivot))  # on the diagonal the inverse, which is all that is needed
+        y.append((rhs[i] - sum((row[m] * y[m] for m in range(i)), jnp.zeros_like(rhs[0]))) * row[i])
         rows.append(row)
     x: list[Array] = [rhs[0]] * n
     for i in reversed(range(n)):
         below = sum((rows[m][i] * x[m] for m in range(i + 1, n)), jnp.zeros_like(rhs[0]))
-        x[i] = (y[i] - below) / rows[i][i]
+        x[i] = (y[i] - below) * rows[i][i]
     return jnp.stack(x)

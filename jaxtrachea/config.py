@@ -185,7 +185,7 @@ class FitSection(_Section):
     seed: int = Field(0, ge=0, lt=2**63)
     max_iterations: int = Field(200, ge=1, le=1_000_000)
     tolerance: float = Field(1e-10, gt=0, lt=0.1)
-    chunk: int = Field(64, ge=1, le=1_000_000)
+    chunk: int = Field(128, ge=1, le=1_000_000)
     precision: Literal["float64", "float32"] = "float64"
 
 

@@ -161,7 +161,10 @@ def test_float32_follows_float64(name):
             assert np.abs(a - b).max() <= 2e-5 * np.abs(b).max()
 
 
-def test_lanes_share_one_beam_only_where_they_have_one():
-    assert study("default").one_beam
-    assert not study("beam of a trial").one_beam
-    assert not study("several beams").one_beam
+@pytest.mark.parametrize(
+    ("name", "common"),
+    [("default", "all"), ("onset and offset", "beam"), ("beam of a trial", "nothing"),
+     ("several beams", "nothing")],
+)  # fmt: skip
+def test_what_trials_of_a_lane_have_in_common(name, common):
+    assert study(name).common == common

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxtrachea.identify import residual as _residual
 from jaxtrachea.identify.problem import Lane, Problem
@@ -68,25 +68,27 @@ def evaluate(
     r = _residual.residual(problem, theta, lane)
     rho, root = weights(problem, r.value, lane, sigma)
     J, z = r.jacobian * root[:, None], r.value * root
-    index = lane.index[:, problem.free_columns]
-    size = theta.shape[0]
     return Point(
         value=r.value,
         jacobian=J,
         cost=0.5 * jnp.sum(rho),
-        gradient=assemble(jnp.einsum("tim,tm->ti", J, z), index, size),
-        hessian=assemble(jnp.einsum("tim,tjm->tij", J, J), index, size),
+        gradient=assemble(problem, jnp.einsum("tim,tm->ti", J, z), lane),
+        hessian=assemble(problem, jnp.einsum("tim,tjm->tij", J, J), lane),
     )
 
 
-def assemble(parts: Array, index: Int[Array, "trials columns"], size: int) -> Array:
+def assemble(problem: Problem, parts: Array, lane: Lane) -> Array:
     """Sum what each trial gives for its columns into the unknowns they read.
 
     Args:
+        problem: static description.
         parts: (T, Jf) or (T, Jf, Jf).
-        index: unknown of each column, -1 where it reads none; (T, Jf).
-        size: number of unknowns.
+        lane: tells which unknown each column reads.
     """
+    if problem.common == "all":
+        return jnp.sum(parts, axis=0)
+    size = lane.lower.shape[0]
+    index = lane.index[:, problem.free_columns]
     place = jnp.where(index >= 0, index, size)
     if parts.ndim == 2:
         return jnp.zeros(size, parts.dtype).at[place].add(parts, mode="drop")

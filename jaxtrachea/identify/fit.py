@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from jaxtrachea.identify import descent
+from jaxtrachea.identify.parameters import Parameter
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.solve import Solved, Tolerances, levenberg_marquardt
 from jaxtrachea.identify.uncertainty import Information, Uncertainty, analyse, informations
@@ -32,7 +33,7 @@ class Settings:
     starts: int = 4
     decades: float = 1.0
     seed: int = 0
-    chunk: int = 64
+    chunk: int = 128
     tolerances: Tolerances = Tolerances()
     float32: bool = False
 
@@ -112,8 +113,11 @@ def fit(
         again = _solve(problem, settings, every, solved.theta, sigma, None)
         solved = again._replace(iterations=solved.iterations + again.iterations)
     info = informations(problem, every, solved.theta, sigma)
-    sigma = next_sigma(problem, info, sigma)
-    info = informations(problem, every, solved.theta, sigma)
+    before, sigma = sigma, next_sigma(problem, info, sigma)
+    if problem.loss == "linear" and problem.lanes.joints is None:
+        info = info.rescaled(before[:, 0] / sigma[:, 0])
+    else:
+        info = informations(problem, every, solved.theta, sigma)
     return _conclude(problem, solved, info, sigma, agree)
 
 
@@ -168,12 +172,9 @@ def draw_starts(problem: Problem, settings: Settings) -> np.ndarray:
     """
     rng = np.random.default_rng(settings.seed)
     lanes, P = problem.lanes.lower.shape
-    guess = np.zeros((lanes, P))
-    reach = np.zeros((lanes, P))
-    for lane, unknowns in enumerate(problem.unknowns):
-        for i, (p, _, _) in enumerate(unknowns):
-            guess[lane, i] = p.to_scaled(p.value)
-            reach[lane, i] = settings.decades * (np.log(10) if p.scale == "log" else 10.0)
+    guess = _of_unknowns(problem, lambda p: p.to_scaled(p.value), 0.0)
+    decade = lambda p: np.log(10) if p.scale == "log" else 10.0  # noqa: E731
+    reach = settings.decades * _of_unknowns(problem, decade, 0.0)
     low = np.maximum(problem.lanes.lower, guess - reach)
     high = np.minimum(problem.lanes.upper, guess + reach)
     others = settings.starts - 1
@@ -228,12 +229,17 @@ def _conclude(problem, solved: Solved, info: Information, sigma, agree) -> FitRe
 
 def _scales(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Which unknowns have a logarithmic scale, and the step of the others; (lanes, P) each."""
-    log = np.zeros(problem.lanes.lower.shape, bool)
-    step = np.ones(log.shape)
-    for lane, unknowns in enumerate(problem.unknowns):
-        for i, (p, _, _) in enumerate(unknowns):
-            log[lane, i], step[lane, i] = p.scale == "log", p.step
-    return log, step
+    log = _of_unknowns(problem, lambda p: p.scale == "log", 0.0) > 0
+    return log, _of_unknowns(problem, lambda p: p.step, 1.0)
+
+
+def _of_unknowns(problem: Problem, number: Callable[[Parameter], float], padding: float):
+    """A number of each unknown's parameter, `padding` where a lane has fewer; (lanes, P)."""
+    known = {p.name: float(number(p)) for p in problem.free}
+    rows = np.full(problem.lanes.lower.shape, padding)
+    for row, unknowns in zip(rows, problem.unknowns, strict=True):
+        row[: len(unknowns)] = [known[p.name] for p, _, _ in unknowns]
+    return rows
 
 
 def _final_status(status, u: Uncertainty, at_bound, dof) -> np.ndarray:

@@ -9,7 +9,7 @@ number of them at once. What they are compared with is in `residual`.
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -19,6 +19,8 @@ from jaxtrachea.identify.measurements import Curve
 from jaxtrachea.identify.parameters import DEFAULTS, SKELETON, Parameter
 from jaxtrachea.model import Options
 from jaxtrachea.trachea.geometry import Geometry
+
+Common = Literal["all", "beam", "nothing"]
 
 
 class Lane(NamedTuple):
@@ -70,7 +72,8 @@ class Problem:
         loss: `linear`, `huber`, `soft_l1` or `cauchy`.
         loss_scale: residual, in standard deviations, where the loss turns robust.
         noise_given: whether sigma of (force, markers) is known.
-        one_beam: whether all trials of a lane press the same beam.
+        common: what all trials of a lane have in common, in every lane: `all` unknowns, the `beam`,
+            or `nothing`.
     """
 
     geometry: Geometry
@@ -82,7 +85,7 @@ class Problem:
     loss: str
     loss_scale: float
     noise_given: tuple[bool, bool]
-    one_beam: bool
+    common: Common
 
     @property
     def free(self) -> tuple[Parameter, ...]:
@@ -108,7 +111,7 @@ class Problem:
             dataclasses.replace(p, description="", value=1.0, lower=1.0, upper=2.0, scope="shared")
             for p in self.parameters
         )
-        same = self.options, columns, self.loss, self.loss_scale, self.one_beam
+        same = self.options, columns, self.loss, self.loss_scale, self.common
         return _program(tree, numbers, *same)
 
     def lane_name(self, lane: int) -> tuple[str, str]:
@@ -119,7 +122,7 @@ class Problem:
 
 
 @functools.lru_cache(maxsize=64)
-def _program(tree, numbers, options, parameters, loss, loss_scale, one_beam) -> Problem:
+def _program(tree, numbers, options, parameters, loss, loss_scale, common) -> Problem:
     leaves = [np.reshape(np.array(v, np.float64), shape) for shape, v in numbers]
     arrays: dict[str, Any] = dict.fromkeys(Lane._fields, np.zeros((0, 0)))
     return Problem(
@@ -132,7 +135,7 @@ def _program(tree, numbers, options, parameters, loss, loss_scale, one_beam) -> 
         loss=loss,
         loss_scale=loss_scale,
         noise_given=(False, False),
-        one_beam=one_beam,
+        common=common,
     )
 
 
@@ -224,7 +227,7 @@ def build(
         loss=loss,
         loss_scale=loss_scale,
         noise_given=(known, noise.joints is not None),
-        one_beam=all(map(_one_beam, unknowns)),
+        common=_common(unknowns, parameters),
     )
 
 
@@ -273,10 +276,14 @@ def _unknowns(lane: list[Curve], parameters) -> list[tuple[Parameter, str, str]]
     return list(names)
 
 
-def _one_beam(unknowns) -> bool:
-    """Whether no parameter of the beam occurs twice in a lane."""
-    names = [p.name for p, _, _ in unknowns if p.name in SKELETON]
-    return len(names) == len(set(names))
+def _common(unknowns, parameters) -> Common:
+    """See `Problem.common`."""
+    free = [p.name for p in parameters if not p.fixed]
+    names = [[p.name for p, _, _ in lane] for lane in unknowns]
+    if all(lane == free for lane in names):
+        return "all"
+    beams = ([name for name in lane if name in SKELETON] for lane in names)
+    return "beam" if all(len(b) == len(set(b)) for b in beams) else "nothing"
 
 
 def _key(p: Parameter, curve: Curve) -> tuple[Parameter, str, str]:

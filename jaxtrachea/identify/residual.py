@@ -46,7 +46,7 @@ def residual(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Residua
         theta: unknowns in scaled coordinates.
         lane: the lane's arrays (no leading axis).
     """
-    free = _free(problem, theta, lane)
+    free = of_trials(problem, theta, lane)
     skeleton, by_beam = _skeleton_and_derivative(problem, free, lane)
     one = lambda *trial: _of_trial_with_jacobian(problem, *trial)  # noqa: E731
     return Residual(*jax.vmap(one)(free, skeleton, by_beam, _trials(lane)))
@@ -54,7 +54,7 @@ def residual(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Residua
 
 def residual_value(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Float[Array, "T m"]:
     """`residual` without its Jacobian."""
-    free = _free(problem, theta, lane)
+    free = of_trials(problem, theta, lane)
     skeleton = _skeleton(problem, free, lane)
 
     def one(free, skeleton, trial):
@@ -67,10 +67,12 @@ def residual_value(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> F
     return jax.vmap(one)(free, skeleton, _trials(lane))
 
 
-def _free(problem: Problem, theta, lane: Lane) -> Float[Array, "T Jf"]:
-    """Scaled value of every free column in every trial."""
+def of_trials(problem: Problem, v: Float[Array, " P"], lane: Lane) -> Float[Array, "T Jf"]:
+    """Entries of a vector over the unknowns for every free column in every trial; 0 where none."""
+    if problem.common == "all":
+        return jnp.broadcast_to(v, (lane.s_c.shape[0], v.shape[0]))
     index = lane.index[:, problem.free_columns]
-    return jnp.where(index >= 0, theta[jnp.maximum(index, 0)], 0)
+    return jnp.where(index >= 0, v[jnp.maximum(index, 0)], 0)
 
 
 def _trials(lane: Lane) -> Lane:
@@ -119,7 +121,7 @@ def _skeleton(problem: Problem, free, lane: Lane) -> Skeleton:
 
     if problem.options.coupling == "total" and lane.joints is None:
         return Skeleton(jnp.zeros_like(lane.s_c), None)
-    if problem.one_beam and lane.joints is None:
+    if problem.common != "nothing" and lane.joints is None:
         return at(free[0], lane.value[0], lane.s_c)
     return jax.vmap(at)(free, lane.value, lane.s_c)
 
@@ -187,9 +189,14 @@ def _of_trial_with_jacobian(problem: Problem, free, skeleton, by_beam, trial: La
     eye = jnp.eye(free.shape[0], dtype=free.dtype)
     push = lambda t: jax.jvp(lambda f: _at_contact(problem, f, trial), (free,), (t,))  # noqa: E731
     contact, d_contact = jax.vmap(push, out_axes=(None, 0))(eye)
-    columns = jnp.array(_beam_columns(problem), int)
-    scatter = lambda v: jnp.zeros((len(eye), *v.shape[1:]), v.dtype).at[columns].set(v)  # noqa: E731
-    d_skeleton = jax.tree.map(scatter, by_beam)
+    of_beam = _beam_columns(problem)
+
+    def all_columns(v):
+        zero = jnp.zeros(v.shape[1:], v.dtype)
+        rows = range(len(eye))
+        return jnp.stack([v[of_beam.index(i)] if i in of_beam else zero for i in rows])
+
+    d_skeleton = jax.tree.map(all_columns, by_beam)
     law, c = contact.law, _felt(problem, skeleton)
     depth = respond(trial.displacement, contact.onset, c, law, problem.options).depth
     by = sensitivity(depth, c, law)

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 from jaxtrachea._numerics import epsilon, solve_spd
 from jaxtrachea.identify.cost import Point, assemble, entry_scale, evaluate, weights
 from jaxtrachea.identify.problem import Lane, Problem
-from jaxtrachea.identify.residual import residual_value, size
+from jaxtrachea.identify.residual import of_trials, residual_value, size
 from jaxtrachea.status import FitStatus
 
 RUNNING = -1
@@ -39,7 +39,8 @@ class Tolerances(NamedTuple):
     """When a lane is done; all relative.
 
     Attributes:
-        cost: predicted and actual change of the cost in one step.
+        cost: predicted and actual change of the cost in one step; or a hundredth of it still to
+            be gained by a Gauss-Newton step.
         step: step against the size of the unknowns.
         gradient: cosine between the residual and any column of the Jacobian.
         iterations: at most.
@@ -134,13 +135,12 @@ def _step(problem: Problem, state: State, lane: Lane, sigma) -> _Step:
     inside = lambda delta: jnp.clip(theta + delta, lane.lower, lane.upper) - theta  # noqa: E731
     straight = inside(straight)
     predicted = -jnp.sum(straight * (g + 0.5 * jnp.sum(H * straight[None], axis=1)))
-    index = lane.index[:, problem.free_columns]
-    along = jnp.where(index >= 0, straight[jnp.maximum(index, 0)], 0)
+    along = of_trials(problem, straight, lane)
     ahead = residual_value(problem, theta + _LOOK * straight, lane)
     _, root = weights(problem, point.value, lane, sigma)
     linear = jnp.einsum("tim,ti->tm", point.jacobian, along)
     curvature = 2 / _LOOK * ((ahead - point.value) / _LOOK * root - linear)
-    pull = assemble(jnp.einsum("tim,tm->ti", point.jacobian, curvature), index, g.shape[0])
+    pull = assemble(problem, jnp.einsum("tim,tm->ti", point.jacobian, curvature), lane)
     bend = 0.5 * solve_spd(damped, jnp.where(free, -pull, 0))
     # Of no use where the expansion fails, nor where the step is so short that its difference is
     # rounding.
@@ -194,6 +194,11 @@ def _status(tolerances, old_cost, new, lane, sigma, fresh, finite, step, actual)
     exact = cost <= 0.5 * data * (10 * epsilon(dtype)) ** 2
     tiny = small(tolerances.cost) * old_cost
     settled = finite & ~fresh & (jnp.abs(actual) <= tiny) & (step.predicted <= tiny)
+    # Nor is there anything left: what a whole Gauss-Newton step from here would gain.
+    downhill = jnp.where(free, g, 0)
+    H = jnp.where(free[:, None] & free[None], new.point.hessian, jnp.eye(len(g), dtype=dtype))
+    left = 0.5 * jnp.sum(downhill * solve_spd(H, downhill))
+    settled |= finite & (left <= 0.01 * small(tolerances.cost) * cost)
     length = jnp.sqrt(jnp.sum(step.delta**2))
     short = ~fresh & (length <= small(tolerances.step) * jnp.sqrt(jnp.sum(new.theta**2) + 1))
     nearly_flat = jnp.max(cosine) <= 1e3 * small(tolerances.gradient) ** 0.5 * jnp.sqrt(2 * cost)
@@ -205,27 +210,17 @@ def _status(tolerances, old_cost, new, lane, sigma, fresh, finite, step, actual)
     return jnp.where(fresh & ~finite, FitStatus.INFEASIBLE_START, status).astype(jnp.int8)
 
 
-def fresh_state(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> State:
-    """A lane before its first evaluation."""
-    unknowns, dtype = theta.shape[0], theta.dtype
-    trials, entries = lane.force.shape[0], size(lane)
-    point = Point(
-        value=jnp.zeros((trials, entries), dtype),
-        jacobian=jnp.zeros((trials, len(problem.free_columns), entries), dtype),
-        cost=jnp.full((), jnp.inf, dtype),
-        gradient=jnp.zeros(unknowns, dtype),
-        hessian=jnp.eye(unknowns, dtype=dtype),
-    )
-    status = jnp.asarray(RUNNING, jnp.int8)
-    radius = jnp.asarray(_FIRST_RADIUS, dtype)
-    return State(theta, point, radius, jnp.asarray(0, jnp.int32), status)
-
-
 def _advance(problem, tolerances, rounds, lane, sigma, start, refill, state):
     """Put fresh lanes where asked, then up to `rounds` iterations of the whole chunk."""
-    new = jax.vmap(functools.partial(fresh_state, problem))(start, lane)
-    put = lambda a, b: jnp.where(refill.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: E731
-    state = jax.tree.map(put, new, state)
+    put = lambda new, old: jnp.where(refill.reshape(-1, *[1] * (old.ndim - 1)), new, old)  # noqa: E731
+    # An infinite cost is the mark of a fresh lane; its point is evaluated before it is used.
+    state = State(
+        theta=put(start, state.theta),
+        point=state.point._replace(cost=put(jnp.inf, state.point.cost)),
+        radius=put(_FIRST_RADIUS, state.radius),
+        iteration=put(0, state.iteration),
+        status=put(jnp.int8(RUNNING), state.status),
+    )
     one = jax.vmap(functools.partial(iterate, problem, tolerances))
 
     def body(carry):
@@ -251,7 +246,7 @@ def levenberg_marquardt(
     sigma: np.ndarray,
     *,
     tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
-    chunk: int = 64,
+    chunk: int = 128,
     rounds: int = 4,
     progress: Callable[[int], None] | None = None,
     dtype=np.float64,
@@ -279,6 +274,10 @@ def levenberg_marquardt(
     lanes = jax.tree.map(cast, problem.lanes)
     advance = _compiled(problem.program, tolerances, rounds)
     state = _idle(problem, lanes, chunk, dtype)
+    # What the lanes of the chunk compute with; rewritten only where a lane takes its place.
+    seats = jax.tree.map(
+        lambda v: np.repeat(v[:1], chunk, axis=0), (lanes, cast(sigma), cast(starts))
+    )
     out = Solved(
         np.zeros((total, problem.size)), np.full(total, np.inf), np.zeros(total, int),
         np.zeros(total, int),
@@ -293,9 +292,11 @@ def levenberg_marquardt(
         refill &= owner >= 0
         if np.all(owner < 0):
             return out
-        of = np.maximum(owner, 0)
-        lane = jax.tree.map(lambda v, row=jobs[of]: v[row], lanes)
-        state = advance(lane, sigma[of].astype(dtype), starts[of].astype(dtype), refill, state)
+        new = owner[slots]
+        arrivals = jax.tree.map(lambda v, of=jobs[new]: v[of], lanes), sigma[new], starts[new]
+        for seat, arrival in zip(jax.tree.leaves(seats), jax.tree.leaves(arrivals), strict=True):
+            seat[slots] = arrival
+        state = advance(*seats, refill, state)
         status = np.asarray(state.status)
         done = (owner >= 0) & (status != RUNNING)
         rows = owner[done]
@@ -309,15 +310,16 @@ def levenberg_marquardt(
             progress(len(rows))
 
 
-def _idle(problem, lanes, chunk, dtype) -> State:
+def _idle(problem: Problem, lanes: Lane, chunk: int, dtype) -> State:
     """A chunk of places nobody works at."""
-    lane = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), lanes)
-    theta = jax.ShapeDtypeStruct((problem.size,), dtype)
-    one = jax.eval_shape(functools.partial(fresh_state, problem), theta, lane)
-    state = jax.tree.map(lambda v: jnp.zeros((chunk, *v.shape), v.dtype), one)
-    return state._replace(status=jnp.full(chunk, FitStatus.CONVERGED, jnp.int8))
+    P, Jf, T, m = problem.size, len(problem.free), lanes.s_c.shape[1], size(lanes)
+    zeros = lambda *shape: jnp.zeros((chunk, *shape), dtype)  # noqa: E731
+    point = Point(zeros(T, m), zeros(T, Jf, m), zeros(), zeros(P), zeros(P, P))
+    done = jnp.full(chunk, FitStatus.CONVERGED, jnp.int8)
+    return State(zeros(P), point, zeros(), jnp.zeros(chunk, jnp.int32), done)
 
 
 @functools.lru_cache(maxsize=32)
 def _compiled(problem: Problem, tolerances: Tolerances, rounds: int):
-    return jax.jit(functools.partial(_advance, problem, tolerances, rounds))
+    run = functools.partial(_advance, problem, tolerances, rounds)
+    return jax.jit(run, donate_argnums=4)

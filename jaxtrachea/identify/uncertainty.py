@@ -50,6 +50,16 @@ class Information(NamedTuple):
     psi2: Float[Array, ""]
     dpsi: Float[Array, ""]
 
+    def rescaled(self, ratio: np.ndarray) -> "Information":
+        """The same lanes with sigma smaller by `ratio`, (lanes,): linear loss, no markers."""
+        square = ratio * ratio
+        return self._replace(
+            bread=self.bread * square[:, None, None],
+            meat=self.meat * square[:, None, None],
+            gradient=self.gradient * square[:, None],
+            psi2=self.psi2 * square,
+        )
+
 
 def information(
     problem: Problem, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
@@ -64,9 +74,7 @@ def information(
     _, slope = robust(problem.loss, z * z, problem.loss_scale)
     psi = lambda z: z * robust(problem.loss, z * z, problem.loss_scale)[1]  # noqa: E731
     _, dpsi = jax.jvp(psi, (z,), (jnp.ones_like(z),))
-    index = lane.index[:, problem.free_columns]
-    size = theta.shape[0]
-    gram = lambda w: assemble(jnp.einsum("tim,tjm->tij", J * w, J), index, size)  # noqa: E731
+    gram = lambda w: assemble(problem, jnp.einsum("tim,tjm->tij", J * w, J), lane)  # noqa: E731
     gradient = jnp.einsum("tim,tm->ti", J * b2, z * slope)
     total = jnp.sum(seen)
     kinds = jnp.arange(seen.shape[1]) < forces
@@ -82,7 +90,7 @@ def information(
     return Information(
         bread=gram(b2),
         meat=gram(b2 * b2),
-        gradient=assemble(gradient, index, size),
+        gradient=assemble(problem, gradient, lane),
         squares=by_kind(r.value**2 * seen),
         counts=by_kind(seen),
         spread=jnp.stack([spread(True), spread(False)]),
@@ -92,7 +100,7 @@ def information(
 
 
 def informations(
-    problem: Problem, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, chunk: int = 64
+    problem: Problem, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, chunk: int = 128
 ) -> Information:
     """`information` of many lanes, on the host; leading axis = order of `lanes`."""
     chunk = chunk_size(len(lanes), chunk)
