@@ -1,0 +1,324 @@
+r"""Global shape: the motion of the skeleton's key points carried to every vertex (paper 2.4).
+
+The key points lie on three lines along the tube: J at phi_c, and the ring ends U at -alpha and V at
++alpha; on each, at the clamp A, the rings and the clamp B (the nodes). The contact C splits the J
+line. Along the tube a vertex lies in a patch between two nodes, round the tube in one of three
+regions, U-J, J-V and the back V-U. The three lines are interpolated along s, then linearly in phi.
+
+- `linear`: displacement vectors, linear between the key points.
+- `hermite` (default): the same, but the transverse displacement of the J line is the beam's cubic,
+  exact for a beam without shear flexibility.
+- `phong`: as printed, magnitude and the angle to the outward normal are interpolated, linear
+  between the key points. One angle does not fix a direction, so the azimuth is carried with it.
+
+Vectors are along (tangent, anterior, lateral) of the centreline, in mm. `bind` is done once for a
+mesh, `weigh` once for an angle of contact.
+"""
+
+import math
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxtrachea._numerics import epsilon
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.mesh import Mesh
+
+Method = Literal["linear", "hermite", "phong"]
+
+#: Least angle between the J line and the lines U and V, rad; see `weigh`.
+NARROWEST = 0.05
+
+#: Displacement below which `phong` fades to the normal direction, mm.
+FADE = 1e-3
+
+
+class Binding(eqx.Module):
+    """Where every vertex stands among the nodes; depends on the rest state alone.
+
+    Attributes:
+        s: position along the centreline, mm; shape (vertices,).
+        phi: angle round it, rad.
+        patch: index of the node below each vertex.
+        fraction: way to the node above, in [0, 1].
+        span: length of each vertex's patch, mm.
+        nodes: A, rings, B, mm; shape (nodes,).
+        half_angle: of the rings, rad.
+    """
+
+    s: Float[Array, " vertices"]
+    phi: Float[Array, " vertices"]
+    patch: Int[Array, " vertices"]
+    fraction: Float[Array, " vertices"]
+    span: Float[Array, " vertices"]
+    nodes: Float[Array, " nodes"]
+    half_angle: Float[Array, ""]
+
+
+class Weights(eqx.Module):
+    """Share of the lines U, J and V in the motion of every vertex; they add up to 1."""
+
+    U: Float[Array, " vertices"]
+    J: Float[Array, " vertices"]
+    V: Float[Array, " vertices"]
+    phi_c: Float[Array, ""]
+
+
+class Keys(eqx.Module):
+    """Motion of the key points; rows are A, the rings, B (see `clamped`).
+
+    Attributes:
+        s_c: contact position, mm.
+        contact: displacement of C with the skeleton, mm; shape (3,).
+        joints: displacement of the J line at the nodes, mm; shape (nodes, 3).
+        U: displacement of the ring ends at -alpha, mm; shape (nodes, 3).
+        V: displacement of the ring ends at +alpha, mm; shape (nodes, 3).
+        slopes: d/ds of the (y, z) displacement of the J line at the nodes; shape (nodes, 2). Only
+            `hermite` needs it.
+        contact_slope: the same at C; shape (2,).
+    """
+
+    s_c: Float[Array, ""]
+    contact: Float[Array, "3"]
+    joints: Float[Array, "nodes 3"]
+    U: Float[Array, "nodes 3"]
+    V: Float[Array, "nodes 3"]
+    slopes: Float[Array, "nodes 2"] | None = None
+    contact_slope: Float[Array, "2"] | None = None
+
+
+def clamped(
+    s_c: Float[Array, ""],
+    contact: Float[Array, "3"],
+    joints: Float[Array, "rings 3"],
+    U: Float[Array, "rings 3"],
+    V: Float[Array, "rings 3"],
+    slopes: Float[Array, "rings 2"] | None = None,
+    contact_slope: Float[Array, "2"] | None = None,
+    *,
+    end_A: Float[Array, "3"] | None = None,
+    end_B: Float[Array, "3"] | None = None,
+) -> Keys:
+    """Keys of a tube whose ends do not turn.
+
+    Args:
+        s_c: contact position, mm.
+        contact: displacement of C, mm.
+        joints: displacement of the joints J_i, mm; so for `U` and `V`.
+        U: of the ring ends at -alpha.
+        V: of the ring ends at +alpha.
+        slopes: d/ds of (y, z) at the joints.
+        contact_slope: the same at C.
+        end_A: displacement of the end A as a whole, mm; None: held.
+        end_B: the same of B.
+    """
+    held = jnp.zeros_like(contact)
+    first, last = (held if end is None else end for end in (end_A, end_B))
+    ends = lambda rows, a, b: jnp.concatenate([a[None], rows, b[None]])  # noqa: E731
+    joints, U, V = (ends(rows, first, last) for rows in (joints, U, V))
+    if slopes is not None:
+        slopes = ends(slopes, held[:2], held[:2])
+    return Keys(s_c, contact, joints, U, V, slopes, contact_slope)
+
+
+def bind(mesh: Mesh, geometry: Geometry) -> Binding:
+    """Find the patch of every vertex and the fraction of the way through it."""
+    inner = geometry.ring_positions
+    nodes = jnp.concatenate([jnp.zeros_like(inner[:1]), inner, geometry.length[None]])
+    patch = jnp.searchsorted(inner, mesh.s, side="right").astype(jnp.int32)
+    span = (nodes[1:] - nodes[:-1])[patch]
+    fraction = jnp.clip((mesh.s - nodes[patch]) / span, 0, 1)
+    return Binding(mesh.s, mesh.phi, patch, fraction, span, nodes, geometry.half_angle)
+
+
+def weigh(binding: Binding, phi_c: Float[Array, ""]) -> Weights:
+    """Angular shares of the lines U, J and V, linear in phi within each region.
+
+    As phi_c comes closer than `NARROWEST` to an end of the rings, the line of that end steps back
+    into the membrane to keep this distance: the motion stays continuous, its derivatives bounded
+    and C itself exact, while the key at the ring end is met up to 0.05 rad off its place.
+
+    Args:
+        binding: from `bind`.
+        phi_c: angle of contact, rad, in [-alpha, alpha].
+
+    Returns:
+        The weights; NaN if C lies behind the ends of the rings.
+    """
+    alpha, phi = binding.half_angle, binding.phi
+    on = jnp.abs(phi_c) <= alpha * (1 + 8 * epsilon(phi.dtype))
+    to_U = jnp.maximum(alpha, NARROWEST - phi_c)
+    to_V = jnp.maximum(alpha, NARROWEST + phi_c)
+    from_U = jnp.clip((phi + to_U) / (phi_c + to_U), 0, 1)
+    from_V = jnp.clip((to_V - phi) / (to_V - phi_c), 0, 1)
+    behind = jnp.maximum(phi - to_V, -phi - to_U) / (2 * math.pi - to_U - to_V)
+    behind = jnp.clip(behind, 0, 1)
+    U = (1 - from_U) * (1 - behind) + (1 - from_V) * behind
+    V = (1 - from_V) * (1 - behind) + (1 - from_U) * behind
+    hide = lambda weight: jnp.where(on, weight, jnp.nan)  # noqa: E731
+    return Weights(hide(U), hide(from_U * from_V), hide(V), phi_c)
+
+
+def interpolate(
+    binding: Binding, weights: Weights, keys: Keys, *, method: Method = "hermite"
+) -> Float[Array, "vertices 3"]:
+    """Displacement of every vertex along (tangent, anterior, lateral), mm.
+
+    Args:
+        binding: from `bind`.
+        weights: from `weigh`.
+        keys: motion of the key points.
+        method: see module docstring.
+
+    Raises:
+        ValueError: `hermite` without slopes, or keys for another number of rings.
+    """
+    if keys.joints.shape[0] != binding.nodes.shape[0]:
+        raise ValueError(
+            f"keys have {keys.joints.shape[0]} rows; expected {binding.nodes.shape[0]}, "
+            "one for A, each ring and B (see `clamped`)"
+        )
+    if method == "phong":
+        return _phong(binding, weights, keys)
+    joints = _joint_line(binding, keys.s_c, keys.joints, keys.contact)
+    if method == "hermite":
+        if keys.slopes is None or keys.contact_slope is None:
+            raise ValueError("method='hermite' needs slopes and contact_slope; or use 'linear'")
+        joints = jnp.concatenate([joints[:1], _cubic_line(binding, keys)])
+    ends = _between(binding, jnp.concatenate([keys.U, keys.V], axis=1))
+    return _mix(weights, ends[:3], joints, ends[3:]).T
+
+
+def _mix(weights: Weights, U, J, V):
+    """Across the regions; rows are components."""
+    return weights.U[None] * U + weights.J[None] * J + weights.V[None] * V
+
+
+def _between(binding: Binding, values):
+    """Linear between the nodes, one row for each component; shape (components, vertices)."""
+    low, high = values.T[:, binding.patch], values.T[:, binding.patch + 1]
+    return low + binding.fraction[None] * (high - low)
+
+
+def _cubic(low, high, slope_low, slope_high, span, t):
+    """Hermite's cubic through both ends of a span."""
+    bend = span * t * (1 - t) * ((1 - t) * slope_low - t * slope_high)
+    return low + t * t * (3 - 2 * t) * (high - low) + bend
+
+
+class _Split(NamedTuple):
+    """C inside its patch: span and way through it, and vertices' way from either node to C.
+
+    `left` rises from 0 at the node below to 1 at C and stays; `right` does from the node above.
+    """
+
+    patch: Int[Array, ""]
+    span: Float[Array, ""]
+    t: Float[Array, ""]
+    reach: tuple[Float[Array, ""], Float[Array, ""]]
+    left: Float[Array, " vertices"]
+    right: Float[Array, " vertices"]
+
+
+def _split(binding: Binding, s_c) -> _Split:
+    patch = jnp.sum(binding.nodes[1:-1] <= s_c)
+    below, above = binding.nodes[patch], binding.nodes[patch + 1]
+    left = _way(binding.s - below, s_c - below)
+    right = _way(above - binding.s, above - s_c)
+    span = above - below
+    return _Split(patch, span, (s_c - below) / span, (s_c - below, above - s_c), left, right)
+
+
+def _way(distance, reach):
+    """distance / reach between 0 and 1; a step if C lies on the node."""
+    apart = reach > 0
+    return jnp.where(apart, jnp.clip(distance / jnp.where(apart, reach, 1), 0, 1), distance >= 0)
+
+
+def _joint_line(binding: Binding, s_c, joints, contact):
+    """Linear between the nodes, and C where it is not on the chord of its patch."""
+    at = _split(binding, s_c)
+    low, high = joints[at.patch], joints[at.patch + 1]
+    off = contact - (low + at.t * (high - low))
+    return _between(binding, joints) + off[:, None] * (at.left * at.right)[None]
+
+
+def _cubic_line(binding: Binding, keys: Keys):
+    """The beam's deflection (y, z) along the J line: cubic between nodes and on both sides of C."""
+    assert keys.slopes is not None
+    assert keys.contact_slope is not None
+    values, slopes = keys.joints[:, 1:], keys.slopes
+    low, high, slope_low, slope_high = (
+        v.T[:, binding.patch + step] for v in (values, slopes) for step in (0, 1)
+    )
+    line = _cubic(
+        low, high, slope_low, slope_high, binding.span[None], binding.fraction[None]
+    )
+    at = _split(binding, keys.s_c)
+    here, there = at.patch, at.patch + 1
+    through = _cubic(values[here], values[there], slopes[here], slopes[there], at.span, at.t)
+    off = keys.contact[1:] - through
+    turn = keys.contact_slope - _cubic_slope(
+        values[here], values[there], slopes[here], slopes[there], at.span, at.t
+    )
+    left, right = at.left, at.right
+    lift = left * left * (3 - 2 * left) * right * right * (3 - 2 * right)
+    tilt = at.reach[1] * right**2 * (1 - right) - at.reach[0] * left**2 * (1 - left)
+    return line + off[:, None] * lift[None] + turn[:, None] * tilt[None]
+
+
+def _cubic_slope(low, high, slope_low, slope_high, span, t):
+    """Derivative of `_cubic` along s."""
+    chord = 6 * t * (1 - t) * (high - low) / span
+    return chord + (1 - t) * (1 - 3 * t) * slope_low + t * (3 * t - 2) * slope_high
+
+
+def _phong(binding: Binding, weights: Weights, keys: Keys):
+    """Interpolate (magnitude, angle and azimuth to the normal), linear between the key points."""
+    # Angles are counted from the inward normal for a press, else from the outward one; the
+    # azimuth is undefined at the opposite pole only, far from where the displacements are.
+    alpha = binding.half_angle
+    inward = _radial(weights.phi_c, keys.contact) > 0
+    pole = jnp.where(inward, 1, -1).astype(alpha.dtype)
+    encode = lambda v, phi: _encode(v, phi, pole)  # noqa: E731
+    joints, contact = encode(keys.joints.T, weights.phi_c).T, encode(keys.contact, weights.phi_c)
+    line = _joint_line(binding, keys.s_c, joints, contact)
+    both = jnp.concatenate([encode(keys.U.T, -alpha).T, encode(keys.V.T, alpha).T], axis=1)
+    ends = _between(binding, both)
+    return _decode(_mix(weights, ends[:3], line, ends[3:]), binding.phi, pole).T
+
+
+def _radial(phi, vector):
+    return jnp.cos(phi) * vector[1] + jnp.sin(phi) * vector[2]
+
+
+def _encode(vector, phi, pole):
+    """Magnitude, and angle to the pole times (cos, sin) of the azimuth; rows, as is `vector`."""
+    normal = pole * _radial(phi, vector)
+    along, round_ = vector[0], jnp.cos(phi) * vector[2] - jnp.sin(phi) * vector[1]
+    square = jnp.sum(vector**2, axis=0)
+    size = jnp.sqrt(square + FADE**2)
+    normal = normal + FADE**2 / size  # at rest the direction is the pole's
+    side = along**2 + round_**2
+    close = side <= (1e-4 * normal) ** 2
+    sideways = jnp.sqrt(jnp.where(close, 1, side))
+    per_length = jnp.where(
+        close & (normal > 0),
+        1 / jnp.where(normal > 0, normal, 1),
+        jnp.arctan2(sideways, normal) / sideways,
+    )
+    return jnp.stack([square / size, per_length * along, per_length * round_])
+
+
+def _decode(channels, phi, pole):
+    magnitude, a, b = channels
+    square = a * a + b * b
+    small = square < 1e-8
+    angle = jnp.sqrt(jnp.where(small, 1, square))
+    sinc = jnp.where(small, 1 - square / 6, jnp.sin(angle) / angle)
+    normal = pole * magnitude * jnp.where(small, 1 - square / 2, jnp.cos(angle))
+    round_ = magnitude * sinc * b
+    c, s = jnp.cos(phi), jnp.sin(phi)
+    return jnp.stack([magnitude * sinc * a, c * normal - s * round_, s * normal + c * round_])
