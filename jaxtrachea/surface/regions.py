@@ -16,10 +16,11 @@ mesh, `weigh` once for an angle of contact.
 """
 
 import math
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import epsilon
@@ -43,7 +44,6 @@ class Binding(eqx.Module):
         phi: angle round it, rad.
         patch: index of the node below each vertex.
         fraction: way to the node above, in [0, 1].
-        span: length of each vertex's patch, mm.
         nodes: A, rings, B, mm; shape (nodes,).
         half_angle: of the rings, rad.
     """
@@ -52,7 +52,6 @@ class Binding(eqx.Module):
     phi: Float[Array, " vertices"]
     patch: Int[Array, " vertices"]
     fraction: Float[Array, " vertices"]
-    span: Float[Array, " vertices"]
     nodes: Float[Array, " nodes"]
     half_angle: Float[Array, ""]
 
@@ -130,7 +129,8 @@ def bind(mesh: Mesh, geometry: Geometry) -> Binding:
     patch = jnp.searchsorted(inner, mesh.s, side="right").astype(jnp.int32)
     span = (nodes[1:] - nodes[:-1])[patch]
     fraction = jnp.clip((mesh.s - nodes[patch]) / span, 0, 1)
-    return Binding(mesh.s, mesh.phi, patch, fraction, span, nodes, geometry.half_angle)
+    s = jnp.clip(mesh.s, nodes[0], nodes[-1])
+    return Binding(s, mesh.phi, patch, fraction, nodes, geometry.half_angle)
 
 
 def weigh(binding: Binding, phi_c: Float[Array, ""]) -> Weights:
@@ -182,11 +182,12 @@ def interpolate(
         )
     if method == "phong":
         return _phong(binding, weights, keys)
-    joints = _joint_line(binding, keys.s_c, keys.joints, keys.contact)
+    slopes = None
     if method == "hermite":
         if keys.slopes is None or keys.contact_slope is None:
             raise ValueError("method='hermite' needs slopes and contact_slope; or use 'linear'")
-        joints = jnp.concatenate([joints[:1], _cubic_line(binding, keys)])
+        slopes = keys.slopes, keys.contact_slope
+    joints = _joint_line(binding, keys.s_c, keys.joints, keys.contact, slopes)
     ends = _between(binding, jnp.concatenate([keys.U, keys.V], axis=1))
     return _mix(weights, ends[:3], joints, ends[3:]).T
 
@@ -196,83 +197,58 @@ def _mix(weights: Weights, U, J, V):
     return weights.U[None] * U + weights.J[None] * J + weights.V[None] * V
 
 
+def _pick(rows, patch, weights):
+    """Combine `rows` (k, patches, c) by `weights` (m, k) and give (m, c, vertices)."""
+    k, patches, c = rows.shape
+    weights = jnp.asarray(np.array(weights, float), rows.dtype)
+    # A matrix product, because the compiler keeps its result: an elementwise table would be merged
+    # into the gather below and computed again for every vertex, several times slower.
+    table = jnp.matmul(weights, rows.reshape(k, -1), precision="highest")
+    table = table.reshape(-1, patches, c).swapaxes(0, 1).reshape(patches, -1)
+    picked = table.at[patch].get(mode="promise_in_bounds")
+    return picked.T.reshape(-1, c, patch.shape[0])
+
+
 def _between(binding: Binding, values):
     """Linear between the nodes, one row for each component; shape (components, vertices)."""
-    low, high = values.T[:, binding.patch], values.T[:, binding.patch + 1]
-    return low + binding.fraction[None] * (high - low)
+    low, rise = _pick(jnp.stack([values[:-1], values[1:]]), binding.patch, [[1, 0], [-1, 1]])
+    return low + binding.fraction[None] * rise
 
 
-def _cubic(low, high, slope_low, slope_high, span, t):
-    """Hermite's cubic through both ends of a span."""
-    bend = span * t * (1 - t) * ((1 - t) * slope_low - t * slope_high)
-    return low + t * t * (3 - 2 * t) * (high - low) + bend
+#: Hermite's cubic c_0 + t (c_1 + t (c_2 + t c_3)) from its values and slopes at both ends.
+HERMITE = [[1, 0, 0, 0], [0, 0, 1, 0], [-3, 3, -2, -1], [2, -2, 1, 1]]
 
 
-class _Split(NamedTuple):
-    """C inside its patch: span and way through it, and vertices' way from either node to C.
+def _joint_line(binding: Binding, s_c, joints, contact, slopes=None):
+    """The J line, with C as one more node; shape (components, vertices).
 
-    `left` rises from 0 at the node below to 1 at C and stays; `right` does from the node above.
+    Linear between the nodes; where `slopes` are given (nodes, C), the last components are cubic.
     """
-
-    patch: Int[Array, ""]
-    span: Float[Array, ""]
-    t: Float[Array, ""]
-    reach: tuple[Float[Array, ""], Float[Array, ""]]
-    left: Float[Array, " vertices"]
-    right: Float[Array, " vertices"]
-
-
-def _split(binding: Binding, s_c) -> _Split:
-    patch = jnp.sum(binding.nodes[1:-1] <= s_c)
-    below, above = binding.nodes[patch], binding.nodes[patch + 1]
-    left = _way(binding.s - below, s_c - below)
-    right = _way(above - binding.s, above - s_c)
-    span = above - below
-    return _Split(patch, span, (s_c - below) / span, (s_c - below, above - s_c), left, right)
-
-
-def _way(distance, reach):
-    """distance / reach between 0 and 1; a step if C lies on the node."""
-    apart = reach > 0
-    return jnp.where(apart, jnp.clip(distance / jnp.where(apart, reach, 1), 0, 1), distance >= 0)
+    below = jnp.sum(binding.nodes[1:-1] <= s_c)
+    nodes, values = _insert(binding.nodes, s_c, below), _insert(joints, contact, below)
+    span, low, high = jnp.diff(nodes)[:, None], values[:-1], values[1:]
+    leave = land = high - low
+    if slopes is not None:
+        turn = _insert(*slopes, below)
+        straight = leave[:, : leave.shape[1] - turn.shape[1]]
+        leave, land = (jnp.concatenate([straight, span * v], 1) for v in (turn[:-1], turn[1:]))
+    # Where a patch begins, and one over its length, travel with the values as two more columns.
+    place = jnp.concatenate([nodes[:-1, None], 1 / jnp.where(span > 0, span, jnp.inf)], axis=1)
+    more = jnp.zeros_like(place)
+    low = jnp.concatenate([low, place], axis=1)
+    high, leave, land = (jnp.concatenate([v, more], axis=1) for v in (high, leave, land))
+    patch = binding.patch + (binding.s >= s_c).astype(binding.patch.dtype)
+    c = _pick(jnp.stack([low, high, leave, land]), patch, HERMITE)
+    t = ((binding.s - c[0, -2]) * c[0, -1])[None]
+    c_0, c_1, c_2, c_3 = c[:, :-2]
+    return c_0 + t * (c_1 + t * (c_2 + t * c_3))
 
 
-def _joint_line(binding: Binding, s_c, joints, contact):
-    """Linear between the nodes, and C where it is not on the chord of its patch."""
-    at = _split(binding, s_c)
-    low, high = joints[at.patch], joints[at.patch + 1]
-    off = contact - (low + at.t * (high - low))
-    return _between(binding, joints) + off[:, None] * (at.left * at.right)[None]
-
-
-def _cubic_line(binding: Binding, keys: Keys):
-    """The beam's deflection (y, z) along the J line: cubic between nodes and on both sides of C."""
-    assert keys.slopes is not None
-    assert keys.contact_slope is not None
-    values, slopes = keys.joints[:, 1:], keys.slopes
-    low, high, slope_low, slope_high = (
-        v.T[:, binding.patch + step] for v in (values, slopes) for step in (0, 1)
-    )
-    line = _cubic(
-        low, high, slope_low, slope_high, binding.span[None], binding.fraction[None]
-    )
-    at = _split(binding, keys.s_c)
-    here, there = at.patch, at.patch + 1
-    through = _cubic(values[here], values[there], slopes[here], slopes[there], at.span, at.t)
-    off = keys.contact[1:] - through
-    turn = keys.contact_slope - _cubic_slope(
-        values[here], values[there], slopes[here], slopes[there], at.span, at.t
-    )
-    left, right = at.left, at.right
-    lift = left * left * (3 - 2 * left) * right * right * (3 - 2 * right)
-    tilt = at.reach[1] * right**2 * (1 - right) - at.reach[0] * left**2 * (1 - left)
-    return line + off[:, None] * lift[None] + turn[:, None] * tilt[None]
-
-
-def _cubic_slope(low, high, slope_low, slope_high, span, t):
-    """Derivative of `_cubic` along s."""
-    chord = 6 * t * (1 - t) * (high - low) / span
-    return chord + (1 - t) * (1 - 3 * t) * slope_low + t * (3 * t - 2) * slope_high
+def _insert(rows, row, below):
+    """`rows` with `row` after the index `below`."""
+    order = jnp.arange(rows.shape[0] + 1).reshape((-1,) + (1,) * (rows.ndim - 1))
+    before, after = jnp.concatenate([rows, rows[-1:]]), jnp.concatenate([rows[:1], rows])
+    return jnp.where(order <= below, before, jnp.where(order == below + 1, row[None], after))
 
 
 def _phong(binding: Binding, weights: Weights, keys: Keys):
