@@ -13,6 +13,8 @@ import numpy as np
 from jaxtrachea.trachea.mesh import MeshError
 
 RAYS = 72
+#: Cross-sections through which the centreline is laid.
+STATIONS = 60
 #: Angles of the rays, rad, ascending; 0 along the first axis of the frame.
 ANGLES = 2 * math.pi * (np.arange(RAYS) + 0.5) / RAYS - math.pi
 #: The arc on which rings are looked for: the anterior side, clear of the rings' ends.
@@ -132,13 +134,13 @@ def find_centreline(vertices, faces, given=None) -> Line:
     axes = axes[:, ::-1]
     along = (vertices - centre) @ axes[:, 0]
     margin = 0.05 * np.ptp(along)
-    stations = np.linspace(along.min() + margin, along.max() - margin, 100)
+    stations = np.linspace(along.min() + margin, along.max() - margin, STATIONS)
     curve = [np.zeros(1)] * 2
     for _ in range(4):
         seen, off = _centres(vertices, faces, centre, axes, stations, curve)
-        if len(seen) < 50:
+        if len(seen) < STATIONS / 2:
             raise MeshError(
-                f"only {len(seen)} of 100 cross-sections close round the axis; expected a tube: "
+                f"only {len(seen)} of {STATIONS} cross-sections close round the axis; expected a tube: "
                 "repair it, or give centreline="
             )
         curve = [np.polynomial.polynomial.polyfit(seen, v, 4) for v in off.T]
@@ -177,7 +179,7 @@ def _frame(tangent, towards):
 def _fine(points):
     """The same line in steps of about 0.5 mm, evenly."""
     s = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    even = np.linspace(0, s[-1], max(10, int(s[-1] / 0.5)))
+    even = np.linspace(0, s[-1], max(20, int(s[-1] / 0.5)))
     return np.stack([np.interp(even, s, v) for v in points.T], axis=1)
 
 
@@ -185,7 +187,7 @@ def _over(vertices, points) -> Line:
     """Lengthen or cut the line straight to where the surface begins and ends, with its frames."""
     reach = np.ptp(vertices, axis=0).max()
     ends = []
-    for end, inner in ((points[0], points[5]), (points[-1], points[-6])):
+    for end, inner in ((points[0], points[9]), (points[-1], points[-10])):
         ends.append(end + (end - inner) / np.linalg.norm(end - inner) * reach)
     line = _framed(_fine(np.concatenate([ends[:1], points, ends[1:]])))
     s = locate(line, vertices).s

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea.trachea.centreline import (
+    Line,
     Shape,
     find_anterior,
     find_centreline,
@@ -103,9 +104,12 @@ def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
     cartilage = _cartilage(parts, name, rings, path, scale, notes)
     given = None if centreline is None else np.asarray(centreline, float) * scale
     line = find_centreline(wall.vertices, wall.faces, given)
-    shape = Shape.scan(line, wall.vertices, wall.faces, cartilage)
-    if _carina_is_last(shape, larynx):
-        shape = Shape.scan(turned(line), wall.vertices, wall.faces, cartilage)
+    scan = lambda line: Shape.scan(line, wall.vertices, wall.faces, cartilage)  # noqa: E731
+    if larynx is not None:
+        shape = scan(turned(line) if _points_back(line, larynx) else line)
+    else:
+        shape = scan(line)
+        shape = scan(turned(line)) if _carina_is_last(shape) else shape
     shape = find_anterior(shape, anterior)
     found = find_rings(shape, ring_positions, half_angle)
     where = locate(shape.line, wall.vertices)
@@ -119,9 +123,7 @@ def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
     dtype = jnp.zeros(0, dtype).dtype
     fields = (normals, where.s, where.phi, where.distance, frames)
     cast = lambda v: jnp.asarray(v, dtype)  # noqa: E731
-    mesh = Mesh(
-        cast(vertices), jnp.asarray(wall.faces, jnp.int32), *(cast(v) for v in fields)
-    )
+    mesh = Mesh(cast(vertices), jnp.asarray(wall.faces, jnp.int32), *(cast(v) for v in fields))
     try:
         geometry = Geometry.create(
             shape.line.s[-1], found.positions, radius=found.radius, half_angle=found.half_angle,
@@ -173,7 +175,7 @@ def _area(surface: _Surface) -> float:
 
 
 def _wall(parts: dict[str, _Surface], part: str | None) -> str:
-    names = ", ".join(parts)
+    names = ", ".join(sorted(parts))
     if part is not None:
         if part not in parts:
             raise MeshError(f"there is no object {part!r} in it; there are {names}")
@@ -315,14 +317,16 @@ def _axes(along, anterior):
     return np.stack([x, y, np.cross(x, y)])
 
 
-def _carina_is_last(shape: Shape, larynx) -> bool:
-    if larynx is not None:
-        along = shape.line.points[-1] - shape.line.points[0]
-        cosine = along @ np.asarray(larynx, float)
-        cosine /= np.linalg.norm(along) * max(np.linalg.norm(larynx), 1e-300)
-        if abs(cosine) < 0.2:
-            raise MeshError("larynx= points across the tube; expected a direction along it")
-        return bool(cosine < 0)
+def _points_back(line: Line, larynx) -> bool:
+    along = line.points[-1] - line.points[0]
+    cosine = along @ np.asarray(larynx, float)
+    cosine /= np.linalg.norm(along) * max(float(np.linalg.norm(larynx)), 1e-300)
+    if abs(cosine) < 0.2:
+        raise MeshError("larynx= points across the tube; expected a direction along it")
+    return bool(cosine < 0)
+
+
+def _carina_is_last(shape: Shape) -> bool:
     first, last = shape.end_radii()
     if max(first, last) < 1.1 * min(first, last):
         raise MeshError(
