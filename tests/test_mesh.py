@@ -188,7 +188,7 @@ def bent(vertices, radius=150.0):
 
 
 def test_curved_double_walled_tube(tmp_path):
-    """s is the arc length; frames carry a motion along the normal to the normal of the bend."""
+    """Arc length is s; frames carry a motion along the normal to the normal of the bend."""
     vertices, faces = as_arrays(TUBE)
     inner = vertices * [1, 0.8, 0.8]
     both = np.concatenate([bent(vertices), bent(inner)])

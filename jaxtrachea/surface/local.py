@@ -131,7 +131,7 @@ def correction(dent: Dent, points: Float[Array, "points 3"]) -> Float[Array, "po
 
 
 def _kernel(points, centres, reach):
-    """psi between points and centres; shape (points, centres)."""
+    """The kernel psi between points and centres; shape (points, centres)."""
     square = sum(
         ((p[:, None] - c[None]) ** 2 for p, c in zip(points.T, centres.T, strict=True)),
         jnp.zeros((), points.dtype),

@@ -219,7 +219,7 @@ def _between(binding: Binding, values):
 HERMITE = [[1, 0, 0, 0], [0, 0, 1, 0], [-3, 3, -2, -1], [2, -2, 1, 1]]
 
 
-def _joint_line(binding: Binding, s_c, joints, contact, slopes=None):
+def _joint_line(binding: Binding, s_c, joints, contact, slopes: tuple[Array, Array] | None = None):
     """The J line, with C as one more node; shape (components, vertices).
 
     Linear between the nodes; where `slopes` are given (nodes, C), the last components are cubic.
@@ -229,7 +229,7 @@ def _joint_line(binding: Binding, s_c, joints, contact, slopes=None):
     span, low, high = jnp.diff(nodes)[:, None], values[:-1], values[1:]
     leave = land = high - low
     if slopes is not None:
-        turn = _insert(*slopes, below)
+        turn = _insert(slopes[0], slopes[1], below)
         straight = leave[:, : leave.shape[1] - turn.shape[1]]
         leave, land = (jnp.concatenate([straight, span * v], 1) for v in (turn[:-1], turn[1:]))
     # Where a patch begins, and one over its length, travel with the values as two more columns.

@@ -140,8 +140,8 @@ def find_centreline(vertices, faces, given=None) -> Line:
         seen, off = _centres(vertices, faces, centre, axes, stations, curve)
         if len(seen) < STATIONS / 2:
             raise MeshError(
-                f"only {len(seen)} of {STATIONS} cross-sections close round the axis; expected a tube: "
-                "repair it, or give centreline="
+                f"only {len(seen)} of {STATIONS} cross-sections close round the axis; "
+                "expected a tube: repair it, or give centreline="
             )
         curve = [np.polynomial.polynomial.polyfit(seen, v, 4) for v in off.T]
     t = np.linspace(seen.min(), seen.max(), 60)
@@ -288,7 +288,7 @@ def _side(strength) -> tuple[float, bool]:
 def _opposite_flat(shape: Shape) -> float:
     """Opposite the angle at which a D-shaped contour is nearest to its centre."""
     mean = _middle(shape.radius)
-    smooth = sum(np.roll(mean, k) for k in range(-4, 5)) / 9
+    smooth = np.mean([np.roll(mean, k) for k in range(-4, 5)], axis=0)
     low = int(np.argmin(smooth))
     others = np.roll(smooth, -low)[RAYS // 6 : -RAYS // 6]
     if not others.min() > 1.03 * smooth[low]:
