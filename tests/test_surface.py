@@ -217,8 +217,9 @@ def test_axial_motion_is_linear_from_C_to_the_ends():
     np.testing.assert_allclose(got, np.interp(s, [0, 73, 160], [0, 1, 0]), atol=1e-14)
 
 
+@pytest.mark.parametrize("at_C", [0.3, 0.0])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_phong_interpolates_magnitude_and_angle(sign):
+def test_phong_interpolates_magnitude_and_angle(sign, at_C):
     """As printed: halfway between two keys of one azimuth, half the magnitude and half the angle.
 
     Press (angles from the inward normal) and draw.
@@ -229,25 +230,32 @@ def test_phong_interpolates_magnitude_and_angle(sign):
     def keyed(size, angle, phi):
         return size * (math.cos(angle) * sign * normal(phi) + math.sin(angle) * x)
 
-    contact, end = keyed(2.0, 0.3, 0.0), keyed(1.0, 0.7, ALPHA)
+    contact, end = keyed(2.0, at_C, 0.0), keyed(1.0, 0.7, ALPHA)
     rows = [jnp.asarray(np.tile(v, (17, 1))) for v in (contact, 0 * end, end)]
     keys = regions.Keys(jnp.asarray(73.0), jnp.asarray(contact), *rows)
     got = motion("phong", 42.0, ALPHA / 2, 0.0, keys)[0]
-    np.testing.assert_allclose(got, keyed(1.5, 0.5, ALPHA / 2), atol=1e-5)
+    np.testing.assert_allclose(got, keyed(1.5, (at_C + 0.7) / 2, ALPHA / 2), atol=1e-5)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("method", METHODS)
 def test_nothing_moves_nothing(method, dtype):
-    """Exactly 0, and derivatives that exist."""
+    """Exactly 0; derivatives there are in `test_gradients`."""
     keys = random_keys(size=0.0, dtype=dtype)
     geometry = table_1(dtype)
     at = regions.bind(points([3.0, 71, 73, 150], [0.4, -3.0, 1, 2.5], dtype=dtype), geometry)
-    x = (at, jnp.asarray(0.4, dtype), keys)
-    np.testing.assert_array_equal(OF[method](*x), 0)
-    for of in (jax.jacfwd, jax.jacrev) if dtype == "float64" else (jax.jacrev,):
-        slopes = jax.jit(of(surface_of(method), (1, 2)), compiler_options=QUICK)(*x)
-        assert all(np.all(np.isfinite(v)) for v in jax.tree.leaves(slopes))
+    np.testing.assert_array_equal(OF[method](at, jnp.asarray(0.4, dtype), keys), 0)
+
+
+def test_phong_at_rest_in_float32():
+    """Derivatives at rest, and at a joint that hardly moves between others that do: bounded."""
+    of = jax.jit(jax.jacrev(surface_of("phong"), (1, 2)), compiler_options=QUICK)
+    keys = random_keys(dtype="float32")
+    small = keys.joints.at[7].multiply(1e-9)
+    moving = regions.Keys(keys.s_c, keys.contact, small, keys.U, keys.V)
+    for keys in (jax.tree.map(jnp.zeros_like, moving), moving):
+        for slope in jax.tree.leaves(of(AT32, jnp.asarray(0.4, "float32"), keys)):
+            assert np.max(np.abs(slope)) < 10 / regions.FADE
 
 
 def slopes_of(f):
@@ -280,6 +288,7 @@ def check_gradient(slopes, x, tangent, shape, step=1e-6, rtol=1e-6, sides=(1, -1
 
 
 AT = regions.bind(points([3.0, 66.3, 71, 74, 152], [0.3, -3.0, 1.0, 1.9, -1.95]), GEOMETRY)
+AT32 = regions.bind(points([68.0, 71, 74], [0.3, 0.5, -2.5], dtype="float32"), table_1("float32"))
 SLOPES = {method: slopes_of(lambda x, m=method: surface_of(m)(AT, *x)) for method in METHODS}
 
 
@@ -342,28 +351,32 @@ def test_one_ring():
 
 
 fit = jax.jit(local.fit, compiler_options=QUICK)
+centres = jax.jit(local.centres, static_argnames="count", compiler_options=QUICK)
+targets = jax.jit(local.targets, compiler_options=QUICK)
+correction = jax.jit(local.correction, compiler_options=QUICK)
+kernel = jax.jit(local._kernel, compiler_options=QUICK)
 
 
 def dent(count, spacing=1.5, reach=5.0, depth=(0.2, -1.0, 0.3), sag=0.0, dtype="float64"):
     s, phi, radius, spacing, reach = (
         jnp.asarray(v, dtype) for v in (73, 0.4, 12.0, spacing, reach)
     )
-    at = local.centres(s, phi, radius, spacing, count)
-    wanted = local.targets(jnp.asarray(depth, dtype), jnp.full(count, sag, dtype))
+    at = centres(s, phi, radius, spacing, count)
+    wanted = targets(jnp.asarray(depth, dtype), jnp.full(count, sag, dtype))
     return at, wanted, fit(at, wanted, reach)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("reach", [3.0, 5.0, 7.5])
+@pytest.mark.parametrize("reach", [3.0, 7.5])
 @pytest.mark.parametrize("count", [1, 8, 16, 32])
 def test_dent_meets_its_targets(count, reach, dtype):
     """2 to 5 spacings: condition below 1e3, targets to the ridge times that."""
     at, wanted, found = dent(count, reach=reach, dtype=dtype)
     np.testing.assert_allclose(at[0], [73, 12 * math.cos(0.4), 12 * math.sin(0.4)], rtol=1e-6)
     np.testing.assert_allclose(np.hypot(at[:, 1], at[:, 2]), 12, rtol=1e-6)
-    matrix = np.asarray(local._kernel(at, at, jnp.asarray(reach, dtype)), float)
+    matrix = np.asarray(kernel(at, at, jnp.asarray(reach, dtype)), float)
     assert np.linalg.cond(matrix) < 1e3
-    got = local.correction(found, at)
+    got = correction(found, at)
     assert got.dtype == jnp.dtype(dtype)
     atol = 16 * count * np.finfo(dtype).eps * 1e3
     np.testing.assert_allclose(got, wanted, atol=atol)
@@ -376,7 +389,7 @@ def test_dent_meets_its_targets(count, reach, dtype):
 def test_dent_is_zero_out_of_reach(count):
     at, _, found = dent(count)
     points = TUBE.straight
-    moved = np.abs(np.asarray(local.correction(found, points))).max(axis=1)
+    moved = np.abs(np.asarray(correction(found, points))).max(axis=1)
     away = np.linalg.norm(np.asarray(points)[:, None] - np.asarray(at)[None], axis=2).min(axis=1)
     np.testing.assert_array_equal(moved[away >= 5.0], 0)
     assert np.all(moved[away < 4.5] > 0)
@@ -385,16 +398,14 @@ def test_dent_is_zero_out_of_reach(count):
 def test_one_centre_is_the_kernel():
     """Wendland's C2 function by hand: psi(1/2) = 3/16."""
     at, wanted, found = dent(1, reach=4.0)
-    got = local.correction(found, at + jnp.asarray([[2.0, 0, 0]]))
+    got = correction(found, at + jnp.asarray([[2.0, 0, 0]]))
     np.testing.assert_allclose(got, 3 / 16 * wanted, rtol=1e-12)
 
 
 def test_sag_makes_the_footprint_shallower():
-    got = local.targets(jnp.asarray([0.0, -2.0, 0]), jnp.asarray([9.0] + [0.5] * 6 + [0] * 9))
+    got = targets(jnp.asarray([0.0, -2.0, 0]), jnp.asarray([9.0] + [0.5] * 6 + [0] * 9))
     np.testing.assert_allclose(got[:, 1], [-2] + [-1.5] * 6 + [0] * 9)
-    np.testing.assert_array_equal(
-        local.targets(jnp.asarray([0.0, -0.3, 0]), jnp.full(16, 0.5))[1:], 0
-    )
+    np.testing.assert_array_equal(targets(jnp.asarray([0.0, -0.3, 0]), jnp.full(16, 0.5))[1:], 0)
 
 
 def test_repeated_centres():
@@ -404,9 +415,9 @@ def test_repeated_centres():
     one = fit(at[1:], jnp.asarray([[1.0, 0, 0], [0, 1, 0]]), reach)
     two = fit(at, jnp.asarray([[1.0, 0, 0], [1, 0, 0], [0, 1, 0]]), reach)
     x = jnp.asarray([[0.5, 0.3, 0], [1.5, 0, 1]])
-    np.testing.assert_allclose(local.correction(two, x), local.correction(one, x), atol=1e-3)
+    np.testing.assert_allclose(correction(two, x), correction(one, x), atol=1e-3)
     odd = fit(at, jnp.asarray([[1.0, 0, 0], [3, 0, 0], [0, 1, 0]]), reach)
-    np.testing.assert_allclose(local.correction(odd, at)[0, 0], 2, atol=1e-2)
+    np.testing.assert_allclose(correction(odd, at)[0, 0], 2, atol=1e-2)
 
 
 @pytest.mark.parametrize("depth", [(0.2, -1.0, 0.3), (0.0, 0.0, 0.0)])
@@ -436,4 +447,4 @@ def test_global_and_local_make_up_the_tool_displacement():
     at_C = motion("hermite", 73.0, 0.4, 0.4, keys)[0]
     _, _, found = dent(16)
     here = points(73.0, 0.4).straight
-    np.testing.assert_allclose(at_C + local.correction(found, here)[0], keys.contact + d, atol=1e-9)
+    np.testing.assert_allclose(at_C + correction(found, here)[0], keys.contact + d, atol=1e-9)

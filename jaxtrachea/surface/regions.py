@@ -256,8 +256,8 @@ def _phong(binding: Binding, weights: Weights, keys: Keys):
     # Angles are counted from the inward normal for a press, else from the outward one; the
     # azimuth is undefined at the opposite pole only, far from where the displacements are.
     alpha = binding.half_angle
-    inward = _radial(weights.phi_c, keys.contact) > 0
-    pole = jnp.where(inward, 1, -1).astype(alpha.dtype)
+    drawn = _radial(weights.phi_c, keys.contact) > 0
+    pole = jnp.where(drawn, 1, -1).astype(alpha.dtype)
     encode = lambda v, phi: _encode(v, phi, pole)  # noqa: E731
     joints, contact = encode(keys.joints.T, weights.phi_c).T, encode(keys.contact, weights.phi_c)
     line = _joint_line(binding, keys.s_c, joints, contact)
