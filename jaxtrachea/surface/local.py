@@ -111,7 +111,7 @@ def fit(
     """The correction that takes the values `targets` at `centres`, by Cholesky factors.
 
     A ridge of 16 eps n keeps repeated centres solvable (they share their mean target); elsewhere
-    the targets are met to 16 eps n times the condition number.
+    the targets are met to 16 eps n times the weights (1 mm: 2e-4 mm in float32).
 
     Args:
         centres: mm.
