@@ -66,6 +66,9 @@ def test_imports_only_from_above(path):
         ("mechanics", "from jaxtrachea.model import press"),
         ("trachea", "def f():\n    import jaxtrachea.mechanics.beam as b"),
         ("model", "from jaxtrachea import identify"),
+        ("surface", "from jaxtrachea.model import press"),
+        ("trachea", "from jaxtrachea.surface.regions import bind"),
+        ("mechanics", "from jaxtrachea.surface import local"),
         ("_numerics", "from .trachea import geometry"),
     ],
 )
@@ -77,6 +80,7 @@ def test_import_is_light():
     """Plots, meshes, the command line and file formats are loaded by those who use them."""
     code = (
         "import sys, jaxtrachea, jaxtrachea.model\n"
+        "import jaxtrachea.surface.local, jaxtrachea.surface.regions, jaxtrachea.trachea.imported\n"
         f"print([m for m in {HEAVY!r} if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

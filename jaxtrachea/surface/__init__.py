@@ -1,0 +1,1 @@
+"""From the motion of the skeleton to the motion of the surface."""

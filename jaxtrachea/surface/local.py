@@ -1,0 +1,142 @@
+r"""Local shape: the dent under the tool, added to the global shape by radial functions.
+
+u(x) = u_global(x) + sum_j w_j psi(|x - x_j| / r), psi(q) = (1 - q)_+^4 (4 q + 1), which is C2,
+positive definite in space, and exactly 0 from r on. The weights meet given targets at the centres:
+the local indentation at C, what keeps the surface out of the tool under its footprint, and 0 on a
+collar round it.
+
+Source of psi: Wendland, "Piecewise polynomial, positive definite and compactly supported radial
+functions of minimal degree", Adv. Comput. Math. 4 (1995), doi:10.1007/BF02123482. The paper names
+the local deformation but prints no equation for it.
+
+Points are those of the tube bent straight (`Mesh.straight`), displacements along (tangent,
+anterior, lateral); mm.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxtrachea._numerics import epsilon
+
+#: Centres on circles round C, by the number of centres; the outermost circle is the collar.
+CIRCLES = {1: (), 8: (7,), 16: (6, 9), 32: (6, 10, 15)}
+
+
+class Dent(eqx.Module):
+    """A fitted local correction.
+
+    Attributes:
+        centres: mm; shape (centres, 3).
+        weights: mm; shape (centres, 3).
+        reach: r, beyond which nothing moves, mm.
+    """
+
+    centres: Float[Array, "centres 3"]
+    weights: Float[Array, "centres 3"]
+    reach: Float[Array, ""]
+
+
+def pattern(count: int) -> tuple[Float[np.ndarray, "centres 2"], Bool[np.ndarray, " centres"]]:
+    """C first, then circles of radius 1, 2, 3 about it; and which centres form the collar.
+
+    Args:
+        count: 1 (the peak alone), 8, 16 or 32.
+
+    Raises:
+        ValueError: for any other count.
+    """
+    if count not in CIRCLES:
+        raise ValueError(f"count is {count}; expected one of {', '.join(map(str, CIRCLES))}")
+    offsets, collar = [np.zeros((1, 2))], [False]
+    for i, n in enumerate(CIRCLES[count]):
+        angle = 2 * math.pi * np.arange(n) / n
+        offsets.append((i + 1) * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        collar += [i + 1 == len(CIRCLES[count])] * n
+    return np.concatenate(offsets), np.array(collar)
+
+
+def centres(
+    s_c: Float[Array, ""],
+    phi_c: Float[Array, ""],
+    distance: Float[Array, ""],
+    spacing: Float[Array, ""],
+    count: int,
+) -> Float[Array, "centres 3"]:
+    """The pattern laid round the tube about C, mm.
+
+    Args:
+        s_c: contact position, mm.
+        phi_c: angle of contact, rad.
+        distance: of C from the centreline, mm, positive.
+        spacing: between the circles, along and round the tube, mm.
+        count: see `pattern`.
+    """
+    offsets = jnp.asarray(pattern(count)[0], s_c.dtype)
+    phi = phi_c + offsets[:, 1] * (spacing / distance)
+    across = distance * jnp.cos(phi), distance * jnp.sin(phi)
+    return jnp.stack([s_c + offsets[:, 0] * spacing, *across], axis=1)
+
+
+def targets(local: Float[Array, "3"], sag: Float[Array, " centres"]) -> Float[Array, "centres 3"]:
+    """What the local correction must be at the centres of `pattern`.
+
+    The dent under the footprint is shallower than at C by the sag, and nowhere reversed.
+
+    Args:
+        local: local part of the displacement of C, mm.
+        sag: how much shallower than at C the tool lies over each centre of the rest surface,
+            against `local`, mm; at C itself it is not read, on the collar neither.
+
+    Returns:
+        mm; shape (centres, 3): `local` at C, 0 on the collar.
+    """
+    collar = pattern(sag.shape[0])[1]
+    square = jnp.sum(local**2)
+    depth = jnp.sqrt(jnp.where(square > 0, square, 1))
+    share = jnp.where(square > 0, jnp.maximum(1 - sag / depth, 0), 0)
+    share = jnp.where(collar, 0, share).at[0].set(1)
+    return share[:, None] * local[None]
+
+
+def fit(
+    centres: Float[Array, "centres 3"],
+    targets: Float[Array, "centres 3"],
+    reach: Float[Array, ""],
+) -> Dent:
+    """The correction that takes the values `targets` at `centres`, by Cholesky factors.
+
+    A ridge of 16 eps n keeps repeated centres solvable (they share their mean target); elsewhere
+    the targets are met to 16 eps n times the weights (1 mm: 2e-4 mm in float32).
+
+    Args:
+        centres: mm.
+        targets: displacement at each centre, mm.
+        reach: r, mm, positive. 2 to 5 spacings keep the condition number below 1e3.
+    """
+    n = centres.shape[0]
+    matrix = _kernel(centres, centres, reach)
+    matrix = matrix + 16 * n * epsilon(matrix.dtype) * jnp.eye(n, dtype=matrix.dtype)
+    factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
+    return Dent(centres, jax.scipy.linalg.cho_solve(factor, targets), reach)
+
+
+def correction(dent: Dent, points: Float[Array, "points 3"]) -> Float[Array, "points 3"]:
+    """Local displacement of every point, mm; exactly 0 beyond the reach of all centres."""
+    return _kernel(points, dent.centres, dent.reach) @ dent.weights
+
+
+def _kernel(points, centres, reach):
+    """The kernel psi between points and centres; shape (points, centres)."""
+    square = sum(
+        ((p[:, None] - c[None]) ** 2 for p, c in zip(points.T, centres.T, strict=True)),
+        jnp.zeros((), points.dtype),
+    ) / (reach * reach)
+    inside = square < 1
+    away = inside & (square > 0)  # before the root, whose derivative at 0 is not finite
+    q = jnp.where(away, jnp.sqrt(jnp.where(away, square, 1)), 0)
+    return jnp.where(inside, (1 - q) ** 4 * (4 * q + 1), 0)

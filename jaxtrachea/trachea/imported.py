@@ -1,0 +1,336 @@
+"""Real tracheas: a surface file made into a mesh bound to its skeleton.
+
+STL, OBJ, PLY, GLB and what else trimesh reads, in any position and orientation. What is found in
+the shape (unit, ends, centreline, anterior side, rings) can be given instead; what can be neither
+is refused.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxtrachea.trachea.centreline import (
+    Line,
+    Shape,
+    find_anterior,
+    find_centreline,
+    find_rings,
+    locate,
+    turned,
+)
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.mesh import Mesh, MeshError, edge_counts, vertex_normals, volume
+from jaxtrachea.units import unit_factor
+
+#: Length of a trachea with its wall, infant to adult, mm: what a guess of the unit goes by.
+PLAUSIBLE = 40.0, 250.0
+
+
+class Imported(eqx.Module):
+    """A trachea read from a file.
+
+    Attributes:
+        mesh: the surface in the tube frame.
+        geometry: length along the centreline, rings, mean outer radius over the rings' arc.
+        rotation: rows are the axes of the tube frame in the file.
+        origin: of the tube frame in the file, in the file's unit.
+        scale: mm per unit of the file. File position = origin + rotation^T position / scale.
+        notes: what was found, chosen or dropped, in words.
+    """
+
+    mesh: Mesh
+    geometry: Geometry
+    rotation: Float[Array, "3 3"]
+    origin: Float[Array, "3"]
+    scale: float = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
+
+
+def read_mesh(
+    path: str | Path,
+    *,
+    unit: str | None = None,
+    part: str | None = None,
+    rings: str | Path | None = None,
+    larynx: Sequence[float] | np.ndarray | None = None,
+    anterior: Sequence[float] | np.ndarray | None = None,
+    centreline: np.ndarray | None = None,
+    ring_positions: Sequence[float] | np.ndarray | None = None,
+    half_angle: float | None = None,
+    dtype=None,
+) -> Imported:
+    """Read a trachea from a surface file.
+
+    Args:
+        path: the file.
+        unit: of the file, "mm" say. None: metres for GLB and glTF, as that format says; else the
+            one of mm, cm, m, in that gives a plausible length, refused if there are two.
+        part: name of the object that is the wall, if the file has several. None: the one with more
+            than half of the area.
+        rings: the cartilage: name of another object in the file, or another file of the same unit
+            and position. None: an object whose name tells of cartilage or rings; without one the
+            rings are looked for in the relief of the wall.
+        larynx: direction from carina to larynx, in file axes. None: the carina is the wider end.
+        anterior: direction of the anterior side, in file axes. None: opposite the gap of the rings
+            or the flat side of the wall.
+        centreline: points from one end to the other, file unit; shape (points, 3).
+        ring_positions: s of the rings, mm from the carina's end.
+        half_angle: of the rings, rad.
+        dtype: of every array; the default float type of JAX if None.
+
+    Raises:
+        MeshError: the file, what was found, what is expected, the cure.
+    """
+    path = Path(path)
+    try:
+        return _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
+                     half_angle, dtype)  # fmt: skip
+    except MeshError as error:
+        raise MeshError(f"{path.name}: {error}") from error.__cause__
+
+
+def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions, half_angle, dtype):
+    parts = _parts(path)
+    name = _wall(parts, part)
+    notes = [f"wall: {name}"] if len(parts) > 1 else []
+    surface, cleaned = _clean(parts[name])
+    scale = _scale(surface, path, unit, notes)
+    wall = _Surface(surface.vertices * scale, surface.faces)
+    cartilage = _cartilage(parts, name, rings, path, scale, notes)
+    given = None if centreline is None else np.asarray(centreline, float) * scale
+    line = find_centreline(wall.vertices, wall.faces, given)
+    scan = lambda line: Shape.scan(line, wall.vertices, wall.faces, cartilage)  # noqa: E731
+    if larynx is not None:
+        shape = scan(turned(line) if _points_back(line, larynx) else line)
+    else:
+        shape = scan(line)
+        shape = scan(turned(line)) if _carina_is_last(shape) else shape
+    shape = find_anterior(shape, anterior)
+    found = find_rings(shape, ring_positions, half_angle)
+    where = locate(shape.line, wall.vertices)
+    chord = shape.line.points[-1] - shape.line.points[0]
+    rotation = _axes(chord, shape.line.frames[:, :, 1].mean(axis=0))
+    origin = shape.line.points[0]
+    vertices = (wall.vertices - origin) @ rotation.T
+    frames = rotation @ where.frames
+    normals = vertex_normals(vertices, wall.faces)
+    notes += cleaned + [f"{len(found.positions)} rings from {found.source}"]
+    dtype = jnp.zeros(0, dtype).dtype
+    fields = (normals, where.s, where.phi, where.distance, frames)
+    cast = lambda v: jnp.asarray(v, dtype)  # noqa: E731
+    mesh = Mesh(cast(vertices), jnp.asarray(wall.faces, jnp.int32), *(cast(v) for v in fields))
+    try:
+        geometry = Geometry.create(
+            shape.line.s[-1], found.positions, radius=found.radius, half_angle=found.half_angle,
+            ring_height=found.height, dtype=dtype,
+        )  # fmt: skip
+    except ValueError as error:
+        raise MeshError(f"{error}; give ring_positions or half_angle") from error
+    return Imported(mesh, geometry, cast(rotation), cast(origin / scale), scale, tuple(notes))
+
+
+class _Surface(NamedTuple):
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+def _parts(path: Path) -> dict[str, _Surface]:
+    """Objects of a file by name, in the file's common frame."""
+    import trimesh  # only those who read meshes wait for it
+
+    if not path.is_file():
+        raise MeshError("there is no such file")
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        nodes = [(node, *scene.graph[node]) for node in scene.graph.nodes_geometry]
+        objects = [(str(node), scene.geometry[name], frame) for node, frame, name in nodes]
+    except Exception as error:  # trimesh raises whatever its many readers raise
+        raise MeshError(
+            f"could not be read as a surface ({type(error).__name__}: {error}); "
+            "expected STL, OBJ, PLY or GLB with triangles"
+        ) from error
+    parts = {
+        name: _Surface(
+            np.asarray(part.vertices, float) @ frame[:3, :3].T + frame[:3, 3],
+            np.asarray(part.faces, np.int64),
+        )
+        for name, part, frame in objects
+        if isinstance(part, trimesh.Trimesh) and len(part.faces)
+    }
+    if not parts:
+        raise MeshError("there are no triangles in it; expected a surface, not points or lines")
+    if any(not np.all(np.isfinite(part.vertices)) for part in parts.values()):
+        raise MeshError("a vertex is not finite; export the surface again")
+    return parts
+
+
+def _area(surface: _Surface) -> float:
+    a, b, c = (surface.vertices[surface.faces[:, i]] for i in range(3))
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+def _wall(parts: dict[str, _Surface], part: str | None) -> str:
+    names = ", ".join(sorted(parts))
+    if part is not None:
+        if part not in parts:
+            raise MeshError(f"there is no object {part!r} in it; there are {names}")
+        return part
+    areas = {name: _area(surface) for name, surface in parts.items()}
+    largest = max(areas, key=lambda name: areas[name])
+    if areas[largest] <= 0.5 * sum(areas.values()):
+        raise MeshError(f"which of the objects {names} is the wall? Give part=")
+    return largest
+
+
+def _clean(surface: _Surface) -> tuple[_Surface, list[str]]:
+    """Join vertices at the same place; drop collapsed and repeated triangles and small fragments.
+
+    Slivers stay: they weigh nothing in normals or sections.
+    """
+    notes = []
+    size = np.ptp(surface.vertices, axis=0).max()
+    if not size > 0:
+        raise MeshError("all vertices lie in one point; expected the surface of a trachea")
+    grid = np.round((surface.vertices - surface.vertices.min(axis=0)) / (1e-7 * size))
+    _, first, same = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    faces = same.ravel()[surface.faces]
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    keep = np.zeros(len(faces), bool)
+    keep[once] = True
+    keep &= whole
+    if not keep.all():
+        notes.append(f"{np.sum(~keep)} collapsed or repeated triangles dropped")
+    vertices, faces = surface.vertices[first], faces[keep]
+    if not len(faces):
+        raise MeshError("every triangle is collapsed; expected the surface of a trachea")
+    faces, dropped = _without_fragments(vertices, faces)
+    if dropped:
+        notes.append(f"{dropped} triangles of small loose fragments dropped")
+    used, faces = np.unique(faces, return_inverse=True)
+    cleaned = _Surface(vertices[used], faces.reshape(-1, 3))
+    return _outward(cleaned, notes), notes
+
+
+def _labels(faces: np.ndarray, count: int) -> np.ndarray:
+    """Smallest vertex connected with each vertex."""
+    label = np.arange(count)
+    while True:
+        least = label[faces].min(axis=1)
+        lower = label.copy()
+        np.minimum.at(lower, faces.ravel(), np.repeat(least, 3))
+        lower = lower[lower]
+        if np.array_equal(lower, label):
+            return label
+        label = lower
+
+
+def _without_fragments(vertices, faces):
+    """Pieces longer than a third of the longest; the rest is dust."""
+    label = _labels(faces, len(vertices))[faces[:, 0]]
+    extent = {
+        piece: np.linalg.norm(np.ptp(vertices[faces[label == piece].ravel()], axis=0))
+        for piece in np.unique(label)
+    }
+    longest = max(extent.values())
+    keep = np.isin(label, [piece for piece, size in extent.items() if size > longest / 3])
+    return faces[keep], int(np.sum(~keep))
+
+
+def _outward(surface: _Surface, notes: list[str]) -> _Surface:
+    """Turn triangles outwards if the whole surface is inside out; refuse a mixed one."""
+    vertices, faces = surface
+    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    if len(np.unique(directed, axis=0)) < len(directed):
+        pairs, count = edge_counts(faces)
+        if np.any(count > 2):
+            raise MeshError(
+                f"{np.sum(count > 2)} edges belong to more than two triangles; expected a surface "
+                "that does not branch: repair it first"
+            )
+        raise MeshError("neighbouring triangles face opposite ways; make the normals consistent")
+    if volume(vertices, faces) < 0:
+        notes.append("the surface was inside out: triangles turned")
+        return _Surface(vertices, faces[:, ::-1])
+    _, count = edge_counts(faces)
+    if np.any(count == 1):
+        notes.append(f"{np.sum(count == 1)} open edges")
+    return surface
+
+
+def _scale(surface: _Surface, path: Path, unit: str | None, notes: list[str]) -> float:
+    """Millimetres per unit of the file."""
+    if unit is not None:
+        try:
+            return float(unit_factor(unit, "length"))
+        except ValueError as error:
+            raise MeshError(str(error)) from error
+    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+    names = ("m",) if path.suffix.lower() in (".glb", ".gltf") else ("mm", "cm", "in", "m")
+    low, high = PLAUSIBLE
+    fits = [name for name in names if low <= size * float(unit_factor(name, "length")) <= high]
+    if len(fits) != 1:
+        found = f"may be in {' or '.join(fits)}" if fits else f"is no trachea in {', '.join(names)}"
+        raise MeshError(
+            f"its size of {size:.4g} {found} (expected {low:g} to {high:g} mm); give unit="
+        )
+    notes.append(f"unit taken as {fits[0]}")
+    return float(unit_factor(fits[0], "length"))
+
+
+def _cartilage(parts, wall, rings, path, scale, notes) -> _Surface | None:
+    """The rings' own surface, mm, or None."""
+    if rings is None:
+        named = [
+            n for n in parts if n != wall and ("cartilage" in n.lower() or "ring" in n.lower())
+        ]
+        if len(named) > 1:
+            raise MeshError(f"which of the objects {', '.join(named)} are the rings? Give rings=")
+        rings = named[0] if named else None
+    if rings is None:
+        return None
+    if str(rings) in parts:
+        found = [parts[str(rings)]]
+    else:
+        other = path.parent / rings
+        try:
+            found = list(_parts(other).values())
+        except MeshError as error:
+            raise MeshError(f"rings={str(rings)!r}: {error}") from error
+    notes.append(f"rings: {rings}")
+    shift = np.cumsum([0, *(len(f.vertices) for f in found[:-1])])
+    vertices = np.concatenate([f.vertices for f in found]) * scale
+    faces = np.concatenate([f.faces + at for f, at in zip(found, shift, strict=True)])
+    return _Surface(vertices, faces)
+
+
+def _axes(along, anterior):
+    """Rows: the unit vector `along`, the part of `anterior` across it, and their product."""
+    x = along / np.linalg.norm(along)
+    y = anterior - x * (x @ anterior)
+    y = y / np.linalg.norm(y)
+    return np.stack([x, y, np.cross(x, y)])
+
+
+def _points_back(line: Line, larynx) -> bool:
+    along = line.points[-1] - line.points[0]
+    cosine = along @ np.asarray(larynx, float)
+    cosine /= np.linalg.norm(along) * max(float(np.linalg.norm(larynx)), 1e-300)
+    if abs(cosine) < 0.2:
+        raise MeshError("larynx= points across the tube; expected a direction along it")
+    return bool(cosine < 0)
+
+
+def _carina_is_last(shape: Shape) -> bool:
+    first, last = shape.end_radii()
+    if max(first, last) < 1.1 * min(first, last):
+        raise MeshError(
+            f"both ends are alike (radius {first:.3g} and {last:.3g} mm): which one is the "
+            "carina? Give larynx=, the direction from carina to larynx"
+        )
+    return last > first
