@@ -139,7 +139,7 @@ def _length(v):
 
 
 def _on_cone(D, compliance, law: Law, mu):
-    """Force with |F_t| = mu F_n, and indentation, where the tangential force is parallel to slip."""
+    """Force with |F_t| = mu F_n along the slip, and the indentation under it."""
     z = _cone_root(D, compliance, law.k_1, law.k_3, mu)
     N, h, d = _given_mobility(z, D, compliance, law, mu)
     force = jnp.concatenate([N[None], mu / z * h])
@@ -149,8 +149,8 @@ def _on_cone(D, compliance, law: Law, mu):
 def _given_mobility(z, D, C, law: Law, mu):
     """Normal force N, h = F_t z / mu and |d| for a tangential compliance z / mu beside C.
 
-    z, not its inverse, so that mu = 0 is an ordinary value: N and h are then frictionless. |d| takes
-    |F_t| = mu N for granted, which makes the normal part a press in series of its own.
+    z, not its inverse, so that mu = 0 is an ordinary value: N and h are then frictionless. |d|
+    takes |F_t| = mu N for granted, which makes the normal part a press in series of its own.
     """
     q = mu / z
     M = jnp.eye(2, dtype=D.dtype) + q * C[1:, 1:]
@@ -164,7 +164,7 @@ def _given_mobility(z, D, C, law: Law, mu):
 
 
 def _excess(z, D, C, k_1, k_3, mu):
-    """mu N / |F_t| - 1: rising in z, and a straight line for equal compliances without coupling."""
+    """What mu N / |F_t| exceeds 1 by; a straight line in z for equal, uncoupled compliances."""
     N, h, _ = _given_mobility(z, D, C, Law(k_1, k_3), mu)
     return N * z / jnp.linalg.norm(h) - 1
 

@@ -39,10 +39,10 @@ def press_vector(
 ) -> VectorEquilibrium:
     """Series coupling: d + C F = D with F = (k_1 + k_3 |d|^2) d; odd in D (press or draw).
 
-    1 / |(1 + kappa C)^-1 D| is a concave function of kappa (a power mean of the 1 + kappa c_i). Each
-    step replaces it by its tangent and solves the cubic that is left in closed form. The tangent
-    lies above, so |d| rises from below and needs no safeguard; for a multiple of the identity, or D
-    along an axis of C, the first step is exact and the answer that of `press_series`.
+    1 / |(1 + kappa C)^-1 D| is a concave function of kappa (a power mean of the 1 + kappa c_i).
+    Each step replaces it by its tangent and solves the cubic that is left in closed form. The
+    tangent lies above, so |d| rises from below and needs no safeguard; for D along an axis of C the
+    first step is exact and the answer that of `press_series`.
 
     Unique for k_3 >= 0. For k_3 < 0 the branch from D = 0 is followed up to its fold, beyond which
     depth and force are NaN. Derivatives are those of the equilibrium.
