@@ -123,8 +123,9 @@ def test_mirror(rings):
     flip = np.array([1.0, 1.0, -1.0])
     one, two = pressed(phi=0.7, rings=rings), pressed(phi=-0.7, D=MOVES * flip, rings=rings)
     for name in ("force", "depth", "skeleton", "joints", "loads"):
-        np.testing.assert_allclose(getattr(two, name), getattr(one, name) * flip, atol=1e-12)
-    np.testing.assert_allclose(two.end_U, one.end_V * flip, atol=1e-12)
+        mirrored = np.asarray(getattr(one, name)) * flip
+        np.testing.assert_allclose(getattr(two, name), mirrored, atol=1e-12)
+    np.testing.assert_allclose(two.end_U, np.asarray(one.end_V) * flip, atol=1e-12)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -219,8 +220,8 @@ def test_path():
     x = np.linspace(0, 2, 6)
     D = 0.8 * frame[0] + x[:, None] * (frame[1] + frame[2])
     run = functools.partial(press_path, table_1(), material(), jnp.asarray(63.0), jnp.asarray(0.4))
-    run = jax.jit(run, compiler_options=QUICK)
-    stuck, slid = (run(jnp.asarray(D), jnp.asarray(mu)) for mu in (1e3, 0.3))
+    quick = jax.jit(run, compiler_options=QUICK)
+    stuck, slid = (quick(jnp.asarray(D), jnp.asarray(mu)) for mu in (1e3, 0.3))
     np.testing.assert_allclose(stuck.press.force, pressed(D=D).force, atol=1e-12)
     np.testing.assert_array_equal(stuck.slip, 0)
     local = np.asarray(slid.press.force) @ frame.T
@@ -234,7 +235,7 @@ def test_path():
 
 @pytest.mark.parametrize(
     ("name", "keywords"),
-    [("EA_L", {}), ("EI_C", {"axial": False}), ("k_t", {"axial": False, "EI_C": 13.0})],
+    [("EA_L", {"rings": "mat"}), ("EI_C", {"axial": False}), ("k_t", {"axial": False, "EI_C": 13.0})],
 )
 def test_missing_values_are_named(name, keywords):
     values = {n: VALUES[n] for n in ("EI_L", "k_M", "k_1", "k_3")}
@@ -249,7 +250,7 @@ def test_wrong_options_are_named():
     run = functools.partial(press_oblique, table_1(), material(), zero, zero, jnp.zeros(3))
     with pytest.raises(ValueError, match="split"):
         run(Options(split="independent"))
-    with pytest.raises(ValueError, match="arch3"):
+    with pytest.raises((ValueError, TypeError), match="arch3"):  # TypeError: the shape checks
         run(rings="arch3")  # pyright: ignore
 
 
