@@ -139,7 +139,13 @@ def _rings(geometry: Geometry, material: Material, phi_c, level: Rings):
         ends = -geometry.half_angle, geometry.half_angle
         return C, tuple(_ring.ring_influence(ring, end, phi_c) for end in ends), status
 
-    C, ends, status = jax.vmap(one)(k_M)
+    if material.k_M.ndim == 0:
+        alike = lambda v: jnp.broadcast_to(v, (*k_M.shape, *v.shape))  # noqa: E731
+        C, ends, status = jax.tree.map(alike, one(material.k_M))
+    else:
+        # Not vmap: XLA's CPU compiler (jaxlib 0.10.2) then gets wrong forward derivatives of many
+        # arguments at once (tests/test_oblique.py: test_gradients).
+        C, ends, status = jax.lax.map(one, k_M)
     if level == "arch":
         normal = jnp.stack([jnp.cos(phi_c), jnp.sin(phi_c)])
         C = jnp.einsum("npq,p,q->n", C, normal, normal)[:, None, None] * eye

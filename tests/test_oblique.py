@@ -235,7 +235,11 @@ def test_path():
 
 @pytest.mark.parametrize(
     ("name", "keywords"),
-    [("EA_L", {"rings": "mat"}), ("EI_C", {"axial": False}), ("k_t", {"axial": False, "EI_C": 13.0})],
+    [
+        ("EA_L", {"rings": "mat"}),
+        ("EI_C", {"axial": False}),
+        ("k_t", {"axial": False, "EI_C": 13.0}),
+    ],
 )
 def test_missing_values_are_named(name, keywords):
     values = {n: VALUES[n] for n in ("EI_L", "k_M", "k_1", "k_3")}
