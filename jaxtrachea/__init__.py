@@ -20,6 +20,12 @@ if TYPE_CHECKING:
     from jaxtrachea.model import Options as Options
     from jaxtrachea.model import Press as Press
     from jaxtrachea.model import press as press
+    from jaxtrachea.oblique import ObliquePath as ObliquePath
+    from jaxtrachea.oblique import ObliquePress as ObliquePress
+    from jaxtrachea.oblique import press_oblique as press_oblique
+    from jaxtrachea.oblique import press_path as press_path
+    from jaxtrachea.skeleton import Skeleton as Skeleton
+    from jaxtrachea.skeleton import skeleton_response as skeleton_response
     from jaxtrachea.status import FitStatus as FitStatus
     from jaxtrachea.status import PressStatus as PressStatus
     from jaxtrachea.trachea.geometry import Geometry as Geometry
@@ -32,6 +38,8 @@ _HOME = {
     "mechanics.beam": ("Beam", "contact_compliance", "deflect"),
     "mechanics.force_law": ("Law", "duffing"),
     "model": ("Options", "Press", "press"),
+    "oblique": ("ObliquePath", "ObliquePress", "press_oblique", "press_path"),
+    "skeleton": ("Skeleton", "skeleton_response"),
     "status": ("FitStatus", "PressStatus"),
     "trachea.geometry": ("Geometry", "table_1"),
     "trachea.material": ("Material",),

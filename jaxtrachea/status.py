@@ -24,6 +24,8 @@ class PressStatus(_Described):
     PAST_FOLD = 2, "past the fold of the softening law (k_3 < 0): no stable equilibrium"
     NEGATIVE_LOCAL = 3, "coupling 'total': the skeleton moves further than the tool presses"
     NON_FINITE = 4, "an input or a result is not finite"
+    BEHIND_GAP = 5, "the contact lies behind the ends of the rings, where there is no cartilage"
+    PULLS = 6, "unilateral contact: the tool would have to pull; it lets go or slides (friction)"
 
 
 class ContactStatus(_Described):

@@ -62,7 +62,7 @@ def press_series(
     depth = _series_depth(displacement, compliance, law.k_1, law.k_3)
     force = duffing(depth, law)
     u = _scaled_cubic(displacement, compliance, law.k_1, law.k_3)[1]
-    return Equilibrium(depth, force, _status(displacement, depth + force, u <= -1))
+    return Equilibrium(depth, force, status_of(displacement, depth + force, u <= -1))
 
 
 def _scaled_cubic(displacement, compliance, k_1, k_3):
@@ -119,13 +119,13 @@ def press_total(
     force = duffing(displacement, law)
     depth = displacement - compliance * force
     negative = depth * displacement < 0
-    status = _status(displacement, depth + force, folded)
+    status = status_of(displacement, depth + force, folded)
     status = jnp.where((status == PressStatus.OK) & negative, PressStatus.NEGATIVE_LOCAL, status)
     hide = lambda v: jnp.where(folded, jnp.nan, v)  # noqa: E731
     return Equilibrium(hide(depth), hide(force), status.astype(jnp.int8))
 
 
-def _status(displacement, result, folded):
+def status_of(displacement, result, folded) -> Int[Array, "..."]:
     """PAST_FOLD, NO_CONTACT, NON_FINITE or OK."""
     status = jnp.where(displacement == 0, PressStatus.NO_CONTACT, PressStatus.OK)
     status = jnp.where(jnp.isfinite(result), status, PressStatus.NON_FINITE)

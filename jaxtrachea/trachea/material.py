@@ -32,6 +32,10 @@ class Material(eqx.Module):
         EA_L: axial stiffness E_L A_L, N; scalar or (rings + 1,), or None.
         k_A: axial spring of the carina end, N/mm; None: rigid.
         k_B: axial spring of the larynx end, N/mm; None: rigid.
+        EI_C: bending stiffness E_C I_C of the cartilage in the plane of a ring, N mm^2, or None.
+        k_t: stiffness of the muscular bar between the ends of a ring, N/mm, or None.
+        EI_side: `EI_L` for bending along the circumference, off the midline sideways; None: EI_L.
+        GA_side: `GA_L` likewise; None: GA_L.
     """
 
     EI_L: Float[Array, "..."] = _array()
@@ -44,3 +48,7 @@ class Material(eqx.Module):
     EA_L: Float[Array, "..."] | None = _optional()
     k_A: Float[Array, ""] | None = _optional()
     k_B: Float[Array, ""] | None = _optional()
+    EI_C: Float[Array, ""] | None = _optional()
+    k_t: Float[Array, ""] | None = _optional()
+    EI_side: Float[Array, "..."] | None = _optional()
+    GA_side: Float[Array, "..."] | None = _optional()

@@ -1,0 +1,198 @@
+r"""Coulomb friction between tool and tube along a path: stick and slip (Table 1: 0.66).
+
+The paper lets the finger move with the surface; here it may slide. Vectors have the components
+(inward normal, tangent, tangent) of the contact. With slip g, the way the tool has slid:
+
+    d + C F + (0, g) = D,   F = kappa(|d|) d,   |F_t| <= mu F_n,   g' || F_t where equality holds.
+
+Backward Euler over one step with g' = lambda F_t makes the slip a compliance lambda in series, in
+the tangent plane only: sticking is `press_vector`, sliding has one unknown more, and a condition
+that is nearly linear in it. Local law and skeleton are the elasticity that regularises Coulomb's
+law: force and slip are continuous in everything, with a kink where sticking turns into sliding.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxtrachea.mechanics._matrix2 import apply, solve
+from jaxtrachea.mechanics.equilibrium import press_series
+from jaxtrachea.mechanics.force_law import Law
+from jaxtrachea.mechanics.vector_equilibrium import press_vector
+from jaxtrachea.status import PressStatus
+
+_ITERATIONS = 12
+
+
+class Slide(NamedTuple):
+    """One step, or with a leading axis a path, of a tool that may slide.
+
+    Attributes:
+        depth: local indentation, mm; (3,).
+        force: contact force, N; (3,).
+        slip: way slid since first touch, mm; (2,). Out of contact it goes with the tool.
+        dissipated: work lost to friction in this step, N mm; not negative.
+        sliding: whether this step slides.
+        status: a `PressStatus` as int8.
+    """
+
+    depth: Float[Array, "*n 3"]
+    force: Float[Array, "*n 3"]
+    slip: Float[Array, "*n 2"]
+    dissipated: Float[Array, "*n"]
+    sliding: Bool[Array, "*n"]
+    status: Int[Array, "*n"]
+
+
+def slide_path(
+    displacement: Float[Array, "steps 3"],
+    compliance: Float[Array, "3 3"],
+    law: Law,
+    friction: Float[Array, ""],
+    slip: Float[Array, "2"] | None = None,
+    *,
+    rounding: float = 0.0,
+) -> Slide:
+    """Follow a tool along a path; the slip is carried from step to step.
+
+    Args:
+        displacement: of the tool, (inward normal, tangent, tangent), mm, in order. Contact is where
+            the normal component is positive (unilateral: no tension).
+        compliance: skeleton at the contact in the same frame, mm/N, symmetric.
+        law: local law; k_1 > 0.
+        friction: mu, not negative.
+        slip: at the start, mm; None: 0 (first touch where the path begins).
+        rounding: as in `slide`.
+
+    Returns:
+        A `Slide` with a leading axis of steps. A step without a solution is NaN with its status and
+        leaves the slip as it was.
+    """
+    start = jnp.zeros_like(displacement[0, 1:]) if slip is None else slip
+
+    def step(slip, D):
+        out = slide(D, compliance, law, friction, slip, rounding=rounding)
+        return out.slip, out
+
+    return jax.lax.scan(step, start, displacement)[1]
+
+
+def slide(
+    displacement: Float[Array, "3"],
+    compliance: Float[Array, "3 3"],
+    law: Law,
+    friction: Float[Array, ""],
+    slip: Float[Array, "2"],
+    *,
+    rounding: float = 0.0,
+) -> Slide:
+    """One step of the return mapping: stick if the friction cone allows it, else slide on the cone.
+
+    Strong coupling of normal and tangent together with high friction can jam (several solutions);
+    the one nearest to frictionless contact is then not guaranteed.
+
+    Args:
+        displacement: of the tool at the end of the step, see `slide_path`.
+        compliance: see `slide_path`.
+        law: see `slide_path`.
+        friction: mu, not negative.
+        slip: at the beginning of the step, mm.
+        rounding: width w that rounds the kink. The step creeps once |F_t| > (1 - w) mu F_n on
+            trial; above (1 + w) it is exact. 0: Coulomb's law, with one-sided derivatives where a
+            step passes from sticking to sliding.
+    """
+    touching = ~(displacement[0] <= 0)  # NaN stays in
+    trial = jnp.where(touching, displacement - jnp.concatenate([jnp.zeros(1, slip.dtype), slip]), 0)
+    stuck = press_vector(trial, compliance, law)
+    tangential, limit = _length(stuck.force[1:]), friction * stuck.force[0]
+    sliding = touching & ~(tangential <= (1 - rounding) * limit)
+    mobilised = friction
+    if rounding > 0:
+        # min(ratio, 1) with its corner replaced by a parabola below it.
+        inside = sliding & (tangential < (1 + rounding) * limit)
+        room = 1 + rounding - tangential / jnp.where(inside, limit, 1)
+        mobilised = friction * (1 - jnp.where(inside, room * room / (4 * rounding), 0))
+    force, depth = _on_cone(jnp.where(sliding, trial, 1), compliance, law, mobilised)
+    force = jnp.where(sliding, force, stuck.force)
+    depth = jnp.where(sliding, depth, stuck.depth)
+    solved = jnp.isfinite(jnp.sum(force))
+    moved = jnp.where(sliding & solved, (trial - depth - compliance @ force)[1:], 0)
+    away = jnp.where(jnp.isfinite(jnp.sum(displacement)), displacement[1:], slip)
+    failed = jnp.where(stuck.status == PressStatus.OK, PressStatus.PAST_FOLD, stuck.status)
+    status = jnp.where(solved, PressStatus.OK, failed)
+    return Slide(
+        depth=depth,
+        force=force,
+        slip=jnp.where(touching, slip + moved, away),
+        dissipated=jnp.sum(jnp.where(solved, force[1:], 0) * moved),
+        sliding=sliding,
+        status=jnp.where(touching, status, PressStatus.NO_CONTACT).astype(jnp.int8),
+    )
+
+
+def _length(v):
+    """Norm with derivative 0 at 0."""
+    squared = jnp.sum(v * v)
+    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
+
+
+def _on_cone(D, compliance, law: Law, mu):
+    """Force with |F_t| = mu F_n along the slip, and the indentation under it."""
+    z = _cone_root(D, compliance, law.k_1, law.k_3, mu)
+    N, h, d = _given_mobility(z, D, compliance, law, mu)
+    force = jnp.concatenate([N[None], mu / z * h])
+    return force, force / (law.k_1 + law.k_3 * d * d)
+
+
+def _given_mobility(z, D, C, law: Law, mu):
+    """Normal force N, h = F_t z / mu and |d| for a tangential compliance z / mu beside C.
+
+    z, not its inverse, so that mu = 0 is an ordinary value: N and h are then frictionless. |d|
+    takes |F_t| = mu N for granted, which makes the normal part a press in series of its own.
+    """
+    q = mu / z
+    M = jnp.eye(2, dtype=D.dtype) + q * C[1:, 1:]
+    h, coupled = solve(M, jnp.stack([D[1:], C[1:, 0]], 1)).T
+    lean = jnp.sqrt(1 + mu * mu)
+    pressed = D[0] - q * jnp.sum(C[1:, 0] * h)
+    softness = C[0, 0] - q * jnp.sum(C[1:, 0] * coupled)
+    normal = press_series(lean * pressed, softness, law)
+    N = normal.force / lean
+    return N, h - N * coupled, normal.depth
+
+
+def _excess(z, D, C, k_1, k_3, mu):
+    """What mu N / |F_t| exceeds 1 by; a straight line in z for equal, uncoupled compliances."""
+    N, h, _ = _given_mobility(z, D, C, Law(k_1, k_3), mu)
+    return N * z / jnp.linalg.norm(h) - 1
+
+
+@jax.custom_jvp
+def _cone_root(D, C, k_1, k_3, mu):
+    """Root z of `_excess`: Newton from the frictionless tangent, kept in a shrinking bracket."""
+    low = mu / (k_1 + jnp.maximum(k_3, 0) * jnp.sum(D * D))  # no softer than sticking
+    N, w, _ = _given_mobility(jnp.full_like(mu, jnp.inf), D, C, Law(k_1, k_3), mu)
+    length = jnp.linalg.norm(w)
+    first = length / N - mu * jnp.sum(w * apply(C[1:, 1:], w)) / length**2
+    excess = lambda z: _excess(z, D, C, k_1, k_3, mu)  # noqa: E731
+
+    def newton(_, state):
+        z, low, high = state
+        value, slope = jax.jvp(excess, (z,), (jnp.ones_like(z),))
+        low, high = jnp.where(value < 0, z, low), jnp.where(value < 0, high, z)
+        new = z - value / slope
+        middle = jnp.where(jnp.isfinite(high), (low + high) / 2, 2 * z)
+        return jnp.where((new >= low) & (new <= high), new, middle), low, high
+
+    start = jnp.maximum(first, low), low, jnp.full_like(low, jnp.inf)
+    return jax.lax.fori_loop(0, _ITERATIONS, newton, start)[0]
+
+
+@_cone_root.defjvp
+def _cone_root_jvp(primals, tangents):
+    z = _cone_root(*primals)
+    _, by_inputs = jax.jvp(lambda *p: _excess(z, *p), primals, tangents)
+    slope = jax.grad(_excess)(z, *primals)
+    return z, -by_inputs / slope

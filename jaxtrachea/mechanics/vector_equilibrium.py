@@ -1,0 +1,130 @@
+"""Local indentation and skeleton displacement together, as vectors (oblique press).
+
+The vector companion of `equilibrium`, in any frame of reference. The local force is parallel to the
+local indentation, F = kappa d with the secant stiffness kappa = k_1 + k_3 |d|^2 (paper eq. 1), so
+that (1 + kappa C) d = D is linear once the number kappa is known.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxtrachea._numerics import cubic_ratio, epsilon, solve_spd
+from jaxtrachea.mechanics.equilibrium import status_of
+from jaxtrachea.mechanics.force_law import Law, fold_depth
+from jaxtrachea.status import PressStatus
+
+#: Tangent steps of `press_vector`; 6 leave rounding whatever C and k_3 (test_any_compliance).
+STEPS = 8
+
+
+class VectorEquilibrium(NamedTuple):
+    """Solved oblique press.
+
+    Attributes:
+        depth: local indentation d, mm; shape (3,).
+        force: contact force, N; shape (3,). NaN where there is no stable solution.
+        status: a `PressStatus` as int8.
+    """
+
+    depth: Float[Array, "3"]
+    force: Float[Array, "3"]
+    status: Int[Array, ""]
+
+
+def press_vector(
+    displacement: Float[Array, "3"], compliance: Float[Array, "3 3"], law: Law
+) -> VectorEquilibrium:
+    """Series coupling: d + C F = D with F = (k_1 + k_3 |d|^2) d; odd in D (press or draw).
+
+    1 / |(1 + kappa C)^-1 D| is a concave function of kappa (a power mean of the 1 + kappa c_i).
+    Each step replaces it by its tangent and solves the cubic that is left in closed form. The
+    tangent lies above, so |d| rises from below and needs no safeguard; for D along an axis of C the
+    first step is exact and the answer that of `press_series`.
+
+    Unique for k_3 >= 0. For k_3 < 0 the branch from D = 0 is followed up to its fold, beyond which
+    depth and force are NaN. Derivatives are those of the equilibrium.
+
+    Args:
+        displacement: D after first touch, mm.
+        compliance: C, skeleton at the contact, mm/N, symmetric and positive semi-definite.
+        law: local law; k_1 > 0.
+    """
+    depth = _series_depth(displacement, compliance, law.k_1, law.k_3)
+    force = _force(depth, law)
+    given = jnp.sum(displacement) + jnp.sum(compliance) + law.k_1 + law.k_3
+    folded = (law.k_3 < 0) & jnp.isfinite(given) & ~jnp.isfinite(jnp.sum(depth))
+    status = status_of(jnp.max(jnp.abs(displacement)), jnp.sum(depth + force), folded)
+    return VectorEquilibrium(depth, force, status)
+
+
+def press_vector_total(
+    displacement: Float[Array, "3"], compliance: Float[Array, "3 3"], law: Law
+) -> VectorEquilibrium:
+    """Total coupling, as printed: F = Duffing(|D|) along D; the local part is D - C F.
+
+    NEGATIVE_LOCAL where the skeleton moves further along the force than the tool. NaN past the
+    law's own fold.
+
+    Args: as `press_vector`.
+    """
+    squared = jnp.sum(displacement * displacement)
+    folded = (law.k_3 < 0) & (squared >= fold_depth(law) ** 2)
+    force = _force(displacement, law)
+    depth = displacement - compliance @ force
+    status = status_of(jnp.max(jnp.abs(displacement)), jnp.sum(depth + force), folded)
+    negative = (status == PressStatus.OK) & (jnp.sum(depth * force) < 0)
+    status = jnp.where(negative, PressStatus.NEGATIVE_LOCAL, status).astype(jnp.int8)
+    hide = lambda v: jnp.where(folded, jnp.nan, v)  # noqa: E731
+    return VectorEquilibrium(hide(depth), hide(force), status)
+
+
+def _force(depth, law: Law):
+    return (law.k_1 + law.k_3 * jnp.sum(depth * depth)) * depth
+
+
+def _secant_motion(direction, compliance, kappa):
+    """M^-1 D and M^-2 D with M = 1 + kappa C."""
+    M = jnp.eye(3, dtype=direction.dtype) + kappa * compliance
+    once = solve_spd(M, direction)
+    return once, solve_spd(M, once)
+
+
+@jax.custom_jvp
+def _series_depth(displacement, compliance, k_1, k_3):
+    """Local indentation of `press_vector`; NaN past the fold."""
+    size = jnp.max(jnp.abs(displacement))
+    still = size == 0
+    direction = jnp.where(still, 1, displacement / jnp.where(still, 1, size))
+    cubic = k_3 * size * size
+
+    def tangent_step(_, t):
+        d, e = _secant_motion(direction, compliance, k_1 + cubic * t * t)
+        length = jnp.linalg.norm(d)
+        # 1/|d| = a + b kappa, neither formed by a subtraction; t (a + b kappa(t)) = 1.
+        a, b = jnp.sum(d * e) / length**3, jnp.sum(d * (compliance @ e)) / length**3
+        delta = 1 / (a + b * k_1)
+        return delta * cubic_ratio(6.75 * (b * cubic * delta) * delta * delta)
+
+    t = jax.lax.fori_loop(0, STEPS, tangent_step, jnp.zeros_like(size))
+    d, _ = _secant_motion(direction, compliance, k_1 + cubic * t * t)
+    missed = jnp.abs(jnp.linalg.norm(d) - t) > 100 * epsilon(t.dtype) * t
+    return jnp.where((k_3 < 0) & missed, jnp.nan, size * d)
+
+
+@_series_depth.defjvp
+def _series_depth_jvp(primals, tangents):
+    """(1 + C (kappa + 2 k_3 d d^T)) d' = D' - C' F - C F', by the secant system and rank one."""
+    _, compliance, k_1, k_3 = primals
+    d_displacement, d_compliance, d_k_1, d_k_3 = tangents
+    depth = _series_depth(*primals)
+    squared = jnp.sum(depth * depth)
+    kappa = k_1 + k_3 * squared
+    change = d_displacement - d_compliance @ (kappa * depth)
+    change = change - compliance @ ((d_k_1 + d_k_3 * squared) * depth)
+    M = jnp.eye(3, dtype=depth.dtype) + kappa * compliance
+    y, v = solve_spd(M, change), solve_spd(M, compliance @ depth)
+    share = 2 * k_3 * jnp.sum(depth * y) / (1 + 2 * k_3 * jnp.sum(depth * v))
+    return depth, y - share * v

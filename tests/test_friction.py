@@ -1,0 +1,263 @@
+"""Friction along a path: closed forms of a block on springs, and an event-driven reference."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+from jaxtrachea.mechanics.force_law import Law
+from jaxtrachea.mechanics.friction import slide, slide_path
+from jaxtrachea.status import PressStatus
+
+MU = 0.66  # paper, Table 1
+DTYPES = ["float32", "float64"]
+COUPLED = np.array([[1.4, 0.3, -0.2], [0.3, 2.0, 0.15], [-0.2, 0.15, 0.6]])
+
+
+QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
+
+
+@functools.cache
+def compiled(rounding):
+    run = lambda D, C, a, b, mu: slide_path(D, C, Law(a, b), mu, rounding=rounding)  # noqa: E731
+    return jax.jit(run, compiler_options=QUICK)
+
+
+def path(D, C=np.zeros((3, 3)), k_1=0.5, k_3=0.0, mu=MU, dtype="float64", rounding=0.0):  # noqa: B008
+    return compiled(rounding)(*(jnp.asarray(v, dtype) for v in (D, C, k_1, k_3, mu)))
+
+
+def sideways(x, normal=1.0):
+    return np.stack([np.full_like(x, normal), x, np.zeros_like(x)], 1)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_block_on_a_spring(dtype):
+    """A straight pull: F_t = k D until mu N, then mu N exactly, in series with the skeleton."""
+    C = np.diag([1.0, 2.0, 3.0])
+    x = np.linspace(0, 3, 13)
+    got = path(sideways(x), C, dtype=dtype)
+    N, k = 0.5 / (1 + 0.5), 1 / (2 + 2.0)
+    assert got.force.dtype == got.slip.dtype == dtype
+    rtol = 20 * np.finfo(dtype).eps
+    np.testing.assert_allclose(got.force[:, 0], N, rtol=rtol)
+    np.testing.assert_allclose(got.force[:, 1], np.minimum(k * x, MU * N), rtol=rtol)
+    np.testing.assert_allclose(got.slip[:, 0], np.maximum(x - MU * N / k, 0), atol=4 * rtol)
+    np.testing.assert_array_equal(got.sliding, k * x > MU * N)
+    np.testing.assert_array_equal(got.status, PressStatus.OK)
+
+
+@pytest.mark.parametrize("steps", [9, 90])
+def test_hysteresis_loop(steps):
+    """Back and forth: the loop's area is what friction takes, 4 mu N (a - mu N / k) per cycle."""
+    a, C = 3.0, np.diag([1.0, 2.0, 3.0])
+    turn = np.concatenate([np.linspace(a, -a, steps)[1:], np.linspace(-a, a, steps)[1:]])
+    x = np.concatenate([np.linspace(0, a, steps), turn, turn])
+    got = path(sideways(x), C)
+    F, cycle = np.asarray(got.force[:, 1]), 2 * (steps - 1)
+    N, k = 0.5 / 1.5, 0.25
+    area = 4 * MU * N * (a - MU * N / k)
+    np.testing.assert_allclose(np.sum(got.dissipated[-cycle:]), area, rtol=1e-12)
+    work = np.sum((F[1:] + F[:-1]) / 2 * np.diff(x))
+    assert abs(np.sum(np.diff(x[-cycle - 1 :]) * (F[-cycle:] + F[-cycle - 1 : -1]) / 2) - area) < (
+        2.5 * area / steps
+    )
+    assert work > 0
+    assert np.all(np.abs(F) <= MU * N * (1 + 1e-12))
+
+
+def _root(f, start, *args):
+    found = scipy.optimize.root(f, start, args, tol=1e-12)
+    assert np.max(np.abs(f(found.x, *args))) < 1e-11
+    return found.x
+
+
+def reference(D, C, k_1, k_3, mu):
+    """Stick or slide step by step with SciPy: unknowns F, and the slip where it slides."""
+    slip, forces, slips = np.zeros(2), [], []
+    depth_of = lambda F: F / (k_1 + k_3 * local(np.linalg.norm(F)) ** 2)  # noqa: E731
+
+    def local(size):
+        return max(
+            r.real for r in np.roots([k_3, 0, k_1, -size]) if abs(r.imag) < 1e-9 * (1 + size)
+        )
+
+    F = np.array([1e-3, 0, 0])
+    for target in D:
+        gap = lambda F, slip: depth_of(F) + C @ F + [0, *slip] - target  # noqa: B023, E731
+        F = _root(gap, F, slip)
+        if np.linalg.norm(F[1:]) > mu * F[0]:
+            old = slip
+
+            def slides(v):
+                force = v[0] * np.array([1, mu * np.cos(v[1]), mu * np.sin(v[1])])
+                return gap(force, old + v[2] * force[1:])  # noqa: B023
+
+            start = [F[0], np.arctan2(F[2], F[1]), 0.1]
+            N, angle, rate = _root(slides, start)
+            F = N * np.array([1, mu * np.cos(angle), mu * np.sin(angle)])
+            assert rate > 0
+            assert N > 0
+            slip = old + rate * F[1:]
+        forces.append(F)
+        slips.append(slip)
+    return np.array(forces), np.array(slips)
+
+
+@pytest.mark.parametrize("k_3", [0.02, 1.0])
+@pytest.mark.parametrize("mu", [0.2, MU])
+def test_against_events(mu, k_3):
+    """A curved path with changing pressure on a coupled skeleton with a hardening law."""
+    t = np.linspace(0, 2 * np.pi, 40)
+    D = np.stack([1.5 + 0.5 * np.sin(2 * t), 2 * np.sin(t), 1.5 - 1.5 * np.cos(t)], 1)
+    got = path(D, COUPLED, 0.7, k_3, mu)
+    force, slip = reference(D, COUPLED, 0.7, k_3, mu)
+    np.testing.assert_allclose(got.force, force, atol=1e-9)
+    np.testing.assert_allclose(got.slip, slip, atol=1e-9)
+    assert 5 < np.sum(got.sliding) < 40
+    assert np.min(got.dissipated) >= 0
+
+
+def test_any_coupling():
+    """3000 random steps: on the cone, in equilibrium, and friction never gives energy."""
+    rng, n = np.random.default_rng(1), 3000
+    axes = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    C = np.einsum("nij,nj,nkj->nik", axes, 10 ** rng.uniform(-2, 1, (n, 3)), axes)
+    D = rng.normal(size=(n, 3))
+    D[:, 0] = np.abs(D[:, 0])
+    k_1, k_3, mu = 10 ** rng.uniform(-1, 1, n), 10 ** rng.uniform(-3, 2, n), rng.uniform(0, 0.9, n)
+    one = lambda D, C, a, b, m: slide(D, C, Law(a, b), m, jnp.zeros(2))  # noqa: E731
+    step = jax.jit(jax.vmap(one))
+    got = step(D, (C + C.mT) / 2, k_1, k_3, mu)
+    F, d = np.asarray(got.force), np.asarray(got.depth)
+    tangential = np.linalg.norm(F[:, 1:], axis=1)
+    assert np.all(got.status == PressStatus.OK)
+    assert np.all(F[:, 0] > 0)
+    assert np.all(tangential <= mu * F[:, 0] * (1 + 1e-11) + 1e-12)
+    slid = np.asarray(got.sliding)
+    assert 2000 < np.sum(slid) < 3000
+    np.testing.assert_allclose(tangential[slid], (mu * F[:, 0])[slid], rtol=1e-10)
+    moved = d + np.einsum("nij,nj->ni", C, F)
+    moved[:, 1:] += got.slip
+    np.testing.assert_allclose(moved, D, atol=1e-12)
+    np.testing.assert_allclose((k_1 + k_3 * np.sum(d * d, 1))[:, None] * d, F, rtol=1e-9)
+    assert np.min(got.dissipated) >= 0
+
+
+def test_no_friction_and_much():
+    """Mu = 0: the normal press alone. Mu large: the tool sticks for good."""
+    D = sideways(np.linspace(0, 2, 5))
+    free = path(D, COUPLED, mu=0.0)
+    np.testing.assert_array_equal(free.force[:, 1:], 0)
+    np.testing.assert_allclose(free.force[:, 0], 1 / (1.4 + 2.0), rtol=1e-14)
+    stuck = path(D, COUPLED, mu=50.0)
+    assert not np.any(stuck.sliding)
+    np.testing.assert_array_equal(stuck.slip, 0)
+
+
+def test_lifting_off():
+    """Out of contact no force, and the tool touches down anew where it then is."""
+    D = np.array([[1, 0.1, 0], [1, 3, 0], [-0.5, 3, 1], [0, 5, 1], [1, 5, 1], [1, 5.1, 1]])
+    got = path(D)
+    np.testing.assert_array_equal(got.force[2:4], 0)
+    no, ok = PressStatus.NO_CONTACT, PressStatus.OK
+    np.testing.assert_array_equal(got.status, [ok, ok, no, no, ok, ok])
+    np.testing.assert_allclose(got.slip[3], [5, 1])
+    np.testing.assert_allclose(got.force[4], [0.5, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(got.force[5], [0.5, 0.05, 0], atol=1e-15)
+
+
+def test_bad_step_is_flagged_and_left_behind():
+    """NaN and a folded step: flagged, and the steps after them start from the slip before."""
+    D = sideways(np.array([0.2, 2.0, 2.1, 2.2]))
+    good = path(D, COUPLED, 0.5, -0.01)
+    for at, value, status in ((0, np.nan, "NON_FINITE"), (0, 50.0, "PAST_FOLD")):
+        broken = D.copy()
+        broken[2, at] = value
+        got = path(broken, COUPLED, 0.5, -0.01)
+        assert got.status[2] == PressStatus[status]
+        assert np.all(np.isnan(got.force[2]))
+        np.testing.assert_array_equal(got.slip[2], good.slip[1])
+        np.testing.assert_allclose(got.force[3], good.force[3], atol=1e-4)
+
+
+def test_rounding():
+    """Within w of Coulomb's limit, exact outside (1 +- w) of it, and without a kink."""
+    w = 0.1
+    x = np.linspace(0, 2, 401)
+    step = jax.jit(
+        lambda x: slide(
+            jnp.stack([jnp.ones_like(x), x, jnp.zeros_like(x)]),
+            jnp.diag(jnp.asarray([1.0, 2.0, 3.0])),
+            Law(jnp.asarray(0.5), jnp.asarray(0.0)),
+            jnp.asarray(MU),
+            jnp.zeros(2),
+            rounding=w,
+        ).force[1]
+    )
+    both = jax.jit(jax.vmap(jax.value_and_grad(step)), compiler_options=QUICK)
+    F, slope = both(jnp.asarray(x))
+    limit, k = MU / 3, 0.25
+    sharp = np.minimum(k * x, limit)
+    inside = np.abs(k * x / limit - 1) < w
+    np.testing.assert_allclose(F[~inside], sharp[~inside], rtol=1e-12)
+    assert np.all((F <= sharp + 1e-15) & (F > sharp - w * limit / 3.9))
+    jump = np.max(np.abs(np.diff(slope)))
+    assert jump < 1.1 * k / (2 * w) * (x[1] - x[0]) * k / limit
+    np.testing.assert_allclose(np.cumsum(slope)[-1] * (x[1] - x[0]), F[-1], rtol=5e-3)
+    creeping = path(sideways(np.linspace(0, 3, 300)), np.diag([1.0, 2, 3]), rounding=w)
+    assert (1 - w) * limit < creeping.force[-1, 1] <= limit
+
+
+@pytest.mark.parametrize(
+    ("rounding", "dtype"),
+    [
+        (0.05, "float64"),
+        pytest.param(0.0, "float64", marks=pytest.mark.slow),
+        pytest.param(0.05, "float32", marks=pytest.mark.slow),
+        pytest.param(0.0, "float32", marks=pytest.mark.slow),
+    ],
+)
+def test_gradients(rounding, dtype):
+    """Forward = reverse = central differences through a path that sticks, slides and turns."""
+    x = np.array([0.0, 0.3, 1.9, 2.6, 1.2, -2.0])
+    point = {"D": sideways(x) + 0.1 * np.cos(np.arange(18)).reshape(6, 3), "C": COUPLED}
+    point |= {"k_1": 0.7, "k_3": 0.3, "mu": MU}
+
+    def f(v):
+        got = slide_path(v["D"], v["C"], Law(v["k_1"], v["k_3"]), v["mu"], rounding=rounding)
+        return jnp.concatenate([got.force.ravel(), got.slip.ravel()])
+
+    here = {n: jnp.asarray(v, dtype) for n, v in point.items()}
+    quick = functools.partial(jax.jit, compiler_options=QUICK)
+    forward, reverse = quick(jax.jacfwd(f))(here), quick(jax.jacrev(f))(here)
+    value, rng = quick(f), np.random.default_rng(2)
+    slid = path(point["D"], COUPLED, 0.7, 0.3)
+    assert 0 < np.sum(slid.sliding) < 6
+    for name, v in point.items():
+        tolerance = 2e4 * np.finfo(dtype).eps * np.max(np.abs(forward[name]))
+        np.testing.assert_allclose(forward[name], reverse[name], atol=tolerance)
+        direction = rng.normal(size=np.shape(v))
+        if name == "C":
+            direction = direction + direction.T
+        up, down = (
+            value({n: jnp.asarray(p) for n, p in (point | {name: v + e * direction}).items()})
+            for e in (1e-6, -1e-6)
+        )
+        along = np.tensordot(forward[name], direction, np.ndim(v))
+        size = np.max(np.abs(along))
+        tolerance = max(tolerance, 1e-6 * size)
+        np.testing.assert_allclose(along, (up - down) / 2e-6, atol=tolerance, err_msg=name)
+
+
+@pytest.mark.parametrize("rounding", [0.0, 0.05])
+def test_gradient_at_rest_is_finite(rounding):
+    """No tangential motion, no pressure: nothing divides by the length of zero."""
+    C, local, mu = jnp.asarray(COUPLED), Law(jnp.asarray(0.5), jnp.asarray(0.1)), jnp.asarray(MU)
+    D = jnp.asarray([[0.0, 0, 0], [1.0, 0, 0], [-1.0, 2, 0], [0.0, 1, 0]])
+    f = lambda D, mu: slide(D, C, local, mu, jnp.zeros(2), rounding=rounding).force  # noqa: E731
+    slopes = jax.jit(jax.vmap(jax.jacrev(f, (0, 1)), (0, None)), compiler_options=QUICK)(D, mu)
+    assert all(np.all(np.isfinite(slope)) for slope in slopes)

@@ -1,0 +1,304 @@
+"""Oblique presses: against a 3-D frame on ring springs, then symmetry, limits and gradients."""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrachea.mechanics.ring import Ring, ring_compliance
+from jaxtrachea.model import Options, press
+from jaxtrachea.oblique import ObliquePress, press_oblique, press_path
+from jaxtrachea.skeleton import local_frame, skeleton_response
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.geometry import table_1
+from jaxtrachea.trachea.material import Material
+
+DTYPES = ["float32", "float64"]
+ALPHA = 2 * math.pi / 3
+VALUES = {"EI_L": 1.862, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02, "EA_L": 3.9, "EI_C": 13.0, "k_t": 0.4}
+MORE = {"k_A": 0.5, "k_B": 2.0, "EI_side": 5.0}
+QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
+MOVES = np.array([[0.0, -1.0, 0.0], [0.3, -1.0, 0.5], [-2.0, 0.4, 1.0], [0.0, 0.0, 0.0]])
+BONDED = Options(contact="bonded")
+
+
+def material(dtype="float64", **changes):
+    return Material(**{n: jnp.asarray(v, dtype) for n, v in (VALUES | changes).items()})
+
+
+@functools.cache
+def compiled(options, rings, axial):
+    run = functools.partial(press_oblique, options=options, rings=rings, axial=axial)
+    return jax.jit(run, compiler_options=QUICK)
+
+
+def pressed(
+    s=63.0, phi=0.4, D=MOVES, options=BONDED, rings="arch2", axial=True, dtype="float64", **changes
+) -> ObliquePress:
+    args = (jnp.asarray(v, dtype) for v in (s, phi, D))
+    run = compiled(options, rings, axial)
+    return run(table_1(dtype=dtype), material(dtype, **changes), *args)
+
+
+def turned(phi):
+    """Columns x, y, z of inward normal, axial, circumferential: written apart from the code."""
+    return np.array(
+        [[0, -math.cos(phi), -math.sin(phi)], [1, 0, 0], [0, -math.sin(phi), math.cos(phi)]]
+    )
+
+
+def frame_fem(s_c, phi, force, v):
+    """Nodes (x, y, z, dy/ds, dz/ds): bar and two Euler beams, ring springs as full 2x2 blocks."""
+    x = 10.0 * np.arange(1, 16)
+    nodes = np.unique(np.concatenate([[0.0, 160.0, s_c], x]))
+    K = np.zeros((5 * nodes.size,) * 2)
+    T = np.eye(5)
+    T[1:3, 1:3] = T[3:, 3:] = turned(phi)[::2, 1:]  # local planes: normal, circumferential
+    for e, h in enumerate(np.diff(nodes)):
+        k = np.zeros((10, 10))
+        k[np.ix_([0, 5], [0, 5])] = v["EA_L"] / h * np.array([[1, -1], [-1, 1]])
+        for plane, EI in enumerate((v["EI_L"], v.get("EI_side", v["EI_L"]))):
+            at = [1 + plane, 3 + plane, 6 + plane, 8 + plane]
+            bend = [[12, 6 * h, -12, 6 * h], [6 * h, 4 * h * h, -6 * h, 2 * h * h]]
+            bend += [[-12, -6 * h, 12, -6 * h], [6 * h, 2 * h * h, -6 * h, 4 * h * h]]
+            k[np.ix_(at, at)] += EI / h**3 * np.array(bend)
+        both = np.kron(np.eye(2), T)
+        K[5 * e : 5 * e + 10, 5 * e : 5 * e + 10] += both.T @ k @ both
+    ring = Ring(*(jnp.asarray(q) for q in (11.3, ALPHA, v["EI_C"], v["k_M"], v["k_t"])))
+    spring = np.linalg.inv(np.asarray(ring_compliance(ring, jnp.asarray(phi))[0]))
+    at = 5 * np.searchsorted(nodes, x)
+    for i in at:
+        K[i + 1 : i + 3, i + 1 : i + 3] += spring
+    free = np.ones(K.shape[0], bool)
+    for end, name in ((0, "k_A"), (K.shape[0] - 5, "k_B")):
+        free[end : end + 5] = False
+        if name in v:
+            free[end], K[end, end] = True, K[end, end] + v[name]
+    f = np.zeros(K.shape[0])
+    at_C = 5 * np.searchsorted(nodes, s_c)
+    f[at_C : at_C + 3] = force
+    u = np.zeros_like(f)
+    u[free] = np.linalg.solve(K[np.ix_(free, free)], f[free])
+    joints = np.stack([u[i : i + 3] for i in at])
+    slopes = np.stack([u[i + 3 : i + 5] for i in at])
+    return u[at_C : at_C + 3], u[at_C + 3 : at_C + 5], joints, slopes, joints[:, 1:] @ spring.T
+
+
+@pytest.mark.parametrize("more", [{}, MORE], ids=["plain", "ends and sides"])
+@pytest.mark.parametrize(("s", "phi"), [(63.0, 0.4), (60.0, -1.9), (4.0, 0.0), (155.0, ALPHA)])
+def test_against_frame(s, phi, more):
+    """All parts of the skeleton at the solved force, and the local law in series with it."""
+    got = pressed(s, phi, **more)
+    for F, d, C_moved, slope_C, joints, slopes, loads, D in zip(
+        got.force, got.depth, got.skeleton, got.slope_C, got.joints, got.slopes, got.loads, MOVES,
+        strict=True,
+    ):  # fmt: skip
+        w_C, theta_C, w, theta, P = frame_fem(s, phi, F, VALUES | more)
+        scale = 1e-11 * (1e-3 + np.max(np.abs(w_C)))
+        np.testing.assert_allclose(C_moved, w_C, atol=scale)
+        np.testing.assert_allclose(slope_C, theta_C, atol=scale)
+        np.testing.assert_allclose(joints, w, atol=scale)
+        np.testing.assert_allclose(slopes, theta, atol=scale)
+        np.testing.assert_allclose(loads[:, 1:], P, atol=scale)
+        np.testing.assert_allclose(d + C_moved, D, atol=1e-12)
+        np.testing.assert_allclose(F, (0.3 + 0.02 * np.sum(d * d)) * d, atol=1e-13)
+
+
+def test_axial_share_is_equal_along_each_side():
+    """Paper fig. 7a: P^x the same at every joint of a side, F_A : F_B = L_BC : L_AC (eq. 2)."""
+    got = pressed()
+    P, F = np.asarray(got.loads[1, :, 0]), float(got.force[1, 0])
+    np.testing.assert_allclose(P[:6], F * 97 / 160, rtol=1e-13)
+    np.testing.assert_allclose(P[6:], F * 63 / 160, rtol=1e-13)
+    d = np.asarray(got.joints[1, :, 0])
+    np.testing.assert_allclose(np.diff(np.concatenate([[0], d[:6]])), d[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("rings", ["mat", "arch", "arch2"])
+def test_mirror(rings):
+    """The press at -phi, mirrored in z, is the mirrored press: U and V change places."""
+    flip = np.array([1.0, 1.0, -1.0])
+    one, two = pressed(phi=0.7, rings=rings), pressed(phi=-0.7, D=MOVES * flip, rings=rings)
+    for name in ("force", "depth", "skeleton", "joints", "loads"):
+        mirrored = np.asarray(getattr(one, name)) * flip
+        np.testing.assert_allclose(getattr(two, name), mirrored, atol=1e-12)
+    np.testing.assert_allclose(two.end_U, np.asarray(one.end_V) * flip, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(
+    "options", [Options(), Options(coupling="total", shear=True, local="two-material")], ids=repr
+)
+def test_normal_on_the_midline_is_press(options, dtype):
+    """Same law, ligament, touch and rings: `press` to rounding, sideways nothing."""
+    changes = {"GA_L": 1.1, "k_1_ring": 0.9} if options.shear else {}
+    depth = np.array([-0.5, 0.0, 0.2, 1.0, 3.0])
+    D = depth[:, None] * np.array([0.0, -1.0, 0.0])
+    got = pressed(44.0, 0.0, D, options, "mat", dtype=dtype, **changes)
+    run = jax.jit(functools.partial(press, options=options), compiler_options=QUICK)
+    s, d = jnp.asarray(44.0, dtype), jnp.asarray(depth, dtype)
+    one = run(table_1(dtype=dtype), material(dtype, **changes), s, d)
+    rtol = 100 * np.finfo(dtype).eps
+    close = lambda a, b: np.testing.assert_allclose(  # noqa: E731
+        a, b, atol=rtol * np.max(np.abs(b)), rtol=0
+    )
+    close(-got.force[:, 1], one.force)
+    close(-got.depth[:, 1], one.depth)
+    close(-got.joints[..., 1], one.joints)
+    close(-got.loads[..., 1], one.reactions)
+    np.testing.assert_array_equal(got.status, one.status)
+    np.testing.assert_array_equal(got.force[:, 0], 0)
+    assert got.force.dtype == dtype
+
+
+def test_reciprocity_and_ends():
+    """C symmetric and positive; ring ends carry the mat's share, all of the load and no more."""
+    run = jax.jit(functools.partial(skeleton_response), compiler_options=QUICK)
+    for phi in (0.0, 0.9, -ALPHA):
+        unit = run(table_1(), material(), jnp.asarray(63.0), jnp.asarray(phi))
+        C = np.asarray(unit.compliance)
+        np.testing.assert_allclose(C, C.T, rtol=1e-14)
+        assert np.min(np.linalg.eigvalsh(C)) > 0
+        carried = 0.05 * (np.asarray(unit.end_U) + np.asarray(unit.end_V))[:, 1:]
+        np.testing.assert_allclose(carried, unit.loads[:, 1:], atol=1e-13)
+    np.testing.assert_allclose(local_frame(jnp.asarray(0.9)), turned(0.9), atol=1e-15)
+
+
+def test_mat_and_arch():
+    """`mat`: 1 / k_M both ways, rings as one piece; `arch`: the stiffness along the normal."""
+    mat, arch = pressed(rings="mat"), pressed(rings="arch")
+    np.testing.assert_allclose(mat.loads[..., 1:], 0.1 * mat.joints[..., 1:], atol=1e-14)
+    np.testing.assert_array_equal(mat.end_U, mat.joints)
+    ring = Ring(*(jnp.asarray(q) for q in (11.3, ALPHA, 13.0, 0.1, 0.4)))
+    n = np.array([math.cos(0.4), math.sin(0.4)])
+    k = 1 / (n @ np.asarray(ring_compliance(ring, jnp.asarray(0.4))[0]) @ n)
+    np.testing.assert_allclose(arch.loads[..., 1:], k * arch.joints[..., 1:], atol=1e-14)
+
+
+def test_bonded_is_odd_and_unilateral_does_not_pull():
+    one, two = pressed(), pressed(D=-MOVES)
+    np.testing.assert_allclose(two.force, -one.force, atol=1e-14)
+    inward, sideways, out = turned(0.4)[0], turned(0.4)[2], -turned(0.4)[0]
+    D = np.stack([inward + 0.1 * sideways, 0.01 * inward + 3 * sideways, out + sideways])
+    got = pressed(D=D, options=Options())
+    wanted = [PressStatus.OK, PressStatus.PULLS, PressStatus.NO_CONTACT]
+    if float(got.force[1] @ inward) > 0:
+        wanted[1] = PressStatus.OK
+    np.testing.assert_array_equal(got.status, wanted)
+    np.testing.assert_array_equal(got.force[2], 0)
+    back = pressed(D=np.stack([0.01 * inward - 3 * sideways]), options=Options())
+    assert PressStatus.PULLS in (got.status[1], back.status[0])
+    np.testing.assert_allclose(got.force[0], pressed(D=D[:1]).force[0], rtol=1e-12)
+
+
+def test_status_of_lanes():
+    """Behind the gap, not finite and past the fold, each in its own lane; the others unchanged."""
+    phi = jnp.asarray([0.4, 2.2, 0.4, 0.4, ALPHA])
+    D = jnp.asarray(np.tile([0.1, -1.0, 0.2], (5, 1)))
+    k_3 = jnp.full(5, 0.02)
+    one = lambda phi, D, k_3: press_oblique(  # noqa: E731
+        table_1(), Material(**(VALUES | {"k_3": k_3})), jnp.asarray(63.0), phi, D, BONDED
+    )
+    run = jax.jit(jax.vmap(one), compiler_options=QUICK)
+    good = run(jnp.where(phi > 2.1, 0.4, phi), D, k_3)
+    bad = run(phi, D.at[2, 0].set(jnp.nan), k_3.at[3].set(-1e3))
+    ok = PressStatus.OK
+    wanted = [ok, PressStatus.BEHIND_GAP, PressStatus.NON_FINITE, PressStatus.PAST_FOLD, ok]
+    np.testing.assert_array_equal(bad.status, wanted)
+    assert np.all(np.isnan(bad.force[1:4]))
+    assert np.all(np.isfinite(bad.force[4]))
+    for a, b in zip(good, bad, strict=True):
+        np.testing.assert_array_equal(a[0], b[0])
+
+
+def test_path():
+    """Sticking, a path is the bonded press; sliding, the force is on the cone, off the midline."""
+    frame = turned(0.4)
+    x = np.linspace(0, 2, 6)
+    D = 0.8 * frame[0] + x[:, None] * (frame[1] + frame[2])
+    run = functools.partial(press_path, table_1(), material(), jnp.asarray(63.0), jnp.asarray(0.4))
+    quick = jax.jit(run, compiler_options=QUICK)
+    stuck, slid = (quick(jnp.asarray(D), jnp.asarray(mu)) for mu in (1e3, 0.3))
+    np.testing.assert_allclose(stuck.press.force, pressed(D=D).force, atol=1e-12)
+    np.testing.assert_array_equal(stuck.slip, 0)
+    local = np.asarray(slid.press.force) @ frame.T
+    np.testing.assert_allclose(np.hypot(*local[1:, 1:].T), 0.3 * local[1:, 0], rtol=1e-11)
+    total = slid.press.depth + slid.press.skeleton + slid.slip
+    np.testing.assert_allclose(total, D, atol=1e-12)
+    assert np.all(slid.dissipated >= 0)
+    with pytest.raises(ValueError, match="unilateral"):
+        run(jnp.asarray(D), jnp.asarray(0.3), BONDED)
+
+
+@pytest.mark.parametrize(
+    ("name", "keywords"),
+    [
+        ("EA_L", {"rings": "mat"}),
+        ("EI_C", {"axial": False}),
+        ("k_t", {"axial": False, "EI_C": 13.0}),
+    ],
+)
+def test_missing_values_are_named(name, keywords):
+    values = {n: VALUES[n] for n in ("EI_L", "k_M", "k_1", "k_3")}
+    values |= {n: keywords.pop(n) for n in ("EI_C",) if n in keywords}
+    zero = jnp.zeros(())
+    with pytest.raises(ValueError, match=name):
+        press_oblique(table_1(), Material(**values), zero, zero, jnp.zeros(3), **keywords)
+
+
+def test_wrong_options_are_named():
+    zero = jnp.zeros(())
+    run = functools.partial(press_oblique, table_1(), material(), zero, zero, jnp.zeros(3))
+    with pytest.raises(ValueError, match="split"):
+        run(Options(split="independent"))
+    with pytest.raises((ValueError, TypeError), match="arch3"):  # TypeError: the shape checks
+        run(rings="arch3")  # pyright: ignore
+
+
+def test_unused_effects_are_not_in_the_program():
+    """Without stretch, and on the mat, the compiled program has fewer operations."""
+    args = table_1(), material(), jnp.asarray(63.0), jnp.asarray(0.4), jnp.asarray(MOVES)
+
+    def operations(**keywords):
+        run = jax.jit(functools.partial(press_oblique, options=BONDED, **keywords))
+        return run.lower(*args).as_text().count(" = ")
+
+    full = operations()
+    assert operations(axial=False) < full
+    assert operations(rings="mat") < operations(rings="arch2") - 100
+
+
+def _values(v):
+    m = Material(**{n: v[n] for n in (*VALUES, *MORE)})
+    got = press_oblique(table_1(dtype=v["s"].dtype), m, v["s"], v["phi"], v["D"], BONDED)
+    return jnp.concatenate([q.ravel() for q in got[:-1]])
+
+
+forward_of = jax.jit(jax.jacfwd(_values), compiler_options=QUICK)
+reverse_of = jax.jit(jax.jacrev(_values), compiler_options=QUICK)
+value_of = jax.jit(_values, compiler_options=QUICK)
+
+
+@pytest.mark.parametrize("D", [[0.3, -1.0, 0.5], [0.0, 0.0, 0.0]])
+@pytest.mark.parametrize("dtype", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
+def test_gradients(D, dtype):
+    """Forward = reverse = central differences through the whole, also without displacement."""
+    point = VALUES | MORE | {"s": 63.0, "phi": 0.4, "D": np.array(D)}
+    here = {n: jnp.asarray(v, dtype) for n, v in point.items()}
+    forward, reverse = forward_of(here), reverse_of(here)
+    for name, v in point.items():
+        ahead, back = (np.asarray(of[name], float) for of in (forward, reverse))
+        size = np.max(np.abs(ahead)) + 1e-9
+        np.testing.assert_allclose(ahead, back, atol=5e3 * np.finfo(dtype).eps * size, rtol=0)
+        direction = np.ones(np.shape(v))
+        step = 1e-5 * max(1.0, float(np.max(np.abs(v))))
+        up, down = (
+            value_of({n: jnp.asarray(p) for n, p in (point | {name: v + e * direction}).items()})
+            for e in (step, -step)
+        )
+        along = np.tensordot(ahead, direction, np.ndim(v))
+        close = max(1e4 * np.finfo(dtype).eps, 3e-7) * size
+        np.testing.assert_allclose(along, (up - down) / (2 * step), atol=close, rtol=0)

@@ -1,0 +1,81 @@
+"""The recorded errors off the midline are those of the model, and the page tells them."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+VIRTUAL = ROOT / "fits" / "virtual_trachea"
+RECORD = json.loads((VIRTUAL / "off_midline.json").read_text())
+
+
+def load(path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+script = load(VIRTUAL / "off_midline.py")
+
+
+def of(rings, fitted):
+    return next(r for r in RECORD if (r["rings"], r["fitted"]) == (rings, fitted))
+
+
+@pytest.mark.parametrize("rings", ["mat", "arch2"])
+def test_errors_are_the_recorded_ones(rings):
+    """Parameters as recorded, everything else computed: forces, side forces, joints, ends."""
+    known = of(rings, "midline")
+    found = script.summary(rings, "midline", known["parameters"], script.read())
+    for one, two in zip(found["off"], known["off"], strict=True):
+        for name, value in two.items():
+            np.testing.assert_allclose(one[name], value, atol=1e-5, err_msg=name)
+    for name, value in known["midline"].items():
+        np.testing.assert_allclose(found["midline"][name], value, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_fit_is_the_recorded_one():
+    data = script.read()
+    rows = np.flatnonzero(data["phi_c"] == 0)
+    found = script.fit(*script.LEVELS["arch2"], rows, data)
+    for name, value in of("arch2", "midline")["parameters"].items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-2, err_msg=name)
+
+
+def test_what_the_page_claims():
+    """The sentences with numbers in docs/off_midline.md."""
+    mat, arch, arch2 = (of(rings, "midline") for rings in ("mat", "arch", "arch2"))
+    at = lambda r, phi: [e for e in r["off"] if e["phi_c"] == phi]  # noqa: E731
+    assert max(abs(e["compliance"]) for e in at(mat, 30)) < 0.025
+    assert all(-0.15 < e["compliance"] < -0.13 for e in at(mat, 90))
+    assert all(0.08 < e["compliance"] < 0.1 for e in at(arch2, 30))
+    assert all(0.42 < e["compliance"] < 0.45 for e in at(arch2, 90))
+    assert all(0.38 < e["side_force"] < 0.42 for e in at(arch2, 30))
+    assert all(e["ends"] < 0.03 for e in at(arch2, 30))
+    assert min(e["compliance"] for e in arch["off"]) > 0.6
+    assert arch2["midline"]["ends"] < 0.013
+    assert all(e["compliance"] > 0.23 for e in at(of("arch2", "all"), 90))
+
+
+def test_page_holds_the_recorded_numbers():
+    page = (ROOT / "docs" / "off_midline.md").read_text(encoding="utf-8")
+    assert page == script.document(RECORD)
+
+
+def test_frame_of_the_data():
+    """Mirror symmetry of the midline data: no side force, U and V alike; y inward is negative."""
+    data = script.read()
+    middle = data["phi_c"] == 0
+    np.testing.assert_allclose(data["force"][middle][:, 2], 0, atol=1e-6)
+    flip = np.array([1, 1, -1])
+    np.testing.assert_allclose(data["end_U"][middle], data["end_V"][middle] * flip, atol=1e-9)
+    assert np.all(data["force"][middle][:, 1] < 0)
+    force = script.measured(data)[0]
+    assert np.all(force[:, 0] > 0.5)
+    assert jnp.asarray(force).dtype == jnp.float64
