@@ -74,7 +74,7 @@ def information(
     _, slope = robust(problem.loss, z * z, problem.loss_scale)
     psi = lambda z: z * robust(problem.loss, z * z, problem.loss_scale)[1]  # noqa: E731
     _, dpsi = jax.jvp(psi, (z,), (jnp.ones_like(z),))
-    gram = lambda w: assemble(problem, jnp.einsum("tim,tjm->tij", J * w, J), lane)  # noqa: E731
+    gram = jnp.einsum("tim,tjm->tij", J, J)
     gradient = jnp.einsum("tim,tm->ti", J * b2, z * slope)
     total = jnp.sum(seen)
     kinds = jnp.arange(seen.shape[1]) < forces
@@ -88,8 +88,8 @@ def information(
         return jnp.nanmedian(jnp.where(mine, jnp.abs(r.value), jnp.nan))
 
     return Information(
-        bread=gram(b2),
-        meat=gram(b2 * b2),
+        bread=assemble(problem, b2 * gram, lane),
+        meat=assemble(problem, b2 * b2 * gram, lane),
         gradient=assemble(problem, gradient, lane),
         squares=by_kind(r.value**2 * seen),
         counts=by_kind(seen),
