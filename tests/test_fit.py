@@ -88,7 +88,7 @@ def test_intervals_cover_5000(given):
     assert np.all((covered >= 0.93) & (covered <= 0.97)), covered
 
 
-@pytest.mark.parametrize("loss", ["linear", "huber"])
+@pytest.mark.parametrize("loss", ["linear", pytest.param("huber", marks=pytest.mark.slow)])
 def test_a_batch_is_its_lanes_one_by_one(noisy, loss):
     """The same lane alone, in a batch, elsewhere in the chunk and among others: to 1e-8."""
     _, force, _ = noisy
@@ -353,7 +353,9 @@ def test_markers_with_both_noise_levels_estimated():
     assert np.all(result.standard_error[:, 1] < force_only.standard_error[:, 1])
 
 
-@pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy"])
+@pytest.mark.parametrize(
+    "loss", ["huber", *(pytest.param(n, marks=pytest.mark.slow) for n in ("soft_l1", "cauchy"))]
+)
 def test_robust_losses_as_scipy(noisy, loss):
     """Outliers in one lane; the same loss, scale and sigma in scipy give the same estimate."""
     _, force, sigma = noisy

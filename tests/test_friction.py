@@ -244,7 +244,12 @@ def test_gradients(rounding, dtype):
         if name == "C":
             direction = direction + direction.T
         up, down = (
-            value({n: jnp.asarray(p) for n, p in (point | {name: v + e * direction}).items()})
+            value(
+                {
+                    n: jnp.asarray(p, "float64")
+                    for n, p in (point | {name: v + e * direction}).items()
+                }
+            )
             for e in (1e-6, -1e-6)
         )
         along = np.tensordot(forward[name], direction, np.ndim(v))

@@ -182,16 +182,16 @@ def test_bonded_is_odd_and_unilateral_does_not_pull():
     one, two = pressed(), pressed(D=-MOVES)
     np.testing.assert_allclose(two.force, -one.force, atol=1e-14)
     inward, sideways, out = turned(0.4)[0], turned(0.4)[2], -turned(0.4)[0]
-    D = np.stack([inward + 0.1 * sideways, 0.01 * inward + 3 * sideways, out + sideways])
+    rows = [inward + 0.1 * sideways, 0.01 * inward + 3 * sideways, out + sideways]
+    D = np.stack([*rows, 0.01 * inward - 3 * sideways])
     got = pressed(D=D, options=Options())
     wanted = [PressStatus.OK, PressStatus.PULLS, PressStatus.NO_CONTACT]
     if float(got.force[1] @ inward) > 0:
         wanted[1] = PressStatus.OK
-    np.testing.assert_array_equal(got.status, wanted)
+    np.testing.assert_array_equal(got.status[:3], wanted)
     np.testing.assert_array_equal(got.force[2], 0)
-    back = pressed(D=np.stack([0.01 * inward - 3 * sideways]), options=Options())
-    assert PressStatus.PULLS in (got.status[1], back.status[0])
-    np.testing.assert_allclose(got.force[0], pressed(D=D[:1]).force[0], rtol=1e-12)
+    assert PressStatus.PULLS in (got.status[1], got.status[3])
+    np.testing.assert_allclose(got.force[0], pressed(D=D).force[0], rtol=1e-12)
 
 
 def test_status_of_lanes():
@@ -246,7 +246,11 @@ def test_missing_values_are_named(name, keywords):
     values |= {n: keywords.pop(n) for n in ("EI_C",) if n in keywords}
     zero = jnp.zeros(())
     with pytest.raises(ValueError, match=name):
-        press_oblique(table_1(), Material(**values), zero, zero, jnp.zeros(3), **keywords)
+        jax.eval_shape(
+            lambda: press_oblique(
+                table_1(), Material(**values), zero, zero, jnp.zeros(3), **keywords
+            )
+        )
 
 
 def test_wrong_options_are_named():
@@ -277,8 +281,10 @@ def _values(v):
     return jnp.concatenate([q.ravel() for q in got[:-1]])
 
 
+# A random combination of all results: one reverse pass instead of one for each (compilation).
+weights = np.random.default_rng(0).normal(size=10_000)
 forward_of = jax.jit(jax.jacfwd(_values), compiler_options=QUICK)
-reverse_of = jax.jit(jax.jacrev(_values), compiler_options=QUICK)
+reverse_of = jax.jit(jax.grad(lambda v, w: jnp.dot(w, _values(v))), compiler_options=QUICK)
 value_of = jax.jit(_values, compiler_options=QUICK)
 
 
@@ -288,15 +294,24 @@ def test_gradients(D, dtype):
     """Forward = reverse = central differences through the whole, also without displacement."""
     point = VALUES | MORE | {"s": 63.0, "phi": 0.4, "D": np.array(D)}
     here = {n: jnp.asarray(v, dtype) for n, v in point.items()}
-    forward, reverse = forward_of(here), reverse_of(here)
+    forward = forward_of(here)
+    w = weights[: forward["s"].shape[0]]
+    reverse = reverse_of(here, jnp.asarray(w, dtype))
     for name, v in point.items():
         ahead, back = (np.asarray(of[name], float) for of in (forward, reverse))
         size = np.max(np.abs(ahead)) + 1e-9
-        np.testing.assert_allclose(ahead, back, atol=5e3 * np.finfo(dtype).eps * size, rtol=0)
+        combined = np.tensordot(w, ahead, 1)
+        close = 5e3 * np.finfo(dtype).eps * size * np.linalg.norm(w)
+        np.testing.assert_allclose(combined, back, atol=close, rtol=0)
         direction = np.ones(np.shape(v))
         step = 1e-5 * max(1.0, float(np.max(np.abs(v))))
         up, down = (
-            value_of({n: jnp.asarray(p) for n, p in (point | {name: v + e * direction}).items()})
+            value_of(
+                {
+                    n: jnp.asarray(p, "float64")
+                    for n, p in (point | {name: v + e * direction}).items()
+                }
+            )
             for e in (step, -step)
         )
         along = np.tensordot(ahead, direction, np.ndim(v))

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
+pytestmark = pytest.mark.slow  # compiles every level of the rings
 
 
 @pytest.fixture(scope="module")

@@ -37,6 +37,10 @@ CASES = {
     "beam of a trial": (Options(), False, {"EI_L": TRIAL, "k_1": SHARED}),
     "several beams": (Options(), False, {"k_1": SHARED, "k_M": FREE | {"scale": "linear"}}),
 }  # fmt: skip
+#: Each takes some seconds of compilation; the others are variations.
+LATER = {"fixed law", "dense", "independent", "total", "several beams", "shear", "two materials"}
+EACH = [pytest.param(n, marks=pytest.mark.slow if n in LATER else ()) for n in CASES]
+QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
 
 
 def study(name):
@@ -74,7 +78,7 @@ def evaluated(name):
     """Residual with Jacobian, residual alone, and its derivative by jax; of every lane."""
     problem = study(name)
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=QUICK)
     def both(theta, lane):
         value = functools.partial(residual_value, problem)
         return residual(problem, theta, lane), value(theta, lane), jax.jacfwd(value)(theta, lane)
@@ -97,13 +101,13 @@ def pressed(problem, theta, k, t):
     return np.asarray(force)[: len(D)] + offset, np.asarray(joints)[: len(D)]
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
 def _press(options, material, s_c, onset, displacement):
     out = press(synthetic.GEOMETRY, material, s_c, displacement, options, onset=onset)
     return out.force, out.joints
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", EACH)
 def test_is_model_minus_data(name):
     problem = study(name)
     for k, curves in enumerate(problem.curves):
@@ -129,7 +133,7 @@ def test_is_model_minus_data(name):
         assert np.all(value[len(curves) :] == 0)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", EACH)
 def test_jacobian_is_that_of_the_value(name):
     problem = study(name)
     for k, curves in enumerate(problem.curves):

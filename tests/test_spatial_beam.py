@@ -183,7 +183,9 @@ def test_compliance_of_many_points(dtype):
 def test_smooth_across_a_ring():
     """Left limit, value and right limit of C and dC/ds agree on every ring."""
     b = beam_of(tube(np.random.default_rng(6), 0.1))
-    slope = jax.jit(jax.vmap(jax.jacfwd(contact_compliance, argnums=1), (None, 0)))
+    slope = jax.jit(
+        jax.vmap(jax.jacfwd(contact_compliance, argnums=1), (None, 0)), compiler_options=QUICK
+    )
     step = 1e-7
     c = [compliances(b, b.x + e) for e in (-step, 0.0, step)]
     dc = [slope(b, b.x + e) for e in (-step, 0.0, step)]
@@ -191,7 +193,7 @@ def test_smooth_across_a_ring():
     np.testing.assert_allclose(c[0], c[2], atol=5 * step * scale)
     assert np.max(np.abs(dc[2] - dc[0])) < 1e-5 * scale
     assert np.max(np.abs(dc[1] - (dc[0] + dc[2]) / 2)) < 1e-6 * scale
-    np.testing.assert_allclose(slope(b, jnp.asarray([0.0, 160.0])), 0, atol=1e-12)
+    np.testing.assert_allclose(slope(b, jnp.asarray([0.0] * 7 + [160.0] * (N - 7))), 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -171,7 +171,12 @@ def test_gradients(k_3, dtype):
         direction = rng.normal(size=np.shape(v))
         direction = direction + direction.T if name == "C" else direction
         up, down = (
-            value_of({n: jnp.asarray(p) for n, p in (point | {name: v + e * direction}).items()})
+            value_of(
+                {
+                    n: jnp.asarray(p, "float64")
+                    for n, p in (point | {name: v + e * direction}).items()
+                }
+            )
             for e in (1e-6, -1e-6)
         )
         along = np.tensordot(np.asarray(forward[name], float), direction, np.ndim(v))
