@@ -84,7 +84,7 @@ class Touch(eqx.Module):
     status: Int[Array, ""]
 
     @property
-    def complete(self) -> Bool[Array, ""]:
+    def complete(self) -> Bool[Array, "*lanes"]:
         """Whether the patches left out are known to be further away."""
         return self.left_out >= self.gap
 

@@ -1,7 +1,7 @@
 r"""A surface round a centreline cut into convex patches.
 
-Each patch is the convex hull of the surface between two borders, opened by a ball of radius r (the
-union of all balls of that radius that fit into the hull): its core is the hull with every face moved
+Each patch is the convex hull of the surface between two borders, opened by a ball of radius r (all
+balls of that radius that fit into the hull): its core is the hull with every face moved
 inwards by r. Corners sharper than the ball are lost a little, by r theta^2 / 8 between two faces at
 a small angle theta; hollows are bridged. Both are measured and stored.
 
@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from jaxtrachea.contact.line import Centreline
 from jaxtrachea.contact.patches import Patches, check_borders
 from jaxtrachea.contact.search import coarse_directions
-from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.contact.shapes import ArrayLike, Shape
 
 #: Directions in which losses are measured.
 PROBES = 2000
@@ -26,13 +26,13 @@ SPACING = 1.0
 
 
 def patches_of(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    s: np.ndarray,
-    borders: np.ndarray,
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    s: ArrayLike,
+    borders: ArrayLike,
     *,
-    centres: np.ndarray | None = None,
-    frames: np.ndarray | None = None,
+    centres: ArrayLike | None = None,
+    frames: ArrayLike | None = None,
     rounding: float = 0.5,
     overlap: float = 0.5,
     most: int = 32,
@@ -72,6 +72,8 @@ def patches_of(
             "rounding, overlap, most: expected in (0, 1), not below 0 and at least 4, found "
             f"{rounding:g}, {overlap:g}, {most}"
         )
+    if centres is not None and frames is not None:
+        centres, frames = np.asarray(centres, float), np.asarray(frames, float)
     line = _line(s, centres, frames, at)
     edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     made = []
@@ -110,10 +112,7 @@ def _line(s, centres, frames, at):
     known, first = np.unique(s, return_index=True)
     x = np.linspace(known[0], known[-1], int(np.ptp(known) / SPACING) + 2)
     spread = lambda rows: np.stack([np.interp(x, known, r) for r in rows[first].T], axis=1)  # noqa: E731
-    frames = np.asarray(frames, float)
-    points, tangents, anterior = (
-        spread(np.asarray(rows, float)) for rows in (centres, frames[:, :, 0], frames[:, :, 1])
-    )
+    points, tangents, anterior = map(spread, (centres, frames[:, :, 0], frames[:, :, 1]))
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     anterior -= np.sum(anterior * tangents, axis=1, keepdims=True) * tangents
     return x, points, tangents, anterior / np.linalg.norm(anterior, axis=1, keepdims=True)
