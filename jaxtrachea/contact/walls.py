@@ -89,7 +89,7 @@ def patches_of(
                     v[(s >= low) & (s <= high)],
                 ]
             )
-            made.append(_patch(inside, ends, own, _station(line, (low, high)), rounding, most))
+            made.append(_patch(inside, ends, own, _station(line, (a, b)), rounding, most))
         except (QhullError, ValueError) as error:
             raise ValueError(
                 f"the surface between s = {low:g} and {high:g} mm encloses nothing: "
@@ -139,15 +139,14 @@ def _section(v, s, edges, at):
 def _patch(inside, ends, own, station, rounding, most):
     """Core (3, n), radius, middle, lost and filled of one patch."""
     middle, (t, t_low, t_high) = station
-    points = np.concatenate([inside, *ends])
-    side = _sides(ConvexHull(points), t)
+    side = _sides(ConvexHull(np.concatenate([inside, *ends])), t)
     largest = (-(side[:, :3] @ middle) - side[:, 3]).min()
     filled = (-(own @ side[:, :3].T) - side[:, 3]).min(axis=1).max()
     r = rounding * largest
-    grown = np.concatenate([points, ends[0] - r * t_low, ends[1] + r * t_high])
-    hull = ConvexHull(grown)
-    planes = np.unique(np.round(hull.equations, 12), axis=0)
-    planes[:, 3] += r
+    caps = np.stack(
+        [[*-t_low, (ends[0] @ t_low).min()], [*t_high, -(ends[1] @ t_high).max()]]
+    )  # the core ends there: swept by the ball, a patch is not cut off but rounded
+    planes = np.concatenate([np.unique(np.round(side, 12), axis=0) + [0, 0, 0, r], caps])
     core = HalfspaceIntersection(planes, middle).intersections
     core = core[ConvexHull(core).vertices]
     d = coarse_directions(PROBES)[0]
