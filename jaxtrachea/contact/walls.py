@@ -21,6 +21,8 @@ from jaxtrachea.contact.shapes import ArrayLike, Shape
 PROBES = 2000
 #: A direction or face belongs to the side of the tube where its sine to the centreline is below.
 SIDEWAYS = 0.5
+#: Planes straight across, which hold a patch together where no face looks sideways.
+ACROSS = 8
 #: Distance of the samples of a curved centreline, mm.
 SPACING = 1.0
 
@@ -139,7 +141,7 @@ def _section(v, s, edges, at):
 def _patch(inside, ends, own, station, rounding, most):
     """Core (3, n), radius, middle, lost and filled of one patch."""
     middle, (t, t_low, t_high) = station
-    side = _sides(ConvexHull(np.concatenate([inside, *ends])), t)
+    side = _sides(np.concatenate([inside, *ends]), t)
     largest = (-(side[:, :3] @ middle) - side[:, 3]).min()
     filled = (-(own @ side[:, :3].T) - side[:, 3]).min(axis=1).max()
     r = rounding * largest
@@ -155,10 +157,17 @@ def _patch(inside, ends, own, station, rounding, most):
     return kept.T, r, middle, max(lost, 0), max(filled, 0)
 
 
-def _sides(hull, t):
-    """The hull's faces that look sideways."""
-    sideways = np.abs(hull.equations[:, :3] @ t) < SIDEWAYS
-    return hull.equations[sideways]
+def _sides(points, t):
+    """Planes round the points: faces of their hull that look sideways, and a few straight across.
+
+    Where the tube opens steeply there is none of the first kind; the others always close it.
+    """
+    faces = ConvexHull(points).equations
+    across = np.linalg.svd(t[None])[2][1:]
+    turn = 2 * np.pi * np.arange(ACROSS) / ACROSS
+    d = np.stack([np.cos(turn), np.sin(turn)], axis=1) @ across
+    straight = np.concatenate([d, -(points @ d.T).max(axis=0)[:, None]], axis=1)
+    return np.concatenate([faces[np.abs(faces[:, :3] @ t) < SIDEWAYS], straight])
 
 
 def _extreme(heights, most):
