@@ -1,8 +1,9 @@
 r"""A surface round a centreline cut into convex patches.
 
 Each patch is the convex hull of the surface between two borders, opened by a ball of radius r (all
-balls of that radius that fit into the hull): its core is the hull with every face moved
-inwards by r. Corners sharper than the ball are lost a little, by r theta^2 / 8 between two faces at
+balls of that radius that fit into the hull): its core is the hull with every side face moved
+inwards by r, cut off by planes across the centreline at the borders.
+Corners sharper than the ball are lost a little, by r theta^2 / 8 between two faces at
 a small angle theta; hollows are bridged. Both are measured and stored.
 
 On numbers, once; nothing here is traced.
