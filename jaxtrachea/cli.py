@@ -5,13 +5,14 @@ Exit codes: 0 everything converged, 1 some lane failed or some curve could not b
 """
 
 import contextlib
+import dataclasses
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich import box
@@ -39,6 +40,10 @@ DataOption = Annotated[
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 LeaveOption = Annotated[
     bool, typer.Option("--leave-one-out", help="Also predict every curve from the others.")
+]
+
+ProfileOption = Annotated[
+    bool, typer.Option("--profile", help="Also profile the likelihood of the parameters.")
 ]
 
 
@@ -108,6 +113,7 @@ def fit(
     data: DataOption = None,
     out_dir: OutOption = None,
     leave_one_out: LeaveOption = False,
+    profile: ProfileOption = False,
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
     from jaxtrachea.identify.output import OutputExists, new_output
@@ -116,13 +122,14 @@ def fit(
     loaded, measurements, problem = _load(spec, data)
     if leave_one_out:
         _can_leave_out(problem)
+    names = _names_to_profile(loaded, problem, profile)
     clock.append(time.perf_counter())
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
     try:
         with _interrupts() as stop_if_asked, new_output(out_dir, default) as folder:
-            result, left_out = _run(loaded, problem, leave_one_out, stop_if_asked)
+            found = _run(loaded, problem, leave_one_out, names, stop_if_asked)
             clock.append(time.perf_counter())
-            _write(folder, spec, loaded, measurements, result, left_out, clock)
+            _write(folder, spec, loaded, measurements, found, clock)
             stop_if_asked()
     except OutputExists as error:
         raise _Stop(str(error)) from None
@@ -131,7 +138,8 @@ def fit(
         raise _Stop(
             f"{where}: cannot be written ({error.strerror}); choose another --out"
         ) from None
-    _print_result(result, folder.parent)
+    result = found.result
+    _print_result(found, folder.parent)
     failed = any(not _succeeded(result, lane) for lane in range(result.lanes))
     raise typer.Exit(1 if failed or measurements.bad else 0)
 
@@ -210,9 +218,29 @@ def _can_leave_out(problem) -> None:
         raise _Stop(f"--leave-one-out: {error}") from None
 
 
-def _run(spec, problem, leave_out: bool, stop_if_asked: Callable[[], None]):
+def _names_to_profile(spec, problem, asked: bool) -> tuple[str, ...]:
+    from jaxtrachea.config import SpecError
+    from jaxtrachea.identify.study import profiled
+
+    try:
+        return profiled(spec, problem, asked=asked)
+    except SpecError as error:
+        raise _Stop(str(error)) from None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Found:
+    """What a run has computed; None: not asked for."""
+
+    result: Any
+    left_out: Any
+    profiles: Any
+
+
+def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked) -> _Found:
     from jaxtrachea.identify.fit import fit as run_fit
     from jaxtrachea.identify.predictions import leave_one_out
+    from jaxtrachea.identify.profile import profiles
     from jaxtrachea.identify.study import settings_of
 
     settings = settings_of(spec)
@@ -225,17 +253,21 @@ def _run(spec, problem, leave_out: bool, stop_if_asked: Callable[[], None]):
 
             def advance(done, of):
                 stop_if_asked()
-                bar.update(task, advance=done, total=of)
+                bar.update(task, advance=done, total=of or None)
 
             return advance
 
         result = run_fit(problem, settings, counted("fitting"))
-        if not leave_out:
-            return result, None
-        return result, leave_one_out(problem, settings, counted("leaving curves out"))
+        left_out = profiled = None
+        if leave_out:
+            left_out = leave_one_out(problem, settings, counted("leaving curves out"))
+        if profile:
+            points, report = spec.uncertainty.profile_points, counted("profiling")
+            profiled = profiles(result, settings, profile, points=points, progress=report)
+        return _Found(result, left_out, profiled)
 
 
-def _write(folder: Path, spec: Path, loaded, measurements, result, left_out, clock) -> None:
+def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock) -> None:
     """All files of one run; `clock`: when reading began, ended, and the fit ended."""
     import json
 
@@ -246,13 +278,17 @@ def _write(folder: Path, spec: Path, loaded, measurements, result, left_out, clo
     from jaxtrachea.identify.predictions import predictions
     from jaxtrachea.plots import draw_all
 
+    result, profiles = found.result, found.profiles
     seen = predictions(result.problem, result.theta)
     rows = [*results.lane_rows(result), *map(results.bad_row, measurements.bad)]
     results.write_csv(folder / "summary.csv", rows)
-    results.write_csv(folder / "parameters.csv", list(results.parameter_rows(result)))
-    draw_all(folder, result, seen)
-    table = None if left_out is None else report.left_out_rows(result, left_out)
-    text = report.report_text(loaded.title or spec.stem, result, measurements.bad, seen, table)
+    results.write_csv(folder / "parameters.csv", list(results.parameter_rows(result, profiles)))
+    if profiles is not None:
+        results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
+    draw_all(folder, result, seen, profiles)
+    table = None if found.left_out is None else report.left_out_rows(result, found.left_out)
+    title = loaded.title or spec.stem
+    text = report.report_text(title, result, measurements.bad, seen, table, profiles)
     results.write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")
@@ -260,7 +296,7 @@ def _write(folder: Path, spec: Path, loaded, measurements, result, left_out, clo
     made = results.provenance(
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
     )
-    results.write_hdf5(folder / "results.h5", result, made)
+    results.write_hdf5(folder / "results.h5", result, made, profiles)
     results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
 
 
@@ -270,16 +306,19 @@ def _succeeded(result, lane: int) -> bool:
     return succeeded(result, lane)
 
 
-def _print_result(result, folder: Path) -> None:
+def _print_result(found: _Found, folder: Path) -> None:
     from jaxtrachea import report
     from jaxtrachea.identify.results import flat_sentence, lane_label
 
-    out = Console()
+    out, result = Console(), found.result
     lanes = range(result.lanes)
     if result.lanes <= report.ONE_BY_ONE:
         rows = report.estimate_rows(result, lanes)
         out.print(_table("Estimates", report.ESTIMATE_HEAD, rows))
         out.print(_table("Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)))
+        if found.profiles is not None:
+            rows = report.profile_table(found.profiles, lanes)
+            out.print(_table("Profile likelihood", report.PROFILE_HEAD, rows))
         for lane in lanes:
             text = f"{lane_label(result, lane)}: {flat_sentence(result, lane)}"
             out.print(escape(text), highlight=False)

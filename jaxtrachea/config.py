@@ -189,6 +189,20 @@ class FitSection(_Section):
     precision: Literal["float64", "float32"] = "float64"
 
 
+class UncertaintySection(_Section):
+    """[uncertainty]: what is done beyond the local standard errors (docs/uncertainty.md)."""
+
+    profile: list[str] = []
+    profile_points: int = Field(10, ge=2, le=1000)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_name(cls, data: Any) -> Any:
+        if isinstance(data, dict) and isinstance(data.get("profile"), str):
+            return {**data, "profile": [data["profile"]]}
+        return data
+
+
 class FitSpec(_Section):
     """A whole fit specification."""
 
@@ -199,6 +213,9 @@ class FitSpec(_Section):
     parameters: dict[str, ParameterSection] = {}
     noise: NoiseSection = NoiseSection()
     fit: FitSection = Field(default_factory=lambda: FitSection.model_validate({}))
+    uncertainty: UncertaintySection = Field(
+        default_factory=lambda: UncertaintySection.model_validate({})
+    )
 
 
 def load_fit_spec(path: Path) -> FitSpec:

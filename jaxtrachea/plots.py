@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.predictions import Prediction
+from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import lane_label, unknown_label
 from jaxtrachea.report import ONE_BY_ONE
 
@@ -24,14 +25,18 @@ _STYLE: dict[Any, object] = {
 }
 
 
-def draw_all(folder: Path, result: FitResult, prediction: Prediction) -> list[Path]:
-    """Write fit.png, residuals.png and correlation.png; returns their paths."""
+def draw_all(
+    folder: Path, result: FitResult, prediction: Prediction, profiles: Profiles | None = None
+) -> list[Path]:
+    """Write fit.png, residuals.png, correlation.png, if given profiles.png; returns the paths."""
     with mpl.rc_context(_STYLE):
         figures = {
             "fit": draw_fit(result, prediction),
             "residuals": draw_residuals(result, prediction),
             "correlation": draw_correlation(result),
         }
+        if profiles is not None and len(profiles.lane):
+            figures["profiles"] = draw_profiles(profiles)
         paths = []
         for name, figure in figures.items():
             paths.append(folder / f"{name}.png")
@@ -147,4 +152,36 @@ def draw_correlation(result: FitResult):
                 axis.text(j, i, f"{mean[i, j]:.2f}", ha="center", va="center", color=dark, size=7)
     axis.set_title("correlation" + (f", mean of {result.lanes} lanes" if result.lanes > 1 else ""))
     figure.colorbar(image, shrink=0.8)
+    return figure
+
+
+def draw_profiles(profiles: Profiles):
+    """Rise of the profile against the parameter, a panel for each parameter, a line for each lane.
+
+    Dotted: the parabola of the local standard error, of the first lane; dashed: threshold.
+    """
+    result = profiles.result
+    names = list(dict.fromkeys(p.name for p in result.problem.free))
+    of = lambda k: result.problem.unknowns[profiles.lane[k]][profiles.unknown[k]][0]  # noqa: E731
+    groups = {n: [k for k in range(len(profiles.lane)) if of(k).name == n] for n in names}
+    groups = {n: members for n, members in groups.items() if members}
+    figure, axes = _grid(len(groups))
+    for axis, members in zip(axes, groups.values(), strict=False):
+        p, first = of(members[0]), members[0]
+        colours = mpl.colormaps["viridis"](np.linspace(0.05, 0.9, len(members)))
+        for k, colour in zip(members[:200], colours, strict=False):
+            at = np.array([p.from_scaled(v) for v in profiles.coordinate[k]])
+            axis.plot(at, profiles.statistic[k], ".-", color=colour, lw=0.9, ms=3)
+        lane, unknown = profiles.lane[first], profiles.unknown[first]
+        se = result.uncertainty[lane].se[unknown]
+        if np.isfinite(se):
+            ends = profiles.coordinate[first]
+            theta = np.linspace(ends[0], ends[-1], 101)
+            local = ((theta - result.theta[lane, unknown]) / se) ** 2
+            axis.plot([p.from_scaled(v) for v in theta], local, ":", color="k", lw=1)
+        axis.axhline(profiles.threshold[first], ls="--", color="tab:red", lw=0.9)
+        wide = np.ptp(profiles.coordinate[members]) > np.log(20)
+        axis.set_xscale("log" if p.scale == "log" and wide else "linear")
+        axis.set_ylim(-0.2, 2.2 * profiles.threshold[first])
+        axis.set(title=p.name, xlabel=f"{p.name} [{p.unit}]", ylabel="rise of the profile")
     return figure

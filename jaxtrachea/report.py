@@ -7,6 +7,7 @@ import numpy as np
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.predictions import LeftOut, Prediction, lag_correlation, rms
+from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import (
     flat_sentence,
     lane_label,
@@ -15,7 +16,7 @@ from jaxtrachea.identify.results import (
     unknown_label,
     verdict_of,
 )
-from jaxtrachea.status import FitStatus
+from jaxtrachea.status import FitStatus, ProfileEnd
 
 #: Lanes that are listed and drawn one by one; beyond it, distributions are shown.
 ONE_BY_ONE = 12
@@ -130,6 +131,7 @@ def report_text(
     bad: Sequence[BadCurve],
     prediction: Prediction,
     left_out: Sequence[Sequence[str]] | None,
+    profiles: Profiles | None = None,
 ) -> str:
     """The whole report.md."""
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
@@ -144,6 +146,8 @@ def report_text(
         f"Largest residual: {prediction.worst(result)}.",
         *_doubts(result, prediction),
     ]
+    if profiles is not None:
+        parts += _profiled(profiles)
     if left_out is not None:
         parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, left_out)]
     names = {"fit": "data and fit", "residuals": "residuals", "correlation": "correlation"}
@@ -173,6 +177,64 @@ def _estimates(result: FitResult) -> list[str]:
         "Identifiable: relative standard error up to 10 %; weak: up to 50 %. Standard errors are "
         "local (Gauss-Newton); they say nothing of what the model leaves out.",
     ]
+
+
+PROFILE_HEAD = ["specimen", "parameter", "value", "profile 95 %", "local 95 %", "ends"]
+
+
+def interval(low: float, high: float, *, log: bool) -> str:
+    """An interval for people; open sides are left out."""
+    open_low, open_high = low == (0 if log else -np.inf), high == np.inf
+    if open_low and open_high:
+        return "anything"
+    if open_low or open_high:
+        return f"up to {number(high)}" if open_low else f"from {number(low)}"
+    return "–" if np.isnan(low) and np.isnan(high) else f"{number(low)} … {number(high)}"
+
+
+def profile_table(profiles: Profiles, lanes: Sequence[int]) -> list[list[str]]:
+    """Lane, parameter, value, interval by profile and by standard error, how the profile ends."""
+    result, rows = profiles.result, []
+    for k, (lane, i) in enumerate(profiles.pairs):
+        if lane not in lanes:
+            continue
+        p = result.problem.unknowns[lane][i][0]
+        low, high = (ProfileEnd(int(e)).name.lower() for e in profiles.end[k])
+        local = (float(v[lane, i]) for v in (result.lower, result.upper))
+        rows.append(
+            [
+                lane_label(result, lane),
+                f"{unknown_label(result, lane, i)} [{p.unit}]",
+                number(float(result.value[lane, i])),
+                interval(profiles.lower[k], profiles.upper[k], log=p.scale == "log"),
+                interval(*local, log=p.scale == "log"),
+                low if low == high else f"{low}, {high}",
+            ]
+        )
+    return rows
+
+
+def _profiled(profiles: Profiles) -> list[str]:
+    """The section on profile likelihood."""
+    result = profiles.result
+    shown = range(min(result.lanes, ONE_BY_ONE))
+    count = lambda end: int(np.sum((profiles.end == end).any(axis=1)))  # noqa: E731
+    parts = [
+        "## Profile likelihood",
+        markdown_table(PROFILE_HEAD, profile_table(profiles, shown)),
+        f"{len(profiles.lane)} profiles: {count(ProfileEnd.OPEN)} open on a side (the data do not "
+        f"limit the parameter there), {count(ProfileEnd.BOUND)} limited only because another "
+        f"unknown is on its bound, {count(ProfileEnd.FAILED)} failed. All other unknowns are "
+        "fitted anew at every point; points: `profiles.csv` (docs/uncertainty.md).",
+    ]
+    better = np.flatnonzero(profiles.improved)
+    if len(better):
+        names = sorted({lane_label(result, int(profiles.lane[k])) for k in better})
+        parts.append(
+            f"**A profile found a better fit than the fit itself** ({', '.join(names[:20])}): "
+            "these intervals are wrong. Fit again with more starts."
+        )
+    return [*parts, "![profiles](profiles.png)"] if len(profiles.lane) else parts
 
 
 def _doubts(result: FitResult, prediction: Prediction) -> list[str]:

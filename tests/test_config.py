@@ -21,6 +21,7 @@ SECTIONS = {
     "## [parameters.NAME]": config.ParameterSection,
     "## [noise]": config.NoiseSection,
     "## [fit]": config.FitSection,
+    "## [uncertainty]": config.UncertaintySection,
 }
 
 

@@ -83,6 +83,11 @@ class FitResult:
         """Number of lanes."""
         return len(self.status)
 
+    @property
+    def whitened_sigma(self) -> np.ndarray:
+        """`sigma` in units of the lanes' precision, as `evaluate` wants it; (lanes, 2)."""
+        return self.sigma / _precision_unit(self.problem)
+
 
 def fit(
     problem: Problem,

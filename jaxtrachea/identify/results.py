@@ -15,8 +15,9 @@ import numpy as np
 
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
+from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.uncertainty import describe_flat, verdict
-from jaxtrachea.status import FitStatus
+from jaxtrachea.status import FitStatus, ProfileEnd
 
 SCHEMA = "jaxtrachea-results"
 SCHEMA_VERSION = 1
@@ -117,12 +118,14 @@ def bad_row(bad: BadCurve) -> dict[str, object]:
     }
 
 
-def parameter_rows(result: FitResult) -> Iterator[dict[str, object]]:
-    """One row per lane and unknown for parameters.csv."""
+def parameter_rows(
+    result: FitResult, profiles: Profiles | None = None
+) -> Iterator[dict[str, object]]:
+    """One row per lane and unknown for parameters.csv; more columns where there is more to say."""
     for lane in range(result.lanes):
         lane_specimen, _ = result.problem.lane_name(lane)
         for i, (p, specimen, trial) in enumerate(result.problem.unknowns[lane]):
-            yield {
+            row = {
                 "specimen": specimen or lane_specimen,
                 "trial": trial or "(all)",
                 "parameter": p.name,
@@ -133,6 +136,39 @@ def parameter_rows(result: FitResult) -> Iterator[dict[str, object]]:
                 "high95": float(result.upper[lane, i]),
                 "relative_se": float(result.relative_se[lane, i]),
                 "verdict": verdict_of(result, lane, i),
+            }
+            yield row | _profile_cells(profiles, lane, i)
+
+
+def _profile_cells(profiles: Profiles | None, lane: int, i: int) -> dict[str, object]:
+    """Interval by profile likelihood, and how it ends."""
+    k = None if profiles is None else profiles.find(lane, i)
+    if profiles is None or k is None:
+        return {}
+    low, high = (ProfileEnd(int(v)).name.lower() for v in profiles.end[k])
+    return {
+        "profile_low95": float(profiles.lower[k]),
+        "profile_high95": float(profiles.upper[k]),
+        "profile_low_end": low,
+        "profile_high_end": high,
+    }
+
+
+def profile_rows(profiles: Profiles) -> Iterator[dict[str, object]]:
+    """One row per point of each profile for profiles.csv."""
+    result = profiles.result
+    for k, (lane, i) in enumerate(profiles.pairs):
+        lane_specimen, _ = result.problem.lane_name(lane)
+        p, specimen, trial = result.problem.unknowns[lane][i]
+        for theta, statistic in zip(profiles.coordinate[k], profiles.statistic[k], strict=True):
+            yield {
+                "specimen": specimen or lane_specimen,
+                "trial": trial or "(all)",
+                "parameter": p.name,
+                "unit": p.unit,
+                "at": p.from_scaled(float(theta)),
+                "statistic": float(statistic),
+                "threshold": float(profiles.threshold[k]),
             }
 
 
@@ -150,19 +186,31 @@ def write_text(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def write_hdf5(path: Path, result: FitResult, provenance: dict) -> None:
+def write_hdf5(
+    path: Path, result: FitResult, provenance: dict, profiles: Profiles | None = None
+) -> None:
     """Write all numbers of a fit; the schema is described in docs/results.md.
 
     Args:
         path: new file.
         result: the fit.
         provenance: stored as JSON in the root attribute of that name.
+        profiles: makes the group `profiles`.
     """
     with h5py.File(path, "x") as file:
         file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
         file.attrs["provenance"] = json.dumps(provenance)
         _write_lanes(file.create_group("lanes"), result)
         _write_unknowns(file.create_group("unknowns"), result)
+        if profiles is not None:
+            _write_profiles(file.create_group("profiles"), profiles)
+
+
+def _write_profiles(group: h5py.Group, profiles: Profiles) -> None:
+    for name in ("lane", "unknown", "lower", "upper", "threshold", "theta", "statistic"):
+        group.create_dataset(name, data=getattr(profiles, name))
+    codes = group.create_dataset("end", data=profiles.end.astype(np.int8))
+    codes.attrs["meaning"] = json.dumps({int(e): e.message for e in ProfileEnd})
 
 
 def _write_lanes(group: h5py.Group, result: FitResult) -> None:

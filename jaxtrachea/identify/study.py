@@ -267,6 +267,22 @@ def problem_of(spec: FitSpec, measurements: Measurements) -> Problem:
         raise SpecError(str(error)) from None
 
 
+def profiled(spec: FitSpec, problem: Problem, *, asked: bool) -> tuple[str, ...]:
+    """Names of the parameters to profile: those of the specification, all if only asked for.
+
+    Raises:
+        SpecError: one is not fitted.
+    """
+    names, free = spec.uncertainty.profile, tuple(p.name for p in problem.free)
+    for name in names:
+        if name not in (*free, "all"):
+            raise SpecError(
+                f"uncertainty.profile: {name!r} is not fitted; expected 'all' or names out of "
+                f"{', '.join(free)}"
+            )
+    return free if "all" in names or (asked and not names) else tuple(names)
+
+
 def settings_of(spec: FitSpec) -> Settings:
     """Solver settings of the [fit] section."""
     f = spec.fit

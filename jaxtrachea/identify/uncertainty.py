@@ -131,6 +131,11 @@ class Uncertainty(NamedTuple):
         flat: unit vector, in relative coordinates, of the least determined combination; (P,).
         flat_se: its standard error (relative).
         half_width: of the 95 % interval, in standard errors (Student's t).
+        along: how all unknowns move where one is moved and the others follow in the least costly
+            way, to first order, scaled coordinates; row i: by a unit change of unknown i; (P, P).
+        dispersion: of twice the rise of the cost along each unknown: where the cost is a
+            likelihood s^2, else such that its curvature gives `se` (Kent 1982,
+            doi:10.1093/biomet/69.1.19); (P,).
     """
 
     se: np.ndarray
@@ -139,6 +144,8 @@ class Uncertainty(NamedTuple):
     flat: np.ndarray
     flat_se: np.ndarray
     half_width: np.ndarray
+    along: np.ndarray
+    dispersion: np.ndarray
 
 
 def analyse(
@@ -164,9 +171,11 @@ def analyse(
     usable = free.any(axis=1) & np.isfinite(info.bread).all(axis=(1, 2)) & (dof >= 0)
     free = free & usable[:, None]
     kappa = np.ones(len(dof)) if noise_given else np.asarray(info.psi2) * total / np.maximum(dof, 1)
-    kappa = kappa / np.maximum(info.dpsi, 1e-3) ** 2
+    dpsi = np.maximum(info.dpsi, 1e-3)
+    kappa = kappa / dpsi**2
     unit = relative * free
-    values, vectors = _spectrum(_scaled(np.asarray(info.bread), unit), free)
+    bread = _scaled(np.asarray(info.bread), unit)
+    values, vectors = _spectrum(bread, free)
     inverse = np.einsum("lpk,lk,lqk->lpq", vectors, 1 / values, vectors)
     meat = _scaled(np.asarray(info.meat), unit) * kappa[:, None, None]
     covariance = inverse @ meat @ inverse
@@ -179,7 +188,30 @@ def analyse(
     both = free[:, :, None] & free[:, None]
     condition, flat, flat_se = _flattest(values, vectors, free, covariance)
     correlation = np.where(both, correlation, np.nan)
-    return Uncertainty(se, correlation, condition, flat, flat_se, half)
+    along = _along(values, vectors, free)
+    dispersion = dpsi[:, None] * _ratio(along, meat, bread)
+    along = along * relative[:, None] / relative[:, :, None]
+    return Uncertainty(se, correlation, condition, flat, flat_se, half, along, dispersion)
+
+
+def _along(values, vectors, free) -> np.ndarray:
+    """Columns of the inverse over their diagonal, in relative coordinates; singular ones too."""
+    largest = np.max(np.where(np.isfinite(values), values, 0), axis=1, keepdims=True)
+    floor = SINGULAR**2 * np.where(largest > 0, largest, 1)
+    own = np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5
+    weight = np.where(own, 1 / np.where(np.isfinite(values), values, floor), 0)
+    inverse = np.einsum("lpk,lk,lqk->lpq", vectors, weight, vectors)
+    both = free[:, :, None] & free[:, None]
+    diagonal = np.where(free, np.diagonal(inverse, axis1=1, axis2=2), 1)
+    return np.where(both, inverse / diagonal[:, :, None], np.eye(values.shape[1]))
+
+
+def _ratio(along, meat, bread) -> np.ndarray:
+    """What the meat is of the bread along each row, or in the mean where both vanish."""
+    form = lambda m: np.einsum("lip,lpq,liq->li", along, m, along)  # noqa: E731
+    trace = lambda m: 1e-12 * np.trace(m, axis1=1, axis2=2)[:, None]  # noqa: E731
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (form(meat) + trace(meat)) / (form(bread) + trace(bread))
 
 
 def _scaled(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
