@@ -280,7 +280,7 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
 
     result, profiles = found.result, found.profiles
     seen = predictions(result.problem, result.theta)
-    rows = [*results.lane_rows(result), *map(results.bad_row, measurements.bad)]
+    rows = [*results.lane_rows(result, profiles), *map(results.bad_row, measurements.bad)]
     results.write_csv(folder / "summary.csv", rows)
     results.write_csv(folder / "parameters.csv", list(results.parameter_rows(result, profiles)))
     if profiles is not None:
@@ -308,22 +308,28 @@ def _succeeded(result, lane: int) -> bool:
 
 def _print_result(found: _Found, folder: Path) -> None:
     from jaxtrachea import report
-    from jaxtrachea.identify.results import flat_sentence, lane_label
+    from jaxtrachea.identify.results import lane_label, verdict_sentence
 
     out, result = Console(), found.result
     lanes = range(result.lanes)
     if result.lanes <= report.ONE_BY_ONE:
-        rows = report.estimate_rows(result, lanes)
+        rows = report.estimate_rows(result, lanes, found.profiles)
         out.print(_table("Estimates", report.ESTIMATE_HEAD, rows))
         out.print(_table("Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)))
         if found.profiles is not None:
             rows = report.profile_table(found.profiles, lanes)
             out.print(_table("Profile likelihood", report.PROFILE_HEAD, rows))
         for lane in lanes:
-            text = f"{lane_label(result, lane)}: {flat_sentence(result, lane)}"
+            text = f"{lane_label(result, lane)}: {verdict_sentence(result, lane, found.profiles)}"
             out.print(escape(text), highlight=False)
     else:
-        out.print(_table("Estimates over lanes", report.SPREAD_HEAD, report.spread_rows(result)))
+        out.print(
+            _table(
+                "Estimates over lanes",
+                report.SPREAD_HEAD,
+                report.spread_rows(result, found.profiles),
+            )
+        )
         good = sum(_succeeded(result, lane) for lane in lanes)
         out.print(f"{good} of {result.lanes} lanes succeeded")
     out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)

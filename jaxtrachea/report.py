@@ -9,12 +9,12 @@ from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.predictions import LeftOut, Prediction, lag_correlation, rms
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import (
-    flat_sentence,
     lane_label,
     peak_force,
     succeeded,
     unknown_label,
     verdict_of,
+    verdict_sentence,
 )
 from jaxtrachea.status import FitStatus, ProfileEnd
 
@@ -27,7 +27,9 @@ def number(value: float, digits: int = 4) -> str:
     return "–" if np.isnan(value) else f"{value:.{digits}g}"
 
 
-def estimate_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
+def estimate_rows(
+    result: FitResult, lanes: Sequence[int], profiles: Profiles | None = None
+) -> list[list[str]]:
     """Lane, parameter, value, standard error, 95 % interval, verdict."""
     rows = []
     for lane in lanes:
@@ -40,7 +42,7 @@ def estimate_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
                     number(result.value[lane, i]),
                     number(result.standard_error[lane, i], 2),
                     "–" if np.isnan(low) else f"{number(low)} … {number(high)}",
-                    verdict_of(result, lane, i),
+                    verdict_of(result, lane, i, profiles),
                 ]
             )
     return rows
@@ -49,12 +51,12 @@ def estimate_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
 ESTIMATE_HEAD = ["specimen", "parameter", "value", "std. error", "95 % interval", "verdict"]
 
 
-def spread_rows(result: FitResult) -> list[list[str]]:
+def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[list[str]]:
     """Over all succeeded lanes: parameter, lanes, median, quartiles, median standard error."""
     columns: dict[str, list[tuple[float, float, str]]] = {}
     for lane in filter(lambda k: succeeded(result, k), range(result.lanes)):
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
-            verdict = verdict_of(result, lane, i)
+            verdict = verdict_of(result, lane, i, profiles)
             entry = (float(result.value[lane, i]), float(result.relative_se[lane, i]), verdict)
             columns.setdefault(f"{p.name} [{p.unit}]", []).append(entry)
     rows = []
@@ -140,7 +142,7 @@ def report_text(
         f"{result.lanes} lanes, {result.lanes - len(failed)} succeeded, {len(failed)} failed; "
         f"{len(bad)} curves could not be used. All numbers: `results.h5`; one row per lane: "
         "`summary.csv`; one row per estimate: `parameters.csv` (docs/results.md).",
-        *_estimates(result),
+        *_estimates(result, profiles),
         "## Quality",
         _quality(result, failed),
         f"Largest residual: {prediction.worst(result)}.",
@@ -159,23 +161,25 @@ def report_text(
     return "\n\n".join(parts) + "\n"
 
 
-def _estimates(result: FitResult) -> list[str]:
+def _estimates(result: FitResult, profiles: Profiles | None) -> list[str]:
     """Values with their errors, and what the data leave open."""
     shown = range(min(result.lanes, ONE_BY_ONE))
     if result.lanes <= ONE_BY_ONE:
-        table = markdown_table(ESTIMATE_HEAD, estimate_rows(result, shown))
+        table = markdown_table(ESTIMATE_HEAD, estimate_rows(result, shown, profiles))
     else:
-        table = markdown_table(SPREAD_HEAD, spread_rows(result))
+        table = markdown_table(SPREAD_HEAD, spread_rows(result, profiles))
     fixed = [f"{p.name} = {p.value:g} {p.unit}" for p in result.problem.parameters if p.fixed]
-    flat = [f"- {lane_label(result, k)}: {flat_sentence(result, k)}." for k in shown]
+    flat = [f"- {lane_label(result, k)}: {verdict_sentence(result, k, profiles)}." for k in shown]
     return [
         "## Estimates",
         table,
         f"Fixed: {', '.join(fixed) or 'none'}.",
         "## What the data determine",
         "\n".join(flat),
-        "Identifiable: relative standard error up to 10 %; weak: up to 50 %. Standard errors are "
-        "local (Gauss-Newton); they say nothing of what the model leaves out.",
+        "Identifiable: relative error up to 10 %; weak: up to 50 %; practically not: more, or a "
+        "profile that stays open; structurally not: no data from these contact points can tell, "
+        "however exact. Judged by the profile where there is one, else by the local standard error "
+        "(Gauss-Newton); neither says anything of what the model leaves out.",
     ]
 
 

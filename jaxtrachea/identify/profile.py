@@ -56,6 +56,18 @@ class Profiles:
     statistic: Float[np.ndarray, "K G"]
 
     @property
+    def relative_error(self) -> Float[np.ndarray, " K"]:
+        """Half the width of the interval in relative coordinates, over the half width in errors."""
+        parameters = [self.result.problem.unknowns[k][i][0] for k, i in self.pairs]
+        log = np.array([p.scale == "log" for p in parameters], bool)
+        step = np.array([p.step for p in parameters])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            size = np.maximum(np.abs(self.result.theta[self.lane, self.unknown]), 1e-3)
+            linear = (self.upper - self.lower) / (step * size)
+            width = np.where(log, np.log(self.upper / self.lower), linear)
+        return width / (2 * np.sqrt(self.threshold))
+
+    @property
     def pairs(self) -> list[tuple[int, int]]:
         """Lane and unknown of every profile."""
         return list(zip(self.lane.tolist(), self.unknown.tolist(), strict=True))

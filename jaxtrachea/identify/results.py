@@ -16,7 +16,7 @@ import numpy as np
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.profile import Profiles
-from jaxtrachea.identify.uncertainty import describe_flat, verdict
+from jaxtrachea.identify.verdict import VERDICTS, describe_flat, verdict
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 SCHEMA = "jaxtrachea-results"
@@ -57,16 +57,22 @@ def flat_sentence(result: FitResult, lane: int) -> str:
         return "no estimate"
     names = [unknown_label(result, lane, i) for i in range(len(result.problem.unknowns[lane]))]
     u = result.uncertainty[lane]
-    size = np.abs(u.flat[: len(names)])
-    if np.sum(size >= 0.1 * np.max(size)) != 1:
-        return describe_flat(names, u.flat, float(u.flat_se))
-    name = names[int(np.argmax(size))]
-    if not np.isfinite(float(u.flat_se)):
-        return f"{name} changes no curve at all"
-    return f"least determined: {name} alone, known to {100 * u.flat_se:.2g} %"
+    return describe_flat(names, u.flat, float(u.flat_se), u.blind)
 
 
-def lane_rows(result: FitResult) -> Iterator[dict[str, object]]:
+def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = None) -> str:
+    """Which unknowns of a lane have which verdict, and what is least determined."""
+    if not succeeded(result, lane):
+        return "no estimate"
+    groups: dict[str, list[str]] = {}
+    for i in range(len(result.problem.unknowns[lane])):
+        word = verdict_of(result, lane, i, profiles)
+        groups.setdefault(word, []).append(unknown_label(result, lane, i))
+    said = [f"{word}: {', '.join(groups[word])}" for word in VERDICTS if word in groups]
+    return "; ".join([*said, flat_sentence(result, lane)])
+
+
+def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[dict[str, object]]:
     """One row per lane for summary.csv; trial-wise unknowns are left to parameters.csv."""
     for lane in range(result.lanes):
         specimen, trial = result.problem.lane_name(lane)
@@ -96,16 +102,22 @@ def lane_rows(result: FitResult) -> Iterator[dict[str, object]]:
                 f"{label} se": float(result.standard_error[lane, i]),
                 f"{label} low95": float(result.lower[lane, i]),
                 f"{label} high95": float(result.upper[lane, i]),
-                f"{label} verdict": verdict_of(result, lane, i),
+                f"{label} verdict": verdict_of(result, lane, i, profiles),
             }
         yield row
 
 
-def verdict_of(result: FitResult, lane: int, i: int) -> str:
-    """Identifiable, weak, not identifiable, at bound, or "failed" where there is no estimate."""
+def verdict_of(result: FitResult, lane: int, i: int, profiles: Profiles | None = None) -> str:
+    """One of `VERDICTS`, by the profile where there is one; "failed" without an estimate."""
     if not succeeded(result, lane):
         return "failed"
-    return verdict(float(result.relative_se[lane, i]), bool(result.at_bound[lane, i]))
+    k = None if profiles is None else profiles.find(lane, i)
+    profile = None
+    if profiles is not None and k is not None:
+        ends = max(profiles.end[k, 0], profiles.end[k, 1])
+        profile = float(profiles.relative_error[k]), ProfileEnd(int(ends))
+    held = bool(result.at_bound[lane, i])
+    return verdict(float(result.relative_se[lane, i]), held, profile)
 
 
 def bad_row(bad: BadCurve) -> dict[str, object]:
@@ -135,7 +147,7 @@ def parameter_rows(
                 "low95": float(result.lower[lane, i]),
                 "high95": float(result.upper[lane, i]),
                 "relative_se": float(result.relative_se[lane, i]),
-                "verdict": verdict_of(result, lane, i),
+                "verdict": verdict_of(result, lane, i, profiles),
             }
             yield row | _profile_cells(profiles, lane, i)
 

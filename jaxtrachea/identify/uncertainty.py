@@ -1,4 +1,4 @@
-"""What the data say about each unknown: standard errors, correlation, flat combinations, verdicts.
+"""What the data say about each unknown: standard errors, correlation, flat combinations.
 
 Everything is local, from the Jacobian at the estimate (Gauss-Newton information matrix); profile
 likelihood and bootstrap, which are not, are separate. With curve weights or a robust loss the
@@ -20,8 +20,6 @@ from jaxtrachea.identify.problem import Lane, Problem
 from jaxtrachea.identify.residual import observations, residual
 from jaxtrachea.identify.solve import chunk_size
 
-#: Relative standard error up to which a parameter counts as identifiable, and as weakly so.
-IDENTIFIABLE, WEAK = 0.1, 0.5
 #: Smallest ratio of singular values of the scaled Jacobian that float64 can tell from zero.
 SINGULAR = 1e-7
 
@@ -130,6 +128,8 @@ class Uncertainty(NamedTuple):
             coordinates (a change of 1 = 100 %); inf if singular.
         flat: unit vector, in relative coordinates, of the least determined combination; (P,).
         flat_se: its standard error (relative).
+        blind: all directions that change no residual, relative coordinates, orthonormal rows; the
+            other rows are 0; (P, P).
         half_width: of the 95 % interval, in standard errors (Student's t).
         along: how all unknowns move where one is moved and the others follow in the least costly
             way, to first order, scaled coordinates; row i: by a unit change of unknown i; (P, P).
@@ -143,6 +143,7 @@ class Uncertainty(NamedTuple):
     condition: np.ndarray
     flat: np.ndarray
     flat_se: np.ndarray
+    blind: np.ndarray
     half_width: np.ndarray
     along: np.ndarray
     dispersion: np.ndarray
@@ -187,11 +188,13 @@ def analyse(
     se = np.where(free, np.where(blind, np.inf, np.sqrt(variance)) * relative, np.nan)
     both = free[:, :, None] & free[:, None]
     condition, flat, flat_se = _flattest(values, vectors, free, covariance)
+    lost = np.isinf(values) & (np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5)
+    silent = np.swapaxes(vectors, 1, 2) * lost[:, :, None] * free[:, None]
     correlation = np.where(both, correlation, np.nan)
     along = _along(values, vectors, free)
     dispersion = dpsi[:, None] * _ratio(along, meat, bread)
     along = along * relative[:, None] / relative[:, :, None]
-    return Uncertainty(se, correlation, condition, flat, flat_se, half, along, dispersion)
+    return Uncertainty(se, correlation, condition, flat, flat_se, silent, half, along, dispersion)
 
 
 def _along(values, vectors, free) -> np.ndarray:
@@ -252,33 +255,3 @@ def _flattest(values, vectors, free, covariance):
         condition = np.sqrt(largest / values[lanes, flattest])
     flat_se = np.where(singular, np.inf, np.sqrt(np.maximum(variance, 0)))
     return np.where(singular, np.inf, condition), flat, flat_se
-
-
-def verdict(relative_se: float, held: bool) -> str:
-    """One plain word for a parameter: identifiable, weak, not identifiable, at bound."""
-    if held:
-        return "at bound"
-    if relative_se <= IDENTIFIABLE:
-        return "identifiable"
-    return "weak" if relative_se <= WEAK else "not identifiable"
-
-
-def describe_flat(names: list[str], flat: np.ndarray, flat_se: float) -> str:
-    """The least determined combination in words, as changes that belong together.
-
-    Args:
-        names: unknowns, in the order of `flat`.
-        flat: direction in relative coordinates, see `Uncertainty.flat`.
-        flat_se: relative standard error along it.
-    """
-    if not np.any(flat):
-        return "no free parameter"
-    order = np.argsort(-np.abs(flat))
-    main = [i for i in order if abs(flat[i]) >= 0.1 * abs(flat[order[0]])]
-    step = 0.1 / abs(flat[order[0]])
-    moves = ", ".join(f"{names[i]} {100 * step * flat[i]:+.3g} %" for i in main)
-    if not np.isfinite(flat_se):
-        return f"{moves} together change no curve at all: only the remaining combinations are known"
-    if flat_se > WEAK:
-        return f"{moves} together change the curves by less than the noise"
-    return f"least determined: {moves} together, known to {100 * flat_se:.2g} %"
