@@ -235,9 +235,11 @@ class _Found:
     result: Any
     left_out: Any
     profiles: Any
+    resampled: Any
 
 
 def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked) -> _Found:
+    from jaxtrachea.identify.bootstrap import bootstrap
     from jaxtrachea.identify.fit import fit as run_fit
     from jaxtrachea.identify.predictions import leave_one_out
     from jaxtrachea.identify.profile import profiles
@@ -258,13 +260,19 @@ def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked
             return advance
 
         result = run_fit(problem, settings, counted("fitting"))
-        left_out = profiled = None
+        left_out = profiled = resampled = None
         if leave_out:
             left_out = leave_one_out(problem, settings, counted("leaving curves out"))
         if profile:
             points, report = spec.uncertainty.profile_points, counted("profiling")
             profiled = profiles(result, settings, profile, points=points, progress=report)
-        return _Found(result, left_out, profiled)
+        u = spec.uncertainty
+        if u.bootstrap:
+            resampled = bootstrap(
+                result, settings, count=u.bootstrap, kind=u.kind, block=u.block,
+                progress=counted("resampling"),
+            )  # fmt: skip
+        return _Found(result, left_out, profiled, resampled)
 
 
 def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock) -> None:
@@ -278,17 +286,19 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
     from jaxtrachea.identify.predictions import predictions
     from jaxtrachea.plots import draw_all
 
-    result, profiles = found.result, found.profiles
+    result, profiles, resampled = found.result, found.profiles, found.resampled
     seen = predictions(result.problem, result.theta)
     rows = [*results.lane_rows(result, profiles), *map(results.bad_row, measurements.bad)]
     results.write_csv(folder / "summary.csv", rows)
-    results.write_csv(folder / "parameters.csv", list(results.parameter_rows(result, profiles)))
+    results.write_csv(
+        folder / "parameters.csv", list(results.parameter_rows(result, profiles, resampled))
+    )
     if profiles is not None:
         results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
     draw_all(folder, result, seen, profiles)
     table = None if found.left_out is None else report.left_out_rows(result, found.left_out)
     title = loaded.title or spec.stem
-    text = report.report_text(title, result, measurements.bad, seen, table, profiles)
+    text = report.report_text(title, result, measurements.bad, seen, table, profiles, resampled)
     results.write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")
@@ -296,7 +306,7 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
     made = results.provenance(
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
     )
-    results.write_hdf5(folder / "results.h5", result, made, profiles)
+    results.write_hdf5(folder / "results.h5", result, made, profiles, resampled)
     results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
 
 
@@ -319,6 +329,9 @@ def _print_result(found: _Found, folder: Path) -> None:
         if found.profiles is not None:
             rows = report.profile_table(found.profiles, lanes)
             out.print(_table("Profile likelihood", report.PROFILE_HEAD, rows))
+        if found.resampled is not None:
+            rows = report.bootstrap_table(found.resampled, lanes)
+            out.print(_table("Bootstrap", report.BOOTSTRAP_HEAD, rows))
         for lane in lanes:
             text = f"{lane_label(result, lane)}: {verdict_sentence(result, lane, found.profiles)}"
             out.print(escape(text), highlight=False)

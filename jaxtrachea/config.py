@@ -194,6 +194,9 @@ class UncertaintySection(_Section):
 
     profile: list[str] = []
     profile_points: int = Field(10, ge=2, le=1000)
+    bootstrap: int = Field(0, ge=0, le=1_000_000)
+    kind: Literal["parametric", "residual"] = "parametric"
+    block: int = Field(1, ge=1, le=1_000_000)
 
     @model_validator(mode="before")
     @classmethod
@@ -201,6 +204,14 @@ class UncertaintySection(_Section):
         if isinstance(data, dict) and isinstance(data.get("profile"), str):
             return {**data, "profile": [data["profile"]]}
         return data
+
+    @model_validator(mode="after")
+    def _enough(self) -> "UncertaintySection":
+        if 0 < self.bootstrap < 40:
+            raise ValueError("bootstrap needs 40 replicates or more for a 95 % interval (0: none)")
+        if self.block > 1 and self.kind == "parametric":
+            raise ValueError("block draws neighbouring residuals together; set kind = 'residual'")
+        return self
 
 
 class FitSpec(_Section):

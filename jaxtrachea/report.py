@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.predictions import LeftOut, Prediction, lag_correlation, rms
@@ -134,6 +135,7 @@ def report_text(
     prediction: Prediction,
     left_out: Sequence[Sequence[str]] | None,
     profiles: Profiles | None = None,
+    resampled: Bootstrap | None = None,
 ) -> str:
     """The whole report.md."""
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
@@ -150,6 +152,8 @@ def report_text(
     ]
     if profiles is not None:
         parts += _profiled(profiles)
+    if resampled is not None:
+        parts += _bootstrapped(resampled)
     if left_out is not None:
         parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, left_out)]
     names = {"fit": "data and fit", "residuals": "residuals", "correlation": "correlation"}
@@ -239,6 +243,42 @@ def _profiled(profiles: Profiles) -> list[str]:
             "these intervals are wrong. Fit again with more starts."
         )
     return [*parts, "![profiles](profiles.png)"] if len(profiles.lane) else parts
+
+
+BOOTSTRAP_HEAD = ["specimen", "parameter", "value", "std. error", "local", "95 % of replicates"]
+
+
+def bootstrap_table(resampled: Bootstrap, lanes: Sequence[int]) -> list[list[str]]:
+    """Lane, parameter, value, standard error by bootstrap and local, percentile interval."""
+    result, rows = resampled.result, []
+    for lane in lanes:
+        for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+            low, high = float(resampled.lower[lane, i]), float(resampled.upper[lane, i])
+            rows.append(
+                [
+                    lane_label(result, lane),
+                    f"{unknown_label(result, lane, i)} [{p.unit}]",
+                    number(result.value[lane, i]),
+                    number(resampled.standard_error[lane, i], 2),
+                    number(result.standard_error[lane, i], 2),
+                    "–" if np.isnan(low) else f"{number(low)} … {number(high)}",
+                ]
+            )
+    return rows
+
+
+def _bootstrapped(resampled: Bootstrap) -> list[str]:
+    """The section on the bootstrap."""
+    shown = range(min(resampled.result.lanes, ONE_BY_ONE))
+    lost = int(np.sum(~resampled.usable))
+    blocks = f" in blocks of {resampled.block} samples" if resampled.block > 1 else ""
+    return [
+        "## Bootstrap",
+        markdown_table(BOOTSTRAP_HEAD, bootstrap_table(resampled, shown)),
+        f"{resampled.usable.shape[1]} replicates of every lane ({resampled.kind}{blocks}); "
+        f"{lost} of {resampled.usable.size} refits did not converge and are left out. All numbers: "
+        "`results.h5` (docs/uncertainty.md).",
+    ]
 
 
 def _doubts(result: FitResult, prediction: Prediction) -> list[str]:

@@ -93,6 +93,7 @@ def fit(
     problem: Problem,
     settings: Settings = Settings(),  # noqa: B008 (frozen)
     progress: Callable[[int, int], None] | None = None,
+    starts: np.ndarray | None = None,
 ) -> FitResult:
     """Fit every lane from every start and keep the best; failed lanes are rows with a status.
 
@@ -100,6 +101,7 @@ def fit(
         problem: from `problem.build`.
         settings: how to solve.
         progress: called with (jobs finished since the last call, jobs in all).
+        starts: where to start, scaled coordinates, (lanes * settings.starts, P); None: drawn.
 
     Returns:
         The `FitResult`. It never raises for a lane's sake.
@@ -107,7 +109,7 @@ def fit(
     lanes = problem.lanes.lower.shape[0]
     jobs = np.repeat(np.arange(lanes), settings.starts)
     sigma = first_sigma(problem)
-    starts = draw_starts(problem, settings)
+    starts = draw_starts(problem, settings) if starts is None else starts
     solved = _solve(problem, settings, jobs, starts, sigma[jobs], progress)
     best, agree = _best(solved, lanes, settings.starts)
     solved = Solved(*(v[best] for v in solved))

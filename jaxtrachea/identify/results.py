@@ -13,6 +13,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.profile import Profiles
@@ -131,7 +132,7 @@ def bad_row(bad: BadCurve) -> dict[str, object]:
 
 
 def parameter_rows(
-    result: FitResult, profiles: Profiles | None = None
+    result: FitResult, profiles: Profiles | None = None, resampled: Bootstrap | None = None
 ) -> Iterator[dict[str, object]]:
     """One row per lane and unknown for parameters.csv; more columns where there is more to say."""
     for lane in range(result.lanes):
@@ -149,7 +150,7 @@ def parameter_rows(
                 "relative_se": float(result.relative_se[lane, i]),
                 "verdict": verdict_of(result, lane, i, profiles),
             }
-            yield row | _profile_cells(profiles, lane, i)
+            yield row | _profile_cells(profiles, lane, i) | _bootstrap_cells(resampled, lane, i)
 
 
 def _profile_cells(profiles: Profiles | None, lane: int, i: int) -> dict[str, object]:
@@ -163,6 +164,17 @@ def _profile_cells(profiles: Profiles | None, lane: int, i: int) -> dict[str, ob
         "profile_high95": float(profiles.upper[k]),
         "profile_low_end": low,
         "profile_high_end": high,
+    }
+
+
+def _bootstrap_cells(resampled: Bootstrap | None, lane: int, i: int) -> dict[str, object]:
+    """Standard error and percentile interval of the replicates."""
+    if resampled is None:
+        return {}
+    return {
+        "bootstrap_se": float(resampled.standard_error[lane, i]),
+        "bootstrap_low95": float(resampled.lower[lane, i]),
+        "bootstrap_high95": float(resampled.upper[lane, i]),
     }
 
 
@@ -199,7 +211,11 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_hdf5(
-    path: Path, result: FitResult, provenance: dict, profiles: Profiles | None = None
+    path: Path,
+    result: FitResult,
+    provenance: dict,
+    profiles: Profiles | None = None,
+    resampled: Bootstrap | None = None,
 ) -> None:
     """Write all numbers of a fit; the schema is described in docs/results.md.
 
@@ -208,6 +224,7 @@ def write_hdf5(
         result: the fit.
         provenance: stored as JSON in the root attribute of that name.
         profiles: makes the group `profiles`.
+        resampled: makes the group `bootstrap`.
     """
     with h5py.File(path, "x") as file:
         file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
@@ -216,6 +233,11 @@ def write_hdf5(
         _write_unknowns(file.create_group("unknowns"), result)
         if profiles is not None:
             _write_profiles(file.create_group("profiles"), profiles)
+        if resampled is not None:
+            group = file.create_group("bootstrap")
+            group.attrs["kind"], group.attrs["block"] = resampled.kind, resampled.block
+            for name in ("theta", "usable", "lower", "upper", "standard_error"):
+                group.create_dataset(name, data=getattr(resampled, name), compression="gzip")
 
 
 def _write_profiles(group: h5py.Group, profiles: Profiles) -> None:
