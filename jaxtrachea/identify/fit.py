@@ -222,12 +222,13 @@ def _conclude(problem, solved: Solved, info: Information, sigma, agree) -> FitRe
         half = u.half_width[:, None] * u.se
         rms = np.sqrt(info.squares / info.counts)
         standard_error = u.se * np.where(log, value, step)
+        lower, upper = unscale(theta - half), unscale(theta + half)
     unit = _precision_unit(problem)
     samples = np.sum(info.counts, axis=1)
     status = _final_status(solved.status, u, at_bound, samples - np.sum(~held, axis=1))
     return FitResult(
         problem=problem, theta=theta, value=value, standard_error=standard_error,
-        lower=unscale(theta - half), upper=unscale(theta + half), relative_se=u.se / relative,
+        lower=lower, upper=upper, relative_se=u.se / relative,
         at_bound=at_bound, status=status, iterations=solved.iterations, cost=solved.cost,
         converged_starts=agree, sigma=sigma * unit, rms=rms * unit, samples=samples,
         uncertainty=tuple(Uncertainty(*row) for row in zip(*u, strict=True)),

@@ -233,7 +233,7 @@ class _Sides:
 
 
 class _Path:
-    """All points found so far: where to start the next fit from."""
+    """Points found so far that belong to the profile: where to start the next fit from."""
 
     def __init__(self, sides: _Sides):
         """With the estimate and its tangent, which is followed where nothing is known."""
@@ -249,36 +249,53 @@ class _Path:
         self.theta.append(theta)
 
     def start(self, side, distance) -> np.ndarray:
-        """Unknowns at `distance`: on the line through the two points that frame it best."""
+        """Unknowns at `distance`: between two known points, or beyond the last one.
+
+        Beyond, the others follow at most one scaled unit: a start far off in a corner of the box
+        leads into other minima.
+        """
         sides, distances = np.concatenate(self.side), np.concatenate(self.distance)
         thetas = np.concatenate(self.theta)
         order = np.lexsort((distances, sides))
         sides, distances, thetas = sides[order], distances[order], thetas[order]
-        first = np.searchsorted(sides, side)
-        count = np.searchsorted(sides, side, "right") - first
-        inside = np.array([
-            np.searchsorted(distances[f : f + n], d) for f, n, d in zip(first, count, distance,
-            strict=True)
-        ], int)  # fmt: skip
-        right = first + np.clip(inside, 1, np.maximum(count - 1, 1))
-        alone = count == 1
-        left, right = right - 1, np.where(alone, first, right)
-        gap = np.where(alone, 1, distances[right] - distances[left])
-        slope = (thetas[right] - thetas[left]) / np.where(gap > 0, gap, 1)[:, None]
+        pairs = [self._frame(sides, distances, s, d) for s, d in zip(side, distance, strict=True)]
+        left, right = np.array(pairs, int).reshape(-1, 2).T
+        gap = distances[right] - distances[left]
+        alone = gap <= 0
+        slope = (thetas[right] - thetas[left]) / np.where(alone, 1, gap)[:, None]
         slope = np.where(alone[:, None], self.sides.along[side], slope)
-        return thetas[left] + slope * (distance - distances[left])[:, None]
+        beyond = distance > distances[right]
+        base = np.where(beyond, right, left)
+        move = slope * (distance - distances[base])[:, None]
+        move = np.where(beyond[:, None], np.clip(move, -1, 1), move)
+        return thetas[base] + move
+
+    @staticmethod
+    def _frame(sides, distances, side, distance) -> tuple[int, int]:
+        """The two known points around a distance, or the last one and another well before it."""
+        first, end = (int(np.searchsorted(sides, side, at)) for at in ("left", "right"))
+        own = distances[first:end]
+        if distance <= own[-1]:
+            right = max(int(np.searchsorted(own, distance)), 1 if len(own) > 1 else 0)
+            return first + max(right - 1, 0), first + right
+        before = int(np.searchsorted(own, 0.75 * own[-1], "right")) - 1
+        return first + min(max(before, 0), len(own) - 1), end - 1
 
 
 def _find_ends(sides: _Sides):
     """Where every side crosses its threshold: outwards until it is passed, then a bracketed secant.
+
+    A point above the threshold may lie in a worse minimum than the profile's. It shows by a jump
+    between it and its neighbour below, is forgotten then, and the search goes on outwards.
 
     Returns:
         Distance from the estimate, `ProfileEnd` (both (S,)), and the `_Path` of all points.
     """
     S = len(sides.lane)
     path, target = _Path(sides), sides.target
-    inner, at_inner = np.zeros(S), -target
-    outer, at_outer = np.full(S, np.inf), np.full(S, np.nan)
+    # Ends of the bracket; excess of sqrt(statistic) there, and as the secant weighs it (Illinois).
+    inner, below_by, at_inner = np.zeros(S), target.copy(), -target
+    outer, above_by, at_outer = np.full(S, np.inf), np.full(S, np.nan), np.full(S, np.nan)
     where = np.minimum(sides.first, sides.limit)
     end = np.full(S, -1)
     end[sides.limit <= 0] = ProfileEnd.OPEN
@@ -291,25 +308,29 @@ def _find_ends(sides: _Sides):
         d = where[rows]
         found, statistic = sides.refit(rows, d, path.start(rows, d))
         good = np.isfinite(statistic)
-        path.add(rows[good], d[good], found[good])
-        theta[rows[good]] = found[good]
         excess = np.sqrt(np.maximum(statistic, 0)) - target[rows]
-        above, below = rows[good & (excess > 0)], rows[good & (excess <= 0)]
-        # Illinois: where the same end of the bracket moves again, the other counts half.
+        close = good & (np.abs(excess) <= _ACCURACY * target[rows])
+        up, down = good & (excess > 0), good & (excess <= 0)
+        keep = down | close
+        path.add(rows[keep], d[keep], found[keep])
+        theta[rows[keep]] = found[keep]
+        above, below = rows[up], rows[down]
         at_inner[above] *= np.where(moved[above] > 0, 0.5, 1)
         at_outer[below] *= np.where(moved[below] < 0, 0.5, 1)
         moved[above], moved[below] = np.where(np.isfinite(outer[above]), 1, 0), -1
-        outer[above], at_outer[above] = where[above], excess[good & (excess > 0)]
-        inner[below], at_inner[below] = where[below], excess[good & (excess <= 0)]
+        outer[above], above_by[above], at_outer[above] = d[up], excess[up], excess[up]
+        inner[below], below_by[below], at_inner[below] = d[down], -excess[down], excess[down]
         failures[rows[~good]] += 1
-        close = good & (np.abs(excess) <= _ACCURACY * target[rows])
-        close |= good & (inner[rows] >= (1 - 1e-10) * outer[rows])
         end[rows[close]] = ProfileEnd.CLOSED
-        out = good & ~close & (excess <= 0) & (d >= sides.limit[rows])
-        end[rows[out]] = ProfileEnd.OPEN
+        end[rows[down & ~close & (d >= sides.limit[rows])]] = ProfileEnd.OPEN
+        jump = (outer - inner < 0.01 * outer) & (above_by + below_by > 0.1 * target) & (end < 0)
+        outer[jump], above_by[jump], at_outer[jump], moved[jump] = np.inf, np.nan, np.nan, 0
+        at_inner[jump] = -below_by[jump]
+        where[jump] = inner[jump]
+        failures[jump] += 1
         following = _next(rows, good, inner, at_inner, outer, at_outer, where, target)
         where[rows] = np.where(end[rows] < 0, np.minimum(following, sides.limit[rows]), d)
-        end[failures > 6] = ProfileEnd.FAILED
+        end[(failures > 6) & (end < 0)] = ProfileEnd.FAILED
     end[end < 0] = ProfileEnd.FAILED
     end[(end == ProfileEnd.CLOSED) & sides.others_on_bound(theta)] = ProfileEnd.BOUND
     return np.where(end == ProfileEnd.FAILED, inner, where), end, path
