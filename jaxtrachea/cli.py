@@ -1,4 +1,4 @@
-"""The command line: check, fit. The only room that turns errors into messages and exit codes.
+"""The command line: check, fit, design. Only here errors become messages and exit codes.
 
 Exit codes: 0 everything converged, 1 some lane failed or some curve could not be used, 2 bad input,
 130 stopped by the user. What is heavy is imported inside the commands.
@@ -116,8 +116,6 @@ def fit(
     profile: ProfileOption = False,
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
-    from jaxtrachea.identify.output import OutputExists, new_output
-
     clock = [time.perf_counter()]
     loaded, measurements, problem = _load(spec, data)
     if leave_one_out:
@@ -125,12 +123,78 @@ def fit(
     names = _names_to_profile(loaded, problem, profile)
     clock.append(time.perf_counter())
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
+    with _writing(out_dir, default) as (stop_if_asked, folder):
+        found = _run(loaded, problem, leave_one_out, names, stop_if_asked)
+        clock.append(time.perf_counter())
+        _write(folder, spec, loaded, measurements, found, clock)
+        stop_if_asked()
+    result = found.result
+    _print_result(found, folder.parent)
+    failed = any(not _succeeded(result, lane) for lane in range(result.lanes))
+    raise typer.Exit(1 if failed or measurements.bad else 0)
+
+
+@app.command()
+def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = None) -> None:
+    """Fit, then say where the next presses tell most."""
+    from jaxtrachea.config import SpecError
+    from jaxtrachea.identify.study import candidates_of
+
+    loaded, measurements, problem = _load(spec, data)
+    try:
+        candidates = candidates_of(loaded, problem)
+    except SpecError as error:
+        raise _Stop(f"{spec}: {error}") from None
+    default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}-design"
+    with _writing(out_dir, default) as (stop_if_asked, folder):
+        found = _run(loaded, problem, False, (), stop_if_asked)
+        try:
+            rows = _design(folder, loaded, found, candidates)
+        except ValueError as error:
+            raise _Stop(f"{spec}: {error}") from None
+        stop_if_asked()
+    errors = [k.removesuffix(" relative se") for k in rows[0] if k.endswith(" relative se")]
+    head = ["press", "s [mm]", "depth [mm]", *errors]
+    cells = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
+    out = Console()
+    out.print(_table("Next presses, relative errors expected after each", head, cells))
+    out.print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
+    raise typer.Exit(1 if measurements.bad else 0)
+
+
+def _design(folder: Path, loaded, found, candidates) -> list[dict[str, object]]:
+    """Choose, write the files, return the rows of the choice."""
+    import numpy as np
+
+    from jaxtrachea.identify import design as designs
+    from jaxtrachea.identify import design_tables as tables
+    from jaxtrachea.identify.results import write_csv
+    from jaxtrachea.plots import draw_design
+
+    section = loaded.design
+    known = designs.situation(found.result, found.resampled)
+    unknowns = tables.names(known, found.result)
+    choice = designs.next_points(known, candidates, section.points, section.criterion)
+    s = np.linspace(candidates.s.min(), candidates.s.max(), 121)
+    chart = designs.identifiability(known, s, float(candidates.depth.max()))
+    rows = list(tables.choice_rows(choice, candidates, unknowns))
+    write_csv(folder / "next_points.csv", rows)
+    gains = designs.gains(known, candidates)
+    write_csv(folder / "candidates.csv", list(tables.candidate_rows(known, gains, candidates)))
+    write_csv(folder / "identifiability.csv", list(tables.map_rows(chart, unknowns)))
+    rings = np.asarray(found.result.problem.geometry.ring_positions)
+    draw_design(folder / "identifiability.png", chart, candidates, choice, rings)
+    return rows
+
+
+@contextlib.contextmanager
+def _writing(out_dir: Path | None, default: Path):
+    """An output folder and `stop_if_asked`; what goes wrong with files becomes `_Stop`."""
+    from jaxtrachea.identify.output import OutputExists, new_output
+
     try:
         with _interrupts() as stop_if_asked, new_output(out_dir, default) as folder:
-            found = _run(loaded, problem, leave_one_out, names, stop_if_asked)
-            clock.append(time.perf_counter())
-            _write(folder, spec, loaded, measurements, found, clock)
-            stop_if_asked()
+            yield stop_if_asked, folder
     except OutputExists as error:
         raise _Stop(str(error)) from None
     except OSError as error:
@@ -138,10 +202,6 @@ def fit(
         raise _Stop(
             f"{where}: cannot be written ({error.strerror}); choose another --out"
         ) from None
-    result = found.result
-    _print_result(found, folder.parent)
-    failed = any(not _succeeded(result, lane) for lane in range(result.lanes))
-    raise typer.Exit(1 if failed or measurements.bad else 0)
 
 
 @contextlib.contextmanager

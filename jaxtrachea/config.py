@@ -214,6 +214,23 @@ class UncertaintySection(_Section):
         return self
 
 
+class DesignSection(_Section):
+    """[design]: which presses are possible, and what is asked of the next ones."""
+
+    s: tuple[Length, Length] | None = Field(None, strict=False)
+    depth: tuple[PositiveLength, PositiveLength] | None = Field(None, strict=False)
+    points: int = Field(3, ge=1, le=100)
+    criterion: Literal["D", "A", "E"] = "D"
+    candidates: int = Field(10_000, ge=5, le=10_000_000)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "DesignSection":
+        for name, span in (("s", self.s), ("depth", self.depth)):
+            if span is not None and span[0] > span[1]:
+                raise ValueError(f"{name} runs from {span[0]:g} down to {span[1]:g} mm; swap them")
+        return self
+
+
 class FitSpec(_Section):
     """A whole fit specification."""
 
@@ -227,6 +244,7 @@ class FitSpec(_Section):
     uncertainty: UncertaintySection = Field(
         default_factory=lambda: UncertaintySection.model_validate({})
     )
+    design: DesignSection = Field(default_factory=lambda: DesignSection.model_validate({}))
 
 
 def load_fit_spec(path: Path) -> FitSpec:

@@ -7,6 +7,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxtrachea.identify.design import Candidates, Choice, Map
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.predictions import Prediction
 from jaxtrachea.identify.profile import Profiles
@@ -185,3 +186,25 @@ def draw_profiles(profiles: Profiles):
         axis.set_ylim(-0.2, 2.2 * profiles.threshold[first])
         axis.set(title=p.name, xlabel=f"{p.name} [{p.unit}]", ylabel="rise of the profile")
     return figure
+
+
+def draw_design(path: Path, found: Map, at: Candidates, choice: Choice, rings: np.ndarray) -> None:
+    """Write the identifiability map: over s with the data, of pairs without, and the gains."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(13, 3.8), layout="constrained")
+        left, middle, right = figure.subplots(1, 3)
+        left.plot(found.s, found.condition, color="0.2")
+        left.set(xlabel="s [mm]", ylabel="condition", title="data and a press at s")
+        left.plot(rings, np.full(len(rings), found.condition.min()), "|", color="tab:green", ms=9)
+        image = middle.pcolormesh(found.s, found.s, np.log10(found.pairs), cmap="viridis_r")
+        figure.colorbar(image, label="log10 condition")
+        middle.set(xlabel="s [mm]", ylabel="s [mm]", title="two presses, no other data")
+        for depth in np.unique(at.depth):
+            own = at.depth == depth
+            right.plot(at.s[own], choice.score[0, own], lw=1, label=f"{depth:.3g} mm")
+        for k in np.unique(choice.chosen):
+            order = ", ".join(str(step + 1) for step in np.flatnonzero(choice.chosen == k))
+            right.annotate(order, (at.s[k], choice.score[0, k]), color="tab:red")
+        right.legend(title="depth")
+        right.set(xlabel="s [mm]", ylabel="criterion", title="first press; chosen in order")
+        figure.savefig(path, bbox_inches="tight")

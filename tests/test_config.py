@@ -22,6 +22,7 @@ SECTIONS = {
     "## [noise]": config.NoiseSection,
     "## [fit]": config.FitSection,
     "## [uncertainty]": config.UncertaintySection,
+    "## [design]": config.DesignSection,
 }
 
 
