@@ -16,7 +16,8 @@ from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.measurements import Curve
 from jaxtrachea.identify.parameters import DEFAULTS
 from jaxtrachea.identify.problem import Noise, build
-from jaxtrachea.identify.profile import _Sides, choose, profiles
+from jaxtrachea.identify.profile import choose, profiles
+from jaxtrachea.identify.profile_search import Sides
 from jaxtrachea.identify.results import profile_rows
 from jaxtrachea.model import Options
 from jaxtrachea.report import interval
@@ -205,7 +206,7 @@ def test_a_point_in_a_worse_minimum_is_passed_by(monkeypatch, curved):
     """Refits beyond 0.8 of the way land far too high once each: the ends stay where they were."""
     _, result, found = curved
     seen = set()
-    usual = _Sides.refit
+    usual = Sides.refit
 
     def spoilt(self, side, distance, start):
         theta, statistic = usual(self, side, distance, start)
@@ -215,7 +216,7 @@ def test_a_point_in_a_worse_minimum_is_passed_by(monkeypatch, curved):
                 statistic[i] += 50
         return theta, statistic
 
-    monkeypatch.setattr(_Sides, "refit", spoilt)
+    monkeypatch.setattr(Sides, "refit", spoilt)
     again = profiles(result, ONE, points=2)
     assert len(seen) == 24
     np.testing.assert_allclose(again.lower, found.lower, rtol=1e-6)
