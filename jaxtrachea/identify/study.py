@@ -285,7 +285,7 @@ def profiled(spec: FitSpec, problem: Problem, *, asked: bool) -> tuple[str, ...]
 
 
 def candidates_of(spec: FitSpec, problem: Problem) -> Candidates:
-    """The presses of the [design] section: the whole tube, half to all of the largest displacement.
+    """The presses of the [design] section; left out: first to last ring, half to full depth.
 
     Raises:
         SpecError: positions outside the tube, or unknowns that a new curve would not share.
@@ -296,7 +296,8 @@ def candidates_of(spec: FitSpec, problem: Problem) -> Candidates:
         raise SpecError(f"parameters: {error}") from None
     section, length = spec.design, float(problem.geometry.length)
     deepest = float(np.max(problem.lanes.displacement))
-    s = (0.0, length) if section.s is None else section.s
+    rings = problem.geometry.ring_positions
+    s = (float(rings[0]), float(rings[-1])) if section.s is None else section.s
     if s[0] < 0 or s[1] > length:
         raise SpecError(f"design.s: {s[0]:g} to {s[1]:g} mm, tube spans 0 to {length:g} mm")
     depth = (0.5 * deepest, deepest) if section.depth is None else section.depth
