@@ -1,0 +1,222 @@
+"""The scene as arrays: trachea, tool, surface, path; and the facts the plan is made from."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxtrachea.contact.distance import signed_distance
+from jaxtrachea.contact.pose import Pose
+from jaxtrachea.contact.shapes import Shape, capsule
+from jaxtrachea.scene import Facts, Plan, PlanError, Wishes, make_plan
+from jaxtrachea.surface import regions
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+from jaxtrachea.trachea.mesh import Mesh
+
+#: Share of the whole motion below which a part of it counts as rounding.
+ROUNDING = 1e-6
+
+#: Distance between the circles of the dent's centres: share of the tool's size; mm at least.
+FOOTPRINT, LEAST = 0.6, 4.0
+
+
+class Presses(eqx.Module):
+    """Presses at known contact points.
+
+    Attributes:
+        s: contact position, mm; shape (rows,).
+        phi: contact angle from the anterior midline, rad; shape (rows,).
+        displacement: of the tool along x (to the larynx), y (anterior), z, mm; shape (rows, 3).
+    """
+
+    s: Float[Array, " rows"] = eqx.field(converter=jnp.asarray)
+    phi: Float[Array, " rows"] = eqx.field(converter=jnp.asarray)
+    displacement: Float[Array, "rows 3"] = eqx.field(converter=jnp.asarray)
+
+
+class Poses(eqx.Module):
+    """A tool's positions in the tube frame, in order.
+
+    Attributes:
+        rotation: shape (rows, 3, 3).
+        translation: of the tool's origin, mm; shape (rows, 3).
+    """
+
+    rotation: Float[Array, "rows 3 3"] = eqx.field(converter=jnp.asarray)
+    translation: Float[Array, "rows 3"] = eqx.field(converter=jnp.asarray)
+
+
+class Scene(eqx.Module):
+    """Everything of a scene but its material and its path.
+
+    Attributes:
+        geometry: the tube at rest.
+        radius: of the tube's outside, where a tool touches it and the dent lies, mm.
+        tool: its shape about its own origin, or None.
+        friction: Coulomb's coefficient of the tool, or None.
+        mesh: the surface at rest, or None.
+        binding: of the mesh, or None.
+        footprint: distance between the circles of the dent's centres, mm.
+        plan: the program (static).
+    """
+
+    geometry: Geometry
+    radius: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    tool: Shape | None
+    friction: Float[Array, ""] | None
+    mesh: Mesh | None
+    binding: regions.Binding | None
+    footprint: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    plan: Plan = eqx.field(static=True)
+
+
+class Touch(NamedTuple):
+    """Where and how deep a tool stands in the undeformed tube, per row.
+
+    Attributes:
+        gap: signed distance, mm; negative: pressed in.
+        s: of the nearest point of the tube, mm.
+        phi: of it, rad.
+        point: of the tool's surface nearest to (deepest in) the tube, mm.
+    """
+
+    gap: Float[Array, " rows"]
+    s: Float[Array, " rows"]
+    phi: Float[Array, " rows"]
+    point: Float[Array, "rows 3"]
+
+
+def touch_tube(scene: Scene, path: Poses) -> Touch:
+    """Signed distance of the tool and the round tube at rest, row by row.
+
+    The tube is a cylinder of `scene.radius` with round lids, without relief and straight.
+
+    Raises:
+        ValueError: no tool.
+    """
+    if scene.tool is None:
+        raise ValueError("scene.tool is None; contact needs a tool")
+    tool, half = scene.tool, scene.geometry.length / 2
+    tube = capsule(half, scene.radius)
+    # Along z in its own frame: (x, y, z) of the tube frame are (z, x, y) there.
+    turn = jnp.asarray([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], half.dtype)
+    centre = jnp.stack([half, jnp.zeros_like(half), jnp.zeros_like(half)])
+
+    def one(rotation, translation):
+        pose = Pose(turn @ rotation, turn @ (translation - centre))
+        found = signed_distance(tube, tool, pose)
+        on_tube, on_tool = (turn.T @ v + centre for v in (found.point_a, found.point_b))
+        phi = jnp.arctan2(on_tube[2], on_tube[1])
+        return Touch(found.distance, on_tube[0], phi, on_tool)
+
+    return jax.vmap(one)(path.rotation, path.translation)
+
+
+def make_scene(
+    geometry: Geometry,
+    material: Material,
+    path: Poses | Presses,
+    *,
+    tool: Shape | None = None,
+    friction: float | None = None,
+    mesh: Mesh | None = None,
+    radius: float | None = None,
+    wishes: Wishes = Wishes(),  # noqa: B008 (frozen)
+) -> Scene:
+    """Put a scene together and choose its program from the path (concrete numbers).
+
+    Args:
+        geometry: the tube at rest.
+        material: read only for which optional values are there.
+        path: what the plan is made for; other paths may follow if they need no more.
+        tool: needed for `Poses`.
+        friction: Coulomb's coefficient.
+        mesh: the surface; without one `wishes.want_surface` must be false.
+        radius: of the tube's outside, mm; None: `geometry.radius` + 1.3 (half of Table 1's wall).
+        wishes: what is not left to the rules.
+
+    Raises:
+        PlanError: a wish that cannot be met.
+    """
+    dtype = geometry.length.dtype
+    outer = geometry.radius + 1.3 if radius is None else jnp.asarray(radius, dtype)
+    size = LEAST
+    if tool is not None:
+        extent = np.ptp(np.asarray(tool.vertices), axis=1).min() / 2 + float(tool.radius)
+        size = max(FOOTPRINT * extent, LEAST)
+    if isinstance(path, Poses):
+        if tool is None:
+            raise PlanError("contact: the path moves a tool, but there is none; give a tool")
+        if mesh is not None and mesh.frames is not None:
+            raise PlanError(
+                "contact: the mesh is curved, and contact with a moving tool is built for straight "
+                "tubes only; give the path as presses at contact points (s, phi, displacement)"
+            )
+    mu = None if friction is None else jnp.asarray(friction, dtype)
+    binding = None if mesh is None else regions.bind(mesh, geometry)
+    spacing = jnp.asarray(size, dtype)
+    placeholder = make_plan(Facts(mesh=mesh is not None), Wishes(want_surface=False))
+    scene = Scene(geometry, outer, tool, mu, mesh, binding, spacing, placeholder)
+    plan = make_plan(facts_of(scene, material, path), wishes)
+    if plan.surface is None:
+        mesh = binding = None
+    return Scene(geometry, outer, tool, mu, mesh, binding, spacing, plan)
+
+
+def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> Facts:
+    """What the rules need to know of a scene and its path."""
+    optional = ("GA_L", "k_1_ring", "EA_L", "k_A", "k_B", "EI_C", "k_t")
+    if isinstance(path, Poses):
+        seen = jax.jit(touch_tube)(scene, path)
+        gap, s, phi, points = (np.asarray(v, float) for v in seen)
+        touching = gap < 0
+        row = int(np.argmax(touching)) if touching.any() else int(np.argmin(gap))
+        moved = _body(path, row, points[row]) - points[row]
+        depth = np.maximum(-gap[row], 0)
+        at = slice(row, row + 1)
+    else:
+        s, phi, moved = (np.asarray(v, float) for v in (path.s, path.phi, path.displacement))
+        touching, depth, at = np.ones(len(s), bool), 0.0, slice(None)
+    here = np.broadcast_to(phi[at], s.shape)
+    radial = moved[:, 1] * np.cos(here) + moved[:, 2] * np.sin(here)
+    across = np.abs(moved[:, 2] * np.cos(here) - moved[:, 1] * np.sin(here))
+    along, whole = np.abs(moved[:, 0]), max(np.abs(radial).max() + depth, np.abs(moved).max(), 1e-9)
+    share = lambda v: float(v.max(initial=0) / whole)  # noqa: E731
+    keep = lambda v: v if v > ROUNDING else 0.0  # noqa: E731
+    angles = np.abs(phi[touching])
+    slip = np.hypot(along, across)[touching].max(initial=0)
+    x = np.asarray(scene.geometry.ring_positions, float)
+    return Facts(
+        poses=isinstance(path, Poses),
+        angle=keep(float(angles.max(initial=0))),
+        seats=bool(np.ptp(s[touching]) + np.ptp(phi[touching]) > ROUNDING * whole)
+        if touching.any() else False,
+        along=keep(share(along[touching])),
+        across=keep(share(across[touching])),
+        slip=float(slip) if slip > ROUNDING * whole else 0.0,
+        spacing=float(np.diff(x).min()) if len(x) > 1 else float(scene.geometry.length),
+        friction=scene.friction is not None,
+        known=frozenset(name for name in optional if getattr(material, name) is not None),
+        mesh=scene.mesh is not None,
+        near=_near(scene, s, phi),
+    )  # fmt: skip
+
+
+def _body(path: Poses, row: int, point):
+    """The tool's material point that is at `point` in a row, followed through the path."""
+    R, T = np.asarray(path.rotation, float), np.asarray(path.translation, float)
+    return R @ (R[row].T @ (point - T[row])) + T
+
+
+def _near(scene: Scene, s, phi) -> bool:
+    """Whether a vertex lies within the reach of a dent at any of the contacts."""
+    if scene.mesh is None:
+        return False
+    r = float(scene.radius)
+    C = np.stack([s, r * np.cos(phi), r * np.sin(phi)], axis=1)
+    points, reach = np.asarray(scene.mesh.straight, float), 3 * float(scene.footprint)
+    return any(bool((np.sum((points - c) ** 2, axis=1) < reach**2).any()) for c in C)
