@@ -1,0 +1,309 @@
+r"""A tube as a row of convex patches, and the contact of a convex tool with it.
+
+Each patch covers the tube between two borders (rings, say) and is a convex core swept by a ball
+(`shapes`). Beyond its borders it runs on inside its neighbours, rounded like the end of a capsule,
+so that a tool pressed in deeply is not pushed out through a border. A tube bent along its
+centreline is one patch after another; the hollows between two borders are bridged.
+
+    gap = -(1/beta) log sum_i exp(-beta gap_i)    over the patches near the tool
+
+with the smooth signed distances gap_i of `distance`; witness points and normal are averaged with
+the same weights. So everything stays smooth where the contact moves from one patch to the next.
+
+The gap is that of the whole row up to the patches left out: `Touch.left_out` is a certified lower
+bound of theirs, from -h_A(d) - h_B(-d) <= distance, which holds for every unit vector d.
+
+`patch_builder` makes the patches of a surface. Lengths in mm.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxtrachea.contact.distance import signed_distance, track
+from jaxtrachea.contact.pose import Pose, transform
+from jaxtrachea.contact.search import STANDARD, Settings
+from jaxtrachea.contact.shapes import ArrayLike, Shape, heights, sharp_support
+from jaxtrachea.status import ContactStatus
+
+#: Steps towards the tool's nearest point in the broad phase; exact after one for two vertices.
+NEARING = 4
+#: Newton steps to the nearest point of the centreline without, then with derivative.
+STEPS, LAST_STEPS = 3, 2
+#: Smallest slope of the projection, 1 - curvature x distance: the centre of the bend is not passed.
+LEAST_SLOPE = 0.05
+#: Share of a patch in the contact from which its status counts.
+COUNTS = 1e-3
+
+
+class Centreline(eqx.Module):
+    """Samples of a smooth line, evenly spaced in arc length; two are enough for a straight one.
+
+    Attributes:
+        s: arc length of the samples, mm; shape (samples,).
+        points: mm; shape (samples, 3).
+        tangents: unit vectors along rising s.
+        anterior: unit vectors across, where the angle phi is zero.
+    """
+
+    s: Float[Array, " samples"]
+    points: Float[Array, "samples 3"]
+    tangents: Float[Array, "samples 3"]
+    anterior: Float[Array, "samples 3"]
+
+
+class Patches(eqx.Module):
+    """A tube as a row of convex patches.
+
+    Attributes:
+        shapes: the patches, stacked: vertices (patches, 3, n), radius (patches,).
+        centres: a point inside each, mm; shape (patches, 3).
+        line: the centreline, for s and phi.
+        lost: how far the surface at most stands out of each patch (thinning, rounding), mm.
+        filled: how far it at most lies inside of it (hollows bridged), mm.
+    """
+
+    shapes: Shape
+    centres: Float[Array, "patches 3"]
+    line: Centreline
+    lost: Float[Array, " patches"]
+    filled: Float[Array, " patches"]
+
+
+class Touch(eqx.Module):
+    """Where a tool touches the tube, or would first.
+
+    Attributes:
+        gap: smoothed signed distance, mm; negative: penetration.
+        point: of the tube's surface nearest to (deepest in) the tool, mm; shape (3,).
+        tool_point: the same of the tool.
+        normal: of the tube, outward unit vector, from the tube to the tool; shape (3,).
+        s: position of `point` along the centreline, mm; beyond the ends on its continuation.
+        phi: its angle round the centreline from the anterior midline, rad, in (-pi, pi].
+        patch: the one with the smallest gap.
+        left_out: lower bound of the gaps of the patches not searched, mm; not below `gap`: none of
+            them is nearer.
+        bound: the gap of the sharp patches is at most this larger than `gap`, mm.
+        status: a `ContactStatus` as int8.
+    """
+
+    gap: Float[Array, ""]
+    point: Float[Array, "3"]
+    tool_point: Float[Array, "3"]
+    normal: Float[Array, "3"]
+    s: Float[Array, ""]
+    phi: Float[Array, ""]
+    patch: Int[Array, ""]
+    left_out: Float[Array, ""]
+    bound: Float[Array, ""]
+    status: Int[Array, ""]
+
+    @property
+    def complete(self) -> Bool[Array, ""]:
+        """Whether the patches left out are known to be further away."""
+        return self.left_out >= self.gap
+
+
+def straight_patches(borders: ArrayLike, radius: ArrayLike, *, overlap=0.5, dtype=None) -> Patches:
+    """A straight round tube along x, exact: its patches are capsules, two vertices each.
+
+    The tube runs on beyond the first and last border as a half ball; s is then outside of them.
+    No polygon; what a real wall has besides (relief of the rings, flat back) is left out.
+
+    Args:
+        borders: s of the ends and of the borders between, mm, rising; shape (patches + 1,).
+        radius: outer radius, mm, positive; may be traced.
+        overlap: by how much a patch runs on beyond its borders before it is rounded, mm.
+        dtype: of every array; the default float type of JAX if None.
+
+    Raises:
+        ValueError: naming the argument.
+    """
+    at = check_borders(borders)
+    dtype = jnp.zeros(0, dtype).dtype
+    r = jnp.asarray(radius, dtype)
+    if r.ndim != 0 or not isinstance(r, Tracer) and not float(r) > 0:
+        raise ValueError(f"radius: expected a positive number, found {radius}")
+    if not overlap >= 0:
+        raise ValueError(f"overlap: expected a length not below 0, found {overlap}")
+    count = len(at) - 1
+    vertices, centres = np.zeros((count, 3, 2)), np.zeros((count, 3))
+    vertices[:, 0] = np.stack([at[:-1] - overlap, at[1:] + overlap], axis=1)
+    centres[:, 0] = (at[:-1] + at[1:]) / 2
+    ends, zero = at[[0, -1]], np.zeros(count)
+    axes = np.eye(3)[:, None].repeat(2, axis=1)
+    line = Centreline(*(jnp.asarray(v, dtype) for v in (ends, ends[:, None] * axes[0], *axes[:2])))
+    shapes = Shape(jnp.asarray(vertices, dtype), jnp.broadcast_to(r, (count,)))
+    return Patches(shapes, *(jnp.asarray(centres, dtype), line, *[jnp.asarray(zero, dtype)] * 2))
+
+
+def check_borders(borders) -> np.ndarray:
+    """Borders as numbers, finite and rising; a ValueError otherwise."""
+    at = np.asarray(borders, float)
+    if at.ndim != 1 or len(at) < 2 or not np.isfinite(at).all() or np.any(np.diff(at) <= 0):
+        raise ValueError(f"borders: expected two or more rising numbers, found {borders}")
+    return at
+
+
+def touch(
+    tool: Shape,
+    pose: Pose,
+    patches: Patches,
+    settings: Settings = STANDARD,
+    *,
+    near: int = 2,
+    beta: Float[Array, ""] | None = None,
+    direction: Float[Array, "3"] | None = None,
+) -> Touch:
+    """Contact of a convex tool with the tube; a pure function of one pose.
+
+    Args:
+        tool: a convex shape, of the dtype of the patches.
+        pose: from the tool's frame to the tube's.
+        patches: the tube.
+        settings: accuracy and work of each signed distance.
+        near: number of patches searched, those with the lowest bounds. Two are enough for tools
+            about as long as a patch; `Touch.complete` says so.
+        beta: sharpness, 1/mm; default `settings.sharpness` over the size of tool and largest patch.
+        direction: the normal of the pose before on a path of small steps: then `track` takes the
+            place of the search.
+
+    Returns:
+        The `Touch`; differentiable in tool, pose and patches. Its gap changes with a shift of the
+        tool by the average of the patches' normals, which is `normal` but for its length.
+
+    Raises:
+        ValueError: `near` is not between 1 and the number of patches.
+    """
+    count = patches.centres.shape[0]
+    if not 1 <= near <= count:
+        raise ValueError(f"near: expected 1 to {count} (the number of patches), found {near}")
+    beta = settings.sharpness / _size(tool, patches) if beta is None else beta
+    bounds = gap_bounds(tool, pose, patches)
+    _, chosen = jax.lax.top_k(-bounds, near)
+    shapes = jax.tree.map(lambda v: v[chosen], patches.shapes)
+
+    def contact(patch):
+        if direction is None:
+            return signed_distance(patch, tool, pose, settings, beta=beta)
+        return track(patch, tool, pose, direction, settings, beta=beta)
+
+    each = jax.vmap(contact)(shapes)
+    low = jax.lax.stop_gradient(jnp.min(each.distance))
+    e = jnp.exp(-beta * (each.distance - low))
+    weight = e / jnp.sum(e)
+    gap = low - jnp.log(jnp.sum(e)) / beta
+    mean = lambda v: jnp.sum(weight[:, None] * v, axis=0)  # noqa: E731
+    point = mean(each.point_a)
+    s, phi = skeleton_coordinates(patches.line, point)
+    terms = patches.shapes.vertices.shape[2] * tool.vertices.shape[1] * near
+    worst = jnp.max(jnp.where(weight > COUNTS, each.status, 0))
+    return Touch(
+        gap,
+        point,
+        mean(each.point_b),
+        _unit(mean(each.normal)),
+        s,
+        phi,
+        chosen[jnp.argmin(each.distance)],
+        jnp.min(bounds.at[chosen].set(jnp.inf)),
+        jax.lax.stop_gradient(jnp.log(jnp.asarray(terms, gap.dtype)) / beta),
+        jnp.where(jnp.isfinite(gap), worst, ContactStatus.NON_FINITE).astype(jnp.int8),
+    )
+
+
+def gap_bounds(tool: Shape, pose: Pose, patches: Patches) -> Float[Array, " patches"]:
+    """The broad phase: a certified lower bound of every patch's sharp gap, mm.
+
+    From the direction in which the tool is nearest to the centre of the patch. Not differentiable.
+    """
+    tool, pose, patches = jax.lax.stop_gradient((tool, pose, patches))
+    moved = Shape(transform(pose, tool.vertices), tool.radius)
+
+    def bound(patch, centre):
+        nearest = jnp.mean(moved.vertices, axis=1)
+        for _ in range(NEARING):  # Frank-Wolfe with exact steps
+            away = nearest - centre
+            step = moved.vertices[:, jnp.argmin(heights(moved.vertices, away))] - nearest
+            square = jnp.sum(step * step)
+            share = -jnp.sum(away * step) / jnp.where(square > 0, square, 1)
+            nearest = nearest + jnp.clip(share, 0, 1) * step
+        d = _unit(nearest - centre)
+        return -(sharp_support(patch, d) + sharp_support(moved, -d))
+
+    return jax.vmap(bound)(patches.shapes, patches.centres)
+
+
+def skeleton_coordinates(
+    line: Centreline, point: Float[Array, "3"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Position s (mm) of the nearest point of the centreline and angle phi round it (rad).
+
+    The root of t(s) . (point - c(s)) by Newton steps, the last two of them differentiable: exact
+    up to the third derivative. Valid nearer to the line than its radius of curvature. On the line
+    itself phi is 0, with derivative 0.
+
+    Args:
+        line: the centreline.
+        point: mm; shape (3,).
+    """
+
+    def step(s, p, line):
+        c, t, bend, _ = _at(line, s)
+        slope = jnp.sum(t * t) - jnp.sum(bend * (p - c))
+        return s + jnp.sum(t * (p - c)) / jnp.maximum(slope, LEAST_SLOPE)
+
+    p, fixed = jax.lax.stop_gradient((point, line))
+    s = fixed.s[jnp.argmin(jnp.sum((fixed.points - p[None]) ** 2, axis=1))]
+    for _ in range(STEPS):
+        s = step(s, p, fixed)
+    for _ in range(LAST_STEPS):
+        s = step(s, point, line)
+    c, t, _, anterior = _at(line, s)
+    out, lateral = point - c, jnp.cross(t, anterior)
+    y, z = jnp.sum(out * anterior), jnp.sum(out * lateral)
+    on_line = (y == 0) & (z == 0)
+    return s, jnp.arctan2(jnp.where(on_line, 0, z), jnp.where(on_line, 1, y))
+
+
+def _at(line: Centreline, s):
+    """Point, first and second derivative (cubic by samples and tangents), anterior direction.
+
+    Beyond the ends the line goes on straight.
+    """
+    last = line.s.shape[0] - 1
+    h = (line.s[-1] - line.s[0]) / last
+    inside = jnp.clip(s, line.s[0], line.s[-1])
+    place = jax.lax.stop_gradient((inside - line.s[0]) / h)
+    i = jnp.clip(jnp.floor(place).astype(int), 0, last - 1)
+    u, beyond = (inside - line.s[i]) / h, s - inside
+    p0, p1, t0, t1 = line.points[i], line.points[i + 1], line.tangents[i], line.tangents[i + 1]
+    rise = (p1 - p0) / h
+    c = p0 + h * u * (t0 + u * (3 * rise - 2 * t0 - t1 + u * (t0 + t1 - 2 * rise)))
+    t = t0 + u * (6 * rise - 4 * t0 - 2 * t1 + 3 * u * (t0 + t1 - 2 * rise))
+    bend = (6 * rise - 4 * t0 - 2 * t1 + 6 * u * (t0 + t1 - 2 * rise)) / h
+    across = line.anterior[i] + u * (line.anterior[i + 1] - line.anterior[i])
+    return c + beyond * t, t, jnp.where(beyond == 0, bend, 0), across
+
+
+def _unit(v):
+    """Unit vector; z for a zero one."""
+    square = jnp.sum(v * v)
+    ahead = jnp.zeros_like(v).at[2].set(1)
+    return jnp.where(square > 0, v, ahead) / jnp.sqrt(jnp.where(square > 0, square, 1))
+
+
+def _size(tool: Shape, patches: Patches):
+    """Half-extents of tool and largest patch together, mm; not differentiable."""
+    tool, shapes = jax.lax.stop_gradient((tool, patches.shapes))
+    reach = lambda v: jnp.sqrt(  # noqa: E731
+        jnp.max(jnp.sum((v - jnp.mean(v, axis=1, keepdims=True)) ** 2, axis=0))
+    )
+    return (
+        reach(tool.vertices)
+        + tool.radius
+        + jnp.max(jax.vmap(reach)(shapes.vertices) + shapes.radius)
+    )
