@@ -243,7 +243,7 @@ def make_plan(facts: Facts, wishes: Wishes = Wishes()) -> Plan:  # noqa: B008 (f
 def _seat(d: _Decisions, facts: Facts):
     near = facts.slip < facts.spacing / 2
     if facts.poses:
-        level = "each" if (facts.slip <= SMALL and facts.seats) or not near else "first"
+        level = "first" if near else "each"
         reason = (
             f"the tool moves {facts.slip:.3g} mm along the surface, less than half a ring spacing"
             if level == "first"

@@ -1,16 +1,14 @@
 """The scene as arrays: trachea, tool, surface, path; and the facts the plan is made from."""
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtrachea.contact.distance import signed_distance
+from jaxtrachea.contact.patches import Patches, Touch, straight_patches, touch
 from jaxtrachea.contact.pose import Pose
-from jaxtrachea.contact.shapes import Shape, capsule
+from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.scene import Facts, Plan, PlanError, Wishes, make_plan
 from jaxtrachea.surface import regions
 from jaxtrachea.trachea.geometry import Geometry
@@ -22,6 +20,9 @@ ROUNDING = 1e-6
 
 #: Distance between the circles of the dent's centres: share of the tool's size; mm at least.
 FOOTPRINT, LEAST = 0.6, 4.0
+
+#: Patches of the tube searched for a contact.
+NEAR = 2
 
 
 class Presses(eqx.Module):
@@ -56,6 +57,7 @@ class Scene(eqx.Module):
     Attributes:
         geometry: the tube at rest.
         radius: of the tube's outside, where a tool touches it and the dent lies, mm.
+        tube: its outside as convex patches, for a tool; or None.
         tool: its shape about its own origin, or None.
         friction: Coulomb's coefficient of the tool, or None.
         mesh: the surface at rest, or None.
@@ -66,6 +68,7 @@ class Scene(eqx.Module):
 
     geometry: Geometry
     radius: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    tube: Patches | None
     tool: Shape | None
     friction: Float[Array, ""] | None
     mesh: Mesh | None
@@ -74,45 +77,19 @@ class Scene(eqx.Module):
     plan: Plan = eqx.field(static=True)
 
 
-class Touch(NamedTuple):
-    """Where and how deep a tool stands in the undeformed tube, per row.
-
-    Attributes:
-        gap: signed distance, mm; negative: pressed in.
-        s: of the nearest point of the tube, mm.
-        phi: of it, rad.
-        point: of the tool's surface nearest to (deepest in) the tube, mm.
-    """
-
-    gap: Float[Array, " rows"]
-    s: Float[Array, " rows"]
-    phi: Float[Array, " rows"]
-    point: Float[Array, "rows 3"]
-
-
 def touch_tube(scene: Scene, path: Poses) -> Touch:
-    """Signed distance of the tool and the round tube at rest, row by row.
+    """Contact of the tool with the round tube at rest, row by row, batched.
 
-    The tube is a cylinder of `scene.radius` with round lids, without relief and straight.
+    The tube is straight, a cylinder of `scene.radius` with round lids, without relief.
 
     Raises:
         ValueError: no tool.
     """
-    if scene.tool is None:
+    if scene.tool is None or scene.tube is None:
         raise ValueError("scene.tool is None; contact needs a tool")
-    tool, half = scene.tool, scene.geometry.length / 2
-    tube = capsule(half, scene.radius)
-    # Along z in its own frame: (x, y, z) of the tube frame are (z, x, y) there.
-    turn = jnp.asarray([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], half.dtype)
-    centre = jnp.stack([half, jnp.zeros_like(half), jnp.zeros_like(half)])
-
-    def one(rotation, translation):
-        pose = Pose(turn @ rotation, turn @ (translation - centre))
-        found = signed_distance(tube, tool, pose)
-        on_tube, on_tool = (turn.T @ v + centre for v in (found.point_a, found.point_b))
-        phi = jnp.arctan2(on_tube[2], on_tube[1])
-        return Touch(found.distance, on_tube[0], phi, on_tool)
-
+    tool, tube = scene.tool, scene.tube
+    near = min(NEAR, tube.centres.shape[0])
+    one = lambda R, T: touch(tool, Pose(R, T), tube, near=near)  # noqa: E731
     return jax.vmap(one)(path.rotation, path.translation)
 
 
@@ -144,8 +121,9 @@ def make_scene(
     """
     dtype = geometry.length.dtype
     outer = geometry.radius + 1.3 if radius is None else jnp.asarray(radius, dtype)
-    size = LEAST
+    size, tube = LEAST, None
     if tool is not None:
+        tube = straight_patches(_borders(geometry), float(outer), dtype=dtype)
         extent = np.ptp(np.asarray(tool.vertices), axis=1).min() / 2 + float(tool.radius)
         size = max(FOOTPRINT * extent, LEAST)
     if isinstance(path, Poses):
@@ -160,11 +138,17 @@ def make_scene(
     binding = None if mesh is None else regions.bind(mesh, geometry)
     spacing = jnp.asarray(size, dtype)
     placeholder = make_plan(Facts(mesh=mesh is not None), Wishes(want_surface=False))
-    scene = Scene(geometry, outer, tool, mu, mesh, binding, spacing, placeholder)
+    scene = Scene(geometry, outer, tube, tool, mu, mesh, binding, spacing, placeholder)
     plan = make_plan(facts_of(scene, material, path), wishes)
     if plan.surface is None:
         mesh = binding = None
-    return Scene(geometry, outer, tool, mu, mesh, binding, spacing, plan)
+    return Scene(geometry, outer, tube, tool, mu, mesh, binding, spacing, plan)
+
+
+def _borders(geometry: Geometry) -> np.ndarray:
+    """Patches about as long as the tube is wide, so that their rounding is small."""
+    length, radius = float(geometry.length), float(geometry.radius)
+    return np.linspace(0, length, max(round(length / (2 * radius)), 1) + 1)
 
 
 def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> Facts:
@@ -172,7 +156,8 @@ def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> Facts:
     optional = ("GA_L", "k_1_ring", "EA_L", "k_A", "k_B", "EI_C", "k_t")
     if isinstance(path, Poses):
         seen = jax.jit(touch_tube)(scene, path)
-        gap, s, phi, points = (np.asarray(v, float) for v in seen)
+        gap, s, phi = (np.asarray(v, float) for v in (seen.gap, seen.s, seen.phi))
+        points = np.asarray(seen.tool_point, float)
         touching = gap < 0
         row = int(np.argmax(touching)) if touching.any() else int(np.argmin(gap))
         moved = _body(path, row, points[row]) - points[row]

@@ -13,6 +13,7 @@ PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 ORDER = [
     {"units", "status", "_numerics"},
     {"config"},
+    {"config_scene"},
     {"trachea"},
     {"contact"},
     {"mechanics"},
@@ -20,9 +21,15 @@ ORDER = [
     {"surface"},
     {"model"},
     {"oblique"},
+    {"operations", "scene"},
+    {"stage"},
+    {"simulation"},
     {"identify"},
+    {"scene_study", "scene_results"},
     {"report"},
-    {"plots", "viewer", "study"},
+    {"plots", "viewer", "study", "scene_plots"},
+    {"terminal"},
+    {"cli_scene"},
     {"cli"},
     {"__main__"},
 ]
@@ -69,6 +76,9 @@ def test_imports_only_from_above(path):
         ("trachea", "def f():\n    import jaxtrachea.mechanics.beam as b"),
         ("model", "from jaxtrachea import identify"),
         ("surface", "from jaxtrachea.model import press"),
+        ("scene", "from jaxtrachea.stage import Scene"),
+        ("stage", "from jaxtrachea import simulation"),
+        ("simulation", "from jaxtrachea.scene_study import stage"),
         ("trachea", "from jaxtrachea.surface.regions import bind"),
         ("mechanics", "from jaxtrachea.surface import local"),
         ("_numerics", "from .trachea import geometry"),
@@ -81,7 +91,7 @@ def test_the_walk_sees_a_fault(room, source):
 def test_import_is_light():
     """Plots, meshes, the command line and file formats are loaded by those who use them."""
     code = (
-        "import sys, jaxtrachea, jaxtrachea.model\n"
+        "import sys, jaxtrachea, jaxtrachea.model, jaxtrachea.simulation, jaxtrachea.stage\n"
         "import jaxtrachea.surface.local, jaxtrachea.surface.regions, jaxtrachea.trachea.imported\n"
         f"print([m for m in {HEAVY!r} if m in sys.modules])"
     )

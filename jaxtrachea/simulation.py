@@ -10,13 +10,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea.contact.distance import signed_distance
+from jaxtrachea.contact.patches import Touch
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.shapes import Shape, sphere
 from jaxtrachea.model import ligament_beam, local_law, respond, unit_deflection
 from jaxtrachea.oblique import press_oblique, press_path
 from jaxtrachea.scene import Plan
 from jaxtrachea.skeleton import local_frame
-from jaxtrachea.stage import Poses, Presses, Scene, Touch, touch_tube
+from jaxtrachea.stage import Poses, Presses, Scene, touch_tube
 from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.material import Material
@@ -195,7 +196,7 @@ def _from_touch(plan: Plan, path: Poses, seen: Touch) -> tuple[Presses, Array | 
     pose = Pose(at(path.rotation, first), at(path.translation, first))
     gap, normal = at(seen.gap, first), at(inward, first)
     # The tool's material point that touches first, followed through the path.
-    body = transform(inverse(pose), at(seen.point, first)[:, None])[:, 0]
+    body = transform(inverse(pose), at(seen.tool_point, first)[:, None])[:, 0]
     points = jax.vmap(lambda R, T: R @ body + T)(path.rotation, path.translation)
     onto = at(points, first)
     closing = at(seen.gap, before) - gap
