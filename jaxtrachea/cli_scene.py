@@ -25,7 +25,7 @@ def plan(scene: SceneArgument) -> None:
     whole, found = shares(staged)
     out = Console()
     head = ["effect", "level", "chosen", "operations", "reason"]
-    out.print(table("Plan", head, plan_rows(staged.scene.plan, found)))
+    out.print(table("Plan", head, plan_rows(staged.scene.plan, found), ("reason",)))
     out.print(f"{whole:,} operations for {_rows(staged)} rows", highlight=False)
     for note in staged.notes:
         out.print(escape(note), highlight=False)
@@ -71,7 +71,6 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
 
     from jaxtrachea.scene_plots import draw_sweep
     from jaxtrachea.scene_results import write_sweep
-    from jaxtrachea.simulation import Sweep
     from jaxtrachea.simulation import sweep as run
     from jaxtrachea.status import PressStatus
 
@@ -103,7 +102,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
                 part = compute(staged.scene, staged.material, *rows, depth, chunk=size)
                 parts.append(jax.tree.map(lambda v: np.asarray(v)[: total - start], part))  # noqa: B023
                 bar.update(task, completed=min(start + size, total))
-        out = Sweep(*(np.concatenate(v) for v in zip(*parts, strict=True)))
+        out = jax.tree.map(lambda *v: np.concatenate(v), *parts)
         clock.append(time.perf_counter())
         for name, figure in draw_sweep(s, phi, out).items():
             figure.savefig(folder / name)
@@ -186,7 +185,7 @@ def _print_rows(out) -> None:
 
     count = len(out.s)
     pick = np.unique(np.linspace(0, count - 1, min(count, MANY)).round().astype(int))
-    vector = lambda v: " ".join(f"{x:.3g}" for x in np.asarray(v))  # noqa: E731
+    vector = lambda v: " ".join(f"{x:.3g}" for x in np.asarray(v).round(9) + 0.0)  # noqa: E731
     rows = [
         [str(i + 1), f"{out.s[i]:.4g}", f"{np.degrees(out.phi[i]):.3g}",
          "–" if out.gap is None else f"{out.gap[i]:.3g}", vector(out.force[i]),

@@ -240,7 +240,7 @@ def make_plan(facts: Facts, wishes: Wishes = Wishes()) -> Plan:  # noqa: B008 (f
     )  # fmt: skip
 
 
-def _seat(d: _Decisions, facts: Facts):
+def _seat(d: _Decisions, facts: Facts) -> Literal["first", "each"]:
     near = facts.slip < facts.spacing / 2
     if facts.poses:
         level = "first" if near else "each"
@@ -256,7 +256,7 @@ def _seat(d: _Decisions, facts: Facts):
         reason = "several contact points" if facts.seats else "one contact point"
         if d.wishes.seat == "first" and facts.seats:
             raise PlanError("seat: 'first', but the presses have different contact points")
-    return d.choose("seat", level, reason)
+    return "first" if d.choose("seat", level, reason) == "first" else "each"
 
 
 def _friction(d: _Decisions, facts: Facts, seat: str) -> bool:

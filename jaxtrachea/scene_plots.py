@@ -3,6 +3,9 @@
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -10,7 +13,7 @@ from jaxtrachea.simulation import Simulation, Sweep
 from jaxtrachea.stage import Scene
 
 
-def draw_surface(scene: Scene, vertices: np.ndarray, title: str = "", span: float = 40.0) -> Figure:
+def draw_surface(scene: Scene, vertices: np.ndarray, title: str = "", span: float = 45.0) -> Figure:
     """The deformed surface round the largest motion, coloured by it, in the manner of Fig. 6.
 
     Args:
@@ -23,29 +26,29 @@ def draw_surface(scene: Scene, vertices: np.ndarray, title: str = "", span: floa
     rest, faces = np.asarray(scene.mesh.vertices, float), np.asarray(scene.mesh.faces)
     moved = np.linalg.norm(vertices - rest, axis=1)
     middle = rest[np.argmax(moved)]
-    keep = (np.linalg.norm(rest[faces] - middle, axis=2) < span).all(axis=1)
+    keep = (np.abs(rest[faces][:, :, 0] - middle[0]) < span).all(axis=1)
     corners = vertices[faces[keep]][:, :, [0, 2, 1]]  # x along, z across, y up
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     light = 0.55 + 0.45 * np.abs(normals @ (np.array([0.3, -0.5, 0.8]) / 0.99))
-    figure = Figure(figsize=(5, 3.4), dpi=90)
+    figure = Figure(figsize=(5, 3.2), dpi=100)
     axis: Any = figure.add_subplot(projection="3d")
     size = moved[faces[keep]].mean(axis=1)
     top = max(float(moved.max()), 1e-9)
-    import matplotlib as mpl
-
-    colour = mpl.colormaps["viridis"](size / top)
+    colour = colormaps["viridis"](size / top)
     colour[:, :3] *= np.minimum(light, 1)[:, None]
-    axis.add_collection3d(Poly3DCollection(corners, facecolors=colour, edgecolors="none"))
+    axis.add_collection3d(
+        Poly3DCollection(corners, facecolors=colour, edgecolors="face", linewidths=0.2)
+    )
     low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axis.set_box_aspect(high - low)
+    axis.set_box_aspect(high - low, zoom=1.35)
     axis.view_init(elev=28, azim=-65)
     axis.set_axis_off()
-    figure.subplots_adjust(left=0, right=0.92, bottom=0, top=0.95)
-    scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(0, top), "viridis")
+    figure.subplots_adjust(left=0, right=0.88, bottom=0, top=1)
+    scale = ScalarMappable(Normalize(0, top), "viridis")
     figure.colorbar(scale, ax=axis, shrink=0.6, label="displacement [mm]")
-    axis.set_title(title)
+    axis.set_title(title, y=0.93, fontsize=10)
     return figure
 
 

@@ -87,10 +87,13 @@ def shares(staged: Staged) -> tuple[int, dict[str, float]]:
         given = jax.tree.map(
             lambda v: jnp.zeros(v.shape, v.dtype), (moved.s, moved.phi, moved.displacement)
         )
-        plan = dataclasses.replace(scene.plan, contact=False, dent=8 if scene.plan.dent else 0)
-        bare = dataclasses.replace(scene, plan=plan)
-        rest = count_operations(simulate, bare, staged.material, Presses(*given))
-        found["contact"] = 1 - rest / whole
+        # Compared without dent, which takes another form without a tool.
+        plan = dataclasses.replace(scene.plan, dent=0)
+        bare = dataclasses.replace(plan, contact=False)
+        rest = count_operations(
+            simulate, dataclasses.replace(scene, plan=bare), staged.material, Presses(*given)
+        )
+        found["contact"] = (count(dataclasses.replace(scene, plan=plan)) - rest) / whole
     return whole, found
 
 

@@ -337,7 +337,7 @@ def _dent(scene: Scene, s_c, phi_c, depth, pose: Poses | None) -> local.Dent:
     count, spacing = scene.plan.dent, scene.footprint
     where = local.centres(s_c, phi_c, scene.radius, spacing, count)
     sag = jnp.zeros_like(where[:, 0])
-    if pose is not None:
+    if pose is not None and scene.tool is not None:
         sag = _sag(scene.tool, pose, where)
     return local.fit(where, local.targets(depth, sag), 3 * spacing)
 

@@ -63,7 +63,7 @@ def use_float64() -> None:
     jax.config.update("jax_enable_x64", True)
 
 
-def table(title: str, head, rows) -> Table:
+def table(title: str, head, rows, text: tuple[str, ...] = ()) -> Table:
     """A table that breaks lines between words only, and leaves out an only specimen's name."""
     named = head[0] != "specimen" or len({row[0] for row in rows}) > 1
     if not named:
@@ -73,7 +73,7 @@ def table(title: str, head, rows) -> Table:
     )
     for i, name in enumerate(head):
         words = " ".join([name, *(row[i] for row in rows)]).split()
-        side = "left" if i == 0 else "right"
+        side = "left" if i == 0 or name in text else "right"
         made.add_column(escape(name), justify=side, min_width=max(map(len, words)), overflow="fold")
     for row in rows:
         made.add_row(*map(escape, row))
