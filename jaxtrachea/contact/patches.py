@@ -13,7 +13,8 @@ the same weights. So everything stays smooth where the contact moves from one pa
 The gap is that of the whole row up to the patches left out: `Touch.left_out` is a certified lower
 bound of theirs, from -h_A(d) - h_B(-d) <= distance, which holds for every unit vector d.
 
-`patch_builder` makes the patches of a surface. Lengths in mm.
+`straight_patches` are those of a smooth round tube, `walls.patches_of` those of a surface. Lengths
+in mm.
 """
 
 import equinox as eqx
@@ -24,35 +25,16 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea.contact.distance import signed_distance, track
+from jaxtrachea.contact.line import Centreline, skeleton_coordinates
 from jaxtrachea.contact.pose import Pose, transform
 from jaxtrachea.contact.search import STANDARD, Settings
 from jaxtrachea.contact.shapes import ArrayLike, Shape, heights, sharp_support
 from jaxtrachea.status import ContactStatus
 
-#: Steps towards the tool's nearest point in the broad phase; exact after one for two vertices.
-NEARING = 4
-#: Newton steps to the nearest point of the centreline without, then with derivative.
-STEPS, LAST_STEPS = 3, 2
-#: Smallest slope of the projection, 1 - curvature x distance: the centre of the bend is not passed.
-LEAST_SLOPE = 0.05
+#: Steps towards the nearest points of two cores in the broad phase.
+NEARING = 6
 #: Share of a patch in the contact from which its status counts.
 COUNTS = 1e-3
-
-
-class Centreline(eqx.Module):
-    """Samples of a smooth line, evenly spaced in arc length; two are enough for a straight one.
-
-    Attributes:
-        s: arc length of the samples, mm; shape (samples,).
-        points: mm; shape (samples, 3).
-        tangents: unit vectors along rising s.
-        anterior: unit vectors across, where the angle phi is zero.
-    """
-
-    s: Float[Array, " samples"]
-    points: Float[Array, "samples 3"]
-    tangents: Float[Array, "samples 3"]
-    anterior: Float[Array, "samples 3"]
 
 
 class Patches(eqx.Module):
@@ -102,7 +84,7 @@ class Touch(eqx.Module):
     status: Int[Array, ""]
 
     @property
-    def complete(self) -> Bool[Array, ""]:
+    def complete(self) -> Bool[Array, "*lanes"]:
         """Whether the patches left out are known to be further away."""
         return self.left_out >= self.gap
 
@@ -156,7 +138,7 @@ def touch(
     *,
     near: int = 2,
     beta: Float[Array, ""] | None = None,
-    direction: Float[Array, "3"] | None = None,
+    search: bool = False,
 ) -> Touch:
     """Contact of a convex tool with the tube; a pure function of one pose.
 
@@ -168,8 +150,10 @@ def touch(
         near: number of patches searched, those with the lowest bounds. Two are enough for tools
             about as long as a patch; `Touch.complete` says so.
         beta: sharpness, 1/mm; default `settings.sharpness` over the size of tool and largest patch.
-        direction: the normal of the pose before on a path of small steps: then `track` takes the
-            place of the search.
+        search: over all directions, as `signed_distance`. Without, each patch starts from the
+            direction of the broad phase, as `track`: several times faster and the same until the
+            tool's core reaches into the core of a patch (penetration beyond both radii). Deeper,
+            the way out may be another than the shortest; the status is then NOT_CONVERGED.
 
     Returns:
         The `Touch`; differentiable in tool, pose and patches. Its gap changes with a shift of the
@@ -182,16 +166,16 @@ def touch(
     if not 1 <= near <= count:
         raise ValueError(f"near: expected 1 to {count} (the number of patches), found {near}")
     beta = settings.sharpness / _size(tool, patches) if beta is None else beta
-    bounds = gap_bounds(tool, pose, patches)
+    bounds, directions = gap_bounds(tool, pose, patches)
     _, chosen = jax.lax.top_k(-bounds, near)
     shapes = jax.tree.map(lambda v: v[chosen], patches.shapes)
 
-    def contact(patch):
-        if direction is None:
+    def contact(patch, direction):
+        if search:
             return signed_distance(patch, tool, pose, settings, beta=beta)
         return track(patch, tool, pose, direction, settings, beta=beta)
 
-    each = jax.vmap(contact)(shapes)
+    each = jax.vmap(contact)(shapes, directions[chosen])
     low = jax.lax.stop_gradient(jnp.min(each.distance))
     e = jnp.exp(-beta * (each.distance - low))
     weight = e / jnp.sum(e)
@@ -201,6 +185,9 @@ def touch(
     s, phi = skeleton_coordinates(patches.line, point)
     terms = patches.shapes.vertices.shape[2] * tool.vertices.shape[1] * near
     worst = jnp.max(jnp.where(weight > COUNTS, each.status, 0))
+    if not search:
+        deep = gap < -(tool.radius + jnp.min(shapes.radius))
+        worst = jnp.where(deep, jnp.maximum(worst, ContactStatus.NOT_CONVERGED), worst)
     return Touch(
         gap,
         point,
@@ -215,78 +202,28 @@ def touch(
     )
 
 
-def gap_bounds(tool: Shape, pose: Pose, patches: Patches) -> Float[Array, " patches"]:
-    """The broad phase: a certified lower bound of every patch's sharp gap, mm.
+def gap_bounds(
+    tool: Shape, pose: Pose, patches: Patches
+) -> tuple[Float[Array, " patches"], Float[Array, "patches 3"]]:
+    """The broad phase: a certified lower bound of each patch's sharp gap (mm), and its direction.
 
-    From the direction in which the tool is nearest to the centre of the patch. Not differentiable.
+    Roughly that between the nearest points of the cores. Not differentiable.
     """
     tool, pose, patches = jax.lax.stop_gradient((tool, pose, patches))
     moved = Shape(transform(pose, tool.vertices), tool.radius)
 
     def bound(patch, centre):
-        nearest = jnp.mean(moved.vertices, axis=1)
-        for _ in range(NEARING):  # Frank-Wolfe with exact steps
-            away = nearest - centre
-            step = moved.vertices[:, jnp.argmin(heights(moved.vertices, away))] - nearest
+        z = jnp.mean(moved.vertices, axis=1) - centre
+        for _ in range(NEARING):  # Frank-Wolfe on the difference of the cores, exact steps
+            tip = moved.vertices[:, jnp.argmin(heights(moved.vertices, z))]
+            step = tip - patch.vertices[:, jnp.argmax(heights(patch.vertices, z))] - z
             square = jnp.sum(step * step)
-            share = -jnp.sum(away * step) / jnp.where(square > 0, square, 1)
-            nearest = nearest + jnp.clip(share, 0, 1) * step
-        d = _unit(nearest - centre)
-        return -(sharp_support(patch, d) + sharp_support(moved, -d))
+            share = -jnp.sum(z * step) / jnp.where(square > 0, square, 1)
+            z = z + jnp.clip(share, 0, 1) * step
+        d = _unit(z)
+        return -(sharp_support(patch, d) + sharp_support(moved, -d)), d
 
     return jax.vmap(bound)(patches.shapes, patches.centres)
-
-
-def skeleton_coordinates(
-    line: Centreline, point: Float[Array, "3"]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Position s (mm) of the nearest point of the centreline and angle phi round it (rad).
-
-    The root of t(s) . (point - c(s)) by Newton steps, the last two of them differentiable: exact
-    up to the third derivative. Valid nearer to the line than its radius of curvature. On the line
-    itself phi is 0, with derivative 0.
-
-    Args:
-        line: the centreline.
-        point: mm; shape (3,).
-    """
-
-    def step(s, p, line):
-        c, t, bend, _ = _at(line, s)
-        slope = jnp.sum(t * t) - jnp.sum(bend * (p - c))
-        return s + jnp.sum(t * (p - c)) / jnp.maximum(slope, LEAST_SLOPE)
-
-    p, fixed = jax.lax.stop_gradient((point, line))
-    s = fixed.s[jnp.argmin(jnp.sum((fixed.points - p[None]) ** 2, axis=1))]
-    for _ in range(STEPS):
-        s = step(s, p, fixed)
-    for _ in range(LAST_STEPS):
-        s = step(s, point, line)
-    c, t, _, anterior = _at(line, s)
-    out, lateral = point - c, jnp.cross(t, anterior)
-    y, z = jnp.sum(out * anterior), jnp.sum(out * lateral)
-    on_line = (y == 0) & (z == 0)
-    return s, jnp.arctan2(jnp.where(on_line, 0, z), jnp.where(on_line, 1, y))
-
-
-def _at(line: Centreline, s):
-    """Point, first and second derivative (cubic by samples and tangents), anterior direction.
-
-    Beyond the ends the line goes on straight.
-    """
-    last = line.s.shape[0] - 1
-    h = (line.s[-1] - line.s[0]) / last
-    inside = jnp.clip(s, line.s[0], line.s[-1])
-    place = jax.lax.stop_gradient((inside - line.s[0]) / h)
-    i = jnp.clip(jnp.floor(place).astype(int), 0, last - 1)
-    u, beyond = (inside - line.s[i]) / h, s - inside
-    p0, p1, t0, t1 = line.points[i], line.points[i + 1], line.tangents[i], line.tangents[i + 1]
-    rise = (p1 - p0) / h
-    c = p0 + h * u * (t0 + u * (3 * rise - 2 * t0 - t1 + u * (t0 + t1 - 2 * rise)))
-    t = t0 + u * (6 * rise - 4 * t0 - 2 * t1 + 3 * u * (t0 + t1 - 2 * rise))
-    bend = (6 * rise - 4 * t0 - 2 * t1 + 6 * u * (t0 + t1 - 2 * rise)) / h
-    across = line.anterior[i] + u * (line.anterior[i + 1] - line.anterior[i])
-    return c + beyond * t, t, jnp.where(beyond == 0, bend, 0), across
 
 
 def _unit(v):

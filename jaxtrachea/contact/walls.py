@@ -1,0 +1,181 @@
+r"""A surface round a centreline cut into convex patches.
+
+Each patch is the convex hull of the surface between two borders, opened by a ball of radius r (all
+balls of that radius that fit into the hull): its core is the hull with every face moved
+inwards by r. Corners sharper than the ball are lost a little, by r theta^2 / 8 between two faces at
+a small angle theta; hollows are bridged. Both are measured and stored.
+
+On numbers, once; nothing here is traced.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+
+from jaxtrachea.contact.line import Centreline
+from jaxtrachea.contact.patches import Patches, check_borders
+from jaxtrachea.contact.search import coarse_directions
+from jaxtrachea.contact.shapes import ArrayLike, Shape
+
+#: Directions in which losses are measured.
+PROBES = 2000
+#: A direction or face belongs to the side of the tube where its sine to the centreline is below.
+SIDEWAYS = 0.5
+#: Distance of the samples of a curved centreline, mm.
+SPACING = 1.0
+
+
+def patches_of(
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    s: ArrayLike,
+    borders: ArrayLike,
+    *,
+    centres: ArrayLike | None = None,
+    frames: ArrayLike | None = None,
+    rounding: float = 0.5,
+    overlap: float = 0.5,
+    most: int = 32,
+    dtype=None,
+) -> Patches:
+    """The convex patches of a surface, one between every two borders.
+
+    Open ends run on beyond the first and last border, rounded.
+
+    Args:
+        vertices: of the outer surface (an inner one does no harm, but counts as `filled`), mm;
+            shape (vertices, 3).
+        faces: its triangles; shape (faces, 3).
+        s: position of every vertex along the centreline, mm; shape (vertices,).
+        borders: s of the ends and of the borders between, mm, rising; shape (patches + 1,).
+        centres: point of the centreline beside each vertex, mm; None: straight along x, (s, 0, 0).
+        frames: columns tangent, anterior, lateral of the centreline there; None: identity.
+        rounding: radius r of the ball over the largest that fits, in (0, 1). More is smoother, and
+            needs fewer vertices, but loses more at corners.
+        overlap: by how much a patch runs on beyond its borders before it is rounded, mm.
+        most: vertices kept of each core, at least 4.
+        dtype: of every array; the default float type of JAX if None.
+
+    Raises:
+        ValueError: naming the argument or the span.
+    """
+    at = check_borders(borders)
+    v, s, faces = np.asarray(vertices, float), np.asarray(s, float), np.asarray(faces)
+    if v.ndim != 2 or v.shape[1] != 3 or s.shape != v.shape[:1] or not np.isfinite(v).all():
+        raise ValueError(
+            f"vertices, s: expected finite (n, 3) and (n,), found {v.shape} and {s.shape}"
+        )
+    if (centres is None) != (frames is None):
+        raise ValueError("centres, frames: expected both (a curved tube) or neither (a straight)")
+    if not 0 < rounding < 1 or not overlap >= 0 or most < 4:
+        raise ValueError(
+            "rounding, overlap, most: expected in (0, 1), not below 0 and at least 4, found "
+            f"{rounding:g}, {overlap:g}, {most}"
+        )
+    if centres is not None and frames is not None:
+        centres, frames = np.asarray(centres, float), np.asarray(frames, float)
+    line = _line(s, centres, frames, at)
+    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    made = []
+    for low, high in zip(at[:-1], at[1:], strict=True):
+        try:
+            a, b = np.clip((low - overlap, high + overlap), s.min(), s.max())
+            ends = [_section(v, s, edges, x) for x in (a, b)]
+            inside = v[(s >= a) & (s <= b)]
+            own = np.concatenate(
+                [
+                    _section(v, s, edges, low),
+                    _section(v, s, edges, high),
+                    v[(s >= low) & (s <= high)],
+                ]
+            )
+            made.append(_patch(inside, ends, own, _station(line, (low, high)), rounding, most))
+        except (QhullError, ValueError) as error:
+            raise ValueError(
+                f"the surface between s = {low:g} and {high:g} mm encloses nothing: "
+                f"{len(inside)} vertices; expected a tube round its centreline there"
+            ) from error
+    count = max(p[0].shape[1] for p in made)
+    cores = np.stack([_filled_up(p[0], count) for p in made])
+    cast = lambda x: jnp.asarray(np.asarray(x), jnp.zeros(0, dtype).dtype)  # noqa: E731
+    shapes = Shape(cast(cores), cast([p[1] for p in made]))
+    middles, lost, filled = (cast([p[i] for p in made]) for i in (2, 3, 4))
+    return Patches(shapes, middles, Centreline(*map(cast, line)), lost, filled)
+
+
+def _line(s, centres, frames, at):
+    """Even samples of s, point, tangent and anterior of the centreline."""
+    if centres is None or frames is None:
+        x = at[[0, -1]]
+        axes = np.eye(3)[:, None].repeat(2, axis=1)
+        return x, x[:, None] * axes[0], axes[0], axes[1]
+    known, first = np.unique(s, return_index=True)
+    x = np.linspace(known[0], known[-1], int(np.ptp(known) / SPACING) + 2)
+    spread = lambda rows: np.stack([np.interp(x, known, r) for r in rows[first].T], axis=1)  # noqa: E731
+    points, tangents, anterior = map(spread, (centres, frames[:, :, 0], frames[:, :, 1]))
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    anterior -= np.sum(anterior * tangents, axis=1, keepdims=True) * tangents
+    return x, points, tangents, anterior / np.linalg.norm(anterior, axis=1, keepdims=True)
+
+
+def _station(line, at):
+    """Point in the middle of a span, and the tangents at its middle and both of its ends."""
+    x, points, tangents, _ = line
+    pick = lambda rows, y: np.array([np.interp(y, x, r) for r in rows.T])  # noqa: E731
+    middle = (at[0] + at[1]) / 2
+    beyond = middle - np.clip(middle, x[0], x[-1])
+    return pick(points, middle) + beyond * tangents[0], [pick(tangents, y) for y in (middle, *at)]
+
+
+def _section(v, s, edges, at):
+    """Points where the edges cross s = at; none beyond the ends."""
+    i, j = edges.T
+    i, j = np.where(s[i] <= s[j], i, j), np.where(s[i] <= s[j], j, i)
+    cut = (s[i] <= at) & (s[j] >= at) & (s[j] > s[i])
+    i, j = i[cut], j[cut]
+    return v[i] + ((at - s[i]) / (s[j] - s[i]))[:, None] * (v[j] - v[i])
+
+
+def _patch(inside, ends, own, station, rounding, most):
+    """Core (3, n), radius, middle, lost and filled of one patch."""
+    middle, (t, t_low, t_high) = station
+    points = np.concatenate([inside, *ends])
+    side = _sides(ConvexHull(points), t)
+    largest = (-(side[:, :3] @ middle) - side[:, 3]).min()
+    filled = (-(own @ side[:, :3].T) - side[:, 3]).min(axis=1).max()
+    r = rounding * largest
+    grown = np.concatenate([points, ends[0] - r * t_low, ends[1] + r * t_high])
+    hull = ConvexHull(grown)
+    planes = np.unique(np.round(hull.equations, 12), axis=0)
+    planes[:, 3] += r
+    core = HalfspaceIntersection(planes, middle).intersections
+    core = core[ConvexHull(core).vertices]
+    d = coarse_directions(PROBES)[0]
+    kept = core[_extreme(core @ d.T, most)]
+    lost = (own @ d.T - (kept @ d.T).max(axis=0)).max() - r
+    return kept.T, r, middle, max(lost, 0), max(filled, 0)
+
+
+def _sides(hull, t):
+    """The hull's faces that look sideways."""
+    sideways = np.abs(hull.equations[:, :3] @ t) < SIDEWAYS
+    return hull.equations[sideways]
+
+
+def _extreme(heights, most):
+    """Of the rows (vertices by directions) up to `most` that keep the maxima best, one by one."""
+    full, chosen = heights.max(axis=0), []
+    reached = np.full_like(full, -np.inf)
+    while len(chosen) < min(most, len(heights)):
+        worst = np.argmax(full - reached)
+        if full[worst] - reached[worst] <= 0:
+            break
+        chosen.append(int(heights[:, worst].argmax()))
+        reached = np.maximum(reached, heights[chosen[-1]])
+    return chosen
+
+
+def _filled_up(core, count):
+    """More vertices in the middle of the core, where they weigh nothing."""
+    middle = core.mean(axis=1, keepdims=True)
+    return np.concatenate([core, np.repeat(middle, count - core.shape[1], axis=1)], axis=1)
