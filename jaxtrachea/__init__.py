@@ -25,18 +25,18 @@ if TYPE_CHECKING:
     from jaxtrachea.oblique import ObliquePress as ObliquePress
     from jaxtrachea.oblique import press_oblique as press_oblique
     from jaxtrachea.oblique import press_path as press_path
-    from jaxtrachea.scene import Plan as Plan
-    from jaxtrachea.scene import PlanError as PlanError
-    from jaxtrachea.scene import Wishes as Wishes
-    from jaxtrachea.simulation import Simulation as Simulation
-    from jaxtrachea.simulation import simulate as simulate
-    from jaxtrachea.simulation import sweep as sweep
+    from jaxtrachea.scene.plan import Plan as Plan
+    from jaxtrachea.scene.plan import PlanError as PlanError
+    from jaxtrachea.scene.plan import Wishes as Wishes
+    from jaxtrachea.scene.simulation import Simulation as Simulation
+    from jaxtrachea.scene.simulation import simulate as simulate
+    from jaxtrachea.scene.simulation import sweep as sweep
+    from jaxtrachea.scene.stage import Poses as Poses
+    from jaxtrachea.scene.stage import Presses as Presses
+    from jaxtrachea.scene.stage import Scene as Scene
+    from jaxtrachea.scene.stage import make_scene as make_scene
     from jaxtrachea.skeleton import Skeleton as Skeleton
     from jaxtrachea.skeleton import skeleton_response as skeleton_response
-    from jaxtrachea.stage import Poses as Poses
-    from jaxtrachea.stage import Presses as Presses
-    from jaxtrachea.stage import Scene as Scene
-    from jaxtrachea.stage import make_scene as make_scene
     from jaxtrachea.status import FitStatus as FitStatus
     from jaxtrachea.status import PressStatus as PressStatus
     from jaxtrachea.trachea.geometry import Geometry as Geometry
@@ -50,9 +50,9 @@ _HOME = {
     "mechanics.force_law": ("Law", "duffing"),
     "model": ("Options", "Press", "press"),
     "oblique": ("ObliquePath", "ObliquePress", "press_oblique", "press_path"),
-    "scene": ("Plan", "PlanError", "Wishes"),
-    "simulation": ("Simulation", "simulate", "sweep"),
-    "stage": ("Poses", "Presses", "Scene", "make_scene"),
+    "scene.plan": ("Plan", "PlanError", "Wishes"),
+    "scene.simulation": ("Simulation", "simulate", "sweep"),
+    "scene.stage": ("Poses", "Presses", "Scene", "make_scene"),
     "skeleton": ("Skeleton", "skeleton_response"),
     "status": ("FitStatus", "PressStatus"),
     "trachea.geometry": ("Geometry", "table_1"),

@@ -18,8 +18,8 @@ MANY = 12
 
 def plan(scene: SceneArgument) -> None:
     """Say which effects a scene calls for, why, and what each costs; compute nothing else."""
-    from jaxtrachea.scene_results import plan_rows
-    from jaxtrachea.scene_study import shares
+    from jaxtrachea.scene.build import shares
+    from jaxtrachea.scene.results import plan_rows
 
     _, staged = _staged(scene)
     whole, found = shares(staged)
@@ -36,8 +36,8 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     import jax
     import numpy as np
 
-    from jaxtrachea.scene_results import last_solved, write_meshes, write_simulation
-    from jaxtrachea.simulation import simulate as run
+    from jaxtrachea.scene.results import last_solved, write_meshes, write_simulation
+    from jaxtrachea.scene.simulation import simulate as run
     from jaxtrachea.status import PressStatus
 
     clock = [time.perf_counter()]
@@ -69,9 +69,9 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
     import jax
     import numpy as np
 
-    from jaxtrachea.scene_plots import draw_sweep
-    from jaxtrachea.scene_results import write_sweep
-    from jaxtrachea.simulation import sweep as run
+    from jaxtrachea.scene.plots import draw_sweep
+    from jaxtrachea.scene.results import write_sweep
+    from jaxtrachea.scene.simulation import sweep as run
     from jaxtrachea.status import PressStatus
 
     clock = [time.perf_counter()]
@@ -122,12 +122,12 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
 def _staged(path: Path):
     """Specification and scene; input errors become `Stop`."""
     from jaxtrachea.config import SpecError
-    from jaxtrachea.config_scene import load_scene_spec
+    from jaxtrachea.scene.spec import load_scene_spec
 
     try:
         spec = load_scene_spec(path)
         use_float64()
-        from jaxtrachea.scene_study import stage
+        from jaxtrachea.scene.build import stage
 
         return spec, stage(spec, path.parent)
     except SpecError as error:
@@ -140,7 +140,7 @@ def _default(scene: Path, ending: str = "") -> Path:
 
 
 def _rows(staged) -> int:
-    from jaxtrachea.stage import Presses
+    from jaxtrachea.scene.stage import Presses
 
     path = staged.path
     return len(path.s if isinstance(path, Presses) else path.translation)
@@ -149,8 +149,8 @@ def _rows(staged) -> int:
 def _draw(folder: Path, title: str, scene, out) -> None:
     import numpy as np
 
-    from jaxtrachea.scene_plots import draw_series, draw_surface
-    from jaxtrachea.scene_results import last_solved
+    from jaxtrachea.scene.plots import draw_series, draw_surface
+    from jaxtrachea.scene.results import last_solved
 
     draw_series(out).savefig(folder / "series.png")
     row = last_solved(out)

@@ -9,8 +9,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from jaxtrachea.simulation import Simulation, Sweep
-from jaxtrachea.stage import Scene
+from jaxtrachea.scene.simulation import Simulation, Sweep
+from jaxtrachea.scene.stage import Scene
 
 
 def draw_surface(scene: Scene, vertices: np.ndarray, title: str = "", span: float = 45.0) -> Figure:

@@ -1,156 +1,18 @@
-"""What a scene calls for: from its facts to a static `Plan`, each choice with its reason.
+"""The rules: from facts and wishes to a `Plan`, each choice with its reason (docs/scenes.md).
 
-The plan selects the program that is compiled (`simulate`); an effect that is off adds no operation
-to it. What is not wished for is chosen by the rules below (docs/scenes.md); a wish that cannot be
-met is refused, never dropped.
+What is not wished for is chosen here; a wish that cannot be met is refused, never dropped.
 """
 
-import dataclasses
 import math
 from typing import Literal, get_args
 
 from jaxtrachea.model import Options
+from jaxtrachea.scene.plan import Effect, Facts, Plan, PlanError, Wishes
 from jaxtrachea.skeleton import Rings
 from jaxtrachea.surface.regions import Method
 
-Switch = Literal["auto", "on", "off"]
-
 #: Angle (rad) and share of the motion below which something counts as not there.
 SMALL = 1e-6
-
-
-class PlanError(ValueError):
-    """A wish that this scene cannot meet: the effect, what was found, the cure."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Facts:
-    """What the rules read of a scene; numbers in mm and rad.
-
-    Attributes:
-        poses: the path is given as motions of the tool, not as presses at contact points.
-        angle: largest |phi| of a contact.
-        seats: whether the contacts of the path lie in more than one place.
-        along: largest axial motion of the tool while it touches, against its whole motion.
-        across: the same round the tube.
-        slip: largest motion of the tool along the surface while it touches, mm.
-        spacing: smallest distance of two rings, mm.
-        friction: whether the tool has a coefficient of friction.
-        known: optional values of the material that are there.
-        mesh: whether there is a surface.
-        near: whether the contact comes near a vertex of it.
-    """
-
-    poses: bool = False
-    angle: float = 0.0
-    seats: bool = False
-    along: float = 0.0
-    across: float = 0.0
-    slip: float = 0.0
-    spacing: float = math.inf
-    friction: bool = False
-    known: frozenset[str] = frozenset()
-    mesh: bool = True
-    near: bool = True
-
-
-@dataclasses.dataclass(frozen=True)
-class Wishes:
-    """What the user asks for; `auto` leaves it to the rules.
-
-    Attributes:
-        seat: `first`: the tool stays on the place it touched first; `each`: every row is a press of
-            its own, frictionless along the surface.
-        friction: Coulomb friction along the path.
-        second_plane: bending along the circumference, vectors; off: a normal press on the midline.
-        rings: see `skeleton_response`.
-        axial: the ligament stretches.
-        shear: it shears.
-        two_material: the rings have a local law of their own.
-        end_motion: the clamps move on axial springs, and the surface with them.
-        surface: method of interpolation, or off.
-        dent: centres of the local correction, or off.
-        want_surface: deformed vertices are asked for.
-        want_joints: joints and their loads are asked for.
-        want_ring_ends: ends of the rings are asked for.
-        coupling: see `Options`; with `contact`, `onset_width` and `transition`.
-        contact: -
-        onset_width: -
-        transition: -
-    """
-
-    seat: Literal["auto", "first", "each"] = "auto"
-    friction: Switch = "auto"
-    second_plane: Switch = "auto"
-    rings: Literal["auto", "mat", "arch", "arch2"] = "auto"
-    axial: Switch = "auto"
-    shear: Switch = "auto"
-    two_material: Switch = "auto"
-    end_motion: Switch = "auto"
-    surface: Literal["auto", "off", "linear", "hermite", "phong"] = "auto"
-    dent: Literal["auto", "off", "8", "16", "32"] = "auto"
-    want_surface: bool = True
-    want_joints: bool = True
-    want_ring_ends: bool = True
-    coupling: Literal["series", "total"] = "series"
-    contact: Literal["unilateral", "bonded"] = "unilateral"
-    onset_width: float = 1e-3
-    transition: float | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Effect:
-    """One decision: its level (`on`, `off` or a word), the reason, and whether it was forced."""
-
-    name: str
-    level: str
-    reason: str
-    forced: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
-class Plan:
-    """The program of a scene; hashable, equal where the programs are. Fields as in `Wishes`.
-
-    Attributes:
-        dent: number of centres, 0: off.
-        options: of the model.
-        effects: all decisions in words; they do not count in comparisons.
-    """
-
-    contact: bool
-    seat: Literal["first", "each"]
-    friction: bool
-    second_plane: bool
-    rings: Rings
-    axial: bool
-    end_motion: bool
-    surface: Method | None
-    dent: int
-    joints: bool
-    ring_ends: bool
-    options: Options
-    effects: tuple[Effect, ...] = dataclasses.field(default=(), compare=False, repr=False)
-
-    def without(self, name: str) -> "Plan | None":
-        """The plan with one effect less, or None where none can be taken away alone."""
-        off: dict[str, dict] = {
-            "friction": {"friction": False},
-            "axial": {"axial": False, "end_motion": False},
-            "end_motion": {"end_motion": False},
-            "surface": {"surface": None, "dent": 0, "end_motion": False},
-            "dent": {"dent": 0},
-            "joints": {"joints": False},
-            "ring_ends": {"ring_ends": False},
-            "rings": {"rings": "mat"},
-            "shear": {"options": dataclasses.replace(self.options, shear=False)},
-            "two_material": {"options": dataclasses.replace(self.options, local="uniform")},
-        }
-        if name == "second_plane" and self.second_plane and not self.friction:
-            return dataclasses.replace(self, second_plane=False, rings="mat", axial=False,
-                                       end_motion=False)  # fmt: skip
-        less = dataclasses.replace(self, **off[name]) if name in off else self
-        return None if less == self else less
 
 
 class _Decisions:
@@ -204,6 +66,13 @@ def make_plan(facts: Facts, wishes: Wishes = Wishes()) -> Plan:  # noqa: B008 (f
         d.note("contact", "on", "the path is given as positions of the tool")
     else:
         d.note("contact", "off", "the contact points are given")
+    curved = facts.poses and facts.curved
+    if facts.curved:
+        d.note(
+            "curved", "on" if curved else "off",
+            "the mesh is bent: motions are turned into the frame of its centreline at the contact"
+            if curved else "displacements are given along the centreline's own frame",
+        )  # fmt: skip
     seat = _seat(d, facts)
     friction = _friction(d, facts, seat)
     sideways = facts.along > SMALL or facts.across > SMALL
@@ -235,7 +104,7 @@ def make_plan(facts: Facts, wishes: Wishes = Wishes()) -> Plan:  # noqa: B008 (f
         onset_width=wishes.onset_width, transition=wishes.transition,
     )  # fmt: skip
     return Plan(
-        facts.poses, seat, friction, second, rings, axial, end_motion, surface, dent,
+        facts.poses, curved, seat, friction, second, rings, axial, end_motion, surface, dent,
         wishes.want_joints, wishes.want_ring_ends, options, tuple(d.effects),
     )  # fmt: skip
 

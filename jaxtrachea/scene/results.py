@@ -6,9 +6,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from jaxtrachea.scene import Plan
-from jaxtrachea.simulation import Simulation, Sweep
-from jaxtrachea.stage import Poses, Presses, Scene
+from jaxtrachea.scene.plan import Plan
+from jaxtrachea.scene.simulation import Simulation, Sweep
+from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.status import PressStatus
 
 SCHEMA, SCHEMA_VERSION = "jaxtrachea-simulation", 1

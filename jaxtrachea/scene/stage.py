@@ -9,7 +9,10 @@ from jaxtyping import Array, Float
 from jaxtrachea.contact.patches import Patches, Touch, straight_patches, touch
 from jaxtrachea.contact.pose import Pose
 from jaxtrachea.contact.shapes import Shape
-from jaxtrachea.scene import Facts, Plan, PlanError, Wishes, make_plan
+from jaxtrachea.contact.walls import patches_of
+from jaxtrachea.scene.curve import frame_at
+from jaxtrachea.scene.plan import Facts, Plan, PlanError, Wishes
+from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.surface import regions
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -21,7 +24,7 @@ ROUNDING = 1e-6
 #: Distance between the circles of the dent's centres: share of the tool's size; mm at least.
 FOOTPRINT, LEAST = 0.6, 4.0
 
-#: Patches of the tube searched for a contact.
+#: Patches of the tube searched for a contact with a tool shorter than one of them.
 NEAR = 2
 
 
@@ -40,7 +43,7 @@ class Presses(eqx.Module):
 
 
 class Poses(eqx.Module):
-    """A tool's positions in the tube frame, in order.
+    """A tool's positions in the frame of the mesh (without one: of the tube), in order.
 
     Attributes:
         rotation: shape (rows, 3, 3).
@@ -58,6 +61,7 @@ class Scene(eqx.Module):
         geometry: the tube at rest.
         radius: of the tube's outside, where a tool touches it and the dent lies, mm.
         tube: its outside as convex patches, for a tool; or None.
+        near: number of patches searched for a contact (static).
         tool: its shape about its own origin, or None.
         friction: Coulomb's coefficient of the tool, or None.
         mesh: the surface at rest, or None.
@@ -74,13 +78,14 @@ class Scene(eqx.Module):
     mesh: Mesh | None
     binding: regions.Binding | None
     footprint: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    near: int = eqx.field(static=True)
     plan: Plan = eqx.field(static=True)
 
 
 def touch_tube(scene: Scene, path: Poses) -> Touch:
-    """Contact of the tool with the round tube at rest, row by row, batched.
+    """Contact of the tool with the tube at rest, row by row, batched.
 
-    The tube is straight, a cylinder of `scene.radius` with round lids, without relief.
+    The tube is that of the mesh; without a mesh a straight cylinder of `scene.radius`.
 
     Raises:
         ValueError: no tool.
@@ -88,8 +93,7 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
     if scene.tool is None or scene.tube is None:
         raise ValueError("scene.tool is None; contact needs a tool")
     tool, tube = scene.tool, scene.tube
-    near = min(NEAR, tube.centres.shape[0])
-    one = lambda R, T: touch(tool, Pose(R, T), tube, near=near)  # noqa: E731
+    one = lambda R, T: touch(tool, Pose(R, T), tube, near=scene.near)  # noqa: E731
     return jax.vmap(one)(path.rotation, path.translation)
 
 
@@ -121,38 +125,61 @@ def make_scene(
     """
     dtype = geometry.length.dtype
     outer = geometry.radius + 1.3 if radius is None else jnp.asarray(radius, dtype)
-    size, tube = LEAST, None
+    if isinstance(path, Poses) and tool is None:
+        raise PlanError("contact: the path moves a tool, but there is none; give a tool")
+    size, tube, near = LEAST, None, 1
+    if tool is not None and isinstance(path, Poses):
+        tube = _round(geometry, float(outer)) if mesh is None else _walls(geometry, mesh)
+        near = _near_patches(tool, geometry, tube.centres.shape[0])
     if tool is not None:
-        tube = straight_patches(_borders(geometry), float(outer), dtype=dtype)
         extent = np.ptp(np.asarray(tool.vertices), axis=1).min() / 2 + float(tool.radius)
         size = max(FOOTPRINT * extent, LEAST)
-    if isinstance(path, Poses):
-        if tool is None:
-            raise PlanError("contact: the path moves a tool, but there is none; give a tool")
-        if mesh is not None and mesh.frames is not None:
-            raise PlanError(
-                "contact: the mesh is curved, and contact with a moving tool is built for straight "
-                "tubes only; give the path as presses at contact points (s, phi, displacement)"
-            )
     mu = None if friction is None else jnp.asarray(friction, dtype)
     binding = None if mesh is None else regions.bind(mesh, geometry)
     spacing = jnp.asarray(size, dtype)
     placeholder = make_plan(Facts(mesh=mesh is not None), Wishes(want_surface=False))
-    scene = Scene(geometry, outer, tube, tool, mu, mesh, binding, spacing, placeholder)
+    fixed = geometry, outer, tube, tool, mu
+    scene = Scene(*fixed, mesh, binding, spacing, near, placeholder)
     plan = make_plan(facts_of(scene, material, path), wishes)
     if plan.surface is None:
         mesh = binding = None
-    return Scene(geometry, outer, tube, tool, mu, mesh, binding, spacing, plan)
+    return Scene(*fixed, mesh, binding, spacing, near, plan)
 
 
-def _borders(geometry: Geometry) -> np.ndarray:
-    """Patches about as long as the tube is wide, so that their rounding is small."""
-    length, radius = float(geometry.length), float(geometry.radius)
-    return np.linspace(0, length, max(round(length / (2 * radius)), 1) + 1)
+def _round(geometry: Geometry, radius: float) -> Patches:
+    """A straight cylinder, in patches about as long as it is wide: so their rounding is small."""
+    length = float(geometry.length)
+    borders = np.linspace(0, length, max(round(length / (2 * float(geometry.radius))), 1) + 1)
+    return straight_patches(borders, radius, dtype=geometry.length.dtype)
+
+
+def _walls(geometry: Geometry, mesh: Mesh) -> Patches:
+    """The surface of a mesh, cut midway between the rings: each patch bulges with its ring."""
+    numbers = (mesh.vertices, mesh.faces, mesh.s, mesh.phi, mesh.distance)
+    vertices, faces, s, phi, distance = (np.asarray(v) for v in numbers)
+    centres = frames = None
+    if mesh.frames is not None:
+        frames = np.asarray(mesh.frames)
+        across = np.stack([distance * np.cos(phi), distance * np.sin(phi)], axis=1)
+        centres = vertices - np.einsum("vij,vj->vi", frames[:, :, 1:], across)
+    ring = np.asarray(geometry.ring_positions, float)
+    ends = max(float(s.min()), 0.0), min(float(s.max()), float(geometry.length))
+    between = (ring[1:] + ring[:-1]) / 2
+    borders = np.array([ends[0], *between[(between > ends[0]) & (between < ends[1])], ends[1]])
+    return patches_of(
+        vertices, faces, s, borders, centres=centres, frames=frames, dtype=geometry.length.dtype
+    )
+
+
+def _near_patches(tool: Shape, geometry: Geometry, count: int) -> int:
+    """As many patches as the tool can lie along, and one more."""
+    length = np.ptp(np.asarray(tool.vertices), axis=1).max() + 2 * float(tool.radius)
+    return min(NEAR + int(length * count / float(geometry.length)), count)
 
 
 def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> Facts:
     """What the rules need to know of a scene and its path."""
+    curved = scene.mesh is not None and scene.mesh.frames is not None
     optional = ("GA_L", "k_1_ring", "EA_L", "k_A", "k_B", "EI_C", "k_t")
     if isinstance(path, Poses):
         seen = jax.jit(touch_tube)(scene, path)
@@ -161,6 +188,8 @@ def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> Facts:
         touching = gap < 0
         row = int(np.argmax(touching)) if touching.any() else int(np.argmin(gap))
         moved = _body(path, row, points[row]) - points[row]
+        if curved and scene.tube is not None:
+            moved = moved @ np.asarray(frame_at(scene.tube.line, jnp.asarray(s[row])))
         depth = np.maximum(-gap[row], 0)
         at = slice(row, row + 1)
     else:
@@ -187,6 +216,7 @@ def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> Facts:
         friction=scene.friction is not None,
         known=frozenset(name for name in optional if getattr(material, name) is not None),
         mesh=scene.mesh is not None,
+        curved=curved,
         near=_near(scene, s, phi),
     )  # fmt: skip
 

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
-from jaxtrachea.config_scene import PathSection, SceneSpec, SceneTracheaSection, ToolSection
 from jaxtrachea.contact import shapes
 from jaxtrachea.contact.pose import pose_from_vector
 from jaxtrachea.identify.study import geometry_of
-from jaxtrachea.operations import count_operations
-from jaxtrachea.scene import PlanError, Wishes
-from jaxtrachea.simulation import simulate
-from jaxtrachea.stage import Poses, Presses, Scene, make_scene
+from jaxtrachea.scene.operations import count_operations
+from jaxtrachea.scene.plan import PlanError, Wishes
+from jaxtrachea.scene.simulation import simulate
+from jaxtrachea.scene.spec import PathSection, SceneSpec, SceneTracheaSection, ToolSection
+from jaxtrachea.scene.stage import Poses, Presses, Scene, make_scene
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.imported import read_mesh
 from jaxtrachea.trachea.material import Material
