@@ -19,12 +19,14 @@ class Approach(NamedTuple):
     Attributes:
         seen: contact of every row with the tube at rest.
         presses: displacements along (tangent, anterior, lateral) at the contact.
+        inward: normal of the straight tube at the contact; shape (rows, 3).
         first: row of first touch, where the tool stays; None: every row is a press of its own.
         frame: those directions as columns in the frame of the mesh; None: straight tube, identity.
     """
 
     seen: Touch
     presses: Presses
+    inward: Float[Array, "rows 3"]
     first: Int[Array, ""] | None
     frame: Float[Array, "rows 3 3"] | None
 
@@ -39,7 +41,7 @@ def approach(scene: Scene, path: Poses) -> Approach:
         frame = jax.vmap(lambda s: frame_at(line, s))(seen.s)
     if scene.plan.seat == "each":
         presses = Presses(seen.s, seen.phi, -seen.gap[:, None] * inward)
-        return Approach(seen, presses, None, frame)
+        return Approach(seen, presses, inward, None, frame)
     rows = seen.gap.shape[0]
     touching = seen.gap < 0
     first = jnp.where(jnp.any(touching), jnp.argmax(touching), jnp.argmin(seen.gap))
@@ -48,7 +50,7 @@ def approach(scene: Scene, path: Poses) -> Approach:
         D = jnp.where((jnp.arange(rows) >= first)[:, None], D, 0)
     spread = lambda v: jnp.broadcast_to(_at(v, first), v.shape)  # noqa: E731
     presses = Presses(spread(seen.s), spread(seen.phi), D)
-    return Approach(seen, presses, first, None if frame is None else spread(frame))
+    return Approach(seen, presses, spread(inward), first, None if frame is None else spread(frame))
 
 
 def _followed(path: Poses, seen: Touch, first, inward, frame):
@@ -61,7 +63,7 @@ def _followed(path: Poses, seen: Touch, first, inward, frame):
     pose = Pose(_at(path.rotation, first), _at(path.translation, first))
     body = transform(inverse(pose), _at(seen.tool_point, first)[:, None])[:, 0]
     points = jax.vmap(lambda R, T: R @ body + T)(path.rotation, path.translation)
-    way = points - _at(points, first)
+    way = points - _at(points, first)[None]
     if frame is not None:
         way = way @ frame
     gap = _at(seen.gap, first)
@@ -69,20 +71,19 @@ def _followed(path: Poses, seen: Touch, first, inward, frame):
     left = jnp.where(closing > 0, -gap / jnp.where(closing > 0, closing, 1), 0)
     step = -_at(way, before)
     step = step - jnp.dot(step, inward) * inward
-    return way + left * step - gap * inward
+    return way + (left * step - gap * inward)[None]
 
 
 def backed_out(path: Poses, made: Approach) -> Poses:
     """Where the tool stands when it just touches, before it presses."""
-    inward = jax.vmap(lambda phi: local_frame(phi)[0])(made.presses.phi)
+    inward = made.inward
     if made.frame is not None:
         inward = jnp.einsum("rij,rj->ri", made.frame, inward)
-    if made.first is None:
-        return Poses(path.rotation, path.translation + made.seen.gap[:, None] * inward)
-    rotation, translation = (
-        jnp.broadcast_to(v[made.first], v.shape) for v in (path.rotation, path.translation)
-    )
-    return Poses(rotation, translation + made.seen.gap[made.first] * inward)
+    gap, rotation, translation = made.seen.gap, path.rotation, path.translation
+    if made.first is not None:
+        first = lambda v: jnp.broadcast_to(_at(v, made.first), v.shape)  # noqa: E731
+        gap, rotation, translation = first(gap), first(rotation), first(translation)
+    return Poses(rotation, translation + gap[:, None] * inward)
 
 
 def _at(v, row):

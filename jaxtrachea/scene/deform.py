@@ -33,11 +33,18 @@ def deform(
     if mesh is None or binding is None or plan.surface is None:
         raise ValueError("scene.mesh or scene.binding is None; the plan has a surface")
     method = plan.surface
-    together = plan.seat == "first"
-    weights = regions.weigh(binding, presses.phi[0]) if together else None
     straight = mesh.straight if plan.dent else None
+    radius = tool = None
+    if plan.dent > 8 and made is not None:
+        radius, tool = _distances(scene, made), backed_out(path, made)
+    where = presses.s, presses.phi, radius, tool
+    together = plan.seat == "first"
+    if together:  # one contact point for all rows: what depends on it alone is computed once
+        where = jax.tree.map(lambda v: v[0], where)
+    weights = regions.weigh(binding, where[1]) if together else None
 
-    def one(s_c, phi_c, moved, radius, tool):
+    def one(moved, where):
+        s_c, phi_c, *_ = where
         ends = _ends(scene, material, s_c, moved) if plan.end_motion else (None, None)
         keys = regions.clamped(
             s_c, moved.skeleton, moved.joints, moved.end_U, moved.end_V, moved.slopes,
@@ -46,23 +53,21 @@ def deform(
         share = regions.weigh(binding, phi_c) if weights is None else weights
         u = regions.interpolate(binding, share, keys, method=method)
         if straight is not None:
-            u = u + local.correction(_dent(scene, s_c, phi_c, moved.depth, radius, tool), straight)
+            u = u + local.correction(_dent(scene, *where, moved.depth), straight)
         return place(mesh, u)
 
-    radius = tool = None
-    if plan.dent > 8 and made is not None:
-        tool = backed_out(path, made)
-        radius = _distances(scene, made)
     moved = moved._replace(slip=None, dissipated=None, status=None)
-    return jax.vmap(one)(presses.s, presses.phi, moved, radius, tool)
+    return jax.vmap(one, (0, None if together else 0))(moved, where)
 
 
 def _distances(scene: Scene, made: Approach):
     """Distance of the contacts from the centreline, mm; of the first for all if they share it."""
     assert scene.tube is not None
     line, seen = scene.tube.line, made.seen
-    found = jax.vmap(lambda s, point: distance_from(line, s, point))(seen.s, seen.point)
-    return found if made.first is None else jnp.broadcast_to(found[made.first], found.shape)
+    if made.first is None:
+        return jax.vmap(lambda s, point: distance_from(line, s, point))(seen.s, seen.point)
+    found = distance_from(line, seen.s[made.first], seen.point[made.first])
+    return jnp.broadcast_to(found, seen.s.shape)
 
 
 def _ends(scene: Scene, material: Material, s_c, moved):
@@ -75,7 +80,7 @@ def _ends(scene: Scene, material: Material, s_c, moved):
     return along(A, material.k_A), along(F - A, material.k_B)
 
 
-def _dent(scene: Scene, s_c, phi_c, depth, radius, tool: Poses | None) -> local.Dent:
+def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.Dent:
     """The local correction for one row."""
     count, spacing = scene.plan.dent, scene.footprint
     where = local.centres(s_c, phi_c, scene.radius if radius is None else radius, spacing, count)
@@ -90,7 +95,7 @@ def _sag(tool: Shape, pose: Poses, points):
     """Distance of the tool, just touching, from points of the rest surface, mm."""
     if tool.vertices.shape[1] == 1:
         centre = pose.rotation @ tool.vertices[:, 0] + pose.translation
-        off = points - centre
+        off = points - centre[None]
         return jnp.maximum(jnp.sqrt(jnp.sum(off * off, axis=1)) - tool.radius, 0)
     point = sphere(jnp.zeros_like(tool.radius))
 

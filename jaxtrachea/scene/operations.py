@@ -12,7 +12,7 @@ from typing import Any
 import jax
 
 #: Moves of data, not operations.
-FREE = {"reshape", "broadcast_in_dim", "squeeze", "transpose", "slice", "concatenate", "copy",
+FREE = {"reshape", "broadcast_in_dim", "squeeze", "stack", "transpose", "slice", "concatenate", "copy",
         "convert_element_type", "stop_gradient", "iota", "rev", "pad", "split",
         "expand_dims"}  # fmt: skip
 

@@ -102,11 +102,8 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
     if plan.contact != isinstance(path, Poses):
         kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
         raise ValueError(f"path is {type(path).__name__}; expected {kinds[not plan.contact]}")
-    if isinstance(path, Poses):
-        made = approach(scene, path)
-        presses = _on_tube(scene, made.presses)
-    else:
-        made, presses = None, _on_tube(scene, path)
+    made = approach(scene, path) if isinstance(path, Poses) else None
+    presses, refused = _refuse(scene, path if isinstance(path, Presses) else None, made)
     moved = (_vectors if plan.second_plane else _one_plane)(scene, material, presses)
     vertices = None
     if plan.surface is not None:
@@ -118,21 +115,35 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
         optional(plan.joints, moved.joints), optional(plan.joints, moved.loads),
         optional(plan.ring_ends, moved.end_U), optional(plan.ring_ends, moved.end_V),
         moved.slip, moved.dissipated, None if made is None else made.frame, vertices,
-        _status(scene, presses, moved.status, made),
+        _status(moved.status, made, refused),
     )  # fmt: skip
 
 
-def _status(scene: Scene, presses: Presses, status, made: Approach | None):
-    """That of the press, of the contact, and of rows that the plan does not cover."""
+def _refuse(scene: Scene, path: Presses | None, made: Approach | None):
+    """The presses, NaN where they are refused; and the rows refused, by status."""
+    assert path is not None or made is not None
+    presses = path if made is None else made.presses
+    D, refused = presses.displacement, {}
+    if made is not None:
+        outside = ~((presses.s >= 0) & (presses.s <= scene.geometry.length))
+        presses_in = jnp.sum(D * made.inward, axis=1) > 0
+        refused[PressStatus.OFF_TUBE] = outside & presses_in
+    if not scene.plan.second_plane:
+        refused[PressStatus.OFF_PLAN] = _off_plan(presses)
+    for rows in refused.values():
+        D = jnp.where(rows[:, None], jnp.nan, D)
+    return Presses(presses.s, presses.phi, D), refused
+
+
+def _status(status, made: Approach | None, refused: dict[PressStatus, Array]):
+    """That of the press; of the contact where it is in doubt; of the rows refused."""
     if made is not None:
         seen = made.seen.status
         seen = seen if made.first is None else jnp.broadcast_to(seen[made.first], seen.shape)
         unsure = (seen > ContactStatus.FLAT) & (status == PressStatus.OK)
         status = jnp.where(unsure, PressStatus.UNSURE, status)
-        inside = (presses.s >= 0) & (presses.s <= scene.geometry.length)
-        status = jnp.where(~inside & (status > 0), PressStatus.OFF_TUBE, status)
-    if not scene.plan.second_plane:
-        status = jnp.where(_covered(presses), status, PressStatus.OFF_PLAN)
+    for code, rows in refused.items():
+        status = jnp.where(rows, code, status)
     return status.astype(jnp.int8)
 
 
@@ -188,24 +199,11 @@ class _Moved(NamedTuple):
     dissipated: Any = None
 
 
-def _on_tube(scene: Scene, presses: Presses) -> Presses:
-    """NaN for what is pressed beyond the ends or, in one plane, off the plan."""
-    D = presses.displacement
-    if scene.plan.contact:
-        inside = (presses.s >= 0) & (presses.s <= scene.geometry.length)
-        idle = jnp.sum(D * jax.vmap(lambda phi: local_frame(phi)[0])(presses.phi), axis=1) <= 0
-        D = jnp.where((inside | idle)[:, None], D, jnp.nan)
-    if not scene.plan.second_plane:
-        D = jnp.where(_covered(presses)[:, None], D, jnp.nan)
-    return Presses(presses.s, presses.phi, D)
-
-
-def _covered(presses: Presses):
-    """Rows that are normal presses on the midline."""
+def _off_plan(presses: Presses):
+    """Rows that are no normal presses on the midline."""
     D = jnp.abs(presses.displacement)
-    return (jnp.abs(presses.phi) <= COVERED) & ~(
-        jnp.maximum(D[:, 0], D[:, 2]) > COVERED * D[:, 1] + COVERED
-    )
+    oblique = jnp.maximum(D[:, 0], D[:, 2]) > COVERED * D[:, 1] + COVERED
+    return ~(jnp.abs(presses.phi) <= COVERED) | oblique
 
 
 def _one_plane(scene: Scene, material: Material, presses: Presses) -> _Moved:
@@ -224,13 +222,13 @@ def _one_plane(scene: Scene, material: Material, presses: Presses) -> _Moved:
         unit = jax.tree.map(lambda v: jnp.broadcast_to(v, (inward.shape[0], *v.shape)), unit)
     else:
         unit, solved = jax.vmap(at)(presses.s, inward)
-    F = solved.force
-    per_ring = lambda v: _anterior(-F[:, None] * v)  # noqa: E731
+    F = -solved.force  # along y
+    per_ring = lambda v: _anterior(F[:, None] * v)  # noqa: E731
     joints = per_ring(unit.w)
     slope = lambda v: jnp.stack([v, jnp.zeros_like(v)], -1)  # noqa: E731
     return _Moved(
-        _anterior(-F), _anterior(-solved.depth), _anterior(-F * unit.w_C),
-        slope(-F * unit.theta_C), joints, slope(-F[:, None] * unit.theta),
+        _anterior(F), _anterior(-solved.depth), _anterior(F * unit.w_C),
+        slope(F * unit.theta_C), joints, slope(F[:, None] * unit.theta),
         per_ring(unit.reaction), joints, joints, solved.status,
     )  # fmt: skip
 

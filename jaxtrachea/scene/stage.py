@@ -26,6 +26,8 @@ FOOTPRINT, LEAST = 0.6, 4.0
 
 #: Patches of the tube searched for a contact with a tool shorter than one of them.
 NEAR = 2
+#: Patches of a mesh: their rounding, and corners of each (docs/scenes.md says what that loses).
+ROUNDED, CORNERS = 0.15, 128
 
 
 class Presses(eqx.Module):
@@ -167,8 +169,9 @@ def _walls(geometry: Geometry, mesh: Mesh) -> Patches:
     between = (ring[1:] + ring[:-1]) / 2
     borders = np.array([ends[0], *between[(between > ends[0]) & (between < ends[1])], ends[1]])
     return patches_of(
-        vertices, faces, s, borders, centres=centres, frames=frames, dtype=geometry.length.dtype
-    )
+        vertices, faces, s, borders, centres=centres, frames=frames, rounding=ROUNDED, most=CORNERS,
+        dtype=geometry.length.dtype,
+    )  # fmt: skip
 
 
 def _near_patches(tool: Shape, geometry: Geometry, count: int) -> int:
