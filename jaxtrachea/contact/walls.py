@@ -1,8 +1,9 @@
 r"""A surface round a centreline cut into convex patches.
 
 Each patch is the convex hull of the surface between two borders, opened by a ball of radius r (all
-balls of that radius that fit into the hull): its core is the hull with every face moved
-inwards by r. Corners sharper than the ball are lost a little, by r theta^2 / 8 between two faces at
+balls of that radius that fit into the hull): its core is the hull with every side face moved
+inwards by r, cut off by planes across the centreline at the borders.
+Corners sharper than the ball are lost a little, by r theta^2 / 8 between two faces at
 a small angle theta; hollows are bridged. Both are measured and stored.
 
 On numbers, once; nothing here is traced.
@@ -21,6 +22,8 @@ from jaxtrachea.contact.shapes import ArrayLike, Shape
 PROBES = 2000
 #: A direction or face belongs to the side of the tube where its sine to the centreline is below.
 SIDEWAYS = 0.5
+#: Planes straight across, which hold a patch together where no face looks sideways.
+ACROSS = 8
 #: Distance of the samples of a curved centreline, mm.
 SPACING = 1.0
 
@@ -89,7 +92,7 @@ def patches_of(
                     v[(s >= low) & (s <= high)],
                 ]
             )
-            made.append(_patch(inside, ends, own, _station(line, (low, high)), rounding, most))
+            made.append(_patch(inside, ends, own, _station(line, (a, b)), rounding, most))
         except (QhullError, ValueError) as error:
             raise ValueError(
                 f"the surface between s = {low:g} and {high:g} mm encloses nothing: "
@@ -139,15 +142,14 @@ def _section(v, s, edges, at):
 def _patch(inside, ends, own, station, rounding, most):
     """Core (3, n), radius, middle, lost and filled of one patch."""
     middle, (t, t_low, t_high) = station
-    points = np.concatenate([inside, *ends])
-    side = _sides(ConvexHull(points), t)
+    side = _sides(np.concatenate([inside, *ends]), t)
     largest = (-(side[:, :3] @ middle) - side[:, 3]).min()
     filled = (-(own @ side[:, :3].T) - side[:, 3]).min(axis=1).max()
     r = rounding * largest
-    grown = np.concatenate([points, ends[0] - r * t_low, ends[1] + r * t_high])
-    hull = ConvexHull(grown)
-    planes = np.unique(np.round(hull.equations, 12), axis=0)
-    planes[:, 3] += r
+    caps = np.stack(
+        [[*-t_low, (ends[0] @ t_low).min()], [*t_high, -(ends[1] @ t_high).max()]]
+    )  # the core ends there: swept by the ball, a patch is not cut off but rounded
+    planes = np.concatenate([np.unique(np.round(side, 12), axis=0) + [0, 0, 0, r], caps])
     core = HalfspaceIntersection(planes, middle).intersections
     core = core[ConvexHull(core).vertices]
     d = coarse_directions(PROBES)[0]
@@ -156,10 +158,17 @@ def _patch(inside, ends, own, station, rounding, most):
     return kept.T, r, middle, max(lost, 0), max(filled, 0)
 
 
-def _sides(hull, t):
-    """The hull's faces that look sideways."""
-    sideways = np.abs(hull.equations[:, :3] @ t) < SIDEWAYS
-    return hull.equations[sideways]
+def _sides(points, t):
+    """Planes round the points: faces of their hull that look sideways, and a few straight across.
+
+    Where the tube opens steeply there is none of the first kind; the others always close it.
+    """
+    faces = ConvexHull(points).equations
+    across = np.linalg.svd(t[None])[2][1:]
+    turn = 2 * np.pi * np.arange(ACROSS) / ACROSS
+    d = np.stack([np.cos(turn), np.sin(turn)], axis=1) @ across
+    straight = np.concatenate([d, -(points @ d.T).max(axis=0)[:, None]], axis=1)
+    return np.concatenate([faces[np.abs(faces[:, :3] @ t) < SIDEWAYS], straight])
 
 
 def _extreme(heights, most):
