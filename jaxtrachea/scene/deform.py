@@ -44,7 +44,7 @@ def deform(
     weights = regions.weigh(binding, where[1]) if together else None
 
     def one(moved, where):
-        s_c, phi_c, *_ = where
+        s_c, phi_c, radius, tool = where
         ends = _ends(scene, material, s_c, moved) if plan.end_motion else (None, None)
         keys = regions.clamped(
             s_c, moved.skeleton, moved.joints, moved.end_U, moved.end_V, moved.slopes,
@@ -53,7 +53,7 @@ def deform(
         share = regions.weigh(binding, phi_c) if weights is None else weights
         u = regions.interpolate(binding, share, keys, method=method)
         if straight is not None:
-            u = u + local.correction(_dent(scene, *where, moved.depth), straight)
+            u = u + local.correction(_dent(scene, s_c, phi_c, radius, tool, moved.depth), straight)
         return place(mesh, u)
 
     moved = moved._replace(slip=None, dissipated=None, status=None)

@@ -12,8 +12,8 @@ from typing import Any
 import jax
 
 #: Moves of data, not operations.
-FREE = {"reshape", "broadcast_in_dim", "squeeze", "stack", "transpose", "slice", "concatenate", "copy",
-        "convert_element_type", "stop_gradient", "iota", "rev", "pad", "split",
+FREE = {"reshape", "broadcast_in_dim", "squeeze", "stack", "transpose", "slice", "concatenate",
+        "copy", "convert_element_type", "stop_gradient", "iota", "rev", "pad", "split",
         "expand_dims"}  # fmt: skip
 
 

@@ -121,8 +121,8 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
 
 def _refuse(scene: Scene, path: Presses | None, made: Approach | None):
     """The presses, NaN where they are refused; and the rows refused, by status."""
-    assert path is not None or made is not None
     presses = path if made is None else made.presses
+    assert presses is not None
     D, refused = presses.displacement, {}
     if made is not None:
         outside = ~((presses.s >= 0) & (presses.s <= scene.geometry.length))

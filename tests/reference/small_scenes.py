@@ -1,5 +1,8 @@
 """A small scene to try things on: Table 1's tube, a coarse mesh, a ball, and its paths."""
 
+import dataclasses
+
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea import Material, Poses, Presses, Wishes, table_1
@@ -33,3 +36,21 @@ def ball(start, end, rows=4, top=OUTER):
 
 
 DOWN, OBLIQUE, OFF = presses([0, -4, 0]), presses([-2, -4, 0]), presses([0, -3, -1], phi=0.5)
+
+
+def on_arc(s, radius):
+    """Centreline and frame (tangent, anterior, lateral) of a tube bent to an arc, anterior out."""
+    a = np.asarray(s) / radius
+    one, no = np.ones_like(a), np.zeros_like(a)
+    columns = [[np.cos(a), -np.sin(a), no], [np.sin(a), np.cos(a), no], [no, no, one]]
+    centre = radius * np.stack([np.sin(a), np.cos(a) - 1, no], -1)
+    return centre, np.stack([np.stack(c, -1) for c in columns], -1)
+
+
+def bend(mesh, radius):
+    """The same tube along an arc, as an imported one: with frames."""
+    s, phi, r = (np.asarray(v) for v in (mesh.s, mesh.phi, mesh.distance))
+    centre, frames = on_arc(s, radius)
+    across = np.stack([0 * s, r * np.cos(phi), r * np.sin(phi)], -1)
+    vertices = centre + np.einsum("vij,vj->vi", frames, across)
+    return dataclasses.replace(mesh, vertices=jnp.asarray(vertices), frames=jnp.asarray(frames))

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from small_scenes import BALL, MATERIAL, TUBE, ball
 
 from jaxtrachea import Poses, Presses, Wishes, make_scene, simulate
@@ -58,6 +59,7 @@ def changed(scene, material, x):
     return dataclasses.replace(scene, geometry=g), dataclasses.replace(material, **new)
 
 
+@pytest.mark.slow
 def test_of_the_tools_pose_the_material_and_the_geometry():
     """Friction, axial motion, a dent shaped by the tool; in contact from the second row on."""
     path = ball([74, 0.4, 0.5], [76, -2.0, 1.0], 3)
@@ -69,7 +71,9 @@ def test_of_the_tools_pose_the_material_and_the_geometry():
 
     def f(x):
         there, m = changed(scene, MATERIAL, x[:9])
-        return flat(simulate(there, m, Poses(path.rotation, path.translation + x[9:].reshape(3, 3))))
+        return flat(
+            simulate(there, m, Poses(path.rotation, path.translation + x[9:].reshape(3, 3)))
+        )
 
     directions = np.eye(18)[[0, 1, 3, 4, 6, 8, 9, 13, 17]]
     agree(f, jnp.zeros(18), jnp.asarray(directions), 1e-6)
@@ -79,7 +83,8 @@ def test_at_first_touch_on_a_ring_at_rest_and_before():
     """Bending rings, on the sixth ring and off the midline.
 
     Rows: pressed hard; in the smooth first touch; at its very beginning (no displacement); the
-    tool away.
+    tool away. Not by the ring positions: the joint under C follows the peak of the axial motion,
+    a kink.
     """
     depth = np.array([3.0, 5e-4, 0.0, -0.5])
     inward = np.array([0.2, -np.cos(0.3), -np.sin(0.3)])
@@ -90,8 +95,7 @@ def test_at_first_touch_on_a_ring_at_rest_and_before():
     def f(x):
         there, m = changed(scene, MATERIAL, x[:9])
         D = path.displacement + 1e-3 * x[9:].reshape(4, 3)
-        out = simulate(there, m, Presses(path.s, path.phi, D))
-        return flat(out)
+        return flat(simulate(there, m, Presses(path.s, path.phi, D)))
 
-    directions = np.eye(21)[[0, 1, 5, 6, 8, 9, 10, 13, 16, 20]]
+    directions = np.eye(21)[[0, 1, 5, 6, 9, 10, 13, 16, 20]]
     agree(f, jnp.zeros(21), jnp.asarray(directions), 2e-6)

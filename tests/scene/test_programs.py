@@ -101,9 +101,7 @@ def tool(scene, m, p):
     refused = outside & (jnp.sum(D * inward, axis=1) > 0)
     D = jnp.where(refused[:, None], jnp.nan, D)
     out = each(scene, m, Presses(seen.s, seen.phi, D))
-    status = jnp.where(
-        (seen.status > ContactStatus.FLAT) & (out[-1] == PressStatus.OK), 9, out[-1]
-    )
+    status = jnp.where((seen.status > ContactStatus.FLAT) & (out[-1] == PressStatus.OK), 9, out[-1])
     return seen.gap, seen.s, seen.phi, D, out, jnp.where(refused, 8, status)
 
 

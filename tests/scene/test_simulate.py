@@ -5,9 +5,23 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from small_scenes import BALL, BARE, DOWN, MATERIAL, MESH, OFF, OUTER, TUBE, ball, poses
+from small_scenes import (
+    BALL,
+    BARE,
+    DOWN,
+    MATERIAL,
+    MESH,
+    OFF,
+    OUTER,
+    TUBE,
+    ball,
+    bend,
+    on_arc,
+    poses,
+)
 
 from jaxtrachea import (
+    Poses,
     Presses,
     Wishes,
     make_scene,
@@ -16,7 +30,7 @@ from jaxtrachea import (
     simulate,
     sweep,
 )
-from jaxtrachea.contact.shapes import box
+from jaxtrachea.contact.shapes import box, sphere
 from jaxtrachea.scene.stage import touch_tube
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.tube import make_tube
@@ -74,7 +88,7 @@ def test_the_dent_follows_the_tool():
     scene = make_scene(TUBE, MATERIAL, path, tool=BALL, mesh=mesh)
     out = run(scene, MATERIAL, path)
     centre = path.translation[-1]
-    inside = lambda v: 5 - np.linalg.norm(np.asarray(v) - centre, axis=1).min()  # noqa: E731
+    inside = lambda v: 5 - np.linalg.norm(np.asarray(v) - np.asarray(centre)[None], axis=1).min()  # noqa: E731
     before, after = inside(mesh.vertices), inside(out.vertices[-1])
     assert before > 2.4
     assert after < 0.35  # mm; what 16 centres of 4 mm spacing leave
@@ -105,3 +119,42 @@ def test_a_box_touches_flat():
     seen = touch_tube(scene, path)
     np.testing.assert_allclose(seen.gap, -1, atol=0.15)
     np.testing.assert_allclose(seen.phi, 0, atol=1e-6)
+
+
+def test_a_bent_tube_is_pressed_like_the_straight_one():
+    """The same tool in the frame of the centreline there: same gap, force and motion of the skin.
+
+    The skeleton is straight in both; what differs is the wall: patches of a bent tube end at
+    planes that are not parallel, and its hollows are bridged a little differently.
+    """
+    mesh = make_tube(TUBE, around=35, along=96)
+    (centre, turn), bent = on_arc(70.0, 150.0), bend(mesh, 150.0)
+    led = np.array([[0, 1, 0.0], [0, -1, 0], [1.0, -3, 0.5]]) + [0, OUTER + 5, 0]
+    eye = np.broadcast_to(np.eye(3), (3, 3, 3))
+    paths = Poses(eye, led + [70, 0, 0]), Poses(eye @ turn, centre + led @ turn.T)
+    how = {"tool": BALL, "friction": 0.66, "wishes": Wishes(rings="mat")}
+    outs = []
+    for where, path in zip((mesh, bent), paths, strict=True):
+        scene = make_scene(TUBE, MATERIAL, path, mesh=where, **how)
+        outs.append(run(scene, MATERIAL, path))
+    straight, out = outs
+    assert (straight.frame is None, out.status.tolist()) == (True, straight.status.tolist())
+    np.testing.assert_allclose(out.frame, eye @ turn, atol=1e-3)
+    np.testing.assert_allclose(straight.gap[:2], [1, -1], atol=0.05)  # bound of the smoothing
+    for name, atol in (("gap", 0.02), ("s", 0.02), ("displacement", 0.005), ("force", 5e-4)):
+        np.testing.assert_allclose(getattr(out, name), getattr(straight, name), atol=atol)
+    moved = jnp.einsum("vji,rvj->rvi", bent.frames, out.vertices - bent.vertices[None])
+    np.testing.assert_allclose(moved, straight.vertices - mesh.vertices[None], atol=0.01)
+    assert abs(moved).max() > 2.5
+
+
+def test_the_tool_touches_the_mesh_not_a_cylinder():
+    """Between two rings the wall lies lower, by the relief."""
+    path = poses([0, OUTER + 5 + 0.2, 0], [160, OUTER + 5 + 0.2, 0], 33)
+    mesh = make_tube(TUBE, around=35, along=96)
+    scene = make_scene(TUBE, MATERIAL, path, tool=sphere(0.5), mesh=mesh, wishes=BARE)
+    lifted = Poses(path.rotation, path.translation - jnp.array([[0, 4.5, 0]]))
+    seen = jax.jit(touch_tube)(scene, lifted)
+    gap = np.asarray(seen.gap)[2:-2]
+    np.testing.assert_allclose(gap[::2], 0.2, atol=0.05)  # on the rings, every 10 mm
+    np.testing.assert_allclose(gap[1::2], 0.2 + 0.6, atol=0.08)  # between them

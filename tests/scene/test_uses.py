@@ -33,9 +33,12 @@ def test_material_from_a_deformed_surface():
 
     x = jnp.log(jnp.array(0.3))
     with jax.numpy_dtype_promotion("standard"):  # optax counts in int32
-        (x, _), values = jax.jit(lambda s: jax.lax.scan(step, s, length=200))((x, optimiser.init(x)))
+        (x, _), values = jax.jit(lambda s: jax.lax.scan(step, s, length=200))(
+            (x, optimiser.init(x))
+        )
     assert values[-1] < 1e-6 * values[0]
     np.testing.assert_allclose(jnp.exp(x), 0.1, rtol=1e-3)
+
 
 def test_a_network_learns_which_motion_reaches_a_force():
     """Depth of the tool from the force wanted: nothing is shown to it but the simulated force."""
