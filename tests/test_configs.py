@@ -35,6 +35,7 @@ def bent_tube(path):
     """A trachea as a scanner might give it: bent, in metres, elsewhere, with relief."""
     mesh = make_tube(table_1(), around=40, along=120, flatten=0.25)
     x, y, z = np.asarray(mesh.vertices).T
+    y, z = np.stack([y, z]) * (1 + 0.3 * np.exp(-x / 12))  # wider at the carina
     a = x / 400
     bent = np.stack([(400 + y) * np.sin(a), (400 + y) * np.cos(a) - 400, z], axis=1)
     path.parent.mkdir(exist_ok=True)
@@ -192,7 +193,10 @@ def test_bad_scene_is_refused_in_a_line(name, folder, monkeypatch, capsys):
     ("sweep", "says"),
     [
         ("", "sweep: missing; give a table [sweep] with a depth"),
-        ('[sweep]\ndepth = "1 mm"\nphi_max = "150 deg"', "sweep.phi_max: 150 deg; expected 0 to 120"),
+        (
+            '[sweep]\ndepth = "1 mm"\nphi_max = "150 deg"',
+            "sweep.phi_max: 150 deg; expected 0 to 120",
+        ),
     ],
 )
 def test_bad_sweep_is_refused(sweep, says, folder, monkeypatch, capsys):

@@ -70,6 +70,12 @@ def stage(spec: SceneSpec, folder: Path) -> Staged:
         )  # fmt: skip
     except PlanError as error:
         raise SpecError(f"effects.{error}") from None
+    if scene.tube is not None and mesh is not None:
+        lost, filled = float(scene.tube.lost.max()), float(scene.tube.filled.max())
+        notes += (
+            f"contact patches: the surface stands out of them by up to {lost:.2g} mm; hollows (and "
+            f"an inner wall) are bridged up to {filled:.2g} mm deep",
+        )
     return Staged(scene, material, path, tuple(files), notes)
 
 

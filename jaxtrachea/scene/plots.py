@@ -38,7 +38,7 @@ def draw_surface(scene: Scene, vertices: np.ndarray, title: str = "", span: floa
     colour = colormaps["viridis"](size / top)
     colour[:, :3] *= np.minimum(light, 1)[:, None]
     axis.add_collection3d(
-        Poly3DCollection(corners, facecolors=colour, edgecolors="face", linewidths=0.2)
+        Poly3DCollection(corners, facecolors=colour, edgecolors=colour, linewidths=0.2)
     )
     low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
