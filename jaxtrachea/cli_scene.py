@@ -17,7 +17,7 @@ MANY = 12
 
 
 def plan(scene: SceneArgument) -> None:
-    """Say which effects a scene calls for, why, and what each costs; compute nothing else."""
+    """Say which effects a scene calls for, and why."""
     from jaxtrachea.scene.build import shares
     from jaxtrachea.scene.results import plan_rows
 
@@ -32,7 +32,7 @@ def plan(scene: SceneArgument) -> None:
 
 
 def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
-    """Follow the path of a scene: series as HDF5, deformed mesh as PLY and GLB, pictures."""
+    """Follow the path: forces, deformed mesh, pictures."""
     import jax
     import numpy as np
 
@@ -65,7 +65,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
 
 
 def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
-    """Press along the normal everywhere ([sweep]): maps of force and compliance."""
+    """Press everywhere: maps of force and compliance."""
     import jax
     import numpy as np
 
