@@ -65,12 +65,13 @@ def normal(scene, m, p):
     """A normal press; its scalars as vectors, rows that are none of its kind refused."""
     D = jnp.abs(p.displacement)
     fits = (jnp.abs(p.phi) <= 1e-5) & ~(jnp.maximum(D[:, 0], D[:, 2]) > 1e-5 * D[:, 1] + 1e-5)
-    inward = -jnp.where(fits[:, None], p.displacement, jnp.nan)[:, 1]
+    led = jnp.where(fits[:, None], p.displacement, jnp.nan)
+    inward = -led[:, 1]
     out = press(scene.geometry, m, p.s[0], inward)
     F = -out.force  # outward is +y
     y = F, -out.depth, F * out.compliance
     vectors = [jnp.stack([jnp.zeros(3), v, jnp.zeros(3)], -1) for v in y]
-    return vectors, jnp.where(fits, out.status, 7)
+    return led, vectors, jnp.where(fits, out.status, 7)
 
 
 def friction(scene, m, p):
