@@ -1,33 +1,29 @@
-"""The command line: check, fit. The only room that turns errors into messages and exit codes.
+"""The command line: the only room that turns errors into messages and exit codes.
 
 Exit codes: 0 everything converged, 1 some lane failed or some curve could not be used, 2 bad input,
 130 stopped by the user. What is heavy is imported inside the commands.
 """
 
-import contextlib
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from jaxtrachea import __version__
+from jaxtrachea import __version__, cli_scene
+from jaxtrachea.terminal import Stop, complain, into, progress_bar, table, to_stderr, use_float64
 
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help="Identify the mechanics of a trachea from force-displacement curves.",
+    help="Trachea mechanics: identify them from force-displacement curves, simulate scenes.",
 )
 #: Rows of a terminal table; the files hold all.
 MANY = 40
@@ -42,16 +38,12 @@ LeaveOption = Annotated[
 ]
 
 
-class _Stop(Exception):
-    """Bad input: end the command with a message and exit code 2."""
-
-
 def main() -> None:
     """Entry point: every expected error becomes one message on stderr and an exit code."""
     try:
         code = app(prog_name="jaxtrachea", standalone_mode=False)
-    except _Stop as stop:
-        code = _complain(str(stop))
+    except Stop as stop:
+        code = complain(str(stop))
     except typer.Exit as stop:
         code = stop.exit_code
     except (typer.Abort, KeyboardInterrupt):
@@ -61,19 +53,14 @@ def main() -> None:
         usage = getattr(error, "format_message", None)
         if usage is None:
             raise
-        code = _complain(usage())
+        code = complain(usage())
     if code == 130:  # some versions of typer turn Ctrl-C into this exit code themselves
-        _to_stderr("stopped; nothing was written")
+        to_stderr("stopped; nothing was written")
     sys.exit(code or 0)
 
 
-def _to_stderr(text: str) -> None:
-    Console(stderr=True).print(text, highlight=False, soft_wrap=True)
-
-
-def _complain(message: str) -> int:
-    _to_stderr(f"[bold red]error:[/] {escape(message)}")
-    return 2
+for _command in (cli_scene.plan, cli_scene.simulate, cli_scene.sweep):
+    app.command()(_command)
 
 
 @app.callback(invoke_without_command=True)
@@ -110,62 +97,23 @@ def fit(
     leave_one_out: LeaveOption = False,
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
-    from jaxtrachea.identify.output import OutputExists, new_output
-
     clock = [time.perf_counter()]
     loaded, measurements, problem = _load(spec, data)
     if leave_one_out:
         _can_leave_out(problem)
     clock.append(time.perf_counter())
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
-    try:
-        with _interrupts() as stop_if_asked, new_output(out_dir, default) as folder:
-            result, left_out = _run(loaded, problem, leave_one_out, stop_if_asked)
-            clock.append(time.perf_counter())
-            _write(folder, spec, loaded, measurements, result, left_out, clock)
-            stop_if_asked()
-    except OutputExists as error:
-        raise _Stop(str(error)) from None
-    except OSError as error:
-        where = out_dir or default
-        raise _Stop(
-            f"{where}: cannot be written ({error.strerror}); choose another --out"
-        ) from None
+    with into(out_dir, default) as (folder, stop_if_asked):
+        result, left_out = _run(loaded, problem, leave_one_out, stop_if_asked)
+        clock.append(time.perf_counter())
+        _write(folder, spec, loaded, measurements, result, left_out, clock)
     _print_result(result, folder.parent)
     failed = any(not _succeeded(result, lane) for lane in range(result.lanes))
     raise typer.Exit(1 if failed or measurements.bad else 0)
 
 
-@contextlib.contextmanager
-def _interrupts() -> Iterator[Callable[[], None]]:
-    """Remember Ctrl-C, since an exception raised inside a callback of jax can get lost there.
-
-    Yields:
-        What raises KeyboardInterrupt if one came; to be called between steps of the work.
-    """
-    asked = []
-
-    def remember(number, frame):
-        asked.append(number)
-        signal.default_int_handler(number, frame)
-
-    def stop_if_asked():
-        if asked:
-            raise KeyboardInterrupt
-
-    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if not usual or threading.current_thread() is not threading.main_thread():
-        yield stop_if_asked
-        return
-    signal.signal(signal.SIGINT, remember)
-    try:
-        yield stop_if_asked
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
 def _load(path: Path, data: Path | None):
-    """Specification, measurements and problem; input errors become `_Stop`."""
+    """Specification, measurements and problem; input errors become `Stop`."""
     from jaxtrachea.config import SpecError, load_fit_spec
     from jaxtrachea.identify.measurements import DataError
     from jaxtrachea.identify.study import problem_of, read_data, usable
@@ -173,32 +121,26 @@ def _load(path: Path, data: Path | None):
     try:
         spec = load_fit_spec(path)
         measurements = read_data(spec, path.parent if data is None else data)
-        _use_float64()
+        use_float64()
         if measurements.curves:
             measurements = usable(spec, measurements)
         _print_bad(measurements)
         if not measurements.curves:
-            raise _Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
+            raise Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
         return spec, measurements, problem_of(spec, measurements)
     except SpecError as error:
         text = str(error)
-        raise _Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
+        raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
     except DataError as error:
-        raise _Stop(str(error)) from None
-
-
-def _use_float64() -> None:
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
+        raise Stop(str(error)) from None
 
 
 def _print_bad(measurements) -> None:
     for bad in measurements.bad[:20]:
         text = f"{bad.specimen} {bad.trial}: {bad.kind}: {bad.source}: {bad.message}; {bad.cure}"
-        _to_stderr(f"[yellow]not usable:[/] {escape(text)}")
+        to_stderr(f"[yellow]not usable:[/] {escape(text)}")
     if len(measurements.bad) > 20:
-        _to_stderr(f"... and {len(measurements.bad) - 20} more")
+        to_stderr(f"... and {len(measurements.bad) - 20} more")
 
 
 def _can_leave_out(problem) -> None:
@@ -207,7 +149,7 @@ def _can_leave_out(problem) -> None:
     try:
         curves_to_leave_out(problem)
     except ValueError as error:
-        raise _Stop(f"--leave-one-out: {error}") from None
+        raise Stop(f"--leave-one-out: {error}") from None
 
 
 def _run(spec, problem, leave_out: bool, stop_if_asked: Callable[[], None]):
@@ -216,9 +158,7 @@ def _run(spec, problem, leave_out: bool, stop_if_asked: Callable[[], None]):
     from jaxtrachea.identify.study import settings_of
 
     settings = settings_of(spec)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-               TimeElapsedColumn())  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with progress_bar() as bar:
 
         def counted(text):
             task = bar.add_task(text, total=None)
@@ -251,8 +191,8 @@ def _write(folder: Path, spec: Path, loaded, measurements, result, left_out, clo
     results.write_csv(folder / "summary.csv", rows)
     results.write_csv(folder / "parameters.csv", list(results.parameter_rows(result)))
     draw_all(folder, result, seen)
-    table = None if left_out is None else report.left_out_rows(result, left_out)
-    text = report.report_text(loaded.title or spec.stem, result, measurements.bad, seen, table)
+    left = None if left_out is None else report.left_out_rows(result, left_out)
+    text = report.report_text(loaded.title or spec.stem, result, measurements.bad, seen, left)
     results.write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")
@@ -278,35 +218,16 @@ def _print_result(result, folder: Path) -> None:
     lanes = range(result.lanes)
     if result.lanes <= report.ONE_BY_ONE:
         rows = report.estimate_rows(result, lanes)
-        out.print(_table("Estimates", report.ESTIMATE_HEAD, rows))
-        out.print(_table("Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)))
+        out.print(table("Estimates", report.ESTIMATE_HEAD, rows))
+        out.print(table("Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)))
         for lane in lanes:
             text = f"{lane_label(result, lane)}: {flat_sentence(result, lane)}"
             out.print(escape(text), highlight=False)
     else:
-        out.print(_table("Estimates over lanes", report.SPREAD_HEAD, report.spread_rows(result)))
+        out.print(table("Estimates over lanes", report.SPREAD_HEAD, report.spread_rows(result)))
         good = sum(_succeeded(result, lane) for lane in lanes)
         out.print(f"{good} of {result.lanes} lanes succeeded")
     out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)
-
-
-def _table(title: str, head, rows) -> Table:
-    """A table that breaks lines between words only, and leaves out an only specimen's name."""
-    named = head[0] != "specimen" or len({row[0] for row in rows}) > 1
-    if not named:
-        title, head, rows = f"{title}: {rows[0][0]}", head[1:], [row[1:] for row in rows]
-    table = Table(
-        title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
-    )
-    for i, name in enumerate(head):
-        words = " ".join([name, *(row[i] for row in rows)]).split()
-        side = "left" if i == 0 else "right"
-        table.add_column(
-            escape(name), justify=side, min_width=max(map(len, words)), overflow="fold"
-        )
-    for row in rows:
-        table.add_row(*map(escape, row))
-    return table
 
 
 def _curve_table(curves) -> Table:
@@ -318,7 +239,7 @@ def _curve_table(curves) -> Table:
         row = [curve.specimen, curve.trial, where, str(len(curve.force)), *spans, str(markers)]
         rows.append(row)
     head = ["specimen", "trial", "s [mm]", "n", "D [mm]", "F [N]", "markers"]
-    return _table(f"{len(curves)} usable curves", head, rows)
+    return table(f"{len(curves)} usable curves", head, rows)
 
 
 def _parameter_table(parameters) -> Table:
@@ -327,4 +248,4 @@ def _parameter_table(parameters) -> Table:
         [f"{p.name} [{p.unit}]", p.description, f"{p.value:g}", f"{p.lower:g} … {p.upper:g}",
          p.scale, p.scope] for p in parameters if not p.fixed
     ]  # fmt: skip
-    return _table("Free parameters", head, rows)
+    return table("Free parameters", head, rows)
