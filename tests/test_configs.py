@@ -58,7 +58,12 @@ def test_each_shows_something():
     assert set(SHOWS) == set(NAMES)
 
 
-@pytest.mark.parametrize("scene", NAMES, indirect=True)
+#: Half a minute of compilation each.
+LATER = {"off_midline", "scan", "imported_tool", "capsule", "friction"}
+EACH = [pytest.param(n, marks=pytest.mark.slow if n in LATER else ()) for n in NAMES]
+
+
+@pytest.mark.parametrize("scene", EACH, indirect=True)
 def test_scene_runs(scene, monkeypatch, capsys):
     monkeypatch.chdir(scene.parent)
     text = tomllib.loads(scene.read_text())

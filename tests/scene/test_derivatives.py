@@ -79,6 +79,7 @@ def test_of_the_tools_pose_the_material_and_the_geometry():
     agree(f, jnp.zeros(18), jnp.asarray(directions), 1e-6)
 
 
+@pytest.mark.slow
 def test_at_first_touch_on_a_ring_at_rest_and_before():
     """Bending rings, on the sixth ring and off the midline.
 

@@ -5,6 +5,7 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from small_scenes import (
     BALL,
     BARE,
@@ -121,6 +122,7 @@ def test_a_box_touches_flat():
     np.testing.assert_allclose(seen.phi, 0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_bent_tube_is_pressed_like_the_straight_one():
     """The same tool in the frame of the centreline there: same gap, force and motion of the skin.
 

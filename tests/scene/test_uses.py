@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import optax
 from small_scenes import BARE, DOWN, MATERIAL, TUBE, presses
 
@@ -15,6 +16,7 @@ from jaxtrachea import Presses, make_scene, simulate
 from jaxtrachea.trachea.tube import make_tube
 
 
+@pytest.mark.slow
 def test_material_from_a_deformed_surface():
     """The muscle's stiffness, recovered from the vertices of one oblique press with optax."""
     path = presses([-2, -4, 0], rows=2)
