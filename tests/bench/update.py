@@ -8,6 +8,8 @@ the skeleton, 1 kHz with the surface).
 
 import ctypes
 import dataclasses
+import functools
+import os
 import subprocess
 import tempfile
 import time
@@ -57,14 +59,12 @@ def latency(out: common.Writer, cases) -> None:
             found[name] += timed(call, CALLS // 10)
     for name, taken in found.items():
         taken = np.array(taken)
-        out.rows.append(
-            {"kind": "latency", "case": name, "calls": CALLS, "above_1_ms": int((taken > 1e-3).sum())}
-            | {q: float(f"{v:.4g}") for q, v in zip(
-                ("p5", "median", "p99", "worst"), np.quantile(taken, [0.05, 0.5, 0.99, 1]), strict=True
-            )}
-        )  # fmt: skip
-        row = out.rows[-1]
-        print(name, {k: row[k] for k in ("p5", "median", "p99", "worst", "above_1_ms")}, flush=True)
+        names, shares = ("p5", "median", "p99", "worst"), [0.05, 0.5, 0.99, 1]
+        times = [float(f"{v:.4g}") for v in np.quantile(taken, shares)]
+        row = {"kind": "latency", "case": name, "calls": CALLS, "load": os.getloadavg()[0]}
+        row |= {"above_1_ms": int((taken > 1e-3).sum())}
+        out.rows.append(row | dict(zip(names, times, strict=True)))
+        print(f"{name:60}", *(f"{1e6 * v:9.1f}" for v in times), row["above_1_ms"], flush=True)
 
 
 def at(dtype, s: float = S, depth: float = DEPTH) -> Poses:
@@ -116,11 +116,14 @@ class CScene(ctypes.Structure):
     """As in update.c."""
 
     _fields_ = [(n, ctypes.c_int) for n in ("vertices", "rings", "patches", "centres")]
-    _fields_ += [(n, ctypes.c_double) for n in ("length", "tube", "radius", "k_1", "k_3", "spacing")]
-    _fields_ += [(n, ctypes.c_void_p) for n in (
-        "x", "node", "EI", "k", "border", "fraction", "s", "weight", "rest", "offset", "patch",
-        "collar",
-    )]  # fmt: skip
+    _fields_ += [(n, ctypes.c_double) for n in "length tube radius k_1 k_3 spacing".split()]
+    _arrays = "x node EI k border fraction s weight rest offset patch collar".split()
+    _fields_ += [(n, ctypes.c_void_p) for n in _arrays]
+
+
+def address(v):
+    """Pointer for ctypes."""
+    return v.ctypes.data_as(ctypes.c_void_p)
 
 
 def c_update(scene, dent: int):
@@ -143,12 +146,12 @@ def c_update(scene, dent: int):
     arrays |= {"patch": np.array(b.patch, np.int32), "collar": np.array(collar, np.int32)}
     numbers = (len(b.s), 15, len(BORDERS) - 1, dent, 160.0, OUTER, RADIUS)
     numbers += (VALUES["k_1"], VALUES["k_3"], float(scene.footprint))
-    where = [arrays[name].ctypes.data for name, _ in CScene._fields_[10:]]
+    where = [arrays[name].ctypes.data for name in CScene._arrays]
     given = CScene(*numbers, *where)
     out = np.empty((len(b.s), 3))
 
     def call(place):
-        force = run(ctypes.byref(given), ctypes.c_void_p(place.ctypes.data), ctypes.c_void_p(out.ctypes.data))
+        force = run(ctypes.byref(given), address(place), address(out))
         return force, out, arrays
 
     return call
@@ -163,7 +166,8 @@ def contacts(out: common.Writer):
     cases = {}
     for name, tool in tools.items():
         for near in (1, 2):
-            run = jax.jit(lambda R, T, t=tool, n=near: touch(t, Pose(R, T), round_tube(float), near=n))
+            search = functools.partial(touch, tool, patches=round_tube(float), near=near)
+            run = jax.jit(lambda R, T, f=search: f(Pose(R, T)))
             cases[f"contact: {name}, {near} of 16 patches"] = lambda r=run: r(eye, place)
     shape = {"ball": coal.Sphere(RADIUS), "rounded box": coal.Box(4.0, 3.0, 8.0)}
     pieces = []
@@ -202,13 +206,13 @@ def main():
             run = jax.jit(of_one_pose(scene, material)).lower(place).compile()
             cases[f"{name}; {dtype}"] = lambda r=run, p=place: r(p)
             if "round" in name and dtype == "float64" and scene.plan.surface:
-                call = c_update(scene, scene.plan.dent)
-                F, vertices, _ = call(np.asarray(place))
+                call, ball = c_update(scene, scene.plan.dent), np.asarray(place)
+                F, vertices, _ = call(ball)
                 force, _, expected = run(place)
                 # The smoothed gap is up to 0.02 mm too small (docs/contact.md): both see another.
                 common.close(name, [F], [-float(force[1])], 0.05)
                 common.close(name, vertices, expected, 1e-3)
-                cases[f"C loop: {name}; {dtype}"] = lambda c=call, p=np.asarray(place): c(p)
+                cases[f"C loop: {name}; {dtype}"] = lambda c=call, p=ball: c(p)
     latency(out, cases)
     throughput(out)
     out.write()
@@ -219,8 +223,8 @@ def throughput(out: common.Writer) -> None:
     for dtype in ("float32", "float64"):
         made, material = scenes(dtype)
         rng = np.random.default_rng(0)
-        places = np.stack([rng.uniform(20, 140, LANES), OUTER + RADIUS - rng.uniform(0.2, 3, LANES), np.zeros(LANES)], 1)
-        places, cases = jnp.asarray(places, dtype), {}
+        s, away = rng.uniform(20, 140, LANES), OUTER + RADIUS - rng.uniform(0.2, 3, LANES)
+        places, cases = jnp.asarray(np.stack([s, away, 0 * s], axis=1), dtype), {}
         for name in ("contact, skeleton", "whole, dent of 16"):
             scene = made[f"{name}; round tube"]
             run = jax.jit(jax.vmap(of_one_pose(scene, material)))

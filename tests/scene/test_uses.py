@@ -8,8 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 import optax
+import pytest
 from small_scenes import BARE, DOWN, MATERIAL, TUBE, presses
 
 from jaxtrachea import Presses, make_scene, simulate
