@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from jaxtrachea import __version__, cli_scene
-from jaxtrachea.terminal import Stop, complain, into, progress_bar, table, to_stderr, use_float64
+from jaxtrachea.terminal import Stop, complain, into, progress_bar, set_up_jax, table, to_stderr
 
 app = typer.Typer(
     add_completion=False,
@@ -121,7 +121,7 @@ def _load(path: Path, data: Path | None):
     try:
         spec = load_fit_spec(path)
         measurements = read_data(spec, path.parent if data is None else data)
-        use_float64()
+        set_up_jax()
         if measurements.curves:
             measurements = usable(spec, measurements)
         _print_bad(measurements)

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from jaxtrachea.terminal import Stop, into, progress_bar, table, use_float64
+from jaxtrachea.terminal import Stop, into, progress_bar, set_up_jax, table
 
 SceneArgument = Annotated[Path, typer.Argument(help="TOML scene (docs/scenes.md).")]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
@@ -126,7 +126,7 @@ def _staged(path: Path):
 
     try:
         spec = load_scene_spec(path)
-        use_float64()
+        set_up_jax()
         from jaxtrachea.scene.build import stage
 
         return spec, stage(spec, path.parent)

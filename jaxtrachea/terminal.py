@@ -1,6 +1,7 @@
 """What all commands share: messages, tables, Ctrl-C."""
 
 import contextlib
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -56,11 +57,29 @@ def interrupts() -> Iterator[Callable[[], None]]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def use_float64() -> None:
-    """The command line computes in float64."""
+def set_up_jax() -> None:
+    """The command line computes in float64 and keeps compiled programs for the next start.
+
+    They lie in `cache_folder()`, or where JAX_COMPILATION_CACHE_DIR says;
+    JAX_ENABLE_COMPILATION_CACHE=false keeps none.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    wanted, chosen = jax.config.jax_enable_compilation_cache, jax.config.jax_compilation_cache_dir
+    if wanted and chosen is None and (folder := cache_folder()) is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+
+
+def cache_folder() -> Path | None:
+    """The user's folder for compiled programs, or None where nothing can be written."""
+    base = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME")
+    try:
+        folder = (Path(base) if base else Path.home() / ".cache") / "jaxtrachea"
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder if os.access(folder, os.W_OK) else None
+    except (OSError, RuntimeError):  # RuntimeError: nobody's home
+        return None
 
 
 def table(title: str, head, rows, text: tuple[str, ...] = ()) -> Table:
