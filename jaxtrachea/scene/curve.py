@@ -4,8 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxtrachea.contact.line import Centreline
-from jaxtrachea.contact.line import _at as point_at
+from jaxtrachea.contact.line import Centreline, point_at
 
 
 def frame_at(line: Centreline, s: Float[Array, ""]) -> Float[Array, "3 3"]:
