@@ -66,8 +66,8 @@ def set_up_jax() -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    wanted = jax.config.read("jax_enable_compilation_cache")
-    chosen = jax.config.read("jax_compilation_cache_dir")
+    wanted = jax.config.values["jax_enable_compilation_cache"]
+    chosen = jax.config.values["jax_compilation_cache_dir"]
     if wanted and chosen is None and (folder := cache_folder()) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
 
