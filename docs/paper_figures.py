@@ -1,8 +1,8 @@
-"""Figure 7 of the paper, recomputed: joint loads, joint displacements and the ends of ring 6.
+"""Figures 6 and 7 of the paper, recomputed: the surface, joint loads and motions, ends of ring 6.
 
     python docs/paper_figures.py
 
-Writes figures/fig_7a.png, 7b and 7c, and paper_figures.md (its text is in paper_figures.md.in).
+Writes figures/fig_6a.png to 7c.png, and paper_figures.md (its text is in paper_figures.md.in).
 """
 
 from pathlib import Path
@@ -13,6 +13,10 @@ import numpy as np
 
 from jaxtrachea.model import Options
 from jaxtrachea.oblique import ObliquePress, press_oblique
+from jaxtrachea.scene.build import stage
+from jaxtrachea.scene.plots import draw_surface
+from jaxtrachea.scene.simulation import simulate
+from jaxtrachea.scene.spec import load_scene_spec
 from jaxtrachea.trachea.geometry import TABLE_1, disc_second_moment, table_1
 from jaxtrachea.trachea.material import Material
 
@@ -108,6 +112,23 @@ def draw() -> None:
     figure.savefig(HERE / "figures" / "fig_7c.png", dpi=80)
 
 
+def pressed(name: str):
+    """The scene configs/NAME.toml and the vertices of its last row."""
+    spec = load_scene_spec(HERE.parent / "configs" / f"{name}.toml")
+    scene, material, path, _, _ = stage(spec, HERE)
+    out = jax.jit(simulate)(scene, material, path)
+    assert out.vertices is not None
+    return spec.title, scene, np.asarray(out.vertices[-1])
+
+
+def draw_surfaces() -> None:
+    """Figure 6."""
+    for letter, name in zip("abc", ("normal", "left_down", "right_down"), strict=True):
+        title, scene, vertices = pressed(name)
+        figure = draw_surface(scene, vertices, title)
+        figure.savefig(HERE / "figures" / f"fig_6{letter}.png", dpi=90)
+
+
 def document() -> str:
     """paper_figures.md."""
     f = facts()
@@ -130,6 +151,7 @@ def main() -> None:
     """Draw and write."""
     jax.config.update("jax_enable_x64", True)
     draw()
+    draw_surfaces()
     (HERE / "paper_figures.md").write_text(document(), encoding="utf-8")
     print(facts())
 

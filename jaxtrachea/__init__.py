@@ -2,6 +2,7 @@
 
 Forward: `press(geometry, material, s_c, displacement, options)`. Identification from Python:
 `jaxtrachea.identify`; from the command line: `jaxtrachea check SPEC`, `jaxtrachea fit SPEC`.
+Whole scenes, from the tool's pose to the deformed surface: `make_scene`, `simulate`, `sweep`.
 Units: mm, N, MPa, rad. The package never changes JAX's configuration; fits want float64
 (`jax.config.update("jax_enable_x64", True)`).
 
@@ -24,6 +25,16 @@ if TYPE_CHECKING:
     from jaxtrachea.oblique import ObliquePress as ObliquePress
     from jaxtrachea.oblique import press_oblique as press_oblique
     from jaxtrachea.oblique import press_path as press_path
+    from jaxtrachea.scene.plan import Plan as Plan
+    from jaxtrachea.scene.plan import PlanError as PlanError
+    from jaxtrachea.scene.plan import Wishes as Wishes
+    from jaxtrachea.scene.simulation import Simulation as Simulation
+    from jaxtrachea.scene.simulation import simulate as simulate
+    from jaxtrachea.scene.simulation import sweep as sweep
+    from jaxtrachea.scene.stage import Poses as Poses
+    from jaxtrachea.scene.stage import Presses as Presses
+    from jaxtrachea.scene.stage import Scene as Scene
+    from jaxtrachea.scene.stage import make_scene as make_scene
     from jaxtrachea.skeleton import Skeleton as Skeleton
     from jaxtrachea.skeleton import skeleton_response as skeleton_response
     from jaxtrachea.status import FitStatus as FitStatus
@@ -39,6 +50,9 @@ _HOME = {
     "mechanics.force_law": ("Law", "duffing"),
     "model": ("Options", "Press", "press"),
     "oblique": ("ObliquePath", "ObliquePress", "press_oblique", "press_path"),
+    "scene.plan": ("Plan", "PlanError", "Wishes"),
+    "scene.simulation": ("Simulation", "simulate", "sweep"),
+    "scene.stage": ("Poses", "Presses", "Scene", "make_scene"),
     "skeleton": ("Skeleton", "skeleton_response"),
     "status": ("FitStatus", "PressStatus"),
     "trachea.geometry": ("Geometry", "table_1"),

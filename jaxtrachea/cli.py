@@ -1,34 +1,29 @@
-"""The command line: check, fit, design. Only here errors become messages and exit codes.
+"""The command line: the only room that turns errors into messages and exit codes.
 
 Exit codes: 0 everything converged, 1 some lane failed or some curve could not be used, 2 bad input,
 130 stopped by the user. What is heavy is imported inside the commands.
 """
 
-import contextlib
 import dataclasses
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from jaxtrachea import __version__
+from jaxtrachea import __version__, cli_scene
+from jaxtrachea.terminal import Stop, complain, into, progress_bar, set_up_jax, table, to_stderr
 
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help="Identify the mechanics of a trachea from force-displacement curves.",
+    help="Trachea mechanics: identify them from force-displacement curves, simulate scenes.",
 )
 #: Rows of a terminal table; the files hold all.
 MANY = 40
@@ -41,22 +36,17 @@ OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for th
 LeaveOption = Annotated[
     bool, typer.Option("--leave-one-out", help="Also predict every curve from the others.")
 ]
-
 ProfileOption = Annotated[
     bool, typer.Option("--profile", help="Also profile the likelihood of the parameters.")
 ]
-
-
-class _Stop(Exception):
-    """Bad input: end the command with a message and exit code 2."""
 
 
 def main() -> None:
     """Entry point: every expected error becomes one message on stderr and an exit code."""
     try:
         code = app(prog_name="jaxtrachea", standalone_mode=False)
-    except _Stop as stop:
-        code = _complain(str(stop))
+    except Stop as stop:
+        code = complain(str(stop))
     except typer.Exit as stop:
         code = stop.exit_code
     except (typer.Abort, KeyboardInterrupt):
@@ -66,19 +56,14 @@ def main() -> None:
         usage = getattr(error, "format_message", None)
         if usage is None:
             raise
-        code = _complain(usage())
+        code = complain(usage())
     if code == 130:  # some versions of typer turn Ctrl-C into this exit code themselves
-        _to_stderr("stopped; nothing was written")
+        to_stderr("stopped; nothing was written")
     sys.exit(code or 0)
 
 
-def _to_stderr(text: str) -> None:
-    Console(stderr=True).print(text, highlight=False, soft_wrap=True)
-
-
-def _complain(message: str) -> int:
-    _to_stderr(f"[bold red]error:[/] {escape(message)}")
-    return 2
+for _command in (cli_scene.plan, cli_scene.simulate, cli_scene.sweep):
+    app.command()(_command)
 
 
 @app.callback(invoke_without_command=True)
@@ -123,11 +108,10 @@ def fit(
     names = _names_to_profile(loaded, problem, profile)
     clock.append(time.perf_counter())
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
-    with _writing(out_dir, default) as (stop_if_asked, folder):
+    with into(out_dir, default) as (folder, stop_if_asked):
         found = _run(loaded, problem, leave_one_out, names, stop_if_asked)
         clock.append(time.perf_counter())
         _write(folder, spec, loaded, measurements, found, clock)
-        stop_if_asked()
     result = found.result
     _print_result(found, folder.parent)
     failed = any(not _succeeded(result, lane) for lane in range(result.lanes))
@@ -144,20 +128,19 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
     try:
         candidates = candidates_of(loaded, problem)
     except SpecError as error:
-        raise _Stop(f"{spec}: {error}") from None
+        raise Stop(f"{spec}: {error}") from None
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}-design"
-    with _writing(out_dir, default) as (stop_if_asked, folder):
+    with into(out_dir, default) as (folder, stop_if_asked):
         found = _run(loaded, problem, False, (), stop_if_asked)
         try:
             rows = _design(folder, loaded, found, candidates)
         except ValueError as error:
-            raise _Stop(f"{spec}: {error}") from None
-        stop_if_asked()
+            raise Stop(f"{spec}: {error}") from None
     errors = [k.removesuffix(" relative se") for k in rows[0] if k.endswith(" relative se")]
     head = ["press", "s [mm]", "depth [mm]", *errors]
     cells = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
     out = Console()
-    out.print(_table("Next presses, relative errors expected after each", head, cells))
+    out.print(table("Next presses, relative errors expected after each", head, cells))
     out.print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
     raise typer.Exit(1 if measurements.bad else 0)
 
@@ -187,53 +170,8 @@ def _design(folder: Path, loaded, found, candidates) -> list[dict[str, object]]:
     return rows
 
 
-@contextlib.contextmanager
-def _writing(out_dir: Path | None, default: Path):
-    """An output folder and `stop_if_asked`; what goes wrong with files becomes `_Stop`."""
-    from jaxtrachea.identify.output import OutputExists, new_output
-
-    try:
-        with _interrupts() as stop_if_asked, new_output(out_dir, default) as folder:
-            yield stop_if_asked, folder
-    except OutputExists as error:
-        raise _Stop(str(error)) from None
-    except OSError as error:
-        where = out_dir or default
-        raise _Stop(
-            f"{where}: cannot be written ({error.strerror}); choose another --out"
-        ) from None
-
-
-@contextlib.contextmanager
-def _interrupts() -> Iterator[Callable[[], None]]:
-    """Remember Ctrl-C, since an exception raised inside a callback of jax can get lost there.
-
-    Yields:
-        What raises KeyboardInterrupt if one came; to be called between steps of the work.
-    """
-    asked = []
-
-    def remember(number, frame):
-        asked.append(number)
-        signal.default_int_handler(number, frame)
-
-    def stop_if_asked():
-        if asked:
-            raise KeyboardInterrupt
-
-    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if not usual or threading.current_thread() is not threading.main_thread():
-        yield stop_if_asked
-        return
-    signal.signal(signal.SIGINT, remember)
-    try:
-        yield stop_if_asked
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
 def _load(path: Path, data: Path | None):
-    """Specification, measurements and problem; input errors become `_Stop`."""
+    """Specification, measurements and problem; input errors become `Stop`."""
     from jaxtrachea.config import SpecError, load_fit_spec
     from jaxtrachea.identify.measurements import DataError
     from jaxtrachea.identify.study import problem_of, read_data, usable
@@ -241,32 +179,26 @@ def _load(path: Path, data: Path | None):
     try:
         spec = load_fit_spec(path)
         measurements = read_data(spec, path.parent if data is None else data)
-        _use_float64()
+        set_up_jax()
         if measurements.curves:
             measurements = usable(spec, measurements)
         _print_bad(measurements)
         if not measurements.curves:
-            raise _Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
+            raise Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
         return spec, measurements, problem_of(spec, measurements)
     except SpecError as error:
         text = str(error)
-        raise _Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
+        raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
     except DataError as error:
-        raise _Stop(str(error)) from None
-
-
-def _use_float64() -> None:
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
+        raise Stop(str(error)) from None
 
 
 def _print_bad(measurements) -> None:
     for bad in measurements.bad[:20]:
         text = f"{bad.specimen} {bad.trial}: {bad.kind}: {bad.source}: {bad.message}; {bad.cure}"
-        _to_stderr(f"[yellow]not usable:[/] {escape(text)}")
+        to_stderr(f"[yellow]not usable:[/] {escape(text)}")
     if len(measurements.bad) > 20:
-        _to_stderr(f"... and {len(measurements.bad) - 20} more")
+        to_stderr(f"... and {len(measurements.bad) - 20} more")
 
 
 def _can_leave_out(problem) -> None:
@@ -275,7 +207,7 @@ def _can_leave_out(problem) -> None:
     try:
         curves_to_leave_out(problem)
     except ValueError as error:
-        raise _Stop(f"--leave-one-out: {error}") from None
+        raise Stop(f"--leave-one-out: {error}") from None
 
 
 def _names_to_profile(spec, problem, asked: bool) -> tuple[str, ...]:
@@ -285,7 +217,7 @@ def _names_to_profile(spec, problem, asked: bool) -> tuple[str, ...]:
     try:
         return profiled(spec, problem, asked=asked)
     except SpecError as error:
-        raise _Stop(str(error)) from None
+        raise Stop(str(error)) from None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -306,9 +238,7 @@ def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked
     from jaxtrachea.identify.study import settings_of
 
     settings = settings_of(spec)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-               TimeElapsedColumn())  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with progress_bar() as bar:
 
         def counted(text):
             task = bar.add_task(text, total=None)
@@ -356,9 +286,9 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
     if profiles is not None:
         results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
     draw_all(folder, result, seen, profiles)
-    table = None if found.left_out is None else report.left_out_rows(result, found.left_out)
+    left = None if found.left_out is None else report.left_out_rows(result, found.left_out)
     title = loaded.title or spec.stem
-    text = report.report_text(title, result, measurements.bad, seen, table, profiles, resampled)
+    text = report.report_text(title, result, measurements.bad, seen, left, profiles, resampled)
     results.write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")
@@ -384,20 +314,20 @@ def _print_result(found: _Found, folder: Path) -> None:
     lanes = range(result.lanes)
     if result.lanes <= report.ONE_BY_ONE:
         rows = report.estimate_rows(result, lanes, found.profiles)
-        out.print(_table("Estimates", report.ESTIMATE_HEAD, rows))
-        out.print(_table("Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)))
+        out.print(table("Estimates", report.ESTIMATE_HEAD, rows))
+        out.print(table("Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)))
         if found.profiles is not None:
             rows = report.profile_table(found.profiles, lanes)
-            out.print(_table("Profile likelihood", report.PROFILE_HEAD, rows))
+            out.print(table("Profile likelihood", report.PROFILE_HEAD, rows))
         if found.resampled is not None:
             rows = report.bootstrap_table(found.resampled, lanes)
-            out.print(_table("Bootstrap", report.BOOTSTRAP_HEAD, rows))
+            out.print(table("Bootstrap", report.BOOTSTRAP_HEAD, rows))
         for lane in lanes:
             text = f"{lane_label(result, lane)}: {verdict_sentence(result, lane, found.profiles)}"
             out.print(escape(text), highlight=False)
     else:
         out.print(
-            _table(
+            table(
                 "Estimates over lanes",
                 report.SPREAD_HEAD,
                 report.spread_rows(result, found.profiles),
@@ -406,25 +336,6 @@ def _print_result(found: _Found, folder: Path) -> None:
         good = sum(_succeeded(result, lane) for lane in lanes)
         out.print(f"{good} of {result.lanes} lanes succeeded")
     out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)
-
-
-def _table(title: str, head, rows) -> Table:
-    """A table that breaks lines between words only, and leaves out an only specimen's name."""
-    named = head[0] != "specimen" or len({row[0] for row in rows}) > 1
-    if not named:
-        title, head, rows = f"{title}: {rows[0][0]}", head[1:], [row[1:] for row in rows]
-    table = Table(
-        title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
-    )
-    for i, name in enumerate(head):
-        words = " ".join([name, *(row[i] for row in rows)]).split()
-        side = "left" if i == 0 else "right"
-        table.add_column(
-            escape(name), justify=side, min_width=max(map(len, words)), overflow="fold"
-        )
-    for row in rows:
-        table.add_row(*map(escape, row))
-    return table
 
 
 def _curve_table(curves) -> Table:
@@ -436,7 +347,7 @@ def _curve_table(curves) -> Table:
         row = [curve.specimen, curve.trial, where, str(len(curve.force)), *spans, str(markers)]
         rows.append(row)
     head = ["specimen", "trial", "s [mm]", "n", "D [mm]", "F [N]", "markers"]
-    return _table(f"{len(curves)} usable curves", head, rows)
+    return table(f"{len(curves)} usable curves", head, rows)
 
 
 def _parameter_table(parameters) -> Table:
@@ -445,4 +356,4 @@ def _parameter_table(parameters) -> Table:
         [f"{p.name} [{p.unit}]", p.description, f"{p.value:g}", f"{p.lower:g} … {p.upper:g}",
          p.scale, p.scope] for p in parameters if not p.fixed
     ]  # fmt: skip
-    return _table("Free parameters", head, rows)
+    return table("Free parameters", head, rows)

@@ -6,7 +6,7 @@ opens a measurement file or imports JAX; the rooms below turn these records into
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
 from pydantic import (
@@ -22,12 +22,14 @@ from pydantic import (
 
 from jaxtrachea.units import parse_quantity
 
+Spec = TypeVar("Spec", bound=BaseModel)
+
 
 class SpecError(ValueError):
     """A specification that cannot be used; the message has one line per problem."""
 
 
-def _quantity(dimension: str, *, positive: bool = False, word: str | None = None):
+def quantity(dimension: str, *, positive: bool = False, word: str | None = None):
     """A field read as a quantity with its unit ("9 mm"), kept as a float in internal units.
 
     Args:
@@ -59,20 +61,22 @@ def _number_or_quantity(value: Any) -> Any:
     return value
 
 
-Length = Annotated[float, _quantity("length")]
-PositiveLength = Annotated[float, _quantity("length", positive=True)]
-Angle = Annotated[float, _quantity("angle")]
+Length = Annotated[float, quantity("length")]
+PositiveLength = Annotated[float, quantity("length", positive=True)]
+Angle = Annotated[float, quantity("angle")]
 Estimate = Literal["estimate"]
-ForceNoise = Annotated[Estimate | float, _quantity("force", positive=True, word="estimate")]
-LengthNoise = Annotated[Estimate | float, _quantity("length", positive=True, word="estimate")]
+ForceNoise = Annotated[Estimate | float, quantity("force", positive=True, word="estimate")]
+LengthNoise = Annotated[Estimate | float, quantity("length", positive=True, word="estimate")]
 Number = Annotated[Any, BeforeValidator(_number_or_quantity)]
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """A table of a specification: strict, closed, finite."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
-class DataSection(_Section):
+class DataSection(Section):
     """[data]: which files, and how to read them (docs/measurements.md)."""
 
     files: list[str] = Field(min_length=1)
@@ -97,7 +101,7 @@ class DataSection(_Section):
         return data
 
 
-class EvenRings(_Section):
+class EvenRings(Section):
     """Evenly spaced rings."""
 
     count: int = Field(ge=1, le=2000)
@@ -113,7 +117,7 @@ Rings = Annotated[
 ]
 
 
-class TracheaSection(_Section):
+class TracheaSection(Section):
     """[trachea]: the tube at rest; Table 1 of the paper unless length and rings are given."""
 
     preset: Literal["table-1"] | None = None
@@ -132,7 +136,7 @@ class TracheaSection(_Section):
         return self
 
 
-class ModelSection(_Section):
+class ModelSection(Section):
     """[model]: what the forward model includes; see `jaxtrachea.model.Options`."""
 
     coupling: Literal["series", "total"] = "series"
@@ -145,7 +149,7 @@ class ModelSection(_Section):
     transition: PositiveLength | None = None
 
 
-class ParameterSection(_Section):
+class ParameterSection(Section):
     """[parameters.NAME]: `fixed`, or free with any of `initial`, `bounds`, `scale`, `scope`.
 
     Numbers are in the parameter's own unit (EI_L N mm^2, GA_L N, k_M, k_1, k_1_ring N/mm, k_3,
@@ -166,14 +170,14 @@ class ParameterSection(_Section):
         return self
 
 
-class NoiseSection(_Section):
+class NoiseSection(Section):
     """[noise]: standard deviation of each kind of observation, or "estimate"."""
 
     force: ForceNoise = "estimate"
     joints: LengthNoise = "estimate"
 
 
-class FitSection(_Section):
+class FitSection(Section):
     """[fit]: how to weigh and solve; see `jaxtrachea.identify.fit.Settings`."""
 
     method: Literal["levenberg-marquardt", "lbfgs", "adam"] = "levenberg-marquardt"
@@ -189,7 +193,7 @@ class FitSection(_Section):
     precision: Literal["float64", "float32"] = "float64"
 
 
-class UncertaintySection(_Section):
+class UncertaintySection(Section):
     """[uncertainty]: what is done beyond the local standard errors (docs/uncertainty.md)."""
 
     profile: list[str] = []
@@ -214,7 +218,7 @@ class UncertaintySection(_Section):
         return self
 
 
-class DesignSection(_Section):
+class DesignSection(Section):
     """[design]: which presses are possible, and what is asked of the next ones."""
 
     s: tuple[Length, Length] | None = Field(None, strict=False)
@@ -231,7 +235,7 @@ class DesignSection(_Section):
         return self
 
 
-class FitSpec(_Section):
+class FitSpec(Section):
     """A whole fit specification."""
 
     title: str = ""
@@ -254,12 +258,26 @@ def load_fit_spec(path: Path) -> FitSpec:
         SpecError: missing file, broken TOML (line and column), unknown key, wrong value; one line
             per problem with its dotted key.
     """
+    return load_spec(path, FitSpec, "fit specification")
+
+
+def load_spec(path: Path, kind: type[Spec], called: str) -> Spec:
+    """Read and validate a specification of any kind.
+
+    Args:
+        path: the TOML file.
+        kind: the record it must fit.
+        called: what a user calls it.
+
+    Raises:
+        SpecError: as `load_fit_spec`.
+    """
     try:
         with path.open("rb") as stream:
             content = tomllib.load(stream)
     except OSError as error:
         reason = error.strerror or "cannot be read"
-        raise SpecError(f"{path}: {reason}; expected a TOML fit specification") from None
+        raise SpecError(f"{path}: {reason}; expected a TOML {called}") from None
     except UnicodeDecodeError as error:
         raise SpecError(f"{path}: not UTF-8 (byte {error.start}); save it as UTF-8") from None
     except tomllib.TOMLDecodeError as error:
@@ -269,12 +287,12 @@ def load_fit_spec(path: Path) -> FitSpec:
     except ValueError as error:  # integers beyond what Python converts
         raise SpecError(f"{path}: not valid TOML: {error}") from None
     try:
-        return FitSpec.model_validate(content)
+        return kind.model_validate(content)
     except ValidationError as error:
-        raise SpecError("\n".join(f"{path}: {line}" for line in _lines(error))) from None
+        raise SpecError("\n".join(f"{path}: {line}" for line in _lines(error, kind))) from None
 
 
-def _lines(error: ValidationError) -> list[str]:
+def _lines(error: ValidationError, root: type[BaseModel]) -> list[str]:
     """One line per problem: dotted key, what is wrong, what was found."""
     lines: dict[str, None] = {}
     for problem in error.errors():
@@ -282,7 +300,7 @@ def _lines(error: ValidationError) -> list[str]:
         key = ".".join(map(str, parts)) or "(top level)"
         text = problem["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
         if problem["type"] == "extra_forbidden":
-            text = f"unknown key; expected one of {', '.join(_known(parts))}"
+            text = f"unknown key; expected one of {', '.join(_known(parts, root))}"
         elif problem["type"] == "missing":
             text = "missing"
         elif problem["type"] in ("model_type", "dict_type"):
@@ -294,12 +312,17 @@ def _lines(error: ValidationError) -> list[str]:
     return list(lines)
 
 
-def _known(parts: list) -> list[str]:
+def _known(parts: list, root: type[BaseModel]) -> list[str]:
     """Keys of the section that holds the unknown key `parts`."""
-    section: Any = FitSpec
+    section = root
     for part in parts[:-1]:
         field = section.model_fields.get(part)
-        section = {"parameters": ParameterSection, "rings": EvenRings}.get(
-            part, field.annotation if field else section
-        )
+        section = _sections(field.annotation)[-1] if field else section
     return list(section.model_fields)
+
+
+def _sections(annotation: Any) -> list[type[BaseModel]]:
+    """The sections named anywhere in a field's type."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [found for part in get_args(annotation) for found in _sections(part)]

@@ -77,3 +77,16 @@ def test_contact_on_a_ring_and_vmap():
     np.testing.assert_allclose(got.u[1, 1], got.u_C[1], rtol=1e-14)
     np.testing.assert_allclose(got.u_C, got.u_C[1], rtol=1e-9)
     np.testing.assert_allclose(got.u, jnp.broadcast_to(got.u[1], (3, 4)), rtol=1e-9)
+
+
+def test_derivatives_with_the_contact_on_a_ring():
+    """One stiffness for all spans: rings do not matter; u_C = F s (L - s) / (EA L)."""
+    rings = jnp.array([20.0, 40.0, 60.0])
+
+    def u_C(s, shift):
+        EA = jnp.full(4, 3.0)
+        return stretch(rings + shift, jnp.array(100.0), EA, s, jnp.array(2.0)).u_C
+
+    by_s, by_shift = jax.grad(u_C, argnums=(0, 1))(jnp.array(40.0), jnp.zeros(3))
+    np.testing.assert_allclose(by_s, 2 * (100 - 2 * 40) / (3 * 100), rtol=1e-12)
+    np.testing.assert_allclose(by_shift, 0, atol=1e-12)

@@ -407,3 +407,25 @@ def test_hostile_hdf5_costs_its_own_row(study, monkeypatch, capsys):
     assert "not usable: evil (all): unreadable" in err
     assert "evil.h5" in err
     assert "1 bad curves" in out
+
+
+def test_a_second_start_compiles_nothing(tmp_path):
+    """Programs are kept in the user's cache; the second start adds none, with the same numbers."""
+    scene = tmp_path / "scene.toml"
+    scene.write_text((ROOT / "configs" / "no_surface.toml").read_text())
+    kept = {"JAX_ENABLE_COMPILATION_CACHE": "true", "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    kept |= {"LOCALAPPDATA": str(tmp_path / "cache")}
+    kept |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    found = []
+    for name in ("first", "second"):
+        process = jaxtrachea_command(
+            "simulate", scene, "--out", name, cwd=tmp_path, env=os.environ | kept
+        )
+        assert process.communicate()[1] == ""
+        assert process.returncode == 0
+        with h5py.File(tmp_path / name / "simulation.h5") as file:
+            numbers = {k: v[()].tobytes() for k, v in file["series"].items()}
+        programs = {p.name for p in (tmp_path / "cache" / "jaxtrachea").iterdir()}
+        found.append((numbers, programs))
+    assert found[0] == found[1]
+    assert any("simulate" in name for name in found[0][1])

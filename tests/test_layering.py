@@ -21,24 +21,39 @@ ORDER = [
     {"model"},
     {"oblique"},
     {"identify"},
+    {"scene"},
     {"report"},
     {"plots", "viewer", "study"},
+    {"terminal"},
+    {"cli_scene"},
     {"cli"},
     {"__main__"},
+]
+#: Within `scene`, likewise: what is there, the program, files and pictures.
+SCENE = [
+    {"operations", "spec", "curve"},
+    {"plan"},
+    {"rules"},
+    {"stage"},
+    {"approach"},
+    {"deform"},
+    {"simulation"},
+    {"build", "results"},
+    {"plots"},
 ]
 #: Rooms that only read or write: they may be told of, but not tell, the physics.
 HEAVY = ["matplotlib", "trimesh", "typer", "rich", "pydantic", "h5py"]
 MODULES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")
 
 
-def level(room):
-    found = [i for i, rooms in enumerate(ORDER) if room in rooms]
+def level(room, order):
+    found = [i for i, rooms in enumerate(order) if room in rooms]
     assert found, f"room {room!r} is not in the order of tests/test_layering.py"
     return found[0]
 
 
-def imported_rooms(source, package):
-    """First names below jaxtrachea of everything that `source` imports, wherever it stands."""
+def imported(source, package):
+    """Dotted names of everything that `source` imports, wherever it stands."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -48,18 +63,25 @@ def imported_rooms(source, package):
             names = [".".join([*stem, alias.name]) for alias in node.names]
         else:
             continue
-        yield from (n.split(".")[1] for n in names if n.startswith("jaxtrachea."))
+        yield from names
 
 
-def faults(room, source, package=("jaxtrachea",)):
-    below = {r for r in imported_rooms(source, list(package)) if r != "__version__"}
-    return sorted(r for r in below - {room} if level(r) >= level(room))
+def faults(room, source, package=("jaxtrachea",), order=ORDER, within="jaxtrachea"):
+    """Rooms of `within` that `room` may not import."""
+    stem = within.split(".")
+    names = [name.split(".") for name in imported(source, list(package))]
+    below = {n[len(stem)] for n in names if n[: len(stem)] == stem and len(n) > len(stem)}
+    mine = level(room, order)
+    return sorted(r for r in below - {room, "__version__"} if level(r, order) >= mine)
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_imports_only_from_above(path):
     inside = path.relative_to(PACKAGE).with_suffix("").parts
-    assert not faults(inside[0], path.read_text(), ("jaxtrachea", *inside[:-1]))
+    package, source = ("jaxtrachea", *inside[:-1]), path.read_text()
+    assert not faults(inside[0], source, package)
+    if inside[0] == "scene" and inside[1] != "__init__":
+        assert not faults(inside[1], source, package, SCENE, "jaxtrachea.scene")
 
 
 @pytest.mark.parametrize(
@@ -69,6 +91,7 @@ def test_imports_only_from_above(path):
         ("trachea", "def f():\n    import jaxtrachea.mechanics.beam as b"),
         ("model", "from jaxtrachea import identify"),
         ("surface", "from jaxtrachea.model import press"),
+        ("identify", "from jaxtrachea.scene.stage import Scene"),
         ("trachea", "from jaxtrachea.surface.regions import bind"),
         ("mechanics", "from jaxtrachea.surface import local"),
         ("_numerics", "from .trachea import geometry"),
@@ -78,10 +101,16 @@ def test_the_walk_sees_a_fault(room, source):
     assert faults(room, source)
 
 
+def test_the_walk_sees_a_fault_within_the_scene():
+    source = "from jaxtrachea.scene import simulation"
+    assert faults("plan", source, order=SCENE, within="jaxtrachea.scene") == ["simulation"]
+    assert not faults("plots", source, order=SCENE, within="jaxtrachea.scene")
+
+
 def test_import_is_light():
     """Plots, meshes, the command line and file formats are loaded by those who use them."""
     code = (
-        "import sys, jaxtrachea, jaxtrachea.model\n"
+        "import sys, jaxtrachea, jaxtrachea.model, jaxtrachea.scene.simulation\n"
         "import jaxtrachea.surface.local, jaxtrachea.surface.regions, jaxtrachea.trachea.imported\n"
         f"print([m for m in {HEAVY!r} if m in sys.modules])"
     )

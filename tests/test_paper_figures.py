@@ -33,3 +33,4 @@ def test_page(script):
     assert (DOCS / "paper_figures.md").read_text(encoding="utf-8") == script.document()
     for letter in "abc":
         assert (DOCS / "figures" / f"fig_7{letter}.png").stat().st_size < 100_000
+        assert (DOCS / "figures" / f"fig_6{letter}.png").stat().st_size < 150_000

@@ -42,7 +42,7 @@ def skeleton_coordinates(
     """
 
     def step(s, p, line):
-        c, t, bend, _ = _at(line, s)
+        c, t, bend, _ = point_at(line, s)
         slope = jnp.sum(t * t) - jnp.sum(bend * (p - c))
         return s + jnp.sum(t * (p - c)) / jnp.maximum(slope, LEAST_SLOPE)
 
@@ -52,17 +52,22 @@ def skeleton_coordinates(
         s = step(s, p, fixed)
     for _ in range(LAST_STEPS):
         s = step(s, point, line)
-    c, t, _, anterior = _at(line, s)
+    c, t, _, anterior = point_at(line, s)
     out, lateral = point - c, jnp.cross(t, anterior)
     y, z = jnp.sum(out * anterior), jnp.sum(out * lateral)
     on_line = (y == 0) & (z == 0)
     return s, jnp.arctan2(jnp.where(on_line, 0, z), jnp.where(on_line, 1, y))
 
 
-def _at(line: Centreline, s):
+def point_at(line: Centreline, s: Float[Array, ""]) -> tuple[Float[Array, "3"], ...]:
     """Point, first and second derivative (cubic by samples and tangents), anterior direction.
 
-    Beyond the ends the line goes on straight.
+    The tangent is not quite of length 1 between the samples, nor is the anterior direction; beyond
+    the ends the line goes on straight.
+
+    Args:
+        line: the centreline.
+        s: arc length, mm.
     """
     last = line.s.shape[0] - 1
     h = (line.s[-1] - line.s[0]) / last

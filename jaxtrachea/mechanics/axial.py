@@ -51,7 +51,9 @@ def stretch(
     zero = jnp.zeros_like(s_c)
     end_A = zero if k_A is None else 1 / k_A
     end_B = zero if k_B is None else 1 / k_B
-    piece = lambda upto: jnp.sum(jnp.where(upto > low, jnp.minimum(upto, high) - low, 0) / EA)  # noqa: E731
+    # Not minimum: with C on a ring it would halve the derivative of the span that ends there.
+    part = lambda upto: jnp.where(upto > high, high, upto) - low  # noqa: E731
+    piece = lambda upto: jnp.sum(jnp.where(upto > low, part(upto), 0) / EA)  # noqa: E731
     upto_C, whole = piece(s_c), jnp.sum((high - low) / EA)
     c_A, c_B = end_A + upto_C, end_B + (whole - upto_C)
     share_A = c_B / (c_A + c_B)

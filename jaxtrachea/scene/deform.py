@@ -1,0 +1,108 @@
+"""From forces and skeleton to the deformed surface: global shape, and the dent under the tool."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxtrachea.contact.distance import signed_distance
+from jaxtrachea.contact.pose import Pose, inverse, transform
+from jaxtrachea.contact.shapes import Shape, sphere
+from jaxtrachea.scene.approach import Approach, backed_out
+from jaxtrachea.scene.curve import distance_from, lay
+from jaxtrachea.scene.stage import REACH, Poses, Presses, Scene
+from jaxtrachea.surface import local, regions
+from jaxtrachea.trachea.material import Material
+from jaxtrachea.trachea.mesh import place
+
+
+def deform(
+    scene: Scene, material: Material, presses: Presses, moved: Any, path: Any, made: Approach | None
+):
+    """Deformed vertices, row by row; shape (rows, vertices, 3), in the frame of the mesh.
+
+    Args:
+        scene: with a surface in its plan.
+        material: -
+        presses: -
+        moved: what the skeleton does, row by row; fields as in `simulation.Simulation`.
+        path: of the tool; read only if `made` is there.
+        made: how the tool comes, or None for presses at given points.
+    """
+    plan, mesh, binding = scene.plan, scene.mesh, scene.binding
+    if mesh is None or binding is None or plan.surface is None:
+        raise ValueError("scene.mesh or scene.binding is None; the plan has a surface")
+    method = plan.surface
+    straight = mesh.straight if plan.dent else None
+    radius = tool = None
+    if plan.dent > 8 and made is not None:
+        radius, tool = _distances(scene, made), backed_out(path, made)
+    where = presses.s, presses.phi, radius, tool
+    together = plan.seat == "first"
+    if together:  # one contact point for all rows: what depends on it alone is computed once
+        where = jax.tree.map(lambda v: v[0], where)
+    weights = regions.weigh(binding, where[1]) if together else None
+
+    def one(moved, where):
+        s_c, phi_c, radius, tool = where
+        ends = _ends(scene, material, s_c, moved) if plan.end_motion else (None, None)
+        keys = regions.clamped(
+            s_c, moved.skeleton, moved.joints, moved.end_U, moved.end_V, moved.slopes,
+            moved.slope_C, end_A=ends[0], end_B=ends[1],
+        )  # fmt: skip
+        share = regions.weigh(binding, phi_c) if weights is None else weights
+        u = regions.interpolate(binding, share, keys, method=method)
+        if straight is not None:
+            dent = _dent(scene, s_c, phi_c, radius, tool, moved.depth)
+            u = local.dented(u, dent, straight, scene.window)
+        return place(mesh, u)
+
+    moved = moved._replace(slip=None, dissipated=None, status=None)
+    return jax.vmap(one, (0, None if together else 0))(moved, where)
+
+
+def _distances(scene: Scene, made: Approach):
+    """Distance of the contacts from the centreline, mm; of the first for all if they share it."""
+    assert scene.tube is not None
+    line, seen = scene.tube.line, made.seen
+    if made.first is None:
+        return jax.vmap(lambda s, point: distance_from(line, s, point))(seen.s, seen.point)
+    found = distance_from(line, seen.s[made.first], seen.point[made.first])
+    return jnp.broadcast_to(found, seen.s.shape)
+
+
+def _ends(scene: Scene, material: Material, s_c, moved):
+    """Motion of both clamps on their axial springs."""
+    passed, F = moved.loads[:, 0], moved.force[0]
+    A = jnp.where(scene.geometry.ring_positions[0] <= s_c, passed[0], F - passed[-1])
+    along = lambda f, k: (  # noqa: E731
+        None if k is None else jnp.zeros_like(moved.force).at[0].set(f / k)
+    )
+    return along(A, material.k_A), along(F - A, material.k_B)
+
+
+def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.Dent:
+    """The local correction for one row."""
+    count, spacing = scene.plan.dent, scene.footprint
+    where = local.centres(s_c, phi_c, scene.radius if radius is None else radius, spacing, count)
+    sag = jnp.zeros_like(where[:, 0])
+    if tool is not None and scene.tool is not None:
+        bent = scene.tube if scene.plan.curved else None
+        sag = _sag(scene.tool, tool, where if bent is None else lay(bent.line, where))
+    return local.fit(where, local.targets(depth, sag), REACH * spacing)
+
+
+def _sag(tool: Shape, pose: Poses, points):
+    """Distance of the tool, just touching, from points of the rest surface, mm."""
+    if tool.vertices.shape[1] == 1:
+        centre = pose.rotation @ tool.vertices[:, 0] + pose.translation
+        off = points - centre[None]
+        return jnp.maximum(jnp.sqrt(jnp.sum(off * off, axis=1)) - tool.radius, 0)
+    point = sphere(jnp.zeros_like(tool.radius))
+
+    def one(x):
+        back = inverse(Pose(pose.rotation, pose.translation))
+        seen = transform(back, x[:, None])[:, 0]
+        return signed_distance(tool, point, Pose(jnp.eye(3, dtype=x.dtype), seen)).distance
+
+    return jnp.maximum(jax.vmap(one)(points), 0)

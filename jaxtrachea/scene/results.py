@@ -1,0 +1,88 @@
+"""Files of a simulation: HDF5 with units, deformed meshes as PLY and GLB."""
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from jaxtrachea.scene.plan import Plan
+from jaxtrachea.scene.simulation import Simulation, Sweep
+from jaxtrachea.scene.stage import Poses, Presses, Scene
+from jaxtrachea.status import PressStatus
+
+SCHEMA, SCHEMA_VERSION = "jaxtrachea-simulation", 1
+
+#: Unit of every series; what is not named is in mm.
+UNITS = {"phi": "rad", "force": "N", "loads": "N", "dissipated": "N mm", "status": "1"}
+
+
+def plan_rows(plan: Plan, shares: dict[str, float]) -> list[list[str]]:
+    """Effect, level, whether forced, share of the operations, reason."""
+    share = lambda name: f"{100 * shares[name]:.1f} %" if name in shares else ""  # noqa: E731
+    return [
+        [e.name, e.level, "forced" if e.forced else "auto", share(e.name), e.reason]
+        for e in plan.effects
+    ]
+
+
+def write_simulation(
+    path: Path, scene: Scene, motion: Poses | Presses, out: Simulation, provenance: dict
+) -> None:
+    """All series of a simulation; one dataset each, its unit as attribute (docs/scenes.md)."""
+    with h5py.File(path, "x") as file:
+        _head(file, provenance, scene.plan)
+        series = file.create_group("series")
+        for name, value in out._asdict().items():
+            if value is not None:
+                data = series.create_dataset(name, data=np.asarray(value), compression="gzip")
+                data.attrs["unit"] = UNITS.get(name, "mm")
+        series["status"].attrs["meaning"] = json.dumps({int(s): s.message for s in PressStatus})
+        if isinstance(motion, Poses):
+            tool = file.create_group("tool")
+            tool.create_dataset("translation", data=motion.translation).attrs["unit"] = "mm"
+            tool.create_dataset("rotation", data=motion.rotation).attrs["unit"] = "1"
+        if scene.mesh is not None:
+            rest = file.create_group("rest")
+            rest.create_dataset("vertices", data=scene.mesh.vertices).attrs["unit"] = "mm"
+            rest.create_dataset("faces", data=scene.mesh.faces).attrs["unit"] = "1"
+
+
+def write_sweep(path: Path, scene: Scene, s, phi, depth: float, out: Sweep, made: dict) -> None:
+    """A sweep over a grid; datasets of shape (s, phi)."""
+    units = {"force": "N", "indentation": "mm", "compliance": "mm/N", "status": "1"}
+    with h5py.File(path, "x") as file:
+        _head(file, made, scene.plan)
+        file.create_dataset("s", data=s).attrs["unit"] = "mm"
+        file.create_dataset("phi", data=phi).attrs["unit"] = "rad"
+        file.create_dataset("depth", data=depth).attrs["unit"] = "mm"
+        for name, value in out._asdict().items():
+            grid = np.asarray(value).reshape(len(s), len(phi))
+            file.create_dataset(name, data=grid, compression="gzip").attrs["unit"] = units[name]
+        file["status"].attrs["meaning"] = json.dumps({int(v): v.message for v in PressStatus})
+
+
+def _head(file: h5py.File, provenance: dict, plan: Plan) -> None:
+    file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
+    file.attrs["provenance"] = json.dumps(provenance)
+    file.attrs["plan"] = json.dumps(plan_rows(plan, {}))
+
+
+def write_meshes(folder: Path, scene: Scene, out: Simulation) -> None:
+    """The last solved row's surface as deformed.ply (mm) and deformed.glb (m, as GLB wants)."""
+    import trimesh  # slow to load, only for files
+
+    if out.vertices is None or scene.mesh is None:
+        return
+    row = last_solved(out)
+    if row is None:
+        return
+    vertices, faces = np.asarray(out.vertices[row], float), np.asarray(scene.mesh.faces)
+    for name, scale in (("deformed.ply", 1.0), ("deformed.glb", 1e-3)):
+        trimesh.Trimesh(vertices * scale, faces, process=False).export(folder / name)
+
+
+def last_solved(out: Simulation) -> int | None:
+    """The last row that is finite."""
+    good = np.flatnonzero(np.isfinite(np.asarray(out.force)).all(axis=1))
+    return int(good[-1]) if len(good) else None

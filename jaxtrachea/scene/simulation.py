@@ -1,0 +1,257 @@
+"""The whole chain for one scene: tool -> contact -> force and skeleton -> surface.
+
+The program is put together from the scene's static `Plan`; what is off is not in it.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxtrachea.model import ligament_beam, local_law, respond, unit_deflection
+from jaxtrachea.oblique import press_oblique, press_path
+from jaxtrachea.scene.approach import Approach, approach
+from jaxtrachea.scene.deform import deform
+from jaxtrachea.scene.stage import Poses, Presses, Scene
+from jaxtrachea.skeleton import local_frame
+from jaxtrachea.status import ContactStatus, PressStatus
+from jaxtrachea.trachea.material import Material
+
+#: What a program without a second plane takes for a normal press on the midline: rad; share.
+COVERED = 1e-5
+
+
+class Simulation(NamedTuple):
+    """What happens along the path, mm and N. None: not asked for, or not modelled.
+
+    Vectors are along x (to the larynx), y (anterior), z of the straight tube. On a bent mesh they
+    are along the tangent, anterior and lateral direction of its centreline (at the contact; joints
+    and ends at their rings): `frame` turns those at the contact into the frame of the mesh.
+
+    Attributes:
+        s: contact position; shape (rows,).
+        phi: contact angle, rad.
+        gap: signed distance of tool and undeformed tube.
+        displacement: of the tool from first touch; shape (rows, 3).
+        force: contact force on the tube.
+        depth: local indentation.
+        skeleton: displacement of C with the skeleton.
+        joints: displacement of each joint; shape (rows, rings, 3).
+        loads: force of the ligament on each ring; x: axial force that passes.
+        end_U: displacement of the rings' ends at -alpha.
+        end_V: at +alpha.
+        slip: way the tool has slid over the surface (friction).
+        dissipated: work lost to friction in each row, N mm.
+        frame: columns tangent, anterior, lateral at the contact; shape (rows, 3, 3). None: the tube
+            is straight, or the contact points are given.
+        vertices: deformed surface in the frame of the mesh; shape (rows, vertices, 3).
+        status: a `PressStatus` per row.
+    """
+
+    s: Float[Array, " rows"]
+    phi: Float[Array, " rows"]
+    gap: Float[Array, " rows"] | None
+    displacement: Float[Array, "rows 3"]
+    force: Float[Array, "rows 3"]
+    depth: Float[Array, "rows 3"]
+    skeleton: Float[Array, "rows 3"]
+    joints: Float[Array, "rows rings 3"] | None
+    loads: Float[Array, "rows rings 3"] | None
+    end_U: Float[Array, "rows rings 3"] | None
+    end_V: Float[Array, "rows rings 3"] | None
+    slip: Float[Array, "rows 3"] | None
+    dissipated: Float[Array, " rows"] | None
+    frame: Float[Array, "rows 3 3"] | None
+    vertices: Float[Array, "rows vertices 3"] | None
+    status: Int[Array, " rows"]
+
+
+class Sweep(NamedTuple):
+    """Normal presses at many contact points.
+
+    Attributes:
+        force: normal contact force, N; shape (points,).
+        indentation: local, along the normal, mm.
+        compliance: of the skeleton along the normal, mm/N; NaN where nothing moves.
+        status: a `PressStatus` each.
+    """
+
+    force: Float[Array, " points"]
+    indentation: Float[Array, " points"]
+    compliance: Float[Array, " points"]
+    status: Int[Array, " points"]
+
+
+def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulation:
+    """Follow a path through the program of `scene.plan`; pure, to be jitted and differentiated.
+
+    The rows of a path with `seat` first belong together: the tool stays on the place that it
+    touched first. A row that the plan does not cover (off the midline in a program of one plane)
+    is NaN with OFF_PLAN; one whose contact lies beyond an end of the tube with OFF_TUBE.
+
+    Args:
+        scene: from `make_scene`, or put together by hand.
+        material: as the plan needs it.
+        path: `Poses` if the plan has contact, else `Presses`.
+
+    Raises:
+        ValueError: the other kind of path, or something missing that the plan needs.
+    """
+    plan = scene.plan
+    if plan.contact != isinstance(path, Poses):
+        kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
+        raise ValueError(f"path is {type(path).__name__}; expected {kinds[not plan.contact]}")
+    made = approach(scene, path) if isinstance(path, Poses) else None
+    presses, refused = _refuse(scene, path if isinstance(path, Presses) else None, made)
+    moved = (_vectors if plan.second_plane else _one_plane)(scene, material, presses)
+    vertices = None
+    if plan.surface is not None:
+        vertices = deform(scene, material, presses, moved, path, made)
+    optional = lambda wanted, value: value if wanted else None  # noqa: E731
+    return Simulation(
+        presses.s, presses.phi, None if made is None else made.seen.gap, presses.displacement,
+        moved.force, moved.depth, moved.skeleton,
+        optional(plan.joints, moved.joints), optional(plan.joints, moved.loads),
+        optional(plan.ring_ends, moved.end_U), optional(plan.ring_ends, moved.end_V),
+        moved.slip, moved.dissipated, None if made is None else made.frame, vertices,
+        _status(moved.status, made, refused),
+    )  # fmt: skip
+
+
+def _refuse(scene: Scene, path: Presses | None, made: Approach | None):
+    """The presses, NaN where they are refused; and the rows refused, by status."""
+    presses = path if made is None else made.presses
+    assert presses is not None
+    D, refused = presses.displacement, {}
+    if made is not None:
+        outside = ~((presses.s >= 0) & (presses.s <= scene.geometry.length))
+        presses_in = jnp.sum(D * made.inward, axis=1) > 0
+        refused[PressStatus.OFF_TUBE] = outside & presses_in
+    if not scene.plan.second_plane:
+        refused[PressStatus.OFF_PLAN] = _off_plan(presses)
+    for rows in refused.values():
+        D = jnp.where(rows[:, None], jnp.nan, D)
+    return Presses(presses.s, presses.phi, D), refused
+
+
+def _status(status, made: Approach | None, refused: dict[PressStatus, Array]):
+    """That of the press; of the contact where it is in doubt; of the rows refused."""
+    if made is not None:
+        seen = made.seen.status
+        seen = seen if made.first is None else jnp.broadcast_to(seen[made.first], seen.shape)
+        unsure = (seen > ContactStatus.FLAT) & (status == PressStatus.OK)
+        status = jnp.where(unsure, PressStatus.UNSURE, status)
+    for code, rows in refused.items():
+        status = jnp.where(rows, code, status)
+    return status.astype(jnp.int8)
+
+
+def sweep(
+    scene: Scene,
+    material: Material,
+    s: Float[Array, " points"],
+    phi: Float[Array, " points"],
+    depth: Float[Array, " points"],
+    *,
+    chunk: int = 256,
+) -> Sweep:
+    """Press along the normal at many contact points, `chunk` of them at a time.
+
+    Args:
+        scene: its geometry and the level of rings, shear and laws of its plan are used.
+        material: -
+        s: mm.
+        phi: rad, within the half-angle of the rings.
+        depth: of the tool along the inward normal, mm.
+        chunk: points computed together.
+    """
+
+    def one(at):
+        s_c, phi_c, d = at
+        inward = local_frame(phi_c)[0]
+        press = press_oblique(
+            scene.geometry, material, s_c, phi_c, d * inward, scene.plan.options,
+            rings=scene.plan.rings, axial=False,
+        )  # fmt: skip
+        force, way = press.force @ inward, press.skeleton @ inward
+        free = ~(force != 0)
+        softness = jnp.where(free, jnp.nan, way / jnp.where(free, 1, force))
+        return Sweep(force, press.depth @ inward, softness, press.status)
+
+    return jax.lax.map(one, (s, phi, depth), batch_size=chunk)
+
+
+class _Moved(NamedTuple):
+    """Force and skeleton, whichever program found them; fields as in `Simulation`."""
+
+    force: Any
+    depth: Any
+    skeleton: Any
+    slope_C: Any
+    joints: Any
+    slopes: Any
+    loads: Any
+    end_U: Any
+    end_V: Any
+    status: Any
+    slip: Any = None
+    dissipated: Any = None
+
+
+def _off_plan(presses: Presses):
+    """Rows that are no normal presses on the midline."""
+    D = jnp.abs(presses.displacement)
+    oblique = jnp.maximum(D[:, 0], D[:, 2]) > COVERED * D[:, 1] + COVERED
+    return ~(jnp.abs(presses.phi) <= COVERED) | oblique
+
+
+def _one_plane(scene: Scene, material: Material, presses: Presses) -> _Moved:
+    """Normal press on the midline: scalars, then spread to vectors."""
+    plan, geometry = scene.plan, scene.geometry
+    beam = ligament_beam(geometry, material, plan.options)
+
+    def at(s_c, inward):
+        unit = unit_deflection(beam, s_c, plan.options)
+        law = local_law(geometry, material, s_c, plan.options)
+        return unit, respond(inward, jnp.zeros_like(s_c), unit.w_C, law, plan.options)
+
+    inward = -presses.displacement[:, 1]
+    if plan.seat == "first":
+        unit, solved = at(presses.s[0], inward)
+        unit = jax.tree.map(lambda v: jnp.broadcast_to(v, (inward.shape[0], *v.shape)), unit)
+    else:
+        unit, solved = jax.vmap(at)(presses.s, inward)
+    F = -solved.force  # along y
+    per_ring = lambda v: _anterior(F[:, None] * v)  # noqa: E731
+    joints = per_ring(unit.w)
+    slope = lambda v: jnp.stack([v, jnp.zeros_like(v)], -1)  # noqa: E731
+    return _Moved(
+        _anterior(F), _anterior(-solved.depth), _anterior(F * unit.w_C),
+        slope(F * unit.theta_C), joints, slope(F[:, None] * unit.theta),
+        per_ring(unit.reaction), joints, joints, solved.status,
+    )  # fmt: skip
+
+
+def _anterior(v):
+    """Vectors with only a y component."""
+    return jnp.stack([jnp.zeros_like(v), v, jnp.zeros_like(v)], -1)
+
+
+def _vectors(scene: Scene, material: Material, presses: Presses) -> _Moved:
+    plan = scene.plan
+    how = {"rings": plan.rings, "axial": plan.axial}
+    fixed = scene.geometry, material
+    if plan.friction:
+        if scene.friction is None:
+            raise ValueError("scene.friction is None; the plan has friction")
+        path = press_path(
+            *fixed, presses.s[0], presses.phi[0], presses.displacement, scene.friction,
+            plan.options, **how,
+        )  # fmt: skip
+        return _Moved(*path.press, slip=path.slip, dissipated=path.dissipated)
+    if plan.seat == "first":
+        at = presses.s[0], presses.phi[0], presses.displacement
+        return _Moved(*press_oblique(*fixed, *at, plan.options, **how))
+    one = lambda s, phi, D: press_oblique(*fixed, s, phi, D, plan.options, **how)  # noqa: E731
+    return _Moved(*jax.vmap(one)(presses.s, presses.phi, presses.displacement))

@@ -1,0 +1,248 @@
+"""TOML scenes: trachea, material, tool and path, validated, in internal units (docs/scenes.md).
+
+As in `config`: every problem with its dotted key, what was found and what is expected. No file but
+the specification is opened here.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from jaxtrachea.config import (
+    Angle,
+    Length,
+    PositiveLength,
+    Rings,
+    Section,
+    load_spec,
+    quantity,
+)
+
+Stiffness = Annotated[float, quantity("stiffness", positive=True)]
+Bending = Annotated[float, quantity("bending_stiffness", positive=True)]
+PositiveForce = Annotated[float, quantity("force", positive=True)]
+Cubic = Annotated[float, quantity("cubic_stiffness")]
+Lengths3 = Annotated[list[Length], Field(min_length=3, max_length=3)]
+Sizes3 = Annotated[list[PositiveLength], Field(min_length=3, max_length=3)]
+Angles3 = Annotated[list[Angle], Field(min_length=3, max_length=3)]
+Direction = Annotated[list[float], Field(min_length=3, max_length=3)]
+Switch = Literal["auto", "on", "off"]
+
+
+class SceneTracheaSection(Section):
+    """[trachea]: made from length and rings (left out: Table 1), or read from a surface file."""
+
+    preset: Literal["table-1"] | None = None
+    length: PositiveLength | None = None
+    rings: Rings | None = None
+    radius: PositiveLength = 11.3
+    half_angle: Angle | None = None
+    ring_height: PositiveLength = 4.0
+    around: int = Field(35, ge=3, le=2000)
+    along: int = Field(97, ge=1, le=5000)
+    wall: PositiveLength = 2.6
+    file: str | None = None
+    unit: str | None = None
+    part: str | None = None
+    cartilage: str | None = None
+    larynx: Direction | None = None
+    anterior: Direction | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> "SceneTracheaSection":
+        given = self.model_fields_set
+        made = {"preset", "length", "radius", "ring_height", "around", "along", "wall"} & given
+        read = {"unit", "part", "cartilage", "larynx", "anterior"} & given
+        if self.file is not None and made:
+            raise ValueError(f"file excludes {', '.join(sorted(made))}; remove one side")
+        if self.file is None and read:
+            raise ValueError(f"{', '.join(sorted(read))}: only with file; name the file")
+        if self.file is not None and isinstance(self.rings, Section):
+            raise ValueError("with file, rings must be a list of positions")
+        if self.file is None and (self.length is None) != (self.rings is None):
+            raise ValueError("give both length and rings, or neither (preset 'table-1')")
+        if self.preset is not None and self.length is not None:
+            raise ValueError("preset and length exclude each other; remove one")
+        return self
+
+
+class MaterialSection(Section):
+    """[material]: see `jaxtrachea.trachea.material.Material`; one value for all rings and spans."""
+
+    EI_L: Bending
+    k_M: Stiffness
+    k_1: Stiffness
+    k_3: Cubic
+    GA_L: PositiveForce | None = None
+    EA_L: PositiveForce | None = None
+    k_A: Stiffness | None = None
+    k_B: Stiffness | None = None
+    EI_C: Bending | None = None
+    k_t: Stiffness | None = None
+    k_1_ring: Stiffness | None = None
+    k_3_ring: Cubic | None = None
+    EI_side: Bending | None = None
+    GA_side: PositiveForce | None = None
+
+
+#: Keys that each shape of tool needs, and those it may have.
+TOOLS = {
+    "sphere": ({"radius"}, set()),
+    "capsule": ({"radius", "length"}, set()),
+    "box": ({"size"}, {"rounding"}),
+    "cylinder": ({"radius", "length"}, {"rounding"}),
+    "cloud": ({"file"}, {"rounding"}),
+}
+
+
+class ToolSection(Section):
+    """[tool]: a convex shape about its own origin; capsule and cylinder along z."""
+
+    shape: Literal["sphere", "capsule", "box", "cylinder", "cloud"]
+    radius: PositiveLength | None = None
+    length: PositiveLength | None = None
+    size: Sizes3 | None = None
+    rounding: PositiveLength | None = None
+    file: str | None = None
+    friction: float | None = Field(None, ge=0, le=10)
+
+    @model_validator(mode="after")
+    def _fitting(self) -> "ToolSection":
+        needed, allowed = TOOLS[self.shape]
+        given = self.model_fields_set - {"shape", "friction"}
+        if needed - given:
+            raise ValueError(f"shape {self.shape!r} needs {', '.join(sorted(needed - given))}")
+        if given - needed - allowed:
+            more = ", ".join(sorted(given - needed - allowed))
+            raise ValueError(f"{more}: not for shape {self.shape!r}; remove it")
+        return self
+
+
+#: Ways to write a path: the keys that tell it, and all it may have.
+PATHS = {
+    "press": ({"s", "displacement"}, {"phi", "steps"}),
+    "line": ({"start", "end"}, {"steps", "rotation"}),
+    "poses": ({"positions"}, {"rotation"}),
+    "file": ({"file"}, set()),
+}
+
+
+class PathSection(Section):
+    """[[path]]: a press at (s, phi) by a vector, a line of the tool, a list, or a CSV file."""
+
+    s: Length | None = None
+    phi: Angle | None = None
+    displacement: Lengths3 | None = None
+    start: Lengths3 | None = None
+    end: Lengths3 | None = None
+    positions: list[Lengths3] | None = Field(None, min_length=1)
+    rotation: Angles3 | None = None
+    file: str | None = None
+    steps: int | None = Field(None, ge=1, le=100_000)
+
+    @property
+    def kind(self) -> str:
+        """One of `PATHS`."""
+        given = self.model_fields_set
+        return next(kind for kind, (needed, _) in PATHS.items() if needed <= given)
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "PathSection":
+        given = self.model_fields_set
+        for needed, allowed in PATHS.values():
+            if needed <= given:
+                if given - needed - allowed:
+                    more = ", ".join(sorted(given - needed - allowed))
+                    raise ValueError(f"{more}: not together with {', '.join(sorted(needed))}")
+                return self
+        ways = "; ".join(" and ".join(sorted(needed)) for needed, _ in PATHS.values())
+        raise ValueError(f"incomplete; give one of: {ways}")
+
+
+class LawSection(Section):
+    """[model]: the contact law; see `jaxtrachea.model.Options`."""
+
+    coupling: Literal["series", "total"] = "series"
+    contact: Literal["unilateral", "bonded"] = "unilateral"
+    onset_width: PositiveLength = 1e-3
+    transition: PositiveLength | None = None
+
+
+def _one_or_auto(value: Any) -> Any:
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+class EffectsSection(Section):
+    """[effects]: what is left "auto" follows the rules of docs/scenes.md."""
+
+    seat: Literal["auto", "first", "each"] = "auto"
+    friction: Switch = "auto"
+    second_plane: Switch = "auto"
+    rings: Literal["auto", "mat", "arch", "arch2"] = "auto"
+    axial: Switch = "auto"
+    shear: Switch = "auto"
+    two_material: Switch = "auto"
+    end_motion: Switch = "auto"
+    surface: Literal["auto", "off", "linear", "hermite", "phong"] = "auto"
+    dent: Annotated[Literal["auto", "off", "8", "16", "32"], BeforeValidator(_one_or_auto)] = "auto"
+
+
+class OutputSection(Section):
+    """[output]: what is wanted."""
+
+    surface: bool = True
+    joints: bool = True
+    ring_ends: bool = True
+    pictures: bool = True
+
+
+class SweepSection(Section):
+    """[sweep]: normal presses on a grid of contact points."""
+
+    depth: PositiveLength
+    s_count: int = Field(60, ge=1, le=10_000)
+    phi_count: int = Field(25, ge=1, le=10_000)
+    phi_max: Angle | None = None
+    chunk: int = Field(256, ge=1, le=1_000_000)
+
+
+class SceneSpec(Section):
+    """A whole scene."""
+
+    title: str = ""
+    trachea: SceneTracheaSection = Field(
+        default_factory=lambda: SceneTracheaSection.model_validate({})
+    )
+    material: MaterialSection
+    tool: ToolSection | None = None
+    path: list[PathSection] = Field(min_length=1)
+    model: LawSection = LawSection()
+    effects: EffectsSection = EffectsSection()
+    output: OutputSection = OutputSection()
+    sweep: SweepSection | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_path(cls, data: Any) -> Any:
+        if isinstance(data, dict) and isinstance(data.get("path"), dict):
+            return {**data, "path": [data["path"]]}
+        return data
+
+    @model_validator(mode="after")
+    def _agree(self) -> "SceneSpec":
+        presses = [leg.kind == "press" for leg in self.path]
+        if any(presses) and not all(presses):
+            raise ValueError("path: presses (s, displacement) and motions of the tool do not mix")
+        if not any(presses) and self.tool is None:
+            raise ValueError("path: a motion of the tool needs [tool]; or give s and displacement")
+        return self
+
+
+def load_scene_spec(path: Path) -> SceneSpec:
+    """Read and validate a scene.
+
+    Raises:
+        SpecError: as `jaxtrachea.config.load_fit_spec`.
+    """
+    return load_spec(path, SceneSpec, "scene")

@@ -1,0 +1,248 @@
+"""The scene as arrays: trachea, tool, surface, path; and the facts the plan is made from."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxtrachea.contact.patches import Patches, Touch, straight_patches, touch
+from jaxtrachea.contact.pose import Pose
+from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.contact.walls import patches_of
+from jaxtrachea.scene.curve import frame_at
+from jaxtrachea.scene.plan import Facts, Plan, PlanError, Wishes
+from jaxtrachea.scene.rules import make_plan
+from jaxtrachea.surface import local, regions
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+from jaxtrachea.trachea.mesh import Mesh
+
+#: Share of the whole motion below which a part of it counts as rounding.
+ROUNDING = 1e-6
+
+#: Distance between the circles of the dent's centres: share of the tool's size; mm at least.
+FOOTPRINT, LEAST = 0.6, 4.0
+
+#: Reach of a dent: distances between its circles.
+REACH = 3
+
+#: Patches of the tube searched for a contact with a tool shorter than one of them.
+NEAR = 2
+#: Patches of a mesh: their rounding, and corners of each (docs/scenes.md says what that loses).
+ROUNDED, CORNERS = 0.15, 128
+
+
+class Presses(eqx.Module):
+    """Presses at known contact points.
+
+    Attributes:
+        s: contact position, mm; shape (rows,).
+        phi: contact angle from the anterior midline, rad; shape (rows,).
+        displacement: of the tool along x (to the larynx), y (anterior), z, mm; shape (rows, 3).
+    """
+
+    s: Float[Array, " rows"] = eqx.field(converter=jnp.asarray)
+    phi: Float[Array, " rows"] = eqx.field(converter=jnp.asarray)
+    displacement: Float[Array, "rows 3"] = eqx.field(converter=jnp.asarray)
+
+
+class Poses(eqx.Module):
+    """A tool's positions in the frame of the mesh (without one: of the tube), in order.
+
+    Attributes:
+        rotation: shape (rows, 3, 3).
+        translation: of the tool's origin, mm; shape (rows, 3).
+    """
+
+    rotation: Float[Array, "rows 3 3"] = eqx.field(converter=jnp.asarray)
+    translation: Float[Array, "rows 3"] = eqx.field(converter=jnp.asarray)
+
+
+class Scene(eqx.Module):
+    """Everything of a scene but its material and its path.
+
+    Attributes:
+        geometry: the tube at rest.
+        radius: of the tube's outside, where a tool touches it and the dent lies, mm.
+        tube: its outside as convex patches, for a tool; or None.
+        near: number of patches searched for a contact (static).
+        window: vertices that a dent can move, see `surface.local.dented` (static).
+        tool: its shape about its own origin, or None.
+        friction: Coulomb's coefficient of the tool, or None.
+        mesh: the surface at rest, or None.
+        binding: of the mesh, or None.
+        footprint: distance between the circles of the dent's centres, mm.
+        plan: the program (static).
+    """
+
+    geometry: Geometry
+    radius: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    tube: Patches | None
+    tool: Shape | None
+    friction: Float[Array, ""] | None
+    mesh: Mesh | None
+    binding: regions.Binding | None
+    footprint: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    near: int = eqx.field(static=True)
+    window: int | None = eqx.field(static=True)
+    plan: Plan = eqx.field(static=True)
+
+
+def touch_tube(scene: Scene, path: Poses) -> Touch:
+    """Contact of the tool with the tube at rest, row by row, batched.
+
+    The tube is that of the mesh; without a mesh a straight cylinder of `scene.radius`.
+
+    Raises:
+        ValueError: no tool.
+    """
+    if scene.tool is None or scene.tube is None:
+        raise ValueError("scene.tool is None; contact needs a tool")
+    tool, tube = scene.tool, scene.tube
+    one = lambda R, T: touch(tool, Pose(R, T), tube, near=scene.near)  # noqa: E731
+    return jax.vmap(one)(path.rotation, path.translation)
+
+
+def make_scene(
+    geometry: Geometry,
+    material: Material,
+    path: Poses | Presses,
+    *,
+    tool: Shape | None = None,
+    friction: float | None = None,
+    mesh: Mesh | None = None,
+    radius: float | None = None,
+    wishes: Wishes = Wishes(),  # noqa: B008 (frozen)
+) -> Scene:
+    """Put a scene together and choose its program from the path (concrete numbers).
+
+    Args:
+        geometry: the tube at rest.
+        material: read only for which optional values are there.
+        path: what the plan is made for; other paths may follow if they need no more.
+        tool: needed for `Poses`.
+        friction: Coulomb's coefficient.
+        mesh: the surface; without one `wishes.want_surface` must be false.
+        radius: of the tube's outside, mm; None: `geometry.radius` + 1.3 (half of Table 1's wall).
+        wishes: what is not left to the rules.
+
+    Raises:
+        PlanError: a wish that cannot be met.
+    """
+    dtype = geometry.length.dtype
+    outer = geometry.radius + 1.3 if radius is None else jnp.asarray(radius, dtype)
+    if isinstance(path, Poses) and tool is None:
+        raise PlanError("contact: the path moves a tool, but there is none; give a tool")
+    size, tube, near = LEAST, None, 1
+    if tool is not None and isinstance(path, Poses):
+        tube = _round(geometry, float(outer)) if mesh is None else _walls(geometry, mesh)
+        near = _near_patches(tool, geometry, tube.centres.shape[0])
+    if tool is not None:
+        extent = np.ptp(np.asarray(tool.vertices), axis=1).min() / 2 + float(tool.radius)
+        size = max(FOOTPRINT * extent, LEAST)
+    mu = None if friction is None else jnp.asarray(friction, dtype)
+    binding = None if mesh is None else regions.bind(mesh, geometry)
+    spacing = jnp.asarray(size, dtype)
+    placeholder = make_plan(Facts(mesh=mesh is not None), Wishes(want_surface=False))
+    fixed = geometry, outer, tube, tool, mu
+    scene = Scene(*fixed, mesh, binding, spacing, near, None, placeholder)
+    plan = make_plan(facts_of(scene, material, path), wishes)
+    if plan.surface is None:
+        mesh = binding = None
+    reached = None
+    if mesh is not None and plan.dent:
+        reached = local.window(mesh.s, plan.dent, REACH * size)
+    return Scene(*fixed, mesh, binding, spacing, near, reached, plan)
+
+
+def _round(geometry: Geometry, radius: float) -> Patches:
+    """A straight cylinder, in patches about as long as it is wide: so their rounding is small."""
+    length = float(geometry.length)
+    borders = np.linspace(0, length, max(round(length / (2 * float(geometry.radius))), 1) + 1)
+    return straight_patches(borders, radius, dtype=geometry.length.dtype)
+
+
+def _walls(geometry: Geometry, mesh: Mesh) -> Patches:
+    """The surface of a mesh, cut midway between the rings: each patch bulges with its ring."""
+    numbers = (mesh.vertices, mesh.faces, mesh.s, mesh.phi, mesh.distance)
+    vertices, faces, s, phi, distance = (np.asarray(v) for v in numbers)
+    centres = frames = None
+    if mesh.frames is not None:
+        frames = np.asarray(mesh.frames)
+        across = np.stack([distance * np.cos(phi), distance * np.sin(phi)], axis=1)
+        centres = vertices - np.einsum("vij,vj->vi", frames[:, :, 1:], across)
+    ring = np.asarray(geometry.ring_positions, float)
+    ends = max(float(s.min()), 0.0), min(float(s.max()), float(geometry.length))
+    between = (ring[1:] + ring[:-1]) / 2
+    borders = np.array([ends[0], *between[(between > ends[0]) & (between < ends[1])], ends[1]])
+    return patches_of(
+        vertices, faces, s, borders, centres=centres, frames=frames, rounding=ROUNDED, most=CORNERS,
+        dtype=geometry.length.dtype,
+    )  # fmt: skip
+
+
+def _near_patches(tool: Shape, geometry: Geometry, count: int) -> int:
+    """As many patches as the tool can lie along, and one more."""
+    length = np.ptp(np.asarray(tool.vertices), axis=1).max() + 2 * float(tool.radius)
+    return min(NEAR + int(length * count / float(geometry.length)), count)
+
+
+def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> Facts:
+    """What the rules need to know of a scene and its path."""
+    curved = scene.mesh is not None and scene.mesh.frames is not None
+    optional = ("GA_L", "k_1_ring", "EA_L", "k_A", "k_B", "EI_C", "k_t")
+    if isinstance(path, Poses):
+        seen = jax.jit(touch_tube)(scene, path)
+        gap, s, phi = (np.asarray(v, float) for v in (seen.gap, seen.s, seen.phi))
+        points = np.asarray(seen.tool_point, float)
+        touching = gap < 0
+        row = int(np.argmax(touching)) if touching.any() else int(np.argmin(gap))
+        moved = _body(path, row, points[row]) - points[row]
+        if curved and scene.tube is not None:
+            moved = moved @ np.asarray(frame_at(scene.tube.line, jnp.asarray(s[row])))
+        depth = np.maximum(-gap[row], 0)
+        at = slice(row, row + 1)
+    else:
+        s, phi, moved = (np.asarray(v, float) for v in (path.s, path.phi, path.displacement))
+        touching, depth, at = np.ones(len(s), bool), 0.0, slice(None)
+    here = np.broadcast_to(phi[at], s.shape)
+    radial = moved[:, 1] * np.cos(here) + moved[:, 2] * np.sin(here)
+    across = np.abs(moved[:, 2] * np.cos(here) - moved[:, 1] * np.sin(here))
+    along, whole = np.abs(moved[:, 0]), max(np.abs(radial).max() + depth, np.abs(moved).max(), 1e-9)
+    share = lambda v: float(v.max(initial=0) / whole)  # noqa: E731
+    keep = lambda v: v if v > ROUNDING else 0.0  # noqa: E731
+    angles = np.abs(phi[touching])
+    slip = np.hypot(along, across)[touching].max(initial=0)
+    x = np.asarray(scene.geometry.ring_positions, float)
+    return Facts(
+        poses=isinstance(path, Poses),
+        angle=keep(float(angles.max(initial=0))),
+        seats=bool(np.ptp(s[touching]) + np.ptp(phi[touching]) > ROUNDING * whole)
+        if touching.any() else False,
+        along=keep(share(along[touching])),
+        across=keep(share(across[touching])),
+        slip=float(slip) if slip > ROUNDING * whole else 0.0,
+        spacing=float(np.diff(x).min()) if len(x) > 1 else float(scene.geometry.length),
+        friction=scene.friction is not None,
+        known=frozenset(name for name in optional if getattr(material, name) is not None),
+        mesh=scene.mesh is not None,
+        curved=curved,
+        near=_near(scene, s, phi),
+    )  # fmt: skip
+
+
+def _body(path: Poses, row: int, point):
+    """The tool's material point that is at `point` in a row, followed through the path."""
+    R, T = np.asarray(path.rotation, float), np.asarray(path.translation, float)
+    return R @ (R[row].T @ (point - T[row])) + T
+
+
+def _near(scene: Scene, s, phi) -> bool:
+    """Whether a vertex lies within the reach of a dent at any of the contacts."""
+    if scene.mesh is None:
+        return False
+    r = float(scene.radius)
+    C = np.stack([s, r * np.cos(phi), r * np.sin(phi)], axis=1)
+    points, reach = np.asarray(scene.mesh.straight, float), REACH * float(scene.footprint)
+    return any(bool((np.sum((points - c) ** 2, axis=1) < reach**2).any()) for c in C)

@@ -1,0 +1,95 @@
+"""What the rules choose, why, and what they refuse."""
+
+import dataclasses
+
+import pytest
+from small_scenes import BALL, BARE, MATERIAL, MESH, TUBE, ball, presses
+
+from jaxtrachea import PlanError, Wishes, make_scene, simulate
+from jaxtrachea.scene.plan import Facts
+from jaxtrachea.scene.rules import make_plan
+
+ALL = frozenset({"EA_L", "EI_C", "k_t", "GA_L", "k_A", "k_B", "k_1_ring"})
+
+
+def levels(**facts):
+    return {e.name: e.level for e in make_plan(Facts(**facts)).effects}
+
+
+@pytest.mark.parametrize(
+    ("facts", "expected"),
+    [
+        ({}, {"contact": "off", "second_plane": "off", "rings": "mat", "axial": "off",
+              "friction": "off", "surface": "hermite", "dent": "8"}),
+        ({"poses": True}, {"contact": "on", "dent": "16", "seat": "first"}),
+        ({"poses": True, "slip": 30.0, "spacing": 10.0}, {"seat": "each", "friction": "off"}),
+        ({"slip": 2.0, "along": 0.5}, {"second_plane": "on", "axial": "off", "friction": "off"}),
+        ({"slip": 2.0, "along": 0.5, "known": ALL}, {"axial": "on", "end_motion": "on",
+                                                     "rings": "mat", "shear": "on",
+                                                     "two_material": "on"}),
+        ({"slip": 2.0, "friction": True, "across": 0.1, "known": ALL}, {"friction": "on",
+                                                                       "rings": "arch2"}),
+        ({"angle": 0.3, "known": ALL}, {"second_plane": "on", "rings": "arch2", "axial": "off"}),
+        ({"angle": 0.3}, {"second_plane": "on", "rings": "mat"}),
+        ({"near": False}, {"dent": "off"}),
+        ({"seats": True}, {"seat": "each"}),
+    ],
+)  # fmt: skip
+def test_rules(facts, expected):
+    found = levels(**facts)
+    assert {name: found[name] for name in expected} == expected
+
+
+def test_every_effect_has_a_reason_and_forcing_says_so():
+    plan = make_plan(Facts(known=ALL, slip=1.0, along=0.5), Wishes(axial="off"))
+    assert all(e.reason for e in plan.effects)
+    assert [e.name for e in plan.effects if e.forced] == ["axial"]
+    assert not plan.axial
+    assert hash(plan) == hash(dataclasses.replace(plan, effects=()))
+
+
+@pytest.mark.parametrize(
+    ("facts", "wishes", "says"),
+    [
+        ({}, {"friction": "on"}, "friction: 'on', but the tool has no coefficient"),
+        ({"friction": True}, {"friction": "on", "contact": "bonded"}, "unilateral"),
+        ({}, {"axial": "on"}, "axial: 'on', but EA_L is not given"),
+        ({}, {"shear": "on"}, "GA_L"),
+        ({}, {"two_material": "on"}, "k_1_ring"),
+        ({}, {"end_motion": "on"}, "k_A or k_B"),
+        ({}, {"rings": "arch2"}, "rings: 'arch2', but EI_C or k_t is not given"),
+        ({"angle": 0.5}, {"second_plane": "off"}, "28.6 deg off the midline"),
+        ({"along": 0.5}, {"second_plane": "off"}, "oblique"),
+        ({"mesh": False}, {}, "surface: asked for, but the scene has no mesh"),
+        ({}, {"want_surface": False, "surface": "linear"}, "output.surface is false"),
+        ({}, {"want_surface": False, "dent": "8"}, "there is no surface"),
+        ({}, {"dent": "16"}, "no tool to shape the dent"),
+        ({"seats": True}, {"seat": "first"}, "different contact points"),
+    ],
+)
+def test_wishes_that_cannot_be_met_are_refused(facts, wishes, says):
+    with pytest.raises(PlanError, match=says.replace("(", r"\(")):
+        make_plan(Facts(**facts), Wishes(**wishes))
+
+
+def test_a_moving_tool_needs_a_tool():
+    with pytest.raises(PlanError, match="there is none"):
+        make_scene(TUBE, MATERIAL, ball([75, 1, 0], [75, -2, 0]), wishes=BARE)
+
+
+def test_the_wrong_kind_of_path_is_refused():
+    scene = make_scene(TUBE, MATERIAL, presses([0, -1, 0]), wishes=BARE)
+    with pytest.raises(ValueError, match="expected Presses"):
+        simulate(scene, MATERIAL, ball([75, 1, 0], [75, -2, 0]))
+
+
+def test_what_the_scene_holds_reaches_the_rules():
+    """Facts of a path of the tool: seats, direction, friction, what is known of the material."""
+    path = ball([75, 1, 0.5], [77, -2, 1.0])
+    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, friction=0.66, mesh=MESH)
+    level = {e.name: e.level for e in scene.plan.effects}
+    assert level["friction"] == level["axial"] == level["second_plane"] == "on"
+    assert (level["rings"], level["dent"], level["seat"]) == ("arch2", "16", "first")
+    assert level["shear"] == level["end_motion"] == "off"
+    far = make_scene(TUBE, MATERIAL, ball([40, -1, 0], [90, -1, 0]), tool=BALL, wishes=BARE)
+    assert far.plan.seat == "each"

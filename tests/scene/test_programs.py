@@ -1,0 +1,187 @@
+"""What is compiled: as many operations as a program written by hand for that scene alone."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_scenes import BALL, DOWN, MATERIAL, MESH, OBLIQUE, OFF, TUBE, ball
+
+from jaxtrachea import (
+    Options,
+    Presses,
+    Wishes,
+    make_scene,
+    press,
+    press_oblique,
+    press_path,
+    simulate,
+)
+from jaxtrachea.contact.patches import touch
+from jaxtrachea.contact.pose import Pose
+from jaxtrachea.scene.operations import count_operations
+from jaxtrachea.skeleton import local_frame
+from jaxtrachea.status import ContactStatus, PressStatus
+from jaxtrachea.surface import local, regions
+from jaxtrachea.trachea.mesh import place
+
+HELD, TOTAL = Options(contact="bonded"), Options(coupling="total")
+
+
+def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **how):  # noqa: B008
+    """A program for presses at one contact point."""
+
+    def run(scene, m, p):
+        at = p.s[0], p.phi[0]
+        out = press_oblique(scene.geometry, m, *at, p.displacement, options, **how)
+        seen = [out.force, out.depth, out.skeleton, out.status]
+        seen += [getattr(out, name) for name in more.split()]
+        return (*seen, move_surface(scene, *at, out, surface)) if surface else seen
+
+    return run
+
+
+def move_surface(scene, s, phi, out, kind):
+    mesh = scene.mesh
+    weights = regions.weigh(scene.binding, phi)
+    if kind == "with a dent":
+        straight = mesh.straight
+        where = local.centres(s, phi, scene.radius, scene.footprint, 8)
+
+    def one(skeleton, joints, U, V, slopes, slope_C, depth):
+        keys = regions.clamped(s, skeleton, joints, U, V, slopes, slope_C)
+        u = regions.interpolate(scene.binding, weights, keys)
+        if kind == "with a dent":
+            goal = local.targets(depth, jnp.zeros(8))
+            u = local.dented(u, local.fit(where, goal, 3 * scene.footprint), straight, scene.window)
+        return place(mesh, u)
+
+    rows = out.skeleton, out.joints, out.end_U, out.end_V, out.slopes, out.slope_C, out.depth
+    return jax.vmap(one)(*rows)
+
+
+def normal(scene, m, p):
+    """A normal press; its scalars as vectors, rows that are none of its kind refused."""
+    D = jnp.abs(p.displacement)
+    fits = (jnp.abs(p.phi) <= 1e-5) & ~(jnp.maximum(D[:, 0], D[:, 2]) > 1e-5 * D[:, 1] + 1e-5)
+    led = jnp.where(fits[:, None], p.displacement, jnp.nan)
+    inward = -led[:, 1]
+    out = press(scene.geometry, m, p.s[0], inward)
+    F = -out.force  # outward is +y
+    y = F, -out.depth, F * out.compliance
+    vectors = [jnp.stack([jnp.zeros(3), v, jnp.zeros(3)], -1) for v in y]
+    return led, vectors, jnp.where(fits, out.status, 7)
+
+
+def friction(scene, m, p):
+    mu = scene.friction
+    out = press_path(scene.geometry, m, p.s[0], p.phi[0], p.displacement, mu, rings="mat")
+    f = out.press
+    vectors = f.force, f.depth, f.skeleton, f.joints, f.loads, f.end_U, f.end_V
+    return vectors, f.status, out.slip, out.dissipated
+
+
+def each(scene, m, p):
+    at = p.s, p.phi, p.displacement
+    one = lambda *at: press_oblique(scene.geometry, m, *at, rings="mat", axial=False)  # noqa: E731
+    out = jax.vmap(one)(*at)
+    return out.force, out.depth, out.skeleton, out.joints, out.loads, out.end_U, out.end_V, (
+        out.status
+    )  # fmt: skip
+
+
+def tool(scene, m, p):
+    """A tool led over the tube: every row presses along the normal where it touches."""
+    geometry, near = scene.geometry, scene.near
+    contact = lambda R, T: touch(scene.tool, Pose(R, T), scene.tube, near=near)  # noqa: E731
+    seen = jax.vmap(contact)(p.rotation, p.translation)
+    inward = jax.vmap(lambda phi: local_frame(phi)[0])(seen.phi)
+    outside = ~((seen.s >= 0) & (seen.s <= geometry.length))
+    D = -seen.gap[:, None] * inward
+    refused = outside & (jnp.sum(D * inward, axis=1) > 0)
+    D = jnp.where(refused[:, None], jnp.nan, D)
+    out = each(scene, m, Presses(seen.s, seen.phi, D))
+    status = jnp.where((seen.status > ContactStatus.FLAT) & (out[-1] == PressStatus.OK), 9, out[-1])
+    return seen.gap, seen.s, seen.phi, D, out, jnp.where(refused, 8, status)
+
+
+BARE = {"want_surface": False}
+ONE = {**BARE, "want_joints": False, "want_ring_ends": False}
+SKIN = {"want_joints": False, "want_ring_ends": False}
+MANY = Presses([30.0, 75.0, 120.0], [0.1, 0.2, 0.3], np.full((3, 3), -1.0))
+LED = ball([20, -1, 1.0], [130, -1, 2.0])
+MAT = {"rings": "mat"}
+#: name -> (path, wishes, program by hand)
+PROGRAMS = {
+    "normal": (DOWN, ONE, normal),
+    "oblique": (OBLIQUE, BARE, by_hand(**MAT)),
+    "force only": (OBLIQUE, ONE, by_hand(more="", **MAT)),
+    "bonded": (OBLIQUE, {**BARE, "contact": "bonded"}, by_hand(HELD, **MAT)),
+    "total": (OBLIQUE, {**BARE, "coupling": "total"}, by_hand(TOTAL, **MAT)),
+    "no axial": (OBLIQUE, {**BARE, "axial": "off"}, by_hand(axial=False, **MAT)),
+    "off the midline": (OFF, BARE, by_hand(rings="arch2", axial=False)),
+    "friction": (OBLIQUE, BARE, friction),
+    "many places": (MANY, {**BARE, **MAT, "axial": "off"}, each),
+    "tool": (LED, {**BARE, **MAT}, tool),
+    "surface": (OBLIQUE, {**SKIN, "dent": "off"}, by_hand(more="", surface="global", **MAT)),
+    "dent": (OBLIQUE, SKIN, by_hand(more="", surface="with a dent", **MAT)),
+}
+
+
+def program(name):
+    path, wishes, hand = PROGRAMS[name]
+    mu = 0.66 if name == "friction" else None
+    scene = make_scene(
+        TUBE, MATERIAL, path, tool=BALL if name == "tool" else None, friction=mu, mesh=MESH,
+        wishes=Wishes(**wishes),
+    )  # fmt: skip
+    return scene, path, hand
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_an_unused_effect_adds_no_operation(name):
+    """In the traced program: exactly those of the program by hand."""
+    scene, path, hand = program(name)
+    assert count_operations(simulate, scene, MATERIAL, path) == count_operations(
+        hand, scene, MATERIAL, path
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_an_unused_effect_adds_none_to_the_compiled_program(name):
+    """After XLA's optimisation, by its own count."""
+    scene, path, hand = program(name)
+    count = lambda f: jax.jit(f).lower(scene, MATERIAL, path).compile().cost_analysis()  # noqa: E731
+    mine, minimal = count(simulate), count(hand)
+    assert mine["flops"] == minimal["flops"]
+    assert mine["transcendentals"] == minimal["transcendentals"]
+
+
+def test_each_effect_that_is_on_costs_operations():
+    path = ball([75, 1, 0.5], [77, -2, 1.0])
+    optional = {"GA_L": 9.0, "k_A": 0.2, "k_1_ring": 0.6}
+    material = dataclasses.replace(MATERIAL, **{k: jnp.array(v) for k, v in optional.items()})
+    scene = make_scene(TUBE, material, path, tool=BALL, friction=0.66, mesh=MESH)
+    without = lambda plan: dataclasses.replace(scene, plan=plan)  # noqa: E731
+    whole, taken = count_operations(simulate, scene, material, path), []
+    for effect in scene.plan.effects:
+        less = scene.plan.without(effect.name)
+        if less is not None:
+            count = count_operations(simulate, without(less), material, path)
+            # Joints and ends are computed for the surface anyway: handing them out costs nothing.
+            free = effect.name in ("joints", "ring_ends")
+            assert count <= whole if free else count < whole, effect.name
+            taken.append(effect.name)
+    assert {"friction", "axial", "end_motion", "surface", "dent", "rings", "shear"} <= set(taken)
+
+
+def test_counting_operations():
+    x = jnp.ones((4, 5))
+    assert count_operations(lambda x: (x + x).reshape(-1), x) == 20
+    assert count_operations(lambda x: x @ x.T, x) == 2 * 5 * 16
+    assert count_operations(lambda x: [jnp.sin(x), x][1], x) == 0
+    loop = lambda x: jax.lax.fori_loop(0, 7, lambda i, y: jnp.sin(y), x)  # noqa: E731
+    assert 140 <= count_operations(loop, x) <= 140 + 14
+    assert count_operations(jax.jit(lambda x: (jnp.sin(x), jnp.cos(x))), x) == 40

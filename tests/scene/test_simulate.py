@@ -1,0 +1,162 @@
+"""The chain from the tool to the surface: against single presses, spheres, and bent meshes."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_scenes import (
+    BALL,
+    BARE,
+    DOWN,
+    MATERIAL,
+    MESH,
+    OFF,
+    OUTER,
+    TUBE,
+    ball,
+    bend,
+    on_arc,
+    poses,
+)
+
+from jaxtrachea import (
+    Poses,
+    Presses,
+    Wishes,
+    make_scene,
+    press,
+    press_oblique,
+    simulate,
+    sweep,
+)
+from jaxtrachea.contact.shapes import box, sphere
+from jaxtrachea.scene.stage import touch_tube
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.tube import make_tube
+
+run = jax.jit(simulate)
+
+
+def test_one_plane_agrees_with_vectors():
+    scene = make_scene(TUBE, MATERIAL, DOWN, mesh=MESH)
+    full = make_scene(TUBE, MATERIAL, DOWN, mesh=MESH, wishes=Wishes(second_plane="on"))
+    assert not scene.plan.second_plane
+    assert full.plan.second_plane
+    a, b = (run(s, MATERIAL, DOWN) for s in (scene, full))
+    for name, value in a._asdict().items():
+        if value is not None and name != "status":
+            np.testing.assert_allclose(value, getattr(b, name), atol=1e-12, err_msg=name)
+
+
+def test_rows_off_the_plan_are_refused_by_status():
+    scene = make_scene(TUBE, MATERIAL, DOWN, wishes=BARE)
+    other = Presses([75.0, 75.0, 75.0], [0.0, 0.3, 0.0], [[0, -2.0, 0], [0, -2.0, 0], [1, -2.0, 0]])
+    out = run(scene, MATERIAL, other)
+    assert out.status.tolist() == [0, PressStatus.OFF_PLAN, PressStatus.OFF_PLAN]
+    assert np.isfinite(out.force[0]).all()
+    assert np.isnan(out.force[1:]).any(axis=1).all()
+
+
+def test_a_ball_led_down_presses_as_deep_as_it_goes():
+    path = ball([75, 1, 0], [75, -3, 0], 5)
+    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, wishes=BARE)
+    out = run(scene, MATERIAL, path)
+    # The smoothed distance is at most log(8) / beta too small (docs/contact.md): 0.1 mm here.
+    np.testing.assert_allclose(out.gap, [1, 0, -1, -2, -3], atol=0.1)
+    np.testing.assert_allclose(out.displacement[1:, 1], out.gap[1:], atol=1e-4)
+    np.testing.assert_allclose(out.s, 75, atol=0.02)
+    direct = press(TUBE, MATERIAL, jnp.asarray(75.0), -out.displacement[:, 1])
+    np.testing.assert_allclose(-out.force[:, 1], direct.force, rtol=1e-3, atol=1e-9)
+    assert out.status.tolist()[0] == PressStatus.NO_CONTACT
+    np.testing.assert_allclose(out.force[0], 0)
+
+
+def test_a_ball_beyond_the_end_is_refused_by_status():
+    path = poses([75, OUTER + 3, 0], [170, OUTER - 3, 0], 2)
+    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, wishes=BARE)
+    assert scene.plan.seat == "each"
+    out = run(scene, MATERIAL, path)
+    assert out.status.tolist() == [0, PressStatus.OFF_TUBE]
+    assert np.isfinite(out.force[0]).all()
+
+
+def test_the_dent_follows_the_tool():
+    """Under the footprint no vertex stays inside the ball by more than the smoothing."""
+    mesh = make_tube(TUBE, around=60, along=160, relief=0.0, flatten=0.0)
+    path = ball([75, 0.5, 0], [75, -2.5, 0], 3)
+    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, mesh=mesh)
+    out = run(scene, MATERIAL, path)
+    centre = path.translation[-1]
+    inside = lambda v: 5 - np.linalg.norm(np.asarray(v) - np.asarray(centre)[None], axis=1).min()  # noqa: E731
+    before, after = inside(mesh.vertices), inside(out.vertices[-1])
+    assert before > 2.4
+    assert after < 0.35  # mm; what 16 centres of 4 mm spacing leave
+
+
+def test_sweep_agrees_with_single_presses_whatever_the_chunk():
+    scene = make_scene(TUBE, MATERIAL, OFF, wishes=BARE)
+    grid = list(itertools.product((20.0, 75.0), (-0.4, 0.0, 0.4)))
+    s, phi = (jnp.array(v) for v in zip(*grid, strict=True))
+    depths = jnp.full(6, 2.0)
+    out = jax.jit(sweep, static_argnames="chunk")(scene, MATERIAL, s, phi, depths, chunk=4)
+    assert out.status.tolist() == [0] * 6
+    i = 5
+    inward = -jnp.array([0, jnp.cos(phi[i]), jnp.sin(phi[i])])
+    single = jax.jit(lambda s, phi, D: press_oblique(TUBE, MATERIAL, s, phi, D, axial=False))
+    one = single(s[i], phi[i], 2.0 * inward)
+    np.testing.assert_allclose(out.force[i], one.force @ inward, rtol=1e-12)
+    np.testing.assert_allclose(
+        out.compliance[i], (one.skeleton @ inward) / (one.force @ inward), rtol=1e-12
+    )
+    np.testing.assert_allclose(out.force[3], out.force[5], rtol=1e-9)  # mirror image
+
+
+def test_a_box_touches_flat():
+    flat = box([4.0, 3.0, 4.0], 0.5)
+    path = poses([75, OUTER + 3.5 - 1, 0], [75, OUTER + 3.5 - 1, 0], 1)
+    scene = make_scene(TUBE, MATERIAL, path, tool=flat, wishes=BARE)
+    seen = touch_tube(scene, path)
+    np.testing.assert_allclose(seen.gap, -1, atol=0.15)
+    np.testing.assert_allclose(seen.phi, 0, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_bent_tube_is_pressed_like_the_straight_one():
+    """The same tool in the frame of the centreline there: same gap, force and motion of the skin.
+
+    The skeleton is straight in both; what differs is the wall: patches of a bent tube end at
+    planes that are not parallel, and its hollows are bridged a little differently.
+    """
+    mesh = make_tube(TUBE, around=35, along=96)
+    (centre, turn), bent = on_arc(70.0, 150.0), bend(mesh, 150.0)
+    led = np.array([[0, 1, 0.0], [0, -1, 0], [1.0, -3, 0.5]]) + [0, OUTER + 5, 0]
+    eye = np.broadcast_to(np.eye(3), (3, 3, 3))
+    paths = Poses(eye, led + [70, 0, 0]), Poses(eye @ turn, centre + led @ turn.T)
+    how = {"tool": BALL, "friction": 0.66, "wishes": Wishes(rings="mat")}
+    outs = []
+    for where, path in zip((mesh, bent), paths, strict=True):
+        scene = make_scene(TUBE, MATERIAL, path, mesh=where, **how)
+        outs.append(run(scene, MATERIAL, path))
+    straight, out = outs
+    assert (straight.frame is None, out.status.tolist()) == (True, straight.status.tolist())
+    np.testing.assert_allclose(out.frame, eye @ turn, atol=1e-3)
+    np.testing.assert_allclose(straight.gap[:2], [1, -1], atol=0.05)  # bound of the smoothing
+    for name, atol in (("gap", 0.02), ("s", 0.02), ("displacement", 0.005), ("force", 5e-4)):
+        np.testing.assert_allclose(getattr(out, name), getattr(straight, name), atol=atol)
+    moved = jnp.einsum("vji,rvj->rvi", bent.frames, out.vertices - bent.vertices[None])
+    np.testing.assert_allclose(moved, straight.vertices - mesh.vertices[None], atol=0.01)
+    assert abs(moved).max() > 2.5
+
+
+def test_the_tool_touches_the_mesh_not_a_cylinder():
+    """Between two rings the wall lies lower, by the relief."""
+    path = poses([0, OUTER + 5 + 0.2, 0], [160, OUTER + 5 + 0.2, 0], 33)
+    mesh = make_tube(TUBE, around=35, along=96)
+    scene = make_scene(TUBE, MATERIAL, path, tool=sphere(0.5), mesh=mesh, wishes=BARE)
+    lifted = Poses(path.rotation, path.translation - jnp.array([[0, 4.5, 0]]))
+    seen = jax.jit(touch_tube)(scene, lifted)
+    gap = np.asarray(seen.gap)[2:-2]
+    np.testing.assert_allclose(gap[::2], 0.2, atol=0.05)  # on the rings, every 10 mm
+    np.testing.assert_allclose(gap[1::2], 0.2 + 0.6, atol=0.08)  # between them

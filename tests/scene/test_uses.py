@@ -1,0 +1,83 @@
+"""What it is good for: a material read off a deformed surface, a network trained through it."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from small_scenes import BARE, DOWN, MATERIAL, TUBE, presses
+
+from jaxtrachea import Presses, make_scene, simulate
+from jaxtrachea.trachea.tube import make_tube
+
+
+@pytest.mark.slow
+def test_material_from_a_deformed_surface():
+    """The muscle's stiffness, recovered from the vertices of one oblique press with optax."""
+    path = presses([-2, -4, 0], rows=2)
+    scene = make_scene(TUBE, MATERIAL, path, mesh=make_tube(TUBE, around=7, along=20))
+    seen = simulate(scene, MATERIAL, path).vertices
+
+    def loss(log_k):
+        m = dataclasses.replace(MATERIAL, k_M=jnp.exp(log_k))
+        return jnp.sum((simulate(scene, m, path).vertices - seen) ** 2)
+
+    optimiser = optax.adam(0.1)
+
+    def step(state, _):
+        x, memory = state
+        value, slope = jax.value_and_grad(loss)(x)
+        change, memory = optimiser.update(slope, memory)
+        return (x + change, memory), value
+
+    x = jnp.log(jnp.array(0.3))
+    with jax.numpy_dtype_promotion("standard"):  # optax counts in int32
+        (x, _), values = jax.jit(lambda s: jax.lax.scan(step, s, length=200))(
+            (x, optimiser.init(x))
+        )
+    assert values[-1] < 1e-6 * values[0]
+    np.testing.assert_allclose(jnp.exp(x), 0.1, rtol=1e-3)
+
+
+def test_a_network_learns_which_motion_reaches_a_force():
+    """Depth of the tool from the force wanted: nothing is shown to it but the simulated force."""
+    scene = make_scene(TUBE, MATERIAL, DOWN, wishes=BARE)
+    wanted = jnp.linspace(0.05, 0.6, 12)
+
+    def forces(depths):
+        D = jnp.stack([0 * depths, -depths, 0 * depths], axis=1)
+        at = jnp.full(12, 75.0), jnp.zeros(12)
+        return -simulate(scene, MATERIAL, Presses(*at, D)).force[:, 1]
+
+    def loss(net):
+        return jnp.mean((forces(jax.vmap(net)(wanted[:, None])[:, 0]) - wanted) ** 2)
+
+    net = eqx.nn.MLP(1, 1, 8, 1, jnp.tanh, jax.nn.softplus, key=jax.random.key(0))
+    optimiser = optax.adam(0.03)
+
+    def step(carry, _):
+        net, memory = carry
+        value, slope = jax.value_and_grad(loss)(net)
+        change, memory = optimiser.update(slope, memory)
+        return (eqx.apply_updates(net, change), memory), value
+
+    net, fixed = eqx.partition(net, eqx.is_inexact_array)
+    whole = loss
+    loss = lambda net: whole(eqx.combine(net, fixed))  # noqa: E731
+    train = jax.jit(lambda c: jax.lax.scan(step, c, length=600))
+    with jax.numpy_dtype_promotion("standard"):  # optax counts in int32
+        (net, _), losses = train((net, optimiser.init(net)))
+    found = forces(jax.vmap(eqx.combine(net, fixed))(wanted[:, None])[:, 0])
+    assert losses[-1] < 1e-3 * losses[0]
+    np.testing.assert_allclose(found, wanted, atol=0.02)
+
+
+def test_the_example_of_the_page_runs(capsys):
+    page = Path(__file__).parents[2] / "docs" / "scenes.md"
+    exec(re.search(r"```python\n(.*?)```", page.read_text(), re.S)[1], {})
+    assert float(capsys.readouterr().out) > 0  # a stiffer muscle: the wall stays higher

@@ -1,0 +1,210 @@
+"""Every scene in configs/ is run; every way to spoil one is refused in a line that helps."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from run_cli import run, tree
+
+from jaxtrachea import table_1
+from jaxtrachea.trachea.tube import make_tube
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+NAMES = sorted(path.stem for path in CONFIGS.glob("*.toml"))
+#: Effects that a scene must have (or not): what it is there to show.
+SHOWS = {
+    "bonded_pull": {"contact law": "bonded", "second_plane": "off"},
+    "capsule": {"contact": "on", "end_motion": "on", "axial": "on"},
+    "friction": {"friction": "on", "axial": "on", "seat": "first"},
+    "imported": {"curved": "off", "rings": "arch2"},
+    "imported_tool": {"contact": "on", "curved": "on"},
+    "left_down": {"axial": "on", "rings": "arch2"},
+    "no_surface": {"surface": "off", "joints": "off", "second_plane": "off"},
+    "normal": {"axial": "off", "rings": "arch2"},
+    "off_midline": {"contact": "on", "second_plane": "on", "rings": "arch2"},
+    "right_down": {"axial": "on", "rings": "arch2"},
+    "scan": {"seat": "each", "surface": "off"},
+}
+
+
+def bent_tube(path):
+    """A trachea as a scanner might give it: bent, in metres, elsewhere, with relief."""
+    mesh = make_tube(table_1(), around=40, along=120, flatten=0.25)
+    x, y, z = np.asarray(mesh.vertices).T
+    y, z = np.stack([y, z]) * (1 + 0.3 * np.exp(-x / 12))  # wider at the carina
+    a = x / 400
+    bent = np.stack([(400 + y) * np.sin(a), (400 + y) * np.cos(a) - 400, z], axis=1)
+    path.parent.mkdir(exist_ok=True)
+    body = trimesh.Trimesh(1e-3 * (bent + 700), np.asarray(mesh.faces), process=False)
+    body.export(path)
+
+
+@pytest.fixture
+def scene(request, tmp_path):
+    """A scene of configs/ beside the mesh that it may name."""
+    text = (CONFIGS / f"{request.param}.toml").read_text()
+    if "meshes/trachea.glb" in text:
+        bent_tube(tmp_path / "meshes" / "trachea.glb")
+    path = tmp_path / f"{request.param}.toml"
+    path.write_text(text)
+    return path
+
+
+def test_each_shows_something():
+    assert set(SHOWS) == set(NAMES)
+
+
+#: Half a minute of compilation each.
+LATER = {"off_midline", "scan", "imported_tool", "capsule", "friction"}
+EACH = [pytest.param(n, marks=pytest.mark.slow if n in LATER else ()) for n in NAMES]
+
+
+@pytest.mark.parametrize("scene", EACH, indirect=True)
+def test_scene_runs(scene, monkeypatch, capsys):
+    monkeypatch.chdir(scene.parent)
+    text = tomllib.loads(scene.read_text())
+    code, out, err = run(monkeypatch, capsys, "plan", scene.name)
+    assert (code, err) == (0, "")
+    assert "operations for" in out
+    code, out, err = run(monkeypatch, capsys, "simulate", scene.name, "--out", "result")
+    assert (code, err) == (0, "")
+    result = scene.parent / "result"
+    output = text.get("output", {})
+    files = {"simulation.h5", "provenance.json"}
+    if output.get("surface", True):
+        files |= {"deformed.ply", "deformed.glb"}
+    if output.get("pictures", True):
+        files |= {"series.png"} | ({"surface.png"} if output.get("surface", True) else set())
+    assert {p.name for p in result.iterdir()} == files
+    with h5py.File(result / "simulation.h5") as file:
+        level = {row[0]: row[1] for row in json.loads(file.attrs["plan"])}
+        assert SHOWS[scene.stem].items() <= level.items()
+        force, status = file["series/force"][:], file["series/status"][:]
+        assert file["series/force"].attrs["unit"] == "N"
+    assert np.isfinite(force).all()
+    assert set(status) <= {0, 1}
+    assert np.abs(force[-1]).max() > 0
+    if "deformed.ply" in files:
+        ply, glb = (trimesh.load(result / f"deformed.{s}", force="mesh") for s in ("ply", "glb"))
+        np.testing.assert_allclose(ply.extents, 1e3 * glb.extents, rtol=1e-5)
+
+
+def test_sweep_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = run(monkeypatch, capsys, "sweep", CONFIGS / "scan.toml", "--out", "maps")
+    assert code == 0
+    assert "112 contact points, 0 without a solution" in out
+    names = {p.name for p in (tmp_path / "maps").iterdir()}
+    assert names == {"force.png", "compliance.png", "sweep.h5", "provenance.json"}
+    with h5py.File(tmp_path / "maps" / "sweep.h5") as file:
+        force = file["force"][:]
+        assert force.shape == (len(file["s"]), len(file["phi"])) == (16, 7)
+    np.testing.assert_allclose(force, force[:, ::-1], rtol=1e-9)  # a symmetric tube
+    assert (force > 0).all()
+
+
+GOOD = """
+[material]
+EI_L = "1.862 N mm^2"
+k_M = "0.1 N/mm"
+k_1 = "0.3 N/mm"
+k_3 = "0.02 N/mm^3"
+"""
+PRESS = '[path]\ns = "75 mm"\ndisplacement = ["0 mm", "-4 mm", "0 mm"]\n'
+LINE = '[path]\nstart = ["75 mm", "19 mm", "0 mm"]\nend = ["75 mm", "16 mm", "0 mm"]\n'
+BALL = '[tool]\nshape = "sphere"\nradius = "5 mm"\n'
+#: name -> (scene, what stderr must say: key, what is wrong, the cure)
+BAD = {
+    "no path": (GOOD, ["path", "missing"]),
+    "no material": (PRESS, ["material: missing"]),
+    "key mistyped": (GOOD + PRESS + "[efects]\naxial = 'on'", ["efects: unknown key", "effects"]),
+    "key in path": (GOOD + PRESS + 'fi = "1 deg"', ["path.0.fi: unknown key", "phi"]),
+    "wrong unit": (
+        GOOD.replace('"0.1 N/mm"', '"0.1 N"') + PRESS,
+        ["material.k_M", "stiffness"],
+    ),
+    "no unit": (GOOD + PRESS.replace('"75 mm"', "75"), ["path.0.s", "unit"]),
+    "negative": (GOOD.replace("1.862", "-1") + PRESS, ["material.EI_L", "positive"]),
+    "two numbers": (GOOD + PRESS.replace(', "0 mm"]', "]"), ["path.0.displacement", "3 items"]),
+    "mesh missing": (GOOD + PRESS + '[trachea]\nfile = "a.stl"', ["trachea.file", "'a.stl'"]),
+    "mesh no mesh": (GOOD + PRESS + '[trachea]\nfile = "bad.stl"', ["trachea.file", "bad.stl"]),
+    "mesh and length": (
+        GOOD + PRESS + '[trachea]\nfile = "a.stl"\nradius = "9 mm"',
+        ["trachea", "file excludes radius", "remove"],
+    ),
+    "cloud missing": (
+        GOOD + LINE + '[tool]\nshape = "cloud"\nfile = "c.csv"',
+        ["tool.file", "'c.csv'"],
+    ),
+    "cloud without unit": (
+        GOOD + LINE + '[tool]\nshape = "cloud"\nfile = "points.csv"',
+        ["tool.file", "points.csv", "x [mm]"],
+    ),
+    "no tool": (GOOD + LINE, ["path", "needs [tool]"]),
+    "tool half told": (GOOD + LINE + '[tool]\nshape = "box"', ["tool", "needs size"]),
+    "tool told twice": (GOOD + LINE + BALL + 'length = "1 mm"', ["tool", "length", "remove"]),
+    "path of two kinds": (GOOD + PRESS + 'end = ["0 mm", "0 mm", "0 mm"]', ["path", "end"]),
+    "behind the rings": (GOOD + PRESS + 'phi = "150 deg"', ["path.0.phi", "150 deg", "120"]),
+    "off the tube": (GOOD + PRESS.replace("75", "175"), ["path.0.s", "175 mm", "160 mm"]),
+    "one step of a line": (GOOD + BALL + LINE + "steps = 1", ["path.0.steps", "at least 2"]),
+    "stretch without EA_L": (
+        GOOD + PRESS + "[effects]\naxial = 'on'",
+        ["effects.axial", "EA_L is not given"],
+    ),
+    "friction without coefficient": (
+        GOOD + PRESS + "[effects]\nfriction = 'on'",
+        ["effects.friction", "tool.friction"],
+    ),
+    "dent without tool": (
+        GOOD + PRESS + "[effects]\ndent = 16",
+        ["effects.dent", "no tool", "use 8 or 'off'"],
+    ),
+    "plane too few": (
+        GOOD + PRESS + "phi = '20 deg'\n[effects]\nsecond_plane = 'off'",
+        ["effects.second_plane", "20 deg off the midline", "auto"],
+    ),
+    "level unknown": (GOOD + PRESS + "[effects]\nrings = 'bow'", ["effects.rings", "'arch2'"]),
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    (tmp_path / "bad.stl").write_text("no mesh")
+    (tmp_path / "points.csv").write_text("x,y,z\n0,0,0\n1,0,0\n0,1,0\n0,0,1\n")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_scene_is_refused_in_a_line(name, folder, monkeypatch, capsys):
+    text, says = BAD[name]
+    (folder / "scene.toml").write_text(text)
+    before = tree(folder)
+    code, out, err = run(monkeypatch, capsys, "simulate", "scene.toml")
+    assert (code, out) == (2, "")
+    assert err.startswith("error: scene.toml: ")
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+    for words in says:
+        assert words in err
+    assert tree(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("sweep", "says"),
+    [
+        ("", "sweep: missing; give a table [sweep] with a depth"),
+        (
+            '[sweep]\ndepth = "1 mm"\nphi_max = "150 deg"',
+            "sweep.phi_max: 150 deg; expected 0 to 120",
+        ),
+    ],
+)
+def test_bad_sweep_is_refused(sweep, says, folder, monkeypatch, capsys):
+    (folder / "scene.toml").write_text(GOOD + PRESS + sweep)
+    code, _, err = run(monkeypatch, capsys, "sweep", "scene.toml")
+    assert (code, says in err) == (2, True), err
