@@ -1,5 +1,6 @@
 """Pictures of simulations and sweeps (matplotlib without a global backend)."""
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -48,7 +49,7 @@ def draw_surface(scene: Scene, vertices: np.ndarray, title: str = "", span: floa
     figure.subplots_adjust(left=0, right=0.88, bottom=0, top=1)
     scale = ScalarMappable(Normalize(0, top), "viridis")
     figure.colorbar(scale, ax=axis, shrink=0.6, label="displacement [mm]")
-    axis.set_title(title, y=0.93, fontsize=10)
+    axis.set_title(textwrap.fill(title, 55), y=0.93, fontsize=10)
     return figure
 
 
