@@ -1,5 +1,7 @@
 """The scene as arrays: trachea, tool, surface, path; and the facts the plan is made from."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -196,6 +198,16 @@ def make_scene(
     if mesh is not None and plan.dent:
         reached = local.window(mesh.s, plan.dent, REACH * size)
     return Scene(*fixed, mesh, binding, spacing, near, reached, plan)
+
+
+def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
+    """The scene with another skeleton: the surface is bound to it anew, the wall stays as it is.
+
+    May be traced; derivatives of the surface by geometry go through this. (A new geometry put into
+    the scene by hand leaves the surface on the old rings.)
+    """
+    binding = None if scene.mesh is None else regions.bind(scene.mesh, geometry)
+    return dataclasses.replace(scene, geometry=geometry, binding=binding)
 
 
 def _round(geometry: Geometry, radius: float) -> Patches:

@@ -32,6 +32,7 @@ from jaxtrachea import (
     press_oblique,
     simulate,
     sweep,
+    with_geometry,
 )
 from jaxtrachea.contact.shapes import box, sphere
 from jaxtrachea.scene.stage import touch_tube
@@ -69,6 +70,15 @@ def test_a_press_elsewhere_is_refused_by_status():
         out = run(scene, MATERIAL, there)
         assert out.status.tolist() == [0, PressStatus.OFF_PLAN, PressStatus.OFF_PLAN]
         assert np.isnan(out.force[1:, 1]).all()
+
+
+def test_another_geometry_moves_the_surface_with_its_rings():
+    """As if made anew; the vertices were bound to the old rings, up to 0.6 mm off."""
+    shifted = dataclasses.replace(TUBE, ring_positions=TUBE.ring_positions + 3.0)
+    scene = make_scene(TUBE, MATERIAL, DOWN, mesh=MESH)
+    anew = make_scene(shifted, MATERIAL, DOWN, mesh=MESH)
+    a, b = (run(s, MATERIAL, DOWN).vertices for s in (with_geometry(scene, shifted), anew))
+    np.testing.assert_allclose(a, b, atol=1e-12)
 
 
 @pytest.mark.parametrize("rings", ["mat", "arch2"])
