@@ -4,11 +4,11 @@ Exit codes: 0 everything converged, 1 some lane failed or some curve could not b
 130 stopped by the user. What is heavy is imported inside the commands.
 """
 
+import dataclasses
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -35,6 +35,9 @@ DataOption = Annotated[
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 LeaveOption = Annotated[
     bool, typer.Option("--leave-one-out", help="Also predict every curve from the others.")
+]
+ProfileOption = Annotated[
+    bool, typer.Option("--profile", help="Also profile the likelihood of the parameters.")
 ]
 
 
@@ -95,21 +98,76 @@ def fit(
     data: DataOption = None,
     out_dir: OutOption = None,
     leave_one_out: LeaveOption = False,
+    profile: ProfileOption = False,
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
     clock = [time.perf_counter()]
     loaded, measurements, problem = _load(spec, data)
     if leave_one_out:
         _can_leave_out(problem)
+    names = _names_to_profile(loaded, problem, profile)
     clock.append(time.perf_counter())
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
     with into(out_dir, default) as (folder, stop_if_asked):
-        result, left_out = _run(loaded, problem, leave_one_out, stop_if_asked)
+        found = _run(loaded, problem, leave_one_out, names, stop_if_asked)
         clock.append(time.perf_counter())
-        _write(folder, spec, loaded, measurements, result, left_out, clock)
-    _print_result(result, folder.parent)
+        _write(folder, spec, loaded, measurements, found, clock)
+    result = found.result
+    _print_result(found, folder.parent)
     failed = any(not _succeeded(result, lane) for lane in range(result.lanes))
     raise typer.Exit(1 if failed or measurements.bad else 0)
+
+
+@app.command()
+def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = None) -> None:
+    """Fit, then say where the next presses tell most."""
+    from jaxtrachea.config import SpecError
+    from jaxtrachea.identify.study import candidates_of
+
+    loaded, measurements, problem = _load(spec, data)
+    try:
+        candidates = candidates_of(loaded, problem)
+    except SpecError as error:
+        raise Stop(f"{spec}: {error}") from None
+    default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}-design"
+    with into(out_dir, default) as (folder, stop_if_asked):
+        found = _run(loaded, problem, False, (), stop_if_asked)
+        try:
+            rows = _design(folder, loaded, found, candidates)
+        except ValueError as error:
+            raise Stop(f"{spec}: {error}") from None
+    errors = [k.removesuffix(" relative se") for k in rows[0] if k.endswith(" relative se")]
+    head = ["press", "s [mm]", "depth [mm]", *errors]
+    cells = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
+    out = Console()
+    out.print(table("Next presses, relative errors expected after each", head, cells))
+    out.print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
+    raise typer.Exit(1 if measurements.bad else 0)
+
+
+def _design(folder: Path, loaded, found, candidates) -> list[dict[str, object]]:
+    """Choose, write the files, return the rows of the choice."""
+    import numpy as np
+
+    from jaxtrachea.identify import design as designs
+    from jaxtrachea.identify import design_tables as tables
+    from jaxtrachea.identify.results import write_csv
+    from jaxtrachea.plots import draw_design
+
+    section = loaded.design
+    known = designs.situation(found.result, found.resampled)
+    unknowns = tables.names(known, found.result)
+    choice = designs.next_points(known, candidates, section.points, section.criterion)
+    s = np.linspace(candidates.s.min(), candidates.s.max(), 121)
+    chart = designs.identifiability(known, s, float(candidates.depth.max()))
+    rows = list(tables.choice_rows(choice, candidates, unknowns))
+    write_csv(folder / "next_points.csv", rows)
+    gains = designs.gains(known, candidates)
+    write_csv(folder / "candidates.csv", list(tables.candidate_rows(known, gains, candidates)))
+    write_csv(folder / "identifiability.csv", list(tables.map_rows(chart, unknowns)))
+    rings = np.asarray(found.result.problem.geometry.ring_positions)
+    draw_design(folder / "identifiability.png", chart, candidates, choice, rings)
+    return rows
 
 
 def _load(path: Path, data: Path | None):
@@ -152,9 +210,31 @@ def _can_leave_out(problem) -> None:
         raise Stop(f"--leave-one-out: {error}") from None
 
 
-def _run(spec, problem, leave_out: bool, stop_if_asked: Callable[[], None]):
+def _names_to_profile(spec, problem, asked: bool) -> tuple[str, ...]:
+    from jaxtrachea.config import SpecError
+    from jaxtrachea.identify.study import profiled
+
+    try:
+        return profiled(spec, problem, asked=asked)
+    except SpecError as error:
+        raise Stop(str(error)) from None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Found:
+    """What a run has computed; None: not asked for."""
+
+    result: Any
+    left_out: Any
+    profiles: Any
+    resampled: Any
+
+
+def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked) -> _Found:
+    from jaxtrachea.identify.bootstrap import bootstrap
     from jaxtrachea.identify.fit import fit as run_fit
     from jaxtrachea.identify.predictions import leave_one_out
+    from jaxtrachea.identify.profile import profiles
     from jaxtrachea.identify.study import settings_of
 
     settings = settings_of(spec)
@@ -165,17 +245,27 @@ def _run(spec, problem, leave_out: bool, stop_if_asked: Callable[[], None]):
 
             def advance(done, of):
                 stop_if_asked()
-                bar.update(task, advance=done, total=of)
+                bar.update(task, advance=done, total=of or None)
 
             return advance
 
         result = run_fit(problem, settings, counted("fitting"))
-        if not leave_out:
-            return result, None
-        return result, leave_one_out(problem, settings, counted("leaving curves out"))
+        left_out = profiled = resampled = None
+        if leave_out:
+            left_out = leave_one_out(problem, settings, counted("leaving curves out"))
+        if profile:
+            points, report = spec.uncertainty.profile_points, counted("profiling")
+            profiled = profiles(result, settings, profile, points=points, progress=report)
+        u = spec.uncertainty
+        if u.bootstrap:
+            resampled = bootstrap(
+                result, settings, count=u.bootstrap, kind=u.kind, block=u.block,
+                progress=counted("resampling"),
+            )  # fmt: skip
+        return _Found(result, left_out, profiled, resampled)
 
 
-def _write(folder: Path, spec: Path, loaded, measurements, result, left_out, clock) -> None:
+def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock) -> None:
     """All files of one run; `clock`: when reading began, ended, and the fit ended."""
     import json
 
@@ -186,13 +276,19 @@ def _write(folder: Path, spec: Path, loaded, measurements, result, left_out, clo
     from jaxtrachea.identify.predictions import predictions
     from jaxtrachea.plots import draw_all
 
+    result, profiles, resampled = found.result, found.profiles, found.resampled
     seen = predictions(result.problem, result.theta)
-    rows = [*results.lane_rows(result), *map(results.bad_row, measurements.bad)]
+    rows = [*results.lane_rows(result, profiles), *map(results.bad_row, measurements.bad)]
     results.write_csv(folder / "summary.csv", rows)
-    results.write_csv(folder / "parameters.csv", list(results.parameter_rows(result)))
-    draw_all(folder, result, seen)
-    left = None if left_out is None else report.left_out_rows(result, left_out)
-    text = report.report_text(loaded.title or spec.stem, result, measurements.bad, seen, left)
+    results.write_csv(
+        folder / "parameters.csv", list(results.parameter_rows(result, profiles, resampled))
+    )
+    if profiles is not None:
+        results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
+    draw_all(folder, result, seen, profiles)
+    left = None if found.left_out is None else report.left_out_rows(result, found.left_out)
+    title = loaded.title or spec.stem
+    text = report.report_text(title, result, measurements.bad, seen, left, profiles, resampled)
     results.write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")
@@ -200,7 +296,7 @@ def _write(folder: Path, spec: Path, loaded, measurements, result, left_out, clo
     made = results.provenance(
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
     )
-    results.write_hdf5(folder / "results.h5", result, made)
+    results.write_hdf5(folder / "results.h5", result, made, profiles, resampled)
     results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
 
 
@@ -210,21 +306,33 @@ def _succeeded(result, lane: int) -> bool:
     return succeeded(result, lane)
 
 
-def _print_result(result, folder: Path) -> None:
+def _print_result(found: _Found, folder: Path) -> None:
     from jaxtrachea import report
-    from jaxtrachea.identify.results import flat_sentence, lane_label
+    from jaxtrachea.identify.results import lane_label, verdict_sentence
 
-    out = Console()
+    out, result = Console(), found.result
     lanes = range(result.lanes)
     if result.lanes <= report.ONE_BY_ONE:
-        rows = report.estimate_rows(result, lanes)
+        rows = report.estimate_rows(result, lanes, found.profiles)
         out.print(table("Estimates", report.ESTIMATE_HEAD, rows))
         out.print(table("Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)))
+        if found.profiles is not None:
+            rows = report.profile_table(found.profiles, lanes)
+            out.print(table("Profile likelihood", report.PROFILE_HEAD, rows))
+        if found.resampled is not None:
+            rows = report.bootstrap_table(found.resampled, lanes)
+            out.print(table("Bootstrap", report.BOOTSTRAP_HEAD, rows))
         for lane in lanes:
-            text = f"{lane_label(result, lane)}: {flat_sentence(result, lane)}"
+            text = f"{lane_label(result, lane)}: {verdict_sentence(result, lane, found.profiles)}"
             out.print(escape(text), highlight=False)
     else:
-        out.print(table("Estimates over lanes", report.SPREAD_HEAD, report.spread_rows(result)))
+        out.print(
+            table(
+                "Estimates over lanes",
+                report.SPREAD_HEAD,
+                report.spread_rows(result, found.profiles),
+            )
+        )
         good = sum(_succeeded(result, lane) for lane in lanes)
         out.print(f"{good} of {result.lanes} lanes succeeded")
     out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)

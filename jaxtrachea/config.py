@@ -193,6 +193,48 @@ class FitSection(Section):
     precision: Literal["float64", "float32"] = "float64"
 
 
+class UncertaintySection(Section):
+    """[uncertainty]: what is done beyond the local standard errors (docs/uncertainty.md)."""
+
+    profile: list[str] = []
+    profile_points: int = Field(10, ge=2, le=1000)
+    bootstrap: int = Field(0, ge=0, le=1_000_000)
+    kind: Literal["parametric", "residual"] = "parametric"
+    block: int = Field(1, ge=1, le=1_000_000)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_name(cls, data: Any) -> Any:
+        if isinstance(data, dict) and isinstance(data.get("profile"), str):
+            return {**data, "profile": [data["profile"]]}
+        return data
+
+    @model_validator(mode="after")
+    def _enough(self) -> "UncertaintySection":
+        if 0 < self.bootstrap < 40:
+            raise ValueError("bootstrap needs 40 replicates or more for a 95 % interval (0: none)")
+        if self.block > 1 and self.kind == "parametric":
+            raise ValueError("block draws neighbouring residuals together; set kind = 'residual'")
+        return self
+
+
+class DesignSection(Section):
+    """[design]: which presses are possible, and what is asked of the next ones."""
+
+    s: tuple[Length, Length] | None = Field(None, strict=False)
+    depth: tuple[PositiveLength, PositiveLength] | None = Field(None, strict=False)
+    points: int = Field(3, ge=1, le=100)
+    criterion: Literal["D", "A", "E"] = "D"
+    candidates: int = Field(10_000, ge=5, le=10_000_000)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "DesignSection":
+        for name, span in (("s", self.s), ("depth", self.depth)):
+            if span is not None and span[0] > span[1]:
+                raise ValueError(f"{name} runs from {span[0]:g} down to {span[1]:g} mm; swap them")
+        return self
+
+
 class FitSpec(Section):
     """A whole fit specification."""
 
@@ -203,6 +245,10 @@ class FitSpec(Section):
     parameters: dict[str, ParameterSection] = {}
     noise: NoiseSection = NoiseSection()
     fit: FitSection = Field(default_factory=lambda: FitSection.model_validate({}))
+    uncertainty: UncertaintySection = Field(
+        default_factory=lambda: UncertaintySection.model_validate({})
+    )
+    design: DesignSection = Field(default_factory=lambda: DesignSection.model_validate({}))
 
 
 def load_fit_spec(path: Path) -> FitSpec:

@@ -7,8 +7,10 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxtrachea.identify.design import Candidates, Choice, Map
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.predictions import Prediction
+from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import lane_label, unknown_label
 from jaxtrachea.report import ONE_BY_ONE
 
@@ -24,14 +26,18 @@ _STYLE: dict[Any, object] = {
 }
 
 
-def draw_all(folder: Path, result: FitResult, prediction: Prediction) -> list[Path]:
-    """Write fit.png, residuals.png and correlation.png; returns their paths."""
+def draw_all(
+    folder: Path, result: FitResult, prediction: Prediction, profiles: Profiles | None = None
+) -> list[Path]:
+    """Write fit.png, residuals.png, correlation.png, if given profiles.png; returns the paths."""
     with mpl.rc_context(_STYLE):
         figures = {
             "fit": draw_fit(result, prediction),
             "residuals": draw_residuals(result, prediction),
             "correlation": draw_correlation(result),
         }
+        if profiles is not None and len(profiles.lane):
+            figures["profiles"] = draw_profiles(profiles)
         paths = []
         for name, figure in figures.items():
             paths.append(folder / f"{name}.png")
@@ -148,3 +154,57 @@ def draw_correlation(result: FitResult):
     axis.set_title("correlation" + (f", mean of {result.lanes} lanes" if result.lanes > 1 else ""))
     figure.colorbar(image, shrink=0.8)
     return figure
+
+
+def draw_profiles(profiles: Profiles):
+    """Rise of the profile against the parameter, a panel for each parameter, a line for each lane.
+
+    Dotted: the parabola of the local standard error, of the first lane; dashed: threshold.
+    """
+    result = profiles.result
+    names = list(dict.fromkeys(p.name for p in result.problem.free))
+    of = lambda k: result.problem.unknowns[profiles.lane[k]][profiles.unknown[k]][0]  # noqa: E731
+    groups = {n: [k for k in range(len(profiles.lane)) if of(k).name == n] for n in names}
+    groups = {n: members for n, members in groups.items() if members}
+    figure, axes = _grid(len(groups))
+    for axis, members in zip(axes, groups.values(), strict=False):
+        p, first = of(members[0]), members[0]
+        colours = mpl.colormaps["viridis"](np.linspace(0.05, 0.9, len(members)))
+        for k, colour in zip(members[:200], colours, strict=False):
+            at = np.array([p.from_scaled(v) for v in profiles.coordinate[k]])
+            axis.plot(at, profiles.statistic[k], ".-", color=colour, lw=0.9, ms=3)
+        lane, unknown = profiles.lane[first], profiles.unknown[first]
+        se = result.uncertainty[lane].se[unknown]
+        if np.isfinite(se):
+            ends = profiles.coordinate[first]
+            theta = np.linspace(ends[0], ends[-1], 101)
+            local = ((theta - result.theta[lane, unknown]) / se) ** 2
+            axis.plot([p.from_scaled(v) for v in theta], local, ":", color="k", lw=1)
+        axis.axhline(profiles.threshold[first], ls="--", color="tab:red", lw=0.9)
+        wide = np.ptp(profiles.coordinate[members]) > np.log(20)
+        axis.set_xscale("log" if p.scale == "log" and wide else "linear")
+        axis.set_ylim(-0.2, 2.2 * profiles.threshold[first])
+        axis.set(title=p.name, xlabel=f"{p.name} [{p.unit}]", ylabel="rise of the profile")
+    return figure
+
+
+def draw_design(path: Path, found: Map, at: Candidates, choice: Choice, rings: np.ndarray) -> None:
+    """Write the identifiability map: over s with the data, of pairs without, and the gains."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(13, 3.8), layout="constrained")
+        left, middle, right = figure.subplots(1, 3)
+        left.plot(found.s, found.condition, color="0.2")
+        left.set(xlabel="s [mm]", ylabel="condition", title="data and a press at s")
+        left.plot(rings, np.full(len(rings), found.condition.min()), "|", color="tab:green", ms=9)
+        image = middle.pcolormesh(found.s, found.s, np.log10(found.pairs), cmap="viridis_r")
+        figure.colorbar(image, label="log10 condition")
+        middle.set(xlabel="s [mm]", ylabel="s [mm]", title="two presses, no other data")
+        for depth in np.unique(at.depth):
+            own = at.depth == depth
+            right.plot(at.s[own], choice.score[0, own], lw=1, label=f"{depth:.3g} mm")
+        for k in np.unique(choice.chosen):
+            order = ", ".join(str(step + 1) for step in np.flatnonzero(choice.chosen == k))
+            right.annotate(order, (at.s[k], choice.score[0, k]), color="tab:red")
+        right.legend(title="depth")
+        right.set(xlabel="s [mm]", ylabel="criterion", title="first press; chosen in order")
+        figure.savefig(path, bbox_inches="tight")

@@ -4,18 +4,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.predictions import LeftOut, Prediction, lag_correlation, rms
+from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import (
-    flat_sentence,
     lane_label,
     peak_force,
     succeeded,
     unknown_label,
     verdict_of,
+    verdict_sentence,
 )
-from jaxtrachea.status import FitStatus
+from jaxtrachea.status import FitStatus, ProfileEnd
 
 #: Lanes that are listed and drawn one by one; beyond it, distributions are shown.
 ONE_BY_ONE = 12
@@ -26,7 +28,9 @@ def number(value: float, digits: int = 4) -> str:
     return "–" if np.isnan(value) else f"{value:.{digits}g}"
 
 
-def estimate_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
+def estimate_rows(
+    result: FitResult, lanes: Sequence[int], profiles: Profiles | None = None
+) -> list[list[str]]:
     """Lane, parameter, value, standard error, 95 % interval, verdict."""
     rows = []
     for lane in lanes:
@@ -39,7 +43,7 @@ def estimate_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
                     number(result.value[lane, i]),
                     number(result.standard_error[lane, i], 2),
                     "–" if np.isnan(low) else f"{number(low)} … {number(high)}",
-                    verdict_of(result, lane, i),
+                    verdict_of(result, lane, i, profiles),
                 ]
             )
     return rows
@@ -48,12 +52,12 @@ def estimate_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
 ESTIMATE_HEAD = ["specimen", "parameter", "value", "std. error", "95 % interval", "verdict"]
 
 
-def spread_rows(result: FitResult) -> list[list[str]]:
+def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[list[str]]:
     """Over all succeeded lanes: parameter, lanes, median, quartiles, median standard error."""
     columns: dict[str, list[tuple[float, float, str]]] = {}
     for lane in filter(lambda k: succeeded(result, k), range(result.lanes)):
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
-            verdict = verdict_of(result, lane, i)
+            verdict = verdict_of(result, lane, i, profiles)
             entry = (float(result.value[lane, i]), float(result.relative_se[lane, i]), verdict)
             columns.setdefault(f"{p.name} [{p.unit}]", []).append(entry)
     rows = []
@@ -130,6 +134,8 @@ def report_text(
     bad: Sequence[BadCurve],
     prediction: Prediction,
     left_out: Sequence[Sequence[str]] | None,
+    profiles: Profiles | None = None,
+    resampled: Bootstrap | None = None,
 ) -> str:
     """The whole report.md."""
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
@@ -138,12 +144,16 @@ def report_text(
         f"{result.lanes} lanes, {result.lanes - len(failed)} succeeded, {len(failed)} failed; "
         f"{len(bad)} curves could not be used. All numbers: `results.h5`; one row per lane: "
         "`summary.csv`; one row per estimate: `parameters.csv` (docs/results.md).",
-        *_estimates(result),
+        *_estimates(result, profiles),
         "## Quality",
         _quality(result, failed),
         f"Largest residual: {prediction.worst(result)}.",
         *_doubts(result, prediction),
     ]
+    if profiles is not None:
+        parts += _profiled(profiles)
+    if resampled is not None:
+        parts += _bootstrapped(resampled)
     if left_out is not None:
         parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, left_out)]
     names = {"fit": "data and fit", "residuals": "residuals", "correlation": "correlation"}
@@ -155,23 +165,119 @@ def report_text(
     return "\n\n".join(parts) + "\n"
 
 
-def _estimates(result: FitResult) -> list[str]:
+def _estimates(result: FitResult, profiles: Profiles | None) -> list[str]:
     """Values with their errors, and what the data leave open."""
     shown = range(min(result.lanes, ONE_BY_ONE))
     if result.lanes <= ONE_BY_ONE:
-        table = markdown_table(ESTIMATE_HEAD, estimate_rows(result, shown))
+        table = markdown_table(ESTIMATE_HEAD, estimate_rows(result, shown, profiles))
     else:
-        table = markdown_table(SPREAD_HEAD, spread_rows(result))
+        table = markdown_table(SPREAD_HEAD, spread_rows(result, profiles))
     fixed = [f"{p.name} = {p.value:g} {p.unit}" for p in result.problem.parameters if p.fixed]
-    flat = [f"- {lane_label(result, k)}: {flat_sentence(result, k)}." for k in shown]
+    flat = [f"- {lane_label(result, k)}: {verdict_sentence(result, k, profiles)}." for k in shown]
     return [
         "## Estimates",
         table,
         f"Fixed: {', '.join(fixed) or 'none'}.",
         "## What the data determine",
         "\n".join(flat),
-        "Identifiable: relative standard error up to 10 %; weak: up to 50 %. Standard errors are "
-        "local (Gauss-Newton); they say nothing of what the model leaves out.",
+        "Identifiable: relative error up to 10 %; weak: up to 50 %; practically not: more, or a "
+        "profile that stays open; structurally not: no data from these contact points can tell, "
+        "however exact. Judged by the profile where there is one, else by the local standard error "
+        "(Gauss-Newton); neither says anything of what the model leaves out.",
+    ]
+
+
+PROFILE_HEAD = ["specimen", "parameter", "value", "profile 95 %", "local 95 %", "ends"]
+
+
+def interval(low: float, high: float, *, log: bool) -> str:
+    """An interval for people; open sides are left out."""
+    open_low, open_high = low == (0 if log else -np.inf), high == np.inf
+    if open_low and open_high:
+        return "anything"
+    if open_low or open_high:
+        return f"up to {number(high)}" if open_low else f"from {number(low)}"
+    return "–" if np.isnan(low) and np.isnan(high) else f"{number(low)} … {number(high)}"
+
+
+def profile_table(profiles: Profiles, lanes: Sequence[int]) -> list[list[str]]:
+    """Lane, parameter, value, interval by profile and by standard error, how the profile ends."""
+    result, rows = profiles.result, []
+    for k, (lane, i) in enumerate(profiles.pairs):
+        if lane not in lanes:
+            continue
+        p = result.problem.unknowns[lane][i][0]
+        low, high = (ProfileEnd(int(e)).name.lower() for e in profiles.end[k])
+        local = (float(v[lane, i]) for v in (result.lower, result.upper))
+        rows.append(
+            [
+                lane_label(result, lane),
+                f"{unknown_label(result, lane, i)} [{p.unit}]",
+                number(float(result.value[lane, i])),
+                interval(profiles.lower[k], profiles.upper[k], log=p.scale == "log"),
+                interval(*local, log=p.scale == "log"),
+                low if low == high else f"{low}, {high}",
+            ]
+        )
+    return rows
+
+
+def _profiled(profiles: Profiles) -> list[str]:
+    """The section on profile likelihood."""
+    result = profiles.result
+    shown = range(min(result.lanes, ONE_BY_ONE))
+    count = lambda end: int(np.sum((profiles.end == end).any(axis=1)))  # noqa: E731
+    parts = [
+        "## Profile likelihood",
+        markdown_table(PROFILE_HEAD, profile_table(profiles, shown)),
+        f"{len(profiles.lane)} profiles: {count(ProfileEnd.OPEN)} open on a side (the data do not "
+        f"limit the parameter there), {count(ProfileEnd.BOUND)} limited only because another "
+        f"unknown is on its bound, {count(ProfileEnd.FAILED)} failed. All other unknowns are "
+        "fitted anew at every point; points: `profiles.csv` (docs/uncertainty.md).",
+    ]
+    better = np.flatnonzero(profiles.improved)
+    if len(better):
+        names = sorted({lane_label(result, int(profiles.lane[k])) for k in better})
+        parts.append(
+            f"**A profile found a better fit than the fit itself** ({', '.join(names[:20])}): "
+            "these intervals are wrong. Fit again with more starts."
+        )
+    return [*parts, "![profiles](profiles.png)"] if len(profiles.lane) else parts
+
+
+BOOTSTRAP_HEAD = ["specimen", "parameter", "value", "std. error", "local", "95 % of replicates"]
+
+
+def bootstrap_table(resampled: Bootstrap, lanes: Sequence[int]) -> list[list[str]]:
+    """Lane, parameter, value, standard error by bootstrap and local, percentile interval."""
+    result, rows = resampled.result, []
+    for lane in lanes:
+        for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+            low, high = float(resampled.lower[lane, i]), float(resampled.upper[lane, i])
+            rows.append(
+                [
+                    lane_label(result, lane),
+                    f"{unknown_label(result, lane, i)} [{p.unit}]",
+                    number(result.value[lane, i]),
+                    number(resampled.standard_error[lane, i], 2),
+                    number(result.standard_error[lane, i], 2),
+                    "–" if np.isnan(low) else f"{number(low)} … {number(high)}",
+                ]
+            )
+    return rows
+
+
+def _bootstrapped(resampled: Bootstrap) -> list[str]:
+    """The section on the bootstrap."""
+    shown = range(min(resampled.result.lanes, ONE_BY_ONE))
+    lost = int(np.sum(~resampled.usable))
+    blocks = f" in blocks of {resampled.block} samples" if resampled.block > 1 else ""
+    return [
+        "## Bootstrap",
+        markdown_table(BOOTSTRAP_HEAD, bootstrap_table(resampled, shown)),
+        f"{resampled.usable.shape[1]} replicates of every lane ({resampled.kind}{blocks}); "
+        f"{lost} of {resampled.usable.size} refits did not converge and are left out. All numbers: "
+        "`results.h5` (docs/uncertainty.md).",
     ]
 
 

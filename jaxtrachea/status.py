@@ -68,3 +68,12 @@ class RingStatus(_Described):
     OK = 0, "solved"
     BEHIND_GAP = 1, "the angle lies behind the ends of the ring, where there is no cartilage"
     NON_FINITE = 2, "an input or a result is not finite"
+
+
+class ProfileEnd(_Described):
+    """How a profile likelihood ends on one side."""
+
+    CLOSED = 0, "the profile rises above the threshold"
+    BOUND = 1, "it rises above the threshold only where another unknown is on its bound"
+    OPEN = 2, "it stays below the threshold up to the bound of the parameter"
+    FAILED = 3, "a fit along it did not converge"

@@ -6,7 +6,6 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -67,8 +66,8 @@ def set_up_jax() -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    config: Any = jax.config  # its attributes are made at run time
-    wanted, chosen = config.jax_enable_compilation_cache, config.jax_compilation_cache_dir
+    wanted = jax.config.values["jax_enable_compilation_cache"]
+    chosen = jax.config.values["jax_compilation_cache_dir"]
     if wanted and chosen is None and (folder := cache_folder()) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
 

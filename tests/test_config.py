@@ -21,6 +21,8 @@ SECTIONS = {
     "## [parameters.NAME]": config.ParameterSection,
     "## [noise]": config.NoiseSection,
     "## [fit]": config.FitSection,
+    "## [uncertainty]": config.UncertaintySection,
+    "## [design]": config.DesignSection,
 }
 
 

@@ -1,6 +1,7 @@
 """Whole fits: what was put in comes out, intervals cover, a batch is its lanes one by one."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from jaxtrachea.identify.fit import Settings, first_sigma, fit
 from jaxtrachea.identify.measurements import read_measurements
 from jaxtrachea.identify.problem import Noise, build
 from jaxtrachea.identify.solve import Tolerances, levenberg_marquardt
-from jaxtrachea.identify.uncertainty import describe_flat
+from jaxtrachea.identify.verdict import describe_flat
 from jaxtrachea.status import FitStatus
 
 #: Truths that four curves with 1 % noise identify: a soft contact that hardens early.
@@ -224,9 +225,11 @@ def test_one_position_leaves_skeleton_undetermined():
     assert -4.5 < ratio < -2.0
     assert np.all(np.isinf(result.standard_error[0, :2]))
     assert np.all(np.isfinite(result.standard_error[0, 2:]))
-    words = describe_flat([p.name for p, _, _ in problem.unknowns[0]], flat, np.inf)
-    assert "EI_L" in words
-    assert "k_M" in words
+    u = result.uncertainty[0]
+    words = describe_flat([p.name for p, _, _ in problem.unknowns[0]], u.flat, np.inf, u.blind)
+    shape = re.fullmatch(r"EI_L and k_M only through EI_L k_M\^([\d.]+)", words)
+    assert shape is not None
+    assert float(shape[1]) == pytest.approx(-ratio, rel=1e-2)
 
 
 def test_a_bound_is_hit_and_said(noisy):

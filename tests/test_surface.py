@@ -395,25 +395,6 @@ def test_dent_is_zero_out_of_reach(count):
     assert np.all(moved[away < 4.5] > 0)
 
 
-def test_dent_within_a_window():
-    """Visiting the points beside the dent gives the same; a dent that reaches more is refused."""
-    points = TUBE.straight
-    count = local.window(points[:, 0], 16, 6.0)
-    assert count is not None
-    moved = jnp.asarray(np.random.default_rng(2).normal(size=points.shape))
-    add = jax.jit(local.dented, static_argnums=3, compiler_options=QUICK)
-    for s in (-3.0, 4.0, 73.0, 158.0):
-        at = local.centres(*(jnp.asarray(v) for v in (s, 0.4, 12.6, 2.0)), 16)
-        found = local.fit(at, jnp.ones((16, 3)), jnp.asarray(6.0))
-        whole, part = (add(moved, found, points, n) for n in (None, count))
-        np.testing.assert_allclose(part, whole, rtol=1e-15, atol=1e-15)
-        assert np.max(np.abs(whole - moved)) > 0.5
-    wide = local.Dent(found.centres, found.weights, jnp.asarray(30.0))
-    assert np.all(np.isnan(np.asarray(add(moved, wide, points, count))).any(axis=1).sum() == count)
-    assert local.window(points[::-1, 0], 16, 6.0) is None
-    assert local.window(points[:, 0], 16, 60.0) is None
-
-
 def test_one_centre_is_the_kernel():
     """Wendland's C2 function by hand: psi(1/2) = 3/16."""
     at, wanted, found = dent(1, reach=4.0)

@@ -83,11 +83,17 @@ class FitResult:
         """Number of lanes."""
         return len(self.status)
 
+    @property
+    def whitened_sigma(self) -> np.ndarray:
+        """`sigma` in units of the lanes' precision, as `evaluate` wants it; (lanes, 2)."""
+        return self.sigma / _precision_unit(self.problem)
+
 
 def fit(
     problem: Problem,
     settings: Settings = Settings(),  # noqa: B008 (frozen)
     progress: Callable[[int, int], None] | None = None,
+    starts: np.ndarray | None = None,
 ) -> FitResult:
     """Fit every lane from every start and keep the best; failed lanes are rows with a status.
 
@@ -95,6 +101,7 @@ def fit(
         problem: from `problem.build`.
         settings: how to solve.
         progress: called with (jobs finished since the last call, jobs in all).
+        starts: where to start, scaled coordinates, (lanes * settings.starts, P); None: drawn.
 
     Returns:
         The `FitResult`. It never raises for a lane's sake.
@@ -102,7 +109,7 @@ def fit(
     lanes = problem.lanes.lower.shape[0]
     jobs = np.repeat(np.arange(lanes), settings.starts)
     sigma = first_sigma(problem)
-    starts = draw_starts(problem, settings)
+    starts = draw_starts(problem, settings) if starts is None else starts
     solved = _solve(problem, settings, jobs, starts, sigma[jobs], progress)
     best, agree = _best(solved, lanes, settings.starts)
     solved = Solved(*(v[best] for v in solved))
@@ -215,12 +222,13 @@ def _conclude(problem, solved: Solved, info: Information, sigma, agree) -> FitRe
         half = u.half_width[:, None] * u.se
         rms = np.sqrt(info.squares / info.counts)
         standard_error = u.se * np.where(log, value, step)
+        lower, upper = unscale(theta - half), unscale(theta + half)
     unit = _precision_unit(problem)
     samples = np.sum(info.counts, axis=1)
     status = _final_status(solved.status, u, at_bound, samples - np.sum(~held, axis=1))
     return FitResult(
         problem=problem, theta=theta, value=value, standard_error=standard_error,
-        lower=unscale(theta - half), upper=unscale(theta + half), relative_se=u.se / relative,
+        lower=lower, upper=upper, relative_se=u.se / relative,
         at_bound=at_bound, status=status, iterations=solved.iterations, cost=solved.cost,
         converged_starts=agree, sigma=sigma * unit, rms=rms * unit, samples=samples,
         uncertainty=tuple(Uncertainty(*row) for row in zip(*u, strict=True)),

@@ -136,7 +136,8 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
         ValueError: as `curves_to_leave_out`.
     """
     lane, trial = (np.array(v) for v in zip(*curves_to_leave_out(problem), strict=True))
-    lanes = jax.tree.map(lambda v: v[lane], problem.lanes)
+    chosen = problem.take(lane)
+    lanes = chosen.lanes
     rows = np.arange(len(lane))
 
     def without(precision):
@@ -146,13 +147,11 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
 
     joint_precision = None if lanes.joint_precision is None else without(lanes.joint_precision)
     held_back = dataclasses.replace(
-        problem,
+        chosen,
         lanes=lanes._replace(precision=without(lanes.precision), joint_precision=joint_precision),
-        curves=tuple(problem.curves[k] for k in lane),
-        unknowns=tuple(problem.unknowns[k] for k in lane),
     )
     result = fit(held_back, settings, progress)
-    seen = predictions(dataclasses.replace(held_back, lanes=lanes), result.theta)
+    seen = predictions(chosen, result.theta)
     force, data = seen.force[rows, trial], lanes.force[rows, trial]
     model = np.where(lanes.precision[rows, trial] > 0, data + force, 0)
     with np.errstate(invalid="ignore", divide="ignore"):

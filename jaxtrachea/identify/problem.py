@@ -114,6 +114,15 @@ class Problem:
         same = self.options, columns, self.loss, self.loss_scale, self.common
         return _program(tree, numbers, *same)
 
+    def take(self, lanes: Int[np.ndarray, " n"]) -> "Problem":
+        """The same study with these lanes, in this order; a lane may come more than once."""
+        return dataclasses.replace(
+            self,
+            lanes=jax.tree.map(lambda v: v[lanes], self.lanes),
+            curves=tuple(self.curves[k] for k in lanes),
+            unknowns=tuple(self.unknowns[k] for k in lanes),
+        )
+
     def lane_name(self, lane: int) -> tuple[str, str]:
         """Specimen and trial of a lane; "(all)" where it spans several."""
         one = lambda names: names.pop() if len(names) == 1 else "(all)"  # noqa: E731

@@ -13,10 +13,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
-from jaxtrachea.identify.uncertainty import describe_flat, verdict
-from jaxtrachea.status import FitStatus
+from jaxtrachea.identify.profile import Profiles
+from jaxtrachea.identify.verdict import VERDICTS, describe_flat, verdict
+from jaxtrachea.status import FitStatus, ProfileEnd
 
 SCHEMA = "jaxtrachea-results"
 SCHEMA_VERSION = 1
@@ -56,16 +58,22 @@ def flat_sentence(result: FitResult, lane: int) -> str:
         return "no estimate"
     names = [unknown_label(result, lane, i) for i in range(len(result.problem.unknowns[lane]))]
     u = result.uncertainty[lane]
-    size = np.abs(u.flat[: len(names)])
-    if np.sum(size >= 0.1 * np.max(size)) != 1:
-        return describe_flat(names, u.flat, float(u.flat_se))
-    name = names[int(np.argmax(size))]
-    if not np.isfinite(float(u.flat_se)):
-        return f"{name} changes no curve at all"
-    return f"least determined: {name} alone, known to {100 * u.flat_se:.2g} %"
+    return describe_flat(names, u.flat, float(u.flat_se), u.blind)
 
 
-def lane_rows(result: FitResult) -> Iterator[dict[str, object]]:
+def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = None) -> str:
+    """Which unknowns of a lane have which verdict, and what is least determined."""
+    if not succeeded(result, lane):
+        return "no estimate"
+    groups: dict[str, list[str]] = {}
+    for i in range(len(result.problem.unknowns[lane])):
+        word = verdict_of(result, lane, i, profiles)
+        groups.setdefault(word, []).append(unknown_label(result, lane, i))
+    said = [f"{word}: {', '.join(groups[word])}" for word in VERDICTS if word in groups]
+    return "; ".join([*said, flat_sentence(result, lane)])
+
+
+def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[dict[str, object]]:
     """One row per lane for summary.csv; trial-wise unknowns are left to parameters.csv."""
     for lane in range(result.lanes):
         specimen, trial = result.problem.lane_name(lane)
@@ -95,16 +103,22 @@ def lane_rows(result: FitResult) -> Iterator[dict[str, object]]:
                 f"{label} se": float(result.standard_error[lane, i]),
                 f"{label} low95": float(result.lower[lane, i]),
                 f"{label} high95": float(result.upper[lane, i]),
-                f"{label} verdict": verdict_of(result, lane, i),
+                f"{label} verdict": verdict_of(result, lane, i, profiles),
             }
         yield row
 
 
-def verdict_of(result: FitResult, lane: int, i: int) -> str:
-    """Identifiable, weak, not identifiable, at bound, or "failed" where there is no estimate."""
+def verdict_of(result: FitResult, lane: int, i: int, profiles: Profiles | None = None) -> str:
+    """One of `VERDICTS`, by the profile where there is one; "failed" without an estimate."""
     if not succeeded(result, lane):
         return "failed"
-    return verdict(float(result.relative_se[lane, i]), bool(result.at_bound[lane, i]))
+    k = None if profiles is None else profiles.find(lane, i)
+    profile = None
+    if profiles is not None and k is not None:
+        ends = max(profiles.end[k, 0], profiles.end[k, 1])
+        profile = float(profiles.relative_error[k]), ProfileEnd(int(ends))
+    held = bool(result.at_bound[lane, i])
+    return verdict(float(result.relative_se[lane, i]), held, profile)
 
 
 def bad_row(bad: BadCurve) -> dict[str, object]:
@@ -117,12 +131,14 @@ def bad_row(bad: BadCurve) -> dict[str, object]:
     }
 
 
-def parameter_rows(result: FitResult) -> Iterator[dict[str, object]]:
-    """One row per lane and unknown for parameters.csv."""
+def parameter_rows(
+    result: FitResult, profiles: Profiles | None = None, resampled: Bootstrap | None = None
+) -> Iterator[dict[str, object]]:
+    """One row per lane and unknown for parameters.csv; more columns where there is more to say."""
     for lane in range(result.lanes):
         lane_specimen, _ = result.problem.lane_name(lane)
         for i, (p, specimen, trial) in enumerate(result.problem.unknowns[lane]):
-            yield {
+            row = {
                 "specimen": specimen or lane_specimen,
                 "trial": trial or "(all)",
                 "parameter": p.name,
@@ -132,7 +148,51 @@ def parameter_rows(result: FitResult) -> Iterator[dict[str, object]]:
                 "low95": float(result.lower[lane, i]),
                 "high95": float(result.upper[lane, i]),
                 "relative_se": float(result.relative_se[lane, i]),
-                "verdict": verdict_of(result, lane, i),
+                "verdict": verdict_of(result, lane, i, profiles),
+            }
+            yield row | _profile_cells(profiles, lane, i) | _bootstrap_cells(resampled, lane, i)
+
+
+def _profile_cells(profiles: Profiles | None, lane: int, i: int) -> dict[str, object]:
+    """Interval by profile likelihood, and how it ends."""
+    k = None if profiles is None else profiles.find(lane, i)
+    if profiles is None or k is None:
+        return {}
+    low, high = (ProfileEnd(int(v)).name.lower() for v in profiles.end[k])
+    return {
+        "profile_low95": float(profiles.lower[k]),
+        "profile_high95": float(profiles.upper[k]),
+        "profile_low_end": low,
+        "profile_high_end": high,
+    }
+
+
+def _bootstrap_cells(resampled: Bootstrap | None, lane: int, i: int) -> dict[str, object]:
+    """Standard error and percentile interval of the replicates."""
+    if resampled is None:
+        return {}
+    return {
+        "bootstrap_se": float(resampled.standard_error[lane, i]),
+        "bootstrap_low95": float(resampled.lower[lane, i]),
+        "bootstrap_high95": float(resampled.upper[lane, i]),
+    }
+
+
+def profile_rows(profiles: Profiles) -> Iterator[dict[str, object]]:
+    """One row per point of each profile for profiles.csv."""
+    result = profiles.result
+    for k, (lane, i) in enumerate(profiles.pairs):
+        lane_specimen, _ = result.problem.lane_name(lane)
+        p, specimen, trial = result.problem.unknowns[lane][i]
+        for theta, statistic in zip(profiles.coordinate[k], profiles.statistic[k], strict=True):
+            yield {
+                "specimen": specimen or lane_specimen,
+                "trial": trial or "(all)",
+                "parameter": p.name,
+                "unit": p.unit,
+                "at": p.from_scaled(float(theta)),
+                "statistic": float(statistic),
+                "threshold": float(profiles.threshold[k]),
             }
 
 
@@ -150,19 +210,41 @@ def write_text(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def write_hdf5(path: Path, result: FitResult, provenance: dict) -> None:
+def write_hdf5(
+    path: Path,
+    result: FitResult,
+    provenance: dict,
+    profiles: Profiles | None = None,
+    resampled: Bootstrap | None = None,
+) -> None:
     """Write all numbers of a fit; the schema is described in docs/results.md.
 
     Args:
         path: new file.
         result: the fit.
         provenance: stored as JSON in the root attribute of that name.
+        profiles: makes the group `profiles`.
+        resampled: makes the group `bootstrap`.
     """
     with h5py.File(path, "x") as file:
         file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
         file.attrs["provenance"] = json.dumps(provenance)
         _write_lanes(file.create_group("lanes"), result)
         _write_unknowns(file.create_group("unknowns"), result)
+        if profiles is not None:
+            _write_profiles(file.create_group("profiles"), profiles)
+        if resampled is not None:
+            group = file.create_group("bootstrap")
+            group.attrs["kind"], group.attrs["block"] = resampled.kind, resampled.block
+            for name in ("theta", "usable", "lower", "upper", "standard_error"):
+                group.create_dataset(name, data=getattr(resampled, name), compression="gzip")
+
+
+def _write_profiles(group: h5py.Group, profiles: Profiles) -> None:
+    for name in ("lane", "unknown", "lower", "upper", "threshold", "theta", "statistic"):
+        group.create_dataset(name, data=getattr(profiles, name))
+    codes = group.create_dataset("end", data=profiles.end.astype(np.int8))
+    codes.attrs["meaning"] = json.dumps({int(e): e.message for e in ProfileEnd})
 
 
 def _write_lanes(group: h5py.Group, result: FitResult) -> None:

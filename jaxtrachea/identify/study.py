@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxtrachea.config import EvenRings, FitSpec, ParameterSection, SpecError, TracheaSection
+from jaxtrachea.identify.design import Candidates, check, grid
 from jaxtrachea.identify.fit import Settings
 from jaxtrachea.identify.measurements import (
     BadCurve,
@@ -265,6 +266,42 @@ def problem_of(spec: FitSpec, measurements: Measurements) -> Problem:
         raise
     except ValueError as error:
         raise SpecError(str(error)) from None
+
+
+def profiled(spec: FitSpec, problem: Problem, *, asked: bool) -> tuple[str, ...]:
+    """Names of the parameters to profile: those of the specification, all if only asked for.
+
+    Raises:
+        SpecError: one is not fitted.
+    """
+    names, free = spec.uncertainty.profile, tuple(p.name for p in problem.free)
+    for name in names:
+        if name not in (*free, "all"):
+            raise SpecError(
+                f"uncertainty.profile: {name!r} is not fitted; expected 'all' or names out of "
+                f"{', '.join(free)}"
+            )
+    return free if "all" in names or (asked and not names) else tuple(names)
+
+
+def candidates_of(spec: FitSpec, problem: Problem) -> Candidates:
+    """The presses of the [design] section; left out: first to last ring, half to full depth.
+
+    Raises:
+        SpecError: positions outside the tube, or unknowns that a new curve would not share.
+    """
+    try:
+        check(problem)
+    except ValueError as error:
+        raise SpecError(f"parameters: {error}") from None
+    section, length = spec.design, float(problem.geometry.length)
+    deepest = float(np.max(problem.lanes.displacement))
+    rings = problem.geometry.ring_positions
+    s = (float(rings[0]), float(rings[-1])) if section.s is None else section.s
+    if s[0] < 0 or s[1] > length:
+        raise SpecError(f"design.s: {s[0]:g} to {s[1]:g} mm, tube spans 0 to {length:g} mm")
+    depth = (0.5 * deepest, deepest) if section.depth is None else section.depth
+    return grid(s, depth, section.candidates)
 
 
 def settings_of(spec: FitSpec) -> Settings:

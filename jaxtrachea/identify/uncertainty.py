@@ -1,4 +1,4 @@
-"""What the data say about each unknown: standard errors, correlation, flat combinations, verdicts.
+"""What the data say about each unknown: standard errors, correlation, flat combinations.
 
 Everything is local, from the Jacobian at the estimate (Gauss-Newton information matrix); profile
 likelihood and bootstrap, which are not, are separate. With curve weights or a robust loss the
@@ -20,8 +20,6 @@ from jaxtrachea.identify.problem import Lane, Problem
 from jaxtrachea.identify.residual import observations, residual
 from jaxtrachea.identify.solve import chunk_size
 
-#: Relative standard error up to which a parameter counts as identifiable, and as weakly so.
-IDENTIFIABLE, WEAK = 0.1, 0.5
 #: Smallest ratio of singular values of the scaled Jacobian that float64 can tell from zero.
 SINGULAR = 1e-7
 
@@ -130,7 +128,14 @@ class Uncertainty(NamedTuple):
             coordinates (a change of 1 = 100 %); inf if singular.
         flat: unit vector, in relative coordinates, of the least determined combination; (P,).
         flat_se: its standard error (relative).
+        blind: all directions that change no residual, relative coordinates, orthonormal rows; the
+            other rows are 0; (P, P).
         half_width: of the 95 % interval, in standard errors (Student's t).
+        along: how all unknowns move where one is moved and the others follow in the least costly
+            way, to first order, scaled coordinates; row i: by a unit change of unknown i; (P, P).
+        dispersion: of twice the rise of the cost along each unknown: where the cost is a
+            likelihood s^2, else such that its curvature gives `se` (Kent 1982,
+            doi:10.1093/biomet/69.1.19); (P,).
     """
 
     se: np.ndarray
@@ -138,7 +143,10 @@ class Uncertainty(NamedTuple):
     condition: np.ndarray
     flat: np.ndarray
     flat_se: np.ndarray
+    blind: np.ndarray
     half_width: np.ndarray
+    along: np.ndarray
+    dispersion: np.ndarray
 
 
 def analyse(
@@ -164,9 +172,11 @@ def analyse(
     usable = free.any(axis=1) & np.isfinite(info.bread).all(axis=(1, 2)) & (dof >= 0)
     free = free & usable[:, None]
     kappa = np.ones(len(dof)) if noise_given else np.asarray(info.psi2) * total / np.maximum(dof, 1)
-    kappa = kappa / np.maximum(info.dpsi, 1e-3) ** 2
+    dpsi = np.maximum(info.dpsi, 1e-3)
+    kappa = kappa / dpsi**2
     unit = relative * free
-    values, vectors = _spectrum(_scaled(np.asarray(info.bread), unit), free)
+    bread = _scaled(np.asarray(info.bread), unit)
+    values, vectors = _spectrum(bread, free)
     inverse = np.einsum("lpk,lk,lqk->lpq", vectors, 1 / values, vectors)
     meat = _scaled(np.asarray(info.meat), unit) * kappa[:, None, None]
     covariance = inverse @ meat @ inverse
@@ -178,8 +188,33 @@ def analyse(
     se = np.where(free, np.where(blind, np.inf, np.sqrt(variance)) * relative, np.nan)
     both = free[:, :, None] & free[:, None]
     condition, flat, flat_se = _flattest(values, vectors, free, covariance)
+    lost = np.isinf(values) & (np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5)
+    silent = np.swapaxes(vectors, 1, 2) * lost[:, :, None] * free[:, None]
     correlation = np.where(both, correlation, np.nan)
-    return Uncertainty(se, correlation, condition, flat, flat_se, half)
+    along = _along(values, vectors, free)
+    dispersion = dpsi[:, None] * _ratio(along, meat, bread)
+    along = along * relative[:, None] / relative[:, :, None]
+    return Uncertainty(se, correlation, condition, flat, flat_se, silent, half, along, dispersion)
+
+
+def _along(values, vectors, free) -> np.ndarray:
+    """Columns of the inverse over their diagonal, in relative coordinates; singular ones too."""
+    largest = np.max(np.where(np.isfinite(values), values, 0), axis=1, keepdims=True)
+    floor = SINGULAR**2 * np.where(largest > 0, largest, 1)
+    own = np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5
+    weight = np.where(own, 1 / np.where(np.isfinite(values), values, floor), 0)
+    inverse = np.einsum("lpk,lk,lqk->lpq", vectors, weight, vectors)
+    both = free[:, :, None] & free[:, None]
+    diagonal = np.where(free, np.diagonal(inverse, axis1=1, axis2=2), 1)
+    return np.where(both, inverse / diagonal[:, :, None], np.eye(values.shape[1]))
+
+
+def _ratio(along, meat, bread) -> np.ndarray:
+    """What the meat is of the bread along each row, or in the mean where both vanish."""
+    form = lambda m: np.einsum("lip,lpq,liq->li", along, m, along)  # noqa: E731
+    trace = lambda m: 1e-12 * np.trace(m, axis1=1, axis2=2)[:, None]  # noqa: E731
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (form(meat) + trace(meat)) / (form(bread) + trace(bread))
 
 
 def _scaled(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
@@ -220,33 +255,3 @@ def _flattest(values, vectors, free, covariance):
         condition = np.sqrt(largest / values[lanes, flattest])
     flat_se = np.where(singular, np.inf, np.sqrt(np.maximum(variance, 0)))
     return np.where(singular, np.inf, condition), flat, flat_se
-
-
-def verdict(relative_se: float, held: bool) -> str:
-    """One plain word for a parameter: identifiable, weak, not identifiable, at bound."""
-    if held:
-        return "at bound"
-    if relative_se <= IDENTIFIABLE:
-        return "identifiable"
-    return "weak" if relative_se <= WEAK else "not identifiable"
-
-
-def describe_flat(names: list[str], flat: np.ndarray, flat_se: float) -> str:
-    """The least determined combination in words, as changes that belong together.
-
-    Args:
-        names: unknowns, in the order of `flat`.
-        flat: direction in relative coordinates, see `Uncertainty.flat`.
-        flat_se: relative standard error along it.
-    """
-    if not np.any(flat):
-        return "no free parameter"
-    order = np.argsort(-np.abs(flat))
-    main = [i for i in order if abs(flat[i]) >= 0.1 * abs(flat[order[0]])]
-    step = 0.1 / abs(flat[order[0]])
-    moves = ", ".join(f"{names[i]} {100 * step * flat[i]:+.3g} %" for i in main)
-    if not np.isfinite(flat_se):
-        return f"{moves} together change no curve at all: only the remaining combinations are known"
-    if flat_se > WEAK:
-        return f"{moves} together change the curves by less than the noise"
-    return f"least determined: {moves} together, known to {100 * flat_se:.2g} %"

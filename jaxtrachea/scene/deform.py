@@ -10,7 +10,7 @@ from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.shapes import Shape, sphere
 from jaxtrachea.scene.approach import Approach, backed_out
 from jaxtrachea.scene.curve import distance_from, lay
-from jaxtrachea.scene.stage import REACH, Poses, Presses, Scene
+from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import place
@@ -53,8 +53,7 @@ def deform(
         share = regions.weigh(binding, phi_c) if weights is None else weights
         u = regions.interpolate(binding, share, keys, method=method)
         if straight is not None:
-            dent = _dent(scene, s_c, phi_c, radius, tool, moved.depth)
-            u = local.dented(u, dent, straight, scene.window)
+            u = u + local.correction(_dent(scene, s_c, phi_c, radius, tool, moved.depth), straight)
         return place(mesh, u)
 
     moved = moved._replace(slip=None, dissipated=None, status=None)
@@ -89,7 +88,7 @@ def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.
     if tool is not None and scene.tool is not None:
         bent = scene.tube if scene.plan.curved else None
         sag = _sag(scene.tool, tool, where if bent is None else lay(bent.line, where))
-    return local.fit(where, local.targets(depth, sag), REACH * spacing)
+    return local.fit(where, local.targets(depth, sag), 3 * spacing)
 
 
 def _sag(tool: Shape, pose: Poses, points):

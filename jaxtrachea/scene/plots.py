@@ -13,6 +13,9 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from jaxtrachea.scene.simulation import Simulation, Sweep
 from jaxtrachea.scene.stage import Scene
 
+#: Unit vector towards the light, over the viewer's shoulder.
+LIGHT = np.array([0.25, -0.55, 0.8]) / np.sqrt(0.25**2 + 0.55**2 + 0.8**2)
+
 
 def draw_surface(scene: Scene, vertices: np.ndarray, title: str = "", span: float = 45.0) -> Figure:
     """The deformed surface round the largest motion, coloured by it, in the manner of Fig. 6.
@@ -28,28 +31,29 @@ def draw_surface(scene: Scene, vertices: np.ndarray, title: str = "", span: floa
     moved = np.linalg.norm(vertices - rest, axis=1)
     middle = rest[np.argmax(moved)]
     keep = (np.abs(rest[faces][:, :, 0] - middle[0]) < span).all(axis=1)
-    corners = vertices[faces[keep]][:, :, [0, 2, 1]]  # x along, z across, y up
+    # x to the right, z towards the viewer, y up: turned, not mirrored.
+    corners = vertices[faces[keep]][:, :, [0, 2, 1]] * [1, -1, 1]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    light = 0.55 + 0.45 * np.abs(normals @ (np.array([0.3, -0.5, 0.8]) / 0.99))
-    figure = Figure(figsize=(5, 3.2), dpi=100)
+    light = 0.3 + 0.7 * np.clip(normals @ LIGHT, 0, 1)
+    figure = Figure(figsize=(6, 3), dpi=110)
     axis: Any = figure.add_subplot(projection="3d")
     size = moved[faces[keep]].mean(axis=1)
     top = max(float(moved.max()), 1e-9)
     colour = colormaps["viridis"](size / top)
-    colour[:, :3] *= np.minimum(light, 1)[:, None]
-    axis.add_collection3d(
-        Poly3DCollection(corners, facecolors=colour, edgecolors=colour, linewidths=0.2)
-    )
+    colour[:, :3] *= light[:, None]
+    wall = Poly3DCollection(corners, facecolors=colour, edgecolors=colour, linewidths=0.2)
+    wall.set_clip_on(False)  # the axes are a square in the middle of the picture
+    axis.add_collection3d(wall)
     low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axis.set_box_aspect(high - low, zoom=1.35)
-    axis.view_init(elev=28, azim=-65)
+    axis.set_box_aspect(high - low, zoom=1.8)
+    axis.view_init(elev=24, azim=-72)
     axis.set_axis_off()
-    figure.subplots_adjust(left=0, right=0.88, bottom=0, top=1)
+    axis.set_position((0, 0, 0.86, 0.95))
     scale = ScalarMappable(Normalize(0, top), "viridis")
-    figure.colorbar(scale, ax=axis, shrink=0.6, label="displacement [mm]")
-    axis.set_title(textwrap.fill(title, 55), y=0.93, fontsize=10)
+    figure.colorbar(scale, cax=figure.add_axes((0.88, 0.2, 0.02, 0.6)), label="displacement [mm]")
+    figure.text(0.43, 0.93, textwrap.fill(title, 55), ha="center", fontsize=10)
     return figure
 
 

@@ -16,7 +16,7 @@ from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.plan import Facts, Plan, PlanError, Wishes
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.skeleton import local_frame
-from jaxtrachea.surface import local, regions
+from jaxtrachea.surface import regions
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import Mesh
@@ -26,9 +26,6 @@ ROUNDING = 1e-6
 
 #: Distance between the circles of the dent's centres: share of the tool's size; mm at least.
 FOOTPRINT, LEAST = 0.6, 4.0
-
-#: Reach of a dent: distances between its circles.
-REACH = 3
 
 #: Patches of the tube searched for a contact with a tool shorter than one of them.
 NEAR = 2
@@ -70,7 +67,6 @@ class Scene(eqx.Module):
         radius: of the tube's outside, where a tool touches it and the dent lies, mm.
         tube: its outside as convex patches, for a tool; or None.
         near: number of patches searched for a contact (static).
-        window: vertices that a dent can move, see `surface.local.dented` (static).
         tool: its shape about its own origin, or None.
         friction: Coulomb's coefficient of the tool, or None.
         mesh: the surface at rest, or None.
@@ -88,7 +84,6 @@ class Scene(eqx.Module):
     binding: regions.Binding | None
     footprint: Float[Array, ""] = eqx.field(converter=jnp.asarray)
     near: int = eqx.field(static=True)
-    window: int | None = eqx.field(static=True)
     plan: Plan = eqx.field(static=True)
 
 
@@ -190,14 +185,11 @@ def make_scene(
     spacing = jnp.asarray(size, dtype)
     placeholder = make_plan(Facts(mesh=mesh is not None), Wishes(want_surface=False))
     fixed = geometry, outer, tube, tool, mu
-    scene = Scene(*fixed, mesh, binding, spacing, near, None, placeholder)
+    scene = Scene(*fixed, mesh, binding, spacing, near, placeholder)
     plan = make_plan(facts_of(scene, material, path), wishes)
     if plan.surface is None:
         mesh = binding = None
-    reached = None
-    if mesh is not None and plan.dent:
-        reached = local.window(mesh.s, plan.dent, REACH * size)
-    return Scene(*fixed, mesh, binding, spacing, near, reached, plan)
+    return Scene(*fixed, mesh, binding, spacing, near, plan)
 
 
 def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
@@ -291,5 +283,5 @@ def _near(scene: Scene, s, phi) -> bool:
         return False
     r = float(scene.radius)
     C = np.stack([s, r * np.cos(phi), r * np.sin(phi)], axis=1)
-    points, reach = np.asarray(scene.mesh.straight, float), REACH * float(scene.footprint)
+    points, reach = np.asarray(scene.mesh.straight, float), 3 * float(scene.footprint)
     return any(bool((np.sum((points - c) ** 2, axis=1) < reach**2).any()) for c in C)

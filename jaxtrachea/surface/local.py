@@ -130,53 +130,6 @@ def correction(dent: Dent, points: Float[Array, "points 3"]) -> Float[Array, "po
     return _kernel(points, dent.centres, dent.reach) @ dent.weights
 
 
-def window(x: Float[Array, " points"], count: int, reach: float) -> int | None:
-    """How many points a dent can move at once; on numbers.
-
-    Args:
-        x: position of every point along the straight tube, mm.
-        count: centres, see `pattern`.
-        reach: r of the largest dent, mm; the circles are reach / 3 apart.
-
-    Returns:
-        The most points within any stretch that the dent covers, for `dented`; None if the points
-        are not in rising order of x, or nearly all are covered.
-    """
-    at = np.asarray(x, float)
-    if np.any(np.diff(at) < 0):
-        return None
-    span = 2 * (1 + len(CIRCLES[count]) / 3) * reach * (1 + 1e-6)
-    most = int(np.max(np.searchsorted(at, at + span, side="right") - np.arange(at.size)))
-    return most if 2 * most < at.size else None
-
-
-def dented(
-    moved: Float[Array, "points 3"],
-    dent: Dent,
-    points: Float[Array, "points 3"],
-    window: int | None = None,
-) -> Float[Array, "points 3"]:
-    """`moved` with the local correction added, mm.
-
-    Args:
-        moved: displacement of every point, mm.
-        dent: the correction.
-        points: mm.
-        window: as many points in a row are visited, those beside the dent; the points must be in
-            rising order of x. They are NaN if the dent reaches more. None: all are visited.
-    """
-    if window is None:
-        return moved + correction(dent, points)
-    x, at = points[:, 0], dent.centres[:, 0]
-    first = jnp.sum(x < jnp.min(at) - dent.reach)
-    reached = jnp.sum(x <= jnp.max(at) + dent.reach) - first
-    start = jnp.clip(first, 0, x.size - window), 0
-    change = correction(dent, jax.lax.dynamic_slice(points, start, (window, 3)))
-    change = change + jnp.where(reached > window, jnp.nan, 0).astype(change.dtype)
-    change = change + jax.lax.dynamic_slice(moved, start, (window, 3))
-    return jax.lax.dynamic_update_slice(moved, change, start)
-
-
 def _kernel(points, centres, reach):
     """The kernel psi between points and centres; shape (points, centres)."""
     square = sum(

@@ -1,0 +1,142 @@
+"""Bootstrap against closed forms of a linear model, with white and with correlated noise."""
+
+import csv
+import dataclasses
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import synthetic
+from run_cli import GOOD, run
+
+from jaxtrachea.identify.bootstrap import bootstrap
+from jaxtrachea.identify.fit import Settings, fit
+from jaxtrachea.identify.measurements import Curve
+from jaxtrachea.identify.parameters import DEFAULTS
+from jaxtrachea.identify.problem import build
+from jaxtrachea.model import Options
+from jaxtrachea.trachea.geometry import table_1
+
+ONE = Settings(starts=1)
+PAGES = Path(__file__).parents[1] / "docs"
+
+
+def study(noises):
+    """F = 1.3 D + 0.4 D^3 + noise, two curves of equal length for each specimen."""
+    linear = {"scale": "linear", "lower": -100.0, "upper": 100.0, "step": 0.1}
+    rows = [dataclasses.replace(DEFAULTS[n], **linear, value=1.0) for n in ("k_1", "k_3")]
+    rows += [DEFAULTS[n] for n in ("onset", "force_offset")]
+    depth = np.linspace(0.02, 2, noises.shape[-1])
+    clean = 1.3 * depth + 0.4 * depth**3
+    curves = [
+        Curve(f"T{i}", f"t{j}", None, 0.0, depth, clean + noise)
+        for i, specimen in enumerate(noises)
+        for j, noise in enumerate(specimen)
+    ]
+    return build(curves, table_1(), Options(coupling="total", onset_width=0.0), rows)
+
+
+@pytest.mark.parametrize("kind", ["parametric", "residual"])
+def test_white_noise_gives_the_standard_error_of_the_covariance(kind):
+    """1,000 replicates tell a standard deviation to 2.2 %; bar four of them; and 1.96 of it."""
+    noise = 0.05 * np.random.default_rng(1).normal(size=(3, 2, 60))
+    result = fit(study(noise), ONE)
+    found = bootstrap(result, ONE, count=1000, kind=kind)
+    assert found.usable.all()
+    np.testing.assert_allclose(found.standard_error, result.standard_error, rtol=0.09)
+    # A 2.5 % quantile of 1,000 normal numbers is known to 0.085 standard deviations.
+    slack = 0.34 * result.standard_error
+    half = 1.96 * result.standard_error
+    assert np.all(np.abs(found.lower - (result.value - half)) <= slack)
+    assert np.all(np.abs(found.upper - (result.value + half)) <= slack)
+    again = bootstrap(result, ONE, count=1000, kind=kind)
+    np.testing.assert_array_equal(again.theta, found.theta)
+
+
+def test_blocks_see_correlated_noise():
+    """AR(1) of 0.7: true error by the closed form of generalised least squares; median of 20."""
+    n, r = 400, 0.7
+    rng = np.random.default_rng(2)
+    white = rng.normal(size=(20, 2, n))
+    noise = np.zeros_like(white)
+    for i in range(n):
+        noise[..., i] = r * noise[..., i - 1] * (i > 0) + white[..., i]
+    noise *= 0.05 * np.sqrt(1 - r * r)
+    result = fit(study(noise), ONE)
+    depth = np.linspace(0.02, 2, n)
+    J = np.stack([depth, depth**3], axis=1)
+    lag = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    pinv = np.linalg.inv(J.T @ J) @ J.T
+    true = np.sqrt(np.diag(pinv @ (0.05**2 * r**lag) @ pinv.T) / 2)
+    share = lambda block: np.median(  # noqa: E731
+        bootstrap(result, ONE, count=200, kind="residual", block=block).standard_error / true, 0
+    )
+    # Independent draws miss the factor sqrt((1 + r) / (1 - r)) = 2.4; blocks of 20 get most of it.
+    assert np.all(share(1) < 0.5)
+    assert np.all((share(20) > 0.8) & (share(20) < 1.1))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"count": 10}, "count is 10; expected at least 40"),
+        ({"block": 3}, "block is 3"),
+        ({"kind": "residual", "block": 0}, "block is 0"),
+    ],
+)
+def test_impossible_settings_are_refused(change, says):
+    result = fit(study(np.random.default_rng(1).normal(size=(1, 2, 12))), ONE)
+    with pytest.raises(ValueError, match=says):
+        bootstrap(result, ONE, **change)
+
+
+def columns(heading):
+    text = (PAGES / "results.md").read_text()
+    body = re.split(r"^## ", text.partition(heading)[2], maxsplit=1, flags=re.M)[0]
+    return re.findall(r"^\| `([\w/]+)` \|", body, re.M)
+
+
+def test_command_writes_what_its_page_says(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("good.csv").write_text(GOOD)
+    text = '[data]\nfiles = "good.csv"\n[model]\ncoupling = "total"\n[uncertainty]\n'
+    Path("spec.toml").write_text(text + 'bootstrap = 50\nkind = "residual"\nblock = 2\n')
+    code, out, _ = run(monkeypatch, capsys, "fit", "spec.toml", "--out", "out")
+    assert code == 0
+    assert "Bootstrap" in out
+    assert max(map(len, out.splitlines())) <= 80
+    with h5py.File("out/results.h5") as file:
+        group = file["bootstrap"]
+        assert sorted(f"bootstrap/{n}" for n in group) == sorted(columns("## Group bootstrap"))
+        assert (group.attrs["kind"], group.attrs["block"]) == ("residual", 2)
+        low = group["lower"][0, 0]
+    with Path("out/parameters.csv").open(newline="") as stream:
+        assert float(next(csv.DictReader(stream))["bootstrap_low95"]) == low
+    assert "residual in blocks of 2 samples" in Path("out/report.md").read_text()
+    for bad, says in (("bootstrap = 10", "40 replicates"), ("block = 2", "kind = 'residual'")):
+        Path("spec.toml").write_text(text + bad)
+        code, _, err = run(monkeypatch, capsys, "fit", "spec.toml")
+        assert code == 2
+        assert says in err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["parametric", "residual"])
+def test_markers_are_resampled_as_well(kind):
+    """Four unknowns from forces and markers: bootstrap and local errors agree to 15 %."""
+    force, joints = synthetic.forces(np.array([[300.0, 1.0, 0.5, 0.2]]))
+    rng = np.random.default_rng(2)
+    force = force + 0.01 * force.max() * rng.normal(size=force.shape)
+    rings = np.array([3, 8, 10])
+    seen = joints[..., rings] + 0.02 * rng.normal(size=(*force.shape, 3))
+    data = [
+        dataclasses.replace(c, joint_rings=rings, joint_displacement=seen[0, i])
+        for i, c in enumerate(synthetic.curves(force))
+    ]
+    table = synthetic.parameters(joints=True)
+    result = fit(build(data, synthetic.GEOMETRY, synthetic.OPTIONS, table), ONE)
+    found = bootstrap(result, ONE, count=400, kind=kind)
+    assert found.usable.all()
+    np.testing.assert_allclose(found.standard_error, result.standard_error, rtol=0.15)

@@ -1,0 +1,179 @@
+"""Design against repeated simulated experiments, closed forms and exhaustive search."""
+
+import csv
+import dataclasses
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic
+from run_cli import run, tree
+
+from jaxtrachea.identify.design import (
+    Candidates,
+    gains,
+    grid,
+    identifiability,
+    next_points,
+    scores,
+    situation,
+)
+from jaxtrachea.identify.fit import Settings, fit
+from jaxtrachea.identify.problem import Noise, build
+from jaxtrachea.status import FitStatus
+
+ONE = Settings(starts=1)
+CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
+BEFORE = np.array([22.0, 75.0, 80.0])
+SIGMA = 0.05
+
+
+def study(force, s_c):
+    changes = {n: {"value": float(v)} for n, v in zip(synthetic.NAMES, CLEAR, strict=True)}
+    return build(
+        synthetic.curves(force, s_c=s_c),
+        synthetic.GEOMETRY,
+        synthetic.OPTIONS,
+        synthetic.parameters(**changes),
+        noise=Noise(force=SIGMA),
+    )
+
+
+def simulated(s_c, count, seed):
+    force, _ = synthetic.forces(CLEAR[None], s_c=s_c)
+    noise = np.random.default_rng(seed).normal(size=(count, *force.shape[1:]))
+    return force + SIGMA * noise
+
+
+@pytest.fixture(scope="module")
+def result():
+    return fit(study(simulated(BEFORE, 4, 1), BEFORE), ONE)
+
+
+@pytest.fixture(scope="module")
+def known(result):
+    return situation(result)
+
+
+def test_predicted_errors_come_true(known):
+    """1,000 repetitions with the chosen point: standard deviation within 20 % of the prediction."""
+    depth = float(synthetic.DEPTHS[-1])
+    choice = next_points(known, grid((10.0, 150.0), (depth, depth), 500))
+    s = grid((10.0, 150.0), (depth, depth), 500).s[choice.chosen[0]]
+    after = np.append(BEFORE, s)
+    done = fit(study(simulated(after, 1000, 2), after), ONE)
+    realised = np.std(done.theta, axis=0)
+    np.testing.assert_allclose(choice.error[1], realised, rtol=0.2)
+    # And the point was worth it: the error without it is larger than what was realised.
+    without = fit(study(simulated(BEFORE, 1000, 3), BEFORE), ONE)
+    assert np.exp(np.mean(np.log(realised / np.std(without.theta, axis=0)))) < 0.9
+
+
+def test_information_of_a_candidate_is_that_of_finite_differences(known):
+    """At s = 51 mm to 4 mm: central differences of `press`, with the noise of the study."""
+    theta, h = known.theta[0], 1e-5
+    displacement = 4.0 * np.arange(1, 51) / 50
+
+    def press(theta):
+        return synthetic.forces(np.exp(theta)[None], np.array([51.0]), displacement)[0][0, 0]
+
+    J = np.stack([(press(theta + h * e) - press(theta - h * e)) / (2 * h) for e in np.eye(4)])
+    found = gains(known, Candidates(np.array([51.0]), np.array([4.0])))[0, 0]
+    np.testing.assert_allclose(found, J @ J.T / SIGMA**2, rtol=1e-6)
+
+
+def test_criteria_are_their_definitions_and_greedy_takes_the_best(known):
+    candidates = grid((10.0, 150.0), (2.0, 6.0), 300)
+    added = gains(known, candidates)
+    total = known.base[:, None] + added
+    by_d = np.mean(np.log(np.linalg.det(total)), axis=0)
+    np.testing.assert_allclose(scores(total, "D"), by_d, rtol=1e-9)
+    trace = np.trace(np.linalg.inv(total), axis1=-2, axis2=-1) / 4
+    np.testing.assert_allclose(scores(total, "A"), -np.log(np.mean(trace, axis=0)), rtol=1e-9)
+    smallest = np.linalg.eigvalsh(total)[..., 0]
+    np.testing.assert_allclose(scores(total, "E"), np.mean(np.log(smallest), axis=0))
+    for criterion in ("D", "A", "E"):
+        choice = next_points(known, candidates, 3, criterion)
+        base = known.base
+        for step, best in enumerate(choice.chosen):
+            each = scores(base[:, None] + added, criterion)
+            np.testing.assert_allclose(choice.score[step], each)
+            assert each[best] == each.max()
+            base = base + added[:, best]
+        assert np.all(np.diff(choice.error, axis=0) < 0)
+    # Deeper is never worse: samples of a deeper press say more of every unknown.
+    assert candidates.depth[next_points(known, candidates).chosen[0]] == 6.0
+
+
+def test_ten_thousand_candidates_in_a_second(known):
+    """One guess, after compilation: sensitivities, scores and choice."""
+    one = dataclasses.replace(
+        known, lane=known.lane[:1], theta=known.theta[:1], base=known.base[:1],
+        relative=known.relative[:1], sigma=known.sigma[:1],
+    )  # fmt: skip
+    candidates = grid((10.0, 150.0), (2.0, 6.0), 10_000)
+    assert len(candidates.s) == 10_000
+    next_points(one, candidates)
+    start = time.perf_counter()
+    next_points(one, candidates)
+    assert time.perf_counter() - start < 1.0
+
+
+def test_map_knows_that_one_place_is_not_enough(known):
+    """The same place twice leaves EI_L and k_M apart by rounding only; two places do not."""
+    s = np.linspace(15.0, 145.0, 27)
+    found = identifiability(known, s, 6.0)
+    assert np.all(np.diag(found.pairs) > 1e5)
+    assert found.pairs.min() < 1e3
+    np.testing.assert_allclose(found.pairs, found.pairs.T, rtol=1e-6)
+    assert np.all(found.condition >= 1)
+    np.testing.assert_allclose(np.linalg.norm(found.weakest, axis=1), 1)
+
+
+def test_what_cannot_be_designed_is_said(result):
+    force = simulated(BEFORE, 1, 1)
+    table = synthetic.parameters(force_offset={"fixed": False})
+    own = build(synthetic.curves(force, s_c=BEFORE), synthetic.GEOMETRY, synthetic.OPTIONS, table)
+    with pytest.raises(ValueError, match="force_offset belongs to single trials"):
+        situation(dataclasses.replace(result, problem=own))
+    nothing = np.full_like(result.status, FitStatus.MAX_ITERATIONS)
+    with pytest.raises(ValueError, match="no lane has an estimate"):
+        situation(dataclasses.replace(result, status=nothing))
+
+
+def test_command_writes_its_files_or_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rows = ["specimen,trial,s [mm],displacement [mm],force [N]"]
+    force = simulated(BEFORE[:2], 1, 1)[0]
+    for j, s in enumerate(BEFORE[:2]):
+        rows += [f"T,{j},{s},{d},{f}" for d, f in zip(synthetic.DEPTHS, force[j], strict=True)]
+    Path("data.csv").write_text("\n".join(rows) + "\n")
+    text = '[data]\nfiles = "data.csv"\n[design]\ncandidates = 200\n'
+    Path("spec.toml").write_text(text + 's = ["20 mm", "140 mm"]\npoints = 2\n')
+    code, out, _ = run(monkeypatch, capsys, "design", "spec.toml", "--out", "out")
+    assert code == 0
+    assert max(map(len, out.splitlines())) <= 80
+    page = (Path(__file__).parents[1] / "docs" / "design.md").read_text()
+    for name in ("next_points", "candidates", "identifiability"):
+        with Path(f"out/{name}.csv").open(newline="") as stream:
+            found = list(csv.DictReader(stream))
+        body = page.partition(f"## {name}.csv")[2].partition("##")[0]
+        for column in found[0]:
+            word = column.replace("k_1", "NAME").replace("k_3", "NAME")
+            assert f"`{word.replace('EI_L', 'NAME').replace('k_M', 'NAME')}`" in body
+        if name == "next_points":
+            assert [row["press"] for row in found] == ["0", "1", "2"]
+            assert all(20 <= float(row["s_mm"]) <= 140 for row in found[1:])
+    assert Path("out/identifiability.png").read_bytes()[:4] == b"\x89PNG"
+    before = tree(tmp_path)
+    for line, says in (
+        ('s = ["20 mm", "200 mm"]', "design.s: 20 to 200 mm, tube spans 0 to 160 mm"),
+        ('s = ["90 mm", "20 mm"]', "swap them"),
+        ("[parameters]\nonset = {}", "onset belongs to single trials"),
+    ):
+        Path("spec.toml").write_text(text + line)
+        code, _, err = run(monkeypatch, capsys, "design", "spec.toml")
+        assert code == 2
+        assert says in err
+    assert tree(tmp_path).keys() == before.keys()

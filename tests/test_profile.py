@@ -1,0 +1,223 @@
+"""Profile likelihood against covariance where that is exact, scipy, and what cannot be known."""
+
+import csv
+import dataclasses
+import re
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import synthetic
+from run_cli import GOOD, run
+from scipy.optimize import least_squares
+
+from jaxtrachea.identify.fit import Settings, fit
+from jaxtrachea.identify.measurements import Curve
+from jaxtrachea.identify.parameters import DEFAULTS
+from jaxtrachea.identify.problem import Noise, build
+from jaxtrachea.identify.profile import choose, profiles
+from jaxtrachea.identify.profile_search import Sides
+from jaxtrachea.identify.results import profile_rows
+from jaxtrachea.model import Options
+from jaxtrachea.report import interval
+from jaxtrachea.status import FitStatus, ProfileEnd
+from jaxtrachea.trachea.geometry import table_1
+
+ONE = Settings(starts=1)
+PAGES = Path(__file__).parents[1] / "docs"
+CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
+
+
+def linear_study(noise=Noise(), **table):  # noqa: B008 (frozen)
+    """F = k_1 D + k_3 D^3 with noise, linear in both; curves of 30, 12 and 20 samples."""
+    rng = np.random.default_rng(5)
+    curves = []
+    for i, (trial, n) in enumerate((("a", 30), ("b", 12), ("c", 20))):
+        depth = np.linspace(0.2, 2, n)
+        force = 1.3 * depth + 0.4 * depth**3 + 0.05 * rng.normal(size=n)
+        curves.append(Curve("T1" if i < 2 else "T2", trial, None, 0.0, depth, force))
+    linear = {"scale": "linear", "lower": -100.0, "upper": 100.0, "step": 0.1}
+    names = ["k_1", "k_3", "onset", "force_offset"]
+    change = {"k_1": linear | {"value": 1.0}, "k_3": linear} | table
+    rows = [dataclasses.replace(DEFAULTS[n], **change.get(n, {})) for n in names]
+    options = Options(coupling="total", onset_width=0.0)
+    return build(curves, table_1(), options, rows, noise=noise)
+
+
+@pytest.mark.parametrize("noise", [Noise(), Noise(force=0.05)], ids=["estimated", "given"])
+def test_linear_model_has_the_interval_of_the_covariance(noise):
+    """Exact for both kinds of noise, and with curves of unequal weight (the sandwich)."""
+    result = fit(linear_study(noise), ONE)
+    found = profiles(result, ONE, points=3)
+    assert found.end.tolist() == [[ProfileEnd.CLOSED] * 2] * 4
+    shape = (2, 2)
+    # The ends are found to 1e-6 of the distance from the estimate.
+    width = (result.upper - result.lower) / 2
+    assert np.abs(found.lower.reshape(shape) - result.lower).max() <= 2e-6 * width.max()
+    assert np.abs(found.upper.reshape(shape) - result.upper).max() <= 2e-6 * width.max()
+    at = (found.coordinate - result.theta.ravel()[:, None]) / np.concatenate(
+        [u.se for u in result.uncertainty]
+    )[:, None]
+    np.testing.assert_allclose(found.statistic, at**2, rtol=1e-5, atol=1e-6)
+    assert not found.improved.any()
+
+
+@pytest.fixture(scope="module")
+def curved():
+    force, _ = synthetic.forces(synthetic.draw(7, 3, 1.3, CLEAR))
+    noise = np.random.default_rng(8).normal(size=force.shape)
+    force = force + 0.02 * np.abs(force).max((1, 2), keepdims=True) * noise
+    result = fit(synthetic.problem(force), ONE)
+    return force, result, profiles(result, ONE, points=4)
+
+
+def test_every_point_is_the_constrained_optimum_of_scipy(curved):
+    """Two specimens, four parameters, nine points each: cost to 1e-6 (measured 1e-12)."""
+    force, result, found = curved
+    for k in range(8):
+        lane, i = found.lane[k], found.unknown[k]
+        others = np.arange(4) != i
+
+        def residual(x, theta, lane=lane, others=others):
+            theta = np.where(others, 0.0, theta)
+            theta[others] = x
+            model = synthetic.forces(np.exp(theta)[None])[0][0]
+            return (model - force[lane]).ravel() / result.sigma[lane, 0]
+
+        best = result.theta[lane]
+        least = 0.5 * np.sum(residual(best[others], best) ** 2)
+        for theta, statistic in zip(found.theta[k], found.statistic[k], strict=True):
+            scipy = least_squares(
+                residual, best[others], "3-point", method="lm", xtol=1e-13, ftol=1e-13,
+                gtol=1e-13, args=(theta,),
+            )  # fmt: skip
+            assert np.isclose(least + statistic / 2, scipy.cost, rtol=1e-6)
+
+
+def test_ends_lie_on_the_threshold_and_batch_equals_one(curved):
+    _, result, found = curved
+    assert np.all(found.end == ProfileEnd.CLOSED)
+    edge = np.log(np.stack([found.lower, found.upper], axis=1))
+    # With points=5 the fourth point of each side lies at 0.8 x 1.25 = 1 of the way to the end.
+    alone = profiles(result, ONE, ["k_M"], points=5)
+    assert alone.statistic[:, [1, 9]] == pytest.approx(
+        np.repeat(alone.threshold[:, None], 2, axis=1), rel=1e-5
+    )
+    of = found.unknown == 1
+    np.testing.assert_allclose(alone.lower, found.lower[of], rtol=1e-9)
+    np.testing.assert_allclose(alone.coordinate[:, [1, 9]], edge[of], rtol=1e-9)
+
+
+def test_what_one_position_cannot_tell_is_open():
+    """EI_L and k_M act through one number: flat up to the bounds, and said so."""
+    force, _ = synthetic.forces(np.array([[100.0, 1.0, 2.0, 0.2]]), s_c=np.array([75.0]))
+    force = force + 0.01 * force.max() * np.random.default_rng(0).normal(size=force.shape)
+    data = synthetic.curves(force, s_c=np.array([75.0]))
+    result = fit(
+        build(data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters()),
+        Settings(starts=2),
+    )
+    found = profiles(result, ONE)
+    assert found.upper[0] == found.upper[1] == np.inf
+    assert found.lower[1] == 0
+    assert found.end[1].tolist() == [ProfileEnd.OPEN] * 2
+    # EI_L downwards: flat until k_M can rise no more.
+    assert found.end[0].tolist() == [ProfileEnd.BOUND, ProfileEnd.OPEN]
+    flat = found.statistic[1]
+    assert np.nanmax(np.abs(flat)) < 1e-3
+    assert interval(found.lower[1], found.upper[1], log=True) == "anything"
+
+
+def test_an_estimate_on_its_bound_has_the_other_side():
+    """k_1 may not exceed 1.2 (optimum near 1.3): open above, and closed below."""
+    table = {"lower": 0.0, "upper": 1.2, "value": 1.0, "scale": "linear", "step": 0.1}
+    result = fit(linear_study(k_1=table), ONE)
+    found = profiles(result, ONE, ["k_1"])
+    lane = int(np.flatnonzero(result.at_bound[:, 0])[0])
+    k = found.find(lane, 0)
+    assert found.end[k].tolist() == [ProfileEnd.CLOSED, ProfileEnd.OPEN]
+    assert found.upper[k] == np.inf
+    assert 0 < found.lower[k] < 1.2
+    assert found.find(lane, 1) is None
+
+
+def test_a_worse_minimum_is_told_and_failed_lanes_are_left_out():
+    result = fit(linear_study(), ONE)
+    moved = dataclasses.replace(result, theta=result.theta + np.array([[0.0, 3.0], [0.0, 0.0]]))
+    assert profiles(moved, ONE, ["k_1"]).improved.tolist() == [True, False]
+    status = np.array([FitStatus.MAX_ITERATIONS, FitStatus.CONVERGED])
+    assert set(choose(dataclasses.replace(result, status=status), None)[0]) == {1}
+    nothing = profiles(dataclasses.replace(result, status=status[[0, 0]]), ONE)
+    assert nothing.statistic.shape == (0, 21)
+    with pytest.raises(ValueError, match=r"'k_M' is not fitted, only k_1, k_3 are"):
+        choose(result, ["k_M"])
+
+
+def columns(heading):
+    text = (PAGES / "results.md").read_text()
+    body = re.split(r"^## ", text.partition(heading)[2], maxsplit=1, flags=re.M)[0]
+    return re.findall(r"^\| `([\w/]+)` \|", body, re.M)
+
+
+def test_command_writes_what_its_page_says(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("good.csv").write_text(GOOD)
+    text = '[data]\nfiles = "good.csv"\n[model]\ncoupling = "total"\n[parameters]\nk_1 = {}\n'
+    Path("spec.toml").write_text(text)
+    code, out, _ = run(monkeypatch, capsys, "fit", "spec.toml", "--profile", "--out", "out")
+    assert code == 0
+    assert "Profile likelihood" in out
+    assert max(map(len, out.splitlines())) <= 80
+    with Path("out/profiles.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert list(rows[0]) == columns("## profiles.csv")
+    with h5py.File("out/results.h5") as file:
+        assert sorted(f"profiles/{n}" for n in file["profiles"]) == sorted(
+            columns("## Group profiles")
+        )
+        assert file["profiles/lower"][0] == pytest.approx(float(first_row()["profile_low95"]))
+    report = Path("out/report.md").read_text()
+    assert "## Profile likelihood" in report
+    assert "](profiles.png)" in report
+    assert Path("out/profiles.png").read_bytes()[:4] == b"\x89PNG"
+    assert len(rows) == 2 * 21
+    Path("spec.toml").write_text(text + '[uncertainty]\nprofile = "EI_L"\n')
+    code, _, err = run(monkeypatch, capsys, "fit", "spec.toml")
+    assert code == 2
+    assert "uncertainty.profile: 'EI_L' is not fitted" in err
+
+
+def first_row():
+    with Path("out/parameters.csv").open(newline="") as stream:
+        return next(csv.DictReader(stream))
+
+
+def test_rows_hold_the_points(curved):
+    _, result, found = curved
+    rows = list(profile_rows(found))
+    assert len(rows) == 12 * 9
+    middle = rows[4]
+    assert middle["statistic"] == 0
+    assert middle["at"] == pytest.approx(result.value[0, 0])
+
+
+def test_a_point_in_a_worse_minimum_is_passed_by(monkeypatch, curved):
+    """Refits beyond 0.8 of the way land far too high once each: the ends stay where they were."""
+    _, result, found = curved
+    seen = set()
+    usual = Sides.refit
+
+    def spoilt(self, side, distance, start):
+        theta, statistic = usual(self, side, distance, start)
+        for i, (s, d) in enumerate(zip(side.tolist(), distance.tolist(), strict=True)):
+            if s not in seen and d > 0.8 * self.first[s]:
+                seen.add(s)
+                statistic[i] += 50
+        return theta, statistic
+
+    monkeypatch.setattr(Sides, "refit", spoilt)
+    again = profiles(result, ONE, points=2)
+    assert len(seen) == 24
+    np.testing.assert_allclose(again.lower, found.lower, rtol=1e-6)
+    np.testing.assert_allclose(again.upper, found.upper, rtol=1e-6)
