@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from jaxtrachea.scene.stage import Presses as Presses
     from jaxtrachea.scene.stage import Scene as Scene
     from jaxtrachea.scene.stage import make_scene as make_scene
+    from jaxtrachea.scene.stage import with_geometry as with_geometry
     from jaxtrachea.skeleton import Skeleton as Skeleton
     from jaxtrachea.skeleton import skeleton_response as skeleton_response
     from jaxtrachea.status import FitStatus as FitStatus
@@ -52,7 +53,7 @@ _HOME = {
     "oblique": ("ObliquePath", "ObliquePress", "press_oblique", "press_path"),
     "scene.plan": ("Plan", "PlanError", "Wishes"),
     "scene.simulation": ("Simulation", "simulate", "sweep"),
-    "scene.stage": ("Poses", "Presses", "Scene", "make_scene"),
+    "scene.stage": ("Poses", "Presses", "Scene", "make_scene", "with_geometry"),
     "skeleton": ("Skeleton", "skeleton_response"),
     "status": ("FitStatus", "PressStatus"),
     "trachea.geometry": ("Geometry", "table_1"),

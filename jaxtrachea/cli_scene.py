@@ -21,12 +21,15 @@ def plan(scene: SceneArgument) -> None:
     from jaxtrachea.scene.build import shares
     from jaxtrachea.scene.results import plan_rows
 
-    _, staged = _staged(scene)
+    spec, staged = _staged(scene)
+    swept = None if spec.sweep is None else _for_sweep(scene, spec, staged)[0]
     whole, found = shares(staged)
     out = Console()
     head = ["effect", "level", "chosen", "operations", "reason"]
     out.print(table("Plan", head, plan_rows(staged.scene.plan, found), ("reason",)))
     out.print(f"{whole:,} operations for {_rows(staged)} rows", highlight=False)
+    if swept is not None:
+        out.print(_rings_of(swept), highlight=False)
     for note in staged.notes:
         out.print(escape(note), highlight=False)
 
@@ -76,18 +79,10 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
 
     clock = [time.perf_counter()]
     spec, staged = _staged(scene)
-    if spec.sweep is None:
+    want = spec.sweep
+    if want is None:
         raise Stop(f"{scene}: sweep: missing; give a table [sweep] with a depth")
-    want, alpha = spec.sweep, float(staged.scene.geometry.half_angle)
-    widest = alpha if want.phi_max is None else want.phi_max
-    if not 0 <= widest <= alpha:
-        raise Stop(
-            f"{scene}: sweep.phi_max: {np.degrees(widest):.4g} deg; expected 0 to "
-            f"{np.degrees(alpha):.4g} deg, the ends of the rings"
-        )
-    length = float(staged.scene.geometry.length)
-    s = (np.arange(want.s_count) + 0.5) * length / want.s_count
-    phi = np.linspace(-widest, widest, want.phi_count) if want.phi_count > 1 else np.zeros(1)
+    swept, s, phi = _for_sweep(scene, spec, staged)
     points = [v.ravel() for v in np.meshgrid(s, phi, indexing="ij")]
     clock.append(time.perf_counter())
     with into(out_dir, _default(scene, "-sweep")) as (folder, stop_if_asked):
@@ -99,7 +94,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
                 stop_if_asked()
                 rows = [v[np.minimum(np.arange(start, start + size), total - 1)] for v in points]
                 depth = np.full(size, want.depth)
-                part = compute(staged.scene, staged.material, *rows, depth, chunk=size)
+                part = compute(swept, staged.material, *rows, depth, chunk=size)
                 parts.append(jax.tree.map(lambda v: np.asarray(v)[: total - start], part))  # noqa: B023
                 bar.update(task, completed=min(start + size, total))
         out = jax.tree.map(lambda *v: np.concatenate(v), *parts)
@@ -107,10 +102,11 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
         for name, figure in draw_sweep(s, phi, out).items():
             figure.savefig(folder / name)
         made = _provenance(scene, staged, clock)
-        write_sweep(folder / "sweep.h5", staged.scene, s, phi, want.depth, out, made)
+        write_sweep(folder / "sweep.h5", swept, s, phi, want.depth, out, made)
         _write_json(folder, made)
     failed = int((np.asarray(out.status) > PressStatus.NO_CONTACT).sum())
     console = Console()
+    console.print(_rings_of(swept), highlight=False)
     console.print(
         f"{total} contact points, {failed} without a solution, "
         f"{clock[2] - clock[1]:.2f} s with compilation", highlight=False,
@@ -133,6 +129,32 @@ def _staged(path: Path):
     except SpecError as error:
         text = str(error)
         raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
+
+
+def _for_sweep(path: Path, spec, staged):
+    """The scene with the program of its sweep, and the s and phi of the grid."""
+    import numpy as np
+
+    from jaxtrachea.scene.build import stage_sweep
+
+    want, geometry = spec.sweep, staged.scene.geometry
+    alpha = float(geometry.half_angle)
+    widest = alpha if want.phi_max is None else want.phi_max
+    if not 0 <= widest <= alpha:
+        raise Stop(
+            f"{path}: sweep.phi_max: {np.degrees(widest):.4g} deg; expected 0 to "
+            f"{np.degrees(alpha):.4g} deg, the ends of the rings"
+        )
+    s = (np.arange(want.s_count) + 0.5) * float(geometry.length) / want.s_count
+    phi = np.linspace(-widest, widest, want.phi_count) if want.phi_count > 1 else np.zeros(1)
+    # The widest angle of the grid decides, wherever it is.
+    return stage_sweep(spec, staged, np.full_like(phi, s[0]), phi), s, phi
+
+
+def _rings_of(scene) -> str:
+    """Which rings a sweep presses on, and why."""
+    rings = next(e for e in scene.plan.effects if e.name == "rings")
+    return f"sweep: rings {rings.level!r}, {rings.reason}"
 
 
 def _default(scene: Path, ending: str = "") -> Path:

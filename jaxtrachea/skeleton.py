@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 from jaxtrachea.mechanics import axial as _axial
 from jaxtrachea.mechanics import ring as _ring
 from jaxtrachea.mechanics import spatial_beam
+from jaxtrachea.status import RingStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 
@@ -67,7 +68,7 @@ def skeleton_response(
         geometry: the tube at rest.
         material: k_M, EI_L; `axial` needs EA_L, `shear` GA_L, the arches EI_C and k_t.
         s_c: mm, in [0, length].
-        phi_c: rad, in [-alpha, alpha]; beyond, the arches give NaN and BEHIND_GAP.
+        phi_c: rad, in [-alpha, alpha]; beyond, NaN and BEHIND_GAP.
         rings: `mat`: every ring moves on k_M alike in y and z, without turning (the paper);
             `arch`: alike too, with the stiffness of the arch along the normal at phi_c; `arch2`:
             the 2x2 compliance of the arch at phi_c.
@@ -130,7 +131,9 @@ def _rings(geometry: Geometry, material: Material, phi_c, level: Rings):
     k_M = jnp.broadcast_to(material.k_M, geometry.ring_positions.shape)
     eye = jnp.eye(2, dtype=k_M.dtype)[None]
     if level == "mat":
-        return eye / k_M[:, None, None], None, jnp.zeros((), jnp.int8)
+        on, _ = _ring.on_ring(geometry.half_angle, phi_c)
+        status = jnp.where(on, RingStatus.OK, RingStatus.BEHIND_GAP).astype(jnp.int8)
+        return eye / jnp.where(on, k_M, jnp.nan)[:, None, None], None, status
     EI, k_t = (_needed(material, name, f"rings={level!r}") for name in ("EI_C", "k_t"))
 
     def one(k):

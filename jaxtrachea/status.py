@@ -26,7 +26,10 @@ class PressStatus(_Described):
     NON_FINITE = 4, "an input or a result is not finite"
     BEHIND_GAP = 5, "the contact lies behind the ends of the rings, where there is no cartilage"
     PULLS = 6, "unilateral contact: the tool would have to pull; it lets go or slides (friction)"
-    OFF_PLAN = 7, "off the midline or oblique, in a program for normal presses on the midline"
+    OFF_PLAN = (
+        7,
+        "off the midline, oblique or elsewhere, in a program made for presses that are not",
+    )
     OFF_TUBE = 8, "the tool presses beyond an end of the tube"
     UNSURE = 9, "solved, but the tool reaches so deep that its contact may be another than found"
 

@@ -98,6 +98,7 @@ def test_sweep_runs(tmp_path, monkeypatch, capsys):
     code, out, _ = run(monkeypatch, capsys, "sweep", CONFIGS / "scan.toml", "--out", "maps")
     assert code == 0
     assert "112 contact points, 0 without a solution" in out
+    assert "sweep: rings 'arch2', off the midline a ring bends" in out
     names = {p.name for p in (tmp_path / "maps").iterdir()}
     assert names == {"force.png", "compliance.png", "sweep.h5", "provenance.json"}
     with h5py.File(tmp_path / "maps" / "sweep.h5") as file:
@@ -105,6 +106,9 @@ def test_sweep_runs(tmp_path, monkeypatch, capsys):
         assert force.shape == (len(file["s"]), len(file["phi"])) == (16, 7)
     np.testing.assert_allclose(force, force[:, ::-1], rtol=1e-9)  # a symmetric tube
     assert (force > 0).all()
+    # The path stays on the midline, where rings are springs; the sweep does not. A ring that bends
+    # gives way most between crown and end (docs/off_midline.md).
+    assert (force[:, 1] < 0.9 * force[:, 3]).all()
 
 
 GOOD = """
@@ -135,6 +139,14 @@ BAD = {
     "mesh and length": (
         GOOD + PRESS + '[trachea]\nfile = "a.stl"\nradius = "9 mm"',
         ["trachea", "file excludes radius", "remove"],
+    ),
+    "cartilage missing": (
+        GOOD + PRESS + '[trachea]\nfile = "tube.stl"\ncartilage = "c.stl"',
+        ["trachea.file", "cartilage='c.stl'", "no such file"],
+    ),
+    "no wall left": (
+        GOOD + PRESS + '[trachea]\nradius = "0.2 mm"\nwall = "0.1 mm"',
+        ["trachea: wall 0.1 mm", "positive radius"],
     ),
     "cloud missing": (
         GOOD + LINE + '[tool]\nshape = "cloud"\nfile = "c.csv"',
@@ -174,6 +186,9 @@ BAD = {
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     (tmp_path / "bad.stl").write_text("no mesh")
+    mesh = make_tube(table_1(), around=9, along=40)
+    tube = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), process=False)
+    tube.export(tmp_path / "tube.stl")
     (tmp_path / "points.csv").write_text("x,y,z\n0,0,0\n1,0,0\n0,1,0\n0,0,1\n")
     monkeypatch.chdir(tmp_path)
     return tmp_path

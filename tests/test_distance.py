@@ -488,6 +488,31 @@ def test_gradients(name):
     np.testing.assert_allclose(by_forward, numeric, atol=1e-5 * (1 + np.abs(numeric).max()))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_gradients_of_random_pairs(scale):
+    """All stored pairs, by turning (rad) and shifting (of the size): finite, as differences are."""
+    batch, _ = pairs(np.arange(2000), "float64", scale)
+
+    def one(a, b, pose):
+        def moved(v):
+            turn = compose(pose_from_vector(v[:3], jnp.zeros(3)), Pose(pose.rotation, jnp.zeros(3)))
+            return Pose(turn.rotation, pose.translation + scale * v[3:])
+
+        zero, step = jnp.zeros(6), 1e-6 * jnp.eye(6)
+        found = signed_distance(a, b, moved(zero))
+        near = lambda v: track(a, b, moved(v), found.normal).distance  # noqa: E731
+        gradient = jax.grad(lambda v: signed_distance(a, b, moved(v)).distance)(zero)
+        return gradient, jax.lax.map(lambda h: (near(h) - near(-h)) / 2e-6, step)
+
+    gradient, numeric = quick(lambda rows: jax.lax.map(lambda x: one(*x), rows, batch_size=250))(
+        batch
+    )
+    assert np.isfinite(gradient).all()
+    # Rounding 1e-15 / 1e-6; truncation 1e-12 times a third derivative of up to 1e5.
+    np.testing.assert_allclose(gradient / scale, numeric / scale, atol=2e-7)
+
+
 # ---------------------------------------------------------------- outcomes and misuse
 
 

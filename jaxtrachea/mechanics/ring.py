@@ -154,9 +154,9 @@ def _influence(ring: Ring, phi, phi_load, breaks, order):
     return rigid + arch + stretch, h_load
 
 
-def _on_ring(ring: Ring, phi):
+def on_ring(half_angle, phi):
     """Whether `phi` lies on the cartilage (to rounding), and an angle that surely does."""
-    on = jnp.abs(phi) <= ring.half_angle * (1 + 8 * epsilon(phi.dtype))
+    on = jnp.abs(phi) <= half_angle * (1 + 8 * epsilon(phi.dtype))
     return on, jnp.where(on, phi, 0)
 
 
@@ -177,7 +177,7 @@ def ring_compliance(
         only: C is NaN there and the status BEHIND_GAP. At the ends themselves C is that of a load
         on the end.
     """
-    on, phi = _on_ring(ring, phi_c)
+    on, phi = on_ring(ring.half_angle, phi_c)
     breaks = jnp.stack([-ring.half_angle, phi, ring.half_angle])
     C, _ = _influence(ring, phi, phi, breaks, order)
     C = jnp.where(on, (C + C.T) / 2, jnp.nan)
@@ -230,7 +230,7 @@ def respond(
         load: (P_y, P_z), N.
         order: as in `ring_compliance`.
     """
-    on, phi = _on_ring(ring, phi_c)
+    on, phi = on_ring(ring.half_angle, phi_c)
     breaks = jnp.stack([-ring.half_angle, phi, ring.half_angle])
     C, h = _influence(ring, phi, phi, breaks, order)
     share, tie = _shares(ring, phi), _tie(ring)
@@ -267,7 +267,7 @@ def ring_influence(
     Returns:
         The 2x2 influence; NaN if either point lies behind the ends of the ring.
     """
-    (on, phi), (on_c, phi_c) = _on_ring(ring, phi), _on_ring(ring, phi_c)
+    (on, phi), (on_c, phi_c) = on_ring(ring.half_angle, phi), on_ring(ring.half_angle, phi_c)
     inner = jnp.minimum(phi, phi_c), jnp.maximum(phi, phi_c)
     breaks = jnp.stack([-ring.half_angle, *inner, ring.half_angle])
     return jnp.where(on & on_c, _influence(ring, phi, phi_c, breaks, order)[0], jnp.nan)

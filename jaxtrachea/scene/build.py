@@ -15,9 +15,10 @@ from jaxtrachea.contact.pose import pose_from_vector
 from jaxtrachea.identify.study import geometry_of
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.plan import PlanError, Wishes
+from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import PathSection, SceneSpec, SceneTracheaSection, ToolSection
-from jaxtrachea.scene.stage import Poses, Presses, Scene, make_scene
+from jaxtrachea.scene.stage import Poses, Presses, Scene, facts_of, make_scene
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.imported import read_mesh
 from jaxtrachea.trachea.material import Material
@@ -27,6 +28,13 @@ from jaxtrachea.units import UnitError, column_unit, convert
 
 #: Steps of a press or a line that names none.
 STEPS = 10
+
+#: Arguments of `read_mesh` that a scene calls otherwise, or does not have.
+KEYS = {
+    "rings=": "cartilage=",
+    "ring_positions": "rings",
+    "give centreline=": "give centreline= to read_mesh (from Python)",
+}
 
 
 class Staged(NamedTuple):
@@ -54,11 +62,6 @@ def stage(spec: SceneSpec, folder: Path) -> Staged:
     material = Material(**spec.material.model_dump())
     tool = None if spec.tool is None else _tool(spec.tool, folder, files)
     path = _path(spec, folder, files, geometry)
-    output, effects = spec.output, spec.effects.model_dump()
-    wishes = Wishes(
-        **effects, want_surface=output.surface, want_joints=output.joints,
-        want_ring_ends=output.ring_ends, **spec.model.model_dump(),
-    )  # fmt: skip
     friction = None if spec.tool is None else spec.tool.friction
     radius = float(geometry.radius) + spec.trachea.wall / 2
     if spec.trachea.file is not None:
@@ -66,7 +69,7 @@ def stage(spec: SceneSpec, folder: Path) -> Staged:
     try:
         scene = make_scene(
             geometry, material, path, tool=tool, friction=friction, mesh=mesh, radius=radius,
-            wishes=wishes,
+            wishes=_wishes(spec),
         )  # fmt: skip
     except PlanError as error:
         raise SpecError(f"effects.{error}") from None
@@ -77,6 +80,35 @@ def stage(spec: SceneSpec, folder: Path) -> Staged:
             f"an inner wall) are bridged up to {filled:.2g} mm deep",
         )
     return Staged(scene, material, path, tuple(files), notes)
+
+
+def stage_sweep(spec: SceneSpec, staged: Staged, s: np.ndarray, phi: np.ndarray) -> Scene:
+    """The scene with the program of its sweep: the path may need less than presses everywhere.
+
+    Args:
+        spec: with a table [sweep].
+        staged: from `stage`.
+        s: of every contact point, mm; shape (points,).
+        phi: rad.
+    """
+    assert spec.sweep is not None
+    inward = np.stack([0 * phi, -np.cos(phi), -np.sin(phi)], axis=1)
+    bare = dataclasses.replace(staged.scene, mesh=None)
+    facts = facts_of(bare, staged.material, Presses(s, phi, spec.sweep.depth * inward))
+    wishes = dataclasses.replace(
+        _wishes(spec), seat="auto", friction="off", second_plane="auto", axial="off",
+        end_motion="off", surface="off", dent="off", want_surface=False, want_joints=False,
+        want_ring_ends=False,
+    )  # fmt: skip
+    return dataclasses.replace(staged.scene, plan=make_plan(facts, wishes))
+
+
+def _wishes(spec: SceneSpec) -> Wishes:
+    output = spec.output
+    return Wishes(
+        **spec.effects.model_dump(), want_surface=output.surface, want_joints=output.joints,
+        want_ring_ends=output.ring_ends, **spec.model.model_dump(),
+    )  # fmt: skip
 
 
 def shares(staged: Staged) -> tuple[int, dict[str, float]]:
@@ -113,7 +145,10 @@ def _trachea(section: SceneTracheaSection, folder: Path, files: list[Path]):
     if given.get("half_angle", 0) is None:
         del given["half_angle"]
     geometry = geometry_of(TracheaSection.model_construct(**given))
-    mesh = make_tube(geometry, around=section.around, along=section.along, wall=section.wall)
+    try:
+        mesh = make_tube(geometry, around=section.around, along=section.along, wall=section.wall)
+    except ValueError as error:
+        raise SpecError(f"trachea: {error}") from None
     return geometry, mesh, ()
 
 
@@ -129,7 +164,10 @@ def _imported(section: SceneTracheaSection, folder: Path, files: list[Path]):
             anterior=section.anterior, ring_positions=rings, half_angle=section.half_angle,
         )  # fmt: skip
     except (MeshError, UnitError) as error:
-        raise SpecError(f"trachea.file: {error}") from None
+        said = str(error)
+        for argument, key in KEYS.items():
+            said = said.replace(argument, key)
+        raise SpecError(f"trachea.file: {said}") from None
     return read.geometry, read.mesh, read.notes
 
 

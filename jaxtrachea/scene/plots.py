@@ -1,5 +1,6 @@
 """Pictures of simulations and sweeps (matplotlib without a global backend)."""
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,7 @@ def draw_surface(scene: Scene, vertices: np.ndarray, title: str = "", span: floa
     axis.set_position((0, 0, 0.86, 0.95))
     scale = ScalarMappable(Normalize(0, top), "viridis")
     figure.colorbar(scale, cax=figure.add_axes((0.88, 0.2, 0.02, 0.6)), label="displacement [mm]")
-    figure.text(0.43, 0.93, title, ha="center", fontsize=10)
+    figure.text(0.43, 0.93, textwrap.fill(title, 55), ha="center", fontsize=10)
     return figure
 
 

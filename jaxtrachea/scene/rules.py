@@ -194,7 +194,9 @@ def _surface(d: _Decisions, facts: Facts) -> Method | None:
         d.note("surface", "off", "not asked for")
         return None
     if not facts.mesh:
-        raise PlanError("surface: asked for, but the scene has no mesh")
+        raise PlanError(
+            "surface: asked for, but the scene has no mesh; give one, or do not ask (want_surface)"
+        )
     level = d.choose("surface", "hermite", "asked for; exact for the beam without shear")
     return next((v for v in get_args(Method) if v == level), None)
 

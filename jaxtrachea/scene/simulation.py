@@ -3,6 +3,7 @@
 The program is put together from the scene's static `Plan`; what is off is not in it.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +19,7 @@ from jaxtrachea.skeleton import local_frame
 from jaxtrachea.status import ContactStatus, PressStatus
 from jaxtrachea.trachea.material import Material
 
-#: What a program without a second plane takes for a normal press on the midline: rad; share.
+#: What counts as a normal press on the midline, and as one contact point: mm, rad; share.
 COVERED = 1e-5
 
 
@@ -87,8 +88,10 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
     """Follow a path through the program of `scene.plan`; pure, to be jitted and differentiated.
 
     The rows of a path with `seat` first belong together: the tool stays on the place that it
-    touched first. A row that the plan does not cover (off the midline in a program of one plane)
-    is NaN with OFF_PLAN; one whose contact lies beyond an end of the tube with OFF_TUBE.
+    touched first. A row off the midline or oblique in a program of one plane, and a press at
+    another point than the first with `seat` first, is NaN with OFF_PLAN; one whose contact lies
+    beyond an end of the tube is NaN with OFF_TUBE. Whatever else the plan leaves out (axial motion,
+    friction, bending rings) is left out of any path.
 
     Args:
         scene: from `make_scene`, or put together by hand.
@@ -128,8 +131,11 @@ def _refuse(scene: Scene, path: Presses | None, made: Approach | None):
         outside = ~((presses.s >= 0) & (presses.s <= scene.geometry.length))
         presses_in = jnp.sum(D * made.inward, axis=1) > 0
         refused[PressStatus.OFF_TUBE] = outside & presses_in
-    if not scene.plan.second_plane:
-        refused[PressStatus.OFF_PLAN] = _off_plan(presses)
+    unlike = [] if scene.plan.second_plane else [_off_plan(presses)]
+    if made is None and scene.plan.seat == "first":
+        unlike.append(_elsewhere(presses))
+    if unlike:
+        refused[PressStatus.OFF_PLAN] = functools.reduce(jnp.logical_or, unlike)
     for rows in refused.values():
         D = jnp.where(rows[:, None], jnp.nan, D)
     return Presses(presses.s, presses.phi, D), refused
@@ -204,6 +210,12 @@ def _off_plan(presses: Presses):
     D = jnp.abs(presses.displacement)
     oblique = jnp.maximum(D[:, 0], D[:, 2]) > COVERED * D[:, 1] + COVERED
     return ~(jnp.abs(presses.phi) <= COVERED) | oblique
+
+
+def _elsewhere(presses: Presses):
+    """Rows at another contact point than the first."""
+    near = lambda v: jnp.abs(v - v[0]) <= COVERED  # noqa: E731
+    return ~(near(presses.s) & near(presses.phi))
 
 
 def _one_plane(scene: Scene, material: Material, presses: Presses) -> _Moved:

@@ -1,5 +1,7 @@
 """The scene as arrays: trachea, tool, surface, path; and the facts the plan is made from."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,12 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea.contact.patches import Patches, Touch, straight_patches, touch
-from jaxtrachea.contact.pose import Pose
+from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.contact.walls import patches_of
 from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.plan import Facts, Plan, PlanError, Wishes
 from jaxtrachea.scene.rules import make_plan
+from jaxtrachea.skeleton import local_frame
 from jaxtrachea.surface import regions
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -99,6 +102,42 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
     return jax.vmap(one)(path.rotation, path.translation)
 
 
+def followed(path: Poses, seen: Touch, first, inward, frame):
+    """Displacement of the tool's material point that touches first, from its first touch on.
+
+    Before the row of first touch the tool came in a straight line: the part of that step which it
+    still went along the surface counts, so that a finer path changes nothing.
+
+    Args:
+        path: of the tool.
+        seen: its contact with the tube at rest, row by row.
+        first: row of first touch.
+        inward: normal of the straight tube there; shape (3,).
+        frame: of the centreline there, as columns; None: the tube is straight.
+
+    Returns:
+        mm, along (tangent, anterior, lateral); shape (rows, 3).
+    """
+    before = jnp.maximum(first - 1, 0)
+    pose = Pose(at_row(path.rotation, first), at_row(path.translation, first))
+    body = transform(inverse(pose), at_row(seen.tool_point, first)[:, None])[:, 0]
+    points = jax.vmap(lambda R, T: R @ body + T)(path.rotation, path.translation)
+    way = points - at_row(points, first)[None]
+    if frame is not None:
+        way = way @ frame
+    gap = at_row(seen.gap, first)
+    closing = at_row(seen.gap, before) - gap
+    left = jnp.where(closing > 0, -gap / jnp.where(closing > 0, closing, 1), 0)
+    step = -at_row(way, before)
+    step = step - jnp.dot(step, inward) * inward
+    return way + (left * step - gap * inward)[None]
+
+
+def at_row(v, row):
+    """One row, of a traced number."""
+    return jax.lax.dynamic_index_in_dim(v, row, keepdims=False)
+
+
 def make_scene(
     geometry: Geometry,
     material: Material,
@@ -124,7 +163,12 @@ def make_scene(
 
     Raises:
         PlanError: a wish that cannot be met.
+        ValueError: a path without rows, or a negative friction.
     """
+    if not len(path.s if isinstance(path, Presses) else path.translation):
+        raise ValueError("path has no rows; expected at least one")
+    if friction is not None and not 0 <= float(friction) < np.inf:
+        raise ValueError(f"friction is {friction}; expected a finite number, not negative")
     dtype = geometry.length.dtype
     outer = geometry.radius + 1.3 if radius is None else jnp.asarray(radius, dtype)
     if isinstance(path, Poses) and tool is None:
@@ -146,6 +190,16 @@ def make_scene(
     if plan.surface is None:
         mesh = binding = None
     return Scene(*fixed, mesh, binding, spacing, near, plan)
+
+
+def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
+    """The scene with another skeleton: the surface is bound to it anew, the wall stays as it is.
+
+    May be traced; derivatives of the surface by geometry go through this. (A new geometry put into
+    the scene by hand leaves the surface on the old rings.)
+    """
+    binding = None if scene.mesh is None else regions.bind(scene.mesh, geometry)
+    return dataclasses.replace(scene, geometry=geometry, binding=binding)
 
 
 def _round(geometry: Geometry, radius: float) -> Patches:
@@ -187,21 +241,20 @@ def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> Facts:
     if isinstance(path, Poses):
         seen = jax.jit(touch_tube)(scene, path)
         gap, s, phi = (np.asarray(v, float) for v in (seen.gap, seen.s, seen.phi))
-        points = np.asarray(seen.tool_point, float)
         touching = gap < 0
         row = int(np.argmax(touching)) if touching.any() else int(np.argmin(gap))
-        moved = _body(path, row, points[row]) - points[row]
+        frame = None
         if curved and scene.tube is not None:
-            moved = moved @ np.asarray(frame_at(scene.tube.line, jnp.asarray(s[row])))
-        depth = np.maximum(-gap[row], 0)
-        at = slice(row, row + 1)
+            frame = frame_at(scene.tube.line, seen.s[row])
+        moved = followed(path, seen, jnp.asarray(row), local_frame(seen.phi[row])[0], frame)
+        moved, at = np.asarray(moved, float), slice(row, row + 1)
     else:
         s, phi, moved = (np.asarray(v, float) for v in (path.s, path.phi, path.displacement))
-        touching, depth, at = np.ones(len(s), bool), 0.0, slice(None)
+        touching, at = np.ones(len(s), bool), slice(None)
     here = np.broadcast_to(phi[at], s.shape)
-    radial = moved[:, 1] * np.cos(here) + moved[:, 2] * np.sin(here)
     across = np.abs(moved[:, 2] * np.cos(here) - moved[:, 1] * np.sin(here))
-    along, whole = np.abs(moved[:, 0]), max(np.abs(radial).max() + depth, np.abs(moved).max(), 1e-9)
+    along, way = np.abs(moved[:, 0]), np.sqrt((moved**2).sum(axis=1))
+    whole = max(way[touching].max(initial=0), 1e-9)  # not what the tool goes before it touches
     share = lambda v: float(v.max(initial=0) / whole)  # noqa: E731
     keep = lambda v: v if v > ROUNDING else 0.0  # noqa: E731
     angles = np.abs(phi[touching])
@@ -222,12 +275,6 @@ def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> Facts:
         curved=curved,
         near=_near(scene, s, phi),
     )  # fmt: skip
-
-
-def _body(path: Poses, row: int, point):
-    """The tool's material point that is at `point` in a row, followed through the path."""
-    R, T = np.asarray(path.rotation, float), np.asarray(path.translation, float)
-    return R @ (R[row].T @ (point - T[row])) + T
 
 
 def _near(scene: Scene, s, phi) -> bool:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from small_scenes import BALL, MATERIAL, TUBE, ball
 
-from jaxtrachea import Poses, Presses, Wishes, make_scene, simulate
+from jaxtrachea import Poses, Presses, Wishes, make_scene, simulate, with_geometry
 from jaxtrachea.trachea.tube import make_tube
 
-COARSE = make_tube(TUBE, around=5, along=12)
+COARSE = make_tube(TUBE, around=5, along=11)  # no row on a ring, where the ends have a kink
 FAST = {"xla_backend_optimization_level": 0}
 
 
@@ -56,7 +56,7 @@ def changed(scene, material, x):
     g = dataclasses.replace(
         g, length=g.length + x[6], radius=g.radius + x[7], ring_positions=g.ring_positions + shift
     )
-    return dataclasses.replace(scene, geometry=g), dataclasses.replace(material, **new)
+    return with_geometry(scene, g), dataclasses.replace(material, **new)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 from small_scenes import BALL, BARE, MATERIAL, MESH, TUBE, ball, presses
 
-from jaxtrachea import PlanError, Wishes, make_scene, simulate
+from jaxtrachea import PlanError, Poses, Wishes, make_scene, simulate
 from jaxtrachea.scene.plan import Facts
 from jaxtrachea.scene.rules import make_plan
 
@@ -93,3 +93,22 @@ def test_what_the_scene_holds_reaches_the_rules():
     assert level["shear"] == level["end_motion"] == "off"
     far = make_scene(TUBE, MATERIAL, ball([40, -1, 0], [90, -1, 0]), tool=BALL, wishes=BARE)
     assert far.plan.seat == "each"
+
+
+def test_one_step_from_afar_to_a_slanting_press():
+    """The way along the surface between two rows, from first touch on, counts for the plan too."""
+    path = ball([70, 4, 0], [76, -2, 0], 2)
+    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, friction=0.66, wishes=BARE)
+    assert scene.plan.friction
+    assert scene.plan.axial
+    assert simulate(scene, MATERIAL, path).status.tolist() == [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("rows", "friction", "says"), [(0, None, "no rows"), (2, -0.1, "-0.1; expected a finite")]
+)
+def test_misuse_is_named(rows, friction, says):
+    path = ball([75, 1, 0], [75, -2, 0], 2)
+    path = Poses(path.rotation[:rows], path.translation[:rows])
+    with pytest.raises(ValueError, match=says):
+        make_scene(TUBE, MATERIAL, path, tool=BALL, friction=friction, wishes=BARE)

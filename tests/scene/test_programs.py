@@ -34,12 +34,21 @@ def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **ho
 
     def run(scene, m, p):
         at = p.s[0], p.phi[0]
-        out = press_oblique(scene.geometry, m, *at, p.displacement, options, **how)
-        seen = [out.force, out.depth, out.skeleton, out.status]
+        led, status = seated(p)
+        out = press_oblique(scene.geometry, m, *at, led, options, **how)
+        seen = [led, out.force, out.depth, out.skeleton, status(out.status)]
         seen += [getattr(out, name) for name in more.split()]
         return (*seen, move_surface(scene, *at, out, surface)) if surface else seen
 
     return run
+
+
+def seated(p, unfit=None):
+    """The presses and their statuses; those at another point than the first are refused."""
+    refused = ~((jnp.abs(p.s - p.s[0]) <= 1e-5) & (jnp.abs(p.phi - p.phi[0]) <= 1e-5))
+    refused = refused if unfit is None else unfit | refused
+    led = jnp.where(refused[:, None], jnp.nan, p.displacement)
+    return led, lambda status: jnp.where(refused, PressStatus.OFF_PLAN, status)
 
 
 def move_surface(scene, s, phi, out, kind):
@@ -64,22 +73,24 @@ def move_surface(scene, s, phi, out, kind):
 def normal(scene, m, p):
     """A normal press; its scalars as vectors, rows that are none of its kind refused."""
     D = jnp.abs(p.displacement)
-    fits = (jnp.abs(p.phi) <= 1e-5) & ~(jnp.maximum(D[:, 0], D[:, 2]) > 1e-5 * D[:, 1] + 1e-5)
-    led = jnp.where(fits[:, None], p.displacement, jnp.nan)
+    oblique = jnp.maximum(D[:, 0], D[:, 2]) > 1e-5 * D[:, 1] + 1e-5
+    unfit = ~(jnp.abs(p.phi) <= 1e-5) | oblique
+    led, status = seated(p, unfit)
     inward = -led[:, 1]
     out = press(scene.geometry, m, p.s[0], inward)
     F = -out.force  # outward is +y
     y = F, -out.depth, F * out.compliance
     vectors = [jnp.stack([jnp.zeros(3), v, jnp.zeros(3)], -1) for v in y]
-    return led, vectors, jnp.where(fits, out.status, 7)
+    return led, vectors, status(out.status)
 
 
 def friction(scene, m, p):
     mu = scene.friction
-    out = press_path(scene.geometry, m, p.s[0], p.phi[0], p.displacement, mu, rings="mat")
+    led, status = seated(p)
+    out = press_path(scene.geometry, m, p.s[0], p.phi[0], led, mu, rings="mat")
     f = out.press
     vectors = f.force, f.depth, f.skeleton, f.joints, f.loads, f.end_U, f.end_V
-    return vectors, f.status, out.slip, out.dissipated
+    return led, vectors, status(f.status), out.slip, out.dissipated
 
 
 def each(scene, m, p):

@@ -1,5 +1,6 @@
 """The chain from the tool to the surface: against single presses, spheres, and bent meshes."""
 
+import dataclasses
 import itertools
 
 import jax
@@ -19,6 +20,7 @@ from small_scenes import (
     bend,
     on_arc,
     poses,
+    presses,
 )
 
 from jaxtrachea import (
@@ -30,6 +32,7 @@ from jaxtrachea import (
     press_oblique,
     simulate,
     sweep,
+    with_geometry,
 )
 from jaxtrachea.contact.shapes import box, sphere
 from jaxtrachea.scene.stage import touch_tube
@@ -57,6 +60,35 @@ def test_rows_off_the_plan_are_refused_by_status():
     assert out.status.tolist() == [0, PressStatus.OFF_PLAN, PressStatus.OFF_PLAN]
     assert np.isfinite(out.force[0]).all()
     assert np.isnan(out.force[1:]).any(axis=1).all()
+
+
+def test_a_press_elsewhere_is_refused_by_status():
+    """A program for one contact point gave every row the answer of the first."""
+    there = Presses([75.0, 40.0, 75.0], [0.0, 0.0, 0.3], [[0, -2.0, 0]] * 3)
+    for wishes in (BARE, dataclasses.replace(BARE, second_plane="on", axial="off")):
+        scene = make_scene(TUBE, MATERIAL, DOWN, wishes=wishes)
+        out = run(scene, MATERIAL, there)
+        assert out.status.tolist() == [0, PressStatus.OFF_PLAN, PressStatus.OFF_PLAN]
+        assert np.isnan(out.force[1:, 1]).all()
+
+
+def test_another_geometry_moves_the_surface_with_its_rings():
+    """As if made anew; the vertices were bound to the old rings, up to 0.6 mm off."""
+    shifted = dataclasses.replace(TUBE, ring_positions=TUBE.ring_positions + 3.0)
+    scene = make_scene(TUBE, MATERIAL, DOWN, mesh=MESH)
+    anew = make_scene(shifted, MATERIAL, DOWN, mesh=MESH)
+    a, b = (run(s, MATERIAL, DOWN).vertices for s in (with_geometry(scene, shifted), anew))
+    np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+@pytest.mark.parametrize("rings", ["mat", "arch2"])
+def test_behind_the_rings_nothing_is_solved(rings):
+    """Not only the arches: the surface is NaN there, and an OK would be misleading."""
+    path = presses([0, 1, -1], phi=2.3)
+    scene = make_scene(TUBE, MATERIAL, path, mesh=MESH, wishes=Wishes(rings=rings))
+    out = run(scene, MATERIAL, path)
+    assert set(out.status.tolist()) == {PressStatus.BEHIND_GAP}
+    assert np.isnan(out.force).any(axis=1).all()
 
 
 def test_a_ball_led_down_presses_as_deep_as_it_goes():
