@@ -288,8 +288,9 @@ reverse_of = jax.jit(jax.grad(lambda v, w: jnp.dot(w, _values(v))), compiler_opt
 value_of = jax.jit(_values, compiler_options=QUICK)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("D", [[0.3, -1.0, 0.5], [0.0, 0.0, 0.0]])
-@pytest.mark.parametrize("dtype", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_gradients(D, dtype):
     """Forward = reverse = central differences through the whole, also without displacement."""
     point = VALUES | MORE | {"s": 63.0, "phi": 0.4, "D": np.array(D)}

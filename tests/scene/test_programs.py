@@ -170,6 +170,7 @@ def test_an_unused_effect_adds_none_to_the_compiled_program(name):
     assert mine["transcendentals"] == minimal["transcendentals"]
 
 
+@pytest.mark.slow
 def test_each_effect_that_is_on_costs_operations():
     path = ball([75, 1, 0.5], [77, -2, 1.0])
     optional = {"GA_L": 9.0, "k_A": 0.2, "k_1_ring": 0.6}

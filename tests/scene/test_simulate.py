@@ -145,6 +145,7 @@ def test_sweep_agrees_with_single_presses_whatever_the_chunk():
     np.testing.assert_allclose(out.force[3], out.force[5], rtol=1e-9)  # mirror image
 
 
+@pytest.mark.slow
 def test_a_box_touches_flat():
     flat = box([4.0, 3.0, 4.0], 0.5)
     path = poses([75, OUTER + 3.5 - 1, 0], [75, OUTER + 3.5 - 1, 0], 1)

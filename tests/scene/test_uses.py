@@ -77,6 +77,7 @@ def test_a_network_learns_which_motion_reaches_a_force():
     np.testing.assert_allclose(found, wanted, atol=0.02)
 
 
+@pytest.mark.slow
 def test_the_example_of_the_page_runs(capsys):
     page = Path(__file__).parents[2] / "docs" / "scenes.md"
     exec(re.search(r"```python\n(.*?)```", page.read_text(), re.S)[1], {})
