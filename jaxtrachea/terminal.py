@@ -3,6 +3,7 @@
 import contextlib
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -31,7 +32,7 @@ def complain(message: str) -> int:
 
 @contextlib.contextmanager
 def interrupts() -> Iterator[Callable[[], None]]:
-    """Remember Ctrl-C, since an exception raised inside a callback of jax can get lost there.
+    """Remember Ctrl-C, since an exception raised inside a callback of jax is printed and lost.
 
     Yields:
         What raises KeyboardInterrupt if one came; to be called between steps of the work.
@@ -46,15 +47,21 @@ def interrupts() -> Iterator[Callable[[], None]]:
         if asked:
             raise KeyboardInterrupt
 
+    def print_others(lost):
+        if not issubclass(lost.exc_type, KeyboardInterrupt):
+            shown(lost)
+
     usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not usual or threading.current_thread() is not threading.main_thread():
         yield stop_if_asked
         return
+    shown, sys.unraisablehook = sys.unraisablehook, print_others
     signal.signal(signal.SIGINT, remember)
     try:
         yield stop_if_asked
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.unraisablehook = shown
 
 
 def set_up_jax() -> None:
