@@ -1,6 +1,8 @@
 """Strict settings for the whole suite: float64, no silent promotion, shapes checked."""
 
 import os
+import subprocess
+import sys
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Also for the commands that tests start: nothing is written beside the tests.
@@ -10,6 +12,21 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
+
+def _compile_quickly() -> None:
+    """Compile in half the time, by XLA's older code generator, if this XLA still has it.
+
+    XLA_FLAGS from outside comes first: the slow tests run on the usual generator (.ci/run).
+    """
+    if "XLA_FLAGS" in os.environ:
+        return
+    flags = "--xla_cpu_use_fusion_emitters=false"
+    start = [sys.executable, "-c", "import jax; jax.devices()"]
+    tried = subprocess.run(start, env=os.environ | {"XLA_FLAGS": flags}, capture_output=True)
+    os.environ["XLA_FLAGS"] = flags if tried.returncode == 0 else ""
+
+
+_compile_quickly()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
