@@ -105,7 +105,7 @@ def fit(
     loaded, measurements, problem = _load(spec, data)
     if leave_one_out:
         _can_leave_out(problem)
-    names = _names_to_profile(loaded, problem, profile)
+    names = _names_to_profile(spec, loaded, problem, profile)
     clock.append(time.perf_counter())
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
     with into(out_dir, default) as (folder, stop_if_asked):
@@ -195,8 +195,7 @@ def _load(path: Path, data: Path | None):
 
 def _print_bad(measurements) -> None:
     for bad in measurements.bad[:20]:
-        text = f"{bad.specimen} {bad.trial}: {bad.kind}: {bad.source}: {bad.message}; {bad.cure}"
-        to_stderr(f"[yellow]not usable:[/] {escape(text)}")
+        to_stderr(f"[yellow]not usable:[/] {escape(f'{bad.specimen} {bad.trial}: {bad.reason}')}")
     if len(measurements.bad) > 20:
         to_stderr(f"... and {len(measurements.bad) - 20} more")
 
@@ -210,14 +209,14 @@ def _can_leave_out(problem) -> None:
         raise Stop(f"--leave-one-out: {error}") from None
 
 
-def _names_to_profile(spec, problem, asked: bool) -> tuple[str, ...]:
+def _names_to_profile(path: Path, spec, problem, asked: bool) -> tuple[str, ...]:
     from jaxtrachea.config import SpecError
     from jaxtrachea.identify.study import profiled
 
     try:
         return profiled(spec, problem, asked=asked)
     except SpecError as error:
-        raise Stop(str(error)) from None
+        raise Stop(f"{path}: {error}") from None
 
 
 @dataclasses.dataclass(frozen=True)

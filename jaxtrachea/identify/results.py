@@ -127,7 +127,7 @@ def bad_row(bad: BadCurve) -> dict[str, object]:
         "specimen": bad.specimen,
         "trial": bad.trial,
         "status": FitStatus.BAD_DATA.name.lower(),
-        "message": f"{bad.kind}: {bad.source}: {bad.message}; {bad.cure}",
+        "message": bad.reason,
     }
 
 
