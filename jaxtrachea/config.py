@@ -195,6 +195,7 @@ class FitSection(Section):
     starts: int = Field(4, ge=1, le=10_000)
     start_decades: float = Field(1.0, ge=0, le=10)
     seed: int = Field(0, ge=0, lt=2**63)
+    more_starts: int = Field(8, ge=0, le=10_000)
     max_iterations: int = Field(200, ge=1, le=1_000_000)
     tolerance: float = Field(1e-10, gt=0, lt=0.1)
     chunk: int = Field(128, ge=1, le=1_000_000)

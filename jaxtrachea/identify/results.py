@@ -86,6 +86,7 @@ def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[d
             "message": status.message,
             "iterations": int(result.iterations[lane]),
             "starts_agreeing": int(result.converged_starts[lane]),
+            "starts": int(result.tried[lane]),
             "samples": int(result.samples[lane]),
             "cost": float(result.cost[lane]),
             "rms_force_N": float(result.rms[lane, 0]),
@@ -254,7 +255,7 @@ def _write_lanes(group: h5py.Group, result: FitResult) -> None:
     group.create_dataset("trial", data=[n[1] for n in names], dtype=text)
     codes = group.create_dataset("status", data=result.status.astype(np.int8))
     codes.attrs["meaning"] = json.dumps({int(s): s.message for s in FitStatus})
-    for name in ("iterations", "cost", "converged_starts", "samples"):
+    for name in ("iterations", "cost", "converged_starts", "tried", "samples"):
         group.create_dataset(name, data=getattr(result, name))
     for name in ("sigma", "rms"):
         group.create_dataset(name, data=getattr(result, name)).attrs["unit"] = "N, mm"

@@ -326,6 +326,7 @@ def settings_of(spec: FitSpec) -> Settings:
         starts=f.starts,
         decades=f.start_decades,
         seed=f.seed,
+        more_starts=f.more_starts,
         chunk=f.chunk,
         tolerances=limits,
         float32=f.precision == "float32",
