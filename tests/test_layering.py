@@ -25,7 +25,8 @@ ORDER = [
     {"report"},
     {"plots", "viewer", "study"},
     {"terminal"},
-    {"cli_scene"},
+    {"cli_load"},
+    {"cli_scene", "cli_compare"},
     {"cli"},
     {"__main__"},
 ]

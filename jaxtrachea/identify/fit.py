@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from jaxtrachea.identify import descent
+from jaxtrachea.identify.criteria import Criteria, criteria
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.solve import Solved, Tolerances, levenberg_marquardt
 from jaxtrachea.identify.starts import best, completed, draw_starts, of_unknowns
@@ -66,6 +67,7 @@ class FitResult:
         sigma: standard deviation of force (N) and markers (mm), given or estimated; (lanes, 2).
         rms: root mean square residual of force (N) and markers (mm); (lanes, 2).
         samples: observed entries; (lanes,).
+        criteria: AIC, AICc, BIC of all lanes.
         uncertainty: `Uncertainty` of each lane.
     """
 
@@ -85,6 +87,7 @@ class FitResult:
     sigma: np.ndarray
     rms: np.ndarray
     samples: np.ndarray
+    criteria: Criteria
     uncertainty: tuple[Uncertainty, ...]
 
     @property
@@ -230,6 +233,7 @@ def _conclude(problem, solved: Solved, info: Information, sigma, agree, tried) -
         lower=lower, upper=upper, relative_se=u.se / relative,
         at_bound=at_bound, status=status, iterations=solved.iterations, cost=solved.cost,
         converged_starts=agree, tried=tried, sigma=sigma * unit, rms=rms * unit, samples=samples,
+        criteria=criteria(problem, info),
         uncertainty=tuple(Uncertainty(*row) for row in zip(*u, strict=True)),
     )  # fmt: skip
 
