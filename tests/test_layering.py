@@ -12,6 +12,7 @@ import jaxtrachea
 PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 ORDER = [
     {"units", "status", "_numerics"},
+    {"spec_file"},
     {"config"},
     {"trachea"},
     {"contact"},
