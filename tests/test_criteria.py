@@ -256,7 +256,7 @@ def test_simulated_data_choose_the_beam_they_came_from(shear):
     GA_L = 1.0
 
     def one(t, s, d):
-        material = Material(*t, GA_L=np.float64(GA_L))
+        material = Material(*t, GA_L=jax.numpy.asarray(GA_L))
         return press(synthetic.GEOMETRY, material, s, d, options[shear]).force
 
     curve = jax.jit(jax.vmap(jax.vmap(one, (None, 0, None)), (0, None, None)))

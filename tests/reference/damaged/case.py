@@ -1,7 +1,7 @@
 """What one damaged input is, and how it is put into a folder."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 HEAD = "specimen,trial,s [mm],displacement [mm],force [N]\n"
@@ -24,7 +24,7 @@ class Case:
     """
 
     says: tuple[str, ...]
-    files: dict[str, str | bytes] = dataclasses.field(default_factory=dict)
+    files: Mapping[str, str | bytes] = dataclasses.field(default_factory=dict)
     make: Callable[[Path], None] | None = None
     command: tuple[str, ...] = ("fit", "spec.toml")
     codes: tuple[int, ...] = (2,)

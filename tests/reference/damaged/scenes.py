@@ -39,7 +39,8 @@ def tube(kind: str) -> bytes:
     mesh = make_tube(table_1(), around=9, along=40)
     body = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), process=False)
     data = body.export(file_type=kind)
-    return data if isinstance(data, bytes) else data.encode()
+    assert isinstance(data, bytes)
+    return data
 
 
 def mesh(kind, change, *says, codes=(2,), keys="larynx = [1.0, 0.0, 0.0]\nunit = 'mm'\n"):
