@@ -25,7 +25,7 @@ CrossOption = Annotated[
 ]
 #: Specimens of a terminal table; the files hold all.
 MANY = 8
-HEAD = ["specimen", "model", "k", "cost", "dAICc", "weight", "BIC", "left out"]
+HEAD = ["specimen", "model", "k", "-2 ln L", "dAICc", "weight", "BIC", "left out"]
 
 
 def compare(
@@ -89,16 +89,22 @@ def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
 
     models = []
     with progress_bar() as bar:
-        for (spec, _, problem), name in zip(loaded, names, strict=True):
-            task = bar.add_task(name, total=None)
 
-            def advance(done, of, task=task):
+        def counted(text):
+            task = bar.add_task(text, total=None)
+
+            def advance(done, of):
                 stop_if_asked()
                 bar.update(task, advance=done, total=of or None)
 
+            return advance
+
+        for (spec, _, problem), name in zip(loaded, names, strict=True):
             settings = settings_of(spec)
-            result = fit(problem, settings, advance)
-            left = leave_position_out(problem, settings, advance) if cross_validation else None
+            result = fit(problem, settings, counted(name))
+            left = None
+            if cross_validation:
+                left = leave_position_out(problem, settings, counted(f"{name}, left out"))
             models.append(Model(name, result, left))
     return models
 
@@ -160,7 +166,7 @@ def _cells(rows) -> list[list[str]]:
     from jaxtrachea.report import number
 
     return [
-        [row.specimen, row.model, str(row.unknowns), number(row.cost), number(row.delta, 3),
+        [row.specimen, row.model, str(row.unknowns), number(row.deviance, 6), number(row.delta, 3),
          number(row.weight, 2), number(row.BIC, 6), _percent(row.left_out)]
         for row in rows
     ]  # fmt: skip

@@ -115,6 +115,7 @@ def row(model, AICc, k=3, left=np.nan):
             "predicts positions left out best",
         ),
         ([row("A", 0, left=0.2), row("B", 30, left=0.1)], False, "B predicts positions left out"),
+        ([row("A", 0, left=0.1), row("B", 30, left=0.2)], True, "left out agree with it"),
         ([row("A", np.inf), row("B", np.inf)], False, "too few samples"),
     ],
 )

@@ -44,7 +44,7 @@ class Row:
         model: its name.
         unknowns: k, summed.
         samples: n, summed.
-        cost: of the fits, summed; smaller fits better.
+        cost: of the fits, summed; with estimated noise each model has its own unit of it.
         deviance: -2 ln L, summed.
         AIC: summed over lanes, as are AICc and BIC.
         AICc: -
@@ -240,6 +240,7 @@ def sentence(rows: Sequence[Row], correlated: bool) -> str:
         (against, f"{predicts} predicts positions left out better"),
     ]
     why = "; ".join(text for doubt, text in doubts if doubt)
+    why += "; positions left out agree with it" if known and not against else ""
     return f"the data prefer {best.model} ({said}), but not decisively: {why}"
 
 
