@@ -15,8 +15,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jaxtrachea import __version__, cli_scene
-from jaxtrachea.terminal import Stop, complain, into, progress_bar, set_up_jax, table, to_stderr
+from jaxtrachea import __version__, cli_compare, cli_scene
+from jaxtrachea.cli_load import load
+from jaxtrachea.terminal import Stop, complain, into, progress_bar, table, to_stderr
 
 app = typer.Typer(
     add_completion=False,
@@ -62,7 +63,7 @@ def main() -> None:
     sys.exit(code or 0)
 
 
-for _command in (cli_scene.plan, cli_scene.simulate, cli_scene.sweep):
+for _command in (cli_compare.compare, cli_scene.plan, cli_scene.simulate, cli_scene.sweep):
     app.command()(_command)
 
 
@@ -78,7 +79,7 @@ def _options(
 @app.command()
 def check(spec: SpecArgument, data: DataOption = None) -> None:
     """Read everything, fit nothing, say what was found."""
-    _, measurements, problem = _load(spec, data)
+    _, measurements, problem = load(spec, data)
     out = Console()
     curves = measurements.curves
     out.print(_curve_table(curves))
@@ -102,10 +103,10 @@ def fit(
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
     clock = [time.perf_counter()]
-    loaded, measurements, problem = _load(spec, data)
+    loaded, measurements, problem = load(spec, data)
     if leave_one_out:
         _can_leave_out(problem)
-    names = _names_to_profile(loaded, problem, profile)
+    names = _names_to_profile(spec, loaded, problem, profile)
     clock.append(time.perf_counter())
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
     with into(out_dir, default) as (folder, stop_if_asked):
@@ -124,7 +125,7 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
     from jaxtrachea.config import SpecError
     from jaxtrachea.identify.study import candidates_of
 
-    loaded, measurements, problem = _load(spec, data)
+    loaded, measurements, problem = load(spec, data)
     try:
         candidates = candidates_of(loaded, problem)
     except SpecError as error:
@@ -170,37 +171,6 @@ def _design(folder: Path, loaded, found, candidates) -> list[dict[str, object]]:
     return rows
 
 
-def _load(path: Path, data: Path | None):
-    """Specification, measurements and problem; input errors become `Stop`."""
-    from jaxtrachea.config import SpecError, load_fit_spec
-    from jaxtrachea.identify.measurements import DataError
-    from jaxtrachea.identify.study import problem_of, read_data, usable
-
-    try:
-        spec = load_fit_spec(path)
-        measurements = read_data(spec, path.parent if data is None else data)
-        set_up_jax()
-        if measurements.curves:
-            measurements = usable(spec, measurements)
-        _print_bad(measurements)
-        if not measurements.curves:
-            raise Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
-        return spec, measurements, problem_of(spec, measurements)
-    except SpecError as error:
-        text = str(error)
-        raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
-    except DataError as error:
-        raise Stop(str(error)) from None
-
-
-def _print_bad(measurements) -> None:
-    for bad in measurements.bad[:20]:
-        text = f"{bad.specimen} {bad.trial}: {bad.kind}: {bad.source}: {bad.message}; {bad.cure}"
-        to_stderr(f"[yellow]not usable:[/] {escape(text)}")
-    if len(measurements.bad) > 20:
-        to_stderr(f"... and {len(measurements.bad) - 20} more")
-
-
 def _can_leave_out(problem) -> None:
     from jaxtrachea.identify.predictions import curves_to_leave_out
 
@@ -210,14 +180,14 @@ def _can_leave_out(problem) -> None:
         raise Stop(f"--leave-one-out: {error}") from None
 
 
-def _names_to_profile(spec, problem, asked: bool) -> tuple[str, ...]:
+def _names_to_profile(path: Path, spec, problem, asked: bool) -> tuple[str, ...]:
     from jaxtrachea.config import SpecError
     from jaxtrachea.identify.study import profiled
 
     try:
         return profiled(spec, problem, asked=asked)
     except SpecError as error:
-        raise Stop(str(error)) from None
+        raise Stop(f"{path}: {error}") from None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,9 +4,8 @@ Every problem is reported with its dotted key, what was found and what is expect
 opens a measurement file or imports JAX; the rooms below turn these records into objects.
 """
 
-import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
@@ -16,17 +15,12 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
-    ValidationError,
     model_validator,
 )
 
-from jaxtrachea.units import parse_quantity
-
-Spec = TypeVar("Spec", bound=BaseModel)
-
-
-class SpecError(ValueError):
-    """A specification that cannot be used; the message has one line per problem."""
+from jaxtrachea.spec_file import EVEN, LISTED, load_spec
+from jaxtrachea.spec_file import SpecError as SpecError
+from jaxtrachea.units import UnitError, parse_quantity
 
 
 def quantity(dimension: str, *, positive: bool = False, word: str | None = None):
@@ -42,9 +36,12 @@ def quantity(dimension: str, *, positive: bool = False, word: str | None = None)
         if word is not None and value == word:
             return value
         if isinstance(value, bool) or not isinstance(value, str | int | float):
-            raise ValueError(f"expected a {dimension} with its unit")
-        with np.errstate(over="ignore"):  # infinity is refused with the key's name
-            number = parse_quantity(value, dimension)
+            raise ValueError(f"expected a {dimension.replace('_', ' ')} with its unit")
+        try:
+            with np.errstate(over="ignore"):  # infinity is refused with the key's name
+                number = parse_quantity(value, dimension)
+        except UnitError as error:
+            raise ValueError(f"{error}{'' if word is None else f', or {word!r}'}") from None
         if positive and number <= 0:
             raise ValueError(f"expected a positive {dimension}")
         return number
@@ -109,11 +106,9 @@ class EvenRings(Section):
     last: PositiveLength
 
 
-#: Names of the two ways to write `trachea.rings`; pydantic puts them into the place of an error.
-_EVEN, _LISTED = "evenly spaced", "listed"
 Rings = Annotated[
-    Annotated[EvenRings, Tag(_EVEN)] | Annotated[list[PositiveLength], Tag(_LISTED)],
-    Discriminator(lambda value: _EVEN if isinstance(value, dict | EvenRings) else _LISTED),
+    Annotated[EvenRings, Tag(EVEN)] | Annotated[list[PositiveLength], Tag(LISTED)],
+    Discriminator(lambda value: EVEN if isinstance(value, dict | EvenRings) else LISTED),
 ]
 
 
@@ -166,7 +161,7 @@ class ParameterSection(Section):
     def _either(self) -> "ParameterSection":
         free = ("initial", "bounds", "scale", "scope")
         if self.fixed is not None and any(getattr(self, name) is not None for name in free):
-            raise ValueError("fixed excludes initial, bounds, scale and scope")
+            raise ValueError("fixed excludes initial, bounds, scale and scope; remove it or them")
         return self
 
 
@@ -187,6 +182,7 @@ class FitSection(Section):
     starts: int = Field(4, ge=1, le=10_000)
     start_decades: float = Field(1.0, ge=0, le=10)
     seed: int = Field(0, ge=0, lt=2**63)
+    more_starts: int = Field(8, ge=0, le=10_000)
     max_iterations: int = Field(200, ge=1, le=1_000_000)
     tolerance: float = Field(1e-10, gt=0, lt=0.1)
     chunk: int = Field(128, ge=1, le=1_000_000)
@@ -259,70 +255,3 @@ def load_fit_spec(path: Path) -> FitSpec:
             per problem with its dotted key.
     """
     return load_spec(path, FitSpec, "fit specification")
-
-
-def load_spec(path: Path, kind: type[Spec], called: str) -> Spec:
-    """Read and validate a specification of any kind.
-
-    Args:
-        path: the TOML file.
-        kind: the record it must fit.
-        called: what a user calls it.
-
-    Raises:
-        SpecError: as `load_fit_spec`.
-    """
-    try:
-        with path.open("rb") as stream:
-            content = tomllib.load(stream)
-    except OSError as error:
-        reason = error.strerror or "cannot be read"
-        raise SpecError(f"{path}: {reason}; expected a TOML {called}") from None
-    except UnicodeDecodeError as error:
-        raise SpecError(f"{path}: not UTF-8 (byte {error.start}); save it as UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise SpecError(f"{path}: not valid TOML: {error}") from None
-    except RecursionError:
-        raise SpecError(f"{path}: not valid TOML: nested too deeply") from None
-    except ValueError as error:  # integers beyond what Python converts
-        raise SpecError(f"{path}: not valid TOML: {error}") from None
-    try:
-        return kind.model_validate(content)
-    except ValidationError as error:
-        raise SpecError("\n".join(f"{path}: {line}" for line in _lines(error, kind))) from None
-
-
-def _lines(error: ValidationError, root: type[BaseModel]) -> list[str]:
-    """One line per problem: dotted key, what is wrong, what was found."""
-    lines: dict[str, None] = {}
-    for problem in error.errors():
-        parts = [part for part in problem["loc"] if part not in (_EVEN, _LISTED)]
-        key = ".".join(map(str, parts)) or "(top level)"
-        text = problem["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
-        if problem["type"] == "extra_forbidden":
-            text = f"unknown key; expected one of {', '.join(_known(parts, root))}"
-        elif problem["type"] == "missing":
-            text = "missing"
-        elif problem["type"] in ("model_type", "dict_type"):
-            text = f"expected a table {{ key = value, ... }} (found {problem['input']!r})"
-        elif not isinstance(problem["input"], dict | list):
-            found = repr(problem["input"])
-            text = f"{text} (found {found if len(found) < 80 else found[:76] + ' ...'})"
-        lines.setdefault(f"{key}: {text}")
-    return list(lines)
-
-
-def _known(parts: list, root: type[BaseModel]) -> list[str]:
-    """Keys of the section that holds the unknown key `parts`."""
-    section = root
-    for part in parts[:-1]:
-        field = section.model_fields.get(part)
-        section = _sections(field.annotation)[-1] if field else section
-    return list(section.model_fields)
-
-
-def _sections(annotation: Any) -> list[type[BaseModel]]:
-    """The sections named anywhere in a field's type."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [found for part in get_args(annotation) for found in _sections(part)]

@@ -92,6 +92,7 @@ def quality_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
                 f"{100 * result.rms[lane, 0] / peak:.2g} %" if peak > 0 else "–",
                 f"{number(result.rms[lane, 1], 3)} mm" if np.isfinite(result.rms[lane, 1]) else "–",
                 number(float(result.uncertainty[lane].condition), 2),
+                number(float(result.criteria.AICc[lane]), 5),
             ]
         )
     return rows
@@ -99,7 +100,17 @@ def quality_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
 
 #: Correlation of neighbouring residuals from which the report doubts the standard errors.
 CORRELATED = 0.3
-QUALITY_HEAD = ["specimen", "outcome", "iter", "n", "rms F", "of peak", "rms joints", "cond"]
+QUALITY_HEAD = [
+    "specimen",
+    "outcome",
+    "iter",
+    "n",
+    "rms F",
+    "of peak",
+    "rms joints",
+    "cond",
+    "AICc",
+]
 LEFT_OUT_HEAD = ["specimen", "left out", "force / model", "rms force / peak", "rms joints / D"]
 
 

@@ -257,7 +257,7 @@ def parse_quantity(text: str | float | int, dimension: str) -> float:
             f'{text!r} has no unit: write it with one, as in "{text.strip()} {example}"'
         )
     if not math.isfinite(number):
-        raise UnitError(f"{text!r} is not a finite number")
+        raise UnitError(f"{text!r} is not a finite number; write a smaller one")
     return convert(number, unit, dimension)
 
 

@@ -1,6 +1,5 @@
 """Bad input: one line says where, what and the cure; no traceback, nothing written."""
 
-import contextlib
 import os
 import signal
 import subprocess

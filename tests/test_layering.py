@@ -12,6 +12,7 @@ import jaxtrachea
 PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 ORDER = [
     {"units", "status", "_numerics"},
+    {"spec_file"},
     {"config"},
     {"trachea"},
     {"contact"},
@@ -25,7 +26,8 @@ ORDER = [
     {"report"},
     {"plots", "viewer", "study"},
     {"terminal"},
-    {"cli_scene"},
+    {"cli_load"},
+    {"cli_scene", "cli_compare"},
     {"cli"},
     {"__main__"},
 ]

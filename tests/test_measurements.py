@@ -359,7 +359,7 @@ def test_missing_file_folder_and_nothing(tmp_path):
         ({"format": "xls"}, "format must be one of auto, tidy"),
         ({"loading": "both"}, "loading must be one of"),
         ({"force_sign": 0}, "force_sign must be one of 1, -1"),
-        ({"columns": {"weight": "w"}}, "role 'weight' is none of"),
+        ({"columns": {"weight": "w"}}, "role 'weight' in columns; expected one of"),
         ({"columns": {"joint": "w"}}, "which ring"),
         ({"units": {"trial": "mm"}}, "has no unit; remove"),
         ({"min_points": 1}, "at least 2"),

@@ -329,7 +329,7 @@ def _gutter(path):
         (write, {"larynx": ROTATION @ Y}, r"larynx= points across"),
         (write, {"larynx": ROTATION @ X, "anterior": ROTATION @ X}, r"anterior= points along"),
         (write, {"larynx": ROTATION @ X, "ring_positions": [3.0, 400.0]}, r"inside \(0, "),
-        (write, {"part": "lung"}, r"no object 'lung' in it; there are"),
+        (write, {"part": "lung"}, r"no object 'lung' in it; expected one of"),
         (write, {"rings": "absent.stl"}, r"rings='absent.stl': there is no such file"),
         (write, {"centreline": np.zeros((3, 2))}, r"centreline has shape \(3, 2\)"),
         (_flipped, {}, r"face opposite ways"),

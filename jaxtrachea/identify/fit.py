@@ -1,17 +1,22 @@
 """One fit from problem to result: starts, noise levels, best start, what may be believed."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
 
 from jaxtrachea.identify import descent
-from jaxtrachea.identify.parameters import Parameter
+from jaxtrachea.identify.criteria import Criteria, criteria
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.solve import Solved, Tolerances, levenberg_marquardt
+from jaxtrachea.identify.starts import best, completed, draw_starts, of_unknowns
 from jaxtrachea.identify.uncertainty import Information, Uncertainty, analyse, informations
 from jaxtrachea.status import FitStatus
+
+#: Lanes computed together where only a few are left.
+FEW = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,6 +29,8 @@ class Settings:
         decades: starts are drawn up to this many decades from the guess (log scale; with linear
             scale up to this many times 10 steps), inside the bounds.
         seed: of the drawn starts.
+        more_starts: added to lanes in doubt: no start converged, or one of several alone came
+            lowest. With them infeasible starts are drawn anew. 0: neither.
         chunk: lanes computed together.
         tolerances: when a lane is done.
         float32: compute in single precision (results are float64 all the same).
@@ -33,6 +40,7 @@ class Settings:
     starts: int = 4
     decades: float = 1.0
     seed: int = 0
+    more_starts: int = 8
     chunk: int = 128
     tolerances: Tolerances = Tolerances()
     float32: bool = False
@@ -55,9 +63,11 @@ class FitResult:
         iterations: of the best start; (lanes,).
         cost: half the weighted sum of squares (or of rho); (lanes,).
         converged_starts: starts that ended in the best minimum; (lanes,).
+        tried: starts in all; (lanes,).
         sigma: standard deviation of force (N) and markers (mm), given or estimated; (lanes, 2).
         rms: root mean square residual of force (N) and markers (mm); (lanes, 2).
         samples: observed entries; (lanes,).
+        criteria: AIC, AICc, BIC of all lanes.
         uncertainty: `Uncertainty` of each lane.
     """
 
@@ -73,9 +83,11 @@ class FitResult:
     iterations: np.ndarray
     cost: np.ndarray
     converged_starts: np.ndarray
+    tried: np.ndarray
     sigma: np.ndarray
     rms: np.ndarray
     samples: np.ndarray
+    criteria: Criteria
     uncertainty: tuple[Uncertainty, ...]
 
     @property
@@ -109,10 +121,16 @@ def fit(
     lanes = problem.lanes.lower.shape[0]
     jobs = np.repeat(np.arange(lanes), settings.starts)
     sigma = first_sigma(problem)
-    starts = draw_starts(problem, settings) if starts is None else starts
+    drawn = starts is None
+    starts = draw_starts(problem, settings) if drawn else starts
     solved = _solve(problem, settings, jobs, starts, sigma[jobs], progress)
-    best, agree = _best(solved, lanes, settings.starts)
-    solved = Solved(*(v[best] for v in solved))
+    if drawn:
+        again = functools.partial(_solve_more, problem, settings, sigma, progress)
+        jobs, solved = completed(
+            problem, settings, jobs, solved, data_weight(problem, sigma), again
+        )
+    found, agree = best(jobs, solved, lanes)
+    solved = Solved(*(v[found] for v in solved))
     every = np.arange(lanes)
     for _ in range(_noise_rounds(problem)):
         info = informations(problem, every, solved.theta, sigma)
@@ -125,7 +143,24 @@ def fit(
         info = info.rescaled(before[:, 0] / sigma[:, 0])
     else:
         info = informations(problem, every, solved.theta, sigma)
-    return _conclude(problem, solved, info, sigma, agree)
+    tried = np.bincount(jobs, minlength=lanes)
+    return _conclude(problem, solved, info, sigma, agree, tried)
+
+
+def _solve_more(problem, settings, sigma, progress, jobs, starts) -> Solved:
+    """Further starts of a few lanes; their chunk does not depend on how many there are."""
+    settings = dataclasses.replace(settings, chunk=min(settings.chunk, FEW))
+    rows = np.arange(max(len(jobs), 2)) % len(jobs)  # one alone would be another program
+    alive = None if progress is None else lambda done, of: progress(0, of)
+    solved = _solve(problem, settings, jobs[rows], starts[rows], sigma[jobs[rows]], alive)
+    return Solved(*(v[: len(jobs)] for v in solved))
+
+
+def data_weight(problem: Problem, sigma: np.ndarray) -> np.ndarray:
+    """Half the weighted sum of squares of the measured forces; (lanes,)."""
+    lanes = problem.lanes
+    z = lanes.force * lanes.precision * lanes.balance[:, :, None] / sigma[:, :1, None]
+    return 0.5 * np.sum(z * z, axis=(1, 2))
 
 
 def _solve(problem, settings, jobs, starts, sigma, progress) -> Solved:
@@ -171,40 +206,7 @@ def next_sigma(problem: Problem, info: Information, sigma: np.ndarray) -> np.nda
     return np.where(keep, sigma, np.maximum(estimate, floor))
 
 
-def draw_starts(problem: Problem, settings: Settings) -> np.ndarray:
-    """Starts of every lane in scaled coordinates: the guess, then a Latin hypercube around it.
-
-    Returns:
-        (lanes * starts, P), lane by lane.
-    """
-    rng = np.random.default_rng(settings.seed)
-    lanes, P = problem.lanes.lower.shape
-    guess = _of_unknowns(problem, lambda p: p.to_scaled(p.value), 0.0)
-    decade = lambda p: np.log(10) if p.scale == "log" else 10.0  # noqa: E731
-    reach = settings.decades * _of_unknowns(problem, decade, 0.0)
-    low = np.maximum(problem.lanes.lower, guess - reach)
-    high = np.minimum(problem.lanes.upper, guess + reach)
-    others = settings.starts - 1
-    strata = (
-        rng.permuted(np.tile(np.arange(others), (P, 1)), axis=1).T if others else np.zeros((0, P))
-    )
-    unit = (strata + rng.uniform(size=(others, P))) / max(others, 1)
-    drawn = low[:, None] + unit[None] * (high - low)[:, None]
-    return np.concatenate([guess[:, None], drawn], axis=1).reshape(-1, P)
-
-
-def _best(solved: Solved, lanes: int, starts: int) -> tuple[np.ndarray, np.ndarray]:
-    """Job with the lowest cost of each lane (converged ones first), and how many starts agree."""
-    cost = solved.cost.reshape(lanes, starts)
-    converged = (solved.status == FitStatus.CONVERGED).reshape(lanes, starts)
-    low = np.nanmin(np.where(np.isfinite(cost), cost, np.inf), axis=1, keepdims=True)
-    near = cost <= low * (1 + 1e-6) + 1e-300
-    rank = np.where(near & converged, -1.0, np.where(np.isfinite(cost), cost, np.inf))
-    best = np.argmin(rank, axis=1)
-    return np.arange(lanes) * starts + best, np.sum(near & converged, axis=1)
-
-
-def _conclude(problem, solved: Solved, info: Information, sigma, agree) -> FitResult:
+def _conclude(problem, solved: Solved, info: Information, sigma, agree, tried) -> FitResult:
     """Standard errors, intervals and final statuses of all lanes."""
     lanes, theta = problem.lanes, solved.theta
     log, step = _scales(problem)
@@ -230,24 +232,16 @@ def _conclude(problem, solved: Solved, info: Information, sigma, agree) -> FitRe
         problem=problem, theta=theta, value=value, standard_error=standard_error,
         lower=lower, upper=upper, relative_se=u.se / relative,
         at_bound=at_bound, status=status, iterations=solved.iterations, cost=solved.cost,
-        converged_starts=agree, sigma=sigma * unit, rms=rms * unit, samples=samples,
+        converged_starts=agree, tried=tried, sigma=sigma * unit, rms=rms * unit, samples=samples,
+        criteria=criteria(problem, info),
         uncertainty=tuple(Uncertainty(*row) for row in zip(*u, strict=True)),
     )  # fmt: skip
 
 
 def _scales(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Which unknowns have a logarithmic scale, and the step of the others; (lanes, P) each."""
-    log = _of_unknowns(problem, lambda p: p.scale == "log", 0.0) > 0
-    return log, _of_unknowns(problem, lambda p: p.step, 1.0)
-
-
-def _of_unknowns(problem: Problem, number: Callable[[Parameter], float], padding: float):
-    """A number of each unknown's parameter, `padding` where a lane has fewer; (lanes, P)."""
-    known = {p.name: float(number(p)) for p in problem.free}
-    rows = np.full(problem.lanes.lower.shape, padding)
-    for row, unknowns in zip(rows, problem.unknowns, strict=True):
-        row[: len(unknowns)] = [known[p.name] for p, _, _ in unknowns]
-    return rows
+    log = of_unknowns(problem, lambda p: p.scale == "log", 0.0) > 0
+    return log, of_unknowns(problem, lambda p: p.step, 1.0)
 
 
 def _final_status(status, u: Uncertainty, at_bound, dof) -> np.ndarray:

@@ -48,12 +48,13 @@ class Parameter:
             ValueError: naming the parameter and the cure.
         """
         if not all(map(math.isfinite, (self.value, self.lower, self.upper))):
-            raise ValueError(f"{self.name}: value and bounds must be finite")
+            raise ValueError(f"{self.name}: value and bounds must be finite numbers; give such")
         if self.fixed:
             return
         if self.lower >= self.upper:
             raise ValueError(
-                f"{self.name}: lower bound {self.lower:g} is not below upper bound {self.upper:g}"
+                f"{self.name}: lower bound {self.lower:g} is not below upper bound {self.upper:g}; "
+                "swap or correct them"
             )
         if self.scale == "log" and self.lower <= 0:
             raise ValueError(
@@ -63,7 +64,7 @@ class Parameter:
         if not self.lower <= self.value <= self.upper:
             raise ValueError(
                 f"{self.name}: initial value {self.value:g} {self.unit} is outside its bounds "
-                f"[{self.lower:g}, {self.upper:g}]"
+                f"[{self.lower:g}, {self.upper:g}]; move one or the other"
             )
 
     def to_scaled(self, value: float) -> float:

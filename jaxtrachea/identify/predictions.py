@@ -6,6 +6,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from jaxtrachea.identify.fit import FitResult, Settings, fit
 from jaxtrachea.identify.problem import Lane, Problem
@@ -139,18 +140,9 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
     chosen = problem.take(lane)
     lanes = chosen.lanes
     rows = np.arange(len(lane))
-
-    def without(precision):
-        held = precision.copy()
-        held[rows, trial] = 0
-        return held
-
-    joint_precision = None if lanes.joint_precision is None else without(lanes.joint_precision)
-    held_back = dataclasses.replace(
-        chosen,
-        lanes=lanes._replace(precision=without(lanes.precision), joint_precision=joint_precision),
-    )
-    result = fit(held_back, settings, progress)
+    held = np.zeros(lanes.s_c.shape, bool)
+    held[rows, trial] = True
+    result = fit(without(chosen, held), settings, progress)
     seen = predictions(chosen, result.theta)
     force, data = seen.force[rows, trial], lanes.force[rows, trial]
     model = np.where(lanes.precision[rows, trial] > 0, data + force, 0)
@@ -164,6 +156,16 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
         share = seen.joints[rows, trial] / np.where(moved, D, np.nan)[:, :, None]
         joints = np.asarray(rms(share.reshape(len(lane), -1)))
     return LeftOut(lane, trial, peak, joints, ratio, result)
+
+
+def without(problem: Problem, held: Bool[np.ndarray, "lanes T"]) -> Problem:
+    """The same lanes, blind to the trials that are held back."""
+    blind = lambda v: None if v is None else np.where(held[:, :, *[None] * (v.ndim - 2)], 0, v)  # noqa: E731
+    lanes = problem.lanes
+    seen = lanes._replace(
+        precision=blind(lanes.precision), joint_precision=blind(lanes.joint_precision)
+    )
+    return dataclasses.replace(problem, lanes=seen)
 
 
 def rms(values: np.ndarray) -> np.ndarray | np.floating:

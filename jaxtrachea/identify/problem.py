@@ -206,7 +206,7 @@ def build(
     if not curves:
         raise ValueError("no usable curve; nothing to fit")
     if all(p.fixed for p in parameters):
-        raise ValueError("every parameter is fixed; free at least one")
+        raise ValueError("parameters: every parameter is fixed; free at least one")
     for curve in curves:
         check_curve(curve, geometry, options)
     groups = group(curves, parameters)
@@ -265,7 +265,9 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
                 "(coupling = 'total' needs none)"
             )
     elif not 0 <= curve.s_c <= length:
-        raise ValueError(f"{where}: contact at s = {curve.s_c:g} mm, tube spans 0 to {length:g} mm")
+        raise ValueError(
+            f"{where}: contact at s = {curve.s_c:g} mm, expected on the tube, 0 to {length:g} mm"
+        )
     if options.coupling == "series" and abs(curve.phi_c) > 1e-6:
         raise ValueError(
             f"{where}: contact at phi = {np.degrees(curve.phi_c):.3g} deg; this model presses on "

@@ -86,6 +86,7 @@ def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[d
             "message": status.message,
             "iterations": int(result.iterations[lane]),
             "starts_agreeing": int(result.converged_starts[lane]),
+            "starts": int(result.tried[lane]),
             "samples": int(result.samples[lane]),
             "cost": float(result.cost[lane]),
             "rms_force_N": float(result.rms[lane, 0]),
@@ -93,6 +94,10 @@ def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[d
             "sigma_force_N": float(result.sigma[lane, 0]),
             "rms_joints_mm": float(result.rms[lane, 1]),
             "condition": float(result.uncertainty[lane].condition),
+            "unknowns": int(result.criteria.unknowns[lane]),
+            "AIC": float(result.criteria.AIC[lane]),
+            "AICc": float(result.criteria.AICc[lane]),
+            "BIC": float(result.criteria.BIC[lane]),
         }
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
             label = unknown_label(result, lane, i)
@@ -127,7 +132,7 @@ def bad_row(bad: BadCurve) -> dict[str, object]:
         "specimen": bad.specimen,
         "trial": bad.trial,
         "status": FitStatus.BAD_DATA.name.lower(),
-        "message": f"{bad.kind}: {bad.source}: {bad.message}; {bad.cure}",
+        "message": bad.reason,
     }
 
 
@@ -254,8 +259,10 @@ def _write_lanes(group: h5py.Group, result: FitResult) -> None:
     group.create_dataset("trial", data=[n[1] for n in names], dtype=text)
     codes = group.create_dataset("status", data=result.status.astype(np.int8))
     codes.attrs["meaning"] = json.dumps({int(s): s.message for s in FitStatus})
-    for name in ("iterations", "cost", "converged_starts", "samples"):
+    for name in ("iterations", "cost", "converged_starts", "tried", "samples"):
         group.create_dataset(name, data=getattr(result, name))
+    for name in ("unknowns", "deviance", "AIC", "AICc", "BIC"):
+        group.create_dataset(name, data=getattr(result.criteria, name))
     for name in ("sigma", "rms"):
         group.create_dataset(name, data=getattr(result, name)).attrs["unit"] = "N, mm"
     group.create_dataset("condition", data=[u.condition for u in result.uncertainty])

@@ -39,18 +39,28 @@ def find_files(spec: FitSpec, root: Path) -> list[Path]:
             matches = _matches(root, pattern)
         except (ValueError, NotImplementedError, IndexError, OSError) as error:
             raise SpecError(
-                f"data.files.{i}: {pattern!r} is no usable path ({_reason(error)}); "
+                f"data.files.{i}: {_short(pattern)} is no usable path ({_reason(error)}); "
                 "name files, or a pattern such as 'curves/*.csv'"
             ) from None
         files = [path for path in matches if path.is_file()]
         if not files:
-            what = f"a folder; list the files in it, as in '{pattern}/*.csv'"
-            missing = "no file; check the name, or say where the data are with --data"
-            raise SpecError(
-                f"data.files.{i}: {pattern!r} matches in {root} {what if matches else missing}"
-            )
+            raise SpecError(f"data.files.{i}: {_short(pattern)} matches in {root} {_what(matches)}")
         found.update(dict.fromkeys(files))
     return list(found)
+
+
+def _short(pattern: str) -> str:
+    """A pattern for a message."""
+    return repr(pattern if len(pattern) < 200 else f"{pattern[:196]} ...")
+
+
+def _what(matches: list[Path]) -> str:
+    """What a pattern leads to that is no file, and the cure."""
+    if not matches:
+        return "no file; check the name, or say where the data are with --data"
+    if matches[0].is_dir():
+        return "a folder; list the files in it, as in 'folder/*.csv'"
+    return "a device or a pipe; expected a file"
 
 
 def _reason(error: Exception) -> str:
@@ -158,7 +168,7 @@ def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Par
     for name in spec.parameters:
         if name not in names:
             known = "not a parameter" if name not in DEFAULTS else "not seen by this model"
-            raise SpecError(f"parameters.{name}: {known}; this model has {', '.join(names)}")
+            raise SpecError(f"parameters.{name}: {known}; expected one of {', '.join(names)}")
     # Unless asked for, a ring hardens like the ligament: k_3_ring is then k_3, not a parameter.
     names = [n for n in names if n != "k_3_ring" or n in spec.parameters]
     return tuple(_parameter(DEFAULTS[n], spec.parameters.get(n)) for n in names)
@@ -228,8 +238,9 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
         try:
             check_curve(curve, geometry, options)
         except ValueError as error:
-            reasons.append(str(error))
-            text = reasons[-1].split(": ", 1)[-1]
+            text = str(error)
+            reasons.append(f"{curve.source}: {text}")
+            text = text.split(": ", 1)[-1]
             cure = "correct the file, or the trachea and model sections"
             bad.append(BadCurve(curve.specimen, curve.trial, curve.source, "position", text, cure))
         else:
@@ -299,7 +310,9 @@ def candidates_of(spec: FitSpec, problem: Problem) -> Candidates:
     rings = problem.geometry.ring_positions
     s = (float(rings[0]), float(rings[-1])) if section.s is None else section.s
     if s[0] < 0 or s[1] > length:
-        raise SpecError(f"design.s: {s[0]:g} to {s[1]:g} mm, tube spans 0 to {length:g} mm")
+        raise SpecError(
+            f"design.s: {s[0]:g} to {s[1]:g} mm, tube spans 0 to {length:g} mm; give places on it"
+        )
     depth = (0.5 * deepest, deepest) if section.depth is None else section.depth
     return grid(s, depth, section.candidates)
 
@@ -313,6 +326,7 @@ def settings_of(spec: FitSpec) -> Settings:
         starts=f.starts,
         decades=f.start_decades,
         seed=f.seed,
+        more_starts=f.more_starts,
         chunk=f.chunk,
         tolerances=limits,
         float32=f.precision == "float32",

@@ -33,6 +33,7 @@ class Information(NamedTuple):
         gradient: of the cost; (P,).
         squares: sum of squared residuals of force (N^2) and markers (mm^2) in units of the given
             precision; (2,).
+        weighted: the same with the squares of the curve weights; (2,).
         counts: observed entries of each; (2,).
         spread: median absolute residual of each, same units, 0 with a linear loss; (2,).
         psi2: mean of psi(z)^2 over observed entries.
@@ -43,6 +44,7 @@ class Information(NamedTuple):
     meat: Float[Array, "P P"]
     gradient: Float[Array, " P"]
     squares: Float[Array, "2"]
+    weighted: Float[Array, "2"]
     counts: Float[Array, "2"]
     spread: Float[Array, "2"]
     psi2: Float[Array, ""]
@@ -90,6 +92,7 @@ def information(
         meat=assemble(problem, b2 * b2 * gram, lane),
         gradient=assemble(problem, gradient, lane),
         squares=by_kind(r.value**2 * seen),
+        weighted=by_kind(r.value**2 * seen * b2[:, 0]),
         counts=by_kind(seen),
         spread=jnp.stack([spread(True), spread(False)]),
         psi2=jnp.sum(psi(z) ** 2 * seen) / total,

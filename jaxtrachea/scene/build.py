@@ -29,6 +29,9 @@ from jaxtrachea.units import UnitError, column_unit, convert
 #: Steps of a press or a line that names none.
 STEPS = 10
 
+#: Longest table of points or poses that is read.
+MAX_BYTES = 64 * 2**20
+
 #: Arguments of `read_mesh` that a scene calls otherwise, or does not have.
 KEYS = {
     "rings=": "cartilage=",
@@ -242,13 +245,15 @@ def _file(folder: Path, name: str, key: str, files: list[Path]) -> Path:
     except (OSError, ValueError):
         found = False
     if not found:
-        raise SpecError(f"{key}: there is no file {name!r} (from the scene's folder)")
+        raise SpecError(f"{key}: there is no file {name!r} in the scene's folder; check the name")
     files.append(path)
     return path
 
 
 def _table(path: Path, key: str, needed: tuple[str, ...], optional: tuple[str, ...]) -> np.ndarray:
     """Columns of a CSV file with units in its header; optional columns that lack are 0."""
+    if path.stat().st_size > MAX_BYTES:
+        raise SpecError(f"{key}: {path.name} has more than {MAX_BYTES} bytes; thin it out")
     try:
         rows = [row for row in csv.reader(path.read_text("utf-8-sig").splitlines()) if row]
     except (UnicodeDecodeError, csv.Error, OSError):
@@ -272,10 +277,27 @@ def _table(path: Path, key: str, needed: tuple[str, ...], optional: tuple[str, .
         try:
             if unit is None:
                 raise UnitError(f"no unit; write {name} [{'mm' if name in needed else 'deg'}]")
-            values = convert(np.array([float(row[at]) for row in rows[1:]]), unit, dimension)
-        except (ValueError, IndexError) as error:
+            values = convert(np.array([_cell(row, at, i) for i, row in enumerate(rows[1:], 1)]),
+                             unit, dimension)  # fmt: skip
+        except ValueError as error:
             raise SpecError(f"{key}: {path.name}, column {name!r}: {error}") from None
         if not np.isfinite(values).all():
             raise SpecError(f"{key}: {path.name}, column {name!r}: expected finite numbers")
         columns.append(values)
     return np.stack(columns, axis=1)
+
+
+def _cell(row: list[str], at: int, number: int) -> float:
+    """A number of the table.
+
+    Raises:
+        ValueError: it is none, or is missing.
+    """
+    if at >= len(row):
+        raise ValueError(f"row {number} below the header has {len(row)} cells; complete it")
+    try:
+        return float(row[at])
+    except ValueError:
+        raise ValueError(
+            f"{row[at]!r} in row {number} below the header; expected a number"
+        ) from None

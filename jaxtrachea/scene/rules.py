@@ -34,9 +34,9 @@ class _Decisions:
         wish = getattr(self.wishes, name)
         on = rule if wish == "auto" else wish == "on"
         if wish == "on" and cannot:
-            raise PlanError(f"{name}: 'on', but {cannot}")
+            raise PlanError(f"{name}: 'on', but {cannot}; give it, or use 'auto'")
         if wish == "off" and must:
-            raise PlanError(f"{name}: 'off', but {must}")
+            raise PlanError(f"{name}: 'off', but {must}; use 'auto'")
         self.note(name, "on" if on else "off", reason, wish != "auto")
         return on
 

@@ -64,7 +64,10 @@ class Geometry(eqx.Module):
         if x.ndim != 1 or x.size == 0:
             raise ValueError("ring_positions is empty; expected at least one ring")
         if not np.all(np.isfinite(x)) or np.any(np.diff(x) <= 0):
-            raise ValueError("ring_positions must be finite and strictly increasing")
+            found = ", ".join(f"{v:g}" for v in x[:12]) + (", ..." if x.size > 12 else "")
+            raise ValueError(
+                f"ring_positions must be finite and strictly increasing; found {found}"
+            )
         if x[0] <= 0 or x[-1] >= length:
             raise ValueError(
                 f"ring_positions run from {x[0]:g} to {x[-1]:g} mm; "
@@ -74,7 +77,9 @@ class Geometry(eqx.Module):
             if not math.isfinite(value) or value <= 0:
                 raise ValueError(f"{name} is {value} mm; expected a positive number")
         if not math.pi / 2 < half_angle < math.pi:
-            raise ValueError(f"half_angle is {half_angle} rad; expected between pi/2 and pi")
+            raise ValueError(
+                f"half_angle is {half_angle:.6g} rad; expected between pi/2 and pi, 90 and 180 deg"
+            )
         dtype = jnp.zeros(0, dtype).dtype
         arrays = (np.asarray(v, dtype) for v in (length, x, radius, half_angle, ring_height))
         return cls(*arrays)

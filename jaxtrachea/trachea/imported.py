@@ -29,6 +29,10 @@ from jaxtrachea.units import unit_factor
 
 #: Length of a trachea with its wall, infant to adult, mm: what a guess of the unit goes by.
 PLAUSIBLE = 40.0, 250.0
+#: Length of anything this can be used for, mm: a unit that says more or less is a mistake.
+POSSIBLE = 1.0, 5000.0
+#: Triangles of the coarsest tube that still shows a shape.
+FEWEST = 24
 
 
 class Imported(eqx.Module):
@@ -150,9 +154,10 @@ def _parts(path: Path) -> dict[str, _Surface]:
         nodes = [(node, *scene.graph[node]) for node in scene.graph.nodes_geometry]
         objects = [(str(node), scene.geometry[name], frame) for node, frame, name in nodes]
     except Exception as error:  # trimesh raises whatever its many readers raise
+        said = "" if isinstance(error, ImportError) else str(error).split("\n")[0][:200]
         raise MeshError(
-            f"could not be read as a surface ({type(error).__name__}: {error}); "
-            "expected STL, OBJ, PLY or GLB with triangles"
+            "could not be read as a surface, damaged or of another format"
+            f"{f' ({said})' if said else ''}; expected STL, OBJ, PLY or GLB with triangles"
         ) from error
     parts = {
         name: _Surface(
@@ -166,6 +171,10 @@ def _parts(path: Path) -> dict[str, _Surface]:
         raise MeshError("there are no triangles in it; expected a surface, not points or lines")
     if any(not np.all(np.isfinite(part.vertices)) for part in parts.values()):
         raise MeshError("a vertex is not finite; export the surface again")
+    if any(
+        part.faces.min() < 0 or part.faces.max() >= len(part.vertices) for part in parts.values()
+    ):
+        raise MeshError("a triangle names a vertex that is not there; export the surface again")
     return parts
 
 
@@ -178,10 +187,12 @@ def _wall(parts: dict[str, _Surface], part: str | None) -> str:
     names = ", ".join(sorted(parts))
     if part is not None:
         if part not in parts:
-            raise MeshError(f"there is no object {part!r} in it; there are {names}")
+            raise MeshError(f"there is no object {part!r} in it; expected one of {names}")
         return part
     areas = {name: _area(surface) for name, surface in parts.items()}
     largest = max(areas, key=lambda name: areas[name])
+    if not areas[largest] > 0:
+        raise MeshError("all vertices lie in one point or line; expected the surface of a trachea")
     if areas[largest] <= 0.5 * sum(areas.values()):
         raise MeshError(f"which of the objects {names} is the wall? Give part=")
     return largest
@@ -209,6 +220,8 @@ def _clean(surface: _Surface) -> tuple[_Surface, list[str]]:
     vertices, faces = surface.vertices[first], faces[keep]
     if not len(faces):
         raise MeshError("every triangle is collapsed; expected the surface of a trachea")
+    if len(faces) < FEWEST:
+        raise MeshError(f"{len(faces)} triangles are no trachea; expected at least {FEWEST}")
     faces, dropped = _without_fragments(vertices, faces)
     if dropped:
         notes.append(f"{dropped} triangles of small loose fragments dropped")
@@ -265,12 +278,15 @@ def _outward(surface: _Surface, notes: list[str]) -> _Surface:
 
 def _scale(surface: _Surface, path: Path, unit: str | None, notes: list[str]) -> float:
     """Millimetres per unit of the file."""
+    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     if unit is not None:
         try:
-            return float(unit_factor(unit, "length"))
+            scale = float(unit_factor(unit, "length"))
         except ValueError as error:
             raise MeshError(str(error)) from error
-    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+        if not POSSIBLE[0] <= size * scale <= POSSIBLE[1]:
+            raise MeshError(f"unit={unit!r} makes it {size * scale:.4g} mm long; correct unit=")
+        return scale
     names = ("m",) if path.suffix.lower() in (".glb", ".gltf") else ("mm", "cm", "in", "m")
     low, high = PLAUSIBLE
     fits = [name for name in names if low <= size * float(unit_factor(name, "length")) <= high]

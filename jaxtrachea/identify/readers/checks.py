@@ -166,7 +166,7 @@ def _check_scale(
                 "absurd_scale",
                 f"{name} reaches {values[worst]:.4g} {unit} in {raw.row_word} {raw.rows[worst]};"
                 f" at most {limit:g} {unit} is plausible",
-                f"check the unit of the {name}, or raise max_{name}",
+                f"check the unit of the {name} (in Python also ReadOptions(max_{name}=...))",
             )
 
 
@@ -209,7 +209,7 @@ def _check_amount(keep: np.ndarray, displacement: np.ndarray, options: ReadOptio
         raise Fault(
             "absurd_scale",
             f"displacement covers {extent:.4g} mm; at least {options.min_range:g} mm is plausible",
-            "check the unit of the displacement, or lower min_range",
+            "check the unit of the displacement (in Python also ReadOptions(min_range=...))",
         )
 
 

@@ -81,6 +81,10 @@ def _state(lines: list[Line]) -> tuple[dict, list[Line]]:
     known: dict = {key: str(state[key]) for key in ("specimen", "trial") if key in state}
     for key in ("s", "phi"):
         if key in state:
+            if not isinstance(state[key], str | int | float):
+                raise DataError(
+                    f'line {lines[0].number}: {key}: expected a quantity with its unit, as "17 mm"'
+                )
             try:
                 known[key] = parse_quantity(state[key], role_dimension(key))
             except (ValueError, TypeError) as error:
@@ -164,8 +168,8 @@ def _curve(
             values["displacement"],
             values["force"],
             rows,
-            s=_constant("s", values, state),
-            phi=_constant("phi", values, state),
+            s=_constant("s", values, state, table, picked),
+            phi=_constant("phi", values, state, table, picked),
             sigma=values.get("sigma"),
             joint_rings=np.array([int(r[6:]) - 1 for r in joints]) if joints else None,
             joint_displacement=np.stack([values[r] for r in joints], axis=1) if joints else None,
@@ -174,13 +178,19 @@ def _curve(
         return bad(*key, source, fault)
 
 
-def _constant(role: str, values: dict[str, np.ndarray], state: dict) -> float | None:
+def _constant(
+    role: str, values: dict[str, np.ndarray], state: dict, table: Table, picked: list[int]
+) -> float | None:
     """Position of a curve, which must be the same in all its rows; None if all are empty."""
     column = values.get(role)
     if column is None:
         return state.get(role)
     if np.isnan(column).all():
         return None
+    unknown = np.isnan(column)
+    if unknown.any():
+        line = table.lines[picked[int(np.argmax(unknown))]]
+        raise Fault("position", f"line {line}: {role} is empty or NaN", "give it in every row")
     if not np.allclose(column, column[0], rtol=1e-9, atol=1e-12):
         raise Fault(
             "position",

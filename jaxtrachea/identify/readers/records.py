@@ -2,14 +2,15 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Integer
 
-from jaxtrachea.units import parse_quantity, unit_factor
+from jaxtrachea.units import UnitError, parse_quantity, unit_factor
 
 
 class DataError(ValueError):
@@ -82,6 +83,12 @@ class BadCurve:
     kind: str
     message: str
     cure: str
+
+    @property
+    def reason(self) -> str:
+        """Kind, place, what is wrong and the cure, in one line."""
+        place = "" if self.message.startswith(self.source) else f"{self.source}: "
+        return f"{self.kind}: {place}{self.message}; {self.cure}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,13 +188,15 @@ class ReadOptions:
         _one_of("displacement_sign", self.displacement_sign, (1, -1))
         for role in [*self.columns, *self.units]:
             if role not in ROLES and not JOINT_ROLE.fullmatch(role):
-                raise ValueError(f"role {role!r} is none of {', '.join(ROLES)}, joint_<ring>")
+                table = "columns" if role in self.columns else "units"
+                known = ", ".join(ROLES)
+                raise ValueError(f"role {role!r} in {table}; expected one of {known}, joint_<ring>")
         if "joint" in self.columns:
             raise ValueError("columns: say which ring the marker is on, as in joint_7")
         for role, unit in self.units.items():
             if role in ("specimen", "trial"):
                 raise ValueError(f"units: {role} is a name and has no unit; remove it")
-            unit_factor(unit, role_dimension(role))
+            _named(f"units.{role}", unit_factor, unit, role_dimension(role))
         if self.min_points < 2:
             raise ValueError(f"min_points must be at least 2, got {self.min_points}")
         low, high = self.displacement_min, self.displacement_max
@@ -201,12 +210,12 @@ class ReadOptions:
     @property
     def s_mm(self) -> float | None:
         """Common position along the centreline, mm."""
-        return None if self.s is None else parse_quantity(self.s, "length")
+        return None if self.s is None else _named("s", parse_quantity, self.s, "length")
 
     @property
     def phi_rad(self) -> float | None:
         """Common contact angle, rad."""
-        return None if self.phi is None else parse_quantity(self.phi, "angle")
+        return None if self.phi is None else _named("phi", parse_quantity, self.phi, "angle")
 
     @property
     def name_pattern(self) -> re.Pattern | None:
@@ -222,7 +231,8 @@ class ReadOptions:
             pattern = re.compile(text)
         except re.error as error:
             raise ValueError(
-                f"specimen pattern {self.specimen!r} is no regular expression: {error}"
+                f"specimen pattern {self.specimen!r} is no regular expression: {error}; correct it,"
+                ' or write a template "{specimen}_A{trial}"'
             ) from None
         if "specimen" not in pattern.groupindex:
             raise ValueError(
@@ -230,6 +240,14 @@ class ReadOptions:
                 ' "{specimen}_A{trial}" or with a group (?P<specimen>...)'
             )
         return pattern
+
+
+def _named(key: str, convert: Callable, *arguments: object) -> Any:
+    """`convert(*arguments)`, with the key before what it refuses."""
+    try:
+        return convert(*arguments)
+    except UnitError as error:
+        raise UnitError(f"{key}: {error}") from None
 
 
 def _one_of(name: str, value: object, allowed: tuple) -> None:

@@ -251,4 +251,6 @@ def attribute(holder: Any, name: str) -> Any:
     try:
         return holder.attrs.get(name)
     except (OSError, RuntimeError, ValueError, TypeError) as error:
-        raise Fault("unreadable", f"attribute {name!r} is damaged ({error})", "copy it") from None
+        raise Fault(
+            "unreadable", f"attribute {name!r} is damaged ({error})", "copy the file again"
+        ) from None

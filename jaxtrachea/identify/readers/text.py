@@ -58,9 +58,10 @@ def read_lines(path: Path) -> list[Line]:
         text = data.decode("utf-16", errors="replace")
     else:
         try:
-            text = data.decode("utf-8-sig")
+            text = data.decode("utf-8")
         except UnicodeDecodeError:
             text = data.decode("latin-1")
+    text = text.lstrip("\ufeff")
     if "\0" in text:
         raise DataError(
             f"{path}: holds zero bytes, so it is no text table; export it as CSV or HDF5"

@@ -1,0 +1,206 @@
+"""The command compare: which of several models the same curves prefer (docs/model_choice.md)."""
+
+import contextlib
+import dataclasses
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from jaxtrachea.cli_load import load
+from jaxtrachea.terminal import Stop, into, progress_bar, table
+
+SpecsArgument = Annotated[
+    list[Path], typer.Argument(help="Fit specifications, two or more, of the same data.")
+]
+DataOption = Annotated[
+    Path | None, typer.Option("--data", help="Folder the data paths start from (default: SPEC's).")
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
+CrossOption = Annotated[
+    bool, typer.Option(help="Also predict every contact position from the others.")
+]
+#: Specimens of a terminal table; the files hold all.
+MANY = 8
+HEAD = ["specimen", "model", "k", "-2 ln L", "dAICc", "weight", "BIC", "left out"]
+
+
+def compare(
+    specs: SpecsArgument,
+    data: DataOption = None,
+    out_dir: OutOption = None,
+    cross_validation: CrossOption = True,
+) -> None:
+    """Fit the same data by several models: which one they prefer."""
+    clock = [time.perf_counter()]
+    if len(specs) < 2:
+        raise Stop("compare: one model has nothing to be compared with; give two or more SPEC")
+    loaded = [_loaded(path, data, first=i == 0) for i, path in enumerate(specs)]
+    names = _names(specs, [spec.title for spec, _, _ in loaded])
+    _same_data(specs, loaded, names)
+    clock.append(time.perf_counter())
+    default = Path("out") / f"{specs[0].absolute().parent.name}-compare"
+    with into(out_dir, default) as (folder, stop_if_asked):
+        models = _fitted(loaded, names, cross_validation, stop_if_asked)
+        clock.append(time.perf_counter())
+        rows, failed, said = _write(folder, specs, loaded, models, clock)
+    _print(rows, said, failed, folder.parent)
+    raise typer.Exit(1 if failed or loaded[0][1].bad else 0)
+
+
+def _loaded(path: Path, data: Path | None, *, first: bool):
+    """As `load`; curves that cannot be used are named once."""
+    if first:
+        return load(path, data)
+    return load(path, data, quiet=True)
+
+
+def _names(specs: list[Path], titles: list[str]) -> list[str]:
+    """Titles where every model has its own, else file names, else paths."""
+    for names in (titles, [path.stem for path in specs], [str(path) for path in specs]):
+        if all(names) and len(set(names)) == len(names):
+            return names
+    raise Stop("compare: the same specification is given twice; give different ones")
+
+
+def _same_data(specs, loaded, names) -> None:
+    from jaxtrachea.identify.comparison import same_data
+
+    digests = [sorted(measured.sha256().values()) for _, measured, _ in loaded]
+    for path, digest in zip(specs[1:], digests[1:], strict=True):
+        if digest != digests[0]:
+            raise Stop(
+                f"{path}: data.files: other content than that of {specs[0]} (SHA-256 differs); "
+                "give both the same files"
+            )
+    try:
+        same_data([problem for _, _, problem in loaded], names)
+    except ValueError as error:
+        raise Stop(f"compare: {error}") from None
+
+
+def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
+    from jaxtrachea.identify.comparison import Model, leave_position_out
+    from jaxtrachea.identify.fit import fit
+    from jaxtrachea.identify.study import settings_of
+
+    models = []
+    with progress_bar() as bar:
+
+        def counted(text):
+            task = bar.add_task(text, total=None)
+
+            def advance(done, of):
+                stop_if_asked()
+                bar.update(task, advance=done, total=of or None)
+
+            return advance
+
+        for (spec, _, problem), name in zip(loaded, names, strict=True):
+            settings = settings_of(spec)
+            result = fit(problem, settings, counted(name))
+            left = None
+            if cross_validation:
+                left = leave_position_out(problem, settings, counted(f"{name}, left out"))
+            models.append(Model(name, result, left))
+    return models
+
+
+def _write(folder: Path, specs, loaded, models, clock):
+    """compare.csv, report.md, provenance.json; returns the rows, failed lanes and sentences."""
+    import json
+    from hashlib import sha256 as digest
+
+    import jax
+
+    from jaxtrachea.identify import results
+    from jaxtrachea.identify.comparison import compared
+
+    rows, failed = compared(models)
+    said = _sentences(models, rows)
+    results.write_csv(folder / "compare.csv", [dataclasses.asdict(row) for row in rows])
+    results.write_text(folder / "report.md", _report(rows, said, failed))
+    ends = [*clock, time.perf_counter()]
+    timings = {n: ends[i + 1] - ends[i] for i, n in enumerate(("read", "fit", "write"))}
+    measured, precision = loaded[0][1], loaded[0][0].fit.precision
+    device = str(jax.devices()[0])
+    made = results.provenance(specs[0], measured.sha256(), device, precision, timings)
+    made["specifications"] = [
+        {"file": path.name, "model": m.name, "sha256": digest(path.read_bytes()).hexdigest()}
+        for path, m in zip(specs, models, strict=True)
+    ]
+    del made["specification"]
+    results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+    return rows, failed, said
+
+
+def _sentences(models, rows) -> dict[str, str]:
+    """Specimen to what its data prefer; the sum last."""
+    import numpy as np
+
+    from jaxtrachea.identify.comparison import is_correlated, sentence
+
+    seen = {m.name: is_correlated(m) for m in models}
+    first = models[0].result
+    labels = [_label(first, lane) for lane in range(first.lanes)]
+    said = {}
+    for specimen in dict.fromkeys(row.specimen for row in rows):
+        mine = [row for row in rows if row.specimen == specimen]
+        flags = seen[min(mine, key=lambda row: row.AICc).model]
+        with contextlib.suppress(ValueError):
+            flags = flags[[labels.index(specimen)]]
+        said[specimen] = sentence(mine, bool(np.mean(flags) > 0.5))
+    return said
+
+
+def _label(result, lane: int) -> str:
+    from jaxtrachea.identify.results import lane_label
+
+    return lane_label(result, lane)
+
+
+def _cells(rows) -> list[list[str]]:
+    from jaxtrachea.report import number
+
+    return [
+        [row.specimen, row.model, str(row.unknowns), number(row.deviance, 6), number(row.delta, 3),
+         number(row.weight, 2), number(row.BIC, 6), _percent(row.left_out)]
+        for row in rows
+    ]  # fmt: skip
+
+
+def _percent(share: float) -> str:
+    return "–" if share != share else f"{100 * share:.2f} %"
+
+
+def _report(rows, said: dict[str, str], failed: int) -> str:
+    from jaxtrachea.report import markdown_table
+
+    parts = [
+        "# Which model",
+        "\n".join(f"- {specimen}: {text}." for specimen, text in said.items()),
+        markdown_table(HEAD, _cells(rows)),
+        "k: fitted parameters and estimated standard deviations. dAICc: above the best model; "
+        "below 2 models cannot be told apart, from 10 on the worse one has next to no support. "
+        "weight: Akaike weight. left out: root mean square error of force at contact positions "
+        "that took no part in the fit, over the largest force. Criteria assume that the noise of "
+        "neighbouring samples is independent (docs/model_choice.md). All numbers: `compare.csv`.",
+    ]
+    if failed:
+        parts.append(f"{failed} lanes could not be fitted by every model and count for none.")
+    return "\n\n".join(parts) + "\n"
+
+
+def _print(rows, said, failed: int, folder: Path) -> None:
+    out = Console()
+    shown = list(said)[:MANY] + (["(all)"] if len(said) > MANY else [])
+    for name in shown:
+        cells = _cells([row for row in rows if row.specimen == name])
+        out.print(table("Models", HEAD, cells))
+        out.print(escape(f"{name}: {said[name]}"), highlight=False)
+    if failed:
+        out.print(f"{failed} lanes could not be fitted by every model and count for none")
+    out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)

@@ -1,0 +1,275 @@
+"""Information criteria against closed forms of the linear normal case; which model data choose."""
+
+import csv
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+import scipy.stats
+import synthetic
+from run_cli import run
+
+from jaxtrachea.identify.comparison import (
+    Row,
+    leave_position_out,
+    same_data,
+    sentence,
+)
+from jaxtrachea.identify.criteria import penalised, weights
+from jaxtrachea.identify.fit import Settings, fit
+from jaxtrachea.identify.measurements import Curve
+from jaxtrachea.identify.parameters import DEFAULTS
+from jaxtrachea.identify.problem import Noise, build
+from jaxtrachea.model import Options, press
+from jaxtrachea.trachea.geometry import table_1
+from jaxtrachea.trachea.material import Material
+
+DEPTH = np.linspace(0.1, 3.0, 20)
+SIGMA = 0.05
+TOTAL = Options(coupling="total", onset_width=0.0, contact="bonded")
+LINEAR = {"lower": -1e3, "scale": "linear", "scope": "specimen"}
+
+
+def noisy(seed=0, specimens=3):
+    """Two curves of each specimen: force k_1 depth + k_3 depth^3 + scatter."""
+    rng = np.random.default_rng(seed)
+    return [
+        Curve(f"T{i}", trial, None, 0.0, DEPTH, 1.5 * DEPTH + 0.05 * DEPTH**3
+              + SIGMA * rng.standard_normal(20))
+        for i in range(specimens) for trial in "ab"
+    ]  # fmt: skip
+
+
+def linear_problem(curves, fixed=(), **settings):
+    """Force is linear in k_1, k_3 and the offset: least squares in closed form."""
+    table = [
+        dataclasses.replace(
+            DEFAULTS[name], **LINEAR, value=0.0 if name in fixed else 1.0, fixed=name in fixed
+        )
+        for name in ("k_1", "k_3", "force_offset")
+    ]
+    onset = DEFAULTS["onset"]
+    return build(curves, table_1(), TOTAL, [*table[:2], onset, table[2]], **settings)
+
+
+def by_hand(curves, powers, sigma=None):
+    """Deviance, k and n by the normal equations and scipy's normal density."""
+    X = np.concatenate([np.stack([c.displacement**p for p in powers], 1) for c in curves])
+    y = np.concatenate([c.force for c in curves])
+    r = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    scale = np.sqrt(np.mean(r**2)) if sigma is None else sigma
+    return -2 * scipy.stats.norm.logpdf(r, 0, scale).sum(), len(powers) + (sigma is None), len(y)
+
+
+@pytest.mark.parametrize("sigma", [None, SIGMA])
+def test_linear_case_in_closed_form(sigma):
+    """Deviance, AIC, AICc and BIC of three unknowns; statsmodels counts sigma only in the first."""
+    curves = noisy()
+    noise = Noise(force=sigma)
+    result = fit(linear_problem(curves, noise=noise), Settings(starts=1))
+    found = result.criteria
+    for lane in range(3):
+        d, k, n = by_hand(curves[2 * lane : 2 * lane + 2], (1, 3, 0), sigma)
+        assert found.unknowns[lane] == k
+        np.testing.assert_allclose(found.deviance[lane], d, rtol=1e-9)
+        np.testing.assert_allclose(found.AIC[lane], d + 2 * k, rtol=1e-9)
+        np.testing.assert_allclose(found.AICc[lane], d + 2 * k * n / (n - k - 1), rtol=1e-9)
+        np.testing.assert_allclose(found.BIC[lane], d + k * np.log(n), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_robust_losses_have_no_likelihood():
+    result = fit(linear_problem(noisy(), loss="huber"), Settings(starts=1))
+    assert np.isnan(result.criteria.AIC).all()
+
+
+def test_few_samples_and_weights():
+    made = penalised(np.array([10.0, 10.0]), np.array([2, 5]), np.array([10, 6]))
+    np.testing.assert_allclose(made.AICc[0], 14 + 12 / 7, rtol=1e-15)
+    assert made.AICc[1] == np.inf
+    # Burnham and Anderson: exp(-delta / 2), normalised.
+    np.testing.assert_allclose(
+        weights(np.array([100.0, 102.0, 110.0, np.inf])),
+        np.array([1, np.exp(-1), np.exp(-5), 0]) / (1 + np.exp(-1) + np.exp(-5)),
+        rtol=1e-14,
+    )
+    assert np.isnan(weights(np.array([np.nan, np.inf]))).all()
+
+
+def row(model, AICc, k=3, left=np.nan):
+    return Row("T", model, k, 40, 1.0, 0.0, 0.0, float(AICc), 0.0, 0.0, 0.0, left)
+
+
+@pytest.mark.parametrize(
+    ("rows", "correlated", "says"),
+    [
+        ([row("A", 0.0), row("B", 1.5)], False, "cannot tell A from B"),
+        ([row("A", 5.0), row("B", 0.0)], False, "prefer B (AICc 5.0 below A), but not decisively"),
+        ([row("A", 0.0), row("B", 30.0)], False, "prefer A decisively (AICc 30.0 below B)"),
+        ([row("A", 0.0), row("B", 30.0)], True, "neighbouring residuals are correlated"),
+        (
+            [row("A", 0, left=0.1), row("B", 30, left=0.2)],
+            False,
+            "predicts positions left out best",
+        ),
+        ([row("A", 0, left=0.2), row("B", 30, left=0.1)], False, "B predicts positions left out"),
+        ([row("A", 0, left=0.1), row("B", 30, left=0.2)], True, "left out agree with it"),
+        ([row("A", np.inf), row("B", np.inf)], False, "too few samples"),
+    ],
+)
+def test_sentences(rows, correlated, says):
+    assert says in sentence(rows, correlated)
+
+
+def test_other_data_or_noise_are_refused():
+    curves = noisy()
+    a = linear_problem(curves)
+    same_data([a, linear_problem(curves, fixed=("k_3",))], "ab")
+    for other, says in (
+        (linear_problem(curves[:-1]), "different samples"),
+        (linear_problem(noisy(1)), "different samples"),
+        (linear_problem(curves, noise=Noise(force=0.1)), "noise or curves"),
+        (linear_problem(curves, loss="huber"), "likelihood"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            same_data([a, other], "ab")
+    given = [linear_problem(curves, noise=Noise(force=s)) for s in (0.1, 0.2)]
+    with pytest.raises(ValueError, match="noise or curves"):
+        same_data(given, "ab")
+
+
+def test_leaving_a_position_out_is_a_fit_without_it():
+    """Curves of both trials at a position go together; against least squares of the others."""
+    rng = np.random.default_rng(3)
+    curves = [
+        Curve("T", f"{s}{t}", s, 0.0, DEPTH, 1.5 * DEPTH + 0.01 * s + 0.1 * rng.normal(size=20))
+        for s in (30.0, 60.0, 90.0) for t in "ab"
+    ]  # fmt: skip
+    problem = linear_problem(curves, fixed=("k_3",))
+    missed = []
+    for s in (30.0, 60.0, 90.0):
+        kept = [c for c in curves if c.s_c != s]
+        X = np.concatenate([np.stack([c.displacement, 1 + 0 * DEPTH], 1) for c in kept])
+        b = np.linalg.lstsq(X, np.concatenate([c.force for c in kept]), rcond=None)[0]
+        missed += [b[0] * DEPTH + b[1] - c.force for c in curves if c.s_c == s]
+    want = np.sqrt(np.mean(np.square(missed))) / max(np.abs(c.force).max() for c in curves)
+    got = leave_position_out(problem, Settings(starts=1))
+    np.testing.assert_allclose(got, [want], rtol=1e-6)
+    alone = linear_problem([c for c in curves if c.s_c == 30.0])
+    assert np.isnan(leave_position_out(alone, Settings(starts=1))).all()
+
+
+SPEC = """title = "{title}"
+[data]
+files = "data.csv"
+[model]
+coupling = "total"
+contact = "bonded"
+[parameters]
+{parameters}
+[fit]
+starts = 1
+"""
+
+
+@pytest.fixture
+def two(tmp_path, monkeypatch):
+    """The data of `noisy` with the model behind them and one that lacks the cubic term."""
+    monkeypatch.chdir(tmp_path)
+    lines = ["specimen,trial,displacement [mm],force [N]"]
+    for c in noisy():
+        pairs = zip(c.displacement.tolist(), c.force.tolist(), strict=True)
+        lines += [f"{c.specimen},{c.trial},{d!r},{f!r}" for d, f in pairs]
+    (tmp_path / "data.csv").write_text("\n".join(lines) + "\n")
+    for title, parameters in (("cubic", ""), ("straight", "k_3 = { fixed = 0 }")):
+        text = SPEC.format(title=title, parameters=parameters)
+        (tmp_path / f"{title}.toml").write_text(text)
+    return tmp_path
+
+
+def test_command_chooses_the_model_behind_the_data(two, monkeypatch, capsys):
+    code, out, _ = run(monkeypatch, capsys, "compare", "straight.toml", "cubic.toml", "--out", "o")
+    assert code == 0
+    assert "(all): the data prefer cubic decisively" in " ".join(out.split())
+    assert {p.name for p in (two / "o").iterdir()} == {
+        "compare.csv",
+        "report.md",
+        "provenance.json",
+    }
+    with (two / "o" / "compare.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(r["specimen"], r["model"]) for r in rows[-2:]] == [
+        ("(all)", "straight"),
+        ("(all)", "cubic"),
+    ]
+    curves = noisy()
+    for i in range(3):
+        for at, powers in ((2 * i, (1,)), (2 * i + 1, (1, 3))):
+            d, k, n = by_hand(curves[2 * i : 2 * i + 2], powers)
+            np.testing.assert_allclose(
+                float(rows[at]["AICc"]), d + 2 * k * n / (n - k - 1), rtol=1e-6
+            )
+            np.testing.assert_allclose(float(rows[at]["BIC"]), d + k * np.log(n), rtol=1e-6)
+    total = sum(float(rows[2 * i + 1]["AICc"]) for i in range(3))
+    np.testing.assert_allclose(float(rows[-1]["AICc"]), total, rtol=1e-12)
+    assert float(rows[-1]["weight"]) > 0.99
+    made = json.loads((two / "o" / "provenance.json").read_text())
+    assert [s["model"] for s in made["specifications"]] == ["straight", "cubic"]
+    assert list(made["inputs"]) == ["data.csv"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["cubic.toml"], "two or more"),
+        (["cubic.toml", "cubic.toml"], "the same specification"),
+        (["cubic.toml", "other.toml"], "other.toml: data.files: other content"),
+        (["cubic.toml", "given.toml"], "same [noise]"),
+        (["cubic.toml", "window.toml"], "same [data] section"),
+        (["cubic.toml", "robust.toml"], "use 'linear'"),
+    ],
+)
+def test_what_cannot_be_compared(arguments, says, two, monkeypatch, capsys):
+    text = SPEC.format(title="x", parameters="")
+    (two / "more.csv").write_text((two / "data.csv").read_text() + "\n")
+    (two / "other.toml").write_text(text.replace("data.csv", "more.csv"))
+    (two / "given.toml").write_text(text + '[noise]\nforce = "0.1 N"\n')
+    (two / "window.toml").write_text(
+        text.replace('"data.csv"', '"data.csv"\ndisplacement_max = "2 mm"')
+    )
+    (two / "robust.toml").write_text(text + 'loss = "huber"\n')
+    code, out, err = run(monkeypatch, capsys, "compare", *arguments)
+    assert (code, out) == (2, "")
+    assert says in err
+    assert err.count("\n") == 1
+    assert not (two / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shear", [False, True])
+def test_simulated_data_choose_the_beam_they_came_from(shear):
+    """Ten specimens of four positions, 0.3 % noise: Bernoulli-Euler or shear, told by the sum."""
+    rng = np.random.default_rng(4)
+    options = [Options(shear=s, onset_width=0.0) for s in (False, True)]
+    truth = synthetic.draw(9, 10, 1.2, np.array([300.0, 1.0, 0.5, 0.2]))
+    GA_L = 1.0
+
+    def one(t, s, d):
+        material = Material(*t, GA_L=jax.numpy.asarray(GA_L))
+        return press(synthetic.GEOMETRY, material, s, d, options[shear]).force
+
+    curve = jax.jit(jax.vmap(jax.vmap(one, (None, 0, None)), (0, None, None)))
+    force = np.array(curve(truth, synthetic.S_C, synthetic.DEPTHS))
+    force += 0.003 * force.max((1, 2), keepdims=True) * rng.standard_normal(force.shape)
+    AICc = [
+        np.sum(
+            fit(
+                build(synthetic.curves(force), synthetic.GEOMETRY, o, synthetic.parameters(o)),
+                Settings(starts=2),
+            ).criteria.AICc
+        )
+        for o in options
+    ]
+    assert AICc[shear] + 10 < AICc[not shear]
