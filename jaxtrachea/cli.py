@@ -39,6 +39,9 @@ LeaveOption = Annotated[
 ProfileOption = Annotated[
     bool, typer.Option("--profile", help="Also profile the likelihood of the parameters.")
 ]
+InfluenceOption = Annotated[
+    bool, typer.Option("--influence", help="Also say which samples and curves the estimates need.")
+]
 
 
 def main() -> None:
@@ -99,6 +102,7 @@ def fit(
     out_dir: OutOption = None,
     leave_one_out: LeaveOption = False,
     profile: ProfileOption = False,
+    influence: InfluenceOption = False,
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
     clock = [time.perf_counter()]
@@ -109,7 +113,7 @@ def fit(
     clock.append(time.perf_counter())
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
     with into(out_dir, default) as (folder, stop_if_asked):
-        found = _run(loaded, problem, leave_one_out, names, stop_if_asked)
+        found = _run(loaded, problem, leave_one_out, names, stop_if_asked, influence)
         clock.append(time.perf_counter())
         _write(folder, spec, loaded, measurements, found, clock)
     result = found.result
@@ -228,11 +232,14 @@ class _Found:
     left_out: Any
     profiles: Any
     resampled: Any
+    influence: Any = None
 
 
-def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked) -> _Found:
+def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked, influence=False):
+    """Fit, and what was asked for besides."""
     from jaxtrachea.identify.bootstrap import bootstrap
     from jaxtrachea.identify.fit import fit as run_fit
+    from jaxtrachea.identify.influence import influence as diagnose
     from jaxtrachea.identify.predictions import leave_one_out
     from jaxtrachea.identify.profile import profiles
     from jaxtrachea.identify.study import settings_of
@@ -262,7 +269,9 @@ def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked
                 result, settings, count=u.bootstrap, kind=u.kind, block=u.block,
                 progress=counted("resampling"),
             )  # fmt: skip
-        return _Found(result, left_out, profiled, resampled)
+        wanted = influence or u.influence
+        found = diagnose(result, settings.chunk) if wanted else None
+        return _Found(result, left_out, profiled, resampled, found)
 
 
 def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock) -> None:
@@ -275,6 +284,8 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
     from jaxtrachea.identify import results
     from jaxtrachea.identify.predictions import predictions
     from jaxtrachea.plots import draw_all
+    from jaxtrachea.sections import write_more
+    from jaxtrachea.webpage import page
 
     result, profiles, resampled = found.result, found.profiles, found.resampled
     seen = predictions(result.problem, result.theta)
@@ -285,10 +296,13 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
     )
     if profiles is not None:
         results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
-    draw_all(folder, result, seen, profiles)
+    drawn = draw_all(folder, result, seen, profiles)
     left = None if found.left_out is None else report.left_out_rows(result, found.left_out)
     title = loaded.title or spec.stem
-    text = report.report_text(title, result, measurements.bad, seen, left, profiles, resampled)
+    more = write_more(folder, found.influence)
+    text = report.report_text(
+        title, result, measurements.bad, seen, left, profiles, resampled, more
+    )
     results.write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")
@@ -298,6 +312,8 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
     )
     results.write_hdf5(folder / "results.h5", result, made, profiles, resampled)
     results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+    pictures = {path.name: path.read_bytes() for path in drawn}
+    results.write_text(folder / "report.html", page(text, pictures, made))
 
 
 def _succeeded(result, lane: int) -> bool:

@@ -201,6 +201,7 @@ class UncertaintySection(Section):
     bootstrap: int = Field(0, ge=0, le=1_000_000)
     kind: Literal["parametric", "residual"] = "parametric"
     block: int = Field(1, ge=1, le=1_000_000)
+    influence: bool = False
 
     @model_validator(mode="before")
     @classmethod

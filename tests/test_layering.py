@@ -11,7 +11,7 @@ import jaxtrachea
 
 PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 ORDER = [
-    {"units", "status", "_numerics"},
+    {"units", "status", "_numerics", "webpage"},
     {"config"},
     {"trachea"},
     {"contact"},
@@ -23,7 +23,7 @@ ORDER = [
     {"identify"},
     {"scene"},
     {"report"},
-    {"plots", "viewer", "study"},
+    {"plots", "sections", "viewer", "study"},
     {"terminal"},
     {"cli_scene"},
     {"cli"},
