@@ -110,6 +110,8 @@ def fit(
     if leave_one_out:
         _can_leave_out(problem)
     names = _names_to_profile(loaded, problem, profile)
+    if loaded.uncertainty.posterior:
+        _can_draw(spec)
     clock.append(time.perf_counter())
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
     with into(out_dir, default) as (folder, stop_if_asked):
@@ -133,6 +135,8 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
         candidates = candidates_of(loaded, problem)
     except SpecError as error:
         raise Stop(f"{spec}: {error}") from None
+    if loaded.uncertainty.posterior:
+        _can_draw(spec)
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}-design"
     with into(out_dir, default) as (folder, stop_if_asked):
         found = _run(loaded, problem, False, (), stop_if_asked)
@@ -214,6 +218,15 @@ def _can_leave_out(problem) -> None:
         raise Stop(f"--leave-one-out: {error}") from None
 
 
+def _can_draw(spec: Path) -> None:
+    from jaxtrachea.identify.posterior import MissingSampler, sampler
+
+    try:
+        sampler()
+    except MissingSampler as error:
+        raise Stop(f"{spec}: uncertainty.posterior: {error}") from None
+
+
 def _names_to_profile(spec, problem, asked: bool) -> tuple[str, ...]:
     from jaxtrachea.config import SpecError
     from jaxtrachea.identify.study import profiled
@@ -233,6 +246,7 @@ class _Found:
     profiles: Any
     resampled: Any
     influence: Any = None
+    posterior: Any = None
 
 
 def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked, influence=False):
@@ -240,6 +254,7 @@ def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked
     from jaxtrachea.identify.bootstrap import bootstrap
     from jaxtrachea.identify.fit import fit as run_fit
     from jaxtrachea.identify.influence import influence as diagnose
+    from jaxtrachea.identify.posterior import posterior as draw
     from jaxtrachea.identify.predictions import leave_one_out
     from jaxtrachea.identify.profile import profiles
     from jaxtrachea.identify.study import settings_of
@@ -271,7 +286,13 @@ def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked
             )  # fmt: skip
         wanted = influence or u.influence
         found = diagnose(result, settings.chunk) if wanted else None
-        return _Found(result, left_out, profiled, resampled, found)
+        drawn = None
+        if u.posterior:
+            drawn = draw(
+                result, draws=u.posterior, chains=u.posterior_chains, seed=spec.fit.seed,
+                progress=counted("drawing"),
+            )  # fmt: skip
+        return _Found(result, left_out, profiled, resampled, found, drawn)
 
 
 def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock) -> None:
@@ -282,6 +303,7 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
 
     from jaxtrachea import report
     from jaxtrachea.identify import results
+    from jaxtrachea.identify.posterior_tables import rows_with_draws, write_draws
     from jaxtrachea.identify.predictions import predictions
     from jaxtrachea.plots import draw_all
     from jaxtrachea.sections import write_more
@@ -292,14 +314,15 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
     rows = [*results.lane_rows(result, profiles), *map(results.bad_row, measurements.bad)]
     results.write_csv(folder / "summary.csv", rows)
     results.write_csv(
-        folder / "parameters.csv", list(results.parameter_rows(result, profiles, resampled))
+        folder / "parameters.csv",
+        list(rows_with_draws(result, profiles, resampled, found.posterior)),
     )
     if profiles is not None:
         results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
     drawn = draw_all(folder, result, seen, profiles)
     left = None if found.left_out is None else report.left_out_rows(result, found.left_out)
     title = loaded.title or spec.stem
-    more = write_more(folder, found.influence)
+    more = write_more(folder, found.influence, found.posterior)
     text = report.report_text(
         title, result, measurements.bad, seen, left, profiles, resampled, more
     )
@@ -311,6 +334,8 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
     )
     results.write_hdf5(folder / "results.h5", result, made, profiles, resampled)
+    if found.posterior is not None:
+        write_draws(folder / "results.h5", found.posterior)
     results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
     pictures = {path.name: path.read_bytes() for path in drawn}
     results.write_text(folder / "report.html", page(text, pictures, made))

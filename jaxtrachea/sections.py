@@ -1,4 +1,4 @@
-"""Sections of the report on influence."""
+"""Sections of the report on influence and on the posterior."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +12,8 @@ from jaxtrachea.identify.influence_tables import (
     sample_rows,
     top_samples,
 )
-from jaxtrachea.identify.results import write_csv
+from jaxtrachea.identify.posterior import Posterior
+from jaxtrachea.identify.results import lane_label, unknown_label, write_csv
 from jaxtrachea.report import ONE_BY_ONE, markdown_table, number
 
 #: Rows of the tables on influence; the files hold all.
@@ -21,13 +22,51 @@ _TOP = 12
 _MOVES = 1.0
 
 
-def write_more(folder: Path, influence: Influence | None) -> list[str]:
+def write_more(
+    folder: Path, influence: Influence | None, drawn: Posterior | None = None
+) -> list[str]:
     """Write the files of what was asked for, and return its sections."""
-    if influence is None:
-        return []
-    write_csv(folder / "influence.csv", list(sample_rows(influence)))
-    write_csv(folder / "influence_curves.csv", list(curve_rows(influence)))
-    return influence_section(influence)
+    parts = []
+    if drawn is not None:
+        parts += posterior_section(drawn)
+    if influence is not None:
+        write_csv(folder / "influence.csv", list(sample_rows(influence)))
+        write_csv(folder / "influence_curves.csv", list(curve_rows(influence)))
+        parts += influence_section(influence)
+    return parts
+
+
+def posterior_section(drawn: Posterior) -> list[str]:
+    """Medians and intervals of the draws, and whether the chains deserve trust."""
+    result, rows = drawn.result, []
+    shown = range(min(result.lanes, ONE_BY_ONE))
+    for lane in shown:
+        for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+            ends = (number(float(v[lane, i])) for v in (drawn.lower, drawn.upper))
+            rows.append(
+                [
+                    lane_label(result, lane),
+                    f"{unknown_label(result, lane, i)} [{p.unit}]",
+                    number(float(drawn.median[lane, i])),
+                    " … ".join(ends),
+                    number(float(drawn.rhat[lane, i])),
+                    number(float(drawn.ess[lane, i]), 3),
+                ]
+            )
+    words = {lane: drawn.verdict(lane) for lane in range(result.lanes)}
+    bad = [k for k, text in words.items() if not text.startswith("good")]
+    said = "\n".join(f"- {lane_label(result, k)}: {words[k]}" for k in bad[:ONE_BY_ONE])
+    chains, draws = drawn.theta.shape[1:3]
+    head = ["specimen", "parameter", "median", "posterior 95 %", "R-hat", "effective draws"]
+    lead = f"**{len(bad)} of {result.lanes} lanes have chains not to be trusted as they are:**"
+    return [
+        "## Posterior",
+        markdown_table(head, rows),
+        f"{chains} chains of {draws} draws (NUTS), priors uniform in scaled coordinates between "
+        "the bounds. Good: R-hat up to 1.01, 400 effective draws, nothing divergent. All draws: "
+        "`results.h5` (docs/uncertainty.md).",
+        *([lead, said] if bad else ["All chains are good."]),
+    ]
 
 
 def influence_section(found: Influence) -> list[str]:

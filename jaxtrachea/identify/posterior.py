@@ -5,8 +5,9 @@ with priors uniform in scaled coordinates (scale `log`: 1 / p) between the bound
 sigma is sampled with the others, prior 1 / sigma: -n log sigma joins the cost, which holds for a
 robust loss as well, read as the density exp(-rho / 2). Bounds are mapped to the real line by a
 logistic function (Carpenter et al. 2017, doi:10.18637/jss.v076.i01); the chains start around the
-estimate, with its covariance as the first mass matrix, and adapt in Stan's windows. R-hat and
-effective sample sizes are rank-normalised (Vehtari et al. 2021, doi:10.1214/20-BA1221).
+estimate, in coordinates whitened by its covariance, and adapt mass matrix and step in Stan's
+windows. R-hat and effective sample sizes are rank-normalised (Vehtari et al. 2021,
+doi:10.1214/20-BA1221).
 """
 
 import contextlib
@@ -80,10 +81,14 @@ class Posterior:
 
 
 class _Start(NamedTuple):
-    """Where the chains of one lane begin; Q unknowns and logarithms of noise, on the real line."""
+    """Of one lane: x = centre + root y; Q unknowns and logarithms of noise on the real line.
 
-    position: Float[np.ndarray, "C Q"]
-    covariance: Float[np.ndarray, "Q Q"]
+    In y the posterior is about standard normal, as the adaptation of mass matrices presumes.
+    """
+
+    centre: Float[np.ndarray, " Q"]
+    root: Float[np.ndarray, "Q Q"]
+    y: Float[np.ndarray, "C Q"]
 
 
 def sampler() -> Any:
@@ -142,22 +147,22 @@ def _spread(drawn: tuple[bool, bool], values: Array) -> Float[Array, "2"]:
     return out.at[jnp.flatnonzero(jnp.array(drawn), size=sum(drawn))].set(values)
 
 
-def _chain(problem: Problem, drawn, draws: int, lane: Lane, sigma, covariance, start, key):
+def _chain(problem: Problem, drawn, draws: int, lane: Lane, sigma, centre, root, y, key):
     """Warm-up and draws of one chain: (D, Q) and whether each diverged."""
     blackjax = sampler()
-    density = functools.partial(log_density, problem, drawn, lane, sigma)
+    to_x = lambda y: centre + jnp.sum(root * y[None], axis=1)  # noqa: E731
+    density = lambda y: log_density(problem, drawn, lane, sigma, to_x(y))  # noqa: E731
     warm, steps = jax.random.split(key)
     adaptation = blackjax.window_adaptation(
         blackjax.nuts, density, is_mass_matrix_diagonal=False,
-        initial_inverse_mass_matrix=covariance, target_acceptance_rate=_ACCEPTANCE,
-        adaptation_info_fn=lambda *_: None,
+        target_acceptance_rate=_ACCEPTANCE, adaptation_info_fn=lambda *_: None,
     )  # fmt: skip
-    (state, tuned), _ = adaptation.run(warm, start, num_steps=_WARM_UP)
+    (state, tuned), _ = adaptation.run(warm, y, num_steps=_WARM_UP)
     kernel = blackjax.nuts(density, **tuned)
 
     def step(state, key):
         state, info = kernel.step(key, state)
-        return state, (state.position, info.is_divergent)
+        return state, (to_x(state.position), info.is_divergent)
 
     return jax.lax.scan(step, state, jax.random.split(steps, draws))[1]
 
@@ -172,7 +177,7 @@ def _lenient():
 @functools.lru_cache(maxsize=8)
 def _compiled(problem: Problem, drawn: tuple[bool, bool], draws: int):
     chain = functools.partial(_chain, problem, drawn, draws)
-    chains = jax.vmap(chain, (None, None, None, 0, 0))
+    chains = jax.vmap(chain, (None, None, None, None, 0, 0))
     return jax.jit(jax.vmap(chains))
 
 
@@ -221,8 +226,8 @@ def posterior(
         keys = [jax.random.split(jax.random.fold_in(jax.random.key(seed), k), chains) for k in of]
         with _lenient():
             x, lost = run(
-                lane, result.whitened_sigma[of], np.stack([s.covariance for s in starts]),
-                np.stack([s.position for s in starts]), jnp.stack(keys),
+                lane, result.whitened_sigma[of], *map(np.stack, zip(*starts, strict=True)),
+                jnp.stack(keys),
             )  # fmt: skip
         of, x, lost = of[:left], np.asarray(x)[:left], np.asarray(lost)[:left]
         low, high = (v[of][:, None, None] for v in (problem.lanes.lower, problem.lanes.upper))
@@ -257,7 +262,7 @@ def _start(result: FitResult, lane: int, drawn, chains: int, seed: int) -> _Star
     rng = np.random.default_rng([seed, lane])
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0))
-    return _Start(centre + rng.normal(size=(chains, Q)) @ root.T, covariance)
+    return _Start(centre, root, rng.normal(size=(chains, Q)))
 
 
 def _mixing(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
