@@ -28,7 +28,7 @@ SPEC = '[data]\nfiles = "good.csv"\n[model]\ncoupling = "total"\n[uncertainty]\n
 
 def study(force, depth, noise=None, scale="linear"):
     """F = k_1 D + k_3 D^3, both free: linear, or their logarithms within narrow bounds."""
-    bounds = {"lower": -1e3, "upper": 1e3} if scale == "linear" else {"lower": 1e-3, "upper": 30.0}
+    bounds = {"lower": -1e3, "upper": 1e3} if scale == "linear" else {"lower": 0.1, "upper": 30.0}
     change = {"scale": scale, "value": 1.0, "step": 0.1} | bounds
     rows = [dataclasses.replace(DEFAULTS[n], **change) for n in ("k_1", "k_3")]
     rows += [DEFAULTS[n] for n in ("onset", "force_offset")]
@@ -53,7 +53,7 @@ def test_density_is_that_of_the_normal_noise():
     density = lambda x: log_density(problem, (True, False), lane, sigma, x)  # noqa: E731
     found = np.asarray(jax.jit(jax.vmap(density))(points))
     share = 1 / (1 + np.exp(-np.asarray(points[:, :2])))
-    k = np.exp(np.log(1e-3) + np.log(30 / 1e-3) * share)
+    k = np.exp(np.log(0.1) + np.log(300.0) * share)
     s = 0.2 * np.exp(np.asarray(points[:, 2]))
     rest = k[:, :1] * depth + k[:, 1:] * depth**3 - force
     expected = -12 * np.log(s) - np.sum(rest**2, axis=1) / (2 * s * s)
@@ -118,11 +118,12 @@ def test_linear_model_is_the_closed_form(blackjax):
 
 @pytest.mark.slow
 def test_curved_posterior_is_that_of_quadrature(blackjax):
-    """Logarithms of k_1 and k_3 from 5 poor samples: skewed, k_3 cut by its bound."""
+    """Logarithms of k_1 and k_3 from 5 poor samples: skewed, both cut by bounds."""
     depth = np.linspace(0.3, 1.2, 5)
     force = 1.0 * depth + 0.2 * depth**3 + 0.3 * np.array([0.5, -1, 0.8, 0.1, -0.4])
     drawn = posterior(fit(study(force, depth, 0.3, "log"), ONE), draws=4000, seed=1)
-    grid = np.linspace(np.log(1e-3), np.log(30.0), 1501)
+    assert not drawn.verdict(0).startswith("poor")
+    grid = np.linspace(np.log(0.1), np.log(30.0), 1501)
     a, b = np.meshgrid(np.exp(grid), np.exp(grid), indexing="ij")
     rest = a[..., None] * depth + b[..., None] * depth**3 - force
     weight = np.exp(-np.sum(rest**2, axis=-1) / (2 * 0.09))
@@ -134,7 +135,7 @@ def test_curved_posterior_is_that_of_quadrature(blackjax):
         mean = np.sum(marginal * grid)
         sd = np.sqrt(np.sum(marginal * (grid - mean) ** 2))
         assert sd > 0.3  # nothing that a linear expansion could know
-        assert abs(drawn.theta[0, ..., i].mean() - mean) < 0.12 * sd
+        assert abs(drawn.theta[0, ..., i].mean() - mean) < 4 * sd / np.sqrt(drawn.ess[0, i])
 
 
 @pytest.mark.slow
