@@ -40,6 +40,9 @@ LeaveOption = Annotated[
 ProfileOption = Annotated[
     bool, typer.Option("--profile", help="Also profile the likelihood of the parameters.")
 ]
+InfluenceOption = Annotated[
+    bool, typer.Option("--influence", help="Also say which samples and curves the estimates need.")
+]
 
 
 def main() -> None:
@@ -100,6 +103,7 @@ def fit(
     out_dir: OutOption = None,
     leave_one_out: LeaveOption = False,
     profile: ProfileOption = False,
+    influence: InfluenceOption = False,
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
     clock = [time.perf_counter()]
@@ -107,10 +111,12 @@ def fit(
     if leave_one_out:
         _can_leave_out(problem)
     names = _names_to_profile(spec, loaded, problem, profile)
+    if loaded.uncertainty.posterior:
+        _can_draw(spec)
     clock.append(time.perf_counter())
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
     with into(out_dir, default) as (folder, stop_if_asked):
-        found = _run(loaded, problem, leave_one_out, names, stop_if_asked)
+        found = _run(loaded, problem, leave_one_out, names, stop_if_asked, influence)
         clock.append(time.perf_counter())
         _write(folder, spec, loaded, measurements, found, clock)
     result = found.result
@@ -130,6 +136,8 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
         candidates = candidates_of(loaded, problem)
     except SpecError as error:
         raise Stop(f"{spec}: {error}") from None
+    if loaded.uncertainty.posterior:
+        _can_draw(spec)
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}-design"
     with into(out_dir, default) as (folder, stop_if_asked):
         found = _run(loaded, problem, False, (), stop_if_asked)
@@ -180,6 +188,15 @@ def _can_leave_out(problem) -> None:
         raise Stop(f"--leave-one-out: {error}") from None
 
 
+def _can_draw(spec: Path) -> None:
+    from jaxtrachea.identify.posterior import MissingSampler, sampler
+
+    try:
+        sampler()
+    except MissingSampler as error:
+        raise Stop(f"{spec}: uncertainty.posterior: {error}") from None
+
+
 def _names_to_profile(path: Path, spec, problem, asked: bool) -> tuple[str, ...]:
     from jaxtrachea.config import SpecError
     from jaxtrachea.identify.study import profiled
@@ -198,11 +215,16 @@ class _Found:
     left_out: Any
     profiles: Any
     resampled: Any
+    influence: Any = None
+    posterior: Any = None
 
 
-def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked) -> _Found:
+def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked, influence=False):
+    """Fit, and what was asked for besides."""
     from jaxtrachea.identify.bootstrap import bootstrap
     from jaxtrachea.identify.fit import fit as run_fit
+    from jaxtrachea.identify.influence import influence as diagnose
+    from jaxtrachea.identify.posterior import posterior as draw
     from jaxtrachea.identify.predictions import leave_one_out
     from jaxtrachea.identify.profile import profiles
     from jaxtrachea.identify.study import settings_of
@@ -232,7 +254,15 @@ def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked
                 result, settings, count=u.bootstrap, kind=u.kind, block=u.block,
                 progress=counted("resampling"),
             )  # fmt: skip
-        return _Found(result, left_out, profiled, resampled)
+        wanted = influence or u.influence
+        found = diagnose(result, settings.chunk) if wanted else None
+        drawn = None
+        if u.posterior:
+            drawn = draw(
+                result, draws=u.posterior, chains=u.posterior_chains, seed=spec.fit.seed,
+                progress=counted("drawing"),
+            )  # fmt: skip
+        return _Found(result, left_out, profiled, resampled, found, drawn)
 
 
 def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock) -> None:
@@ -243,22 +273,29 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
 
     from jaxtrachea import report
     from jaxtrachea.identify import results
+    from jaxtrachea.identify.posterior_tables import rows_with_draws, write_draws
     from jaxtrachea.identify.predictions import predictions
     from jaxtrachea.plots import draw_all
+    from jaxtrachea.sections import write_more
+    from jaxtrachea.webpage import page
 
     result, profiles, resampled = found.result, found.profiles, found.resampled
     seen = predictions(result.problem, result.theta)
     rows = [*results.lane_rows(result, profiles), *map(results.bad_row, measurements.bad)]
     results.write_csv(folder / "summary.csv", rows)
     results.write_csv(
-        folder / "parameters.csv", list(results.parameter_rows(result, profiles, resampled))
+        folder / "parameters.csv",
+        list(rows_with_draws(result, profiles, resampled, found.posterior)),
     )
     if profiles is not None:
         results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
-    draw_all(folder, result, seen, profiles)
+    drawn = draw_all(folder, result, seen, profiles)
     left = None if found.left_out is None else report.left_out_rows(result, found.left_out)
     title = loaded.title or spec.stem
-    text = report.report_text(title, result, measurements.bad, seen, left, profiles, resampled)
+    more = write_more(folder, found.influence, found.posterior)
+    text = report.report_text(
+        title, result, measurements.bad, seen, left, profiles, resampled, more
+    )
     results.write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")
@@ -267,7 +304,11 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
     )
     results.write_hdf5(folder / "results.h5", result, made, profiles, resampled)
+    if found.posterior is not None:
+        write_draws(folder / "results.h5", found.posterior)
     results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+    pictures = {path.name: path.read_bytes() for path in drawn}
+    results.write_text(folder / "report.html", page(text, pictures, made))
 
 
 def _succeeded(result, lane: int) -> bool:

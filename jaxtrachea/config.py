@@ -197,6 +197,9 @@ class UncertaintySection(Section):
     bootstrap: int = Field(0, ge=0, le=1_000_000)
     kind: Literal["parametric", "residual"] = "parametric"
     block: int = Field(1, ge=1, le=1_000_000)
+    influence: bool = False
+    posterior: int = Field(0, ge=0, le=1_000_000)
+    posterior_chains: int = Field(4, ge=2, le=1000)
 
     @model_validator(mode="before")
     @classmethod
@@ -209,6 +212,8 @@ class UncertaintySection(Section):
     def _enough(self) -> "UncertaintySection":
         if 0 < self.bootstrap < 40:
             raise ValueError("bootstrap needs 40 replicates or more for a 95 % interval (0: none)")
+        if 0 < self.posterior < 100:
+            raise ValueError("posterior needs 100 draws of each chain or more (0: none)")
         if self.block > 1 and self.kind == "parametric":
             raise ValueError("block draws neighbouring residuals together; set kind = 'residual'")
         return self

@@ -147,8 +147,9 @@ def report_text(
     left_out: Sequence[Sequence[str]] | None,
     profiles: Profiles | None = None,
     resampled: Bootstrap | None = None,
+    more: Sequence[str] = (),
 ) -> str:
-    """The whole report.md."""
+    """The whole report.md; `more`: further sections, before the figures."""
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
     parts = [
         f"# {title or 'Fit'}",
@@ -167,6 +168,7 @@ def report_text(
         parts += _bootstrapped(resampled)
     if left_out is not None:
         parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, left_out)]
+    parts += more
     names = {"fit": "data and fit", "residuals": "residuals", "correlation": "correlation"}
     parts += [f"![{text}]({name}.png)" for name, text in names.items()]
     if bad:

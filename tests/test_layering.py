@@ -11,7 +11,7 @@ import jaxtrachea
 
 PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 ORDER = [
-    {"units", "status", "_numerics"},
+    {"units", "status", "_numerics", "webpage"},
     {"spec_file"},
     {"config"},
     {"trachea"},
@@ -24,7 +24,7 @@ ORDER = [
     {"identify"},
     {"scene"},
     {"report"},
-    {"plots", "viewer", "study"},
+    {"plots", "sections", "viewer", "study"},
     {"terminal"},
     {"cli_load"},
     {"cli_scene", "cli_compare"},

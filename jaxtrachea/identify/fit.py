@@ -100,6 +100,11 @@ class FitResult:
         """`sigma` in units of the lanes' precision, as `evaluate` wants it; (lanes, 2)."""
         return self.sigma / _precision_unit(self.problem)
 
+    @property
+    def relative(self) -> np.ndarray:
+        """Change of each scaled coordinate that makes a relative change of 1; (lanes, P)."""
+        return np.where(_scales(self.problem)[0], 1.0, np.maximum(np.abs(self.theta), 1e-3))
+
 
 def fit(
     problem: Problem,

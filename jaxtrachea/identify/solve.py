@@ -30,7 +30,7 @@ from jaxtrachea.status import FitStatus
 
 RUNNING = -1
 #: First radius of the trust region, in scaled coordinates (log: a factor of 7).
-_FIRST_RADIUS = 2.0
+FIRST_RADIUS = 2.0
 #: Part of the step after which the residual's curvature along it is looked up.
 _LOOK = 0.1
 
@@ -217,7 +217,7 @@ def _advance(problem, tolerances, rounds, lane, sigma, start, refill, state):
     state = State(
         theta=put(start, state.theta),
         point=state.point._replace(cost=put(jnp.inf, state.point.cost)),
-        radius=put(_FIRST_RADIUS, state.radius),
+        radius=put(FIRST_RADIUS, state.radius),
         iteration=put(0, state.iteration),
         status=put(jnp.int8(RUNNING), state.status),
     )
