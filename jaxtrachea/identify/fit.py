@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from jaxtrachea.identify import descent
+from jaxtrachea.identify import descent, joint
 from jaxtrachea.identify.parameters import Parameter
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.solve import Solved, Tolerances, levenberg_marquardt
@@ -106,35 +106,63 @@ def fit(
     Returns:
         The `FitResult`. It never raises for a lane's sake.
     """
-    lanes = problem.lanes.lower.shape[0]
-    jobs = np.repeat(np.arange(lanes), settings.starts)
     sigma = first_sigma(problem)
     starts = draw_starts(problem, settings) if starts is None else starts
-    solved = _solve(problem, settings, jobs, starts, sigma[jobs], progress)
-    best, agree = _best(solved, lanes, settings.starts)
-    solved = Solved(*(v[best] for v in solved))
-    every = np.arange(lanes)
+    solved, agree = _solve(problem, settings, starts, sigma, progress)
     for _ in range(_noise_rounds(problem)):
-        info = informations(problem, every, solved.theta, sigma)
-        sigma = next_sigma(problem, info, sigma)
-        again = _solve(problem, settings, every, solved.theta, sigma, None)
+        _, pool, unknowns = _known(problem, solved, sigma)
+        sigma = next_sigma(problem, pool, sigma, unknowns)
+        again, _ = _solve(problem, settings, solved.theta, sigma, None, near=True)
         solved = again._replace(iterations=solved.iterations + again.iterations)
-    info = informations(problem, every, solved.theta, sigma)
-    before, sigma = sigma, next_sigma(problem, info, sigma)
+    info, pool, unknowns = _known(problem, solved, sigma)
+    before, sigma = sigma, next_sigma(problem, pool, sigma, unknowns)
     if problem.loss == "linear" and problem.lanes.joints is None:
-        info = info.rescaled(before[:, 0] / sigma[:, 0])
+        ratio = before[:, 0] / sigma[:, 0]
+        info, pool = info.rescaled(ratio), pool.rescaled(ratio)
     else:
-        info = informations(problem, every, solved.theta, sigma)
-    return _conclude(problem, solved, info, sigma, agree)
+        info, pool, unknowns = _known(problem, solved, sigma)
+    return _conclude(problem, solved, (info, pool, unknowns), sigma, agree)
 
 
-def _solve(problem, settings, jobs, starts, sigma, progress) -> Solved:
-    report = None if progress is None else lambda done: progress(done, len(jobs))
+def _solve(
+    problem: Problem, settings: Settings, starts, sigma, progress, *, near=False
+) -> tuple[Solved, np.ndarray]:
+    """The best of the starts of every lane, and how many of them agree; `near`: only one start."""
+    lanes = problem.lanes.lower.shape[0]
+    report = None if progress is None else lambda done: progress(done, len(starts))
     common = {"tolerances": settings.tolerances, "chunk": settings.chunk, "progress": report}
     common["dtype"] = np.float32 if settings.float32 else np.float64
+    count = len(starts) // lanes
+    if problem.joint:
+        if settings.method != "levenberg-marquardt":
+            raise ValueError(f"a joint problem needs levenberg-marquardt, not {settings.method}")
+        of_starts = np.swapaxes(starts.reshape(lanes, count, -1), 0, 1)
+        solved, agree = joint.solve_jointly(problem, of_starts, sigma, alone=not near, **common)
+        return solved, np.full(lanes, agree)
+    jobs = np.repeat(np.arange(lanes), count)
     if settings.method == "levenberg-marquardt":
-        return levenberg_marquardt(problem, jobs, starts, sigma, **common)
-    return descent.descend(problem, jobs, starts, sigma, method=settings.method, **common)
+        solved = levenberg_marquardt(problem, jobs, starts, sigma[jobs], **common)
+    else:
+        method = settings.method
+        solved = descent.descend(problem, jobs, starts, sigma[jobs], method=method, **common)
+    if near:
+        return solved, np.ones(lanes, int)
+    best, agree = _best(solved, lanes, count)
+    return Solved(*(v[best] for v in solved)), agree
+
+
+def _known(problem: Problem, solved: Solved, sigma) -> tuple[Information, Information, int | None]:
+    """What each lane knows, what is known of the noise, and the unknowns that this is shared by.
+
+    By itself a lane knows its own noise; the lanes of a joint problem have it in common.
+    """
+    every = np.arange(len(solved.theta))
+    info = informations(problem, every, solved.theta, sigma)
+    if not problem.joint:
+        return info, info, None
+    alive = solved.status <= FitStatus.STALLED
+    pool = joint.pooled(problem, info, solved.theta, alive)
+    return info, pool, joint.unknown_count(problem, alive)
 
 
 def _noise_rounds(problem: Problem) -> int:
@@ -145,9 +173,16 @@ def _noise_rounds(problem: Problem) -> int:
 
 
 def first_sigma(problem: Problem) -> np.ndarray:
-    """Standard deviations to begin with: 1 where given, else 2 % of the peak; (lanes, 2)."""
+    """Standard deviations to begin with: 1 where given, else 2 % of the peak; (lanes, 2).
+
+    Of the lane's peak, or that of the study if it is fitted jointly.
+    """
     lanes = problem.lanes
-    peak = lambda v: np.maximum(np.abs(v).reshape(len(v), -1).max(axis=1), 1e-300)  # noqa: E731
+
+    def peak(v):
+        of_lane = np.maximum(np.abs(v).reshape(len(v), -1).max(axis=1), 1e-300)
+        return np.full(len(v), np.nanmax(of_lane)) if problem.joint else of_lane
+
     force = np.ones(len(lanes.s_c)) if problem.noise_given[0] else 0.02 * peak(lanes.force)
     joints = np.ones(len(lanes.s_c))
     if lanes.joints is not None and not problem.noise_given[1]:
@@ -155,13 +190,17 @@ def first_sigma(problem: Problem) -> np.ndarray:
     return np.stack([force, joints], axis=1)
 
 
-def next_sigma(problem: Problem, info: Information, sigma: np.ndarray) -> np.ndarray:
+def next_sigma(
+    problem: Problem, info: Information, sigma: np.ndarray, unknowns: int | None = None
+) -> np.ndarray:
     """Standard deviations from the residuals, where they are not given.
 
-    Mean square, less the share of the unknowns; with a robust loss 1.4826 times the median.
+    Mean square, less the share of the unknowns (`unknowns`, or those of each lane); with a robust
+    loss 1.4826 times the median.
     """
     total = info.counts.sum(axis=1, keepdims=True)
-    share = np.maximum(1 - problem.lanes.active.sum(axis=1)[:, None] / np.maximum(total, 1), 0.05)
+    own = problem.lanes.active.sum(axis=1)[:, None] if unknowns is None else unknowns
+    share = np.maximum(1 - own / np.maximum(total, 1), 0.05)
     with np.errstate(invalid="ignore", divide="ignore"):
         estimate = np.sqrt(info.squares / (info.counts * share))
         if problem.loss != "linear":
@@ -204,18 +243,25 @@ def _best(solved: Solved, lanes: int, starts: int) -> tuple[np.ndarray, np.ndarr
     return np.arange(lanes) * starts + best, np.sum(near & converged, axis=1)
 
 
-def _conclude(problem, solved: Solved, info: Information, sigma, agree) -> FitResult:
-    """Standard errors, intervals and final statuses of all lanes."""
+def _conclude(problem: Problem, solved: Solved, known, sigma, agree) -> FitResult:
+    """Standard errors, intervals and final statuses of all lanes; `known`: see `_known`."""
     lanes, theta = problem.lanes, solved.theta
+    info, pool, unknowns = known
+    alive = solved.status <= FitStatus.STALLED
+    gradient = joint.summed_gradient(problem, info, alive) if problem.joint else info.gradient
     log, step = _scales(problem)
     both = lanes.joints is None or problem.noise_given[1]
-    at_bound = (theta <= lanes.lower) & (info.gradient > 0)
-    at_bound |= (theta >= lanes.upper) & (info.gradient < 0)
+    at_bound = (theta <= lanes.lower) & (gradient > 0)
+    at_bound |= (theta >= lanes.upper) & (gradient < 0)
     present = lanes.active > 0
     at_bound &= present
     held = at_bound | ~present
     relative = np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))
-    u = analyse(info, relative, held, noise_given=problem.noise_given[0] and both)
+    if problem.joint:
+        pool = joint.marginal(problem, pool, held, alive)
+        unknowns -= joint.held_count(problem, held, alive)
+    noise_given = problem.noise_given[0] and both
+    u = analyse(pool, relative, held, noise_given=noise_given, unknowns=unknowns)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         unscale = lambda v: np.where(present, np.where(log, np.exp(v), v * step), np.nan)  # noqa: E731
         value = unscale(theta)
@@ -225,7 +271,8 @@ def _conclude(problem, solved: Solved, info: Information, sigma, agree) -> FitRe
         lower, upper = unscale(theta - half), unscale(theta + half)
     unit = _precision_unit(problem)
     samples = np.sum(info.counts, axis=1)
-    status = _final_status(solved.status, u, at_bound, samples - np.sum(~held, axis=1))
+    left = np.sum(pool.counts, axis=1) - (np.sum(~held, axis=1) if unknowns is None else unknowns)
+    status = _final_status(solved.status, u, at_bound, left)
     return FitResult(
         problem=problem, theta=theta, value=value, standard_error=standard_error,
         lower=lower, upper=upper, relative_se=u.se / relative,
