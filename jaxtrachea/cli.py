@@ -88,7 +88,8 @@ def check(spec: SpecArgument, data: DataOption = None) -> None:
     fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in problem.parameters if p.fixed)
     out.print(f"Fixed: {fixed or 'none'}", highlight=False)
     lanes, bad = len(problem.curves), len(measurements.bad)
-    out.print(f"{lanes} lane(s) of up to {problem.size} unknowns, {bad} bad curves")
+    joint = ", fitted jointly" if problem.joint else ""
+    out.print(f"{lanes} lane(s){joint} of up to {problem.size} unknowns, {bad} bad curves")
     raise typer.Exit(1 if bad else 0)
 
 
@@ -102,7 +103,7 @@ def fit(
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
     clock = [time.perf_counter()]
-    loaded, measurements, problem = _load(spec, data)
+    loaded, measurements, problem = _load(spec, data, refits=leave_one_out or profile)
     if leave_one_out:
         _can_leave_out(problem)
     names = _names_to_profile(loaded, problem, profile)
@@ -124,7 +125,7 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
     from jaxtrachea.config import SpecError
     from jaxtrachea.identify.study import candidates_of
 
-    loaded, measurements, problem = _load(spec, data)
+    loaded, measurements, problem = _load(spec, data, refits=True)
     try:
         candidates = candidates_of(loaded, problem)
     except SpecError as error:
@@ -170,7 +171,7 @@ def _design(folder: Path, loaded, found, candidates) -> list[dict[str, object]]:
     return rows
 
 
-def _load(path: Path, data: Path | None):
+def _load(path: Path, data: Path | None, *, refits: bool = False):
     """Specification, measurements and problem; input errors become `Stop`."""
     from jaxtrachea.config import SpecError, load_fit_spec
     from jaxtrachea.identify.measurements import DataError
@@ -185,7 +186,7 @@ def _load(path: Path, data: Path | None):
         _print_bad(measurements)
         if not measurements.curves:
             raise Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
-        return spec, measurements, problem_of(spec, measurements)
+        return spec, measurements, problem_of(spec, measurements, refits=refits)
     except SpecError as error:
         text = str(error)
         raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
@@ -228,6 +229,7 @@ class _Found:
     left_out: Any
     profiles: Any
     resampled: Any
+    population: Any = None
 
 
 def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked) -> _Found:
@@ -262,7 +264,20 @@ def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked
                 result, settings, count=u.bootstrap, kind=u.kind, block=u.block,
                 progress=counted("resampling"),
             )  # fmt: skip
-        return _Found(result, left_out, profiled, resampled)
+        return _Found(result, left_out, profiled, resampled, _population(spec, result))
+
+
+def _population(spec, result):
+    """The specimens as a sample, or None with a word why not if it was asked for."""
+    from jaxtrachea.identify.population import population, wanted
+
+    if not wanted(spec.fit.population, result):
+        return None
+    try:
+        return population(result)
+    except ValueError as error:
+        to_stderr(f"[yellow]no population:[/] {escape(str(error))}")
+        return None
 
 
 def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock) -> None:
@@ -273,6 +288,7 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
 
     from jaxtrachea import report
     from jaxtrachea.identify import results
+    from jaxtrachea.identify.population import population_rows
     from jaxtrachea.identify.predictions import predictions
     from jaxtrachea.plots import draw_all
 
@@ -280,15 +296,18 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
     seen = predictions(result.problem, result.theta)
     rows = [*results.lane_rows(result, profiles), *map(results.bad_row, measurements.bad)]
     results.write_csv(folder / "summary.csv", rows)
-    results.write_csv(
-        folder / "parameters.csv", list(results.parameter_rows(result, profiles, resampled))
-    )
+    found_rows = results.parameter_rows(result, profiles, resampled, found.population)
+    results.write_csv(folder / "parameters.csv", list(found_rows))
+    if found.population is not None:
+        results.write_csv(folder / "population.csv", list(population_rows(found.population)))
     if profiles is not None:
         results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
     draw_all(folder, result, seen, profiles)
     left = None if found.left_out is None else report.left_out_rows(result, found.left_out)
     title = loaded.title or spec.stem
-    text = report.report_text(title, result, measurements.bad, seen, left, profiles, resampled)
+    text = report.report_text(
+        title, result, measurements.bad, seen, left, profiles, resampled, found.population
+    )
     results.write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")
@@ -333,6 +352,9 @@ def _print_result(found: _Found, folder: Path) -> None:
                 report.spread_rows(result, found.profiles),
             )
         )
+        if found.population is not None:
+            rows = report.population_table(found.population)
+            out.print(table("Population", report.POPULATION_HEAD, rows))
         good = sum(_succeeded(result, lane) for lane in lanes)
         out.print(f"{good} of {result.lanes} lanes succeeded")
     out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)

@@ -8,6 +8,7 @@ from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.predictions import LeftOut, Prediction, lag_correlation, rms
+from jaxtrachea.identify.population import Population, population_rows
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import (
     lane_label,
@@ -136,6 +137,7 @@ def report_text(
     left_out: Sequence[Sequence[str]] | None,
     profiles: Profiles | None = None,
     resampled: Bootstrap | None = None,
+    population: Population | None = None,
 ) -> str:
     """The whole report.md."""
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
@@ -145,6 +147,7 @@ def report_text(
         f"{len(bad)} curves could not be used. All numbers: `results.h5`; one row per lane: "
         "`summary.csv`; one row per estimate: `parameters.csv` (docs/results.md).",
         *_estimates(result, profiles),
+        *([] if population is None else _sampled(population)),
         "## Quality",
         _quality(result, failed),
         f"Largest residual: {prediction.worst(result)}.",
@@ -184,6 +187,40 @@ def _estimates(result: FitResult, profiles: Profiles | None) -> list[str]:
         "profile that stays open; structurally not: no data from these contact points can tell, "
         "however exact. Judged by the profile where there is one, else by the local standard error "
         "(Gauss-Newton); neither says anything of what the model leaves out.",
+    ]
+
+
+POPULATION_HEAD = ["parameter", "n", "mean", "95 % interval", "spread", "95 % interval"]
+
+
+def population_table(population: Population) -> list[list[str]]:
+    """Parameter, specimens, mean and its interval, spread between specimens and its interval."""
+    rows = []
+    for row in population_rows(population):
+        sign = "× / " if row["spread_is"] == "factor" else "± "
+        cell = {k: number(v) for k, v in row.items() if isinstance(v, float)}
+        rows.append(
+            [
+                f"{row['parameter']} [{row['unit']}]",
+                str(row["specimens"]),
+                cell["mean"],
+                f"{cell['mean_low95']} … {cell['mean_high95']}",
+                f"{sign}{cell['spread']}",
+                f"{cell['spread_low95']} … {cell['spread_high95']}",
+            ]
+        )
+    return rows
+
+
+def _sampled(population: Population) -> list[str]:
+    """The section on the population."""
+    return [
+        "## Population",
+        markdown_table(POPULATION_HEAD, population_table(population)),
+        "The specimens as a sample: their errors are taken out of the spread between them. Spread: "
+        "one standard deviation, with scale `log` as a factor, and the mean is then the geometric "
+        "one. Estimates drawn towards the mean by what they are uncertain: `shrunk` in "
+        "`parameters.csv`; all numbers: `population.csv` (docs/population.md).",
     ]
 
 

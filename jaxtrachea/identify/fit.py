@@ -9,7 +9,7 @@ import numpy as np
 from jaxtrachea.identify import descent, joint
 from jaxtrachea.identify.parameters import Parameter
 from jaxtrachea.identify.problem import Problem
-from jaxtrachea.identify.solve import Solved, Tolerances, levenberg_marquardt
+from jaxtrachea.identify.solve import Solved, Tolerances, chunk_size, levenberg_marquardt
 from jaxtrachea.identify.uncertainty import Information, Uncertainty, analyse, informations
 from jaxtrachea.status import FitStatus
 
@@ -136,6 +136,8 @@ def _solve(
     if problem.joint:
         if settings.method != "levenberg-marquardt":
             raise ValueError(f"a joint problem needs levenberg-marquardt, not {settings.method}")
+        # One size for all calls, so that it is compiled once.
+        common["chunk"] = chunk_size(lanes * settings.starts, settings.chunk)
         of_starts = np.swapaxes(starts.reshape(lanes, count, -1), 0, 1)
         solved, agree = joint.solve_jointly(problem, of_starts, sigma, alone=not near, **common)
         return solved, np.full(lanes, agree)

@@ -31,9 +31,10 @@ from jaxtrachea.status import FitStatus
 
 #: First radius of the trust region of the shared unknowns, scaled coordinates.
 _FIRST_RADIUS = 2.0
-#: Share of its cost that a lane may be above its own minimum before it is fitted anew.
-_POOR = 0.01
-#: Iterations granted to single lanes after the shared unknowns have come to rest.
+#: A lane is fitted anew if it is above its own minimum by more than this share of its cost, or of
+#: what it has moved through (a Gauss-Newton step that works leaves far less).
+_POOR, _LEFT = 0.01, 0.1
+#: Iterations granted after the shared unknowns have come to rest, or when the cost falls no more.
 _PATIENCE = 10
 
 
@@ -94,14 +95,13 @@ def solve_jointly(
         sigma: of each lane, as for `levenberg_marquardt`.
         alone: fit every lane by itself first; else a start is a point near the solution.
         tolerances: when all is done; the cost's is per lane.
-        chunk: lanes computed together.
+        chunk: lanes computed together, always as many.
         progress: as for `levenberg_marquardt`; also called with 0 in every joint iteration.
         dtype: of the computation; sums over lanes are float64.
 
     Returns:
         The best outcome, one row per lane, and how many starts ended in it.
     """
-    chunk = chunk_size(starts.shape[0] * starts.shape[1], chunk)
     task = _Task(problem, sigma, tolerances, chunk, dtype, problem.shared)
     if alone:
         starts = _fitted_alone(task, starts, progress)
@@ -150,6 +150,7 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
     here = _settle(task, clip(start), None, np.ones(len(start), bool))
     alive = here.finite
     radius, status, patience, n = _FIRST_RADIUS, FitStatus.MAX_ITERATIONS, _PATIENCE, 0
+    fall = np.inf
     restless = np.zeros(len(alive), bool)
     while alive.any() and n < task.tolerances.iterations:
         n += 1
@@ -158,7 +159,7 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
         reduced, moving, gradient, hessian = _reduce(task, here, alive)
         step = _shared_step(task, here, alive, radius, moving, gradient, hessian)
         resting, restless = _at_rest(task, here, alive, reduced, gradient, hessian, moving)
-        patience -= resting
+        patience -= resting or fall <= _floor(task, here, alive)
         if (resting and not restless.any()) or patience == 0:
             status = FitStatus.CONVERGED
             break
@@ -170,7 +171,7 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
         promised = -(gradient @ step + 0.5 * step @ hessian @ step) + np.sum(reduced.gain[alive])
         length = np.linalg.norm(step)
         if fall < 0.25 * promised:
-            radius = 0.25 * min(radius, length)
+            radius = 0.25 * (min(radius, length) if length > 0 else radius)
         elif fall > 0.75 * promised:
             radius = max(radius, 2 * length)
         if fall > 0:
@@ -181,7 +182,7 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
         elif radius < task.tolerances.step:
             status = FitStatus.STALLED
             break
-    codes = np.where(restless, FitStatus.MAX_ITERATIONS, status)
+    codes = np.where(restless & ~_nearly_flat(task, here), FitStatus.MAX_ITERATIONS, status)
     codes = np.where(alive, codes, FitStatus.INFEASIBLE_START)
     return Solved(here.theta, here.cost, codes, np.full(len(alive), n))
 
@@ -225,19 +226,36 @@ def _held(theta, gradient, box) -> np.ndarray:
 
 
 def _at_rest(task: _Task, here: Settled, alive, reduced, gradient, hessian, moving):
-    """Whether the shared unknowns have nothing to gain, and which lanes have.
-
-    Measured against the cost of one lane: a share of the whole would let errors grow with the
-    number of lanes.
-    """
-    of_lane = np.sum(here.cost[alive]) / np.sum(alive)
-    lanes = task.problem.lanes
-    data = np.sum((lanes.force * lanes.precision)[alive] ** 2) / task.sigma[alive][0, 0] ** 2
-    exact = 0.5 * data / np.sum(alive) * (10 * epsilon(task.dtype)) ** 2
-    floor = 0.01 * task.tolerance * of_lane + exact
+    """Whether the shared unknowns have nothing left to gain, and which lanes have."""
+    floor = _floor(task, here, alive)
     newton = np.linalg.lstsq(hessian[np.ix_(moving, moving)], gradient[moving], rcond=None)[0]
     resting = 0.5 * newton @ gradient[moving] <= floor
-    return bool(resting), alive & (reduced.gain > floor + 0.01 * task.tolerance * here.cost)
+    return bool(resting), alive & (reduced.gain > floor)
+
+
+def _nearly_flat(task: _Task, here: Settled) -> np.ndarray:
+    """Lanes whose residual is all but orthogonal to their Jacobian, as for single lanes; (L,)."""
+    diagonal = np.diagonal(here.hessian, axis1=1, axis2=2)
+    own = ~_held(here.theta, here.gradient, task.problem.lanes) & (diagonal > 0)
+    own[np.arange(len(own))[:, None], task.shared] = False
+    cosine = np.abs(here.gradient) / np.sqrt(np.where(own, diagonal, 1)) * own
+    tolerance = max(task.tolerances.gradient, 4 * epsilon(task.dtype))
+    return np.max(cosine, axis=1) <= 1e3 * tolerance**0.5 * np.sqrt(2 * here.cost)
+
+
+def _floor(task: _Task, here: Settled, alive) -> float:
+    """Fall of the cost that is not worth a step, for the shared unknowns and for each lane.
+
+    A share of the cost of one lane, or what rounding leaves where the data are exact: a share of
+    the whole cost would let errors grow with the number of lanes.
+    """
+    alive = alive & here.finite
+    if not alive.any():
+        return 0.0
+    lanes = task.problem.lanes
+    data = np.sum((lanes.force * lanes.precision)[alive] ** 2) / task.sigma[alive][0, 0] ** 2
+    total = 0.01 * task.tolerance * np.sum(here.cost[alive])
+    return (total + 0.5 * data * (10 * epsilon(task.dtype)) ** 2) / np.sum(alive)
 
 
 def _rounding(task: _Task, here: Settled, alive) -> float:
@@ -263,7 +281,13 @@ def _settle(task: _Task, theta: np.ndarray, before: Settled | None, alive) -> Se
     g = np.where(finite[:, None], here.gradient, 0)
     H = np.where(finite[:, None, None], here.hessian, 0)
     gain = arrow.eliminate(g, H, task.shared, ~_held(theta, g, lanes)).gain
-    poor = np.flatnonzero(alive & (~finite | (gain > _POOR * here.cost)))
+    floor = _floor(task, here, alive)
+    poor = ~finite | (gain > _POOR * here.cost)
+    if before is not None:
+        moved = theta - before.theta
+        through = 0.5 * np.einsum("lp,lpq,lq->l", moved, before.hessian, moved)
+        poor |= (gain > _LEFT * through) & (gain > floor)
+    poor = np.flatnonzero(alive & poor)
     if not len(poor):
         return here
     row = np.arange(len(theta))[:, None]
@@ -297,7 +321,7 @@ def _evaluated(task: _Task, theta: Float[np.ndarray, "L P"]) -> Settled:
 def in_chunks(run, problem: Problem, theta, sigma, chunk: int, dtype) -> tuple[np.ndarray, ...]:
     """A function of (theta, lane, sigma) over all lanes; float64 on the host."""
     count, parts = len(theta), []
-    chunk = min(chunk, chunk_size(count, chunk))
+    chunk = chunk_size(count, chunk)
     cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype)  # noqa: E731
     for first in range(0, count, chunk):
         of = np.minimum(np.arange(first, first + chunk), count - 1)
@@ -338,7 +362,7 @@ def pooled(
     """
     squares, counts = info.squares[alive].sum(axis=0), info.counts[alive].sum(axis=0)
     of_lane = info.counts[alive].sum(axis=1)
-    mean = lambda v: np.sum(v[alive] * of_lane) / np.sum(of_lane)  # noqa: E731
+    mean = lambda v: np.sum(v[alive] * of_lane) / max(np.sum(of_lane), 1)  # noqa: E731
     spread = np.zeros(2)
     if problem.loss != "linear":
         run, forces = _compiled_residual(problem.program), problem.lanes.force.shape[-1]

@@ -127,6 +127,15 @@ class Problem:
         same = self.options, columns, self.loss, self.loss_scale, self.common
         return _program(tree, numbers, *same)
 
+    def refuse_joint(self, what: str) -> None:
+        """Say that something is made for lanes that are fitted one by one.
+
+        Raises:
+            ValueError: the problem is joint.
+        """
+        if self.joint:
+            raise ValueError(f"{what} needs lanes without shared unknowns; build with joint=False")
+
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Problem":
         """The same study with these lanes, in this order; a lane may come more than once."""
         return dataclasses.replace(

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
+from jaxtrachea.identify.population import Population
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.verdict import VERDICTS, describe_flat, verdict
 from jaxtrachea.status import FitStatus, ProfileEnd
@@ -132,14 +133,25 @@ def bad_row(bad: BadCurve) -> dict[str, object]:
 
 
 def parameter_rows(
-    result: FitResult, profiles: Profiles | None = None, resampled: Bootstrap | None = None
+    result: FitResult,
+    profiles: Profiles | None = None,
+    resampled: Bootstrap | None = None,
+    population: Population | None = None,
 ) -> Iterator[dict[str, object]]:
-    """One row per lane and unknown for parameters.csv; more columns where there is more to say."""
+    """One row per lane and unknown for parameters.csv; more columns where there is more to say.
+
+    What the lanes of a joint fit share has one row, that of the first lane which succeeded.
+    """
+    good = (lane for lane in range(result.lanes) if succeeded(result, lane))
+    spokesman = next(good, 0)
     for lane in range(result.lanes):
         lane_specimen, _ = result.problem.lane_name(lane)
         for i, (p, specimen, trial) in enumerate(result.problem.unknowns[lane]):
+            shared = result.problem.joint and p.scope == "shared"
+            if shared and lane != spokesman:
+                continue
             row = {
-                "specimen": specimen or lane_specimen,
+                "specimen": "(all)" if shared else specimen or lane_specimen,
                 "trial": trial or "(all)",
                 "parameter": p.name,
                 "unit": p.unit,
@@ -150,7 +162,8 @@ def parameter_rows(
                 "relative_se": float(result.relative_se[lane, i]),
                 "verdict": verdict_of(result, lane, i, profiles),
             }
-            yield row | _profile_cells(profiles, lane, i) | _bootstrap_cells(resampled, lane, i)
+            row |= _profile_cells(profiles, lane, i) | _bootstrap_cells(resampled, lane, i)
+            yield row if population is None else row | population.shrunk_cells(lane, i)
 
 
 def _profile_cells(profiles: Profiles | None, lane: int, i: int) -> dict[str, object]:
