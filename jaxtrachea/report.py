@@ -7,8 +7,8 @@ import numpy as np
 from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
-from jaxtrachea.identify.predictions import LeftOut, Prediction, lag_correlation, rms
 from jaxtrachea.identify.population import Population, population_rows
+from jaxtrachea.identify.predictions import LeftOut, Prediction, lag_correlation, rms
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import (
     lane_label,

@@ -263,8 +263,8 @@ def problem_of(spec: FitSpec, measurements: Measurements, *, refits: bool = Fals
     shared = [p.name for p in problem.free if p.scope == "shared"]
     if shared and not joint and problem.size > MOST_DENSE:
         raise SpecError(
-            f"parameters.{shared[0]}: shared, so that {problem.size} unknowns depend on each other; "
-            "profiles, bootstrap, --leave-one-out, design and methods other than "
+            f"parameters.{shared[0]}: shared, so that {problem.size} unknowns depend on each "
+            "other; profiles, bootstrap, --leave-one-out, design and methods other than "
             f"levenberg-marquardt take at most {MOST_DENSE}; leave them out (the joint fit has no "
             "limit), or give it the scope 'specimen'"
         )
