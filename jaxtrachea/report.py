@@ -11,8 +11,10 @@ from jaxtrachea.identify.population import Population, population_rows
 from jaxtrachea.identify.predictions import LeftOut, Prediction, lag_correlation, rms
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import (
+    is_own,
     lane_label,
     peak_force,
+    said_before,
     succeeded,
     unknown_label,
     verdict_of,
@@ -36,10 +38,12 @@ def estimate_rows(
     rows = []
     for lane in lanes:
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+            if said_before(result, lanes, lane, i):
+                continue
             low, high = result.lower[lane, i], result.upper[lane, i]
             rows.append(
                 [
-                    lane_label(result, lane),
+                    lane_label(result, lane) if is_own(result, lane, i) else "(all)",
                     f"{unknown_label(result, lane, i)} [{p.unit}]",
                     number(result.value[lane, i]),
                     number(result.standard_error[lane, i], 2),
@@ -56,8 +60,11 @@ ESTIMATE_HEAD = ["specimen", "parameter", "value", "std. error", "95 % interval"
 def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[list[str]]:
     """Over all succeeded lanes: parameter, lanes, median, quartiles, median standard error."""
     columns: dict[str, list[tuple[float, float, str]]] = {}
-    for lane in filter(lambda k: succeeded(result, k), range(result.lanes)):
+    good = [k for k in range(result.lanes) if succeeded(result, k)]
+    for lane in good:
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+            if said_before(result, good, lane, i):
+                continue
             verdict = verdict_of(result, lane, i, profiles)
             entry = (float(result.value[lane, i]), float(result.relative_se[lane, i]), verdict)
             columns.setdefault(f"{p.name} [{p.unit}]", []).append(entry)
@@ -220,7 +227,7 @@ def _sampled(population: Population) -> list[str]:
         "The specimens as a sample: their errors are taken out of the spread between them. Spread: "
         "one standard deviation, with scale `log` as a factor, and the mean is then the geometric "
         "one. Estimates drawn towards the mean by what they are uncertain: `shrunk` in "
-        "`parameters.csv`; all numbers: `population.csv` (docs/population.md).",
+        "`parameters.csv`; all numbers: `population.csv` (docs/joint.md).",
     ]
 
 

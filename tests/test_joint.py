@@ -158,6 +158,7 @@ def test_a_lane_that_cannot_be_evaluated_costs_itself(linear):
     assert np.all(fit(problem, ONE_START).status == FitStatus.INFEASIBLE_START)
 
 
+@pytest.mark.slow
 def test_result_does_not_depend_on_chunks_nor_much_on_precision(linear):
     other = fit(linear_problem(), dataclasses.replace(ONE_START, chunk=7, starts=2))
     np.testing.assert_allclose(other.theta, linear.theta, rtol=1e-9, atol=1e-9)
@@ -230,8 +231,9 @@ def dense_reference(force):
 
     def model(t):
         at = Material(*jnp.exp(t))
-        go = lambda s: press(synthetic.GEOMETRY, at, s, synthetic.DEPTHS, synthetic.OPTIONS)  # noqa: E731
-        return jax.vmap(lambda s: go(s).force)(jnp.asarray(synthetic.S_C)).ravel()
+        depth, options = jnp.asarray(synthetic.DEPTHS), synthetic.OPTIONS
+        go = lambda s: press(synthetic.GEOMETRY, at, s, depth, options).force  # noqa: E731
+        return jax.vmap(go)(jnp.asarray(synthetic.S_C)).ravel()
 
     both = jax.jit(jax.vmap(lambda t: (model(t), jax.jacfwd(model)(t))))
     n, m = len(force), force[0].size
@@ -254,6 +256,7 @@ def dense_reference(force):
     return found.x, np.sqrt(np.diagonal(np.linalg.inv(found.jac.T @ found.jac)) * variance)
 
 
+@pytest.mark.slow
 def test_twenty_specimens_are_the_dense_fit_of_scipy():
     """Estimates and standard errors within 1e-6 (relative)."""
     force, problem = skeleton_study(20)

@@ -183,7 +183,11 @@ def first_sigma(problem: Problem) -> np.ndarray:
 
     def peak(v):
         of_lane = np.maximum(np.abs(v).reshape(len(v), -1).max(axis=1), 1e-300)
-        return np.full(len(v), np.nanmax(of_lane)) if problem.joint else of_lane
+        return (
+            np.full(len(v), np.max(np.nan_to_num(of_lane, nan=1e-300)))
+            if problem.joint
+            else of_lane
+        )
 
     force = np.ones(len(lanes.s_c)) if problem.noise_given[0] else 0.02 * peak(lanes.force)
     joints = np.ones(len(lanes.s_c))

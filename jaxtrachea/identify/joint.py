@@ -167,7 +167,7 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
         trial = np.where(alive[:, None], trial, here.theta)
         there = _settle(task, trial, here, alive)
         finite = np.all(there.finite[alive])
-        fall = np.sum((here.cost - there.cost)[alive]) if finite else -np.inf
+        fall = np.sum(here.cost[alive] - there.cost[alive]) if finite else -np.inf
         promised = -(gradient @ step + 0.5 * step @ hessian @ step) + np.sum(reduced.gain[alive])
         length = np.linalg.norm(step)
         if fall < 0.25 * promised:

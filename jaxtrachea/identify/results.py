@@ -6,7 +6,7 @@ import hashlib
 import json
 import platform
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -132,6 +132,17 @@ def bad_row(bad: BadCurve) -> dict[str, object]:
     }
 
 
+def is_own(result: FitResult, lane: int, i: int) -> bool:
+    """Whether an unknown belongs to its lane alone, not to all lanes of a joint fit."""
+    return not (result.problem.joint and result.problem.unknowns[lane][i][0].scope == "shared")
+
+
+def said_before(result: FitResult, lanes: Sequence[int], lane: int, i: int) -> bool:
+    """Whether an unknown that all lanes share is listed with another of `lanes`, the first good."""
+    first = next((k for k in lanes if succeeded(result, k)), lanes[0])
+    return not is_own(result, lane, i) and lane != first
+
+
 def parameter_rows(
     result: FitResult,
     profiles: Profiles | None = None,
@@ -142,16 +153,14 @@ def parameter_rows(
 
     What the lanes of a joint fit share has one row, that of the first lane which succeeded.
     """
-    good = (lane for lane in range(result.lanes) if succeeded(result, lane))
-    spokesman = next(good, 0)
+    every = range(result.lanes)
     for lane in range(result.lanes):
         lane_specimen, _ = result.problem.lane_name(lane)
         for i, (p, specimen, trial) in enumerate(result.problem.unknowns[lane]):
-            shared = result.problem.joint and p.scope == "shared"
-            if shared and lane != spokesman:
+            if said_before(result, every, lane, i):
                 continue
             row = {
-                "specimen": "(all)" if shared else specimen or lane_specimen,
+                "specimen": (specimen or lane_specimen) if is_own(result, lane, i) else "(all)",
                 "trial": trial or "(all)",
                 "parameter": p.name,
                 "unit": p.unit,
