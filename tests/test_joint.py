@@ -1,21 +1,24 @@
 """Joint fits: against linear algebra in full, linear least squares, SciPy and one dense lane."""
 
 import dataclasses
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic
+from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
-from jaxtrachea.identify import arrow, joint, results
+from jaxtrachea.identify import arrow, joint, results, study
 from jaxtrachea.identify.bootstrap import bootstrap
 from jaxtrachea.identify.design import check
 from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.measurements import Curve
 from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.population import population
+from jaxtrachea.identify.population import population, population_rows, wanted
 from jaxtrachea.identify.predictions import curves_to_leave_out
 from jaxtrachea.identify.problem import Noise, build
 from jaxtrachea.identify.profile import profiles
@@ -24,6 +27,7 @@ from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
+PAGE = (Path(__file__).parents[1] / "docs" / "results.md").read_text()
 TOTAL = Options(coupling="total", contact="bonded")
 LANES, DEPTH = 20, np.linspace(0.1, 2, 12)
 ONE_START = Settings(starts=1, chunk=16)
@@ -200,6 +204,32 @@ def test_rows_name_what_is_shared_once(linear):
     summary = list(results.lane_rows(linear))
     assert len({r["k_3 [N/mm^3]"] for r in summary}) == 1
     assert len({r["k_1 [N/mm]"] for r in summary}) == LANES
+
+
+def test_population_and_its_page(linear):
+    """Mean and spread of k_1 = 1 ... 2.9 in logarithms; columns as documented."""
+    rows = list(population_rows(population(linear)))
+    assert list(rows[0]) == re.findall(r"^\| `(\w+)`", PAGE.split("## ")[3], re.M)
+    assert [r["parameter"] for r in rows] == ["k_1"]
+    truth = np.log(1 + 0.1 * np.arange(LANES))
+    np.testing.assert_allclose(np.log(rows[0]["mean"]), truth.mean(), atol=0.02)
+    np.testing.assert_allclose(rows[0]["sd_scaled"], truth.std(ddof=1), atol=0.02)
+    assert not wanted(False, linear)
+    assert wanted(None, linear)
+
+
+def test_command_line_fits_jointly_what_is_shared(tmp_path, monkeypatch, capsys):
+    text = GOOD + GOOD.partition("\n")[2].replace("T01", "T02")
+    (tmp_path / "data.csv").write_text(text)
+    spec = '[data]\nfiles = "data.csv"\n[parameters]\nk_M = { scope = "shared" }\n'
+    (tmp_path / "spec.toml").write_text(spec)
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = run(monkeypatch, capsys, "check", "spec.toml")
+    assert (code, "2 lane(s), fitted jointly of up to 4" in out) == (0, True)
+    monkeypatch.setattr(study, "MOST_DENSE", 6)
+    code, _, err = run(monkeypatch, capsys, "fit", "spec.toml", "--profile")
+    assert code == 2
+    assert "parameters.k_M: shared, so that 7 unknowns" in err
 
 
 def test_what_refits_single_lanes_is_refused(linear):
