@@ -92,7 +92,8 @@ def check(spec: SpecArgument, data: DataOption = None) -> None:
     fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in problem.parameters if p.fixed)
     out.print(f"Fixed: {fixed or 'none'}", highlight=False)
     lanes, bad = len(problem.curves), len(measurements.bad)
-    out.print(f"{lanes} lane(s) of up to {problem.size} unknowns, {bad} bad curves")
+    joint = ", fitted jointly" if problem.joint else ""
+    out.print(f"{lanes} lane(s){joint} of up to {problem.size} unknowns, {bad} bad curves")
     raise typer.Exit(1 if bad else 0)
 
 
@@ -107,7 +108,7 @@ def fit(
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
     clock = [time.perf_counter()]
-    loaded, measurements, problem = load(spec, data)
+    loaded, measurements, problem = load(spec, data, refits=leave_one_out or profile or influence)
     if leave_one_out:
         _can_leave_out(problem)
     names = _names_to_profile(spec, loaded, problem, profile)
@@ -131,7 +132,7 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
     from jaxtrachea.config import SpecError
     from jaxtrachea.identify.study import candidates_of
 
-    loaded, measurements, problem = load(spec, data)
+    loaded, measurements, problem = load(spec, data, refits=True)
     try:
         candidates = candidates_of(loaded, problem)
     except SpecError as error:
@@ -217,6 +218,7 @@ class _Found:
     resampled: Any
     influence: Any = None
     posterior: Any = None
+    population: Any = None
 
 
 def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked, influence=False):
@@ -262,7 +264,21 @@ def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked
                 result, draws=u.posterior, chains=u.posterior_chains, seed=spec.fit.seed,
                 progress=counted("drawing"),
             )  # fmt: skip
-        return _Found(result, left_out, profiled, resampled, found, drawn)
+        specimens = _population(spec, result)
+        return _Found(result, left_out, profiled, resampled, found, drawn, specimens)
+
+
+def _population(spec, result):
+    """The specimens as a sample, or None with a word why not if it was asked for."""
+    from jaxtrachea.identify.population import population, wanted
+
+    if not wanted(spec.fit.population, result):
+        return None
+    try:
+        return population(result)
+    except ValueError as error:
+        to_stderr(f"[yellow]no population:[/] {escape(str(error))}")
+        return None
 
 
 def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock) -> None:
@@ -273,6 +289,7 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
 
     from jaxtrachea import report
     from jaxtrachea.identify import results
+    from jaxtrachea.identify.population import population_rows
     from jaxtrachea.identify.posterior_tables import rows_with_draws, write_draws
     from jaxtrachea.identify.predictions import predictions
     from jaxtrachea.plots import draw_all
@@ -283,10 +300,10 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
     seen = predictions(result.problem, result.theta)
     rows = [*results.lane_rows(result, profiles), *map(results.bad_row, measurements.bad)]
     results.write_csv(folder / "summary.csv", rows)
-    results.write_csv(
-        folder / "parameters.csv",
-        list(rows_with_draws(result, profiles, resampled, found.posterior)),
-    )
+    found_rows = rows_with_draws(result, profiles, resampled, found.population, found.posterior)
+    results.write_csv(folder / "parameters.csv", list(found_rows))
+    if found.population is not None:
+        results.write_csv(folder / "population.csv", list(population_rows(found.population)))
     if profiles is not None:
         results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
     drawn = draw_all(folder, result, seen, profiles)
@@ -294,7 +311,7 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
     title = loaded.title or spec.stem
     more = write_more(folder, found.influence, found.posterior)
     text = report.report_text(
-        title, result, measurements.bad, seen, left, profiles, resampled, more
+        title, result, measurements.bad, seen, left, profiles, resampled, more, found.population
     )
     results.write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
@@ -344,6 +361,9 @@ def _print_result(found: _Found, folder: Path) -> None:
                 report.spread_rows(result, found.profiles),
             )
         )
+        if found.population is not None:
+            rows = report.population_table(found.population)
+            out.print(table("Population", report.POPULATION_HEAD, rows))
         good = sum(_succeeded(result, lane) for lane in lanes)
         out.print(f"{good} of {result.lanes} lanes succeeded")
     out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)

@@ -54,8 +54,8 @@ def compare(
 def _loaded(path: Path, data: Path | None, *, first: bool):
     """As `load`; curves that cannot be used are named once."""
     if first:
-        return load(path, data)
-    return load(path, data, quiet=True)
+        return load(path, data, refits=True)
+    return load(path, data, refits=True, quiet=True)
 
 
 def _names(specs: list[Path], titles: list[str]) -> list[str]:

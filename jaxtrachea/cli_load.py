@@ -7,12 +7,13 @@ from rich.markup import escape
 from jaxtrachea.terminal import Stop, set_up_jax, to_stderr
 
 
-def load(path: Path, data: Path | None, *, quiet: bool = False):
+def load(path: Path, data: Path | None, *, refits: bool = False, quiet: bool = False):
     """Specification, measurements and problem; what is wrong with curves is said on stderr.
 
     Args:
         path: the specification.
         data: folder its paths start from; None: its own.
+        refits: single curves will be left out, or unknowns held (see `study.problem_of`).
         quiet: name no curve that cannot be used.
 
     Raises:
@@ -32,7 +33,7 @@ def load(path: Path, data: Path | None, *, quiet: bool = False):
             print_bad(measurements)
         if not measurements.curves:
             raise Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
-        return spec, measurements, problem_of(spec, measurements)
+        return spec, measurements, problem_of(spec, measurements, refits=refits)
     except SpecError as error:
         text = str(error)
         raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None

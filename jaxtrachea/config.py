@@ -187,6 +187,7 @@ class FitSection(Section):
     tolerance: float = Field(1e-10, gt=0, lt=0.1)
     chunk: int = Field(128, ge=1, le=1_000_000)
     precision: Literal["float64", "float32"] = "float64"
+    population: bool | None = None
 
 
 class UncertaintySection(Section):

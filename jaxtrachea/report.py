@@ -7,11 +7,14 @@ import numpy as np
 from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
+from jaxtrachea.identify.population import Population, population_rows
 from jaxtrachea.identify.predictions import LeftOut, Prediction, lag_correlation, rms
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import (
+    is_own,
     lane_label,
     peak_force,
+    said_before,
     succeeded,
     unknown_label,
     verdict_of,
@@ -35,10 +38,12 @@ def estimate_rows(
     rows = []
     for lane in lanes:
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+            if said_before(result, lanes, lane, i):
+                continue
             low, high = result.lower[lane, i], result.upper[lane, i]
             rows.append(
                 [
-                    lane_label(result, lane),
+                    lane_label(result, lane) if is_own(result, lane, i) else "(all)",
                     f"{unknown_label(result, lane, i)} [{p.unit}]",
                     number(result.value[lane, i]),
                     number(result.standard_error[lane, i], 2),
@@ -55,8 +60,11 @@ ESTIMATE_HEAD = ["specimen", "parameter", "value", "std. error", "95 % interval"
 def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[list[str]]:
     """Over all succeeded lanes: parameter, lanes, median, quartiles, median standard error."""
     columns: dict[str, list[tuple[float, float, str]]] = {}
-    for lane in filter(lambda k: succeeded(result, k), range(result.lanes)):
+    good = [k for k in range(result.lanes) if succeeded(result, k)]
+    for lane in good:
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+            if said_before(result, good, lane, i):
+                continue
             verdict = verdict_of(result, lane, i, profiles)
             entry = (float(result.value[lane, i]), float(result.relative_se[lane, i]), verdict)
             columns.setdefault(f"{p.name} [{p.unit}]", []).append(entry)
@@ -148,6 +156,7 @@ def report_text(
     profiles: Profiles | None = None,
     resampled: Bootstrap | None = None,
     more: Sequence[str] = (),
+    population: Population | None = None,
 ) -> str:
     """The whole report.md; `more`: further sections, before the figures."""
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
@@ -157,6 +166,7 @@ def report_text(
         f"{len(bad)} curves could not be used. All numbers: `results.h5`; one row per lane: "
         "`summary.csv`; one row per estimate: `parameters.csv` (docs/results.md).",
         *_estimates(result, profiles),
+        *([] if population is None else _sampled(population)),
         "## Quality",
         _quality(result, failed),
         f"Largest residual: {prediction.worst(result)}.",
@@ -197,6 +207,40 @@ def _estimates(result: FitResult, profiles: Profiles | None) -> list[str]:
         "profile that stays open; structurally not: no data from these contact points can tell, "
         "however exact. Judged by the profile where there is one, else by the local standard error "
         "(Gauss-Newton); neither says anything of what the model leaves out.",
+    ]
+
+
+POPULATION_HEAD = ["parameter", "n", "mean", "95 % interval", "spread", "95 % interval"]
+
+
+def population_table(population: Population) -> list[list[str]]:
+    """Parameter, specimens, mean and its interval, spread between specimens and its interval."""
+    rows = []
+    for row in population_rows(population):
+        sign = "× / " if row["spread_is"] == "factor" else "± "
+        cell = {k: number(v) for k, v in row.items() if isinstance(v, float)}
+        rows.append(
+            [
+                f"{row['parameter']} [{row['unit']}]",
+                str(row["specimens"]),
+                cell["mean"],
+                f"{cell['mean_low95']} … {cell['mean_high95']}",
+                f"{sign}{cell['spread']}",
+                f"{cell['spread_low95']} … {cell['spread_high95']}",
+            ]
+        )
+    return rows
+
+
+def _sampled(population: Population) -> list[str]:
+    """The section on the population."""
+    return [
+        "## Population",
+        markdown_table(POPULATION_HEAD, population_table(population)),
+        "The specimens as a sample: their errors are taken out of the spread between them. Spread: "
+        "one standard deviation, with scale `log` as a factor, and the mean is then the geometric "
+        "one. Estimates drawn towards the mean by what they are uncertain: `shrunk` in "
+        "`parameters.csv`; all numbers: `population.csv` (docs/joint.md).",
     ]
 
 

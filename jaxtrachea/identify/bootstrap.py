@@ -76,9 +76,10 @@ def bootstrap(
         progress: called with (refits done since the last call, refits in all).
 
     Raises:
-        ValueError: too few replicates, an impossible block.
+        ValueError: too few replicates, an impossible block, or a joint problem.
     """
     _check(count, kind, block)
+    result.problem.refuse_joint("the bootstrap")
     seen = predictions(result.problem, result.theta)
     chunk = chunk_size(max(result.lanes * settings.starts, 16), settings.chunk)
     one = dataclasses.replace(settings, starts=1, chunk=chunk)

@@ -4,11 +4,13 @@ Akaike (1974, doi:10.1109/TAC.1974.1100705), corrected for few samples by Hurvic
 doi:10.1093/biomet/76.2.297); Schwarz (1978, doi:10.1214/aos/1176344136).
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from jaxtrachea.identify.joint import unknown_count
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.uncertainty import Information
 
@@ -35,8 +37,8 @@ class Criteria(NamedTuple):
     BIC: Float[np.ndarray, " lanes"]
 
 
-def criteria(problem: Problem, info: Information) -> Criteria:
-    """Criteria of all lanes.
+def criteria(problem: Problem, info: Information, alive: Bool[np.ndarray, " lanes"]) -> Criteria:
+    """Criteria of all lanes; in a joint problem those of the whole study, the same in every lane.
 
     With a given standard deviation the deviance is sum(z^2 + ln(2 pi sigma^2)), with an estimated
     one n (ln(2 pi S / n) + 1), forces and markers each with their own. S is the sum of squares that
@@ -45,9 +47,14 @@ def criteria(problem: Problem, info: Information) -> Criteria:
     Args:
         problem: what was fitted.
         info: of all lanes at their estimates.
+        alive: lanes that count in a joint problem.
     """
     lanes, estimated = problem.lanes, [not given for given in problem.noise_given]
-    counts, squares = np.asarray(info.counts, float), np.asarray(info.weighted, float)
+
+    def whole(v, combine=np.sum):
+        return np.broadcast_to(combine(v[alive], axis=0), v.shape) if problem.joint else v
+
+    counts, squares = whole(np.asarray(info.counts, float)), whole(np.asarray(info.weighted))
     deviance = np.zeros(len(counts))
     kinds = ((lanes.precision, lanes.force), (lanes.joint_precision, lanes.joints))
     for kind, (precision, data) in enumerate(kinds):
@@ -57,16 +64,20 @@ def criteria(problem: Problem, info: Information) -> Criteria:
         flat = lambda v: v.reshape(len(v), -1)  # noqa: E731
         if estimated[kind]:
             peak = np.max(np.abs(flat(data * precision)), axis=1, initial=0)
+            peak = whole(peak, functools.partial(np.max, initial=0))
             S = np.maximum(S, np.maximum(n, 1) * (ROUNDING * peak) ** 2)
             with np.errstate(divide="ignore", invalid="ignore"):
                 deviance += np.where(n > 0, n * (np.log(2 * np.pi * S / n) + 1), 0)
         else:
             seen = flat(precision)
             logs = np.log(seen, where=seen > 0, out=np.zeros(seen.shape)).sum(axis=1)
-            deviance += S + n * np.log(2 * np.pi) - 2 * logs
+            deviance += S + n * np.log(2 * np.pi) - 2 * whole(logs)
     if problem.loss != "linear":
         deviance = np.full(len(counts), np.nan)
-    k = np.sum(lanes.active, axis=1) + np.sum((counts > 0) * np.array(estimated), axis=1)
+    own = np.sum(lanes.active, axis=1)
+    if problem.joint:
+        own = np.full(len(own), unknown_count(problem, alive))
+    k = own + np.sum((counts > 0) * np.array(estimated), axis=1)
     return penalised(deviance, k.astype(int), np.sum(counts, axis=1))
 
 

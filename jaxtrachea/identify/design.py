@@ -94,8 +94,9 @@ def check(problem: Problem) -> None:
     """Refuse a study whose unknowns a new curve would not share.
 
     Raises:
-        ValueError: naming the parameters.
+        ValueError: naming the parameters; or a joint problem.
     """
+    problem.refuse_joint("a design")
     own = [p.name for p in problem.free if p.scope == "trial"]
     if own:
         raise ValueError(f"{', '.join(own)} belongs to single trials; give it another scope")

@@ -3,14 +3,14 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from jaxtrachea.identify import descent
+from jaxtrachea.identify import descent, joint
 from jaxtrachea.identify.criteria import Criteria, criteria
 from jaxtrachea.identify.problem import Problem
-from jaxtrachea.identify.solve import Solved, Tolerances, levenberg_marquardt
+from jaxtrachea.identify.solve import Solved, Tolerances, chunk_size, levenberg_marquardt
 from jaxtrachea.identify.starts import best, completed, draw_starts, of_unknowns
 from jaxtrachea.identify.uncertainty import Information, Uncertainty, analyse, informations
 from jaxtrachea.status import FitStatus
@@ -123,11 +123,32 @@ def fit(
     Returns:
         The `FitResult`. It never raises for a lane's sake.
     """
-    lanes = problem.lanes.lower.shape[0]
-    jobs = np.repeat(np.arange(lanes), settings.starts)
     sigma = first_sigma(problem)
+    solved, agree, tried = _from_starts(problem, settings, starts, sigma, progress)
+    for _ in range(_noise_rounds(problem)):
+        _, pool, unknowns = _known(problem, solved, sigma)
+        sigma = next_sigma(problem, pool, sigma, unknowns)
+        again = _from_there(problem, settings, solved.theta, sigma)
+        solved = again._replace(iterations=solved.iterations + again.iterations)
+    info, pool, unknowns = _known(problem, solved, sigma)
+    before, sigma = sigma, next_sigma(problem, pool, sigma, unknowns)
+    if problem.loss == "linear" and problem.lanes.joints is None:
+        ratio = before[:, 0] / sigma[:, 0]
+        info, pool = info.rescaled(ratio), pool.rescaled(ratio)
+    else:
+        info, pool, unknowns = _known(problem, solved, sigma)
+    return _conclude(problem, solved, (info, pool, unknowns), sigma, agree, tried)
+
+
+def _from_starts(problem: Problem, settings: Settings, starts, sigma, progress):
+    """The best of all starts of every lane, how many of them agree, and how many there were."""
     drawn = starts is None
     starts = draw_starts(problem, settings) if drawn else starts
+    lanes = problem.lanes.lower.shape[0]
+    if problem.joint:
+        solved, agree = _solve_jointly(problem, settings, starts, sigma, progress)
+        return solved, np.full(lanes, agree), np.full(lanes, len(starts) // lanes)
+    jobs = np.repeat(np.arange(lanes), settings.starts)
     solved = _solve(problem, settings, jobs, starts, sigma[jobs], progress)
     if drawn:
         again = functools.partial(_solve_more, problem, settings, sigma, progress)
@@ -135,21 +156,14 @@ def fit(
             problem, settings, jobs, solved, data_weight(problem, sigma), again
         )
     found, agree = best(jobs, solved, lanes)
-    solved = Solved(*(v[found] for v in solved))
-    every = np.arange(lanes)
-    for _ in range(_noise_rounds(problem)):
-        info = informations(problem, every, solved.theta, sigma)
-        sigma = next_sigma(problem, info, sigma)
-        again = _solve(problem, settings, every, solved.theta, sigma, None)
-        solved = again._replace(iterations=solved.iterations + again.iterations)
-    info = informations(problem, every, solved.theta, sigma)
-    before, sigma = sigma, next_sigma(problem, info, sigma)
-    if problem.loss == "linear" and problem.lanes.joints is None:
-        info = info.rescaled(before[:, 0] / sigma[:, 0])
-    else:
-        info = informations(problem, every, solved.theta, sigma)
-    tried = np.bincount(jobs, minlength=lanes)
-    return _conclude(problem, solved, info, sigma, agree, tried)
+    return Solved(*(v[found] for v in solved)), agree, np.bincount(jobs, minlength=lanes)
+
+
+def _from_there(problem: Problem, settings: Settings, theta, sigma) -> Solved:
+    """Solved anew from near the minimum, with other noise."""
+    if problem.joint:
+        return _solve_jointly(problem, settings, theta, sigma, None, near=True)[0]
+    return _solve(problem, settings, np.arange(len(theta)), theta, sigma, None)
 
 
 def _solve_more(problem, settings, sigma, progress, jobs, starts) -> Solved:
@@ -168,13 +182,46 @@ def data_weight(problem: Problem, sigma: np.ndarray) -> np.ndarray:
     return 0.5 * np.sum(z * z, axis=(1, 2))
 
 
-def _solve(problem, settings, jobs, starts, sigma, progress) -> Solved:
-    report = None if progress is None else lambda done: progress(done, len(jobs))
-    common = {"tolerances": settings.tolerances, "chunk": settings.chunk, "progress": report}
-    common["dtype"] = np.float32 if settings.float32 else np.float64
+def _solve(problem: Problem, settings: Settings, jobs, starts, sigma, progress) -> Solved:
+    common = _common(settings, len(jobs), progress)
     if settings.method == "levenberg-marquardt":
         return levenberg_marquardt(problem, jobs, starts, sigma, **common)
     return descent.descend(problem, jobs, starts, sigma, method=settings.method, **common)
+
+
+def _solve_jointly(
+    problem: Problem, settings: Settings, starts, sigma, progress, *, near=False
+) -> tuple[Solved, int]:
+    """The best of the starts of the whole study, and how many agree; `near`: only one start."""
+    if settings.method != "levenberg-marquardt":
+        raise ValueError(f"a joint problem needs levenberg-marquardt, not {settings.method}")
+    lanes = problem.lanes.lower.shape[0]
+    common = _common(settings, len(starts), progress)
+    # One size for all calls, so that it is compiled once.
+    common["chunk"] = chunk_size(lanes * settings.starts, settings.chunk)
+    of_starts = np.swapaxes(starts.reshape(lanes, len(starts) // lanes, -1), 0, 1)
+    return joint.solve_jointly(problem, of_starts, sigma, alone=not near, **common)
+
+
+def _common(settings: Settings, jobs: int, progress) -> dict[str, Any]:
+    """What all solvers are told."""
+    report = None if progress is None else lambda done: progress(done, jobs)
+    common = {"tolerances": settings.tolerances, "chunk": settings.chunk, "progress": report}
+    return common | {"dtype": np.float32 if settings.float32 else np.float64}
+
+
+def _known(problem: Problem, solved: Solved, sigma) -> tuple[Information, Information, int | None]:
+    """What each lane knows, what is known of the noise, and the unknowns that this is shared by.
+
+    By itself a lane knows its own noise; the lanes of a joint problem have it in common.
+    """
+    every = np.arange(len(solved.theta))
+    info = informations(problem, every, solved.theta, sigma)
+    if not problem.joint:
+        return info, info, None
+    alive = solved.status <= FitStatus.STALLED
+    pool = joint.pooled(problem, info, solved.theta, alive)
+    return info, pool, joint.unknown_count(problem, alive)
 
 
 def _noise_rounds(problem: Problem) -> int:
@@ -185,9 +232,20 @@ def _noise_rounds(problem: Problem) -> int:
 
 
 def first_sigma(problem: Problem) -> np.ndarray:
-    """Standard deviations to begin with: 1 where given, else 2 % of the peak; (lanes, 2)."""
+    """Standard deviations to begin with: 1 where given, else 2 % of the peak; (lanes, 2).
+
+    Of the lane's peak, or that of the study if it is fitted jointly.
+    """
     lanes = problem.lanes
-    peak = lambda v: np.maximum(np.abs(v).reshape(len(v), -1).max(axis=1), 1e-300)  # noqa: E731
+
+    def peak(v):
+        of_lane = np.maximum(np.abs(v).reshape(len(v), -1).max(axis=1), 1e-300)
+        return (
+            np.full(len(v), np.max(np.nan_to_num(of_lane, nan=1e-300)))
+            if problem.joint
+            else of_lane
+        )
+
     force = np.ones(len(lanes.s_c)) if problem.noise_given[0] else 0.02 * peak(lanes.force)
     joints = np.ones(len(lanes.s_c))
     if lanes.joints is not None and not problem.noise_given[1]:
@@ -195,13 +253,17 @@ def first_sigma(problem: Problem) -> np.ndarray:
     return np.stack([force, joints], axis=1)
 
 
-def next_sigma(problem: Problem, info: Information, sigma: np.ndarray) -> np.ndarray:
+def next_sigma(
+    problem: Problem, info: Information, sigma: np.ndarray, unknowns: int | None = None
+) -> np.ndarray:
     """Standard deviations from the residuals, where they are not given.
 
-    Mean square, less the share of the unknowns; with a robust loss 1.4826 times the median.
+    Mean square, less the share of the unknowns (`unknowns`, or those of each lane); with a robust
+    loss 1.4826 times the median.
     """
     total = info.counts.sum(axis=1, keepdims=True)
-    share = np.maximum(1 - problem.lanes.active.sum(axis=1)[:, None] / np.maximum(total, 1), 0.05)
+    own = problem.lanes.active.sum(axis=1)[:, None] if unknowns is None else unknowns
+    share = np.maximum(1 - own / np.maximum(total, 1), 0.05)
     with np.errstate(invalid="ignore", divide="ignore"):
         estimate = np.sqrt(info.squares / (info.counts * share))
         if problem.loss != "linear":
@@ -211,18 +273,25 @@ def next_sigma(problem: Problem, info: Information, sigma: np.ndarray) -> np.nda
     return np.where(keep, sigma, np.maximum(estimate, floor))
 
 
-def _conclude(problem, solved: Solved, info: Information, sigma, agree, tried) -> FitResult:
-    """Standard errors, intervals and final statuses of all lanes."""
+def _conclude(problem: Problem, solved: Solved, known, sigma, agree, tried) -> FitResult:
+    """Standard errors, intervals and final statuses of all lanes; `known`: see `_known`."""
     lanes, theta = problem.lanes, solved.theta
+    info, pool, unknowns = known
+    alive = solved.status <= FitStatus.STALLED
+    gradient = joint.summed_gradient(problem, info, alive) if problem.joint else info.gradient
     log, step = _scales(problem)
     both = lanes.joints is None or problem.noise_given[1]
-    at_bound = (theta <= lanes.lower) & (info.gradient > 0)
-    at_bound |= (theta >= lanes.upper) & (info.gradient < 0)
+    at_bound = (theta <= lanes.lower) & (gradient > 0)
+    at_bound |= (theta >= lanes.upper) & (gradient < 0)
     present = lanes.active > 0
     at_bound &= present
     held = at_bound | ~present
     relative = np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))
-    u = analyse(info, relative, held, noise_given=problem.noise_given[0] and both)
+    if problem.joint:
+        pool = joint.marginal(problem, pool, held, alive)
+        unknowns -= joint.held_count(problem, held, alive)
+    noise_given = problem.noise_given[0] and both
+    u = analyse(pool, relative, held, noise_given=noise_given, unknowns=unknowns)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         unscale = lambda v: np.where(present, np.where(log, np.exp(v), v * step), np.nan)  # noqa: E731
         value = unscale(theta)
@@ -232,13 +301,14 @@ def _conclude(problem, solved: Solved, info: Information, sigma, agree, tried) -
         lower, upper = unscale(theta - half), unscale(theta + half)
     unit = _precision_unit(problem)
     samples = np.sum(info.counts, axis=1)
-    status = _final_status(solved.status, u, at_bound, samples - np.sum(~held, axis=1))
+    left = np.sum(pool.counts, axis=1) - (np.sum(~held, axis=1) if unknowns is None else unknowns)
+    status = _final_status(solved.status, u, at_bound, left)
     return FitResult(
         problem=problem, theta=theta, value=value, standard_error=standard_error,
         lower=lower, upper=upper, relative_se=u.se / relative,
         at_bound=at_bound, status=status, iterations=solved.iterations, cost=solved.cost,
         converged_starts=agree, tried=tried, sigma=sigma * unit, rms=rms * unit, samples=samples,
-        criteria=criteria(problem, info),
+        criteria=criteria(problem, info, alive),
         uncertainty=tuple(Uncertainty(*row) for row in zip(*u, strict=True)),
     )  # fmt: skip
 

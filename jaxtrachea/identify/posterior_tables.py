@@ -8,6 +8,7 @@ import h5py
 
 from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.population import Population
 from jaxtrachea.identify.posterior import Posterior
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import parameter_rows
@@ -19,25 +20,25 @@ def rows_with_draws(
     result: FitResult,
     profiles: Profiles | None,
     resampled: Bootstrap | None,
+    population: Population | None,
     drawn: Posterior | None,
 ) -> Iterator[dict[str, Any]]:
     """`parameter_rows`, with the posterior where there is one."""
+    rows = parameter_rows(result, profiles, resampled, population)
+    if drawn is None:
+        yield from rows
+        return
     places = ((k, i) for k, unknowns in enumerate(result.problem.unknowns)
               for i in range(len(unknowns)))  # fmt: skip
-    for (lane, i), row in zip(places, parameter_rows(result, profiles, resampled), strict=True):
-        yield (
-            row
-            if drawn is None
-            else row
-            | {
-                "posterior_median": float(drawn.median[lane, i]),
-                "posterior_low95": float(drawn.lower[lane, i]),
-                "posterior_high95": float(drawn.upper[lane, i]),
-                "posterior_rhat": float(drawn.rhat[lane, i]),
-                "posterior_ess": float(drawn.ess[lane, i]),
-                "posterior_verdict": drawn.verdict(lane),
-            }
-        )
+    for (lane, i), row in zip(places, rows, strict=True):
+        yield row | {
+            "posterior_median": float(drawn.median[lane, i]),
+            "posterior_low95": float(drawn.lower[lane, i]),
+            "posterior_high95": float(drawn.upper[lane, i]),
+            "posterior_rhat": float(drawn.rhat[lane, i]),
+            "posterior_ess": float(drawn.ess[lane, i]),
+            "posterior_verdict": drawn.verdict(lane),
+        }
 
 
 def write_draws(path: Path, drawn: Posterior) -> None:

@@ -113,6 +113,7 @@ def curves_to_leave_out(problem: Problem) -> list[tuple[int, int]]:
         ValueError: no lane has two curves, or an unknown belongs to a trial (a curve left out could
             then not be predicted).
     """
+    problem.refuse_joint("leaving curves out")
     own = [p.name for p in problem.parameters if p.scope == "trial" and not p.fixed]
     if own:
         raise ValueError(

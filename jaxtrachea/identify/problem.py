@@ -1,9 +1,11 @@
 """From curves to a least-squares problem: lanes of padded arrays.
 
 A *lane* is the smallest set of curves that share unknowns: the whole study if any parameter is
-shared, one specimen otherwise, one trial if all free parameters belong to trials. Lanes have equal
-shapes (curves of unequal length are padded with weight zero), so that one compiled program fits any
-number of them at once. What they are compared with is in `residual`.
+shared, one specimen otherwise, one trial if all free parameters belong to trials. In a *joint*
+problem lanes are specimens although they share unknowns: every lane holds a copy of the shared
+ones, and the solver keeps the copies equal. Lanes have equal shapes (curves of unequal length are
+padded with weight zero), so that one compiled program fits any number of them at once. What they
+are compared with is in `residual`.
 """
 
 import dataclasses
@@ -74,6 +76,7 @@ class Problem:
         noise_given: whether sigma of (force, markers) is known.
         common: what all trials of a lane have in common, in every lane: `all` unknowns, the `beam`,
             or `nothing`.
+        joint: whether shared unknowns are one and the same in all lanes.
     """
 
     geometry: Geometry
@@ -86,6 +89,7 @@ class Problem:
     loss_scale: float
     noise_given: tuple[bool, bool]
     common: Common
+    joint: bool = False
 
     @property
     def free(self) -> tuple[Parameter, ...]:
@@ -103,6 +107,15 @@ class Problem:
         return self.lanes.lower.shape[1]
 
     @property
+    def shared(self) -> Int[np.ndarray, "lanes k"]:
+        """Where the unknowns that all lanes of a joint problem share stand in each lane."""
+        names = [p.name for p in self.free if p.scope == "shared"] if self.joint else []
+        rows = [{p.name: i for i, (p, _, _) in enumerate(lane)} for lane in self.unknowns]
+        return np.array([[row[name] for name in names] for row in rows], int).reshape(
+            len(self.unknowns), len(names)
+        )
+
+    @property
     def program(self) -> "Problem":
         """This problem without its data: the same object for all that compile to one program."""
         leaves, tree = jax.tree.flatten(self.geometry)
@@ -113,6 +126,15 @@ class Problem:
         )
         same = self.options, columns, self.loss, self.loss_scale, self.common
         return _program(tree, numbers, *same)
+
+    def refuse_joint(self, what: str) -> None:
+        """Say that something is made for lanes that are fitted one by one.
+
+        Raises:
+            ValueError: the problem is joint.
+        """
+        if self.joint:
+            raise ValueError(f"{what} needs lanes without shared unknowns; build with joint=False")
 
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Problem":
         """The same study with these lanes, in this order; a lane may come more than once."""
@@ -161,9 +183,11 @@ class Noise:
     joints: float | None = None
 
 
-def group(curves: Sequence[Curve], parameters: Sequence[Parameter]) -> list[list[Curve]]:
-    """Divide curves into lanes by the widest scope among the free parameters."""
-    scopes = {p.scope for p in parameters if not p.fixed}
+def group(
+    curves: Sequence[Curve], parameters: Sequence[Parameter], *, joint: bool = False
+) -> list[list[Curve]]:
+    """Divide curves into lanes by the widest scope among the free parameters; joint: specimens."""
+    scopes = {"specimen"} if joint else {p.scope for p in parameters if not p.fixed}
     if "shared" in scopes:
         return [list(curves)]
     lanes: dict[tuple[str, str], list[Curve]] = {}
@@ -184,6 +208,7 @@ def build(
     loss: str = "linear",
     loss_scale: float = 1.345,
     tool_radius: float | None = None,
+    joint: bool = False,
 ) -> Problem:
     """Put curves and parameters together.
 
@@ -198,6 +223,8 @@ def build(
         loss_scale: see `Problem`.
         tool_radius: mm; markers closer to the contact are held by the tool and left out. None: all
             are used.
+        joint: one lane per specimen even if parameters are shared; without effect if none is, or
+            if there is but one specimen.
 
     Raises:
         ValueError: no curve, no free parameter, a marker on a ring that does not exist, a curve
@@ -209,7 +236,9 @@ def build(
         raise ValueError("parameters: every parameter is fixed; free at least one")
     for curve in curves:
         check_curve(curve, geometry, options)
-    groups = group(curves, parameters)
+    joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
+    joint = joint and len({c.specimen for c in curves}) > 1
+    groups = group(curves, parameters, joint=joint)
     unknowns = [_unknowns(lane, parameters) for lane in groups]
     sizes = _Sizes(
         trials=max(map(len, groups)),
@@ -237,6 +266,7 @@ def build(
         loss_scale=loss_scale,
         noise_given=(known, noise.joints is not None),
         common=_common(unknowns, parameters),
+        joint=joint,
     )
 
 

@@ -120,8 +120,9 @@ def profiles(
         progress: called with (refits done since the last call, 0 for unknown in all).
 
     Raises:
-        ValueError: as `choose`.
+        ValueError: as `choose`, or a joint problem.
     """
+    result.problem.refuse_joint("a profile")
     lane, unknown = choose(result, names)
     sides = Sides(result, settings, lane.repeat(2), unknown.repeat(2), progress)
     distance, end, path = find_ends(sides)

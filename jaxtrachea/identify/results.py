@@ -6,7 +6,7 @@ import hashlib
 import json
 import platform
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
+from jaxtrachea.identify.population import Population
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.verdict import VERDICTS, describe_flat, verdict
 from jaxtrachea.status import FitStatus, ProfileEnd
@@ -136,15 +137,35 @@ def bad_row(bad: BadCurve) -> dict[str, object]:
     }
 
 
+def is_own(result: FitResult, lane: int, i: int) -> bool:
+    """Whether an unknown belongs to its lane alone, not to all lanes of a joint fit."""
+    return not (result.problem.joint and result.problem.unknowns[lane][i][0].scope == "shared")
+
+
+def said_before(result: FitResult, lanes: Sequence[int], lane: int, i: int) -> bool:
+    """Whether an unknown that all lanes share is listed with another of `lanes`, the first good."""
+    first = next((k for k in lanes if succeeded(result, k)), lanes[0])
+    return not is_own(result, lane, i) and lane != first
+
+
 def parameter_rows(
-    result: FitResult, profiles: Profiles | None = None, resampled: Bootstrap | None = None
+    result: FitResult,
+    profiles: Profiles | None = None,
+    resampled: Bootstrap | None = None,
+    population: Population | None = None,
 ) -> Iterator[dict[str, object]]:
-    """One row per lane and unknown for parameters.csv; more columns where there is more to say."""
+    """One row per lane and unknown for parameters.csv; more columns where there is more to say.
+
+    What the lanes of a joint fit share has one row, that of the first lane which succeeded.
+    """
+    every = range(result.lanes)
     for lane in range(result.lanes):
         lane_specimen, _ = result.problem.lane_name(lane)
         for i, (p, specimen, trial) in enumerate(result.problem.unknowns[lane]):
+            if said_before(result, every, lane, i):
+                continue
             row = {
-                "specimen": specimen or lane_specimen,
+                "specimen": (specimen or lane_specimen) if is_own(result, lane, i) else "(all)",
                 "trial": trial or "(all)",
                 "parameter": p.name,
                 "unit": p.unit,
@@ -155,7 +176,8 @@ def parameter_rows(
                 "relative_se": float(result.relative_se[lane, i]),
                 "verdict": verdict_of(result, lane, i, profiles),
             }
-            yield row | _profile_cells(profiles, lane, i) | _bootstrap_cells(resampled, lane, i)
+            row |= _profile_cells(profiles, lane, i) | _bootstrap_cells(resampled, lane, i)
+            yield row if population is None else row | population.shrunk_cells(lane, i)
 
 
 def _profile_cells(profiles: Profiles | None, lane: int, i: int) -> dict[str, object]:

@@ -270,7 +270,7 @@ def levenberg_marquardt(
     """
     total = len(jobs)
     chunk = chunk_size(total, chunk)
-    cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype)  # noqa: E731
+    cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype, copy=False)  # noqa: E731
     lanes = jax.tree.map(cast, problem.lanes)
     advance = _compiled(problem.program, tolerances, rounds)
     state = _idle(problem, lanes, chunk, dtype)

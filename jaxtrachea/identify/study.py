@@ -250,12 +250,41 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
     return dataclasses.replace(measurements, curves=tuple(good), bad=tuple(bad))
 
 
-def problem_of(spec: FitSpec, measurements: Measurements) -> Problem:
-    """Everything together.
+#: Unknowns up to which a study with shared parameters is refitted as one dense lane.
+MOST_DENSE = 500
+
+
+def problem_of(spec: FitSpec, measurements: Measurements, *, refits: bool = False) -> Problem:
+    """Everything together; parameters that are shared are fitted jointly, specimens as lanes.
+
+    What looks at whole lanes (profiles, bootstrap, posterior, influence, leaving out, design,
+    comparison) and methods other than
+    Levenberg-Marquardt get one dense lane in place of the joint problem.
+
+    Args:
+        spec: the specification.
+        measurements: what to fit.
+        refits: something that refits lanes was asked for outside the specification.
 
     Raises:
         SpecError: with the key, or the specimen and trial, that cannot be used.
     """
+    u = spec.uncertainty
+    asked = u.profile or u.bootstrap or u.posterior or u.influence
+    joint = not (refits or asked or spec.fit.method != "levenberg-marquardt")
+    problem = _built(spec, measurements, joint)
+    shared = [p.name for p in problem.free if p.scope == "shared"]
+    if shared and not joint and problem.size > MOST_DENSE:
+        raise SpecError(
+            f"parameters.{shared[0]}: shared, so that {problem.size} unknowns depend on each "
+            "other; profiles, bootstrap, posterior, influence, --leave-one-out, design, compare "
+            f"and methods other than levenberg-marquardt take at most {MOST_DENSE}; leave them out (the joint fit has no "
+            "limit), or give it the scope 'specimen'"
+        )
+    return problem
+
+
+def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Problem:
     options = Options(**spec.model.model_dump())
     curves = measurements.curves
     joints = any(c.joint_displacement is not None for c in curves)
@@ -272,6 +301,7 @@ def problem_of(spec: FitSpec, measurements: Measurements) -> Problem:
             loss=spec.fit.loss,
             loss_scale=spec.fit.loss_scale,
             tool_radius=spec.data.tool_radius,
+            joint=joint,
         )
     except SpecError:
         raise

@@ -153,7 +153,12 @@ class Uncertainty(NamedTuple):
 
 
 def analyse(
-    info: Information, relative: np.ndarray, held: np.ndarray, *, noise_given: bool
+    info: Information,
+    relative: np.ndarray,
+    held: np.ndarray,
+    *,
+    noise_given: bool,
+    unknowns: int | None = None,
 ) -> Uncertainty:
     """Turn the information of all lanes into standard errors and directions.
 
@@ -162,13 +167,14 @@ def analyse(
         relative: change of each scaled coordinate that makes a relative change of 1; (lanes, P).
         held: unknowns that are absent or on a bound; (lanes, P).
         noise_given: whether sigma is known, so that residuals do not scale the covariance.
+        unknowns: estimated from the `counts`, if more than those of one lane.
 
     Returns:
         One record whose arrays have the leading axis of lanes.
     """
     free = ~held
     total = np.sum(info.counts, axis=1)
-    dof = total - np.sum(free, axis=1)
+    dof = total - (np.sum(free, axis=1) if unknowns is None else unknowns)
     half = np.full(len(dof), 1.959963984540054)
     if not noise_given:
         half = np.where(dof > 0, stdtrit(np.maximum(dof, 1), 0.975), half)

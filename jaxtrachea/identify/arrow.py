@@ -1,0 +1,134 @@
+"""Normal equations of a joint fit: a block per lane, bordered by the unknowns that all lanes share.
+
+Written out, the matrix is an arrow, and its cost would grow with the cube of the lanes. Given the
+shared unknowns the lanes know nothing of each other: each eliminates its own and leaves a small
+Schur complement, whose sum determines the shared step (Triggs et al. 2000, sec. 6,
+doi:10.1007/3-540-44480-7_21). Everything is linear in the number of lanes, on the host, and summed
+in the order of the lanes.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+#: Eigenvalue, over the largest, of a lane's scaled matrix that counts as zero.
+_SINGULAR = 1e-14
+
+
+class Reduced(NamedTuple):
+    """Lanes after the elimination of their own unknowns; P unknowns each, k of them shared.
+
+    Attributes:
+        step: Newton step of a lane's own unknowns where the shared ones stay; 0 for those; (L, P).
+        follow: how all unknowns of a lane move with each shared one; (L, P, k).
+        gain: fall of each lane's cost by `step`, to second order; (L,).
+        gradient: of each lane's cost by the shared unknowns, its own following; (L, k).
+        hessian: Schur complement; (L, k, k).
+    """
+
+    step: Float[np.ndarray, "L P"]
+    follow: Float[np.ndarray, "L P k"]
+    gain: Float[np.ndarray, " L"]
+    gradient: Float[np.ndarray, "L k"]
+    hessian: Float[np.ndarray, "L k k"]
+
+
+def eliminate(
+    gradient: Float[np.ndarray, "L P"],
+    hessian: Float[np.ndarray, "L P P"],
+    shared: Int[np.ndarray, "L k"],
+    free: Bool[np.ndarray, "L P"],
+) -> Reduced:
+    """Eliminate every lane's own unknowns; directions that change nothing do not move.
+
+    Args:
+        gradient: of the lane's cost.
+        hessian: symmetric, not negative.
+        shared: where the shared unknowns stand in each lane.
+        free: unknowns that move; shared ones are not looked at.
+    """
+    tip = tips(shared, hessian.shape[1])
+    own = free & (tip.sum(axis=2) == 0)
+    inverse = pseudo_inverse(hessian, own)
+    step = -np.einsum("lpq,lq->lp", inverse, gradient)
+    follow = tip - inverse @ hessian @ tip
+    gain = -0.5 * np.sum(step * gradient * own, axis=1)
+    reduced = np.einsum("lpk,lp->lk", follow, gradient)
+    return Reduced(step, follow, gain, reduced, congruent(hessian, follow))
+
+
+def tips(shared: Int[np.ndarray, "L k"], size: int) -> Float[np.ndarray, "L size k"]:
+    """Columns that put shared unknowns into their places in every lane."""
+    return np.swapaxes(np.eye(size)[shared], 1, 2)
+
+
+def congruent(matrix: Float[np.ndarray, "L P P"], follow: Float[np.ndarray, "L P k"]):
+    """follow^T matrix follow of every lane, symmetric to the last digit; (L, k, k)."""
+    product = np.swapaxes(follow, 1, 2) @ matrix @ follow
+    return 0.5 * (product + np.swapaxes(product, 1, 2))
+
+
+def pseudo_inverse(
+    matrix: Float[np.ndarray, "L P P"], free: Bool[np.ndarray, "L P"]
+) -> Float[np.ndarray, "L P P"]:
+    """Inverse of the free block of each lane, 0 elsewhere and along directions without weight."""
+    diagonal = np.diagonal(matrix, axis1=1, axis2=2)
+    scale = np.where(free & (diagonal > 0), 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1)), 0)
+    scaled = matrix * scale[:, :, None] * scale[:, None]
+    values, vectors = np.linalg.eigh(scaled)
+    keep = values > _SINGULAR * np.maximum(values[:, -1:], 1e-300)
+    weight = np.where(keep, 1 / np.where(keep, values, 1), 0)
+    inverse = (vectors * weight[:, None]) @ np.swapaxes(vectors, 1, 2)
+    return inverse * scale[:, :, None] * scale[:, None]
+
+
+def within(
+    radius: float, gradient: Float[np.ndarray, " k"], hessian: Float[np.ndarray, "k k"]
+) -> Float[np.ndarray, " k"]:
+    """Minimum of the quadratic model in the ball of this radius.
+
+    Damping by bisection of its logarithm, in the coordinates where the matrix is diagonal.
+    """
+    values, vectors = np.linalg.eigh(hessian)
+    top = max(values[-1], 1e-300)
+    values = np.maximum(values, 0)
+    along = vectors.T @ gradient
+    step = lambda damping: -along / (values + damping)  # noqa: E731
+    low, high = np.log(_SINGULAR * top), np.log(top + np.linalg.norm(along) / radius)
+    if np.linalg.norm(step(np.exp(low))) > radius:
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            outside = np.linalg.norm(step(np.exp(middle))) > radius
+            low, high = (middle, high) if outside else (low, middle)
+        low = high
+    return vectors @ step(np.exp(low))
+
+
+def marginal(
+    bread: Float[np.ndarray, "L P P"],
+    meat: Float[np.ndarray, "L P P"],
+    shared: Int[np.ndarray, "L k"],
+    free: Bool[np.ndarray, "L P"],
+) -> tuple[Float[np.ndarray, "L P P"], Float[np.ndarray, "L P P"]]:
+    """Information of each lane's unknowns with those of all other lanes eliminated.
+
+    With A the returned first and B the second matrix of a lane, A^-1 B A^-1 is the lane's block of
+    the sandwich of the whole arrow, exactly: what other lanes know of the shared unknowns is the
+    sum of their Schur complements, and the scores of lanes are independent.
+
+    Args:
+        bread: of each lane by itself.
+        meat: of each lane by itself.
+        shared: where the shared unknowns stand in each lane.
+        free: unknowns that are not held on a bound.
+    """
+    reduced = eliminate(np.zeros(free.shape), bread, shared, free)
+    tip = tips(shared, free.shape[1])
+
+    def with_others(matrix):
+        schur = congruent(matrix, reduced.follow)
+        others = schur.sum(axis=0) - schur
+        return matrix + tip @ others @ np.swapaxes(tip, 1, 2)
+
+    return with_others(bread), with_others(meat)

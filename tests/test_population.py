@@ -1,0 +1,109 @@
+"""Population of specimens: closed forms, SciPy on the same likelihood, coverage by simulation."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.stats import chi2, multivariate_normal, t
+
+from jaxtrachea.identify.population import random_effects
+
+
+def draw(rng, m, tau, middle):
+    """Truths, estimates and their covariances, of unequal size and correlated."""
+    q = len(tau)
+    A = 0.12 * rng.normal(size=(m, q, q))
+    C = A @ np.swapaxes(A, 1, 2) + 0.003 * np.eye(q)
+    theta = middle + tau * rng.normal(size=(m, q))
+    error = np.einsum("mij,mj->mi", np.linalg.cholesky(C), rng.normal(size=(m, q)))
+    return theta, theta + error, C
+
+
+def test_balanced_one_way_layout():
+    """Equal variances c: tau^2 = s^2 - c, and everything else in closed form (Searle, ch. 3)."""
+    m, c = 9, 0.04
+    y = np.random.default_rng(0).normal(1.0, 0.5, (m, 1))
+    e = random_effects(y, np.full((m, 1, 1), c))
+    s2, mean = y.var(ddof=1), y.mean()
+    np.testing.assert_allclose(e.sd[0] ** 2, s2 - c, rtol=1e-9)
+    np.testing.assert_allclose([e.mean[0], e.mean_se[0]], [mean, np.sqrt(s2 / m)], rtol=1e-9)
+    se = s2 * np.sqrt(2 / (m - 1)) / (2 * e.sd[0])
+    np.testing.assert_allclose(e.sd_se[0], se, rtol=1e-9)
+    ends = np.sqrt(s2 * (m - 1) / chi2.ppf([0.975, 0.025], m - 1) - c)
+    np.testing.assert_allclose([e.sd_low[0], e.sd_high[0]], ends, rtol=1e-9)
+    pull = (s2 - c) / s2
+    np.testing.assert_allclose(e.shrunk, mean + pull * (y - mean), rtol=1e-9)
+    sd = np.sqrt(pull * c + (1 - pull) ** 2 * s2 / m)
+    np.testing.assert_allclose(e.shrunk_sd, sd, rtol=1e-9)
+
+
+def test_unequal_and_correlated_errors_against_scipy():
+    """The restricted likelihood written as a density of contrasts, maximised by SciPy."""
+    _, y, C = draw(np.random.default_rng(1), 7, np.array([0.3, 0.15]), np.array([1.0, -2.0]))
+    e = random_effects(y, C)
+    contrasts = np.kron(np.linalg.qr(np.ones((7, 1)), mode="complete")[0][:, 1:].T, np.eye(2))
+
+    def against(log_tau):
+        V = np.zeros((14, 14))
+        for i in range(7):
+            V[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = C[i] + np.diag(np.exp(2 * log_tau))
+        return -multivariate_normal.logpdf(contrasts @ y.ravel(), cov=contrasts @ V @ contrasts.T)
+
+    ends = {"xatol": 1e-10, "fatol": 1e-13}
+    best = minimize(against, np.log([0.2, 0.2]), method="Nelder-Mead", options=ends)
+    np.testing.assert_allclose(e.sd, np.exp(best.x), rtol=1e-6)
+    W = np.linalg.inv(C + np.diag(e.sd**2))
+    mean = np.linalg.solve(W.sum(0), np.einsum("mij,mj->i", W, y))
+    np.testing.assert_allclose(e.mean, mean, rtol=1e-9)
+
+
+def test_an_estimate_that_does_not_exist_says_nothing():
+    rng = np.random.default_rng(2)
+    _, y, C = draw(rng, 8, np.array([0.3, 0.3]), np.zeros(2))
+    C = C * np.eye(2)  # uncorrelated: each coordinate then stands by itself
+    known = np.ones((8, 2), bool)
+    known[3, 0] = False
+    e = random_effects(y, C, known)
+    alone = random_effects(np.delete(y[:, :1], 3, axis=0), np.delete(C[:, :1, :1], 3, axis=0))
+    np.testing.assert_allclose([e.sd[0], e.mean[0]], [alone.sd[0], alone.mean[0]], rtol=1e-5)
+    np.testing.assert_allclose(e.shrunk[3, 0], e.mean[0], rtol=1e-5)
+    with pytest.raises(ValueError, match="needs 3 specimens, found 2"):
+        random_effects(y, C, np.arange(8)[:, None] < [2, 8])
+
+
+def test_no_spread_beyond_the_errors():
+    """Estimates closer together than their errors: spread 0, everyone is the mean."""
+    y = np.array([[1.0], [1.1], [0.9], [1.05]])
+    e = random_effects(y, np.full((4, 1, 1), 0.25))
+    assert e.sd[0] == 0
+    assert np.isnan(e.sd_se[0])
+    assert e.sd_low[0] == 0 < e.sd_high[0]
+    np.testing.assert_allclose(e.shrunk, y.mean())
+    exact = random_effects(y, np.zeros((4, 1, 1)))
+    np.testing.assert_allclose(exact.sd[0], y.std(ddof=1))
+    np.testing.assert_allclose(exact.shrunk, y)
+
+
+def coverage(count, m):
+    """How often 95 % intervals hold: mean, spread, shrunk; bias of tau^2; squared errors ratio."""
+    tau, middle = np.array([0.3, 0.15]), np.array([1.0, -2.0])
+    rng, rows = np.random.default_rng(m), []
+    for _ in range(count):
+        theta, y, C = draw(rng, m, tau, middle)
+        e = random_effects(y, C)
+        mean = np.abs(e.mean - middle) < t.ppf(0.975, m - 1) * e.mean_se
+        spread = (e.sd_low <= tau) & (tau <= e.sd_high)
+        inside = np.mean(np.abs(e.shrunk - theta) < 1.96 * e.shrunk_sd, axis=0)
+        gain = np.mean((e.shrunk - theta) ** 2, 0) / np.mean((y - theta) ** 2, 0)
+        rows.append([mean, spread, inside, e.sd**2 / tau**2, gain])
+    return np.mean(rows, axis=0)
+
+
+def test_coverage_of_mean_and_spread():
+    mean, spread, inside, square, gain = coverage(200, 12)
+    # 95 % of 200: standard error 1.5 %.
+    assert np.all((mean > 0.89) & (mean < 0.995))
+    assert np.all((spread > 0.89) & (spread < 0.995))
+    # tau^2 is unbiased unless cut at zero; its standard error here is 4 %.
+    assert np.all(np.abs(square - 1) < 0.12)
+    assert np.all(inside > 0.82)
+    assert np.all(gain < 1)
