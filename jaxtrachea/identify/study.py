@@ -278,8 +278,8 @@ def problem_of(spec: FitSpec, measurements: Measurements, *, refits: bool = Fals
         raise SpecError(
             f"parameters.{shared[0]}: shared, so that {problem.size} unknowns depend on each "
             "other; profiles, bootstrap, posterior, influence, --leave-one-out, design, compare "
-            f"and methods other than levenberg-marquardt take at most {MOST_DENSE}; leave them out (the joint fit has no "
-            "limit), or give it the scope 'specimen'"
+            f"and methods other than levenberg-marquardt take at most {MOST_DENSE}; leave them out "
+            "(the joint fit has no limit), or give it the scope 'specimen'"
         )
     return problem
 
