@@ -245,12 +245,12 @@ def test_what_refits_single_lanes_is_refused(linear):
         fit(linear.problem, Settings(method="adam"))
 
 
-def skeleton_study(count, joint=True, noise=0.01, **settings):
+def skeleton_study(count, joint=True, **settings):
     """EI_L and k_M of all specimens one and the same, k_1 and k_3 their own."""
     truth = synthetic.draw(7, count, 1.3, np.array([300.0, 1.0, 0.5, 0.2]))
     truth[:, :2] = [300.0, 1.0]
     force, _ = synthetic.forces(truth)
-    sigma = noise * np.abs(force).max((1, 2), keepdims=True)
+    sigma = 0.01 * np.abs(force).max((1, 2), keepdims=True)
     force = force + sigma * np.random.default_rng(8).normal(size=force.shape)
     changes = {name: {"scope": "shared"} for name in ("EI_L", "k_M")}
     return force, synthetic.problem(force, changes=changes, joint=joint, **settings)
