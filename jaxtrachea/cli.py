@@ -1,7 +1,7 @@
 """The command line: the only room that turns errors into messages and exit codes.
 
 Exit codes: 0 everything converged, 1 some lane failed or some curve could not be used, 2 bad input,
-130 stopped by the user. What is heavy is imported inside the commands.
+3 another process was lost, 130 stopped by the user. What is heavy is imported inside the commands.
 """
 
 import dataclasses
@@ -15,8 +15,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jaxtrachea import __version__, cli_scene
-from jaxtrachea.terminal import Stop, complain, into, progress_bar, set_up_jax, table, to_stderr
+from jaxtrachea import __version__, cli_fit, cli_scene
+from jaxtrachea.terminal import (
+    Kept,
+    Stop,
+    complain,
+    into,
+    progress_bar,
+    set_up_jax,
+    table,
+    to_stderr,
+)
 
 app = typer.Typer(
     add_completion=False,
@@ -47,6 +56,9 @@ def main() -> None:
         code = app(prog_name="jaxtrachea", standalone_mode=False)
     except Stop as stop:
         code = complain(str(stop))
+    except Kept as stop:
+        to_stderr(str(stop))
+        sys.exit(stop.code)
     except typer.Exit as stop:
         code = stop.exit_code
     except (typer.Abort, KeyboardInterrupt):
@@ -99,21 +111,43 @@ def fit(
     out_dir: OutOption = None,
     leave_one_out: LeaveOption = False,
     profile: ProfileOption = False,
+    resume: cli_fit.ResumeOption = False,
+    rerun_failed: cli_fit.RerunOption = False,
+    force: cli_fit.ForceOption = False,
+    distributed: cli_fit.DistributedOption = False,
+    coordinator: cli_fit.CoordinatorOption = None,
+    processes: cli_fit.ProcessesOption = None,
+    process: cli_fit.ProcessOption = None,
+    patience: cli_fit.PatienceOption = 100.0,
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
+    from jaxtrachea.identify.study import settings_of
+
     clock = [time.perf_counter()]
+    meeting = cli_fit.meet(distributed, coordinator, processes, process, patience)
+    default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
+    how = cli_fit.How(out_dir, default, resume, rerun_failed, force, meeting)
+    cli_fit.check_options(how)
     loaded, measurements, problem = _load(spec, data)
+    asked = {"leave-one-out": leave_one_out, "profile": profile}
+    options = [name for name, wanted in asked.items() if wanted]
+    root = spec.parent if data is None else data
+    now = cli_fit.describe(how, spec, root, loaded, measurements, problem, options)
+    if meeting.process > 0:
+        cli_fit.help_out(how, now, problem, settings_of(loaded))
+        raise typer.Exit(0)
     if leave_one_out:
         _can_leave_out(problem)
     names = _names_to_profile(loaded, problem, profile)
     clock.append(time.perf_counter())
-    default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
-    with into(out_dir, default) as (folder, stop_if_asked):
-        found = _run(loaded, problem, leave_one_out, names, stop_if_asked)
+    with cli_fit.running(how, now, problem, settings_of(loaded)) as run:
+        names = _names_to_profile(loaded, problem, "profile" in run.options)
+        left_out = "leave-one-out" in run.options
+        found = _run(loaded, problem, run.settings, left_out, names, run.stop_if_asked, run.fit)
         clock.append(time.perf_counter())
-        _write(folder, spec, loaded, measurements, found, clock)
+        _write(run.folder, spec, loaded, measurements, found, clock, run.journal)
     result = found.result
-    _print_result(found, folder.parent)
+    _print_result(found, run.folder.parent)
     failed = any(not _succeeded(result, lane) for lane in range(result.lanes))
     raise typer.Exit(1 if failed or measurements.bad else 0)
 
@@ -122,7 +156,7 @@ def fit(
 def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = None) -> None:
     """Fit, then say where the next presses tell most."""
     from jaxtrachea.config import SpecError
-    from jaxtrachea.identify.study import candidates_of
+    from jaxtrachea.identify.study import candidates_of, settings_of
 
     loaded, measurements, problem = _load(spec, data)
     try:
@@ -131,7 +165,7 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
         raise Stop(f"{spec}: {error}") from None
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}-design"
     with into(out_dir, default) as (folder, stop_if_asked):
-        found = _run(loaded, problem, False, (), stop_if_asked)
+        found = _run(loaded, problem, settings_of(loaded), False, (), stop_if_asked)
         try:
             rows = _design(folder, loaded, found, candidates)
         except ValueError as error:
@@ -230,14 +264,15 @@ class _Found:
     resampled: Any
 
 
-def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked) -> _Found:
+def _run(
+    spec, problem, settings, leave_out: bool, profile: tuple[str, ...], stop_if_asked, fit=None
+) -> _Found:
+    """Fit, by `fit` if given, then what needs a fit; all with `settings`."""
     from jaxtrachea.identify.bootstrap import bootstrap
-    from jaxtrachea.identify.fit import fit as run_fit
+    from jaxtrachea.identify.fit import fit as in_one_go
     from jaxtrachea.identify.predictions import leave_one_out
     from jaxtrachea.identify.profile import profiles
-    from jaxtrachea.identify.study import settings_of
 
-    settings = settings_of(spec)
     with progress_bar() as bar:
 
         def counted(text):
@@ -249,7 +284,7 @@ def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked
 
             return advance
 
-        result = run_fit(problem, settings, counted("fitting"))
+        result = (fit or in_one_go)(problem, settings, counted("fitting"))
         left_out = profiled = resampled = None
         if leave_out:
             left_out = leave_one_out(problem, settings, counted("leaving curves out"))
@@ -265,7 +300,7 @@ def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked
         return _Found(result, left_out, profiled, resampled)
 
 
-def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock) -> None:
+def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock, journal) -> None:
     """All files of one run; `clock`: when reading began, ended, and the fit ended."""
     import json
 
@@ -295,7 +330,7 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
     timings = {name: ends[i + 1] - ends[i] for i, name in enumerate(phases)}
     made = results.provenance(
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
-    )
+    ) | {"run": journal}
     results.write_hdf5(folder / "results.h5", result, made, profiles, resampled)
     results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
 

@@ -189,7 +189,8 @@ class FitSection(Section):
     seed: int = Field(0, ge=0, lt=2**63)
     max_iterations: int = Field(200, ge=1, le=1_000_000)
     tolerance: float = Field(1e-10, gt=0, lt=0.1)
-    chunk: int = Field(128, ge=1, le=1_000_000)
+    chunk: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = "auto"
+    save_every: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = "auto"
     precision: Literal["float64", "float32"] = "float64"
 
 

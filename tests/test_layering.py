@@ -24,8 +24,8 @@ ORDER = [
     {"scene"},
     {"report"},
     {"plots", "viewer", "study"},
-    {"terminal"},
-    {"cli_scene"},
+    {"terminal", "processes"},
+    {"cli_scene", "cli_fit"},
     {"cli"},
     {"__main__"},
 ]
