@@ -209,8 +209,7 @@ def running(how: How, now, problem, settings) -> Iterator[Run]:
                 check()
             run_folder.commit(run)
         except BaseException as error:
-            alone = how.meeting.processes == 1
-            kept = run_folder.abandon(run) if alone else run.chunks.is_dir()
+            kept = run_folder.abandon(run, shared=how.meeting.processes > 1)
             if kept and isinstance(error, KeyboardInterrupt | Lost | OSError):
                 raise _kept(how, run, problem, error) from None
             raise

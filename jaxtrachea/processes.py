@@ -111,7 +111,8 @@ class Watch:
         thread.start()
         try:
             yield self
-            self._say(DONE)
+            if self._said == WORKING:
+                self._say(DONE)
         except BaseException:
             with contextlib.suppress(OSError):
                 self._say(FAILED)

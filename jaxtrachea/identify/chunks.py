@@ -154,7 +154,7 @@ def load(path: Path, run: str, lanes: np.ndarray, problem: Problem) -> FitResult
         problem: of these lanes.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         mine = arrays.pop("run") == run and np.array_equal(arrays.pop("lanes"), lanes)
         return result_of(problem, arrays) if mine else None

@@ -193,10 +193,15 @@ def complete(target: Path) -> bool:
     return True
 
 
-def abandon(run: RunFolder) -> bool:
-    """Clear up after a run that was stopped; returns whether anything of it is kept."""
+def abandon(run: RunFolder, *, shared: bool = False) -> bool:
+    """Clear up after a run that was stopped; returns whether anything of it is kept.
+
+    Args:
+        run: that was stopped.
+        shared: other processes may be at work in it.
+    """
     shutil.rmtree(run.staging, ignore_errors=True)
-    if run.finished():
+    if shared or run.finished():
         return True
     shutil.rmtree(run.chunks, ignore_errors=True)
     for folder in run.made:
