@@ -31,7 +31,7 @@ PatienceOption = Annotated[
     float, typer.Option("--patience", min=1.0, help="Silent seconds till one is lost.")
 ]
 
-#: What a run takes to compute chunks: run, problem, settings, chunks, progress.
+#: Called with (jobs finished since the last call, jobs in all).
 Progress = Callable[[int, int], None]
 
 
