@@ -1,7 +1,7 @@
 """The command line: the only room that turns errors into messages and exit codes.
 
 Exit codes: 0 everything converged, 1 some lane failed or some curve could not be used, 2 bad input,
-130 stopped by the user. What is heavy is imported inside the commands.
+3 another process was lost, 130 stopped by the user. What is heavy is imported inside the commands.
 """
 
 import dataclasses
@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jaxtrachea import __version__, cli_compare, cli_scene
+from jaxtrachea import __version__, cli_compare, cli_fit, cli_scene
 from jaxtrachea.cli_load import load
-from jaxtrachea.terminal import Stop, complain, into, progress_bar, table, to_stderr
+from jaxtrachea.terminal import Kept, Stop, complain, into, progress_bar, table, to_stderr
 
 app = typer.Typer(
     add_completion=False,
@@ -51,6 +51,9 @@ def main() -> None:
         code = app(prog_name="jaxtrachea", standalone_mode=False)
     except Stop as stop:
         code = complain(str(stop))
+    except Kept as stop:
+        to_stderr(str(stop))
+        sys.exit(stop.code)
     except typer.Exit as stop:
         code = stop.exit_code
     except (typer.Abort, KeyboardInterrupt):
@@ -105,23 +108,44 @@ def fit(
     leave_one_out: LeaveOption = False,
     profile: ProfileOption = False,
     influence: InfluenceOption = False,
+    resume: cli_fit.ResumeOption = False,
+    rerun_failed: cli_fit.RerunOption = False,
+    force: cli_fit.ForceOption = False,
+    distributed: cli_fit.DistributedOption = False,
+    coordinator: cli_fit.CoordinatorOption = None,
+    processes: cli_fit.ProcessesOption = None,
+    process: cli_fit.ProcessOption = None,
+    patience: cli_fit.PatienceOption = 100.0,
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
+    from jaxtrachea.identify.study import settings_of
+
     clock = [time.perf_counter()]
-    loaded, measurements, problem = load(spec, data, refits=leave_one_out or profile or influence)
+    meeting = cli_fit.meet(distributed, coordinator, processes, process, patience)
+    default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
+    how = cli_fit.How(out_dir, default, resume, rerun_failed, force, meeting)
+    cli_fit.check_options(how)
+    asked = {"leave-one-out": leave_one_out, "profile": profile, "influence": influence}
+    options = [name for name, wanted in asked.items() if wanted]
+    loaded, measurements, problem = load(spec, data, refits=bool(options))
+    root = spec.parent if data is None else data
+    now = cli_fit.describe(how, spec, root, loaded, measurements, problem, options)
+    if meeting.process > 0:
+        cli_fit.help_out(how, now, problem, settings_of(loaded))
+        raise typer.Exit(0)
     if leave_one_out:
         _can_leave_out(problem)
     names = _names_to_profile(spec, loaded, problem, profile)
     if loaded.uncertainty.posterior:
         _can_draw(spec)
     clock.append(time.perf_counter())
-    default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
-    with into(out_dir, default) as (folder, stop_if_asked):
-        found = _run(loaded, problem, leave_one_out, names, stop_if_asked, influence)
+    with cli_fit.running(how, now, problem, settings_of(loaded)) as run:
+        names = _names_to_profile(spec, loaded, problem, "profile" in run.options)
+        found = _run(loaded, problem, run.settings, run.options, names, run.stop_if_asked, run.fit)
         clock.append(time.perf_counter())
-        _write(folder, spec, loaded, measurements, found, clock)
+        _write(run.folder, spec, loaded, measurements, found, clock, run.journal)
     result = found.result
-    _print_result(found, folder.parent)
+    _print_result(found, run.folder.parent)
     failed = any(not _succeeded(result, lane) for lane in range(result.lanes))
     raise typer.Exit(1 if failed or measurements.bad else 0)
 
@@ -130,7 +154,7 @@ def fit(
 def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = None) -> None:
     """Fit, then say where the next presses tell most."""
     from jaxtrachea.config import SpecError
-    from jaxtrachea.identify.study import candidates_of
+    from jaxtrachea.identify.study import candidates_of, settings_of
 
     loaded, measurements, problem = load(spec, data, refits=True)
     try:
@@ -141,7 +165,7 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
         _can_draw(spec)
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}-design"
     with into(out_dir, default) as (folder, stop_if_asked):
-        found = _run(loaded, problem, False, (), stop_if_asked)
+        found = _run(loaded, problem, settings_of(loaded), (), (), stop_if_asked)
         try:
             rows = _design(folder, loaded, found, candidates)
         except ValueError as error:
@@ -221,17 +245,17 @@ class _Found:
     population: Any = None
 
 
-def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked, influence=False):
-    """Fit, and what was asked for besides."""
+def _run(
+    spec, problem, settings, options, profile: tuple[str, ...], stop_if_asked, fit=None
+) -> _Found:
+    """Fit, by `fit` if given, then what needs a fit; all with `settings`."""
     from jaxtrachea.identify.bootstrap import bootstrap
-    from jaxtrachea.identify.fit import fit as run_fit
+    from jaxtrachea.identify.fit import fit as in_one_go
     from jaxtrachea.identify.influence import influence as diagnose
     from jaxtrachea.identify.posterior import posterior as draw
     from jaxtrachea.identify.predictions import leave_one_out
     from jaxtrachea.identify.profile import profiles
-    from jaxtrachea.identify.study import settings_of
 
-    settings = settings_of(spec)
     with progress_bar() as bar:
 
         def counted(text):
@@ -243,9 +267,9 @@ def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked
 
             return advance
 
-        result = run_fit(problem, settings, counted("fitting"))
+        result = (fit or in_one_go)(problem, settings, counted("fitting"))
         left_out = profiled = resampled = None
-        if leave_out:
+        if "leave-one-out" in options:
             left_out = leave_one_out(problem, settings, counted("leaving curves out"))
         if profile:
             points, report = spec.uncertainty.profile_points, counted("profiling")
@@ -256,7 +280,7 @@ def _run(spec, problem, leave_out: bool, profile: tuple[str, ...], stop_if_asked
                 result, settings, count=u.bootstrap, kind=u.kind, block=u.block,
                 progress=counted("resampling"),
             )  # fmt: skip
-        wanted = influence or u.influence
+        wanted = u.influence or "influence" in options
         found = diagnose(result, settings.chunk) if wanted else None
         drawn = None
         if u.posterior:
@@ -281,7 +305,7 @@ def _population(spec, result):
         return None
 
 
-def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock) -> None:
+def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock, journal) -> None:
     """All files of one run; `clock`: when reading began, ended, and the fit ended."""
     import json
 
@@ -319,7 +343,7 @@ def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock)
     timings = {name: ends[i + 1] - ends[i] for i, name in enumerate(phases)}
     made = results.provenance(
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
-    )
+    ) | {"run": journal}
     results.write_hdf5(folder / "results.h5", result, made, profiles, resampled)
     if found.posterior is not None:
         write_draws(folder / "results.h5", found.posterior)

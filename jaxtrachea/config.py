@@ -185,7 +185,8 @@ class FitSection(Section):
     more_starts: int = Field(8, ge=0, le=10_000)
     max_iterations: int = Field(200, ge=1, le=1_000_000)
     tolerance: float = Field(1e-10, gt=0, lt=0.1)
-    chunk: int = Field(128, ge=1, le=1_000_000)
+    chunk: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = "auto"
+    save_every: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = "auto"
     precision: Literal["float64", "float32"] = "float64"
     population: bool | None = None
 

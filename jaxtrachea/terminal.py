@@ -19,6 +19,15 @@ class Stop(Exception):
     """Bad input: end the command with a message and exit code 2."""
 
 
+class Kept(Exception):
+    """Stopped, with something kept: end with a message and an exit code of its own."""
+
+    def __init__(self, message: str, code: int = 130):
+        """Say what is kept; `code` 130: stopped by the user, 3: another process was lost."""
+        super().__init__(message)
+        self.code = code
+
+
 def to_stderr(text: str) -> None:
     """One line on stderr, in rich's markup."""
     Console(stderr=True).print(text, highlight=False, soft_wrap=True)

@@ -263,16 +263,13 @@ def test_leaving_out_needs_common_parameters(study, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("error", "code"), [(KeyboardInterrupt(), 130), (RuntimeError("a bug"), None)]
 )
-@pytest.mark.parametrize("where", ["identify.fit.fit", "plots.draw_all"])
-def test_stopped_run_leaves_nothing(where, error, code, out, study, monkeypatch, capsys):
-    import jaxtrachea.plots  # noqa: F401
-
+def test_stopped_run_leaves_nothing(error, code, out, study, monkeypatch, capsys):
     def stop(*arguments):
         raise error
 
     (study / "there").mkdir()
     monkeypatch.chdir(study)
-    monkeypatch.setattr(f"jaxtrachea.{where}", stop)
+    monkeypatch.setattr("jaxtrachea.identify.fit.fit", stop)
     before = tree(study)
     arguments = ("fit", "spec.toml", "--out", out)
     if code is None:

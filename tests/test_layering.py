@@ -25,9 +25,9 @@ ORDER = [
     {"scene"},
     {"report"},
     {"plots", "sections", "viewer", "study"},
-    {"terminal"},
+    {"terminal", "processes"},
     {"cli_load"},
-    {"cli_scene", "cli_compare"},
+    {"cli_scene", "cli_compare", "cli_fit"},
     {"cli"},
     {"__main__"},
 ]

@@ -23,6 +23,8 @@ from jaxtrachea.status import FitStatus, ProfileEnd
 
 SCHEMA = "jaxtrachea-results"
 SCHEMA_VERSION = 1
+#: Fields of `Uncertainty` in the group of that name; the others stand with lanes and unknowns.
+MORE = ("se", "flat_se", "blind", "half_width", "along", "dispersion")
 
 
 def unknown_label(result: FitResult, lane: int, i: int) -> str:
@@ -258,6 +260,10 @@ def write_hdf5(
         file.attrs["provenance"] = json.dumps(provenance)
         _write_lanes(file.create_group("lanes"), result)
         _write_unknowns(file.create_group("unknowns"), result)
+        group = file.create_group("uncertainty")
+        for name in MORE:
+            rows = np.stack([getattr(u, name) for u in result.uncertainty])
+            group.create_dataset(name, data=rows, compression="gzip")
         if profiles is not None:
             _write_profiles(file.create_group("profiles"), profiles)
         if resampled is not None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxtrachea.config import EvenRings, FitSpec, ParameterSection, SpecError, TracheaSection
+from jaxtrachea.identify.chunks import MOST_SEATS
 from jaxtrachea.identify.design import Candidates, check, grid
 from jaxtrachea.identify.fit import Settings
 from jaxtrachea.identify.measurements import (
@@ -348,7 +349,7 @@ def candidates_of(spec: FitSpec, problem: Problem) -> Candidates:
 
 
 def settings_of(spec: FitSpec) -> Settings:
-    """Solver settings of the [fit] section."""
+    """Solver settings of the [fit] section; `chunk` is its upper bound if left to the machine."""
     f = spec.fit
     limits = Tolerances(f.tolerance, f.tolerance, f.tolerance, f.max_iterations)
     return Settings(
@@ -357,7 +358,7 @@ def settings_of(spec: FitSpec) -> Settings:
         decades=f.start_decades,
         seed=f.seed,
         more_starts=f.more_starts,
-        chunk=f.chunk,
+        chunk=MOST_SEATS if f.chunk == "auto" else f.chunk,
         tolerances=limits,
         float32=f.precision == "float32",
     )

@@ -1,0 +1,77 @@
+"""A fit read back from its results.h5, with the journal of its run."""
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from jaxtrachea.identify import journal as journals
+from jaxtrachea.identify.chunks import FIELDS, result_of
+from jaxtrachea.identify.criteria import Criteria
+from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.problem import Problem
+from jaxtrachea.identify.results import MORE, SCHEMA, SCHEMA_VERSION
+from jaxtrachea.identify.run_folder import NoRun
+from jaxtrachea.identify.uncertainty import Uncertainty
+from jaxtrachea.status import FitStatus
+
+
+def read_hdf5(path: Path, problem: Problem) -> FitResult:
+    """Read the fit back from results.h5, bit for bit.
+
+    Args:
+        path: written by `results.write_hdf5`.
+        problem: what was fitted.
+
+    Raises:
+        NoRun: the file is no such file, or of another problem.
+    """
+    try:
+        with h5py.File(path) as file:
+            if (file.attrs["schema"], file.attrs["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
+                raise ValueError("another schema")
+            found: dict[str, np.ndarray] = {}
+            file.visititems(lambda name, item: _keep(found, name, item))
+    except (OSError, KeyError, ValueError) as error:
+        raise NoRun(f"{path} cannot be read back ({error})") from None
+    try:
+        arrays = {name: found[_place(found, name)] for name in FIELDS}
+        arrays |= {f"criteria.{name}": found[f"lanes/{name}"] for name in Criteria._fields}
+        for name in Uncertainty._fields:
+            place = f"uncertainty/{name}" if name in MORE else _place(found, name)
+            arrays[f"uncertainty.{name}"] = found[place]
+        arrays["status"] = arrays["status"].astype(int)
+        return result_of(problem, arrays)
+    except (KeyError, ValueError) as error:
+        raise NoRun(f"{path} is of another study or version ({error})") from None
+
+
+def _keep(found: dict[str, np.ndarray], name: str, item: object) -> None:
+    if isinstance(item, h5py.Dataset):
+        found[name] = item[()]
+
+
+def _place(found: dict[str, np.ndarray], name: str) -> str:
+    """Where an array of the fit lies."""
+    return f"lanes/{name}" if f"lanes/{name}" in found else f"unknowns/{name}"
+
+
+def read_journal(path: Path) -> journals.Journal:
+    """The journal of the run that wrote a results.h5.
+
+    Raises:
+        NoRun: there is none.
+    """
+    try:
+        with h5py.File(path) as file:
+            return journals.from_dict(json.loads(str(file.attrs["provenance"]))["run"])
+    except (OSError, KeyError, ValueError) as error:
+        raise NoRun(f"{path} tells nothing of its run ({error})") from None
+
+
+def failed_lanes(result: FitResult) -> list[int]:
+    """Lanes that the solver failed at: where other starts may help."""
+    hopeless = (FitStatus.BAD_DATA, FitStatus.TOO_FEW_DATA)
+    statuses = [FitStatus(int(status)) for status in result.status]
+    return [k for k, s in enumerate(statuses) if not s.succeeded and s not in hopeless]

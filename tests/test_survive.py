@@ -1,0 +1,388 @@
+"""Runs that are stopped, damaged, moved or shared: the numbers are those of a run in peace."""
+
+import dataclasses
+import json
+import shutil
+import signal
+import socket
+import time
+
+import h5py
+import jax
+import numpy as np
+import pytest
+from interrupted import finish, kill_often, numbers, start, wait_for, write_study
+from run_cli import run, tree
+
+import jaxtrachea
+from jaxtrachea import cli, processes
+from jaxtrachea.config import load_fit_spec
+from jaxtrachea.identify import chunks, fit, former, in_chunks, run_folder, solve
+from jaxtrachea.identify.study import problem_of, read_data
+from jaxtrachea.processes import Lost, Meeting, Watch
+from jaxtrachea.terminal import set_up_jax
+
+FIT = ("fit", "spec.toml", "--out", "out")
+
+
+@pytest.fixture(scope="module")
+def peace(tmp_path_factory):
+    """A study of 9 lanes in 3 chunks, fitted without interruption; all its files, as text."""
+    folder = tmp_path_factory.mktemp("peace")
+    write_study(folder, 9, 3)
+    with pytest.MonkeyPatch.context() as patch:
+        quietly(patch, folder)
+        patch.setattr("sys.argv", ["jaxtrachea", *FIT])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+    assert stop.value.code == 0
+    return folder
+
+
+def quietly(patch, folder):
+    """Work in `folder`, without plots."""
+    patch.chdir(folder)
+    patch.setattr("jaxtrachea.plots.draw_all", lambda *_: None)
+
+
+@pytest.fixture
+def study(peace, tmp_path, monkeypatch):
+    """The same study, not yet fitted."""
+    for name in ("curves.csv", "spec.toml"):
+        shutil.copy(peace / name, tmp_path)
+    quietly(monkeypatch, tmp_path)
+    return tmp_path
+
+
+def stop_at(patch, k, error=KeyboardInterrupt):
+    """Let fits before the k-th through, stop that one; counts them in the list it returns."""
+    asked, real = [], fit.fit
+
+    def stopping(problem, settings, progress):
+        asked.append(problem.lanes.lower.shape[0])
+        if len(asked) == k:
+            raise error
+        return real(problem, settings, progress)
+
+    patch.setattr("jaxtrachea.identify.fit.fit", stopping)
+    return asked
+
+
+def test_stopped_and_resumed(peace, study, monkeypatch, capsys):
+    """Ctrl-C in the third chunk, a damaged chunk, and on: two chunks anew, numbers as in peace."""
+    with monkeypatch.context() as patch:
+        stop_at(patch, 3)
+        code, _, err = run(patch, capsys, *FIT)
+    assert code == 130
+    assert "2 of 3 chunks are kept in out" in err
+    assert "--out out --resume" in err
+    assert "nothing was written" not in err
+    so_far = (study / "out" / run_folder.SO_FAR).read_text().splitlines()
+    assert so_far == (peace / "out" / "summary.csv").read_text().splitlines()[:7]
+    code, _, err = run(monkeypatch, capsys, *FIT)
+    assert (code, "go on with --resume" in err) == (2, True)
+    path = study / "out" / ".run" / "00001.npz"
+    path.write_bytes(path.read_bytes()[:-500])
+    again = stop_at(monkeypatch, -1)
+    code, _, err = run(monkeypatch, capsys, *FIT, "--resume")
+    assert code == 0, err
+    assert "damaged, fitted again: 00001.npz" in err
+    assert "1 of 3 chunks are there" in err
+    assert again == [3, 3]
+    assert numbers(study / "out") == numbers(peace / "out")
+    assert sorted(tree(study / "out")) == sorted(tree(peace / "out"))
+
+
+def test_an_error_while_files_are_written_keeps_the_chunks(peace, study, monkeypatch, capsys):
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "jaxtrachea.plots.draw_all", lambda *_: (_ for _ in ()).throw(OSError(28, ""))
+        )
+        code, _, err = run(patch, capsys, *FIT)
+    assert (code, "3 of 3 chunks are kept" in err) == (2, True)
+    monkeypatch.setattr("jaxtrachea.identify.fit.fit", None)
+    assert run(monkeypatch, capsys, *FIT, "--resume")[0] == 0
+    assert numbers(study / "out") == numbers(peace / "out")
+
+
+def test_stopped_while_files_move(peace, study, monkeypatch, capsys):
+    """From the renaming on nothing is computed again, and nothing is lost."""
+    shutil.copytree(peace / "out", study / "out" / ".written")
+    (study / "out" / ".run").mkdir()
+    (study / "out" / ".written" / "summary.csv").replace(study / "out" / "summary.csv")
+    monkeypatch.setattr("jaxtrachea.identify.fit.fit", None)
+    code, _, err = run(monkeypatch, capsys, *FIT, "--resume")
+    assert (code, "out is finished" in err) == (0, True)
+    assert tree(study / "out") == tree(peace / "out")
+
+
+def changed_spec(folder):
+    path = folder / "spec.toml"
+    path.write_text(path.read_text().replace("starts = 2", "starts = 3"))
+
+
+def changed_dtype(folder):
+    path = folder / "spec.toml"
+    path.write_text(path.read_text() + 'precision = "float32"\n')
+
+
+def changed_input(folder):
+    path = folder / "curves.csv"
+    path.write_text(path.read_text().replace("T0000,0,30,0.1,", "T0000,0,30,0.11,"))
+
+
+def fewer_lanes(folder):
+    path = folder / "curves.csv"
+    rows = path.read_text().splitlines()
+    path.write_text("\n".join(row for row in rows if not row.startswith("T0008")) + "\n")
+
+
+CHANGES = {
+    "specification": (changed_spec, ["the specification has changed", "--force"]),
+    "dtype": (changed_dtype, ["dtype was float64 and is float32"]),
+    "input": (changed_input, ["curves.csv has changed", "another --out"]),
+    "another study": (fewer_lanes, ["lanes was 9 and is 8", "the run there is of another study"]),
+}
+
+
+def test_refusals(peace, study, monkeypatch, capsys):
+    """Unfinished and finished runs of something else; nothing is touched, one line says why."""
+
+    def refused(*arguments, says):
+        before = tree(study)
+        code, _, err = run(monkeypatch, capsys, *arguments)
+        assert (code, len(err.splitlines())) == (2, 1), err
+        for words in says:
+            assert words in err
+        assert tree(study) == before
+
+    refused(*FIT, "--resume", says=["out holds no unfinished run"])
+    refused("fit", "spec.toml", "--resume", says=["--out"])
+    refused(*FIT, "--force", says=["--force goes with --resume"])
+    refused(*FIT, "--process", 1, says=["--coordinator, --processes and --process"])
+    with monkeypatch.context() as patch:
+        stop_at(patch, 2)
+        assert run(patch, capsys, *FIT)[0] == 130
+    shutil.copytree(peace / "out", study / "finished")
+    monkeypatch.setattr("jaxtrachea.identify.fit.fit", None)
+    refused(*FIT, "--rerun-failed", says=["not finished; use --resume first"])
+    for change, says in CHANGES.values():
+        kept = {p.name: p.read_text() for p in (study / "spec.toml", study / "curves.csv")}
+        change(study)
+        refused(*FIT, "--resume", says=says)
+        for option in ("--resume", "--rerun-failed"):
+            refused(*FIT[:3], "finished", option, says=["finished is finished, and", says[0]])
+        for name, text in kept.items():
+            (study / name).write_text(text)
+    with monkeypatch.context() as patch:
+        patch.setattr(jaxtrachea, "__version__", "99")
+        refused(*FIT, "--resume", says=["jaxtrachea was 0", "and is 99"])
+    (study / "out" / ".run" / "run.json").write_text("{")
+    refused(*FIT, "--resume", says=["its journal cannot be read"])
+
+
+def test_force_goes_on_and_says_so(study, monkeypatch, capsys):
+    with monkeypatch.context() as patch:
+        stop_at(patch, 2)
+        assert run(patch, capsys, *FIT)[0] == 130
+    changed_input(study)
+    again = stop_at(monkeypatch, -1)
+    assert run(monkeypatch, capsys, *FIT, "--resume", "--force")[0] == 0
+    assert again == [3, 3]
+    made = json.loads((study / "out" / "provenance.json").read_text())
+    assert made["run"]["forced"] == ["curves.csv has changed"]
+
+
+def test_failed_lanes_are_fitted_again(peace, study, monkeypatch, capsys):
+    """Lanes 1 and 5 are made to fail; the rerun gives them an estimate and touches no other bit."""
+    shutil.copytree(peace / "out", study / "out")
+    set_failed(study / "out" / "results.h5", [1, 5])
+    before = tree(study / "out")
+    with monkeypatch.context() as patch:
+        stop_at(patch, 1)
+        assert run(patch, capsys, *FIT, "--rerun-failed")[0] == 130
+    assert tree(study / "out") == before
+    seen = []
+    real = fit.fit
+
+    def fit_and_tell(problem, settings, progress):
+        seen.append((problem.lanes.lower.shape[0], settings.starts, settings.seed))
+        return real(problem, settings, progress)
+
+    monkeypatch.setattr("jaxtrachea.identify.fit.fit", fit_and_tell)
+    code, _, err = run(monkeypatch, capsys, *FIT, "--rerun-failed")
+    assert code == 0, err
+    assert seen == [(2, 8, 1)]
+    old, new = numbers(peace / "out"), numbers(study / "out")
+    for name in ("lanes/status", "lanes/specimen"):
+        assert new[name] == old[name]
+    shapes = np.frombuffer(old["unknowns/value"]).reshape(9, -1)
+    found = np.frombuffer(new["unknowns/value"]).reshape(9, -1)
+    others = [k for k in range(9) if k not in (1, 5)]
+    assert np.array_equal(found[others], shapes[others])
+    np.testing.assert_allclose(found[[1, 5]], shapes[[1, 5]], rtol=1e-6)
+    code, _, err = run(monkeypatch, capsys, *FIT, "--rerun-failed")
+    assert (code, "no lane of out failed" in err) == (0, True)
+
+
+def set_failed(path, lanes):
+    """Let a results.h5 say that lanes did not converge."""
+    with h5py.File(path, "r+") as file:
+        file["lanes/status"][lanes] = 3
+        file["unknowns/value"][lanes] = 7.0
+
+
+def load_peace(peace):
+    set_up_jax()
+    spec = load_fit_spec(peace / "spec.toml")
+    return problem_of(spec, read_data(spec, peace))
+
+
+def test_results_are_read_back_bit_for_bit(peace, tmp_path):
+    """What write_hdf5 and save wrote comes back; damaged, foreign and truncated chunks do not."""
+    problem = load_peace(peace)
+    result = former.read_hdf5(peace / "out" / "results.h5", problem)
+    lanes, path = np.arange(9), tmp_path / "0.npz"
+    chunks.save(path, "me", lanes, result)
+    found = chunks.load(path, "me", lanes, problem)
+    assert found is not None
+    expected = chunks.arrays_of(result)
+    for name, array in chunks.arrays_of(found).items():
+        assert array.dtype == expected[name].dtype
+        assert array.tobytes() == expected[name].tobytes(), name
+    parts = [chunks.load(path, "me", lanes, problem) for _ in range(2)]
+    assert chunks.join(problem.take(np.tile(lanes, 2)), parts).lanes == 18
+    assert chunks.load(path, "another", lanes, problem) is None
+    assert chunks.load(path, "me", lanes[::-1], problem) is None
+    whole = path.read_bytes()
+    for length in np.linspace(0, len(whole) - 1, 40).astype(int):
+        path.write_bytes(whole[:length])
+        assert chunks.load(path, "me", lanes, problem) is None
+    middle = len(whole) // 2
+    path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+    assert chunks.load(path, "me", lanes, problem) is None
+    with pytest.raises(run_folder.NoRun, match="another study"):
+        former.read_hdf5(peace / "out" / "results.h5", problem.take(lanes[:8]))
+
+
+def test_sizes_of_chunks(peace):
+    """Equal chunks; fewer lanes together where lanes are long or memory is short."""
+    assert [len(c) for c in chunks.divide(10, 4)] == [4, 3, 3]
+    assert np.array_equal(np.concatenate(chunks.divide(1000, 7)), np.arange(1000))
+    problem = load_peace(peace)
+    assert chunks.lanes_per_chunk(problem, 2) == 4096
+    long = dataclasses.replace(
+        problem, lanes=problem.lanes._replace(force=np.zeros((1, 2, 100_000)))
+    )
+    assert chunks.lanes_per_chunk(long, 4) == 5
+    each = chunks.bytes_per_seat(problem)
+    assert [chunks.seats(problem, m) for m in (0.0, 2.1 * each, 65.0 * each, 1e12)] == [
+        *(1, 1, 32, 128)
+    ]
+    assert chunks.free_memory() > 1e6
+
+
+@pytest.mark.slow
+def test_memory_of_a_lane_is_what_xla_counts(peace):
+    """The estimate bounds XLA's own figure, by at most a factor of 3."""
+    problem, count = load_peace(peace), 32
+    lanes = jax.tree.map(lambda v: np.repeat(v[:1], count, axis=0), problem.lanes)
+    state = solve._idle(problem, problem.lanes, count, np.float64)
+    step = solve._compiled(problem.program, solve.Tolerances(), 4)
+    starts, sigma = np.zeros((count, problem.size)), np.ones((count, 2))
+    lowered = step.lower(lanes, sigma, starts, np.ones(count, bool), state)
+    used = lowered.compile().memory_analysis()
+    total = used.temp_size_in_bytes + used.argument_size_in_bytes
+    assert total / count <= chunks.bytes_per_seat(problem) <= 3 * total / count
+
+
+def test_devices_share_the_work_and_its_end():
+    """Each item once; an error on one device ends the others after the item they are at."""
+    device, done = jax.local_devices()[0], []
+    in_chunks._on_devices(done.append, list(range(20)), [device] * 3)
+    assert sorted(done) == list(range(20))
+
+    def fail(k):
+        done.append(k)
+        time.sleep(0.01)
+        if k == 3:
+            raise OSError("full")
+
+    done.clear()
+    with pytest.raises(OSError, match="full"):
+        in_chunks._on_devices(fail, list(range(100)), [device] * 3)
+    assert len(done) < 20
+
+
+def test_processes_notice_each_other(tmp_path):
+    """One that is through is waited for no longer; a silent one and one that failed are lost."""
+    meetings = [Meeting(k, 2, "s", 1.0) for k in range(2)]
+    first, second = (Watch(tmp_path, m) for m in meetings)
+    assert processes.opened(tmp_path, meetings[1]) is None
+    with first.watching(todo=[1, 2]):
+        assert processes.opened(tmp_path, meetings[1])["todo"] == [1, 2]
+        with second.watching():
+            second.done()
+            first.wait_for_others()
+    silent = Watch(tmp_path, Meeting(0, 3, "s", 1.0))
+    with pytest.raises(Lost, match="process 2 has been silent for 1 s"), silent.watching():
+        silent.wait_for_others()
+    with pytest.raises(Lost, match="process 0 stopped early"), Watch(
+        tmp_path, Meeting(2, 3, "s", 9.0)
+    ).watching() as third:  # fmt: skip
+        third.wait_for(0)
+
+
+def test_no_cluster_is_said(study):
+    code, _, err = finish(start(study, *FIT, "--distributed"))
+    assert code == 2
+    assert "no cluster found" in err
+    assert "give --coordinator" in err
+    assert not (study / "out").exists()
+
+
+@pytest.mark.slow
+def test_killed_runs_give_the_same_numbers(tmp_path):
+    kill_often(tmp_path, 2)
+
+
+def two(folder, *arguments):
+    """The same command in two processes that meet on a free port."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    meeting = ("--coordinator", f"127.0.0.1:{port}", "--processes", "2", "--process")
+    return [start(folder, *arguments, *meeting, k) for k in range(2)]
+
+
+@pytest.mark.slow
+def test_two_processes_and_two_devices(peace, study):
+    found = [finish(p) for p in two(study, *FIT)]
+    assert [code for code, _, _ in found] == [0, 0], found
+    assert numbers(study / "out") == numbers(peace / "out")
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    code, _, err = finish(start(study, *FIT[:3], "devices", **flags))
+    assert code == 0, err
+    assert numbers(study / "devices") == numbers(peace / "out")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_lost_process_ends_the_other(lost, tmp_path):
+    """Exit code 3 and a clear line within the patience; one process goes on alone."""
+    write_study(tmp_path, 60, 3)
+    pair = two(tmp_path, *FIT, "--patience", 5)
+    there = lambda: any((tmp_path / "out" / ".run").glob("*.npz"))  # noqa: E731
+    wait_for(there, pair[lost])
+    pair[lost].send_signal(signal.SIGKILL)
+    since = time.monotonic()
+    code, _, err = finish(pair[1 - lost])
+    assert time.monotonic() - since < 20
+    finish(pair[lost])
+    assert code == 3, err
+    assert f"process {lost} has been silent for 5 s; it is lost" in err
+    assert "--resume" in err
+    assert "Traceback" not in err
+    code, _, err = finish(start(tmp_path, *FIT, "--resume"))
+    assert code == 0, err
+    assert "of 20 chunks are there" in err
