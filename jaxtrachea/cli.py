@@ -4,11 +4,10 @@ Exit codes: 0 everything converged, 1 some lane failed or some curve could not b
 3 another process was lost, 130 stopped by the user. What is heavy is imported inside the commands.
 """
 
-import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -17,7 +16,8 @@ from rich.table import Table
 
 from jaxtrachea import __version__, cli_compare, cli_fit, cli_scene
 from jaxtrachea.cli_load import load
-from jaxtrachea.terminal import Kept, Stop, complain, into, progress_bar, table, to_stderr
+from jaxtrachea.cli_run import run, show, write
+from jaxtrachea.terminal import Kept, Stop, complain, into, table, to_stderr
 
 app = typer.Typer(
     add_completion=False,
@@ -118,6 +118,7 @@ def fit(
     patience: cli_fit.PatienceOption = 100.0,
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
+    from jaxtrachea.identify.results import succeeded
     from jaxtrachea.identify.study import settings_of
 
     clock = [time.perf_counter()]
@@ -139,14 +140,15 @@ def fit(
     if loaded.uncertainty.posterior:
         _can_draw(spec)
     clock.append(time.perf_counter())
-    with cli_fit.running(how, now, problem, settings_of(loaded)) as run:
-        names = _names_to_profile(spec, loaded, problem, "profile" in run.options)
-        found = _run(loaded, problem, run.settings, run.options, names, run.stop_if_asked, run.fit)
+    with cli_fit.running(how, now, problem, settings_of(loaded)) as under:
+        names = _names_to_profile(spec, loaded, problem, "profile" in under.options)
+        found = run(
+            loaded, problem, under.settings, under.options, names, under.stop_if_asked, under.fit
+        )
         clock.append(time.perf_counter())
-        _write(run.folder, spec, loaded, measurements, found, clock, run.journal)
-    result = found.result
-    _print_result(found, run.folder.parent)
-    failed = any(not _succeeded(result, lane) for lane in range(result.lanes))
+        write(under.folder, spec, loaded, measurements, found, clock, under.journal)
+    show(found, under.folder.parent)
+    failed = any(not succeeded(found.result, lane) for lane in range(found.result.lanes))
     raise typer.Exit(1 if failed or measurements.bad else 0)
 
 
@@ -165,7 +167,7 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
         _can_draw(spec)
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}-design"
     with into(out_dir, default) as (folder, stop_if_asked):
-        found = _run(loaded, problem, settings_of(loaded), (), (), stop_if_asked)
+        found = run(loaded, problem, settings_of(loaded), (), (), stop_if_asked)
         try:
             rows = _design(folder, loaded, found, candidates)
         except ValueError as error:
@@ -230,167 +232,6 @@ def _names_to_profile(path: Path, spec, problem, asked: bool) -> tuple[str, ...]
         return profiled(spec, problem, asked=asked)
     except SpecError as error:
         raise Stop(f"{path}: {error}") from None
-
-
-@dataclasses.dataclass(frozen=True)
-class _Found:
-    """What a run has computed; None: not asked for."""
-
-    result: Any
-    left_out: Any
-    profiles: Any
-    resampled: Any
-    influence: Any = None
-    posterior: Any = None
-    population: Any = None
-
-
-def _run(
-    spec, problem, settings, options, profile: tuple[str, ...], stop_if_asked, fit=None
-) -> _Found:
-    """Fit, by `fit` if given, then what needs a fit; all with `settings`."""
-    from jaxtrachea.identify.bootstrap import bootstrap
-    from jaxtrachea.identify.fit import fit as in_one_go
-    from jaxtrachea.identify.influence import influence as diagnose
-    from jaxtrachea.identify.posterior import posterior as draw
-    from jaxtrachea.identify.predictions import leave_one_out
-    from jaxtrachea.identify.profile import profiles
-
-    with progress_bar() as bar:
-
-        def counted(text):
-            task = bar.add_task(text, total=None)
-
-            def advance(done, of):
-                stop_if_asked()
-                bar.update(task, advance=done, total=of or None)
-
-            return advance
-
-        result = (fit or in_one_go)(problem, settings, counted("fitting"))
-        left_out = profiled = resampled = None
-        if "leave-one-out" in options:
-            left_out = leave_one_out(problem, settings, counted("leaving curves out"))
-        if profile:
-            points, report = spec.uncertainty.profile_points, counted("profiling")
-            profiled = profiles(result, settings, profile, points=points, progress=report)
-        u = spec.uncertainty
-        if u.bootstrap:
-            resampled = bootstrap(
-                result, settings, count=u.bootstrap, kind=u.kind, block=u.block,
-                progress=counted("resampling"),
-            )  # fmt: skip
-        wanted = u.influence or "influence" in options
-        found = diagnose(result, settings.chunk) if wanted else None
-        drawn = None
-        if u.posterior:
-            drawn = draw(
-                result, draws=u.posterior, chains=u.posterior_chains, seed=spec.fit.seed,
-                progress=counted("drawing"),
-            )  # fmt: skip
-        specimens = _population(spec, result)
-        return _Found(result, left_out, profiled, resampled, found, drawn, specimens)
-
-
-def _population(spec, result):
-    """The specimens as a sample, or None with a word why not if it was asked for."""
-    from jaxtrachea.identify.population import population, wanted
-
-    if not wanted(spec.fit.population, result):
-        return None
-    try:
-        return population(result)
-    except ValueError as error:
-        to_stderr(f"[yellow]no population:[/] {escape(str(error))}")
-        return None
-
-
-def _write(folder: Path, spec: Path, loaded, measurements, found: _Found, clock, journal) -> None:
-    """All files of one run; `clock`: when reading began, ended, and the fit ended."""
-    import json
-
-    import jax
-
-    from jaxtrachea import report
-    from jaxtrachea.identify import results
-    from jaxtrachea.identify.population import population_rows
-    from jaxtrachea.identify.posterior_tables import rows_with_draws, write_draws
-    from jaxtrachea.identify.predictions import predictions
-    from jaxtrachea.plots import draw_all
-    from jaxtrachea.sections import write_more
-    from jaxtrachea.webpage import page
-
-    result, profiles, resampled = found.result, found.profiles, found.resampled
-    seen = predictions(result.problem, result.theta)
-    rows = [*results.lane_rows(result, profiles), *map(results.bad_row, measurements.bad)]
-    results.write_csv(folder / "summary.csv", rows)
-    found_rows = rows_with_draws(result, profiles, resampled, found.population, found.posterior)
-    results.write_csv(folder / "parameters.csv", list(found_rows))
-    if found.population is not None:
-        results.write_csv(folder / "population.csv", list(population_rows(found.population)))
-    if profiles is not None:
-        results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
-    drawn = draw_all(folder, result, seen, profiles)
-    left = None if found.left_out is None else report.left_out_rows(result, found.left_out)
-    title = loaded.title or spec.stem
-    more = write_more(folder, found.influence, found.posterior)
-    text = report.report_text(
-        title, result, measurements.bad, seen, left, profiles, resampled, more, found.population
-    )
-    results.write_text(folder / "report.md", text)
-    ends = [*clock, time.perf_counter()]
-    phases = ("read", "fit", "write")
-    timings = {name: ends[i + 1] - ends[i] for i, name in enumerate(phases)}
-    made = results.provenance(
-        spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
-    ) | {"run": journal}
-    results.write_hdf5(folder / "results.h5", result, made, profiles, resampled)
-    if found.posterior is not None:
-        write_draws(folder / "results.h5", found.posterior)
-    results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
-    pictures = {path.name: path.read_bytes() for path in drawn}
-    results.write_text(folder / "report.html", page(text, pictures, made))
-
-
-def _succeeded(result, lane: int) -> bool:
-    from jaxtrachea.identify.results import succeeded
-
-    return succeeded(result, lane)
-
-
-def _print_result(found: _Found, folder: Path) -> None:
-    from jaxtrachea import report
-    from jaxtrachea.identify.results import lane_label, verdict_sentence
-
-    out, result = Console(), found.result
-    lanes = range(result.lanes)
-    if result.lanes <= report.ONE_BY_ONE:
-        rows = report.estimate_rows(result, lanes, found.profiles)
-        out.print(table("Estimates", report.ESTIMATE_HEAD, rows))
-        out.print(table("Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)))
-        if found.profiles is not None:
-            rows = report.profile_table(found.profiles, lanes)
-            out.print(table("Profile likelihood", report.PROFILE_HEAD, rows))
-        if found.resampled is not None:
-            rows = report.bootstrap_table(found.resampled, lanes)
-            out.print(table("Bootstrap", report.BOOTSTRAP_HEAD, rows))
-        for lane in lanes:
-            text = f"{lane_label(result, lane)}: {verdict_sentence(result, lane, found.profiles)}"
-            out.print(escape(text), highlight=False)
-    else:
-        out.print(
-            table(
-                "Estimates over lanes",
-                report.SPREAD_HEAD,
-                report.spread_rows(result, found.profiles),
-            )
-        )
-        if found.population is not None:
-            rows = report.population_table(found.population)
-            out.print(table("Population", report.POPULATION_HEAD, rows))
-        good = sum(_succeeded(result, lane) for lane in lanes)
-        out.print(f"{good} of {result.lanes} lanes succeeded")
-    out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)
 
 
 def _curve_table(curves) -> Table:

@@ -26,7 +26,7 @@ ORDER = [
     {"report"},
     {"plots", "sections", "viewer", "study"},
     {"terminal", "processes"},
-    {"cli_load"},
+    {"cli_load", "cli_run"},
     {"cli_scene", "cli_compare", "cli_fit"},
     {"cli"},
     {"__main__"},
