@@ -40,8 +40,9 @@ class Numpy:
     and Jacobian share what they can.
     """
 
-    def __init__(self, rings, length: float):
+    def __init__(self, rings, length: float, spots=SPOTS, depths=DEPTHS):
         """Spectrum of the flexibility of the unsupported beam (EI = 1)."""
+        self.depths = depths
 
         def green(x, s):
             low, high = np.minimum(x, s), np.maximum(x, s)
@@ -50,12 +51,12 @@ class Numpy:
 
         eigenvalues, vectors = np.linalg.eigh(green(rings[:, None], rings[None]))
         self.eigenvalues = eigenvalues
-        self.direct = green(SPOTS, SPOTS)
-        self.squares = (green(SPOTS[:, None], rings[None]) @ vectors) ** 2
+        self.direct = green(spots, spots)
+        self.squares = (green(spots[:, None], rings[None]) @ vectors) ** 2
         self.force, self.seen = None, None
 
     def load(self, force):
-        """Take the measured forces of a specimen, (4, 50)."""
+        """Take the measured forces of a specimen, (positions, points)."""
         self.force, self.seen = force, None
 
     def parts(self, theta):
@@ -70,7 +71,7 @@ class Numpy:
         by_k = (self.squares @ (weight * weight))[:, None] * (-rho / EI)
         stiffening, cubic = 1 + c * k_1, c * k_3
         p = np.sqrt(stiffening / (3 * abs(cubic)))
-        q = (0.5 / (abs(cubic) * p**3)) * DEPTHS
+        q = (0.5 / (abs(cubic) * p**3)) * self.depths
         if k_3 > 0:
             d = 2 * p * np.sinh(np.arcsinh(q) / 3)
         else:
@@ -82,16 +83,16 @@ class Numpy:
         return self.kept
 
     def value(self, theta):
-        """Model - data, (200,)."""
+        """Model - data, (positions * points,)."""
         return (self.parts(theta)[4] - self.force).ravel()
 
     def jacobian(self, theta):
-        """(200, 4)."""
+        """(positions * points, 4)."""
         c, by_k, d, d2, force, k_1, k_3 = self.parts(theta)
         slope = k_1 + 3 * k_3 * d2
         share = 1 / (1 + c * slope)
         by_c = -slope * force * share
-        J = np.empty((4, 4, len(DEPTHS)))
+        J = np.empty((4, len(c), len(self.depths)))
         J[1] = by_c * by_k
         J[0] = -by_c * c - J[1]
         share *= d
@@ -100,22 +101,25 @@ class Numpy:
         return J.reshape(4, -1).T
 
 
-def study():
-    """The problem of the library, and the forces (specimens, 4, 50)."""
+def study(specimens=SPECIMENS, spots=SPOTS, depths=DEPTHS):
+    """The problem of the library, and the forces (specimens, positions, points)."""
     rng = np.random.default_rng(11)
     geometry = table_1(np.float64)
-    truths = np.array([100.0, 1.0, 1.0, 0.01]) * np.exp(0.2 * rng.standard_normal((SPECIMENS, 4)))
-    model = Numpy(np.asarray(geometry.ring_positions), 160.0)
-    model.load(np.zeros((4, 50)))
+    truths = np.array([100.0, 1.0, 1.0, 0.01]) * np.exp(0.2 * rng.standard_normal((specimens, 4)))
+    model, shape = (
+        Numpy(np.asarray(geometry.ring_positions), 160.0, spots, depths),
+        (len(spots), len(depths)),
+    )
+    model.load(np.zeros(shape))
     curves = []
-    forces = np.zeros((SPECIMENS, 4, 50))
+    forces = np.zeros((specimens, *shape))
     for i, truth in enumerate(truths):
         theta = np.append(np.log(truth[:3]), truth[3] / STEP_K_3)
-        clean = model.value(theta).reshape(4, 50)
+        clean = model.value(theta).reshape(shape)
         peak = clean.max(axis=1, keepdims=True)
-        forces[i] = clean + 0.005 * peak * rng.standard_normal((4, 50))
-        for spot, force in zip(SPOTS, forces[i], strict=True):
-            curves.append(Curve(f"s{i:04d}", f"{spot:g}", spot, 0.0, DEPTHS, force))
+        forces[i] = clean + 0.005 * peak * rng.standard_normal(shape)
+        for spot, force in zip(spots, forces[i], strict=True):
+            curves.append(Curve(f"s{i:05d}", f"{spot:g}", spot, 0.0, depths, force))
     options = Options()
     parameters = default_parameters(in_model(options, joints=False), {})
     return build(curves, geometry, options, parameters), model, forces
