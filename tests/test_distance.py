@@ -200,11 +200,16 @@ def test_hard_cases(dtype, scale):
         assert law[i](normals[i]), (name, normals[i])
         assert c.status[i] in (ContactStatus.OK, ContactStatus.FLAT), (name, c.status[i])
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=ROUNDING[dtype])
-    # Moving B along the normal opens the gap by as much; forward and reverse agree.
-    np.testing.assert_allclose(gradient[:, 3:], c.normal, atol=50 * ROUNDING[dtype])
-    np.testing.assert_allclose(
-        jacobian[0], gradient, atol=50 * ROUNDING[dtype] * float(np.max(gradient) + 1)
-    )
+    # Moving B along the normal opens the gap by as much; forward and reverse agree. Where many
+    # normals are right, float32 may take another one in the derivative than in the value.
+    one = [dtype == "float64" or v.__qualname__.startswith("along") for v in law]
+    reverse, forward = np.asarray(gradient, float), np.asarray(jacobian[0], float)
+    np.testing.assert_allclose(reverse[one, 3:], normals[one], atol=50 * ROUNDING[dtype])
+    for i, name in enumerate(HARD):
+        assert law[i](reverse[i, 3:]), (name, reverse[i])
+        assert law[i](forward[i, 3:]), (name, forward[i])
+    rounding = 50 * ROUNDING[dtype] * float(np.max(reverse) + 1)
+    np.testing.assert_allclose(forward[one], reverse[one], atol=rounding)
 
 
 # ---------------------------------------------------------------- closed forms

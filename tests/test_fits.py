@@ -58,7 +58,8 @@ def folder(tmp_path_factory):
 def test_run_writes_every_file_and_the_plots_decode(folder):
     names = {p.name for p in folder.iterdir()}
     assert names == {
-        *("results.h5", "summary.csv", "parameters.csv", "report.md", "provenance.json"),
+        *("results.h5", "summary.csv", "parameters.csv", "report.md", "report.html"),
+        "provenance.json",
         *("fit.png", "residuals.png", "correlation.png"),
     }
     for path in folder.glob("*.png"):

@@ -42,7 +42,8 @@ def peace(tmp_path_factory):
 def quietly(patch, folder):
     """Work in `folder`, without plots."""
     patch.chdir(folder)
-    patch.setattr("jaxtrachea.plots.draw_all", lambda *_: None)
+    patch.setattr("jaxtrachea.plots.draw_all", lambda *_: [])
+    patch.setattr("jaxtrachea.webpage.page", lambda *_: "")
 
 
 @pytest.fixture
