@@ -5,6 +5,7 @@ import statistics
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
+SUITES = ("skeleton", "update", "fitting", "cohort", "joint", "startup")
 DOCUMENT = FOLDER.parents[1] / "docs" / "benchmarks.md"
 
 
@@ -156,6 +157,37 @@ def fitting_section(rows: list[dict], goals: list[list[str]]) -> str:
     return "\n".join([FITTING, table([*head, "missed", "first call s"], lines)])
 
 
+def cohort_section(rows: list[dict], goals: list[list[str]]) -> str:
+    """Tables of cohort.jsonl: fits a second, and the command from file to plots."""
+    serial = [r for r in rows if r["table"] == "cohort"]
+    lines = [[r["case"], number(1e6 / microseconds(r)[0]), *map(number, microseconds(r))]
+             for r in serial]  # fmt: skip
+    for r in serial[1:]:
+        name = f"cohort fits against {r['case']}"
+        goals.append([name, "-", quoted(r, serial[0]), "-"])
+    (told,) = (r for r in rows if r["table"] == "command")
+    seconds = ", ".join(f"{name} {number(v)} s" for name, v in told["seconds"].items())
+    after = (
+        f"`jaxtrachea fit` on the same data, {told['case'].split(', ')[1]}: "
+        f"{number(told['samples'][0])} s ({seconds}), peak memory {told['peak_MB']:,} MB, "
+        f"{told['output_MB']} MB of results. "
+        f"Peak of the process above: {serial[0]['peak_MB']:,} MB.\n"
+    )
+    head = ["solver", "fits/s", "median µs per fit", "min"]
+    return "\n".join([COHORT, table(head, lines), after])
+
+
+def joint_section(rows: list[dict]) -> str:
+    """Table of joint.jsonl: processor time per specimen."""
+    lines = [
+        [f"{r['lanes']:,}", r["how"], number(1e3 * r["cpu"] / r["lanes"]),
+         number(1e-3 * microseconds(r)[0]), str(r["iterations"]), f"{r['peak_MB']:,}"]
+        for r in rows
+    ]  # fmt: skip
+    head = ["specimens", "", "processor ms per specimen", "median ms", "iterations", "peak MB"]
+    return "\n".join([JOINT, table(head, lines)])
+
+
 def startup_section(rows: list[dict]) -> str:
     """Table of startup.jsonl, in seconds."""
     lines = [
@@ -223,6 +255,14 @@ compiled to some 125 small kernels in a row; that their starts cost more than th
 likely reason, since 256 poses together pay 7 to 10 µs each for contact and skeleton.
 Slow calls come to all rows, the C loop included: the core is shared.
 """
+COHORT = """\
+The same model, truths and start with five positions of 200 points: 10,000 specimens in one batch of
+ours, 20 by each serial solver, in turn.
+"""
+JOINT = """\
+EI_L and k_M shared by all specimens, k_1 and k_3 of each its own; four positions of 50 points, two
+starts. *dense*: the study as one lane.
+"""
 FITTING = """\
 Four parameters (EI_L, k_M, k_1, k_3) from 4 contact positions × 50 points, noise 0.5 % of the peak;
 truths log-normal (20 %) around (100, 1, 1, 0.01), start (10, 0.1, 1, 0.01). Ours fits 2,000
@@ -238,7 +278,7 @@ the compilation.
 
 def document() -> str:
     """The whole page."""
-    suites = {name: read(name) for name in ("skeleton", "update", "fitting", "startup")}
+    suites = {name: read(name) for name in SUITES}
     goals: list[list[str]] = []
     parts = [
         skeleton_section(suites["skeleton"][1], goals),
@@ -246,6 +286,10 @@ def document() -> str:
         update_section(suites["update"][1], goals),
         "## Fits\n",
         fitting_section(suites["fitting"][1], goals),
+        "## Cohort\n",
+        cohort_section(suites["cohort"][1], goals),
+        "## Joint fits\n",
+        joint_section(suites["joint"][1]),
         "## Import and compilation\n",
         startup_section(suites["startup"][1]),
     ]
