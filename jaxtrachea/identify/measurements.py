@@ -170,7 +170,7 @@ def _sniff(path: Path) -> str:
 
 
 def _sniff_hdf5(path: Path) -> str:
-    with opened(path) as file:
+    with opened(path, audit=False) as file:
         if "schema" in file.attrs:
             return "hdf5"
         if any(name.isdecimal() for name in file):
