@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from jaxtrachea.scene.plan import Plan as Plan
     from jaxtrachea.scene.plan import PlanError as PlanError
     from jaxtrachea.scene.plan import Wishes as Wishes
+    from jaxtrachea.scene.session import Session as Session
     from jaxtrachea.scene.simulation import Simulation as Simulation
     from jaxtrachea.scene.simulation import simulate as simulate
     from jaxtrachea.scene.simulation import sweep as sweep
@@ -52,6 +53,7 @@ _HOME = {
     "model": ("Options", "Press", "press"),
     "oblique": ("ObliquePath", "ObliquePress", "press_oblique", "press_path"),
     "scene.plan": ("Plan", "PlanError", "Wishes"),
+    "scene.session": ("Session",),
     "scene.simulation": ("Simulation", "simulate", "sweep"),
     "scene.stage": ("Poses", "Presses", "Scene", "make_scene", "with_geometry"),
     "skeleton": ("Skeleton", "skeleton_response"),

@@ -40,6 +40,7 @@ SCENE = [
     {"approach"},
     {"deform"},
     {"simulation"},
+    {"session"},
     {"build", "results"},
     {"plots"},
 ]

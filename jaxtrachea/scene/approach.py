@@ -33,23 +33,34 @@ class Approach(NamedTuple):
 def approach(scene: Scene, path: Poses) -> Approach:
     """Let the tool touch the tube at rest, and say what it does to the place it touches."""
     seen = touch_tube(scene, path)
-    inward = jax.vmap(lambda phi: local_frame(phi)[0])(seen.phi)
-    frame = None
-    if scene.plan.curved and scene.tube is not None:
-        line = scene.tube.line
-        frame = jax.vmap(lambda s: frame_at(line, s))(seen.s)
     if scene.plan.seat == "each":
+        inward, frame = _directions(scene, seen)
         presses = Presses(seen.s, seen.phi, -seen.gap[:, None] * inward)
         return Approach(seen, presses, inward, None, frame)
-    rows = seen.gap.shape[0]
     touching = seen.gap < 0
     first = jnp.where(jnp.any(touching), jnp.argmax(touching), jnp.argmin(seen.gap))
+    return seated(scene, path, seen, first)
+
+
+def seated(scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""]) -> Approach:
+    """The path as presses on the place that row `first` touches."""
+    inward, frame = _directions(scene, seen)
+    rows = seen.gap.shape[0]
     D = followed(path, seen, first, at_row(inward, first), None if frame is None else frame[first])
     if scene.plan.options.contact == "bonded":
         D = jnp.where((jnp.arange(rows) >= first)[:, None], D, 0)
     spread = lambda v: jnp.broadcast_to(at_row(v, first), v.shape)  # noqa: E731
     presses = Presses(spread(seen.s), spread(seen.phi), D)
     return Approach(seen, presses, spread(inward), first, None if frame is None else spread(frame))
+
+
+def _directions(scene: Scene, seen: Touch):
+    """Inward normal of the straight tube at every contact, and the frame of the centreline."""
+    inward = jax.vmap(lambda phi: local_frame(phi)[0])(seen.phi)
+    if not scene.plan.curved or scene.tube is None:
+        return inward, None
+    line = scene.tube.line
+    return inward, jax.vmap(lambda s: frame_at(line, s))(seen.s)
 
 
 def backed_out(path: Poses, made: Approach) -> Poses:

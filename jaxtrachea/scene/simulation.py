@@ -105,7 +105,14 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
     if plan.contact != isinstance(path, Poses):
         kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
         raise ValueError(f"path is {type(path).__name__}; expected {kinds[not plan.contact]}")
-    made = approach(scene, path) if isinstance(path, Poses) else None
+    return follow(scene, material, path, approach(scene, path) if isinstance(path, Poses) else None)
+
+
+def follow(
+    scene: Scene, material: Material, path: Poses | Presses, made: Approach | None
+) -> Simulation:
+    """What follows from the presses of `path`, or of the tool's way `made` of it."""
+    plan = scene.plan
     presses, refused = _refuse(scene, path if isinstance(path, Presses) else None, made)
     moved = (_vectors if plan.second_plane else _one_plane)(scene, material, presses)
     vertices = None

@@ -1,0 +1,201 @@
+"""A scene step by step: one position of the tool in, forces and surface out, without a pause.
+
+For loops in real time (haptics, a simulator's frame). Everything is compiled when the session is
+made; a step compiles nothing and writes into the memory of the step before.
+"""
+
+import functools
+import time
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
+
+from jaxtrachea.contact.patches import Touch
+from jaxtrachea.scene.approach import Approach, approach, seated
+from jaxtrachea.scene.simulation import Simulation, follow
+from jaxtrachea.scene.stage import Poses, Scene, touch_tube
+from jaxtrachea.trachea.material import Material
+
+#: Borders of the histogram of latencies, s: four a decade from 10 us to 1 s.
+EDGES = np.logspace(-5, 0, 21)
+
+
+class Instant(NamedTuple):
+    """Where the tool was, and what it touched; leading axis 1."""
+
+    path: Poses
+    seen: Touch
+
+
+class Seat(NamedTuple):
+    """What the next step must know.
+
+    Attributes:
+        started: there was a step.
+        touching: the tool is on the place of `touch`.
+        last: the step before.
+        before: the step before the first touch.
+        touch: the first touch.
+    """
+
+    started: Bool[Array, ""]
+    touching: Bool[Array, ""]
+    last: Instant
+    before: Instant
+    touch: Instant
+
+
+class Latency(NamedTuple):
+    """How long steps took, from call to finished result, s.
+
+    Attributes:
+        steps: that count.
+        median: -
+        p99: 99th percentile.
+        worst: -
+        edges: borders of the histogram; (bins + 1,).
+        counts: steps in each bin; faster and slower ones are in the first and last; (bins,).
+    """
+
+    steps: int
+    median: float
+    p99: float
+    worst: float
+    edges: Float[np.ndarray, " borders"]
+    counts: np.ndarray
+
+
+class Session:
+    """A scene and its material, compiled for one pose at a time.
+
+    With `seat` first the tool stays on the place it touched first, as in `simulate`; it lets go
+    when it leaves the undeformed tube, and may then touch elsewhere (`simulate` keeps the first
+    place of its whole path; a bonded tool never lets go).
+
+    A step gives up the arrays of the step before: copy what must last longer
+    (`jax.tree.map(np.array, result)`). On the CPU 7 to 9 us of a step go away with
+    `jax.config.update("jax_cpu_enable_async_dispatch", False)` before the first use of JAX.
+    """
+
+    def __init__(self, scene: Scene, material: Material, *, keep: int = 10_000):
+        """Compile.
+
+        Args:
+            scene: from `make_scene` with a path of `Poses`.
+            material: as the plan needs it; its numbers become constants of the program.
+            keep: latencies of so many last steps are kept.
+
+        Raises:
+            ValueError: a scene without contact, or with friction, which depends on the whole path.
+        """
+        if not scene.plan.contact:
+            raise ValueError("the plan has no contact; make the scene with a path of Poses")
+        if scene.plan.friction:
+            raise ValueError(
+                "the plan has friction, which depends on the whole path; use simulate, or make the "
+                "scene with Wishes(friction='off')"
+            )
+        if keep < 1:
+            raise ValueError(f"keep is {keep}; expected at least 1")
+        self.scene, self.dtype = scene, np.dtype(scene.footprint.dtype)
+        run = functools.partial(_step, scene, material)
+        pose = (np.eye(3, dtype=self.dtype), np.zeros(3, self.dtype))
+        start = _start(scene, *pose)
+        empty = jax.eval_shape(lambda seat, *pose: run(seat, None, *pose), start, *pose)[1]
+        zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), empty)
+        # Donated: the new state and result are written where the old ones were.
+        made = jax.jit(run, donate_argnums=(0, 1), keep_unused=True)
+        self._run = made.lower(start, zeros, *pose).compile()
+        self._start, self._seat, self._result = start, _copy(start), zeros
+        self._seconds, self._steps = np.zeros(keep), 0
+
+    def step(self, rotation: ArrayLike, translation: ArrayLike) -> Simulation:
+        """Move the tool.
+
+        Args:
+            rotation: of the tool; shape (3, 3).
+            translation: of its origin, mm; shape (3,).
+
+        Returns:
+            Fields as those of `simulate`, without the axis of rows; finished, on the device.
+
+        Raises:
+            ValueError: another shape.
+        """
+        begin = time.perf_counter()
+        pose = np.asarray(rotation, self.dtype), np.asarray(translation, self.dtype)
+        if pose[0].shape != (3, 3) or pose[1].shape != (3,):
+            raise ValueError(
+                f"rotation {pose[0].shape}, translation {pose[1].shape}; expected (3, 3) and (3,)"
+            )
+        self._seat, self._result = self._run(self._seat, self._result, *pose)
+        jax.block_until_ready(self._result)
+        self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin
+        self._steps += 1
+        return self._result
+
+    def reset(self) -> None:
+        """Forget where the tool was, and all latencies."""
+        self._seat, self._steps = _copy(self._start), 0
+
+    def latency(self, edges: Float[np.ndarray, " borders"] = EDGES) -> Latency:
+        """Of the steps kept.
+
+        Raises:
+            ValueError: there was no step.
+        """
+        if not self._steps:
+            raise ValueError("no step yet")
+        taken = self._seconds[: self._steps]
+        counts = np.histogram(np.clip(taken, edges[0], edges[-1]), edges)[0]
+        median, p99 = np.quantile(taken, (0.5, 0.99))
+        return Latency(len(taken), float(median), float(p99), float(taken.max()), edges, counts)
+
+
+def _copy(seat: Seat) -> Seat:
+    """Memory of its own, to be given away."""
+    return jax.tree.map(jnp.array, seat)
+
+
+def _start(scene: Scene, rotation, translation) -> Seat:
+    """Before the first step; its instants are not read."""
+    path = Poses(rotation[None], translation[None])
+    seen = jax.tree.map(
+        lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(touch_tube, scene, path)
+    )
+    no, nowhere = jnp.asarray(False), Instant(path, seen)
+    return Seat(no, no, nowhere, nowhere, nowhere)
+
+
+def _step(scene: Scene, material: Material, seat: Seat, _, rotation, translation):
+    """The next seat, and the result without its axis of rows."""
+    path = Poses(rotation[None], translation[None])
+    if scene.plan.seat == "each":
+        result = follow(scene, material, path, approach(scene, path))
+        return seat, jax.tree.map(lambda v: v[0], result)
+    here = Instant(path, touch_tube(scene, path))
+    hit = here.seen.gap[0] < 0
+    free = ~seat.touching
+    if scene.plan.options.contact != "bonded":
+        free |= ~hit
+    pick = lambda when, a, b: jax.tree.map(lambda v, w: jnp.where(when, v, w), a, b)  # noqa: E731
+    last = pick(seat.started, seat.last, here)
+    before, touch = pick(free, last, seat.before), pick(free, here, seat.touch)
+    made = _seated(scene, before, touch, here)
+    result = follow(scene, material, touch.path, made)._replace(gap=here.seen.gap)
+    touching = hit | (seat.touching & ~free)
+    after = Seat(jnp.asarray(True), touching, here, before, touch)
+    return after, jax.tree.map(lambda v: v[0], result)
+
+
+def _seated(scene: Scene, before: Instant, touch: Instant, here: Instant) -> Approach:
+    """The tool's way from the step before its first touch to here, as one press."""
+    join = lambda *v: jnp.concatenate(v)  # noqa: E731
+    path, seen = jax.tree.map(join, tuple(before), tuple(touch), tuple(here))
+    made = seated(scene, path, seen, jnp.asarray(1))
+    now = jax.tree.map(lambda v: v[2:], made._replace(seen=None, first=None))
+    return now._replace(seen=touch.seen, first=jnp.asarray(0))
