@@ -45,7 +45,7 @@ class Case:
         entrywise: errors are relative to each entry, not to the largest of the array.
         only: the only dtype that can hold the inputs or the answer, or None.
         constant: inputs that are not differentiated.
-        free: inputs whose derivative is not unique: it must be finite, no more.
+        free: inputs ("s") or pairs ("u by s") whose derivative is not unique: finite, no more.
         scale: least size that an error is seen against, of an output ("u") or of a derivative
             ("u by s"), where the truth is 0 or next to it.
         one_sided: input to +1 or -1 where the model lives on one side only (for the truth).
