@@ -92,8 +92,8 @@ def _series_jvp(primals, tangents):
     slope = k_1 + 3 * k_3 * d2
     share = 1 / (1 + compliance * slope)
     pushed = share * (d_displacement - force * d_compliance)
-    grown = share * depth * (d_k_1 + d2 * d_k_3)
-    return (depth, force), (pushed - compliance * grown, slope * pushed + grown)
+    grown = depth * (d_k_1 + d2 * d_k_3)
+    return (depth, force), (pushed - (compliance * share) * grown, slope * pushed + share * grown)
 
 
 def sensitivity(depth: Float[Array, "*n"], compliance: Float[Array, ""], law: Law) -> Sensitivity:

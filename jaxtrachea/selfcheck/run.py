@@ -236,7 +236,7 @@ def _judge(case: Case, truth: Truth | None, faults: list[str], values, status, j
     if int(status) != case.code:
         faults.append(f"status {int(status)}, expected {case.code} ({case.status})")
     if not case.answer:
-        if np.any(np.isfinite(next(iter(values.values())))):
+        if np.any(np.isfinite(values.get("force", next(iter(values.values()))))):
             faults.append("a number where the model has no answer")
         return 0.0, (0.0, ""), 0
     nans = sum(int(np.sum(~np.isfinite(v))) for v in jax.tree.leaves((values, jacobians)))
@@ -246,14 +246,23 @@ def _judge(case: Case, truth: Truth | None, faults: list[str], values, status, j
     value = max(error(o, values[o], wanted) for o, wanted in truth.value.items())
     worst = (0.0, "")
     for o, i in ((o, i) for o, by in truth.gradient.items() for i in by):
+        natural = _natural(case, truth, o, i)
         for jacobian in jacobians:
-            gap = error(f"{o} by {i}", jacobian[o][i], truth.gradient[o][i])
+            gap = error(f"{o} by {i}", jacobian[o][i], truth.gradient[o][i], natural)
             if not gap <= worst[0]:
                 worst = gap, f"{o} by {i}"
     return value, worst, nans
 
 
-def _error(case: Case, dtype, name: str, got, wanted) -> float:
+def _natural(case: Case, truth: Truth, output: str, name: str) -> float:
+    """Size of y/x, or 0 where the case does not ask for it."""
+    if not case.natural:
+        return 0.0
+    x = np.max(np.abs(case.inputs[name]))
+    return float(np.max(np.abs(truth.value[output])) / x) if 0 < x < np.inf else 0.0
+
+
+def _error(case: Case, dtype, name: str, got, wanted, elasticity: float = 0.0) -> float:
     """Largest error over the largest truth (or each over its own); exact zeros must be zeros.
 
     What is smaller than the dtype can hold to its precision counts as that small.
@@ -262,5 +271,6 @@ def _error(case: Case, dtype, name: str, got, wanted) -> float:
     got, wanted = np.asarray(got, float), np.asarray(wanted, float)
     size = np.abs(wanted) if case.entrywise else np.max(np.abs(wanted), initial=0)
     size = np.maximum(size, case.scale.get(name, smallest))
+    size = np.maximum(size, elasticity)
     gap = np.abs(got - wanted)
     return float(np.max(np.where(gap == 0, 0, gap / size), initial=0))

@@ -46,6 +46,8 @@ class Case:
         only: the only dtype that can hold the inputs or the answer, or None.
         constant: inputs that are not differentiated.
         free: inputs ("s") or pairs ("u by s") whose derivative is not unique: finite, no more.
+        natural: whether errors of derivatives are seen against y/x where dy/dx is far below it:
+            what no longer depends on an input is known to rounding of y, not to its own.
         scale: least size that an error is seen against, of an output ("u") or of a derivative
             ("u by s"), where the truth is 0 or next to it.
         one_sided: input to +1 or -1 where the model lives on one side only (for the truth).
@@ -64,6 +66,7 @@ class Case:
     only: str | None = None
     constant: tuple[str, ...] = ()
     free: tuple[str, ...] = ()
+    natural: bool = False
     scale: dict[str, float] = dataclasses.field(default_factory=dict)
     one_sided: dict[str, int] = dataclasses.field(default_factory=dict)
 
@@ -98,7 +101,7 @@ def read_cases(text: str | None = None) -> list[Case]:
 def _case(function: str, group: dict, row: dict) -> Case:
     row, base = dict(row), group["base"]
     kept = {n: row.pop(n) for n in ("name", "hard")}
-    optional = ("status", "answer", "entrywise", "only", "one_sided", "free", "scale")
+    optional = ("status", "answer", "entrywise", "only", "one_sided", "free", "scale", "natural")
     more = {n: row.pop(n) for n in optional if n in row}
     more |= {n: group[n] for n in ("constant", "enumeration") if n in group}
     tolerance = {d: _tolerance(group["tolerance"] | row.get("tolerance", {}), d) for d in DTYPES}

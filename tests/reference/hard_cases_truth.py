@@ -422,10 +422,10 @@ def derivative(case: Case, inputs, name, index, base):
     if name in case.one_sided:
         h *= case.one_sided[name]
         near, far = at(h), at(2 * h)
-        return {
-            o: [(-3 * p + 4 * q - r) / (2 * h) for p, q, r in zip(flat(v), near[o], far[o], strict=True)]
-            for o, v in base.items()
-        }  # fmt: skip
+        slope = lambda p, q, r: (-3 * p + 4 * q - r) / (2 * h)  # noqa: E731
+        sides = {o: zip(flat(v), near[o], far[o], strict=True) for o, v in base.items()}
+        out = {o: [slope(*three) for three in side] for o, side in sides.items()}
+        return {o: [v if abs(v) > mp.mpf(10) ** -45 else 0 for v in row] for o, row in out.items()}
     up, down, out = at(h), at(-h), {}
     for o, v in base.items():
         here = flat(v)
@@ -433,7 +433,9 @@ def derivative(case: Case, inputs, name, index, base):
         behind = [(q - r) / h for q, r in zip(here, down[o], strict=True)]
         size = max(map(abs, ahead + behind))
         gap = max(abs(p - q) for p, q in zip(ahead, behind, strict=True))
-        if gap > mp.mpf(10) ** -18 * size + mp.mpf(10) ** -28 and f"{o} by {name}" not in case.free:
+        if gap > mp.mpf(10) ** -18 * size + mp.mpf(10) ** -28 and (
+            f"{o} by {name}" not in case.free
+        ):
             raise RuntimeError(f"{case.name}: {o} has a kink in {name}{list(index)}")
         # Both sides next to 0 and yet different: what is left of a step where the truth is 0.
         gone = gap > mp.mpf(10) ** -18 * size
