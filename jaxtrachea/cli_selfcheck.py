@@ -103,4 +103,6 @@ def _write(folder: Path, found, seconds) -> None:
         folder.mkdir(parents=True)
         (folder / "selfcheck.json").write_text(json.dumps(made, indent=1) + "\n")
     except OSError as error:
-        raise Stop(f"{folder}: cannot be written ({error.strerror}); choose another --out") from None
+        raise Stop(
+            f"{folder}: cannot be written ({error.strerror}); choose another --out"
+        ) from None

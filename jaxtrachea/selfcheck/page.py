@@ -35,7 +35,9 @@ def page(cases: list[Case], outcomes: list[Outcome]) -> str:
     parts = [_HEAD]
     for function in dict.fromkeys(c.function for c in cases):
         rows = [c for c in cases if c.function == function]
-        parts.append(f"\n## {function}\n\n{_about(function)}\n\n{_table(rows, by)}\n\n{_why(rows)}\n")
+        parts.append(
+            f"\n## {function}\n\n{_about(function)}\n\n{_table(rows, by)}\n\n{_why(rows)}\n"
+        )
     return "".join(parts)
 
 
@@ -72,7 +74,10 @@ def _why(rows) -> str:
     said: dict[str, list[str]] = {}
     for case in rows:
         t64, t32 = case.tolerance["float64"], case.tolerance["float32"]
-        bounds = [f"{_pair(t64.value, t32.value)} value", f"{_pair(t64.gradient, t32.gradient)} gradient"]
+        bounds = [
+            f"{_pair(t64.value, t32.value)} value",
+            f"{_pair(t64.gradient, t32.gradient)} gradient",
+        ]
         said.setdefault(f"{', '.join(bounds)}: {t64.why}.", []).append(case.name)
     longest = max(said, key=lambda text: len(said[text]))
     lines = [f"Tolerance {longest}"]
@@ -81,7 +86,9 @@ def _why(rows) -> str:
             lines.append(f"- {', '.join(names)}: {text}")
     natural = [c.name for c in rows if c.natural]
     if natural:
-        lines.append(f"- Derivatives seen against y/x where they are far below it: {', '.join(natural)}.")
+        lines.append(
+            f"- Derivatives seen against y/x where they are far below it: {', '.join(natural)}."
+        )
     return "\n".join(lines)
 
 

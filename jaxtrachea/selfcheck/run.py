@@ -223,8 +223,10 @@ def _run_case(case: Case, truth: Truth | None, programs: _Programs, untouched) -
 def _neighbours_agree(mixed, untouched) -> bool:
     """Bit for bit, the rows on both sides."""
     same = jax.tree.map(
-        lambda p, q: np.array_equal(p[0], q[0], equal_nan=True)
-        and np.array_equal(p[-1], q[-1], equal_nan=True),
+        lambda p, q: (
+            np.array_equal(p[0], q[0], equal_nan=True)
+            and np.array_equal(p[-1], q[-1], equal_nan=True)
+        ),
         mixed,
         untouched,
     )

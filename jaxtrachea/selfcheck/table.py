@@ -110,7 +110,9 @@ def _case(function: str, group: dict, row: dict) -> Case:
     round_ = lambda v: np.asarray(v, rounded).astype(float).tolist()  # noqa: E731
     inputs = {n: round_(v) for n, v in _changed(base, row).items()}
     healthy = {n: round_(v) for n, v in base.items()}
-    return Case(**kept, function=function, inputs=inputs, healthy=healthy, tolerance=tolerance, **more)
+    return Case(
+        **kept, function=function, inputs=inputs, healthy=healthy, tolerance=tolerance, **more
+    )
 
 
 def _changed(base: dict, changes: dict) -> dict:

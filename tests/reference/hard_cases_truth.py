@@ -104,7 +104,9 @@ def press_1(v):
 
 def compliance_200(v):
     x = (np.arange(1, 201) * (100.5 / 201)).astype(np.float32)
-    return {"compliance": beam_fem.solve(x, 100.5, [v["EI_L"]] * 201, [v["k_M"]] * 200, v["s"], ONE).w_C}
+    return {
+        "compliance": beam_fem.solve(x, 100.5, [v["EI_L"]] * 201, [v["k_M"]] * 200, v["s"], ONE).w_C
+    }
 
 
 def beam(v):
@@ -121,9 +123,11 @@ def axial(v):
     """Two springs in parallel, each an end spring and bars in a row; stiffnesses, so k = 0 is 0."""
     ends = [mp.mpf(0), *v["x"], v["length"]]
     s = v["s"]
-    bar = lambda a, b: sum(  # noqa: E731
-        max(min(q, b) - max(p, a), mp.mpf(0)) / e
-        for p, q, e in zip(ends, ends[1:], v["EA"], strict=False)
+    bar = (
+        lambda a, b: sum(  # noqa: E731
+            max(min(q, b) - max(p, a), mp.mpf(0)) / e
+            for p, q, e in zip(ends, ends[1:], v["EA"], strict=False)
+        )
     )
     flexible = lambda k, c: 1 / c if k == mp.inf else k / (1 + k * c)  # noqa: E731
     c_A, c_B = bar(mp.mpf(0), s), bar(s, ends[-1])
@@ -400,6 +404,7 @@ def lifted(value):
 
 def moved(inputs, name, index, step):
     """`inputs` with one number of one input moved."""
+
     def place(value, index):
         if not index:
             return value + step
@@ -474,7 +479,9 @@ def main(names):
         old = known.get(case.name)
         given = {n: repr(v) for n, v in case.inputs.items()}
         same = old is not None and old["inputs"] == given and case.name not in names
-        known_by = {f"{o} by {i}" for o, by in (old or {"gradient": {}})["gradient"].items() for i in by}
+        known_by = {
+            f"{o} by {i}" for o, by in (old or {"gradient": {}})["gradient"].items() for i in by
+        }
         unchanged = same and known_by == {
             f"{o} by {i}"
             for o in old["value"]
