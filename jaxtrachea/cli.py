@@ -70,7 +70,8 @@ def main() -> None:
 
 
 for _command in (
-    cli_compare.compare, cli_scene.plan, cli_scene.simulate, cli_scene.sweep, cli_selfcheck.selfcheck,
+    cli_compare.compare, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
+    cli_selfcheck.selfcheck,
 ):  # fmt: skip
     app.command()(_command)
 

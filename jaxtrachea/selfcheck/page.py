@@ -9,15 +9,15 @@ from jaxtrachea.selfcheck.table import Case
 
 _HEAD = """# Hard cases
 
-Written by `tests/reference/hard_cases_page.py` from `jaxtrachea/selfcheck/cases.toml`. Run them on your
-own machine: `jaxtrachea selfcheck` (`--only NAME`, `--dtype float32`, `--out FOLDER`).
+Written by `tests/reference/hard_cases_page.py` from `jaxtrachea/selfcheck/cases.toml`. Run them on
+your own machine: `jaxtrachea selfcheck` (`--only NAME`, `--dtype float32`, `--out FOLDER`).
 
-Every case is run by itself and in a batch between healthy neighbours, which must keep every bit; for
-the values, the reverse Jacobian and, in the batch, the forward one. The truth has 25 digits
+Every case is run by itself and in a batch between healthy neighbours, which must keep every bit:
+values, the reverse Jacobian and, in the batch, the forward one. The truth has 25 digits
 (`tests/reference/hard_cases_truth.py`: finite elements and closed forms in 260 digits, derivatives
 by differences in them) of exactly the numbers given, which both dtypes can hold. Errors are
 relative to the largest entry of each array, in units of the dtype's epsilon (2.2e-16, 1.2e-7); a
-dash: the model has no answer there, and says so by its status.
+dash: the model has no answer there, and says so by its status, or the dtype cannot hold it.
 """
 
 

@@ -1,7 +1,7 @@
 """Run the table: every case alone and between healthy neighbours, value and both Jacobians.
 
-Two programs for each function and dtype serve all of its rows, one for a press by itself and one for
-a batch; they are compiled beside each other, which takes nearly all of the time.
+Two programs for each function and dtype serve all of its rows, one for a press by itself and one
+for a batch; they are compiled beside each other, which takes nearly all of the time.
 """
 
 import dataclasses
@@ -256,15 +256,16 @@ def _judge(case: Case, truth: Truth | None, faults: list[str], values, status, j
     return value, worst, nans
 
 
-def _natural(case: Case, truth: Truth, output: str, name: str) -> float:
-    """Size of y/x, or 0 where the case does not ask for it."""
+def _natural(case: Case, truth: Truth, output: str, name: str):
+    """Size of y/x for every number x of the input, or 0 where the case does not ask for it."""
+    x, y = np.abs(case.inputs[name]), np.abs(truth.value[output])
     if not case.natural:
         return 0.0
-    x = np.max(np.abs(case.inputs[name]))
-    return float(np.max(np.abs(truth.value[output])) / x) if 0 < x < np.inf else 0.0
+    per_input = np.where((x > 0) & (x < np.inf), 1 / np.where(x > 0, x, 1), 0)
+    return np.multiply.outer(y if case.entrywise else np.full_like(y, np.max(y)), per_input)
 
 
-def _error(case: Case, dtype, name: str, got, wanted, elasticity: float = 0.0) -> float:
+def _error(case: Case, dtype, name: str, got, wanted, elasticity=0.0) -> float:
     """Largest error over the largest truth (or each over its own); exact zeros must be zeros.
 
     What is smaller than the dtype can hold to its precision counts as that small.

@@ -220,6 +220,11 @@ def _rotation(w):
     return mp.eye(3) + mp.sin(angle) / angle * K + (1 - mp.cos(angle)) / angle**2 * K * K
 
 
+def _cross(a, b):
+    i, j, k = (a[p] * b[q] - a[q] * b[p] for p, q in ((1, 2), (2, 0), (0, 1)))
+    return mp.matrix([i, j, k])
+
+
 def boxes(v):
     """Minimum over the sphere of the smoothed support of the difference: logarithms of cosh."""
     A, B, t, beta, R = v["A"], v["B"], mp.matrix(v["t"]), v["beta"], _rotation(v["turn"])
@@ -239,11 +244,9 @@ def boxes(v):
     start = _STARTS.setdefault(key, None) or _descend(value, t, R)
     _STARTS[key] = start
     helper = mp.matrix([1, 0, 0] if abs(start[0]) < 0.8 else [0, 1, 0])
-    cross = lambda a, b: mp.matrix([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2],
-                                    a[0] * b[1] - a[1] * b[0]])  # noqa: E731  # fmt: skip
-    e1 = cross(start, helper)
+    e1 = _cross(start, helper)
     e1 /= mp.norm(e1)
-    e2 = cross(start, e1)
+    e2 = _cross(start, e1)
 
     def along(p, q):
         n = start + p * e1 + q * e2
@@ -391,8 +394,8 @@ def friction(v):
 MODELS = {
     f.__name__: f
     for f in (
-        series, total, first_touch, vector, press_9, press_1, compliance_200, beam, beam_alone, axial,
-        ring, oblique, spheres, boxes, dent, global_shape, on_ring_weight, friction,
+        series, total, first_touch, vector, press_9, press_1, compliance_200, beam, beam_alone,
+        axial, ring, oblique, spheres, boxes, dent, global_shape, on_ring_weight, friction,
     )
 } | {"beam_shear": beam}  # fmt: skip
 
@@ -497,8 +500,8 @@ def main(names):
 
 def _write(made):
     source = (
-        f"Written by tests/reference/hard_cases_truth.py: independent models in {mp.mp.dps} decimal "
-        f"digits (mpmath {mp.__version__}), {KEPT} digits kept. Inputs are exact."
+        f"Written by tests/reference/hard_cases_truth.py: independent models in {mp.mp.dps} "
+        f"decimal digits (mpmath {mp.__version__}), {KEPT} digits kept. Inputs are exact."
     )
     made = {c.name: made[c.name] for c in read_cases() if c.name in made}
     rows = ",\n".join(f"{json.dumps(n)}: {json.dumps(r)}" for n, r in made.items())
