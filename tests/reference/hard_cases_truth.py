@@ -123,12 +123,11 @@ def axial(v):
     """Two springs in parallel, each an end spring and bars in a row; stiffnesses, so k = 0 is 0."""
     ends = [mp.mpf(0), *v["x"], v["length"]]
     s = v["s"]
-    bar = (
-        lambda a, b: sum(  # noqa: E731
-            max(min(q, b) - max(p, a), mp.mpf(0)) / e
-            for p, q, e in zip(ends, ends[1:], v["EA"], strict=False)
-        )
-    )
+
+    def bar(a, b):
+        spans = zip(ends, ends[1:], v["EA"], strict=False)
+        return sum(max(min(q, b) - max(p, a), mp.mpf(0)) / e for p, q, e in spans)
+
     flexible = lambda k, c: 1 / c if k == mp.inf else k / (1 + k * c)  # noqa: E731
     c_A, c_B = bar(mp.mpf(0), s), bar(s, ends[-1])
     held_A, held_B = (k == mp.inf and c == 0 for k, c in ((v["k_A"], c_A), (v["k_B"], c_B)))
