@@ -105,6 +105,7 @@ def _case(function: str, group: dict, row: dict) -> Case:
     more = {n: row.pop(n) for n in optional if n in row}
     more |= {n: group[n] for n in ("constant", "enumeration") if n in group}
     more |= {n: tuple(more[n]) for n in ("constant", "free") if n in more}
+    more["scale"] = {n: float(v) for n, v in more.get("scale", {}).items()}
     tolerance = {d: _tolerance(group["tolerance"] | row.get("tolerance", {}), d) for d in DTYPES}
     row.pop("tolerance", None)
     rounded = "float64" if more.get("only") == "float64" else "float32"
