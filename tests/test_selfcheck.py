@@ -54,9 +54,11 @@ def test_every_kind_of_fault_is_seen():
     """A wrong value, derivative or status each fail the row that has it, and no other."""
     case = next(c for c in CASES if c.name == "k_3 = 0")
     truth = TRUTHS[case.name]
-    far = dataclasses.replace(truth, value=truth.value | {"force": truth.value["force"] * 1.0001})
+    far = dataclasses.replace(
+        truth, value=truth.value | {"force": np.asarray(truth.value["force"] * 1.0001)}
+    )
     bent = {o: dict(by) for o, by in truth.gradient.items()}
-    bent["force"]["c"] = bent["force"]["c"] * 1.0001
+    bent["force"]["c"] = np.asarray(bent["force"]["c"] * 1.0001)
     steep = dataclasses.replace(truth, gradient=bent)
     rows = [
         case,
