@@ -17,7 +17,7 @@ values, the reverse Jacobian and, in the batch, the forward one. The truth has 2
 (`tests/reference/hard_cases_truth.py`: finite elements and closed forms in 260 digits, derivatives
 by differences in them) of exactly the numbers given, which both dtypes can hold. Errors are
 relative to the largest entry of each array, in units of the dtype's epsilon (2.2e-16, 1.2e-7); a
-dash: the model has no answer there, and says so by its status, or the dtype cannot hold it.
+dash: the model has no answer there, and says so by its status, or the dtype cannot hold it; a question mark: not measured yet.
 """
 
 
@@ -43,7 +43,7 @@ def page(cases: list[Case], outcomes: list[Outcome]) -> str:
 
 def skeleton(text: str) -> str:
     """The page without its measured numbers: what must follow from the table alone."""
-    return re.sub(r"\| [-0-9.e+]+ (?=\|)|\| - (?=\|)", "| # ", text)
+    return re.sub(r"\| [-0-9.e+]+ (?=\|)|\| [-?] (?=\|)", "| # ", text)
 
 
 def _about(function: str) -> str:
@@ -63,8 +63,10 @@ def _table(rows, by) -> str:
 
 
 def _error(case: Case, outcome, dtype: str):
-    if outcome is None or not case.answer:
+    if not case.answer or dtype not in case.dtypes:
         return "-", "-"
+    if outcome is None:
+        return "?", "?"
     eps = 2.0**-52 if dtype == "float64" else 2.0**-23
     return f"{outcome.value_error / eps:.2g}", f"{outcome.gradient_error / eps:.2g}"
 
