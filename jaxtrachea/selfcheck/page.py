@@ -17,7 +17,8 @@ values, the reverse Jacobian and, in the batch, the forward one. The truth has 2
 (`tests/reference/hard_cases_truth.py`: finite elements and closed forms in 260 digits, derivatives
 by differences in them) of exactly the numbers given, which both dtypes can hold. Errors are
 relative to the largest entry of each array, in units of the dtype's epsilon (2.2e-16, 1.2e-7); a
-dash: the model has no answer there, and says so by its status, or the dtype cannot hold it; a question mark: not measured yet.
+dash: the model has no answer there, and says so by its status, or the dtype cannot hold it; a
+question mark: not measured yet.
 """
 
 
