@@ -1,4 +1,8 @@
-"""Hard cases of the whole press (docs/model.md), value and gradient, in both dtypes."""
+"""Hard cases of the whole press that the table (jaxtrachea.selfcheck) does not hold.
+
+200 rings with all their joints, and the softest ligament in float32, where only gradients of forces
+stay finite. All others, with truth, are rows of the table: tests/test_selfcheck.py.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -18,26 +22,12 @@ BASE = {"EI_L": 1.862, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02, "s": 42.0}
 #: name: (changes, number of rings, expected status of the two presses that touch)
 CASES = {
     "plain": ({}, 9, PressStatus.OK),
-    "k -> 0": ({"k_M": 1e-12}, 9, PressStatus.OK),
-    "k -> inf": ({"k_M": 1e12}, 9, PressStatus.OK),
     "on a ring": ({"s": 40.0}, 9, PressStatus.OK),
-    "on a rigid ring": ({"s": 40.0, "k_M": 1e12}, 9, PressStatus.OK),
-    "at the carina": ({"s": 0.0}, 9, PressStatus.OK),
     "beside the carina": ({"s": 1e-4}, 9, PressStatus.OK),
-    "at the larynx": ({"s": LENGTH}, 9, PressStatus.OK),
-    "one ring": ({}, 1, PressStatus.OK),
-    "one ring, on it": ({"s": 50.0}, 1, PressStatus.OK),
     "200 rings": ({}, 200, PressStatus.OK),
     "200 rigid rings": ({"k_M": 1e9}, 200, PressStatus.OK),
-    "k_3 = 0": ({"k_3": 0.0}, 9, PressStatus.OK),
-    "k_3 tiny": ({"k_3": 1e-30}, 9, PressStatus.OK),
-    "k_3 huge": ({"k_3": 1e25}, 9, PressStatus.OK),
-    "softening": ({"k_3": -1e-4}, 9, PressStatus.OK),
     "past the fold": ({"k_3": -1e4}, 9, PressStatus.PAST_FOLD),
-    "no local stiffness": ({"k_1": 1e-12, "k_3": 0.0}, 9, PressStatus.OK),
-    "rigid local law": ({"k_1": 1e12}, 9, PressStatus.OK),
     "soft ligament": ({"EI_L": 1e-9}, 9, PressStatus.OK),
-    "stiff ligament": ({"EI_L": 1e9}, 9, PressStatus.OK),
     "NaN ligament": ({"EI_L": np.nan}, 9, PressStatus.NON_FINITE),
 }
 

@@ -23,11 +23,12 @@ ORDER = [
     {"oblique"},
     {"identify"},
     {"scene"},
+    {"selfcheck"},
     {"report"},
     {"plots", "sections", "viewer", "study"},
     {"terminal", "processes"},
     {"cli_load", "cli_run"},
-    {"cli_scene", "cli_compare", "cli_fit"},
+    {"cli_scene", "cli_compare", "cli_fit", "cli_selfcheck"},
     {"cli"},
     {"__main__"},
 ]

@@ -43,23 +43,37 @@ def stretch(
         EA: axial stiffness of each span, N, positive; shape (n + 1,).
         s_c: contact position, mm, in [0, length].
         force: N, positive towards end B (larynx).
-        k_A: axial spring holding end A, N/mm; None: rigid.
-        k_B: axial spring holding end B, N/mm; None: rigid.
+        k_A: axial spring holding end A, N/mm, in [0, inf]; None: rigid. Both 0: not finite.
+        k_B: axial spring holding end B, N/mm, likewise.
     """
     ends = jnp.concatenate([jnp.zeros_like(x[:1]), x, length[None]])
     low, high = ends[:-1], ends[1:]
-    zero = jnp.zeros_like(s_c)
-    end_A = zero if k_A is None else 1 / k_A
-    end_B = zero if k_B is None else 1 / k_B
-    # Not minimum: with C on a ring it would halve the derivative of the span that ends there.
-    part = lambda upto: jnp.where(upto > high, high, upto) - low  # noqa: E731
-    piece = lambda upto: jnp.sum(jnp.where(upto > low, part(upto), 0) / EA)  # noqa: E731
-    upto_C, whole = piece(s_c), jnp.sum((high - low) / EA)
-    c_A, c_B = end_A + upto_C, end_B + (whole - upto_C)
-    share_A = c_B / (c_A + c_B)
-    u_C = c_A * share_A * force
+    A, B = _end(k_A, s_c), _end(k_B, s_c)
+    # Not minimum: with C on a ring it would halve the derivative of the span that ends there. The
+    # span at A is begun even at s = 0, or the derivative there would be lost.
+    begun = jnp.concatenate([jnp.ones_like(x[:1], bool), s_c > x])
+    upto_C = jnp.sum(jnp.where(begun, jnp.where(s_c > high, high, s_c) - low, 0) / EA)
+    beyond_C = jnp.sum(jnp.where(begun, jnp.where(s_c > high, 0, high - s_c), high - low) / EA)
     upto_ring = jnp.cumsum((high - low) / EA)[:-1]
-    from_A = (end_A + upto_ring) * share_A
-    from_B = (end_B + (whole - upto_ring)) * (1 - share_A)
+    beyond_ring = jnp.cumsum(((high - low) / EA)[::-1])[::-1][1:]
+    c_A, c_B = A.give + A.hold * upto_C, B.give + B.hold * beyond_C
+    # Each side's compliance is c / hold: a sum of positive terms also for k = 0 and inf.
+    both = c_A * B.hold + c_B * A.hold
+    from_A = (A.give + A.hold * upto_ring) * (c_B / both)
+    from_B = (B.give + B.hold * beyond_ring) * (c_A / both)
     u = jnp.where(x <= s_c, from_A, from_B) * force
-    return Axial(u_C, u, share_A * force, c_A / (c_A + c_B) * force)
+    force_A, force_B = A.hold * c_B / both * force, B.hold * c_A / both * force
+    return Axial(c_A * (c_B / both) * force, u, force_A, force_B)
+
+
+class _End(NamedTuple):
+    """An end spring as k = `hold` / `give`, so that 0 (free) and inf (held) are ordinary values."""
+
+    hold: Float[Array, ""]
+    give: Float[Array, ""]
+
+
+def _end(k, like) -> _End:
+    if k is None:
+        return _End(jnp.ones_like(like), jnp.zeros_like(like))
+    return _End(jnp.minimum(k, 1), 1 / jnp.maximum(k, 1))

@@ -59,8 +59,7 @@ def press_series(
         compliance: c, deflection of the skeleton at C per unit force, mm/N, not negative.
         law: local law; k_1 > 0.
     """
-    depth = _series_depth(displacement, compliance, law.k_1, law.k_3)
-    force = duffing(depth, law)
+    depth, force = _series(displacement, compliance, law.k_1, law.k_3)
     u = _scaled_cubic(displacement, compliance, law.k_1, law.k_3)[1]
     return Equilibrium(depth, force, status_of(displacement, depth + force, u <= -1))
 
@@ -73,22 +72,28 @@ def _scaled_cubic(displacement, compliance, k_1, k_3):
 
 
 @jax.custom_jvp
-def _series_depth(displacement, compliance, k_1, k_3):
-    """Local indentation of `press_series`, with the derivative of the equilibrium d + c F = D."""
+def _series(displacement, compliance, k_1, k_3):
+    """Indentation and force of `press_series`, with the derivatives of the equilibrium d + c F = D.
+
+    Both are differentiated here: the derivative of F(d) by the law would be the difference of its
+    growth at fixed d and of the growth of c F, which cancel on a soft skeleton.
+    """
     delta, u = _scaled_cubic(displacement, compliance, k_1, k_3)
-    return delta * cubic_ratio(u)
+    depth = delta * cubic_ratio(u)
+    return depth, duffing(depth, Law(k_1, k_3))
 
 
-@_series_depth.defjvp
-def _series_depth_jvp(primals, tangents):
-    displacement, compliance, k_1, k_3 = primals
+@_series.defjvp
+def _series_jvp(primals, tangents):
+    _, compliance, k_1, k_3 = primals
     d_displacement, d_compliance, d_k_1, d_k_3 = tangents
-    depth = _series_depth(*primals)
+    depth, force = _series(*primals)
     d2 = depth * depth
-    share = 1 / (1 + compliance * (k_1 + 3 * k_3 * d2))
-    force = depth * (k_1 + k_3 * d2)
-    d_law = compliance * depth * (d_k_1 + d2 * d_k_3)
-    return depth, share * (d_displacement - force * d_compliance - d_law)
+    slope = k_1 + 3 * k_3 * d2
+    share = 1 / (1 + compliance * slope)
+    pushed = share * (d_displacement - force * d_compliance)
+    grown = depth * (d_k_1 + d2 * d_k_3)
+    return (depth, force), (pushed - (compliance * share) * grown, slope * pushed + share * grown)
 
 
 def sensitivity(depth: Float[Array, "*n"], compliance: Float[Array, ""], law: Law) -> Sensitivity:

@@ -126,7 +126,9 @@ def _tie(ring: Ring) -> _Tie:
 
 def _thrust(moments, rise, weights, bend, tie: _Tie):
     """H over `tie.hold`, per unit load: -int M m_H / (int m_H^2 + EI / (R k_e)); shape (2,)."""
-    squared = tie.give + tie.hold * bend * jnp.sum(weights * rise * rise)
+    # Over bend where the arch is soft: the derivatives by EI and R then need no difference.
+    bend, stiff = jnp.minimum(bend, 1), 1 / jnp.maximum(bend, 1)
+    squared = tie.give * stiff + tie.hold * bend * jnp.sum(weights * rise * rise)
     # A rigid arch with a rigid tie is indeterminate; it is given no thrust.
     squared = jnp.where(squared > 0, squared, 1)
     return -bend * jnp.sum((weights * rise)[:, None] * moments, axis=0) / squared

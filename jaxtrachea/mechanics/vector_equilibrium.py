@@ -52,8 +52,7 @@ def press_vector(
         compliance: C, skeleton at the contact, mm/N, symmetric and positive semi-definite.
         law: local law; k_1 > 0.
     """
-    depth = _series_depth(displacement, compliance, law.k_1, law.k_3)
-    force = _force(depth, law)
+    depth, force = _series(displacement, compliance, law.k_1, law.k_3)
     given = jnp.sum(displacement) + jnp.sum(compliance) + law.k_1 + law.k_3
     folded = (law.k_3 < 0) & jnp.isfinite(given) & ~jnp.isfinite(jnp.sum(depth))
     status = status_of(jnp.max(jnp.abs(displacement)), jnp.sum(depth + force), folded)
@@ -93,8 +92,8 @@ def _secant_motion(direction, compliance, kappa):
 
 
 @jax.custom_jvp
-def _series_depth(displacement, compliance, k_1, k_3):
-    """Local indentation of `press_vector`; NaN past the fold."""
+def _series(displacement, compliance, k_1, k_3):
+    """Local indentation and force of `press_vector`; NaN past the fold."""
     size = jnp.max(jnp.abs(displacement))
     still = size == 0
     direction = jnp.where(still, 1, displacement / jnp.where(still, 1, size))
@@ -111,20 +110,27 @@ def _series_depth(displacement, compliance, k_1, k_3):
     t = jax.lax.fori_loop(0, STEPS, tangent_step, jnp.zeros_like(size))
     d, _ = _secant_motion(direction, compliance, k_1 + cubic * t * t)
     missed = jnp.abs(jnp.linalg.norm(d) - t) > 100 * epsilon(t.dtype) * t
-    return jnp.where((k_3 < 0) & missed, jnp.nan, size * d)
+    depth = jnp.where((k_3 < 0) & missed, jnp.nan, size * d)
+    return depth, _force(depth, Law(k_1, k_3))
 
 
-@_series_depth.defjvp
-def _series_depth_jvp(primals, tangents):
-    """(1 + C (kappa + 2 k_3 d d^T)) d' = D' - C' F - C F', by the secant system and rank one."""
+@_series.defjvp
+def _series_jvp(primals, tangents):
+    """(1 + C (kappa + 2 k_3 d d^T)) d' = D' - C' F - C f, by the secant system and rank one.
+
+    f is the growth of F at fixed d, along d. F' is not formed from d', where f and C f would cancel
+    on a soft skeleton.
+    """
     _, compliance, k_1, k_3 = primals
     d_displacement, d_compliance, d_k_1, d_k_3 = tangents
-    depth = _series_depth(*primals)
+    depth, force = _series(*primals)
     squared = jnp.sum(depth * depth)
-    kappa = k_1 + k_3 * squared
-    change = d_displacement - d_compliance @ (kappa * depth)
-    change = change - compliance @ ((d_k_1 + d_k_3 * squared) * depth)
+    kappa, grown = k_1 + k_3 * squared, d_k_1 + d_k_3 * squared
     M = jnp.eye(3, dtype=depth.dtype) + kappa * compliance
-    y, v = solve_spd(M, change), solve_spd(M, compliance @ depth)
-    share = 2 * k_3 * jnp.sum(depth * y) / (1 + 2 * k_3 * jnp.sum(depth * v))
-    return depth, y - share * v
+    y, z = solve_spd(M, d_displacement - d_compliance @ force), solve_spd(M, depth)
+    v = compliance @ z
+    share = 1 / (1 + 2 * k_3 * jnp.sum(depth * v))
+    along = 2 * k_3 * share * jnp.sum(depth * y)
+    d_depth = y - along * v
+    d_force = kappa * d_depth + along * depth + (grown * share) * z
+    return (depth, force), (d_depth - (grown * share) * v, d_force)

@@ -27,6 +27,11 @@ class Solution(NamedTuple):
     energy: mp.mpf  # half of w^T K w, springs included
 
 
+def _exact(v):
+    """A float as it is; a number in high precision unchanged."""
+    return v if isinstance(v, mp.mpf) else mp.mpf(float(v))
+
+
 def _element(h, EI, GA):
     shear = 0 if GA is None else 12 * EI / (GA * h * h)
     c = EI / (h**3 * (1 + shear))
@@ -61,10 +66,10 @@ def _solve_banded(K, f):
 def solve(x, length, EI, k, s_c, force, GA=None, ring_load=None, *, free_end=False) -> Solution:
     """Beam clamped at 0 and `length` (`free_end`: at 0 only) on springs k at x, force at s_c.
 
-    The numbers are taken as they are: floats are converted exactly, without rounding.
+    The numbers are taken as they are: floats exactly, `mpmath` numbers unchanged.
     """
     with mp.workdps(DIGITS):
-        exact = lambda values: [mp.mpf(float(v)) for v in values]  # noqa: E731
+        exact = lambda values: [_exact(v) for v in values]  # noqa: E731
         x, EI, k = exact(x), exact(EI), exact(k)
         GA = [None] * len(EI) if GA is None else exact(GA)
         load = [mp.mpf(0)] * len(x) if ring_load is None else exact(ring_load)
@@ -115,15 +120,15 @@ def solve_independent(x, length, EI, k, s_c, force, GA=None):
     Returns (w_C as sum(share * tip), reactions at all rings).
     """
     with mp.workdps(DIGITS):
-        n = sum(1 for position in x if float(position) <= float(s_c))
-        a, b = mp.mpf(float(s_c)), mp.mpf(float(length)) - mp.mpf(float(s_c))
+        n = sum(1 for position in x if _exact(position) <= _exact(s_c))
+        a, b = _exact(s_c), _exact(length) - _exact(s_c)
         share_A = b**3 / (a**3 + b**3)
         sides = []
         for share, x_i, EI_i, k_i, GA_i, tip in (
             (share_A, x[:n], EI[: n + 1], k[:n], None if GA is None else GA[: n + 1], a),
             (
                 1 - share_A,
-                [mp.mpf(float(length)) - mp.mpf(float(v)) for v in x[n:]][::-1],
+                [_exact(length) - _exact(v) for v in x[n:]][::-1],
                 EI[n:][::-1],
                 k[n:][::-1],
                 None if GA is None else GA[n:][::-1],
@@ -137,21 +142,20 @@ def solve_independent(x, length, EI, k, s_c, force, GA=None):
 
 def _cantilever(x, EI, k, tip, GA):
     """Tip deflection and reactions per unit tip force, positions already exact."""
-    exact = lambda v: v if isinstance(v, mp.mpf) else mp.mpf(float(v))  # noqa: E731
-    nodes = [mp.mpf(0), *(exact(v) for v in x)]
+    nodes = [mp.mpf(0), *(_exact(v) for v in x)]
     if nodes[-1] != tip:
         nodes.append(tip)
     n = len(nodes)
     K = [[mp.mpf(0)] * (_BAND + 1) for _ in range(2 * n)]
     for e in range(n - 1):
-        shear = None if GA is None else exact(GA[e])
-        element = _element(nodes[e + 1] - nodes[e], exact(EI[e]), shear)
+        shear = None if GA is None else _exact(GA[e])
+        element = _element(nodes[e + 1] - nodes[e], _exact(EI[e]), shear)
         for i in range(4):
             for j in range(i, 4):
                 K[2 * e + i][j - i] += element[i][j]
     for i, stiffness in enumerate(k):
-        K[2 * (i + 1)][0] += exact(stiffness)
+        K[2 * (i + 1)][0] += _exact(stiffness)
     f = [mp.mpf(0)] * (2 * n - 2)
     f[-2] = mp.mpf(1)
     u = _solve_banded(K[2:], f)
-    return u[-2], [exact(stiffness) * u[2 * i] for i, stiffness in enumerate(k)]
+    return u[-2], [_exact(stiffness) * u[2 * i] for i, stiffness in enumerate(k)]

@@ -7,7 +7,7 @@ planes, ring springs as the inverse of their compliance, one dense solve in `DIG
 from typing import NamedTuple
 
 import mpmath as mp
-from beam_fem import _element
+from beam_fem import _element, _exact
 
 DIGITS = 60
 _BAND = 7
@@ -61,10 +61,10 @@ def _assemble(nodes, x, EI, GA):
 def solve(x, length, EI, C, s_c, force, GA=None, ring_load=None, integrity=None) -> Solution:
     """Beam clamped at both ends, rings of compliance C_i / integrity_i at x, force (2) at s_c.
 
-    The numbers are taken as they are: floats are converted exactly, without rounding.
+    The numbers are taken as they are: floats exactly, `mpmath` numbers unchanged.
     """
     with mp.workdps(DIGITS):
-        exact = lambda v: [exact(u) for u in v] if hasattr(v, "__len__") else mp.mpf(float(v))  # noqa: E731
+        exact = lambda v: [exact(u) for u in v] if hasattr(v, "__len__") else _exact(v)  # noqa: E731
         x, EI, C, force = exact(x), exact(EI), exact(C), exact(force)
         GA = None if GA is None else exact(GA)
         load = exact([[0, 0]] * len(x) if ring_load is None else ring_load)

@@ -1,0 +1,279 @@
+"""Run the table: every case alone and between healthy neighbours, value and both Jacobians.
+
+Two programs for each function and dtype serve all of its rows, one for a press by itself and one
+for a batch; they are compiled beside each other, which takes nearly all of the time.
+"""
+
+import dataclasses
+import functools
+import itertools
+import math
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import numpy as np
+
+from jaxtrachea.selfcheck.functions import FUNCTIONS
+from jaxtrachea.selfcheck.table import Case, Tolerance, Truth
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What became of one case in one dtype.
+
+    Attributes:
+        case: name.
+        dtype: name.
+        value: worst error of a value over its tolerance, in either run.
+        gradient: worst error of an entry of the Jacobian, forward or reverse, over its tolerance.
+        value_error: worst relative error of a value.
+        gradient_error: worst relative error of a derivative.
+        where: output and input of the worst derivative.
+        nans: numbers that are not finite where they must be.
+        faults: what else is wrong, as sentences.
+        tolerance: what was asked.
+    """
+
+    case: str
+    dtype: str
+    value_error: float
+    gradient_error: float
+    where: str
+    nans: int
+    faults: tuple[str, ...]
+    tolerance: Tolerance
+
+    @property
+    def value(self) -> float:
+        """Error of the values over their tolerance."""
+        return self.value_error / (self.tolerance.value * _eps(self.dtype))
+
+    @property
+    def gradient(self) -> float:
+        """Error of the derivatives over their tolerance."""
+        return self.gradient_error / (self.tolerance.gradient * _eps(self.dtype))
+
+    @property
+    def passed(self) -> bool:
+        """Whether everything is as it should be (a NaN error is not)."""
+        close = self.value <= 1 and self.gradient <= 1
+        return close and self.nans == 0 and not self.faults
+
+
+def _eps(dtype: str) -> float:
+    return float(np.finfo(dtype).eps)
+
+
+def _lane(call, constant, v, tangent, cotangent):
+    """Values, status, one column of the Jacobian (forward) and one row of it (reverse)."""
+    fixed = {n: v[n] for n in constant}
+    moving = {n: w for n, w in v.items() if n not in constant}
+    run = lambda moving: call(fixed | moving)  # noqa: E731
+    values, column, status = jax.jvp(run, (moving,), (tangent,), has_aux=True)
+    row = jax.vjp(run, moving, has_aux=True)[1](cotangent)[0]
+    return values, status, column, row
+
+
+def _alone(call, constant, v, cotangent):
+    """The same without the forward derivative: what one gradient of one press compiles to."""
+    fixed = {n: v[n] for n in constant}
+    moving = {n: w for n, w in v.items() if n not in constant}
+    values, pull, status = jax.vjp(lambda m: call(fixed | m), moving, has_aux=True)
+    return values, status, pull(cotangent)[0]
+
+
+class _Programs:
+    """What serves all rows of one function in one dtype.
+
+    A batch holds a healthy neighbour, one lane for each column (row) of the Jacobian, and another
+    neighbour.
+    """
+
+    def __init__(self, case: Case, dtype: str):
+        """Compile for the shapes of `case`."""
+        call, self.dtype, self.constant = FUNCTIONS[case.function], dtype, case.constant
+        healthy = self.arrays(case.healthy)
+        out = jax.eval_shape(call, healthy)[0]
+        moving = {n: np.shape(v) for n, v in case.healthy.items() if n not in case.constant}
+        self.inputs, self.outputs = moving, {n: v.shape for n, v in out.items()}
+        self.lanes = max(_size(self.inputs), _size(self.outputs))
+        basis = [_basis(shapes, self.lanes, dtype) for shapes in (self.inputs, self.outputs)]
+        self.directions = basis
+        self.healthy = healthy
+        one, many = (functools.partial(f, call, case.constant) for f in (_alone, _lane))
+        first = {n: v[0] for n, v in basis[1].items()}
+        self.one = jax.jit(one).lower(healthy, first).compile()
+        self.many = jax.jit(jax.vmap(many)).lower(self.batch(healthy), *basis).compile()
+
+    def arrays(self, inputs: dict) -> dict[str, np.ndarray]:
+        """Inputs of a row as arrays of the dtype."""
+        return {n: np.asarray(v, self.dtype) for n, v in inputs.items()}
+
+    def batch(self, row):
+        """`row` in every lane but the first and last."""
+        lanes = [self.healthy, *[row] * self.lanes, self.healthy]
+        return {n: np.stack([lane[n] for lane in lanes]) for n in row}
+
+    def between(self, row):
+        """All lanes of a batch with `row` between healthy neighbours."""
+        return jax.device_get(self.many(self.batch(row), *self.directions))
+
+    def by_itself(self, row):
+        """Values, status and the reverse Jacobian of one row, without neighbours."""
+        rows = []
+        for i in range(_size(self.outputs)):
+            cotangent = {n: v[i + 1] for n, v in self.directions[1].items()}
+            values, status, pulled = jax.device_get(self.one(row, cotangent))
+            rows.append(pulled)
+        reverse = {n: np.stack([r[n] for r in rows]) for n in self.inputs}
+        return values, status, self.by_rows(reverse)
+
+    def by_columns(self, columns):
+        """Forward columns, (lane, *output), as {output: {input: (*output, *input)}}."""
+        return {
+            o: {
+                i: np.moveaxis(v[at], 0, -1).reshape((*self.outputs[o], *shape))
+                for i, (at, shape) in _places(self.inputs).items()
+            }
+            for o, v in columns.items()
+        }
+
+    def by_rows(self, rows):
+        """Reverse rows, (lane, *input), in the same form."""
+        return {
+            o: {i: v[at].reshape((*shape, *self.inputs[i])) for i, v in rows.items()}
+            for o, (at, shape) in _places(self.outputs).items()
+        }
+
+
+def _size(shapes) -> int:
+    return sum(math.prod(shape) for shape in shapes.values())
+
+
+def _places(shapes):
+    """Where each name's numbers lie among all: {name: (slice, shape)}."""
+    ends = list(itertools.accumulate(math.prod(s) for s in shapes.values()))
+    starts = [0, *ends]
+    return {
+        n: (slice(a, b), shape)
+        for (n, shape), a, b in zip(shapes.items(), starts, ends, strict=False)
+    }
+
+
+def _basis(shapes, lanes: int, dtype: str):
+    """Unit directions, one to a lane, zeros for the neighbours and what is left."""
+    made = {}
+    for name, (at, shape) in _places(shapes).items():
+        flat = np.zeros((lanes + 2, math.prod(shape)), dtype)
+        flat[1 + at.start : 1 + at.stop] = np.eye(math.prod(shape))
+        made[name] = flat.reshape((lanes + 2, *shape))
+    return made
+
+
+def run_table(cases: list[Case], truths: dict[str, Truth], dtypes) -> Iterator[Outcome]:
+    """Run all cases; outcomes come in the order of the table, function by function.
+
+    Args:
+        cases: rows of the table.
+        truths: by name.
+        dtypes: some of `table.DTYPES`.
+    """
+    groups: dict[tuple[str, str], list[Case]] = {}
+    for case in cases:
+        for dtype in dtypes:
+            if dtype in case.dtypes:
+                groups.setdefault((case.function, dtype), []).append(case)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        made = {key: pool.submit(_Programs, rows[0], key[1]) for key, rows in groups.items()}
+        for key, rows in groups.items():
+            programs = made.pop(key).result()
+            untouched = programs.between(programs.healthy)
+            for case in rows:
+                yield _run_case(case, truths.get(case.name), programs, untouched)
+
+
+def _run_case(case: Case, truth: Truth | None, programs: _Programs, untouched) -> Outcome:
+    row = programs.arrays(case.inputs)
+    mixed = programs.between(row)
+    faults = [] if _neighbours_agree(mixed, untouched) else ["it changed its neighbours"]
+    if case.answer and truth is None:
+        faults.append("no truth; run tests/reference/hard_cases_truth.py")
+    values, status, columns, rows = jax.tree.map(lambda v: v[1:-1], mixed)
+    values, status = jax.tree.map(lambda v: v[0], (values, status))
+    jacobians = programs.by_columns(columns), programs.by_rows(rows)
+    value, status_alone, reverse = programs.by_itself(row)
+    judge = functools.partial(_judge, case, truth, faults)
+    found = [judge(values, status, jacobians), judge(value, status_alone, (reverse,))]
+    large = lambda v: np.inf if np.isnan(v) else v  # noqa: E731
+    gradient, where = max((f[1] for f in found), key=lambda f: large(f[0]))
+    return Outcome(
+        case.name,
+        programs.dtype,
+        max((f[0] for f in found), key=large),
+        gradient,
+        where,
+        max(f[2] for f in found),
+        tuple(dict.fromkeys(faults)),
+        case.tolerance[programs.dtype],
+    )
+
+
+def _neighbours_agree(mixed, untouched) -> bool:
+    """Bit for bit, the rows on both sides."""
+    same = jax.tree.map(
+        lambda p, q: (
+            np.array_equal(p[0], q[0], equal_nan=True)
+            and np.array_equal(p[-1], q[-1], equal_nan=True)
+        ),
+        mixed,
+        untouched,
+    )
+    return all(jax.tree.leaves(same))
+
+
+def _judge(case: Case, truth: Truth | None, faults: list[str], values, status, jacobians):
+    """(value error, (gradient error, where), number of values that are not finite)."""
+    if int(status) != case.code:
+        faults.append(f"status {int(status)}, expected {case.code} ({case.status})")
+    if not case.answer:
+        if np.any(np.isfinite(values.get("force", next(iter(values.values()))))):
+            faults.append("a number where the model has no answer")
+        return 0.0, (0.0, ""), 0
+    nans = sum(int(np.sum(~np.isfinite(v))) for v in jax.tree.leaves((values, jacobians)))
+    if truth is None:
+        return np.nan, (np.nan, ""), nans
+    error = functools.partial(_error, case, next(iter(values.values())).dtype)
+    value = max(error(o, values[o], wanted) for o, wanted in truth.value.items())
+    worst = (0.0, "")
+    for o, i in ((o, i) for o, by in truth.gradient.items() for i in by):
+        natural = _natural(case, truth, o, i)
+        for jacobian in jacobians:
+            gap = error(f"{o} by {i}", jacobian[o][i], truth.gradient[o][i], natural)
+            if not gap <= worst[0]:
+                worst = gap, f"{o} by {i}"
+    return value, worst, nans
+
+
+def _natural(case: Case, truth: Truth, output: str, name: str):
+    """Size of y/x for every number x of the input, or 0 where the case does not ask for it."""
+    x, y = np.abs(case.inputs[name]), np.abs(truth.value[output])
+    if not case.natural:
+        return 0.0
+    per_input = np.where((x > 0) & (x < np.inf), 1 / np.where(x > 0, x, 1), 0)
+    return np.multiply.outer(y if case.entrywise else np.full_like(y, np.max(y)), per_input)
+
+
+def _error(case: Case, dtype, name: str, got, wanted, elasticity=0.0) -> float:
+    """Largest error over the largest truth (or each over its own); exact zeros must be zeros.
+
+    What is smaller than the dtype can hold to its precision counts as that small.
+    """
+    smallest = float(np.finfo(dtype).tiny / np.finfo(dtype).eps)
+    got, wanted = np.asarray(got, float), np.asarray(wanted, float)
+    size = np.abs(wanted) if case.entrywise else np.max(np.abs(wanted), initial=0)
+    size = np.maximum(size, case.scale.get(name, smallest))
+    size = np.maximum(size, elasticity)
+    gap = np.abs(got - wanted)
+    return float(np.max(np.where(gap == 0, 0, gap / size), initial=0))
