@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import jax
 import numpy as np
@@ -265,7 +266,7 @@ def _natural(case: Case, truth: Truth, output: str, name: str):
     return np.multiply.outer(y if case.entrywise else np.full_like(y, np.max(y)), per_input)
 
 
-def _error(case: Case, dtype, name: str, got, wanted, elasticity=0.0) -> float:
+def _error(case: Case, dtype, name: str, got, wanted, elasticity: Any = 0.0) -> float:
     """Largest error over the largest truth (or each over its own); exact zeros must be zeros.
 
     What is smaller than the dtype can hold to its precision counts as that small.

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtrachea import status as _status
 
 DTYPES = ("float64", "float32")
-CASES, TRUTH = (files(__package__) / name for name in ("cases.toml", "truth.json"))
+CASES, TRUTH = (files("jaxtrachea.selfcheck") / name for name in ("cases.toml", "truth.json"))
 _ENTRY = re.compile(r"(\w+)\[(\d+)\]")
 
 
