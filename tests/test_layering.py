@@ -23,11 +23,12 @@ ORDER = [
     {"oblique"},
     {"identify"},
     {"scene"},
+    {"tradeoff"},
     {"report"},
     {"plots", "sections", "viewer", "study"},
     {"terminal", "processes"},
     {"cli_load"},
-    {"cli_scene", "cli_compare", "cli_fit"},
+    {"cli_scene", "cli_compare", "cli_fit", "cli_tradeoff"},
     {"cli"},
     {"__main__"},
 ]

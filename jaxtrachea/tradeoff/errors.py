@@ -10,7 +10,7 @@ from jaxtrachea.scene.stage import Scene
 
 
 class Errors(NamedTuple):
-    """Largest difference over the path, against the largest value of the reference. None: not there.
+    """Largest difference over the path, against the largest value of the reference. None: no such.
 
     A row that one of the two has not solved counts as infinitely wrong.
 
@@ -102,7 +102,8 @@ def spread(joints: np.ndarray, x: np.ndarray, at: np.ndarray, length: float) -> 
 
 def remesh(moved: np.ndarray, scene: Scene, fine: Scene) -> np.ndarray:
     """Displacements on a made tube's grid, bilinear at the vertices of another; (rows, n, 3)."""
-    assert scene.mesh is not None and fine.mesh is not None
+    assert scene.mesh is not None
+    assert fine.mesh is not None
     s, phi = (np.asarray(v, float) for v in (scene.mesh.s, scene.mesh.phi))
     lines = np.unique(s)
     around = len(s) // len(lines)
@@ -115,7 +116,8 @@ def remesh(moved: np.ndarray, scene: Scene, fine: Scene) -> np.ndarray:
 
 
 def _moved(out: Simulation, scene: Scene) -> np.ndarray:
-    assert scene.mesh is not None and out.vertices is not None
+    assert scene.mesh is not None
+    assert out.vertices is not None
     return np.asarray(out.vertices, float) - np.asarray(scene.mesh.vertices, float)
 
 

@@ -88,6 +88,7 @@ class Full(NamedTuple):
         levels: what that plan and the finest of all else are.
         facts: of the scene.
         wishes: of the user, what was `auto` at its finest.
+        given: of the user.
         made: vertices round and along the mesh; None: not made, or none.
         load: s of the contacts, mm.
     """
@@ -98,6 +99,7 @@ class Full(NamedTuple):
     levels: Levels
     facts: Facts
     wishes: Wishes
+    given: Wishes
     made: tuple[int, int, float] | None
     load: np.ndarray
 
@@ -117,22 +119,22 @@ def full_scene(spec: SceneSpec, staged: Staged, *, coupling: str | None = None) 
         PlanError: a wish that cannot be met.
     """
     scene, material, path = staged.scene, staged.material, staged.path
-    facts, wishes = facts_of(scene, material, path), _finest(spec, scene, material, path)
+    facts, given = facts_of(scene, material, path), wishes_of(spec)
+    wishes = _finest(given, scene, material, path)
     if coupling is not None:
         wishes = dataclasses.replace(wishes, coupling=coupling)
-    plan = make_plan(facts, wishes)
-    scene = dataclasses.replace(scene, plan=plan, quality=FINE)
+    scene = dataclasses.replace(scene, plan=make_plan(facts, wishes), quality=FINE)
     made = None
     if spec.trachea.file is None and scene.mesh is not None:
         made = spec.trachea.around, spec.trachea.along, spec.trachea.wall
+    load = _load(scene, path)
     return Full(
-        scene, material, path, levels_of(plan, scene), facts, wishes, made, _load(scene, path)
+        scene, material, path, levels_of(scene.plan, scene), facts, wishes, given, made, load
     )
 
 
-def _finest(spec: SceneSpec, scene: Scene, material: Material, path) -> Wishes:
+def _finest(wishes: Wishes, scene: Scene, material: Material, path) -> Wishes:
     """The user's wishes, with the finest level instead of `auto` where the rules stop short."""
-    wishes = wishes_of(spec)
     bends = material.EI_C is not None and material.k_t is not None
     if wishes.rings == "auto" and bends and wishes.second_plane != "off":
         wishes = dataclasses.replace(wishes, rings="arch2")

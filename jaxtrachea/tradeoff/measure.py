@@ -1,0 +1,232 @@
+"""Measure what every rung of a scene errs and costs."""
+
+import datetime
+import os
+import platform
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtrachea.scene.simulation import Simulation, simulate
+from jaxtrachea.scene.stage import Presses, Scene
+from jaxtrachea.tradeoff.errors import Errors, compare, relative
+from jaxtrachea.tradeoff.ladders import Ladder, ladders
+from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
+
+#: Turns in which the rungs are called one after the other, so that all see the same machine.
+TURNS = 10
+
+Report = Callable[[str], None]
+
+
+class Solved(NamedTuple):
+    """A program's path: its scene, what came out, derivatives of the force."""
+
+    scene: Scene
+    out: Simulation
+    gradient: np.ndarray
+
+
+class Compiled(NamedTuple):
+    """Programs of one pose, ready to be called, and the seconds that the first took to compile."""
+
+    call: Callable
+    gradient: Callable
+    lanes: Callable | None
+    seconds: float
+
+
+class Settings(NamedTuple):
+    """How much is measured.
+
+    Attributes:
+        calls: timed calls of each program.
+        lanes: poses of one batch; 0: batches are not timed.
+        quick: the coarsest, the middle and the finest rung of each ladder only.
+    """
+
+    calls: int = 1000
+    lanes: int = 64
+    quick: bool = False
+
+
+def measure(
+    name: str, full: Full, settings: Settings = Settings(), report: Report = lambda text: None,  # noqa: B008
+    curves: Sequence[Any] = (), radius: float = 0.0,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Errors and times of every rung, one dict each; then one for each ladder left out.
+
+    Each ladder is measured against its finest rung in float64, all else at its finest level.
+
+    Args:
+        name: of the scene.
+        full: the scene at its finest.
+        settings: -
+        report: called with what is done next.
+        curves: measured curves of the scene's specimen; or none.
+        radius: markers closer to the contact say nothing, mm.
+    """
+    found, left_out = ladders(full)
+    solved: dict[Levels, Solved] = {}
+    points, programs = [], {}
+    for ladder in found:
+        finest = ladder.levels(full, list(ladder.rungs)[-1])
+        for rung in _picked(ladder, settings.quick):
+            levels = ladder.levels(full, rung)
+            report(f"{ladder.name} {rung}")
+            for one in (finest, levels):
+                if one not in solved:
+                    solved[one] = _solved(full, one)
+            if levels not in programs:
+                programs[levels] = compiled(full, levels, settings.lanes)
+            errors = _errors(solved[levels], solved[finest])
+            point = _point(name, ladder, rung, levels == finest, errors)
+            if curves:
+                point["data"] = against(full.path, solved[levels], curves, radius)
+            points.append((levels, point))
+    report("timing")
+    times = timed(full, programs, settings)
+    end = _environment(settings)
+    rows = [point | {"times": times[levels]} | end for levels, point in points]
+    return rows + [{"scene": name, "ladder": k, "left_out": v} for k, v in left_out.items()]
+
+
+def against(path, solved: Solved, curves: Sequence[Any], radius: float) -> dict[str, float]:
+    """Errors of force and joints against measured normal presses, relative to the largest.
+
+    Raises:
+        ValueError: a row that no curve covers.
+    """
+    if not isinstance(path, Presses):
+        raise ValueError("the scene moves a tool; data are compared with presses at given points")
+    x = np.asarray(solved.scene.geometry.ring_positions)
+    here = [[], []]
+    there = [[], []]
+    for i, (s, D) in enumerate(zip(np.asarray(path.s), np.asarray(path.displacement), strict=True)):
+        near = [c for c in curves if c.s_c is not None and abs(c.s_c - s) < 1e-6]
+        depth = -D[1]
+        if not near or not near[0].displacement.min() <= depth <= near[0].displacement.max():
+            raise ValueError(f"row {i + 1} (s = {s:g} mm, {depth:g} mm deep): no curve covers it")
+        curve = near[0]
+        there[0].append([np.interp(depth, curve.displacement, curve.force)])
+        here[0].append([-float(solved.out.force[i, 1])])
+        if curve.joint_displacement is not None and solved.out.joints is not None:
+            seen = curve.joint_rings[np.abs(x[curve.joint_rings] - s) >= radius]
+            for ring in seen:
+                column = curve.joint_displacement[:, list(curve.joint_rings).index(ring)]
+                there[1].append([np.interp(depth, curve.displacement, column)])
+                here[1].append([-float(solved.out.joints[i, ring, 1])])
+    names = ("force", "joints")
+    return {
+        k: relative(a, b) for k, a, b in zip(names, here, there, strict=True) if b
+    }  # fmt: skip
+
+
+def compiled(full: Full, levels: Levels, lanes: int) -> Compiled:
+    """The program of one pose: material and path in, everything out; and those beside it."""
+    scene, material, path = program(full, levels)
+    row = jax.tree.map(lambda v: v[-1:], path)
+    start = time.perf_counter()
+    call = jax.jit(lambda m, p: simulate(scene, m, p)).lower(material, row).compile()
+    seconds = time.perf_counter() - start
+
+    def slopes(m, p):
+        out, change = solve(scene, m, p)
+        return out.force, change
+
+    gradient = jax.jit(slopes).lower(material, row).compile()
+    many = None
+    if lanes:
+        wide = jax.tree.map(lambda v: jnp.stack([v] * lanes), (material, row))
+        batch = jax.jit(jax.vmap(lambda m, p: simulate(scene, m, p))).lower(*wide).compile()
+        many = lambda: batch(*wide)  # noqa: E731
+    return Compiled(lambda: call(material, row), lambda: gradient(material, row), many, seconds)
+
+
+def timed(full: Full, programs: dict[Levels, Compiled], settings: Settings) -> dict[Levels, dict]:
+    """Seconds: median and 99 % of single calls, median per lane of batches, compilation."""
+    samples = {levels: {"call": [], "gradient": [], "lane": []} for levels in programs}
+    block = max(settings.calls // TURNS, 1)
+    for _ in range(TURNS):
+        for levels, made in programs.items():
+            seen = samples[levels]
+            seen["call"] += sampled(made.call, block)
+            seen["gradient"] += sampled(made.gradient, block)
+            if made.lanes is not None:
+                batches = sampled(made.lanes, max(block // settings.lanes, 2))
+                seen["lane"] += [v / settings.lanes for v in batches]
+    short = lambda v: float(f"{v:.4g}")  # noqa: E731
+    found = {}
+    for levels, seen in samples.items():
+        found[levels] = {
+            name: {"median": short(np.median(v)), "p99": short(np.quantile(v, 0.99))}
+            for name, v in seen.items() if v
+        } | {"compile": short(programs[levels].seconds)}  # fmt: skip
+    return found
+
+
+def sampled(call: Callable, calls: int) -> list[float]:
+    """Seconds of single calls, each waited for; one before them is not counted."""
+    jax.block_until_ready(call())
+    taken = []
+    for _ in range(calls):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        taken.append(time.perf_counter() - start)
+    return taken
+
+
+def _picked(ladder: Ladder, quick: bool) -> list[str]:
+    names = list(ladder.rungs)
+    if not quick or len(names) <= 3:
+        return names
+    return [names[0], names[len(names) // 2], names[-1]]
+
+
+def _solved(full: Full, levels: Levels) -> Solved:
+    made = program(full, levels)
+    out, gradient = jax.jit(solve)(*made)
+    return Solved(made[0], jax.tree.map(np.asarray, out), np.asarray(gradient))
+
+
+def _errors(found: Solved, reference: Solved) -> Errors:
+    both = (found.scene, reference.scene)
+    return compare(found.out, reference.out, both, (found.gradient, reference.gradient))
+
+
+def _point(name: str, ladder: Ladder, rung: str, finest: bool, errors: Errors) -> dict[str, Any]:
+    short = {k: _number(v) for k, v in errors._asdict().items()}
+    return {"scene": name, "ladder": ladder.name, "level": rung, "kind": ladder.kind,
+            "finest": finest, "errors": short}  # fmt: skip
+
+
+def _number(v: float | None) -> float | str | None:
+    """Four digits; infinity as a word, since JSON has none."""
+    if v is None:
+        return None
+    return float(f"{v:.4g}") if np.isfinite(v) else "inf"
+
+
+def _environment(settings: Settings) -> dict[str, Any]:
+    names = ("jaxtrachea", "jax", "jaxlib", "numpy")
+    return {
+        "calls": settings.calls, "lanes": settings.lanes, "load": round(os.getloadavg()[0], 2),
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "device": str(jax.devices()[0]), "processor": _processor(),
+        "versions": {"python": platform.python_version()} | {n: version(n) for n in names},
+    }  # fmt: skip
+
+
+def _processor() -> str:
+    """Name of the processor where Linux tells it."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            names = [line.split(":", 1)[1].strip() for line in file if "model name" in line]
+    except OSError:
+        names = []
+    return names[0] if names else platform.processor()
