@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jaxtrachea import __version__, cli_compare, cli_fit, cli_scene
+from jaxtrachea import __version__, cli_compare, cli_fit, cli_scene, cli_tradeoff
 from jaxtrachea.cli_load import load
 from jaxtrachea.terminal import Kept, Stop, complain, into, progress_bar, table, to_stderr
 
@@ -69,7 +69,9 @@ def main() -> None:
     sys.exit(code or 0)
 
 
-for _command in (cli_compare.compare, cli_scene.plan, cli_scene.simulate, cli_scene.sweep):
+for _command in (
+    cli_compare.compare, cli_scene.plan, cli_scene.simulate, cli_scene.sweep, cli_tradeoff.tradeoff
+):  # fmt: skip
     app.command()(_command)
 
 

@@ -26,13 +26,16 @@ from jaxtrachea.tradeoff.levels import Full, Levels, program
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
 BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
-#: Share of the operations that an effect must save to be dropped.
-LEAST = 1e-3
 #: Effects of a plan, by the name of their ladder where that differs.
 EFFECT = {"local": "two_material", "interpolation": "surface", "quality": "contact quality"}
 #: Ladders of which the choice takes rungs, besides `quality`.
 CHOSEN = ("second_plane", "rings", "shear", "local", "axial", "end_motion", "friction",
           "interpolation", "dent")  # fmt: skip
+
+#: `simulate` for several paths; compiled quickly, since every program is called once.
+_simulate = jax.jit(
+    jax.vmap(simulate, (None, None, 0)), compiler_options={"xla_backend_optimization_level": 0}
+)
 
 
 class Rung(NamedTuple):
@@ -144,9 +147,7 @@ class _Trial:
 
     def _run(self, levels: Levels):
         scene, material, _ = program(self.full, levels)
-        quick = {"xla_backend_optimization_level": 0}  # a program of one call
-        run = jax.jit(jax.vmap(simulate, (None, None, 0)), compiler_options=quick)
-        return jax.tree.map(np.asarray, run(scene, material, self.paths))
+        return jax.tree.map(np.asarray, _simulate(scene, material, self.paths))
 
 
 def samples(full: Full) -> Poses | Presses:
@@ -197,7 +198,7 @@ def _within(
     names = list(ladder.rungs)[:-1]
     costs = {name: trial.saved(ladder.levels(trial.full, name)) for name in names}
     for name in sorted(names, key=lambda n: -costs[n]):
-        if costs[name] < LEAST or (above is not None and costs[name] >= above.saved):
+        if costs[name] <= 0 or (above is not None and costs[name] >= above.saved):
             continue
         trial.report(f"{ladder.name} {name}")
         rung = Rung(ladder.name, name, trial.errors(ladder.levels(trial.full, name)), costs[name])

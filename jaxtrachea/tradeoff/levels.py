@@ -33,6 +33,17 @@ from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.tube import make_tube
 
+#: A scene that climbs every ladder but friction's: a ball on the trachea of Table 1.
+BUILT_IN = {
+    "material": {
+        "EI_L": "1.862 N mm^2", "EA_L": "3.9 N", "GA_L": "1.2 N", "EI_C": "13.07 N mm^2",
+        "k_M": "0.1 N/mm", "k_t": "0.4 N/mm", "k_1": "0.3 N/mm", "k_3": "0.02 N/mm^3",
+        "k_1_ring": "0.6 N/mm", "k_A": "0.2 N/mm", "k_B": "0.5 N/mm",
+    },
+    "tool": {"shape": "sphere", "radius": "5 mm"},
+    "path": [{"start": ["73 mm", "18 mm", "1 mm"], "end": ["74 mm", "15 mm", "1.5 mm"], "steps": 4}],
+}  # fmt: skip
+
 
 @dataclasses.dataclass(frozen=True)
 class Levels:

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxtrachea.scene.simulation import Simulation, simulate
 from jaxtrachea.scene.stage import Presses, Scene
+from jaxtrachea.tradeoff.choice import Choice
 from jaxtrachea.tradeoff.errors import Errors, compare, relative
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
@@ -90,7 +91,7 @@ def measure(
                 point["data"] = against(full.path, solved[levels], curves, radius)
             points.append((levels, point))
     report("timing")
-    times = timed(full, programs, settings)
+    times = timed(programs, settings)
     end = _environment(settings)
     rows = [point | {"times": times[levels]} | end for levels, point in points]
     return rows + [{"scene": name, "ladder": k, "left_out": v} for k, v in left_out.items()]
@@ -148,7 +149,7 @@ def compiled(full: Full, levels: Levels, lanes: int) -> Compiled:
     return Compiled(lambda: call(material, row), lambda: gradient(material, row), many, seconds)
 
 
-def timed(full: Full, programs: dict[Levels, Compiled], settings: Settings) -> dict[Levels, dict]:
+def timed(programs: dict[Levels, Compiled], settings: Settings) -> dict[Levels, dict]:
     """Seconds: median and 99 % of single calls, median per lane of batches, compilation."""
     samples = {levels: {"call": [], "gradient": [], "lane": []} for levels in programs}
     block = max(settings.calls // TURNS, 1)
@@ -168,6 +169,23 @@ def timed(full: Full, programs: dict[Levels, Compiled], settings: Settings) -> d
             for name, v in seen.items() if v
         } | {"compile": short(programs[levels].seconds)}  # fmt: skip
     return found
+
+
+def choice_row(
+    name: str, full: Full, choice: Choice, times: dict[Levels, dict], settings: Settings
+) -> dict[str, Any]:
+    """A choice as a line of JSON, with the times of its program and of the full one."""
+    said = lambda rungs: [  # noqa: E731
+        {"ladder": r.ladder, "level": r.level, "error": _number(r.errors.worst)} for r in rungs
+    ]
+    call = lambda levels: times[levels]["call"]["median"]  # noqa: E731
+    return {
+        "scene": name, "tolerance": choice.tolerance, "dropped": said(choice.dropped),
+        "refused": said(choice.refused), "returned": said(choice.returned),
+        "errors": {k: _number(v) for k, v in choice.errors._asdict().items()},
+        "operations": round(choice.operations[1] / choice.operations[0], 4),
+        "times": {"chosen": call(choice.levels), "full": call(full.levels)},
+    } | _environment(settings)  # fmt: skip
 
 
 def sampled(call: Callable, calls: int) -> list[float]:
