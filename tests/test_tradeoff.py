@@ -6,7 +6,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from run_cli import run
 
 from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.simulation import simulate
@@ -56,14 +55,13 @@ def test_a_coarse_mesh_is_interpolated_where_the_fine_one_has_vertices():
     from jaxtrachea.trachea.tube import make_tube
 
     coarse, fine = (make_tube(table_1(), around=n, along=2 * n) for n in (8, 16))
-    of = lambda mesh: dataclasses.make_dataclass("S", ["mesh"])(mesh)  # noqa: E731
     field = lambda mesh: np.stack([mesh.s, 2 * mesh.s + 1, 0 * mesh.s], 1)[None]  # noqa: E731
-    found = remesh(np.asarray(field(coarse)), of(coarse), of(fine))
+    found = remesh(np.asarray(field(coarse)), coarse, fine)
     np.testing.assert_allclose(found, field(fine), atol=1e-12)
     # Linear in the turn from 0 to 315 deg, and from there back to its value at 360 = 0 deg.
     turn = lambda mesh: np.asarray(mesh.phi) % (2 * np.pi)  # noqa: E731
     around = lambda mesh: np.stack([turn(mesh)] * 3, 1)[None]  # noqa: E731
-    found = remesh(around(coarse), of(coarse), of(fine))[0, :, 0]
+    found = remesh(around(coarse), coarse, fine)[0, :, 0]
     last = 7 / 8 * 2 * np.pi
     expected = np.where(turn(fine) <= last + 1e-9, turn(fine), last / 2)
     np.testing.assert_allclose(found, expected, atol=1e-12)

@@ -27,7 +27,11 @@ from jaxtrachea.tradeoff.levels import Full, Levels, program
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
 BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
 #: Effects of a plan, by the name of their ladder where that differs.
-EFFECT = {"local": "two_material", "interpolation": "surface", "quality": "contact quality"}
+EFFECT: dict[str, str] = {
+    "local": "two_material",
+    "interpolation": "surface",
+    "quality": "contact quality",
+}
 #: Ladders of which the choice takes rungs, besides `quality`.
 CHOSEN = ("second_plane", "rings", "shear", "local", "axial", "end_motion", "friction",
           "interpolation", "dent")  # fmt: skip
@@ -115,8 +119,8 @@ def choose(
         else:
             options[back.ladder].append(finer)
     operations = trial.operations(full.levels), trial.operations(levels)
-    found = tuple(tuple(v) for v in (picked, refused, returned))
-    scene = _explained(program(full, levels)[0], *found)
+    scene = _explained(program(full, levels)[0], picked, refused, returned)
+    found = tuple(picked), tuple(refused), tuple(returned)
     return Choice(scene, levels, tolerance, *found, errors, operations)
 
 
@@ -134,7 +138,7 @@ class _Trial:
     def errors(self, levels: Levels) -> Errors:
         if levels not in self.known:
             found = self._run(levels)
-            self.known[levels] = compare(found, self.reference, (self.full.scene,) * 2)
+            self.known[levels] = compare(found, self.reference, (self.full.scene, self.full.scene))
         return self.known[levels]
 
     def operations(self, levels: Levels) -> int:
@@ -182,12 +186,11 @@ def changes(errors: Errors) -> str:
 
 def _ladders(full: Full) -> list[Ladder]:
     """Those of the choice: what saves operations, and what the user has not decided."""
-    free = lambda name: getattr(full.given, EFFECT.get(name, name)) == "auto"  # noqa: E731
+    free = lambda name: getattr(full.given, _effect(name)) == "auto"  # noqa: E731
     found = [v for v in ladders(full)[0] if v.name in CHOSEN and free(v.name)]
     if full.scene.plan.contact:
-        names = ("sharpness", "steps")
-        rungs = {k: dict(zip(names, v, strict=True)) for k, v in QUALITY.items()}
-        found.append(Ladder("quality", "truncation", rungs | {"fine": {}}, {}))
+        rungs = {k: {"sharpness": sharp, "steps": n} for k, (sharp, n) in QUALITY.items()}
+        found.append(Ladder("quality", "truncation", {**rungs, "fine": {}}, {}))
     return found
 
 
@@ -225,16 +228,22 @@ def _explained(scene: Scene, picked, refused, returned) -> Scene:
         (returned, "{0} would change {1}, too much together with the others"),
     ):
         for rung in rungs:
-            name = EFFECT.get(rung.ladder, rung.ladder)
-            said.setdefault(name, []).append(form.format(rung.level, changes(rung.errors)))
+            said.setdefault(_effect(rung.ladder), []).append(
+                form.format(rung.level, changes(rung.errors))
+            )
     plan = scene.plan
     more = [Effect("contact quality", "fine", "the finest")] if plan.contact else []
-    level = {EFFECT.get(rung.ladder, rung.ladder): rung.level for rung in picked}
+    level = {_effect(rung.ladder): rung.level for rung in picked}
     effects = tuple(
         Effect(e.name, level.get(e.name, _level(plan, e)), "; ".join(said.get(e.name, [e.reason])),
                e.forced) for e in (*plan.effects, *more)
     )  # fmt: skip
     return dataclasses.replace(scene, plan=dataclasses.replace(plan, effects=effects))
+
+
+def _effect(ladder: str) -> str:
+    """The effect of a plan that a ladder is of."""
+    return EFFECT[ladder] if ladder in EFFECT else ladder
 
 
 def _level(plan: Plan, effect: Effect) -> str:

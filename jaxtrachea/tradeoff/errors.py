@@ -7,6 +7,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Scene
+from jaxtrachea.trachea.mesh import Mesh
 
 
 class Errors(NamedTuple):
@@ -63,7 +64,9 @@ def compare(
         expected = _moved(reference, fine)
         here = expected * 0 if found.vertices is None else _moved(found, scene)
         if here.shape != expected.shape:
-            here = remesh(here, scene, fine)
+            assert scene.mesh is not None
+            assert fine.mesh is not None
+            here = remesh(here, scene.mesh, fine.mesh)
         surface = relative(here, expected)
         millimetres = surface * largest(expected)
     gradient = None if gradients is None else relative(*(np.swapaxes(g, -1, -2) for g in gradients))
@@ -100,18 +103,16 @@ def spread(joints: np.ndarray, x: np.ndarray, at: np.ndarray, length: float) -> 
     return np.apply_along_axis(line, 1, padded)
 
 
-def remesh(moved: np.ndarray, scene: Scene, fine: Scene) -> np.ndarray:
+def remesh(moved: np.ndarray, mesh: Mesh, fine: Mesh) -> np.ndarray:
     """Displacements on a made tube's grid, bilinear at the vertices of another; (rows, n, 3)."""
-    assert scene.mesh is not None
-    assert fine.mesh is not None
-    s, phi = (np.asarray(v, float) for v in (scene.mesh.s, scene.mesh.phi))
+    s, phi = (np.asarray(v, float) for v in (mesh.s, mesh.phi))
     lines = np.unique(s)
     around = len(s) // len(lines)
     turn = 2 * np.pi * np.arange(around + 1) / around
     assert np.allclose(np.cos(phi[:around]), np.cos(turn[:-1]))
     grid = moved.reshape(len(moved), len(lines), around, 3).transpose(1, 2, 0, 3)
     grid = np.concatenate([grid, grid[:, :1]], axis=1)
-    there = np.stack([np.asarray(fine.mesh.s), np.asarray(fine.mesh.phi) % (2 * np.pi)], axis=1)
+    there = np.stack([np.asarray(fine.s), np.asarray(fine.phi) % (2 * np.pi)], axis=1)
     return RegularGridInterpolator((lines, turn), grid)(there).transpose(1, 0, 2)
 
 

@@ -41,7 +41,9 @@ BUILT_IN = {
         "k_1_ring": "0.6 N/mm", "k_A": "0.2 N/mm", "k_B": "0.5 N/mm",
     },
     "tool": {"shape": "sphere", "radius": "5 mm"},
-    "path": [{"start": ["73 mm", "18 mm", "1 mm"], "end": ["74 mm", "15 mm", "1.5 mm"], "steps": 4}],
+    "path": [
+        {"start": ["73 mm", "18 mm", "1 mm"], "end": ["74 mm", "15 mm", "1.5 mm"], "steps": 4}
+    ],
 }  # fmt: skip
 
 
