@@ -1,11 +1,15 @@
 """Errors of rungs by hand, and plans chosen by tolerance against the full model."""
 
 import dataclasses
+import json
 from pathlib import Path
+from types import SimpleNamespace
 
+import h5py
 import jax
 import numpy as np
 import pytest
+from run_cli import run
 
 from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.simulation import simulate
@@ -136,12 +140,12 @@ def off(found, reference):
 def test_chosen_plan_is_within_the_tolerance():
     spec, made = staged()
     full = full_scene(spec, made)
-    run = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
-    reference = run(made.scene, made.material, made.path)  # the rules leave nothing out here
+    solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
+    reference = solve(made.scene, made.material, made.path)  # the rules leave nothing out here
     dropped = []
     for tolerance in (0.1, 0.01, 0.001):
         choice = choose(full, tolerance)
-        assert off(run(choice.scene, made.material, made.path), reference) <= tolerance
+        assert off(solve(choice.scene, made.material, made.path), reference) <= tolerance
         assert choice.errors.worst <= tolerance
         dropped.append({rung.ladder for rung in choice.dropped})
         level = {e.name: e.level for e in choice.scene.plan.effects}
@@ -158,7 +162,7 @@ def test_chosen_plan_is_within_the_tolerance():
 def test_two_effects_within_tolerance_can_break_it_together():
     spec, made = staged(GA_L="10 N")
     full = full_scene(spec, made)
-    run = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
+    solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
     options = made.scene.plan.options
     plan = lambda **less: dataclasses.replace(  # noqa: E731
         made.scene, plan=dataclasses.replace(
@@ -172,9 +176,9 @@ def test_two_effects_within_tolerance_can_break_it_together():
     saved = {rung.ladder: rung.saved for rung in loose.dropped}
     assert choice.returned[0].ladder == max(alone, key=lambda k: alone[k] / saved[k])
     assert choice.errors.worst <= tolerance
-    reference = run(full.scene, made.material, made.path)
-    both = run(plan(shear=False, local="uniform"), made.material, made.path)
-    assert off(run(choice.scene, made.material, made.path), reference) <= tolerance
+    reference = solve(full.scene, made.material, made.path)
+    both = solve(plan(shear=False, local="uniform"), made.material, made.path)
+    assert off(solve(choice.scene, made.material, made.path), reference) <= tolerance
     assert off(both, reference) > 0
 
 
@@ -183,3 +187,75 @@ def test_a_wish_is_kept():
     choice = choose(full_scene(*staged(wish)), 0.1)
     assert {rung.ladder for rung in choice.dropped} == {"local"}
     assert choice.levels.shear
+
+
+TOML = f"""
+[trachea]
+length = "80 mm"
+rings = {{ count = 7, first = "10 mm", last = "70 mm" }}
+[material]
+EI_L = "1.86 N mm^2"
+k_M = "0.1 N/mm"
+k_1 = "{K_1} N/mm"
+k_3 = "{K_3} N/mm^3"
+GA_L = "20 N"
+k_1_ring = "0.28 N/mm"
+[model]
+contact = "bonded"
+[path]
+s = "42 mm"
+displacement = ["0 mm", "-{DEPTH} mm", "0 mm"]
+steps = 2
+[output]
+surface = false
+ring_ends = false
+pictures = false
+"""
+
+
+def test_simulate_takes_the_plan_within_the_tolerance(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("scene.toml").write_text(TOML + '[plan]\ntolerance = "10 %"\n')
+    code, out, _ = run(monkeypatch, capsys, "simulate", "scene.toml", "--out", "result")
+    assert code == 0
+    assert "within 10 %: force" in out
+    with h5py.File("result/simulation.h5") as file:
+        level = {row[0]: (row[1], row[4]) for row in json.loads(file.attrs["plan"])}
+        force = file["series/force"][:]
+    assert level["shear"][0] == level["two_material"][0] == "off"
+    assert level["shear"][1].startswith("within the tolerance: changes force 0.")
+    spec, made = staged(GA_L=None, k_1_ring=None)  # never knew of the two effects
+    np.testing.assert_allclose(force, simulate(made.scene, made.material, made.path).force)
+
+
+@pytest.mark.parametrize("tolerance", ["0 %", "100 %", "1 mm"])
+def test_bad_tolerance_is_refused(tolerance, tmp_path, monkeypatch, capsys):
+    path = tmp_path / "scene.toml"
+    path.write_text(TOML + f'[plan]\ntolerance = "{tolerance}"\n')
+    code, _, err = run(monkeypatch, capsys, "plan", path)
+    assert code == 2
+    assert "plan.tolerance" in err
+
+
+def test_data_must_cover_the_scene():
+    full = full_scene(*staged())
+    curve = SimpleNamespace(s_c=42.0, displacement=np.array([0, 3.0]), force=np.array([0, 1.0]))
+    with pytest.raises(ValueError, match=r"row 2 \(s = 42 mm, 4 mm deep\): no curve covers it"):
+        measuring.check_curves(full.path, [curve])
+
+
+@pytest.mark.slow
+def test_command_writes_every_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("scene.toml").write_text(TOML)
+    code, out, _ = run(monkeypatch, capsys, "tradeoff", "scene.toml", "--quick", "--out", "made")
+    assert code == 0
+    assert "left out: dent: no surface" in out
+    names = {path.name for path in Path("made").iterdir()}
+    assert names == {"tradeoff.jsonl", "tradeoff.md", "tradeoff.png", "provenance.json"}
+    rows = [json.loads(line) for line in Path("made/tradeoff.jsonl").read_text().splitlines()]
+    error = {(r["ladder"], r["level"]): r["errors"] for r in rows if "errors" in r}
+    assert error["form", "reactions"]["force"] < 1e-9
+    assert 1e-9 < error["dtype", "float32"]["force"] < 1e-5
+    kept = [error["rings_kept", n]["joints"] for n in ("1", "3", "7")]
+    assert kept[0] > kept[1] > kept[2] == 0

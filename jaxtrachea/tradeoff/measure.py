@@ -15,7 +15,7 @@ import numpy as np
 from jaxtrachea.scene.simulation import Simulation, simulate
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.tradeoff.choice import Choice
-from jaxtrachea.tradeoff.errors import Errors, compare, relative
+from jaxtrachea.tradeoff.errors import Errors, compare, relative, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
 
@@ -37,7 +37,7 @@ class Compiled(NamedTuple):
     """Programs of one pose, ready to be called, and the seconds that the first took to compile."""
 
     call: Callable
-    gradient: Callable
+    gradient: Callable | None
     lanes: Callable | None
     seconds: float
 
@@ -72,6 +72,8 @@ def measure(
         curves: measured curves of the scene's specimen; or none.
         radius: markers closer to the contact say nothing, mm.
     """
+    if curves:
+        check_curves(full.path, curves)
     found, left_out = ladders(full)
     solved: dict[Levels, Solved] = {}
     points, programs = [], {}
@@ -88,7 +90,7 @@ def measure(
             errors = _errors(solved[levels], solved[finest])
             point = _point(name, ladder, rung, levels == finest, errors)
             if curves:
-                point["data"] = against(full.path, solved[levels], curves, radius)
+                point["data"] = against(full, solved[levels], curves, radius)
             points.append((levels, point))
     report("timing")
     times = timed(programs, settings)
@@ -97,38 +99,53 @@ def measure(
     return rows + [{"scene": name, "ladder": k, "left_out": v} for k, v in left_out.items()]
 
 
-def against(path, solved: Solved, curves: Sequence[Any], radius: float) -> dict[str, float]:
+def check_curves(path, curves: Sequence[Any]) -> list[tuple[Any, float]]:
+    """The curve of every row of a path of normal presses, and its depth, mm.
+
+    Raises:
+        ValueError: a motion of a tool, or a row that no curve covers.
+    """
+    if not isinstance(path, Presses):
+        raise ValueError("the scene moves a tool; curves are compared with presses at given points")
+    found = []
+    for i, (s, D) in enumerate(zip(np.asarray(path.s), np.asarray(path.displacement), strict=True)):
+        depth = -float(D[1])
+        near = [
+            c for c in curves if c.s_c is not None and abs(c.s_c - s) < 1e-6
+            and c.displacement.min() <= depth <= c.displacement.max()
+        ]  # fmt: skip
+        if not near:
+            raise ValueError(f"row {i + 1} (s = {s:g} mm, {depth:g} mm deep): no curve covers it")
+        found.append((near[0], depth))
+    return found
+
+
+def against(full: Full, solved: Solved, curves: Sequence[Any], radius: float) -> dict[str, float]:
     """Errors of force and joints against measured normal presses, relative to the largest.
 
     Raises:
-        ValueError: a row that no curve covers.
+        ValueError: as `check_curves`.
     """
-    if not isinstance(path, Presses):
-        raise ValueError("the scene moves a tool; data are compared with presses at given points")
-    x = np.asarray(solved.scene.geometry.ring_positions)
-    here = [[], []]
-    there = [[], []]
-    for i, (s, D) in enumerate(zip(np.asarray(path.s), np.asarray(path.displacement), strict=True)):
-        near = [c for c in curves if c.s_c is not None and abs(c.s_c - s) < 1e-6]
-        depth = -D[1]
-        if not near or not near[0].displacement.min() <= depth <= near[0].displacement.max():
-            raise ValueError(f"row {i + 1} (s = {s:g} mm, {depth:g} mm deep): no curve covers it")
-        curve = near[0]
-        there[0].append([np.interp(depth, curve.displacement, curve.force)])
-        here[0].append([-float(solved.out.force[i, 1])])
-        if curve.joint_displacement is not None and solved.out.joints is not None:
-            seen = curve.joint_rings[np.abs(x[curve.joint_rings] - s) >= radius]
-            for ring in seen:
-                column = curve.joint_displacement[:, list(curve.joint_rings).index(ring)]
-                there[1].append([np.interp(depth, curve.displacement, column)])
-                here[1].append([-float(solved.out.joints[i, ring, 1])])
-    names = ("force", "joints")
-    return {
-        k: relative(a, b) for k, a, b in zip(names, here, there, strict=True) if b
-    }  # fmt: skip
+    x, kept = (np.asarray(v.geometry.ring_positions) for v in (full.scene, solved.scene))
+    moved = solved.out.joints
+    if moved is not None:
+        moved = spread(np.asarray(moved), kept, x, float(full.scene.geometry.length))
+    force, joints = ([], []), ([], [])
+    for i, (curve, depth) in enumerate(check_curves(full.path, curves)):
+        at = lambda v: [np.interp(depth, curve.displacement, v)]  # noqa: B023, E731
+        force[0].append([-float(solved.out.force[i, 1])])
+        force[1].append(at(curve.force))
+        if curve.joint_rings is None or moved is None:
+            continue
+        for column, ring in enumerate(curve.joint_rings):
+            if abs(x[ring] - curve.s_c) >= radius:
+                joints[0].append([-float(moved[i, ring, 1])])
+                joints[1].append(at(curve.joint_displacement[:, column]))
+    both = {"force": force, "joints": joints}
+    return {name: _number(relative(*v)) for name, v in both.items() if v[0]}
 
 
-def compiled(full: Full, levels: Levels, lanes: int) -> Compiled:
+def compiled(full: Full, levels: Levels, lanes: int, *, slopes: bool = True) -> Compiled:
     """The program of one pose: material and path in, everything out; and those beside it."""
     scene, material, path = program(full, levels)
     row = jax.tree.map(lambda v: v[-1:], path)
@@ -136,17 +153,19 @@ def compiled(full: Full, levels: Levels, lanes: int) -> Compiled:
     call = jax.jit(lambda m, p: simulate(scene, m, p)).lower(material, row).compile()
     seconds = time.perf_counter() - start
 
-    def slopes(m, p):
+    def derivatives(m, p):
         out, change = solve(scene, m, p)
         return out.force, change
 
-    gradient = jax.jit(slopes).lower(material, row).compile()
-    many = None
+    many = gradient = None
+    if slopes:
+        both = jax.jit(derivatives).lower(material, row).compile()
+        gradient = lambda: both(material, row)  # noqa: E731
     if lanes:
         wide = jax.tree.map(lambda v: jnp.stack([v] * lanes), (material, row))
         batch = jax.jit(jax.vmap(lambda m, p: simulate(scene, m, p))).lower(*wide).compile()
         many = lambda: batch(*wide)  # noqa: E731
-    return Compiled(lambda: call(material, row), lambda: gradient(material, row), many, seconds)
+    return Compiled(lambda: call(material, row), gradient, many, seconds)
 
 
 def timed(programs: dict[Levels, Compiled], settings: Settings) -> dict[Levels, dict]:
@@ -157,7 +176,8 @@ def timed(programs: dict[Levels, Compiled], settings: Settings) -> dict[Levels, 
         for levels, made in programs.items():
             seen = samples[levels]
             seen["call"] += sampled(made.call, block)
-            seen["gradient"] += sampled(made.gradient, block)
+            if made.gradient is not None:
+                seen["gradient"] += sampled(made.gradient, block)
             if made.lanes is not None:
                 batches = sampled(made.lanes, max(block // settings.lanes, 2))
                 seen["lane"] += [v / settings.lanes for v in batches]

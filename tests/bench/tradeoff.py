@@ -69,7 +69,8 @@ def choices(settings) -> None:
         full = full_of(name)
         found = [choose(full, v, lambda text: print(text, flush=True)) for v in TOLERANCES]
         levels = {full.levels, *(choice.levels for choice in found)}
-        times = timed({v: compiled(full, v, 0) for v in levels}, settings._replace(lanes=0))
+        programs = {v: compiled(full, v, 0, slopes=False) for v in levels}
+        times = timed(programs, settings._replace(lanes=0))
         rows += [choice_row(name, full, choice, times, settings) for choice in found]
         (FOLDER / "choice.jsonl").write_text(lines(rows), "utf-8")
 
