@@ -120,7 +120,7 @@ def check_curves(path, curves: Sequence[Any]) -> list[tuple[Any, float]]:
     return found
 
 
-def against(full: Full, solved: Solved, curves: Sequence[Any], radius: float) -> dict[str, float]:
+def against(full: Full, solved: Solved, curves: Sequence[Any], radius: float) -> dict[str, Any]:
     """Errors of force and joints against measured normal presses, relative to the largest.
 
     Raises:
