@@ -94,9 +94,10 @@ def test_a_measured_rung_errs_as_by_hand(monkeypatch):
     full = full_scene(*staged(GA_L=None, k_1_ring=None))
     ladder = Ladder("coupling", "model", {v: {"coupling": v} for v in ("total", "series")}, {})
     monkeypatch.setattr(measuring, "ladders", lambda full: ([ladder], {"x": "why"}))
-    rows = measuring.measure("small", full, measuring.Settings(calls=10, lanes=2))
+    rows = measuring.measure("small", full, measuring.Settings(calls=10, lanes=0))
     total, series, left = rows
-    out = simulate(full.scene, full.material, full.path)
+    solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
+    out = solve(full.scene, full.material, full.path)
     F = -float(out.force[-1, 1])
     c = float(out.skeleton[-1, 1]) / float(out.force[-1, 1])
     d = np.roots([c * K_3, 0, 1 + c * K_1, -DEPTH])
@@ -114,7 +115,7 @@ def test_a_measured_rung_errs_as_by_hand(monkeypatch):
     for name in ("EI_L", "k_M"):
         value = getattr(full.material, name) * (1 + small)
         more = dataclasses.replace(full.material, **{name: value})
-        stiff.append(-float(simulate(full.scene, more, full.path).force[-1, 1]))
+        stiff.append(-float(solve(full.scene, more, full.path).force[-1, 1]))
     J = np.array([*(np.array(stiff[1:]) - F) / small, *own])
     expected = np.abs(np.array([0, 0, K_1 * DEPTH, K_3 * DEPTH**3]) - J)
     found = total["errors"]["gradient"]
@@ -123,7 +124,6 @@ def test_a_measured_rung_errs_as_by_hand(monkeypatch):
         times = row["times"]
         assert 0 < times["call"]["median"] <= times["call"]["p99"]
         assert times["gradient"]["median"] > 0
-        assert times["lane"]["median"] > 0
         assert times["compile"] > 0
     assert left == {"scene": "small", "ladder": "x", "left_out": "why"}
 
@@ -225,7 +225,9 @@ def test_simulate_takes_the_plan_within_the_tolerance(tmp_path, monkeypatch, cap
     assert level["shear"][0] == level["two_material"][0] == "off"
     assert level["shear"][1].startswith("within the tolerance: changes force 0.")
     spec, made = staged(GA_L=None, k_1_ring=None)  # never knew of the two effects
-    np.testing.assert_allclose(force, simulate(made.scene, made.material, made.path).force)
+    solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
+    expected = solve(made.scene, made.material, made.path).force
+    np.testing.assert_allclose(force, expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("tolerance", ["0 %", "100 %", "1 mm"])

@@ -32,6 +32,8 @@ EFFECT: dict[str, str] = {
     "interpolation": "surface",
     "quality": "contact quality",
 }
+#: Levels that a plan calls otherwise.
+WORD = {"uniform": "off", "0": "off"}
 #: Ladders of which the choice takes rungs, besides `quality`.
 CHOSEN = ("second_plane", "rings", "shear", "local", "axial", "end_motion", "friction",
           "interpolation", "dent")  # fmt: skip
@@ -233,7 +235,7 @@ def _explained(scene: Scene, picked, refused, returned) -> Scene:
             )
     plan = scene.plan
     more = [Effect("contact quality", "fine", "the finest")] if plan.contact else []
-    level = {_effect(rung.ladder): rung.level for rung in picked}
+    level = {_effect(rung.ladder): WORD.get(rung.level, rung.level) for rung in picked}
     effects = tuple(
         Effect(e.name, level.get(e.name, _level(plan, e)), "; ".join(said.get(e.name, [e.reason])),
                e.forced) for e in (*plan.effects, *more)
