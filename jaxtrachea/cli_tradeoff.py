@@ -91,11 +91,12 @@ def _full(scene: Path | None):
 def measured_curves(data: Path | None):
     """Measured curves, the radius of the tool that made them, digests of their files."""
     if data is None:
-        return (), 0.0, {}
+        return (), -1.0, {}
     from jaxtrachea.cli_load import load
 
     spec, measurements, _ = load(data, None)
-    return measurements.curves, spec.data.tool_radius or 0.0, measurements.sha256()
+    radius = spec.data.tool_radius
+    return measurements.curves, -1.0 if radius is None else radius, measurements.sha256()
 
 
 def _write(folder: Path, name: str, rows, scene: Path | None, inputs, clock) -> None:

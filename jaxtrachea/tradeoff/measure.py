@@ -58,7 +58,7 @@ class Settings(NamedTuple):
 
 def measure(
     name: str, full: Full, settings: Settings = Settings(), report: Report = lambda text: None,  # noqa: B008
-    curves: Sequence[Any] = (), radius: float = 0.0,
+    curves: Sequence[Any] = (), radius: float = -1.0,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Errors and times of every rung, one dict each; then one for each ladder left out.
 
@@ -70,7 +70,7 @@ def measure(
         settings: -
         report: called with what is done next.
         curves: measured curves of the scene's specimen; or none.
-        radius: markers closer to the contact say nothing, mm.
+        radius: markers no further from the contact say nothing, mm; negative: all count.
     """
     if curves:
         check_curves(full.path, curves)
@@ -138,7 +138,7 @@ def against(full: Full, solved: Solved, curves: Sequence[Any], radius: float) ->
         if curve.joint_rings is None or moved is None:
             continue
         for column, ring in enumerate(curve.joint_rings):
-            if abs(x[ring] - curve.s_c) >= radius:
+            if abs(x[ring] - curve.s_c) > radius:
                 joints[0].append([-float(moved[i, ring, 1])])
                 joints[1].append(at(curve.joint_displacement[:, column]))
     both = {"force": force, "joints": joints}

@@ -63,6 +63,7 @@ def _panel(axis, points, panel: str, colours) -> None:
         if gradient
         else "largest error: force, joints, surface"
     )
+    axis.set_ylim(1e-5, 1e-2)
     axis.set_ylabel("time of a call with derivatives [s]" if gradient else "time of a call [s]")
     for name, at in GOALS.items():
         axis.axhline(at, color="0.5", lw=0.8, ls="--")
