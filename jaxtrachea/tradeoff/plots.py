@@ -82,7 +82,7 @@ def _panel(axis, points, panel: str, colours) -> None:
         axis.errorbar(x[on], y[on], yerr=[0 * up, up], fmt="o-", ms=4, lw=0.8, elinewidth=0.6,
                       color=colours[name], label=name)  # fmt: skip
         if not gradient:
-            for i in np.flatnonzero(on & np.isfinite(x)):
+            for i in np.flatnonzero(on & np.isfinite(x) & (x > EXACT)):
                 axis.annotate(shown[i]["level"], (x[i], y[i]), fontsize=6, xytext=(3, 3),
                               textcoords="offset points")  # fmt: skip
     front = pareto(x, y)

@@ -64,13 +64,13 @@ def choices(settings) -> None:
     from jaxtrachea.tradeoff.measure import choice_row, compiled, timed
     from jaxtrachea.tradeoff.page import lines
 
-    rows = []
+    rows, settings = [], settings._replace(lanes=0)
     for name in CHOICES:
         full = full_of(name)
         found = [choose(full, v, lambda text: print(text, flush=True)) for v in TOLERANCES]
         levels = {full.levels, *(choice.levels for choice in found)}
         programs = {v: compiled(full, v, 0, slopes=False) for v in levels}
-        times = timed(programs, settings._replace(lanes=0))
+        times = timed(programs, settings)
         rows += [choice_row(name, full, choice, times, settings) for choice in found]
         (FOLDER / "choice.jsonl").write_text(lines(rows), "utf-8")
 
