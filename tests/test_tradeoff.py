@@ -154,6 +154,8 @@ def test_chosen_plan_is_within_the_tolerance():
         assert "change" in reason["shear"]
     assert dropped[0] == {"shear", "local"}
     assert dropped[2] == set()
+    assert {rung.ladder for rung in choice.refused} == {"shear", "local"}
+    assert not choice.returned
     assert dropped[0] > dropped[1] >= dropped[2]
     assert "no program but the full one is within 0.1 %" in choice.sentence
     assert choice.operations[0] == choice.operations[1]

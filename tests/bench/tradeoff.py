@@ -22,8 +22,9 @@ SCENES = {
     "virtual_trachea": "fits/virtual_trachea/scene.toml",
 }
 DATA = {"virtual_trachea": "fits/virtual_trachea/fit.toml"}
-#: Scenes and tolerances of the table of choices.
-CHOICES, TOLERANCES = ("normal", "off_midline", "friction"), (0.1, 0.01, 0.001)
+#: Scenes of configs/ and tolerances of the table of choices.
+CHOICES = ("no_surface", "bonded_pull", "normal", "off_midline", "friction")
+TOLERANCES = (0.1, 0.01, 0.001)
 
 
 def document() -> str:
@@ -39,7 +40,7 @@ def full_of(name: str, coupling: str | None = None):
     from jaxtrachea.scene.spec import load_scene_spec
     from jaxtrachea.tradeoff.levels import full_scene
 
-    path = ROOT / SCENES[name]
+    path = ROOT / SCENES.get(name, f"configs/{name}.toml")
     spec = load_scene_spec(path)
     return full_scene(spec, stage(spec, path.parent), coupling=coupling)
 
