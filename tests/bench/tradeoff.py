@@ -1,7 +1,7 @@
 """Accuracy against time of the repository's scenes, and docs/tradeoff.md from it.
 
 Run: python tests/bench/tradeoff.py. Options: `--quick` (three rungs a ladder, 100 calls),
-`--scenes A,B` and `--no-choice` (measure these only), `--page` (write the page from the JSON,
+`--scenes A,B` and `--choices A,B` (these only; "": none), `--page` (write the page from the JSON,
 measure nothing).
 """
 
@@ -59,14 +59,14 @@ def scene(name: str, settings) -> None:
     draw([row for row in rows if "left_out" not in row], name).savefig(FOLDER / f"{name}.png")
 
 
-def choices(settings) -> None:
-    """Choose plans for three scenes at three tolerances, and time them against the full ones."""
+def choices(names: list[str], settings) -> None:
+    """Choose plans for these scenes at every tolerance, and time them against the full ones."""
     from jaxtrachea.tradeoff.choice import choose
     from jaxtrachea.tradeoff.measure import choice_row, compiled, timed
     from jaxtrachea.tradeoff.page import lines
 
     rows, settings = [], settings._replace(lanes=0)
-    for name in CHOICES:
+    for name in names:
         full = full_of(name)
         found = [choose(full, v, lambda text: print(text, flush=True)) for v in TOLERANCES]
         levels = {full.levels, *(choice.levels for choice in found)}
@@ -81,10 +81,11 @@ def main() -> None:
     import jax
 
     parser = argparse.ArgumentParser(description=__doc__)
-    for option in ("--quick", "--page", "--no-choice"):
+    for option in ("--quick", "--page"):
         parser.add_argument(option, action="store_true")
     parser.add_argument("--calls", type=int, default=1000)
     parser.add_argument("--scenes", default=",".join(SCENES))
+    parser.add_argument("--choices", default=",".join(CHOICES))
     asked = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     from jaxtrachea.tradeoff.measure import Settings
@@ -94,8 +95,8 @@ def main() -> None:
     if not asked.page:
         for name in filter(None, asked.scenes.split(",")):
             scene(name, settings)
-        if not asked.no_choice:
-            choices(settings)
+        if asked.choices:
+            choices(asked.choices.split(","), settings)
     DOCUMENT.write_text(document(), "utf-8")
 
 
