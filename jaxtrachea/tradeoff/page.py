@@ -79,11 +79,13 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
     for row in rows:
         error, call = row["errors"], row["times"]
         worst = max(v for k in ("force", "joints", "surface") if (v := error[k]) is not None)
-        dropped = ", ".join(f"{d['ladder']} {d['level']} ({100 * d['error']:.2g} %)"
-                            for d in row["dropped"])  # fmt: skip
-        returned = ", ".join(f"{d['ladder']} {d['level']}" for d in row["returned"])
+        dropped, refused, returned = (
+            ", ".join(f"{d['ladder']} {d['level']} ({_percent(d['error'])})" for d in row[k])
+            for k in ("dropped", "refused", "returned")
+        )
         found.append([
-            row["scene"], f"{100 * row['tolerance']:g} %", dropped or "nothing", returned or "-",
+            row["scene"], f"{100 * row['tolerance']:g} %", dropped or "nothing", refused or "-",
+            returned or "-",
             f"{100 * worst:.2g} %", f"{100 * row['operations']:.0f} %",
             f"{_micro(call['chosen'])} / {_micro(call['full'])}",
             f"{call['chosen'] / call['full']:.2f}",
@@ -91,7 +93,7 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
     return found
 
 
-CHOICE_HEAD = ["scene", "tolerance", "dropped (changes alone)", "came back", "verified error",
+CHOICE_HEAD = ["scene", "tolerance", "dropped (changes alone)", "too far off alone", "came back", "verified error",
                "operations", "call, chosen / full [µs]", "ratio"]  # fmt: skip
 
 
@@ -103,7 +105,7 @@ def document(folder: Path, head: str) -> str:
         head: Markdown; `{choice}` is the table of choices.
     """
     choices = read(folder / "choice.jsonl")
-    body = table(CHOICE_HEAD, choice_rows(choices), 4) + "\n" + measured(choices)
+    body = table(CHOICE_HEAD, choice_rows(choices), 5) + "\n" + measured(choices)
     parts = [head.replace("{choice}", body)]
     for path in sorted(folder.glob("*.jsonl")):
         if path.stem != "choice":
@@ -118,6 +120,10 @@ def _error(v: float | str | None) -> str:
     if isinstance(v, str):
         return v
     return "0" if v == 0 else f"{v:.1e}"
+
+
+def _percent(v: float | str) -> str:
+    return v if isinstance(v, str) else f"{100 * v:.2g} %"
 
 
 def _micro(v: float) -> str:
