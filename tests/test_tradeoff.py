@@ -89,6 +89,20 @@ def test_ladders_of_a_scene_and_why_others_are_left_out():
     assert (kinds["form"], kinds["dtype"], kinds["shear"]) == ("algebra", "truncation", "model")
 
 
+def test_the_finest_level_is_no_wish_of_the_user():
+    arch = {"EI_C": "13 N mm^2", "k_t": "0.4 N/mm"}
+    said = {e.name: e for e in full_scene(*staged(**arch)).scene.plan.effects}
+    assert (said["rings"].level, said["rings"].forced) == ("arch2", False)
+    assert said["second_plane"].reason == "arches need vectors"
+    wish = SCENE | {"effects": {"rings": "arch2"}}
+    said = {e.name: e for e in full_scene(*staged(wish, **arch)).scene.plan.effects}
+    assert said["rings"].forced
+    wish = SCENE | {"effects": {"rings": "mat"}}
+    full = full_scene(*staged(wish, **arch))
+    assert full.levels.rings == "mat"
+    assert not full.levels.second_plane
+
+
 def test_a_measured_rung_errs_as_by_hand(monkeypatch):
     """`total` is F = k_1 D + k_3 D^3, by hand; `series` solves d + c F(d) = D."""
     full = full_scene(*staged(GA_L=None, k_1_ring=None))

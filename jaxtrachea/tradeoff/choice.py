@@ -235,11 +235,15 @@ def _explained(scene: Scene, picked, refused, returned) -> Scene:
             )
     plan = scene.plan
     more = [Effect("contact quality", "fine", "the finest")] if plan.contact else []
-    level = {_effect(rung.ladder): WORD.get(rung.level, rung.level) for rung in picked}
-    effects = tuple(
-        Effect(e.name, level.get(e.name, _level(plan, e)), "; ".join(said.get(e.name, [e.reason])),
-               e.forced) for e in (*plan.effects, *more)
-    )  # fmt: skip
+    picks = {_effect(rung.ladder): WORD.get(rung.level, rung.level) for rung in picked}
+
+    def explained(effect: Effect) -> Effect:
+        level = picks.get(effect.name, _level(plan, effect))
+        reason = effect.reason if level == effect.level else "goes with another effect"
+        reason = "; ".join(said.get(effect.name, [reason]))
+        return Effect(effect.name, level, reason, effect.forced)
+
+    effects = tuple(map(explained, (*plan.effects, *more)))
     return dataclasses.replace(scene, plan=dataclasses.replace(plan, effects=effects))
 
 

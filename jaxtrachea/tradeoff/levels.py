@@ -14,7 +14,7 @@ import numpy as np
 from jaxtrachea.contact.search import FINE
 from jaxtrachea.mechanics.beam import Form, Split
 from jaxtrachea.scene.build import Staged, wishes_of
-from jaxtrachea.scene.plan import Facts, Plan, PlanError, Wishes
+from jaxtrachea.scene.plan import Effect, Facts, Plan, PlanError, Wishes
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import SceneSpec
@@ -136,7 +136,8 @@ def full_scene(spec: SceneSpec, staged: Staged, *, coupling: str | None = None) 
     wishes = _finest(given, scene, material, path)
     if coupling is not None:
         wishes = dataclasses.replace(wishes, coupling=coupling)
-    scene = dataclasses.replace(scene, plan=make_plan(facts, wishes), quality=FINE)
+    plan = _in_words(make_plan(facts, wishes), given)
+    scene = dataclasses.replace(scene, plan=plan, quality=FINE)
     made = None
     if spec.trachea.file is None and scene.mesh is not None:
         made = spec.trachea.around, spec.trachea.along, spec.trachea.wall
@@ -154,6 +155,20 @@ def _finest(wishes: Wishes, scene: Scene, material: Material, path) -> Wishes:
     if wishes.dent == "auto" and scene.plan.dent and isinstance(path, Poses):
         wishes = dataclasses.replace(wishes, dent="32")
     return wishes
+
+
+def _in_words(plan: Plan, given: Wishes) -> Plan:
+    """The plan with reasons that do not call a wish what is one of `_finest` only."""
+
+    def said(effect: Effect) -> Effect:
+        mine = effect.name in ("rings", "dent") and getattr(given, effect.name) == "auto"
+        if mine and effect.forced:
+            return Effect(effect.name, effect.level, "the finest level")
+        if effect.reason == "rings 'arch2' were asked for" and given.rings == "auto":
+            return Effect(effect.name, effect.level, "arches need vectors")
+        return effect
+
+    return dataclasses.replace(plan, effects=tuple(map(said, plan.effects)))
 
 
 def levels_of(plan: Plan, scene: Scene) -> Levels:
