@@ -238,7 +238,7 @@ def _explained(scene: Scene, picked, refused, returned) -> Scene:
     picks = {_effect(rung.ladder): WORD.get(rung.level, rung.level) for rung in picked}
 
     def explained(effect: Effect) -> Effect:
-        level = picks.get(effect.name, _level(plan, effect))
+        level = picks[effect.name] if effect.name in picks else _level(plan, effect)
         reason = effect.reason if level == effect.level else "goes with another effect"
         reason = "; ".join(said.get(effect.name, [reason]))
         return Effect(effect.name, level, reason, effect.forced)
