@@ -177,7 +177,7 @@ def samples(full: Full) -> Poses | Presses:
 
 def percent(v: float) -> str:
     """Two digits, in percent."""
-    return f"{100 * v:.2g} %"
+    return f"{float(f'{100 * v:.2g}'):g} %"
 
 
 def changes(errors: Errors) -> str:
@@ -221,7 +221,9 @@ def _combined(full: Full, named: dict[str, Ladder], picked: list[Rung]) -> Level
     return dataclasses.replace(full.levels, **changed)
 
 
-def _explained(scene: Scene, picked, refused, returned) -> Scene:
+def _explained(
+    scene: Scene, picked: list[Rung], refused: list[Rung], returned: list[Rung]
+) -> Scene:
     """The scene with the decisions of its plan in words."""
     said: dict[str, list[str]] = {}
     for rungs, form in (

@@ -123,7 +123,7 @@ def _error(v: float | str | None) -> str:
 
 
 def _percent(v: float | str) -> str:
-    return v if isinstance(v, str) else f"{100 * v:.2g} %"
+    return v if isinstance(v, str) else f"{float(f'{100 * v:.2g}'):g} %"
 
 
 def _micro(v: float) -> str:

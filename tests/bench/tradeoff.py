@@ -22,8 +22,8 @@ SCENES = {
     "virtual_trachea": "fits/virtual_trachea/scene.toml",
 }
 DATA = {"virtual_trachea": "fits/virtual_trachea/fit.toml"}
-#: Scenes of configs/ and tolerances of the table of choices.
-CHOICES = ("no_surface", "bonded_pull", "normal", "off_midline", "friction")
+#: Scenes and tolerances of the table of choices; names not in `SCENES` are those of configs/.
+CHOICES = ("no_surface", "bonded_pull", "normal", "off_midline", "friction", "virtual_trachea")
 TOLERANCES = (0.1, 0.01, 0.001)
 
 
