@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from jaxtrachea.terminal import Stop, into, progress_bar, set_up_jax, table
+from jaxtrachea.terminal import Stop, interrupts, into, progress_bar, set_up_jax, table
 
 SceneArgument = Annotated[Path, typer.Argument(help="TOML scene (docs/scenes.md).")]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
@@ -23,11 +23,14 @@ def plan(scene: SceneArgument) -> None:
 
     spec, staged = _staged(scene)
     swept = None if spec.sweep is None else _for_sweep(scene, spec, staged)[0]
+    staged, choice = _chosen(scene, spec, staged)
     whole, found = shares(staged)
     out = Console()
     head = ["effect", "level", "chosen", "operations", "reason"]
     out.print(table("Plan", head, plan_rows(staged.scene.plan, found), ("reason",)))
     out.print(f"{whole:,} operations for {_rows(staged)} rows", highlight=False)
+    if choice is not None:
+        out.print(choice.sentence, highlight=False)
     if swept is not None:
         out.print(_rings_of(swept), highlight=False)
     for note in staged.notes:
@@ -45,6 +48,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
 
     clock = [time.perf_counter()]
     spec, staged = _staged(scene)
+    staged, choice = _chosen(scene, spec, staged)
     clock.append(time.perf_counter())
     with into(out_dir, _default(scene)) as (folder, stop_if_asked):
         out = jax.block_until_ready(jax.jit(run)(staged.scene, staged.material, staged.path))
@@ -61,6 +65,8 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     failed = (status > PressStatus.NO_CONTACT).sum()
     for code in np.unique(status[status > PressStatus.NO_CONTACT]):
         Console().print(f"{(status == code).sum()} row(s): {PressStatus(int(code)).message}")
+    if choice is not None:
+        Console().print(choice.sentence, highlight=False)
     if last_solved(out) is None:
         Console().print("no row was solved: no mesh, no picture of the surface")
     Console().print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
@@ -129,6 +135,29 @@ def _staged(path: Path):
     except SpecError as error:
         text = str(error)
         raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
+
+
+def _chosen(path: Path, spec, staged):
+    """The scene with the plan within its tolerance, and that choice; as it is without tolerance."""
+    if spec.plan is None:
+        return staged, None
+    from jaxtrachea.scene.plan import PlanError
+    from jaxtrachea.tradeoff.choice import choose
+    from jaxtrachea.tradeoff.levels import full_scene
+
+    try:
+        full = full_scene(spec, staged)
+    except PlanError as error:
+        raise Stop(f"{path}: effects.{error}") from None
+    with interrupts() as stop_if_asked, progress_bar() as bar:
+        task = bar.add_task("choosing", total=None)
+
+        def report(text: str) -> None:
+            stop_if_asked()
+            bar.update(task, description=f"choosing: {text}", advance=1)
+
+        choice = choose(full, spec.plan.tolerance, report)
+    return staged._replace(scene=choice.scene), choice
 
 
 def _for_sweep(path: Path, spec, staged):

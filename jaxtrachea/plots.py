@@ -14,7 +14,8 @@ from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import lane_label, unknown_label
 from jaxtrachea.report import ONE_BY_ONE
 
-_STYLE: dict[Any, object] = {
+#: What all figures share.
+STYLE: dict[Any, object] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
@@ -30,7 +31,7 @@ def draw_all(
     folder: Path, result: FitResult, prediction: Prediction, profiles: Profiles | None = None
 ) -> list[Path]:
     """Write fit.png, residuals.png, correlation.png, if given profiles.png; returns the paths."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figures = {
             "fit": draw_fit(result, prediction),
             "residuals": draw_residuals(result, prediction),
@@ -190,7 +191,7 @@ def draw_profiles(profiles: Profiles):
 
 def draw_design(path: Path, found: Map, at: Candidates, choice: Choice, rings: np.ndarray) -> None:
     """Write the identifiability map: over s with the data, of pairs without, and the gains."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(13, 3.8), layout="constrained")
         left, middle, right = figure.subplots(1, 3)
         left.plot(found.s, found.condition, color="0.2")

@@ -26,9 +26,10 @@ ORDER = [
     {"selfcheck"},
     {"report"},
     {"plots", "sections", "viewer", "study"},
+    {"tradeoff"},
     {"terminal", "processes"},
     {"cli_load", "cli_run"},
-    {"cli_scene", "cli_compare", "cli_fit", "cli_selfcheck"},
+    {"cli_scene", "cli_compare", "cli_fit", "cli_selfcheck", "cli_tradeoff"},
     {"cli"},
     {"__main__"},
 ]

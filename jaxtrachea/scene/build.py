@@ -72,7 +72,7 @@ def stage(spec: SceneSpec, folder: Path) -> Staged:
     try:
         scene = make_scene(
             geometry, material, path, tool=tool, friction=friction, mesh=mesh, radius=radius,
-            wishes=_wishes(spec),
+            wishes=wishes_of(spec),
         )  # fmt: skip
     except PlanError as error:
         raise SpecError(f"effects.{error}") from None
@@ -99,14 +99,15 @@ def stage_sweep(spec: SceneSpec, staged: Staged, s: np.ndarray, phi: np.ndarray)
     bare = dataclasses.replace(staged.scene, mesh=None)
     facts = facts_of(bare, staged.material, Presses(s, phi, spec.sweep.depth * inward))
     wishes = dataclasses.replace(
-        _wishes(spec), seat="auto", friction="off", second_plane="auto", axial="off",
+        wishes_of(spec), seat="auto", friction="off", second_plane="auto", axial="off",
         end_motion="off", surface="off", dent="off", want_surface=False, want_joints=False,
         want_ring_ends=False,
     )  # fmt: skip
     return dataclasses.replace(staged.scene, plan=make_plan(facts, wishes))
 
 
-def _wishes(spec: SceneSpec) -> Wishes:
+def wishes_of(spec: SceneSpec) -> Wishes:
+    """What the specification asks for."""
     output = spec.output
     return Wishes(
         **spec.effects.model_dump(), want_surface=output.surface, want_joints=output.joints,

@@ -197,6 +197,12 @@ class OutputSection(Section):
     pictures: bool = True
 
 
+class PlanSection(Section):
+    """[plan]: choose the cheapest program within a tolerance, for this path (docs/tradeoff.md)."""
+
+    tolerance: Annotated[float, quantity("dimensionless", positive=True), Field(lt=1)]
+
+
 class SweepSection(Section):
     """[sweep]: normal presses on a grid of contact points."""
 
@@ -220,6 +226,7 @@ class SceneSpec(Section):
     model: LawSection = LawSection()
     effects: EffectsSection = EffectsSection()
     output: OutputSection = OutputSection()
+    plan: PlanSection | None = None
     sweep: SweepSection | None = None
 
     @model_validator(mode="before")

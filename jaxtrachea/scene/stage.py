@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxtrachea.contact.patches import Patches, Touch, straight_patches, touch
 from jaxtrachea.contact.pose import Pose, inverse, transform
+from jaxtrachea.contact.search import STANDARD, Settings
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.contact.walls import patches_of
 from jaxtrachea.scene.curve import frame_at
@@ -73,6 +74,7 @@ class Scene(eqx.Module):
         binding: of the mesh, or None.
         footprint: distance between the circles of the dent's centres, mm.
         plan: the program (static).
+        quality: accuracy and work of the search for a contact (static).
     """
 
     geometry: Geometry
@@ -85,6 +87,7 @@ class Scene(eqx.Module):
     footprint: Float[Array, ""] = eqx.field(converter=jnp.asarray)
     near: int = eqx.field(static=True)
     plan: Plan = eqx.field(static=True)
+    quality: Settings = eqx.field(static=True, default=STANDARD)
 
 
 def touch_tube(scene: Scene, path: Poses) -> Touch:
@@ -98,7 +101,7 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
     if scene.tool is None or scene.tube is None:
         raise ValueError("scene.tool is None; contact needs a tool")
     tool, tube = scene.tool, scene.tube
-    one = lambda R, T: touch(tool, Pose(R, T), tube, near=scene.near)  # noqa: E731
+    one = lambda R, T: touch(tool, Pose(R, T), tube, scene.quality, near=scene.near)  # noqa: E731
     return jax.vmap(one)(path.rotation, path.translation)
 
 
@@ -200,6 +203,13 @@ def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
     """
     binding = None if scene.mesh is None else regions.bind(scene.mesh, geometry)
     return dataclasses.replace(scene, geometry=geometry, binding=binding)
+
+
+def with_mesh(scene: Scene, mesh: Mesh) -> Scene:
+    """The scene with another surface: bound to the rings, and the wall that a tool touches."""
+    tube = None if scene.tube is None else _walls(scene.geometry, mesh)
+    binding = regions.bind(mesh, scene.geometry)
+    return dataclasses.replace(scene, mesh=mesh, binding=binding, tube=tube)
 
 
 def _round(geometry: Geometry, radius: float) -> Patches:

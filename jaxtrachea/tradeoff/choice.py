@@ -1,0 +1,263 @@
+"""The cheapest program of a scene whose error is within a tolerance.
+
+Every effect is dropped alone from the full program, the cheapest rung within the tolerance is
+taken, and all of them together are checked. Effects do not add up: while the whole is too far off,
+the effect that errs most per operation saved comes back by one rung. Cost is the number of
+operations, so that the choice does not depend on the machine; errors are those of force, joints and
+surface over the path and two sample paths beside it.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtrachea.scene.approach import approach
+from jaxtrachea.scene.operations import count_operations
+from jaxtrachea.scene.plan import Effect, Plan
+from jaxtrachea.scene.simulation import simulate
+from jaxtrachea.scene.stage import Poses, Presses, Scene
+from jaxtrachea.tradeoff.errors import Errors, compare
+from jaxtrachea.tradeoff.ladders import QUALITY, Ladder, ladders
+from jaxtrachea.tradeoff.levels import Full, Levels, program
+
+#: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
+BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
+#: Effects of a plan, by the name of their ladder where that differs.
+EFFECT: dict[str, str] = {
+    "local": "two_material",
+    "interpolation": "surface",
+    "quality": "contact quality",
+}
+#: Levels that a plan calls otherwise.
+WORD = {"uniform": "off", "0": "off"}
+#: Ladders of which the choice takes rungs, besides `quality`.
+CHOSEN = ("second_plane", "rings", "shear", "local", "axial", "end_motion", "friction",
+          "interpolation", "dent")  # fmt: skip
+
+#: `simulate` for several paths; compiled quickly, since every program is called once.
+_simulate = jax.jit(
+    jax.vmap(simulate, (None, None, 0)), compiler_options={"xla_backend_optimization_level": 0}
+)
+
+
+class Rung(NamedTuple):
+    """One effect at a lower level, alone: what that changes, and the share of operations saved."""
+
+    ladder: str
+    level: str
+    errors: Errors
+    saved: float
+
+
+class Choice(NamedTuple):
+    """What was chosen.
+
+    Attributes:
+        scene: with the plan chosen; its decisions say what was dropped.
+        levels: chosen.
+        tolerance: relative.
+        dropped: effects at a lower level than in the full program.
+        refused: rungs that are too far off alone.
+        returned: rungs that were within the tolerance alone, but not together with the others.
+        errors: of the choice against the full program, on all sample paths.
+        operations: of the full program and of the choice, for the path.
+    """
+
+    scene: Scene
+    levels: Levels
+    tolerance: float
+    dropped: tuple[Rung, ...]
+    refused: tuple[Rung, ...]
+    returned: tuple[Rung, ...]
+    errors: Errors
+    operations: tuple[int, int]
+
+    @property
+    def sentence(self) -> str:
+        """What was found, in a line."""
+        if not self.dropped:
+            return f"no program but the full one is within {percent(self.tolerance)}; it is taken"
+        share = self.operations[1] / self.operations[0]
+        return (
+            f"within {percent(self.tolerance)}: {changes(self.errors)} off the full program, "
+            f"{100 * share:.0f} % of its operations"
+        )
+
+
+def choose(
+    full: Full, tolerance: float, report: Callable[[str], None] = lambda text: None
+) -> Choice:
+    """Choose the cheapest levels within the tolerance.
+
+    Args:
+        full: the scene at its finest.
+        tolerance: largest error of force, joints and surface, relative to the largest value.
+        report: called with what is tried next; may raise to stop.
+    """
+    trial = _Trial(full, report)
+    refused: list[Rung] = []
+    options: dict[str, list[Rung]] = {}
+    for ladder in _ladders(full):
+        within = _within(trial, ladder, tolerance, refused)
+        if within is not None:
+            options[ladder.name] = [within]
+    named = {ladder.name: ladder for ladder in _ladders(full)}
+    returned: list[Rung] = []
+    while True:
+        picked = [rungs[-1] for rungs in options.values()]
+        levels = _combined(full, named, picked)
+        errors = trial.errors(levels)
+        if errors.worst <= tolerance or not picked:
+            break
+        back = max(picked, key=lambda r: r.errors.worst / r.saved)
+        returned.append(back)
+        finer = _within(trial, named[back.ladder], tolerance, refused, back)
+        if finer is None:
+            del options[back.ladder]
+        else:
+            options[back.ladder].append(finer)
+    operations = trial.operations(full.levels), trial.operations(levels)
+    scene = _explained(program(full, levels)[0], picked, refused, returned)
+    found = tuple(picked), tuple(refused), tuple(returned)
+    return Choice(scene, levels, tolerance, *found, errors, operations)
+
+
+class _Trial:
+    """Runs programs on the sample paths, each once."""
+
+    def __init__(self, full: Full, report: Callable[[str], None]):
+        self.full, self.report = full, report
+        self.paths = samples(full)
+        self.known: dict[Levels, Errors] = {}
+        self.counts: dict[Levels, int] = {}
+        report("full program")
+        self.reference = self._run(full.levels)
+
+    def errors(self, levels: Levels) -> Errors:
+        if levels not in self.known:
+            found = self._run(levels)
+            self.known[levels] = compare(found, self.reference, (self.full.scene, self.full.scene))
+        return self.known[levels]
+
+    def operations(self, levels: Levels) -> int:
+        if levels not in self.counts:
+            self.counts[levels] = count_operations(simulate, *program(self.full, levels))
+        return self.counts[levels]
+
+    def saved(self, levels: Levels) -> float:
+        return 1 - self.operations(levels) / self.operations(self.full.levels)
+
+    def _run(self, levels: Levels):
+        scene, material, _ = program(self.full, levels)
+        return jax.tree.map(np.asarray, _simulate(scene, material, self.paths))
+
+
+def samples(full: Full) -> Poses | Presses:
+    """The path, and the same beside it (`BESIDE`); a leading axis."""
+    path, geometry = full.path, full.scene.geometry
+    spacing = min(full.facts.spacing, float(geometry.length))
+    if isinstance(path, Presses):
+        moved = [
+            Presses(jnp.clip(path.s + a * spacing, 0, geometry.length), path.phi,
+                    path.displacement * (1 + d)) for a, d in BESIDE
+        ]  # fmt: skip
+    else:
+        made = jax.jit(approach)(full.scene, path)
+        row = int(np.argmin(np.asarray(made.seen.gap)))
+        deep = max(-float(made.seen.gap[row]), 0.0)
+        along = jnp.eye(3)[0] if made.frame is None else made.frame[row][:, 0]
+        shifts = [a * spacing * along - d * deep * made.seen.normal[row] for a, d in BESIDE]
+        moved = [Poses(path.rotation, path.translation + v) for v in shifts]
+    return jax.tree.map(lambda *v: jnp.stack(v), *moved)
+
+
+def percent(v: float) -> str:
+    """Two digits, in percent."""
+    return f"{float(f'{100 * v:.2g}'):g} %"
+
+
+def changes(errors: Errors) -> str:
+    """The three errors in words."""
+    parts = {"force": errors.force, "joints": errors.joints, "surface": errors.surface}
+    return ", ".join(f"{name} {percent(v)}" for name, v in parts.items() if v is not None)
+
+
+def _ladders(full: Full) -> list[Ladder]:
+    """Those of the choice: what saves operations, and what the user has not decided."""
+    free = lambda name: getattr(full.given, _effect(name)) == "auto"  # noqa: E731
+    found = [v for v in ladders(full)[0] if v.name in CHOSEN and free(v.name)]
+    if full.scene.plan.contact:
+        rungs = {k: {"sharpness": sharp, "steps": n} for k, (sharp, n) in QUALITY.items()}
+        found.append(Ladder("quality", "truncation", {**rungs, "fine": {}}, {}))
+    return found
+
+
+def _within(
+    trial: _Trial, ladder: Ladder, tolerance: float, refused: list[Rung], above: Rung | None = None
+) -> Rung | None:
+    """The cheapest rung that is within the tolerance alone; dearer than `above` if given."""
+    names = list(ladder.rungs)[:-1]
+    costs = {name: trial.saved(ladder.levels(trial.full, name)) for name in names}
+    for name in sorted(names, key=lambda n: -costs[n]):
+        if costs[name] <= 0 or (above is not None and costs[name] >= above.saved):
+            continue
+        trial.report(f"{ladder.name} {name}")
+        rung = Rung(ladder.name, name, trial.errors(ladder.levels(trial.full, name)), costs[name])
+        if rung.errors.worst <= tolerance:
+            return rung
+        if above is None:
+            refused.append(rung)
+    return None
+
+
+def _combined(full: Full, named: dict[str, Ladder], picked: list[Rung]) -> Levels:
+    changed = {}
+    for rung in picked:
+        changed |= named[rung.ladder].rungs[rung.level]
+    return dataclasses.replace(full.levels, **changed)
+
+
+def _explained(
+    scene: Scene, picked: list[Rung], refused: list[Rung], returned: list[Rung]
+) -> Scene:
+    """The scene with the decisions of its plan in words."""
+    said: dict[str, list[str]] = {}
+    for rungs, form in (
+        (picked, "within the tolerance: changes {1}"),
+        (refused, "{0} would change {1}"),
+        (returned, "{0} would change {1}, too much together with the others"),
+    ):
+        for rung in rungs:
+            said.setdefault(_effect(rung.ladder), []).append(
+                form.format(rung.level, changes(rung.errors))
+            )
+    plan = scene.plan
+    more = [Effect("contact quality", "fine", "the finest")] if plan.contact else []
+    picks = {_effect(rung.ladder): WORD.get(rung.level, rung.level) for rung in picked}
+
+    def explained(effect: Effect) -> Effect:
+        level = picks[effect.name] if effect.name in picks else _level(plan, effect)
+        reason = effect.reason if level == effect.level else "goes with another effect"
+        reason = "; ".join(said.get(effect.name, [reason]))
+        return Effect(effect.name, level, reason, effect.forced)
+
+    effects = tuple(map(explained, (*plan.effects, *more)))
+    return dataclasses.replace(scene, plan=dataclasses.replace(plan, effects=effects))
+
+
+def _effect(ladder: str) -> str:
+    """The effect of a plan that a ladder is of."""
+    return EFFECT[ladder] if ladder in EFFECT else ladder
+
+
+def _level(plan: Plan, effect: Effect) -> str:
+    """The level of an effect that another one took with it."""
+    if effect.name == "rings":
+        return plan.rings
+    if effect.name in ("axial", "end_motion", "friction", "second_plane"):
+        return "on" if getattr(plan, effect.name) else "off"
+    return effect.level

@@ -1,0 +1,279 @@
+"""Errors of rungs by hand, and plans chosen by tolerance against the full model."""
+
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import h5py
+import jax
+import numpy as np
+import pytest
+from run_cli import run
+
+from jaxtrachea.scene.build import stage
+from jaxtrachea.scene.simulation import simulate
+from jaxtrachea.scene.spec import SceneSpec
+from jaxtrachea.tradeoff import measure as measuring
+from jaxtrachea.tradeoff.choice import choose
+from jaxtrachea.tradeoff.errors import relative, remesh, spread
+from jaxtrachea.tradeoff.ladders import Ladder, ladders
+from jaxtrachea.tradeoff.levels import full_scene, kept_rings
+from jaxtrachea.tradeoff.plots import pareto
+
+K_1, K_3, DEPTH = 0.3, 0.02, 4.0
+SCENE = {
+    "trachea": {"length": "80 mm", "rings": {"count": 7, "first": "10 mm", "last": "70 mm"}},
+    "material": {
+        "EI_L": "1.86 N mm^2", "k_M": "0.1 N/mm", "k_1": f"{K_1} N/mm", "k_3": f"{K_3} N/mm^3",
+        "GA_L": "20 N", "k_1_ring": "0.28 N/mm",
+    },
+    "model": {"contact": "bonded"},
+    "path": {"s": "42 mm", "displacement": ["0 mm", f"-{DEPTH} mm", "0 mm"], "steps": 2},
+    "output": {"surface": False, "ring_ends": False},
+}  # fmt: skip
+
+
+def staged(scene=SCENE, **material):
+    spec = SceneSpec.model_validate(scene | {"material": scene["material"] | material})
+    return spec, stage(spec, Path())
+
+
+def test_errors_are_those_of_the_longest_vector():
+    expected = np.array([[3.0, 4, 0], [0, 0, 1]])
+    assert relative(expected + [0, 0, 0.5], expected) == pytest.approx(0.1)
+    lost = expected.copy()
+    lost[1] = np.nan
+    assert relative(lost, expected) == np.inf
+    assert relative(lost, lost) == 0
+    assert relative(0 * expected, 0 * expected) == 0
+
+
+def test_a_ring_left_out_lies_between_its_neighbours():
+    found = spread(np.array([[[2.0, 8, 0]]]), np.array([20.0]), np.array([10.0, 20, 70]), 120.0)
+    np.testing.assert_allclose(found, [[[1, 4, 0], [2, 8, 0], [1, 4, 0]]])
+
+
+def test_a_coarse_mesh_is_interpolated_where_the_fine_one_has_vertices():
+    from jaxtrachea import table_1
+    from jaxtrachea.trachea.tube import make_tube
+
+    coarse, fine = (make_tube(table_1(), around=n, along=2 * n) for n in (8, 16))
+    field = lambda mesh: np.stack([mesh.s, 2 * mesh.s + 1, 0 * mesh.s], 1)[None]  # noqa: E731
+    found = remesh(np.asarray(field(coarse)), coarse, fine)
+    np.testing.assert_allclose(found, field(fine), atol=1e-12)
+    # Linear in the turn from 0 to 315 deg, and from there back to its value at 360 = 0 deg.
+    turn = lambda mesh: np.asarray(mesh.phi) % (2 * np.pi)  # noqa: E731
+    around = lambda mesh: np.stack([turn(mesh)] * 3, 1)[None]  # noqa: E731
+    found = remesh(around(coarse), coarse, fine)[0, :, 0]
+    last = 7 / 8 * 2 * np.pi
+    expected = np.where(turn(fine) <= last + 1e-9, turn(fine), last / 2)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_pareto_front_by_hand():
+    x, y = np.array([1.0, 2, 3, 1, np.nan]), np.array([5.0, 6, 1, 4, 0])
+    assert pareto(x, y).tolist() == [3, 2]
+
+
+def test_ladders_of_a_scene_and_why_others_are_left_out():
+    full = full_scene(*staged())
+    found, out = ladders(full)
+    names = {ladder.name for ladder in found}
+    assert names == {"form", "split", "coupling", "shear", "local", "rings_kept", "dtype"}
+    assert out["dent"] == "no surface"
+    assert out["smoothing"] == "the contact points are given"
+    assert "fixed numbers of steps" in out["tolerance"]
+    assert kept_rings(full, 3).tolist() == [2, 3, 4]  # 30, 40, 50 mm beside 42 mm
+    kinds = {ladder.name: ladder.kind for ladder in found}
+    assert (kinds["form"], kinds["dtype"], kinds["shear"]) == ("algebra", "truncation", "model")
+
+
+def test_the_finest_level_is_no_wish_of_the_user():
+    arch = {"EI_C": "13 N mm^2", "k_t": "0.4 N/mm"}
+    said = {e.name: e for e in full_scene(*staged(**arch)).scene.plan.effects}
+    assert (said["rings"].level, said["rings"].forced) == ("arch2", False)
+    assert said["second_plane"].reason == "arches need vectors"
+    wish = SCENE | {"effects": {"rings": "arch2"}}
+    said = {e.name: e for e in full_scene(*staged(wish, **arch)).scene.plan.effects}
+    assert said["rings"].forced
+    wish = SCENE | {"effects": {"rings": "mat"}}
+    full = full_scene(*staged(wish, **arch))
+    assert full.levels.rings == "mat"
+    assert not full.levels.second_plane
+
+
+def test_a_measured_rung_errs_as_by_hand(monkeypatch):
+    """`total` is F = k_1 D + k_3 D^3, by hand; `series` solves d + c F(d) = D."""
+    full = full_scene(*staged(GA_L=None, k_1_ring=None))
+    ladder = Ladder("coupling", "model", {v: {"coupling": v} for v in ("total", "series")}, {})
+    monkeypatch.setattr(measuring, "ladders", lambda full: ([ladder], {"x": "why"}))
+    rows = measuring.measure("small", full, measuring.Settings(calls=10, lanes=0))
+    total, series, left = rows
+    solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
+    out = solve(full.scene, full.material, full.path)
+    F = -float(out.force[-1, 1])
+    c = float(out.skeleton[-1, 1]) / float(out.force[-1, 1])
+    d = np.roots([c * K_3, 0, 1 + c * K_1, -DEPTH])
+    d = d[np.abs(d.imag) < 1e-12].real.item()
+    assert pytest.approx(K_1 * d + K_3 * d**3) == F
+    printed = K_1 * DEPTH + K_3 * DEPTH**3
+    assert total["errors"]["force"] == pytest.approx((printed - F) / F, rel=1e-3)
+    assert series["errors"]["force"] == 0
+    assert series["finest"]
+    # d F / d log (EI_L, k_M, k_1, k_3): total: (0, 0, k_1 D, k_3 D^3); series: implicit.
+    slope = K_1 + 3 * K_3 * d**2
+    own = np.array([K_1 * d, K_3 * d**3]) / (1 + c * slope)
+    small = 1e-4
+    stiff = [F]
+    for name in ("EI_L", "k_M"):
+        value = getattr(full.material, name) * (1 + small)
+        more = dataclasses.replace(full.material, **{name: value})
+        stiff.append(-float(solve(full.scene, more, full.path).force[-1, 1]))
+    J = np.array([*(np.array(stiff[1:]) - F) / small, *own])
+    expected = np.abs(np.array([0, 0, K_1 * DEPTH, K_3 * DEPTH**3]) - J)
+    found = total["errors"]["gradient"]
+    assert found == pytest.approx(expected.max() / np.abs(J).max(), rel=2e-3)
+    for row in (total, series):
+        times = row["times"]
+        assert 0 < times["call"]["median"] <= times["call"]["p99"]
+        assert times["gradient"]["median"] > 0
+        assert times["compile"] > 0
+    assert left == {"scene": "small", "ladder": "x", "left_out": "why"}
+
+
+def off(found, reference):
+    """Largest error of force and joints, by hand."""
+    worst = 0.0
+    for a, b in ((found.force, reference.force), (found.joints, reference.joints)):
+        length = lambda v: np.sqrt((np.asarray(v) ** 2).sum(-1)).max()  # noqa: E731
+        worst = max(worst, length(a - b) / length(b))
+    return worst
+
+
+def test_chosen_plan_is_within_the_tolerance():
+    spec, made = staged()
+    full = full_scene(spec, made)
+    solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
+    reference = solve(made.scene, made.material, made.path)  # the rules leave nothing out here
+    dropped = []
+    for tolerance in (0.1, 0.01, 0.001):
+        choice = choose(full, tolerance)
+        assert off(solve(choice.scene, made.material, made.path), reference) <= tolerance
+        assert choice.errors.worst <= tolerance
+        dropped.append({rung.ladder for rung in choice.dropped})
+        level = {e.name: e.level for e in choice.scene.plan.effects}
+        reason = {e.name: e.reason for e in choice.scene.plan.effects}
+        assert (level["shear"] == "off") == ("shear" in dropped[-1])
+        assert "change" in reason["shear"]
+    assert dropped[0] == {"shear", "local"}
+    assert dropped[2] == set()
+    assert {rung.ladder for rung in choice.refused} == {"shear", "local"}
+    assert not choice.returned
+    assert dropped[0] > dropped[1] >= dropped[2]
+    assert "no program but the full one is within 0.1 %" in choice.sentence
+    assert choice.operations[0] == choice.operations[1]
+
+
+def test_two_effects_within_tolerance_can_break_it_together():
+    spec, made = staged(GA_L="10 N")
+    full = full_scene(spec, made)
+    solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
+    options = made.scene.plan.options
+    plan = lambda **less: dataclasses.replace(  # noqa: E731
+        made.scene, plan=dataclasses.replace(
+            made.scene.plan, options=dataclasses.replace(options, **less)))  # fmt: skip
+    loose = choose(full, 0.1)
+    alone = {rung.ladder: rung.errors.worst for rung in loose.dropped}
+    assert loose.errors.worst > max(alone.values())
+    tolerance = (loose.errors.worst + max(alone.values())) / 2
+    choice = choose(full, tolerance)
+    assert len(choice.dropped) == len(choice.returned) == 1
+    saved = {rung.ladder: rung.saved for rung in loose.dropped}
+    assert choice.returned[0].ladder == max(alone, key=lambda k: alone[k] / saved[k])
+    assert choice.errors.worst <= tolerance
+    reference = solve(full.scene, made.material, made.path)
+    both = solve(plan(shear=False, local="uniform"), made.material, made.path)
+    assert off(solve(choice.scene, made.material, made.path), reference) <= tolerance
+    assert off(both, reference) > 0
+
+
+def test_a_wish_is_kept():
+    wish = SCENE | {"effects": {"shear": "on"}}
+    choice = choose(full_scene(*staged(wish)), 0.1)
+    assert {rung.ladder for rung in choice.dropped} == {"local"}
+    assert choice.levels.shear
+
+
+TOML = f"""
+[trachea]
+length = "80 mm"
+rings = {{ count = 7, first = "10 mm", last = "70 mm" }}
+[material]
+EI_L = "1.86 N mm^2"
+k_M = "0.1 N/mm"
+k_1 = "{K_1} N/mm"
+k_3 = "{K_3} N/mm^3"
+GA_L = "20 N"
+k_1_ring = "0.28 N/mm"
+[model]
+contact = "bonded"
+[path]
+s = "42 mm"
+displacement = ["0 mm", "-{DEPTH} mm", "0 mm"]
+steps = 2
+[output]
+surface = false
+ring_ends = false
+pictures = false
+"""
+
+
+def test_simulate_takes_the_plan_within_the_tolerance(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("scene.toml").write_text(TOML + '[plan]\ntolerance = "10 %"\n')
+    code, out, _ = run(monkeypatch, capsys, "simulate", "scene.toml", "--out", "result")
+    assert code == 0
+    assert "within 10 %: force" in out
+    with h5py.File("result/simulation.h5") as file:
+        level = {row[0]: (row[1], row[4]) for row in json.loads(file.attrs["plan"])}
+        force = file["series/force"][:]
+    assert level["shear"][0] == level["two_material"][0] == "off"
+    assert level["shear"][1].startswith("within the tolerance: changes force 0.")
+    spec, made = staged(GA_L=None, k_1_ring=None)  # never knew of the two effects
+    solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
+    expected = solve(made.scene, made.material, made.path).force
+    np.testing.assert_allclose(force, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("tolerance", ["0 %", "100 %", "1 mm"])
+def test_bad_tolerance_is_refused(tolerance, tmp_path, monkeypatch, capsys):
+    path = tmp_path / "scene.toml"
+    path.write_text(TOML + f'[plan]\ntolerance = "{tolerance}"\n')
+    code, _, err = run(monkeypatch, capsys, "plan", path)
+    assert code == 2
+    assert "plan.tolerance" in err
+
+
+def test_data_must_cover_the_scene():
+    full = full_scene(*staged())
+    curve = SimpleNamespace(s_c=42.0, displacement=np.array([0, 3.0]), force=np.array([0, 1.0]))
+    with pytest.raises(ValueError, match=r"row 2 \(s = 42 mm, 4 mm deep\): no curve covers it"):
+        measuring.check_curves(full.path, [curve])
+
+
+@pytest.mark.slow
+def test_command_writes_every_file(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("scene.toml").write_text(TOML)
+    code, out, _ = run(monkeypatch, capsys, "tradeoff", "scene.toml", "--quick", "--out", "made")
+    assert code == 0
+    assert "left out: dent: no surface" in out
+    names = {path.name for path in Path("made").iterdir()}
+    assert names == {"tradeoff.jsonl", "tradeoff.md", "tradeoff.png", "provenance.json"}
+    rows = [json.loads(line) for line in Path("made/tradeoff.jsonl").read_text().splitlines()]
+    error = {(r["ladder"], r["level"]): r["errors"] for r in rows if "errors" in r}
+    assert error["form", "reactions"]["force"] < 1e-9
+    assert 1e-9 < error["dtype", "float32"]["force"] < 1e-5
+    kept = [error["rings_kept", n]["joints"] for n in ("1", "3", "7")]
+    assert kept[0] > kept[1] > kept[2] == 0

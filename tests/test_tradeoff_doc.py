@@ -1,0 +1,59 @@
+"""docs/tradeoff.md says what the recorded measurements say."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+from jaxtrachea.tradeoff.page import read
+
+BENCH = Path(__file__).parent / "bench" / "tradeoff.py"
+FOLDER = Path(__file__).parents[1] / "docs" / "tradeoff"
+SCENES = sorted(path for path in FOLDER.glob("*.jsonl") if path.stem != "choice")
+
+
+def bench():
+    spec = importlib.util.spec_from_file_location("bench_tradeoff", BENCH)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_document_is_what_the_measurements_give():
+    module = bench()
+    text = module.document()
+    assert module.DOCUMENT.read_text("utf-8") == text, "run tests/bench/tradeoff.py --page"
+    for path in SCENES:
+        assert (FOLDER / f"{path.stem}.png").is_file()
+        assert f"## {path.stem}\n" in text
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda p: p.stem)
+def test_measurements_are_complete(path):
+    points = [row for row in read(path) if "left_out" not in row]
+    for row in points:
+        assert row["scene"] == path.stem
+        assert {"device", "versions", "calls", "date", "load"} <= row.keys()
+        assert 0 < row["times"]["call"]["median"] <= row["times"]["call"]["p99"]
+    for name in {row["ladder"] for row in points}:
+        rungs = [row for row in points if row["ladder"] == name]
+        finest = [row for row in rungs if row["finest"]]
+        assert len(finest) == 1
+        assert not any(v for v in finest[0]["errors"].values())
+        assert len(rungs) > 1
+
+
+def test_choices_hold_their_tolerance_and_are_no_dearer():
+    rows = read(FOLDER / "choice.jsonl")
+    pairs = [(row["scene"], row["tolerance"]) for row in rows]
+    names = list(dict.fromkeys(name for name, _ in pairs))
+    assert len(names) >= 3
+    assert pairs == [(name, v) for name in names for v in (0.1, 0.01, 0.001)]
+    for row in rows:
+        errors = [row["errors"][k] for k in ("force", "joints", "surface")]
+        assert max(v for v in errors if v is not None) <= row["tolerance"]
+        assert row["operations"] <= 1
+        for rung in row["dropped"]:
+            assert rung["error"] <= row["tolerance"]
+        for rung in row["refused"]:
+            assert float(rung["error"]) > row["tolerance"]
