@@ -131,7 +131,8 @@ def fit(
     cli_fit.check_options(how)
     asked = {"leave-one-out": leave_one_out, "profile": profile, "influence": influence}
     options = [name for name, wanted in asked.items() if wanted]
-    loaded, measurements, problem = load(spec, data, refits=bool(options))
+    refits = bool(options or cli_fit.remembered(how))
+    loaded, measurements, problem = load(spec, data, refits=refits)
     root = spec.parent if data is None else data
     now = cli_fit.describe(how, spec, root, loaded, measurements, problem, options)
     if meeting.process > 0:

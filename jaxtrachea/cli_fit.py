@@ -109,6 +109,22 @@ def check_options(how: How) -> None:
         raise Stop("several processes need --out, a folder that all of them see")
 
 
+def remembered(how: How) -> list[str]:
+    """Options that the run to go on with was started with; none if there is none to be read."""
+    from jaxtrachea.identify import former, journal, run_folder
+
+    if how.out_dir is None or not (how.resume or how.rerun_failed):
+        return []
+    try:
+        return journal.read(how.out_dir / ".run" / "run.json").options
+    except (OSError, ValueError):  # what is damaged is said when it is opened
+        pass
+    try:
+        return former.read_journal(how.out_dir / "results.h5").options
+    except run_folder.NoRun:
+        return []
+
+
 def describe(how: How, spec: Path, root: Path, loaded, measurements, problem, options: list[str]):
     """The journal of what would be run now."""
     import jax

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxtrachea.identify.bootstrap import Bootstrap
+from jaxtrachea.identify.bootstrap import FEWEST, Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.population import Population, population_rows
@@ -333,8 +333,9 @@ def _bootstrapped(resampled: Bootstrap) -> list[str]:
         "## Bootstrap",
         markdown_table(BOOTSTRAP_HEAD, bootstrap_table(resampled, shown)),
         f"{resampled.usable.shape[1]} replicates of every lane ({resampled.kind}{blocks}); "
-        f"{lost} of {resampled.usable.size} refits did not converge and are left out. All numbers: "
-        "`results.h5` (docs/uncertainty.md).",
+        f"{lost} of {resampled.usable.size} refits did not converge and are left out; a lane with "
+        f"fewer than {FEWEST} others has no interval. All numbers: `results.h5` "
+        "(docs/uncertainty.md).",
     ]
 
 

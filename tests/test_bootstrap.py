@@ -115,6 +115,7 @@ def test_command_writes_what_its_page_says(tmp_path, monkeypatch, capsys):
     with Path("out/parameters.csv").open(newline="") as stream:
         assert float(next(csv.DictReader(stream))["bootstrap_low95"]) == low
     assert "residual in blocks of 2 samples" in Path("out/report.md").read_text()
+    assert "a lane with fewer than 40 others has no interval" in Path("out/report.md").read_text()
     for bad, says in (("bootstrap = 10", "40 replicates"), ("block = 2", "kind = 'residual'")):
         Path("spec.toml").write_text(text + bad)
         code, _, err = run(monkeypatch, capsys, "fit", "spec.toml")

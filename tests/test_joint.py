@@ -12,7 +12,8 @@ import synthetic
 from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
-from jaxtrachea.identify import arrow, joint, results, study
+from jaxtrachea.identify import arrow, joint, journal, results, study
+from jaxtrachea.identify import population as populations
 from jaxtrachea.identify.bootstrap import bootstrap
 from jaxtrachea.identify.design import check
 from jaxtrachea.identify.fit import Settings, fit
@@ -218,6 +219,26 @@ def test_population_and_its_page(linear):
     assert wanted(None, linear)
 
 
+def test_population_knows_what_errors_have_in_common(linear, monkeypatch):
+    """Errors of k_1 at given k_3 and how k_1 follows it, by least squares of each specimen."""
+    seen, real = [], populations.random_effects
+    keep = lambda *given: (seen.append(given), real(*given))[1]  # noqa: E731
+    monkeypatch.setattr(populations, "random_effects", keep)
+    population(linear)
+    (_, covariance, _, common), scale = seen[0], linear.standard_error[:, 0] / linear.value[:, 0]
+    sigma, k_1, i = linear.sigma[0, 0], linear.value[:, 0], linear.problem.shared[0, 0]
+    step = linear.problem.unknowns[0][i][0].step
+    for lane, curves in enumerate(linear.problem.curves):
+        X = columns(len(curves))
+        own, shared = np.delete(X, 1, axis=1), X[:, 1]
+        error = sigma * np.sqrt(np.linalg.inv(own.T @ own)[0, 0]) / k_1[lane]
+        np.testing.assert_allclose(covariance[lane, 0, 0], error**2, rtol=1e-5)
+        follow = -np.linalg.lstsq(own, shared)[0][0] * step / k_1[lane]
+        np.testing.assert_allclose(common.follow[lane, 0, 0], follow, rtol=1e-5)
+        whole = error**2 + follow**2 * common.covariance[0, 0]
+        np.testing.assert_allclose(whole, scale[lane] ** 2, rtol=1e-5)
+
+
 def test_command_line_fits_jointly_what_is_shared(tmp_path, monkeypatch, capsys):
     text = GOOD + GOOD.partition("\n")[2].replace("T01", "T02")
     (tmp_path / "data.csv").write_text(text)
@@ -230,6 +251,18 @@ def test_command_line_fits_jointly_what_is_shared(tmp_path, monkeypatch, capsys)
     code, _, err = run(monkeypatch, capsys, "fit", "spec.toml", "--profile")
     assert code == 2
     assert "parameters.k_M: shared, so that 7 unknowns" in err
+    was = journal.describe(
+        tmp_path / "spec.toml", tmp_path, {}, "float64", "cpu",
+        lanes=1, chunk=1, save_every=1, options=["influence"],
+    )  # fmt: skip
+    (tmp_path / "out" / ".run").mkdir(parents=True)
+    journal.write(tmp_path / "out" / ".run" / "run.json", was)
+    code, _, err = run(monkeypatch, capsys, "fit", "spec.toml", "--out", "out", "--resume")
+    assert (code, "so that 7 unknowns" in err) == (2, True), err  # it was one lane, and is again
+    now = dataclasses.replace(was, lanes=2, options=[])
+    assert list(journal.differences(now, was)) == [
+        "lanes was 2 and is 1 (--influence of a joint fit needs one lane)"
+    ]
 
 
 def test_what_refits_single_lanes_is_refused(linear):

@@ -111,7 +111,9 @@ def differences(was: Journal, now: Journal) -> Iterator[str]:
             yield f"{name} was {old} and is {new}"
     for name in ("dtype", "device", "lanes"):
         if (old := getattr(was, name)) != (new := getattr(now, name)):
-            yield f"{name} was {old} and is {new}"
+            more = [f"--{option}" for option in now.options if option not in was.options]
+            why = f" ({', '.join(more)} of a joint fit needs one lane)" if more and new == 1 else ""
+            yield f"{name} was {old} and is {new}{why}"
 
 
 def as_dict(journal: Journal) -> dict[str, object]:

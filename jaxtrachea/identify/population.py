@@ -4,8 +4,12 @@ Empirical Bayes on the estimates, in scaled coordinates: \theta_i ~ N(\mu, diag(
 specimens, \hat\theta_i ~ N(\theta_i, C_i) with C_i the covariance of specimen i's own estimates.
 \tau^2 maximises the restricted likelihood (REML; Patterson and Thompson 1971,
 doi:10.1093/biomet/58.3.545), by Fisher scoring with bounds at zero; \mu is then the generalised
-least-squares mean. The errors C_i of different specimens are taken as independent, which those of a
-joint fit are only as far as the shared parameters are known much better than each specimen's own.
+least-squares mean.
+
+In a joint fit the errors of all specimens move together with that of the shared parameters. C_i is
+then the covariance at given shared parameters, which is independent from specimen to specimen, and
+tau is found at their estimates; their own error, by which the mean and all estimates move together,
+is added to the standard errors of the mean and of the estimates.
 """
 
 import dataclasses
@@ -50,6 +54,18 @@ class Effects(NamedTuple):
     shrunk_sd: Float[np.ndarray, "m q"]
 
 
+class Common(NamedTuple):
+    """What the errors of all specimens have in common: those of k shared unknowns.
+
+    Attributes:
+        follow: how the estimates of each specimen follow the shared unknowns; (m, q, k).
+        covariance: of the shared unknowns; (k, k).
+    """
+
+    follow: Float[np.ndarray, "m q k"]
+    covariance: Float[np.ndarray, "k k"]
+
+
 class _Restricted(NamedTuple):
     """Restricted likelihood at tau^2: its value, slope and expected information, and the mean."""
 
@@ -83,6 +99,7 @@ def random_effects(
     estimate: Float[np.ndarray, "m q"],
     covariance: Float[np.ndarray, "m q q"],
     known: Bool[np.ndarray, "m q"] | None = None,
+    common: Common | None = None,
 ) -> Effects:
     """Mean and spread behind estimates of unequal precision.
 
@@ -91,8 +108,9 @@ def random_effects(
 
     Args:
         estimate: of each specimen.
-        covariance: of its errors.
+        covariance: of its errors, without what they have in common.
         known: which estimates exist; None: all.
+        common: None: the errors are independent.
 
     Raises:
         ValueError: fewer than three specimens have an estimate of some coordinate.
@@ -121,8 +139,9 @@ def random_effects(
     with np.errstate(divide="ignore", invalid="ignore"):
         sd_se = np.where(free, 0.5 * np.sqrt(variance) / sd, np.nan)
     low, high = _interval(tau2, variance, count - 1)
-    shrunk, shrunk_sd = _posterior(tau2, here, estimate)
-    mean_se = np.sqrt(np.diagonal(here.mean_covariance))
+    follow = np.zeros((*estimate.shape, 0)) if common is None else known[:, :, None] * common.follow
+    shared = np.zeros((0, 0)) if common is None else common.covariance
+    shrunk, shrunk_sd, mean_se = _posterior(tau2, here, estimate, follow, shared)
     return Effects(here.mean, mean_se, sd, sd_se, low, high, shrunk, shrunk_sd)
 
 
@@ -161,16 +180,19 @@ def _interval(tau2, variance, dof) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def _posterior(tau2, here: _Restricted, estimate) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of every specimen given all estimates."""
+def _posterior(tau2, here: _Restricted, estimate, follow, shared):
+    """Mean and standard deviation of every specimen given all estimates, and that of the mean."""
     prior = np.diag(tau2)
     pull = prior @ here.weight
     shrunk = here.mean + np.einsum("mij,mj->mi", pull, estimate - here.mean)
     rest = np.eye(len(tau2)) - pull
-    covariance = prior - pull @ prior
+    moves = here.mean_covariance @ np.sum(here.weight @ follow, axis=0)
+    of_mean = here.mean_covariance + moves @ shared @ moves.T
+    moves = pull @ follow + rest @ moves
+    covariance = prior - pull @ prior + moves @ shared @ np.swapaxes(moves, 1, 2)
     covariance = covariance + rest @ here.mean_covariance @ np.swapaxes(rest, 1, 2)
     variance = np.diagonal(covariance, axis1=1, axis2=2)
-    return shrunk, np.sqrt(np.maximum(variance, 0))
+    return shrunk, np.sqrt(np.maximum(variance, 0)), np.sqrt(np.diagonal(of_mean))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -242,9 +264,39 @@ def population(result: FitResult) -> Population:
     se = np.where(known, se, 0)
     covariance = np.nan_to_num(correlation) * se[:, :, None] * se[:, None]
     theta = np.where(known, result.theta[row, place], 0)
-    effects = random_effects(theta, covariance, known)
+    common = _common(result, place, se) if result.problem.joint else None
+    if common is not None:
+        together = common.follow @ common.covariance @ np.swapaxes(common.follow, 1, 2)
+        covariance = _not_negative(covariance - together, covariance)
+    effects = random_effects(theta, covariance, known, common)
     chosen = tuple(p for p, e in zip(parameters, enough, strict=True) if e)
     return Population(result, chosen, known, place, effects)
+
+
+def _common(result: FitResult, place, se: Float[np.ndarray, "lanes q"]) -> Common:
+    """How the estimates of a joint fit follow what is shared; `place`: see `Population`."""
+    row, shared = np.arange(result.lanes)[:, None], result.problem.shared
+    own = np.stack([u.se for u in result.uncertainty])[row, shared]
+    own = np.where(np.isfinite(own), own, 0)
+    full = np.nan_to_num(np.stack([u.correlation for u in result.uncertainty]))
+    between = full[row[:, :, None], shared[:, :, None], shared[:, None]]
+    across = full[row[:, :, None], place[:, :, None], shared[:, None]]
+    first = int(np.argmax(result.status <= FitStatus.UNIDENTIFIABLE))
+    known = (own[first] > 0)[:, None] & (own[first] > 0)
+    inverse = np.linalg.pinv(np.where(known, between[first], 0), rcond=1e-12, hermitian=True)
+    scale = np.where(own[first] > 0, 1 / np.where(own[first] > 0, own[first], 1), 0)
+    follow = se[:, :, None] * (across @ inverse) * scale
+    return Common(follow, between[first] * own[first][:, None] * own[first])
+
+
+def _not_negative(rest: Float[np.ndarray, "m q q"], of: Float[np.ndarray, "m q q"]):
+    """A difference of covariances without what rounding has made negative."""
+    scale = np.sqrt(np.diagonal(of, axis1=1, axis2=2))
+    unit = np.where(scale > 0, scale, 1)
+    both = unit[:, :, None] * unit[:, None]
+    values, vectors = np.linalg.eigh(rest / both)
+    vectors = vectors * np.sqrt(np.maximum(values, 0))[:, None]
+    return both * (vectors @ np.swapaxes(vectors, 1, 2))
 
 
 def population_rows(of: Population) -> Iterator[dict[str, object]]:

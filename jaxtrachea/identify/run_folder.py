@@ -129,7 +129,10 @@ def _passed(target: Path, was: Journal, now: Journal, force: bool) -> list[str]:
     """
     changed = [line for line in journals.differences(was, now) if line not in was.forced]
     if was.lanes != now.lanes:
-        raise NoRun(f"{target}: {'; '.join(changed)}; the run there is of another study")
+        raise NoRun(
+            f"{target}: {'; '.join(changed)}; the run there is of another study, "
+            "choose another --out"
+        )
     if changed and not force:
         raise NoRun(
             f"{target}: {'; '.join(changed)}; undo that, or choose another --out, "

@@ -43,9 +43,11 @@ def command(problem) -> dict:
         curves = tuple(curve for lane in problem.curves for curve in lane)
         write_hdf5(folder / "cohort.h5", Measurements(curves, (), ()))
         (folder / "spec.toml").write_text('[data]\nfiles = ["cohort.h5"]\n')
-        run = [sys.executable, "-m", "jaxtrachea", "fit", "spec.toml", "--out", "out"]
+        code = "from jaxtrachea.cli import main; main()"
+        run = [sys.executable, "-c", code, "fit", "spec.toml", "--out", "out"]
         begin = time.perf_counter()
-        subprocess.run(run, cwd=folder, check=True, stdout=subprocess.DEVNULL)
+        done = subprocess.run(run, cwd=folder, stdout=subprocess.DEVNULL)
+        assert done.returncode in (0, 1)  # 1: some lane failed
         wall = time.perf_counter() - begin
         seconds = json.loads((folder / "out" / "provenance.json").read_text())["seconds"]
         size = sum(path.stat().st_size for path in (folder / "out").iterdir()) // 2**20

@@ -1,7 +1,9 @@
 """Runs of the command line that are stopped on the way, and what of their results must agree."""
 
+import contextlib
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -15,7 +17,9 @@ import numpy as np
 TABLES = ("summary.csv", "parameters.csv", "report.md")
 
 
-def write_study(folder: Path, lanes: int, every: int, *, samples: int = 12, more: str = ""):
+def write_study(
+    folder: Path, lanes: int, every: int, *, samples: int = 12, starts: int = 2, more: str = ""
+):
     """A study of `lanes` specimens, two presses each, in chunks of `every`; coupling `total`."""
     rng = np.random.default_rng(0)
     rows = ["specimen,trial,s [mm],displacement [mm],force [N]"]
@@ -29,7 +33,7 @@ def write_study(folder: Path, lanes: int, every: int, *, samples: int = 12, more
     (folder / "curves.csv").write_text("\n".join(rows) + "\n")
     text = '[data]\nfiles = "curves.csv"\n[model]\ncoupling = "total"\n'
     (folder / "spec.toml").write_text(
-        f"{text}[fit]\nstarts = 2\nchunk = 32\nsave_every = {every}\n{more}"
+        f"{text}[fit]\nstarts = {starts}\nchunk = 32\nsave_every = {every}\n{more}"
     )
 
 
@@ -76,54 +80,83 @@ def finish(process: subprocess.Popen, seconds: float = 300) -> tuple[int, str, s
     return process.returncode, out, err
 
 
-def wait_for(condition, process: subprocess.Popen, seconds: float = 120) -> None:
+def wait_for(
+    condition, process: subprocess.Popen, seconds: float = 120, pause: float = 0.01
+) -> None:
     """Return when something has happened, or the process has ended."""
     end = time.monotonic() + seconds
     while not condition() and process.poll() is None:
         assert time.monotonic() < end
-        time.sleep(0.01)
+        time.sleep(pause)
 
 
-def kill_and_resume(folder: Path, name: str, after: float) -> tuple[int, str]:
-    """Kill a run `after` seconds from the opening of its folder, then let it go on to its end.
+def saved(folder: Path) -> dict[str, tuple[int, int]]:
+    """Inode and time of every saved chunk: another where a chunk was written again."""
+    found = {}
+    with contextlib.suppress(FileNotFoundError):  # a chunk or the folder may go meanwhile
+        for path in sorted((folder / ".run").glob("*.npz")):
+            found[path.name] = (path.stat().st_ino, path.stat().st_mtime_ns)
+    return found
+
+
+def kill_and_resume(folder: Path, name: str, chunks: int, after: float) -> tuple[int, int, str]:
+    """Kill a run `after` seconds from its `chunks`-th chunk, then let it go on to its end.
 
     Returns:
-        Chunks that were there after the kill (-1: it had ended), and what the resumed run said.
+        Chunks that were there after the kill (-1: it had ended), starts that the resumed run
+        fitted, and what it said. No chunk that was there is written again.
     """
     out = folder / name
     process = start(folder, "fit", "spec.toml", "--out", name)
     wait_for((out / ".run").exists, process)
+    wait_for(lambda: len(saved(out)) >= chunks, process, pause=0.001)
     time.sleep(after)
     process.send_signal(signal.SIGKILL)
     finish(process)
     if not (out / ".run").exists() and (out / "results.h5").exists():
-        return -1, ""
-    done = len(list((out / ".run").glob("*.npz")))
-    code, _, err = finish(start(folder, "fit", "spec.toml", "--out", name, "--resume"))
+        return -1, 0, ""
+    there = saved(out)
+    process = start(folder, "fit", "spec.toml", "--out", name, "--resume")
+    while process.poll() is None:
+        now = saved(out)
+        assert all(now[chunk] == there[chunk] for chunk in now.keys() & there.keys())
+        time.sleep(0.01)
+    code, _, err = finish(process)
     assert code == 0, err
-    return done, err
+    fitted = re.search(r"fitting.*?(\d+)/(\d+|\?)", err)
+    assert fitted, err
+    return len(there), int(fitted[1]), err
 
 
-def kill_often(folder: Path, times: int, seed: int = 0) -> list[int]:
-    """Kill and resume `times` runs at random moments; their numbers are those of one in peace.
+def kill_often(folder: Path, times: int, seed: int = 0, *, lanes: int = 240) -> list[int]:
+    """Kill and resume `times` runs; their numbers are those of one in peace.
+
+    Four of five between two chunks, at a random moment after a random one of them; the others
+    anywhere, also while files are written.
 
     Returns:
-        Chunks there after each kill.
+        Chunks there after each kill, out of 20 (-1: the run had ended).
     """
-    write_study(folder, 100, 10)
+    starts, every = 24, lanes // 20
+    write_study(folder, lanes, every, samples=60, starts=starts)
     for name in ("first", "peace"):  # the second finds its programs compiled
         process = start(folder, "fit", "spec.toml", "--out", name)
         wait_for((folder / name / ".run").exists, process)
         begun = time.monotonic()
+        wait_for(lambda name=name: len(saved(folder / name)) == 20, process)
+        fitting = time.monotonic() - begun
         assert finish(process)[0] == 0
         lasted = time.monotonic() - begun
     expected, rng, there = numbers(folder / "peace"), random.Random(seed), []
     for k in range(times):
-        # Every other one early, among the chunks; the rest anywhere, also while files are written.
-        latest = lasted if k % 2 else 0.4 * lasted
-        done, said = kill_and_resume(folder, f"run{k}", rng.uniform(0, latest))
+        anywhere = k % 5 == 4
+        chunks = 0 if anywhere else rng.randrange(20)
+        after = rng.uniform(0, lasted if anywhere else fitting / 20)
+        done, fitted, said = kill_and_resume(folder, f"run{k}", chunks, after)
         assert numbers(folder / f"run{k}") == expected
         assert not any((folder / f"run{k}").glob(".*"))
-        assert (f"{done} of 10 chunks are there" in said) == (done > 0)
+        if done >= 0:
+            assert (f"{done} of 20 chunks are there" in said) == (done > 0)
+            assert fitted == starts * every * (20 - done)
         there.append(done)
     return there
