@@ -38,11 +38,13 @@ def run(
     with progress_bar() as bar:
 
         def counted(text):
-            task = bar.add_task(text, total=None)
+            task, finished = bar.add_task(text, total=None), 0
 
             def advance(done, of):
+                nonlocal finished
                 stop_if_asked()
-                bar.update(task, advance=done, total=of or None)
+                finished += done  # of a joint fit, lanes that fill up a chunk as well
+                bar.update(task, completed=min(finished, of or finished), total=of or None)
 
             return advance
 
