@@ -87,6 +87,9 @@ def test_every_problem_is_reported_at_once(tmp_path):
     assert all(line.startswith(f"{path}: ") for line in lines)
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "fits").glob("*/*.toml")), ids=lambda p: p.name)
+SHIPPED = sorted(p for p in (ROOT / "fits").glob("*/*.toml") if p.name != "scene.toml")
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.name)
 def test_shipped_specifications_load(path):
     assert load_fit_spec(path).title

@@ -92,6 +92,8 @@ class Session:
         Raises:
             ValueError: a scene without contact, or with friction, which depends on the whole path.
         """
+        if keep < 1:
+            raise ValueError(f"keep is {keep}; expected at least 1")
         if not scene.plan.contact:
             raise ValueError("the plan has no contact; make the scene with a path of Poses")
         if scene.plan.friction:
@@ -99,8 +101,6 @@ class Session:
                 "the plan has friction, which depends on the whole path; use simulate, or make the "
                 "scene with Wishes(friction='off')"
             )
-        if keep < 1:
-            raise ValueError(f"keep is {keep}; expected at least 1")
         self.scene, self.dtype = scene, np.dtype(scene.footprint.dtype)
         run = functools.partial(_step, scene, material)
         pose = (np.eye(3, dtype=self.dtype), np.zeros(3, self.dtype))
