@@ -176,7 +176,7 @@ def global_shape(v: Values) -> Answer:
     span = (nodes[1:] - nodes[:-1])[patch]
     fraction = jnp.clip((v["s"] - nodes[patch]) / span, 0, 1)
     binding = Binding(v["s"], v["phi"], patch, fraction, nodes, v["alpha"])
-    row = lambda y: y[..., None] * jnp.ones((3,), y.dtype)  # noqa: E731
+    row = lambda y: jnp.broadcast_to(y[..., None], (*y.shape, 3))  # noqa: E731
     keys: Keys = clamped(v["s_c"], row(v["w_C"]), row(v["J"]), row(v["U"]), row(v["V"]))
     moved = interpolate(binding, weigh(binding, v["phi_c"]), keys, method="linear")
     return _done(u=moved[:, 0])
