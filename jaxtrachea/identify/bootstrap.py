@@ -18,7 +18,6 @@ from jaxtrachea.identify.fit import FitResult, Settings, fit
 from jaxtrachea.identify.predictions import Prediction, predictions
 from jaxtrachea.identify.problem import Lane
 from jaxtrachea.identify.solve import chunk_size
-from jaxtrachea.status import FitStatus
 
 Kind = Literal["parametric", "residual"]
 #: Refits handed to the solver at a time; bounds the memory.
@@ -92,7 +91,7 @@ def bootstrap(
         chosen = result.problem.take(rows)
         again = fit(dataclasses.replace(chosen, lanes=drawn), one, starts=result.theta[rows])
         thetas.append(again.theta.reshape(len(lanes), count, -1))
-        usable.append((again.status <= FitStatus.UNIDENTIFIABLE).reshape(len(lanes), count))
+        usable.append(again.succeeded.reshape(len(lanes), count))
         if progress is not None:
             progress(len(rows), result.lanes * count)
     theta, good = np.concatenate(thetas), np.concatenate(usable)

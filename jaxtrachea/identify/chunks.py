@@ -19,7 +19,6 @@ from jaxtrachea.identify.criteria import Criteria
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.uncertainty import Uncertainty
-from jaxtrachea.status import FitStatus
 
 #: Lanes of a chunk at most, and its residual entries times starts at most: about ten seconds of
 #: one core.
@@ -126,7 +125,7 @@ def join(problem: Problem, parts: list[FitResult]) -> FitResult:
 
 def replaced(result: FitResult, lanes: np.ndarray, by: FitResult) -> FitResult:
     """The same result with the rows `lanes` from `by` where it succeeded; the others untouched."""
-    better = by.status <= FitStatus.UNIDENTIFIABLE
+    better = by.succeeded
     arrays, new = arrays_of(result), arrays_of(by)
     for name, array in arrays.items():
         arrays[name] = array.copy()

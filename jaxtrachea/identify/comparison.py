@@ -10,7 +10,6 @@ from jaxtrachea.identify.criteria import weights
 from jaxtrachea.identify.fit import FitResult, Settings, fit
 from jaxtrachea.identify.predictions import lag_correlation, predictions, rms, without
 from jaxtrachea.identify.problem import Problem
-from jaxtrachea.status import FitStatus
 
 #: Difference of AICc up to which models cannot be told apart, and from which on they clearly can
 #: (Burnham and Anderson 2002, sec. 2.6).
@@ -138,7 +137,7 @@ def leave_position_out(
     chosen = problem.take(lanes)
     result = fit(without(chosen, held), settings, progress)
     seen = predictions(chosen, result.theta).force
-    solved = result.status <= FitStatus.UNIDENTIFIABLE
+    solved = result.succeeded
     missed = np.where((held & solved[:, None])[:, :, None], seen, np.nan)
     for lane in np.unique(lanes):
         mine = lanes == lane
@@ -170,11 +169,11 @@ def compared(models: Sequence[Model]) -> tuple[list[Row], int]:
     """
     names = [[m.result.problem.lane_name(k) for k in range(m.result.lanes)] for m in models]
     if any(n != names[0] for n in names):
-        usable = [_solved(m) for m in models]
+        usable = [m.result.succeeded for m in models]
         if not all(u.all() for u in usable):
             return [], sum(int(np.sum(~u)) for u in usable)
         return _rows("(all)", models, [np.arange(m.result.lanes) for m in models]), 0
-    usable = np.all([_solved(m) for m in models], axis=0)
+    usable = np.all([m.result.succeeded for m in models], axis=0)
     rows = []
     for lane in np.flatnonzero(usable):
         specimen, trial = names[0][lane]
@@ -184,10 +183,6 @@ def compared(models: Sequence[Model]) -> tuple[list[Row], int]:
     if len(every) > 1:
         rows += _rows("(all)", models, [every] * len(models))
     return rows, int(np.sum(~usable))
-
-
-def _solved(model: Model) -> np.ndarray:
-    return model.result.status <= FitStatus.UNIDENTIFIABLE
 
 
 def _rows(specimen: str, models: Sequence[Model], lanes: Sequence[np.ndarray]) -> list[Row]:

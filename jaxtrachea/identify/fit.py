@@ -96,6 +96,11 @@ class FitResult:
         return len(self.status)
 
     @property
+    def succeeded(self) -> np.ndarray:
+        """Lanes that have an estimate; (lanes,)."""
+        return self.status <= FitStatus.UNIDENTIFIABLE
+
+    @property
     def whitened_sigma(self) -> np.ndarray:
         """`sigma` in units of the lanes' precision, as `evaluate` wants it; (lanes, 2)."""
         return self.sigma / _precision_unit(self.problem)

@@ -81,14 +81,15 @@ def describe(
         id=uuid.uuid4().hex,
         specification=hashlib.sha256(spec.read_bytes()).hexdigest(),
         inputs={os.path.relpath(name, root): digest for name, digest in inputs.items()},
-        versions={"jaxtrachea": jaxtrachea.__version__} | {p: _version(p) for p in _PACKAGES},
+        versions={"jaxtrachea": jaxtrachea.__version__} | {p: installed(p) for p in _PACKAGES},
         dtype=dtype,
         device=device,
         **sizes,
     )
 
 
-def _version(package: str) -> str:
+def installed(package: str) -> str:
+    """Version of a package, in words where there is none."""
     try:
         return version(package)
     except PackageNotFoundError:

@@ -22,7 +22,6 @@ from scipy.special import chdtri, stdtrit
 
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.parameters import Parameter
-from jaxtrachea.status import FitStatus
 
 #: Specimens below which no spread is estimated, and from which one is unasked.
 FEWEST, ENOUGH = 3, 5
@@ -254,7 +253,7 @@ def population(result: FitResult) -> Population:
     row = np.arange(result.lanes)[:, None]
     se = np.stack([u.se for u in result.uncertainty])[row, place]
     known = (place >= 0) & np.isfinite(se) & ~result.at_bound[row, place]
-    known &= (result.status <= FitStatus.UNIDENTIFIABLE)[:, None]
+    known &= result.succeeded[:, None]
     enough = known.sum(axis=0) >= FEWEST
     if not enough.any():
         raise ValueError(f"no parameter is determined in {FEWEST} specimens of their own")
@@ -281,7 +280,7 @@ def _common(result: FitResult, place, se: Float[np.ndarray, "lanes q"]) -> Commo
     full = np.nan_to_num(np.stack([u.correlation for u in result.uncertainty]))
     between = full[row[:, :, None], shared[:, :, None], shared[:, None]]
     across = full[row[:, :, None], place[:, :, None], shared[:, None]]
-    first = int(np.argmax(result.status <= FitStatus.UNIDENTIFIABLE))
+    first = int(np.argmax(result.succeeded))
     known = (own[first] > 0)[:, None] & (own[first] > 0)
     inverse = np.linalg.pinv(np.where(known, between[first], 0), rcond=1e-12, hermitian=True)
     scale = np.where(own[first] > 0, 1 / np.where(own[first] > 0, own[first], 1), 0)

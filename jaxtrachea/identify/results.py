@@ -7,7 +7,6 @@ import json
 import platform
 import sys
 from collections.abc import Iterator, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import h5py
@@ -15,6 +14,7 @@ import numpy as np
 
 from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.journal import installed
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.population import Population
 from jaxtrachea.identify.profile import Profiles
@@ -336,10 +336,7 @@ def provenance(
     """
     versions = {"python": platform.python_version(), "platform": platform.platform()}
     for name in ("jaxtrachea", "jax", "jaxlib", "numpy", "scipy", "equinox", "optax", "h5py"):
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = "not installed"
+        versions[name] = installed(name)
     return {
         "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],

@@ -204,7 +204,7 @@ MESHES = {
     **{f"GLB cut to {n} bytes": mesh("glb", lambda d, n=n: d[:n]) for n in (4, 12, 20, 300, 2000)},
     "GLB that is an STL": mesh("glb", lambda _: tube("stl")),
     "GLB of version 1": mesh("glb", lambda d: d[:4] + b"\1\0\0\0" + d[8:]),
-    "GLB without JSON": mesh("glb", lambda d: d[:16] + b"XXXX" + d[20:]),
+    "GLB without JSON": mesh("glb", lambda d: d[:16] + b"NONE" + d[20:]),
     "GLB with broken JSON": mesh("glb", lambda d: d[:20] + b"[" + d[21:]),
     "GLB without mesh": mesh("glb", lambda _: glb({})),
     "GLB of one triangle": mesh("glb", lambda _: glb(triangle(3), ONE)),
