@@ -131,21 +131,20 @@ def fit(
     cli_fit.check_options(how)
     asked = {"leave-one-out": leave_one_out, "profile": profile, "influence": influence}
     options = [name for name, wanted in asked.items() if wanted]
-    refits = bool(options or cli_fit.remembered(how))
-    loaded, measurements, problem = load(spec, data, refits=refits)
+    options = sorted({*options, *cli_fit.remembered(how)})
+    loaded, measurements, problem = load(spec, data, refits=bool(options))
     root = spec.parent if data is None else data
     now = cli_fit.describe(how, spec, root, loaded, measurements, problem, options)
     if meeting.process > 0:
         cli_fit.help_out(how, now, problem, settings_of(loaded))
         raise typer.Exit(0)
-    if leave_one_out:
+    if "leave-one-out" in options:
         _can_leave_out(problem)
-    names = _names_to_profile(spec, loaded, problem, profile)
+    names = _names_to_profile(spec, loaded, problem, "profile" in options)
     if loaded.uncertainty.posterior:
         _can_draw(spec)
     clock.append(time.perf_counter())
     with cli_fit.running(how, now, problem, settings_of(loaded)) as under:
-        names = _names_to_profile(spec, loaded, problem, "profile" in under.options)
         found = run(
             loaded, problem, under.settings, under.options, names, under.stop_if_asked, under.fit
         )
