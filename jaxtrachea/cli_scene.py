@@ -156,8 +156,10 @@ def _chosen(path: Path, spec, staged):
             stop_if_asked()
             bar.update(task, description=f"choosing: {text}", advance=1)
 
-        choice = choose(full, spec.plan.tolerance, report)
-    return staged._replace(scene=choice.scene), choice
+        wish = spec.plan
+        choice = choose(full, wish.tolerance, report, precision=wish.precision)
+    chosen = {name: getattr(choice, name) for name in ("scene", "material", "path")}
+    return staged._replace(**chosen), choice
 
 
 def _for_sweep(path: Path, spec, staged):
@@ -218,7 +220,8 @@ def _provenance(scene: Path, staged, clock: list[float]) -> dict:
 
     inputs = {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in staged.files}
     seconds = {name: clock[i + 1] - clock[i] for i, name in enumerate(("read", "compute"))}
-    return provenance(scene, inputs, str(jax.devices()[0]), "float64", seconds)
+    dtype = str(staged.material.k_1.dtype)
+    return provenance(scene, inputs, str(jax.devices()[0]), dtype, seconds)
 
 
 def _write_json(folder: Path, made: dict) -> None:

@@ -146,7 +146,8 @@ def off(found, reference):
     """Largest error of force and joints, by hand."""
     worst = 0.0
     for a, b in ((found.force, reference.force), (found.joints, reference.joints)):
-        length = lambda v: np.sqrt((np.asarray(v) ** 2).sum(-1)).max()  # noqa: E731
+        a, b = np.asarray(a, float), np.asarray(b)
+        length = lambda v: np.sqrt((v**2).sum(-1)).max()  # noqa: E731
         worst = max(worst, length(a - b) / length(b))
     return worst
 
@@ -157,22 +158,22 @@ def test_chosen_plan_is_within_the_tolerance():
     solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
     reference = solve(made.scene, made.material, made.path)  # the rules leave nothing out here
     dropped = []
-    for tolerance in (0.1, 0.01, 0.001):
+    for tolerance in (0.1, 0.01, 0.001, 1e-10):
         choice = choose(full, tolerance)
-        assert off(solve(choice.scene, made.material, made.path), reference) <= tolerance
+        assert off(solve(choice.scene, choice.material, choice.path), reference) <= tolerance
         assert choice.errors.worst <= tolerance
         dropped.append({rung.ladder for rung in choice.dropped})
         level = {e.name: e.level for e in choice.scene.plan.effects}
         reason = {e.name: e.reason for e in choice.scene.plan.effects}
         assert (level["shear"] == "off") == ("shear" in dropped[-1])
         assert "change" in reason["shear"]
-    assert dropped[0] == {"shear", "local"}
-    assert dropped[2] == set()
-    assert {rung.ladder for rung in choice.refused} == {"shear", "local"}
+        assert level["precision"] == str(choice.material.k_1.dtype) == str(choice.path.s.dtype)
+    assert dropped[0] == {"shear", "local", "dtype"}
+    assert dropped[0] > dropped[1] >= dropped[2] == {"dtype"} > dropped[3]
+    assert {rung.ladder for rung in choice.refused} == {"shear", "local", "dtype"}
     assert not choice.returned
-    assert dropped[0] > dropped[1] >= dropped[2]
-    assert "no program but the full one is within 0.1 %" in choice.sentence
-    assert choice.operations[0] == choice.operations[1]
+    assert "no program but the full one is within 1e-08 %" in choice.sentence
+    assert choice.cost[0] == choice.cost[1]
 
 
 def test_two_effects_within_tolerance_can_break_it_together():
@@ -183,11 +184,12 @@ def test_two_effects_within_tolerance_can_break_it_together():
     plan = lambda **less: dataclasses.replace(  # noqa: E731
         made.scene, plan=dataclasses.replace(
             made.scene.plan, options=dataclasses.replace(options, **less)))  # fmt: skip
-    loose = choose(full, 0.1)
+    kept = {"precision": "float64"}
+    loose = choose(full, 0.1, **kept)
     alone = {rung.ladder: rung.errors.worst for rung in loose.dropped}
     assert loose.errors.worst > max(alone.values())
     tolerance = (loose.errors.worst + max(alone.values())) / 2
-    choice = choose(full, tolerance)
+    choice = choose(full, tolerance, **kept)
     assert len(choice.dropped) == len(choice.returned) == 1
     saved = {rung.ladder: rung.saved for rung in loose.dropped}
     assert choice.returned[0].ladder == max(alone, key=lambda k: alone[k] / saved[k])
@@ -200,8 +202,9 @@ def test_two_effects_within_tolerance_can_break_it_together():
 
 def test_a_wish_is_kept():
     wish = SCENE | {"effects": {"shear": "on"}}
-    choice = choose(full_scene(*staged(wish)), 0.1)
+    choice = choose(full_scene(*staged(wish)), 0.1, precision="float64")
     assert {rung.ladder for rung in choice.dropped} == {"local"}
+    assert choice.material.k_1.dtype == float
     assert choice.levels.shear
 
 
@@ -229,9 +232,13 @@ pictures = false
 """
 
 
-def test_simulate_takes_the_plan_within_the_tolerance(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(("precision", "dtype"), [("auto", "float32"), ("float64", "float64")])
+def test_simulate_takes_the_plan_within_the_tolerance(
+    precision, dtype, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
-    Path("scene.toml").write_text(TOML + '[plan]\ntolerance = "10 %"\n')
+    plan = f'[plan]\ntolerance = "10 %"\nprecision = "{precision}"\n'
+    Path("scene.toml").write_text(TOML + plan)
     code, out, _ = run(monkeypatch, capsys, "simulate", "scene.toml", "--out", "result")
     assert code == 0
     assert "within 10 %: force" in out
@@ -243,7 +250,11 @@ def test_simulate_takes_the_plan_within_the_tolerance(tmp_path, monkeypatch, cap
     spec, made = staged(GA_L=None, k_1_ring=None)  # never knew of the two effects
     solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
     expected = solve(made.scene, made.material, made.path).force
-    np.testing.assert_allclose(force, expected, rtol=1e-9, atol=1e-12)
+    assert force.dtype == dtype
+    assert json.loads(Path("result/provenance.json").read_text())["dtype"] == dtype
+    assert (level["precision"][0] if "precision" in level else "float64") == dtype
+    rtol = {"float32": 3e-6, "float64": 1e-9}[dtype]
+    np.testing.assert_allclose(force, expected, rtol=rtol, atol=1e-12)
 
 
 @pytest.mark.parametrize("tolerance", ["0 %", "100 %", "1 mm"])

@@ -201,6 +201,7 @@ class PlanSection(Section):
     """[plan]: choose the cheapest program within a tolerance, for this path (docs/tradeoff.md)."""
 
     tolerance: Annotated[float, quantity("dimensionless", positive=True), Field(lt=1)]
+    precision: Literal["auto", "float64"] = "auto"
 
 
 class SweepSection(Section):

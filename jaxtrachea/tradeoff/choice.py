@@ -3,13 +3,13 @@
 Every effect is dropped alone from the full program, the cheapest rung within the tolerance is
 taken, and all of them together are checked. Effects do not add up: while the whole is too far off,
 the effect that errs most per operation saved comes back by one rung. Cost is the number of
-operations, so that the choice does not depend on the machine; errors are those of force, joints and
-surface over the path and two sample paths beside it.
+operations, those in float32 counted half, so that the choice does not depend on the machine; errors
+are those of force, joints and surface over the path and two sample paths beside it.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,8 @@ from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.tradeoff.errors import Errors, compare
 from jaxtrachea.tradeoff.ladders import QUALITY, Ladder, ladders
-from jaxtrachea.tradeoff.levels import Full, Levels, program
+from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
+from jaxtrachea.trachea.material import Material
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
 BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
@@ -31,12 +32,15 @@ EFFECT: dict[str, str] = {
     "local": "two_material",
     "interpolation": "surface",
     "quality": "contact quality",
+    "dtype": "precision",
 }
 #: Levels that a plan calls otherwise.
 WORD = {"uniform": "off", "0": "off"}
-#: Ladders of which the choice takes rungs, besides `quality`.
+#: Ladders of which the choice takes rungs, if the user leaves their effect to it.
 CHOSEN = ("second_plane", "rings", "shear", "local", "axial", "end_motion", "friction",
           "interpolation", "dent")  # fmt: skip
+#: What an operation costs.
+COST = {"float32": 0.5, "float64": 1.0}
 
 #: `simulate` for several paths; compiled quickly, since every program is called once.
 _simulate = jax.jit(
@@ -58,54 +62,60 @@ class Choice(NamedTuple):
 
     Attributes:
         scene: with the plan chosen; its decisions say what was dropped.
+        material: in the precision chosen.
+        path: likewise.
         levels: chosen.
         tolerance: relative.
         dropped: effects at a lower level than in the full program.
         refused: rungs that are too far off alone.
         returned: rungs that were within the tolerance alone, but not together with the others.
         errors: of the choice against the full program, on all sample paths.
-        operations: of the full program and of the choice, for the path.
+        cost: of the full program and of the choice, for the path: operations, in float32 half.
     """
 
     scene: Scene
+    material: Material
+    path: Poses | Presses
     levels: Levels
     tolerance: float
     dropped: tuple[Rung, ...]
     refused: tuple[Rung, ...]
     returned: tuple[Rung, ...]
     errors: Errors
-    operations: tuple[int, int]
+    cost: tuple[float, float]
 
     @property
     def sentence(self) -> str:
         """What was found, in a line."""
         if not self.dropped:
             return f"no program but the full one is within {percent(self.tolerance)}; it is taken"
-        share = self.operations[1] / self.operations[0]
+        share = self.cost[1] / self.cost[0]
         return (
             f"within {percent(self.tolerance)}: {changes(self.errors)} off the full program, "
-            f"{100 * share:.0f} % of its operations"
+            f"{100 * share:.0f} % of its cost"
         )
 
 
 def choose(
-    full: Full, tolerance: float, report: Callable[[str], None] = lambda text: None
-) -> Choice:
+    full: Full, tolerance: float, report: Callable[[str], None] = lambda text: None,
+    *, precision: Literal["auto", "float64"] = "auto",
+) -> Choice:  # fmt: skip
     """Choose the cheapest levels within the tolerance.
 
     Args:
         full: the scene at its finest.
         tolerance: largest error of force, joints and surface, relative to the largest value.
         report: called with what is tried next; may raise to stop.
+        precision: `auto`: float32 where that is within the tolerance.
     """
-    trial = _Trial(full, report)
+    trial, every = _Trial(full, report), _ladders(full, precision)
     refused: list[Rung] = []
     options: dict[str, list[Rung]] = {}
-    for ladder in _ladders(full):
+    for ladder in every:
         within = _within(trial, ladder, tolerance, refused)
         if within is not None:
             options[ladder.name] = [within]
-    named = {ladder.name: ladder for ladder in _ladders(full)}
+    named = {ladder.name: ladder for ladder in every}
     returned: list[Rung] = []
     while True:
         picked = [rungs[-1] for rungs in options.values()]
@@ -120,10 +130,11 @@ def choose(
             del options[back.ladder]
         else:
             options[back.ladder].append(finer)
-    operations = trial.operations(full.levels), trial.operations(levels)
-    scene = _explained(program(full, levels)[0], picked, refused, returned)
+    scene, material, path = program(full, levels)
+    scene = _explained(scene, picked, refused, returned)
     found = tuple(picked), tuple(refused), tuple(returned)
-    return Choice(scene, levels, tolerance, *found, errors, operations)
+    cost = trial.cost(full.levels), trial.cost(levels)
+    return Choice(scene, material, path, levels, tolerance, *found, errors, cost)
 
 
 class _Trial:
@@ -133,7 +144,7 @@ class _Trial:
         self.full, self.report = full, report
         self.paths = samples(full)
         self.known: dict[Levels, Errors] = {}
-        self.counts: dict[Levels, int] = {}
+        self.costs: dict[Levels, float] = {}
         report("full program")
         self.reference = self._run(full.levels)
 
@@ -143,17 +154,19 @@ class _Trial:
             self.known[levels] = compare(found, self.reference, (self.full.scene, self.full.scene))
         return self.known[levels]
 
-    def operations(self, levels: Levels) -> int:
-        if levels not in self.counts:
-            self.counts[levels] = count_operations(simulate, *program(self.full, levels))
-        return self.counts[levels]
+    def cost(self, levels: Levels) -> float:
+        if levels not in self.costs:
+            count = count_operations(simulate, *program(self.full, levels))
+            self.costs[levels] = count * COST[levels.dtype]
+        return self.costs[levels]
 
     def saved(self, levels: Levels) -> float:
-        return 1 - self.operations(levels) / self.operations(self.full.levels)
+        return 1 - self.cost(levels) / self.cost(self.full.levels)
 
     def _run(self, levels: Levels):
         scene, material, _ = program(self.full, levels)
-        return jax.tree.map(np.asarray, _simulate(scene, material, self.paths))
+        paths = cast(self.paths, levels.dtype)
+        return jax.tree.map(np.asarray, _simulate(scene, material, paths))
 
 
 def samples(full: Full) -> Poses | Presses:
@@ -186,14 +199,15 @@ def changes(errors: Errors) -> str:
     return ", ".join(f"{name} {percent(v)}" for name, v in parts.items() if v is not None)
 
 
-def _ladders(full: Full) -> list[Ladder]:
+def _ladders(full: Full, precision: str) -> list[Ladder]:
     """Those of the choice: what saves operations, and what the user has not decided."""
     free = lambda name: getattr(full.given, _effect(name)) == "auto"  # noqa: E731
-    found = [v for v in ladders(full)[0] if v.name in CHOSEN and free(v.name)]
+    every = ladders(full)[0]
+    found = [v for v in every if v.name in CHOSEN and free(v.name)]
     if full.scene.plan.contact:
         rungs = {k: {"sharpness": sharp, "steps": n} for k, (sharp, n) in QUALITY.items()}
         found.append(Ladder("quality", "truncation", {**rungs, "fine": {}}, {}))
-    return found
+    return found + [v for v in every if v.name == "dtype" and precision == "auto"]
 
 
 def _within(
@@ -237,6 +251,7 @@ def _explained(
             )
     plan = scene.plan
     more = [Effect("contact quality", "fine", "the finest")] if plan.contact else []
+    more.append(Effect("precision", "float64", "the finest"))
     picks = {_effect(rung.ladder): WORD.get(rung.level, rung.level) for rung in picked}
 
     def explained(effect: Effect) -> Effect:

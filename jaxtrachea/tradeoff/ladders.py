@@ -16,7 +16,8 @@ Kind = Literal["truncation", "algebra", "model"]
 SHARPNESS = (100.0, 300.0, 1000.0, 3000.0)
 STEPS = (1, 2, 4, 6, 8, 10, 12)
 #: Sharpness and steps together, for the choice by tolerance.
-QUALITY = {"rough": (300.0, 5), "fast": (300.0, 10), "standard": (1000.0, 10)}
+QUALITY = {"rough": (300.0, 5), "fast": (300.0, 10), "standard": (1000.0, 10),
+           "sharp": (3000.0, 10), "fine, 10 steps": (FINE.sharpness, 10)}  # fmt: skip
 MESH = (0.25, 0.5, 1.0, 2.0)
 KEPT = (1, 2, 3, 5, 7, 9, 11, 13)
 

@@ -203,7 +203,7 @@ def choice_row(
         "scene": name, "tolerance": choice.tolerance, "dropped": said(choice.dropped),
         "refused": said(choice.refused), "returned": said(choice.returned),
         "errors": {k: _number(v) for k, v in choice.errors._asdict().items()},
-        "operations": round(choice.operations[1] / choice.operations[0], 4),
+        "cost": round(choice.cost[1] / choice.cost[0], 4),
         "times": {"chosen": call(choice.levels), "full": call(full.levels)},
     } | _environment(settings)  # fmt: skip
 

@@ -94,7 +94,7 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
 
 
 CHOICE_HEAD = ["scene", "tolerance", "dropped (changes alone)", "too far off alone", "came back",
-               "verified error", "operations", "call, chosen / full [µs]", "ratio"]  # fmt: skip
+               "verified error", "cost", "call, chosen / full [µs]", "ratio"]  # fmt: skip
 
 
 def document(folder: Path, head: str) -> str:

@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[2]
 FOLDER, DOCUMENT = ROOT / "docs" / "tradeoff", ROOT / "docs" / "tradeoff.md"
 HEAD = ROOT / "docs" / "tradeoff.md.in"
 SCENES = {
+    "table_1": "",  # the scene that `jaxtrachea tradeoff` takes by itself
     "normal": "configs/normal.toml",
     "capsule": "configs/capsule.toml",
     "off_midline": "configs/off_midline.toml",
@@ -23,7 +24,8 @@ SCENES = {
 }
 DATA = {"virtual_trachea": "fits/virtual_trachea/fit.toml"}
 #: Scenes and tolerances of the table of choices; names not in `SCENES` are those of configs/.
-CHOICES = ("no_surface", "bonded_pull", "normal", "off_midline", "friction", "virtual_trachea")
+CHOICES = ("table_1", "no_surface", "bonded_pull", "normal", "off_midline", "friction",
+           "virtual_trachea")  # fmt: skip
 TOLERANCES = (0.1, 0.01, 0.001)
 
 
@@ -37,11 +39,11 @@ def document() -> str:
 def full_of(name: str, coupling: str | None = None):
     """A scene of the repository at its finest."""
     from jaxtrachea.scene.build import stage
-    from jaxtrachea.scene.spec import load_scene_spec
-    from jaxtrachea.tradeoff.levels import full_scene
+    from jaxtrachea.scene.spec import SceneSpec, load_scene_spec
+    from jaxtrachea.tradeoff.levels import BUILT_IN, full_scene
 
-    path = ROOT / SCENES.get(name, f"configs/{name}.toml")
-    spec = load_scene_spec(path)
+    path = ROOT / (SCENES.get(name, f"configs/{name}.toml") or "configs")
+    spec = SceneSpec.model_validate(BUILT_IN) if path.is_dir() else load_scene_spec(path)
     return full_scene(spec, stage(spec, path.parent), coupling=coupling)
 
 
