@@ -73,14 +73,16 @@ def with_dpbsv(band, f):
 
 
 def _load_opensees():
-    """The module, on Linux after the libraries that lie beside it and that it does not find."""
+    """The module; on Linux after the libraries that come with it and that it does not find."""
     found = importlib.util.find_spec("openseespylinux")
-    if found is not None and found.origin is not None:
-        folder = Path(found.origin).parent / "lib"
-        for name in ("libquadmath.so.0", "libgfortran.so.4", "libblas.so.3", "liblapack.so.3"):
-            ctypes.CDLL(str(folder / name), mode=ctypes.RTLD_GLOBAL)
-    import openseespy.opensees as ops
-
+    try:
+        if found is not None and found.origin is not None:
+            folder = Path(found.origin).parent / "lib"
+            for name in ("libquadmath.so.0", "libgfortran.so.4", "libblas.so.3", "liblapack.so.3"):
+                ctypes.CDLL(str(folder / name), mode=ctypes.RTLD_GLOBAL)
+        import openseespy.opensees as ops
+    except (OSError, RuntimeError) as error:
+        raise ImportError(f"OpenSees could not be loaded: {error}") from error
     return ops
 
 
@@ -90,7 +92,7 @@ def opensees(frame: Frame, EI, k, F) -> Callable:
     OpenSees holds one model per process: a function returned before this call is of no more use.
 
     Raises:
-        ImportError, OSError, RuntimeError: OpenSees or one of its libraries cannot be loaded.
+        ImportError: OpenSees or one of its libraries cannot be loaded.
     """
     ops = _load_opensees()
     nodes = frame.nodes
