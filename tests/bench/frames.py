@@ -131,29 +131,33 @@ def opensees(frame: Frame, EI, k, F) -> Callable:
     return call
 
 
-def pynite(frame: Frame, EI, k, F) -> Callable:
-    """The frame in PyNite, built once; returns a function that analyses it.
-
-    PyNite has six degrees of freedom per node: what leaves the plane is held at every node. The
-    spring forces are those that PyNite gives, not k w: their sign has been wrong in the past.
-    """
+def pynite_model(frame: Frame, EI, k, F):
+    """The frame in PyNite; what would leave the plane is held at every node."""
     from Pynite import FEModel3D
 
     model = FEModel3D()
     model.add_material("ligament", 1e3, 1e3, 0.3, 0.0)
-    places = np.append(0.0, frame.nodes)
-    for i, x in enumerate(places):
+    for i, x in enumerate(np.append(0.0, frame.nodes)):
         model.add_node(f"N{i}", float(x), 0.0, 0.0)
         held = i == 0 or (i == len(frame.nodes) and frame.clamped_end)
         model.def_support(f"N{i}", i == 0, held, True, True, True, held)
         if i:
             model.add_section(f"S{i}", 1e3, EI[i - 1] / 1e3, EI[i - 1] / 1e3, 1.0)
             model.add_member(f"M{i}", f"N{i - 1}", f"N{i}", "ligament", f"S{i}")
-    springs = [f"N{node + 1}" for node in frame.rings]
-    for name, stiffness in zip(springs, k, strict=True):
-        model.def_support_spring(name, "DY", float(stiffness))
-    tip = f"N{frame.loaded + 1}"
-    model.add_node_load(tip, "FY", F)
+    for node, stiffness in zip(frame.rings, k, strict=True):
+        model.def_support_spring(f"N{node + 1}", "DY", float(stiffness))
+    model.add_node_load(f"N{frame.loaded + 1}", "FY", F)
+    return model
+
+
+def pynite(frame: Frame, EI, k, F) -> Callable:
+    """The frame in PyNite, built once; returns a function that analyses it.
+
+    The matrix is full and its stability not looked for, which is fastest. The forces are those
+    that PyNite gives, not k w: it has had their sign wrong.
+    """
+    model = pynite_model(frame, EI, k, F)
+    tip, springs = f"N{frame.loaded + 1}", [f"N{node + 1}" for node in frame.rings]
 
     def call():
         model.analyze_linear(sparse=False, check_stability=False)
