@@ -9,10 +9,12 @@ import pytest
 BENCH = Path(__file__).parent / "bench"
 
 
-def report():
-    spec = importlib.util.spec_from_file_location("bench_report", BENCH / "report.py")
+def report(name: str = "report"):
+    spec = importlib.util.spec_from_file_location(f"bench_{name}", BENCH / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(BENCH)
+        spec.loader.exec_module(module)
     return module
 
 
@@ -38,3 +40,24 @@ def test_competitors_agree_with_us():
         for row in report().read(suite)[1]:
             assert (row.get("error") or 0) < 1e-8
             assert row.get("missed", 0) == 0
+
+
+def test_every_peer_has_the_turns_that_we_have_and_agrees():
+    rows = [r for r in report().read("peers")[1] if r["kind"] == "row"]
+    turns = {}
+    for r in rows:
+        turns.setdefault(r["group"], {}).setdefault(r["case"], []).append(r["turn"])
+        smooth = r["group"].startswith(("contact", "whole"))
+        assert (r["error"] or 0) < (0.05 if smooth else 1e-3 if r["group"] == "fit" else 1e-8)
+    assert len(turns) >= 5
+    for cases in turns.values():
+        assert len(cases) >= 2
+        assert len(cases["jaxtrachea"]) >= 5
+        assert all(found == cases["jaxtrachea"] for found in cases.values())
+
+
+def test_ratio_to_a_peer_is_taken_within_a_turn():
+    ours = [{"turn": i, "lanes": 2, "median": t} for i, t in enumerate([1.0, 4.0, 16.0])]
+    peer = [{"turn": i, "lanes": 10, "median": t} for i, t in enumerate([20.0, 40.0, 480.0])]
+    # Per problem 2 / 0.5, 4 / 2 and 48 / 8.
+    assert report("report_peers").ratios(ours, peer[::-1]) == [6.0, 2.0, 4.0]

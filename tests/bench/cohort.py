@@ -25,17 +25,6 @@ SPECIMENS, SAMPLE, ROUNDS = 10_000, 20, 3
 SPOTS, DEPTHS = np.array([15.0, 30.0, 45.0, 65.0, 80.0]), np.linspace(0.03, 6.0, 200)
 
 
-def each(model, forces, one):
-    """Fit the first specimens one by one."""
-
-    def call():
-        for force in forces[:SAMPLE]:
-            model.load(force)
-            one()
-
-    return call
-
-
 def command(problem) -> dict:
     """Seconds by phase and peak memory (MB) of `jaxtrachea fit` on the same data."""
     with tempfile.TemporaryDirectory() as name:
@@ -59,13 +48,14 @@ def main() -> None:
     """Time all in turn and write the results."""
     out = common.Writer("cohort", "scipy", "lmfit")
     problem, model, forces = fitting.study(SPECIMENS, SPOTS, DEPTHS)
+    few = forces[:SAMPLE]
     cases = {
         "jaxtrachea: fit with standard errors": lambda: fit.fit(problem, fit.Settings(starts=1)),
-        "scipy least_squares lm, numpy residual and Jacobian": each(
-            model, forces, lambda: fitting.with_scipy(model.value, model.jacobian)
+        "scipy least_squares lm, numpy residual and Jacobian": fitting.one_by_one(
+            model, few, lambda i: fitting.with_scipy(model.value, model.jacobian)
         ),
-        "lmfit leastsq, numpy residual and Jacobian": each(
-            model, forces, lambda: fitting.with_lmfit(model)
+        "lmfit leastsq, numpy residual and Jacobian": fitting.one_by_one(
+            model, few, lambda i: fitting.with_lmfit(model)
         ),
     }
     lanes = dict(zip(cases, (SPECIMENS, SAMPLE, SAMPLE), strict=True))

@@ -213,6 +213,19 @@ def jitted_residual(problem):
     return one
 
 
+def one_by_one(model, forces, one):
+    """A function that fits the specimens of `forces` one after the other by `one(i)`."""
+
+    def call():
+        results = []
+        for i, force in enumerate(forces):
+            model.load(force)
+            results.append(one(i))
+        return results
+
+    return call
+
+
 def check(problem, model, forces) -> None:
     """Our residual and the numpy one are the same function, Jacobian included."""
     theta = np.array([np.log(80.0), np.log(0.7), 0.1, 1.2])
@@ -239,16 +252,6 @@ def main() -> None:
     def solve_only():
         return solve.levenberg_marquardt(problem, jobs, starts, sigma)
 
-    def each(one):
-        def call():
-            results = []
-            for i in range(SAMPLE):
-                model.load(forces[i])
-                results.append(one(i))
-            return results
-
-        return call
-
     through_jax = jitted_residual(problem)
     count = {
         "jaxtrachea: fit with standard errors": SPECIMENS,
@@ -258,13 +261,14 @@ def main() -> None:
         "lmfit leastsq, numpy residual and Jacobian": SAMPLE,
         "scipy least_squares lm, jitted JAX residual and Jacobian": SAMPLE,
     }
+    few = forces[:SAMPLE]
     calls = (
         ours,
         solve_only,
         optimistix_batch(problem, 512),
-        each(lambda i: with_scipy(model.value, model.jacobian)),
-        each(lambda i: with_lmfit(model)),
-        each(through_jax),
+        one_by_one(model, few, lambda i: with_scipy(model.value, model.jacobian)),
+        one_by_one(model, few, lambda i: with_lmfit(model)),
+        one_by_one(model, few, through_jax),
     )
     cases = dict(zip(count, calls, strict=True))
     results = {}

@@ -1,8 +1,7 @@
 """Speed of the skeleton: one call, many lanes, growth. Run: python tests/bench/skeleton.py [part].
 
 15 rings 10 mm apart, k = 0.1 N/mm, EI = 1.86 N mm^2 (the test problem of docs/beam_accuracy.md).
-OpenSees needs its own libraries: LD_LIBRARY_PATH=<site-packages>/openseespylinux/lib. Without it
-the row is missing and the results say why.
+If OpenSees cannot be loaded its row is missing and the results say why.
 """
 
 import ctypes
@@ -15,8 +14,8 @@ import common
 import jax
 import jax.numpy as jnp
 import numpy as np
+from frames import Banded, Frame, opensees, with_dpbsv
 from scipy.linalg import solveh_banded
-from scipy.linalg.lapack import dpbsv
 
 from jaxtrachea.mechanics.beam import Beam, contact_compliance, deflect
 
@@ -40,145 +39,84 @@ def wait(call):
     return lambda: jax.block_until_ready(call())
 
 
-class Banded:
-    """Hermite beam elements on rings and the loaded point; upper banded storage, 3 off-diagonals.
+def mid_tube() -> tuple[Frame, tuple]:
+    """Contact between two rings of a tube clamped at both ends; the frame and our arguments."""
+    nodes = np.sort(np.append(beam().x, [83.0, 160.0]))
+    frame = Frame(nodes, [*range(8), *range(9, 16)], 8, True)
+    return frame, (*jax.tree.leaves(beam()), jnp.asarray(83.0), jnp.asarray(FORCE))
 
-    Springs, loads and clamps are written into kept arrays; assembly is five slices per solve.
+
+def cantilever() -> tuple[Frame, tuple]:
+    """Loaded free end: rings up to 150, C = 155; the frame and our arguments.
+
+    The library clamps both ends: beyond the tip follow a ring without stiffness and a span that is
+    1e-10 times as stiff.
     """
-
-    def __init__(self, nodes, rings, loaded: int, clamped_end: bool):
-        """Nodes (mm) without the first clamp; `rings`: node of each spring."""
-        self.h = np.diff(nodes, prepend=0.0)
-        self.count = len(nodes) - clamped_end
-        self.rings, self.load = 2 * np.asarray(rings), 2 * loaded
-
-    def solve(self, EI, k, F, solver):
-        """Displacement at the load and reactions of the springs."""
-        h, m = self.h, self.count
-        EI_h = EI / h
-        r = 6 * EI_h / h
-        t = 2 * r / h
-        band = np.zeros((4, 2 * m))
-        band[3, 0::2] = t[:m]
-        band[3, 0 : 2 * (len(h) - 1) : 2] += t[1:]
-        band[3, 1::2] = 4 * EI_h[:m]
-        band[3, 1 : 2 * (len(h) - 1) : 2] += 4 * EI_h[1:]
-        band[3, self.rings] += k
-        band[2, 1::2] = -r[:m]
-        band[2, 1 : 2 * (len(h) - 1) : 2] += r[1:]
-        band[1, 2::2] = -t[1:m]
-        band[1, 3::2] = 2 * EI_h[1:m]
-        band[2, 2::2] = -r[1:m]
-        band[0, 3::2] = r[1:m]
-        f = np.zeros(2 * m)
-        f[self.load] = F
-        u = solver(band, f)
-        return u[self.load], k * u[self.rings]
+    frame = Frame(np.append(beam().x, 155.0), list(range(15)), 15, False)
+    tip, k, soft = jnp.asarray(155.0), jnp.full(16, K).at[15].set(0.0), 1e-10 * EI
+    args = (jnp.append(beam().x, tip), jnp.asarray(1155.0), jnp.full(17, EI).at[16].set(soft), k)
+    return frame, (*args, tip, jnp.asarray(FORCE))
 
 
-def with_dpbsv(band, f):
-    """LAPACK's banded Cholesky without scipy's checks."""
-    return dpbsv(band, f, overwrite_ab=1, overwrite_b=1)[1]
+def of_frame(frame: Frame) -> tuple:
+    """EI of every element, k of every spring and the force, for the programs in frames.py."""
+    return np.full(len(frame.nodes), EI), np.full(len(frame.rings), K), FORCE
 
 
-def opensees(nodes, rings, loaded: int, clamped_end: bool):
-    """The same frame in OpenSees, built once; returns a function reset + analyze + reactions."""
-    import openseespy.opensees as ops
+def our_calls(args: tuple) -> dict:
+    """Ours with everything read at every call, and with the beam as constants of the program."""
+    run, kept = jax.jit(two_outputs), jax.jit(lambda s, F: two_outputs(*args[:4], s, F))
+    return {
+        "jaxtrachea: w_C, reactions": wait(lambda: run(*args)),
+        "jaxtrachea: w_C, reactions, beam kept": wait(lambda: kept(*args[4:])),
+    }
 
-    ops.wipe()
-    ops.model("basic", "-ndm", 2, "-ndf", 3)
-    ops.geomTransf("Linear", 1)
-    ops.node(1, 0.0, 0.0)
-    ops.fix(1, 1, 1, 1)
-    for i, x in enumerate(nodes):
-        ops.node(i + 2, float(x), 0.0)
-        ops.element("elasticBeamColumn", i + 1, i + 1, i + 2, 1e3, 1e3, EI / 1e3, 1)
-    ops.fix(len(nodes) + 1, 1, int(clamped_end), int(clamped_end))
-    ops.uniaxialMaterial("Elastic", 1, K)
-    for i, node in enumerate(rings):
-        ops.node(1000 + i, float(nodes[node]), 0.0)
-        ops.fix(1000 + i, 1, 1, 1)
-        pair = (1000 + i, int(node) + 2)
-        ops.element("zeroLength", 1000 + i, *pair, "-mat", 1, "-dir", 2)
-    ops.timeSeries("Constant", 1)
-    ops.pattern("Plain", 1, 1)
-    ops.load(loaded + 2, 0.0, FORCE, 0.0)
-    ops.system("BandSPD")
-    ops.numberer("RCM")
-    ops.constraints("Plain")
-    ops.integrator("LoadControl", 1.0)
-    ops.algorithm("Linear")
-    ops.analysis("Static")
-    springs = range(1000, 1000 + len(rings))
 
-    def call():
-        ops.reset()
-        assert ops.analyze(1) == 0
-        ops.reactions()
-        return ops.nodeDisp(loaded + 2, 2), [-ops.nodeReaction(i, 2) for i in springs]
+def more_calls(args: tuple) -> dict:
+    """Ours with more outputs."""
+    everything = jax.jit(lambda x, L, EI, k, s, F: tuple(deflect(Beam(x, L, EI, k), s, F)))
+    gradient = jax.jit(jax.value_and_grad(compliance_of, argnums=(2, 3, 4)))
+    return {
+        "jaxtrachea: all seven outputs": wait(lambda: everything(*args)),
+        "jaxtrachea: w_C and gradient (k, EI, s_c)": wait(lambda: gradient(*args[:5])),
+    }
 
-    return call
+
+def numpy_calls(frame: Frame) -> dict:
+    """The banded matrix by scipy and by LAPACK alone."""
+    banded, given = Banded(frame), of_frame(frame)
+    return {
+        "numpy + solveh_banded": lambda: banded.solve(*given, solveh_banded),
+        "numpy + dpbsv": lambda: banded.solve(*given, with_dpbsv),
+    }
+
+
+def differs(name: str, found, expected) -> float:
+    """Of deflection and reactions, the one that differs more; of our reactions the first count."""
+    (w, R), (w_C, reactions) = found, expected
+    error = common.close(name, w, w_C), common.close(name, R, np.asarray(reactions)[: len(R)])
+    return max(error)
 
 
 def single(out: common.Writer) -> None:
     """One call with reactions against OpenSees and banded LAPACK, same problem, same outputs."""
-    x = PITCH * np.arange(1, 16)
-    problems = {
-        # Contact between two rings of a tube clamped at both ends.
-        "mid-tube": (np.sort(np.append(x, [83.0, 160.0])), [*range(8), *range(9, 16)], 8, True),
-        # Loaded free end: rings up to 150, C = 155; the far beam is what the library always has.
-        "cantilever": (np.append(x, 155.0), list(range(15)), 15, False),
-    }
-    for name, (nodes, rings, loaded, clamped) in problems.items():
-        cases = {}
-        if clamped:
-            args = (*jax.tree.leaves(beam()), jnp.asarray(83.0), jnp.asarray(FORCE))
-            run = jax.jit(two_outputs)
-            everything = jax.jit(lambda x, L, EI, k, s, F: tuple(deflect(Beam(x, L, EI, k), s, F)))
-            cases["jaxtrachea: w_C, reactions"] = wait(lambda r=run, a=args: r(*a))
-            cases["jaxtrachea: all seven outputs"] = wait(lambda r=everything, a=args: r(*a))
-            gradient = jax.jit(jax.value_and_grad(compliance_of, argnums=(2, 3, 4)))
-            cases["jaxtrachea: w_C and gradient (k, EI, s_c)"] = wait(
-                lambda r=gradient, a=args: r(*a[:5])
-            )
-            expected = [np.asarray(v) for v in run(*args)]
-        else:
-            # The library clamps both ends: beyond the tip follow a ring without stiffness and a
-            # span that is 1e-10 times as stiff.
-            tip, k, soft = jnp.asarray(155.0), jnp.full(16, K).at[15].set(0.0), 1e-10 * EI
-            args = (jnp.append(beam().x, tip), jnp.asarray(1155.0))
-            args = (*args, jnp.full(17, EI).at[16].set(soft), k, tip, jnp.asarray(FORCE))
-            run = jax.jit(two_outputs)
-            expected = [np.asarray(v) for v in run(*args)]
-            expected[1] = expected[1][:15]
-            cases["jaxtrachea: w_C, reactions"] = wait(lambda r=run, a=args: r(*a))
-        kept = jax.jit(lambda s, F, a=args: two_outputs(*a[:4], s, F))
-        cases["jaxtrachea: w_C, reactions, beam kept"] = wait(lambda r=kept, a=args: r(*a[4:]))
+    for problem, (frame, args) in {"mid-tube": mid_tube(), "cantilever": cantilever()}.items():
+        cases = our_calls(args)
+        expected = cases["jaxtrachea: w_C, reactions"]()
+        cases |= more_calls(args) if frame.clamped_end else {}
         floor = jax.jit(lambda x, L, EI, k, s, F: (x[0] + L, EI + k[0] + s + F))
         cases["a jitted call that computes nothing (6 in, 2 out)"] = wait(
             lambda f=floor, a=args: f(*a)
         )
-        banded = Banded(nodes, rings, loaded, clamped)
-        EIs, ks = np.full(len(nodes), EI), np.full(15, K)
-        solvers = {"solveh_banded": solveh_banded, "dpbsv": with_dpbsv}
-        for label, solver in solvers.items():
-            cases[f"numpy + {label}"] = lambda b=banded, s=solver, e=EIs, k=ks: b.solve(
-                e, k, FORCE, s
-            )
+        rivals = numpy_calls(frame)
         try:
-            cases["OpenSees: reset + analyze + reactions"] = opensees(nodes, rings, loaded, clamped)
-        except (ImportError, RuntimeError) as error:
-            out.note("single", f"OpenSees could not be loaded: {error}")
-        errors = {}
-        for case, call in cases.items():
-            if "numpy" in case or "OpenSees" in case:
-                w, R = call()
-                errors[case] = max(
-                    common.close(case, w, expected[0]), common.close(case, R, expected[1])
-                )
-        found = common.interleaved(cases, rounds=51, target=0.004)
+            rivals["OpenSees: reset + analyze + reactions"] = opensees(frame, *of_frame(frame))
+        except ImportError as error:
+            out.note("single", f"{error}")
+        errors = {case: differs(case, call(), expected) for case, call in rivals.items()}
+        found = common.interleaved(cases | rivals, rounds=51, target=0.004)
         for case, samples in found.items():
-            out.add("single", case, samples, problem=name, error=errors.get(case))
+            out.add("single", case, samples, problem=problem, error=errors.get(case))
 
 
 def two_outputs(x, L, EI, k, s, F):
@@ -264,18 +202,30 @@ def jax_calls(n: int, lanes: int, form: str = "recursion"):
     return {name: wait(lambda f=f: f(*inputs)) for name, f in batched.items()}
 
 
+def values_differ(c_outputs, outputs) -> float:
+    """The largest difference of all outputs between the C loop and ours."""
+    w_C, theta_C, w, theta, R, force_A, moment_A = outputs
+    expected = np.stack([w_C, theta_C, force_A, moment_A], 1), w, theta, R
+    pairs = zip(("tip", "w", "theta", "R"), c_outputs[:4], expected, strict=True)
+    return max(common.close(f"C {name}", a, b) for name, a, b in pairs)
+
+
+def gradients_differ(c_outputs, outputs) -> float:
+    """The largest difference of w_C and its gradient between the C loop and ours."""
+    value, (dEI, dk, ds) = outputs
+    pairs = zip(("w_C", "dk", "dEI", "ds"), c_outputs[:4], (value, dk, dEI, ds), strict=True)
+    return max(common.close(f"C {name}", a, b) for name, a, b in pairs)
+
+
 def lanes(out: common.Writer) -> None:
     """4096 lanes: ours, the dense form, a scalar C loop."""
     ours, dense = jax_calls(15, LANES), jax_calls(15, LANES, "reactions")
     c_value, c_gradient = c_calls(15, LANES)
-    w_C, theta_C, w, theta, R, force_A, moment_A = ours["value"]()
-    tip = np.stack([w_C, theta_C, force_A, moment_A], 1)
-    errors = {}
-    pairs = zip(("tip", "w", "theta", "R"), c_value()[:4], (tip, w, theta, R), strict=True)
-    errors["C: all outputs"] = max(common.close(f"C {name}", a, b) for name, a, b in pairs)
-    value, (dEI, dk, ds) = ours["gradient"]()
-    pairs = zip(("w_C", "dk", "dEI", "ds"), c_gradient()[:4], (value, dk, dEI, ds), strict=True)
-    errors["C: w_C and gradient"] = max(common.close(f"C {name}", a, b) for name, a, b in pairs)
+    (*_, R, _, _), (_, (_, dk, _)) = ours["value"](), ours["gradient"]()
+    errors = {
+        "C: all outputs": values_differ(c_value(), ours["value"]()),
+        "C: w_C and gradient": gradients_differ(c_gradient(), ours["gradient"]()),
+    }
     errors["dense: w_C"] = common.close("dense", dense["w_C"](), ours["w_C"]())
     errors["dense: all outputs"] = common.close("dense", dense["value"]()[4], R)
     dense_gradient = dense["gradient"]()
