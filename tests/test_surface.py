@@ -395,6 +395,58 @@ def test_dent_is_zero_out_of_reach(count):
     assert np.all(moved[away < 4.5] > 0)
 
 
+def shuffled(mesh, seed=3):
+    """The same vertices in another order."""
+    order = np.random.default_rng(seed).permutation(len(mesh.s))
+    return mesh.straight[order]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("order", ["by s", "shuffled"])
+def test_dent_of_the_vertices_near_it_is_that_of_all(order, dtype):
+    """Values, and derivatives by s_c and depth; also at both ends of the tube, in a batch."""
+    at = jnp.asarray(TUBE.straight if order == "by s" else shuffled(TUBE), dtype)
+    spacing = jnp.asarray(1.5, dtype)
+    chosen = local.runs(at[:, 0], spacing)
+    assert (chosen.order is None) == (order == "by s")
+    s = jnp.asarray([-2.0, 0.0, 1.0, 73.3, 81.0, 159.0, 160.0, 163.0], dtype)
+    for count, most in zip((8, 32), chosen.longest[1::2], strict=True):
+
+        def both(s_c, depth, count=count):
+            phi, radius = jnp.asarray(0.4, dtype), jnp.asarray(12.0, dtype)
+            where = local.centres(s_c, phi, radius, spacing, count)
+            wanted = local.targets(depth, jnp.full(count, 0.2, dtype))
+            found = local.fit(where, wanted, 3 * spacing)
+            u = at * depth[None]
+            near = local.add_correction(u, found, at, chosen, s_c)
+            far = u + local.correction(found, at)
+            return jnp.stack([near, far]), jnp.stack([jnp.sum(near**2), jnp.sum(far**2)])
+
+        depth = jnp.asarray([0.2, -1.0, 0.3], dtype)
+        slopes = jax.jacrev(lambda *x: both(*x)[1], argnums=(0, 1))
+        program = lambda s, d, f=both, df=slopes: (f(s, d)[0], df(s, d))  # noqa: E731
+        batch = jax.jit(jax.vmap(program, (0, None)), compiler_options=QUICK)
+        moved, derivatives = batch(s, depth)
+        assert moved.dtype == jnp.dtype(dtype)
+        assert most < len(at) / 3
+        ulp = 8 * np.finfo(dtype).eps
+        np.testing.assert_allclose(moved[:, 0], moved[:, 1], rtol=ulp, atol=ulp)
+        for slope in derivatives:
+            near, far = (np.asarray(slope[:, i]) for i in (0, 1))
+            scale = 4 * count * np.finfo(dtype).eps * np.abs(far).max()
+            np.testing.assert_allclose(near, far, rtol=0, atol=scale)
+
+
+def test_vertices_of_a_dent_wider_than_prepared_are_nan():
+    chosen = local.runs(TUBE.s, jnp.asarray(1.0))
+    at, wanted, found = dent(8, spacing=2.0, reach=6.0)
+    u = local.add_correction(0 * TUBE.straight, found, TUBE.straight, chosen, at[0, 0])
+    assert np.isnan(u).any()
+    right = local.runs(TUBE.s, jnp.asarray(2.0))
+    u = local.add_correction(0 * TUBE.straight, found, TUBE.straight, right, at[0, 0])
+    assert np.isfinite(u).all()
+
+
 def test_one_centre_is_the_kernel():
     """Wendland's C2 function by hand: psi(1/2) = 3/16."""
     at, wanted, found = dent(1, reach=4.0)

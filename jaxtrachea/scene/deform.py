@@ -33,7 +33,9 @@ def deform(
     if mesh is None or binding is None or plan.surface is None:
         raise ValueError("scene.mesh or scene.binding is None; the plan has a surface")
     method = plan.surface
-    straight = mesh.straight if plan.dent else None
+    straight, runs = mesh.straight, scene.runs if plan.dent else None
+    if plan.dent and runs is None:
+        raise ValueError("scene.runs is None; the plan has a dent")
     radius = tool = None
     if plan.dent > 8 and made is not None:
         radius, tool = _distances(scene, made), backed_out(path, made)
@@ -52,8 +54,9 @@ def deform(
         )  # fmt: skip
         share = regions.weigh(binding, phi_c) if weights is None else weights
         u = regions.interpolate(binding, share, keys, method=method)
-        if straight is not None:
-            u = u + local.correction(_dent(scene, s_c, phi_c, radius, tool, moved.depth), straight)
+        if runs is not None:
+            dent = _dent(scene, s_c, phi_c, radius, tool, moved.depth)
+            u = local.add_correction(u, dent, straight, runs, s_c)
         return place(mesh, u)
 
     moved = moved._replace(slip=None, dissipated=None, status=None)
@@ -88,7 +91,7 @@ def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.
     if tool is not None and scene.tool is not None:
         bent = scene.tube if scene.plan.curved else None
         sag = _sag(scene.tool, tool, where if bent is None else lay(bent.line, where))
-    return local.fit(where, local.targets(depth, sag), 3 * spacing)
+    return local.fit(where, local.targets(depth, sag), local.REACH * spacing)
 
 
 def _sag(tool: Shape, pose: Poses, points):

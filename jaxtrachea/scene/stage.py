@@ -17,7 +17,7 @@ from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.plan import Facts, Plan, PlanError, Wishes
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.skeleton import local_frame
-from jaxtrachea.surface import regions
+from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import Mesh
@@ -73,6 +73,7 @@ class Scene(eqx.Module):
         mesh: the surface at rest, or None.
         binding: of the mesh, or None.
         footprint: distance between the circles of the dent's centres, mm.
+        runs: order of the mesh's vertices, for a dent of this footprint; or None.
         plan: the program (static).
         quality: accuracy and work of the search for a contact (static).
     """
@@ -88,6 +89,7 @@ class Scene(eqx.Module):
     near: int = eqx.field(static=True)
     plan: Plan = eqx.field(static=True)
     quality: Settings = eqx.field(static=True, default=STANDARD)
+    runs: local.Runs | None = None
 
 
 def touch_tube(scene: Scene, path: Poses) -> Touch:
@@ -190,9 +192,9 @@ def make_scene(
     fixed = geometry, outer, tube, tool, mu
     scene = Scene(*fixed, mesh, binding, spacing, near, placeholder)
     plan = make_plan(facts_of(scene, material, path), wishes)
-    if plan.surface is None:
-        mesh = binding = None
-    return Scene(*fixed, mesh, binding, spacing, near, plan)
+    if plan.surface is None or mesh is None:
+        return Scene(*fixed, None, None, spacing, near, plan)
+    return Scene(*fixed, mesh, binding, spacing, near, plan, runs=local.runs(mesh.s, spacing))
 
 
 def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
@@ -208,8 +210,8 @@ def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
 def with_mesh(scene: Scene, mesh: Mesh) -> Scene:
     """The scene with another surface: bound to the rings, and the wall that a tool touches."""
     tube = None if scene.tube is None else _walls(scene.geometry, mesh)
-    binding = regions.bind(mesh, scene.geometry)
-    return dataclasses.replace(scene, mesh=mesh, binding=binding, tube=tube)
+    binding, runs = regions.bind(mesh, scene.geometry), local.runs(mesh.s, scene.footprint)
+    return dataclasses.replace(scene, mesh=mesh, binding=binding, tube=tube, runs=runs)
 
 
 def _round(geometry: Geometry, radius: float) -> Patches:
@@ -293,5 +295,5 @@ def _near(scene: Scene, s, phi) -> bool:
         return False
     r = float(scene.radius)
     C = np.stack([s, r * np.cos(phi), r * np.sin(phi)], axis=1)
-    points, reach = np.asarray(scene.mesh.straight, float), 3 * float(scene.footprint)
+    points, reach = np.asarray(scene.mesh.straight, float), local.REACH * float(scene.footprint)
     return any(bool((np.sum((points - c) ** 2, axis=1) < reach**2).any()) for c in C)

@@ -10,7 +10,7 @@ functions of minimal degree", Adv. Comput. Math. 4 (1995), doi:10.1007/BF0212348
 the local deformation but prints no equation for it.
 
 Points are those of the tube bent straight (`Mesh.straight`), displacements along (tangent,
-anterior, lateral); mm.
+anterior, lateral); mm. Most vertices are beyond every centre's reach: `Runs` picks the others.
 """
 
 import math
@@ -19,12 +19,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._numerics import epsilon
 
 #: Centres on circles round C, by the number of centres; the outermost circle is the collar.
 CIRCLES = {1: (), 8: (7,), 16: (6, 9), 32: (6, 10, 15)}
+#: How far each centre reaches in a scene, in spacings.
+REACH = 3
 
 
 class Dent(eqx.Module):
@@ -39,6 +41,47 @@ class Dent(eqx.Module):
     centres: Float[Array, "centres 3"]
     weights: Float[Array, "centres 3"]
     reach: Float[Array, ""]
+
+
+class Runs(eqx.Module):
+    """The vertices in the order of s, in which those near a contact are one run.
+
+    Attributes:
+        order: vertices by s; None: they already are in this order.
+        rank: place of each vertex in it, or None.
+        longest: most vertices that a dent with 0, 1, 2 or 3 circles can reach, wherever it lies
+            (static: the number of vertices a program computes).
+    """
+
+    order: Int[Array, " vertices"] | None
+    rank: Int[Array, " vertices"] | None
+    longest: tuple[int, ...] = eqx.field(static=True)
+
+
+def runs(s: Float[Array, " vertices"], spacing: Float[Array, ""]) -> Runs:
+    """Put vertices in order (concrete numbers).
+
+    Args:
+        s: of the vertices, mm.
+        spacing: between the circles of the centres, mm.
+    """
+    at = np.asarray(s, float)
+    order = np.argsort(at, kind="stable")
+    at = at[order]
+    longest = tuple(
+        int((np.searchsorted(at, at + 2 * half, side="right") - np.arange(len(at))).max())
+        for half in (_half_width(circles, float(spacing)) for circles in range(4))
+    )
+    if (np.diff(order) > 0).all():
+        return Runs(None, None, longest)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return Runs(jnp.asarray(order, jnp.int32), jnp.asarray(rank, jnp.int32), longest)
+
+
+def _half_width(circles: int, spacing):
+    """Way along the tube from C beyond which a dent moves nothing, and a little more, mm."""
+    return (circles + REACH) * spacing * 1.001
 
 
 def pattern(count: int) -> tuple[Float[np.ndarray, "centres 2"], Bool[np.ndarray, " centres"]]:
@@ -128,6 +171,41 @@ def fit(
 def correction(dent: Dent, points: Float[Array, "points 3"]) -> Float[Array, "points 3"]:
     """Local displacement of every point, mm; exactly 0 beyond the reach of all centres."""
     return _kernel(points, dent.centres, dent.reach) @ dent.weights
+
+
+def add_correction(
+    u: Float[Array, "points 3"],
+    dent: Dent,
+    points: Float[Array, "points 3"],
+    runs: Runs,
+    s_c: Float[Array, ""],
+) -> Float[Array, "points 3"]:
+    """Add the `correction` of a dent about s_c to u; computed only where it can reach.
+
+    Args:
+        u: displacement of every vertex, mm.
+        dent: with centres as from `centres`, reaching `REACH` of their spacings.
+        points: all vertices.
+        runs: of these points.
+        s_c: contact position, mm.
+
+    Returns:
+        mm. NaN in the run if `runs` was made for a smaller spacing or for other vertices, so that
+        a vertex within reach is not in it.
+    """
+    circles = len(CIRCLES[dent.centres.shape[0]])
+    length = min(runs.longest[circles], points.shape[0])
+    half = _half_width(circles, dent.reach / REACH)
+    reached = lambda v: jnp.sum(jnp.abs(v[:, 0] - s_c) <= half * (1 - 5e-4))  # noqa: E731
+    start = jnp.minimum(jnp.sum(points[:, 0] < s_c - half), points.shape[0] - length)
+    cut = lambda v: jax.lax.dynamic_slice_in_dim(v, start, length)  # noqa: E731
+    run = cut(points) if runs.order is None else points[cut(runs.order)]
+    here = jnp.where(reached(points) == reached(run), correction(dent, run), jnp.nan)
+    # A slice of what is padded by zeros: cheaper than writing the run into zeros.
+    rest = points.shape[0] - length
+    padded = jnp.pad(here, ((rest, rest), (0, 0)))
+    whole = jax.lax.dynamic_slice_in_dim(padded, rest - start, points.shape[0])
+    return u + (whole if runs.rank is None else whole[runs.rank])
 
 
 def _kernel(points, centres, reach):

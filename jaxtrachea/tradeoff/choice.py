@@ -20,10 +20,10 @@ from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.plan import Effect, Plan
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.stage import Poses, Presses, Scene
+from jaxtrachea.trachea.material import Material
 from jaxtrachea.tradeoff.errors import Errors, compare
 from jaxtrachea.tradeoff.ladders import QUALITY, Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
-from jaxtrachea.trachea.material import Material
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
 BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))

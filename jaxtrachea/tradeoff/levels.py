@@ -197,7 +197,7 @@ def program(full: Full, levels: Levels) -> tuple[Scene, Material, Poses | Presse
         x = scene.geometry.ring_positions[kept_rings(full, levels.kept)]
         scene = with_geometry(scene, dataclasses.replace(scene.geometry, ring_positions=x))
     if plan.surface is None and not plan.contact:
-        scene = dataclasses.replace(scene, mesh=None, binding=None)
+        scene = dataclasses.replace(scene, mesh=None, binding=None, runs=None)
     made = scene, full.material, full.path
     return made if levels.dtype == "float64" else cast(made, levels.dtype)
 

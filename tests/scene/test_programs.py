@@ -63,7 +63,8 @@ def move_surface(scene, s, phi, out, kind):
         u = regions.interpolate(scene.binding, weights, keys)
         if kind == "with a dent":
             goal = local.targets(depth, jnp.zeros(8))
-            u = u + local.correction(local.fit(where, goal, 3 * scene.footprint), straight)
+            dent = local.fit(where, goal, 3 * scene.footprint)
+            u = local.add_correction(u, dent, straight, scene.runs, s)
         return place(mesh, u)
 
     rows = out.skeleton, out.joints, out.end_U, out.end_V, out.slopes, out.slope_C, out.depth
