@@ -69,6 +69,7 @@ class Case:
     natural: bool = False
     scale: dict[str, float] = dataclasses.field(default_factory=dict)
     one_sided: dict[str, int] = dataclasses.field(default_factory=dict)
+    spans: tuple[str, ...] = ()
 
     @property
     def code(self) -> int:
@@ -103,8 +104,8 @@ def _case(function: str, group: dict, row: dict) -> Case:
     kept = {n: row.pop(n) for n in ("name", "hard")}
     optional = ("status", "answer", "entrywise", "only", "one_sided", "free", "scale", "natural")
     more = {n: row.pop(n) for n in optional if n in row}
-    more |= {n: group[n] for n in ("constant", "enumeration") if n in group}
-    more |= {n: tuple(more[n]) for n in ("constant", "free") if n in more}
+    more |= {n: group[n] for n in ("constant", "enumeration", "spans") if n in group}
+    more |= {n: tuple(more[n]) for n in ("constant", "free", "spans") if n in more}
     more["scale"] = {n: float(v) for n, v in more.get("scale", {}).items()}
     tolerance = {d: _tolerance(group["tolerance"] | row.get("tolerance", {}), d) for d in DTYPES}
     row.pop("tolerance", None)
