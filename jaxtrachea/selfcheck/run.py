@@ -8,16 +8,38 @@ import dataclasses
 import functools
 import itertools
 import math
+import operator
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxtrachea.selfcheck.functions import FUNCTIONS
 from jaxtrachea.selfcheck.table import Case, Tolerance, Truth
+
+
+class Gap(NamedTuple):
+    """The worst of some errors, in units of the dtype's epsilon.
+
+    Attributes:
+        over: error over the size of the truth and what the truth itself moves (its spread).
+        error: the same error over the size alone.
+        condition: size and spread over size: how much rounding the case itself magnifies.
+        where: output, or output and input.
+    """
+
+    over: float = 0.0
+    error: float = 0.0
+    condition: float = 1.0
+    where: str = ""
+
+    @property
+    def rank(self) -> float:
+        """What the worst is chosen by: NaN above all."""
+        return math.inf if math.isnan(self.over) else self.over
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,11 +49,8 @@ class Outcome:
     Attributes:
         case: name.
         dtype: name.
-        value: worst error of a value over its tolerance, in either run.
-        gradient: worst error of an entry of the Jacobian, forward or reverse, over its tolerance.
-        value_error: worst relative error of a value.
-        gradient_error: worst relative error of a derivative.
-        where: output and input of the worst derivative.
+        value_gap: worst error of a value, in either run.
+        gradient_gap: worst error of an entry of the Jacobian, forward or reverse.
         nans: numbers that are not finite where they must be.
         faults: what else is wrong, as sentences.
         tolerance: what was asked.
@@ -39,9 +58,8 @@ class Outcome:
 
     case: str
     dtype: str
-    value_error: float
-    gradient_error: float
-    where: str
+    value_gap: Gap
+    gradient_gap: Gap
     nans: int
     faults: tuple[str, ...]
     tolerance: Tolerance
@@ -49,12 +67,12 @@ class Outcome:
     @property
     def value(self) -> float:
         """Error of the values over their tolerance."""
-        return self.value_error / (self.tolerance.value * _eps(self.dtype))
+        return self.value_gap.over / self.tolerance.value
 
     @property
     def gradient(self) -> float:
         """Error of the derivatives over their tolerance."""
-        return self.gradient_error / (self.tolerance.gradient * _eps(self.dtype))
+        return self.gradient_gap.over / self.tolerance.gradient
 
     @property
     def passed(self) -> bool:
@@ -63,18 +81,12 @@ class Outcome:
         return close and self.nans == 0 and not self.faults
 
 
-def _eps(dtype: str) -> float:
-    return float(np.finfo(dtype).eps)
-
-
 def _lane(call, constant, v, tangent, cotangent):
     """Values, status, one column of the Jacobian (forward) and one row of it (reverse)."""
     fixed = {n: v[n] for n in constant}
     moving = {n: w for n, w in v.items() if n not in constant}
-    run = lambda moving: call(fixed | moving)  # noqa: E731
-    values, column, status = jax.jvp(run, (moving,), (tangent,), has_aux=True)
-    row = jax.vjp(run, moving, has_aux=True)[1](cotangent)[0]
-    return values, status, column, row
+    values, push, status = jax.linearize(lambda m: call(fixed | m), moving, has_aux=True)
+    return values, status, push(tangent), jax.linear_transpose(push, moving)(cotangent)[0]
 
 
 def _alone(call, constant, v, cotangent):
@@ -207,15 +219,13 @@ def _run_case(case: Case, truth: Truth | None, programs: _Programs, untouched) -
     value, status_alone, reverse = programs.by_itself(row)
     judge = functools.partial(_judge, case, truth, faults)
     found = [judge(values, status, jacobians), judge(value, status_alone, (reverse,))]
-    large = lambda v: np.inf if np.isnan(v) else v  # noqa: E731
-    gradient, where = max((f[1] for f in found), key=lambda f: large(f[0]))
+    value_gaps, gradient_gaps, nans = zip(*found, strict=True)
     return Outcome(
         case.name,
         programs.dtype,
-        max((f[0] for f in found), key=large),
-        gradient,
-        where,
-        max(f[2] for f in found),
+        max(value_gaps, key=_rank),
+        max(gradient_gaps, key=_rank),
+        max(nans),
         tuple(dict.fromkeys(faults)),
         case.tolerance[programs.dtype],
     )
@@ -234,47 +244,54 @@ def _neighbours_agree(mixed, untouched) -> bool:
     return all(jax.tree.leaves(same))
 
 
+_rank = operator.attrgetter("rank")
+
+
 def _judge(case: Case, truth: Truth | None, faults: list[str], values, status, jacobians):
-    """(value error, (gradient error, where), number of values that are not finite)."""
+    """(worst value, worst derivative, number of values that are not finite)."""
     if int(status) != case.code:
         faults.append(f"status {int(status)}, expected {case.code} ({case.status})")
     if not case.answer:
         if np.any(np.isfinite(values.get("force", next(iter(values.values()))))):
             faults.append("a number where the model has no answer")
-        return 0.0, (0.0, ""), 0
+        return Gap(), Gap(), 0
     nans = sum(int(np.sum(~np.isfinite(v))) for v in jax.tree.leaves((values, jacobians)))
     if truth is None:
-        return np.nan, (np.nan, ""), nans
-    error = functools.partial(_error, case, next(iter(values.values())).dtype)
-    value = max(error(o, values[o], wanted) for o, wanted in truth.value.items())
-    worst = (0.0, "")
-    for o, i in ((o, i) for o, by in truth.gradient.items() for i in by):
-        natural = _natural(case, truth, o, i)
-        for jacobian in jacobians:
-            gap = error(f"{o} by {i}", jacobian[o][i], truth.gradient[o][i], natural)
-            if not gap <= worst[0]:
-                worst = gap, f"{o} by {i}"
-    return value, worst, nans
+        return Gap(math.nan), Gap(math.nan), nans
+    gap = functools.partial(_gap, case)
+    value = (gap(o, values[o], truth.value[o], truth.spread[o]) for o in truth.value)
+    gradient = (
+        gap(f"{o} by {i}", jacobian[o][i], wanted, truth.gradient_spread[o][i], least)
+        for o, by in truth.gradient.items()
+        for i, wanted in by.items()
+        for least in [_natural(case, truth, o, i)]
+        for jacobian in jacobians
+    )
+    return max(value, key=_rank), max(gradient, key=_rank, default=Gap()), nans
 
 
 def _natural(case: Case, truth: Truth, output: str, name: str):
     """Size of y/x for every number x of the input, or 0 where the case does not ask for it."""
-    x, y = np.abs(case.inputs[name]), np.abs(truth.value[output])
-    if not case.natural:
+    if name not in case.natural:
         return 0.0
+    x, y = np.abs(case.inputs[name]), np.abs(truth.value[output])
     per_input = np.where((x > 0) & (x < np.inf), 1 / np.where(x > 0, x, 1), 0)
     return np.multiply.outer(y if case.entrywise else np.full_like(y, np.max(y)), per_input)
 
 
-def _error(case: Case, dtype, name: str, got, wanted, elasticity: Any = 0.0) -> float:
-    """Largest error over the largest truth (or each over its own); exact zeros must be zeros.
+def _gap(case: Case, name: str, got, wanted, spread, least: Any = 0.0) -> Gap:
+    """Largest error over the largest truth and its spread (or each over its own).
 
-    What is smaller than the dtype can hold to its precision counts as that small.
+    What is smaller than the dtype can hold to its precision counts as that small; an error of
+    exactly 0 is none whatever it is compared with.
     """
-    smallest = float(np.finfo(dtype).tiny / np.finfo(dtype).eps)
+    kind = np.finfo(got.dtype)
     got, wanted = np.asarray(got, float), np.asarray(wanted, float)
-    size = np.abs(wanted) if case.entrywise else np.max(np.abs(wanted), initial=0)
-    size = np.maximum(size, case.scale.get(name, smallest))
-    size = np.maximum(size, elasticity)
-    gap = np.abs(got - wanted)
-    return float(np.max(np.where(gap == 0, 0, gap / size), initial=0))
+    size = np.abs(wanted) if case.entrywise else np.full_like(wanted, np.max(np.abs(wanted)))
+    size = np.maximum(size, np.maximum(least, case.scale.get(name, float(kind.tiny / kind.eps))))
+    allowed = size + np.reshape(spread, wanted.shape if case.entrywise else ())
+    error = np.abs(got - wanted)
+    over = np.where(error == 0, 0, error / allowed)
+    at = np.unravel_index(np.argmax(over), over.shape)
+    worst = (over[at], error[at] / size[at], allowed[at] / size[at] * kind.eps)
+    return Gap(*(float(v / kind.eps) for v in worst), name)
