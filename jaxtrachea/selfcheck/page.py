@@ -33,7 +33,8 @@ differences in 260 digits). An error is within its limit up to
 one constant for all rows, both dtypes, values and derivatives: what {roundings:g} roundings of the
 inputs would do to exact arithmetic. Positions on one line (rings, ends, C) enter by their
 differences, which floating point forms without an error of its own: there it is the spans between
-neighbours that are moved. Where another limit is needed, it is listed with its reason below the
+neighbours that are moved. Angles enter by directions, whose entries are of size 1: less than 1 rad
+is moved as if it were 1 rad. Where another limit is needed, it is listed with its reason below the
 table.
 
 Some derivatives are far below y/x, the size of a derivative of a power law: what hardly depends on

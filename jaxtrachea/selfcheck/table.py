@@ -63,6 +63,7 @@ class Case:
         scale_why: where these sizes come from.
         one_sided: input to +1 or -1 where the model lives on one side only (for the truth).
         spans: inputs that are positions on one line, and enter by their differences.
+        angles: inputs that enter by directions, known to rounding of 1 rad.
     """
 
     name: str
@@ -83,6 +84,7 @@ class Case:
     scale_why: str = ""
     one_sided: dict[str, int] = dataclasses.field(default_factory=dict)
     spans: tuple[str, ...] = ()
+    angles: tuple[str, ...] = ()
 
     @property
     def code(self) -> int:
@@ -128,10 +130,13 @@ def _case(function: str, group: dict, row: dict) -> Case:
     kept = {n: row.pop(n) for n in ("name", "hard")}
     optional = ("status", "answer", "entrywise", "only", "one_sided", "free", "scale", "natural")
     more = {n: row.pop(n) for n in optional if n in row}
-    more |= {n: group[n] for n in ("constant", "enumeration", "spans") if n in group}
-    more |= {n: tuple(more[n]) for n in ("constant", "free", "spans", "natural") if n in more}
+    more |= {n: group[n] for n in ("constant", "enumeration", "spans", "angles") if n in group}
+    more |= {
+        n: tuple(more[n]) for n in ("constant", "free", "spans", "angles", "natural") if n in more
+    }
     scale = dict(more.get("scale", {}))
-    more |= {"scale_why": scale.pop("why", ""), "scale": scale}
+    more["scale_why"] = scale.pop("why", "")
+    more["scale"] = {n: float(v) for n, v in scale.items()}
     said = row.pop("exception", group.get("exception"))
     tolerance = {d: _tolerance(said, d) for d in DTYPES}
     rounded = "float64" if more.get("only") == "float64" else "float32"

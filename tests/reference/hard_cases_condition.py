@@ -3,7 +3,8 @@
 Every input number is moved in turn by the same small fraction of itself. Inputs named in `spans`
 are positions on one line and enter by their differences, which floating point forms without error
 of its own: there the spans between neighbours are moved instead, and positions that coincide stay
-together. What a value or a derivative moves, added over all inputs, per unit of that fraction, is
+together. Angles named in `angles` enter by directions, whose entries are of size 1: what is less
+than 1 rad is moved as if it were 1 rad. What a value or a derivative moves, added over all inputs, per unit of that fraction, is
 its spread. Differences of the independent models in high precision.
 """
 
@@ -82,9 +83,9 @@ def _directions(case, inputs):
         if name in case.spans:
             continue
         for index in np.ndindex(np.shape(value)):
-            x = float(np.asarray(value, float)[index])
+            x = max(abs(float(np.asarray(value, float)[index])), 1.0 * (name in case.angles))
             if x != 0 and np.isfinite(x):
-                h = STEP * abs(mp.mpf(x)) * case.one_sided.get(name, 1)
+                h = STEP * mp.mpf(x) * case.one_sided.get(name, 1)
                 yield lambda v, at=(name, index, h): moved(v, *at)
     places = [(n, i) for n in case.spans for i in np.ndindex(np.shape(case.inputs[n]))]
     where = {p: mp.mpf(float(np.asarray(case.inputs[p[0]], float)[p[1]])) for p in places}
