@@ -1,6 +1,5 @@
 """The table as a page (docs/hard_cases.md) and as JSON."""
 
-import dataclasses
 import math
 import re
 
@@ -17,7 +16,8 @@ values, the reverse Jacobian and, in the batch, the forward one. The truth has 2
 (`tests/reference/hard_cases_truth.py`: finite elements and closed forms in 260 digits, derivatives
 by differences in them) of exactly the numbers given, which both dtypes can hold.
 
-**Errors** are relative to the largest entry of each array, in units of the dtype's epsilon
+**Errors** are relative to the largest entry of each array (to its spread, see below, where it is
+0), in units of the dtype's epsilon
 (2.2e-16, 1.2e-7). A cell "3.1 of 48" is the error measured, 3.1 epsilon, and the largest allowed,
 of the array that comes nearest to its limit, in either run and either mode. A dash: the model has
 no answer there, and says so by its status, or the dtype cannot hold it; a question mark: not
@@ -44,9 +44,24 @@ size of such a derivative is taken as y/x.
 
 
 def as_dict(outcome: Outcome) -> dict:
-    """An outcome as plain values; what is not finite as null."""
-    plain = dataclasses.asdict(outcome) | {"value": outcome.value, "gradient": outcome.gradient}
-    plain |= {"passed": outcome.passed, "faults": list(outcome.faults)}
+    """An outcome as plain values, errors in epsilon; what is not finite as null."""
+    value, gradient, most = outcome.value_gap, outcome.gradient_gap, outcome.tolerance
+    plain = {
+        "case": outcome.case,
+        "dtype": outcome.dtype,
+        "passed": outcome.passed,
+        "value": outcome.value,
+        "value_error": value.error,
+        "value_limit": value.limit(most.value),
+        "value_where": value.where,
+        "gradient": outcome.gradient,
+        "gradient_error": gradient.error,
+        "gradient_limit": gradient.limit(most.gradient),
+        "gradient_where": gradient.where,
+        "nans": outcome.nans,
+        "faults": list(outcome.faults),
+        "why": most.why,
+    }
     hide = lambda v: None if isinstance(v, float) and not math.isfinite(v) else v  # noqa: E731
     return {n: hide(v) for n, v in plain.items()}
 
@@ -90,7 +105,7 @@ def _cells(case: Case, outcome: Outcome | None, dtype: str):
         return "?", "?"
     tolerance = outcome.tolerance
     pairs = (outcome.value_gap, tolerance.value), (outcome.gradient_gap, tolerance.gradient)
-    return tuple(f"{gap.error:.2g} of {gap.condition * most:.2g}" for gap, most in pairs)
+    return tuple(f"{gap.error:.2g} of {gap.limit(most):.2g}" for gap, most in pairs)
 
 
 def _notes(rows: list[Case]) -> str:

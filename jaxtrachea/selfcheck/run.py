@@ -20,6 +20,9 @@ import numpy as np
 from jaxtrachea.selfcheck.functions import FUNCTIONS
 from jaxtrachea.selfcheck.table import Case, Tolerance, Truth
 
+#: Options of the compiler for a quick look: not the programs that are otherwise run.
+QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+
 
 class Gap(NamedTuple):
     """The worst of some errors, in units of the dtype's epsilon.
@@ -35,6 +38,10 @@ class Gap(NamedTuple):
     error: float = 0.0
     condition: float = 1.0
     where: str = ""
+
+    def limit(self, roundings: float) -> float:
+        """Largest error allowed, on the scale of `error`."""
+        return roundings * self.condition
 
     @property
     def rank(self) -> float:
@@ -104,7 +111,7 @@ class _Programs:
     neighbour.
     """
 
-    def __init__(self, case: Case, dtype: str):
+    def __init__(self, case: Case, dtype: str, *, quick: bool = False):
         """Compile for the shapes of `case`."""
         call, self.dtype, self.constant = FUNCTIONS[case.function], dtype, case.constant
         healthy = self.arrays(case.healthy)
@@ -117,8 +124,9 @@ class _Programs:
         self.healthy = healthy
         one, many = (functools.partial(f, call, case.constant) for f in (_alone, _lane))
         first = {n: v[0] for n, v in basis[1].items()}
-        self.one = jax.jit(one).lower(healthy, first).compile()
-        self.many = jax.jit(jax.vmap(many)).lower(self.batch(healthy), *basis).compile()
+        options = QUICK if quick else None
+        self.one = jax.jit(one).lower(healthy, first).compile(options)
+        self.many = jax.jit(jax.vmap(many)).lower(self.batch(healthy), *basis).compile(options)
 
     def arrays(self, inputs: dict) -> dict[str, np.ndarray]:
         """Inputs of a row as arrays of the dtype."""
@@ -185,13 +193,16 @@ def _basis(shapes, lanes: int, dtype: str):
     return made
 
 
-def run_table(cases: list[Case], truths: dict[str, Truth], dtypes) -> Iterator[Outcome]:
+def run_table(
+    cases: list[Case], truths: dict[str, Truth], dtypes, *, quick: bool = False
+) -> Iterator[Outcome]:
     """Run all cases; outcomes come in the order of the table, function by function.
 
     Args:
         cases: rows of the table.
         truths: by name.
         dtypes: some of `table.DTYPES`.
+        quick: compile without optimisation (`QUICK`).
     """
     groups: dict[tuple[str, str], list[Case]] = {}
     for case in cases:
@@ -199,7 +210,10 @@ def run_table(cases: list[Case], truths: dict[str, Truth], dtypes) -> Iterator[O
             if dtype in case.dtypes:
                 groups.setdefault((case.function, dtype), []).append(case)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        made = {key: pool.submit(_Programs, rows[0], key[1]) for key, rows in groups.items()}
+        made = {
+            key: pool.submit(_Programs, rows[0], key[1], quick=quick)
+            for key, rows in groups.items()
+        }
         for key, rows in groups.items():
             programs = made.pop(key).result()
             untouched = programs.between(programs.healthy)
@@ -282,14 +296,15 @@ def _natural(case: Case, truth: Truth, output: str, name: str):
 def _gap(case: Case, name: str, got, wanted, spread, least: Any = 0.0) -> Gap:
     """Largest error over the largest truth and its spread (or each over its own).
 
-    What is smaller than the dtype can hold to its precision counts as that small; an error of
-    exactly 0 is none whatever it is compared with.
+    What is smaller than the dtype can hold to its precision counts as that small; a truth of 0 has
+    the size of its spread; an error of exactly 0 is none whatever it is compared with.
     """
     kind = np.finfo(got.dtype)
     got, wanted = np.asarray(got, float), np.asarray(wanted, float)
     size = np.abs(wanted) if case.entrywise else np.full_like(wanted, np.max(np.abs(wanted)))
     size = np.maximum(size, np.maximum(least, case.scale.get(name, float(kind.tiny / kind.eps))))
     allowed = size + np.reshape(spread, wanted.shape if case.entrywise else ())
+    size = size if np.any(wanted) else allowed
     error = np.abs(got - wanted)
     over = np.where(error == 0, 0, error / allowed)
     at = np.unravel_index(np.argmax(over), over.shape)

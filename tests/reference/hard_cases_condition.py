@@ -4,8 +4,8 @@ Every input number is moved in turn by the same small fraction of itself. Inputs
 are positions on one line and enter by their differences, which floating point forms without error
 of its own: there the spans between neighbours are moved instead, and positions that coincide stay
 together. Angles named in `angles` enter by directions, whose entries are of size 1: what is less
-than 1 rad is moved as if it were 1 rad. What a value or a derivative moves, added over all inputs, per unit of that fraction, is
-its spread. Differences of the independent models in high precision.
+than 1 rad is moved as if it were 1 rad. What a value or a derivative moves, added over all inputs,
+per unit of that fraction, is its spread. Differences of the independent models in high precision.
 """
 
 import mpmath as mp
