@@ -10,8 +10,9 @@ from run_cli import run
 
 from jaxtrachea.selfcheck import table
 from jaxtrachea.selfcheck.functions import FUNCTIONS
+from jaxtrachea.selfcheck.judge import gap_of
 from jaxtrachea.selfcheck.page import page, skeleton
-from jaxtrachea.selfcheck.run import _gap, run_table
+from jaxtrachea.selfcheck.run import run_table
 
 CASES, TRUTHS = table.read_cases(), table.read_truth()
 DOCUMENT = Path(__file__).parents[1] / "docs" / "hard_cases.md"
@@ -70,7 +71,7 @@ def test_limit_is_sixteen_roundings_of_size_and_spread(times):
     size, spread = truth.value["force"], truth.spread["force"]
     assert spread > 30 * size
     got = size + times * 16 * 2.0**-52 * (size + spread)
-    gap = _gap(case, "force", np.float64(got), size, spread)
+    gap = gap_of(case, "force", np.float64(got), size, spread)
     assert (gap.over / case.tolerance["float64"].value > 1) == (times > 1)
 
 
