@@ -58,7 +58,7 @@ def test_spread_of_values_is_that_of_their_jacobian():
             size = truth.value[output].size
             moves = sum(np.abs(d.reshape(size, -1) * np.ravel(case.inputs[i])).sum(1)
                         for i, d in by.items())  # fmt: skip
-            np.testing.assert_allclose(truth.spread[output], np.max(moves), 5.1e-3, 1e-40)
+            np.testing.assert_allclose(truth.spread[output], np.max(moves), 5.1e-3, 1e-30)
             seen += 1
     assert seen > 100
 

@@ -10,6 +10,8 @@ _HEAD = """# Hard cases
 
 Written by `tests/reference/hard_cases_page.py` from `jaxtrachea/selfcheck/cases.toml`. Run them on
 your own machine: `jaxtrachea selfcheck` (`--only NAME`, `--dtype float32`, `--out FOLDER`).
+Nearly all of the time is compilation of the programs, which are kept for the next start. `--quick`
+compiles without optimisation: not the programs that you usually run.
 
 Every case is run by itself and in a batch between healthy neighbours, which must keep every bit:
 values, the reverse Jacobian and, in the batch, the forward one. The truth has 25 digits
@@ -17,8 +19,7 @@ values, the reverse Jacobian and, in the batch, the forward one. The truth has 2
 by differences in them) of exactly the numbers given, which both dtypes can hold.
 
 **Errors** are relative to the largest entry of each array (to its spread, see below, where it is
-0), in units of the dtype's epsilon
-(2.2e-16, 1.2e-7). A cell "3.1 of 48" is the error measured, 3.1 epsilon, and the largest allowed,
+0), in units of the dtype's epsilon (2.2e-16, 1.2e-7). A cell "3.1 of 48" is the error measured, 3.1 epsilon, and the largest allowed,
 of the array that comes nearest to its limit, in either run and either mode. A dash: the model has
 no answer there, and says so by its status, or the dtype cannot hold it; a question mark: not
 measured yet.
