@@ -19,7 +19,7 @@ DTYPES = ("float64", "float32")
 #: Roundings allowed to every value and derivative: an error is at most this many epsilon times the
 #: size of the truth and of what the truth moves when every input is moved by the fraction 1 (to
 #: first order): ROUNDINGS eps (|y| + sum |x dy/dx|).
-ROUNDINGS = 16.0
+ROUNDINGS = 32.0
 CASES, TRUTH = (files("jaxtrachea.selfcheck") / name for name in ("cases.toml", "truth.json"))
 _ENTRY = re.compile(r"(\w+)\[(\d+)\]")
 
