@@ -19,10 +19,10 @@ values, the reverse Jacobian and, in the batch, the forward one. The truth has 2
 by differences in them) of exactly the numbers given, which both dtypes can hold.
 
 **Errors** are relative to the largest entry of each array (to its spread, see below, where it is
-0), in units of the dtype's epsilon (2.2e-16, 1.2e-7). A cell "3.1 of 48" is the error measured, 3.1 epsilon, and the largest allowed,
-of the array that comes nearest to its limit, in either run and either mode. A dash: the model has
-no answer there, and says so by its status, or the dtype cannot hold it; a question mark: not
-measured yet.
+0), in units of the dtype's epsilon (2.2e-16, 1.2e-7). A cell "3.1 of 48" is the error measured, 3.1
+epsilon, and the largest allowed, of the array that comes nearest to its limit, in either run and
+either mode. A dash: the model has no answer there, and says so by its status, or the dtype cannot
+hold it; a question mark: not measured yet.
 
 **Limits** follow from the truth alone, never from what the code gives. Every input in turn is moved
 by the same small fraction of itself; what the truth moves, added over all inputs, per unit of that
