@@ -16,6 +16,12 @@ OnlyOption = Annotated[
     list[str] | None, typer.Option("--only", help="Only this case or function; may be repeated.")
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for selfcheck.json.")]
+QuickOption = Annotated[
+    bool,
+    typer.Option(
+        "--quick", help="Compile without optimisation: not your usual programs, but soon."
+    ),
+]
 HEAD = ["case", "dtype", "value", "gradient", "not finite", "verdict"]
 
 
@@ -26,7 +32,10 @@ class _Dtype(enum.Enum):
 
 
 def selfcheck(
-    dtype: DtypeOption = "both", only: OnlyOption = None, out_dir: OutOption = None
+    dtype: DtypeOption = "both",
+    only: OnlyOption = None,
+    out_dir: OutOption = None,
+    quick: QuickOption = False,
 ) -> None:
     """Run the hard cases here: errors against 25-digit truth."""
     from jaxtrachea.selfcheck.table import read_cases, read_truth
@@ -41,7 +50,7 @@ def selfcheck(
     from jaxtrachea.selfcheck.run import run_table
 
     out, found = Console(), []
-    found = list(run_table(cases, read_truth(), _Dtype[dtype].value))
+    found = list(run_table(cases, read_truth(), _Dtype[dtype].value, quick=quick))
     if not found:
         raise Stop(f"--only, --dtype {dtype}: none of these cases is run in this dtype")
     seconds = time.perf_counter() - start
@@ -52,7 +61,7 @@ def selfcheck(
     failed = sum(not o.passed for o in found)
     out.print(_summary(found, failed, seconds), highlight=False)
     if out_dir is not None:
-        _write(out_dir, found, seconds)
+        _write(out_dir, found, seconds, quick)
         out.print(f"written to {out_dir}", markup=False, highlight=False, soft_wrap=True)
     raise typer.Exit(1 if failed else 0)
 
@@ -86,7 +95,7 @@ def _summary(found, failed, seconds) -> str:
     return f"{cases} cases, {len(found)} rows: {said}; {seconds:.1f} s on {device.device_kind}"
 
 
-def _write(folder: Path, found, seconds) -> None:
+def _write(folder: Path, found, seconds, quick) -> None:
     import jax
 
     from jaxtrachea import __version__
@@ -97,6 +106,7 @@ def _write(folder: Path, found, seconds) -> None:
         "jax": jax.__version__,
         "device": jax.devices()[0].device_kind,
         "seconds": round(seconds, 2),
+        "optimised": not quick,
         "rows": [as_dict(o) for o in found],
     }
     try:

@@ -10,6 +10,7 @@ from run_cli import run
 
 from jaxtrachea.selfcheck import table
 from jaxtrachea.selfcheck.functions import FUNCTIONS
+from jaxtrachea.selfcheck.judge import gap_of
 from jaxtrachea.selfcheck.page import page, skeleton
 from jaxtrachea.selfcheck.run import run_table
 
@@ -24,7 +25,8 @@ def wrong(outcomes):
 
 
 def test_quick_functions():
-    assert not wrong(run_table([c for c in CASES if c.function in QUICK], TRUTHS, table.DTYPES))
+    rows = [c for c in CASES if c.function in QUICK]
+    assert not wrong(run_table(rows, TRUTHS, table.DTYPES, quick=True))
 
 
 @pytest.mark.slow
@@ -43,6 +45,40 @@ def test_table_is_whole():
     for case in CASES:
         if case.answer:
             assert TRUTHS[case.name].inputs == {n: repr(v) for n, v in case.inputs.items()}
+
+
+def test_spread_of_values_is_that_of_their_jacobian():
+    """Where no input is free, an angle or one of positions on a line: sum |x dy/dx|, both kept."""
+    seen = 0
+    for case in CASES:
+        if not case.answer or case.free or case.spans or case.angles or case.entrywise:
+            continue
+        truth = TRUTHS[case.name]
+        for output, by in truth.gradient.items():
+            size = truth.value[output].size
+            moves = sum(np.abs(d.reshape(size, -1) * np.ravel(case.inputs[i])).sum(1)
+                        for i, d in by.items())  # fmt: skip
+            np.testing.assert_allclose(truth.spread[output], np.max(moves), 5.1e-3, 1e-30)
+            seen += 1
+    assert seen > 100
+
+
+@pytest.mark.parametrize("times", [0.9, 1.1])
+def test_limit_is_32_roundings_of_size_and_spread(times):
+    """An error just within the limit passes, one just beyond fails; exact by the definition."""
+    case = next(c for c in CASES if c.name == "softening, 2 % before the fold")
+    truth = TRUTHS[case.name]
+    size, spread = truth.value["force"], truth.spread["force"]
+    assert spread > 30 * size
+    got = size + times * 32 * 2.0**-52 * (size + spread)
+    gap = gap_of(case, "force", np.float64(got), size, spread)
+    assert (gap.over / case.tolerance["float64"].value > 1) == (times > 1)
+
+
+def test_exceptions_are_few():
+    assert {c.name for c in CASES if c.tolerance["float64"].why and c.function != "dent"} == {
+        "two rigid rings 1e-3 mm apart"
+    }
 
 
 def test_document_follows_the_table():
@@ -69,16 +105,16 @@ def test_every_kind_of_fault_is_seen():
         dataclasses.replace(case, name="truth"),
     ]
     truths = {case.name: truth, "value": far, "gradient": steep, "status": truth}
-    found = {o.case: o for o in run_table(rows, truths, ["float64"])}
+    found = {o.case: o for o in run_table(rows, truths, ["float64"], quick=True)}
     assert [o.case for o in wrong(found.values())] == [r.name for r in rows[1:]]
     assert found["value"].value > 1 >= found["value"].gradient
     assert found["gradient"].gradient > 1 >= found["gradient"].value
-    assert found["gradient"].where == "force by c"
+    assert found["gradient"].gradient_gap.where == "force by c"
 
 
 def test_command(monkeypatch, capsys, tmp_path):
     """Exit 0 and a file; with a wrong truth exit 1, and the row is named."""
-    one = ("selfcheck", "--only", "k_3 = 0", "--dtype", "float64")
+    one = ("selfcheck", "--only", "k_3 = 0", "--dtype", "float64", "--quick")
     folder = tmp_path / "out"
     code, out, _ = run(monkeypatch, capsys, *one, "--out", folder)
     assert code == 0

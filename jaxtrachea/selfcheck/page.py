@@ -1,31 +1,68 @@
 """The table as a page (docs/hard_cases.md) and as JSON."""
 
-import dataclasses
 import math
 import re
 
-from jaxtrachea.selfcheck.run import Outcome
-from jaxtrachea.selfcheck.table import Case
+from jaxtrachea.selfcheck.judge import Outcome
+from jaxtrachea.selfcheck.table import ROUNDINGS, Case
 
 _HEAD = """# Hard cases
 
 Written by `tests/reference/hard_cases_page.py` from `jaxtrachea/selfcheck/cases.toml`. Run them on
 your own machine: `jaxtrachea selfcheck` (`--only NAME`, `--dtype float32`, `--out FOLDER`).
+Nearly all of the time is compilation of the programs, which are kept for the next start. `--quick`
+compiles without optimisation: not the programs that you usually run.
 
 Every case is run by itself and in a batch between healthy neighbours, which must keep every bit:
 values, the reverse Jacobian and, in the batch, the forward one. The truth has 25 digits
 (`tests/reference/hard_cases_truth.py`: finite elements and closed forms in 260 digits, derivatives
-by differences in them) of exactly the numbers given, which both dtypes can hold. Errors are
-relative to the largest entry of each array, in units of the dtype's epsilon (2.2e-16, 1.2e-7); a
-dash: the model has no answer there, and says so by its status, or the dtype cannot hold it; a
-question mark: not measured yet.
+by differences in them) of exactly the numbers given, which both dtypes can hold.
+
+**Errors** are relative to the largest entry of each array (to its spread, see below, where it is
+0), in units of the dtype's epsilon (2.2e-16, 1.2e-7). A cell "3.1 of 48" is the error measured, 3.1
+epsilon, and the largest allowed, of the array that comes nearest to its limit, in either run and
+either mode. A dash: the model has no answer there, and says so by its status, or the dtype cannot
+hold it; a question mark: not measured yet.
+
+**Limits** follow from the truth alone, never from what the code gives. Every input in turn is moved
+by the same small fraction of itself; what the truth moves, added over all inputs, per unit of that
+fraction, is its spread (`tests/reference/hard_cases_condition.py`; of derivatives, by second
+differences in 260 digits). An error is within its limit up to
+
+    {roundings:g} epsilon (size + spread),
+
+one constant for all rows, both dtypes, values and derivatives: what {roundings:g} roundings of the
+inputs would do to exact arithmetic. Positions on one line (rings, ends, C) enter by their
+differences, which floating point forms without an error of its own: there it is the spans between
+neighbours that are moved. Angles enter by directions, whose entries are of size 1: less than 1 rad
+is moved as if it were 1 rad. Where another limit is needed, it is listed with its reason below the
+table.
+
+Some derivatives are far below y/x, the size of a derivative of a power law: what hardly depends on
+an input any more is known to rounding of y, not to its own. Where it is said below a table, the
+size of such a derivative is taken as y/x.
 """
 
 
 def as_dict(outcome: Outcome) -> dict:
-    """An outcome as plain values; what is not finite as null."""
-    plain = dataclasses.asdict(outcome) | {"value": outcome.value, "gradient": outcome.gradient}
-    plain |= {"passed": outcome.passed, "faults": list(outcome.faults)}
+    """An outcome as plain values, errors in epsilon; what is not finite as null."""
+    value, gradient, most = outcome.value_gap, outcome.gradient_gap, outcome.tolerance
+    plain = {
+        "case": outcome.case,
+        "dtype": outcome.dtype,
+        "passed": outcome.passed,
+        "value": outcome.value,
+        "value_error": value.error,
+        "value_limit": value.limit(most.value),
+        "value_where": value.where,
+        "gradient": outcome.gradient,
+        "gradient_error": gradient.error,
+        "gradient_limit": gradient.limit(most.gradient),
+        "gradient_where": gradient.where,
+        "nans": outcome.nans,
+        "faults": list(outcome.faults),
+        "why": most.why,
+    }
     hide = lambda v: None if isinstance(v, float) and not math.isfinite(v) else v  # noqa: E731
     return {n: hide(v) for n, v in plain.items()}
 
@@ -33,18 +70,17 @@ def as_dict(outcome: Outcome) -> dict:
 def page(cases: list[Case], outcomes: list[Outcome]) -> str:
     """The page, with the errors measured."""
     by = {(o.case, o.dtype): o for o in outcomes}
-    parts = [_HEAD]
+    parts = [_HEAD.format(roundings=ROUNDINGS)]
     for function in dict.fromkeys(c.function for c in cases):
         rows = [c for c in cases if c.function == function]
-        parts.append(
-            f"\n## {function}\n\n{_about(function)}\n\n{_table(rows, by)}\n\n{_why(rows)}\n"
-        )
+        parts.append(f"\n## {function}\n\n{_about(function)}\n\n{_table(rows, by)}\n")
+        parts.extend(f"\n{notes}" for notes in [_notes(rows)] if notes)
     return "".join(parts)
 
 
 def skeleton(text: str) -> str:
     """The page without its measured numbers: what must follow from the table alone."""
-    return re.sub(r"\| [-0-9.e+]+ (?=\|)|\| [-?] (?=\|)", "| # ", text)
+    return re.sub(r"\| ([-?]|[0-9.e+-]+ of [0-9.e+-]+) (?=\|)", "| # ", text)
 
 
 def _about(function: str) -> str:
@@ -57,42 +93,43 @@ def _table(rows, by) -> str:
     lines = ["| case | what is hard | value 64 | gradient 64 | value 32 | gradient 32 |"]
     lines.append("|---|---|---|---|---|---|")
     for case in rows:
-        cells = [_error(case, by.get((case.name, d)), d) for d in ("float64", "float32")]
+        cells = [_cells(case, by.get((case.name, d)), d) for d in ("float64", "float32")]
         numbers = " | ".join(q for pair in cells for q in pair)
         lines.append(f"| {case.name} | {case.hard} | {numbers} |")
     return "\n".join(lines)
 
 
-def _error(case: Case, outcome, dtype: str):
+def _cells(case: Case, outcome: Outcome | None, dtype: str):
     if not case.answer or dtype not in case.dtypes:
         return "-", "-"
     if outcome is None:
         return "?", "?"
-    eps = 2.0**-52 if dtype == "float64" else 2.0**-23
-    return f"{outcome.value_error / eps:.2g}", f"{outcome.gradient_error / eps:.2g}"
+    tolerance = outcome.tolerance
+    pairs = (outcome.value_gap, tolerance.value), (outcome.gradient_gap, tolerance.gradient)
+    return tuple(f"{gap.error:.2g} of {gap.limit(most):.2g}" for gap, most in pairs)
 
 
-def _why(rows) -> str:
-    """Tolerances, once for all rows that share them."""
+def _notes(rows: list[Case]) -> str:
+    """What differs from the rule, once for all rows that share it."""
     said: dict[str, list[str]] = {}
     for case in rows:
-        t64, t32 = case.tolerance["float64"], case.tolerance["float32"]
-        bounds = [
-            f"{_pair(t64.value, t32.value)} value",
-            f"{_pair(t64.gradient, t32.gradient)} gradient",
-        ]
-        said.setdefault(f"{', '.join(bounds)}: {t64.why}.", []).append(case.name)
-    longest = max(said, key=lambda text: len(said[text]))
-    lines = [f"Tolerance {longest}"]
-    for text, names in said.items():
-        if text != longest:
-            lines.append(f"- {', '.join(names)}: {text}")
-    natural = [c.name for c in rows if c.natural]
-    if natural:
-        lines.append(
-            f"- Derivatives seen against y/x where they are far below it: {', '.join(natural)}."
-        )
-    return "\n".join(lines)
+        for text in _remarks(case):
+            said.setdefault(text, []).append(case.name)
+    return "".join(f"- {', '.join(names)}: {text}.\n" for text, names in said.items())
+
+
+def _remarks(case: Case):
+    t64, t32 = case.tolerance["float64"], case.tolerance["float32"]
+    if t64.why:
+        value, gradient = _pair(t64.value, t32.value), _pair(t64.gradient, t32.gradient)
+        yield f"{value} roundings in values, {gradient} in derivatives: {t64.why}"
+    if case.entrywise:
+        yield "every entry is seen against its own size and spread"
+    if case.natural:
+        yield f"derivatives by {', '.join(case.natural)}: seen against y/x where it is larger"
+    if case.scale:
+        sizes = ", ".join(f"{n} {v:g}" for n, v in case.scale.items())
+        yield f"seen against {sizes}: {case.scale_why}"
 
 
 def _pair(a: float, b: float) -> str:

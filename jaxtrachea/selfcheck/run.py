@@ -4,77 +4,30 @@ Two programs for each function and dtype serve all of its rows, one for a press 
 for a batch; they are compiled beside each other, which takes nearly all of the time.
 """
 
-import dataclasses
 import functools
 import itertools
 import math
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import jax
 import numpy as np
 
 from jaxtrachea.selfcheck.functions import FUNCTIONS
-from jaxtrachea.selfcheck.table import Case, Tolerance, Truth
+from jaxtrachea.selfcheck.judge import Outcome, judge, rank
+from jaxtrachea.selfcheck.table import Case, Truth
 
-
-@dataclasses.dataclass(frozen=True)
-class Outcome:
-    """What became of one case in one dtype.
-
-    Attributes:
-        case: name.
-        dtype: name.
-        value: worst error of a value over its tolerance, in either run.
-        gradient: worst error of an entry of the Jacobian, forward or reverse, over its tolerance.
-        value_error: worst relative error of a value.
-        gradient_error: worst relative error of a derivative.
-        where: output and input of the worst derivative.
-        nans: numbers that are not finite where they must be.
-        faults: what else is wrong, as sentences.
-        tolerance: what was asked.
-    """
-
-    case: str
-    dtype: str
-    value_error: float
-    gradient_error: float
-    where: str
-    nans: int
-    faults: tuple[str, ...]
-    tolerance: Tolerance
-
-    @property
-    def value(self) -> float:
-        """Error of the values over their tolerance."""
-        return self.value_error / (self.tolerance.value * _eps(self.dtype))
-
-    @property
-    def gradient(self) -> float:
-        """Error of the derivatives over their tolerance."""
-        return self.gradient_error / (self.tolerance.gradient * _eps(self.dtype))
-
-    @property
-    def passed(self) -> bool:
-        """Whether everything is as it should be (a NaN error is not)."""
-        close = self.value <= 1 and self.gradient <= 1
-        return close and self.nans == 0 and not self.faults
-
-
-def _eps(dtype: str) -> float:
-    return float(np.finfo(dtype).eps)
+#: Options of the compiler for a quick look: not the programs that are otherwise run.
+QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 
 
 def _lane(call, constant, v, tangent, cotangent):
     """Values, status, one column of the Jacobian (forward) and one row of it (reverse)."""
     fixed = {n: v[n] for n in constant}
     moving = {n: w for n, w in v.items() if n not in constant}
-    run = lambda moving: call(fixed | moving)  # noqa: E731
-    values, column, status = jax.jvp(run, (moving,), (tangent,), has_aux=True)
-    row = jax.vjp(run, moving, has_aux=True)[1](cotangent)[0]
-    return values, status, column, row
+    values, push, status = jax.linearize(lambda m: call(fixed | m), moving, has_aux=True)
+    return values, status, push(tangent), jax.linear_transpose(push, moving)(cotangent)[0]
 
 
 def _alone(call, constant, v, cotangent):
@@ -92,7 +45,7 @@ class _Programs:
     neighbour.
     """
 
-    def __init__(self, case: Case, dtype: str):
+    def __init__(self, case: Case, dtype: str, *, quick: bool = False):
         """Compile for the shapes of `case`."""
         call, self.dtype, self.constant = FUNCTIONS[case.function], dtype, case.constant
         healthy = self.arrays(case.healthy)
@@ -105,8 +58,9 @@ class _Programs:
         self.healthy = healthy
         one, many = (functools.partial(f, call, case.constant) for f in (_alone, _lane))
         first = {n: v[0] for n, v in basis[1].items()}
-        self.one = jax.jit(one).lower(healthy, first).compile()
-        self.many = jax.jit(jax.vmap(many)).lower(self.batch(healthy), *basis).compile()
+        options = QUICK if quick else None
+        self.one = jax.jit(one).lower(healthy, first).compile(options)
+        self.many = jax.jit(jax.vmap(many)).lower(self.batch(healthy), *basis).compile(options)
 
     def arrays(self, inputs: dict) -> dict[str, np.ndarray]:
         """Inputs of a row as arrays of the dtype."""
@@ -173,13 +127,16 @@ def _basis(shapes, lanes: int, dtype: str):
     return made
 
 
-def run_table(cases: list[Case], truths: dict[str, Truth], dtypes) -> Iterator[Outcome]:
+def run_table(
+    cases: list[Case], truths: dict[str, Truth], dtypes, *, quick: bool = False
+) -> Iterator[Outcome]:
     """Run all cases; outcomes come in the order of the table, function by function.
 
     Args:
         cases: rows of the table.
         truths: by name.
         dtypes: some of `table.DTYPES`.
+        quick: compile without optimisation (`QUICK`).
     """
     groups: dict[tuple[str, str], list[Case]] = {}
     for case in cases:
@@ -187,7 +144,10 @@ def run_table(cases: list[Case], truths: dict[str, Truth], dtypes) -> Iterator[O
             if dtype in case.dtypes:
                 groups.setdefault((case.function, dtype), []).append(case)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        made = {key: pool.submit(_Programs, rows[0], key[1]) for key, rows in groups.items()}
+        made = {
+            key: pool.submit(_Programs, rows[0], key[1], quick=quick)
+            for key, rows in groups.items()
+        }
         for key, rows in groups.items():
             programs = made.pop(key).result()
             untouched = programs.between(programs.healthy)
@@ -205,17 +165,15 @@ def _run_case(case: Case, truth: Truth | None, programs: _Programs, untouched) -
     values, status = jax.tree.map(lambda v: v[0], (values, status))
     jacobians = programs.by_columns(columns), programs.by_rows(rows)
     value, status_alone, reverse = programs.by_itself(row)
-    judge = functools.partial(_judge, case, truth, faults)
-    found = [judge(values, status, jacobians), judge(value, status_alone, (reverse,))]
-    large = lambda v: np.inf if np.isnan(v) else v  # noqa: E731
-    gradient, where = max((f[1] for f in found), key=lambda f: large(f[0]))
+    found_in = functools.partial(judge, case, truth, faults)
+    found = [found_in(values, status, jacobians), found_in(value, status_alone, (reverse,))]
+    value_gaps, gradient_gaps, nans = zip(*found, strict=True)
     return Outcome(
         case.name,
         programs.dtype,
-        max((f[0] for f in found), key=large),
-        gradient,
-        where,
-        max(f[2] for f in found),
+        max(value_gaps, key=rank),
+        max(gradient_gaps, key=rank),
+        max(nans),
         tuple(dict.fromkeys(faults)),
         case.tolerance[programs.dtype],
     )
@@ -232,49 +190,3 @@ def _neighbours_agree(mixed, untouched) -> bool:
         untouched,
     )
     return all(jax.tree.leaves(same))
-
-
-def _judge(case: Case, truth: Truth | None, faults: list[str], values, status, jacobians):
-    """(value error, (gradient error, where), number of values that are not finite)."""
-    if int(status) != case.code:
-        faults.append(f"status {int(status)}, expected {case.code} ({case.status})")
-    if not case.answer:
-        if np.any(np.isfinite(values.get("force", next(iter(values.values()))))):
-            faults.append("a number where the model has no answer")
-        return 0.0, (0.0, ""), 0
-    nans = sum(int(np.sum(~np.isfinite(v))) for v in jax.tree.leaves((values, jacobians)))
-    if truth is None:
-        return np.nan, (np.nan, ""), nans
-    error = functools.partial(_error, case, next(iter(values.values())).dtype)
-    value = max(error(o, values[o], wanted) for o, wanted in truth.value.items())
-    worst = (0.0, "")
-    for o, i in ((o, i) for o, by in truth.gradient.items() for i in by):
-        natural = _natural(case, truth, o, i)
-        for jacobian in jacobians:
-            gap = error(f"{o} by {i}", jacobian[o][i], truth.gradient[o][i], natural)
-            if not gap <= worst[0]:
-                worst = gap, f"{o} by {i}"
-    return value, worst, nans
-
-
-def _natural(case: Case, truth: Truth, output: str, name: str):
-    """Size of y/x for every number x of the input, or 0 where the case does not ask for it."""
-    x, y = np.abs(case.inputs[name]), np.abs(truth.value[output])
-    if not case.natural:
-        return 0.0
-    per_input = np.where((x > 0) & (x < np.inf), 1 / np.where(x > 0, x, 1), 0)
-    return np.multiply.outer(y if case.entrywise else np.full_like(y, np.max(y)), per_input)
-
-
-def _error(case: Case, dtype, name: str, got, wanted, elasticity: Any = 0.0) -> float:
-    """Largest error over the largest truth (or each over its own); exact zeros must be zeros.
-
-    What is smaller than the dtype can hold to its precision counts as that small.
-    """
-    smallest = float(np.finfo(dtype).tiny / np.finfo(dtype).eps)
-    got, wanted = np.asarray(got, float), np.asarray(wanted, float)
-    size = np.abs(wanted) if case.entrywise else np.max(np.abs(wanted), initial=0)
-    size = np.maximum(size, case.scale.get(name, smallest))
-    size = np.maximum(size, elasticity)
-    gap = np.abs(got - wanted)
-    return float(np.max(np.where(gap == 0, 0, gap / size), initial=0))

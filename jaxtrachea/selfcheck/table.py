@@ -16,17 +16,27 @@ import numpy as np
 from jaxtrachea import status as _status
 
 DTYPES = ("float64", "float32")
+#: Roundings allowed to every value and derivative: an error is at most this many epsilon times the
+#: size of the truth and of what the truth moves when every input is moved by the fraction 1 (to
+#: first order): ROUNDINGS eps (|y| + sum |x dy/dx|).
+ROUNDINGS = 32.0
 CASES, TRUTH = (files("jaxtrachea.selfcheck") / name for name in ("cases.toml", "truth.json"))
 _ENTRY = re.compile(r"(\w+)\[(\d+)\]")
 
 
 @dataclasses.dataclass(frozen=True)
 class Tolerance:
-    """Largest error allowed, in units of the dtype's epsilon; why it is that much."""
+    """Largest error allowed, in roundings of what the case itself moves (see `ROUNDINGS`).
 
-    value: float
-    gradient: float
-    why: str
+    Attributes:
+        value: of values.
+        gradient: of derivatives.
+        why: why it is not `ROUNDINGS`, or "".
+    """
+
+    value: float = ROUNDINGS
+    gradient: float = ROUNDINGS
+    why: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,11 +56,14 @@ class Case:
         only: the only dtype that can hold the inputs or the answer, or None.
         constant: inputs that are not differentiated.
         free: inputs ("s") or pairs ("u by s") whose derivative is not unique: finite, no more.
-        natural: whether errors of derivatives are seen against y/x where dy/dx is far below it:
-            what no longer depends on an input is known to rounding of y, not to its own.
+        natural: inputs whose derivatives are seen against y/x where they are far below it: what no
+            longer depends on an input is known to rounding of y, not to its own.
         scale: least size that an error is seen against, of an output ("u") or of a derivative
             ("u by s"), where the truth is 0 or next to it.
+        scale_why: where these sizes come from.
         one_sided: input to +1 or -1 where the model lives on one side only (for the truth).
+        spans: inputs that are positions on one line, and enter by their differences.
+        angles: inputs that enter by directions, known to rounding of 1 rad.
     """
 
     name: str
@@ -66,9 +79,12 @@ class Case:
     only: str | None = None
     constant: tuple[str, ...] = ()
     free: tuple[str, ...] = ()
-    natural: bool = False
+    natural: tuple[str, ...] = ()
     scale: dict[str, float] = dataclasses.field(default_factory=dict)
+    scale_why: str = ""
     one_sided: dict[str, int] = dataclasses.field(default_factory=dict)
+    spans: tuple[str, ...] = ()
+    angles: tuple[str, ...] = ()
 
     @property
     def code(self) -> int:
@@ -83,11 +99,22 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """Values by output; derivatives by output, then input: shape (*output, *input)."""
+    """Values by output; derivatives by output, then input: shape (*output, *input).
+
+    Attributes:
+        inputs: what it was made for.
+        value: by output.
+        gradient: by output, then input.
+        spread: how far a value moves when each input in turn is moved by the same fraction, over
+            that fraction, added: largest entry of the array, or all, flat, in `entrywise` cases.
+        gradient_spread: likewise of derivatives.
+    """
 
     inputs: dict
     value: dict[str, np.ndarray]
     gradient: dict[str, dict[str, np.ndarray]]
+    spread: dict[str, np.ndarray]
+    gradient_spread: dict[str, dict[str, np.ndarray]]
 
 
 def read_cases(text: str | None = None) -> list[Case]:
@@ -103,11 +130,15 @@ def _case(function: str, group: dict, row: dict) -> Case:
     kept = {n: row.pop(n) for n in ("name", "hard")}
     optional = ("status", "answer", "entrywise", "only", "one_sided", "free", "scale", "natural")
     more = {n: row.pop(n) for n in optional if n in row}
-    more |= {n: group[n] for n in ("constant", "enumeration") if n in group}
-    more |= {n: tuple(more[n]) for n in ("constant", "free") if n in more}
-    more["scale"] = {n: float(v) for n, v in more.get("scale", {}).items()}
-    tolerance = {d: _tolerance(group["tolerance"] | row.get("tolerance", {}), d) for d in DTYPES}
-    row.pop("tolerance", None)
+    more |= {n: group[n] for n in ("constant", "enumeration", "spans", "angles") if n in group}
+    more |= {
+        n: tuple(more[n]) for n in ("constant", "free", "spans", "angles", "natural") if n in more
+    }
+    scale = dict(more.get("scale", {}))
+    more["scale_why"] = scale.pop("why", "")
+    more["scale"] = {n: float(v) for n, v in scale.items()}
+    said = row.pop("exception", group.get("exception"))
+    tolerance = {d: _tolerance(said, d) for d in DTYPES}
     rounded = "float64" if more.get("only") == "float64" else "float32"
     round_ = lambda v: np.asarray(v, rounded).astype(float).tolist()  # noqa: E731
     inputs = {n: round_(v) for n, v in _changed(base, row).items()}
@@ -129,10 +160,12 @@ def _changed(base: dict, changes: dict) -> dict:
     return made
 
 
-def _tolerance(given: dict, dtype: str) -> Tolerance:
-    """`value = 8` for both dtypes, or `value_float32 = 40` for one."""
-    pick = lambda name: float(given.get(f"{name}_{dtype}", given[name]))  # noqa: E731
-    return Tolerance(pick("value"), pick("gradient"), given["why"])
+def _tolerance(said: dict | None, dtype: str) -> Tolerance:
+    """An exception: `value = 8` for both dtypes, or `value_float32 = 40` for one."""
+    if said is None:
+        return Tolerance()
+    pick = lambda name: float(said.get(f"{name}_{dtype}", said.get(name, ROUNDINGS)))  # noqa: E731
+    return Tolerance(pick("value"), pick("gradient"), said["why"])
 
 
 def read_truth(text: str | None = None) -> dict[str, Truth]:
@@ -144,6 +177,11 @@ def read_truth(text: str | None = None) -> dict[str, Truth]:
             row["inputs"],
             {o: array(v) for o, v in row["value"].items()},
             {o: {i: array(v) for i, v in by.items()} for o, by in row["gradient"].items()},
+            {o: array(v) for o, v in row["spread"]["value"].items()},
+            {
+                o: {i: array(v) for i, v in by.items()}
+                for o, by in row["spread"]["gradient"].items()
+            },
         )
         for name, row in given["cases"].items()
     }

@@ -15,13 +15,12 @@ import beam_fem
 import mpmath as mp
 import numpy as np
 import spatial_fem
+from hard_cases_condition import ONE, STEP, flat, moved, spread
 
 from jaxtrachea.selfcheck.table import TRUTH, Case, read_cases
 
 mp.mp.dps = beam_fem.DIGITS = spatial_fem.DIGITS = 260
-STEP = mp.mpf(10) ** -35
 KEPT = 25
-ONE = mp.mpf(1)
 
 
 def cubic(D, c, k_1, k_3):
@@ -404,21 +403,6 @@ def lifted(value):
     return [lifted(v) for v in value] if isinstance(value, list) else mp.mpf(value)
 
 
-def moved(inputs, name, index, step):
-    """`inputs` with one number of one input moved."""
-
-    def place(value, index):
-        if not index:
-            return value + step
-        return [place(v, index[1:]) if i == index[0] else v for i, v in enumerate(value)]
-
-    return inputs | {name: place(inputs[name], index)}
-
-
-def flat(value):
-    return [q for v in value for q in flat(v)] if isinstance(value, list) else [value]
-
-
 def derivative(case: Case, inputs, name, index, base):
     """Of all outputs, flat, by one number."""
     model, x = MODELS[case.function], np.asarray(case.inputs[name], float)[index]
@@ -468,7 +452,8 @@ def truth(case: Case):
             gradient[o][name] = rows.reshape((*np.shape(v), *shape)).tolist()
     as_text = lambda v: [as_text(q) for q in v] if isinstance(v, list) else text(v)  # noqa: E731
     return {"inputs": {n: repr(v) for n, v in case.inputs.items()},
-            "value": {o: as_text(v) for o, v in base.items()}, "gradient": gradient}  # fmt: skip
+            "value": {o: as_text(v) for o, v in base.items()}, "gradient": gradient,
+            "spread": spread(MODELS[case.function], case, inputs, base)}  # fmt: skip
 
 
 def main(names):
