@@ -29,10 +29,10 @@ by the same small fraction of itself; what the truth moves, added over all input
 fraction, is its spread (`tests/reference/hard_cases_condition.py`; of derivatives, by second
 differences in 260 digits). An error is within its limit up to
 
-    {roundings:g} epsilon (size + spread),
+    {value:g} epsilon (size + spread), of a derivative {gradient:g} epsilon (size + spread),
 
-one constant for all rows, both dtypes, values and derivatives: what {roundings:g} roundings of the
-inputs would do to exact arithmetic. Positions on one line (rings, ends, C) enter by their
+in all rows and both dtypes: what {value:g} roundings of the inputs would do to exact arithmetic; a
+derivative takes up to four times the operations of its value. Positions on one line (rings, ends, C) enter by their
 differences, which floating point forms without an error of its own: there it is the spans between
 neighbours that are moved. Angles enter by directions, whose entries are of size 1: less than 1 rad
 is moved as if it were 1 rad. Where another limit is needed, it is listed with its reason below the
@@ -70,7 +70,7 @@ def as_dict(outcome: Outcome) -> dict:
 def page(cases: list[Case], outcomes: list[Outcome]) -> str:
     """The page, with the errors measured."""
     by = {(o.case, o.dtype): o for o in outcomes}
-    parts = [_HEAD.format(roundings=ROUNDINGS)]
+    parts = [_HEAD.format(**ROUNDINGS)]
     for function in dict.fromkeys(c.function for c in cases):
         rows = [c for c in cases if c.function == function]
         parts.append(f"\n## {function}\n\n{_about(function)}\n\n{_table(rows, by)}\n")
