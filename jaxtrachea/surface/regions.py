@@ -19,6 +19,7 @@ import math
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -193,8 +194,14 @@ def interpolate(
 
 
 def _mix(weights: Weights, U, J, V):
-    """Across the regions; rows are components."""
-    return weights.U[None] * U + weights.J[None] * J + weights.V[None] * V
+    """Across the regions; rows are components.
+
+    Here and below component by component, not by broadcasting: the derivative by what all
+    components share is then a few additions, and not a reduction over three rows, which the
+    compiler hands to a library that takes longer for it than the whole surface does.
+    """
+    rows = zip(U, J, V, strict=True)
+    return jnp.stack([weights.U * u + weights.J * j + weights.V * v for u, j, v in rows])
 
 
 def _pick(rows, patch, weights):
@@ -205,14 +212,31 @@ def _pick(rows, patch, weights):
     # into the gather below and computed again for every vertex, several times slower.
     table = jnp.matmul(weights, rows.reshape(k, -1), precision="highest")
     table = table.reshape(-1, patches, c).swapaxes(0, 1).reshape(patches, -1)
-    picked = table.at[patch].get(mode="promise_in_bounds")
-    return picked.T.reshape(-1, c, patch.shape[0])
+    return _rows(table, patch).T.reshape(-1, c, patch.shape[0])
+
+
+@jax.custom_jvp
+def _rows(table, patch):
+    """Row `patch` of the table for every vertex; shape (vertices, columns).
+
+    Its derivative is a product with ones and zeros: the transposed gather, a scatter, goes vertex
+    by vertex and takes several times as long as all the rest of a gradient.
+    """
+    return table.at[patch].get(mode="promise_in_bounds")
+
+
+@_rows.defjvp
+def _rows_jvp(primals, tangents):
+    table, patch = primals
+    chosen = jnp.arange(table.shape[0], dtype=patch.dtype)[None] == patch[:, None]
+    moved = jnp.matmul(chosen.astype(table.dtype), tangents[0], precision="highest")
+    return _rows(table, patch), moved
 
 
 def _between(binding: Binding, values):
     """Linear between the nodes, one row for each component; shape (components, vertices)."""
-    low, rise = _pick(jnp.stack([values[:-1], values[1:]]), binding.patch, [[1, 0], [-1, 1]])
-    return low + binding.fraction[None] * rise
+    picked = _pick(jnp.stack([values[:-1], values[1:]]), binding.patch, [[1, 0], [-1, 1]])
+    return jnp.stack([low + binding.fraction * rise for low, rise in zip(*picked, strict=True)])
 
 
 #: Hermite's cubic c_0 + t (c_1 + t (c_2 + t c_3)) from its values and slopes at both ends.
@@ -239,9 +263,9 @@ def _joint_line(binding: Binding, s_c, joints, contact, slopes: tuple[Array, Arr
     high, leave, land = (jnp.concatenate([v, more], axis=1) for v in (high, leave, land))
     patch = binding.patch + (binding.s >= s_c).astype(binding.patch.dtype)
     c = _pick(jnp.stack([low, high, leave, land]), patch, HERMITE)
-    t = ((binding.s - c[0, -2]) * c[0, -1])[None]
-    c_0, c_1, c_2, c_3 = c[:, :-2]
-    return c_0 + t * (c_1 + t * (c_2 + t * c_3))
+    t = (binding.s - c[0, -2]) * c[0, -1]
+    cubics = zip(*c[:, :-2], strict=True)
+    return jnp.stack([c_0 + t * (c_1 + t * (c_2 + t * c_3)) for c_0, c_1, c_2, c_3 in cubics])
 
 
 def _insert(rows, row, below):

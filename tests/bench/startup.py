@@ -1,12 +1,18 @@
 """Import and compile times. Run: python tests/bench/startup.py.
 
 Every sample is a fresh process, so that nothing is cached. Compile time: first call less a later
-one.
+one. Commands: wall time of the whole process, with an empty folder for compiled programs (cold) and
+with the one that the cold start left (warm).
 """
 
 import json
+import os
+import re
 import subprocess
 import sys
+import tempfile
+import time
+from pathlib import Path
 
 import common
 
@@ -54,6 +60,68 @@ CASES = {
 }
 
 
+ROOT = common.FOLDER.parents[1]
+COMMANDS = {
+    "fit": ["fit", str(ROOT / "fits" / "virtual_trachea" / "fit.toml")],
+    "simulate": ["simulate", str(ROOT / "configs" / "normal.toml")],
+}
+#: What jax says of every program that it looks up in the cache.
+LOGGED = {"JAX_DEBUG_LOG_MODULES": "jax._src.compiler"}
+
+
+def command(arguments, cache: Path, out: Path | None = None, **more) -> tuple[float, str]:
+    """Wall seconds of a fresh `jaxtrachea` with compiled programs in `cache`, and its messages."""
+    where = [] if out is None else ["--out", str(out)]
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache)} | more
+    begin = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxtrachea", *arguments, *where],
+        capture_output=True, text=True, check=True, env=environment,
+    )  # fmt: skip
+    return time.perf_counter() - begin, done.stderr
+
+
+def looked_up(messages: str) -> dict[str, int]:
+    """Programs found in the cache, and those compiled anew."""
+    hits = len(re.findall("compilation cache hit for", messages, re.IGNORECASE))
+    misses = len(re.findall("compilation cache miss for", messages, re.IGNORECASE))
+    return {"hits": hits, "misses": misses}
+
+
+def programs(cache: Path) -> set[str]:
+    """Names of the compiled programs in the folder."""
+    return {path.name for path in cache.iterdir() if not path.name.endswith("-atime")}
+
+
+def commands(out: common.Writer) -> None:
+    """Cold and warm start of the command line; asserts that no warm start leaves a new program."""
+    quick = {"jaxtrachea --help": ["--help"], "jaxtrachea --version": ["--version"]}
+    samples = {name: [] for name in quick}
+    kept = {}
+    with tempfile.TemporaryDirectory() as base:
+        for i in range(3):
+            for name, arguments in quick.items():
+                samples[name].append(command(arguments, Path(base))[0])
+            for name, arguments in COMMANDS.items():
+                cache = Path(base) / f"{name}_cache_{i}"
+                cache.mkdir()
+                for start in ("cold", "warm"):
+                    before = programs(cache)
+                    taken, _ = command(arguments, cache, Path(base) / f"{name}_{start}_{i}")
+                    samples.setdefault(f"jaxtrachea {name}, {start}", []).append(taken)
+                new = programs(cache) - before
+                assert before and not new, f"{name}: compiled anew with a warm cache: {new}"
+                kept[name] = len(before)
+        for name, arguments in COMMANDS.items():
+            cache = Path(base) / f"{name}_cache_0"
+            _, messages = command(arguments, cache, Path(base) / f"{name}_logged", **LOGGED)
+            found = looked_up(messages)
+            assert found["hits"] == kept[name], f"{name}: {found}, kept {kept[name]}"
+            out.rows.append({"kind": "cache", "case": name, "kept": kept[name], **found})
+            print(out.rows[-1], flush=True)
+    out.table("commands", samples)
+
+
 def main() -> None:
     """Three fresh processes each, in turn."""
     out = common.Writer("startup", "equinox")
@@ -65,6 +133,7 @@ def main() -> None:
             )
             samples[name].append(json.loads(done.stdout.splitlines()[-1]))
     out.table("startup", samples)
+    commands(out)
     out.write()
 
 
