@@ -63,7 +63,8 @@ def pipeline(out: common.Writer) -> None:
         rng = np.random.default_rng(0)
         spread = lambda v: v * jnp.asarray(rng.uniform(0.8, 1.25, LANES), v.dtype)  # noqa: B023, E731
         materials = jax.tree.map(spread, material)
-        s, depth = rng.uniform(20, 140, LANES), rng.uniform(0.5, 3, LANES)
+        s = rng.uniform(update.S - 2, update.S + 2, LANES)
+        depth = rng.uniform(0.5, 3, LANES)
         places = np.stack([s, update.OUTER + update.RADIUS - depth, 0 * s], axis=1)
         single = material, update.at(dtype).translation[0]
         many = materials, jnp.asarray(places, dtype)

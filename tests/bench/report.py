@@ -5,7 +5,7 @@ import statistics
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-SUITES = ("skeleton", "update", "fitting", "cohort", "joint", "startup")
+SUITES = ("skeleton", "update", "fitting", "cohort", "joint", "startup", "growth", "gradient")
 DOCUMENT = FOLDER.parents[1] / "docs" / "benchmarks.md"
 
 
@@ -112,28 +112,7 @@ def skeleton_section(rows: list[dict], goals: list[list[str]]) -> str:
     for name, goal, a, b, met in checks:
         word = "-" if met is None else verdict(met(ratio(a, b)[0]))
         goals.append([name, goal, quoted(a, b), word])
-    text += ["## Growth\n", GROWTH, growth(of("growth"), goals)]
-    positions = of("positions")
-    text.append(
-        table(["contact positions m", "median µs", "min µs"], [
-            [f"{r['m']:,}", *map(number, microseconds(r))] for r in positions
-        ])
-    )  # fmt: skip
     return "\n".join(text)
-
-
-def growth(rows: list[dict], goals: list[list[str]]) -> str:
-    """Time against n, one column per case, and the local exponent of the last step."""
-    sizes = sorted({r["n"] for r in rows})
-    cases = list(dict.fromkeys(r["case"] for r in rows))
-    at = {(r["case"], r["n"]): microseconds(r) for r in rows}
-    lines = [[str(n), *(number(at[c, n][0]) for c in cases)] for n in sizes]
-    slopes = [at[c, 500][1] / at[c, 100][1] / 5 for c in cases]
-    goals.append(
-        ["500 rings against 5 times 100 rings", "linear: about 1",
-         " / ".join(map(number, slopes)), verdict(max(slopes) < 1.3)]
-    )  # fmt: skip
-    return table(["rings", *(f"{c}, median µs" for c in cases)], lines)
 
 
 def fitting_section(rows: list[dict], goals: list[list[str]]) -> str:
@@ -193,6 +172,7 @@ def startup_section(rows: list[dict]) -> str:
     lines = [
         [r["case"], number(statistics.median(r["samples"])), number(min(r["samples"]))]
         for r in rows
+        if r["table"] == "startup"
     ]
     return table(["fresh process", "median s", "min s"], lines)
 
@@ -238,11 +218,6 @@ respect to k, EI and s_c (32 numbers), ours by reverse mode. C is a plain scalar
 inputs and outputs (`sweep.c`); its gradient uses that the beam is self-adjoint and needs no tape.
 The dense form is the paper's force method (`form="reactions"`).
 """
-GROWTH = """\
-Contact at 52 % of the length; lanes: 256 together, time per lane. The operations are linear in the
-number of rings. At 500 rings each intermediate array of the 256 lanes takes 2 MiB; that they leave
-the cache is the likely, not the proven, reason why lanes get slower than that.
-"""
 UPDATE = """\
 Pose of a ball of 5 mm in, force and all 3,430 vertices (6,856 triangles) out; 10,000 calls each, in
 turns of 1,000. The tool touches the mesh itself (16 patches of up to 128 corners) or a round tube
@@ -278,10 +253,14 @@ the compilation.
 
 def document() -> str:
     """The whole page."""
+    from report_growth import commands_section, gradient_section, growth_section
+
     suites = {name: read(name) for name in SUITES}
     goals: list[list[str]] = []
     parts = [
         skeleton_section(suites["skeleton"][1], goals),
+        growth_section(suites["growth"][1], goals),
+        gradient_section(suites["gradient"][1], goals),
         "## Whole update\n",
         update_section(suites["update"][1], goals),
         "## Fits\n",
@@ -292,6 +271,7 @@ def document() -> str:
         joint_section(suites["joint"][1]),
         "## Import and compilation\n",
         startup_section(suites["startup"][1]),
+        commands_section(suites["startup"][1]),
     ]
     intro = [
         "# Benchmarks\n",
