@@ -305,6 +305,14 @@ def test_gradients(method, size):
 
 
 @pytest.mark.parametrize("method", METHODS)
+def test_gradients_need_no_scatter(method):
+    """On a processor a scatter goes vertex by vertex: it took most of the time of a gradient."""
+    total = lambda phi_c, keys: jnp.sum(surface_of(method)(BINDING, phi_c, keys) ** 2)  # noqa: E731
+    gradient = jax.make_jaxpr(jax.grad(total, (0, 1)))(jnp.asarray(0.3), random_keys())
+    assert "scatter" not in str(gradient)
+
+
+@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_gradients_at_the_ends_of_the_rings(method, side):
     """C on an end: in the keys both ways; in phi_c from the side of the ring."""

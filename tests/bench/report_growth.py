@@ -160,7 +160,7 @@ memory is not what limits it.
 GRADIENT = """\
 Whole update: as below, dent of 16, out comes force + mean square of the vertices' motion; gradient
 by EI_L, k_M, k_1, k_3 and the tool's place (7 numbers), forward mode along the first or all four of
-the material. Fit: residual of 4 positions × 50 points with and without its Jacobian by four parameters,
+the material. Fit: residual of 4 positions × 50 points, its Jacobian by four parameters,
 and a whole step (residual, Jacobian, normal equations, one more residual for the curvature, the
 trust region). Times are per lane. In brackets: ratio of the smallest samples.
 """
