@@ -96,10 +96,10 @@ def programs(cache: Path) -> set[str]:
 
 
 def commands(out: common.Writer) -> None:
-    """Cold and warm start of the command line; asserts that no warm start leaves a new program."""
+    """Cold and warm start of the command line; asserts that a warm one finds all that was kept."""
     quick = {"jaxtrachea --help": ["--help"], "jaxtrachea --version": ["--version"]}
     samples = {name: [] for name in quick}
-    kept = {}
+    kept, added = {}, {}
     with tempfile.TemporaryDirectory() as base:
         for i in range(3):
             for name, arguments in quick.items():
@@ -111,15 +111,13 @@ def commands(out: common.Writer) -> None:
                     before = programs(cache)
                     taken, _ = command(arguments, cache, Path(base) / f"{name}_{start}_{i}")
                     samples.setdefault(f"jaxtrachea {name}, {start}", []).append(taken)
-                new = programs(cache) - before
-                assert not new, f"{name}: compiled anew with a warm cache: {new}"
-                kept[name] = len(before)
+                kept[name], added[name] = len(before), len(programs(cache) - before)
         for name, arguments in COMMANDS.items():
             cache = Path(base) / f"{name}_cache_0"
             _, said = command(arguments, cache, Path(base) / f"{name}_more", ("-c", COUNTED))
             hits, asked = map(int, re.findall(r"counted (\d+) (\d+)", said)[-1])
             assert hits >= kept[name] > 0, f"{name}: {hits} found of {kept[name]} kept"
-            counts = {"kept": kept[name], "hits": hits, "asked": asked}
+            counts = {"kept": kept[name], "added": added[name], "hits": hits, "asked": asked}
             out.rows.append({"kind": "cache", "table": "cache", "case": name} | counts)
             print(out.rows[-1], flush=True)
     out.table("commands", samples)
