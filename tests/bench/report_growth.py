@@ -167,5 +167,5 @@ trust region). Times are per lane. In brackets: ratio of the smallest samples.
 """
 COMMANDS = """\
 Whole processes. Cold: the folder of compiled programs is empty; warm: as the cold start left it.
-`fit` is that of the README, `simulate` that of `configs/normal.toml`. jax keeps
-programs that take a second or more to compile; that a warm start finds all of these is asserted. """
+`fit` is that of the README, `simulate` that of `configs/normal.toml`. jax keeps programs that take a
+second or more to compile; that a warm start finds all of these is asserted. Of its programs """

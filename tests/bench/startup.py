@@ -113,7 +113,7 @@ def commands(out: common.Writer) -> None:
                     samples.setdefault(f"jaxtrachea {name}, {start}", []).append(taken)
                 kept[name], added[name] = len(before), len(programs(cache) - before)
         for name, arguments in COMMANDS.items():
-            cache = Path(base) / f"{name}_cache_0"
+            cache = Path(base) / f"{name}_cache_2"  # the last one
             _, said = command(arguments, cache, Path(base) / f"{name}_more", ("-c", COUNTED))
             hits, asked = map(int, re.findall(r"counted (\d+) (\d+)", said)[-1])
             assert hits >= kept[name] > 0, f"{name}: {hits} found of {kept[name]} kept"
