@@ -5,6 +5,7 @@ that gives the value, and programs that give derivatives with it, timed in turn.
 """
 
 import functools
+import itertools
 
 import common
 import fitting
@@ -56,18 +57,23 @@ def forward(value, directions: int):
     return program
 
 
+def arguments(dtype, material, lanes: int):
+    """Material and place of the ball; of many lanes, all different."""
+    if lanes == 1:
+        return material, update.at(dtype).translation[0]
+    rng = np.random.default_rng(0)
+    spread = lambda v: v * jnp.asarray(rng.uniform(0.8, 1.25, lanes), v.dtype)  # noqa: E731
+    s = rng.uniform(update.S - 2, update.S + 2, lanes)
+    away = update.OUTER + update.RADIUS - rng.uniform(0.5, 3, lanes)
+    places = np.stack([s, away, 0 * s], axis=1)
+    return jax.tree.map(spread, material), jnp.asarray(places, dtype)
+
+
 def pipeline(out: common.Writer) -> None:
     """Tool, contact, skeleton, surface; by four material parameters and three of the pose."""
-    for dtype in ("float32", "float64"):
+    for lanes, dtype in itertools.product((1, LANES), ("float32", "float64")):
         made, material = update.scenes(dtype)
-        rng = np.random.default_rng(0)
-        spread = lambda v: v * jnp.asarray(rng.uniform(0.8, 1.25, LANES), v.dtype)  # noqa: B023, E731
-        materials = jax.tree.map(spread, material)
-        s = rng.uniform(update.S - 2, update.S + 2, LANES)
-        depth = rng.uniform(0.5, 3, LANES)
-        places = np.stack([s, update.OUTER + update.RADIUS - depth, 0 * s], axis=1)
-        single = material, update.at(dtype).translation[0]
-        many = materials, jnp.asarray(places, dtype)
+        args = arguments(dtype, material, lanes)
         for walls in WALLS:
             value = scalar_of(made[f"whole, dent of 16; {walls}"])
             programs = {
@@ -76,12 +82,12 @@ def pipeline(out: common.Writer) -> None:
                 "value and one direction (forward)": forward(value, 1),
                 "value and 4 directions (forward)": forward(value, 4),
             }
-            for lanes, args in ((1, single), (LANES, many)):
-                batched = {k: f if lanes == 1 else jax.vmap(f) for k, f in programs.items()}
-                cases = {name: wait(f, *args) for name, f in batched.items()}
-                check(cases)
-                found = common.interleaved(cases, rounds=25, target=0.02)
-                out.table("pipeline", found, lanes=lanes, dtype=dtype, walls=walls)
+            batched = {k: f if lanes == 1 else jax.vmap(f) for k, f in programs.items()}
+            cases = {name: wait(f, *args) for name, f in batched.items()}
+            check(cases)
+            found = common.interleaved(cases, rounds=25, target=0.02)
+            out.table("pipeline", found, lanes=lanes, dtype=dtype, walls=walls)
+            out.write()
 
 
 def check(cases) -> None:
@@ -143,7 +149,6 @@ def main() -> None:
     curve(out)
     fits(out)
     pipeline(out)
-    out.write()
 
 
 if __name__ == "__main__":
