@@ -15,6 +15,7 @@ Vectors are along (tangent, anterior, lateral) of the centreline, in mm. `bind` 
 mesh, `weigh` once for an angle of contact.
 """
 
+import functools
 import math
 from typing import Literal
 
@@ -22,6 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import epsilon
@@ -194,14 +196,28 @@ def interpolate(
 
 
 def _mix(weights: Weights, U, J, V):
-    """Across the regions; rows are components.
+    """Across the regions; rows are components."""
+    u, j, v = (_spread(w, 3) for w in (weights.U, weights.J, weights.V))
+    return u * U + j * J + v * V
 
-    Here and below component by component, not by broadcasting: the derivative by what all
-    components share is then a few additions, and not a reduction over three rows, which the
-    compiler hands to a library that takes longer for it than the whole surface does.
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _spread(v, rows: int):
+    """The same row `rows` times.
+
+    Its transpose adds the rows one to another. That of broadcasting is a reduction over three rows,
+    which the compiler hands to a library that takes longer for it than the whole surface does.
     """
-    rows = zip(U, J, V, strict=True)
-    return jnp.stack([weights.U * u + weights.J * j + weights.V * v for u, j, v in rows])
+    return jnp.broadcast_to(v[None], (rows, *v.shape))
+
+
+@functools.partial(_spread.defjvp, symbolic_zeros=True)
+def _spread_jvp(rows, primals, tangents):
+    (v,), (dv,) = primals, tangents
+    value = _spread(v, rows)
+    if isinstance(dv, SymbolicZero):
+        return value, SymbolicZero(jax.typeof(value).to_tangent_aval())
+    return value, jnp.stack([dv] * rows)
 
 
 def _pick(rows, patch, weights):
@@ -212,31 +228,14 @@ def _pick(rows, patch, weights):
     # into the gather below and computed again for every vertex, several times slower.
     table = jnp.matmul(weights, rows.reshape(k, -1), precision="highest")
     table = table.reshape(-1, patches, c).swapaxes(0, 1).reshape(patches, -1)
-    return _rows(table, patch).T.reshape(-1, c, patch.shape[0])
-
-
-@jax.custom_jvp
-def _rows(table, patch):
-    """Row `patch` of the table for every vertex; shape (vertices, columns).
-
-    Its derivative is a product with ones and zeros: the transposed gather, a scatter, goes vertex
-    by vertex and takes several times as long as all the rest of a gradient.
-    """
-    return table.at[patch].get(mode="promise_in_bounds")
-
-
-@_rows.defjvp
-def _rows_jvp(primals, tangents):
-    table, patch = primals
-    chosen = jnp.arange(table.shape[0], dtype=patch.dtype)[None] == patch[:, None]
-    moved = jnp.matmul(chosen.astype(table.dtype), tangents[0], precision="highest")
-    return _rows(table, patch), moved
+    picked = table.at[patch].get(mode="promise_in_bounds")
+    return picked.T.reshape(-1, c, patch.shape[0])
 
 
 def _between(binding: Binding, values):
     """Linear between the nodes, one row for each component; shape (components, vertices)."""
-    picked = _pick(jnp.stack([values[:-1], values[1:]]), binding.patch, [[1, 0], [-1, 1]])
-    return jnp.stack([low + binding.fraction * rise for low, rise in zip(*picked, strict=True)])
+    low, rise = _pick(jnp.stack([values[:-1], values[1:]]), binding.patch, [[1, 0], [-1, 1]])
+    return low + _spread(binding.fraction, low.shape[0]) * rise
 
 
 #: Hermite's cubic c_0 + t (c_1 + t (c_2 + t c_3)) from its values and slopes at both ends.
@@ -263,9 +262,9 @@ def _joint_line(binding: Binding, s_c, joints, contact, slopes: tuple[Array, Arr
     high, leave, land = (jnp.concatenate([v, more], axis=1) for v in (high, leave, land))
     patch = binding.patch + (binding.s >= s_c).astype(binding.patch.dtype)
     c = _pick(jnp.stack([low, high, leave, land]), patch, HERMITE)
-    t = (binding.s - c[0, -2]) * c[0, -1]
-    cubics = zip(*c[:, :-2], strict=True)
-    return jnp.stack([c_0 + t * (c_1 + t * (c_2 + t * c_3)) for c_0, c_1, c_2, c_3 in cubics])
+    c_0, c_1, c_2, c_3 = c[:, :-2]
+    t = _spread((binding.s - c[0, -2]) * c[0, -1], c_0.shape[0])
+    return c_0 + t * (c_1 + t * (c_2 + t * c_3))
 
 
 def _insert(rows, row, below):
