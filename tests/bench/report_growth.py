@@ -138,14 +138,17 @@ NAMES = {
     "fit": "fit",
     "curve": "press curve of 50 displacements, 5 arguments",
 }
-WITH_GOAL = ("value and gradient (reverse)", "value and gradient", "residual and Jacobian")
+WITH_GOAL = (
+    "value and gradient (reverse)", "value and gradient", "residual and Jacobian",
+    "one Levenberg-Marquardt step",
+)  # fmt: skip
 GROWTH = """\
 Time against size, and its exponent: least squares of log time against log size over the upper half
 of the sizes, and that of the last step alone. Every size is compiled for itself.
 
-Rings: contact at 52 % of the length; lanes: 256 together (or 32), time per lane. At 500 rings each
-intermediate array of 256 lanes takes 1 to 2 MiB; that they leave the cache is why lanes get slower
-than linear there: 32 lanes do so later.
+Rings: contact at 52 % of the length; lanes: 256 together (or 32), time per lane. From 500 rings on
+256 lanes are slower per lane than 32, so it is the size of the intermediate arrays that costs (each
+1 to 2 MiB at 500 rings); whether by leaving the cache or by fresh memory at every call is not known.
 """
 POSITIONS = """\
 Contact positions of one sweep over the tube of Table 1; `sweep` goes through them 256 at a time.
@@ -157,8 +160,8 @@ and poses of one path of the tool on 16 patches.
 VERTICES = """\
 Skeleton, global shape and a dent of 16 centres under a given press. Bytes: what must at least be
 read (s, phi, fraction and patch of each vertex, its rest position) and written (its position); GB/s
-is this over the time, beside a copy (`v + 1`) of as many bytes. Where it is far below the copy,
-memory is not what limits it.
+is this over the time, beside a copy (`v + 1`) of as many bytes. Far below the copy, this least
+traffic is not the limit; intermediate arrays are not counted and may be.
 """
 GRADIENT = """\
 Whole update: as below, dent of 16, out comes force + mean square of the vertices' motion; gradient
