@@ -148,7 +148,7 @@ of the sizes, and that of the last step alone. Every size is compiled for itself
 
 Rings: contact at 52 % of the length; lanes: 256 together (or 32), time per lane. From 500 rings on
 256 lanes are slower per lane than 32, so it is the size of the intermediate arrays that costs (each
-1 to 2 MiB at 500 rings); whether by leaving the cache or by fresh memory at every call is not known.
+1 to 2 MiB at 500 rings); whether by leaving the cache or by fresh memory at every call is open.
 """
 POSITIONS = """\
 Contact positions of one sweep over the tube of Table 1; `sweep` goes through them 256 at a time.
