@@ -23,7 +23,7 @@ def test_document_is_what_the_results_give():
     assert module.DOCUMENT.read_text() == module.document(), "run python tests/bench/report.py"
 
 
-@pytest.mark.parametrize("suite", ["skeleton", "fitting", "startup"])
+@pytest.mark.parametrize("suite", ["skeleton", "fitting", "startup", "growth", "gradient"])
 def test_results_name_their_machine_and_keep_every_sample(suite):
     environment, rows = report().read(suite)
     assert {"cpu", "cores_used", "versions", "date"} <= environment.keys()

@@ -32,11 +32,11 @@ differences in 260 digits). An error is within its limit up to
     {value:g} epsilon (size + spread), of a derivative {gradient:g} epsilon (size + spread),
 
 in all rows and both dtypes: what {value:g} roundings of the inputs would do to exact arithmetic; a
-derivative takes up to four times the operations of its value. Positions on one line (rings, ends, C) enter by their
-differences, which floating point forms without an error of its own: there it is the spans between
-neighbours that are moved. Angles enter by directions, whose entries are of size 1: less than 1 rad
-is moved as if it were 1 rad. Where another limit is needed, it is listed with its reason below the
-table.
+derivative takes up to four times the operations of its value. Positions on one line (rings, ends,
+C) enter by their differences, which floating point forms without an error of its own: there it is
+the spans between neighbours that are moved. Angles enter by directions, whose entries are of size
+1: less than 1 rad is moved as if it were 1 rad. Where another limit is needed, it is listed with
+its reason below the table.
 
 Some derivatives are far below y/x, the size of a derivative of a power law: what hardly depends on
 an input any more is known to rounding of y, not to its own. Where it is said below a table, the

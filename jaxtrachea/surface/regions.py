@@ -15,12 +15,15 @@ Vectors are along (tangent, anterior, lateral) of the centreline, in mm. `bind` 
 mesh, `weigh` once for an angle of contact.
 """
 
+import functools
 import math
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import epsilon
@@ -194,7 +197,27 @@ def interpolate(
 
 def _mix(weights: Weights, U, J, V):
     """Across the regions; rows are components."""
-    return weights.U[None] * U + weights.J[None] * J + weights.V[None] * V
+    u, j, v = (_spread(w, 3) for w in (weights.U, weights.J, weights.V))
+    return u * U + j * J + v * V
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _spread(v, rows: int):
+    """The same row `rows` times.
+
+    Its transpose adds the rows one to another. That of broadcasting is a reduction over three rows,
+    which the compiler hands to a library that takes longer for it than the whole surface does.
+    """
+    return jnp.broadcast_to(v[None], (rows, *v.shape))
+
+
+@functools.partial(_spread.defjvp, symbolic_zeros=True)
+def _spread_jvp(rows, primals, tangents):
+    (v,), (dv,) = primals, tangents
+    value = _spread(v, rows)
+    if isinstance(dv, SymbolicZero):
+        return value, SymbolicZero(jax.typeof(value).to_tangent_aval())
+    return value, jnp.stack([dv] * rows)
 
 
 def _pick(rows, patch, weights):
@@ -212,7 +235,7 @@ def _pick(rows, patch, weights):
 def _between(binding: Binding, values):
     """Linear between the nodes, one row for each component; shape (components, vertices)."""
     low, rise = _pick(jnp.stack([values[:-1], values[1:]]), binding.patch, [[1, 0], [-1, 1]])
-    return low + binding.fraction[None] * rise
+    return low + _spread(binding.fraction, low.shape[0]) * rise
 
 
 #: Hermite's cubic c_0 + t (c_1 + t (c_2 + t c_3)) from its values and slopes at both ends.
@@ -239,8 +262,8 @@ def _joint_line(binding: Binding, s_c, joints, contact, slopes: tuple[Array, Arr
     high, leave, land = (jnp.concatenate([v, more], axis=1) for v in (high, leave, land))
     patch = binding.patch + (binding.s >= s_c).astype(binding.patch.dtype)
     c = _pick(jnp.stack([low, high, leave, land]), patch, HERMITE)
-    t = ((binding.s - c[0, -2]) * c[0, -1])[None]
     c_0, c_1, c_2, c_3 = c[:, :-2]
+    t = _spread((binding.s - c[0, -2]) * c[0, -1], c_0.shape[0])
     return c_0 + t * (c_1 + t * (c_2 + t * c_3))
 
 

@@ -2,30 +2,13 @@
 
 import statistics
 
-from page import FOLDER, number, read, table
+from page import FOLDER, microseconds, number, quoted, ratio, read, table, verdict
+from report_growth import commands_section, gradient_section, growth_section
 from report_peers import peers_section
 
-SUITES = ("skeleton", "update", "fitting", "cohort", "joint", "startup", "peers")
+SUITES = ("skeleton", "update", "fitting", "cohort", "joint", "startup", "peers", "growth",
+          "gradient")  # fmt: skip
 DOCUMENT = FOLDER.parents[1] / "docs" / "benchmarks.md"
-
-
-def microseconds(row: dict) -> tuple[float, float]:
-    """Median and smallest sample, per lane where there are lanes."""
-    per = 1e6 / row.get("lanes", 1)
-    return statistics.median(row["samples"]) * per, min(row["samples"]) * per
-
-
-def ratio(a: dict, b: dict) -> tuple[float, float]:
-    """Median of the paired ratios a / b of one run, and the ratio of the smallest samples."""
-    pairs = zip(a["samples"], b["samples"], strict=True)
-    scale = b.get("lanes", 1) / a.get("lanes", 1)
-    paired = statistics.median(x / y for x, y in pairs) * scale
-    return paired, min(a["samples"]) / min(b["samples"]) * scale
-
-
-def quoted(a: dict, b: dict) -> str:
-    """A ratio as text: median of pairs (of the smallest samples)."""
-    return "{} ({})".format(*map(number, ratio(a, b)))
 
 
 def plain(rows: list[dict], *columns: str) -> list[list[str]]:
@@ -48,11 +31,6 @@ def environment(environments: list[dict]) -> str:
         f"ratios**, which come from samples taken in turn (A B A B). {packages}; "
         f"{first['compiler']}, `-O3 -march=native`. float64 everywhere.\n"
     )
-
-
-def verdict(met: bool) -> str:
-    """A goal in a word."""
-    return "met" if met else "**missed**"
 
 
 def skeleton_section(rows: list[dict], goals: list[list[str]]) -> str:
@@ -94,28 +72,7 @@ def skeleton_section(rows: list[dict], goals: list[list[str]]) -> str:
     for name, goal, a, b, met in checks:
         word = "-" if met is None else verdict(met(ratio(a, b)[0]))
         goals.append([name, goal, quoted(a, b), word])
-    text += ["## Growth\n", GROWTH, growth(of("growth"), goals)]
-    positions = of("positions")
-    text.append(
-        table(["contact positions m", "median µs", "min µs"], [
-            [f"{r['m']:,}", *map(number, microseconds(r))] for r in positions
-        ])
-    )  # fmt: skip
     return "\n".join(text)
-
-
-def growth(rows: list[dict], goals: list[list[str]]) -> str:
-    """Time against n, one column per case, and the local exponent of the last step."""
-    sizes = sorted({r["n"] for r in rows})
-    cases = list(dict.fromkeys(r["case"] for r in rows))
-    at = {(r["case"], r["n"]): microseconds(r) for r in rows}
-    lines = [[str(n), *(number(at[c, n][0]) for c in cases)] for n in sizes]
-    slopes = [at[c, 500][1] / at[c, 100][1] / 5 for c in cases]
-    goals.append(
-        ["500 rings against 5 times 100 rings", "linear: about 1",
-         " / ".join(map(number, slopes)), verdict(max(slopes) < 1.3)]
-    )  # fmt: skip
-    return table(["rings", *(f"{c}, median µs" for c in cases)], lines)
 
 
 def fitting_section(rows: list[dict], goals: list[list[str]]) -> str:
@@ -175,6 +132,7 @@ def startup_section(rows: list[dict]) -> str:
     lines = [
         [r["case"], number(statistics.median(r["samples"])), number(min(r["samples"]))]
         for r in rows
+        if r["table"] == "startup"
     ]
     return table(["fresh process", "median s", "min s"], lines)
 
@@ -220,11 +178,6 @@ respect to k, EI and s_c (32 numbers), ours by reverse mode. C is a plain scalar
 inputs and outputs (`sweep.c`); its gradient uses that the beam is self-adjoint and needs no tape.
 The dense form is the paper's force method (`form="reactions"`).
 """
-GROWTH = """\
-Contact at 52 % of the length; lanes: 256 together, time per lane. The operations are linear in the
-number of rings. At 500 rings each intermediate array of the 256 lanes takes 2 MiB; that they leave
-the cache is the likely, not the proven, reason why lanes get slower than that.
-"""
 UPDATE = """\
 Pose of a ball of 5 mm in, force and all 3,430 vertices (6,856 triangles) out; 10,000 calls each, in
 turns of 1,000. The tool touches the mesh itself (16 patches of up to 128 corners) or a round tube
@@ -266,6 +219,8 @@ def document() -> str:
         "## Peers\n",
         peers_section(*suites["peers"]),
         skeleton_section(suites["skeleton"][1], goals),
+        growth_section(suites["growth"][1], goals),
+        gradient_section(suites["gradient"][1], goals),
         "## Whole update\n",
         update_section(suites["update"][1], goals),
         "## Fits\n",
@@ -276,6 +231,7 @@ def document() -> str:
         joint_section(suites["joint"][1]),
         "## Import and compilation\n",
         startup_section(suites["startup"][1]),
+        commands_section(suites["startup"][1]),
     ]
     intro = [
         "# Benchmarks\n",

@@ -1,4 +1,4 @@
-"""Speed of the skeleton: one call, many lanes, growth. Run: python tests/bench/skeleton.py [part].
+"""Speed of the skeleton: one call, many lanes. Run: python tests/bench/skeleton.py [part].
 
 15 rings 10 mm apart, k = 0.1 N/mm, EI = 1.86 N mm^2 (the test problem of docs/beam_accuracy.md).
 If OpenSees cannot be loaded its row is missing and the results say why.
@@ -245,35 +245,9 @@ def lanes(out: common.Writer) -> None:
     out.table("lanes", found, lanes=LANES, error=every)
 
 
-def growth(out: common.Writer) -> None:
-    """Run time against the number of rings and of contact positions."""
-    for n in (10, 20, 50, 100, 200, 500):
-        ours = jax_calls(n, 256)
-        b = beam(n)
-        args = (*jax.tree.leaves(b), jnp.asarray(0.52 * float(b.length)), jnp.asarray(FORCE))
-        run = jax.jit(two_outputs)
-        gradient = jax.jit(jax.value_and_grad(compliance_of, argnums=(2, 3, 4)))
-        one = {
-            "call: w_C, reactions": wait(lambda r=run, a=args: r(*a)),
-            "call: w_C and gradient": wait(lambda r=gradient, a=args: r(*a[:5])),
-        }
-        out.table("growth", common.interleaved(one, rounds=25, target=0.003), n=n)
-        many = {
-            "lane: all outputs": ours["value"],
-            "lane: w_C and gradient": ours["gradient"],
-        }
-        out.table("growth", common.interleaved(many, rounds=25, target=0.003), n=n, lanes=256)
-    for m in (1, 10, 100, 1000, 10_000):
-        b = beam()
-        s = jnp.linspace(5.0, 155.0, m)
-        sweep = jax.jit(contact_compliance)
-        cases = {"sweep of contact positions": wait(lambda f=sweep, b=b, s=s: f(b, s))}
-        out.table("positions", common.interleaved(cases, rounds=25, target=0.003), m=m)
-
-
 if __name__ == "__main__":
     writer = common.Writer("skeleton", "scipy", "openseespy")
-    parts = {"single": single, "lanes": lanes, "growth": growth}
+    parts = {"single": single, "lanes": lanes}
     for part in sys.argv[1:] or parts:
         parts[part](writer)
     if not sys.argv[1:]:

@@ -1,12 +1,18 @@
 """Import and compile times. Run: python tests/bench/startup.py.
 
 Every sample is a fresh process, so that nothing is cached. Compile time: first call less a later
-one.
+one. Commands: wall time of the whole process, with an empty folder for compiled programs (cold) and
+with the one that the cold start left (warm).
 """
 
 import json
+import os
+import re
 import subprocess
 import sys
+import tempfile
+import time
+from pathlib import Path
 
 import common
 
@@ -54,6 +60,69 @@ CASES = {
 }
 
 
+ROOT = common.FOLDER.parents[1]
+COMMANDS = {
+    "fit": ["fit", str(ROOT / "fits" / "virtual_trachea" / "fit.toml")],
+    "simulate": ["simulate", str(ROOT / "configs" / "normal.toml")],
+}
+#: The command with a count of the programs asked for and of those found in the cache.
+COUNTED = """
+import collections, sys, jax
+seen = collections.Counter()
+jax.monitoring.register_event_listener(lambda name, **_: seen.update([name.rsplit("/")[-1]]))
+from jaxtrachea.cli import main
+try:
+    sys.exit(main())
+finally:
+    print("counted", seen["cache_hits"], seen["compile_requests_use_cache"], file=sys.stderr)
+"""
+
+
+def command(arguments, cache: Path, out: Path | None = None, how=("-m", "jaxtrachea")):
+    """Wall seconds of a fresh `jaxtrachea` with compiled programs in `cache`, and its messages."""
+    where = [] if out is None else ["--out", str(out)]
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache)}
+    begin = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, *how, *arguments, *where],
+        capture_output=True, text=True, check=True, env=environment,
+    )  # fmt: skip
+    return time.perf_counter() - begin, done.stderr
+
+
+def programs(cache: Path) -> set[str]:
+    """Names of the compiled programs in the folder."""
+    return {path.name for path in cache.iterdir() if not path.name.endswith("-atime")}
+
+
+def commands(out: common.Writer) -> None:
+    """Cold and warm start of the command line; asserts that a warm one finds all that was kept."""
+    quick = {"jaxtrachea --help": ["--help"], "jaxtrachea --version": ["--version"]}
+    samples = {name: [] for name in quick}
+    kept, added = {}, {}
+    with tempfile.TemporaryDirectory() as base:
+        for i in range(3):
+            for name, arguments in quick.items():
+                samples[name].append(command(arguments, Path(base))[0])
+            for name, arguments in COMMANDS.items():
+                cache = Path(base) / f"{name}_cache_{i}"
+                cache.mkdir()
+                for start in ("cold", "warm"):
+                    before = programs(cache)
+                    taken, _ = command(arguments, cache, Path(base) / f"{name}_{start}_{i}")
+                    samples.setdefault(f"jaxtrachea {name}, {start}", []).append(taken)
+                kept[name], added[name] = len(before), len(programs(cache) - before)
+        for name, arguments in COMMANDS.items():
+            cache = Path(base) / f"{name}_cache_2"  # the last one
+            _, said = command(arguments, cache, Path(base) / f"{name}_more", ("-c", COUNTED))
+            hits, asked = map(int, re.findall(r"counted (\d+) (\d+)", said)[-1])
+            assert hits >= kept[name] > 0, f"{name}: {hits} found of {kept[name]} kept"
+            counts = {"kept": kept[name], "added": added[name], "hits": hits, "asked": asked}
+            out.rows.append({"kind": "cache", "table": "cache", "case": name} | counts)
+            print(out.rows[-1], flush=True)
+    out.table("commands", samples)
+
+
 def main() -> None:
     """Three fresh processes each, in turn."""
     out = common.Writer("startup", "equinox")
@@ -65,6 +134,7 @@ def main() -> None:
             )
             samples[name].append(json.loads(done.stdout.splitlines()[-1]))
     out.table("startup", samples)
+    commands(out)
     out.write()
 
 

@@ -1,0 +1,176 @@
+"""Sections of docs/benchmarks.md: growth with size, cost of derivatives, start of the commands."""
+
+import statistics
+
+import numpy as np
+from page import microseconds, number, quoted, ratio, table, verdict
+
+#: Most that a value with its derivatives may cost, in values.
+DERIVATIVES = 4
+
+
+def slopes(sizes, times) -> tuple[float, float]:
+    """Exponent of the time: least squares over the upper half of the sizes; of the last step."""
+    x, y = np.log(sizes), np.log(times)
+    half = len(x) // 2
+    return float(np.polyfit(x[half:], y[half:], 1)[0]), float((y[-1] - y[-2]) / (x[-1] - x[-2]))
+
+
+def by_size(rows: list[dict], head: str, unit: str = "µs") -> str:
+    """Median time by size (rows) and case (columns), and two lines of exponents."""
+    rows = [r for r in rows if r["kind"] == "row"]
+    cases = list(dict.fromkeys(r["case"] for r in rows))
+    scale = {"µs": 1, "ns": 1e3}[unit]
+    at = {(r["case"], r["size"]): scale * microseconds(r)[0] for r in rows}
+    shown = lambda case, size: number(at[case, size]) if (case, size) in at else "-"  # noqa: E731
+    lines = [[f"{n:,}", *(shown(c, n) for c in cases)] for n in sorted({r["size"] for r in rows})]
+    found = []
+    for case in cases:
+        sizes = sorted(n for c, n in at if c == case)
+        found.append(slopes(sizes, [at[case, n] for n in sizes]))
+    lines += [
+        ["exponent, upper half of the sizes", *(f"{a:.2f}" for a, _ in found)],
+        ["exponent, last step", *(f"{b:.2f}" for _, b in found)],
+    ]
+    return table([head, *(f"{c}, {unit}" for c in cases)], lines)
+
+
+def growth_section(rows: list[dict], goals: list[list[str]]) -> str:
+    """Tables of growth.jsonl; the goal of the rings goes to `goals`."""
+    of = lambda name: [r for r in rows if r["table"] == name]  # noqa: E731
+    rings = [r for r in of("rings") if r["kind"] == "row"]
+    best = {(r["case"], r["size"]): microseconds(r)[1] for r in rings}
+    cases = list(dict.fromkeys(r["case"] for r in rings))
+    growth = [best[c, 500] / best[c, 100] / 5 for c in cases if "lane of" not in c]
+    goals.append(
+        ["500 rings against 5 times 100 rings", "linear: about 1",
+         " / ".join(map(number, growth)), verdict(max(growth) < 1.3)]
+    )  # fmt: skip
+    built = {(r["case"], r["size"]): r["compile"] for r in rings}
+    first, last = min(r["size"] for r in rings), max(r["size"] for r in rings)
+    compiled = "; ".join(
+        f"{c} {number(built[c, first])} and {number(built[c, last])} s"
+        for c in cases
+        if (c, last) in built
+    )
+    parts = ["## Growth\n", GROWTH, by_size(of("rings"), "rings")]
+    parts.append(f"Compile time with {first} and with {last:,} rings: {compiled}.\n")
+    parts += [POSITIONS, by_size(of("positions"), "contact positions")]
+    parts += [PATCHES, by_size(of("patches"), "patches"), by_size(of("path"), "poses of one path")]
+    parts += ["## Vertices\n", VERTICES, vertices(of("vertices"))]
+    parts += ["## Lanes\n", by_size(of("lanes"), "lanes"), falling(of("lanes"))]
+    parts += [f"{r['text']}.\n" for r in rows if r["kind"] == "note"]
+    return "\n".join(parts)
+
+
+def vertices(rows: list[dict]) -> str:
+    """Time, time per vertex and least traffic of the surface, beside a copy."""
+    lines = []
+    for dtype in ("float32", "float64"):
+        pairs = {}
+        for r in rows:
+            if r["case"].endswith(dtype):
+                pairs.setdefault(r["size"], []).append(r)
+        for n, (surface, copy) in pairs.items():
+            us, rest = microseconds(surface)[0], microseconds(copy)[0]
+            rate = lambda t, b=surface["bytes"]: number(1e-3 * b / t)  # noqa: E731
+            line = [dtype, f"{n:,}", number(us), number(1e3 * us / n)]
+            lines.append([*line, number(surface["bytes"] / n), rate(us), rate(rest)])
+        sizes = list(pairs)
+        a, b = slopes(sizes, [microseconds(pairs[n][0])[0] for n in sizes])
+        lines.append([dtype, f"exponent {a:.2f}, last step {b:.2f}", *["" for _ in range(5)]])
+    head = ["", "vertices", "median µs", "ns per vertex", "bytes per vertex", "GB/s", "copy GB/s"]
+    return table(head, lines)
+
+
+def falling(rows: list[dict]) -> str:
+    """From how many lanes on the time per lane is within a tenth of the least."""
+    words = []
+    rows = [r for r in rows if r["kind"] == "row"]
+    for case in dict.fromkeys(r["case"] for r in rows):
+        own = {r["size"]: microseconds(r)[0] for r in rows if r["case"] == case}
+        least = min(own.values())
+        size = min(n for n, t in own.items() if t <= 1.1 * least)
+        words.append(f"{case}: {size:,} lanes, {number(least)} µs at the least")
+    return f"Time per lane is within 10 % of its least from here on: {'; '.join(words)}.\n"
+
+
+def gradient_section(rows: list[dict], goals: list[list[str]]) -> str:
+    """Tables of gradient.jsonl; every reverse gradient and the Jacobian of the fit have a goal."""
+    groups: dict[tuple, list[dict]] = {}
+    for r in rows:
+        groups.setdefault((r["table"], r.get("walls"), r.get("dtype"), r["lanes"]), []).append(r)
+    lines = []
+    for (what, walls, dtype, lanes), (value, *others) in groups.items():
+        name = NAMES[what] if walls is None else f"{NAMES[what]}, {walls}, {dtype}"
+        name = name if lanes == 1 else f"{name}, {lanes} lanes"
+        lines.append([name, value["case"], *map(number, microseconds(value)), "1"])
+        for r in others:
+            lines.append([name, r["case"], *map(number, microseconds(r)), quoted(r, value)])
+            if r["case"] in WITH_GOAL:
+                met = verdict(ratio(r, value)[0] <= DERIVATIVES)
+                goal = f"at most {DERIVATIVES} times"
+                words = f"{r['case']} against {value['case']}: {name}"
+                goals.append([words, goal, quoted(r, value), met])
+    head = ["", "case", "median µs", "min", "against the first"]
+    return "\n".join(["## Derivatives\n", GRADIENT, table(head, lines)])
+
+
+def commands_section(rows: list[dict]) -> str:
+    """Cold and warm start of the command line, in seconds."""
+    timed = [r for r in rows if r["table"] == "commands"]
+    lines = [
+        [r["case"], number(statistics.median(r["samples"])), number(min(r["samples"]))]
+        for r in timed
+    ]
+    found = "; ".join(
+        f"`{r['case']}` keeps {r['kept']} and finds them again, compiles {r['asked'] - r['hits']} "
+        f"anew, {r['added']} of them for long enough to be kept now"
+        for r in rows
+        if r["table"] == "cache"
+    )
+    after = f"{COMMANDS}{found}.\n"
+    return "\n".join([table(["command", "median s", "min s"], lines), after])
+
+
+NAMES = {
+    "pipeline": "whole update",
+    "fit": "fit",
+    "curve": "press curve of 50 displacements, 5 arguments",
+}
+WITH_GOAL = (
+    "value and gradient (reverse)", "value and gradient", "residual and Jacobian",
+    "one Levenberg-Marquardt step",
+)  # fmt: skip
+GROWTH = """\
+Time against size, and its exponent: least squares of log time against log size over the upper half
+of the sizes, and that of the last step alone. Every size is compiled for itself.
+
+Rings: contact at 52 % of the length; lanes: 256 together (or 32), time per lane. From 500 rings on
+256 lanes are slower per lane than 32, so it is the size of the intermediate arrays that costs (each
+1 to 2 MiB at 500 rings); whether by leaving the cache or by fresh memory at every call is open.
+"""
+POSITIONS = """\
+Contact positions of one sweep over the tube of Table 1; `sweep` goes through them 256 at a time.
+"""
+PATCHES = """\
+Patches of the tube that a ball may touch (the broad phase bounds all of them, two are searched);
+and poses of one path of the tool on 16 patches.
+"""
+VERTICES = """\
+Skeleton, global shape and a dent of 16 centres under a given press. Bytes: what must at least be
+read (s, phi, fraction and patch of each vertex, its rest position) and written (its position); GB/s
+is this over the time, beside a copy (`v + 1`) of as many bytes. Far below the copy, this least
+traffic is not the limit; intermediate arrays are not counted and may be.
+"""
+GRADIENT = """\
+Whole update: as below, dent of 16, out comes force + mean square of the vertices' motion; gradient
+by EI_L, k_M, k_1, k_3 and the tool's place (7 numbers), forward mode along the first or all four of
+the material. Fit: residual of 4 positions × 50 points, its Jacobian by four parameters,
+and a whole step (residual, Jacobian, normal equations, one more residual for the curvature, the
+trust region). Times are per lane. In brackets: ratio of the smallest samples.
+"""
+COMMANDS = """\
+Whole processes. Cold: the folder of compiled programs is empty; warm: as the cold start left it.
+`fit` is that of the README, `simulate` that of `configs/normal.toml`. jax keeps programs that take
+a second or more to compile; that a warm start finds all of these is asserted. Of its programs """
