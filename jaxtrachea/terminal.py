@@ -77,7 +77,8 @@ def set_up_jax() -> None:
     """The command line computes in float64 and keeps compiled programs for the next start.
 
     They lie in `cache_folder()`, or where JAX_COMPILATION_CACHE_DIR says;
-    JAX_ENABLE_COMPILATION_CACHE=false keeps none.
+    JAX_ENABLE_COMPILATION_CACHE=false keeps none. All are kept, unless
+    JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS says which.
     """
     import jax
 
@@ -86,6 +87,9 @@ def set_up_jax() -> None:
     chosen = jax.config.values["jax_compilation_cache_dir"]
     if wanted and chosen is None and (folder := cache_folder()) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
+    if wanted and "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        # Also the many small ones, which jax leaves out by itself: they make up half of a start.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 
 def cache_folder() -> Path | None:

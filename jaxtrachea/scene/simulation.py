@@ -14,13 +14,10 @@ from jaxtrachea.model import ligament_beam, local_law, respond, unit_deflection
 from jaxtrachea.oblique import press_oblique, press_path
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.deform import deform
-from jaxtrachea.scene.stage import Poses, Presses, Scene
+from jaxtrachea.scene.stage import COVERED, Poses, Presses, Scene
 from jaxtrachea.skeleton import local_frame
 from jaxtrachea.status import ContactStatus, PressStatus
 from jaxtrachea.trachea.material import Material
-
-#: What counts as a normal press on the midline, and as one contact point: mm, rad; share.
-COVERED = 1e-5
 
 
 class Simulation(NamedTuple):

@@ -22,8 +22,10 @@ from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import Mesh
 
-#: Share of the whole motion below which a part of it counts as rounding.
-ROUNDING = 1e-6
+#: What counts as a normal press on the midline and as one contact point: rad, mm, and share of the
+#: motion. Patches of a mesh with a mirror plane are not its mirror images to the last corner: a
+#: tool in the plane touches up to 2e-5 rad beside it.
+COVERED = 1e-4
 
 #: Distance between the circles of the dent's centres: share of the tool's size; mm at least.
 FOOTPRINT, LEAST = 0.6, 4.0
@@ -268,18 +270,18 @@ def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> Facts:
     along, way = np.abs(moved[:, 0]), np.sqrt((moved**2).sum(axis=1))
     whole = max(way[touching].max(initial=0), 1e-9)  # not what the tool goes before it touches
     share = lambda v: float(v.max(initial=0) / whole)  # noqa: E731
-    keep = lambda v: v if v > ROUNDING else 0.0  # noqa: E731
+    keep = lambda v: v if v > COVERED else 0.0  # noqa: E731
     angles = np.abs(phi[touching])
     slip = np.hypot(along, across)[touching].max(initial=0)
     x = np.asarray(scene.geometry.ring_positions, float)
     return Facts(
         poses=isinstance(path, Poses),
         angle=keep(float(angles.max(initial=0))),
-        seats=bool(np.ptp(s[touching]) + np.ptp(phi[touching]) > ROUNDING * whole)
+        seats=bool(np.ptp(s[touching]) + np.ptp(phi[touching]) > COVERED * whole)
         if touching.any() else False,
         along=keep(share(along[touching])),
         across=keep(share(across[touching])),
-        slip=float(slip) if slip > ROUNDING * whole else 0.0,
+        slip=float(slip) if slip > COVERED * whole else 0.0,
         spacing=float(np.diff(x).min()) if len(x) > 1 else float(scene.geometry.length),
         friction=scene.friction is not None,
         known=frozenset(name for name in optional if getattr(material, name) is not None),

@@ -124,8 +124,7 @@ def commands_section(rows: list[dict]) -> str:
         for r in timed
     ]
     found = "; ".join(
-        f"`{r['case']}` keeps {r['kept']} and finds them again, compiles {r['asked'] - r['hits']} "
-        f"anew, {r['added']} of them for long enough to be kept now"
+        f"`{r['case']}` keeps {r['kept']}, a warm start finds {r['hits']} of the {r['asked']} it needs"
         for r in rows
         if r["table"] == "cache"
     )
@@ -172,5 +171,5 @@ trust region). Times are per lane. In brackets: ratio of the smallest samples.
 """
 COMMANDS = """\
 Whole processes. Cold: the folder of compiled programs is empty; warm: as the cold start left it.
-`fit` is that of the README, `simulate` that of `configs/normal.toml`. jax keeps programs that take
-a second or more to compile; that a warm start finds all of these is asserted. Of its programs """
+`fit` is that of the README, `simulate` that of `configs/normal.toml`. That a warm start compiles
+nothing is asserted. Programs: """

@@ -45,7 +45,7 @@ def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **ho
 
 def seated(p, unfit=None):
     """The presses and their statuses; those at another point than the first are refused."""
-    refused = ~((jnp.abs(p.s - p.s[0]) <= 1e-5) & (jnp.abs(p.phi - p.phi[0]) <= 1e-5))
+    refused = ~((jnp.abs(p.s - p.s[0]) <= 1e-4) & (jnp.abs(p.phi - p.phi[0]) <= 1e-4))
     refused = refused if unfit is None else unfit | refused
     led = jnp.where(refused[:, None], jnp.nan, p.displacement)
     return led, lambda status: jnp.where(refused, PressStatus.OFF_PLAN, status)
@@ -74,8 +74,8 @@ def move_surface(scene, s, phi, out, kind):
 def normal(scene, m, p):
     """A normal press; its scalars as vectors, rows that are none of its kind refused."""
     D = jnp.abs(p.displacement)
-    oblique = jnp.maximum(D[:, 0], D[:, 2]) > 1e-5 * D[:, 1] + 1e-5
-    unfit = ~(jnp.abs(p.phi) <= 1e-5) | oblique
+    oblique = jnp.maximum(D[:, 0], D[:, 2]) > 1e-4 * D[:, 1] + 1e-4
+    unfit = ~(jnp.abs(p.phi) <= 1e-4) | oblique
     led, status = seated(p, unfit)
     inward = -led[:, 1]
     out = press(scene.geometry, m, p.s[0], inward)

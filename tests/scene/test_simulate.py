@@ -37,9 +37,11 @@ from jaxtrachea import (
 from jaxtrachea.contact.shapes import box, sphere
 from jaxtrachea.scene.stage import touch_tube
 from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.tube import make_tube
 
 run = jax.jit(simulate)
+FINE = make_tube(table_1())
 
 
 def test_one_plane_agrees_with_vectors():
@@ -143,6 +145,17 @@ def test_sweep_agrees_with_single_presses_whatever_the_chunk():
         out.compliance[i], (one.skeleton @ inward) / (one.force @ inward), rtol=1e-12
     )
     np.testing.assert_allclose(out.force[3], out.force[5], rtol=1e-9)  # mirror image
+
+
+def test_a_ball_in_the_plane_of_symmetry_is_on_the_midline_everywhere():
+    """A mesh with a mirror plane: the contact is in it, wherever between and on the rings."""
+    along = np.linspace(21.3, 138.7, 200)
+    at = np.stack([along, np.full(200, OUTER + 5 - 1.5), np.zeros(200)], axis=1)
+    path = Poses(np.tile(np.eye(3), (200, 1, 1)), at)
+    wishes = dataclasses.replace(BARE, seat="each")
+    scene = make_scene(table_1(), MATERIAL, path, tool=sphere(5.0), mesh=FINE, wishes=wishes)
+    assert not scene.plan.second_plane
+    assert run(scene, MATERIAL, path).status.tolist() == [PressStatus.OK] * 200
 
 
 @pytest.mark.slow
