@@ -19,7 +19,8 @@ from jaxtrachea.tradeoff.errors import Errors, compare, relative, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
 
-#: Turns in which the rungs are called one after the other, so that all see the same machine.
+#: Turns in which the rungs of a ladder are called one after the other, so that all see the same
+#: machine.
 TURNS = 10
 
 Report = Callable[[str], None]
@@ -76,8 +77,10 @@ def measure(
         check_curves(full.path, curves)
     found, left_out = ladders(full)
     solved: dict[Levels, Solved] = {}
-    points, programs = [], {}
+    kept: dict[Levels, Compiled] = {}
+    rows = []
     for ladder in found:
+        programs, points = {}, []
         finest = ladder.levels(full, list(ladder.rungs)[-1])
         for rung in _picked(ladder, settings.quick):
             levels = ladder.levels(full, rung)
@@ -85,17 +88,21 @@ def measure(
             for one in (finest, levels):
                 if one not in solved:
                     solved[one] = _solved(full, one)
-            if levels not in programs:
-                programs[levels] = compiled(full, levels, settings.lanes)
+            programs[levels] = kept.get(levels) or compiled(full, levels, settings.lanes)
             errors = _errors(solved[levels], solved[finest])
             point = _point(name, ladder, rung, levels == finest, errors)
             if curves:
                 point["data"] = against(full, solved[levels], curves, radius)
             points.append((levels, point))
-    report("timing")
-    times = timed(programs, settings)
-    end = _environment(settings)
-    rows = [point | {"times": times[levels]} | end for levels, point in points]
+        report(f"{ladder.name}: timing")
+        times = timed(programs, settings)
+        end = _environment(settings)
+        rows += [point | {"times": times[levels]} | end for levels, point in points]
+        # A system allows a process so many memory maps (Linux: 65,530), and a program takes
+        # hundreds: what is not needed again goes.
+        kept = {levels: made for levels, made in programs.items() if levels == full.levels} or kept
+        del programs
+        jax.clear_caches()
     return rows + [{"scene": name, "ladder": k, "left_out": v} for k, v in left_out.items()]
 
 

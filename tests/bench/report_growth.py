@@ -124,7 +124,7 @@ def commands_section(rows: list[dict]) -> str:
         for r in timed
     ]
     found = "; ".join(
-        f"`{r['case']}` keeps {r['kept']}, a warm start finds {r['hits']} of the {r['asked']} it needs"
+        f"`{r['case']}` keeps {r['kept']}, of which a warm start finds {r['hits']} of {r['asked']}"
         for r in rows
         if r["table"] == "cache"
     )

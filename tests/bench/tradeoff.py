@@ -63,6 +63,8 @@ def scene(name: str, settings) -> None:
 
 def choices(names: list[str], settings) -> None:
     """Choose plans for these scenes at every tolerance, and time them against the full ones."""
+    import jax
+
     from jaxtrachea.tradeoff.choice import choose
     from jaxtrachea.tradeoff.measure import choice_row, compiled, timed
     from jaxtrachea.tradeoff.page import lines
@@ -76,6 +78,8 @@ def choices(names: list[str], settings) -> None:
         times = timed(programs, settings)
         rows += [choice_row(name, full, choice, times, settings) for choice in found]
         (FOLDER / "choice.jsonl").write_text(lines(rows), "utf-8")
+        del programs
+        jax.clear_caches()  # programs of one scene at a time: see measure
 
 
 def main() -> None:
