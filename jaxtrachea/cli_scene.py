@@ -157,7 +157,10 @@ def _chosen(path: Path, spec, staged):
             bar.update(task, description=f"choosing: {text}", advance=1)
 
         wish = spec.plan
-        choice = choose(full, wish.tolerance, report, precision=wish.precision)
+        try:
+            choice = choose(full, wish.tolerance, report, precision=wish.precision)
+        except PlanError as error:
+            raise Stop(f"{path}: plan.tolerance: {error}") from None
     chosen = {name: getattr(choice, name) for name in ("scene", "material", "path")}
     return staged._replace(**chosen), choice
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,10 @@ def test_exceptions_are_few():
 def test_document_follows_the_table():
     text = DOCUMENT.read_text()
     assert skeleton(text) == skeleton(page(CASES, [])), "run tests/reference/hard_cases_page.py"
+    assert "; 0 numbers that are not finite where they must be." in text
+    cells = re.findall(r"\| ([0-9.e+-]+) of ([0-9.e+-]+) (?=\|)", text)
+    assert len(cells) > 400
+    assert all(float(error) <= float(limit) for error, limit in cells)
 
 
 def test_every_kind_of_fault_is_seen():

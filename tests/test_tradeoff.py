@@ -12,13 +12,16 @@ import pytest
 from run_cli import run
 
 from jaxtrachea.scene.build import stage
+from jaxtrachea.scene.plan import PlanError
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import SceneSpec
+from jaxtrachea.tradeoff import choice as choosing
 from jaxtrachea.tradeoff import measure as measuring
 from jaxtrachea.tradeoff.choice import choose
-from jaxtrachea.tradeoff.errors import relative, remesh, spread
+from jaxtrachea.tradeoff.errors import Errors, relative, remesh, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import full_scene, kept_rings
+from jaxtrachea.tradeoff.page import choice_rows
 from jaxtrachea.tradeoff.plots import pareto
 
 K_1, K_3, DEPTH = 0.3, 0.02, 4.0
@@ -198,6 +201,40 @@ def test_two_effects_within_tolerance_can_break_it_together():
     both = solve(plan(shear=False, local="uniform"), made.material, made.path)
     assert off(solve(choice.scene, made.material, made.path), reference) <= tolerance
     assert off(both, reference) > 0
+
+
+def test_a_tolerance_needs_something_to_be_measured_by():
+    lifted = SCENE | {"path": SCENE["path"] | {"displacement": ["0 mm", "1 mm", "0 mm"]},
+                      "model": {"contact": "unilateral"}}  # fmt: skip
+    with pytest.raises(PlanError, match="no row of the path is solved with a force"):
+        choose(full_scene(*staged(lifted)), 0.1)
+
+
+def test_of_rungs_that_cost_the_same_the_best_is_taken():
+    """Sharpness of the contact is free: the sharpest within the tolerance, and no other is kept."""
+    full = full_scene(*staged())
+    rungs = {name: {"kept": i} for i, name in enumerate(("worst", "best", "good"))}
+    ladder = Ladder("made up", "truncation", rungs | {"finest": {}}, {})
+    errors = {0: 0.5, 1: 0.001, 2: 0.01}
+    trial = object.__new__(choosing._Trial)
+    trial.full, trial.report, trial.saved = full, lambda text: None, lambda levels: 0.25
+    trial.errors = lambda levels: Errors(errors[levels.kept], None, None, None, None, None)
+    refused = []
+    assert choosing._within(trial, ladder, 0.1, refused).level == "best"
+    assert not refused
+    assert choosing._within(trial, ladder, 1e-4, refused) is None
+    assert {rung.level for rung in refused} == set(rungs)
+
+
+def test_a_choice_can_be_shown():
+    full = full_scene(*staged())
+    choice = choose(full, 0.1, precision="float64")
+    times = {v: {"call": {"median": 1e-5}} for v in (choice.levels, full.levels)}
+    row = measuring.choice_row("small", full, choice, times, measuring.Settings())
+    ((*_, error, cost, calls, ratio),) = choice_rows([json.loads(json.dumps(row))])
+    assert (calls, ratio) == ("10 / 10", "1.00")
+    assert float(error.removesuffix(" %")) <= 10
+    assert float(cost.removesuffix(" %")) < 100
 
 
 def test_a_wish_is_kept():

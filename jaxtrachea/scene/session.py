@@ -106,9 +106,9 @@ class Session:
 
         def run(packed, _, *pose):
             seat, result = _step(scene, material, _unpack(packed, start), *pose)
-            return _pack(seat, self.dtype), result
+            return _pack(seat), result
 
-        self._start = np.asarray(_pack(start, self.dtype))
+        self._start = np.asarray(_pack(start))
         empty = jax.eval_shape(run, self._start, None, *pose)[1]
         zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), empty)
         # Donated: the new state and result are written where the old ones were.
@@ -160,9 +160,15 @@ class Session:
         return Latency(len(taken), float(median), float(p99), float(taken.max()), edges, counts)
 
 
-def _pack(seat: Seat, dtype) -> Float[Array, " numbers"]:
-    """One array instead of 38: each costs some 2 us a step. Flags and statuses are held exactly."""
-    return jnp.concatenate([jnp.ravel(v).astype(dtype) for v in jax.tree.leaves(seat)])
+def _pack(seat: Seat) -> Float[Array, " numbers"]:
+    """One array instead of 38: each costs some 2 us a step. All is held exactly."""
+    leaves = jax.tree.leaves(seat)
+    widest = max((v.dtype for v in leaves if jnp.issubdtype(v.dtype, jnp.floating)), key=_bits)
+    return jnp.concatenate([jnp.ravel(v).astype(widest) for v in leaves])
+
+
+def _bits(dtype) -> int:
+    return jnp.finfo(dtype).bits
 
 
 def _unpack(packed: Float[Array, " numbers"], like: Seat) -> Seat:

@@ -24,23 +24,26 @@ epsilon, and the largest allowed, of the array that comes nearest to its limit, 
 either mode. A dash: the model has no answer there, and says so by its status, or the dtype cannot
 hold it; a question mark: not measured yet.
 
-**Limits** follow from the truth alone, never from what the code gives. Every input in turn is moved
-by the same small fraction of itself; what the truth moves, added over all inputs, per unit of that
-fraction, is its spread (`tests/reference/hard_cases_condition.py`; of derivatives, by second
+**Limits** follow from the truth alone in all rows but six, which say why. Every input in turn is
+moved by the same small fraction of itself; what the truth moves, added over all inputs, per unit of
+that fraction, is its spread (`tests/reference/hard_cases_condition.py`; of derivatives, by second
 differences in 260 digits). An error is within its limit up to
 
     {value:g} epsilon (size + spread), of a derivative {gradient:g} epsilon (size + spread),
 
-in all rows and both dtypes: what {value:g} roundings of the inputs would do to exact arithmetic; a
-derivative takes up to four times the operations of its value. Positions on one line (rings, ends,
-C) enter by their differences, which floating point forms without an error of its own: there it is
-the spans between neighbours that are moved. Angles enter by directions, whose entries are of size
-1: less than 1 rad is moved as if it were 1 rad. Where another limit is needed, it is listed with
-its reason below the table.
+in both dtypes: what {value:g} roundings of the inputs would do to exact arithmetic. The two numbers
+are chosen (a reverse gradient takes up to four times the operations of its value), the rest is
+derived. Positions on one line (rings, ends, C) enter by their differences, which floating point
+forms without an error of its own: there it is the spans between neighbours that are moved. Angles
+enter by directions, whose entries are of size 1: less than 1 rad is moved as if it were 1 rad.
+Where another limit is needed, it is listed with its reason below the table.
 
 Some derivatives are far below y/x, the size of a derivative of a power law: what hardly depends on
 an input any more is known to rounding of y, not to its own. Where it is said below a table, the
 size of such a derivative is taken as y/x.
+"""
+_WORST = """
+**Worst**, {rows} rows on {where}: {worst}; {nans} numbers that are not finite where they must be.
 """
 
 
@@ -67,10 +70,12 @@ def as_dict(outcome: Outcome) -> dict:
     return {n: hide(v) for n, v in plain.items()}
 
 
-def page(cases: list[Case], outcomes: list[Outcome]) -> str:
-    """The page, with the errors measured."""
+def page(cases: list[Case], outcomes: list[Outcome], where: str = "") -> str:
+    """The page, with the errors measured; `where`: device and versions."""
     by = {(o.case, o.dtype): o for o in outcomes}
     parts = [_HEAD.format(**ROUNDINGS)]
+    if outcomes:
+        parts.append(_worst(outcomes, where))
     for function in dict.fromkeys(c.function for c in cases):
         rows = [c for c in cases if c.function == function]
         parts.append(f"\n## {function}\n\n{_about(function)}\n\n{_table(rows, by)}\n")
@@ -78,8 +83,20 @@ def page(cases: list[Case], outcomes: list[Outcome]) -> str:
     return "".join(parts)
 
 
+def _worst(outcomes: list[Outcome], where: str) -> str:
+    """Worst errors over their limits by dtype, and how many numbers are not finite."""
+    said = []
+    for dtype in dict.fromkeys(o.dtype for o in outcomes):
+        own = [o for o in outcomes if o.dtype == dtype]
+        value, gradient = max(o.value for o in own), max(o.gradient for o in own)
+        said.append(f"{dtype}: values {value:.2g}, derivatives {gradient:.2g} of their limits")
+    nans = sum(o.nans for o in outcomes)
+    return _WORST.format(rows=len(outcomes), where=where, worst="; ".join(said), nans=nans)
+
+
 def skeleton(text: str) -> str:
     """The page without its measured numbers: what must follow from the table alone."""
+    text = re.sub(r"\n\*\*Worst\*\*[^\n]*\n", "", text)
     return re.sub(r"\| ([-?]|[0-9.e+-]+ of [0-9.e+-]+) (?=\|)", "| # ", text)
 
 

@@ -16,10 +16,11 @@ import numpy as np
 from jaxtrachea import status as _status
 
 DTYPES = ("float64", "float32")
-#: Roundings allowed to every value, and to every derivative, which takes up to four times the
-#: operations (Griewank and Walther, "Evaluating Derivatives", 2008, doi:10.1137/1.9780898717761):
-#: an error is at most this many epsilon times the size of the truth and of what the truth moves
-#: when every input is moved by the fraction 1 (to first order): eps (|y| + sum |x dy/dx|).
+#: Roundings allowed to every value, and to every derivative: chosen, not derived; a reverse
+#: gradient takes up to four times the operations of its value (Griewank and Walther, "Evaluating
+#: Derivatives", 2008, doi:10.1137/1.9780898717761). An error is at most this many epsilon times the
+#: size of the truth and of what the truth moves when every input is moved by the fraction 1 (to
+#: first order): eps (|y| + sum |x dy/dx|).
 ROUNDINGS = {"value": 8.0, "gradient": 32.0}
 CASES, TRUTH = (files("jaxtrachea.selfcheck") / name for name in ("cases.toml", "truth.json"))
 _ENTRY = re.compile(r"(\w+)\[(\d+)\]")

@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._numerics import epsilon
@@ -59,17 +60,19 @@ class Runs(eqx.Module):
 
 
 def runs(s: Float[Array, " vertices"], spacing: Float[Array, ""]) -> Runs:
-    """Put vertices in order (concrete numbers).
+    """Put vertices in order (concrete numbers; traced ones become one run of all).
 
     Args:
         s: of the vertices, mm.
         spacing: between the circles of the centres, mm.
     """
+    if isinstance(s, Tracer) or isinstance(spacing, Tracer):
+        return Runs(None, None, (len(s),) * 4)
     at = np.asarray(s, float)
     order = np.argsort(at, kind="stable")
     at = at[order]
     longest = tuple(
-        int((np.searchsorted(at, at + 2 * half, side="right") - np.arange(len(at))).max())
+        int((np.searchsorted(at, at + 2 * half, side="right") - np.arange(len(at))).max(initial=0))
         for half in (_half_width(circles, float(spacing)) for circles in range(4))
     )
     if (np.diff(order) > 0).all():

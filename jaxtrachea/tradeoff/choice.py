@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.operations import count_operations
-from jaxtrachea.scene.plan import Effect, Plan
+from jaxtrachea.scene.plan import Effect, Plan, PlanError
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
@@ -107,6 +107,9 @@ def choose(
         tolerance: largest error of force, joints and surface, relative to the largest value.
         report: called with what is tried next; may raise to stop.
         precision: `auto`: float32 where that is within the tolerance.
+
+    Raises:
+        PlanError: the path, or a sample path beside it, has no row with a force.
     """
     trial, every = _Trial(full, report), _ladders(full, precision)
     refused: list[Rung] = []
@@ -147,6 +150,13 @@ class _Trial:
         self.costs: dict[Levels, float] = {}
         report("full program")
         self.reference = self._run(full.levels)
+        pressed = np.nan_to_num(self.reference.force).any(axis=(1, 2))
+        if not pressed.all():
+            where = "the path" + (" a quarter of a ring spacing beside it" if pressed[0] else "")
+            raise PlanError(
+                f"no row of {where} is solved with a force: nothing that a tolerance could be "
+                "measured by; press deeper, further from the ends, or take no tolerance"
+            )
 
     def errors(self, levels: Levels) -> Errors:
         if levels not in self.known:
@@ -213,18 +223,25 @@ def _ladders(full: Full, precision: str) -> list[Ladder]:
 def _within(
     trial: _Trial, ladder: Ladder, tolerance: float, refused: list[Rung], above: Rung | None = None
 ) -> Rung | None:
-    """The cheapest rung that is within the tolerance alone; dearer than `above` if given."""
+    """The cheapest rung within the tolerance alone, of equal ones that which errs least.
+
+    Dearer than `above` if given.
+    """
     names = list(ladder.rungs)[:-1]
-    costs = {name: trial.saved(ladder.levels(trial.full, name)) for name in names}
-    for name in sorted(names, key=lambda n: -costs[n]):
-        if costs[name] <= 0 or (above is not None and costs[name] >= above.saved):
+    saved = {name: trial.saved(ladder.levels(trial.full, name)) for name in names}
+    for worth in sorted(set(saved.values()), reverse=True):
+        if worth <= 0 or (above is not None and worth >= above.saved):
             continue
-        trial.report(f"{ladder.name} {name}")
-        rung = Rung(ladder.name, name, trial.errors(ladder.levels(trial.full, name)), costs[name])
-        if rung.errors.worst <= tolerance:
-            return rung
+        rungs = []
+        for name in (name for name in names if saved[name] == worth):
+            trial.report(f"{ladder.name} {name}")
+            errors = trial.errors(ladder.levels(trial.full, name))
+            rungs.append(Rung(ladder.name, name, errors, worth))
+        best = min(rungs, key=lambda rung: rung.errors.worst)
+        if best.errors.worst <= tolerance:
+            return best
         if above is None:
-            refused.append(rung)
+            refused += rungs
     return None
 
 

@@ -86,7 +86,7 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
         found.append([
             row["scene"], f"{100 * row['tolerance']:g} %", dropped or "nothing", refused or "-",
             returned or "-",
-            f"{100 * worst:.2g} %", f"{100 * row['operations']:.0f} %",
+            f"{100 * worst:.2g} %", f"{100 * row['cost']:.0f} %",
             f"{_micro(call['chosen'])} / {_micro(call['full'])}",
             f"{call['chosen'] / call['full']:.2f}",
         ])  # fmt: skip

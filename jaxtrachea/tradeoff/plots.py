@@ -63,7 +63,6 @@ def _panel(axis, points, panel: str, colours) -> None:
         if gradient
         else "largest error: force, joints, surface"
     )
-    axis.set_ylim(1e-5, 1e-2)
     axis.set_ylabel("time of a call with derivatives [s]" if gradient else "time of a call [s]")
     for name, at in GOALS.items():
         axis.axhline(at, color="0.5", lw=0.8, ls="--")
@@ -75,6 +74,10 @@ def _panel(axis, points, panel: str, colours) -> None:
     x = np.array([value(p) for p in shown])
     time = [p["times"]["gradient" if gradient else "call"] for p in shown]
     y, high = (np.array([t[k] for t in time]) for k in ("median", "p99"))
+    axis.set_ylim(min(1e-5, y.min() / 2), max(1e-2, 2 * high.max()))
+    lost = ~np.isfinite(x)
+    axis.plot(np.ones(lost.sum()), y[lost], "x", color="0.3", transform=axis.get_yaxis_transform(),
+              clip_on=False, label="infinite error" if lost.any() else None)  # fmt: skip
     x = np.where(np.isfinite(x), np.maximum(x, EXACT), np.nan)
     for name in dict.fromkeys(p["ladder"] for p in shown):
         on = np.array([p["ladder"] == name for p in shown])

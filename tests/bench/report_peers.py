@@ -64,8 +64,7 @@ to which we add the springs. They, OpenSees and the numpy rows (which keep the m
 solve the whole problem each time, also in *beam kept*, where the peers keep their model and ours
 has rings and stiffness as constants of the program. The C loops are our own, written for the
 problem. coal is called from Python for each of 16 capsules and gives no derivatives; ours searches
-two of 16 patches and smooths the gap to be differentiable: the difference is ours, and that of the
-whole update has the same cause. Ours fits 500 specimens in one batch, the solvers 10 one after the
-other; estimates differ by that part of a standard error.
+two of 16 patches and smooths the gap to be differentiable. Ours fits 500 specimens in one batch,
+the solvers 10 one after the other; estimates differ by that part of a standard error.
 
 """

@@ -1,5 +1,6 @@
 """Writes docs/hard_cases.md. Run from the root: python tests/reference/hard_cases_page.py."""
 
+import datetime
 import pathlib
 
 import jax
@@ -14,4 +15,5 @@ if __name__ == "__main__":
     from jaxtrachea.selfcheck.run import run_table
 
     cases = read_cases()
-    DOCUMENT.write_text(page(cases, list(run_table(cases, read_truth(), DTYPES))))
+    where = f"{jax.devices()[0]}, jax {jax.__version__}, {datetime.date.today()}"
+    DOCUMENT.write_text(page(cases, list(run_table(cases, read_truth(), DTYPES)), where))
