@@ -43,6 +43,12 @@ def test_measurements_are_complete(path):
         assert len(rungs) > 1
 
 
+def test_a_scene_with_a_tool_and_one_with_measured_curves_are_there():
+    assert {"table_1", "virtual_trachea"} <= {path.stem for path in SCENES}
+    for path in SCENES:
+        assert path.with_suffix(".png").is_file()
+
+
 def test_choices_hold_their_tolerance_and_are_no_dearer():
     rows = read(FOLDER / "choice.jsonl")
     pairs = [(row["scene"], row["tolerance"]) for row in rows]
