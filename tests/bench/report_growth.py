@@ -169,6 +169,11 @@ by EI_L, k_M, k_1, k_3 and the tool's place (7 numbers), forward mode along the 
 the material. Fit: residual of 4 positions × 50 points, its Jacobian by four parameters,
 and a whole step (residual, Jacobian, normal equations, one more residual for the curvature, the
 trust region). Times are per lane. In brackets: ratio of the smallest samples.
+
+Why reverse mode misses its goal: the surface's backward pass becomes one kernel that computes
+everything anew for each of the 20 rows of a padded table (profiled); many poses together are held
+up by fresh memory besides (17 MB an array at 64). Batches of few poses, or forward mode for few
+parameters, cost less. A step of the fit has a second residual in it.
 """
 COMMANDS = """\
 Whole processes. Cold: the folder of compiled programs is empty; warm: as the cold start left it.
