@@ -171,9 +171,9 @@ and a whole step (residual, Jacobian, normal equations, one more residual for th
 trust region). Times are per lane. In brackets: ratio of the smallest samples.
 
 Why reverse mode misses its goal: the surface's backward pass becomes one kernel that computes
-everything anew for each of the 20 rows of a padded table (profiled); many poses together are held
-up by fresh memory besides (17 MB an array at 64). Batches of few poses, or forward mode for few
-parameters, cost less. A step of the fit has a second residual in it.
+everything anew for each of the 20 rows of a padded table (profiled); with many poses together fresh
+memory is likely to come to that (17 MB an array at 64; not proven). Forward mode costs less for few
+parameters. A step of the fit has a second residual in it.
 """
 COMMANDS = """\
 Whole processes. Cold: the folder of compiled programs is empty; warm: as the cold start left it.
