@@ -88,7 +88,7 @@ def set_up_jax() -> None:
     if wanted and chosen is None and (folder := cache_folder()) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
     if wanted and "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        # Also the many small ones, which jax leaves out by itself: they make up half of a start.
+        # Also the many small ones, which jax leaves out by itself: about a quarter of a start.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 

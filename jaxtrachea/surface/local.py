@@ -77,8 +77,7 @@ def runs(s: Float[Array, " vertices"], spacing: Float[Array, ""]) -> Runs:
     )
     if (np.diff(order) > 0).all():
         return Runs(None, None, longest)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
+    rank = np.argsort(order)
     return Runs(jnp.asarray(order, jnp.int32), jnp.asarray(rank, jnp.int32), longest)
 
 
