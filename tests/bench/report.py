@@ -185,9 +185,9 @@ turns of 1,000. The tool touches the mesh itself (16 patches of up to 128 corner
 capsule, and the angular weights prepared; called through ctypes. coal is called once for each of 16
 capsules. The paper states 10 kHz for the skeleton and 1 kHz with the surface (100 and 1,000 µs).
 
-Single calls of the whole update take two to three times as long as the C loop, with a dent. The contact alone is
-compiled to some 125 small kernels in a row; that their starts cost more than their work is the
-likely reason, since 256 poses together pay 9 to 16 µs each for contact and skeleton.
+With a dent, single calls of the whole update take two to three times as long as the C loop. The
+contact alone is compiled to some 125 small kernels in a row; that their starts cost more than their
+work is the likely reason, since 256 poses together pay 9 to 16 µs each for contact and skeleton.
 Slow calls come to all rows, the C loop included: the core is shared.
 """
 COHORT = """\
