@@ -22,7 +22,7 @@ from jaxtrachea.tradeoff.errors import Errors, relative, remesh, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import full_scene, kept_rings
 from jaxtrachea.tradeoff.page import choice_rows
-from jaxtrachea.tradeoff.plots import pareto
+from jaxtrachea.tradeoff.plots import draw, pareto
 
 K_1, K_3, DEPTH = 0.3, 0.02, 4.0
 SCENE = {
@@ -77,6 +77,31 @@ def test_a_coarse_mesh_is_interpolated_where_the_fine_one_has_vertices():
 def test_pareto_front_by_hand():
     x, y = np.array([1.0, 2, 3, 1, np.nan]), np.array([5.0, 6, 1, 4, 0])
     assert pareto(x, y).tolist() == [3, 2]
+
+
+def test_every_point_lies_within_its_panel():
+    """Of the four panels one stays empty; times beyond the usual limits widen theirs."""
+
+    def point(kind, level, error, seconds):
+        time = {"median": seconds, "p99": 3 * seconds}
+        errors = {"force": error, "joints": None, "surface": error / 2, "gradient": error}
+        times = {"call": time, "gradient": time}
+        return {"ladder": "l", "kind": kind, "level": level, "errors": errors, "times": times}
+
+    points = [point("algebra", "a", 0.0, 2e-6), point("algebra", "b", 1e-3, 0.05),
+              point("model", "c", np.inf, 1e-3)]  # fmt: skip
+    figure = draw(points, "scene")
+    limits = [axis.get_ylim() for axis in figure.axes]
+    assert limits[1] == (1e-5, 1e-2)  # Empty.
+    assert limits[2] == (1e-5, 1e-2)
+    for low, high in (limits[0], limits[3]):
+        assert low < 2e-6
+        assert high > 3 * 0.05
+    figure.draw_without_rendering()
+    for axis in figure.axes:
+        box = axis.get_tightbbox()
+        assert box is not None
+        assert min(box.x0, box.y0) >= 0
 
 
 def test_ladders_of_a_scene_and_why_others_are_left_out():

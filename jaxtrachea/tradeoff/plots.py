@@ -58,6 +58,7 @@ def _panel(axis, points, panel: str, colours) -> None:
     gradient = panel == "gradient"
     shown = [p for p in points if gradient or p["kind"] == panel]
     axis.set(xscale="log", yscale="log", title=panel if not gradient else "gradient, all kinds")
+    axis.set_ylim(1e-5, 1e-2)
     axis.set_xlabel(
         "error of d force / d log parameter"
         if gradient
@@ -74,10 +75,12 @@ def _panel(axis, points, panel: str, colours) -> None:
     x = np.array([value(p) for p in shown])
     time = [p["times"]["gradient" if gradient else "call"] for p in shown]
     y, high = (np.array([t[k] for t in time]) for k in ("median", "p99"))
-    axis.set_ylim(min(1e-5, y.min() / 2), max(1e-2, 2 * high.max()))
+    low, top = axis.get_ylim()
+    axis.set_ylim(min(low, y.min() / 2), max(top, 2 * high.max()))
     lost = ~np.isfinite(x)
-    axis.plot(np.ones(lost.sum()), y[lost], "x", color="0.3", transform=axis.get_yaxis_transform(),
-              clip_on=False, label="infinite error" if lost.any() else None)  # fmt: skip
+    if lost.any():
+        axis.plot(np.ones(lost.sum()), y[lost], "x", color="0.3", clip_on=False,
+                  transform=axis.get_yaxis_transform(), label="infinite error")  # fmt: skip
     x = np.where(np.isfinite(x), np.maximum(x, EXACT), np.nan)
     for name in dict.fromkeys(p["ladder"] for p in shown):
         on = np.array([p["ladder"] == name for p in shown])
