@@ -175,7 +175,8 @@ def global_shape(v: Values) -> Answer:
     patch = jnp.searchsorted(x, v["s"], side="right").astype(jnp.int32)
     span = (nodes[1:] - nodes[:-1])[patch]
     fraction = jnp.clip((v["s"] - nodes[patch]) / span, 0, 1)
-    binding = Binding(v["s"], v["phi"], patch, fraction, nodes, v["alpha"])
+    s, phi, fraction = (w[:, None] for w in (v["s"], v["phi"], fraction))
+    binding = Binding(s, phi, fraction, patch, nodes, v["alpha"])
     row = lambda y: jnp.broadcast_to(y[..., None], (*y.shape, 3))  # noqa: E731
     keys: Keys = clamped(v["s_c"], row(v["w_C"]), row(v["J"]), row(v["U"]), row(v["V"]))
     moved = interpolate(binding, weigh(binding, v["phi_c"]), keys, method="linear")

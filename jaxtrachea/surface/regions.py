@@ -27,6 +27,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import epsilon
+from jaxtrachea.surface.blocks import Blocks, in_blocks, to_blocks, to_vertices
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh
 
@@ -43,28 +44,30 @@ class Binding(eqx.Module):
     """Where every vertex stands among the nodes; depends on the rest state alone.
 
     Attributes:
-        s: position along the centreline, mm; shape (vertices,).
+        s: position along the centreline, mm; shape (blocks, width), see `blocks`.
         phi: angle round it, rad.
-        patch: index of the node below each vertex.
         fraction: way to the node above, in [0, 1].
+        patch: index of the node below the vertices of each block.
         nodes: A, rings, B, mm; shape (nodes,).
         half_angle: of the rings, rad.
+        blocks: in which the vertices stand; None: each is a block of its own.
     """
 
-    s: Float[Array, " vertices"]
-    phi: Float[Array, " vertices"]
-    patch: Int[Array, " vertices"]
-    fraction: Float[Array, " vertices"]
+    s: Float[Array, "blocks width"]
+    phi: Float[Array, "blocks width"]
+    fraction: Float[Array, "blocks width"]
+    patch: Int[Array, " blocks"]
     nodes: Float[Array, " nodes"]
     half_angle: Float[Array, ""]
+    blocks: Blocks | None = None
 
 
 class Weights(eqx.Module):
     """Share of the lines U, J and V in the motion of every vertex; they add up to 1."""
 
-    U: Float[Array, " vertices"]
-    J: Float[Array, " vertices"]
-    V: Float[Array, " vertices"]
+    U: Float[Array, "blocks width"]
+    J: Float[Array, "blocks width"]
+    V: Float[Array, "blocks width"]
     phi_c: Float[Array, ""]
 
 
@@ -130,10 +133,12 @@ def bind(mesh: Mesh, geometry: Geometry) -> Binding:
     inner = geometry.ring_positions
     nodes = jnp.concatenate([jnp.zeros_like(inner[:1]), inner, geometry.length[None]])
     patch = jnp.searchsorted(inner, mesh.s, side="right").astype(jnp.int32)
-    span = (nodes[1:] - nodes[:-1])[patch]
-    fraction = jnp.clip((mesh.s - nodes[patch]) / span, 0, 1)
-    s = jnp.clip(mesh.s, nodes[0], nodes[-1])
-    return Binding(s, mesh.phi, patch, fraction, nodes, geometry.half_angle)
+    blocks = in_blocks(patch, nodes.shape[0] - 1)
+    s, phi, patch = (to_blocks(v, blocks) for v in (mesh.s, mesh.phi, patch))
+    low, high = nodes[patch], nodes[patch + 1]
+    fraction = jnp.clip((s - low) / (high - low), 0, 1)
+    s = jnp.clip(s, nodes[0], nodes[-1])
+    return Binding(s, phi, fraction, patch[:, 0], nodes, geometry.half_angle, blocks)
 
 
 def weigh(binding: Binding, phi_c: Float[Array, ""]) -> Weights:
@@ -190,81 +195,105 @@ def interpolate(
         if keys.slopes is None or keys.contact_slope is None:
             raise ValueError("method='hermite' needs slopes and contact_slope; or use 'linear'")
         slopes = keys.slopes, keys.contact_slope
-    joints = _joint_line(binding, keys.s_c, keys.joints, keys.contact, slopes)
-    ends = _between(binding, jnp.concatenate([keys.U, keys.V], axis=1))
-    return _mix(weights, ends[:3], joints, ends[3:]).T
-
-
-def _mix(weights: Weights, U, J, V):
-    """Across the regions; rows are components."""
-    u, j, v = (_spread(w, 3) for w in (weights.U, weights.J, weights.V))
-    return u * U + j * J + v * V
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
-def _spread(v, rows: int):
-    """The same row `rows` times.
-
-    Its transpose adds the rows one to another. That of broadcasting is a reduction over three rows,
-    which the compiler hands to a library that takes longer for it than the whole surface does.
-    """
-    return jnp.broadcast_to(v[None], (rows, *v.shape))
-
-
-@functools.partial(_spread.defjvp, symbolic_zeros=True)
-def _spread_jvp(rows, primals, tangents):
-    (v,), (dv,) = primals, tangents
-    value = _spread(v, rows)
-    if isinstance(dv, SymbolicZero):
-        return value, SymbolicZero(jax.typeof(value).to_tangent_aval())
-    return value, jnp.stack([dv] * rows)
-
-
-def _pick(rows, patch, weights):
-    """Combine `rows` (k, patches, c) by `weights` (m, k) and give (m, c, vertices)."""
-    k, patches, c = rows.shape
-    weights = jnp.asarray(np.array(weights, float), rows.dtype)
-    # A matrix product, because the compiler keeps its result: an elementwise table would be merged
-    # into the gather below and computed again for every vertex, several times slower.
-    table = jnp.matmul(weights, rows.reshape(k, -1), precision="highest")
-    table = table.reshape(-1, patches, c).swapaxes(0, 1).reshape(patches, -1)
-    picked = table.at[patch].get(mode="promise_in_bounds")
-    return picked.T.reshape(-1, c, patch.shape[0])
-
-
-def _between(binding: Binding, values):
-    """Linear between the nodes, one row for each component; shape (components, vertices)."""
-    low, rise = _pick(jnp.stack([values[:-1], values[1:]]), binding.patch, [[1, 0], [-1, 1]])
-    return low + _spread(binding.fraction, low.shape[0]) * rise
+    line = _joint_line(binding.nodes, keys.s_c, keys.joints, keys.contact, slopes)
+    u = _mix(binding, weights, keys.s_c, line, keys.U, keys.V)
+    return to_vertices(u, binding.blocks)
 
 
 #: Hermite's cubic c_0 + t (c_1 + t (c_2 + t c_3)) from its values and slopes at both ends.
 HERMITE = [[1, 0, 0, 0], [0, 0, 1, 0], [-3, 3, -2, -1], [2, -2, 1, 1]]
 
 
-def _joint_line(binding: Binding, s_c, joints, contact, slopes: tuple[Array, Array] | None = None):
-    """The J line, with C as one more node; shape (components, vertices).
+def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None = None):
+    """The J line, with C as one more node.
 
     Linear between the nodes; where `slopes` are given (nodes, C), the last components are cubic.
+
+    Returns:
+        Where each patch begins, mm, and one over its length; shape (nodes,). The coefficients of
+        t = 0..1 in it; shape (nodes, 4, components).
     """
-    below = jnp.sum(binding.nodes[1:-1] <= s_c)
-    nodes, values = _insert(binding.nodes, s_c, below), _insert(joints, contact, below)
-    span, low, high = jnp.diff(nodes)[:, None], values[:-1], values[1:]
+    below = jnp.sum(nodes[1:-1] <= s_c)
+    nodes, values = _insert(nodes, s_c, below), _insert(joints, contact, below)
+    span, low, high = jnp.diff(nodes), values[:-1], values[1:]
     leave = land = high - low
     if slopes is not None:
         turn = _insert(slopes[0], slopes[1], below)
         straight = leave[:, : leave.shape[1] - turn.shape[1]]
-        leave, land = (jnp.concatenate([straight, span * v], 1) for v in (turn[:-1], turn[1:]))
-    # Where a patch begins, and one over its length, travel with the values as two more columns.
-    place = jnp.concatenate([nodes[:-1, None], 1 / jnp.where(span > 0, span, jnp.inf)], axis=1)
-    more = jnp.zeros_like(place)
-    low = jnp.concatenate([low, place], axis=1)
-    high, leave, land = (jnp.concatenate([v, more], axis=1) for v in (high, leave, land))
-    patch = binding.patch + (binding.s >= s_c).astype(binding.patch.dtype)
-    c = _pick(jnp.stack([low, high, leave, land]), patch, HERMITE)
-    c_0, c_1, c_2, c_3 = c[:, :-2]
-    t = _spread((binding.s - c[0, -2]) * c[0, -1], c_0.shape[0])
-    return c_0 + t * (c_1 + t * (c_2 + t * c_3))
+        leave, land = (
+            jnp.concatenate([straight, span[:, None] * v], 1) for v in (turn[:-1], turn[1:])
+        )
+    weights = jnp.asarray(np.array(HERMITE, float), low.dtype)
+    cubic = jnp.einsum(
+        "ck,pkd->pcd", weights, jnp.stack([low, high, leave, land], 1), precision="highest"
+    )
+    return nodes[:-1], 1 / jnp.where(span > 0, span, jnp.inf), cubic
+
+
+def _mix(binding: Binding, weights: Weights, s_c, line, U, V):
+    """Along the tube between the nodes, round it between the lines.
+
+    Args:
+        binding: -
+        weights: -
+        s_c: contact position, mm.
+        line: from `_joint_line`.
+        U: values at the nodes; shape (nodes, components).
+        V: -
+
+    Returns:
+        Shape (blocks, components, width).
+    """
+    patch, beyond = binding.patch, binding.s >= s_c
+    begin, density, cubic = line
+    # Of the patch that C splits, a vertex belongs to the lower or to the upper part.
+    side = lambda v: jnp.where(beyond, v[patch + 1][:, None], v[patch][:, None])  # noqa: E731
+    t = (binding.s - side(begin)) * side(density)
+    ends = jnp.stack([U[:-1], U[1:] - U[:-1], V[:-1], V[1:] - V[:-1]], axis=1)
+    table = jnp.concatenate([cubic[patch], cubic[patch + 1], ends[patch]], axis=1)
+    return _combine((weights.U, weights.J, weights.V, t), beyond, binding.fraction, table)
+
+
+@jax.custom_jvp
+def _combine(where, beyond, fraction, table):
+    """Values of the three lines at the vertices, times their weights; linear in `table`.
+
+    Derivatives are written as matrix products, one for each block: their transposes then are such
+    products too. Of the plain sums the compiler makes, going back, a reduction over the vertices
+    for each column of the table, and computes everything anew in each (CPU; three times slower).
+    """
+    U, J, V, t, f = (v[:, None] for v in (*where, fraction))
+    rows = [row[:, :, None] for row in table.swapaxes(0, 1)]
+    a, b, c, d = (
+        jnp.where(beyond[:, None], upper, lower)
+        for lower, upper in zip(rows[:4], rows[4:8], strict=True)
+    )
+    u, along_u, v, along_v = rows[8:]
+    line = a + t * (b + t * (c + t * d))
+    return U * (u + f * along_u) + J * line + V * (v + f * along_v)
+
+
+@functools.partial(_combine.defjvp, symbolic_zeros=True)
+def _combine_jvp(primals, tangents):
+    (where, beyond, fraction, table), (d_where, _, d_fraction, d_table) = primals, tangents
+    still = lambda v: isinstance(v, SymbolicZero)  # noqa: E731
+    real = lambda v: jnp.zeros(v.shape, v.dtype) if still(v) else v  # noqa: E731
+
+    def basis(where, fraction):
+        U, J, V, t = where
+        zero = jnp.zeros_like(J)
+        sides = jnp.where(beyond, zero, J), jnp.where(beyond, J, zero)
+        line = [w * t**k for w in sides for k in range(4)]
+        return jnp.stack([*line, U, U * fraction, V, V * fraction], axis=1)
+
+    product = functools.partial(jnp.einsum, "bkc,bkw->bcw", precision="highest")
+    given = where, fraction
+    change = d_where, d_fraction
+    out = _combine(*primals)
+    if all(map(still, jax.tree.leaves(change, is_leaf=still))):
+        return out, product(real(d_table), basis(*given))
+    matrix, d_matrix = jax.jvp(basis, given, jax.tree.map(real, change, is_leaf=still))
+    return out, product(table, d_matrix) + product(real(d_table), matrix)
 
 
 def _insert(rows, row, below):
@@ -283,10 +312,11 @@ def _phong(binding: Binding, weights: Weights, keys: Keys):
     pole = jnp.where(drawn, 1, -1).astype(alpha.dtype)
     encode = lambda v, phi: _encode(v, phi, pole)  # noqa: E731
     joints, contact = encode(keys.joints.T, weights.phi_c).T, encode(keys.contact, weights.phi_c)
-    line = _joint_line(binding, keys.s_c, joints, contact)
-    both = jnp.concatenate([encode(keys.U.T, -alpha).T, encode(keys.V.T, alpha).T], axis=1)
-    ends = _between(binding, both)
-    return _decode(_mix(weights, ends[:3], line, ends[3:]), binding.phi, pole).T
+    line = _joint_line(binding.nodes, keys.s_c, joints, contact)
+    U, V = encode(keys.U.T, -alpha).T, encode(keys.V.T, alpha).T
+    channels = _mix(binding, weights, keys.s_c, line, U, V)
+    u = _decode(channels.swapaxes(0, 1), binding.phi, pole).swapaxes(0, 1)
+    return to_vertices(u, binding.blocks)
 
 
 def _radial(phi, vector):

@@ -135,20 +135,24 @@ def c_update(scene, dent: int):
     run = ctypes.CDLL(str(target)).update
     run.restype = ctypes.c_double
     b, weights = scene.binding, regions.weigh(scene.binding, jnp.asarray(0.0))
+    each = lambda v: np.broadcast_to(v, b.s.shape).ravel()[b.blocks.place]  # noqa: E731
     offsets, collar = local.pattern(dent) if dent else (np.zeros((0, 2)), np.zeros(0))
     arrays = {
         "x": scene.geometry.ring_positions, "node": b.nodes, "EI": np.full(16, VALUES["EI_L"]),
-        "k": np.full(15, VALUES["k_M"]), "border": BORDERS, "fraction": b.fraction, "s": b.s,
-        "weight": np.stack([weights.U, weights.J, weights.V], axis=1), "rest": scene.mesh.straight,
-        "offset": offsets,
+        "k": np.full(15, VALUES["k_M"]), "border": BORDERS, "fraction": each(b.fraction),
+        "s": each(b.s), "rest": scene.mesh.straight, "offset": offsets,
+        "weight": np.stack([each(w) for w in (weights.U, weights.J, weights.V)], axis=1),
     }  # fmt: skip
     arrays = {k: np.ascontiguousarray(v, float) for k, v in arrays.items()}
-    arrays |= {"patch": np.array(b.patch, np.int32), "collar": np.array(collar, np.int32)}
-    numbers = (len(b.s), 15, len(BORDERS) - 1, dent, 160.0, OUTER, RADIUS)
+    arrays |= {
+        "patch": np.array(each(b.patch[:, None]), np.int32),
+        "collar": np.array(collar, np.int32),
+    }
+    numbers = (len(scene.mesh.s), 15, len(BORDERS) - 1, dent, 160.0, OUTER, RADIUS)
     numbers += (VALUES["k_1"], VALUES["k_3"], float(scene.footprint))
     where = [arrays[name].ctypes.data for name in CScene._arrays]
     given = CScene(*numbers, *where)
-    out = np.empty((len(b.s), 3))
+    out = np.empty((len(scene.mesh.s), 3))
 
     def call(place):
         force = run(ctypes.byref(given), address(place), address(out))
