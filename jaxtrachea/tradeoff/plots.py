@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from jaxtrachea.plots import STYLE
 
-#: Error at which what is exact, or nearly so, is drawn.
+#: Below this an error is rounding: what has no more is drawn as exact, left of all others.
 EXACT = 1e-17
 #: Times that the paper states: skeleton at 10 kHz, surface at 1 kHz; s.
 GOALS = {"100 µs": 1e-4, "1 ms": 1e-3}
@@ -23,7 +23,7 @@ def draw(points: list[dict[str, Any]], title: str) -> Figure:
         title: of the figure.
     """
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(10, 7.6), layout="constrained")
+        figure = Figure(figsize=(11.6, 7.6), layout="constrained")
         figure.suptitle(title)
         colours = _colours(points)
         for axis, panel in zip(figure.subplots(2, 2).flat, PANELS, strict=True):
@@ -58,7 +58,7 @@ def _panel(axis, points, panel: str, colours) -> None:
     gradient = panel == "gradient"
     shown = [p for p in points if gradient or p["kind"] == panel]
     axis.set(xscale="log", yscale="log", title=panel if not gradient else "gradient, all kinds")
-    axis.set_ylim(1e-5, 1e-2)
+    axis.set_ylim(5e-5, 5e-3)
     axis.set_xlabel(
         "error of d force / d log parameter"
         if gradient
@@ -81,17 +81,24 @@ def _panel(axis, points, panel: str, colours) -> None:
     if lost.any():
         axis.plot(np.ones(lost.sum()), y[lost], "x", color="0.3", clip_on=False,
                   transform=axis.get_yaxis_transform(), label="infinite error")  # fmt: skip
-    x = np.where(np.isfinite(x), np.maximum(x, EXACT), np.nan)
+    exact = x <= EXACT
+    left = x[np.isfinite(x) & ~exact].min(initial=1) / 100
+    x = np.where(np.isfinite(x), np.where(exact, left, x), np.nan)
+    axis.set_xlim(left / 3, 3 * np.nanmax(x, initial=100 * left))
+    if exact.any():
+        axis.axvline(left * 10, color="0.8", lw=0.8)
+        axis.annotate("exact", (left, 0.97), xycoords=("data", "axes fraction"), fontsize=7,
+                      ha="center", va="top")  # fmt: skip
     for name in dict.fromkeys(p["ladder"] for p in shown):
         on = np.array([p["ladder"] == name for p in shown])
         up = np.maximum(high[on] - y[on], 0)
         axis.errorbar(x[on], y[on], yerr=[0 * up, up], fmt="o-", ms=4, lw=0.8, elinewidth=0.6,
                       color=colours[name], label=name)  # fmt: skip
         if not gradient:
-            for i in np.flatnonzero(on & np.isfinite(x) & (x > EXACT)):
+            for i in np.flatnonzero(on & np.isfinite(x) & ~exact):
                 axis.annotate(shown[i]["level"], (x[i], y[i]), fontsize=6, xytext=(3, 3),
                               textcoords="offset points")  # fmt: skip
     front = pareto(x, y)
     axis.step(x[front], y[front], where="post", color="k", lw=0.8, label="Pareto front")
     axis.plot(x[front], y[front], "ko", mfc="none", ms=8, lw=0)
-    axis.legend(fontsize=6)
+    axis.legend(fontsize=6, loc="upper left", bbox_to_anchor=(1, 1))
