@@ -205,7 +205,9 @@ def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
     May be traced; derivatives of the surface by geometry go through this. (A new geometry put into
     the scene by hand leaves the surface on the old rings.)
     """
-    binding = None if scene.mesh is None else regions.bind(scene.mesh, geometry)
+    binding = None
+    if scene.mesh is not None:
+        binding = regions.bind(scene.mesh, geometry, scene.binding)
     return dataclasses.replace(scene, geometry=geometry, binding=binding)
 
 

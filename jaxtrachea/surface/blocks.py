@@ -2,7 +2,8 @@
 
 A block is a row of at most `WIDEST` vertices that lie between the same two nodes. Functions of a
 vertex and its patch then need no index for each vertex, and going back, what the vertices of a
-patch add up to is a sum along rows. The last block of a patch is filled up by its first vertex.
+patch add up to is a sum along rows. A row that is not full is filled up by its first vertex. The
+number of rows is that of the worst case: it does not depend on where the nodes are.
 """
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from jaxtyping import Array, Float, Int, Shaped
 
 #: Most vertices in a block.
 WIDEST = 32
-#: Least blocks to a patch, on average: so at most a quarter of the places is filled up.
+#: Least blocks to a patch, on average; filled up are at most a quarter of the number of vertices.
 LEAST = 4
 
 
@@ -24,40 +25,61 @@ class Blocks(eqx.Module):
     Attributes:
         vertex: of each place; beyond the number of vertices where it is only filled up.
         place: of each vertex, counted row by row.
+        order: vertices along the tube.
+        rank: of each vertex in this order.
     """
 
     vertex: Int[Array, "blocks width"]
     place: Int[Array, " vertices"]
+    order: Int[Array, " vertices"]
+    rank: Int[Array, " vertices"]
 
 
-def in_blocks(patch: Int[Array, " vertices"], patches: int) -> Blocks | None:
-    """Group vertices by their patch.
-
-    The shape depends on the numbers of vertices and patches alone.
+def in_blocks(
+    s: Float[Array, " vertices"],
+    patch: Int[Array, " vertices"],
+    patches: int,
+    known: Blocks | None = None,
+) -> Blocks | None:
+    """Group vertices by their patch; everything may be traced.
 
     Args:
-        patch: of each vertex, in [0, patches).
+        s: position of each vertex along the tube.
+        patch: of each vertex, in [0, patches), rising with s.
         patches: number of patches.
+        known: blocks of the same vertices between other nodes, whose order is kept (so that a
+            traced program need not sort).
 
     Returns:
-        The blocks; None if each vertex is to be its own: patches are traced, or have few vertices.
+        The blocks; None if each vertex is to be its own: there are few to a patch.
     """
     vertices = len(patch)
     width = min(WIDEST, vertices // (LEAST * patches))
-    if isinstance(patch, Tracer) or width < 2:
+    if width < 2:
         return None
+    # Concrete numbers by numpy: nothing is compiled for them.
+    given = jax.tree.leaves((s, patch, known))
+    xp = jnp if any(isinstance(v, Tracer) for v in given) else np
+    at, to = xp.asarray(patch, np.int32), lambda n: xp.arange(n, dtype=np.int32)  # noqa: E731
+    if known is None:
+        order = jnp.argsort(s) if xp is jnp else np.argsort(np.asarray(s), kind="stable")
+        order, rank = (xp.asarray(v, np.int32) for v in (order, xp.argsort(order)))
+    else:
+        order, rank = xp.asarray(known.order), xp.asarray(known.rank)
     count = (vertices + patches * (width - 1)) // width
-    at = np.asarray(patch)
-    order = np.argsort(at, kind="stable")
-    inside = np.bincount(at, minlength=patches)
-    first = np.cumsum(inside) - inside
-    used = -(-inside // width)
-    row = np.cumsum(used) - used
-    place = np.empty(vertices, np.int32)
-    place[order] = (row * width - first)[at[order]] + np.arange(vertices)
-    vertex = vertices + np.arange(count * width, dtype=np.int32)
-    vertex[place] = np.arange(vertices)
-    return Blocks(jnp.asarray(vertex.reshape(count, width)), jnp.asarray(place))
+    bounds = xp.searchsorted(at[order], to(patches + 1))
+    first, rows = bounds[:-1], -(-xp.diff(bounds) // width)
+    below = xp.cumsum(rows)
+    place = ((below - rows) * width - first)[at] + rank
+    # Spare rows come last, as if they were of the last patch.
+    row = to(count)
+    owner = xp.minimum(xp.searchsorted(below, row, side="right"), patches - 1)
+    start = first[owner] + (row - (below - rows)[owner]) * width
+    ranks = start[:, None] + to(width)[None]
+    filled = vertices + to(count * width).reshape(count, width)
+    real = ranks < bounds[owner + 1][:, None]
+    vertex = xp.where(real, order[xp.minimum(ranks, vertices - 1)], filled)
+    return Blocks(*(jnp.asarray(v, jnp.int32) for v in (vertex, place, order, rank)))
 
 
 def to_blocks(
@@ -81,7 +103,7 @@ def to_vertices(
 
 @jax.custom_jvp
 def _pick(values, blocks: Blocks):
-    return values.at[blocks.place].get(mode="promise_in_bounds", unique_indices=True)
+    return values.at[blocks.place].get(mode="promise_in_bounds")
 
 
 @_pick.defjvp

@@ -128,17 +128,25 @@ def clamped(
     return Keys(s_c, contact, joints, U, V, slopes, contact_slope)
 
 
-def bind(mesh: Mesh, geometry: Geometry) -> Binding:
-    """Find the patch of every vertex and the fraction of the way through it."""
+def bind(mesh: Mesh, geometry: Geometry, known: Binding | None = None) -> Binding:
+    """Find the patch of every vertex and the fraction of the way through it.
+
+    Args:
+        mesh: -
+        geometry: with the rings.
+        known: binding of the same mesh to other rings: spares sorting the vertices anew.
+    """
     inner = geometry.ring_positions
     nodes = jnp.concatenate([jnp.zeros_like(inner[:1]), inner, geometry.length[None]])
     patch = jnp.searchsorted(inner, mesh.s, side="right").astype(jnp.int32)
-    blocks = in_blocks(patch, nodes.shape[0] - 1)
+    before = None if known is None else known.blocks
+    blocks = in_blocks(mesh.s, patch, nodes.shape[0] - 1, before)
     s, phi, patch = (to_blocks(v, blocks) for v in (mesh.s, mesh.phi, patch))
-    low, high = nodes[patch], nodes[patch + 1]
+    patch = patch[:, 0]
+    low, high = (nodes[v][:, None] for v in (patch, patch + 1))
     fraction = jnp.clip((s - low) / (high - low), 0, 1)
     s = jnp.clip(s, nodes[0], nodes[-1])
-    return Binding(s, phi, fraction, patch[:, 0], nodes, geometry.half_angle, blocks)
+    return Binding(s, phi, fraction, patch, nodes, geometry.half_angle, blocks)
 
 
 def weigh(binding: Binding, phi_c: Float[Array, ""]) -> Weights:
@@ -257,6 +265,14 @@ def _mix(binding: Binding, weights: Weights, s_c, line, U, V):
 @jax.custom_jvp
 def _combine(where, beyond, fraction, table):
     """Values of the three lines at the vertices, times their weights; linear in `table`.
+
+    Args:
+        where: U, J, V and the way t through the patch, or through its part on one side of C; each
+            of shape (blocks, width).
+        beyond: whether on the side away from A.
+        fraction: way through the whole patch.
+        table: rows: coefficients of 1, t, t^2, t^3 on the side of A, and on the other; of U, of
+            the line U by fraction, of V and the line V by it; shape (blocks, 12, components).
 
     Derivatives are written as matrix products, one for each block: their transposes then are such
     products too. Of the plain sums the compiler makes, going back, a reduction over the vertices
