@@ -108,9 +108,9 @@ def gradient_section(rows: list[dict], goals: list[list[str]]) -> str:
         for r in others:
             lines.append([name, r["case"], *map(number, microseconds(r)), quoted(r, value)])
             if r["case"].startswith(WITH_GOAL):
-                own = next(
-                    v for v in (r["case"].replace(DERIVED, "value"), value["case"]) if v in by
-                )
+                own = value["case"]
+                if r["case"].startswith(DERIVED):
+                    own = r["case"].replace(DERIVED, "value")
                 both = [v <= DERIVATIVES for v in ratio(r, by[own])]
                 met = verdict(all(both)) if all(both) or not any(both) else "unclear"
                 goal = f"at most {DERIVATIVES} times"
