@@ -204,7 +204,7 @@ def interpolate(
             raise ValueError("method='hermite' needs slopes and contact_slope; or use 'linear'")
         slopes = keys.slopes, keys.contact_slope
     line = _joint_line(binding.nodes, keys.s_c, keys.joints, keys.contact, slopes)
-    u = _mix(binding, weights, keys.s_c, line, keys.U, keys.V)
+    u = _carry(binding, weights, keys.s_c, line, keys.U, keys.V)
     return to_vertices(u, binding.blocks)
 
 
@@ -238,7 +238,7 @@ def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None 
     return nodes[:-1], 1 / jnp.where(span > 0, span, jnp.inf), cubic
 
 
-def _mix(binding: Binding, weights: Weights, s_c, line, U, V):
+def _carry(binding: Binding, weights: Weights, s_c, line, U, V):
     """Along the tube between the nodes, round it between the lines.
 
     Args:
@@ -330,7 +330,7 @@ def _phong(binding: Binding, weights: Weights, keys: Keys):
     joints, contact = encode(keys.joints.T, weights.phi_c).T, encode(keys.contact, weights.phi_c)
     line = _joint_line(binding.nodes, keys.s_c, joints, contact)
     U, V = encode(keys.U.T, -alpha).T, encode(keys.V.T, alpha).T
-    channels = _mix(binding, weights, keys.s_c, line, U, V)
+    channels = _carry(binding, weights, keys.s_c, line, U, V)
     u = _decode(channels.swapaxes(0, 1), binding.phi, pole).swapaxes(0, 1)
     return to_vertices(u, binding.blocks)
 
