@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxtrachea.mechanics.beam import Beam, deflect
-from jaxtrachea.surface import local, regions
+from jaxtrachea.surface import local, phong, regions
 from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.mesh import Mesh
 from jaxtrachea.trachea.tube import make_tube
@@ -255,7 +255,7 @@ def test_phong_at_rest_in_float32():
     moving = regions.Keys(keys.s_c, keys.contact, small, keys.U, keys.V)
     for keys in (jax.tree.map(jnp.zeros_like, moving), moving):
         for slope in jax.tree.leaves(of(AT32, jnp.asarray(0.4, "float32"), keys)):
-            assert np.max(np.abs(slope)) < 10 / regions.FADE
+            assert np.max(np.abs(slope)) < 10 / phong.FADE
 
 
 def slopes_of(f):

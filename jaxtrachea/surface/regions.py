@@ -27,6 +27,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import epsilon
+from jaxtrachea.surface import phong
 from jaxtrachea.surface.blocks import Blocks, in_blocks, to_blocks, to_vertices
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh
@@ -35,9 +36,6 @@ Method = Literal["linear", "hermite", "phong"]
 
 #: Least angle between the J line and the lines U and V, rad; see `weigh`.
 NARROWEST = 0.05
-
-#: Displacement below which `phong` fades to the normal direction, mm.
-FADE = 1e-3
 
 
 class Binding(eqx.Module):
@@ -324,46 +322,12 @@ def _phong(binding: Binding, weights: Weights, keys: Keys):
     # Angles are counted from the inward normal for a press, else from the outward one; the
     # azimuth is undefined at the opposite pole only, far from where the displacements are.
     alpha = binding.half_angle
-    drawn = _radial(weights.phi_c, keys.contact) > 0
+    drawn = phong.radial(weights.phi_c, keys.contact) > 0
     pole = jnp.where(drawn, 1, -1).astype(alpha.dtype)
-    encode = lambda v, phi: _encode(v, phi, pole)  # noqa: E731
+    encode = lambda v, phi: phong.encode(v, phi, pole)  # noqa: E731
     joints, contact = encode(keys.joints.T, weights.phi_c).T, encode(keys.contact, weights.phi_c)
     line = _joint_line(binding.nodes, keys.s_c, joints, contact)
     U, V = encode(keys.U.T, -alpha).T, encode(keys.V.T, alpha).T
     channels = _carry(binding, weights, keys.s_c, line, U, V)
-    u = _decode(channels.swapaxes(0, 1), binding.phi, pole).swapaxes(0, 1)
+    u = phong.decode(channels.swapaxes(0, 1), binding.phi, pole).swapaxes(0, 1)
     return to_vertices(u, binding.blocks)
-
-
-def _radial(phi, vector):
-    return jnp.cos(phi) * vector[1] + jnp.sin(phi) * vector[2]
-
-
-def _encode(vector, phi, pole):
-    """Magnitude, and angle to the pole times (cos, sin) of the azimuth; rows, as is `vector`."""
-    normal = pole * _radial(phi, vector)
-    along, round_ = vector[0], jnp.cos(phi) * vector[2] - jnp.sin(phi) * vector[1]
-    square = jnp.sum(vector**2, axis=0)
-    size = jnp.sqrt(square + FADE**2)
-    normal = normal + FADE**2 / size  # at rest the direction is the pole's
-    side = along**2 + round_**2
-    close = side <= (1e-4 * normal) ** 2
-    sideways = jnp.sqrt(jnp.where(close, 1, side))
-    per_length = jnp.where(
-        close & (normal > 0),
-        1 / jnp.where(normal > 0, normal, 1),
-        jnp.arctan2(sideways, normal) / sideways,
-    )
-    return jnp.stack([square / size, per_length * along, per_length * round_])
-
-
-def _decode(channels, phi, pole):
-    magnitude, a, b = channels
-    square = a * a + b * b
-    small = square < 1e-8
-    angle = jnp.sqrt(jnp.where(small, 1, square))
-    sinc = jnp.where(small, 1 - square / 6, jnp.sin(angle) / angle)
-    normal = pole * magnitude * jnp.where(small, 1 - square / 2, jnp.cos(angle))
-    round_ = magnitude * sinc * b
-    c, s = jnp.cos(phi), jnp.sin(phi)
-    return jnp.stack([magnitude * sinc * a, c * normal - s * round_, s * normal + c * round_])
