@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from jaxtrachea.plots import STYLE
 
-#: Below this an error is rounding: what has no more is drawn as exact, left of all others.
+#: An error up to this is drawn as exact, left of all others.
 EXACT = 1e-17
 #: Times that the paper states: skeleton at 10 kHz, surface at 1 kHz; s.
 GOALS = {"100 µs": 1e-4, "1 ms": 1e-3}

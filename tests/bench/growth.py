@@ -142,7 +142,7 @@ def vertices(out: common.Writer) -> None:
             scene = dataclasses.replace(scene, plan=dataclasses.replace(scene.plan, dent=16))
             run = lambda scene, m, p: simulate(scene, m, p).vertices  # noqa: E731
             size = mesh.vertices.shape[0]
-            # What must be read (s, phi, fraction, rest shape; patch) and written (shape), at least.
+            # What must be read (s, phi, fraction, rest shape; place) and written (shape), at least.
             bytes_ = size * (9 * mesh.vertices.dtype.itemsize + 4)
             block = jnp.zeros(bytes_ // 2 // mesh.vertices.dtype.itemsize, dtype)
             cases = {
