@@ -14,11 +14,14 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from jaxtrachea.identify.cost import entry_scale, robust
+from jaxtrachea.identify.cost import entry_scale, evaluate, robust
 from jaxtrachea.identify.problem import Lane, Problem
 from jaxtrachea.identify.residual import residual_value
-from jaxtrachea.identify.solve import Solved, Tolerances
+from jaxtrachea.identify.solve import Solved, Tolerances, held, promise, rounding_cost
 from jaxtrachea.status import FitStatus
+
+#: Cosine between residual and Jacobian up to which a point counts as a minimum.
+NEARLY_FLAT = 1e-2
 
 
 def cost(
@@ -54,6 +57,8 @@ def descend(
 
     `tolerances.iterations` counts tens of steps for L-BFGS and hundreds for Adam; a job is done
     when the relative change of its cost over such a block is below `tolerances.cost` per step.
+    Where an unknown alone could still lower the residual's norm by more than `NEARLY_FLAT`, it has
+    stalled.
     """
     block = {"lbfgs": 10, "adam": 100}[method]
     run = _compiled(problem.program, method, learning_rate, block, tolerances)
@@ -88,6 +93,8 @@ def _descend(problem, method, learning_rate, block, tolerances, start, lane, sig
     def step(_, carry):
         theta, state = carry
         value, gradient = jax.value_and_grad(loss)(theta)
+        # What a bound holds does not move, and the others do not count on it.
+        gradient = jnp.where(held(theta, gradient, lane), 0, gradient)
         extra = {"value": value, "grad": gradient, "value_fn": loss} if method == "lbfgs" else {}
         updates, state = optimiser.update(gradient, state, theta, **extra)
         return box(optax.apply_updates(theta, updates)), state
@@ -109,5 +116,10 @@ def _descend(problem, method, learning_rate, block, tolerances, start, lane, sig
     status = jnp.where(
         blocks >= tolerances.iterations, FitStatus.MAX_ITERATIONS, FitStatus.CONVERGED
     )
+    point = evaluate(problem, theta, lane, sigma)
+    left = jnp.max(promise(theta, point, lane))
+    steep = left > NEARLY_FLAT * jnp.sqrt(2 * point.cost)
+    steep &= (status == FitStatus.CONVERGED) & (value > rounding_cost(lane, sigma))
+    status = jnp.where(steep, FitStatus.STALLED, status)
     bad = jnp.where(blocks == 0, FitStatus.INFEASIBLE_START, FitStatus.NON_FINITE)
     return theta, value, jnp.where(jnp.isfinite(value), status, bad), block * blocks

@@ -157,13 +157,14 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
         if progress is not None:
             progress(0)
         reduced, moving, gradient, hessian = _reduce(task, here, alive)
-        step = _shared_step(task, here, alive, radius, moving, gradient, hessian)
+        step, shared = _shared_step(task, here, alive, radius, moving, gradient, hessian)
         resting, restless = _at_rest(task, here, alive, reduced, gradient, hessian, moving)
         patience -= resting or fall <= _floor(task, here, alive)
         if (resting and not restless.any()) or patience == 0:
             status = FitStatus.CONVERGED
             break
         trial = clip(here.theta + reduced.step + reduced.follow @ step)
+        trial[np.arange(len(trial))[:, None], task.shared] = shared
         trial = np.where(alive[:, None], trial, here.theta)
         there = _settle(task, trial, here, alive)
         finite = np.all(there.finite[alive])
@@ -188,12 +189,25 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
 
 
 def _shared_step(task: _Task, here: Settled, alive, radius, moving, gradient, hessian):
-    """Step of the shared unknowns within the radius and their bounds; (k,)."""
-    step = np.zeros(len(gradient))
-    if moving.any():
-        step[moving] = arrow.within(radius, gradient[moving], hessian[np.ix_(moving, moving)])
+    """Step of the shared unknowns within the radius, and where it leads; (k,) each.
+
+    What the step would carry over a bound stops on it, and the others are minimal given that.
+    """
     theta, box = _of_shared(task, here.theta, alive)
-    return np.clip(theta + step, box.lower, box.upper) - theta
+    step, stops = np.zeros(len(gradient)), np.zeros(len(gradient), bool)
+    while True:
+        free = moving & ~stops
+        if free.any():
+            pull = gradient[free] + hessian[np.ix_(free, stops)] @ step[stops]
+            step[free] = arrow.within(radius, pull, hessian[np.ix_(free, free)])
+        ahead = theta + step
+        crossing = free & ((ahead < box.lower) | (ahead > box.upper))
+        if not crossing.any():
+            # Not by the difference: theta + (bound - theta) may miss the bound by a rounding.
+            bound = np.where(step > 0, box.upper, box.lower)
+            return step, np.where(stops & (step != 0), bound, ahead)
+        step[crossing] = np.clip(ahead, box.lower, box.upper)[crossing] - theta[crossing]
+        stops |= crossing
 
 
 def _of_shared(task: _Task, theta, alive):

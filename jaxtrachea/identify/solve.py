@@ -5,8 +5,9 @@ long as the radius allows, in coordinates that are scaled already. Each step ben
 that a second directional derivative predicts (geodesic acceleration, Transtrum and Sethna 2012,
 arXiv:1201.5885): the valleys of this model are narrow and curved, since stiffness of skeleton and
 contact nearly trade off, and straight steps crawl in them. Bounds by an active set: an unknown on
-its bound whose gradient points outwards is held, steps are clipped to the box. A robust loss enters
-as a reweighting by rho'(r^2).
+its bound whose gradient points outwards is held; one that a step would carry over its bound stops
+on it exactly, and the others go to where that leaves their minimum. A robust loss enters as a
+reweighting by rho'(r^2).
 
 A chunk of lanes takes a few iterations at a time; lanes that are done leave and waiting ones take
 their place, so that a slow lane holds up nobody and one program serves any number of lanes. Each
@@ -87,11 +88,36 @@ class Solved(NamedTuple):
     iterations: np.ndarray
 
 
-def _held(theta, gradient, lane: Lane):
+def _rounding(bound, dtype=None):
+    """Distance to a bound that is rounding, at most."""
+    return 8 * epsilon(bound.dtype if dtype is None else dtype) * (1 + abs(bound))
+
+
+def held(theta, gradient, lane: Lane):
     """Unknowns that do not move: absent, or on a bound that the gradient pushes against."""
-    low = (theta <= lane.lower) & (gradient > 0)
-    high = (theta >= lane.upper) & (gradient < 0)
+    low = (theta - lane.lower <= _rounding(lane.lower)) & (gradient > 0)
+    high = (lane.upper - theta <= _rounding(lane.upper)) & (gradient < 0)
     return low | high | (lane.active == 0)
+
+
+def promise(theta, point: Point, lane: Lane):
+    """Fall of the residual's norm that each unknown alone still promises inside its bounds; (P,).
+
+    Inside the box |g_i| / sqrt(H_ii): over the norm of the residual, the cosine between it and a
+    column of the Jacobian. On a bound that the gradient pushes against it is 0.
+    """
+    diagonal = jnp.diagonal(point.hessian)
+    moves = (diagonal > 0) & (lane.active > 0)
+    curvature = jnp.where(moves, diagonal, 1)
+    newton = jnp.clip(theta - point.gradient / curvature, lane.lower, lane.upper) - theta
+    return jnp.where(moves, jnp.abs(newton) * jnp.sqrt(curvature), 0)
+
+
+def rounding_cost(lane: Lane, sigma: Float[Array, "2"]) -> Float[Array, ""]:
+    """Cost that rounding alone leaves: ten roundings of every force."""
+    scale = entry_scale(lane, sigma)[: lane.force.shape[-1]]
+    data = jnp.sum((lane.force * lane.precision * lane.balance[:, None] * scale[None]) ** 2)
+    return 0.5 * data * (10 * epsilon(lane.force.dtype)) ** 2
 
 
 def _within(radius, hessian, gradient, free):
@@ -121,6 +147,24 @@ def _within(radius, hessian, gradient, free):
     return step * jnp.minimum(1, 1.2 * radius / _length(step)), damped
 
 
+def _onto_bounds(theta, straight, damped, point: Point, free, radius, lane: Lane):
+    """Step with what would leave the box on its bound, the others minimal given that.
+
+    Returns:
+        The step, and which unknowns stop on a bound by it.
+    """
+    g, H = point.gradient, point.hessian
+    ahead = theta + straight
+    stops = free & ((ahead < lane.lower) | (ahead > lane.upper))
+    onto = jnp.where(stops, jnp.clip(ahead, lane.lower, lane.upper) - theta, 0)
+    moves = free & ~stops
+    matrix = jnp.where(moves[:, None] & moves[None], damped, jnp.eye(len(g), dtype=g.dtype))
+    pull = g + jnp.sum(H * onto[None], axis=1)
+    rest = solve_spd(matrix, jnp.where(moves, -pull, 0))
+    rest = rest * jnp.minimum(1, 1.2 * radius / _length(rest))
+    return jnp.where(jnp.any(stops), jnp.where(stops, onto, rest), straight), stops
+
+
 def _length(v):
     """Euclidean length, not below the smallest normal number."""
     return jnp.sqrt(jnp.maximum(jnp.sum(v * v), jnp.finfo(v.dtype).tiny))
@@ -130,10 +174,11 @@ def _step(problem: Problem, state: State, lane: Lane, sigma) -> _Step:
     """Step of the trust region inside the box, bent by the residual's curvature along it."""
     point, theta = state.point, state.theta
     g, H = point.gradient, point.hessian
-    free = ~_held(theta, g, lane)
+    free = ~held(theta, g, lane)
     straight, damped = _within(state.radius, H, g, free)
-    inside = lambda delta: jnp.clip(theta + delta, lane.lower, lane.upper) - theta  # noqa: E731
-    straight = inside(straight)
+    straight, stops = _onto_bounds(theta, straight, damped, point, free, state.radius, lane)
+    box = lambda theta: jnp.clip(theta, lane.lower, lane.upper)  # noqa: E731
+    straight = box(theta + straight) - theta
     predicted = -jnp.sum(straight * (g + 0.5 * jnp.sum(H * straight[None], axis=1)))
     along = of_trials(problem, straight, lane)
     ahead = residual_value(problem, theta + _LOOK * straight, lane)
@@ -141,13 +186,16 @@ def _step(problem: Problem, state: State, lane: Lane, sigma) -> _Step:
     linear = jnp.einsum("tim,ti->tm", point.jacobian, along)
     curvature = 2 / _LOOK * ((ahead - point.value) / _LOOK * root - linear)
     pull = assemble(problem, jnp.einsum("tim,tm->ti", point.jacobian, curvature), lane)
-    bend = 0.5 * solve_spd(damped, jnp.where(free, -pull, 0))
+    bend = 0.5 * solve_spd(damped, jnp.where(free & ~stops, -pull, 0))
     # Of no use where the expansion fails, nor where the step is so short that its difference is
     # rounding.
     length = _length(straight)
     useful = (_length(bend) <= 0.375 * length) & (length > epsilon(g.dtype) ** 0.25)
-    delta = inside(straight + jnp.where(useful & jnp.all(jnp.isfinite(bend)), bend, 0))
-    return _Step(theta + delta, delta, length, predicted)
+    bend = jnp.where(useful & ~stops & jnp.all(jnp.isfinite(bend)), bend, 0)
+    # Not by the difference: theta + (bound - theta) may miss the bound by a rounding.
+    bound = jnp.where(straight > 0, lane.upper, lane.lower)
+    trial = jnp.where(stops & (straight != 0), bound, box(theta + straight + bend))
+    return _Step(trial, trial - theta, length, predicted)
 
 
 def iterate(
@@ -182,18 +230,15 @@ def _status(tolerances, old_cost, new, lane, sigma, fresh, finite, step, actual)
     """RUNNING, or why this lane is done."""
     dtype = new.theta.dtype
     small = lambda tolerance: max(tolerance, 4 * epsilon(dtype))  # noqa: E731
-    cost = new.point.cost
-    g, diagonal = new.point.gradient, jnp.diagonal(new.point.hessian)
-    free = ~_held(new.theta, g, lane)
-    cosine = jnp.where(
-        free & (diagonal > 0), jnp.abs(g) / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 0
-    )
-    flat = jnp.max(cosine) <= small(tolerances.gradient) * jnp.sqrt(2 * cost)
-    scale = entry_scale(lane, sigma)[: lane.force.shape[-1]]
-    data = jnp.sum((lane.force * lane.precision * lane.balance[:, None] * scale[None]) ** 2)
-    exact = cost <= 0.5 * data * (10 * epsilon(dtype)) ** 2
+    cost, g = new.point.cost, new.point.gradient
+    free = ~held(new.theta, g, lane)
+    steepest = jnp.max(promise(new.theta, new.point, lane))
+    flat = steepest <= small(tolerances.gradient) * jnp.sqrt(2 * cost)
+    exact = cost <= rounding_cost(lane, sigma)
     tiny = small(tolerances.cost) * old_cost
     settled = finite & ~fresh & (jnp.abs(actual) <= tiny) & (step.predicted <= tiny)
+    # A whole Gauss-Newton step promises more than any unknown alone: a short one proves nothing.
+    settled &= 0.5 * steepest**2 <= 100 * tiny
     # Nor is there anything left: what a whole Gauss-Newton step from here would gain.
     downhill = jnp.where(free, g, 0)
     H = jnp.where(free[:, None] & free[None], new.point.hessian, jnp.eye(len(g), dtype=dtype))
@@ -201,7 +246,7 @@ def _status(tolerances, old_cost, new, lane, sigma, fresh, finite, step, actual)
     settled |= finite & (left <= 0.01 * small(tolerances.cost) * cost)
     length = jnp.sqrt(jnp.sum(step.delta**2))
     short = ~fresh & (length <= small(tolerances.step) * jnp.sqrt(jnp.sum(new.theta**2) + 1))
-    nearly_flat = jnp.max(cosine) <= 1e3 * small(tolerances.gradient) ** 0.5 * jnp.sqrt(2 * cost)
+    nearly_flat = steepest <= 1e3 * small(tolerances.gradient) ** 0.5 * jnp.sqrt(2 * cost)
     converged = flat | exact | settled | (short & nearly_flat)
     status = jnp.where(converged, FitStatus.CONVERGED, RUNNING)
     status = jnp.where(~converged & short, FitStatus.STALLED, status)
@@ -301,13 +346,22 @@ def levenberg_marquardt(
         done = (owner >= 0) & (status != RUNNING)
         rows = owner[done]
         if len(rows):
-            out.theta[rows] = np.asarray(state.theta)[done]
+            theta = np.asarray(state.theta)[done]
+            out.theta[rows] = _on_bounds(theta, problem.lanes, jobs[rows])
             out.cost[rows] = np.asarray(state.point.cost)[done]
             out.status[rows] = status[done]
             out.iterations[rows] = np.asarray(state.iteration)[done]
             owner[done] = -1
         if progress is not None:
             progress(len(rows))
+
+
+def _on_bounds(theta, lanes: Lane, rows) -> np.ndarray:
+    """Unknowns of the lanes `rows` in the box, on its bounds where rounding alone parts them."""
+    lower, upper = lanes.lower[rows], lanes.upper[rows]
+    inside = np.clip(np.asarray(theta, np.float64), lower, upper)
+    inside = np.where(inside - lower <= _rounding(lower, theta.dtype), lower, inside)
+    return np.where(upper - inside <= _rounding(upper, theta.dtype), upper, inside)
 
 
 def _idle(problem: Problem, lanes: Lane, chunk: int, dtype) -> State:

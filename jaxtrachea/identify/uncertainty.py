@@ -178,7 +178,7 @@ def analyse(
     half = np.full(len(dof), 1.959963984540054)
     if not noise_given:
         half = np.where(dof > 0, stdtrit(np.maximum(dof, 1), 0.975), half)
-    usable = free.any(axis=1) & np.isfinite(info.bread).all(axis=(1, 2)) & (dof >= 0)
+    usable = np.isfinite(info.bread).all(axis=(1, 2)) & (dof >= 0)
     free = free & usable[:, None]
     kappa = np.ones(len(dof)) if noise_given else np.asarray(info.psi2) * total / np.maximum(dof, 1)
     dpsi = np.maximum(info.dpsi, 1e-3)
@@ -196,12 +196,13 @@ def analyse(
         correlation = covariance / root[:, :, None] / root[:, None]
     se = np.where(free, np.where(blind, np.inf, np.sqrt(variance)) * relative, np.nan)
     both = free[:, :, None] & free[:, None]
-    condition, flat, flat_se = _flattest(values, vectors, free, covariance)
+    condition, flat, flat_se = _flattest(values, vectors, free, covariance, usable)
     lost = np.isinf(values) & (np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5)
     silent = np.swapaxes(vectors, 1, 2) * lost[:, :, None] * free[:, None]
     correlation = np.where(both, correlation, np.nan)
     along = _along(values, vectors, free)
-    dispersion = dpsi[:, None] * _ratio(along, meat, bread)
+    whole = [np.trace(_scaled(np.asarray(m), relative), axis1=1, axis2=2) for m in info[:2]]
+    dispersion = dpsi[:, None] * _ratio(along, meat, bread, whole[1] * kappa, whole[0])
     along = along * relative[:, None] / relative[:, :, None]
     return Uncertainty(se, correlation, condition, flat, flat_se, silent, half, along, dispersion)
 
@@ -218,12 +219,16 @@ def _along(values, vectors, free) -> np.ndarray:
     return np.where(both, inverse / diagonal[:, :, None], np.eye(values.shape[1]))
 
 
-def _ratio(along, meat, bread) -> np.ndarray:
-    """What the meat is of the bread along each row, or in the mean where both vanish."""
+def _ratio(along, meat, bread, meat_trace, bread_trace) -> np.ndarray:
+    """What the meat is of the bread along each row, or in the mean where both vanish.
+
+    The traces are of the whole matrices: those of all unknowns, held ones too.
+    """
     form = lambda m: np.einsum("lip,lpq,liq->li", along, m, along)  # noqa: E731
-    trace = lambda m: 1e-12 * np.trace(m, axis1=1, axis2=2)[:, None]  # noqa: E731
     with np.errstate(invalid="ignore", divide="ignore"):
-        return (form(meat) + trace(meat)) / (form(bread) + trace(bread))
+        return (form(meat) + 1e-12 * meat_trace[:, None]) / (
+            form(bread) + 1e-12 * bread_trace[:, None]
+        )
 
 
 def _scaled(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
@@ -248,11 +253,15 @@ def _spectrum(matrix: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.where(keep, values, np.inf), vectors
 
 
-def _flattest(values, vectors, free, covariance):
-    """Condition number, least determined direction and its standard error, of all lanes."""
+def _flattest(values, vectors, free, covariance, usable):
+    """Condition number, least determined direction and its standard error, of all lanes.
+
+    Where every unknown is held nothing is left undetermined: 1, no direction, no error.
+    """
     lanes = np.arange(len(values))
     own = np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5
-    singular = np.any(np.isinf(values) & own, axis=1) | ~free.any(axis=1)
+    singular = np.any(np.isinf(values) & own, axis=1) | ~usable
+    nothing = usable & ~free.any(axis=1)
     order = np.where(own, np.where(np.isinf(values), -1, values), np.inf)
     flattest = np.argmin(order, axis=1)
     v = vectors[lanes, :, flattest] * free
@@ -263,4 +272,5 @@ def _flattest(values, vectors, free, covariance):
     with np.errstate(invalid="ignore", divide="ignore"):
         condition = np.sqrt(largest / values[lanes, flattest])
     flat_se = np.where(singular, np.inf, np.sqrt(np.maximum(variance, 0)))
-    return np.where(singular, np.inf, condition), flat, flat_se
+    condition = np.where(nothing, 1, np.where(singular, np.inf, condition))
+    return condition, np.where(nothing[:, None], 0, flat), np.where(nothing, 0, flat_se)

@@ -1,0 +1,202 @@
+"""Bounded problems: lanes end where the KKT conditions hold, and SciPy finds nothing lower."""
+
+import functools
+
+import bounded
+import numpy as np
+import pytest
+import synthetic
+
+from jaxtrachea.identify import bootstrap as bootstraps
+from jaxtrachea.identify.descent import descend
+from jaxtrachea.identify.fit import Settings, first_sigma, fit
+from jaxtrachea.identify.problem import Noise, build
+from jaxtrachea.identify.profile import profiles
+from jaxtrachea.identify.solve import Tolerances, levenberg_marquardt
+from jaxtrachea.status import FitStatus, ProfileEnd
+
+EPSILON = np.finfo(np.float64).eps
+
+
+def promise_allowed(dtype):
+    """Largest KKT residual of a lane that counts as converged.
+
+    The solver stops where neither a step nor any unknown alone lowers the cost by more than 100
+    times its tolerance, relative: 0.5 r^2 <= 100 tol / 2 in units of the residual's norm. The
+    tolerance is 1e-10, or four roundings of the cost.
+    """
+    return np.sqrt(200 * max(1e-10, 4 * float(np.finfo(dtype).eps)))
+
+
+def parted_from_bounds(problem, theta):
+    """Unknowns that are next to a bound, by less than a part in 1e9, and not on it."""
+    lanes = problem.lanes
+    gap = np.minimum(theta - lanes.lower, lanes.upper - theta)
+    return (gap != 0) & (gap < 1e-9 * (1 + np.abs(theta)))
+
+
+def check_lanes(count, dtype):
+    problem, start = bounded.random_problem(11, count)
+    sigma = first_sigma(problem)
+    solved = levenberg_marquardt(problem, np.arange(count), start, sigma, dtype=dtype)
+    assert np.all(solved.status == FitStatus.CONVERGED), np.bincount(solved.status)
+    assert np.max(bounded.kkt_residual(problem, solved.theta, sigma)) <= promise_allowed(dtype)
+    assert not np.any(parted_from_bounds(problem, solved.theta))
+    return problem, start, sigma, solved
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_random_bounds_against_scipy(dtype):
+    """Three of four lanes end on a bound; `trf` from where they end finds nothing lower."""
+    count = 60
+    problem, _, sigma, solved = check_lanes(count, dtype)
+    lanes = problem.lanes
+    assert np.mean(np.any((solved.theta == lanes.lower) | (solved.theta == lanes.upper), 1)) > 0.7
+    excess = bounded.costs(problem, solved.theta, sigma)
+    excess = excess / bounded.scipy_costs(problem, solved.theta, sigma) - 1
+    # Twice the log-likelihood ratio of 100 samples: 1e-4 standard errors, in single precision 0.2.
+    assert np.max(100 * excess) <= {np.float64: 1e-8, np.float32: 0.04}[dtype]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_1000_random_bounds(dtype):
+    """From the same starts SciPy is lower as rarely as we are: both may end in another minimum."""
+    problem, start, sigma, solved = check_lanes(1000, dtype)
+    cost, other = (
+        bounded.costs(problem, solved.theta, sigma),
+        bounded.scipy_costs(problem, start, sigma),
+    )
+    close = {np.float64: 1e-10, np.float32: 4e-4}[dtype]
+    lower, higher = np.sum(cost < other * (1 - close)), np.sum(cost > other * (1 + close))
+    assert lower + higher <= 30
+    assert higher <= 15
+
+
+@pytest.mark.parametrize("gap", [0.0, 5e-14, 1e-9])
+def test_a_start_next_to_a_bound(gap):
+    """The free optimum lies beyond: the others must not stay where it has them."""
+    problem, _ = bounded.random_problem(11, 60)
+    wide = problem.lanes._replace(lower=np.full((60, 4), -12.0), upper=np.full((60, 4), 12.0))
+    sigma, jobs = first_sigma(problem), np.arange(60)
+    guess = np.tile(np.log(bounded.CLEAR), (60, 1))
+    best = levenberg_marquardt(bounded.with_lanes(problem, wide), jobs, guess, sigma)
+    upper = wide.upper.copy()
+    upper[:, 2] = best.theta[:, 2] - 0.3
+    tight = bounded.with_lanes(problem, wide._replace(upper=upper))
+    start = best.theta.copy()
+    start[:, 2] = upper[:, 2] - gap
+    solved = levenberg_marquardt(tight, jobs, start, sigma)
+    assert np.all(solved.status == FitStatus.CONVERGED)
+    assert np.all(solved.theta[:, 2] == upper[:, 2])
+    assert np.max(bounded.kkt_residual(tight, solved.theta, sigma)) <= promise_allowed(np.float64)
+
+
+@pytest.mark.parametrize(
+    ("method", "blocks"), [("lbfgs", 60), pytest.param("adam", 100, marks=pytest.mark.slow)]
+)
+def test_first_order_methods_respect_bounds(method, blocks):
+    problem, start = bounded.random_problem(11, 60)
+    sigma, jobs = first_sigma(problem), np.arange(60)
+    solved = descend(
+        problem, jobs, start, sigma, method=method, tolerances=Tolerances(iterations=blocks)
+    )
+    assert np.all(solved.status == FitStatus.CONVERGED)
+    # Their tolerance is on the cost over a block of steps, no better than its square root.
+    assert np.max(bounded.kkt_residual(problem, solved.theta, sigma)) <= 1e-3
+
+
+def joint_study(seed, specimens=3):
+    """Specimens that share EI_L and k_3, bounds that cut off about half of the optima."""
+    rng = np.random.default_rng(seed)
+    depths = synthetic.DEPTHS[::2]
+    truth = synthetic.draw(seed, specimens, 1.5, bounded.CLEAR)
+    truth[:, [0, 3]] = truth[0, [0, 3]]
+    force, _ = synthetic.forces(truth, displacement=depths)
+    level = float(0.01 * np.abs(force).max())
+    force = force + level * rng.normal(size=force.shape)
+    changes = {}
+    for i, name in enumerate(synthetic.NAMES):
+        side, factor = rng.choice([-1, 0, 1], p=[0.3, 0.4, 0.3]), np.exp(rng.uniform(0.05, 0.7))
+        lower, upper = truth[:, i].min() / 50, truth[:, i].max() * 50
+        lower = truth[:, i].mean() * factor if side > 0 else lower
+        upper = truth[:, i].mean() / factor if side < 0 else upper
+        changes[name] = {
+            "value": float(np.sqrt(lower * upper)),
+            "lower": float(lower),
+            "upper": float(upper),
+            "scope": "shared" if name in ("EI_L", "k_3") else "specimen",
+            "scale": "log",
+        }
+    return functools.partial(
+        build,
+        synthetic.curves(force, displacement=depths),
+        synthetic.GEOMETRY,
+        synthetic.OPTIONS,
+        synthetic.parameters(**changes),
+        noise=Noise(force=level),
+    )
+
+
+@pytest.mark.parametrize(
+    "seeds", [range(100, 102), pytest.param(range(102, 130), marks=pytest.mark.slow)]
+)
+def test_joint_fits_with_bounds(seeds):
+    """The dense problem's KKT conditions hold at the joint estimate; SciPy finds nothing lower."""
+    for seed in seeds:
+        study = joint_study(seed)
+        joint, dense = study(joint=True), study()
+        result = fit(joint, Settings(starts=1, more_starts=0))
+        assert np.all(result.status <= FitStatus.AT_BOUND)
+        theta = bounded.dense_theta(joint, dense, result.theta)
+        known = np.ones((1, 2))
+        kkt = bounded.kkt_residual(dense, theta, known)
+        assert kkt[0] <= promise_allowed(np.float64)
+        below = bounded.scipy_costs(dense, theta, known)[0]
+        assert result.cost.sum() <= below * (1 + 1e-8)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    problem, start = bounded.random_problem(5, 40)
+    result = fit(problem, Settings(starts=1, more_starts=0), starts=start)
+    assert np.all(result.succeeded)
+    return result
+
+
+def test_profiles_with_bounds(fitted):
+    """Given the profiled unknown, all others satisfy the KKT conditions at every point."""
+    cornered = fitted.at_bound.all(axis=1)
+    assert cornered.any()
+    assert np.all(fitted.status[cornered] == FitStatus.AT_BOUND)
+    curves = profiles(fitted, Settings(starts=1), points=2)
+    good = np.isfinite(curves.statistic)
+    assert np.mean(good) > 0.99
+    assert np.mean(curves.end == ProfileEnd.FAILED) < 0.01
+    k, at = np.nonzero(good)
+    chosen = fitted.problem.take(curves.lane[k])
+    active = chosen.lanes.active.copy()
+    active[np.arange(len(k)), curves.unknown[k]] = 0
+    pinned = bounded.with_lanes(chosen, chosen.lanes._replace(active=active))
+    sigma = fitted.whitened_sigma[curves.lane[k]]
+    kkt = bounded.kkt_residual(pinned, curves.theta[k, at], sigma)
+    assert np.max(kkt) <= promise_allowed(np.float64)
+
+
+def test_bootstrap_with_bounds(fitted, monkeypatch):
+    """Every replicate is a minimum of its own data in the box."""
+    seen = []
+
+    def recorded(problem, *args, **keys):
+        result = fit(problem, *args, **keys)
+        seen.append((problem, result))
+        return result
+
+    monkeypatch.setattr(bootstraps, "fit", recorded)
+    bootstraps.bootstrap(fitted, Settings(starts=1), count=bootstraps.FEWEST)
+    problem, result = seen[0]
+    assert np.mean(result.succeeded) > 0.99
+    rows = np.flatnonzero(result.succeeded)
+    kkt = bounded.kkt_residual(problem.take(rows), result.theta[rows], result.whitened_sigma[rows])
+    assert np.max(kkt) <= promise_allowed(np.float64)
+    assert not np.any(parted_from_bounds(problem, result.theta)[rows])
