@@ -45,32 +45,35 @@ def check_lanes(count, dtype):
     return problem, start, sigma, solved
 
 
+def check_nothing_lower(problem, sigma, solved, dtype):
+    """`trf` from where the lanes end finds nothing lower that matters; returns the costs.
+
+    The difference is twice the log-likelihood ratio of 100 samples: 1e-4 standard errors in double
+    precision, 0.2 in single.
+    """
+    cost = bounded.costs(problem, solved.theta, sigma)
+    excess = cost / bounded.scipy_costs(problem, solved.theta, sigma) - 1
+    assert np.max(100 * excess) <= {np.float64: 1e-8, np.float32: 0.04}[dtype]
+    return cost
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_random_bounds_against_scipy(dtype):
-    """Three of four lanes end on a bound; `trf` from where they end finds nothing lower."""
-    count = 60
-    problem, _, sigma, solved = check_lanes(count, dtype)
+    """Most lanes end on a bound."""
+    problem, _, sigma, solved = check_lanes(60, dtype)
     lanes = problem.lanes
     assert np.mean(np.any((solved.theta == lanes.lower) | (solved.theta == lanes.upper), 1)) > 0.7
-    excess = bounded.costs(problem, solved.theta, sigma)
-    excess = excess / bounded.scipy_costs(problem, solved.theta, sigma) - 1
-    # Twice the log-likelihood ratio of 100 samples: 1e-4 standard errors, in single precision 0.2.
-    assert np.max(100 * excess) <= {np.float64: 1e-8, np.float32: 0.04}[dtype]
+    check_nothing_lower(problem, sigma, solved, dtype)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_1000_random_bounds(dtype):
-    """From the same starts SciPy is lower as rarely as we are: both may end in another minimum."""
+    """From the same starts SciPy and we end in the same minimum, but for 4 % of the lanes."""
     problem, start, sigma, solved = check_lanes(1000, dtype)
-    cost, other = (
-        bounded.costs(problem, solved.theta, sigma),
-        bounded.scipy_costs(problem, start, sigma),
-    )
-    close = {np.float64: 1e-10, np.float32: 4e-4}[dtype]
-    lower, higher = np.sum(cost < other * (1 - close)), np.sum(cost > other * (1 + close))
-    assert lower + higher <= 30
-    assert higher <= 15
+    cost = check_nothing_lower(problem, sigma, solved, dtype)
+    other = bounded.scipy_costs(problem, start, sigma)
+    assert np.sum(np.abs(cost / other - 1) > 1e-3) <= 40
 
 
 @pytest.mark.parametrize("gap", [0.0, 5e-14, 1e-9])
