@@ -18,6 +18,8 @@ from jaxtrachea.identify.measurements import (
 )
 from jaxtrachea.identify.parameters import DEFAULTS, Parameter, in_model
 from jaxtrachea.identify.problem import Noise, Problem, build, check_curve
+from jaxtrachea.identify.readers.patterns import ensure_quick
+from jaxtrachea.identify.readers.recognise import is_workbook
 from jaxtrachea.identify.solve import Tolerances
 from jaxtrachea.model import Options
 from jaxtrachea.trachea.geometry import Geometry, table_1
@@ -93,13 +95,21 @@ def read_data(spec: FitSpec, root: Path) -> Measurements:
     except ValueError as error:
         raise SpecError(f"data: {error}") from None
     files = find_files(spec, root)
+    if options.name_pattern is not None:
+        try:
+            ensure_quick(options.name_pattern, [path.name for path in files])
+        except DataError as error:
+            raise SpecError(f"data.specimen: {error}") from None
+    if options.sheet is not None and not any(map(is_workbook, files)):
+        raise SpecError("data.sheet: none of the files is a workbook (xlsx); remove it")
     if len(files) == 1:
         return read_measurements(files, options)
     parts = [_read_one(path, options) for path in files]
     curves = [curve for part in parts for curve in part.curves]
     bad = [curve for part in parts for curve in part.bad]
+    notes = [note for part in parts for note in part.notes]
     _refuse_twice(parts)
-    return Measurements(tuple(curves), tuple(bad), tuple(files))
+    return Measurements(tuple(curves), tuple(bad), tuple(files), tuple(notes))
 
 
 def _read_one(path: Path, options: ReadOptions) -> Measurements:
