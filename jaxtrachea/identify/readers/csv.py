@@ -97,7 +97,7 @@ def _table(text: Text, lines: list[Line]) -> Table:
     while header and header[-1] == "":
         header.pop()
     names, units = zip(*map(column_unit, header), strict=True)
-    repeated = {name for name in names if names.count(name) > 1}
+    repeated = {name for name in names if name and names.count(name) > 1}
     if repeated:
         raise DataError(
             f"{text.place}: {text.word} {lines[0].number}: column {min(repeated)!r} is there twice; rename one"

@@ -107,6 +107,14 @@ def _table(text: Text, options: ReadOptions) -> tuple[Table, dict[str, int]]:
                 # An ambiguous header is still the header; any other line is part of the preamble.
                 reason = fault if fault.kind == "ambiguous" else reason
                 continue
+            if "specimen" in roles and options.format == "auto":
+                raise Fault(
+                    "ambiguous",
+                    f"{text.word} {line.number} is the header of a table with a column for the"
+                    " specimen, but other lines stand above it",
+                    'remove them or begin them with #, or set format = "machine" to name the'
+                    " specimen after the file",
+                )
             at, units = _units_row(lines, at, delimiter, units)
             numbers, rows = read_rows(lines[at + 1 :], len(names), delimiter, text.word)
             table = Table(

@@ -96,7 +96,9 @@ def read_rows(
             cells.pop()
         if len(cells) != width:
             cure = "complete or remove the row"
-            if delimiter == "," and len(cells) > width:
+            if word == "row" and len(cells) > width:
+                cure = "clear the cells beside the table, or give their columns a header"
+            elif delimiter == "," and len(cells) > width:
                 cure += "; decimal commas need ; or tab between the columns"
             raise Fault(
                 "ragged",
@@ -154,9 +156,11 @@ def find_roles(names: Sequence[str], options: ReadOptions) -> dict[str, int]:
 
 
 def _no_column(wanted: str, role: str, names: Sequence[str]) -> Fault:
+    shown = [repr(name if len(name) <= 60 else f"{name[:56]} ...") for name in names[:30]]
+    more = f" and {len(names) - 30} more" if len(names) > 30 else ""
     return Fault(
         "column_missing",
-        f"no column {wanted!r} for the {role}; the columns are {', '.join(map(repr, names))}",
+        f"no column {wanted!r} for the {role}; the columns are {', '.join(shown)}{more}",
         f"name it in columns.{role}",
     )
 

@@ -39,6 +39,9 @@ CASES = {
     "data a folder": only(lambda folder: (folder / "data.csv").mkdir(), "folder"),
     "data missing": only(None, "data.csv", "--data"),
     "data far above": only(None, spec='[data]\nfiles = "' + "../" * 60 + 'no.csv"\n'),
+    "data that cannot be read": Case(
+        ("mem", "cannot be read"), {"spec.toml": '[data]\nfiles = "/proc/self/mem"\n'}
+    ),
     "data with NUL in the name": only(None, spec='[data]\nfiles = "a\\u0000b.csv"\n'),
     "data with a long name": only(None, "long", spec=f'[data]\nfiles = "{"x" * 5000}"\n'),
     "pattern of nothing": only(None, "*.tsv", spec='[data]\nfiles = "*.tsv"\n'),
