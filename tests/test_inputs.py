@@ -12,13 +12,13 @@ import zipfile
 
 import numpy as np
 import pytest
-from run_cli import GOOD, run
+from run_cli import GOOD
 
 from jaxtrachea.identify.measurements import DataError, ReadOptions, read_measurements
 from jaxtrachea.identify.names import appearance, look_alikes
 from jaxtrachea.identify.readers import lines, patterns, recognise, workbook
 from jaxtrachea.identify.readers.patterns import ensure_quick, is_plain
-from jaxtrachea.identify.readers.records import Curve
+from jaxtrachea.identify.readers.records import BadCurve, Curve
 
 needs_openpyxl = pytest.mark.skipif(
     importlib.util.find_spec("openpyxl") is None, reason="openpyxl (extra 'xlsx') is not installed"
@@ -243,17 +243,6 @@ def test_large_sheets_are_bounded(tmp_path, monkeypatch):
         assert time.process_time() - began < 5
 
 
-@needs_openpyxl
-def test_check_says_which_sheet(tmp_path, monkeypatch, capsys):
-    made = book(TWO)
-    made.create_sheet("Notes")
-    keep(tmp_path, made)
-    spec = put(tmp_path, '[data]\nfiles = "study.xlsx"\nsheet = "Data"\n', "spec.toml")
-    code, out, err = run(monkeypatch, capsys, "check", spec)
-    assert (code, "2 usable curves" in out) == (0, True)
-    assert "sheet 'Data' was read, not 'Notes'" in err
-
-
 def test_without_openpyxl(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "openpyxl", None)
     with zipfile.ZipFile(tmp_path / "a.xlsx", "w") as archive:
@@ -368,21 +357,9 @@ def test_trials_look_alike_within_a_specimen_only():
 
 
 def test_look_alikes_of_many_names():
-    names = [f"S{i:06d}" for i in range(20_000)]
+    names = [f"S\xfc{i:06d}" for i in range(10_000)]
+    curves = [BadCurve(name, "1", "f.csv", "empty", "none", "cure") for name in names]
     began = time.process_time()
-    assert look_alikes([*map(curve, names), *(curve(name, "2") for name in names)]) == []
-    assert time.process_time() - began < 5
+    assert look_alikes(curves) == []
+    assert time.process_time() - began < 5  # 0.5 s; comparing pairs would take minutes
     assert len({appearance(name) for name in names}) == len(names)
-
-
-def test_commands_say_names_that_look_alike(tmp_path, monkeypatch, capsys):
-    put(tmp_path, TWO.replace("T02", "t01"))
-    spec = put(tmp_path, '[data]\nfiles = "study.csv"\n', "spec.toml")
-    code, _, err = run(monkeypatch, capsys, "check", spec)
-    assert code == 0
-    assert "note: specimens 'T01'" in err
-    assert "differ by case alone" in err
-    # `fit` says it before it looks for the run to go on with, of which there is none.
-    code, _, err = run(monkeypatch, capsys, "fit", spec, "--resume", "--out", tmp_path / "none")
-    assert code == 2
-    assert "differ by case alone" in err

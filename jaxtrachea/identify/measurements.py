@@ -5,9 +5,9 @@ comes back as a `BadCurve` with its reason, and only what spoils a whole file or
 `DataError`. The formats are described in docs/measurements.md.
 """
 
+import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
-import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,5 +1,6 @@
 """From a fit specification to a problem: opens the files, names what is wrong, builds the lanes."""
 
+import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from jaxtrachea.identify.measurements import (
     ReadOptions,
     read_measurements,
 )
+from jaxtrachea.identify.names import appearance
 from jaxtrachea.identify.parameters import DEFAULTS, Parameter, in_model
 from jaxtrachea.identify.problem import Noise, Problem, build, check_curve
 from jaxtrachea.identify.readers.patterns import ensure_quick
@@ -47,7 +49,10 @@ def find_files(spec: FitSpec, root: Path) -> list[Path]:
             ) from None
         files = [path for path in matches if path.is_file()]
         if not files:
-            raise SpecError(f"data.files.{i}: {_short(pattern)} matches in {root} {_what(matches)}")
+            raise SpecError(
+                f"data.files.{i}: {_short(pattern)} matches in {root} "
+                f"{_what(matches) if matches else _nothing(root / pattern)}"
+            )
         found.update(dict.fromkeys(files))
     return list(found)
 
@@ -59,11 +64,19 @@ def _short(pattern: str) -> str:
 
 def _what(matches: list[Path]) -> str:
     """What a pattern leads to that is no file, and the cure."""
-    if not matches:
-        return "no file; check the name, or say where the data are with --data"
     if matches[0].is_dir():
         return "a folder; list the files in it, as in 'folder/*.csv'"
     return "a device or a pipe; expected a file"
+
+
+def _nothing(path: Path) -> str:
+    """That there is no such file, the one whose name looks like it if there is any, the cure."""
+    with contextlib.suppress(OSError):
+        names = sorted(other.name for other in path.parent.iterdir())
+        for name in names:
+            if name != path.name and appearance(name) == appearance(path.name):
+                return f"no file; {ascii(name)}, which looks alike, is there; write its name so"
+    return "no file; check the name, or say where the data are with --data"
 
 
 def _reason(error: Exception) -> str:

@@ -80,7 +80,8 @@ def _state(lines: list[Line], word: str) -> tuple[dict, list[Line]]:
         if key in state:
             if not isinstance(state[key], str | int | float):
                 raise DataError(
-                    f'{word} {lines[0].number}: {key}: expected a quantity with its unit, as "17 mm"'
+                    f"{word} {lines[0].number}: {key}: expected a quantity with its unit,"
+                    ' as "17 mm"'
                 )
             try:
                 known[key] = parse_quantity(state[key], role_dimension(key))
@@ -100,7 +101,8 @@ def _table(text: Text, lines: list[Line]) -> Table:
     repeated = {name for name in names if name and names.count(name) > 1}
     if repeated:
         raise DataError(
-            f"{text.place}: {text.word} {lines[0].number}: column {min(repeated)!r} is there twice; rename one"
+            f"{text.place}: {text.word} {lines[0].number}: column {min(repeated)!r} is there"
+            " twice; rename one"
         )
     numbers, rows = read_rows(lines[1:], len(header), delimiter, text.word)
     if not rows:
@@ -136,16 +138,19 @@ def _group(
             row[roles[role]] if role in roles else fixed[role] for role in ("specimen", "trial")
         )
         key = (specimen, trial)
+        if key == last:
+            groups[key].append(i)
+            continue
         if fault := _name_fault(table, "specimen", specimen) or _name_fault(table, "trial", trial):
             raise DataError(f"{table.text.place}: {table.text.word} {table.lines[i]}: {fault}")
-        if key != last and key in groups:
+        if key in groups:
             first = table.lines[groups[key][0]]
             raise DataError(
                 f"{table.text.place}: specimen {key[0]!r} trial {key[1]!r} starts in"
-                f" {table.text.word} {first} and again in {table.text.word} {table.lines[i]}; keep the rows of a curve together, or rename it"
+                f" {table.text.word} {first} and again in {table.text.word} {table.lines[i]};"
+                " keep the rows of a curve together, or rename it"
             )
-        groups.setdefault(key, []).append(i)
-        last = key
+        groups[key], last = [i], key
     return groups
 
 
@@ -212,7 +217,9 @@ def _constant(
     unknown = np.isnan(column)
     if unknown.any():
         line = table.lines[picked[int(np.argmax(unknown))]]
-        raise Fault("position", f"{table.text.word} {line}: {role} is empty or NaN", "give it in every row")
+        raise Fault(
+            "position", f"{table.text.word} {line}: {role} is empty or NaN", "give it in every row"
+        )
     if not np.allclose(column, column[0], rtol=1e-9, atol=1e-12):
         raise Fault(
             "position",

@@ -1,6 +1,5 @@
 """Machine CSV: some lines about the test, then a table; one trial per file, named by the file."""
 
-
 import numpy as np
 
 from jaxtrachea.identify.readers.checks import bad

@@ -10,6 +10,7 @@ import tarfile
 import zipfile
 
 import numpy as np
+
 from damaged.case import GOOD, OTHER, SPEC, Case
 
 SHEET = "xl/worksheets/sheet1.xml"

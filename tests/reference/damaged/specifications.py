@@ -57,8 +57,10 @@ UNKNOWN = {
 WRONG = {
     "specimen a pattern that backtracks": Case(
         ("data.specimen", "(a+)+$", "was stopped"),
-        {"a" * 60 + "!.csv": GOOD,
-         "spec.toml": '[data]\nfiles = "*.csv"\nspecimen = "(?P<specimen>(a+)+$)"'},
+        {
+            "a" * 60 + "!.csv": GOOD,
+            "spec.toml": '[data]\nfiles = "*.csv"\nspecimen = "(?P<specimen>(a+)+$)"',
+        },
         command=("check", "spec.toml"),
     ),
     "sheet of a text file": of(SPEC + 'sheet = "Data"', "data.sheet", "workbook"),

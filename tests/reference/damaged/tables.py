@@ -61,7 +61,9 @@ DIALECT = {
     "no rows": alone(HEAD, "no rows"),
     "comments only": alone("# a\n# b\n", "empty"),
     "lines above a tidy table": alone("Lab 3\nMay\n" + GOOD, "line 3", "begin them with #"),
-    "header of a million blanks": alone("specimen," + "a" + " " * 10**6 + "b\n1,2\n", "displacement"),
+    "header of a million blanks": alone(
+        "specimen,a" + " " * 10**6 + "b\n1,2\n", "displacement"
+    ),
     "line of dashes": changed("T01,1,35,0,0\n", "-----\n", "line 2 has 1 cells"),
     "total below": beside(GOOD + "Total,,,,2.05\n", "line 6"),
     "specimen lost": changed("T01,1,35,1,", ",1,35,1,", "line 4", "specimen"),
