@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -90,7 +91,9 @@ def _matches(root: Path, pattern: str) -> list[Path]:
     if pattern and path.exists():
         return [path]
     relative = path.relative_to(path.anchor) if Path(pattern).is_absolute() else pattern
-    return sorted((Path(path.anchor) if Path(pattern).is_absolute() else root).glob(str(relative)))
+    # Folders below folders once: pathlib walks through all of them for every further "**/".
+    once = re.sub(r"(?:\*\*/)+", "**/", str(relative))
+    return sorted((Path(path.anchor) if Path(pattern).is_absolute() else root).glob(once))
 
 
 def read_data(spec: FitSpec, root: Path) -> Measurements:

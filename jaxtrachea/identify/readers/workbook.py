@@ -26,7 +26,7 @@ MAX_MEMBERS = 10_000
 MAX_SHEET_BYTES = 512 * 2**20
 MAX_TEXTS_BYTES = 64 * 2**20
 MAX_PART_BYTES = 8 * 2**20
-#: Rows and columns of a sheet in Excel, and cells that are read (about 20 s).
+#: Rows and columns of a sheet in Excel, and cells that are read (about 50 s).
 MAX_ROWS = 2**20
 MAX_COLUMNS = 2**14
 MAX_CELLS = 5_000_000
