@@ -31,6 +31,7 @@ def load(path: Path, data: Path | None, *, refits: bool = False, quiet: bool = F
             measurements = usable(spec, measurements)
         if not quiet:
             print_bad(measurements)
+            print_notes(measurements)
         if not measurements.curves:
             raise Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
         return spec, measurements, problem_of(spec, measurements, refits=refits)
@@ -39,6 +40,17 @@ def load(path: Path, data: Path | None, *, refits: bool = False, quiet: bool = F
         raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
     except DataError as error:
         raise Stop(str(error)) from None
+
+
+def print_notes(measurements) -> None:
+    """Say what a user should know of how files were read, and which names look alike."""
+    from jaxtrachea.identify.names import look_alikes
+
+    notes = [*measurements.notes, *look_alikes((*measurements.curves, *measurements.bad))]
+    for note in notes[:20]:
+        to_stderr(f"[yellow]note:[/] {escape(note)}")
+    if len(notes) > 20:
+        to_stderr(f"... and {len(notes) - 20} more notes")
 
 
 def print_bad(measurements) -> None:

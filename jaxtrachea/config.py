@@ -88,6 +88,7 @@ class DataSection(Section):
     loading: Literal["require-monotone", "loading", "all"] = "require-monotone"
     force_sign: Literal[1, -1] = 1
     displacement_sign: Literal[1, -1] = 1
+    sheet: str | None = None
     tool_radius: PositiveLength | None = None
 
     @model_validator(mode="before")

@@ -125,6 +125,8 @@ def _unit_table() -> dict[str, tuple[Fraction, tuple[int, int, int, int]]]:
 
 
 _UNITS = _unit_table()
+#: Longest header or quantity that is looked into; the expressions below may take its square.
+MAX_TEXT = 1000
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
 _FACTOR = re.compile(r"(?P<name>.*?[^\d^+-])\^?(?P<power>[+-]?\d+)")
 _QUANTITY = re.compile(r"(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>.*)")
@@ -248,6 +250,10 @@ def parse_quantity(text: str | float | int, dimension: str) -> float:
         if dimension == "dimensionless" and not isinstance(text, bool) and math.isfinite(text):
             return float(text)
         raise UnitError(f'{text!r} has no unit: write it with one, as in "{text} {example}"')
+    if len(text) > MAX_TEXT:
+        raise UnitError(
+            f'{text[:40]!r} ... is too long for a number with a unit: write "9.5 {example}"'
+        )
     match = _QUANTITY.fullmatch(text.strip())
     if match is None or match["unit"].startswith(","):
         raise UnitError(f'{text!r} is not a number with a unit: write it as in "9.5 {example}"')
@@ -275,6 +281,8 @@ def column_unit(header: str) -> tuple[str, str | None]:
         Name and unit; the unit is None if the header has none.
     """
     text = header.strip()
+    if len(text) > MAX_TEXT:
+        return text, None
     match = re.fullmatch(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))", text)
     if match and match[1]:
         return match[1], (match[2] if match[2] is not None else match[3]).strip()

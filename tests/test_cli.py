@@ -397,6 +397,46 @@ def test_check_reads_and_reports(study, monkeypatch, capsys):
     assert tree(study) == before
 
 
+def test_commands_say_names_that_look_alike(study, monkeypatch, capsys):
+    (study / "good.csv").write_text(GOOD + GOOD.partition("\n")[2].replace("T01", "t01"))
+    code, _, err = run(monkeypatch, capsys, "check", study / "spec.toml")
+    assert code == 0
+    assert "note: specimens 'T01' (1 curve, first" in err
+    assert "differ by case alone" in err
+    # `fit` says it before it looks for the run to go on with, of which there is none.
+    there = ("--resume", "--out", study / "none")
+    code, _, err = run(monkeypatch, capsys, "fit", study / "spec.toml", *there)
+    assert code == 2
+    assert "differ by case alone" in err
+
+
+def test_a_file_whose_name_looks_alike_is_named(study, monkeypatch, capsys):
+    (study / "good.csv").rename(study / "Good.csv")
+    if (study / "good.csv").exists():
+        pytest.skip("this file system does not tell the two apart")
+    code, _, err = run(monkeypatch, capsys, "check", study / "spec.toml")
+    assert code == 2
+    assert "'good.csv' matches" in err
+    assert "'Good.csv', which looks alike, is there; write its name so" in err
+
+
+def test_check_says_which_sheet(study, monkeypatch, capsys):
+    openpyxl = pytest.importorskip("openpyxl", reason="openpyxl (extra 'xlsx') is not installed")
+    book = openpyxl.Workbook()
+    book.active.title = "Data"
+    for line in GOOD.splitlines():
+        cells = line.split(",")
+        numbers = line[0] == "T"
+        book.active.append([*cells[:2], *(map(float, cells[2:]) if numbers else cells[2:])])
+    book.create_sheet("Notes")
+    book.save(study / "good.xlsx")
+    (study / "spec.toml").write_text('[data]\nfiles = "good.xlsx"\nsheet = "Data"\n')
+    code, out, err = run(monkeypatch, capsys, "check", study / "spec.toml")
+    assert code == 0
+    assert "1 usable curves" in out
+    assert "sheet 'Data' was read, not 'Notes'; data.sheet chooses another" in err
+
+
 def test_hostile_hdf5_costs_its_own_row(study, monkeypatch, capsys):
     with h5py.File(study / "evil.h5", "w") as file:
         file.attrs["schema"], file.attrs["schema_version"] = "jaxtrachea-measurements", 1

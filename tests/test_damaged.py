@@ -97,4 +97,4 @@ def test_damaged_in_a_process(name, folder):
 
 def test_there_are_many_kinds():
     assert len(CASES) >= 400
-    assert len({name.partition(": ")[0] for name in CASES}) == 5
+    assert len({name.partition(": ")[0] for name in CASES}) == 6

@@ -183,7 +183,7 @@ def test_first_line_state(tmp_path):
             {},
             "starts in line 3 and again in line 7",
         ),
-        (TIDY.replace("T02,a,40,90,0,", ",a,40,90,0,"), {}, "line 6: specimen or trial is empty"),
+        (TIDY.replace("T02,a,40,90,0,", ",a,40,90,0,"), {}, "line 6: specimen is empty; name it"),
         (TIDY.replace("joint_7", "joint_3"), {}, "column 'joint_3' is there twice"),
         (TIDY.replace("joint_7", "joint_0"), {}, "ring below 1"),
         (TIDY.replace("joint_3 [um]", "load [N]"), {}, "'force', 'load' can all be the force"),

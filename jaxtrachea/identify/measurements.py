@@ -5,6 +5,7 @@ comes back as a `BadCurve` with its reason, and only what spoils a whole file or
 `DataError`. The formats are described in docs/measurements.md.
 """
 
+import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,21 +13,20 @@ from pathlib import Path
 
 from jaxtrachea.identify.readers import afmformats, csv, hdf5, machine_csv
 from jaxtrachea.identify.readers.checks import finish
+from jaxtrachea.identify.readers.lines import Line, Text, is_comment, read_lines
+from jaxtrachea.identify.readers.patterns import ensure_quick
+from jaxtrachea.identify.readers.recognise import kind_of
 from jaxtrachea.identify.readers.records import (
     BadCurve,
     Curve,
     DataError,
     Fault,
+    RawCurve,
     ReadOptions,
 )
 from jaxtrachea.identify.readers.safe_hdf5 import opened
-from jaxtrachea.identify.readers.text import (
-    ALIASES,
-    guess_delimiter,
-    is_comment,
-    read_lines,
-    split_cells,
-)
+from jaxtrachea.identify.readers.text import ALIASES, guess_delimiter, split_cells
+from jaxtrachea.identify.readers.workbook import listed, read_sheet
 from jaxtrachea.units import column_unit
 
 __all__ = [
@@ -39,12 +39,10 @@ __all__ = [
     "write_hdf5",
 ]
 
-_READERS = {
-    "tidy": csv.read,
-    "machine": machine_csv.read,
-    "hdf5": hdf5.read,
-    "afmformats": afmformats.read,
-}
+_TEXT_READERS = {"tidy": csv.read, "machine": machine_csv.read}
+_FILE_READERS = {"hdf5": hdf5.read, "afmformats": afmformats.read}
+#: What another sheet of the same workbook may mend.
+_OF_THE_SHEET = ("empty", "column_missing")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +53,13 @@ class Measurements:
         curves: usable curves, in the order of the files and within them.
         bad: what could not be used, in the same order.
         files: the files read.
+        notes: what a user should know of how they were read, in a line each.
     """
 
     curves: tuple[Curve, ...]
     bad: tuple[BadCurve, ...]
     files: tuple[Path, ...]
+    notes: tuple[str, ...] = ()
 
     def sha256(self) -> dict[str, str]:
         """SHA-256 of each file as it is now, in hexadecimal, by its path as given.
@@ -88,7 +88,8 @@ def read_measurements(
 
     Raises:
         DataError: a file is missing, unreadable, hostile or of no known format, its table is
-            malformed, or a (specimen, trial) comes twice.
+            malformed, a (specimen, trial) comes twice, or the specimen pattern backtracks for
+            seconds on the name of a file.
     """
     options = options or ReadOptions()
     if isinstance(paths, (str, bytes)) or not paths:
@@ -96,11 +97,15 @@ def read_measurements(
     files = tuple(Path(path) for path in paths)
     curves: list[Curve] = []
     bad: list[BadCurve] = []
+    notes: list[str] = []
+    if options.name_pattern is not None:
+        ensure_quick(options.name_pattern, [path.name for path in files])
     seen: dict[tuple[str, str], str] = {}
     for path in files:
-        kind = options.format if options.format != "auto" else None
         _check_file(path)
-        for record in _READERS[kind or _sniff(path)](path, options):
+        records, said = _read_file(path, options)
+        notes.extend(said)
+        for record in records:
             key = (record.specimen, record.trial)
             if key in seen:
                 raise DataError(
@@ -113,7 +118,7 @@ def read_measurements(
                 bad.append(done)
             else:
                 curves.append(done)
-    return Measurements(tuple(curves), tuple(bad), files)
+    return Measurements(tuple(curves), tuple(bad), files, tuple(notes))
 
 
 def write_hdf5(
@@ -144,16 +149,63 @@ def _check_file(path: Path) -> None:
     if not path.exists():
         raise DataError(f"{path}: no such file; check the path")
     if not path.is_file():
-        raise DataError(f"{path}: is no file; list the files in it instead")
+        what = "a folder, so is no file" if path.is_dir() else "a device or a pipe, so is no file"
+        raise DataError(f"{path}: is {what}; list files with curves instead")
 
 
-def _sniff(path: Path) -> str:
-    """Format of a file by its content."""
-    with path.open("rb") as stream:
-        magic = stream.read(8)
-    if magic == b"\x89HDF\r\n\x1a\n" or path.suffix.lower() in (".h5", ".hdf5"):
-        return _sniff_hdf5(path)
-    lines = read_lines(path)
+def _read_file(path: Path, options: ReadOptions) -> tuple[list[RawCurve | BadCurve], list[str]]:
+    """What one file holds, and what should be said of it.
+
+    Raises:
+        DataError: as `read_measurements`.
+    """
+    asked = None if options.format == "auto" else options.format
+    named_hdf5 = path.suffix.lower() in (".h5", ".hdf5")
+    found = "hdf5" if named_hdf5 and asked is None else kind_of(path)
+    if found == "hdf5" and asked is None:
+        asked = _sniff_hdf5(path)
+    if asked in _FILE_READERS and found != "xlsx":
+        return _FILE_READERS[asked](path, options), []
+    if found == "xlsx" and asked not in _FILE_READERS:
+        return _read_workbook(path, asked, options)
+    if found != "text":
+        what = "HDF5" if found == "hdf5" else "a workbook (xlsx)"
+        raise DataError(f"{path}: is {what}, but data.format is {asked!r}; remove data.format")
+    text = Text(path, read_lines(path))
+    kind = asked or _sniff(text.lines)
+    if kind == "afmformats":
+        return afmformats.read(path, options), []
+    return _TEXT_READERS[kind](text, options), []
+
+
+def _read_workbook(
+    path: Path, asked: str | None, options: ReadOptions
+) -> tuple[list[RawCurve | BadCurve], list[str]]:
+    """The curves of a sheet, and which sheet it is if there are several.
+
+    Raises:
+        DataError: the workbook or the table of the sheet cannot be read.
+    """
+    text, sheets = read_sheet(path, options.sheet)
+    others = listed([name for name in sheets if name != text.sheet])
+    hint = f", or choose another sheet with data.sheet ({others})" if others else ""
+    kind = asked or _sniff(text.lines)
+    try:
+        records = _TEXT_READERS["tidy" if kind == "afmformats" else kind](text, options)
+    except DataError as error:
+        raise DataError(f"{error}{hint}") from None
+    records = [
+        dataclasses.replace(r, cure=r.cure + hint)
+        if isinstance(r, BadCurve) and r.kind in _OF_THE_SHEET
+        else r
+        for r in records
+    ]
+    note = f"{path}: sheet {text.sheet!r} was read, not {others}; data.sheet chooses another"
+    return records, [note] if others else []
+
+
+def _sniff(lines: list[Line]) -> str:
+    """Format of a text by its lines."""
     if any("BEGIN METADATA" in line.text for line in lines[:10]):
         return "afmformats"
     content = [line.text for line in lines if not is_comment(line)]

@@ -1,6 +1,8 @@
 """From a fit specification to a problem: opens the files, names what is wrong, builds the lanes."""
 
+import contextlib
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +18,11 @@ from jaxtrachea.identify.measurements import (
     ReadOptions,
     read_measurements,
 )
+from jaxtrachea.identify.names import appearance
 from jaxtrachea.identify.parameters import DEFAULTS, Parameter, in_model
 from jaxtrachea.identify.problem import Noise, Problem, build, check_curve
+from jaxtrachea.identify.readers.patterns import ensure_quick
+from jaxtrachea.identify.readers.recognise import is_workbook
 from jaxtrachea.identify.solve import Tolerances
 from jaxtrachea.model import Options
 from jaxtrachea.trachea.geometry import Geometry, table_1
@@ -45,7 +50,10 @@ def find_files(spec: FitSpec, root: Path) -> list[Path]:
             ) from None
         files = [path for path in matches if path.is_file()]
         if not files:
-            raise SpecError(f"data.files.{i}: {_short(pattern)} matches in {root} {_what(matches)}")
+            raise SpecError(
+                f"data.files.{i}: {_short(pattern)} matches in {root} "
+                f"{_what(matches) if matches else _nothing(root / pattern)}"
+            )
         found.update(dict.fromkeys(files))
     return list(found)
 
@@ -57,11 +65,19 @@ def _short(pattern: str) -> str:
 
 def _what(matches: list[Path]) -> str:
     """What a pattern leads to that is no file, and the cure."""
-    if not matches:
-        return "no file; check the name, or say where the data are with --data"
     if matches[0].is_dir():
         return "a folder; list the files in it, as in 'folder/*.csv'"
     return "a device or a pipe; expected a file"
+
+
+def _nothing(path: Path) -> str:
+    """That there is no such file, the one whose name looks like it if there is any, the cure."""
+    with contextlib.suppress(OSError):
+        names = sorted(other.name for other in path.parent.iterdir())
+        for name in names:
+            if name != path.name and appearance(name) == appearance(path.name):
+                return f"no file; {ascii(name)}, which looks alike, is there; write its name so"
+    return "no file; check the name, or say where the data are with --data"
 
 
 def _reason(error: Exception) -> str:
@@ -75,7 +91,9 @@ def _matches(root: Path, pattern: str) -> list[Path]:
     if pattern and path.exists():
         return [path]
     relative = path.relative_to(path.anchor) if Path(pattern).is_absolute() else pattern
-    return sorted((Path(path.anchor) if Path(pattern).is_absolute() else root).glob(str(relative)))
+    # Folders below folders once: pathlib walks through all of them for every further "**/".
+    once = re.sub(r"(?:\*\*/)+", "**/", str(relative))
+    return sorted((Path(path.anchor) if Path(pattern).is_absolute() else root).glob(once))
 
 
 def read_data(spec: FitSpec, root: Path) -> Measurements:
@@ -93,13 +111,21 @@ def read_data(spec: FitSpec, root: Path) -> Measurements:
     except ValueError as error:
         raise SpecError(f"data: {error}") from None
     files = find_files(spec, root)
+    if options.name_pattern is not None:
+        try:
+            ensure_quick(options.name_pattern, [path.name for path in files])
+        except DataError as error:
+            raise SpecError(f"data.specimen: {error}") from None
+    if options.sheet is not None and not any(map(is_workbook, files)):
+        raise SpecError("data.sheet: none of the files is a workbook (xlsx); remove it")
     if len(files) == 1:
         return read_measurements(files, options)
     parts = [_read_one(path, options) for path in files]
     curves = [curve for part in parts for curve in part.curves]
     bad = [curve for part in parts for curve in part.bad]
+    notes = [note for part in parts for note in part.notes]
     _refuse_twice(parts)
-    return Measurements(tuple(curves), tuple(bad), tuple(files))
+    return Measurements(tuple(curves), tuple(bad), tuple(files), tuple(notes))
 
 
 def _read_one(path: Path, options: ReadOptions) -> Measurements:

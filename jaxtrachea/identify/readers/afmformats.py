@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from jaxtrachea.identify.readers.checks import bad
+from jaxtrachea.identify.readers.lines import Line, read_lines
 from jaxtrachea.identify.readers.records import (
     BadCurve,
     DataError,
@@ -30,7 +31,7 @@ from jaxtrachea.identify.readers.records import (
     identify_file,
 )
 from jaxtrachea.identify.readers.safe_hdf5 import attribute, numeric, opened, unit_of
-from jaxtrachea.identify.readers.text import Line, numbers, read_lines, read_rows, resolve_unit
+from jaxtrachea.identify.readers.text import numbers, read_rows, resolve_unit
 from jaxtrachea.units import convert
 
 # afmformats fixes the unit of each column to SI; its tab files do not repeat it.

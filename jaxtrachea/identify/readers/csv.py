@@ -1,11 +1,11 @@
 """Tidy CSV or TSV: one row per sample, one table for a whole study."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 
 from jaxtrachea.identify.readers.checks import bad
+from jaxtrachea.identify.readers.lines import Line, Text, is_comment
 from jaxtrachea.identify.readers.records import (
     BadCurve,
     DataError,
@@ -16,12 +16,9 @@ from jaxtrachea.identify.readers.records import (
     role_dimension,
 )
 from jaxtrachea.identify.readers.text import (
-    Line,
     Table,
     find_roles,
     guess_delimiter,
-    is_comment,
-    read_lines,
     read_rows,
     require_roles,
     resolve_unit,
@@ -33,11 +30,11 @@ from jaxtrachea.units import column_unit, parse_quantity
 NUMERIC = ("s", "phi", "displacement", "force", "sigma")
 
 
-def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
+def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
     """Read a tidy table; see docs/measurements.md for the format.
 
     Args:
-        path: the file.
+        text: the lines of the file.
         options: columns, units and naming.
 
     Returns:
@@ -46,10 +43,10 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
     Raises:
         DataError: the header, a unit or the shape of the table is wrong.
     """
-    lines = [line for line in read_lines(path) if not is_comment(line)]
+    place, lines = text.place, [line for line in text.lines if not is_comment(line)]
     try:
-        state, lines = _state(lines)
-        table = _table(path, lines)
+        state, lines = _state(lines, text.word)
+        table = _table(text, lines)
         roles = find_roles(table.names, options)
         require_roles(roles, table.names)
         units = {
@@ -58,17 +55,17 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
             if role in NUMERIC or role.startswith("joint_")
         }
     except Fault as fault:
-        raise DataError(f"{path}: {fault}") from None
+        raise DataError(f"{place}: {fault}") from None
     except DataError as error:
-        raise DataError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+        raise DataError(str(error) if place in str(error) else f"{place}: {error}") from None
     twice = [key for key in state if key in roles]
     if twice:
-        raise DataError(f"{path}: {twice[0]} stands in the first line and in a column; remove one")
+        raise DataError(f"{place}: {twice[0]} stands in the first line and in a column; remove one")
     groups = _group(table, roles, state, options)
     return [_curve(table, roles, units, state, key, picked) for key, picked in groups.items()]
 
 
-def _state(lines: list[Line]) -> tuple[dict, list[Line]]:
+def _state(lines: list[Line], word: str) -> tuple[dict, list[Line]]:
     """The optional JSON object on the first line: what holds for the whole table."""
     if not lines or not lines[0].text.lstrip().startswith("{"):
         return {}, lines
@@ -76,48 +73,59 @@ def _state(lines: list[Line]) -> tuple[dict, list[Line]]:
         state = json.loads(lines[0].text)
     except (ValueError, RecursionError) as error:
         raise DataError(
-            f"line {lines[0].number}: not a JSON object ({error}); correct it"
+            f"{word} {lines[0].number}: not a JSON object ({error}); correct it"
         ) from None
     known: dict = {key: str(state[key]) for key in ("specimen", "trial") if key in state}
     for key in ("s", "phi"):
         if key in state:
             if not isinstance(state[key], str | int | float):
                 raise DataError(
-                    f'line {lines[0].number}: {key}: expected a quantity with its unit, as "17 mm"'
+                    f"{word} {lines[0].number}: {key}: expected a quantity with its unit,"
+                    ' as "17 mm"'
                 )
             try:
                 known[key] = parse_quantity(state[key], role_dimension(key))
             except (ValueError, TypeError) as error:
-                raise DataError(f"line {lines[0].number}: {key}: {error}") from None
+                raise DataError(f"{word} {lines[0].number}: {key}: {error}") from None
     return known, lines[1:]
 
 
-def _table(path: Path, lines: list[Line]) -> Table:
+def _table(text: Text, lines: list[Line]) -> Table:
     if not lines:
-        raise DataError(f"{path}: is empty; expected a header with displacement and force")
+        raise DataError(f"{text.place}: is empty; expected a header with displacement and force")
     delimiter = guess_delimiter(lines[0].text)
     header = split_cells(lines[0].text, delimiter)
     while header and header[-1] == "":
         header.pop()
     names, units = zip(*map(column_unit, header), strict=True)
-    repeated = {name for name in names if names.count(name) > 1}
+    repeated = {name for name in names if name and names.count(name) > 1}
     if repeated:
         raise DataError(
-            f"{path}: line {lines[0].number}: column {min(repeated)!r} is there twice; rename one"
+            f"{text.place}: {text.word} {lines[0].number}: column {min(repeated)!r} is there"
+            " twice; rename one"
         )
-    numbers, rows = read_rows(lines[1:], len(header), delimiter)
+    numbers, rows = read_rows(lines[1:], len(header), delimiter, text.word)
     if not rows:
         raise DataError(
-            f"{path}: no rows below the header in line {lines[0].number}; export it again"
+            f"{text.place}: no rows below the header in {text.word} {lines[0].number};"
+            " export it again"
         )
-    return Table(path, list(names), list(units), lines[0].number, numbers, rows, delimiter)
+    return Table(
+        text=text,
+        names=list(names),
+        units=list(units),
+        header_line=lines[0].number,
+        lines=numbers,
+        rows=rows,
+        delimiter=delimiter,
+    )
 
 
 def _group(
     table: Table, roles: dict[str, int], state: dict, options: ReadOptions
 ) -> dict[tuple[str, str], list[int]]:
     """Row indices of each (specimen, trial); a curve must be one block, or it is there twice."""
-    name = None if "specimen" in {**roles, **state} else identify_file(table.path, options)
+    name = None if "specimen" in {**roles, **state} else identify_file(table.text.path, options)
     fixed = {
         "specimen": name.specimen if name else "",
         "trial": (name and name.trial) or "1",
@@ -130,20 +138,38 @@ def _group(
             row[roles[role]] if role in roles else fixed[role] for role in ("specimen", "trial")
         )
         key = (specimen, trial)
-        if not specimen or not trial or not (specimen + trial).isprintable():
-            raise DataError(
-                f"{table.path}: line {table.lines[i]}: specimen or trial is empty or"
-                " unprintable; name both"
-            )
-        if key != last and key in groups:
+        if key == last:
+            groups[key].append(i)
+            continue
+        if fault := _name_fault(table, "specimen", specimen) or _name_fault(table, "trial", trial):
+            raise DataError(f"{table.text.place}: {table.text.word} {table.lines[i]}: {fault}")
+        if key in groups:
             first = table.lines[groups[key][0]]
             raise DataError(
-                f"{table.path}: specimen {key[0]!r} trial {key[1]!r} starts in line {first} and"
-                f" again in line {table.lines[i]}; keep the rows of a curve together, or rename it"
+                f"{table.text.place}: specimen {key[0]!r} trial {key[1]!r} starts in"
+                f" {table.text.word} {first} and again in {table.text.word} {table.lines[i]};"
+                " keep the rows of a curve together, or rename it"
             )
-        groups.setdefault(key, []).append(i)
-        last = key
+        groups[key], last = [i], key
     return groups
+
+
+def _name_fault(table: Table, role: str, name: str) -> str:
+    """What is wrong with a name and its cure; empty if nothing is."""
+    if not name:
+        cure = "name it in every row"
+        if table.text.sheet is not None:
+            cure += " (merged cells hold their value in the first alone: unmerge and fill down)"
+        return f"{role} is empty; {cure}"
+    if name.startswith("=") and table.text.sheet is not None:
+        return (
+            f"{role} {name!r} is a formula without a stored value; open the file in a spreadsheet"
+            " program and save it, or write the name itself"
+        )
+    hidden = [c for c in name if not c.isprintable()]
+    if hidden:
+        return f"{role} {name!a} holds the unprintable character U+{ord(hidden[0]):04X}; rename it"
+    return ""
 
 
 def _curve(
@@ -155,7 +181,7 @@ def _curve(
     picked: list[int],
 ) -> RawCurve | BadCurve:
     rows = np.array([table.lines[i] for i in picked])
-    source = f"{table.path}:{rows[0]}-{rows[-1]}"
+    source = f"{table.text.place}:{rows[0]}-{rows[-1]}"
     try:
         values = {
             role: role_values(table, role, roles[role], picked, unit)
@@ -168,6 +194,7 @@ def _curve(
             values["displacement"],
             values["force"],
             rows,
+            table.text.word,
             s=_constant("s", values, state, table, picked),
             phi=_constant("phi", values, state, table, picked),
             sigma=values.get("sigma"),
@@ -190,7 +217,9 @@ def _constant(
     unknown = np.isnan(column)
     if unknown.any():
         line = table.lines[picked[int(np.argmax(unknown))]]
-        raise Fault("position", f"line {line}: {role} is empty or NaN", "give it in every row")
+        raise Fault(
+            "position", f"{table.text.word} {line}: {role} is empty or NaN", "give it in every row"
+        )
     if not np.allclose(column, column[0], rtol=1e-9, atol=1e-12):
         raise Fault(
             "position",

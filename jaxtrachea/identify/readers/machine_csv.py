@@ -1,10 +1,9 @@
 """Machine CSV: some lines about the test, then a table; one trial per file, named by the file."""
 
-from pathlib import Path
-
 import numpy as np
 
 from jaxtrachea.identify.readers.checks import bad
+from jaxtrachea.identify.readers.lines import Line, Text, is_comment
 from jaxtrachea.identify.readers.records import (
     BadCurve,
     Fault,
@@ -13,11 +12,8 @@ from jaxtrachea.identify.readers.records import (
     identify_file,
 )
 from jaxtrachea.identify.readers.text import (
-    Line,
     Table,
     find_roles,
-    is_comment,
-    read_lines,
     read_rows,
     require_roles,
     resolve_unit,
@@ -30,30 +26,30 @@ from jaxtrachea.units import column_unit, is_unit
 MAX_PREAMBLE = 500
 
 
-def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
+def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
     """Read the one curve of a machine file; whatever is wrong with it costs this curve only.
 
     Repeated rows and initial offsets are left as they are.
 
     Args:
-        path: the file.
+        text: the lines of the file.
         options: columns, units and naming.
 
     Returns:
         One record.
 
     Raises:
-        DataError: the file is unreadable, its name does not fit the pattern, or its units
-            contradict the options.
+        DataError: the name of the file does not fit the pattern, or its units contradict the
+            options.
     """
-    who = identify_file(path, options)
+    who = identify_file(text.path, options)
     trial = who.trial or "1"
-    source = str(path)
+    source = text.place
     try:
-        table, roles = _table(path, read_lines(path), options)
+        table, roles = _table(text, options)
         rows = np.array(table.lines, dtype=np.int64)
         if rows.size:
-            source = f"{path}:{rows[0]}-{rows[-1]}"
+            source = f"{text.place}:{rows[0]}-{rows[-1]}"
         values = _values(table, roles, options)
     except Fault as fault:
         return [bad(who.specimen, trial, source, fault)]
@@ -66,6 +62,7 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
             values["displacement"],
             values["force"],
             rows,
+            text.word,
             s=who.s,
             phi=who.phi,
             sigma=values.get("sigma"),
@@ -80,15 +77,15 @@ def _values(table: Table, roles: dict[str, int], options: ReadOptions) -> dict[s
     values = {}
     for role, i in roles.items():
         if role in ("displacement", "force", "sigma") or role.startswith("joint_"):
-            place = f"{table.path}: column {table.names[i]!r}"
+            place = f"{table.text.place}: column {table.names[i]!r}"
             unit = resolve_unit(role, table.units[i], options, place)
             values[role] = role_values(table, role, i, range(len(table.rows)), unit)
     return values
 
 
-def _table(path: Path, lines: list[Line], options: ReadOptions) -> tuple[Table, dict[str, int]]:
+def _table(text: Text, options: ReadOptions) -> tuple[Table, dict[str, int]]:
     """Find the header: the first line, by any delimiter, that names displacement and force."""
-    lines = [line for line in lines if not is_comment(line)]
+    lines = [line for line in text.lines if not is_comment(line)]
     if not lines:
         raise Fault("empty", "the file is empty", "export it again")
     reason: Fault | None = None
@@ -109,15 +106,32 @@ def _table(path: Path, lines: list[Line], options: ReadOptions) -> tuple[Table, 
                 # An ambiguous header is still the header; any other line is part of the preamble.
                 reason = fault if fault.kind == "ambiguous" else reason
                 continue
+            if "specimen" in roles and options.format == "auto":
+                raise Fault(
+                    "ambiguous",
+                    f"{text.word} {line.number} is the header of a table with a column for the"
+                    " specimen, but other lines stand above it",
+                    'remove them or begin them with #, or set format = "machine" to name the'
+                    " specimen after the file",
+                )
             at, units = _units_row(lines, at, delimiter, units)
-            numbers, rows = read_rows(lines[at + 1 :], len(names), delimiter)
-            return Table(path, names, units, line.number, numbers, rows, delimiter), roles
+            numbers, rows = read_rows(lines[at + 1 :], len(names), delimiter, text.word)
+            table = Table(
+                text=text,
+                names=names,
+                units=units,
+                header_line=line.number,
+                lines=numbers,
+                rows=rows,
+                delimiter=delimiter,
+            )
+            return table, roles
     if reason is not None:
         raise reason
     raise Fault(
         "column_missing",
         f"no header line names {options.columns.get('displacement', 'displacement')!r}"
-        f" and {options.columns.get('force', 'force')!r} in the first {MAX_PREAMBLE} lines",
+        f" and {options.columns.get('force', 'force')!r} in the first {MAX_PREAMBLE} {text.word}s",
         "name the columns in columns.displacement and columns.force",
     )
 

@@ -155,6 +155,7 @@ class ReadOptions:
             branch) or "all" (keep every sample).
         force_sign: -1 if the file counts the resisting force negative.
         displacement_sign: -1 if the file counts inward displacement negative.
+        sheet: which sheet of a workbook holds the table; None: the first that is not hidden.
         min_points: fewest samples of a curve.
         max_displacement: largest plausible displacement, mm.
         min_range: smallest plausible range of displacement, mm.
@@ -175,6 +176,7 @@ class ReadOptions:
     loading: str = "require-monotone"
     force_sign: int = 1
     displacement_sign: int = 1
+    sheet: str | None = None
     min_points: int = 2
     max_displacement: float = 1000.0
     min_range: float = 1e-6
@@ -226,7 +228,7 @@ class ReadOptions:
         if "(?P<" not in text:
             parts = re.split(r"\{(\w+)\}", text)
             parts = [f"(?P<{p}>.+?)" if i % 2 else re.escape(p) for i, p in enumerate(parts)]
-            text = "^" + "".join(parts) + r"(?:\.\w+)?$"
+            text = "^" + "".join(parts) + r"(?:\.\w+)?(?:\.gz)?$"
         try:
             pattern = re.compile(text)
         except re.error as error:
@@ -268,14 +270,15 @@ class FileIdentity:
 def identify_file(path: Path, options: ReadOptions) -> FileIdentity:
     """Specimen, trial and position from a file name by `ReadOptions.specimen`.
 
-    Without a pattern the specimen is the file name without its suffix.
+    Without a pattern the specimen is the file name without its suffix (``.csv`` or ``.csv.gz``).
 
     Raises:
         DataError: the pattern does not fit, or s or phi is no number or has no unit.
     """
     pattern = options.name_pattern
     if pattern is None:
-        return FileIdentity(path.stem, None, None, None)
+        name = path.with_suffix("") if path.suffix.lower() == ".gz" else path
+        return FileIdentity(name.stem, None, None, None)
     match = pattern.search(path.name)
     if match is None:
         raise DataError(

@@ -1,17 +1,16 @@
-"""What all text files share: encoding, lines, cells, numbers, and which column plays which role."""
+"""What all tables share: cells, numbers, units, and which column plays which role."""
 
 import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from jaxtrachea.identify.readers.lines import Line, Text, is_comment
 from jaxtrachea.identify.readers.records import JOINT, DataError, Fault, ReadOptions, role_dimension
 from jaxtrachea.units import UnitError, column_unit, convert, unit_factor
 
-MAX_TEXT_BYTES = 256 * 2**20
 # Column names understood without `ReadOptions.columns`, in lower case.
 ALIASES = {
     "specimen": ("specimen",),
@@ -23,56 +22,7 @@ ALIASES = {
     "sigma": ("sigma", "force_sigma", "force_noise"),
 }
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
-
-
-@dataclass(frozen=True)
-class Line:
-    """One line of a text file and its number, counted from 1."""
-
-    number: int
-    text: str
-
-
-def read_lines(path: Path) -> list[Line]:
-    """All lines of a text file that hold something, with their numbers.
-
-    UTF-8 (with or without byte-order mark) and UTF-16 with one are decoded; other bytes are taken
-    for Latin-1, in which many instruments write µ and °. Unix, DOS and old Mac line ends.
-
-    Raises:
-        DataError: the file is too large, unreadable or binary.
-    """
-    try:
-        size = path.stat().st_size
-        if size > MAX_TEXT_BYTES:
-            raise DataError(
-                f"{path}: {size} bytes of text, at most {MAX_TEXT_BYTES} are read;"
-                " split it or use HDF5"
-            )
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(
-            f"{path}: cannot be read ({error.strerror}); check the permissions"
-        ) from None
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        text = data.decode("utf-16", errors="replace")
-    else:
-        try:
-            text = data.decode("utf-8")
-        except UnicodeDecodeError:
-            text = data.decode("latin-1")
-    text = text.lstrip("\ufeff")
-    if "\0" in text:
-        raise DataError(
-            f"{path}: holds zero bytes, so it is no text table; export it as CSV or HDF5"
-        )
-    lines = re.split(r"\r\n|\n|\r", text)
-    return [Line(i, line) for i, line in enumerate(lines, 1) if line.strip()]
-
-
-def is_comment(line: Line) -> bool:
-    """Whether a line is a ``#`` comment."""
-    return line.text.lstrip().startswith("#")
+_DATE = re.compile(r"\d{4}-\d\d-\d\d|\d\d:\d\d:\d\d")
 
 
 def split_cells(text: str, delimiter: str) -> list[str]:
@@ -102,16 +52,16 @@ class Table:
     """A header and rows of as many cells.
 
     Attributes:
-        path: the file.
+        text: where it comes from.
         names: column names without units.
         units: column units, None where the header gives none.
-        header_line: line number of the header.
-        lines: line number of each row.
+        header_line: number of the header, in the file or sheet.
+        lines: number of each row.
         rows: the cells.
         delimiter: what separates them.
     """
 
-    path: Path
+    text: Text
     names: list[str]
     units: list[str | None]
     header_line: int
@@ -125,7 +75,7 @@ class Table:
 
 
 def read_rows(
-    lines: Sequence[Line], width: int, delimiter: str
+    lines: Sequence[Line], width: int, delimiter: str, word: str = "line"
 ) -> tuple[list[int], list[list[str]]]:
     """Cells of the rows of a table; empty cells beyond the header are dropped.
 
@@ -139,17 +89,21 @@ def read_rows(
         try:
             cells = split_cells(line.text, delimiter)
         except Fault as fault:
-            raise Fault(fault.kind, f"line {line.number}: {fault.message}", fault.cure) from None
+            raise Fault(fault.kind, f"{word} {line.number}: {fault.message}", fault.cure) from None
         if not any(cells):
             continue
         while len(cells) > width and cells[-1] == "":
             cells.pop()
         if len(cells) != width:
             cure = "complete or remove the row"
-            if delimiter == "," and len(cells) > width:
+            if word == "row" and len(cells) > width:
+                cure = "clear the cells beside the table, or give their columns a header"
+            elif delimiter == "," and len(cells) > width:
                 cure += "; decimal commas need ; or tab between the columns"
             raise Fault(
-                "ragged", f"line {line.number} has {len(cells)} cells, the header has {width}", cure
+                "ragged",
+                f"{word} {line.number} has {len(cells)} cells, the header has {width}",
+                cure,
             )
         numbers.append(line.number)
         rows.append(cells)
@@ -202,9 +156,11 @@ def find_roles(names: Sequence[str], options: ReadOptions) -> dict[str, int]:
 
 
 def _no_column(wanted: str, role: str, names: Sequence[str]) -> Fault:
+    shown = [repr(name if len(name) <= 60 else f"{name[:56]} ...") for name in names[:30]]
+    more = f" and {len(names) - 30} more" if len(names) > 30 else ""
     return Fault(
         "column_missing",
-        f"no column {wanted!r} for the {role}; the columns are {', '.join(map(repr, names))}",
+        f"no column {wanted!r} for the {role}; the columns are {', '.join(shown)}{more}",
         f"name it in columns.{role}",
     )
 
@@ -251,7 +207,9 @@ def resolve_unit(role: str, found: str | None, options: ReadOptions, place: str)
     return unit
 
 
-def numbers(cells: Sequence[str], lines: Sequence[int], name: str, delimiter: str) -> np.ndarray:
+def numbers(
+    cells: Sequence[str], lines: Sequence[int], name: str, delimiter: str, word: str = "line"
+) -> np.ndarray:
     """Numbers of one column; empty cells become NaN.
 
     A comma counts as the decimal sign where it does not separate the columns, unless another
@@ -271,13 +229,24 @@ def numbers(cells: Sequence[str], lines: Sequence[int], name: str, delimiter: st
             # float() takes 1_000, which no instrument means.
             values[i] = float("_" if "_" in cell else cell)
         except ValueError:
-            cure = "write numbers as 1.5 or 1.5e-3, and leave a missing value empty"
-            if "," in cell:
-                cure = "use one decimal sign throughout and no thousands separator"
+            shown = cell if len(cell) <= 80 else f"{cell[:76]} ..."
             raise Fault(
-                "unparsable", f"line {lines[i]}: {name} {cell!r} is not a number", cure
+                "unparsable",
+                f"{word} {lines[i]}: {name} {shown!r} is not a number",
+                _number_cure(cell),
             ) from None
     return values
+
+
+def _number_cure(cell: str) -> str:
+    """What to do about a cell that is no number."""
+    if cell.startswith("="):
+        return "open the file in a spreadsheet program and save it, so that formulas have values"
+    if _DATE.match(cell):
+        return "a spreadsheet took it for a date: set the column to numbers and write it anew"
+    if "," in cell:
+        return "use one decimal sign throughout and no thousands separator"
+    return "write numbers as 1.5 or 1.5e-3, and leave a missing value empty"
 
 
 def role_values(
@@ -286,5 +255,5 @@ def role_values(
     """Numbers of some rows of a role's column, in internal units (mm, N, rad, s)."""
     cells = [table.rows[i][index] for i in picked]
     lines = [table.lines[i] for i in picked]
-    values = numbers(cells, lines, table.names[index], table.delimiter)
+    values = numbers(cells, lines, table.names[index], table.delimiter, table.text.word)
     return convert(values, unit, role_dimension(role))

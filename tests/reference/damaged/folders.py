@@ -39,9 +39,16 @@ CASES = {
     "data a folder": only(lambda folder: (folder / "data.csv").mkdir(), "folder"),
     "data missing": only(None, "data.csv", "--data"),
     "data far above": only(None, spec='[data]\nfiles = "' + "../" * 60 + 'no.csv"\n'),
+    "data that cannot be read": Case(
+        ("mem", "cannot be read"), {"spec.toml": '[data]\nfiles = "/proc/self/mem"\n'}
+    ),
     "data with NUL in the name": only(None, spec='[data]\nfiles = "a\\u0000b.csv"\n'),
     "data with a long name": only(None, "long", spec=f'[data]\nfiles = "{"x" * 5000}"\n'),
     "pattern of nothing": only(None, "*.tsv", spec='[data]\nfiles = "*.tsv"\n'),
+    "pattern of many stars": only(
+        lambda folder: folder.joinpath(*["a"] * 40).mkdir(parents=True), "no file",
+        spec=f'[data]\nfiles = "{"**/" * 9}x.csv"\n',
+    ),
     "pattern that is none": only(None, "a**b", spec='[data]\nfiles = "a**b"\n'),
     "links to one file": Case(
         ("T01", "already in", "rename"),
