@@ -4,6 +4,7 @@ Exit codes: 0 everything converged, 1 some lane failed or some curve could not b
 3 another process was lost, 130 stopped by the user. What is heavy is imported inside the commands.
 """
 
+import contextlib
 import sys
 import time
 from pathlib import Path
@@ -58,6 +59,8 @@ def main() -> None:
         code = stop.exit_code
     except (typer.Abort, KeyboardInterrupt):
         code = 130
+    except OSError as error:  # none of the folders: those say where and what is kept
+        code = complain(_not_shown(error))
     except Exception as error:
         # Usage errors come from click or from typer's own copy of it, whichever is installed.
         usage = getattr(error, "format_message", None)
@@ -67,6 +70,14 @@ def main() -> None:
     if code == 130:  # some versions of typer turn Ctrl-C into this exit code themselves
         to_stderr("stopped; nothing was written")
     sys.exit(code or 0)
+
+
+def _not_shown(error: OSError) -> str:
+    """What is said where the terminal, or what stands for it, takes no more text."""
+    with contextlib.suppress(OSError):
+        sys.stdout.close()  # not tried again as Python ends
+    reason = error.strerror or str(error)
+    return f"{error.filename or 'the output'}: {reason}; files said to be kept or written are there"
 
 
 for _command in (
@@ -114,6 +125,7 @@ def fit(
     resume: cli_fit.ResumeOption = False,
     rerun_failed: cli_fit.RerunOption = False,
     force: cli_fit.ForceOption = False,
+    no_lock: cli_fit.NoLockOption = False,
     distributed: cli_fit.DistributedOption = False,
     coordinator: cli_fit.CoordinatorOption = None,
     processes: cli_fit.ProcessesOption = None,
@@ -127,7 +139,7 @@ def fit(
     clock = [time.perf_counter()]
     meeting = cli_fit.meet(distributed, coordinator, processes, process, patience)
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
-    how = cli_fit.How(out_dir, default, resume, rerun_failed, force, meeting)
+    how = cli_fit.How(out_dir, default, resume, rerun_failed, force, meeting, not no_lock)
     cli_fit.check_options(how)
     asked = {"leave-one-out": leave_one_out, "profile": profile, "influence": influence}
     options = [name for name, wanted in asked.items() if wanted]

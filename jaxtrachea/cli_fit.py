@@ -19,6 +19,9 @@ RerunOption = Annotated[
     bool, typer.Option("--rerun-failed", help="Fit the failed lanes of OUT again.")
 ]
 ForceOption = Annotated[bool, typer.Option("--force", help="Go on though inputs have changed.")]
+NoLockOption = Annotated[
+    bool, typer.Option("--no-lock", help="Start where the file system has no locks.")
+]
 DistributedOption = Annotated[
     bool, typer.Option("--distributed", help="Share the work as the cluster says.")
 ]
@@ -46,6 +49,7 @@ class How:
         rerun_failed: fit the failed lanes of a finished run again.
         force: whatever has changed.
         meeting: who takes part.
+        lock: keep other runs out of the folder.
     """
 
     out_dir: Path | None
@@ -54,6 +58,7 @@ class How:
     rerun_failed: bool
     force: bool
     meeting: Meeting
+    lock: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,14 +116,13 @@ def check_options(how: How) -> None:
 
 def remembered(how: How) -> list[str]:
     """Options that the run to go on with was started with; none if there is none to be read."""
-    from jaxtrachea.identify import former, journal, run_folder
+    from jaxtrachea.identify import former, run_folder
 
     if how.out_dir is None or not (how.resume or how.rerun_failed):
         return []
-    try:
-        return journal.read(how.out_dir / ".run" / "run.json").options
-    except (OSError, ValueError):  # what is damaged is said when it is opened
-        pass
+    journal, _ = run_folder.known_journal(how.out_dir)
+    if journal is not None:
+        return journal.options
     try:
         return former.read_journal(how.out_dir / "results.h5").options
     except run_folder.NoRun:
@@ -144,9 +148,31 @@ def describe(how: How, spec: Path, root: Path, loaded, measurements, problem, op
 
 
 def open_run(how: How, now, problem):
-    """New, resumed or rerun, as the user asks; ends the command where there is nothing to do."""
+    """New, resumed or rerun, as the user asks; ends the command where there is nothing to do.
+
+    The folder is locked until `RunFolder.release`.
+    """
+    from jaxtrachea.identify.run_lock import take
+
+    target, lock, going_on = how.out_dir, None, how.resume or how.rerun_failed
+    if target is not None and how.lock:
+        written, unfinished = ((target / name).is_dir() for name in (".written", ".run"))
+        again = how.rerun_failed and (target / "results.h5").exists()
+        if written or (going_on and unfinished) or again:
+            lock = take(target)
+    try:
+        run = _opened(how, now, problem)
+    except BaseException:
+        if lock is not None:
+            lock.release()
+        raise
+    return run if lock is None else dataclasses.replace(run, lock=lock)
+
+
+def _opened(how: How, now, problem):
+    """As `open_run`; a folder that is there is locked already."""
     from jaxtrachea.identify import run_folder
-    from jaxtrachea.identify.output import OutputExists
+    from jaxtrachea.identify.output import InUse, OutputExists
 
     target = how.out_dir
     if target is not None and target.is_dir() and run_folder.complete(target):
@@ -155,9 +181,10 @@ def open_run(how: How, now, problem):
         )
     if target is None or not (how.resume or how.rerun_failed):
         try:
-            return run_folder.claim(target, how.default, now)
+            return run_folder.claim(target, how.default, now, locked=how.lock)
         except OutputExists as error:
             hint = target is not None and (target / ".run").is_dir()
+            hint = hint and not isinstance(error, InUse)
             raise Stop(f"{error}" + (", or go on with --resume" if hint else "")) from None
     unfinished = (target / ".run").is_dir()
     if not unfinished and (target / "results.h5").exists():
@@ -233,6 +260,8 @@ def running(how: How, now, problem, settings) -> Iterator[Run]:
             if kept and isinstance(error, KeyboardInterrupt | Lost | OSError):
                 raise _kept(how, run, problem, error) from None
             raise
+        finally:
+            run.release()
 
 
 def _watched(watch: processes.Watch, **content):
@@ -244,22 +273,39 @@ def _watched(watch: processes.Watch, **content):
 def _said(how: How) -> Iterator[None]:
     """Failures to open or write a run become messages."""
     from jaxtrachea.identify.run_folder import NoRun
+    from jaxtrachea.identify.run_lock import Busy, NoLocks
 
     try:
         yield
-    except NoRun as error:
+    except (NoRun, Busy, NoLocks) as error:
         raise Stop(str(error)) from None
     except Lost as error:
         raise Kept(f"error: {error}", 3) from None
     except OSError as error:
-        where = how.out_dir or how.default
-        raise Stop(f"{where}: cannot be written ({error.strerror}); choose another --out") from None
+        raise Stop(_unwritable(how, error)) from None
+
+
+def _unwritable(how: How, error: OSError) -> str:
+    """What is said of a folder that a run could not even be opened in, or that keeps nothing."""
+    from jaxtrachea.identify.run_folder import saved_chunks
+    from jaxtrachea.identify.whole_files import cure
+
+    where, reason = how.out_dir or how.default, error.strerror or str(error)
+    text = f"{where}: cannot be written ({reason}); "
+    if not (how.resume or how.rerun_failed):
+        return f"{text}choose another --out"
+    kept = saved_chunks(where)
+    if kept:
+        text += f"{kept} finished chunk{'s are' if kept > 1 else ' is'} kept there; "
+    return f"{text}{cure(error)}, then give the same command again"
 
 
 def _say_what_is_there(run, problem, todo: list[int], damaged: list[int]) -> None:
     from jaxtrachea.identify import in_chunks
 
     count = in_chunks.count(run, problem)
+    if run.note:
+        to_stderr(f"[yellow]note:[/] {escape(f'{run.target}: {run.note}')}")
     if damaged:
         names = ", ".join(run.chunk(k).name for k in damaged)
         to_stderr(f"damaged, fitted again: {escape(names)}")
@@ -271,6 +317,7 @@ def _say_what_is_there(run, problem, todo: list[int], damaged: list[int]) -> Non
 def _kept(how: How, run, problem, error: BaseException) -> Kept:
     """What is kept of a run that was stopped, and how to go on; writes the lanes so far."""
     from jaxtrachea.identify import in_chunks, run_folder
+    from jaxtrachea.identify.whole_files import cure
 
     done, count = run.finished(), in_chunks.count(run, problem)
     text = f"{done} of {count} chunks are kept in {run.target}"
@@ -278,7 +325,8 @@ def _kept(how: How, run, problem, error: BaseException) -> Kept:
         with contextlib.suppress(OSError):
             in_chunks.write_so_far(run.target / run_folder.SO_FAR, run, problem)
             text += f", their lanes in {run_folder.SO_FAR}"
-    text = escape(f"{text}; go on with --out {run.target} --resume")
+    first = f"{cure(error)}, then " if isinstance(error, OSError) else ""
+    text = escape(f"{text}; {first}go on with --out {run.target} --resume")
     if isinstance(error, KeyboardInterrupt):
         return Kept(f"stopped; {text}")
     reason = (isinstance(error, OSError) and error.strerror) or str(error)

@@ -147,5 +147,5 @@ def into(out_dir: Path | None, default: Path) -> Iterator[tuple[Path, Callable[[
     except OutputExists as error:
         raise Stop(str(error)) from None
     except OSError as error:
-        where = out_dir or default
-        raise Stop(f"{where}: cannot be written ({error.strerror}); choose another --out") from None
+        where, reason = out_dir or default, error.strerror or str(error)
+        raise Stop(f"{where}: cannot be written ({reason}); choose another --out") from None

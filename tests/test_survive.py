@@ -1,23 +1,38 @@
 """Runs that are stopped, damaged, moved or shared: the numbers are those of a run in peace."""
 
 import dataclasses
+import errno
 import json
+import os
 import shutil
 import signal
 import socket
+import subprocess
+import sys
 import time
 
 import h5py
 import jax
 import numpy as np
 import pytest
+from full_disk import Disk
 from interrupted import finish, kill_often, numbers, start, wait_for, write_study
 from run_cli import run, tree
 
 import jaxtrachea
 from jaxtrachea import cli, processes
 from jaxtrachea.config import load_fit_spec
-from jaxtrachea.identify import chunks, fit, former, in_chunks, run_folder, solve
+from jaxtrachea.identify import (
+    chunks,
+    fit,
+    former,
+    in_chunks,
+    journal,
+    output,
+    run_folder,
+    run_lock,
+    solve,
+)
 from jaxtrachea.identify.study import problem_of, read_data
 from jaxtrachea.processes import Lost, Meeting, Watch
 from jaxtrachea.terminal import set_up_jax
@@ -178,8 +193,18 @@ def test_refusals(peace, study, monkeypatch, capsys):
     with monkeypatch.context() as patch:
         patch.setattr(jaxtrachea, "__version__", "99")
         refused(*FIT, "--resume", says=["jaxtrachea was 0", "and is 99"])
+    strip_journals(study / "out" / ".run")
     (study / "out" / ".run" / "run.json").write_text("{")
-    refused(*FIT, "--resume", says=["its journal cannot be read"])
+    refused(*FIT, "--resume", says=["its run.json cannot be read", "none of its 1 chunks says"])
+
+
+def strip_journals(folder):
+    """Chunks as they were before each held the journal of its run; the former journal is gone."""
+    for path in folder.glob("*.npz"):
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files if name != "journal"}
+        np.savez(path, **arrays)
+    (folder / "previous-run.json").unlink(missing_ok=True)
 
 
 def test_force_goes_on_and_says_so(study, monkeypatch, capsys):
@@ -244,7 +269,9 @@ def test_results_are_read_back_bit_for_bit(peace, tmp_path):
     problem = load_peace(peace)
     result = former.read_hdf5(peace / "out" / "results.h5", problem)
     lanes, path = np.arange(9), tmp_path / "0.npz"
-    chunks.save(path, "me", lanes, result)
+    run_of_it = former.read_journal(peace / "out" / "results.h5")
+    chunks.save(path, dataclasses.replace(run_of_it, id="me"), lanes, result)
+    assert chunks.read_journal(path) == dataclasses.replace(run_of_it, id="me")
     found = chunks.load(path, "me", lanes, problem)
     assert found is not None
     expected = chunks.arrays_of(result)
@@ -340,6 +367,308 @@ def test_no_cluster_is_said(study):
     assert "no cluster found" in err
     assert "give --coordinator" in err
     assert not (study / "out").exists()
+
+
+def begun(peace, study, monkeypatch, capsys):
+    """Stop the study in its third chunk; two are saved."""
+    with monkeypatch.context() as patch:
+        stop_at(patch, 3)
+        assert run(patch, capsys, *FIT)[0] == 130
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from jaxtrachea.identify.run_lock import take
+lock = take(Path("out"))
+print("held", "jax" in sys.modules, flush=True)
+sys.stdin.read()
+"""
+
+
+def test_two_runs_of_one_folder(peace, study, monkeypatch, capsys):
+    """A process holds the folder: nobody else starts, resumes or reruns there.
+
+    Killed, it holds nobody, though its file is still there.
+    """
+    begun(peace, study, monkeypatch, capsys)
+    shutil.copytree(peace / "out", study / "finished")
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "held False\n"
+        before = tree(study)
+        # Reading is free; the second of two commands of any kind is told who is at work.
+        for more in ((), ("--resume",), ("--resume", "--force"), ("--rerun-failed",)):
+            code, _, err = run(monkeypatch, capsys, *FIT, *more)
+            assert (code, len(err.splitlines())) == (2, 1), err
+            assert f"out: another run is at work here (process {other.pid} on " in err
+            assert "since 20" in err
+            assert "go on with" not in err
+            assert tree(study) == before
+        other.kill()
+    assert (study / "out" / run_lock.LOCK).exists()
+    code, _, err = run(monkeypatch, capsys, *FIT, "--resume")
+    assert (code, "2 of 3 chunks are there" in err) == (0, True), err
+    assert numbers(study / "out") == numbers(peace / "out")
+    assert sorted(tree(study / "out")) == sorted(tree(peace / "out"))
+
+
+def test_the_lock_lasts_as_long_as_the_run(study, monkeypatch, capsys):
+    """From the first chunk to the last file; new runs, too; and it is gone with the run."""
+    seen, real = [], fit.fit
+
+    def at_work(*_):
+        with pytest.raises(run_lock.Busy, match=f"process {os.getpid()} on"):
+            run_lock.take(study / "out")
+        with pytest.raises(output.InUse, match="another run is at work"):
+            output.new_directory(study / "out", study)
+        seen.append(len(seen))
+
+    def fit_and_look(*arguments):
+        at_work()
+        return real(*arguments)
+
+    monkeypatch.setattr("jaxtrachea.identify.fit.fit", fit_and_look)
+    monkeypatch.setattr("jaxtrachea.plots.draw_all", lambda *_: at_work() or [])
+    assert run(monkeypatch, capsys, *FIT)[0] == 0
+    assert len(seen) == 4
+    set_failed(study / "out" / "results.h5", [1])
+    assert run(monkeypatch, capsys, *FIT, "--rerun-failed")[0] == 0
+    assert len(seen) == 6
+    assert not any((study / "out").glob(".*"))
+
+
+def test_a_folder_that_another_run_takes_first(peace, tmp_path, monkeypatch):
+    """Between a look at an empty folder and its lock: a run that is there, or has come and gone."""
+    real, now = run_folder.take, former.read_journal(peace / "out" / "results.h5")
+
+    def late(folder):
+        lock = real(folder)
+        (folder / "results.h5").write_text("of the other")
+        return lock
+
+    monkeypatch.setattr(run_folder, "take", late)
+    with pytest.raises(output.OutputExists, match="not empty"):
+        run_folder.claim(tmp_path / "a", tmp_path, now)
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["results.h5"]
+    # The file is removed between the opening and the lock of another: that one opens it anew.
+    taken, first = run_lock._take, real(tmp_path)
+
+    def overtaken(stream):
+        monkeypatch.setattr(run_lock, "_take", taken)
+        first.release()
+        taken(stream)
+
+    monkeypatch.setattr(run_lock, "_take", overtaken)
+    second = real(tmp_path)
+    with pytest.raises(run_lock.Busy):
+        real(tmp_path)
+    second.release()
+    second.release()
+    assert not (tmp_path / run_lock.LOCK).exists()
+
+
+def test_a_file_system_without_locks(peace, study, monkeypatch, capsys):
+    def no_locks(stream):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(run_lock, "_take", no_locks)
+    code, _, err = run(monkeypatch, capsys, *FIT)
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert "its file system has no locks (No locks available)" in err
+    assert "--no-lock" in err
+    assert run(monkeypatch, capsys, *FIT, "--no-lock")[0] == 0
+    assert numbers(study / "out") == numbers(peace / "out")
+
+
+def from_peace(problem):
+    """Stand in for `fit.fit`: the same numbers, read back."""
+    whole = former.read_hdf5(problem / "out" / "results.h5", load_peace(problem))
+    names = [curves[0].specimen for curves in whole.problem.curves]
+    arrays = chunks.arrays_of(whole)
+
+    def fitted(problem, settings, progress):
+        rows = np.array([names.index(curves[0].specimen) for curves in problem.curves])
+        return chunks.result_of(problem, {name: v[rows] for name, v in arrays.items()})
+
+    return fitted
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS], ids=["full", "read-only"])
+def test_a_disk_that_fills_up(peace, study, monkeypatch, capsys, code):
+    """Each write of a run in turn is the first that fails: one line, exit code 2, what was saved.
+
+    With room again the run goes on to the same numbers.
+    """
+    monkeypatch.setattr("jaxtrachea.identify.fit.fit", from_peace(peace))
+    monkeypatch.setattr("jaxtrachea.cli_run.show", lambda *_: None)
+    out, expected = study / "out", numbers(peace / "out")
+    with Disk(out).watched() as disk:
+        assert run(monkeypatch, capsys, *FIT)[0] == 0
+    writes = disk.count
+    assert writes > 20
+    for first in range(1, writes + 1, 1 if code == errno.ENOSPC else 6):
+        shutil.rmtree(out)
+        with Disk(out, first, code).watched() as disk:
+            said, _, err = run(monkeypatch, capsys, *FIT)
+        if said == 0:  # only what may be left undone
+            assert numbers(out) == expected
+            continue
+        assert said == 2, err
+        assert "Traceback" not in err
+        assert os.strerror(code) in err.splitlines()[-1]
+        kept = len(list(out.glob(".run/*.npz")))
+        assert kept or not out.exists() or not any(out.iterdir())
+        if kept:
+            assert f"{kept} of 3 chunks are kept in out" in err
+            assert ("make room on the disk, then go on with --out out --resume" in err) == (
+                code == errno.ENOSPC
+            )
+            assert not list(out.glob(".run/*.npz.*"))
+        more = ("--resume",) if kept else ()
+        again, _, err = run(monkeypatch, capsys, *FIT, *more)
+        assert again == 0, (first, err)
+        assert not kept or f"{kept} of 3 chunks are there" in err or "are now in out" in err
+        assert numbers(out) == expected
+        assert sorted(tree(out)) == sorted(tree(peace / "out"))
+
+
+def test_a_folder_that_became_read_only(peace, study, monkeypatch, capsys):
+    """Resumed and rerun where nothing can be written: said with what is kept, nothing changed."""
+    begun(peace, study, monkeypatch, capsys)
+    shutil.copytree(peace / "out", study / "finished")
+    set_failed(study / "finished" / "results.h5", [1])
+    before = tree(study)
+    for folder, option in (("out", "--resume"), ("finished", "--rerun-failed")):
+        with Disk(study / folder, 1, errno.EROFS).watched():
+            code, _, err = run(monkeypatch, capsys, *FIT[:3], folder, option)
+        assert (code, len(err.splitlines())) == (2, 1), err
+        assert f"{folder}: cannot be written (Read-only file system)" in err
+        assert ("2 finished chunks are kept there" in err) == (folder == "out")
+        assert "copy it and go on in the copy" in err
+        assert tree(study) == before
+    with Disk(study / "finished", 1, errno.EROFS).watched():
+        code, _, err = run(monkeypatch, capsys, *FIT[:3], "finished", "--resume")
+    assert (code, "finished is finished" in err) == (0, True)
+
+
+def test_hdf5_on_a_full_disk(tmp_path):
+    """The HDF5 library itself ends the process there: files are put together in memory."""
+    code = f"""
+import resource
+from pathlib import Path
+from jaxtrachea.identify.whole_files import hdf5_file
+resource.setrlimit(resource.RLIMIT_FSIZE, (5000, resource.RLIM_INFINITY))
+try:
+    with hdf5_file(Path({str(tmp_path / "a.h5")!r})) as file:
+        for k in range(20):
+            file[f"a{{k}}"] = [1.0] * 500
+except OSError as error:
+    print(error.strerror)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "File too large\n", "")
+    assert not any(tmp_path.iterdir())
+
+
+def garbled(path):
+    """run.json, damaged in one way after another; yields what is to be said of it."""
+    text = path.read_text()
+    for content in (text[: len(text) // 2], "", "\0\xff" * 40, "[1, 2]", "5", '{"schema": 1}',
+                    text.replace('"lanes": 9', '"lanes": "9"'), "[" * 100_000):  # fmt: skip
+        path.write_bytes(content.encode("latin-1"))
+        yield
+    path.unlink()
+    yield
+
+
+def test_a_damaged_journal_costs_no_chunk(peace, study, monkeypatch, capsys):
+    """Every chunk holds the journal of its run: rebuilt, still checked, and said."""
+    begun(peace, study, monkeypatch, capsys)
+    shutil.copytree(study / "out", study / "kept")
+    path = study / "out" / ".run" / "run.json"
+    fitted = from_peace(peace)
+    for _ in garbled(path):
+        (path.parent / "previous-run.json").unlink(missing_ok=True)
+        with monkeypatch.context() as patch:
+            changed_input(study)
+            code, _, err = run(patch, capsys, *FIT, "--resume")
+            assert (code, "curves.csv has changed" in err) == (2, True), err
+            shutil.copy(peace / "curves.csv", study)
+            asked = []
+            patch.setattr(
+                "jaxtrachea.identify.fit.fit", lambda p, *a, n=asked: n.append(p) or fitted(p, *a)
+            )
+            code, _, err = run(patch, capsys, *FIT, "--resume")
+        assert code == 0, err
+        assert "its run.json cannot be read" in err
+        assert "it was rebuilt from its 2 chunks" in err
+        assert len(asked) == 1
+        assert numbers(study / "out") == numbers(peace / "out")
+        shutil.rmtree(study / "out")
+        shutil.copytree(study / "kept", study / "out")
+
+
+def test_options_and_force_outlive_the_journal(peace, study, monkeypatch, capsys):
+    """What a resume added is in the former copy, or in the chunks saved since.
+
+    Without both and without chunks nothing is lost, and the run starts anew.
+    """
+    begun(peace, study, monkeypatch, capsys)
+    folder = study / "out" / ".run"
+    changed_input(study)
+    with monkeypatch.context() as patch:
+        stop_at(patch, 1)
+        assert run(patch, capsys, *FIT, "--resume", "--force", "--influence")[0] == 130
+    text = (folder / "run.json").read_text()
+    (folder / "previous-run.json").write_text(text)
+    (folder / "run.json").write_text(text[:-30])
+    found, note = run_folder.known_journal(study / "out")
+    assert found is not None
+    assert (found.options, found.forced) == (["influence"], ["curves.csv has changed"])
+    assert "rebuilt from its 2 chunks" in note
+    for path in folder.glob("*.npz"):
+        path.unlink()
+    assert run_folder.known_journal(study / "out")[0] == journal.from_dict(json.loads(text))
+    (folder / "previous-run.json").unlink()
+    monkeypatch.setattr("jaxtrachea.identify.fit.fit", from_peace(peace))
+    shutil.copy(peace / "curves.csv", study)
+    code, _, err = run(monkeypatch, capsys, *FIT, "--resume")
+    assert (code, "nothing was saved yet" in err) == (0, True), err
+    assert numbers(study / "out") == numbers(peace / "out")
+
+
+FILL = """
+set -e
+mount -t tmpfs -o size=$SIZE tmpfs disk
+"$@" fit spec.toml --out disk/out && exit 9 || echo "first $?"
+mount -o remount,size=20m disk
+"$@" fit spec.toml --out disk/out $(test -d disk/out/.run && echo --resume)
+cp -r disk/out done
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", ["8k", "32k", "64k", "160k"])
+def test_a_disk_that_is_really_full(peace, study, size):
+    """A tiny file system of its own, filled by the run and then enlarged."""
+    own = ["unshare", "--user", "--map-root-user", "--mount"]
+    if shutil.which("unshare") is None or subprocess.run([*own, "true"]).returncode:
+        pytest.skip("no file systems of one's own here")
+    (study / "disk").mkdir()
+    command = [*own, "sh", "-c", FILL, "sh", sys.executable, "-m", "jaxtrachea"]
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=study, env=os.environ | {"SIZE": size}
+    )
+    assert done.returncode == 0, done.stderr
+    assert "first 2" in done.stdout
+    assert "No space left on device" in done.stderr
+    assert "Traceback" not in done.stderr
+    whole = {name: v for name, v in numbers(peace / "out").items() if name != "report.md"}
+    found = numbers(study / "done")
+    assert {name: found[name] for name in whole} == whole
 
 
 @pytest.mark.slow

@@ -7,6 +7,8 @@ depend on when a run was stopped, nor on which process or device fitted which ch
 
 import contextlib
 import dataclasses
+import io
+import json
 import os
 import zipfile
 from pathlib import Path
@@ -14,11 +16,14 @@ from typing import Any
 
 import numpy as np
 
+from jaxtrachea.identify import journal as journals
 from jaxtrachea.identify import residual
 from jaxtrachea.identify.criteria import Criteria
 from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.journal import Journal
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.uncertainty import Uncertainty
+from jaxtrachea.identify.whole_files import write_whole
 
 #: Lanes of a chunk at most, and its residual entries times starts at most: about ten seconds of
 #: one core.
@@ -133,22 +138,30 @@ def replaced(result: FitResult, lanes: np.ndarray, by: FitResult) -> FitResult:
     return result_of(result.problem, arrays)
 
 
-def save(path: Path, run: str, lanes: np.ndarray, result: FitResult) -> None:
+def save(path: Path, journal: Journal, lanes: np.ndarray, result: FitResult) -> None:
     """Write a chunk at once or not at all, and onto the disk.
 
     Args:
         path: file, replaced if it exists.
-        run: name of the run it belongs to.
+        journal: of the run it belongs to; stored whole, for the case that the run's own is lost.
         lanes: that were fitted.
         result: of these lanes.
     """
-    beside = path.with_name(f"{path.name}.{os.getpid()}")
-    arrays: dict[str, Any] = {"run": np.array(run), "lanes": lanes} | arrays_of(result)
-    with beside.open("wb") as stream:
-        np.savez(stream, **arrays)
-        stream.flush()
-        os.fsync(stream.fileno())
-    beside.replace(path)
+    image = io.BytesIO()
+    text = json.dumps(journals.as_dict(journal))
+    arrays: dict[str, Any] = {"run": np.array(journal.id), "journal": np.array(text)}
+    arrays |= {"lanes": lanes} | arrays_of(result)
+    np.savez(image, **arrays)
+    write_whole(path, image.getvalue())
+
+
+def read_journal(path: Path) -> Journal | None:
+    """The journal in a saved chunk, or None where there is none to be read."""
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            return journals.from_dict(json.loads(str(file["journal"])))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
 
 
 def load(path: Path, run: str, lanes: np.ndarray, problem: Problem) -> FitResult | None:
@@ -163,6 +176,7 @@ def load(path: Path, run: str, lanes: np.ndarray, problem: Problem) -> FitResult
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
+        arrays.pop("journal", None)
         mine = arrays.pop("run") == run and np.array_equal(arrays.pop("lanes"), lanes)
         return result_of(problem, arrays) if mine else None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):

@@ -70,7 +70,7 @@ def fit_chunks(
     def one(k: int) -> None:
         lanes = chunks[k]
         result = fit(part.take(lanes), settings, lambda done, of: progress(done, jobs))
-        save(run.chunk(k), run.journal.id, lanes, result)
+        save(run.chunk(k), run.journal, lanes, result)
 
     _on_devices(one, todo, jax.local_devices())
 
@@ -128,7 +128,11 @@ def write_so_far(path: Path, run: RunFolder, problem: Problem) -> None:
     for k, lanes in enumerate(_chunks(run, problem)):
         part = _read(run, k, problem.take(lanes), lanes)
         rows += [] if part is None else lane_rows(part)
-    write_csv(path, rows)
+    try:
+        write_csv(path, rows)
+    except OSError:
+        path.unlink(missing_ok=True)  # not half a table
+        raise
 
 
 def count(run: RunFolder, problem: Problem) -> int:

@@ -1,5 +1,6 @@
 """What decides the numbers of a run, kept beside its chunks, so that no other run goes on there."""
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -8,8 +9,10 @@ import uuid
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import get_args, get_origin, get_type_hints
 
 import jaxtrachea
+from jaxtrachea.identify.whole_files import write_whole
 
 SCHEMA = "jaxtrachea-run"
 SCHEMA_VERSION = 1
@@ -123,36 +126,70 @@ def as_dict(journal: Journal) -> dict[str, object]:
 
 
 def write(path: Path, journal: Journal) -> None:
-    """Write a journal at once or not at all."""
-    beside = path.with_name(f"{path.name}.{os.getpid()}")
-    with beside.open("w", encoding="utf-8") as stream:
-        json.dump(as_dict(journal), stream, indent=2)
-        stream.flush()
-        os.fsync(stream.fileno())
-    beside.replace(path)
+    """Write a journal at once or not at all; the former one stays beside it (`previous`).
+
+    Raises:
+        OSError: it could not be written; the one that was there still is.
+    """
+    with contextlib.suppress(OSError, ValueError):
+        if read(path) == journal:
+            return
+        write_whole(previous(path), path.read_bytes())
+    write_whole(path, json.dumps(as_dict(journal), indent=2).encode())
+
+
+def previous(path: Path) -> Path:
+    """Where the former journal lies."""
+    return path.with_name(f"previous-{path.name}")
 
 
 def read(path: Path) -> Journal:
     """Read a journal.
 
     Raises:
-        FileNotFoundError: there is none.
+        OSError: there is none, or it cannot be read.
         ValueError: it is damaged, or of another version.
     """
-    return from_dict(json.loads(path.read_text(encoding="utf-8")))
+    try:
+        return from_dict(json.loads(path.read_text(encoding="utf-8")))
+    except RecursionError:
+        raise ValueError("nested too deeply for the journal of a run") from None
 
 
-def from_dict(content: dict) -> Journal:
+def from_dict(content: object) -> Journal:
     """A journal from what `as_dict` gives.
 
     Raises:
         ValueError: it is none, or of another version.
     """
+    if not isinstance(content, dict):
+        raise ValueError(f"not the journal of a run, but {type(content).__name__}")
     found = dict(content)
     if (found.pop("schema", None), found.pop("schema_version", None)) != (SCHEMA, SCHEMA_VERSION):
         raise ValueError("not the journal of a run, or one of another version")
     try:
         rerun = found.pop("rerun")
+        _check_types(Journal, found, {"rerun"})
+        if rerun is not None:
+            _check_types(Rerun, rerun, set())
         return Journal(**found, rerun=None if rerun is None else Rerun(**rerun))
     except (TypeError, KeyError) as error:
         raise ValueError(f"not the journal of a run: {error}") from None
+
+
+def _check_types(kind: type, found: dict, apart: set[str]) -> None:
+    """Refuse values that are not of the field's type.
+
+    Raises:
+        TypeError: naming the field.
+    """
+    for name, hint in get_type_hints(kind).items():
+        if name in apart:
+            continue
+        wanted = get_origin(hint) or hint
+        if not isinstance(found[name], wanted) or isinstance(found[name], bool):
+            raise TypeError(f"{name} is {found[name]!r}; expected {wanted.__name__}")
+        inner = get_args(hint)[-1:]
+        parts = found[name].values() if isinstance(found[name], dict) else found[name]
+        if inner and not all(isinstance(part, inner) for part in parts):
+            raise TypeError(f"{name} holds something else than {inner[0].__name__}")

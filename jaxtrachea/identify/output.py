@@ -5,9 +5,15 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from jaxtrachea.identify.run_lock import LOCK, Busy, refuse_busy
+
 
 class OutputExists(FileExistsError):
     """The output directory holds files already."""
+
+
+class InUse(OutputExists):
+    """Another command is at work in it."""
 
 
 def new_directory(wanted: Path | None, default: Path) -> Path:
@@ -17,11 +23,8 @@ def new_directory(wanted: Path | None, default: Path) -> Path:
         OutputExists: `wanted` exists and is not empty, or is a file.
     """
     if wanted is not None:
-        if wanted.exists() and (not wanted.is_dir() or any(wanted.iterdir())):
-            raise OutputExists(
-                f"{wanted} exists and is not empty; nothing was written. "
-                "Choose another --out, or remove it yourself"
-            )
+        if wanted.exists():
+            refuse_full(wanted)
         wanted.mkdir(parents=True, exist_ok=True)
         return wanted
     for n in range(1, 10_000):
@@ -32,6 +35,29 @@ def new_directory(wanted: Path | None, default: Path) -> Path:
             continue
         return path
     raise OutputExists(f"{default} and its numbered successors exist; give --out")
+
+
+def refuse_full(wanted: Path, *, held: bool = False) -> None:
+    """Refuse a folder that holds anything but the lock of a run.
+
+    Args:
+        wanted: the folder.
+        held: the lock is our own.
+
+    Raises:
+        OutputExists: it does, or is a file; `InUse`: a run is at work in it.
+    """
+    if wanted.is_dir() and not any(path.name != LOCK for path in wanted.iterdir()):
+        return
+    try:
+        if not held:
+            refuse_busy(wanted)
+    except Busy as error:
+        raise InUse(str(error)) from None
+    raise OutputExists(
+        f"{wanted} exists and is not empty; nothing was written. "
+        "Choose another --out, or remove it yourself"
+    )
 
 
 @contextlib.contextmanager
@@ -55,6 +81,9 @@ def new_output(wanted: Path | None, default: Path) -> Iterator[Path]:
     staging = target / ".unfinished"
     try:
         staging.mkdir()
+    except FileExistsError:  # by another command, since the folder was seen to be empty
+        raise InUse(f"{target}: another command is writing here; choose another --out") from None
+    try:
         yield staging
         for path in sorted(staging.iterdir()):
             path.replace(target / path.name)

@@ -4,14 +4,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import h5py
-
 from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.population import Population
 from jaxtrachea.identify.posterior import Posterior
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import parameter_rows
+from jaxtrachea.identify.whole_files import hdf5_file
 
 _DATASETS = ("theta", "sigma", "divergent", "rhat", "ess", "median", "lower", "upper")
 
@@ -43,7 +42,7 @@ def rows_with_draws(
 
 def write_draws(path: Path, drawn: Posterior) -> None:
     """Add the group `posterior` to a results file."""
-    with h5py.File(path, "a") as file:
+    with hdf5_file(path, "r+") as file:
         group = file.create_group("posterior")
         for name in _DATASETS:
             group.create_dataset(name, data=getattr(drawn, name), compression="gzip")

@@ -19,6 +19,7 @@ from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.population import Population
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.verdict import VERDICTS, describe_flat, verdict
+from jaxtrachea.identify.whole_files import hdf5_file
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 SCHEMA = "jaxtrachea-results"
@@ -255,7 +256,7 @@ def write_hdf5(
         profiles: makes the group `profiles`.
         resampled: makes the group `bootstrap`.
     """
-    with h5py.File(path, "x") as file:
+    with hdf5_file(path) as file:
         file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
         file.attrs["provenance"] = json.dumps(provenance)
         _write_lanes(file.create_group("lanes"), result)

@@ -6,6 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from jaxtrachea.identify.whole_files import hdf5_file
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.simulation import Simulation, Sweep
 from jaxtrachea.scene.stage import Poses, Presses, Scene
@@ -30,7 +31,7 @@ def write_simulation(
     path: Path, scene: Scene, motion: Poses | Presses, out: Simulation, provenance: dict
 ) -> None:
     """All series of a simulation; one dataset each, its unit as attribute (docs/scenes.md)."""
-    with h5py.File(path, "x") as file:
+    with hdf5_file(path) as file:
         _head(file, provenance, scene.plan)
         series = file.create_group("series")
         for name, value in out._asdict().items():
@@ -51,7 +52,7 @@ def write_simulation(
 def write_sweep(path: Path, scene: Scene, s, phi, depth: float, out: Sweep, made: dict) -> None:
     """A sweep over a grid; datasets of shape (s, phi)."""
     units = {"force": "N", "indentation": "mm", "compliance": "mm/N", "status": "1"}
-    with h5py.File(path, "x") as file:
+    with hdf5_file(path) as file:
         _head(file, made, scene.plan)
         file.create_dataset("s", data=s).attrs["unit"] = "mm"
         file.create_dataset("phi", data=phi).attrs["unit"] = "rad"
