@@ -6,7 +6,9 @@ from typing import Literal, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxtrachea._arguments import ArrayLike, check_record, real, shaped
 from jaxtrachea._numerics import positive_part
+from jaxtrachea.admission import Admitted, admit, hide, status_of
 from jaxtrachea.mechanics import beam as _beam
 from jaxtrachea.mechanics import equilibrium, force_law
 from jaxtrachea.trachea.geometry import Geometry
@@ -39,6 +41,16 @@ class Options:
     contact: Literal["unilateral", "bonded"] = "unilateral"
     onset_width: float = 1e-3
     transition: float | None = None
+
+    def __post_init__(self):
+        """Refuse words and numbers that no model has.
+
+        Raises:
+            ValueError: naming the option, what was found and what is expected.
+        """
+        check_record(self, onset_width=0.0)
+        if self.transition is not None and self.transition <= 0:
+            raise ValueError(f"transition is {self.transition:g} mm; expected more than 0, or None")
 
 
 class Press(NamedTuple):
@@ -147,11 +159,11 @@ def respond(
 def press(
     geometry: Geometry,
     material: Material,
-    s_c: Float[Array, ""],
-    displacement: Float[Array, "*n"],
+    s_c: ArrayLike,
+    displacement: ArrayLike,
     options: Options = Options(),  # noqa: B008 (frozen)
     *,
-    onset: Float[Array, ""] | None = None,
+    onset: ArrayLike | None = None,
 ) -> Press:
     """Press the tool along the inward normal at (s_c, phi = 0) and solve for force and skeleton.
 
@@ -161,19 +173,49 @@ def press(
 
     Args:
         geometry: the tube at rest.
-        material: stiffness values; floating dtype of the result follows the arrays.
-        s_c: contact position, mm, in [0, length].
+        material: stiffness values; floating dtype of the result follows the arrays, that of Python
+            numbers and lists the geometry.
+        s_c: contact position, mm, in [0, length]; a scalar.
         displacement: tool displacement along the inward normal, mm; any shape.
         options: what is modelled (static).
         onset: tool displacement at first touch, mm; 0 if None.
 
     Returns:
         The `Press`; rows without a stable solution are NaN with a status, others are untouched.
+        A contact off the tube (OFF_TUBE) and a negative stiffness (BAD_MATERIAL) are NaN
+        throughout; a stiffness of zero is the limit of a small one where that exists.
+
+    Raises:
+        ValueError: an argument that is no number, an array of a length that does not fit the tube,
+            or a value of the material that the options need.
     """
-    onset = jnp.zeros((), displacement.dtype) if onset is None else onset
+    dtype = geometry.length.dtype
+    displacement = real("displacement", displacement, dtype)
+    onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=displacement.dtype)
+    asked = admit(geometry, material, s_c, read_values(options))
+    return _press(geometry, asked, displacement, options, onset)
+
+
+def read_values(options: Options) -> tuple[str, ...]:
+    """Values of the material that a press reads and that must not be negative."""
+    names = ("EI_L", "k_M", "k_1")
+    names += ("GA_L",) if options.shear else ()
+    return names + (("k_1_ring",) if options.local == "two-material" else ())
+
+
+def _press(
+    geometry: Geometry,
+    asked: Admitted,
+    displacement: Float[Array, "*n"],
+    options: Options,
+    onset: Float[Array, ""],
+) -> Press:
+    """`press`, of arguments that are checked."""
+    material, s_c, refused = asked
     unit = unit_deflection(ligament_beam(geometry, material, options), s_c, options)
     law = local_law(geometry, material, s_c, options)
     solved = respond(displacement, onset, unit.w_C, law, options)
+    unit, solved = hide(refused, unit, solved)
     per_ring = lambda v: solved.force[..., None] * v  # noqa: E731
     shape = (*displacement.shape, *unit.w.shape)
     return Press(
@@ -183,5 +225,5 @@ def press(
         joints=per_ring(jnp.broadcast_to(unit.w, shape)),
         reactions=per_ring(jnp.broadcast_to(unit.reaction, shape)),
         compliance=unit.w_C,
-        status=solved.status,
+        status=status_of(refused, solved.status),
     )

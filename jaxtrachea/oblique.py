@@ -4,16 +4,20 @@ Contact force, local indentation and skeleton in one; with friction along a path
 the frame of the tube: x along s towards the larynx, y anterior, z to the side of positive phi.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea import skeleton
+from jaxtrachea._arguments import ArrayLike, check_word, last_axis, shaped
+from jaxtrachea.admission import admit, hide, status_of
 from jaxtrachea.mechanics import friction as _friction
 from jaxtrachea.mechanics import vector_equilibrium
-from jaxtrachea.model import Options, local_law, touch
-from jaxtrachea.skeleton import Rings, Skeleton, local_frame, skeleton_response
+from jaxtrachea.model import Options, local_law, read_values, touch
+from jaxtrachea.skeleton import Rings, Skeleton, local_frame
 from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -57,14 +61,14 @@ class ObliquePath(NamedTuple):
 def press_oblique(
     geometry: Geometry,
     material: Material,
-    s_c: Float[Array, ""],
-    phi_c: Float[Array, ""],
-    displacement: Float[Array, "*n 3"],
+    s_c: ArrayLike,
+    phi_c: ArrayLike,
+    displacement: ArrayLike,
     options: Options = Options(),  # noqa: B008 (frozen)
     *,
     rings: Rings = "arch2",
     axial: bool = True,
-    onset: Float[Array, ""] | None = None,
+    onset: ArrayLike | None = None,
 ) -> ObliquePress:
     """Move the tool, stuck to the surface at (s_c, phi_c), by a vector.
 
@@ -83,17 +87,21 @@ def press_oblique(
         axial: see `skeleton_response`.
         onset: inward displacement at first touch, mm; 0 if None.
 
+    Returns:
+        The `ObliquePress`; as for `press`, OFF_TUBE and BAD_MATERIAL are NaN throughout.
+
     Raises:
-        ValueError: an option that is not for oblique presses, or a missing value of the material.
+        ValueError: an option that is not for oblique presses, a missing value of the material, an
+            argument that is no number, or an array of a wrong length.
     """
     _only_default(options)
-    unit = skeleton_response(
-        geometry, material, s_c, phi_c, rings=rings, axial=axial, shear=options.shear
+    dtype = geometry.length.dtype
+    displacement = last_axis("displacement", displacement, 3, dtype)
+    asked, unit, law, phi_c, onset = _begin(
+        geometry, material, s_c, phi_c, onset, options, rings, axial
     )
-    law = local_law(geometry, material, s_c, options)
     normal = local_frame(phi_c)[0]
     inward = displacement @ normal
-    onset = jnp.zeros_like(s_c) if onset is None else onset
     if options.contact == "bonded":
         moved = displacement - onset * jnp.broadcast_to(normal, displacement.shape)
     else:
@@ -111,21 +119,22 @@ def press_oblique(
         pulls = force @ normal < 0
         force, depth = (jnp.where(pulls[..., None], jnp.nan, v) for v in (force, depth))
         status = jnp.where(pulls, PressStatus.PULLS, status)
-    return _assemble(unit, force, depth, status)
+    unit, force, depth = hide(asked.refused, unit, force, depth)
+    return _assemble(unit, force, depth, status_of(asked.refused, status))
 
 
 def press_path(
     geometry: Geometry,
     material: Material,
-    s_c: Float[Array, ""],
-    phi_c: Float[Array, ""],
-    displacement: Float[Array, "steps 3"],
-    friction: Float[Array, ""],
+    s_c: ArrayLike,
+    phi_c: ArrayLike,
+    displacement: ArrayLike,
+    friction: ArrayLike,
     options: Options = Options(),  # noqa: B008 (frozen)
     *,
     rings: Rings = "arch2",
     axial: bool = True,
-    onset: Float[Array, ""] | None = None,
+    onset: ArrayLike | None = None,
     rounding: float = 0.0,
 ) -> ObliquePath:
     """Lead the tool along a path; it sticks and slides by Coulomb's law (unilateral, `series`).
@@ -144,23 +153,51 @@ def press_path(
         axial: -
         onset: -
         rounding: see `mechanics.friction.slide`.
+
+    Returns:
+        The `ObliquePath`; OFF_TUBE and BAD_MATERIAL (also: a negative mu) are NaN throughout.
+
+    Raises:
+        ValueError: as `press_oblique`; `rounding` below 0.
     """
     _only_default(options)
     if options.contact != "unilateral" or options.coupling != "series":
         raise ValueError(
             "friction needs options.contact='unilateral' and options.coupling='series'"
         )
-    unit = skeleton_response(
-        geometry, material, s_c, phi_c, rings=rings, axial=axial, shear=options.shear
+    if not 0 <= rounding < math.inf:
+        raise ValueError(f"rounding is {rounding}; expected a finite number, not negative")
+    dtype = geometry.length.dtype
+    displacement = shaped("displacement", displacement, ("steps", 3), dtype=dtype)
+    asked, unit, law, phi_c, onset = _begin(
+        geometry, material, s_c, phi_c, onset, options, rings, axial
     )
-    law, frame = local_law(geometry, material, s_c, options), local_frame(phi_c)
+    mu = shaped("friction", friction, (), dtype=dtype)
+    friction = jnp.where(mu < 0, 0, mu)
+    refused = jnp.where(mu < 0, PressStatus.BAD_MATERIAL, asked.refused).astype(jnp.int8)
+    frame = local_frame(phi_c)
     D = displacement @ frame.T
-    onset = jnp.zeros_like(s_c) if onset is None else onset
     D = D.at[:, 0].set(touch(D[:, 0], onset, options))
     C = frame @ unit.compliance @ frame.T
     slid = _friction.slide_path(D, C, law, friction, rounding=rounding)
-    press = _assemble(unit, slid.force @ frame, slid.depth @ frame, slid.status)
-    return ObliquePath(press, slid.slip @ frame[1:], slid.dissipated, slid.sliding)
+    unit, slid = hide(refused, unit, slid)
+    status = status_of(refused, slid.status)
+    press = _assemble(unit, slid.force @ frame, slid.depth @ frame, status)
+    sliding = slid.sliding & (refused == PressStatus.OK)
+    return ObliquePath(press, slid.slip @ frame[1:], slid.dissipated, sliding)
+
+
+def _begin(geometry, material, s_c, phi_c, onset, options, rings, axial):
+    """Checked arguments, and the skeleton and the local law at the contact."""
+    check_word("rings", rings, Rings)
+    dtype = geometry.length.dtype
+    phi_c = shaped("phi_c", phi_c, (), dtype=dtype)
+    onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=dtype)
+    levels = {"axial": axial, "shear": options.shear}
+    used = (*read_values(options), *skeleton.read_values(rings, **levels))
+    asked = admit(geometry, material, s_c, dict.fromkeys(used))
+    unit = skeleton.respond(geometry, asked.material, asked.s_c, phi_c, rings=rings, **levels)
+    return asked, unit, local_law(geometry, asked.material, asked.s_c, options), phi_c, onset
 
 
 def _only_default(options: Options):

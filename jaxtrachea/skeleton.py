@@ -11,10 +11,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxtrachea._arguments import ArrayLike, check_word, shaped
+from jaxtrachea.admission import admit, hide, status_of
 from jaxtrachea.mechanics import axial as _axial
 from jaxtrachea.mechanics import ring as _ring
 from jaxtrachea.mechanics import spatial_beam
-from jaxtrachea.status import RingStatus
+from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 
@@ -55,8 +57,8 @@ def local_frame(phi_c: Float[Array, ""]) -> Float[Array, "3 3"]:
 def skeleton_response(
     geometry: Geometry,
     material: Material,
-    s_c: Float[Array, ""],
-    phi_c: Float[Array, ""],
+    s_c: ArrayLike,
+    phi_c: ArrayLike,
     *,
     rings: Rings = "arch2",
     axial: bool = True,
@@ -66,8 +68,9 @@ def skeleton_response(
 
     Args:
         geometry: the tube at rest.
-        material: k_M, EI_L; `axial` needs EA_L, `shear` GA_L, the arches EI_C and k_t.
-        s_c: mm, in [0, length].
+        material: k_M, EI_L; `axial` needs EA_L, `shear` GA_L, the arches EI_C and k_t. A negative
+            stiffness gives NaN and BAD_MATERIAL.
+        s_c: mm, in [0, length]; beyond, NaN and OFF_TUBE.
         phi_c: rad, in [-alpha, alpha]; beyond, NaN and BEHIND_GAP.
         rings: `mat`: every ring moves on k_M alike in y and z, without turning (the paper);
             `arch`: alike too, with the stiffness of the arch along the normal at phi_c; `arch2`:
@@ -76,10 +79,39 @@ def skeleton_response(
         shear: it also shears.
 
     Raises:
-        ValueError: a missing value of the material, or an unknown level of `rings`.
+        ValueError: a missing value of the material, an array whose length does not fit the tube, or
+            an unknown level of `rings`.
     """
-    if rings not in ("mat", "arch", "arch2"):
-        raise ValueError(f"rings is {rings!r}; expected 'mat', 'arch' or 'arch2'")
+    check_word("rings", rings, Rings)
+    phi_c = shaped("phi_c", phi_c, (), dtype=geometry.length.dtype)
+    asked = admit(geometry, material, s_c, read_values(rings, axial=axial, shear=shear))
+    levels = {"rings": rings, "axial": axial, "shear": shear}
+    unit = respond(geometry, asked.material, asked.s_c, phi_c, **levels)
+    off_tube = asked.refused == PressStatus.OFF_TUBE
+    own = jnp.where(off_tube, RingStatus.OFF_TUBE, RingStatus.BAD_MATERIAL)
+    status = status_of(asked.refused, unit.status, own)
+    return hide(asked.refused, unit)._replace(status=status)
+
+
+def read_values(rings: Rings, *, axial: bool, shear: bool) -> tuple[str, ...]:
+    """Values of the material that the skeleton reads; none may be negative."""
+    names = ("EI_L", "EI_side", "k_M")
+    names += ("EA_L", "k_A", "k_B") if axial else ()
+    names += ("GA_L", "GA_side") if shear else ()
+    return names + (() if rings == "mat" else ("EI_C", "k_t"))
+
+
+def respond(
+    geometry: Geometry,
+    material: Material,
+    s_c: Float[Array, ""],
+    phi_c: Float[Array, ""],
+    *,
+    rings: Rings,
+    axial: bool,
+    shear: bool,
+) -> Skeleton:
+    """As `skeleton_response`, at a place on the tube with stiffnesses that are not negative."""
     frame = local_frame(phi_c)[::2, 1:]  # rows: inward normal, circumferential; columns y, z
     C, per_load, status = _rings(geometry, material, phi_c, rings)
     x = geometry.ring_positions

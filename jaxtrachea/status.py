@@ -30,8 +30,9 @@ class PressStatus(_Described):
         7,
         "off the midline, oblique or elsewhere, in a program made for presses that are not",
     )
-    OFF_TUBE = 8, "the tool presses beyond an end of the tube"
+    OFF_TUBE = 8, "the contact lies beyond an end of the tube"
     UNSURE = 9, "solved, but the tool reaches so deep that its contact may be another than found"
+    BAD_MATERIAL = 10, "a stiffness or the coefficient of friction is negative"
 
 
 class ContactStatus(_Described):
@@ -68,6 +69,8 @@ class RingStatus(_Described):
     OK = 0, "solved"
     BEHIND_GAP = 1, "the angle lies behind the ends of the ring, where there is no cartilage"
     NON_FINITE = 2, "an input or a result is not finite"
+    OFF_TUBE = 3, "the contact lies beyond an end of the tube"
+    BAD_MATERIAL = 4, "a stiffness is negative"
 
 
 class ProfileEnd(_Described):

@@ -11,10 +11,11 @@ import jaxtrachea
 
 PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 ORDER = [
-    {"units", "status", "_numerics", "webpage"},
+    {"units", "status", "_numerics", "_arguments", "webpage"},
     {"spec_file"},
     {"config"},
     {"trachea"},
+    {"admission"},
     {"contact"},
     {"mechanics"},
     {"skeleton"},

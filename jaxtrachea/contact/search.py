@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtrachea._arguments import check_record
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.contact.shapes import heights, log_mean
 
@@ -61,6 +62,7 @@ class Settings:
         Raises:
             ValueError: naming the setting, what was expected and what was found.
         """
+        check_record(self)
         least = {"directions": 16, "starts": 1, "survivors": 1, "coarse_steps": 0}
         least |= {"fine_steps": 1, "final_steps": 1, "warm_steps": 1}
         for name, low in least.items():

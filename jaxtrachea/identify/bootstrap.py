@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.identify.fit import FitResult, Settings, fit
 from jaxtrachea.identify.predictions import Prediction, predictions
 from jaxtrachea.identify.problem import Lane
@@ -99,6 +100,7 @@ def bootstrap(
 
 
 def _check(count, kind, block) -> None:
+    check_word("kind", kind, Kind)
     if count < FEWEST:
         raise ValueError(f"count is {count}; expected at least {FEWEST} for a 95 % interval")
     if block < 1 or (block > 1 and kind == "parametric"):

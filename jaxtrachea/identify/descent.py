@@ -14,6 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.identify.cost import entry_scale, evaluate, robust
 from jaxtrachea.identify.problem import Lane, Problem
 from jaxtrachea.identify.residual import residual_value
@@ -60,6 +61,7 @@ def descend(
     Where an unknown alone could still lower the residual's norm by more than `NEARLY_FLAT`, it has
     stalled.
     """
+    check_word("method", method, Literal["lbfgs", "adam"])
     block = {"lbfgs": 10, "adam": 100}[method]
     run = _compiled(problem.program, method, learning_rate, block, tolerances)
     cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype)  # noqa: E731

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.cost import assemble
 from jaxtrachea.identify.fit import FitResult
@@ -176,6 +177,7 @@ def _compiled(problem: Problem, samples: int):
 
 def scores(information: Float[np.ndarray, "G C P P"], criterion: Criterion):
     """Mean over guesses of what is to be made large, see `Choice.score`; (C,)."""
+    check_word("criterion", criterion, Criterion)
     values = np.maximum(np.linalg.eigvalsh(information), 1e-300)
     if criterion == "D":
         return np.mean(np.sum(np.log(values), axis=-1), axis=0)
@@ -195,6 +197,7 @@ def next_points(
         count: how many to choose.
         criterion: D (volume of the error ellipsoid), A (mean variance) or E (worst combination).
     """
+    check_word("criterion", criterion, Criterion)
     added = gains(known, candidates)
     base, chosen, table = known.base, [], []
     errors = [_errors(base)]

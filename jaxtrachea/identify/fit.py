@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxtrachea._arguments import check_record
 from jaxtrachea.identify import descent, joint
 from jaxtrachea.identify.criteria import Criteria, criteria
 from jaxtrachea.identify.problem import Problem
@@ -44,6 +45,15 @@ class Settings:
     chunk: int = 128
     tolerances: Tolerances = Tolerances()
     float32: bool = False
+
+    def __post_init__(self):
+        """Refuse words and numbers that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_record(self, starts=1.0, decades=0.0, seed=0.0, more_starts=0.0, chunk=1.0)
+        check_record(self.tolerances, cost=0.0, step=0.0, gradient=0.0, iterations=1.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from typing import Literal
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.model import Options
 
 Scope = Literal["shared", "specimen", "trial"]
@@ -47,6 +48,10 @@ class Parameter:
         Raises:
             ValueError: naming the parameter and the cure.
         """
+        check_word(f"{self.name}: scale", self.scale, Scale)
+        check_word(f"{self.name}: scope", self.scope, Scope)
+        if not 0 < self.step < math.inf:
+            raise ValueError(f"{self.name}: step is {self.step}; expected more than 0")
         if not all(map(math.isfinite, (self.value, self.lower, self.upper))):
             raise ValueError(f"{self.name}: value and bounds must be finite numbers; give such")
         if self.fixed:

@@ -17,12 +17,15 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxtrachea._arguments import check_record, check_word
 from jaxtrachea.identify.measurements import Curve
 from jaxtrachea.identify.parameters import DEFAULTS, SKELETON, Parameter
 from jaxtrachea.model import Options
 from jaxtrachea.trachea.geometry import Geometry
 
 Common = Literal["all", "beam", "nothing"]
+Balance = Literal["curve", "sample"]
+Loss = Literal["linear", "huber", "soft_l1", "cauchy"]
 
 
 class Lane(NamedTuple):
@@ -182,6 +185,19 @@ class Noise:
     force: float | None = None
     joints: float | None = None
 
+    def __post_init__(self):
+        """Refuse words and numbers that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_record(self)
+        for name in ("force", "joints"):
+            if (value := getattr(self, name)) is not None and value <= 0:
+                raise ValueError(
+                    f"{name} is {value:g}; expected a standard deviation of more than 0, or None"
+                )
+
 
 def group(
     curves: Sequence[Curve], parameters: Sequence[Parameter], *, joint: bool = False
@@ -204,8 +220,8 @@ def build(
     parameters: Sequence[Parameter],
     *,
     noise: Noise = Noise(),  # noqa: B008 (frozen)
-    balance: str = "curve",
-    loss: str = "linear",
+    balance: Balance = "curve",
+    loss: Loss = "linear",
     loss_scale: float = 1.345,
     tool_radius: float | None = None,
     joint: bool = False,
@@ -227,9 +243,16 @@ def build(
             if there is but one specimen.
 
     Raises:
-        ValueError: no curve, no free parameter, a marker on a ring that does not exist, a curve
-            without a contact position where one is needed, with specimen and trial named.
+        ValueError: an unknown `balance` or `loss`, no curve, no free parameter, a marker on a ring
+            that does not exist, a curve without a contact position where one is needed, with
+            specimen and trial named.
     """
+    check_word("balance", balance, Balance)
+    check_word("loss", loss, Loss)
+    if not 0 < loss_scale < np.inf:
+        raise ValueError(f"loss_scale is {loss_scale}; expected a finite number, more than 0")
+    if tool_radius is not None and not 0 <= tool_radius < np.inf:
+        raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
     if not curves:
         raise ValueError("no usable curve; nothing to fit")
     if all(p.fixed for p in parameters):

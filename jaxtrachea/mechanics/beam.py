@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxtrachea._arguments import ArrayLike, check_word, real, shaped
 from jaxtrachea.mechanics.compliance import (
     Beam,
     Compliance,
@@ -137,7 +138,7 @@ def _compliance_at(tips: Compliance, s, split: Split):
 
 
 def contact_compliance(
-    beam: Beam, s_c: Float[Array, "*m"], *, split: Split = "continuous"
+    beam: Beam, s_c: ArrayLike, *, split: Split = "continuous"
 ) -> Float[Array, "*m"]:
     """Deflection of C per unit normal force at C for every contact position: O(n + m).
 
@@ -151,7 +152,14 @@ def contact_compliance(
 
     Returns:
         Compliance, mm/N, of the shape of `s_c`.
+
+    Raises:
+        ValueError: an unknown `split`, or no numbers.
     """
+    check_word("split", split, Split)
+    s_c = real("s_c", s_c, beam.x.dtype)
+    if s_c.ndim > 1:
+        raise ValueError(f"s_c has shape {s_c.shape}; expected a scalar or one axis")
     both = _both_sides(beam)
     if s_c.ndim == 0:
         count, last, s = _reach(beam, s_c)
@@ -174,12 +182,12 @@ def contact_compliance(
 
 def deflect(
     beam: Beam,
-    s_c: Float[Array, ""],
-    force: Float[Array, ""],
+    s_c: ArrayLike,
+    force: ArrayLike,
     *,
     split: Split = "continuous",
     form: Form = "recursion",
-    ring_load: Float[Array, " n"] | None = None,
+    ring_load: ArrayLike | None = None,
 ) -> Deflection:
     """Deflection, rotation and reaction at every support under a normal force at C.
 
@@ -199,8 +207,16 @@ def deflect(
         The `Deflection`; differentiable in every argument.
 
     Raises:
-        ValueError: `ring_load` asked of `reactions`.
+        ValueError: an unknown word, no numbers or a wrong number of them, or `ring_load` asked of
+            `reactions`.
     """
+    check_word("split", split, Split)
+    check_word("form", form, Form)
+    dtype = beam.x.dtype
+    s_c, force = shaped("s_c", s_c, (), dtype=dtype), shaped("force", force, (), dtype=dtype)
+    if ring_load is not None:
+        why = " (one for each ring)"
+        ring_load = shaped("ring_load", ring_load, beam.x.shape, dtype=dtype, why=why)
     if form == "reactions":
         if ring_load is not None:
             raise ValueError("ring_load is not part of form='reactions'; use form='recursion'")

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.mechanics._matrix2 import apply
 from jaxtrachea.status import RingStatus
@@ -207,6 +208,7 @@ def support_stiffness(
     Returns:
         Stiffness, N/mm, and a `RingStatus`. `arch` gives NaN behind the ring's ends.
     """
+    check_word("level", level, Level)
     if level == "mat":
         return ring.k_M, jnp.zeros((), jnp.int8)
     C, status = ring_compliance(ring, phi_c, order=order)

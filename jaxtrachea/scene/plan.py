@@ -8,6 +8,7 @@ import dataclasses
 import math
 from typing import Literal
 
+from jaxtrachea._arguments import check_record
 from jaxtrachea.model import Options
 from jaxtrachea.skeleton import Rings
 from jaxtrachea.surface.regions import Method
@@ -95,6 +96,16 @@ class Wishes:
     onset_width: float = 1e-3
     transition: float | None = None
 
+    def __post_init__(self):
+        """Refuse words and numbers that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_record(self)
+        Options(self.coupling, contact=self.contact, onset_width=self.onset_width,
+                transition=self.transition)  # fmt: skip
+
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
@@ -131,6 +142,14 @@ class Plan:
     ring_ends: bool
     options: Options
     effects: tuple[Effect, ...] = dataclasses.field(default=(), compare=False, repr=False)
+
+    def __post_init__(self):
+        """Refuse words and numbers that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_record(self, dent=0.0)
 
     def without(self, name: str) -> "Plan | None":
         """The plan with one effect less, or None where none can be taken away alone."""

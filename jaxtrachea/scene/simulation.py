@@ -10,12 +10,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea.model import ligament_beam, local_law, respond, unit_deflection
+from jaxtrachea._arguments import ArrayLike, shaped
+from jaxtrachea.admission import check_shapes, without_negative
+from jaxtrachea.model import ligament_beam, local_law, read_values, respond, unit_deflection
 from jaxtrachea.oblique import press_oblique, press_path
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.deform import deform
-from jaxtrachea.scene.stage import COVERED, Poses, Presses, Scene
+from jaxtrachea.scene.stage import COVERED, Poses, Presses, Scene, check_path
 from jaxtrachea.skeleton import local_frame
+from jaxtrachea.skeleton import read_values as skeleton_values
 from jaxtrachea.status import ContactStatus, PressStatus
 from jaxtrachea.trachea.material import Material
 
@@ -87,7 +90,8 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
     The rows of a path with `seat` first belong together: the tool stays on the place that it
     touched first. A row off the midline or oblique in a program of one plane, and a press at
     another point than the first with `seat` first, is NaN with OFF_PLAN; one whose contact lies
-    beyond an end of the tube is NaN with OFF_TUBE. Whatever else the plan leaves out (axial motion,
+    beyond an end of the tube is NaN with OFF_TUBE; a negative stiffness or coefficient of friction
+    is NaN with BAD_MATERIAL in every row. Whatever else the plan leaves out (axial motion,
     friction, bending rings) is left out of any path.
 
     Args:
@@ -96,9 +100,12 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
         path: `Poses` if the plan has contact, else `Presses`.
 
     Raises:
-        ValueError: the other kind of path, or something missing that the plan needs.
+        ValueError: the other kind of path, arrays of a wrong length, or something missing that the
+            plan needs.
     """
     plan = scene.plan
+    check_path(path)
+    check_shapes(scene.geometry, material)
     if plan.contact != isinstance(path, Poses):
         kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
         raise ValueError(f"path is {type(path).__name__}; expected {kinds[not plan.contact]}")
@@ -110,7 +117,8 @@ def follow(
 ) -> Simulation:
     """What follows from the presses of `path`, or of the tool's way `made` of it."""
     plan = scene.plan
-    presses, refused = _refuse(scene, path if isinstance(path, Presses) else None, made)
+    material, bad = _without_negative(scene, material)
+    presses, refused = _refuse(scene, path if isinstance(path, Presses) else None, made, bad)
     moved = (_vectors if plan.second_plane else _one_plane)(scene, material, presses)
     vertices = None
     if plan.surface is not None:
@@ -126,13 +134,30 @@ def follow(
     )  # fmt: skip
 
 
-def _refuse(scene: Scene, path: Presses | None, made: Approach | None):
+def _without_negative(scene: Scene, material: Material):
+    """The material with 1 in place of negative values that the plan reads, and whether it had any.
+
+    A negative coefficient of friction counts as well (`press_path` puts 0 in its place).
+    """
+    plan = scene.plan
+    shear = plan.options.shear
+    skeleton = skeleton_values(plan.rings, axial=plan.axial, shear=shear)
+    used = (*read_values(plan.options), *(skeleton if plan.second_plane else ()))
+    material, bad = without_negative(material, dict.fromkeys(used))
+    if plan.friction and scene.friction is not None:
+        bad = bad | (scene.friction < 0)
+    return material, bad
+
+
+def _refuse(scene: Scene, path: Presses | None, made: Approach | None, bad):
     """The presses, NaN where they are refused; and the rows refused, by status."""
     presses = path if made is None else made.presses
     assert presses is not None
-    D, refused = presses.displacement, {}
-    if made is not None:
-        outside = ~((presses.s >= 0) & (presses.s <= scene.geometry.length))
+    D, length, refused = presses.displacement, scene.geometry.length, {}
+    if made is None:
+        refused[PressStatus.OFF_TUBE] = (presses.s < 0) | (presses.s > length)
+    else:
+        outside = ~((presses.s >= 0) & (presses.s <= length))
         presses_in = jnp.sum(D * made.inward, axis=1) > 0
         refused[PressStatus.OFF_TUBE] = outside & presses_in
     unlike = [] if scene.plan.second_plane else [_off_plan(presses)]
@@ -140,6 +165,7 @@ def _refuse(scene: Scene, path: Presses | None, made: Approach | None):
         unlike.append(_elsewhere(presses))
     if unlike:
         refused[PressStatus.OFF_PLAN] = functools.reduce(jnp.logical_or, unlike)
+    refused[PressStatus.BAD_MATERIAL] = jnp.broadcast_to(bad, presses.s.shape)
     for rows in refused.values():
         D = jnp.where(rows[:, None], jnp.nan, D)
     return Presses(presses.s, presses.phi, D), refused
@@ -160,9 +186,9 @@ def _status(status, made: Approach | None, refused: dict[PressStatus, Array]):
 def sweep(
     scene: Scene,
     material: Material,
-    s: Float[Array, " points"],
-    phi: Float[Array, " points"],
-    depth: Float[Array, " points"],
+    s: ArrayLike,
+    phi: ArrayLike,
+    depth: ArrayLike,
     *,
     chunk: int = 256,
 ) -> Sweep:
@@ -175,7 +201,16 @@ def sweep(
         phi: rad, within the half-angle of the rings.
         depth: of the tool along the inward normal, mm.
         chunk: points computed together.
+
+    Raises:
+        ValueError: arrays of different lengths, or no numbers.
     """
+    dtype = scene.geometry.length.dtype
+    s = shaped("s", s, ("points",), dtype=dtype)
+    phi, depth = (
+        shaped(name, value, s.shape, dtype=dtype, why=" (as s has)")
+        for name, value in (("phi", phi), ("depth", depth))
+    )
 
     def one(at):
         s_c, phi_c, d = at
@@ -258,6 +293,10 @@ def _vectors(scene: Scene, material: Material, presses: Presses) -> _Moved:
     plan = scene.plan
     how = {"rings": plan.rings, "axial": plan.axial}
     fixed = scene.geometry, material
+    # Rows off the tube are refused already where they press; the others find no contact.
+    s, length = presses.s, scene.geometry.length
+    s = jnp.where(s < 0, 0, jnp.where(s > length, length, s))
+    presses = Presses(s, presses.phi, presses.displacement)
     if plan.friction:
         if scene.friction is None:
             raise ValueError("scene.friction is None; the plan has friction")

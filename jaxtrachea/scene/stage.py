@@ -1,6 +1,7 @@
 """The scene as arrays: trachea, tool, surface, path; and the facts the plan is made from."""
 
 import dataclasses
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -8,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtrachea._arguments import real, shaped
+from jaxtrachea.admission import check_shapes
 from jaxtrachea.contact.patches import Patches, Touch, straight_patches, touch
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import STANDARD, Settings
@@ -45,9 +48,9 @@ class Presses(eqx.Module):
         displacement: of the tool along x (to the larynx), y (anterior), z, mm; shape (rows, 3).
     """
 
-    s: Float[Array, " rows"] = eqx.field(converter=jnp.asarray)
-    phi: Float[Array, " rows"] = eqx.field(converter=jnp.asarray)
-    displacement: Float[Array, "rows 3"] = eqx.field(converter=jnp.asarray)
+    s: Float[Array, " rows"] = eqx.field(converter=partial(real, "s"))
+    phi: Float[Array, " rows"] = eqx.field(converter=partial(real, "phi"))
+    displacement: Float[Array, "rows 3"] = eqx.field(converter=partial(real, "displacement"))
 
 
 class Poses(eqx.Module):
@@ -58,8 +61,24 @@ class Poses(eqx.Module):
         translation: of the tool's origin, mm; shape (rows, 3).
     """
 
-    rotation: Float[Array, "rows 3 3"] = eqx.field(converter=jnp.asarray)
-    translation: Float[Array, "rows 3"] = eqx.field(converter=jnp.asarray)
+    rotation: Float[Array, "rows 3 3"] = eqx.field(converter=partial(real, "rotation"))
+    translation: Float[Array, "rows 3"] = eqx.field(converter=partial(real, "translation"))
+
+
+def check_path(path: Presses | Poses) -> None:
+    """Refuse a path whose arrays do not belong together.
+
+    Raises:
+        ValueError: the argument, its length and the expected one.
+    """
+    if isinstance(path, Presses):
+        rows = shaped("path.s", path.s, ("rows",)).shape[0]
+        shaped("path.phi", path.phi, (rows,), why=" (as path.s has)")
+        shaped("path.displacement", path.displacement, (rows, 3), why=" (rows as path.s has)")
+    else:
+        rows = shaped("path.translation", path.translation, ("rows", 3)).shape[0]
+        why = " (rows as path.translation has)"
+        shaped("path.rotation", path.rotation, (rows, 3, 3), why=why)
 
 
 class Scene(eqx.Module):
@@ -170,8 +189,10 @@ def make_scene(
 
     Raises:
         PlanError: a wish that cannot be met.
-        ValueError: a path without rows, or a negative friction.
+        ValueError: a path without rows, arrays of a wrong length, or a negative friction.
     """
+    check_path(path)
+    check_shapes(geometry, material)
     if not len(path.s if isinstance(path, Presses) else path.translation):
         raise ValueError("path has no rows; expected at least one")
     if friction is not None and not 0 <= float(friction) < np.inf:

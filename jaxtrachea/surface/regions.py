@@ -26,6 +26,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.surface import phong
 from jaxtrachea.surface.blocks import Blocks, in_blocks, to_blocks, to_vertices
@@ -187,8 +188,10 @@ def interpolate(
         method: see module docstring.
 
     Raises:
-        ValueError: `hermite` without slopes, or keys for another number of rings.
+        ValueError: an unknown `method`, `hermite` without slopes, or keys for another number of
+            rings.
     """
+    check_word("method", method, Method)
     if keys.joints.shape[0] != binding.nodes.shape[0]:
         raise ValueError(
             f"keys have {keys.joints.shape[0]} rows; expected {binding.nodes.shape[0]}, "

@@ -1,5 +1,6 @@
 """What is there at rest: length, ring positions and cross-section of a ring-supported tube."""
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -7,6 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
+
+from jaxtrachea._arguments import real
 
 
 class Geometry(eqx.Module):
@@ -23,11 +26,13 @@ class Geometry(eqx.Module):
         ring_height: extent of a ring along s, mm (sets where the local law is that of a ring).
     """
 
-    length: Float[Array, ""] = eqx.field(converter=jnp.asarray)
-    ring_positions: Float[Array, " rings"] = eqx.field(converter=jnp.asarray)
-    radius: Float[Array, ""] = eqx.field(converter=jnp.asarray)
-    half_angle: Float[Array, ""] = eqx.field(converter=jnp.asarray)
-    ring_height: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    length: Float[Array, ""] = eqx.field(converter=functools.partial(real, "length"))
+    ring_positions: Float[Array, " rings"] = eqx.field(
+        converter=functools.partial(real, "ring_positions")
+    )
+    radius: Float[Array, ""] = eqx.field(converter=functools.partial(real, "radius"))
+    half_angle: Float[Array, ""] = eqx.field(converter=functools.partial(real, "half_angle"))
+    ring_height: Float[Array, ""] = eqx.field(converter=functools.partial(real, "ring_height"))
 
     @property
     def rings(self) -> int:
@@ -58,10 +63,15 @@ class Geometry(eqx.Module):
         Raises:
             ValueError: naming the argument, what was found and what is expected.
         """
-        x = np.atleast_1d(np.asarray(ring_positions, dtype=np.float64))
+        length, radius = _number("length", length), _number("radius", radius)
+        half_angle = _number("half_angle", half_angle)
+        ring_height = _number("ring_height", ring_height)
+        x = np.atleast_1d(_numbers("ring_positions", ring_positions))
+        if x.ndim != 1:
+            raise ValueError(f"ring_positions has shape {x.shape}; expected one axis of s")
         if not math.isfinite(length) or length <= 0:
             raise ValueError(f"length is {length} mm; expected a positive number")
-        if x.ndim != 1 or x.size == 0:
+        if x.size == 0:
             raise ValueError("ring_positions is empty; expected at least one ring")
         if not np.all(np.isfinite(x)) or np.any(np.diff(x) <= 0):
             found = ", ".join(f"{v:g}" for v in x[:12]) + (", ..." if x.size > 12 else "")
@@ -83,6 +93,20 @@ class Geometry(eqx.Module):
         dtype = jnp.zeros(0, dtype).dtype
         arrays = (np.asarray(v, dtype) for v in (length, x, radius, half_angle, ring_height))
         return cls(*arrays)
+
+
+def _numbers(name: str, value: object) -> np.ndarray:
+    try:
+        return np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is {value!r}; expected numbers in mm or rad") from None
+
+
+def _number(name: str, value: object) -> float:
+    array = _numbers(name, value)
+    if array.ndim:
+        raise ValueError(f"{name} has shape {array.shape}; expected a single number")
+    return float(array)
 
 
 def table_1(dtype=None) -> Geometry:

@@ -1,18 +1,21 @@
 """The mechanical parameters of a trachea as one pytree."""
 
+import functools
+
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxtrachea._arguments import real
 
-def _array():
+
+def _array(name: str):
     """A field whose Python numbers become arrays (one door, so that jit does not retrace)."""
-    return eqx.field(converter=jnp.asarray)
+    return eqx.field(converter=functools.partial(real, name))
 
 
-def _optional():
+def _optional(name: str):
     """As `_array`, or None."""
-    return eqx.field(default=None, converter=lambda v: None if v is None else jnp.asarray(v))
+    return eqx.field(default=None, converter=lambda v: None if v is None else real(name, v))
 
 
 class Material(eqx.Module):
@@ -38,17 +41,17 @@ class Material(eqx.Module):
         GA_side: `GA_L` likewise; None: GA_L.
     """
 
-    EI_L: Float[Array, "..."] = _array()
-    k_M: Float[Array, "..."] = _array()
-    k_1: Float[Array, ""] = _array()
-    k_3: Float[Array, ""] = _array()
-    GA_L: Float[Array, "..."] | None = _optional()
-    k_1_ring: Float[Array, ""] | None = _optional()
-    k_3_ring: Float[Array, ""] | None = _optional()
-    EA_L: Float[Array, "..."] | None = _optional()
-    k_A: Float[Array, ""] | None = _optional()
-    k_B: Float[Array, ""] | None = _optional()
-    EI_C: Float[Array, ""] | None = _optional()
-    k_t: Float[Array, ""] | None = _optional()
-    EI_side: Float[Array, "..."] | None = _optional()
-    GA_side: Float[Array, "..."] | None = _optional()
+    EI_L: Float[Array, "..."] = _array("EI_L")
+    k_M: Float[Array, "..."] = _array("k_M")
+    k_1: Float[Array, ""] = _array("k_1")
+    k_3: Float[Array, ""] = _array("k_3")
+    GA_L: Float[Array, "..."] | None = _optional("GA_L")
+    k_1_ring: Float[Array, ""] | None = _optional("k_1_ring")
+    k_3_ring: Float[Array, ""] | None = _optional("k_3_ring")
+    EA_L: Float[Array, "..."] | None = _optional("EA_L")
+    k_A: Float[Array, ""] | None = _optional("k_A")
+    k_B: Float[Array, ""] | None = _optional("k_B")
+    EI_C: Float[Array, ""] | None = _optional("EI_C")
+    k_t: Float[Array, ""] | None = _optional("k_t")
+    EI_side: Float[Array, "..."] | None = _optional("EI_side")
+    GA_side: Float[Array, "..."] | None = _optional("GA_side")

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.plan import Effect, Plan, PlanError
@@ -111,6 +112,7 @@ def choose(
     Raises:
         PlanError: the path, or a sample path beside it, has no row with a force.
     """
+    check_word("precision", precision, Literal["auto", "float64"])
     trial, every = _Trial(full, report), _ladders(full, precision)
     refused: list[Rung] = []
     options: dict[str, list[Rung]] = {}

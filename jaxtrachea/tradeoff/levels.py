@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea._arguments import check_record
 from jaxtrachea.contact.search import FINE
 from jaxtrachea.mechanics.beam import Form, Split
 from jaxtrachea.scene.build import Staged, wishes_of
@@ -89,6 +90,14 @@ class Levels:
     mesh: float = 1.0
     kept: int = 1
     dtype: Literal["float32", "float64"] = "float64"
+
+    def __post_init__(self):
+        """Refuse words and numbers that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_record(self, dent=0.0, sharpness=0.0, steps=1.0, mesh=0.0, kept=1.0)
 
 
 class Full(NamedTuple):

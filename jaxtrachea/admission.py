@@ -1,0 +1,122 @@
+"""What a press may be asked: shapes that fit the tube, a place on it, stiffnesses not negative.
+
+Shapes are static and end in a `ValueError`; places and stiffnesses may be traced and end in a
+status. Refused values are replaced *before* they are used and the results hidden after, so that
+derivatives of other rows stay finite.
+"""
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxtrachea._arguments import ArrayLike, shaped
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+
+#: Values of a material that may be given span by span, and ring by ring; the others are scalars.
+BY_SPAN, BY_RING = ("EI_L", "GA_L", "EA_L", "EI_side", "GA_side"), ("k_M",)
+
+
+class Admitted(NamedTuple):
+    """What a press is computed with.
+
+    Attributes:
+        material: with 1 in place of negative values.
+        s_c: contact position, mm; the middle of the tube in place of one off it.
+        refused: `PressStatus`: OK, OFF_TUBE or BAD_MATERIAL.
+    """
+
+    material: Material
+    s_c: Float[Array, ""]
+    refused: Int[Array, ""]
+
+
+def admit(geometry: Geometry, material: Material, s_c: ArrayLike, used: Iterable[str]) -> Admitted:
+    """Check what a press is asked.
+
+    Args:
+        geometry: the tube at rest.
+        material: its shapes are checked, all of them.
+        s_c: contact position, mm.
+        used: names of the values of the material that the model reads and that must not be
+            negative; None values are passed over.
+
+    Raises:
+        ValueError: a value of the material that is neither a scalar nor one for each span or ring,
+            or a contact position that is no scalar.
+    """
+    check_shapes(geometry, material)
+    length = geometry.length
+    s_c = shaped("s_c", s_c, (), dtype=length.dtype, why="; use jax.vmap for many positions")
+    off = (s_c < 0) | (s_c > length)
+    material, bad = without_negative(material, used)
+    refused = jnp.where(off, PressStatus.OFF_TUBE, PressStatus.OK)
+    refused = jnp.where(bad, PressStatus.BAD_MATERIAL, refused).astype(jnp.int8)
+    return Admitted(material, jnp.where(off, length / 2, s_c), refused)
+
+
+def check_shapes(geometry: Geometry, material: Material) -> None:
+    """Refuse arrays of a wrong length.
+
+    Raises:
+        ValueError: the argument, its length and the expected one.
+    """
+    for name in ("length", "radius", "half_angle", "ring_height"):
+        shaped(f"Geometry.{name}", getattr(geometry, name), (), why="; use jax.vmap for many")
+    shaped("Geometry.ring_positions", geometry.ring_positions, ("any number of",))
+    rings = geometry.rings
+    for field in dataclasses.fields(material):
+        value, name = getattr(material, field.name), f"Material.{field.name}"
+        if value is None:
+            continue
+        if field.name in BY_SPAN:
+            why = f" ({rings} rings make {rings + 1} spans)"
+            shaped(name, value, (), (rings + 1,), why=why)
+        elif field.name in BY_RING:
+            shaped(name, value, (), (rings,), why=" (one for each ring)")
+        else:
+            shaped(name, value, ())
+
+
+def without_negative(material: Material, used: Iterable[str]) -> tuple[Material, Array]:
+    """The material with 1 in place of negative values, and whether there were any."""
+    safe, bad = {}, jnp.zeros((), bool)
+    for name in used:
+        if (value := getattr(material, name)) is not None:
+            negative = value < 0
+            safe[name] = jnp.where(negative, 1, value)
+            bad = bad | jnp.any(negative)
+    return dataclasses.replace(material, **safe), bad
+
+
+def hide(refused: Int[Array, ""], *arrays: Any) -> Any:
+    """NaN for every number of a refused press.
+
+    Where products of several of these are returned, hiding the factors is enough, and cheaper:
+    `where` passes no derivative, not even NaN, to what it hides.
+
+    Args:
+        refused: from `admit`.
+        arrays: arrays and trees of arrays; what is not floating stays.
+
+    Returns:
+        The same, one for each argument (of one argument: itself).
+    """
+    off = refused != PressStatus.OK
+    floating = lambda v: jnp.issubdtype(v.dtype, jnp.floating)  # noqa: E731
+    hidden = jax.tree.map(lambda v: jnp.where(off, jnp.nan, v) if floating(v) else v, arrays)
+    return hidden[0] if len(hidden) == 1 else hidden
+
+
+def status_of(
+    refused: Int[Array, ""], status: Int[Array, "*n"], own: Int[Array, ""] | None = None
+) -> Int[Array, "*n"]:
+    """The status of a press, or why it was refused (`own`: in the words of another enumeration)."""
+    return jnp.where(refused != PressStatus.OK, refused if own is None else own, status).astype(
+        jnp.int8
+    )

@@ -1,0 +1,384 @@
+"""What presses refuse: words, shapes, places off the tube, negative stiffnesses.
+
+Statuses and gradients are checked against presses of the good rows alone, values of refused ones
+against NaN; nothing here is a number of the code's own.
+"""
+
+import ast
+import dataclasses
+import functools
+import importlib
+import inspect
+import math
+import pathlib
+import typing
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxtrachea
+from jaxtrachea.identify.fit import Settings
+from jaxtrachea.identify.parameters import DEFAULTS, Parameter
+from jaxtrachea.identify.problem import Noise
+from jaxtrachea.identify.solve import Tolerances
+from jaxtrachea.mechanics import beam
+from jaxtrachea.model import Options, press
+from jaxtrachea.oblique import press_oblique, press_path
+from jaxtrachea.scene.plan import Wishes
+from jaxtrachea.scene.simulation import simulate, sweep
+from jaxtrachea.scene.stage import Poses, Presses, make_scene
+from jaxtrachea.skeleton import skeleton_response
+from jaxtrachea.status import PressStatus, RingStatus
+from jaxtrachea.trachea.geometry import Geometry, table_1
+from jaxtrachea.trachea.material import Material
+
+VALUES = {"EI_L": 1.862, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02}
+FULL = VALUES | {"EA_L": 3.9, "EI_C": 13.0, "k_t": 0.4}
+OK, OFF, BAD = PressStatus.OK, PressStatus.OFF_TUBE, PressStatus.BAD_MATERIAL
+PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
+BEAM = beam.Beam(jnp.array([3.0]), jnp.array(9.0), jnp.ones(2), jnp.ones(1))
+
+
+def bare(kind, start=None, **changes):
+    """Make a record as users do, who have no checker of annotations in front of it."""
+    record = object.__new__(kind)
+    for field in dataclasses.fields(kind):
+        value = getattr(start, field.name, None if start else field.default)
+        object.__setattr__(record, field.name, changes.get(field.name, value))
+    if not start and kind is Parameter:
+        return bare(kind, DEFAULTS["k_1"], **changes)
+    if hasattr(record, "effects"):  # a `Plan`
+        for field, word in (("seat", "first"), ("rings", "mat"), ("dent", 0), ("surface", None)):
+            object.__setattr__(record, field, changes.get(field, word))
+        for field in ("contact", "curved", "friction", "second_plane", "axial", "end_motion",
+                      "joints", "ring_ends"):  # fmt: skip
+            object.__setattr__(record, field, False)
+    record.__post_init__()
+    return record
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"split": "indep"}, "split is 'indep'; expected 'continuous' or 'independent'"),
+        ({"form": "x"}, "form is 'x'; expected 'recursion' or 'reactions'"),
+        ({"contact": "bond"}, "contact is 'bond'; expected 'unilateral' or 'bonded'"),
+        ({"coupling": "serie"}, "coupling is 'serie'; expected 'series' or 'total'"),
+        ({"local": "two"}, "local is 'two'; expected 'uniform' or 'two-material'"),
+        ({"shear": "off"}, "shear is 'off'; expected True or False"),
+        ({"onset_width": -1}, "onset_width is -1; expected a finite number, 0 or more"),
+        ({"onset_width": math.nan}, "onset_width is nan; expected a finite number, 0 or more"),
+        ({"transition": 0.0}, "transition is 0 mm; expected more than 0, or None"),
+    ],
+)
+def test_options(change, says):
+    with pytest.raises(ValueError, match=f"^{says}"):
+        bare(Options, **change)
+    assert bare(Options, transition=np.float64(2), onset_width=0, shear=True)
+
+
+def test_other_records():
+    """Numbers and words of every other record that is made by hand."""
+    for kind, change in (
+        (Settings, {"method": "lm"}),
+        (Settings, {"starts": 0}),
+        (Settings, {"starts": 1.5}),
+        (Settings, {"decades": math.nan}),
+        (Settings, {"tolerances": Tolerances(iterations=0)}),
+        (Settings, {"tolerances": Tolerances(cost=-1.0)}),
+        (Noise, {"force": 0.0}),
+        (Noise, {"joints": math.inf}),
+        (Wishes, {"seat": "every"}),
+        (Wishes, {"onset_width": -1.0}),
+        (Wishes, {"want_joints": "no"}),
+        (Parameter, {"scale": "ln"}),
+        (Parameter, {"scope": "specimens"}),
+        (Parameter, {"step": 0.0}),
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            bare(kind, **change)
+        bare(kind)
+
+
+def has_words(hint):
+    """Whether a `Literal` stands anywhere in a hint."""
+    if typing.get_origin(hint) is typing.Literal:
+        return any(isinstance(word, str) for word in typing.get_args(hint))
+    return any(map(has_words, typing.get_args(hint)))
+
+
+def takes_words():
+    """Public functions of the package with an argument that is a `Literal`."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = ".".join(["jaxtrachea", *path.relative_to(PACKAGE).with_suffix("").parts])
+        if "__" in name or "cli" in name:
+            continue
+        functions = [n for n in ast.parse(path.read_text()).body if isinstance(n, ast.FunctionDef)]
+        for node in functions:
+            if not node.name.startswith("_"):
+                function = inspect.unwrap(getattr(importlib.import_module(name), node.name))
+                for argument, hint in typing.get_type_hints(function).items():
+                    if argument != "return" and has_words(hint):
+                        yield f"{name.removeprefix('jaxtrachea.')}.{node.name}", argument
+
+
+def any_words(function, argument):
+    """Call a function with a word that there is not; all else is never looked at."""
+    signature = inspect.signature(function)
+    filled = {
+        n: None if p.default is p.empty else p.default for n, p in signature.parameters.items()
+    }
+    known = {"geometry": table_1(), "material": Material(**FULL), "s_c": 40.0, "phi_c": 0.0,
+             "displacement": np.zeros((1, 3)), "friction": 0.5, "force": 1.0, "count": 100,
+             "block": 1, "options": Options(), "beam": BEAM}  # fmt: skip
+    filled |= {n: v for n, v in known.items() if n in filled}
+    return function(**filled | {argument: "no such word"})
+
+
+#: Called by what checks the word, with its own word; never from outside.
+INNER = {
+    "mechanics.compliance.divide_load", "mechanics.reactions.deflect_dense", "skeleton.respond",
+    "skeleton.read_values",
+}  # fmt: skip
+
+
+def test_no_function_runs_a_misspelt_word():
+    """Any argument of any public function that is one of several words."""
+    seen = set()
+    for name, argument in takes_words():
+        module, _, function = f"jaxtrachea.{name}".rpartition(".")
+        seen.add(name)
+        if name in INNER:
+            continue
+        real = inspect.unwrap(getattr(importlib.import_module(module), function))
+        with pytest.raises(ValueError, match="'no such word'.*expected"):
+            any_words(real, argument)
+    assert seen >= INNER | {
+        "mechanics.beam.deflect",
+        "identify.problem.build",
+        "oblique.press_path",
+    }
+
+
+def test_no_record_keeps_a_misspelt_word():
+    """Any field of any dataclass that is one of several words (specifications: pydantic)."""
+    seen = set()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = ".".join(["jaxtrachea", *path.relative_to(PACKAGE).with_suffix("").parts])
+        if "__" in name or "cli" in name:
+            continue
+        for node in ast.parse(path.read_text()).body:
+            kind = isinstance(node, ast.ClassDef) and getattr(
+                importlib.import_module(name), node.name
+            )
+            if not (kind and dataclasses.is_dataclass(kind)) or node.name in RESULTS:
+                continue
+            for field, hint in typing.get_type_hints(kind).items():
+                if has_words(hint):
+                    seen.add(node.name)
+                    with pytest.raises(ValueError, match="'no such word'; expected"):
+                        bare(kind, **{field: "no such word"})
+    assert seen >= {"Options", "Wishes", "Plan", "Settings", "Parameter", "Levels"}
+
+
+#: Made by the package out of words that were checked.
+RESULTS = {"Bootstrap", "Problem", "Situation", "Choice", "Ladder"}
+
+
+@functools.cache
+def compiled(which):
+    """Presses of one kind: status, force and compliance; arguments material and s_c."""
+    g, inward = table_1(), np.array([0.0, -1.0, 0.0])
+    more = {"local": "two-material", "shear": True}
+
+    def one(values, s):
+        m = Material(**{n: v for n, v in values.items() if n != "friction"})
+        if which == "press":
+            out = press(g, m, s, [0.0, 1.0, 3.0], Options(**more))
+            return out.status, out.force, out.compliance
+        if which == "oblique":
+            out = press_oblique(g, m, s, 0.3, inward, Options(**more))
+            return out.status, out.force, out.joints
+        if which == "path":
+            mu = values["friction"]
+            out = press_path(g, m, s, 0.3, np.stack([inward, 2 * inward]), mu)
+            return out.press.status, out.press.force, out.slip
+        out = skeleton_response(g, m, s, 0.3, shear=True)
+        return out.status, out.compliance, out.loads
+
+    def summed(values, s):
+        status, force, more = one(values, s)
+        return jnp.sum(jnp.where(jnp.isfinite(force), force, 0)), (status, force, more)
+
+    return jax.jit(jax.vmap(jax.value_and_grad(summed, (0, 1), has_aux=True), (0, 0)))
+
+
+ALL = FULL | {"GA_L": 1.1, "k_1_ring": 0.9, "EI_side": 1.5, "GA_side": 1.3, "k_A": 1.0, "k_B": 2.0}
+ALL["friction"] = 0.5
+READ = {
+    "press": ("EI_L", "k_M", "k_1", "GA_L", "k_1_ring"),
+    "oblique": ("EI_L", "EI_side", "k_M", "k_1", "GA_L", "GA_side", "k_1_ring", "EI_C", "k_t",
+                "EA_L", "k_A", "k_B"),
+    "path": ("EI_L", "EI_side", "k_M", "k_1", "EI_C", "k_t", "EA_L", "k_A", "k_B",
+             "friction"),
+    "skeleton": ("EI_L", "EI_side", "k_M", "GA_L", "GA_side", "EI_C", "k_t", "EA_L", "k_A", "k_B"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "which",
+    ["press", *(pytest.param(n, marks=pytest.mark.slow) for n in ("oblique", "path", "skeleton"))],
+)
+def test_statuses_in_a_batch(which):
+    """Off the tube and each negative stiffness in turn: NaN with a status of their own.
+
+    Good rows keep every bit, and all derivatives are finite: those of refused rows are 0. Values
+    that the model does not read, and k_3, may be negative.
+    """
+    read = READ[which]
+    rows = [{}, *({n: -0.1} for n in read), {"k_3": -1e-4}, {}, {}, {}]
+    s = np.array([63.0] * (len(rows) - 3) + [-1e-9, 160.0001, 400.0])
+    refused = np.array([0, *[1] * len(read), 0, 1, 1, 1], bool)
+    wanted = ["OK", *["BAD_MATERIAL"] * len(read), "OK", *["OFF_TUBE"] * 3]
+    values = {n: np.array([row.get(n, v) for row in rows]) for n, v in ALL.items()}
+    (_, (status, force, more)), slopes = compiled(which)(values, s)
+    names = RingStatus if which == "skeleton" else PressStatus
+    last = np.asarray(status).reshape(len(rows), -1)[:, -1]
+    assert [names(int(k)).name for k in last] == wanted
+    for out in (force, more):
+        bad = ~np.isfinite(np.asarray(out)).reshape(len(rows), -1)
+        np.testing.assert_array_equal(bad.all(axis=1), refused)
+        np.testing.assert_array_equal(bad.any(axis=1), refused)
+    for slope in jax.tree.leaves(slopes):
+        assert np.all(np.isfinite(slope))
+        assert np.all(slope[refused] == 0)
+    alone = {n: np.repeat(v[:1], len(rows)) for n, v in values.items()}
+    (_, (_, same, _)), others = compiled(which)(alone, np.full(len(rows), 63.0))
+    np.testing.assert_array_equal(force[0], same[0])
+    for a, b in zip(jax.tree.leaves(slopes), jax.tree.leaves(others), strict=True):
+        np.testing.assert_array_equal(a[0], b[0])
+
+
+def test_zero_limits():
+    """A cut span, its stiffness to 0; no rings, k_M = 0: a beam between two clamps; both ends."""
+    run = jax.jit(jax.vmap(lambda EI, k, s: press(table_1(), Material(EI, k, 0.3, 0.02), s, 1.0)))
+    EI = np.full((4, 16), 1.862)
+    EI[0, 3] = 1e-9
+    out = run(EI, np.array([0.1, 0.0, 0.1, 0.1]), np.array([63.0, 80.0, 0.0, 160.0]))
+    assert out.status.tolist() == [OK] * 4
+    np.testing.assert_allclose(out.compliance[1:], [160.0**3 / (192 * 1.862), 0, 0], rtol=1e-12)
+
+
+def test_python_numbers():
+    """Numbers, integers, lists and numpy arrays are the arrays they stand for, in both dtypes."""
+    run = jax.jit(press)
+    for dtype in (jnp.float64, jnp.float32):
+        g = table_1(dtype=dtype)
+        arrays = Material(**{n: jnp.asarray(v, dtype) for n, v in VALUES.items()})
+        exact = run(g, arrays, jnp.asarray(40, dtype), jnp.asarray([1, 2], dtype))
+        for s, D, onset in ((40.0, [1.0, 2.0], 0.0), (40, (1, 2), None), (np.int64(40), [1, 2], 0),
+                            (np.float32(40), np.array([1, 2]), None)):  # fmt: skip
+            m = Material(**VALUES)
+            got = jax.eval_shape(functools.partial(press, g, m, s, D, onset=onset))
+            assert (got.force.shape, got.force.dtype) == ((2,), dtype)
+        got = jax.jit(lambda g=g: press(g, Material(**VALUES), 40, [1, 2]))()
+        for a, b in zip(got, exact, strict=True):
+            np.testing.assert_allclose(a, b, rtol=50 * jnp.finfo(dtype).eps)
+    one = press(table_1(), Material(2, 1, 1, 0), 40, 2)
+    assert (one.force.shape, one.force.dtype) == ((), jnp.float64)
+    for k in range(3):  # one program for every new number
+        run(table_1(), Material(2.0 + k, 1.0, 1.0, 0.0), 40.0 + k, 2.0)
+    assert run._cache_size() == 3
+    path = functools.partial(press_path, table_1(), Material(**FULL), 40, 0, [[0, -1, 0]], 1)
+    assert jax.eval_shape(path).press.force.shape == (1, 3)
+    assert Geometry(160, [20, 40], 11, 2, 4).ring_positions.dtype == jnp.float64
+    deflect = jax.jit(lambda: (beam.deflect(BEAM, 2, 1).w_C, beam.contact_compliance(BEAM, [2, 4])))
+    w_C, compliance = deflect()
+    np.testing.assert_allclose(compliance[0], w_C, rtol=1e-13)
+
+
+PLAIN = {"s_c": 40.0, "displacement": 2.0}
+WRONG = [
+    ({"k_M": np.ones(14)}, PLAIN, "Material.k_M has 14 values; expected .* or 15 values .one for"),
+    ({"EI_L": np.ones(15)}, PLAIN, "Material.EI_L has 15 values; .* 16 values .15 rings make 16"),
+    ({"k_1": np.ones(15)}, PLAIN, "Material.k_1 has 15 values; expected no axis"),
+    ({"GA_L": np.ones((2, 16))}, PLAIN, r"Material.GA_L has shape \(2, 16\); expected"),
+    ({}, PLAIN | {"s_c": [1.0, 2.0]}, "s_c has 2 values; expected no axis .*jax.vmap"),
+    ({}, PLAIN | {"onset": [1.0, 2.0]}, "onset has 2 values; expected no axis"),
+    ({}, PLAIN | {"displacement": "2 mm"}, "displacement is '2 mm'; expected a number"),
+    ({}, PLAIN | {"displacement": [[1.0], 2.0]}, "displacement is .* expected a number"),
+    ({}, PLAIN | {"s_c": True}, "s_c is True; expected a number"),
+]
+
+
+def test_wrong_lengths():
+    """Before anything is traced: the argument, its length and the expected one."""
+    for values, arguments, says in WRONG:
+        with pytest.raises(ValueError, match=f"^{says}"):
+            press(table_1(), Material(**VALUES | values), **arguments)
+    with pytest.raises(ValueError, match="k_M has 14 values"):
+        jax.jit(press)(table_1(), Material(**VALUES | {"k_M": jnp.ones(14)}), 1.0, 1.0)
+
+
+def test_wrong_lengths_elsewhere():
+    g, m = table_1(), Material(**FULL)
+    bad = Material(**FULL | {"EA_L": np.ones(3)})
+    D = np.zeros((2, 3))
+    path = Presses([40.0, 50.0], [0.0, 0.0], [[0, -1, 0], [0, -2, 0]])
+    scene = make_scene(g, m, path, wishes=Wishes(want_surface=False))
+    flat = jnp.zeros((2, 2))
+    short = eqx.tree_at(lambda p: p.phi, path, jnp.zeros(3))
+    narrow = eqx.tree_at(lambda p: p.displacement, path, flat)
+    one_turn = eqx.tree_at(lambda p: p.rotation, Poses(np.zeros((2, 3, 3)), D), jnp.ones((1, 3, 3)))
+    for says, call in {
+        r"displacement has 2 values; expected shape \(..., 3\)":
+            lambda: press_oblique(g, m, 40, 0, [1, 2]),
+        r"displacement has 3 values; expected shape \(steps, 3\)":
+            lambda: press_path(g, m, 40, 0, [0, 1, 2], 0.5),
+        "phi_c has 2 values": lambda: press_oblique(g, m, 40, [0, 1], D),
+        "friction is 'a'": lambda: press_path(g, m, 40, 0, D, "a"),
+        "rounding is -1": lambda: press_path(g, m, 40, 0, D, 0.5, rounding=-1.0),
+        "Material.EA_L has 3 values; expected .*16": lambda: skeleton_response(g, bad, 40, 0),
+        "s_c has 3 values": lambda: skeleton_response(g, m, [1, 2, 3], 0),
+        "path.phi has 3 values; expected 2":
+            lambda: make_scene(g, m, short, wishes=Wishes(want_surface=False)),
+        "path.rotation has": lambda: make_scene(g, m, one_turn),
+        "path.displacement has": lambda: simulate(scene, m, narrow),
+        "Material.EA_L has 3 ": lambda: simulate(scene, bad, path),
+        "phi has 1 value; expected 2 values .as s": lambda: sweep(scene, m, [1, 2], [0], [1, 1]),
+        "k_M is 'soft'; expected a number": lambda: Material(1.0, "soft", 1.0, 0.0),
+        "length is 'long'; expected numbers":
+            lambda: inspect.unwrap(Geometry.create.__func__)(Geometry, "long", [1.0]),
+        "ring_positions has shape": lambda: Geometry.create(9.0, np.ones((1, 2))),
+        r"radius has shape \(2,\)":
+            lambda: inspect.unwrap(Geometry.create.__func__)(Geometry, 9.0, [1.0], radius=[1, 2]),
+        "s_c has shape": lambda: beam.contact_compliance(BEAM, np.ones((2, 2))),
+        "ring_load has 2 values": lambda: beam.deflect(BEAM, 1, 1, ring_load=[1, 2]),
+    }.items():  # fmt: skip
+        with pytest.raises(ValueError, match=f"^{says}"):
+            call()
+
+
+def test_scenes_and_sweeps():
+    """Rows off the tube, a negative stiffness or friction: their own status; the others keep it."""
+    g, m = table_1(), Material(**FULL)
+    path = Presses([40.0, 400.0, -1.0], [0.0] * 3, [[0, -1, 0]] * 3)
+    none = {"want_surface": False, "want_joints": False, "want_ring_ends": False}
+    run = jax.jit(simulate)
+    for wishes in (Wishes(seat="each", **none), Wishes(seat="each", second_plane="on", **none)):
+        scene = make_scene(g, m, path, wishes=wishes)
+        out = run(scene, m, path)
+        assert out.status.tolist() == [OK, OFF, OFF]
+        np.testing.assert_array_equal(np.isnan(out.force[:, 1]), [False, True, True])
+        out = run(scene, Material(**FULL | {"k_M": -0.1}), path)
+        assert out.status.tolist() == [BAD] * 3
+        assert np.isnan(out.force[:, 1]).all()
+    points = [40, 200, 50], [0, 0, 0], [1, 1, 1]
+    swept = sweep(scene, m, *points)
+    assert swept.status.tolist() == [OK, OFF, OK]
+    assert np.isnan(swept.compliance).tolist() == [False, True, False]
+    swept = sweep(scene, Material(**FULL | {"k_1": -0.1}), *points)
+    assert swept.status.tolist() == [BAD] * 3
