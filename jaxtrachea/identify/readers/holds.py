@@ -11,11 +11,14 @@ from jaxtrachea.identify.readers.turning import noise
 BAND = 0.005
 #: A hold lasts this share of the loading at least, takes its band this many times as long as the
 #: loading does, and has this many samples.
-LEAST_HOLD, SLOWER, FEWEST = 0.1, 6.0, 5
+LEAST_HOLD, SLOWER, FEWEST = 0.05, 6.0, 5
+#: One that lasts less than this share of the loading counts only where its force falls by at least
+#: this share: the tool of a gentle press slows down towards its end.
+SHORT, FALLS = 0.2, 0.02
 #: Of a force that rises in proportion to the displacement, what tells slow loading from a hold.
 RISING = 0.3
 #: Shares of the loading between which its speed is taken, in so many parts.
-_UPPER = np.linspace(0.45, 0.95, 11)
+_UPPER, _ALL = np.linspace(0.45, 0.95, 11), np.array([0.05, 0.95])
 #: Bands on each side of a knee that are looked at to place it.
 _AROUND = 3
 
@@ -60,6 +63,11 @@ class Rise:
         """Within it the tool stands still, mm."""
         return max(BAND * self.height, 6 * self.sigma)
 
+    @property
+    def still(self) -> float:
+        """From the level of a hold, within it the tool has arrived, mm."""
+        return max(0.3 * BAND * self.height, 2 * self.sigma)
+
 
 def may_hold(travel: Float64[np.ndarray, " n"]) -> bool:
     """Whether a rising record could hold anywhere: a cheap look, for records sampled evenly.
@@ -81,24 +89,27 @@ def holds(rise: Rise) -> tuple[int, tuple[Hold, ...], Hold | None]:
         Samples of rest before the loading begins, holds on the way up, and the hold at the peak.
     """
     envelope = np.maximum.accumulate(rise.travel)
-    least = _least_duration(rise, envelope)
+    least, short = _durations(rise, envelope)
     size = envelope.size
     until = np.searchsorted(envelope, envelope + rise.band, side="right")
     long = rise.clock[until - 1] - rise.clock >= least
     slow = np.flatnonzero(long & (until - np.arange(size) >= FEWEST))
     rest, steps, top = 0, [], None
     for start, stop in _runs(slow, until):
-        first = _knee_before(rise, envelope, start, stop, least)
-        last = stop if stop >= size else _knee_after(rise, envelope, start, stop, least)
         if envelope[start] <= envelope[0] + rise.band:
-            if rise.travel[last - 1] - rise.travel[0] <= 2 * rise.band and last < size:
-                rest = last - 1
+            last = _leaves(rise, envelope, start, stop, least)
+            if _lapse(rise, 0, last) >= short:
+                rest = max(rest, last)
             continue
+        first = _arrives(rise, envelope, start, stop, least)
+        last = stop if stop >= size else _leaves(rise, envelope, start, stop, least) + 1
         dip = float((envelope[first:last] - rise.travel[first:last]).max(initial=0.0))
         if last - first < FEWEST or dip > 2 * rise.band or _rises(rise, first, last):
             continue
-        first = _where_force_stops(rise, first)
-        hold = _hold(rise, first, last)
+        hold = _hold(rise, _where_force_stops(rise, first), last)
+        scatter = 3 * noise(rise.force) / float(np.ptp(rise.force))
+        if hold.duration < short and hold.relaxed < max(FALLS, scatter):
+            continue
         if stop >= size:
             top = hold
         else:
@@ -106,12 +117,20 @@ def holds(rise: Rise) -> tuple[int, tuple[Hold, ...], Hold | None]:
     return rest, tuple(steps), top
 
 
-def _least_duration(rise: Rise, envelope: np.ndarray) -> float:
-    """Shortest hold, in the unit of the clock, from the usual speed of the upper half."""
-    levels = float(rise.travel.max()) - rise.height * (1 - _UPPER)
-    part = float(np.median(np.diff(np.interp(levels, envelope, rise.clock))))
-    loading = part / float(_UPPER[1] - _UPPER[0])
-    return max(LEAST_HOLD, SLOWER * rise.band / rise.height) * loading
+def _durations(rise: Rise, envelope: np.ndarray) -> tuple[float, float]:
+    """Of the shortest hold, and of one that needs no further sign, in the unit of the clock."""
+    top = float(rise.travel.max())
+    passed = np.interp(top - rise.height * (1 - _UPPER), envelope, rise.clock)
+    ends = np.interp(top - rise.height * (1 - _ALL), envelope, rise.clock)
+    usual = float(np.median(np.diff(passed))) / float(_UPPER[1] - _UPPER[0])
+    whole = float(ends[1] - ends[0]) / float(_ALL[1] - _ALL[0])
+    passing = SLOWER * rise.band / rise.height * usual
+    return max(LEAST_HOLD * whole, passing), max(SHORT * whole, passing)
+
+
+def _lapse(rise: Rise, start: int, stop: int) -> float:
+    """Time between two samples, in the unit of the clock."""
+    return float(rise.clock[stop] - rise.clock[start])
 
 
 def _runs(slow: np.ndarray, until: np.ndarray) -> list[tuple[int, int]]:
@@ -123,21 +142,37 @@ def _runs(slow: np.ndarray, until: np.ndarray) -> list[tuple[int, int]]:
     return [(int(group[0]), int(until[group[-1]])) for group in groups]
 
 
-def _knee_before(rise: Rise, envelope: np.ndarray, start: int, stop: int, least: float) -> int:
-    """First sample after a loading bends into a hold: farthest above the chord."""
+def _arrives(rise: Rise, envelope: np.ndarray, start: int, stop: int, least: float) -> int:
+    """First sample after a loading ends in a hold."""
     low = int(np.searchsorted(envelope, envelope[start] - _AROUND * rise.band))
+    level = _level(rise, start, stop)
+    if level is not None:
+        return low + int(np.argmax(rise.travel[low:stop] >= level - rise.still)) + 1
     high = int(np.searchsorted(rise.clock, rise.clock[start] + least, side="right"))
     high = max(min(high, stop) - 1, start + 1)
     return low + int(np.argmax(_above_chord(rise, low, high))) + 1
 
 
-def _knee_after(rise: Rise, envelope: np.ndarray, start: int, stop: int, least: float) -> int:
-    """First sample after a hold bends into a loading: farthest below the chord."""
+def _leaves(rise: Rise, envelope: np.ndarray, start: int, stop: int, least: float) -> int:
+    """Last sample of a hold before a loading begins."""
+    level = _level(rise, start, stop)
+    if level is not None:
+        return start + int(np.flatnonzero(rise.travel[start:stop] <= level + rise.still)[-1])
     low = int(np.searchsorted(rise.clock, rise.clock[stop - 1] - least))
     low = min(max(low, start), stop - 2)
-    level = envelope[stop - 1] + _AROUND * rise.band
-    high = min(int(np.searchsorted(envelope, level, side="right")), envelope.size - 1)
-    return low + int(np.argmin(_above_chord(rise, low, high))) + 1
+    above = envelope[stop - 1] + _AROUND * rise.band
+    high = min(int(np.searchsorted(envelope, above, side="right")), envelope.size - 1)
+    return low + int(np.argmin(_above_chord(rise, low, high)))
+
+
+def _level(rise: Rise, start: int, stop: int) -> float | None:
+    """Displacement of a hold, mm; None where it creeps."""
+    quarter = (stop - start) // 4
+    middle = rise.travel[start + quarter : stop - quarter]
+    third = max(middle.size // 3, 1)
+    if abs(float(middle[-third:].mean() - middle[:third].mean())) > rise.still:
+        return None
+    return float(np.median(middle))
 
 
 def _above_chord(rise: Rise, low: int, high: int) -> np.ndarray:
@@ -162,10 +197,10 @@ def _rises(rise: Rise, start: int, stop: int) -> bool:
 def _where_force_stops(rise: Rise, start: int) -> int:
     """First sample of a hold that creeps fast at first: from where its force no longer grows."""
     few = max(start // 50, 1)
-    level = float(rise.force[start - few : start + few].mean())
-    spread = max(3 * noise(rise.force), 0.01 * float(np.ptp(rise.force)))
-    first = int(np.argmax(rise.force >= level - spread)) + 1
-    if first > start - FEWEST:
+    smooth = np.convolve(rise.force[: start + few], np.full(few, 1 / few), "valid")
+    spread = max(2 * noise(rise.force) / few**0.5, 0.005 * float(np.ptp(rise.force)))
+    first = int(np.argmax(smooth >= smooth.max() - spread)) + few // 2 + 1
+    if first > start - FEWEST or _rises(rise, first, start):
         return start
     before = int(np.searchsorted(rise.travel[:first], rise.travel[first] - 0.2 * rise.height))
     usual = _speed(rise, min(before, first - 1), first)

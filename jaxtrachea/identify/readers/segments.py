@@ -34,6 +34,8 @@ STEPS = 2
 MOST_STEP = 3.0
 #: Share of the force range up to which a tool is said to approach.
 APPROACH = 0.02
+#: Samples between which slow wander is looked for, if the loading has this many such pieces.
+_LAG, _LEGS = 8, 32
 
 
 @dataclass(frozen=True)
@@ -114,8 +116,10 @@ def segment(
     Raises:
         NoLoading: the record only unloads.
     """
-    sign = direction(displacement)
+    sign = direction(displacement, force)
     travel = sign * displacement
+    if time is not None and not time[-1] > time[0]:
+        time = None
     even = time is None or _even(time)
     if (travel[1:] >= travel[:-1]).all() and even and not may_hold(travel):
         return _plain(sign, travel)
@@ -129,10 +133,14 @@ def _even(time: np.ndarray) -> bool:
     return longest * (time.size - 1) <= 2 * float(time[-1] - time[0])
 
 
-def direction(displacement: Float64[np.ndarray, " n"]) -> int:
-    """-1 if the record draws outward: it falls more than it rises, to beyond zero."""
+def direction(
+    displacement: Float64[np.ndarray, " n"], force: Float64[np.ndarray, " n"]
+) -> int:
+    """-1 if the record draws outward: it falls more than it rises, to beyond zero, and so does F."""
     low, high, start = displacement.min(), displacement.max(), displacement[0]
-    return -1 if start - low > high - start and -low > abs(high) else 1
+    if start - low <= high - start or -low <= abs(high):
+        return 1
+    return -1 if force[0] - force.min() > force.max() - force[0] else 1
 
 
 def _plain(sign: int, travel: np.ndarray) -> Segments:
@@ -173,15 +181,17 @@ def _of_many(
         raise NoLoading(sign * travel[0], sign * travel[-1])
     full = np.flatnonzero(heights >= FULL * heights.max())
     pick = int(full[0] if first else full[-1])
-    foot = _foot(travel, points, found[pick][0])
-    peak = found[pick][1]
-    until = _end(travel, peak, 2 * max(BAND * height, SIGMAS * sigma))
+    corners = turning_points(travel, tolerance)
+    start, peak = found[pick]
+    start += int(np.flatnonzero(clipped[start : peak + 1] <= clipped[start])[-1])
+    foot = _foot(travel, points, corners, start)
+    begin, until, wander = _around(travel, foot, peak, sigma, float(heights[pick]))
     rise = Rise(
-        travel=travel[foot:until],
-        force=force[foot:until],
-        clock=clock[foot:until],
+        travel=travel[begin:until],
+        force=force[begin:until],
+        clock=clock[begin:until],
         height=float(heights[pick]),
-        sigma=sigma,
+        sigma=wander,
     )
     whole = Segments(
         direction=sign,
@@ -195,8 +205,8 @@ def _of_many(
         chosen=int(np.searchsorted(full, pick)) + 1,
         last_share=float(heights[-1] / heights.max()),
     )
-    legs = tuple(_legs(travel, turning_points(travel, tolerance), tolerance))
-    return _held(whole, rise, legs)
+    legs = tuple(_legs(travel, corners, tolerance))
+    return _held(whole, rise, legs, begin)
 
 
 def _legs(travel: np.ndarray, points: Sequence[int], tolerance: float) -> Iterator[Segment]:
@@ -208,34 +218,58 @@ def _legs(travel: np.ndarray, points: Sequence[int], tolerance: float) -> Iterat
         yield Segment(kind, start, stop + (stop == travel.size - 1))
 
 
-def _foot(travel: np.ndarray, points: list[int], foot: int) -> int:
-    """Last of the lowest samples since the turning point before a foot, in air as well."""
+def _foot(travel: np.ndarray, points: list[int], corners: list[int], foot: int) -> int:
+    """Where a loading begins in air: its last return there, else the lowest place since.
+
+    Args:
+        travel: the record.
+        points: turning points of what counts of it.
+        corners: its own turning points.
+        foot: where what counts of the loading begins.
+    """
     before = max((p for p in points if p < foot), default=0)
+    returns = [start for start, _ in loadings(travel, corners) if before < start <= foot]
+    if returns:
+        return returns[-1]
     return foot - int(np.argmin(travel[before : foot + 1][::-1]))
 
 
-def _end(travel: np.ndarray, peak: int, band: float) -> int:
-    """First sample after a peak and all that stays near it."""
-    left = np.flatnonzero(travel[peak:] < travel[peak] - band)
-    return peak + int(left[0]) if left.size else travel.size
+def _around(
+    travel: np.ndarray, foot: int, peak: int, sigma: float, height: float
+) -> tuple[int, int, float]:
+    """A loading with all that stays near its foot and its peak, and the noise within it.
+
+    Returns:
+        First sample, first sample after it, and standard deviation of the displacement, mm, slow
+        wander included.
+    """
+    lag = min(_LAG, (peak - foot) // _LEGS)
+    if lag > 1 and sigma > 0:
+        sigma = max(sigma, min(noise(travel[foot : peak + 1], lag), MOST_NOISE * height / SIGMAS))
+    near = 2 * max(BAND * height, SIGMAS * sigma)
+    above = np.flatnonzero(travel[:foot] > travel[foot] + max(0.1 * near, SIGMAS * sigma))
+    left = np.flatnonzero(travel[peak:] < travel[peak] - near)
+    begin = int(above[-1]) + 1 if above.size else 0
+    return begin, peak + int(left[0]) if left.size else travel.size, sigma
 
 
-def _held(whole: Segments, rise: Rise, legs: Sequence[Segment]) -> Segments:
+def _held(whole: Segments, rise: Rise, legs: Sequence[Segment], start: int) -> Segments:
     """With holds, the samples to keep, all segments, and what is left out and why."""
-    start, size = whole.foot, whole.keep.size
+    size = whole.keep.size
     rest, steps, top = holds(rise)
+    rest = max(rest, whole.foot - start) if rest == 0 else rest
     last = whole.stop - start if top is None else top.start
     keep = np.zeros(rise.travel.shape, bool)
     keep[rest:last] = True
     for hold in steps:
         keep[hold.start : hold.stop] = False
-    stepwise = len(steps) >= STEPS or keep.sum() < FEWEST <= rise.travel.size
+    stepwise = len(steps) >= STEPS or bool(keep.sum() < FEWEST <= keep.size)
     if stepwise:
         if top is not None and _alike(steps, top):
             last, steps, top = top.stop, (*steps, top), None
         keep[rest:last] = True
-    back = turned_back(rise.travel[:last], whole.tolerance)
-    back[:rest] = False
+    back = np.zeros(last, bool)
+    back[rest:] = turned_back(rise.travel[rest:last], whole.tolerance)
     keep[:last] &= ~back
     after = last if top is None else top.stop
     resting = all(leg.kind == "rest" for leg in legs if leg.start < start)

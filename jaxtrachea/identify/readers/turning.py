@@ -15,7 +15,7 @@ _RETURN = 0.5
 _MEDIAN = 0.6745
 
 
-def noise(values: Float64[np.ndarray, " n"]) -> float:
+def noise(values: Float64[np.ndarray, " n"], lag: int = 1) -> float:
     """Standard deviation of white noise on a smooth record.
 
     The differences of order 2, 3 and 4 of noise have sqrt(6), sqrt(20) and sqrt(70) times its
@@ -25,15 +25,16 @@ def noise(values: Float64[np.ndarray, " n"]) -> float:
 
     Args:
         values: the record, at least one sample.
+        lag: samples between those that are subtracted; more than 1 sees slow wander as well.
 
     Returns:
         The estimate in the unit of `values`; 0 for less than 16 samples.
     """
-    if values.size < _FEWEST:
+    if values.size < _FEWEST * lag:
         return 0.0
     estimates, change = [], values
     for order in range(1, 5):
-        change = np.diff(change)
+        change = change[lag:] - change[:-lag]
         if order > 1:
             size = math.sqrt(math.comb(2 * order, order))
             estimates.append(float(np.median(np.abs(change))) / (_MEDIAN * size))
