@@ -81,7 +81,7 @@ def path(kind, peak, speed, hold, rate):
     to(peak)
     end = corners[-1][0]
     if "drift" in kind:
-        wait(1.0, 0.02 * peak)
+        wait(1.0, 0.005 * peak)
         wait(hold - 1.0, 0.01 * peak)
     elif "hold" in kind:
         wait(hold)

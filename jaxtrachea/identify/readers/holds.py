@@ -191,7 +191,7 @@ def _rises(rise: Rise, start: int, stop: int) -> bool:
     more = float(force[-third:].mean() - force[:third].mean())
     scatter = noise(force) * np.sqrt(2 / third)
     usual = float(np.ptp(rise.force)) / rise.height
-    return far > 0.5 * rise.band and more > max(RISING * usual * far, 3 * scatter)
+    return bool(far > 0.5 * rise.band and more > max(RISING * usual * far, 3 * scatter))
 
 
 def _where_force_stops(rise: Rise, start: int) -> int:

@@ -258,7 +258,9 @@ def _held(whole: Segments, rise: Rise, legs: Sequence[Segment], start: int) -> S
     size = whole.keep.size
     rest, steps, top = holds(rise)
     rest = max(rest, whole.foot - start) if rest == 0 else rest
-    last = whole.stop - start if top is None else top.start
+    # Noise puts the peak anywhere on the last samples: those of a record that ends there are kept.
+    peak = rise.travel.size if start + rise.travel.size == size else whole.stop - start
+    last = peak if top is None else top.start
     keep = np.zeros(rise.travel.shape, bool)
     keep[rest:last] = True
     for hold in steps:

@@ -7,8 +7,6 @@ from jaxtyping import Bool, Float64
 
 #: Fewest samples from which the noise is estimated; below, there is said to be none.
 _FEWEST = 16
-#: Larger steps, as a share of the range, are no rounding.
-_COARSEST = 0.02
 #: A loading ends where the tool returns by more than this share of the way it came.
 _RETURN = 0.5
 #: Median of the absolute value of a standard normal variable.
@@ -20,8 +18,7 @@ def noise(values: Float64[np.ndarray, " n"], lag: int = 1) -> float:
 
     The differences of order 2, 3 and 4 of noise have sqrt(6), sqrt(20) and sqrt(70) times its
     standard deviation; medians of their sizes leave steps and turning points out of account, and
-    the smallest of the three leaves out what a smooth curve adds. Quantised values, in steps of up
-    to 2 % of their range, have the noise of rounding at least.
+    the smallest of the three leaves out what a smooth curve adds.
 
     Args:
         values: the record, at least one sample.
@@ -38,10 +35,7 @@ def noise(values: Float64[np.ndarray, " n"], lag: int = 1) -> float:
         if order > 1:
             size = math.sqrt(math.comb(2 * order, order))
             estimates.append(float(np.median(np.abs(change))) / (_MEDIAN * size))
-    steps = np.abs(np.diff(values))
-    quantum = float(steps.min(where=steps > 0, initial=np.inf))
-    quantised = quantum <= _COARSEST * float(np.ptp(values))
-    return max(min(estimates), quantum / math.sqrt(12) if quantised else 0.0)
+    return min(estimates)
 
 
 def turning_points(values: Float64[np.ndarray, " n"], tolerance: float) -> list[int]:
