@@ -121,5 +121,6 @@ def turned_back(values: Float64[np.ndarray, " n"], tolerance: float) -> Bool[np.
             continue
         again = np.flatnonzero(values[valley:] >= values[peak])
         until = valley + int(again[0]) if again.size else values.size
-        back[peak + 1 : until] = True
+        still = peak + int(np.flatnonzero(values[peak:valley] >= values[peak])[-1])
+        back[still + 1 : until] = True
     return back
