@@ -97,8 +97,8 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
     from jaxtrachea.identify.population import population_rows
     from jaxtrachea.identify.posterior_tables import rows_with_draws, write_draws
     from jaxtrachea.identify.predictions import predictions
-    from jaxtrachea.plots import draw_all
     from jaxtrachea.identify.usage_tables import usage_rows, usage_section
+    from jaxtrachea.plots import draw_all
     from jaxtrachea.sections import write_more
     from jaxtrachea.webpage import page
 

@@ -1,4 +1,4 @@
-"""What of every record is used, for `check`, the terminal, report.md, summary.csv and curves.csv."""
+"""What of every record is used: for `check`, terminal, report.md, summary.csv and curves.csv."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -89,8 +89,8 @@ def _cut(curves: Sequence[Curve]) -> Iterator[str]:
     )
     why = ", ".join(f"{CAUSES[cause]} {n}" for cause, n in causes.most_common())
     yield (
-        f"more than {100 * CUT:.0f} % of the samples is left out of {len(cut)} of {len(curves)} curves "
-        f"(mostly {why}): {_listed([c for c, _ in cut])}"
+        f"more than {100 * CUT:.0f} % of the samples is left out of {len(cut)} of {len(curves)} "
+        f"curves (mostly {why}): {_listed([c for c, _ in cut])}"
     )
 
 

@@ -1,7 +1,7 @@
-"""Records of a press on a viscoelastic tube, with known segments: holds, dips, cycles, steps, noise.
+"""Records of a press on a viscoelastic tube, with known segments: holds, dips, cycles, noise.
 
-Written for the tests; numpy only, nothing of the package in it. The force follows from the history
-of the displacement by quasi-linear viscoelasticity with two Prony branches,
+Written for the tests; the records know nothing of the package (numpy only). The force follows from
+the history of the displacement by quasi-linear viscoelasticity with two Prony branches,
 
     F(t) = int_0^t G(t - u) dF_e(D(u))/du du,   G(t) = 1 - sum_i g_i (1 - exp(-t / tau_i)),
 

@@ -74,8 +74,8 @@ class BadCurve:
         source: file, and lines or group, it came from.
         kind: short code: "empty", "too_few_points", "unparsable", "ragged", "column_missing",
             "ambiguous", "unit_missing", "unit_unknown", "shape", "non_finite", "bad_sigma",
-            "position", "absurd_scale", "time", "non_monotone", "no_signal", "sign", "metadata_missing",
-            "unreadable".
+            "position", "absurd_scale", "time", "non_monotone", "no_signal", "sign",
+            "metadata_missing", "unreadable".
         message: one line: file, place, what was found and what expected.
         cure: one line.
     """

@@ -6,13 +6,14 @@ its foot to its peak. What counts as turning back follows from the noise of the 
 what counts as standing still from the speed of the loading itself; neither needs a time column.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from jaxtrachea.identify.readers.holds import BAND, FEWEST, Hold, Rise, holds, may_hold
+from jaxtrachea.identify.readers.parts import Segment, legs_of, parts_of, touch
 from jaxtrachea.identify.readers.turning import loadings, noise, turned_back, turning_points
 
 #: A reversal of less than this share of the loading is jitter of the machine, noise or not.
@@ -32,19 +33,8 @@ TOUCH, FARTHER = 0.05, 1.25
 STEPS = 2
 #: A hold at the peak is one more step if it lasts at most this many times as long as they do.
 MOST_STEP = 3.0
-#: Share of the force range up to which a tool is said to approach.
-APPROACH = 0.02
 #: Samples between which slow wander is looked for, if the loading has this many such pieces.
 _LAG, _LEGS = 8, 32
-
-
-@dataclass(frozen=True)
-class Segment:
-    """Samples `start` up to, not including, `stop`; kind: rest, approach, load, hold, unload."""
-
-    kind: str
-    start: int
-    stop: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,10 +123,8 @@ def _even(time: np.ndarray) -> bool:
     return longest * (time.size - 1) <= 2 * float(time[-1] - time[0])
 
 
-def direction(
-    displacement: Float64[np.ndarray, " n"], force: Float64[np.ndarray, " n"]
-) -> int:
-    """-1 if the record draws outward: it falls more than it rises, to beyond zero, and so does F."""
+def direction(displacement: Float64[np.ndarray, " n"], force: Float64[np.ndarray, " n"]) -> int:
+    """-1 if the record draws outward: it falls more than it rises, beyond zero; so does F."""
     low, high, start = displacement.min(), displacement.max(), displacement[0]
     if start - low <= high - start or -low <= abs(high):
         return 1
@@ -205,17 +193,8 @@ def _of_many(
         chosen=int(np.searchsorted(full, pick)) + 1,
         last_share=float(heights[-1] / heights.max()),
     )
-    legs = tuple(_legs(travel, corners, tolerance))
+    legs = tuple(legs_of(travel, corners, tolerance))
     return _held(whole, rise, legs, begin)
-
-
-def _legs(travel: np.ndarray, points: Sequence[int], tolerance: float) -> Iterator[Segment]:
-    """The record from turning point to turning point."""
-    ends = sorted({0, *points, travel.size - 1})
-    for start, stop in zip(ends[:-1], ends[1:], strict=True):
-        way = float(travel[stop] - travel[start])
-        kind = "rest" if abs(way) <= tolerance else "load" if way > 0 else "unload"
-        yield Segment(kind, start, stop + (stop == travel.size - 1))
 
 
 def _foot(travel: np.ndarray, points: list[int], corners: list[int], foot: int) -> int:
@@ -290,7 +269,7 @@ def _held(whole: Segments, rise: Rise, legs: Sequence[Segment], start: int) -> S
         foot=places[1],
         stop=places[2],
         keep=kept,
-        parts=tuple(_parts(legs, places, _touch(rise, rest, last) + start)),
+        parts=tuple(parts_of(legs, places, touch(rise, rest, last) + start)),
         hold=None if top is None else _shifted(top, start),
         steps=tuple(_shifted(hold, start) for hold in steps),
         stepwise=stepwise and len(steps) > 0,
@@ -306,27 +285,3 @@ def _shifted(hold: Hold, by: int) -> Hold:
 def _alike(steps: tuple[Hold, ...], top: Hold) -> bool:
     """Whether the hold at the peak is one more step."""
     return not steps or top.duration <= MOST_STEP * float(np.median([h.duration for h in steps]))
-
-
-def _touch(rise: Rise, foot: int, last: int) -> int:
-    """First sample of a loading after which the force stays above a small share of its range."""
-    force = rise.force[foot:last]
-    low = float(force.min())
-    below = np.flatnonzero(force <= low + APPROACH * (float(force.max()) - low))
-    return foot + (int(below[-1]) + 1 if below.size and below[-1] < force.size - 1 else 0)
-
-
-def _parts(
-    legs: Sequence[Segment], places: tuple[int, int, int, int], touch: int
-) -> Iterator[Segment]:
-    """All samples in order: legs before and after, the rest, the loading and its hold."""
-    start, foot, last, after = places
-    named = (
-        *(Segment(leg.kind, leg.start, min(leg.stop, start)) for leg in legs),
-        Segment("rest", start, foot),
-        Segment("approach", foot, touch),
-        Segment("load", max(foot, touch), last),
-        Segment("hold", last, after),
-        *(Segment(leg.kind, max(leg.start, after), leg.stop) for leg in legs),
-    )
-    yield from (part for part in named if part.start < part.stop)

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtrachea.identify.readers.holds import Hold
 from jaxtrachea.identify.readers.segments import FULL, Segment, Segments
 
+#: Loading rules that choose a loading.
+CHOOSING = ("last", "first", "loading")
 #: A fall of the force in a hold, as a share, from which it is worth a word.
 RELAXED = 0.01
 #: Causes of samples left out, for people.
@@ -70,8 +72,8 @@ def usage(
         Counts, segments, causes and remarks.
     """
     used = int(np.count_nonzero(keep))
-    chosen = loading in ("last", "first", "loading") and found is not None
-    left_out = dict(found.left_out) if chosen else {}
+    chosen = found is not None and loading in CHOOSING
+    left_out = dict(found.left_out) if found is not None and chosen else {}
     window = keep.size - sum(left_out.values()) - used
     if window > 0:
         left_out["window"] = window
