@@ -236,8 +236,10 @@ def _held(whole: Segments, rise: Rise, legs: Sequence[Segment], start: int) -> S
     """With holds, the samples to keep, all segments, and what is left out and why."""
     size = whole.keep.size
     rest, steps, top = holds(rise)
-    rest = max(rest, whole.foot - start) if rest == 0 else rest
-    # Noise puts the peak anywhere on the last samples: those of a record that ends there are kept.
+    # Noise puts foot and peak anywhere on the first and last samples: those of a record that begins
+    # or ends there are kept.
+    if rest == 0 and start > 0:
+        rest = whole.foot - start
     peak = rise.travel.size if start + rise.travel.size == size else whole.stop - start
     last = peak if top is None else top.start
     keep = np.zeros(rise.travel.shape, bool)
