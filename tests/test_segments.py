@@ -43,6 +43,7 @@ KNOWN = {
     "last one short": (np.r_[UP, DOWN, UP[:100]], 0, 200, 0),
     "cut off in the hold of a cycle": (np.r_[DOWN, UP, HOLD], 200, 400, 0),
     "steps": (STEPS, 0, 240, 0),
+    "slower at the end": (np.r_[UP[:170], np.linspace(3.4, 4, 300)], 0, 470, 0),
     "only steps recorded": (np.repeat(np.arange(4.0), 5), 4, 20, 0),
     "pause": (np.r_[UP[:100], np.full(100, 2.0), UP[100:], HOLD], 0, 300, 100),
     "from the air, cycles": (np.r_[AIR, UP, DOWN, UP, DOWN], 700, 900, 0),
