@@ -105,6 +105,7 @@ def check(spec: SpecArgument, data: DataOption = None) -> None:
     out.print(_curve_table(curves))
     if len(curves) > MANY:
         out.print(f"... and {len(curves) - MANY} more")
+    _print_usage(out, curves)
     out.print(_parameter_table(problem.parameters))
     fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in problem.parameters if p.fixed)
     out.print(f"Fixed: {fixed or 'none'}", highlight=False)
@@ -249,15 +250,30 @@ def _names_to_profile(path: Path, spec, problem, asked: bool) -> tuple[str, ...]
         raise Stop(f"{path}: {error}") from None
 
 
+def _print_usage(out: Console, curves) -> None:
+    """What is used of the curves that are not used whole, and what is doubtful about them."""
+    from jaxtrachea.identify.usage_tables import sentences, usage_lines
+
+    told = [c for c in curves if usage_lines([c])]
+    for line in usage_lines(told[:MANY]):
+        out.print(escape(line), highlight=False)
+    if len(told) > MANY:
+        out.print(f"... and {len(told) - MANY} more curves not used whole; a fit lists all")
+    for sentence in sentences(curves):
+        out.print(escape(f"{sentence[:1].upper()}{sentence[1:]}."), highlight=False)
+
+
 def _curve_table(curves) -> Table:
     rows = []
     for curve in curves[:MANY]:
         where = "–" if curve.s_c is None else f"{curve.s_c:.4g}"
         markers = 0 if curve.joint_displacement is None else curve.joint_displacement.shape[1]
         spans = [f"{v.min():.3g} … {v.max():.3g}" for v in (curve.displacement, curve.force)]
-        row = [curve.specimen, curve.trial, where, str(len(curve.force)), *spans, str(markers)]
+        recorded = len(curve.force) if curve.usage is None else curve.usage.recorded
+        counts = [str(len(curve.force)), str(recorded)]
+        row = [curve.specimen, curve.trial, where, *counts, *spans, str(markers)]
         rows.append(row)
-    head = ["specimen", "trial", "s [mm]", "n", "D [mm]", "F [N]", "markers"]
+    head = ["specimen", "trial", "s [mm]", "n", "of", "D [mm]", "F [N]", "markers"]
     return table(f"{len(curves)} usable curves", head, rows)
 
 

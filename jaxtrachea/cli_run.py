@@ -97,6 +97,7 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
     from jaxtrachea.identify.population import population_rows
     from jaxtrachea.identify.posterior_tables import rows_with_draws, write_draws
     from jaxtrachea.identify.predictions import predictions
+    from jaxtrachea.identify.usage_tables import usage_rows, usage_section
     from jaxtrachea.plots import draw_all
     from jaxtrachea.sections import write_more
     from jaxtrachea.webpage import page
@@ -114,7 +115,9 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
     drawn = draw_all(folder, result, seen, profiles)
     left = None if found.left_out is None else report.left_out_rows(result, found.left_out)
     title = loaded.title or spec.stem
-    more = write_more(folder, found.influence, found.posterior)
+    results.write_csv(folder / "curves.csv", list(usage_rows(measurements.curves)))
+    used = usage_section(measurements.curves)
+    more = [*used, *write_more(folder, found.influence, found.posterior)]
     text = report.report_text(
         title, result, measurements.bad, seen, left, profiles, resampled, more, found.population
     )
@@ -137,6 +140,7 @@ def show(found: Found, folder: Path) -> None:
     """Tables of a run on the terminal."""
     from jaxtrachea import report
     from jaxtrachea.identify.results import lane_label, succeeded, verdict_sentence
+    from jaxtrachea.identify.usage_tables import sentences
 
     out, result = Console(), found.result
     lanes = range(result.lanes)
@@ -166,4 +170,6 @@ def show(found: Found, folder: Path) -> None:
             out.print(table("Population", report.POPULATION_HEAD, rows))
         good = sum(succeeded(result, lane) for lane in lanes)
         out.print(f"{good} of {result.lanes} lanes succeeded")
+    for sentence in sentences([c for curves in result.problem.curves for c in curves]):
+        out.print(escape(f"{sentence} (curves.csv)"), highlight=False)
     out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)

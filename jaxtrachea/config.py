@@ -85,7 +85,7 @@ class DataSection(Section):
     phi: str | None = None
     displacement_min: Length | None = None
     displacement_max: Length | None = None
-    loading: Literal["require-monotone", "loading", "all"] = "require-monotone"
+    loading: Literal["last", "first", "loading", "all", "require-monotone"] = "last"
     force_sign: Literal[1, -1] = 1
     displacement_sign: Literal[1, -1] = 1
     sheet: str | None = None

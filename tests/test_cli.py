@@ -148,7 +148,10 @@ BAD_DATA = {
     "a number lost": (GOOD.replace("0.66", "O.66").encode(), ["T01 1", "O.66", "no usable curve"]),
     "nan": (GOOD.replace("0.66", "nan").encode(), ["T01 1", "non_finite", "no usable curve"]),
     "infinite": (GOOD.replace("0.66", "inf").encode(), ["T01 1", "non_finite"]),
-    "falling": (GOOD.replace(",1.5,", ",0.2,").encode(), ["T01 1", "non_monotone"]),
+    "falling": (
+        GOOD.replace("0.0,", "9.0,").replace("0.5,", "8.0,").replace("1.0,", "7.0,").encode(),
+        ["T01 1", "non_monotone", "an unloading branch"],
+    ),
     "no signal": ((HEAD + "a,1,9,0,0\na,1,9,1,0\n").encode(), ["a 1", "no_signal"]),
     "one point": ((HEAD + "a,1,9,0,0\n").encode(), ["a 1", "too_few_points"]),
     "absurd": (GOOD.replace("1.5,", "1.5e9,").encode(), ["T01 1", "absurd_scale"]),

@@ -115,7 +115,7 @@ def _put(v, i, x):
 _SPOIL = {
     1: lambda d, f: (d, _put(f, 7, np.nan)),
     2: lambda d, f: (d[:1], f[:1]),
-    3: lambda d, f: (_put(d, 20, 0.5), f),
+    3: lambda d, f: (d[::-1], f[::-1]),
     4: lambda d, f: (d, 0 * f),
     5: lambda d, f: (d, 1e9 * f),
 }

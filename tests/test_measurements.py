@@ -243,9 +243,15 @@ def test_varying_position(tmp_path):
         ([(1, 0), (1, 1)], {}, "absurd_scale", "covers 0 mm"),
         (
             [(0, 0), (2, 2), (1, 1), (3, 3)],
-            {},
+            {"loading": "require-monotone"},
             "non_monotone",
             "turns back by 1 mm, first in line 4",
+        ),
+        (
+            [(i, i) for i in range(10)] + [(9, 9 - 0.1 * i) for i in range(30)],
+            {"loading": "require-monotone"},
+            "non_monotone",
+            "stands still at its peak for 30 samples, from line 12 on; the force falls by 3",
         ),
         ([(2, 2), (1, 1), (0, 0)], {}, "non_monotone", "an unloading branch"),
     ],
@@ -271,9 +277,12 @@ def test_sigma_must_be_positive(tmp_path, sigma):
 def test_jitter_and_repeated_rows_pass(tmp_path):
     # Range 10 mm: a reversal of 0.09 mm is below 1 %, one of 0.11 mm is not.
     rows = [(0, 0), (5, 5), (5, 5), (4.91, 5), (10, 10)]
-    assert len(read(put(tmp_path, table(rows))).curves[0].force) == 5
+    for loading in ("last", "require-monotone"):
+        assert len(read(put(tmp_path, table(rows)), loading=loading).curves[0].force) == 5
     rows[3] = (4.89, 5)
-    assert only_bad(read(put(tmp_path, table(rows)))).kind == "non_monotone"
+    path = put(tmp_path, table(rows))
+    assert only_bad(read(path, loading="require-monotone")).kind == "non_monotone"
+    np.testing.assert_array_equal(read(path).curves[0].displacement, [0, 5, 5, 10])
 
 
 def test_narrow_window_does_not_tighten_the_jitter(tmp_path):
@@ -285,10 +294,13 @@ def test_narrow_window_does_not_tighten_the_jitter(tmp_path):
 CYCLES = [(0, 0), (1, 2), (2, 5), (1, 1), (0, 0), (2, 4), (4, 9), (0, 0)]
 
 
-def test_first_loading_branch(tmp_path):
-    (got,) = read(put(tmp_path, table(CYCLES)), loading="loading").curves
-    np.testing.assert_array_equal(got.displacement, [0, 1, 2])
-    np.testing.assert_array_equal(got.force, [0, 2, 5])
+@pytest.mark.parametrize("loading", ["last", "first", "loading"])
+def test_full_loading_of_cycles(tmp_path, loading):
+    """The first branch reaches half of the second: only the second is full."""
+    (got,) = read(put(tmp_path, table(CYCLES)), loading=loading).curves
+    np.testing.assert_array_equal(got.displacement, [0, 2, 4])
+    np.testing.assert_array_equal(got.force, [0, 4, 9])
+    assert (got.usage.used, got.usage.recorded) == (3, 8)
 
 
 def test_all_samples(tmp_path):
@@ -317,6 +329,28 @@ def test_position_in_file_and_options_must_agree(tmp_path):
 
 def test_angle_in_degrees_taken_for_radians(tmp_path):
     assert "deg, not rad" in read(put(tmp_path, TIDY.replace("[deg]", "[rad]"))).bad[0].cure
+
+
+@pytest.mark.parametrize(("jitter", "fits"), [(0.001, True), (0.2, False)])
+def test_stage_that_jitters_along_the_tube(tmp_path, jitter, fits):
+    """A micrometre in s is the stage; 0.2 mm are two positions."""
+    rows = [("T1", 35 + (i % 2) * jitter, i, i) for i in range(4)]
+    head = "specimen,s [mm],displacement [mm],force [N]"
+    found = read(put(tmp_path, table(rows, head)))
+    if fits:
+        assert found.curves[0].s_c == pytest.approx(35 + jitter / 2, rel=1e-12)
+    else:
+        assert only_bad(found).kind == "position"
+
+
+def test_time_that_falls(tmp_path):
+    rows = [(0, 0, 0), (1, 1, 1), (0.5, 2, 2), (3, 3, 3)]
+    text = table(rows, "time [s],displacement [mm],force [N]")
+    bad = only_bad(read(put(tmp_path, text)))
+    assert bad.kind == "time"
+    assert "from 1 to 0.5 s in line 4" in bad.message
+    assert len(read(put(tmp_path, text), loading="all").curves[0].force) == 4
+    assert len(read(put(tmp_path, text.replace(" [s]", ""))).curves[0].force) == 4
 
 
 def test_offsets_stay(tmp_path):

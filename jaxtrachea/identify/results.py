@@ -18,6 +18,7 @@ from jaxtrachea.identify.journal import installed
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.population import Population
 from jaxtrachea.identify.profile import Profiles
+from jaxtrachea.identify.usage_tables import lane_cells
 from jaxtrachea.identify.verdict import VERDICTS, describe_flat, verdict
 from jaxtrachea.identify.whole_files import hdf5_file
 from jaxtrachea.status import FitStatus, ProfileEnd
@@ -92,6 +93,7 @@ def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[d
             "starts_agreeing": int(result.converged_starts[lane]),
             "starts": int(result.tried[lane]),
             "samples": int(result.samples[lane]),
+            **lane_cells(result.problem.curves[lane]),
             "cost": float(result.cost[lane]),
             "rms_force_N": float(result.rms[lane, 0]),
             "rms_over_peak": float(result.rms[lane, 0]) / peak if peak > 0 else float("nan"),

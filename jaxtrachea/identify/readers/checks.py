@@ -5,19 +5,20 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from jaxtrachea.identify.readers.loading import check_one_loading, segments_of, selection, usage_of
 from jaxtrachea.identify.readers.records import BadCurve, Curve, Fault, RawCurve, ReadOptions
 
-# A reversal of less than this fraction of the displacement range is jitter of the machine.
-JITTER = 0.01
-# Below this correlation of force with displacement a curve has its force upside down.
+#: Positions that differ by less, mm and rad, are one: a stage of the rig stands no steadier.
+STEADY = {"s": 0.05, "phi": 1e-3}
+#: Below this correlation of force with displacement a curve has its force upside down.
 UPSIDE_DOWN = -0.5
 
 
 def finish(raw: RawCurve, options: ReadOptions) -> Curve | BadCurve:
     """Turn what a reader found into a usable curve, or into the reason why it is none.
 
-    Order: shapes, finite numbers, signs, plausible size, loading branch, displacement window,
-    number of points, monotone displacement, signal.
+    Order: shapes, finite numbers, signs, plausible size, segments, displacement window, number of
+    points, monotone displacement (where required), signal.
 
     Args:
         raw: the curve as read, in mm, N, rad.
@@ -50,12 +51,11 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
     displacement = options.displacement_sign * raw.displacement
     force = options.force_sign * raw.force
     _check_scale(raw, displacement, force, options)
-    # The scale of jitter is that of the whole recording, so a narrow window does not tighten it.
-    jitter = JITTER * float(np.ptp(displacement))
-    keep = _selection(displacement, jitter, options)
+    found = segments_of(raw, displacement, force, options)
+    keep = selection(displacement, found, options)
     _check_amount(keep, displacement, options)
-    if options.loading != "all":
-        _check_monotone(raw.rows[keep], raw.row_word, displacement[keep], jitter)
+    if options.loading == "require-monotone":
+        check_one_loading(raw, displacement, keep, found)
     _check_signal(displacement[keep], force[keep])
     joints = raw.joint_displacement
     return Curve(
@@ -69,6 +69,7 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
         joint_rings=None if raw.joint_rings is None else raw.joint_rings.astype(np.int64),
         joint_displacement=None if joints is None else joints[keep].astype(np.float64),
         source=raw.source,
+        usage=usage_of(raw, displacement, force, keep, found, options),
     )
 
 
@@ -84,6 +85,8 @@ def _check_shapes(raw: RawCurve) -> None:
         )
     if n[0] == 0:
         raise Fault("empty", "there are no samples", "remove the curve or export it again")
+    if raw.time is not None and raw.time.shape != n:
+        raise Fault("shape", f"time has shape {raw.time.shape}, displacement {n}", "store both")
     rings, joints = raw.joint_rings, raw.joint_displacement
     if (rings is None) != (joints is None):
         raise Fault(
@@ -113,6 +116,7 @@ def _listed(rows: Iterable, word: str) -> str:
 
 def _check_finite(raw: RawCurve) -> None:
     columns = {"displacement": raw.displacement, "force": raw.force, "sigma": raw.sigma}
+    columns["time"] = raw.time
     for name, values in columns.items():
         if values is not None and not np.isfinite(values).all():
             rows = raw.rows[~np.isfinite(values)]
@@ -143,7 +147,7 @@ def _position(name: str, own: float | None, common: float | None, unit: str) -> 
             raise Fault("position", f"{name} is {value:g} {unit}", "give a finite position")
     if own is None or common is None:
         return common if own is None else own
-    if not math.isclose(own, common, rel_tol=1e-9, abs_tol=1e-9):
+    if abs(own - common) > STEADY[name]:
         raise Fault(
             "position",
             f"{name} is {own:g} {unit} in the file but {common:g} {unit} in the options",
@@ -170,32 +174,6 @@ def _check_scale(
             )
 
 
-def _direction(displacement: np.ndarray, jitter: float) -> int:
-    """+1 if the curve first moves inward by more than the jitter, -1 if outward (a draw)."""
-    away = displacement - displacement[0]
-    moved = np.flatnonzero(np.abs(away) > jitter)
-    return -1 if moved.size and away[moved[0]] < 0 else 1
-
-
-def _first_branch(displacement: np.ndarray, jitter: float) -> int:
-    """Number of samples up to the first peak, before the first reversal above the jitter."""
-    travel = _direction(displacement, jitter) * displacement
-    reversed_at = np.flatnonzero(np.maximum.accumulate(travel) - travel > jitter)
-    end = int(reversed_at[0]) if reversed_at.size else travel.size
-    return int(np.argmax(travel[:end])) + 1
-
-
-def _selection(displacement: np.ndarray, jitter: float, options: ReadOptions) -> np.ndarray:
-    keep = np.ones(displacement.shape, dtype=bool)
-    if options.loading == "loading":
-        keep[_first_branch(displacement, jitter) :] = False
-    if options.displacement_min is not None:
-        keep &= displacement >= options.displacement_min
-    if options.displacement_max is not None:
-        keep &= displacement <= options.displacement_max
-    return keep
-
-
 def _check_amount(keep: np.ndarray, displacement: np.ndarray, options: ReadOptions) -> None:
     if keep.sum() < options.min_points:
         left = "" if keep.all() else f" of {keep.size} after choosing branch and window"
@@ -210,27 +188,6 @@ def _check_amount(keep: np.ndarray, displacement: np.ndarray, options: ReadOptio
             "absurd_scale",
             f"displacement covers {extent:.4g} mm; at least {options.min_range:g} mm is plausible",
             "check the unit of the displacement (in Python also ReadOptions(min_range=...))",
-        )
-
-
-def _check_monotone(rows: np.ndarray, word: str, displacement: np.ndarray, jitter: float) -> None:
-    direction = _direction(displacement, jitter)
-    travel = direction * displacement
-    back = np.maximum.accumulate(travel) - travel
-    if (back > jitter).any():
-        at = rows[int(np.argmax(back > jitter))]
-        raise Fault(
-            "non_monotone",
-            f"displacement turns back by {back.max():.4g} mm, first in {word} {at};"
-            f" up to {jitter:.2g} mm (1 % of its range) passes as jitter",
-            'use loading = "loading" for the first loading branch, or "all" to keep every sample',
-        )
-    if direction < 0 and abs(displacement[-1]) <= abs(displacement[0]):
-        raise Fault(
-            "non_monotone",
-            f"displacement falls from {displacement[0]:.4g} to {displacement[-1]:.4g} mm:"
-            " an unloading branch",
-            'give the loading branch, or use loading = "all"',
         )
 
 

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from jaxtrachea.identify.readers.checks import bad
+from jaxtrachea.identify.readers.checks import STEADY, bad
 from jaxtrachea.identify.readers.lines import Line, Text, is_comment
 from jaxtrachea.identify.readers.records import (
     BadCurve,
@@ -24,6 +24,7 @@ from jaxtrachea.identify.readers.text import (
     resolve_unit,
     role_values,
     split_cells,
+    time_values,
 )
 from jaxtrachea.units import column_unit, parse_quantity
 
@@ -62,7 +63,9 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
     if twice:
         raise DataError(f"{place}: {twice[0]} stands in the first line and in a column; remove one")
     groups = _group(table, roles, state, options)
-    return [_curve(table, roles, units, state, key, picked) for key, picked in groups.items()]
+    return [
+        _curve(table, roles, units, state, key, picked, options) for key, picked in groups.items()
+    ]
 
 
 def _state(lines: list[Line], word: str) -> tuple[dict, list[Line]]:
@@ -179,6 +182,7 @@ def _curve(
     state: dict,
     key: tuple[str, str],
     picked: list[int],
+    options: ReadOptions,
 ) -> RawCurve | BadCurve:
     rows = np.array([table.lines[i] for i in picked])
     source = f"{table.text.place}:{rows[0]}-{rows[-1]}"
@@ -200,6 +204,7 @@ def _curve(
             sigma=values.get("sigma"),
             joint_rings=np.array([int(r[6:]) - 1 for r in joints]) if joints else None,
             joint_displacement=np.stack([values[r] for r in joints], axis=1) if joints else None,
+            time=time_values(table, roles, picked, options),
         )
     except Fault as fault:
         return bad(*key, source, fault)
@@ -220,10 +225,10 @@ def _constant(
         raise Fault(
             "position", f"{table.text.word} {line}: {role} is empty or NaN", "give it in every row"
         )
-    if not np.allclose(column, column[0], rtol=1e-9, atol=1e-12):
+    if np.ptp(column) > STEADY[role]:
         raise Fault(
             "position",
             f"{role} varies from {np.nanmin(column):g} to {np.nanmax(column):g} within the curve",
             "give each position its own trial",
         )
-    return float(column[0])
+    return float(column[0] if np.ptp(column) == 0 else column.mean())

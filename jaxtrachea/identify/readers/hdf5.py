@@ -112,7 +112,16 @@ def _trial(group: Any, key: tuple[str, str], source: str, options: ReadOptions) 
         sigma=_quantity(group, "sigma", "sigma", source, options) if "sigma" in group else None,
         joint_rings=rings,
         joint_displacement=joints,
+        time=_time(group, source, options),
     )
+
+
+def _time(group: Any, source: str, options: ReadOptions) -> np.ndarray | None:
+    """Time of a trial, s, where it is stored with a unit."""
+    if "time" not in group or (unit_of(group, "time") or options.units.get("time")) is None:
+        return None
+    unit = resolve_unit("time", unit_of(group, "time"), options, f"{source}/time")
+    return np.atleast_1d(convert(numeric(group, "time"), unit, "time"))
 
 
 def _quantity(group: Any, name: str, role: str, source: str, options: ReadOptions) -> np.ndarray:

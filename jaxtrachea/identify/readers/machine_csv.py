@@ -19,6 +19,7 @@ from jaxtrachea.identify.readers.text import (
     resolve_unit,
     role_values,
     split_cells,
+    time_values,
 )
 from jaxtrachea.units import column_unit, is_unit
 
@@ -51,6 +52,7 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
         if rows.size:
             source = f"{text.place}:{rows[0]}-{rows[-1]}"
         values = _values(table, roles, options)
+        time = time_values(table, roles, range(len(table.rows)), options)
     except Fault as fault:
         return [bad(who.specimen, trial, source, fault)]
     joints = [role for role in values if role.startswith("joint_")]
@@ -68,6 +70,7 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
             sigma=values.get("sigma"),
             joint_rings=np.array([int(r[6:]) - 1 for r in joints]) if joints else None,
             joint_displacement=np.stack([values[r] for r in joints], axis=1) if joints else None,
+            time=time,
         )
     ]
 

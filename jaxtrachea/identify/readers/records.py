@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Integer
 
+from jaxtrachea.identify.readers.usage import Usage
 from jaxtrachea.units import UnitError, parse_quantity, unit_factor
 
 
@@ -47,6 +48,7 @@ class Curve:
         joint_rings: (M,) 0-based ring index of each marker, or None.
         joint_displacement: (N, M) mm along the inward normal, NaN where not observed, or None.
         source: file, and lines or group, it came from.
+        usage: what of the record this is, or None if nobody says.
     """
 
     specimen: str
@@ -59,6 +61,7 @@ class Curve:
     joint_rings: Integer[np.ndarray, " m"] | None = None
     joint_displacement: Float64[np.ndarray, "n m"] | None = None
     source: str = ""
+    usage: Usage | None = None
 
 
 @dataclass(frozen=True)
@@ -71,8 +74,8 @@ class BadCurve:
         source: file, and lines or group, it came from.
         kind: short code: "empty", "too_few_points", "unparsable", "ragged", "column_missing",
             "ambiguous", "unit_missing", "unit_unknown", "shape", "non_finite", "bad_sigma",
-            "position", "absurd_scale", "non_monotone", "no_signal", "sign", "metadata_missing",
-            "unreadable".
+            "position", "absurd_scale", "time", "non_monotone", "no_signal", "sign",
+            "metadata_missing", "unreadable".
         message: one line: file, place, what was found and what expected.
         cure: one line.
     """
@@ -110,10 +113,12 @@ class RawCurve:
     sigma: np.ndarray | None = None
     joint_rings: np.ndarray | None = None
     joint_displacement: np.ndarray | None = None
+    time: np.ndarray | None = None
 
 
 FORMATS = ("auto", "tidy", "machine", "hdf5", "afmformats")
-LOADINGS = ("require-monotone", "loading", "all")
+#: "loading" is the former name of "first".
+LOADINGS = ("last", "first", "loading", "all", "require-monotone")
 ROLE_DIMENSIONS = {
     "s": "length",
     "phi": "angle",
@@ -151,8 +156,9 @@ class ReadOptions:
         phi: contact angle of all curves as a quantity, ``"30 deg"``.
         displacement_min: drop samples below, mm.
         displacement_max: drop samples above, mm.
-        loading: "require-monotone" (else the curve is bad), "loading" (keep the first loading
-            branch) or "all" (keep every sample).
+        loading: "last" or "first" (that full loading, from its foot to its peak, without holds;
+            "loading" is "first"), "all" (every sample) or "require-monotone" (a record that is
+            more than one loading, or holds its peak, is bad).
         force_sign: -1 if the file counts the resisting force negative.
         displacement_sign: -1 if the file counts inward displacement negative.
         sheet: which sheet of a workbook holds the table; None: the first that is not hidden.
@@ -173,7 +179,7 @@ class ReadOptions:
     phi: str | None = None
     displacement_min: float | None = None
     displacement_max: float | None = None
-    loading: str = "require-monotone"
+    loading: str = "last"
     force_sign: int = 1
     displacement_sign: int = 1
     sheet: str | None = None

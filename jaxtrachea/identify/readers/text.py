@@ -21,6 +21,8 @@ ALIASES = {
     "force": ("force", "load", "compressive load", "compressive force"),
     "sigma": ("sigma", "force_sigma", "force_noise"),
 }
+# Columns of time, taken where they have a unit; they tell the duration of holds.
+TIMES = ("time", "elapsed time", "total time", "test time", "running time")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d|\d\d:\d\d:\d\d")
 
@@ -257,3 +259,29 @@ def role_values(
     lines = [table.lines[i] for i in picked]
     values = numbers(cells, lines, table.names[index], table.delimiter, table.text.word)
     return convert(values, unit, role_dimension(role))
+
+
+def time_values(
+    table: Table, roles: dict[str, int], picked: Sequence[int], options: ReadOptions
+) -> np.ndarray | None:
+    """Time of some rows, s: of `columns.time`, else of the only column named so, if usable.
+
+    Returns:
+        The values, or None: there is no such column, it has no unit, or holds no numbers.
+
+    Raises:
+        Fault: the column named in the options has no unit or holds text.
+    """
+    if "time" in roles:
+        i = roles["time"]
+        unit = resolve_unit("time", table.units[i], options, f"column {table.names[i]!r}")
+        return role_values(table, "time", i, picked, unit)
+    hits = [i for i, name in enumerate(table.names) if name.lower() in TIMES]
+    if len(hits) != 1:
+        return None
+    try:
+        unit = resolve_unit("time", table.units[hits[0]], options, "column of time")
+        values = role_values(table, "time", hits[0], picked, unit)
+    except Fault:
+        return None
+    return values if np.isfinite(values).all() else None

@@ -1,0 +1,39 @@
+"""Sizes of force and displacement that a soft tube under a tool does not reach."""
+
+import numpy as np
+
+#: Plausible extent of displacement (mm), of force (N), and stiffness (N/mm) of a press: from thin
+#: airways of small animals to silicone cylinders of 50 mm, with room to spare.
+DISPLACEMENT, FORCE, STIFFNESS = (0.05, 100.0), (1e-3, 1000.0), (1e-3, 200.0)
+#: Units that are taken for mm and N by mistake, in mm and N.
+LENGTHS = {"um": 1e-3, "cm": 10.0, "m": 1000.0}
+FORCES = {"mN": 1e-3, "gf": 9.80665e-3, "kN": 1000.0}
+
+
+def doubt(displacement: np.ndarray, force: np.ndarray) -> str | None:
+    """What is hard to believe about the size of a curve, with the unit it may be in.
+
+    A displacement and a force that are both tiny are taken for a cantilever's and left alone.
+
+    Args:
+        displacement: (N,) mm.
+        force: (N,) N.
+
+    Returns:
+        One sentence, or None.
+    """
+    extent, peak = float(np.ptp(displacement)), float(np.ptp(force))
+    if _within(extent, peak) or (extent < DISPLACEMENT[0] and peak < FORCE[0]):
+        return None
+    units = [f"force in {u} ({peak * f:.3g} N)" for u, f in FORCES.items()
+             if _within(extent, peak * f)]  # fmt: skip
+    units += [f"displacement in {u} ({extent * f:.3g} mm)" for u, f in LENGTHS.items()
+              if _within(extent * f, peak)]  # fmt: skip
+    hint = f"likely the {' or the '.join(units)}" if units else "check both units"
+    return f"{peak:.4g} N over {extent:.3g} mm is hard to believe of a soft tube: {hint}"
+
+
+def _within(extent: float, peak: float) -> bool:
+    """Whether displacement, force and stiffness are all plausible."""
+    values = ((extent, DISPLACEMENT), (peak, FORCE), (peak / extent, STIFFNESS))
+    return all(low <= value <= high for value, (low, high) in values)
