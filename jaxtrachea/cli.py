@@ -12,7 +12,6 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from jaxtrachea import __version__, cli_compare, cli_fit, cli_scene, cli_selfcheck, cli_tradeoff
 from jaxtrachea.cli_load import load
@@ -237,7 +236,7 @@ def _names_to_profile(path: Path, spec, problem, asked: bool) -> tuple[str, ...]
         raise Stop(f"{path}: {error}") from None
 
 
-def _curve_table(curves) -> Table:
+def _curve_table(curves):
     rows = []
     for curve in curves[:MANY]:
         where = "–" if curve.s_c is None else f"{curve.s_c:.4g}"
@@ -249,7 +248,7 @@ def _curve_table(curves) -> Table:
     return table(f"{len(curves)} usable curves", head, rows)
 
 
-def _parameter_table(parameters) -> Table:
+def _parameter_table(parameters):
     head = ["free parameter", "what", "initial", "bounds", "scale", "scope"]
     rows = [
         [f"{p.name} [{p.unit}]", p.description, f"{p.value:g}", f"{p.lower:g} … {p.upper:g}",

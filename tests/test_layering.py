@@ -11,7 +11,7 @@ import jaxtrachea
 
 PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 ORDER = [
-    {"units", "status", "_numerics", "webpage"},
+    {"units", "status", "_numerics", "webpage", "spreadsheet", "pictures"},
     {"spec_file"},
     {"config"},
     {"trachea"},
@@ -27,6 +27,7 @@ ORDER = [
     {"report"},
     {"plots", "sections", "viewer", "study"},
     {"tradeoff"},
+    {"terminal_table"},
     {"terminal", "processes"},
     {"cli_load", "cli_run"},
     {"cli_scene", "cli_compare", "cli_fit", "cli_selfcheck", "cli_tradeoff"},

@@ -25,6 +25,7 @@ from jaxtrachea.identify.readers.text import (
     role_values,
     split_cells,
 )
+from jaxtrachea.spreadsheet import unquoted
 from jaxtrachea.units import column_unit, parse_quantity
 
 NUMERIC = ("s", "phi", "displacement", "force", "sigma")
@@ -135,7 +136,8 @@ def _group(
     last = None
     for i, row in enumerate(table.rows):
         specimen, trial = (
-            row[roles[role]] if role in roles else fixed[role] for role in ("specimen", "trial")
+            unquoted(row[roles[role]]) if role in roles else fixed[role]
+            for role in ("specimen", "trial")
         )
         key = (specimen, trial)
         if key == last:
