@@ -15,8 +15,8 @@ from rich.markup import escape
 
 from jaxtrachea import __version__, cli_compare, cli_fit, cli_scene, cli_selfcheck, cli_tradeoff
 from jaxtrachea.cli_load import load
-from jaxtrachea.cli_run import run, show, write
-from jaxtrachea.terminal import Kept, Stop, complain, into, table, to_stderr
+from jaxtrachea.cli_run import posterior_failed, run, show, write
+from jaxtrachea.terminal import Kept, Stop, complain, into, say_lost, table, to_stderr
 
 app = typer.Typer(
     add_completion=False,
@@ -151,7 +151,7 @@ def fit(
         write(under.folder, spec, loaded, measurements, found, clock, under.journal)
     show(found, under.folder.parent)
     failed = any(not succeeded(found.result, lane) for lane in range(found.result.lanes))
-    raise typer.Exit(1 if failed or measurements.bad else 0)
+    raise typer.Exit(1 if failed or measurements.bad or posterior_failed(found) else 0)
 
 
 @app.command()
@@ -204,7 +204,7 @@ def _design(folder: Path, loaded, found, candidates) -> list[dict[str, object]]:
     write_csv(folder / "candidates.csv", list(tables.candidate_rows(known, gains, candidates)))
     write_csv(folder / "identifiability.csv", list(tables.map_rows(chart, unknowns)))
     rings = np.asarray(found.result.problem.geometry.ring_positions)
-    draw_design(folder / "identifiability.png", chart, candidates, choice, rings)
+    say_lost(draw_design(folder / "identifiability.png", chart, candidates, choice, rings))
     return rows
 
 

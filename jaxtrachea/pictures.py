@@ -4,6 +4,7 @@ matplotlib reads text between two `$` as mathematics, and hides labels that star
 """
 
 import io
+import re
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -62,3 +63,13 @@ def save_each(
 def sentence(name: str, reason: str) -> str:
     """What stands in the place of a picture that could not be drawn."""
     return f"the picture {name} could not be drawn ({reason}); all numbers are written"
+
+
+def without_lost(text: str, lost: Mapping[str, str]) -> str:
+    """The text of a report with words where pictures would be that could not be drawn."""
+    for name, reason in lost.items():
+        words = f"**No {name}**: {sentence(name, reason)}."
+        text = re.sub(
+            rf"^!\[[^\n]*\]\({re.escape(name)}\)$", lambda _, w=words: w, text, flags=re.M
+        )
+    return text

@@ -5,18 +5,19 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from jaxtrachea.pictures import sentence
 from jaxtrachea.terminal_table import wide_table as table
 
 __all__ = [
-    "Kept", "Stop", "cache_folder", "complain", "interrupts", "into", "progress_bar", "set_up_jax",
-    "table", "to_stderr",
+    "Kept", "Stop", "cache_folder", "complain", "interrupts", "into", "progress_bar", "say_lost",
+    "set_up_jax", "table", "to_stderr",
 ]  # fmt: skip
 
 
@@ -42,6 +43,12 @@ def complain(message: str) -> int:
     """Report bad input; returns its exit code."""
     to_stderr(f"[bold red]error:[/] {escape(message)}")
     return 2
+
+
+def say_lost(pictures: Mapping[str, str]) -> None:
+    """Warn of pictures that could not be drawn; the numbers stand."""
+    for name, reason in pictures.items():
+        to_stderr(f"[yellow]warning:[/] {escape(sentence(name, reason))}")
 
 
 @contextlib.contextmanager

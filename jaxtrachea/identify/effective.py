@@ -34,7 +34,7 @@ class Effective(NamedTuple):
     Attributes:
         correlation: of neighbouring force residuals; (lanes,).
         samples: how many independent ones the samples are worth; (lanes,).
-        factor: by which standard errors grow; inf where that is no more than the unknowns; (lanes,).
+        factor: by which standard errors grow; inf where no more than the unknowns; (lanes,).
         lower: widened 95 % interval, in the parameter's unit; 0 or -inf where open; (lanes, P).
         upper: (lanes, P).
     """

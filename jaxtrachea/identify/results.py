@@ -17,6 +17,7 @@ from jaxtrachea.identify.journal import installed
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.population import Population
 from jaxtrachea.identify.profile import Profiles
+from jaxtrachea.identify.rows import row_places, samples_of, trials_of
 from jaxtrachea.identify.verdict import VERDICTS, describe_flat, verdict
 from jaxtrachea.spreadsheet import write_csv as write_csv
 from jaxtrachea.status import FitStatus, ProfileEnd
@@ -76,24 +77,6 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
     return "; ".join([*said, flat_sentence(result, lane)])
 
 
-def row_places(result: FitResult) -> list[tuple[int, str]]:
-    """Lane and specimen of every row of summary.csv: a lane of several specimens has one for each.
-
-    The specimen is "" where the lane has but one.
-    """
-    places = []
-    for lane, curves in enumerate(result.problem.curves):
-        names = list(dict.fromkeys(c.specimen for c in curves))
-        places += [(lane, name) for name in (names if len(names) > 1 else [""])]
-    return places
-
-
-def trials_of(result: FitResult, lane: int, specimen: str) -> list[int]:
-    """Which trials of a lane belong to a specimen; "": all."""
-    curves = result.problem.curves[lane]
-    return [t for t, c in enumerate(curves) if specimen in ("", c.specimen)]
-
-
 def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[dict[str, object]]:
     """Rows of summary.csv, see `row_places`.
 
@@ -117,7 +100,7 @@ def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[d
             "iterations": int(result.iterations[lane]),
             "starts_agreeing": int(result.converged_starts[lane]),
             "starts": int(result.tried[lane]),
-            "samples": _samples(result, lane, trials) if one else int(result.samples[lane]),
+            "samples": samples_of(result, lane, trials) if one else int(result.samples[lane]),
             "cost": float(result.cost[lane]),
             "rms_force_N": float(result.rms[lane, 0]),
             "rms_over_peak": float(result.rms[lane, 0]) / peak if peak > 0 else float("nan"),
@@ -130,13 +113,6 @@ def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[d
             "BIC": float(result.criteria.BIC[lane]),
         }
         yield row | _unknown_cells(result, lane, one, profiles)
-
-
-def _samples(result: FitResult, lane: int, trials: list[int]) -> int:
-    """Observed forces and markers of some trials of a lane."""
-    lanes = result.problem.lanes
-    kinds = (v for v in (lanes.precision, lanes.joint_precision) if v is not None)
-    return sum(int(np.sum(v[lane, trials] > 0)) for v in kinds)
 
 
 def _unknown_cells(
