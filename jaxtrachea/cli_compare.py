@@ -210,6 +210,8 @@ def _report(rows, said: dict[str, str], failed: int, models) -> str:
 def _print(rows, said, failed: int, folder: Path) -> None:
     out = Console()
     names = [name for name in said if name != "(all)"]
+    if len(names) > MANY:  # what is decided says little more
+        names.sort(key=lambda name: "decisively (" in said[name])
     shown = names[:MANY] + [name for name in said if name == "(all)"]
     for name in shown:
         cells = _cells([row for row in rows if row.specimen == name])

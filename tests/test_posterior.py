@@ -67,8 +67,12 @@ def made(rhat, ess, lost):
     theta, divergent = np.zeros((1, 2, 100, 2)), np.zeros((1, 2, 100), bool)
     divergent[0, 0, :lost] = True
     pair = lambda v: np.array([[v, v]])  # noqa: E731
-    sigma, zero = np.ones((1, 2, 100, 2)), pair(0.0)
-    return Posterior(result, theta, sigma, divergent, pair(rhat), pair(ess), zero, zero, zero)
+    zero = pair(0.0)
+    return Posterior(
+        result=result, theta=theta, sigma=np.ones((1, 2, 100, 2)), divergent=divergent,
+        steps=np.array([100]), lost=divergent.mean(axis=(1, 2)), rhat=pair(rhat), ess=pair(ess),
+        median=zero, lower=zero, upper=zero,
+    )  # fmt: skip
 
 
 def test_verdicts_say_why():

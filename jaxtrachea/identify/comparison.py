@@ -150,9 +150,7 @@ def _worth(model: Model) -> Float[np.ndarray, " lanes"]:
     return np.where(np.isnan(worth), np.asarray(result.samples, float), worth)
 
 
-def deflated(
-    criteria: Criteria, share: Float[np.ndarray, " lanes"], at: np.ndarray
-) -> Float[np.ndarray, ""]:
+def deflated(criteria: Criteria, share: Float[np.ndarray, " lanes"], at: np.ndarray) -> float:
     """AICc of lanes, their deviances counted for independent samples only, unknowns in full.
 
     Args:
@@ -161,7 +159,7 @@ def deflated(
         at: which lanes are summed.
     """
     penalty = criteria.AICc - criteria.deviance
-    return np.sum((criteria.deviance * share + penalty)[at])
+    return float(np.sum((criteria.deviance * share + penalty)[at]))
 
 
 def _rows(
