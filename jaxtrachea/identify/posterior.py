@@ -34,7 +34,8 @@ from jaxtrachea.identify.solve import chunk_size
 
 #: Steps of each chain before its draws count.
 _WARM_UP = 500
-_ACCEPTANCE = 0.9
+#: Acceptance that the step is adapted to, by round: divergences ask for shorter ones.
+_ACCEPTANCE = (0.9, 0.97, 0.99)
 #: Draws of a lane whose chains are not good yet, in those asked for.
 _AGAIN = (2, 4)
 #: Doublings of a trajectory: well-whitened posteriors need 2 to 4; a limit to hopeless ones.
@@ -141,13 +142,13 @@ def _density(problem: Problem, drawn, lane: Lane, sigma, centre, root):
     return lambda y: log_density(problem, drawn, lane, sigma, to_x(y)), to_x
 
 
-def _warm_up(problem: Problem, drawn, lane: Lane, sigma, centre, root, y, key):
+def _warm_up(problem: Problem, drawn, acceptance, lane: Lane, sigma, centre, root, y, key):
     """Place, step and inverse mass matrix of one chain after its warm-up."""
     blackjax = sampler()
     density, _ = _density(problem, drawn, lane, sigma, centre, root)
     adaptation = blackjax.window_adaptation(
         blackjax.nuts, density, is_mass_matrix_diagonal=False, max_num_doublings=_DOUBLINGS,
-        target_acceptance_rate=_ACCEPTANCE, adaptation_info_fn=lambda *_: None,
+        target_acceptance_rate=acceptance, adaptation_info_fn=lambda *_: None,
     )  # fmt: skip
     (state, tuned), _ = adaptation.run(key, y, num_steps=_WARM_UP)
     return state.position, tuned["step_size"], tuned["inverse_mass_matrix"]
@@ -173,10 +174,12 @@ def _compiled(problem: Problem, drawn: tuple[bool, bool], draws: int):
     """Warm-up and drawing of many lanes of many chains."""
 
     def many(chain):
-        return jax.jit(jax.vmap(jax.vmap(chain, (None, None, None, None, 0, 0))))
+        return jax.vmap(jax.vmap(chain, (None, None, None, None, 0, 0)))
 
-    warm_up = functools.partial(_warm_up, problem, drawn)
-    return many(warm_up), many(functools.partial(_draw, problem, drawn, draws))
+    def warm_up(acceptance, *lanes):
+        return many(functools.partial(_warm_up, problem, drawn, acceptance))(*lanes)
+
+    return jax.jit(warm_up), jax.jit(many(functools.partial(_draw, problem, drawn, draws)))
 
 
 def posterior(
@@ -256,7 +259,7 @@ def _run(base: FitResult, drawn, draws: int, times: int, start: dict[int, Start]
 
     sigma, parts = base.whitened_sigma[of], []
     with lenient():
-        warm = warm_up(lane, sigma, centre, root, y, keys(0))
+        warm = warm_up(_ACCEPTANCE[again], lane, sigma, centre, root, y, keys(0))
         for turn in range(times):
             x, lost, last = draw(lane, sigma, centre, root, warm, keys(1 + turn))
             warm = (last, *warm[1:])
