@@ -1,7 +1,8 @@
 """The command line: the only room that turns errors into messages and exit codes.
 
-Exit codes: 0 everything converged, 1 some lane failed or some curve could not be used, 2 bad input,
-3 another process was lost, 130 stopped by the user. What is heavy is imported inside the commands.
+Exit codes: 0 everything converged, 1 some lane failed, some curve could not be used or the chains
+of a posterior are poor, 2 bad input, 3 another process was lost, 130 stopped by the user. What is
+heavy is imported inside the commands.
 """
 
 import sys

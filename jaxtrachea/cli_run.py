@@ -94,11 +94,8 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
 
     from jaxtrachea import report
     from jaxtrachea.identify import results
-    from jaxtrachea.identify.effective import effective
-    from jaxtrachea.identify.population import population_rows
-    from jaxtrachea.identify.posterior_tables import rows_with_draws, write_draws
+    from jaxtrachea.identify.posterior_tables import write_draws
     from jaxtrachea.identify.predictions import predictions
-    from jaxtrachea.identify.summary import left_out_cells, widened_rows, with_residuals
     from jaxtrachea.pictures import without_lost
     from jaxtrachea.plots import draw_all
     from jaxtrachea.sections import write_more
@@ -106,20 +103,10 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
 
     result, profiles, resampled = found.result, found.profiles, found.resampled
     seen = predictions(result.problem, result.theta)
-    wide = effective(result, seen)
-    rows = with_residuals(result, list(results.lane_rows(result, profiles)), seen, wide)
-    results.write_csv(folder / "summary.csv", [*rows, *map(results.bad_row, measurements.bad)])
-    found_rows = rows_with_draws(result, profiles, resampled, found.population, found.posterior)
-    results.write_csv(folder / "parameters.csv", widened_rows(result, list(found_rows), wide))
-    if found.population is not None:
-        results.write_csv(folder / "population.csv", list(population_rows(found.population)))
-    if profiles is not None:
-        results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
+    _write_tables(folder, found, measurements.bad, seen)
     drawn, lost = draw_all(folder, result, seen, profiles)
     say_lost(lost)
     left = None if found.left_out is None else report.left_out_rows(result, found.left_out)
-    if found.left_out is not None:
-        results.write_csv(folder / "left_out.csv", left_out_cells(result, found.left_out))
     title = loaded.title or spec.stem
     more = write_more(folder, found.influence, found.posterior)
     text = report.report_text(
@@ -140,6 +127,27 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
     results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
     pictures = {path.name: path.read_bytes() for path in drawn}
     results.write_text(folder / "report.html", page(text, pictures, made))
+
+
+def _write_tables(folder: Path, found: Found, bad, seen) -> None:
+    """All CSV files but those on influence."""
+    from jaxtrachea.identify import results
+    from jaxtrachea.identify.effective import effective
+    from jaxtrachea.identify.population import population_rows
+    from jaxtrachea.identify.posterior_tables import rows_with_draws
+    from jaxtrachea.identify.summary import left_out_cells, widened_rows, with_residuals
+
+    result, profiles, wide = found.result, found.profiles, effective(found.result, seen)
+    rows = with_residuals(result, list(results.lane_rows(result, profiles)), seen, wide)
+    results.write_csv(folder / "summary.csv", [*rows, *map(results.bad_row, bad)])
+    rows = rows_with_draws(result, profiles, found.resampled, found.population, found.posterior)
+    results.write_csv(folder / "parameters.csv", widened_rows(result, list(rows), wide))
+    if found.population is not None:
+        results.write_csv(folder / "population.csv", list(population_rows(found.population)))
+    if profiles is not None:
+        results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
+    if found.left_out is not None:
+        results.write_csv(folder / "left_out.csv", left_out_cells(result, found.left_out))
 
 
 def show(found: Found, folder: Path) -> None:

@@ -11,7 +11,7 @@ import scipy.stats
 import synthetic
 from run_cli import run
 
-from jaxtrachea.identify.comparison import Row, same_data, sentence
+from jaxtrachea.identify.comparison import Model, Row, compared, same_data, sentence
 from jaxtrachea.identify.criteria import penalised, weights
 from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.measurements import Curve
@@ -136,6 +136,43 @@ def row(model, AICc, k=3, left=np.nan, fair=None, worth=40.0):
 )
 def test_sentences(rows, left, says):
     assert says in sentence(rows, left)
+
+
+def test_deflated_difference_is_that_by_hand():
+    """AR(1) noise of 0.8: deviances of the normal equations times n_eff / n, unknowns in full."""
+    rng = np.random.default_rng(2)
+    curves = []
+    for i in range(3):
+        for trial in "ab":
+            noise = rng.standard_normal(20)
+            for k in range(1, 20):
+                noise[k] = 0.8 * noise[k - 1] + 0.6 * noise[k]
+            force = 1.5 * DEPTH + 0.05 * DEPTH**3 + SIGMA * noise
+            curves.append(Curve(f"T{i}", trial, None, 0.0, DEPTH, force))
+    fits = [
+        Model(name, fit(linear_problem(curves, fixed=fixed), Settings(starts=1)), None)
+        for name, fixed in (("cubic", ("force_offset",)), ("straight", ("k_3", "force_offset")))
+    ]
+    rows, failed = compared(fits)
+    assert failed == 0
+    for i in range(3):
+        pair = curves[2 * i : 2 * i + 2]
+        X, F = (
+            np.tile(np.stack([DEPTH, DEPTH**3], 1), (2, 1)),
+            np.concatenate([c.force for c in pair]),
+        )
+        e = (F - X @ np.linalg.lstsq(X, F, rcond=None)[0]).reshape(2, 20)
+        r = 2 * np.sum(e[:, 1:] * e[:, :-1]) / np.sum(e[:, 1:] ** 2 + e[:, :-1] ** 2)
+        share = (1 - max(r, 0)) / (1 + max(r, 0))
+        worth = []
+        for powers in ((1, 3), (1,)):
+            d, k, n = by_hand(pair, powers)
+            worth.append(d * share + 2 * k * n / (n - k - 1))
+        cubic, straight = (row for row in rows if row.specimen == f"T{i}")
+        assert cubic.AICc < straight.AICc
+        np.testing.assert_allclose(straight.deflated, worth[1] - worth[0], rtol=1e-6)
+        np.testing.assert_allclose(cubic.effective_samples, 40 * share, rtol=1e-6)
+        assert straight.deflated < straight.delta
 
 
 def test_other_data_or_noise_are_refused():

@@ -199,6 +199,7 @@ def test_chains_start_where_the_estimate_is():
         np.testing.assert_allclose(found, result.uncertainty[lane].correlation[0, 1], atol=0.02)
 
 
+@pytest.mark.slow
 def test_chains_start_at_the_mode_of_the_posterior():
     """Curves of 30 and 10 samples that disagree: the fit weighs curves, the posterior samples."""
     rng = np.random.default_rng(1)
