@@ -24,14 +24,21 @@ def overview(found: Any) -> Iterator[Table | str]:
     """
     result, lanes = found.result, listed(found.result)
     cut = result.lanes > len(lanes)
+    wide = effective(result, predictions(result.problem, result.theta))
     if cut:
         spread = report.spread_rows(result, found.profiles)
         yield "Estimates over lanes", report.SPREAD_HEAD, spread
     else:
-        wide = effective(result, predictions(result.problem, result.theta))
         widened = wide if np.any(wide.correlation > CORRELATED) else None
         head = report.ESTIMATE_HEAD if widened is None else report.WIDENED_HEAD
         yield "Estimates", head, report.estimate_rows(result, lanes, found.profiles, widened)
+    doubted = int(np.sum(wide.correlation > CORRELATED))
+    if doubted:
+        yield (
+            f"Neighbouring residuals are correlated in {doubted} of {result.lanes} lanes: standard "
+            "errors are too small there; wider intervals: low95_widened, high95_widened in "
+            "parameters.csv"
+        )
     if found.posterior is not None:
         yield from (text.replace("**", "") for text in distrust(found.posterior))
     if found.population is not None:

@@ -321,6 +321,7 @@ def test_fewer_independent_samples_than_unknowns_leave_no_limit():
     text = report_text("T", result, [], predictions(result.problem, result.theta), None)
     assert "95 % widened" in text
     assert "no more independent samples than unknowns" in text
+    assert "correlated in 1 of 1 lanes" in " ".join(shown(overview(found(result))).split())
 
 
 def test_the_command_with_names_of_mathematics(tmp_path, monkeypatch, capsys):
