@@ -1,7 +1,8 @@
 """The command line: the only room that turns errors into messages and exit codes.
 
-Exit codes: 0 everything converged, 1 some lane failed or some curve could not be used, 2 bad input,
-3 another process was lost, 130 stopped by the user. What is heavy is imported inside the commands.
+Exit codes: 0 everything converged, 1 some lane failed, some curve could not be used or the chains
+of a posterior are poor, 2 bad input, 3 another process was lost, 130 stopped by the user. What is
+heavy is imported inside the commands.
 """
 
 import contextlib
@@ -13,12 +14,11 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from jaxtrachea import __version__, cli_compare, cli_fit, cli_scene, cli_selfcheck, cli_tradeoff
 from jaxtrachea.cli_load import load
-from jaxtrachea.cli_run import run, show, write
-from jaxtrachea.terminal import Kept, Stop, complain, into, table, to_stderr
+from jaxtrachea.cli_run import posterior_failed, run, show, write
+from jaxtrachea.terminal import Kept, Stop, complain, into, say_lost, table, to_stderr
 
 app = typer.Typer(
     add_completion=False,
@@ -165,7 +165,7 @@ def fit(
         write(under.folder, spec, loaded, measurements, found, clock, under.journal)
     show(found, under.folder.parent)
     failed = any(not succeeded(found.result, lane) for lane in range(found.result.lanes))
-    raise typer.Exit(1 if failed or measurements.bad else 0)
+    raise typer.Exit(1 if failed or measurements.bad or posterior_failed(found) else 0)
 
 
 @app.command()
@@ -218,7 +218,7 @@ def _design(folder: Path, loaded, found, candidates) -> list[dict[str, object]]:
     write_csv(folder / "candidates.csv", list(tables.candidate_rows(known, gains, candidates)))
     write_csv(folder / "identifiability.csv", list(tables.map_rows(chart, unknowns)))
     rings = np.asarray(found.result.problem.geometry.ring_positions)
-    draw_design(folder / "identifiability.png", chart, candidates, choice, rings)
+    say_lost(draw_design(folder / "identifiability.png", chart, candidates, choice, rings))
     return rows
 
 
@@ -263,7 +263,7 @@ def _print_usage(out: Console, curves) -> None:
         out.print(escape(f"{sentence[:1].upper()}{sentence[1:]}."), highlight=False)
 
 
-def _curve_table(curves) -> Table:
+def _curve_table(curves):
     rows = []
     for curve in curves[:MANY]:
         where = "–" if curve.s_c is None else f"{curve.s_c:.4g}"
@@ -277,7 +277,7 @@ def _curve_table(curves) -> Table:
     return table(f"{len(curves)} usable curves", head, rows)
 
 
-def _parameter_table(parameters) -> Table:
+def _parameter_table(parameters):
     head = ["free parameter", "what", "initial", "bounds", "scale", "scope"]
     rows = [
         [f"{p.name} [{p.unit}]", p.description, f"{p.value:g}", f"{p.lower:g} … {p.upper:g}",

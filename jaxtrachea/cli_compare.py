@@ -1,6 +1,5 @@
 """The command compare: which of several models the same curves prefer (docs/model_choice.md)."""
 
-import contextlib
 import dataclasses
 import time
 from pathlib import Path
@@ -21,11 +20,11 @@ DataOption = Annotated[
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 CrossOption = Annotated[
-    bool, typer.Option(help="Also predict every contact position from the others.")
+    bool, typer.Option(help="Also predict every position, or trial, from the others.")
 ]
 #: Specimens of a terminal table; the files hold all.
 MANY = 8
-HEAD = ["specimen", "model", "k", "-2 ln L", "dAICc", "weight", "BIC", "left out"]
+HEAD = ["specimen", "model", "k", "-2 ln L", "dAICc", "deflated", "weight", "BIC", "left out"]
 
 
 def compare(
@@ -83,8 +82,9 @@ def _same_data(specs, loaded, names) -> None:
 
 
 def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
-    from jaxtrachea.identify.comparison import Model, leave_position_out
+    from jaxtrachea.identify.comparison import Model
     from jaxtrachea.identify.fit import fit
+    from jaxtrachea.identify.repeats import leave_repeats_out
     from jaxtrachea.identify.study import settings_of
 
     models = []
@@ -104,7 +104,7 @@ def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
             result = fit(problem, settings, counted(name))
             left = None
             if cross_validation:
-                left = leave_position_out(problem, settings, counted(f"{name}, left out"))
+                left = leave_repeats_out(problem, settings, counted(f"{name}, left out"))
             models.append(Model(name, result, left))
     return models
 
@@ -122,7 +122,7 @@ def _write(folder: Path, specs, loaded, models, clock):
     rows, failed = compared(models)
     said = _sentences(models, rows)
     results.write_csv(folder / "compare.csv", [dataclasses.asdict(row) for row in rows])
-    results.write_text(folder / "report.md", _report(rows, said, failed))
+    results.write_text(folder / "report.md", _report(rows, said, failed, models))
     ends = [*clock, time.perf_counter()]
     timings = {n: ends[i + 1] - ends[i] for i, n in enumerate(("read", "fit", "write"))}
     measured, precision = loaded[0][1], loaded[0][0].fit.precision
@@ -139,27 +139,36 @@ def _write(folder: Path, specs, loaded, models, clock):
 
 def _sentences(models, rows) -> dict[str, str]:
     """Specimen to what its data prefer; the sum last."""
-    import numpy as np
+    from jaxtrachea.identify.comparison import sentence
 
-    from jaxtrachea.identify.comparison import is_correlated, sentence
-
-    seen = {m.name: is_correlated(m) for m in models}
-    first = models[0].result
-    labels = [_label(first, lane) for lane in range(first.lanes)]
+    left = _left_out_words(models)
     said = {}
     for specimen in dict.fromkeys(row.specimen for row in rows):
-        mine = [row for row in rows if row.specimen == specimen]
-        flags = seen[min(mine, key=lambda row: row.AICc).model]
-        with contextlib.suppress(ValueError):
-            flags = flags[[labels.index(specimen)]]
-        said[specimen] = sentence(mine, bool(np.mean(flags) > 0.5))
+        own = [row for row in rows if row.specimen == specimen]
+        said[specimen] = sentence(own, left)
     return said
 
 
-def _label(result, lane: int) -> str:
-    from jaxtrachea.identify.results import lane_label
+def _left_out_words(models) -> str:
+    """What was left out, in words; "curves" if nothing was."""
+    from jaxtrachea.identify.repeats import repeats
 
-    return lane_label(result, lane)
+    return repeats(models[0].result.problem).words or "curves"
+
+
+def _why_nothing(models) -> str:
+    """Why nothing was left out of a model that was to be cross-validated; "" if something was."""
+    for model in models:
+        problem = model.result.problem
+        own = [p.name for p in problem.free if p.scope == "trial"]
+        if model.left_out is not None and own:
+            return (
+                f"Nothing was left out: {', '.join(own)} of {model.name} belongs to single curves, "
+                "and no other curve tells of it."
+            )
+        if model.left_out is not None and not (model.left_out == model.left_out).any():
+            return "Nothing was left out: no specimen has a second position or trial."
+    return ""
 
 
 def _cells(rows) -> list[list[str]]:
@@ -167,7 +176,7 @@ def _cells(rows) -> list[list[str]]:
 
     return [
         [row.specimen, row.model, str(row.unknowns), number(row.deviance, 6), number(row.delta, 3),
-         number(row.weight, 2), number(row.BIC, 6), _percent(row.left_out)]
+         number(row.deflated, 3), number(row.weight, 2), number(row.BIC, 6), _percent(row.left_out)]
         for row in rows
     ]  # fmt: skip
 
@@ -176,18 +185,22 @@ def _percent(share: float) -> str:
     return "–" if share != share else f"{100 * share:.2f} %"
 
 
-def _report(rows, said: dict[str, str], failed: int) -> str:
+def _report(rows, said: dict[str, str], failed: int, models) -> str:
     from jaxtrachea.report import markdown_table
 
+    nothing = _why_nothing(models)
     parts = [
         "# Which model",
         "\n".join(f"- {specimen}: {text}." for specimen, text in said.items()),
         markdown_table(HEAD, _cells(rows)),
         "k: fitted parameters and estimated standard deviations. dAICc: above the best model; "
         "below 2 models cannot be told apart, from 10 on the worse one has next to no support. "
-        "weight: Akaike weight. left out: root mean square error of force at contact positions "
-        "that took no part in the fit, over the largest force. Criteria assume that the noise of "
-        "neighbouring samples is independent (docs/model_choice.md). All numbers: `compare.csv`.",
+        "deflated: the same where the likelihood counts only as many samples as are independent, "
+        "by the correlation of neighbouring residuals of the best model; decisive is what stays at "
+        "10 or more so. weight: Akaike weight. left out: root mean square error of force of "
+        f"{_left_out_words(models)} that took no part in the fit, over the largest force "
+        "(docs/model_choice.md). All numbers: `compare.csv`.",
+        *([nothing] if nothing else []),
     ]
     if failed:
         parts.append(f"{failed} lanes could not be fitted by every model and count for none.")
@@ -196,11 +209,16 @@ def _report(rows, said: dict[str, str], failed: int) -> str:
 
 def _print(rows, said, failed: int, folder: Path) -> None:
     out = Console()
-    shown = list(said)[:MANY] + (["(all)"] if len(said) > MANY else [])
+    names = [name for name in said if name != "(all)"]
+    if len(names) > MANY:  # what is decided says little more
+        names.sort(key=lambda name: "decisively (" in said[name])
+    shown = names[:MANY] + [name for name in said if name == "(all)"]
     for name in shown:
         cells = _cells([row for row in rows if row.specimen == name])
         out.print(table("Models", HEAD, cells))
-        out.print(escape(f"{name}: {said[name]}"), highlight=False)
+        out.print(escape(f"{name}: {said[name]}"), highlight=False, emoji=False)
+    if len(names) > MANY:
+        out.print(f"and {len(names) - MANY} more specimens, see compare.csv")
     if failed:
         out.print(f"{failed} lanes could not be fitted by every model and count for none")
     out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)

@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from jaxtrachea.terminal import progress_bar, table, to_stderr
+from jaxtrachea.terminal import progress_bar, say_lost, table, to_stderr
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,33 +94,29 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
 
     from jaxtrachea import report
     from jaxtrachea.identify import results
-    from jaxtrachea.identify.population import population_rows
-    from jaxtrachea.identify.posterior_tables import rows_with_draws, write_draws
+    from jaxtrachea.identify.posterior_tables import write_draws
     from jaxtrachea.identify.predictions import predictions
     from jaxtrachea.identify.usage_tables import usage_rows, usage_section
+    from jaxtrachea.pictures import without_lost
     from jaxtrachea.plots import draw_all
     from jaxtrachea.sections import write_more
     from jaxtrachea.webpage import page
 
     result, profiles, resampled = found.result, found.profiles, found.resampled
     seen = predictions(result.problem, result.theta)
-    rows = [*results.lane_rows(result, profiles), *map(results.bad_row, measurements.bad)]
-    results.write_csv(folder / "summary.csv", rows)
-    found_rows = rows_with_draws(result, profiles, resampled, found.population, found.posterior)
-    results.write_csv(folder / "parameters.csv", list(found_rows))
-    if found.population is not None:
-        results.write_csv(folder / "population.csv", list(population_rows(found.population)))
-    if profiles is not None:
-        results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
-    drawn = draw_all(folder, result, seen, profiles)
+    _write_tables(folder, found, measurements.bad, seen)
+    drawn, lost = draw_all(folder, result, seen, profiles)
+    say_lost(lost)
     left = None if found.left_out is None else report.left_out_rows(result, found.left_out)
     title = loaded.title or spec.stem
     results.write_csv(folder / "curves.csv", list(usage_rows(measurements.curves)))
     used = usage_section(measurements.curves)
     more = [*used, *write_more(folder, found.influence, found.posterior)]
     text = report.report_text(
-        title, result, measurements.bad, seen, left, profiles, resampled, more, found.population
-    )
+        title, result, measurements.bad, seen, left, profiles, resampled, more, found.population,
+        found.posterior,
+    )  # fmt: skip
+    text = without_lost(text, lost)
     results.write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")
@@ -136,40 +132,43 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
     results.write_text(folder / "report.html", page(text, pictures, made))
 
 
+def _write_tables(folder: Path, found: Found, bad, seen) -> None:
+    """All CSV files but those on influence."""
+    from jaxtrachea.identify import results
+    from jaxtrachea.identify.effective import effective
+    from jaxtrachea.identify.population import population_rows
+    from jaxtrachea.identify.posterior_tables import rows_with_draws
+    from jaxtrachea.identify.summary import left_out_cells, widened_rows, with_residuals
+
+    result, profiles, wide = found.result, found.profiles, effective(found.result, seen)
+    rows = with_residuals(result, list(results.lane_rows(result, profiles)), seen, wide)
+    results.write_csv(folder / "summary.csv", [*rows, *map(results.bad_row, bad)])
+    rows = rows_with_draws(result, profiles, found.resampled, found.population, found.posterior)
+    results.write_csv(folder / "parameters.csv", widened_rows(result, list(rows), wide))
+    if found.population is not None:
+        results.write_csv(folder / "population.csv", list(population_rows(found.population)))
+    if profiles is not None:
+        results.write_csv(folder / "profiles.csv", list(results.profile_rows(profiles)))
+    if found.left_out is not None:
+        results.write_csv(folder / "left_out.csv", left_out_cells(result, found.left_out))
+
+
 def show(found: Found, folder: Path) -> None:
     """Tables of a run on the terminal."""
-    from jaxtrachea import report
-    from jaxtrachea.identify.results import lane_label, succeeded, verdict_sentence
-    from jaxtrachea.identify.usage_tables import sentences
+    from jaxtrachea.overview import overview
 
-    out, result = Console(), found.result
-    lanes = range(result.lanes)
-    if result.lanes <= report.ONE_BY_ONE:
-        rows = report.estimate_rows(result, lanes, found.profiles)
-        out.print(table("Estimates", report.ESTIMATE_HEAD, rows))
-        out.print(table("Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)))
-        if found.profiles is not None:
-            rows = report.profile_table(found.profiles, lanes)
-            out.print(table("Profile likelihood", report.PROFILE_HEAD, rows))
-        if found.resampled is not None:
-            rows = report.bootstrap_table(found.resampled, lanes)
-            out.print(table("Bootstrap", report.BOOTSTRAP_HEAD, rows))
-        for lane in lanes:
-            text = f"{lane_label(result, lane)}: {verdict_sentence(result, lane, found.profiles)}"
-            out.print(escape(text), highlight=False)
-    else:
-        out.print(
-            table(
-                "Estimates over lanes",
-                report.SPREAD_HEAD,
-                report.spread_rows(result, found.profiles),
-            )
-        )
-        if found.population is not None:
-            rows = report.population_table(found.population)
-            out.print(table("Population", report.POPULATION_HEAD, rows))
-        good = sum(succeeded(result, lane) for lane in lanes)
-        out.print(f"{good} of {result.lanes} lanes succeeded")
-    for sentence in sentences([c for curves in result.problem.curves for c in curves]):
-        out.print(escape(f"{sentence} (curves.csv)"), highlight=False)
+    out = Console()
+    for item in overview(found):
+        if isinstance(item, str):
+            out.print(escape(item), highlight=False, emoji=False)
+        else:
+            out.print(table(*item))
     out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)
+
+
+def posterior_failed(found: Found) -> bool:
+    """Whether the posterior was asked for and some lane's chains are poor."""
+    drawn, result = found.posterior, found.result
+    if drawn is None:
+        return False
+    return any(drawn.verdict(lane).startswith("poor") for lane in range(result.lanes))

@@ -1,6 +1,7 @@
 """The commands for scenes: plan, simulate, sweep. What is heavy is imported inside the commands."""
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -8,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from jaxtrachea.terminal import Stop, interrupts, into, progress_bar, set_up_jax, table
+from jaxtrachea.terminal import Stop, interrupts, into, progress_bar, say_lost, set_up_jax, table
 
 SceneArgument = Annotated[Path, typer.Argument(help="TOML scene (docs/scenes.md).")]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
@@ -78,6 +79,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
     import jax
     import numpy as np
 
+    from jaxtrachea.pictures import save_each
     from jaxtrachea.scene.plots import draw_sweep
     from jaxtrachea.scene.results import write_sweep
     from jaxtrachea.scene.simulation import sweep as run
@@ -105,8 +107,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
                 bar.update(task, completed=min(start + size, total))
         out = jax.tree.map(lambda *v: np.concatenate(v), *parts)
         clock.append(time.perf_counter())
-        for name, figure in draw_sweep(s, phi, out).items():
-            figure.savefig(folder / name)
+        say_lost(save_each(folder, draw_sweep(s, phi, out))[1])
         made = _provenance(scene, staged, clock)
         write_sweep(folder / "sweep.h5", swept, s, phi, want.depth, out, made)
         _write_json(folder, made)
@@ -205,13 +206,15 @@ def _rows(staged) -> int:
 def _draw(folder: Path, title: str, scene, out) -> None:
     import numpy as np
 
+    from jaxtrachea.pictures import save_each
     from jaxtrachea.scene.plots import draw_series, draw_surface
     from jaxtrachea.scene.results import last_solved
 
-    draw_series(out).savefig(folder / "series.png")
+    drawings = {"series.png": partial(draw_series, out)}
     row = last_solved(out)
     if out.vertices is not None and row is not None:
-        draw_surface(scene, np.asarray(out.vertices[row]), title).savefig(folder / "surface.png")
+        drawings["surface.png"] = partial(draw_surface, scene, np.asarray(out.vertices[row]), title)
+    say_lost(save_each(folder, drawings)[1])
 
 
 def _provenance(scene: Path, staged, clock: list[float]) -> dict:

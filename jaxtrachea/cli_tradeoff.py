@@ -1,6 +1,7 @@
 """The command `tradeoff`: what every accuracy choice of a scene errs and costs."""
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -8,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from jaxtrachea.terminal import Stop, into, progress_bar, table
+from jaxtrachea.terminal import Stop, into, progress_bar, say_lost, table
 
 SceneArgument = Annotated[
     Path | None, typer.Argument(help="TOML scene (default: a ball on the trachea of Table 1).")
@@ -105,6 +106,7 @@ def _write(folder: Path, name: str, rows, scene: Path | None, inputs, clock) -> 
     import jax
 
     from jaxtrachea.identify.results import provenance, write_text
+    from jaxtrachea.pictures import save_each, without_lost
     from jaxtrachea.tradeoff.levels import BUILT_IN
     from jaxtrachea.tradeoff.page import lines, scene_text
     from jaxtrachea.tradeoff.plots import draw
@@ -115,8 +117,11 @@ def _write(folder: Path, name: str, rows, scene: Path | None, inputs, clock) -> 
 
     write_text(folder / "tradeoff.jsonl", lines(rows))
     picture = "tradeoff.png"
-    write_text(folder / "tradeoff.md", f"# {name}\n\n{scene_text(rows, picture)}")
-    draw([row for row in rows if "left_out" not in row], name).savefig(folder / picture)
+    points = [row for row in rows if "left_out" not in row]
+    lost = save_each(folder, {picture: partial(draw, points, name)})[1]
+    say_lost(lost)
+    text = f"# {name}\n\n{scene_text(rows, picture)}"
+    write_text(folder / "tradeoff.md", without_lost(text, lost))
     seconds = {k: clock[i + 1] - clock[i] for i, k in enumerate(("read", "compute"))}
     made = provenance(scene, inputs, str(jax.devices()[0]), "float64, float32", seconds)
     write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")

@@ -1,5 +1,6 @@
 """The figures of a fit (matplotlib, imported only here, and without a global backend)."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,11 @@ from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.predictions import Prediction
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import lane_label, unknown_label
-from jaxtrachea.report import ONE_BY_ONE
+from jaxtrachea.identify.rows import ONE_BY_ONE, listed, worst_first
+from jaxtrachea.pictures import plain, save_each
 
+#: Lanes that have a line of their own in a picture of all; of more, the worst.
+LINES = 200
 #: What all figures share.
 STYLE: dict[Any, object] = {
     "axes.spines.top": False,
@@ -24,34 +28,36 @@ STYLE: dict[Any, object] = {
     "legend.frameon": False,
     "legend.fontsize": 7,
     "figure.dpi": 130,
+    "text.usetex": False,
 }
 
 
 def draw_all(
     folder: Path, result: FitResult, prediction: Prediction, profiles: Profiles | None = None
-) -> list[Path]:
-    """Write fit.png, residuals.png, correlation.png, if given profiles.png; returns the paths."""
+) -> tuple[list[Path], dict[str, str]]:
+    """Write fit.png, residuals.png, correlation.png, if given profiles.png.
+
+    Returns:
+        The paths; and by file name, why a picture could not be drawn: it costs itself only.
+    """
+    drawings: dict[str, Any] = {
+        "fit.png": partial(draw_fit, result, prediction),
+        "residuals.png": partial(draw_residuals, result, prediction),
+        "correlation.png": partial(draw_correlation, result),
+    }
+    if profiles is not None and len(profiles.lane):
+        drawings["profiles.png"] = partial(draw_profiles, profiles)
     with mpl.rc_context(STYLE):
-        figures = {
-            "fit": draw_fit(result, prediction),
-            "residuals": draw_residuals(result, prediction),
-            "correlation": draw_correlation(result),
-        }
-        if profiles is not None and len(profiles.lane):
-            figures["profiles"] = draw_profiles(profiles)
-        paths = []
-        for name, figure in figures.items():
-            paths.append(folder / f"{name}.png")
-            figure.savefig(paths[-1], bbox_inches="tight")
-    return paths
+        return save_each(folder, drawings, bbox_inches="tight")
 
 
 def _panels(result: FitResult) -> list[int]:
-    """Lanes drawn one by one: the first ones, or of many those with the best to worst residual."""
+    """Lanes drawn one by one: all of few; of many the worst, then some on the way to the best."""
     if result.lanes <= ONE_BY_ONE:
         return list(range(result.lanes))
-    order = np.argsort(np.nan_to_num(result.rms[:, 0], nan=np.inf))
-    return [int(order[i]) for i in np.linspace(0, result.lanes - 1, ONE_BY_ONE).astype(int)]
+    order, half = worst_first(result), ONE_BY_ONE // 2
+    rest = np.linspace(half, result.lanes - 1, ONE_BY_ONE - half).astype(int)
+    return [order[i] for i in [*range(half), *rest]]
 
 
 def _grid(count: int, height: float = 2.7):
@@ -79,14 +85,21 @@ def draw_fit(result: FitResult, prediction: Prediction):
             n = len(curve.force)
             model = curve.force + prediction.force[lane, t, :n]
             step = max(1, n // 60)
-            label = curve.trial if len(curves) <= 12 else None
+            label = plain(curve.trial) if len(curves) <= 12 else None
             axis.plot(curve.displacement[::step], curve.force[::step], ".", color=colour, ms=4)
             axis.plot(curve.displacement, model, "-", color=colour, lw=1.2, label=label)
-        axis.set(title=lane_label(result, lane), xlabel="displacement [mm]", ylabel="force [N]")
+        name = plain(lane_label(result, lane))
+        axis.set(title=name, xlabel="displacement [mm]", ylabel="force [N]")
         if 1 < len(curves) <= 12:
             axis.legend(ncols=2, title="dots: measured, lines: model", title_fontsize=7)
         if with_joints:
             _draw_joints(next(axes), result, prediction, lane, colours)
+    if len(shown) < result.lanes:
+        half = ONE_BY_ONE // 2
+        figure.suptitle(
+            f"{len(shown)} of {result.lanes} lanes: the {half} worst, then every so many to the "
+            "best; all: summary.csv"
+        )
     return figure
 
 
@@ -112,18 +125,20 @@ def draw_residuals(result: FitResult, prediction: Prediction):
     """Force residuals, model - data, against displacement, and their distribution."""
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    pooled = []
+    pooled, lined = [], set(listed(result, LINES))
     for lane in range(result.lanes):
         for t, curve in enumerate(result.problem.curves[lane]):
             n = len(curve.force)
             peak = np.max(np.abs(curve.force))
             r = 100 * prediction.force[lane, t, :n] / (peak if peak > 0 else 1)
             pooled.append(r)
-            if lane < 200:
+            if lane in lined:
                 left.plot(curve.displacement, r, lw=0.7, alpha=0.6)
     left.axhline(0, color="k", lw=0.6)
     left.set(
-        xlabel="displacement [mm]", ylabel="(model - data) / peak [%]", title="force residuals"
+        xlabel="displacement [mm]",
+        ylabel="(model - data) / peak [%]",
+        title="force residuals" + _of(len(lined), result.lanes, "worst lanes"),
     )
     values = np.concatenate(pooled)
     right.hist(values[np.isfinite(values)], bins=60, color="0.4")
@@ -131,9 +146,15 @@ def draw_residuals(result: FitResult, prediction: Prediction):
     return figure
 
 
+def _of(shown: int, total: int, what: str) -> str:
+    """In a title, how much of all is drawn; "" for all."""
+    return "" if shown >= total else f", {shown} {what} of {total}"
+
+
 def draw_correlation(result: FitResult):
     """Correlation of the estimates: of the lane, or the mean over lanes."""
-    names = [unknown_label(result, 0, i) for i in range(len(result.problem.unknowns[0]))]
+    count = len(result.problem.unknowns[0])
+    names = [plain(unknown_label(result, 0, i), 24) for i in range(count)]
     shown = min(len(names), 30)
     with np.errstate(invalid="ignore"):
         stack = np.stack([u.correlation[:shown, :shown] for u in result.uncertainty])
@@ -152,7 +173,8 @@ def draw_correlation(result: FitResult):
             if np.isfinite(mean[i, j]) and shown <= 12:
                 dark = "w" if abs(mean[i, j]) > 0.6 else "k"
                 axis.text(j, i, f"{mean[i, j]:.2f}", ha="center", va="center", color=dark, size=7)
-    axis.set_title("correlation" + (f", mean of {result.lanes} lanes" if result.lanes > 1 else ""))
+    title = "correlation" + (f", mean of {result.lanes} lanes" if result.lanes > 1 else "")
+    axis.set_title(title + _of(shown, len(names), "unknowns"))
     figure.colorbar(image, shrink=0.8)
     return figure
 
@@ -166,12 +188,17 @@ def draw_profiles(profiles: Profiles):
     names = list(dict.fromkeys(p.name for p in result.problem.free))
     of = lambda k: result.problem.unknowns[profiles.lane[k]][profiles.unknown[k]][0]  # noqa: E731
     groups = {n: [k for k in range(len(profiles.lane)) if of(k).name == n] for n in names}
-    groups = {n: members for n, members in groups.items() if members}
+    place = {lane: n for n, lane in enumerate(listed(result, LINES))}
+    groups = {
+        n: sorted(members, key=lambda k: place.get(profiles.lane[k], LINES))
+        for n, members in groups.items()
+        if members
+    }
     figure, axes = _grid(len(groups))
     for axis, members in zip(axes, groups.values(), strict=False):
         p, first = of(members[0]), members[0]
         colours = mpl.colormaps["viridis"](np.linspace(0.05, 0.9, len(members)))
-        for k, colour in zip(members[:200], colours, strict=False):
+        for k, colour in zip(members[:LINES], colours, strict=False):
             at = np.array([p.from_scaled(v) for v in profiles.coordinate[k]])
             axis.plot(at, profiles.statistic[k], ".-", color=colour, lw=0.9, ms=3)
         lane, unknown = profiles.lane[first], profiles.unknown[first]
@@ -185,27 +212,40 @@ def draw_profiles(profiles: Profiles):
         wide = np.ptp(profiles.coordinate[members]) > np.log(20)
         axis.set_xscale("log" if p.scale == "log" and wide else "linear")
         axis.set_ylim(-0.2, 2.2 * profiles.threshold[first])
-        axis.set(title=p.name, xlabel=f"{p.name} [{p.unit}]", ylabel="rise of the profile")
+        title = p.name + _of(min(len(members), LINES), len(members), "worst lanes")
+        axis.set(title=title, xlabel=f"{p.name} [{p.unit}]", ylabel="rise of the profile")
     return figure
 
 
-def draw_design(path: Path, found: Map, at: Candidates, choice: Choice, rings: np.ndarray) -> None:
-    """Write the identifiability map: over s with the data, of pairs without, and the gains."""
+def draw_design(
+    path: Path, found: Map, at: Candidates, choice: Choice, rings: np.ndarray
+) -> dict[str, str]:
+    """Write the identifiability map: over s with the data, of pairs without, and the gains.
+
+    Returns:
+        By file name, why it could not be drawn; empty if it could.
+    """
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(13, 3.8), layout="constrained")
-        left, middle, right = figure.subplots(1, 3)
-        left.plot(found.s, found.condition, color="0.2")
-        left.set(xlabel="s [mm]", ylabel="condition", title="data and a press at s")
-        left.plot(rings, np.full(len(rings), found.condition.min()), "|", color="tab:green", ms=9)
-        image = middle.pcolormesh(found.s, found.s, np.log10(found.pairs), cmap="viridis_r")
-        figure.colorbar(image, label="log10 condition")
-        middle.set(xlabel="s [mm]", ylabel="s [mm]", title="two presses, no other data")
-        for depth in np.unique(at.depth):
-            own = at.depth == depth
-            right.plot(at.s[own], choice.score[0, own], lw=1, label=f"{depth:.3g} mm")
-        for k in np.unique(choice.chosen):
-            order = ", ".join(str(step + 1) for step in np.flatnonzero(choice.chosen == k))
-            right.annotate(order, (at.s[k], choice.score[0, k]), color="tab:red")
-        right.legend(title="depth")
-        right.set(xlabel="s [mm]", ylabel="criterion", title="first press; chosen in order")
-        figure.savefig(path, bbox_inches="tight")
+        draw = partial(_design, found, at, choice, rings)
+        return save_each(path.parent, {path.name: draw}, bbox_inches="tight")[1]
+
+
+def _design(found: Map, at: Candidates, choice: Choice, rings: np.ndarray) -> Figure:
+    """The identifiability map."""
+    figure = Figure(figsize=(13, 3.8), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    left.plot(found.s, found.condition, color="0.2")
+    left.set(xlabel="s [mm]", ylabel="condition", title="data and a press at s")
+    left.plot(rings, np.full(len(rings), found.condition.min()), "|", color="tab:green", ms=9)
+    image = middle.pcolormesh(found.s, found.s, np.log10(found.pairs), cmap="viridis_r")
+    figure.colorbar(image, label="log10 condition")
+    middle.set(xlabel="s [mm]", ylabel="s [mm]", title="two presses, no other data")
+    for depth in np.unique(at.depth):
+        own = at.depth == depth
+        right.plot(at.s[own], choice.score[0, own], lw=1, label=f"{depth:.3g} mm")
+    for k in np.unique(choice.chosen):
+        order = ", ".join(str(step + 1) for step in np.flatnonzero(choice.chosen == k))
+        right.annotate(order, (at.s[k], choice.score[0, k]), color="tab:red")
+    right.legend(title="depth")
+    right.set(xlabel="s [mm]", ylabel="criterion", title="first press; chosen in order")
+    return figure

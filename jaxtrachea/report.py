@@ -4,11 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxtrachea.doubts import distrust, doubts
 from jaxtrachea.identify.bootstrap import FEWEST, Bootstrap
+from jaxtrachea.identify.effective import CORRELATED, Effective, effective
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.population import Population, population_rows
-from jaxtrachea.identify.predictions import LeftOut, Prediction, lag_correlation, rms
+from jaxtrachea.identify.posterior import Posterior
+from jaxtrachea.identify.predictions import LeftOut, Prediction, rms
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import (
     is_own,
@@ -20,10 +23,8 @@ from jaxtrachea.identify.results import (
     verdict_of,
     verdict_sentence,
 )
+from jaxtrachea.identify.rows import ONE_BY_ONE, and_more, listed
 from jaxtrachea.status import FitStatus, ProfileEnd
-
-#: Lanes that are listed and drawn one by one; beyond it, distributions are shown.
-ONE_BY_ONE = 12
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -32,9 +33,12 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def estimate_rows(
-    result: FitResult, lanes: Sequence[int], profiles: Profiles | None = None
+    result: FitResult,
+    lanes: Sequence[int],
+    profiles: Profiles | None = None,
+    wide: Effective | None = None,
 ) -> list[list[str]]:
-    """Lane, parameter, value, standard error, 95 % interval, verdict."""
+    """Lane, parameter, value, standard error, 95 % interval, if given widened, verdict."""
     rows = []
     for lane in lanes:
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
@@ -48,13 +52,21 @@ def estimate_rows(
                     number(result.value[lane, i]),
                     number(result.standard_error[lane, i], 2),
                     "–" if np.isnan(low) else f"{number(low)} … {number(high)}",
+                    *([] if wide is None else [_widened(wide, lane, i, log=p.scale == "log")]),
                     verdict_of(result, lane, i, profiles),
                 ]
             )
     return rows
 
 
+def _widened(wide: Effective, lane: int, i: int, *, log: bool) -> str:
+    """The interval as it is with the samples that correlated ones are worth."""
+    return interval(float(wide.lower[lane, i]), float(wide.upper[lane, i]), log=log)
+
+
 ESTIMATE_HEAD = ["specimen", "parameter", "value", "std. error", "95 % interval", "verdict"]
+#: Likewise, with intervals for correlated residuals.
+WIDENED_HEAD = [*ESTIMATE_HEAD[:-1], "95 % widened", ESTIMATE_HEAD[-1]]
 
 
 def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[list[str]]:
@@ -106,8 +118,6 @@ def quality_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
     return rows
 
 
-#: Correlation of neighbouring residuals from which the report doubts the standard errors.
-CORRELATED = 0.3
 QUALITY_HEAD = [
     "specimen",
     "outcome",
@@ -157,20 +167,22 @@ def report_text(
     resampled: Bootstrap | None = None,
     more: Sequence[str] = (),
     population: Population | None = None,
+    drawn: Posterior | None = None,
 ) -> str:
     """The whole report.md; `more`: further sections, before the figures."""
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
+    wide = effective(result, prediction)
     parts = [
         f"# {title or 'Fit'}",
         f"{result.lanes} lanes, {result.lanes - len(failed)} succeeded, {len(failed)} failed; "
         f"{len(bad)} curves could not be used. All numbers: `results.h5`; one row per lane: "
         "`summary.csv`; one row per estimate: `parameters.csv` (docs/results.md).",
-        *_estimates(result, profiles),
+        *_estimates(result, profiles, wide, drawn),
         *([] if population is None else _sampled(population)),
         "## Quality",
-        _quality(result, failed),
+        *_quality(result, failed),
         f"Largest residual: {prediction.worst(result)}.",
-        *_doubts(result, prediction),
+        *doubts(result, wide),
     ]
     if profiles is not None:
         parts += _profiled(profiles)
@@ -188,26 +200,38 @@ def report_text(
     return "\n\n".join(parts) + "\n"
 
 
-def _estimates(result: FitResult, profiles: Profiles | None) -> list[str]:
+def _estimates(
+    result: FitResult, profiles: Profiles | None, wide: Effective, drawn: Posterior | None
+) -> list[str]:
     """Values with their errors, and what the data leave open."""
-    shown = range(min(result.lanes, ONE_BY_ONE))
-    if result.lanes <= ONE_BY_ONE:
-        table = markdown_table(ESTIMATE_HEAD, estimate_rows(result, shown, profiles))
-    else:
-        table = markdown_table(SPREAD_HEAD, spread_rows(result, profiles))
+    shown = listed(result)
+    widened = wide if np.any(wide.correlation > CORRELATED) else None
+    head = ESTIMATE_HEAD if widened is None else WIDENED_HEAD
+    rows = estimate_rows(result, shown, profiles, widened)
+    tables = [markdown_table(head, rows), *more_of(result, shown, "parameters.csv")]
+    if result.lanes > len(shown):
+        tables = [markdown_table(SPREAD_HEAD, spread_rows(result, profiles)), *tables]
     fixed = [f"{p.name} = {p.value:g} {p.unit}" for p in result.problem.parameters if p.fixed]
     flat = [f"- {lane_label(result, k)}: {verdict_sentence(result, k, profiles)}." for k in shown]
     return [
         "## Estimates",
-        table,
+        *tables,
+        *([] if drawn is None else distrust(drawn)),
         f"Fixed: {', '.join(fixed) or 'none'}.",
         "## What the data determine",
         "\n".join(flat),
+        *more_of(result, shown, "summary.csv"),
         "Identifiable: relative error up to 10 %; weak: up to 50 %; practically not: more, or a "
         "profile that stays open; structurally not: no data from these contact points can tell, "
         "however exact. Judged by the profile where there is one, else by the local standard error "
         "(Gauss-Newton); neither says anything of what the model leaves out.",
     ]
+
+
+def more_of(result: FitResult, shown: Sequence[int], file: str) -> list[str]:
+    """A paragraph that says how many lanes a table leaves out; none if it holds all."""
+    text = and_more(result.lanes, len(shown), file)
+    return [f"{text}."] if text else []
 
 
 POPULATION_HEAD = ["parameter", "n", "mean", "95 % interval", "spread", "95 % interval"]
@@ -260,9 +284,9 @@ def interval(low: float, high: float, *, log: bool) -> str:
 def profile_table(profiles: Profiles, lanes: Sequence[int]) -> list[list[str]]:
     """Lane, parameter, value, interval by profile and by standard error, how the profile ends."""
     result, rows = profiles.result, []
-    for k, (lane, i) in enumerate(profiles.pairs):
-        if lane not in lanes:
-            continue
+    place = {lane: n for n, lane in enumerate(lanes)}
+    pairs = [(k, lane, i) for k, (lane, i) in enumerate(profiles.pairs) if lane in place]
+    for k, lane, i in sorted(pairs, key=lambda pair: place[pair[1]]):
         p = result.problem.unknowns[lane][i][0]
         low, high = (ProfileEnd(int(e)).name.lower() for e in profiles.end[k])
         local = (float(v[lane, i]) for v in (result.lower, result.upper))
@@ -282,11 +306,12 @@ def profile_table(profiles: Profiles, lanes: Sequence[int]) -> list[list[str]]:
 def _profiled(profiles: Profiles) -> list[str]:
     """The section on profile likelihood."""
     result = profiles.result
-    shown = range(min(result.lanes, ONE_BY_ONE))
+    shown = listed(result)
     count = lambda end: int(np.sum((profiles.end == end).any(axis=1)))  # noqa: E731
     parts = [
         "## Profile likelihood",
         markdown_table(PROFILE_HEAD, profile_table(profiles, shown)),
+        *more_of(result, shown, "parameters.csv"),
         f"{len(profiles.lane)} profiles: {count(ProfileEnd.OPEN)} open on a side (the data do not "
         f"limit the parameter there), {count(ProfileEnd.BOUND)} limited only because another "
         f"unknown is on its bound, {count(ProfileEnd.FAILED)} failed. All other unknowns are "
@@ -326,12 +351,13 @@ def bootstrap_table(resampled: Bootstrap, lanes: Sequence[int]) -> list[list[str
 
 def _bootstrapped(resampled: Bootstrap) -> list[str]:
     """The section on the bootstrap."""
-    shown = range(min(resampled.result.lanes, ONE_BY_ONE))
+    shown = listed(resampled.result)
     lost = int(np.sum(~resampled.usable))
     blocks = f" in blocks of {resampled.block} samples" if resampled.block > 1 else ""
     return [
         "## Bootstrap",
         markdown_table(BOOTSTRAP_HEAD, bootstrap_table(resampled, shown)),
+        *more_of(resampled.result, shown, "parameters.csv"),
         f"{resampled.usable.shape[1]} replicates of every lane ({resampled.kind}{blocks}); "
         f"{lost} of {resampled.usable.size} refits did not converge and are left out; a lane with "
         f"fewer than {FEWEST} others has no interval. All numbers: `results.h5` "
@@ -339,30 +365,8 @@ def _bootstrapped(resampled: Bootstrap) -> list[str]:
     ]
 
 
-def _doubts(result: FitResult, prediction: Prediction) -> list[str]:
-    """What speaks against the standard errors of this fit."""
-    doubts = []
-    correlation = lag_correlation(prediction)
-    lanes = np.flatnonzero(correlation > CORRELATED)
-    if len(lanes):
-        r = float(np.median(correlation[lanes]))
-        factor = np.sqrt((1 + r) / max(1 - r, 1e-3))
-        doubts.append(
-            f"Neighbouring force residuals are correlated in {len(lanes)} of {result.lanes} lanes "
-            f"(median correlation {r:.2f}): the model misses the shape of these curves, or the "
-            "noise is not independent from sample to sample. The standard errors assume that it "
-            f"is; there they are too small, by a factor of about {factor:.2g} if it is noise."
-        )
-    bound = np.flatnonzero(result.at_bound.any(axis=1))
-    if len(bound):
-        doubts.append(
-            f"In {len(bound)} of {result.lanes} lanes an unknown ended on its bound. The errors of "
-            "the other unknowns there hold it fixed: they do not include its own uncertainty."
-        )
-    return doubts
-
-
-def _quality(result: FitResult, failed: list[int]) -> str:
-    """The first lanes and those that failed."""
-    lanes = list(dict.fromkeys([*range(min(result.lanes, ONE_BY_ONE)), *failed]))[:50]
-    return markdown_table(QUALITY_HEAD, quality_rows(result, lanes))
+def _quality(result: FitResult, failed: list[int]) -> list[str]:
+    """Lanes one by one: of many those that failed (50 at most), then the worst."""
+    shown = listed(result, max(ONE_BY_ONE, min(len(failed), 50)))
+    table = markdown_table(QUALITY_HEAD, quality_rows(result, shown))
+    return [table, *more_of(result, shown, "summary.csv")]

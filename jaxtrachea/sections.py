@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxtrachea.doubts import distrust
 from jaxtrachea.identify.influence import Influence
 from jaxtrachea.identify.influence_tables import (
     curve_rows,
@@ -13,8 +14,9 @@ from jaxtrachea.identify.influence_tables import (
     top_samples,
 )
 from jaxtrachea.identify.posterior import Posterior
-from jaxtrachea.identify.results import lane_label, unknown_label, write_csv
-from jaxtrachea.report import ONE_BY_ONE, markdown_table, number
+from jaxtrachea.identify.results import lane_label, succeeded, unknown_label, write_csv
+from jaxtrachea.identify.rows import ONE_BY_ONE, and_more, listed
+from jaxtrachea.report import markdown_table, more_of, number
 
 #: Rows of the tables on influence; the files hold all.
 _TOP = 12
@@ -36,51 +38,77 @@ def write_more(
     return parts
 
 
-def posterior_section(drawn: Posterior) -> list[str]:
-    """Medians and intervals of the draws, and whether the chains deserve trust."""
+POSTERIOR_HEAD = [
+    "specimen", "parameter", "median", "posterior 95 %", "R-hat", "effective draws", "chains",
+]  # fmt: skip
+
+
+def posterior_rows(drawn: Posterior, lanes: Sequence[int]) -> list[list[str]]:
+    """Medians, intervals and what they are worth; poor chains have neither median nor interval."""
     result, rows = drawn.result, []
-    shown = range(min(result.lanes, ONE_BY_ONE))
-    for lane in shown:
+    for lane in lanes:
+        grade = drawn.verdict(lane).partition(":")[0]
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
-            ends = (number(float(v[lane, i])) for v in (drawn.lower, drawn.upper))
+            median, low, high = (
+                number(float(v[lane, i])) for v in (drawn.median, drawn.lower, drawn.upper)
+            )
             rows.append(
                 [
                     lane_label(result, lane),
                     f"{unknown_label(result, lane, i)} [{p.unit}]",
-                    number(float(drawn.median[lane, i])),
-                    " … ".join(ends),
+                    "–" if grade == "poor" else median,
+                    "–" if grade == "poor" else f"{low} … {high}",
                     number(float(drawn.rhat[lane, i])),
                     number(float(drawn.ess[lane, i]), 3),
+                    grade,
                 ]
             )
-    words = {lane: drawn.verdict(lane) for lane in range(result.lanes)}
-    bad = [k for k, text in words.items() if not text.startswith("good")]
-    said = "\n".join(f"- {lane_label(result, k)}: {words[k]}" for k in bad[:ONE_BY_ONE])
+    return rows
+
+
+def posterior_section(drawn: Posterior) -> list[str]:
+    """Medians and intervals of the draws, and whether the chains deserve trust."""
+    result = drawn.result
+    shown = listed(result)
     chains, draws = drawn.theta.shape[1:3]
-    head = ["specimen", "parameter", "median", "posterior 95 %", "R-hat", "effective draws"]
-    lead = f"**{len(bad)} of {result.lanes} lanes have chains not to be trusted as they are:**"
+    longer = drawn.steps[drawn.steps > draws]
+    more = f", {longer.min()} to {longer.max()} in {len(longer)} lanes" if len(longer) else ""
     return [
         "## Posterior",
-        markdown_table(head, rows),
-        f"{chains} chains of {draws} draws (NUTS), priors uniform in scaled coordinates between "
-        "the bounds. Good: R-hat up to 1.01, 400 effective draws, nothing divergent. All draws: "
-        "`results.h5` (docs/uncertainty.md).",
-        *([lead, said] if bad else ["All chains are good."]),
+        markdown_table(POSTERIOR_HEAD, posterior_rows(drawn, shown)),
+        *more_of(result, shown, "parameters.csv"),
+        f"{chains} chains of {draws} draws (NUTS{more}), priors uniform in scaled coordinates "
+        "between the bounds. Good: R-hat up to 1.01, 400 effective draws, nothing divergent. Of "
+        "poor chains (R-hat above 1.05, less than 100 effective draws, or more than 2 % divergent) "
+        "no interval is given. All draws: `results.h5` (docs/uncertainty.md).",
+        *(distrust(drawn) or ["All chains are good."]),
     ]
+
+
+def influence_head(found: Influence) -> list[str]:
+    """Head of `influence_rows`."""
+    names = [p.name for p in found.result.problem.free]
+    return ["specimen", "curve", *(f"{n}: share, left out" for n in names), "Cook"]
+
+
+def influence_rows(found: Influence, most: int = ONE_BY_ONE) -> list[list[str]]:
+    """Curves: all of few; of many those with the largest Cook's distance."""
+    return [_curve_row(found, *place) for place in _top_curves(found, most)]
 
 
 def influence_section(found: Influence) -> list[str]:
     """Which curves and samples the estimates hang on."""
     names = [p.name for p in found.result.problem.free]
-    head = ["specimen", "curve", *(f"{n}: share, left out" for n in names), "Cook"]
-    places = _top_curves(found)
+    table, total = influence_rows(found), sum(map(len, found.result.problem.curves))
+    more = and_more(total, len(table), "influence_curves.csv")
     parts = [
         "## Influence",
-        markdown_table(head, [_curve_row(found, *place) for place in places]),
+        markdown_table(influence_head(found), table),
+        *([f"{more}."] if more else []),
         "Share: part of the variance of an estimate that the noise of this curve makes. Left out: "
-        "change of the estimate, in standard errors, if the curve were not there (first order; a "
-        "dash: the others do not determine it). All curves: `influence_curves.csv`.",
-        *_drivers(found, names),
+        "change of the estimate, in standard errors, if the curve were not there (first order). "
+        f"{REASONS} All curves: `influence_curves.csv`.",
+        *drivers(found),
     ]
     rows = [_sample_row(found, names, *place) for place in top_samples(found, _TOP)]
     head = ["specimen", "curve", "sample", "leverage", "studentised", "Cook", "moves most"]
@@ -92,23 +120,46 @@ def influence_section(found: Influence) -> list[str]:
     ]
 
 
-def _top_curves(found: Influence) -> list[tuple[int, int]]:
-    """All curves of few lanes; of many those with the largest Cook's distance."""
+#: What stands in a table of influence where a number cannot be given.
+REASONS = (
+    "`own`: nobody else tells of this unknown. `needed`: without this curve the others do not "
+    "determine all unknowns. `held`: the unknown is on its bound. `undetermined`: it has no "
+    "standard error. `no estimate`: the fit failed."
+)
+
+
+def _top_curves(found: Influence, most: int) -> list[tuple[int, int]]:
+    """All curves if few; of many those that nothing is known of, then by Cook's distance."""
     curves = found.result.problem.curves
     places = [(k, t) for k, of in enumerate(curves) for t in range(len(of))]
-    if len(places) <= ONE_BY_ONE:
+    if len(places) <= most:
         return places
     cook = np.nan_to_num(found.of.curve_cook, nan=-1)
-    return sorted(places, key=lambda place: -cook[place])[:_TOP]
+    return sorted(places, key=lambda place: -cook[place])[:most]
 
 
 def _curve_row(found: Influence, lane: int, t: int) -> list[str]:
     curve, of = found.result.problem.curves[lane][t], found.of
-    cells = [
-        "–" if np.isnan(share) else f"{100 * share:.0f} %, {number(left, 2)}"
-        for share, left in zip(of.curve_share[lane, t], of.curve_left_out[lane, t], strict=True)
-    ]
-    return [curve.specimen, curve.trial, *cells, number(float(of.curve_cook[lane, t]), 2)]
+    cells = [influence_cell(found, lane, t, i) for i in range(of.curve_share.shape[2])]
+    cook = float(of.curve_cook[lane, t])
+    return [curve.specimen, curve.trial, *cells, number(cook, 2) if np.isfinite(cook) else "–"]
+
+
+def influence_cell(found: Influence, lane: int, t: int, i: int) -> str:
+    """Share and change where the curve is left out, or in one word why there is none."""
+    result, of = found.result, found.of
+    unknown = int(result.problem.lanes.index[lane, t, result.problem.free_columns[i]])
+    if not succeeded(result, lane):
+        return "no estimate"
+    if result.at_bound[lane, unknown]:
+        return "held"
+    share, left = float(of.curve_share[lane, t, i]), float(of.curve_left_out[lane, t, i])
+    if np.isnan(share):
+        return "undetermined"
+    if np.isfinite(left):
+        return f"{100 * share:.0f} %, {number(left, 2)}"
+    column = result.problem.lanes.index[lane][:, result.problem.free_columns[i]]
+    return f"{100 * share:.0f} %, {'own' if np.sum(column == unknown) == 1 else 'needed'}"
 
 
 def _sample_row(found: Influence, names: Sequence[str], lane: int, t: int, e: int) -> list[str]:
@@ -123,8 +174,9 @@ def _sample_row(found: Influence, names: Sequence[str], lane: int, t: int, e: in
     return [curve.specimen, curve.trial, where, *(number(float(v), 2) for v in numbers), most]
 
 
-def _drivers(found: Influence, names: Sequence[str]) -> list[str]:
+def drivers(found: Influence) -> list[str]:
     """In words: the curve whose loss moves each parameter most, where it moves it by much."""
+    names = [p.name for p in found.result.problem.free]
     said, moves = [], np.abs(np.nan_to_num(found.of.curve_left_out))
     for i, name in enumerate(names):
         lane, t = np.unravel_index(int(np.argmax(moves[:, :, i])), moves.shape[:2])

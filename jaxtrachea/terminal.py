@@ -5,14 +5,20 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+
+from jaxtrachea.pictures import sentence
+from jaxtrachea.terminal_table import wide_table as table
+
+__all__ = [
+    "Kept", "Stop", "cache_folder", "complain", "interrupts", "into", "progress_bar", "say_lost",
+    "set_up_jax", "table", "to_stderr",
+]  # fmt: skip
 
 
 class Stop(Exception):
@@ -37,6 +43,12 @@ def complain(message: str) -> int:
     """Report bad input; returns its exit code."""
     to_stderr(f"[bold red]error:[/] {escape(message)}")
     return 2
+
+
+def say_lost(pictures: Mapping[str, str]) -> None:
+    """Warn of pictures that could not be drawn; the numbers stand."""
+    for name, reason in pictures.items():
+        to_stderr(f"[yellow]warning:[/] {escape(sentence(name, reason))}")
 
 
 @contextlib.contextmanager
@@ -101,23 +113,6 @@ def cache_folder() -> Path | None:
         return folder if os.access(folder, os.W_OK) else None
     except (OSError, RuntimeError):  # RuntimeError: nobody's home
         return None
-
-
-def table(title: str, head, rows, text: tuple[str, ...] = ()) -> Table:
-    """A table that breaks lines between words only, and leaves out an only specimen's name."""
-    named = head[0] != "specimen" or len({row[0] for row in rows}) > 1
-    if not named:
-        title, head, rows = f"{title}: {rows[0][0]}", head[1:], [row[1:] for row in rows]
-    made = Table(
-        title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
-    )
-    for i, name in enumerate(head):
-        words = " ".join([name, *(row[i] for row in rows)]).split()
-        side = "left" if i == 0 or name in text else "right"
-        made.add_column(escape(name), justify=side, min_width=max(map(len, words)), overflow="fold")
-    for row in rows:
-        made.add_row(*map(escape, row))
-    return made
 
 
 def progress_bar() -> Progress:

@@ -11,17 +11,13 @@ import scipy.stats
 import synthetic
 from run_cli import run
 
-from jaxtrachea.identify.comparison import (
-    Row,
-    leave_position_out,
-    same_data,
-    sentence,
-)
+from jaxtrachea.identify.comparison import Model, Row, compared, same_data, sentence
 from jaxtrachea.identify.criteria import penalised, weights
 from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.measurements import Curve
 from jaxtrachea.identify.parameters import DEFAULTS
 from jaxtrachea.identify.problem import Noise, build
+from jaxtrachea.identify.repeats import leave_repeats_out, repeats
 from jaxtrachea.model import Options, press
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
@@ -98,29 +94,85 @@ def test_few_samples_and_weights():
     assert np.isnan(weights(np.array([np.nan, np.inf]))).all()
 
 
-def row(model, AICc, k=3, left=np.nan):
-    return Row("T", model, k, 40, 1.0, 0.0, 0.0, float(AICc), 0.0, 0.0, 0.0, left)
+def row(model, AICc, k=3, left=np.nan, fair=None, worth=40.0):
+    fair = float(AICc) if fair is None else fair
+    return Row("T", model, k, 40, 1.0, 0.0, 0.0, float(AICc), 0.0, 0.0, 0.0, left, fair, worth)
 
 
 @pytest.mark.parametrize(
-    ("rows", "correlated", "says"),
+    ("rows", "left", "says"),
     [
-        ([row("A", 0.0), row("B", 1.5)], False, "cannot tell A from B"),
-        ([row("A", 5.0), row("B", 0.0)], False, "prefer B (AICc 5.0 below A), but not decisively"),
-        ([row("A", 0.0), row("B", 30.0)], False, "prefer A decisively (AICc 30.0 below B)"),
-        ([row("A", 0.0), row("B", 30.0)], True, "neighbouring residuals are correlated"),
+        ([row("A", 0.0), row("B", 1.5)], "trials", "cannot tell A from B"),
+        ([row("A", 5.0), row("B", 0.0)], "", "prefer B (AICc 5.0 below A), but not decisively"),
+        ([row("A", 0.0), row("B", 30.0)], "", "prefer A decisively (AICc 30.0 below B)"),
+        (
+            [row("A", 0.0, worth=9.1), row("B", 30.0, fair=5.0)],
+            "",
+            "not decisively: 40 correlated samples count as 9.1 independent ones, which leave 5 to",
+        ),
+        (
+            [row("A", 0.0, worth=9.1), row("B", 45743.0, fair=120.0)],
+            "",
+            "decisively (AICc 45743.0 below B; 40 correlated samples count as 9.1 independent ones,"
+            " which leave 120 to B)",
+        ),
         (
             [row("A", 0, left=0.1), row("B", 30, left=0.2)],
-            False,
-            "predicts positions left out best",
+            "trials",
+            "it predicts trials left out best",
         ),
-        ([row("A", 0, left=0.2), row("B", 30, left=0.1)], False, "B predicts positions left out"),
-        ([row("A", 0, left=0.1), row("B", 30, left=0.2)], True, "left out agree with it"),
-        ([row("A", np.inf), row("B", np.inf)], False, "too few samples"),
+        (
+            [row("A", 0, left=0.2), row("B", 30, left=0.1)],
+            "positions",
+            "B predicts positions left out better",
+        ),
+        (
+            [row("A", 0, left=0.1, worth=9.1), row("B", 30, left=0.2, fair=5.0)],
+            "positions",
+            "positions left out agree with it",
+        ),
+        ([row("A", np.inf), row("B", np.inf)], "", "too few samples"),
     ],
 )
-def test_sentences(rows, correlated, says):
-    assert says in sentence(rows, correlated)
+def test_sentences(rows, left, says):
+    assert says in sentence(rows, left)
+
+
+def test_deflated_difference_is_that_by_hand():
+    """AR(1) noise of 0.8: deviances of the normal equations times n_eff / n, unknowns in full."""
+    rng = np.random.default_rng(2)
+    curves = []
+    for i in range(3):
+        for trial in "ab":
+            noise = rng.standard_normal(20)
+            for k in range(1, 20):
+                noise[k] = 0.8 * noise[k - 1] + 0.6 * noise[k]
+            force = 1.5 * DEPTH + 0.05 * DEPTH**3 + SIGMA * noise
+            curves.append(Curve(f"T{i}", trial, None, 0.0, DEPTH, force))
+    fits = [
+        Model(name, fit(linear_problem(curves, fixed=fixed), Settings(starts=1)), None)
+        for name, fixed in (("cubic", ("force_offset",)), ("straight", ("k_3", "force_offset")))
+    ]
+    rows, failed = compared(fits)
+    assert failed == 0
+    for i in range(3):
+        pair = curves[2 * i : 2 * i + 2]
+        X, F = (
+            np.tile(np.stack([DEPTH, DEPTH**3], 1), (2, 1)),
+            np.concatenate([c.force for c in pair]),
+        )
+        e = (F - X @ np.linalg.lstsq(X, F, rcond=None)[0]).reshape(2, 20)
+        r = 2 * np.sum(e[:, 1:] * e[:, :-1]) / np.sum(e[:, 1:] ** 2 + e[:, :-1] ** 2)
+        share = (1 - max(r, 0)) / (1 + max(r, 0))
+        worth = []
+        for powers in ((1, 3), (1,)):
+            d, k, n = by_hand(pair, powers)
+            worth.append(d * share + 2 * k * n / (n - k - 1))
+        cubic, straight = (row for row in rows if row.specimen == f"T{i}")
+        assert cubic.AICc < straight.AICc
+        np.testing.assert_allclose(straight.deflated, worth[1] - worth[0], rtol=1e-6)
+        np.testing.assert_allclose(cubic.effective_samples, 40 * share, rtol=1e-6)
+        assert straight.deflated < straight.delta
 
 
 def test_other_data_or_noise_are_refused():
@@ -155,10 +207,45 @@ def test_leaving_a_position_out_is_a_fit_without_it():
         b = np.linalg.lstsq(X, np.concatenate([c.force for c in kept]), rcond=None)[0]
         missed += [b[0] * DEPTH + b[1] - c.force for c in curves if c.s_c == s]
     want = np.sqrt(np.mean(np.square(missed))) / max(np.abs(c.force).max() for c in curves)
-    got = leave_position_out(problem, Settings(starts=1))
+    got = leave_repeats_out(problem, Settings(starts=1))
     np.testing.assert_allclose(got, [want], rtol=1e-6)
-    alone = linear_problem([c for c in curves if c.s_c == 30.0])
-    assert np.isnan(leave_position_out(alone, Settings(starts=1))).all()
+    assert repeats(problem).words == "positions"
+
+
+def test_without_a_second_position_trials_are_left_out():
+    """As `sklearn.model_selection.LeaveOneGroupOut`: each trial once, specimens by themselves."""
+    problem = linear_problem(noisy(), fixed=("k_3",))
+    plan = repeats(problem)
+    assert (plan.words, plan.lanes.tolist()) == ("trials", [0, 0, 1, 1, 2, 2])
+    assert plan.held.tolist() == [[True, False], [False, True]] * 3
+    got = leave_repeats_out(problem, Settings(starts=1))
+    for lane, (a, b) in enumerate(zip(noisy()[::2], noisy()[1::2], strict=True)):
+        missed = []
+        for kept, out in ((a, b), (b, a)):
+            X = np.stack([kept.displacement, 1 + 0 * DEPTH], 1)
+            missed.append(X @ np.linalg.lstsq(X, kept.force, rcond=None)[0] - out.force)
+        peak = max(np.abs(c.force).max() for c in (a, b))
+        np.testing.assert_allclose(got[lane], np.sqrt(np.mean(np.square(missed))) / peak, rtol=1e-6)
+
+
+def test_what_can_be_left_out_within_one_lane():
+    """Of several specimens that share all: positions of one, trials of another, a third whole."""
+    places = [("A", "1", 30.0), ("A", "2", 30.0), ("A", "3", 60.0), ("B", "1", 30.0),
+              ("B", "2", 30.0), ("C", "1", 45.0)]  # fmt: skip
+    curves = [Curve(who, t, s, 0.0, DEPTH, 1.5 * DEPTH) for who, t, s in places]
+
+    def held(scope):
+        table = [
+            dataclasses.replace(DEFAULTS[n], **LINEAR | {"scope": scope}, fixed=n != "k_1")
+            for n in ("k_1", "k_3", "onset", "force_offset")
+        ]
+        found = repeats(build(curves, table_1(), TOTAL, table))
+        return found.words, [np.flatnonzero(row).tolist() for row in found.held]
+
+    both = [[0, 1], [2], [3], [4]]
+    assert held("shared") == ("positions and trials and specimens", [*both, [5]])
+    assert held("specimen") == ("positions and trials", [[0, 1], [2], [0], [1]])
+    assert held("trial") == ("", [])
 
 
 SPEC = """title = "{title}"
@@ -193,6 +280,7 @@ def test_command_chooses_the_model_behind_the_data(two, monkeypatch, capsys):
     code, out, _ = run(monkeypatch, capsys, "compare", "straight.toml", "cubic.toml", "--out", "o")
     assert code == 0
     assert "(all): the data prefer cubic decisively" in " ".join(out.split())
+    assert "it predicts trials left out best" in " ".join(out.split())
     assert {p.name for p in (two / "o").iterdir()} == {
         "compare.csv",
         "report.md",

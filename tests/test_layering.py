@@ -11,7 +11,7 @@ import jaxtrachea
 
 PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 ORDER = [
-    {"units", "status", "_numerics", "_arguments", "webpage"},
+    {"units", "status", "_numerics", "_arguments", "webpage", "spreadsheet", "pictures"},
     {"spec_file"},
     {"config"},
     {"trachea"},
@@ -25,9 +25,11 @@ ORDER = [
     {"identify"},
     {"scene"},
     {"selfcheck"},
+    {"doubts"},
     {"report"},
     {"plots", "sections", "viewer", "study"},
-    {"tradeoff"},
+    {"tradeoff", "overview"},
+    {"terminal_table"},
     {"terminal", "processes"},
     {"cli_load", "cli_run"},
     {"cli_scene", "cli_compare", "cli_fit", "cli_selfcheck", "cli_tradeoff"},

@@ -13,13 +13,20 @@ import numpy as np
 import pytest
 from run_cli import GOOD, run
 
+from jaxtrachea.cli_run import Found, posterior_failed
 from jaxtrachea.identify.estimate import lane_of
 from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import DEFAULTS
+from jaxtrachea.identify.parameters import DEFAULTS, in_model
 from jaxtrachea.identify.posterior import Posterior, log_density, posterior
-from jaxtrachea.identify.problem import Noise, build
+from jaxtrachea.identify.posterior_start import around_the_fit, mode
+from jaxtrachea.identify.posterior_tables import rows_with_draws
+from jaxtrachea.identify.predictions import predictions
+from jaxtrachea.identify.problem import Noise, build, default_parameters
 from jaxtrachea.model import Options
+from jaxtrachea.overview import overview
+from jaxtrachea.report import report_text
+from jaxtrachea.sections import posterior_rows
 from jaxtrachea.trachea.geometry import table_1
 
 ONE = Settings(starts=1)
@@ -67,8 +74,12 @@ def made(rhat, ess, lost):
     theta, divergent = np.zeros((1, 2, 100, 2)), np.zeros((1, 2, 100), bool)
     divergent[0, 0, :lost] = True
     pair = lambda v: np.array([[v, v]])  # noqa: E731
-    sigma, zero = np.ones((1, 2, 100, 2)), pair(0.0)
-    return Posterior(result, theta, sigma, divergent, pair(rhat), pair(ess), zero, zero, zero)
+    zero = pair(0.0)
+    return Posterior(
+        result=result, theta=theta, sigma=np.ones((1, 2, 100, 2)), divergent=divergent,
+        steps=np.array([100]), lost=divergent.mean(axis=(1, 2)), rhat=pair(rhat), ess=pair(ess),
+        median=zero, lower=zero, upper=zero,
+    )  # fmt: skip
 
 
 def test_verdicts_say_why():
@@ -136,6 +147,112 @@ def test_curved_posterior_is_that_of_quadrature(blackjax):
         sd = np.sqrt(np.sum(marginal * (grid - mean) ** 2))
         assert sd > 0.3  # nothing that a linear expansion could know
         assert abs(drawn.theta[0, ..., i].mean() - mean) < 4 * sd / np.sqrt(drawn.ess[0, i])
+
+
+def default_study(truths, seed=0):
+    """One curve of 40 samples per truth, parameters and bounds as users have them: k_3 in [0, 1e6].
+
+    Coordinates: ln k_1, and k_3 in hundredths, of which the bounds are 1e8 apart.
+    """
+    rng, depth = np.random.default_rng(seed), np.linspace(0.1, 2, 40)
+    curves = [
+        Curve(f"T{i}", "t", None, 0.0, depth,
+              k_1 * depth + k_3 * depth**3 + 0.02 * rng.normal(size=40))
+        for i, (k_1, k_3) in enumerate(truths)
+    ]  # fmt: skip
+    options = Options(coupling="total", onset_width=0.0)
+    table = default_parameters(in_model(options, joints=False), {})
+    return build(curves, table_1(), options, table)
+
+
+def quadrature(curve):
+    """2.5, 50 and 97.5 % quantiles of k_1 and k_3; sigma integrated away: S^(-n/2) / k_1."""
+    J = np.stack([curve.displacement, curve.displacement**3], axis=1)
+    best, squares, *_ = np.linalg.lstsq(J, curve.force)
+    sd = np.sqrt(np.diag(np.linalg.inv(J.T @ J)) * squares[0] / 38)
+    axes = [
+        np.linspace(max(b - 8 * d, 1e-9), b + 8 * d, 801) for b, d in zip(best, sd, strict=True)
+    ]
+    offset = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - best
+    S = squares[0] + np.einsum("abi,ij,abj->ab", offset, J.T @ J, offset)
+    weight = (S / squares[0]) ** -20 / axes[0][:, None]
+    out = []
+    for axis, other in ((0, 1), (1, 0)):
+        share = np.cumsum(weight.sum(axis=other)) / weight.sum()
+        out.append(np.interp([0.025, 0.5, 0.975], share, axes[axis]))
+    return np.array(out).T
+
+
+def test_chains_start_where_the_estimate_is():
+    """k_3 = 0.4 within [0, 1e6]: the centre of the chains was 1000, out of reach of a warm-up."""
+    result = fit(default_study([(1.3, 0.4), (0.5, 1.0)]), ONE)
+    for lane in range(2):
+        start = around_the_fit(result, lane, (True, False), 200, 0)
+        x = start.centre + start.y @ start.root.T
+        share = 1 / (1 + np.exp(-x[:, :2]))
+        low, high = result.problem.lanes.lower[lane], result.problem.lanes.upper[lane]
+        theta = low + (high - low) * share
+        se = result.uncertainty[lane].se
+        np.testing.assert_allclose(theta.mean(axis=0), result.theta[lane], atol=0.3 * se.max())
+        np.testing.assert_allclose(theta.std(axis=0), se, rtol=0.15)
+        found = np.corrcoef(theta.T)[0, 1]
+        np.testing.assert_allclose(found, result.uncertainty[lane].correlation[0, 1], atol=0.02)
+
+
+@pytest.mark.slow
+def test_chains_start_at_the_mode_of_the_posterior():
+    """Curves of 30 and 10 samples that disagree: the fit weighs curves, the posterior samples."""
+    rng = np.random.default_rng(1)
+    curves = []
+    for t, n, k in (("a", 30, 1.0), ("b", 10, 1.5)):
+        depth = np.linspace(0.1, 2, n)
+        curves.append(Curve("T", t, None, 0.0, depth, k * depth + 0.01 * rng.normal(size=n)))
+    rows = [dataclasses.replace(DEFAULTS["k_1"], scale="linear", value=1.0)]
+    zero = {"lower": -1.0, "value": 0.0, "fixed": True}
+    rows += [dataclasses.replace(DEFAULTS[n], **zero) for n in ("k_3", "onset", "force_offset")]
+    problem = build(curves, table_1(), Options(coupling="total", onset_width=0.0), rows)
+    result = fit(problem, ONE)
+    D, F = (np.concatenate([getattr(c, n) for c in curves]) for n in ("displacement", "force"))
+    best = (D @ F) / (D @ D)
+    assert abs(result.value[0, 0] - best) > 0.03
+    np.testing.assert_allclose(mode(result).theta[0, 0], best, rtol=1e-6)
+
+
+def test_poor_chains_are_said_beside_the_estimates():
+    """No interval in report and table, a sentence under the estimates, empty cells, exit code 1."""
+    drawn = made(1.55, 8.0, 0)
+    seen = predictions(drawn.result.problem, drawn.result.theta)
+    text = report_text("T", drawn.result, [], seen, None, drawn=drawn)
+    estimates = text.partition("## Estimates")[2].partition("## What")[0]
+    assert "The posterior of 1 of 1 lanes is not to be trusted" in estimates
+    assert "poor: R-hat 1.550, 8 effective draws" in estimates
+    assert [row[2:4] + row[-1:] for row in posterior_rows(drawn, [0])] == [["–", "–", "poor"]] * 2
+    rows = list(rows_with_draws(drawn.result, None, None, None, drawn))
+    assert rows[0]["posterior_low95"] == rows[0]["posterior_median"] == ""
+    nothing = dict.fromkeys(("left_out", "profiles", "resampled", "influence", "population"))
+    found = Found(result=drawn.result, posterior=drawn, **nothing)
+    said = [item for item in overview(found) if isinstance(item, str)]
+    assert any("not to be trusted" in text for text in said)
+    assert posterior_failed(found)
+    fine = dataclasses.replace(found, posterior=made(1.0, 900.0, 0))
+    assert not posterior_failed(fine)
+
+
+@pytest.mark.slow
+def test_well_conditioned_lanes_are_those_of_quadrature(blackjax):
+    """Conditions 5 to 14, bounds and numbers of draws as users have them; 200 asked, more drawn."""
+    result = fit(default_study([(1.3, 0.4), (0.5, 1.0), (1.0, 0.6)]), ONE)
+    assert max(u.condition for u in result.uncertainty) < 20
+    drawn = posterior(result, draws=200)
+    for lane in range(3):
+        assert drawn.rhat[lane].max() < 1.01
+        assert drawn.ess[lane].min() > 400
+        low, _, high = quadrature(result.problem.curves[lane][0])
+        width = high - low
+        assert np.all(np.abs(drawn.lower[lane] - low) < 0.1 * width)
+        assert np.all(np.abs(drawn.upper[lane] - high) < 0.1 * width)
+        np.testing.assert_allclose(drawn.upper[lane] - drawn.lower[lane], width, rtol=0.1)
+    assert drawn.steps.max() > 200
 
 
 @pytest.mark.slow

@@ -166,7 +166,8 @@ def test_plots_of_many_lanes_and_of_nothing_finite(result, tmp_path):
         ("none", dataclasses.replace(seen, force=np.full_like(seen.force, np.nan))),
     ):
         (tmp_path / name).mkdir()
-        paths = draw_all(tmp_path / name, result, one)
+        paths, lost = draw_all(tmp_path / name, result, one)
+        assert (len(paths), lost) == (3, {})
         assert all(p.read_bytes()[:4] == b"\x89PNG" for p in paths)
 
 

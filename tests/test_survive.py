@@ -57,7 +57,7 @@ def peace(tmp_path_factory):
 def quietly(patch, folder):
     """Work in `folder`, without plots."""
     patch.chdir(folder)
-    patch.setattr("jaxtrachea.plots.draw_all", lambda *_: [])
+    patch.setattr("jaxtrachea.plots.draw_all", lambda *_: ([], {}))
     patch.setattr("jaxtrachea.webpage.page", lambda *_: "")
 
 

@@ -1,21 +1,20 @@
 """Which of several models the same curves prefer: information criteria and cross-validation."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from jaxtrachea.identify.criteria import weights
-from jaxtrachea.identify.fit import FitResult, Settings, fit
-from jaxtrachea.identify.predictions import lag_correlation, predictions, rms, without
+from jaxtrachea.identify.criteria import Criteria, weights
+from jaxtrachea.identify.effective import CORRELATED, effective_samples
+from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.predictions import predictions, rms
 from jaxtrachea.identify.problem import Problem
 
 #: Difference of AICc up to which models cannot be told apart, and from which on they clearly can
 #: (Burnham and Anderson 2002, sec. 2.6).
 ALIKE, DECISIVE = 2.0, 10.0
-#: Correlation of neighbouring residuals from which a difference of AICc says too much.
-CORRELATED = 0.3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -25,8 +24,8 @@ class Model:
     Attributes:
         name: for tables.
         result: the fit.
-        left_out: rms force residual at contact positions left out, over the largest force of the
-            lane; (lanes,), NaN where a lane has one position; None: not asked for.
+        left_out: rms force residual of what was left out, over the largest force of the lane;
+            (lanes,), NaN where a lane repeats nothing; None: not asked for.
     """
 
     name: str
@@ -51,6 +50,9 @@ class Row:
         delta: AICc less the smallest of the models.
         weight: Akaike weight.
         left_out: as `Model.left_out`; of all lanes the root mean square.
+        deflated: AICc with the deviance of as many samples as are independent, less the smallest of
+            the models; see `deflated`.
+        effective_samples: that many.
     """
 
     specimen: str
@@ -65,6 +67,8 @@ class Row:
     delta: float
     weight: float
     left_out: float
+    deflated: float
+    effective_samples: float
 
 
 def same_data(problems: Sequence[Problem], names: Sequence[str]) -> None:
@@ -114,53 +118,6 @@ def _same_noise(a: Problem, b: Problem) -> bool:
     return count == other and len(ours) == len(theirs) and all(same)
 
 
-def leave_position_out(
-    problem: Problem, settings: Settings, progress: Callable[[int, int], None] | None = None
-) -> Float[np.ndarray, " lanes"]:
-    """Fit every lane without each of its contact positions and predict the curves there.
-
-    Args:
-        problem: the study.
-        settings: as for `fit`.
-        progress: as for `fit`.
-
-    Returns:
-        Root mean square force residual of the curves left out, over the lane's largest force;
-        (lanes,), NaN where a lane has fewer than two positions or an unknown of a curve alone.
-    """
-    error = np.full(len(problem.curves), np.nan)
-    if any(p.scope == "trial" and not p.fixed for p in problem.parameters):
-        return error
-    lanes, held = _positions(problem)
-    if not len(lanes):
-        return error
-    chosen = problem.take(lanes)
-    result = fit(without(chosen, held), settings, progress)
-    seen = predictions(chosen, result.theta).force
-    solved = result.succeeded
-    missed = np.where((held & solved[:, None])[:, :, None], seen, np.nan)
-    for lane in np.unique(lanes):
-        mine = lanes == lane
-        if solved[mine].all():
-            peak = np.max(np.abs(problem.lanes.force[lane]))
-            error[lane] = float(rms(missed[mine].ravel())) / peak
-    return error
-
-
-def _positions(problem: Problem) -> tuple[np.ndarray, Bool[np.ndarray, "jobs T"]]:
-    """Lane of each position that can be left out, and which trials are there."""
-    lanes, held = [], []
-    for lane, curves in enumerate(problem.curves):
-        s = [c.s_c for c in curves]
-        places = list(dict.fromkeys(s))
-        for place in places if len(places) > 1 else ():
-            row = np.zeros(problem.lanes.s_c.shape[1], bool)
-            row[: len(s)] = [at == place for at in s]
-            lanes.append(lane)
-            held.append(row)
-    return np.array(lanes, int), np.array(held, bool).reshape(len(held), problem.lanes.s_c.shape[1])
-
-
 def compared(models: Sequence[Model]) -> tuple[list[Row], int]:
     """Rows of all lanes and of their sum, model by model, and lanes left out of the sum.
 
@@ -168,54 +125,100 @@ def compared(models: Sequence[Model]) -> tuple[list[Row], int]:
     lanes (one shares a parameter, another not) only the sum is compared.
     """
     names = [[m.result.problem.lane_name(k) for k in range(m.result.lanes)] for m in models]
+    worth = [_worth(m) for m in models]
     if any(n != names[0] for n in names):
         usable = [m.result.succeeded for m in models]
         if not all(u.all() for u in usable):
             return [], sum(int(np.sum(~u)) for u in usable)
-        return _rows("(all)", models, [np.arange(m.result.lanes) for m in models]), 0
+        return _rows("(all)", models, [np.arange(m.result.lanes) for m in models], worth), 0
     usable = np.all([m.result.succeeded for m in models], axis=0)
     rows = []
     for lane in np.flatnonzero(usable):
         specimen, trial = names[0][lane]
         label = specimen if trial == "(all)" else f"{specimen} {trial}"
-        rows += _rows(label, models, [np.array([lane])] * len(models))
+        rows += _rows(label, models, [np.array([lane])] * len(models), worth)
     every = np.flatnonzero(usable)
     if len(every) > 1:
-        rows += _rows("(all)", models, [every] * len(models))
+        rows += _rows("(all)", models, [every] * len(models), worth)
     return rows, int(np.sum(~usable))
 
 
-def _rows(specimen: str, models: Sequence[Model], lanes: Sequence[np.ndarray]) -> list[Row]:
-    """One row per model of the sum over its lanes."""
+def _worth(model: Model) -> Float[np.ndarray, " lanes"]:
+    """Independent samples that those of each lane are worth by the residuals of a model."""
+    result = model.result
+    worth = effective_samples(predictions(result.problem, result.theta))
+    return np.where(np.isnan(worth), np.asarray(result.samples, float), worth)
+
+
+def deflated(criteria: Criteria, share: Float[np.ndarray, " lanes"], at: np.ndarray) -> float:
+    """AICc of lanes, their deviances counted for independent samples only, unknowns in full.
+
+    Args:
+        criteria: of a model.
+        share: of the samples of each lane that is independent.
+        at: which lanes are summed.
+    """
+    penalty = criteria.AICc - criteria.deviance
+    return float(np.sum((criteria.deviance * share + penalty)[at]))
+
+
+def _rows(
+    specimen: str, models: Sequence[Model], lanes: Sequence[np.ndarray], worth: Sequence[np.ndarray]
+) -> list[Row]:
+    """One row per model of the sum over its lanes; samples are worth what the best model says."""
     of = [m.result.criteria for m in models]
     total = lambda v, at: float(np.sum(v[at]))  # noqa: E731
     AICc = np.array([total(c.AICc, at) for c, at in zip(of, lanes, strict=True)])
     with np.errstate(invalid="ignore"):
         delta = AICc - np.min(AICc)
-    share = weights(AICc)
+    best = int(np.argmin(AICc))
+    counts = [np.asarray(m.result.samples, float) for m in models]
+    share = [w / np.maximum(n, 1) for w, n in zip(worth, counts, strict=True)]
+    if all(len(s) == len(share[best]) for s in share):
+        share = [share[best]] * len(models)
+    else:  # other lanes: the sum's own share for all
+        mean = total(worth[best], lanes[best]) / max(total(counts[best], lanes[best]), 1)
+        share = [np.full(len(n), mean) for n in counts]
+    fair = np.array([deflated(c, s, at) for c, s, at in zip(of, share, lanes, strict=True)])
+    with np.errstate(invalid="ignore"):
+        fair = fair - fair[best]
+    weight = weights(AICc)
+    independent = total(worth[best], lanes[best])
     return [
         Row(
-            specimen, m.name, int(np.sum(c.unknowns[at])), int(np.sum(m.result.samples[at])),
-            total(m.result.cost, at), total(c.deviance, at), total(c.AIC, at), float(AICc[i]),
-            total(c.BIC, at), float(delta[i]), float(share[i]),
-            np.nan if m.left_out is None else float(rms(m.left_out[at])),
+            specimen=specimen,
+            model=m.name,
+            unknowns=int(np.sum(c.unknowns[at])),
+            samples=int(np.sum(m.result.samples[at])),
+            cost=total(m.result.cost, at),
+            deviance=total(c.deviance, at),
+            AIC=total(c.AIC, at),
+            AICc=float(AICc[i]),
+            BIC=total(c.BIC, at),
+            delta=float(delta[i]),
+            weight=float(weight[i]),
+            left_out=np.nan if m.left_out is None else float(rms(m.left_out[at])),
+            deflated=float(fair[i]),
+            effective_samples=independent,
         )
         for i, (m, c, at) in enumerate(zip(models, of, lanes, strict=True))
-    ]  # fmt: skip
+    ]
 
 
-def sentence(rows: Sequence[Row], correlated: bool) -> str:
+def sentence(rows: Sequence[Row], left: str = "positions") -> str:
     """Which model a specimen (or all) prefers, and whether that is decisive.
+
+    Decisive is a difference of AICc of `DECISIVE` or more that remains so for as many samples as
+    are independent, and that no prediction of what was left out contradicts.
 
     Args:
         rows: of one specimen, one per model.
-        correlated: neighbouring residuals of the best model are correlated.
+        left: what was left out, in words.
     """
     best, second = sorted(rows, key=lambda row: row.AICc)[:2]
     if not np.isfinite(best.AICc):
         return "too few samples to compare these models"
-    left = [row.left_out for row in rows]
-    known = np.isfinite(left).all()
+    known = np.isfinite([row.left_out for row in rows]).all()
     predicts = min(rows, key=lambda row: row.left_out).model if known else ""
     gap = second.AICc - best.AICc
     said = f"AICc {gap:.1f} below {second.model}"
@@ -225,21 +228,23 @@ def sentence(rows: Sequence[Row], correlated: bool) -> str:
             f"these data cannot tell {best.model} from {second.model} (AICc differs by {gap:.1f}); "
             f"{simple.model} has no more unknowns than the other"
         )
+    rival = min((row for row in rows if row is not best), key=lambda row: row.deflated)
+    correlated = best.effective_samples < (1 - CORRELATED) / (1 + CORRELATED) * best.samples
+    fair = (
+        f"{best.samples} correlated samples count as {best.effective_samples:.3g} independent ones"
+        f", which leave {max(rival.deflated, 0):.3g} to {rival.model}"
+    )
+    weak = correlated and not rival.deflated >= DECISIVE
     against = known and predicts != best.model
-    if gap >= DECISIVE and not correlated and not against:
-        more = ", and it predicts positions left out best" if known else ""
+    if gap >= DECISIVE and not weak and not against:
+        more = f"; {fair}" if correlated else ""
+        more += f"; and it predicts {left} left out best" if known else ""
         return f"the data prefer {best.model} decisively ({said}{more})"
     doubts = [
         (gap < DECISIVE, f"the difference is below {DECISIVE:g}"),
-        (correlated, "neighbouring residuals are correlated, so that it says too much"),
-        (against, f"{predicts} predicts positions left out better"),
+        (weak, fair),
+        (against, f"{predicts} predicts {left} left out better"),
     ]
     why = "; ".join(text for doubt, text in doubts if doubt)
-    why += "; positions left out agree with it" if known and not against else ""
+    why += f"; {left} left out agree with it" if known and not against else ""
     return f"the data prefer {best.model} ({said}), but not decisively: {why}"
-
-
-def is_correlated(model: Model) -> Bool[np.ndarray, " lanes"]:
-    """Lanes whose neighbouring force residuals are correlated."""
-    r = lag_correlation(predictions(model.result.problem, model.result.theta))
-    return np.nan_to_num(r) > CORRELATED

@@ -10,11 +10,14 @@ import jax
 import numpy as np
 
 from jaxtrachea.identify.chunks import divide, join, load, replaced, save
+from jaxtrachea.identify.effective import effective
 from jaxtrachea.identify.fit import FitResult, Settings
 from jaxtrachea.identify.former import read_hdf5
+from jaxtrachea.identify.predictions import predictions
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.results import lane_rows, write_csv
 from jaxtrachea.identify.run_folder import NoRun, RunFolder, digest
+from jaxtrachea.identify.summary import with_residuals
 
 #: A rerun of failed lanes has so many times more starts.
 MORE_STARTS = 4
@@ -127,7 +130,9 @@ def write_so_far(path: Path, run: RunFolder, problem: Problem) -> None:
     rows = []
     for k, lanes in enumerate(_chunks(run, problem)):
         part = _read(run, k, problem.take(lanes), lanes)
-        rows += [] if part is None else lane_rows(part)
+        if part is not None:
+            seen = predictions(part.problem, part.theta)
+            rows += with_residuals(part, list(lane_rows(part)), seen, effective(part, seen))
     try:
         write_csv(path, rows)
     except OSError:

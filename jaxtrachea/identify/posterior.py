@@ -6,24 +6,27 @@ sigma is sampled with the others, prior 1 / sigma: -n log sigma joins the cost, 
 robust loss as well, read as the density exp(-rho / 2). Bounds are mapped to the real line by a
 logistic function (Carpenter et al. 2017, doi:10.18637/jss.v076.i01); the chains start around the
 estimate, in coordinates whitened by its covariance, and adapt mass matrix and step in Stan's
-windows. R-hat and effective sample sizes are rank-normalised (Vehtari et al. 2021,
+windows. Lanes whose chains are not good go on by themselves, from where they are, whitened by the
+covariance of their own draws, adapted anew, with twice and then four times the draws; what they
+drew before is dropped. R-hat and effective sample sizes are rank-normalised (Vehtari et al. 2021,
 doi:10.1214/20-BA1221).
 """
 
-import contextlib
 import dataclasses
 import functools
 import importlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea.identify.chains import grade, lenient, mixing, quantiles
 from jaxtrachea.identify.cost import weights
 from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.posterior_start import Start, around_the_draws, around_the_fit, mode
 from jaxtrachea.identify.problem import Lane, Problem
 from jaxtrachea.identify.residual import observations, residual_value
 from jaxtrachea.identify.results import succeeded
@@ -31,9 +34,12 @@ from jaxtrachea.identify.solve import chunk_size
 
 #: Steps of each chain before its draws count.
 _WARM_UP = 500
-_ACCEPTANCE = 0.9
-#: What good chains reach, and what makes draws useless: R-hat, effective draws, share divergent.
-GOOD, POOR = (1.01, 400, 0.0), (1.05, 100, 0.02)
+#: Acceptance that the step is adapted to, by round: divergences ask for shorter ones.
+_ACCEPTANCE = (0.9, 0.97, 0.99)
+#: Draws of a lane whose chains are not good yet, in those asked for.
+_AGAIN = (2, 4)
+#: Doublings of a trajectory: well-whitened posteriors need 2 to 4; a limit to hopeless ones.
+_DOUBLINGS = 8
 
 
 class MissingSampler(ImportError):
@@ -49,6 +55,8 @@ class Posterior:
         theta: scaled coordinates; (lanes, C, D, P).
         sigma: of force (N) and markers (mm), drawn or given; (lanes, C, D, 2).
         divergent: transitions that failed; (lanes, C, D).
+        steps: of each chain that count; of more than D, D equally spaced ones are kept; (lanes,).
+        lost: share of them that failed; (lanes,).
         rhat: rank-normalised, split; (lanes, P).
         ess: effective draws, the smaller of bulk and tail; (lanes, P).
         median: in the parameter's unit; (lanes, P).
@@ -60,6 +68,8 @@ class Posterior:
     theta: Float[np.ndarray, "lanes C D P"]
     sigma: Float[np.ndarray, "lanes C D 2"]
     divergent: Bool[np.ndarray, "lanes C D"]
+    steps: Int[np.ndarray, " lanes"]
+    lost: Float[np.ndarray, " lanes"]
     rhat: Float[np.ndarray, "lanes P"]
     ess: Float[np.ndarray, "lanes P"]
     median: Float[np.ndarray, "lanes P"]
@@ -71,24 +81,9 @@ class Posterior:
         if not np.isfinite(self.theta[lane]).any():
             return "no draws"
         rhat, ess = np.nanmax(self.rhat[lane]), np.nanmin(self.ess[lane])
-        share = float(self.divergent[lane].mean())
+        share = float(self.lost[lane])
         says = f"R-hat {rhat:.3f}, {ess:.0f} effective draws, {100 * share:.2g} % divergent"
-        found = np.array([rhat, -ess, share])
-        beyond = lambda bar: not np.all(found <= (bar[0], -bar[1], bar[2]))  # noqa: E731
-        if not beyond(GOOD):
-            return f"good: {says}"
-        return f"poor: {says}" if beyond(POOR) else f"doubtful: {says}"
-
-
-class _Start(NamedTuple):
-    """Of one lane: x = centre + root y; Q unknowns and logarithms of noise on the real line.
-
-    In y the posterior is about standard normal, as the adaptation of mass matrices presumes.
-    """
-
-    centre: Float[np.ndarray, " Q"]
-    root: Float[np.ndarray, "Q Q"]
-    y: Float[np.ndarray, "C Q"]
+        return f"{grade(rhat, ess, share)}: {says}"
 
 
 def sampler() -> Any:
@@ -103,12 +98,6 @@ def sampler() -> Any:
         raise MissingSampler(
             "drawing from the posterior needs blackjax; pip install 'jaxtrachea[bayes]'"
         ) from None
-
-
-def to_line(theta, lower, upper):
-    """From inside the bounds to the real line."""
-    share = (theta - lower) / (upper - lower)
-    return np.log(share) - np.log1p(-share)
 
 
 def from_line(x: Float[Array, " P"], lane: Lane) -> Float[Array, " P"]:
@@ -147,38 +136,50 @@ def _spread(drawn: tuple[bool, bool], values: Array) -> Float[Array, "2"]:
     return out.at[jnp.flatnonzero(jnp.array(drawn), size=sum(drawn))].set(values)
 
 
-def _chain(problem: Problem, drawn, draws: int, lane: Lane, sigma, centre, root, y, key):
-    """Warm-up and draws of one chain: (D, Q) and whether each diverged."""
-    blackjax = sampler()
+def _density(problem: Problem, drawn, lane: Lane, sigma, centre, root):
+    """Log posterior where the sampler moves, and the way from there to the real line."""
     to_x = lambda y: centre + jnp.sum(root * y[None], axis=1)  # noqa: E731
-    density = lambda y: log_density(problem, drawn, lane, sigma, to_x(y))  # noqa: E731
-    warm, steps = jax.random.split(key)
+    return lambda y: log_density(problem, drawn, lane, sigma, to_x(y)), to_x
+
+
+def _warm_up(problem: Problem, drawn, acceptance, lane: Lane, sigma, centre, root, y, key):
+    """Place, step and inverse mass matrix of one chain after its warm-up."""
+    blackjax = sampler()
+    density, _ = _density(problem, drawn, lane, sigma, centre, root)
     adaptation = blackjax.window_adaptation(
-        blackjax.nuts, density, is_mass_matrix_diagonal=False,
-        target_acceptance_rate=_ACCEPTANCE, adaptation_info_fn=lambda *_: None,
+        blackjax.nuts, density, is_mass_matrix_diagonal=False, max_num_doublings=_DOUBLINGS,
+        target_acceptance_rate=acceptance, adaptation_info_fn=lambda *_: None,
     )  # fmt: skip
-    (state, tuned), _ = adaptation.run(warm, y, num_steps=_WARM_UP)
-    kernel = blackjax.nuts(density, **tuned)
+    (state, tuned), _ = adaptation.run(key, y, num_steps=_WARM_UP)
+    return state.position, tuned["step_size"], tuned["inverse_mass_matrix"]
+
+
+def _draw(problem: Problem, drawn, draws: int, lane: Lane, sigma, centre, root, warm, key):
+    """Draws of one chain on the real line, (D, Q), whether each diverged, and its last place."""
+    blackjax = sampler()
+    density, to_x = _density(problem, drawn, lane, sigma, centre, root)
+    y, step_size, inverse_mass = warm
+    kernel = blackjax.nuts(density, step_size, inverse_mass, max_num_doublings=_DOUBLINGS)
 
     def step(state, key):
         state, info = kernel.step(key, state)
         return state, (to_x(state.position), info.is_divergent)
 
-    return jax.lax.scan(step, state, jax.random.split(steps, draws))[1]
-
-
-@contextlib.contextmanager
-def _lenient():
-    """Blackjax mixes dtypes and ranks; a caller's strictness is for the caller's code."""
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        yield
+    state, (x, lost) = jax.lax.scan(step, kernel.init(y), jax.random.split(key, draws))
+    return x, lost, state.position
 
 
 @functools.lru_cache(maxsize=8)
 def _compiled(problem: Problem, drawn: tuple[bool, bool], draws: int):
-    chain = functools.partial(_chain, problem, drawn, draws)
-    chains = jax.vmap(chain, (None, None, None, None, 0, 0))
-    return jax.jit(jax.vmap(chains))
+    """Warm-up and drawing of many lanes of many chains."""
+
+    def many(chain):
+        return jax.vmap(jax.vmap(chain, (None, None, None, None, 0, 0)))
+
+    def warm_up(acceptance, *lanes):
+        return many(functools.partial(_warm_up, problem, drawn, acceptance))(*lanes)
+
+    return jax.jit(warm_up), jax.jit(many(functools.partial(_draw, problem, drawn, draws)))
 
 
 def posterior(
@@ -196,7 +197,7 @@ def posterior(
 
     Args:
         result: the fit.
-        draws: of each chain, after 500 steps of warm-up.
+        draws: of each chain, after 500 steps of warm-up; more where the chains are not good.
         chains: of each lane, 2 or more.
         seed: of the drawing.
         chunk: lanes computed together.
@@ -209,83 +210,83 @@ def posterior(
     if draws < 100 or chains < 2:
         raise ValueError(f"{draws} draws of {chains} chains; expected 100 of 2, or more")
     sampler()
-    problem, P = result.problem, result.problem.size
+    problem, base = result.problem, mode(result)
     markers = problem.lanes.joints is not None
     drawn = (not problem.noise_given[0], markers and not problem.noise_given[1])
     good = np.array([k for k in range(result.lanes) if succeeded(result, k)], int)
-    shape = (result.lanes, chains, draws)
-    theta, sigma = np.full((*shape, P), np.nan), np.full((*shape, 2), np.nan)
-    divergent = np.zeros(shape, bool)
+    found = _empty(result, chains, draws)
     chunk = chunk_size(max(len(good), 1), chunk)
-    run = _compiled(problem.program, drawn, draws)
     for first in range(0, len(good), chunk):
-        left = len(good) - first
-        of = good[np.minimum(np.arange(first, first + chunk), len(good) - 1)]
-        lane = jax.tree.map(lambda v, of=of: v[of], problem.lanes)
-        starts = [_start(result, int(k), drawn, chains, seed) for k in of]
-        keys = [jax.random.split(jax.random.fold_in(jax.random.key(seed), k), chains) for k in of]
-        with _lenient():
-            x, lost = run(
-                lane, result.whitened_sigma[of], *map(np.stack, zip(*starts, strict=True)),
-                jnp.stack(keys),
-            )  # fmt: skip
-        of, x, lost = of[:left], np.asarray(x)[:left], np.asarray(lost)[:left]
-        low, high = (v[of][:, None, None] for v in (problem.lanes.lower, problem.lanes.upper))
-        theta[of] = low + (high - low) / (1 + np.exp(-x[..., :P]))
-        noise = np.zeros((*x.shape[:-1], 2))
-        noise[..., np.flatnonzero(drawn)] = x[..., P:]
-        sigma[of] = result.sigma[of][:, None, None] * np.exp(noise)
-        divergent[of] = lost
+        of = good[first : first + chunk]
+        start = {int(k): around_the_fit(base, int(k), drawn, chains, seed) for k in of}
+        for again, times in enumerate((1, *_AGAIN)):
+            if not start:
+                break
+            x, lost = _run(base, drawn, draws, times, start, chunk, (seed, again))
+            start = _keep(found, base, drawn, start, x, lost)
         if progress is not None:
             progress(len(of), len(good))
-    theta = np.where((problem.lanes.active > 0)[:, None, None], theta, np.nan)
-    return Posterior(result, theta, sigma, divergent, *_mixing(theta), *_quantiles(result, theta))
+    return found
 
 
-def _start(result: FitResult, lane: int, drawn, chains: int, seed: int) -> _Start:
-    """Around the estimate, its covariance on the real line, inside the bounds."""
-    lanes, u = result.problem.lanes, result.uncertainty[lane]
-    P, active = result.problem.size, lanes.active[lane] > 0
-    width = np.where(active, lanes.upper[lane] - lanes.lower[lane], 1)
-    low = np.where(active, lanes.lower[lane], -0.5)
-    share = np.clip((result.theta[lane] - low) / width, 1e-3, 1 - 1e-3)
-    se = np.where(np.isfinite(u.se), u.se, 0.3 * width)
-    slope = width * share * (1 - share)
-    deviation = np.where(active, np.clip(se / slope, 1e-8, 2), 1)
-    known = np.isfinite(u.correlation) & np.isfinite(u.se)[:, None] & np.isfinite(u.se)
-    correlation = np.where(known, 0.99 * np.clip(u.correlation, -1, 1), 0)
-    np.fill_diagonal(correlation, 1)
-    Q = P + sum(drawn)
-    covariance = np.eye(Q) / max(2 * result.samples[lane], 1)
-    covariance[:P, :P] = correlation * np.outer(deviation, deviation)
-    centre = np.append(np.where(active, to_line(share, 0, 1), 0), np.zeros(Q - P))
-    rng = np.random.default_rng([seed, lane])
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0))
-    return _Start(centre, root, rng.normal(size=(chains, Q)))
+def _empty(result: FitResult, chains: int, draws: int) -> Posterior:
+    """Nothing drawn yet."""
+    lanes, P = result.theta.shape
+    shape, nan = (lanes, chains, draws), np.full((lanes, P), np.nan)
+    return Posterior(
+        result=result, theta=np.full((*shape, P), np.nan), sigma=np.full((*shape, 2), np.nan),
+        divergent=np.zeros(shape, bool), steps=np.zeros(lanes, int), lost=np.zeros(lanes),
+        rhat=nan.copy(), ess=nan.copy(), median=nan.copy(), lower=nan.copy(), upper=nan.copy(),
+    )  # fmt: skip
 
 
-def _mixing(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R-hat and effective sample size of every unknown; (lanes, P) each."""
-    diagnostics = importlib.import_module("blackjax.diagnostics")
-    rhat, ess = (np.full((theta.shape[0], theta.shape[-1]), np.nan) for _ in range(2))
-    with _lenient():
-        for lane in np.flatnonzero(np.isfinite(theta).any(axis=(1, 2, 3))):
-            known = np.isfinite(theta[lane]).all(axis=(0, 1))
-            draws = jnp.asarray(theta[lane][..., known])
-            rhat[lane, known] = diagnostics.rhat(draws)
-            tail = np.asarray(diagnostics.ess_tail(draws))
-            ess[lane, known] = np.minimum(diagnostics.ess_bulk(draws), tail)
-    return rhat, ess
+def _run(base: FitResult, drawn, draws: int, times: int, start: dict[int, Start], chunk: int, salt):
+    """Warm up and draw `times` times: (lanes, C, times D, Q) on the real line, and what diverged.
+
+    The lanes are filled up to `chunk`, so that one program serves all rounds.
+    """
+    lanes = list(start)
+    of = np.array(lanes + [lanes[-1]] * (chunk - len(lanes)))
+    lane = jax.tree.map(lambda v: v[of], base.problem.lanes)
+    chains, (seed, again) = len(start[lanes[0]].y), salt
+    places = map(np.stack, zip(*(start[int(k)] for k in of), strict=True))
+    centre, root, y = places
+    warm_up, draw = _compiled(base.problem.program, drawn, draws)
+
+    def keys(turn: int):
+        key = jax.random.fold_in(jax.random.key(seed), again * 1000 + turn)
+        return jnp.stack([jax.random.split(jax.random.fold_in(key, k), chains) for k in of])
+
+    sigma, parts = base.whitened_sigma[of], []
+    with lenient():
+        warm = warm_up(_ACCEPTANCE[again], lane, sigma, centre, root, y, keys(0))
+        for turn in range(times):
+            x, lost, last = draw(lane, sigma, centre, root, warm, keys(1 + turn))
+            warm = (last, *warm[1:])
+            parts.append((np.asarray(x), np.asarray(lost)))
+    whole = (np.concatenate(v, axis=2)[: len(lanes)] for v in zip(*parts, strict=True))
+    return tuple(whole)
 
 
-def _quantiles(result: FitResult, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Median and 95 % interval in the unit of each parameter."""
-    middle, lower, upper = (np.full(result.theta.shape, np.nan) for _ in range(3))
-    for lane, unknowns in enumerate(result.problem.unknowns):
-        for i, (p, _, _) in enumerate(unknowns):
-            if np.isfinite(theta[lane, ..., i]).all():
-                ends = np.quantile(theta[lane, ..., i], [0.5, 0.025, 0.975])
-                values = (p.from_scaled(float(v)) for v in ends)
-                middle[lane, i], lower[lane, i], upper[lane, i] = values
-    return middle, lower, upper
+def _keep(found: Posterior, base: FitResult, drawn, start, x, lost) -> dict[int, Start]:
+    """Put the draws of some lanes in their places; returns where those not good go on."""
+    lanes, P = base.problem.lanes, base.problem.size
+    more = {}
+    for lane, own, failed in zip(start, x, lost, strict=True):
+        low, high = lanes.lower[lane], lanes.upper[lane]
+        theta = low + (high - low) / (1 + np.exp(-own[..., :P]))
+        theta = np.where(lanes.active[lane] > 0, theta, np.nan)
+        noise = np.zeros((*own.shape[:-1], 2))
+        noise[..., np.flatnonzero(drawn)] = own[..., P:]
+        times = own.shape[1] // found.theta.shape[2]
+        found.theta[lane] = theta[:, times - 1 :: times]
+        found.sigma[lane] = base.sigma[lane] * np.exp(noise[:, times - 1 :: times])
+        found.divergent[lane] = failed[:, times - 1 :: times]
+        found.steps[lane], found.lost[lane] = own.shape[1], failed.mean()
+        found.rhat[lane], found.ess[lane] = mixing(theta)
+        for name, values in zip(("median", "lower", "upper"), quantiles(base, lane, theta),
+                                strict=True):  # fmt: skip
+            getattr(found, name)[lane] = values
+        if not found.verdict(lane).startswith("good"):
+            more[lane] = around_the_draws(own)
+    return more

@@ -12,7 +12,9 @@ from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.results import parameter_rows
 from jaxtrachea.identify.whole_files import hdf5_file
 
-_DATASETS = ("theta", "sigma", "divergent", "rhat", "ess", "median", "lower", "upper")
+_DATASETS = (
+    "theta", "sigma", "divergent", "steps", "lost", "rhat", "ess", "median", "lower", "upper",
+)  # fmt: skip
 
 
 def rows_with_draws(
@@ -22,7 +24,10 @@ def rows_with_draws(
     population: Population | None,
     drawn: Posterior | None,
 ) -> Iterator[dict[str, Any]]:
-    """`parameter_rows`, with the posterior where there is one."""
+    """`parameter_rows`, with the posterior where there is one.
+
+    What poor chains say is left out: it stands in results.h5 for those who want to look into it.
+    """
     rows = parameter_rows(result, profiles, resampled, population)
     if drawn is None:
         yield from rows
@@ -30,14 +35,19 @@ def rows_with_draws(
     places = ((k, i) for k, unknowns in enumerate(result.problem.unknowns)
               for i in range(len(unknowns)))  # fmt: skip
     for (lane, i), row in zip(places, rows, strict=True):
-        yield row | {
-            "posterior_median": float(drawn.median[lane, i]),
-            "posterior_low95": float(drawn.lower[lane, i]),
-            "posterior_high95": float(drawn.upper[lane, i]),
-            "posterior_rhat": float(drawn.rhat[lane, i]),
-            "posterior_ess": float(drawn.ess[lane, i]),
-            "posterior_verdict": drawn.verdict(lane),
-        }
+        verdict = drawn.verdict(lane)
+        poor = verdict.startswith("poor")
+        ends = {"median": drawn.median, "low95": drawn.lower, "high95": drawn.upper}
+        cells = {f"posterior_{name}": "" if poor else float(v[lane, i]) for name, v in ends.items()}
+        yield (
+            row
+            | cells
+            | {
+                "posterior_rhat": float(drawn.rhat[lane, i]),
+                "posterior_ess": float(drawn.ess[lane, i]),
+                "posterior_verdict": verdict,
+            }
+        )
 
 
 def write_draws(path: Path, drawn: Posterior) -> None:

@@ -1,6 +1,5 @@
 """What a fit found, as rows and files: HDF5, CSV, provenance (docs/results.md)."""
 
-import csv
 import datetime
 import hashlib
 import json
@@ -18,9 +17,11 @@ from jaxtrachea.identify.journal import installed
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.population import Population
 from jaxtrachea.identify.profile import Profiles
+from jaxtrachea.identify.rows import row_places, samples_of, trials_of
 from jaxtrachea.identify.usage_tables import lane_cells
 from jaxtrachea.identify.verdict import VERDICTS, describe_flat, verdict
 from jaxtrachea.identify.whole_files import hdf5_file
+from jaxtrachea.spreadsheet import write_csv as write_csv
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 SCHEMA = "jaxtrachea-results"
@@ -79,11 +80,20 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
 
 
 def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[dict[str, object]]:
-    """One row per lane for summary.csv; trial-wise unknowns are left to parameters.csv."""
-    for lane in range(result.lanes):
-        specimen, trial = result.problem.lane_name(lane)
+    """Rows of summary.csv, see `row_places`.
+
+    What a specimen has several of (unknowns of single trials) is left to parameters.csv, and named
+    in the column `more`. Of a lane of several specimens, everything but the unknowns, `samples` and
+    `rms_over_peak`'s peak is that of the lane.
+    """
+    for lane, one in row_places(result):
         status = FitStatus(int(result.status[lane]))
-        peak = peak_force(result, lane)
+        trials = trials_of(result, lane, one)
+        curves = [result.problem.curves[lane][t] for t in trials]
+        peak = max(float(np.max(np.abs(c.force))) for c in curves)
+        specimen, trial = result.problem.lane_name(lane)
+        if one:
+            specimen, trial = one, curves[0].trial if len(curves) == 1 else "(all)"
         row: dict[str, object] = {
             "specimen": specimen,
             "trial": trial,
@@ -92,8 +102,8 @@ def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[d
             "iterations": int(result.iterations[lane]),
             "starts_agreeing": int(result.converged_starts[lane]),
             "starts": int(result.tried[lane]),
-            "samples": int(result.samples[lane]),
-            **lane_cells(result.problem.curves[lane]),
+            "samples": samples_of(result, lane, trials) if one else int(result.samples[lane]),
+            **lane_cells(curves),
             "cost": float(result.cost[lane]),
             "rms_force_N": float(result.rms[lane, 0]),
             "rms_over_peak": float(result.rms[lane, 0]) / peak if peak > 0 else float("nan"),
@@ -105,18 +115,31 @@ def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[d
             "AICc": float(result.criteria.AICc[lane]),
             "BIC": float(result.criteria.BIC[lane]),
         }
-        for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
-            label = unknown_label(result, lane, i)
-            if label != p.name:
-                continue
-            row |= {
-                f"{label} [{p.unit}]": float(result.value[lane, i]),
-                f"{label} se": float(result.standard_error[lane, i]),
-                f"{label} low95": float(result.lower[lane, i]),
-                f"{label} high95": float(result.upper[lane, i]),
-                f"{label} verdict": verdict_of(result, lane, i, profiles),
-            }
-        yield row
+        yield row | _unknown_cells(result, lane, one, profiles)
+
+
+def _unknown_cells(
+    result: FitResult, lane: int, specimen: str, profiles: Profiles | None
+) -> dict[str, object]:
+    """What a row of summary.csv says of the unknowns of its specimen."""
+    unknowns = result.problem.unknowns[lane]
+    own = [i for i, u in enumerate(unknowns) if not specimen or u[1] in ("", specimen)]
+    cells: dict[str, object] = {}
+    more = []
+    for i in own:
+        p = unknowns[i][0]
+        if sum(unknowns[k][0].name == p.name for k in own) > 1:
+            more.append(unknown_label(result, lane, i))
+            continue
+        cells |= {
+            f"{p.name} [{p.unit}]": float(result.value[lane, i]),
+            f"{p.name} se": float(result.standard_error[lane, i]),
+            f"{p.name} low95": float(result.lower[lane, i]),
+            f"{p.name} high95": float(result.upper[lane, i]),
+            f"{p.name} verdict": verdict_of(result, lane, i, profiles),
+        }
+    said = f"{', '.join(more)}: see parameters.csv" if more else ""
+    return cells | ({"more": said} if more else {})
 
 
 def verdict_of(result: FitResult, lane: int, i: int, profiles: Profiles | None = None) -> str:
@@ -226,15 +249,6 @@ def profile_rows(profiles: Profiles) -> Iterator[dict[str, object]]:
                 "statistic": float(statistic),
                 "threshold": float(profiles.threshold[k]),
             }
-
-
-def write_csv(path: Path, rows: list[dict[str, object]]) -> None:
-    """Write rows that may have different keys; missing cells are empty."""
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, columns, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def write_text(path: Path, text: str) -> None:

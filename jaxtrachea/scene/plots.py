@@ -1,6 +1,8 @@
 """Pictures of simulations and sweeps (matplotlib without a global backend)."""
 
 import textwrap
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from jaxtrachea.pictures import plain
 from jaxtrachea.scene.simulation import Simulation, Sweep
 from jaxtrachea.scene.stage import Scene
 
@@ -53,7 +56,8 @@ def draw_surface(scene: Scene, vertices: np.ndarray, title: str = "", span: floa
     axis.set_position((0, 0, 0.86, 0.95))
     scale = ScalarMappable(Normalize(0, top), "viridis")
     figure.colorbar(scale, cax=figure.add_axes((0.88, 0.2, 0.02, 0.6)), label="displacement [mm]")
-    figure.text(0.43, 0.93, textwrap.fill(title, 55), ha="center", fontsize=10)
+    lines = [plain(line, 56) for line in textwrap.wrap(title, 55)[:3]]
+    figure.text(0.43, 0.93, "\n".join(lines), ha="center", fontsize=10)
     return figure
 
 
@@ -90,10 +94,10 @@ def draw_map(s, phi, values: np.ndarray, label: str) -> Figure:
     return figure
 
 
-def draw_sweep(s, phi, out: Sweep) -> dict[str, Figure]:
-    """Maps of force and compliance by file name."""
+def draw_sweep(s, phi, out: Sweep) -> dict[str, Callable[[], Figure]]:
+    """What draws maps of force and compliance, by file name."""
     grid = lambda v: np.asarray(v).reshape(len(s), len(phi))  # noqa: E731
     return {
-        "force.png": draw_map(s, phi, grid(out.force), "force [N]"),
-        "compliance.png": draw_map(s, phi, grid(out.compliance), "compliance [mm/N]"),
+        "force.png": partial(draw_map, s, phi, grid(out.force), "force [N]"),
+        "compliance.png": partial(draw_map, s, phi, grid(out.compliance), "compliance [mm/N]"),
     }

@@ -6,6 +6,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from jaxtrachea.pictures import plain
 from jaxtrachea.plots import STYLE
 
 #: An error up to this is drawn as exact, left of all others.
@@ -24,7 +25,7 @@ def draw(points: list[dict[str, Any]], title: str) -> Figure:
     """
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(11.6, 7.6), layout="constrained")
-        figure.suptitle(title)
+        figure.suptitle(plain(title, 100))
         colours = _colours(points)
         for axis, panel in zip(figure.subplots(2, 2).flat, PANELS, strict=True):
             _panel(axis, points, panel, colours)
@@ -93,10 +94,10 @@ def _panel(axis, points, panel: str, colours) -> None:
         on = np.array([p["ladder"] == name for p in shown])
         up = np.maximum(high[on] - y[on], 0)
         axis.errorbar(x[on], y[on], yerr=[0 * up, up], fmt="o-", ms=4, lw=0.8, elinewidth=0.6,
-                      color=colours[name], label=name)  # fmt: skip
+                      color=colours[name], label=plain(name))  # fmt: skip
         if not gradient:
             for i in np.flatnonzero(on & np.isfinite(x) & ~exact):
-                axis.annotate(shown[i]["level"], (x[i], y[i]), fontsize=6, xytext=(3, 3),
+                axis.annotate(plain(shown[i]["level"]), (x[i], y[i]), fontsize=6, xytext=(3, 3),
                               textcoords="offset points")  # fmt: skip
     front = pareto(x, y)
     axis.step(x[front], y[front], where="post", color="k", lw=0.8, label="Pareto front")

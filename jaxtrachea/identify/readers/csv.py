@@ -26,6 +26,7 @@ from jaxtrachea.identify.readers.text import (
     split_cells,
     time_values,
 )
+from jaxtrachea.spreadsheet import unquoted
 from jaxtrachea.units import column_unit, parse_quantity
 
 NUMERIC = ("s", "phi", "displacement", "force", "sigma")
@@ -138,7 +139,8 @@ def _group(
     last = None
     for i, row in enumerate(table.rows):
         specimen, trial = (
-            row[roles[role]] if role in roles else fixed[role] for role in ("specimen", "trial")
+            unquoted(row[roles[role]]) if role in roles else fixed[role]
+            for role in ("specimen", "trial")
         )
         key = (specimen, trial)
         if key == last:

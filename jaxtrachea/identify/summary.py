@@ -1,0 +1,62 @@
+"""What the residuals add to the rows of summary.csv and parameters.csv, and left_out.csv."""
+
+import numpy as np
+
+from jaxtrachea.identify.effective import Effective
+from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.predictions import LeftOut, Prediction, rms
+from jaxtrachea.identify.results import said_before
+from jaxtrachea.identify.rows import row_places, trials_of
+
+
+def with_residuals(
+    result: FitResult, rows: list[dict[str, object]], seen: Prediction, wide: Effective
+) -> list[dict[str, object]]:
+    """Rows of `lane_rows`; that of one specimen among several of a lane has its own residuals."""
+    out = []
+    for (lane, specimen), row in zip(row_places(result), rows, strict=True):
+        cells: dict[str, object] = {}
+        if specimen:
+            trials = trials_of(result, lane, specimen)
+            own = float(rms(seen.force[lane, trials].ravel()))
+            curves = [result.problem.curves[lane][t] for t in trials]
+            peak = max(float(np.max(np.abs(c.force))) for c in curves)
+            cells = {"rms_force_N": own, "rms_over_peak": own / peak if peak > 0 else np.nan}
+            if seen.joints is not None:
+                cells["rms_joints_mm"] = float(rms(seen.joints[lane, trials].ravel()))
+        cells |= {
+            "residual_correlation": float(wide.correlation[lane]),
+            "effective_samples": float(wide.samples[lane]),
+        }
+        out.append(row | cells)
+    return out
+
+
+def widened_rows(
+    result: FitResult, rows: list[dict[str, object]], wide: Effective
+) -> list[dict[str, object]]:
+    """Rows of `parameter_rows` with the intervals for correlated residuals."""
+    every, out = range(result.lanes), iter(rows)
+    return [
+        next(out)
+        | {
+            "low95_widened": float(wide.lower[lane, i]),
+            "high95_widened": float(wide.upper[lane, i]),
+        }
+        for lane in every
+        for i in range(len(result.problem.unknowns[lane]))
+        if not said_before(result, every, lane, i)
+    ]
+
+
+def left_out_cells(result: FitResult, left_out: LeftOut) -> list[dict[str, object]]:
+    """Rows of left_out.csv: a curve left out and its errors each."""
+    errors = (left_out.ratio, left_out.force, left_out.joints)
+    rows = []
+    for k, t, *values in zip(left_out.lane, left_out.trial, *errors, strict=True):
+        curve = result.problem.curves[k][t]
+        names = ("force_over_model", "rms_over_peak", "rms_joints_over_displacement")
+        row: dict[str, object] = {"specimen": curve.specimen, "trial": curve.trial}
+        out = zip(names, values, strict=True)
+        rows.append(row | {name: float(v) for name, v in out})
+    return rows

@@ -1,0 +1,75 @@
+"""What users named, as plain text in pictures; pictures saved so that a bad one costs only itself.
+
+matplotlib reads text between two `$` as mathematics, and hides labels that start with `_`.
+"""
+
+import io
+import re
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+#: Characters of a name in a picture; beyond it, an ellipsis.
+LONGEST = 48
+
+
+def plain(name: str, longest: int = LONGEST) -> str:
+    """A name as matplotlib shall show it: one line, no mathematics, not hidden, not endless.
+
+    Args:
+        name: any text.
+        longest: characters that are shown.
+    """
+    words = " ".join("".join(c if c.isprintable() else " " for c in name).split())
+    short = words if len(words) <= longest else f"{words[: longest - 1]}…"
+    # matplotlib draws "\$" as "$", and what holds no other "$" is no mathematics.
+    safe = short.replace("$", r"\$")
+    return f" {safe}" if safe.startswith("_") else safe
+
+
+def save_each(
+    folder: Path, drawings: Mapping[str, Callable[[], Any]], **options: Any
+) -> tuple[list[Path], dict[str, str]]:
+    """Draw and write every picture; one that fails is left out, whatever it failed of.
+
+    Args:
+        folder: where to.
+        drawings: file name, with its ending, to what returns the figure.
+        options: of `Figure.savefig`.
+
+    Returns:
+        The files written, and for those that are not, why.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    paths, lost = [], {}
+    for name, draw in drawings.items():
+        memory = io.BytesIO()
+        try:
+            with warnings.catch_warnings():
+                # A letter that the font has not got is drawn as a box.
+                warnings.filterwarnings("ignore", message=r"(?s).*Glyph .* missing")
+                draw().savefig(memory, format=Path(name).suffix[1:], **options)
+        except Exception as error:  # noqa: BLE001 (a picture is worth less than the numbers)
+            lost[name] = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+            continue
+        paths.append(folder / name)
+        paths[-1].write_bytes(memory.getvalue())
+    return paths, lost
+
+
+def sentence(name: str, reason: str) -> str:
+    """What stands in the place of a picture that could not be drawn."""
+    return f"the picture {name} could not be drawn ({reason}); all numbers are written"
+
+
+def without_lost(text: str, lost: Mapping[str, str]) -> str:
+    """The text of a report with words where pictures would be that could not be drawn."""
+    for name, reason in lost.items():
+        words = f"**No {name}**: {sentence(name, reason)}."
+        text = re.sub(
+            rf"^!\[[^\n]*\]\({re.escape(name)}\)$", lambda _, w=words: w, text, flags=re.M
+        )
+    return text

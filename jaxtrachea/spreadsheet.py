@@ -1,0 +1,45 @@
+"""Text that a spreadsheet would run as a formula, in CSV files that people open with one.
+
+A cell that starts a formula is written behind an apostrophe, as OWASP recommends ("CSV injection",
+https://owasp.org/www-community/attacks/CSV_Injection); `unquoted` takes it away again.
+"""
+
+import csv
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+#: What spreadsheets take for the start of a formula, full-width forms included.
+FORMULA = "=+-@\t\r\n＝＋－＠"  # noqa: RUF001
+_STARTS = re.compile(f"'*[{re.escape(FORMULA)}]")
+_QUOTED = re.compile(f"'+[{re.escape(FORMULA)}]")
+
+
+def quoted(cell: object) -> object:
+    """The cell, behind an apostrophe if it is text that starts a formula; numbers as they are.
+
+    Apostrophes before such a character count as part of it, so that `unquoted` undoes this always.
+    """
+    return f"'{cell}" if isinstance(cell, str) and _STARTS.match(cell) else cell
+
+
+def unquoted(text: str) -> str:
+    """The text that `quoted` was given."""
+    return text[1:] if _QUOTED.match(text) else text
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    """Write rows that may have different keys; missing cells are empty, formulas are quoted."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow([quoted(name) for name in columns])
+        writer.writerows([[quoted(row.get(name, "")) for name in columns] for row in rows])
+
+
+def read_csv(path: Path) -> list[dict[str, Any]]:
+    """Rows of a file that `write_csv` wrote, all cells as text."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        rows = csv.DictReader(stream)
+        return [{unquoted(k): unquoted(v) for k, v in row.items()} for row in rows]

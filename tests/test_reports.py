@@ -1,0 +1,351 @@
+"""What people read of a fit: names of any kind, tables and what they leave out, wider errors."""
+
+import csv
+import dataclasses
+import io
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from rich.console import Console
+from run_cli import run
+
+from jaxtrachea.identify import results
+from jaxtrachea.identify.effective import effective, share_independent
+from jaxtrachea.identify.fit import Settings, fit
+from jaxtrachea.identify.influence import influence
+from jaxtrachea.identify.measurements import Curve, read_measurements
+from jaxtrachea.identify.parameters import DEFAULTS
+from jaxtrachea.identify.predictions import predictions
+from jaxtrachea.identify.problem import Noise, build
+from jaxtrachea.identify.rows import worst_first
+from jaxtrachea.identify.summary import with_residuals
+from jaxtrachea.model import Options
+from jaxtrachea.overview import overview
+from jaxtrachea.pictures import plain, save_each, without_lost
+from jaxtrachea.plots import STYLE, draw_all
+from jaxtrachea.report import report_text
+from jaxtrachea.sections import REASONS, influence_cell, influence_section
+from jaxtrachea.spreadsheet import quoted, read_csv, unquoted, write_csv
+from jaxtrachea.status import FitStatus
+from jaxtrachea.terminal_table import wide_table
+from jaxtrachea.trachea.geometry import table_1
+from jaxtrachea.webpage import page
+
+NAMES = ["$a$", "a_b$", r"$\frac{$", "=1+1", "<script>", "a|b", "two\nlines", "x" * 200, "🫁",
+         "_hidden", "[bold]", ":smile:", r"\$x$"]  # fmt: skip
+DEPTH = np.linspace(0.1, 2, 12)
+BONDED = Options(coupling="total", contact="bonded", onset_width=0.0)
+ONE = Settings(starts=1, more_starts=0)
+
+
+def table(**changes):
+    """k_1 and k_3 linear, per specimen; onset and offset fixed; unless changed."""
+    usual = {"lower": -1e3, "scale": "linear", "scope": "specimen", "value": 1.0}
+    rows = [dataclasses.replace(DEFAULTS[n], **usual | changes.get(n, {})) for n in ("k_1", "k_3")]
+    rest = [
+        dataclasses.replace(DEFAULTS[n], **changes.get(n, {})) for n in ("onset", "force_offset")
+    ]
+    return [*rows, *rest]
+
+
+def curve(specimen, trial="a", k=1.0, noise=0.0, seed=0):
+    scatter = noise * np.random.default_rng(seed).normal(size=DEPTH.size)
+    return Curve(specimen, trial, None, 0.0, DEPTH, k * DEPTH + 0.1 * DEPTH**3 + scatter)
+
+
+@pytest.fixture(scope="module")
+def many():
+    """Fourteen lanes, the later the noisier, of names that no program expects; the third failed."""
+    names = [*NAMES, "last"]
+    problem = build(
+        [curve(n, noise=1e-3 * (i + 1), seed=i) for i, n in enumerate(names)],
+        table_1(), BONDED, table(),
+    )  # fmt: skip
+    result = fit(problem, ONE)
+    status = result.status.copy()
+    status[2] = FitStatus.MAX_ITERATIONS
+    return dataclasses.replace(result, status=status)
+
+
+def shown(items, width=80):
+    """What a terminal of this width shows."""
+    console = Console(width=width, file=io.StringIO(), force_terminal=False)
+    for item in items:
+        console.print(item if isinstance(item, str) else wide_table(*item), emoji=False)
+    return console.file.getvalue()
+
+
+def found(result, **more):
+    """As `cli_run.Found`."""
+    nothing = dict.fromkeys(("left_out", "profiles", "resampled", "influence", "posterior",
+                             "population"))  # fmt: skip
+    return SimpleNamespace(result=result, **nothing | more)
+
+
+def test_formulas_are_quoted_and_read_back(tmp_path):
+    """Every start that OWASP names; numbers and harmless text stay; names are read back."""
+    texts = ["=1+1", "+1", "-1", "@SUM(A1)", "\tx", "\rx", "＝1", "'=1", "''-1", "'tis", "a=b", ""]
+    assert [quoted(t) for t in texts[:6]] == ["'" + t for t in texts[:6]]
+    assert [unquoted(quoted(t)) for t in texts] == texts
+    assert quoted("a=b") == "a=b"
+    assert quoted(-1.5) == -1.5
+    rows = [{"specimen": t, "=head": -1.5} for t in texts]
+    write_csv(tmp_path / "t.csv", rows)
+    with (tmp_path / "t.csv").open(newline="", encoding="utf-8") as stream:
+        cells = [row for row in csv.reader(stream)][1:]
+    assert all(cell[0][:1] not in tuple("=+-@\t\r＝") or not cell[0] for cell in cells)
+    assert all(cell[1] == "-1.5" for cell in cells)
+    back = read_csv(tmp_path / "t.csv")
+    assert [row["specimen"] for row in back] == texts
+    (tmp_path / "d.csv").write_text(
+        "specimen,trial,s [mm],displacement [mm],force [N]\n"
+        + "".join(f"'=1+1,'-2,30,{d},{d}\n" for d in (0.1, 0.5, 1.0, 1.5))
+    )
+    read = read_measurements([tmp_path / "d.csv"]).curves[0]
+    assert (read.specimen, read.trial) == ("=1+1", "-2")
+
+
+def test_summary_quotes_what_specimens_are_called(many, tmp_path):
+    results.write_csv(tmp_path / "s.csv", list(results.lane_rows(many)))
+    with (tmp_path / "s.csv").open(newline="", encoding="utf-8") as stream:
+        names = [row["specimen"] for row in csv.DictReader(stream)]
+    assert names[3] == "'=1+1"
+    assert [row["specimen"] for row in read_csv(tmp_path / "s.csv")][:13] == NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_are_plain_text_in_pictures(name):
+    """As title, axis label and legend: no mathematics, no line of its own, in the legend."""
+    figure = Figure()
+    axis = figure.subplots()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="(?s).*Glyph")
+        axis.plot([0, 1], [0, 1], label=plain(name))
+        axis.set(title=plain(name), xlabel=f"{plain(name)} and {plain(name)} [mm]")
+        legend = axis.legend()
+        figure.savefig(io.BytesIO())
+    assert len(legend.get_texts()) == 1
+    for text in (axis.title, axis.xaxis.label):
+        drawn, mathematics = text._preprocess_math(text.get_text())
+        assert mathematics is False
+        assert "\n" not in drawn
+    assert len(plain(name)) <= 60
+    head = " ".join(name.split())[:20]
+    assert axis.title._preprocess_math(axis.title.get_text())[0].strip().startswith(head)
+
+
+def test_a_run_of_such_names_writes_all_its_files(many, tmp_path):
+    """Every picture and the page; markup and formulas as text; tables say what they leave out."""
+    seen = predictions(many.problem, many.theta)
+    paths, lost = draw_all(tmp_path, many, seen)
+    assert lost == {}
+    assert all(p.read_bytes()[:4] == b"\x89PNG" for p in paths)
+    text = report_text("$x$ | <b>", many, [], seen, None)
+    made = page(text, {p.name: p.read_bytes() for p in paths}, {})
+    assert "<script>" not in made
+    assert "&lt;script&gt;" in made
+    for part in (text, made):
+        assert part.count("Worst first; and 2 more, see summary.csv") == 2
+        assert part.count("Worst first; and 2 more, see parameters.csv") == 1
+    quality = text.partition("## Quality")[2]
+    first, second = quality.split("| --- |\n", 1)[1].splitlines()[:2]
+    assert first.startswith(r"| $\frac{$ a | max iterations")
+    assert second.startswith("| last a |")
+
+
+def test_the_worst_come_first(many):
+    order = worst_first(many)
+    assert order[0] == 2
+    share = [many.rms[k, 0] / results.peak_force(many, k) for k in order[1:]]
+    assert share == sorted(share, reverse=True)
+
+
+def test_a_picture_that_fails_costs_itself(many, tmp_path, monkeypatch):
+    """The others are written, the report says which is missing and why; a full disk is no fault."""
+
+    def broken(*_):
+        raise ValueError("no such $ colour")
+
+    monkeypatch.setattr("jaxtrachea.plots.draw_residuals", broken)
+    seen = predictions(many.problem, many.theta)
+    paths, lost = draw_all(tmp_path, many, seen)
+    assert [p.name for p in paths] == ["fit.png", "correlation.png"]
+    assert lost == {"residuals.png": "ValueError: no such $ colour"}
+    text = without_lost(report_text("T", many, [], seen, None), lost)
+    assert "](residuals.png)" not in text
+    assert "residuals.png could not be drawn (ValueError: no such $ colour)" in text
+    made = page(text, {p.name: p.read_bytes() for p in paths}, {})
+    assert "could not be drawn" in made
+    with pytest.raises(OSError, match="such"):
+        save_each(tmp_path / "nowhere", {"x.png": Figure})
+
+
+def test_mathematics_of_matplotlib_itself_stays():
+    """Powers of ten at logarithmic axes are drawn as such, not as dollars."""
+    with mpl.rc_context(STYLE):
+        figure = Figure()
+        axis = figure.subplots()
+        axis.set(xscale="log", xlim=(1, 1e6), title=plain("$a$"))
+        figure.savefig(io.BytesIO())
+        drawn = [t._preprocess_math(t.get_text()) for t in axis.get_xticklabels()]
+    assert any("mathdefault" in text and mathematics for text, mathematics in drawn)
+
+
+@pytest.mark.parametrize("width", [20, 40, 60, 80, 200])
+def test_no_column_is_cut_without_an_ellipsis(width):
+    head = ["specimen", "parameter", "value", "95 % interval", "a very long heading", "verdict"]
+    rows = [["T1", "k_1 [N/mm]", "1.234", "1.2 … 1.3", "0.5", "structurally not"],
+            ["x" * 200, "k_3", "–", "anything", "1", "weak"]]  # fmt: skip
+    text = shown([("All", head, rows)], width)
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= width
+    words = text.replace("\n", " ").split()
+    for name in head[2:]:
+        cut = [w for w in name.split() if w not in words]
+        assert all(any(v.endswith("…") and w.startswith(v[:-1]) for v in words) for w in cut)
+    assert any(w.startswith("xxx") and w.endswith("…") for w in words)
+    if width >= 40:
+        for cell in ("1.234", "structurally", "weak", "anything"):
+            assert cell in words
+
+
+def test_terminal_takes_names_as_they_are(many):
+    text = shown(overview(found(many)), 120)
+    for name in ("[bold]", ":smile:", "<script>", "=1+1"):
+        assert name in text.split()
+    assert "Worst first; and 2 more, see summary.csv" in " ".join(text.split())
+    assert "13 of 14 lanes succeeded" in text
+
+
+@pytest.fixture(scope="module")
+def dense():
+    """One lane of three specimens: shared k_1, own k_3, own offset of every curve."""
+    curves = [curve(n, t, noise=0.01, seed=i) for i, (n, t) in
+              enumerate((("A", "1"), ("A", "2"), ("B", "1"), ("C", "1")))]  # fmt: skip
+    changes = {"k_1": {"scope": "shared"}, "force_offset": {"fixed": False, "scope": "trial"}}
+    return fit(build(curves, table_1(), BONDED, table(**changes)), ONE)
+
+
+def test_one_lane_of_several_specimens_has_a_row_for_each(dense):
+    """All columns of a specimen's own unknowns; what it has several of is named, not dropped."""
+    assert dense.lanes == 1
+    seen = predictions(dense.problem, dense.theta)
+    rows = with_residuals(dense, list(results.lane_rows(dense)), seen, effective(dense, seen))
+    assert [(r["specimen"], r["trial"]) for r in rows] == [("A", "(all)"), ("B", "1"), ("C", "1")]
+    labels = [results.unknown_label(dense, 0, i) for i in range(8)]
+    for row in rows:
+        k = labels.index(f"k_3[{row['specimen']}]")
+        assert row["k_3 [N/mm^3]"] == dense.value[0, k]
+        assert row["k_3 verdict"] == results.verdict_of(dense, 0, k)
+        assert row["k_1 [N/mm]"] == dense.value[0, 0]
+        assert row["k_1 low95"] == dense.lower[0, 0]
+    assert rows[0]["more"] == "force_offset[A/1], force_offset[A/2]: see parameters.csv"
+    assert "more" not in rows[1]
+    assert "force_offset [N]" in rows[1]
+    assert [r["samples"] for r in rows] == [24, 12, 12]
+    own = [np.sqrt(np.mean(np.square(seen.force[0, t]))) for t in ([0, 1], [2], [3])]
+    np.testing.assert_allclose([r["rms_force_N"] for r in rows], own, rtol=1e-12)
+
+
+def test_influence_says_why_there_is_no_number(dense):
+    """An unknown of one curve is its own; a lane without an estimate has none; bounds hold."""
+    diagnosed = influence(dense)
+    problem = dense.problem
+    assert influence_cell(diagnosed, 0, 0, 2).endswith(", own")
+    text = "\n".join(influence_section(diagnosed))
+    assert REASONS in text
+    status = np.array([FitStatus.MAX_ITERATIONS])
+    failed = dataclasses.replace(diagnosed, result=dataclasses.replace(dense, status=status))
+    assert influence_cell(failed, 0, 0, 0) == "no estimate"
+    bound = np.zeros((1, problem.size), bool)
+    bound[0, 0] = True
+    held = dataclasses.replace(diagnosed, result=dataclasses.replace(dense, at_bound=bound))
+    assert influence_cell(held, 0, 0, 0) == "held"
+    shown_text = shown(overview(found(dense, influence=diagnosed)))
+    assert "Influence of curves" in shown_text
+
+
+def autoregressive(shape, r, seed):
+    """AR(1) noise of unit variance."""
+    noise = np.random.default_rng(seed).normal(size=shape)
+    noise[..., 1:] *= np.sqrt(1 - r * r)
+    for i in range(1, shape[-1]):
+        noise[..., i] += r * noise[..., i - 1]
+    return noise
+
+
+@pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_widened_intervals_cover(given):
+    """1,000 linear lanes of two curves of 100 samples, AR(1) noise of 0.8: 90 to 98 %, not < 75."""
+    depth, count, r = np.linspace(0.1, 2, 100), 1000, 0.8
+    noise = 0.05 * autoregressive((count, 2, 100), r, 5)
+    curves = [
+        Curve(f"s{k}", t, None, 0.0, depth, 1.3 * depth + 0.4 * depth**3 + noise[k, i])
+        for k in range(count)
+        for i, t in enumerate("ab")
+    ]
+    level = Noise(force=0.05 if given else None)
+    result = fit(build(curves, table_1(), BONDED, table(), noise=level), ONE)
+    wide = effective(result, predictions(result.problem, result.theta))
+    truth = np.array([1.3, 0.4])
+    inside = lambda low, high: np.mean((low <= truth) & (truth <= high), axis=0)  # noqa: E731
+    plain_share = inside(result.lower, result.upper)
+    share = inside(wide.lower, wide.upper)
+    assert np.all(plain_share < 0.75), plain_share
+    assert np.all((share > 0.90) & (share < 0.98)), share
+    # Residuals of a fit are a little less correlated than the noise.
+    assert abs(np.mean(wide.correlation) - r) < 0.06
+    closed = 200 * (1 - wide.correlation) / (1 + wide.correlation)
+    np.testing.assert_allclose(wide.samples, closed, rtol=1e-12)
+
+
+def test_independent_residuals_widen_nothing():
+    assert share_independent(np.array([-0.5, 0.0, 0.5, 1.0])).tolist() == [1, 1, 1 / 3, 0]
+
+
+def test_fewer_independent_samples_than_unknowns_leave_no_limit():
+    """A straight line through a bent curve: residuals of one sign, one after the other."""
+    depth = np.linspace(0, 1, 40)
+    bent = Curve("T", "a", None, 0.0, depth, depth + 0.2 * np.sin(3 * depth))
+    result = fit(build([bent], table_1(), BONDED, table()), ONE)
+    wide = effective(result, predictions(result.problem, result.theta))
+    assert wide.samples[0] < 2
+    assert np.isinf(wide.factor[0])
+    assert np.isneginf(wide.lower[0]).all()
+    assert np.isposinf(wide.upper[0]).all()
+    text = report_text("T", result, [], predictions(result.problem, result.theta), None)
+    assert "95 % widened" in text
+    assert "no more independent samples than unknowns" in text
+    assert "correlated in 1 of 1 lanes" in " ".join(shown(overview(found(result))).split())
+
+
+def test_the_command_with_names_of_mathematics(tmp_path, monkeypatch, capsys):
+    """Two `$` ended the run in a traceback; leaving out and influence reach the terminal."""
+    monkeypatch.chdir(tmp_path)
+    rows = ["specimen,trial,displacement [mm],force [N]"]
+    for i, name in enumerate(("$a$ $b$", r"$\frac{$", "=1+1")):
+        for t in "xy":
+            one = curve(name, t, noise=0.01, seed=2 * i + (t == "y"))
+            pairs = zip(one.displacement.tolist(), one.force.tolist(), strict=True)
+            rows += [f"{name},{t}$,{d!r},{f!r}" for d, f in pairs]
+    Path("d.csv").write_text("\n".join(rows) + "\n")
+    Path("s.toml").write_text(
+        'title = "$t$"\n[data]\nfiles = "d.csv"\n[model]\ncoupling = "total"\n[fit]\nstarts = 1\n'
+    )
+    code, out, err = run(
+        monkeypatch, capsys, "fit", "s.toml", "--leave-one-out", "--influence", "--out", "o"
+    )
+    assert code == 0, err
+    assert "Leaving one curve out" in out
+    assert "Influence of curves" in out
+    names = {p.name for p in Path("o").iterdir()}
+    assert {"fit.png", "residuals.png", "correlation.png", "left_out.csv"} <= names
+    assert len(read_csv(Path("o/left_out.csv"))) == 6
+    parameters = read_csv(Path("o/parameters.csv"))
+    assert {row["specimen"] for row in parameters} == {"$a$ $b$", r"$\frac{$", "=1+1"}
+    assert all(float(row["low95_widened"]) <= float(row["value"]) for row in parameters)
