@@ -166,7 +166,7 @@ def _compiled(problem: Problem, samples: int):
         ones, size = jnp.ones_like(displacement), theta.shape[0]
         lane = Lane(
             s_c=s[None], displacement=displacement, force=0 * ones, precision=ones, joints=None,
-            joint_precision=None, balance=ones[:, 0], value=value, index=index,
+            joint_precision=None, balance=ones[:, 0], blend=None, value=value, index=index,
             lower=jnp.zeros(size), upper=jnp.zeros(size), active=jnp.ones(size),
         )  # fmt: skip
         J = residual(problem, theta, lane).jacobian

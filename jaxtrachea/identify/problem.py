@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import check_record, check_word
+from jaxtrachea.identify.first_touch import FirstTouch, blend_widths, first_touch
 from jaxtrachea.identify.measurements import Curve
 from jaxtrachea.identify.parameters import DEFAULTS, SKELETON, Parameter
 from jaxtrachea.model import Options
@@ -42,6 +43,8 @@ class Lane(NamedTuple):
         joints: marker displacement, mm; (T, N, rings); None without markers.
         joint_precision: as `precision`; None without markers.
         balance: weight of each trial against the others; (T,).
+        blend: smooth first touch of each trial, mm, see `first_touch`; (T,); None where no onset is
+            fitted.
         value: value of every model parameter, used where it is not free; (T, J).
         index: (T, J).
         lower: bounds of the unknowns in scaled coordinates; (P,).
@@ -56,6 +59,7 @@ class Lane(NamedTuple):
     joints: Float[Array, "*l T N rings"] | None
     joint_precision: Float[Array, "*l T N rings"] | None
     balance: Float[Array, "*l T"]
+    blend: Float[Array, "*l T"] | None
     value: Float[Array, "*l T J"]
     index: Int[Array, "*l T J"]
     lower: Float[Array, "*l P"]
@@ -277,6 +281,8 @@ def build(
         for lane, names in zip(groups, unknowns, strict=True)
     ]
     stacked = jax.tree.map(lambda *arrays: np.stack(arrays), *lanes)
+    if onset_is_sought(parameters, options):
+        stacked = stacked._replace(blend=_blends(stacked, groups, noise, parameters, options))
     known = noise.force is not None or all(c.sigma is not None for c in curves)
     return Problem(
         geometry=jax.tree.map(lambda v: np.asarray(v, np.float64), geometry),
@@ -369,6 +375,7 @@ def _lane(
         "joints": joints,
         "joint_precision": None if joints is None else joints.copy(),
         "balance": np.ones(T),
+        "blend": None,
         "value": np.tile([p.value for p in parameters], (T, 1)).astype(np.float64),
         "index": np.full((T, J), -1, np.int32),
         "lower": np.zeros(P),
@@ -396,6 +403,32 @@ def _lane(
             lane["joints"][t, :n, at] = np.where(seen, curve.joint_displacement, 0).T
             lane["joint_precision"][t, :n, at] = np.where(seen, weight, 0).T
     return Lane(**lane)
+
+
+def onset_is_sought(parameters: Sequence[Parameter], options: Options) -> bool:
+    """Whether the displacement at first touch is fitted, and is a corner of the curves."""
+    free = any(p.name == "onset" and not p.fixed for p in parameters)
+    return free and options.contact == "unilateral"
+
+
+def touches(lanes: Lane, parameters: Sequence[Parameter]) -> FirstTouch:
+    """Change point of every trial of every lane, see `first_touch`; (lanes, T) each."""
+    shape = lanes.s_c.shape
+    rows = (v.reshape(-1, v.shape[-1]) for v in (lanes.displacement, lanes.force))
+    seen = (lanes.precision > 0).reshape(-1, lanes.force.shape[-1])
+    known = next(p for p in parameters if p.name == "force_offset")
+    offset = np.full(len(seen), known.value) if known.fixed else None
+    found = first_touch(*rows, seen, offset)
+    return FirstTouch(*(v.reshape(shape) for v in found))
+
+
+def _blends(lanes: Lane, curves, noise: Noise, parameters, options: Options) -> np.ndarray:
+    """Width of the rounded corner of every trial, mm; (lanes, T)."""
+    given = np.full(lanes.s_c.shape, np.nan)
+    for row, lane in zip(given, curves, strict=True):
+        sigma = [noise.force if c.sigma is None else np.median(c.sigma) for c in lane]
+        row[: len(lane)] = [np.nan if v is None else v for v in sigma]
+    return blend_widths(touches(lanes, parameters), given, options.onset_width)
 
 
 def _seen_joints(curve: Curve, geometry: Geometry, reach: float) -> np.ndarray:
