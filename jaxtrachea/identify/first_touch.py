@@ -28,7 +28,7 @@ _MOST_WINDOWS = 200
 _BEHIND = 0.2
 #: Force grows by this many standard deviations of the noise within the rounded corner, which takes
 #: at most this share of the press.
-_STANDARD_DEVIATIONS, _LARGEST = 2.0, 0.05
+_STANDARD_DEVIATIONS, _LARGEST = 1.0, 0.05
 
 
 class FirstTouch(NamedTuple):

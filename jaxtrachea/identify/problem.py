@@ -10,6 +10,7 @@ are compared with is in `residual`.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -263,6 +264,7 @@ def build(
         raise ValueError("parameters: every parameter is fixed; free at least one")
     for curve in curves:
         check_curve(curve, geometry, options)
+    parameters = _natural_steps(parameters, curves)
     joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1
     groups = group(curves, parameters, joint=joint)
@@ -403,6 +405,25 @@ def _lane(
             lane["joints"][t, :n, at] = np.where(seen, curve.joint_displacement, 0).T
             lane["joint_precision"][t, :n, at] = np.where(seen, weight, 0).T
     return Lane(**lane)
+
+
+def _natural_steps(
+    parameters: Sequence[Parameter], curves: Sequence[Curve]
+) -> tuple[Parameter, ...]:
+    """The table with the steps of a free onset and offset as large as the presses of the study.
+
+    A power of ten, not above the median over the curves: studies alike share compiled programs.
+    """
+    span = np.median([np.ptp(c.displacement) for c in curves])
+    peak = np.median([np.max(np.abs(c.force)) for c in curves])
+    size = {"onset": float(span), "force_offset": float(peak)}
+
+    def scaled(p: Parameter) -> Parameter:
+        if p.fixed or p.name not in size or p.step != DEFAULTS[p.name].step or not size[p.name] > 0:
+            return p
+        return dataclasses.replace(p, step=10.0 ** math.floor(math.log10(size[p.name])))
+
+    return tuple(map(scaled, parameters))
 
 
 def onset_is_sought(parameters: Sequence[Parameter], options: Options) -> bool:
