@@ -8,7 +8,14 @@ from jaxtyping import Bool, Float
 
 from jaxtrachea.identify.criteria import weights
 from jaxtrachea.identify.fit import FitResult, Settings, fit
-from jaxtrachea.identify.predictions import lag_correlation, predictions, rms, without
+from jaxtrachea.identify.parameters import OF_THE_PRESS
+from jaxtrachea.identify.predictions import (
+    lag_correlation,
+    predictions,
+    rms,
+    with_own_touch,
+    without,
+)
 from jaxtrachea.identify.problem import Problem
 
 #: Difference of AICc up to which models cannot be told apart, and from which on they clearly can
@@ -126,17 +133,18 @@ def leave_position_out(
 
     Returns:
         Root mean square force residual of the curves left out, over the lane's largest force;
-        (lanes,), NaN where a lane has fewer than two positions or an unknown of a curve alone.
+        (lanes,), NaN where a lane has fewer than two positions, or an unknown of a curve alone that
+        is no onset or offset (these are fitted to the curve left out, all else kept).
     """
     error = np.full(len(problem.curves), np.nan)
-    if any(p.scope == "trial" and not p.fixed for p in problem.parameters):
+    if any(p.scope == "trial" and p.name not in OF_THE_PRESS for p in problem.free):
         return error
     lanes, held = _positions(problem)
     if not len(lanes):
         return error
     chosen = problem.take(lanes)
     result = fit(without(chosen, held), settings, progress)
-    seen = predictions(chosen, result.theta).force
+    seen = predictions(chosen, with_own_touch(chosen, held, result.theta, settings)).force
     solved = result.succeeded
     missed = np.where((held & solved[:, None])[:, :, None], seen, np.nan)
     for lane in np.unique(lanes):

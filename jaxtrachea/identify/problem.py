@@ -285,6 +285,7 @@ def build(
     stacked = jax.tree.map(lambda *arrays: np.stack(arrays), *lanes)
     if onset_is_sought(parameters, options):
         stacked = stacked._replace(blend=_blends(stacked, groups, noise, parameters, options))
+        stacked = _within_reach(stacked, parameters)
     known = noise.force is not None or all(c.sigma is not None for c in curves)
     return Problem(
         geometry=jax.tree.map(lambda v: np.asarray(v, np.float64), geometry),
@@ -450,6 +451,29 @@ def _blends(lanes: Lane, curves, noise: Noise, parameters, options: Options) -> 
         sigma = [noise.force if c.sigma is None else np.median(c.sigma) for c in lane]
         row[: len(lane)] = [np.nan if v is None else v for v in sigma]
     return blend_widths(touches(lanes, parameters), given, options.onset_width)
+
+
+def _within_reach(lanes: Lane, parameters: Sequence[Parameter]) -> Lane:
+    """Lanes whose onset, where its bounds are the default, lies within reach of the samples.
+
+    From one range of displacement before the first sample to the last one. A curve that does not
+    show its first touch is otherwise fitted with one anywhere before it.
+    """
+    column = next(j for j, p in enumerate(parameters) if p.name == "onset")
+    p, usual = parameters[column], DEFAULTS["onset"]
+    if p.scale != "linear" or (p.lower, p.upper) != (usual.lower, usual.upper):
+        return lanes
+    seen = lanes.precision > 0
+    first = np.min(np.where(seen, lanes.displacement, np.inf), axis=2)
+    last = np.max(np.where(seen, lanes.displacement, -np.inf), axis=2)
+    lower, upper = lanes.lower.copy(), lanes.upper.copy()
+    for lane, row in enumerate(lanes.index[:, :, column]):
+        for i in np.unique(row[row >= 0]):
+            low, high = np.min(first[lane][row == i]), np.max(last[lane][row == i])
+            if high > low:
+                lower[lane, i] = max(lower[lane, i], p.to_scaled(min(2 * low - high, p.value)))
+                upper[lane, i] = min(upper[lane, i], p.to_scaled(max(high, p.value)))
+    return lanes._replace(lower=lower, upper=upper)
 
 
 def _seen_joints(curve: Curve, geometry: Geometry, reach: float) -> np.ndarray:
