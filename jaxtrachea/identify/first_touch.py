@@ -23,7 +23,7 @@ _COARSE, _FINE, _BEFORE = 40, 16, 0.2
 #: Samples in a window for the noise, and the degree that is taken out of it.
 _WINDOW, _DEGREE = 9, 3
 #: Windows of a curve that are looked at, at most.
-_MOST_WINDOWS = 200
+_MOST_WINDOWS = 400
 #: Share of the span behind the onset over which the slope there is taken.
 _BEHIND = 0.2
 #: Force grows by this many standard deviations of the noise within the rounded corner, which takes
@@ -43,19 +43,19 @@ class FirstTouch(NamedTuple):
         peak: largest force less the offset, absolute, N.
     """
 
-    onset: Float[np.ndarray, " C"]
-    force_offset: Float[np.ndarray, " C"]
-    slope: Float[np.ndarray, " C"]
-    noise: Float[np.ndarray, " C"]
-    span: Float[np.ndarray, " C"]
-    peak: Float[np.ndarray, " C"]
+    onset: Float[np.ndarray, "*C"]
+    force_offset: Float[np.ndarray, "*C"]
+    slope: Float[np.ndarray, "*C"]
+    noise: Float[np.ndarray, "*C"]
+    span: Float[np.ndarray, "*C"]
+    peak: Float[np.ndarray, "*C"]
 
 
 def first_touch(
     displacement: Float[np.ndarray, "C N"],
     force: Float[np.ndarray, "C N"],
     seen: Bool[np.ndarray, "C N"],
-    force_offset: Float[np.ndarray, " C"] | None = None,
+    force_offset: Float[np.ndarray, "*C"] | None = None,
 ) -> FirstTouch:
     """Change point of every curve.
 
@@ -159,7 +159,7 @@ def noise_of(
     displacement: Float[np.ndarray, "C N"],
     force: Float[np.ndarray, "C N"],
     seen: Bool[np.ndarray, "C N"],
-) -> Float[np.ndarray, " C"]:
+) -> Float[np.ndarray, "*C"]:
     """Standard deviation of the samples about a cubic through their neighbours, robust, N.
 
     The neighbours are those in displacement. Steps of the curve as a whole (its corner) lie in few
@@ -188,8 +188,8 @@ def noise_of(
 
 
 def blend_widths(
-    touch: FirstTouch, noise: Float[np.ndarray, " C"], least: float
-) -> Float[np.ndarray, " C"]:
+    touch: FirstTouch, noise: Float[np.ndarray, "*C"], least: float
+) -> Float[np.ndarray, "*C"]:
     """Half the width of the rounded corner at the onset of every curve, mm.
 
     Args:

@@ -175,9 +175,8 @@ def _of_one_curve(problem: Problem, lane: Lane, free) -> Bool[Array, "T Jf"]:
     size = lane.lower.shape[0]
     place = jnp.where(index >= 0, index, size)
     readers = jnp.zeros(size + 1, index.dtype).at[place].add(1)
-    trial = jnp.array([p.scope == "trial" for p in problem.free])
     there = (index >= 0) & (jnp.append(free, 0)[place] > 0)
-    own = (readers[place] == 1) & there & trial[None]
+    own = (readers[place] == 1) & there
     return own & jnp.any(there & ~own, axis=1, keepdims=True)
 
 
