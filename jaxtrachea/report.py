@@ -147,11 +147,13 @@ def _percent(value: float) -> str:
 
 
 def own_touch_sentence(result: FitResult, which: str) -> list[str]:
-    """That a curve left out has an onset or an offset fitted to itself; nothing where it has none."""
+    """That a curve left out has an onset or an offset fitted to itself; empty where it has none."""
     own = [p.name for p in result.problem.free if p.scope == "trial" and p.name in OF_THE_PRESS]
     if not own:
         return []
-    return [f"{which} fits its own {' and '.join(own)}; all other unknowns are those of the others."]
+    return [
+        f"{which} fits its own {' and '.join(own)}; all other unknowns are those of the others."
+    ]
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

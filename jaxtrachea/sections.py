@@ -79,8 +79,8 @@ def influence_section(found: Influence) -> list[str]:
         markdown_table(head, [_curve_row(found, *place) for place in places]),
         "Share: part of the variance of an estimate that the noise of this curve makes. Left out: "
         "change of the estimate, in standard errors, if the curve were not there (first order; a "
-        "dash: the others do not determine it, or it belongs to the curve alone, as an onset does, and "
-        "goes with it). All curves: `influence_curves.csv`.",
+        "dash: the others do not determine it, or it belongs to the curve alone and goes with it, "
+        "as an onset does). All curves: `influence_curves.csv`.",
         *_drivers(found, names),
     ]
     rows = [_sample_row(found, names, *place) for place in top_samples(found, _TOP)]

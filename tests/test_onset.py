@@ -1,4 +1,4 @@
-"""Fits with an unknown onset and force offset, against an exact hinge solved and fitted by SciPy."""
+"""Fits with an unknown onset and force offset, against a sharp hinge fitted by SciPy."""
 
 import jax
 import jax.numpy as jnp

@@ -6,8 +6,8 @@ data (Fisher information of normal noise; Fedorov 1972). Relative coordinates: 1
 100 %. Bounds count as a weak prior, of the variance of a uniform distribution between them, so that
 nothing is infinite where the data so far leave a combination undetermined.
 
-Unknowns of single trials (an onset, an offset) are told apart from those that are sought: a new press
-brings its own, about which nothing is known, and the measured curves keep theirs. Both are
+Unknowns of single trials (an onset, an offset) are told apart from those that are sought: a new
+press brings its own, about which nothing is known, and the measured curves keep theirs. Both are
 marginalised, so that information, scores and errors are those of the other unknowns.
 """
 
@@ -23,6 +23,7 @@ from jaxtyping import Float, Int
 from jaxtrachea._arguments import check_word
 from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.cost import assemble
+from jaxtrachea.identify.design_press import marginal, of_a_new_press
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.press_scale import relative_change
 from jaxtrachea.identify.problem import Lane, Problem
@@ -61,8 +62,8 @@ class Situation:
         sigma: of a force sample, N; (G,).
         samples: of a curve.
         kept: these unknowns; (G, Q).
-        own: unknowns of the first trial alone, which stand for those of a new press; `theta` has the
-            median of all trials there; (G, R).
+        own: unknowns of the first trial alone, which stand for those of a new press; `theta` has
+            the median of all trials there; (G, R).
         prior: information of the bounds on all unknowns, relative coordinates; (G, P).
         blend: rounded corner of a new curve, mm, see `Lane`; (G,); None where no onset is fitted.
     """
@@ -149,7 +150,7 @@ def situation(
         found = [resampled.theta[k][resampled.usable[k]][:_DRAWS] for k in lanes]
         lane = np.repeat(lanes, [len(rows) for rows in found])
         theta = np.concatenate(found)
-    kept, own, theta = _of_a_new_press(problem, lane, theta)
+    kept, own, theta = of_a_new_press(problem, lane, theta)
     relative = relative_change(problem.take(lane), theta)
     absent = problem.lanes.active[lane] == 0
     relative = np.where(absent, 1.0, relative)
@@ -168,47 +169,9 @@ def situation(
         blend = np.array([np.median(blends[k, : counts[k]]) for k in lane])
     return Situation(
         problem=problem, lane=lane, theta=theta, relative=relative,
-        base=_marginal(base, kept), sigma=result.sigma[lane, 0], samples=n,
+        base=marginal(base, kept), sigma=result.sigma[lane, 0], samples=n,
         kept=kept, own=own, prior=prior, blend=blend,
     )  # fmt: skip
-
-
-def _of_a_new_press(problem: Problem, lane, theta):
-    """Unknowns that a new press shares, its own ones, and theta with typical values of these."""
-    scopes = [[p.scope for p, _, _ in u] + ["specimen"] * (problem.size - len(u))
-              for u in problem.unknowns]  # fmt: skip
-    shared = np.array(scopes)[lane] != "trial"
-    if shared.all():
-        return np.tile(np.arange(problem.size), (len(lane), 1)), np.zeros((len(lane), 0), int), theta
-    theta = theta.copy()
-    columns = [j for j in problem.free_columns if problem.parameters[j].scope == "trial"]
-    own = problem.lanes.index[lane, 0][:, columns]
-    for g, k in enumerate(lane):
-        for i, j in zip(own[g], columns, strict=True):
-            every = problem.lanes.index[k, : len(problem.curves[k]), j]
-            theta[g, i] = np.median(theta[g, every])
-    return np.stack([np.flatnonzero(row) for row in _as_many(shared)]), own, theta
-
-
-def _as_many(shared: np.ndarray) -> np.ndarray:
-    """Rows of a mask with as many entries as the first: padding beyond it does not count."""
-    most = int(np.min(np.sum(shared, axis=1)))
-    return shared & (np.cumsum(shared, axis=1) <= most)
-
-
-def _marginal(information, kept) -> np.ndarray:
-    """Information (G, ..., P, P) on the unknowns `kept` (G, Q), all others eliminated."""
-    size = information.shape[-1]
-    if kept.shape[1] == size:
-        return information
-    parts = []
-    for matrix, rows in zip(information, kept, strict=True):
-        others = np.setdiff1d(np.arange(size), rows)
-        cross = matrix[..., others[:, None], rows[None]]
-        inner = np.linalg.solve(matrix[..., others[:, None], others[None]], cross)
-        outer = np.swapaxes(cross, -1, -2) @ inner
-        parts.append(matrix[..., rows[:, None], rows[None]] - outer)
-    return np.stack(parts)
 
 
 def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q Q"]:
@@ -235,7 +198,7 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
     rows = np.concatenate([known.kept, known.own], axis=1)
     of_press = np.stack([m[:, r[:, None], r[None]] for m, r in zip(added, rows, strict=True)])
     shared = np.tile(np.arange(known.kept.shape[1]), (len(rows), 1))
-    return _marginal(of_press, shared)
+    return marginal(of_press, shared)
 
 
 @functools.lru_cache(maxsize=16)

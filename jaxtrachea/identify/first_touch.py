@@ -114,7 +114,10 @@ class _Moments:
         F = w * (F - self.base[:, None])
         self.x = x
         powers = np.where(w > 0, x, 0)[..., None] ** np.arange(7) * w[..., None]
-        self.powers, self.forces = _sums_behind(powers), _sums_behind(powers[..., :4] * F[..., None])
+        self.powers, self.forces = (
+            _sums_behind(powers),
+            _sums_behind(powers[..., :4] * F[..., None]),
+        )
         self.count, self.total = np.sum(w, axis=1), np.sum(F, axis=1)
 
     def best(self, onset: Float[np.ndarray, "C K"]) -> _Best:
@@ -129,7 +132,9 @@ class _Moments:
         if self.known is not None:
             gram, forces = gram[..., 1:, 1:], forces[..., 1:]
         top = np.maximum(np.trace(gram, axis1=-2, axis2=-1), 1e-300)[..., None, None]
-        found = np.linalg.solve(gram + 1e-9 * top * np.eye(gram.shape[-1]), forces[..., None])[..., 0]
+        found = np.linalg.solve(gram + 1e-9 * top * np.eye(gram.shape[-1]), forces[..., None])[
+            ..., 0
+        ]
         fall = np.sum(found * forces, axis=-1)
         a, b, c = np.moveaxis(found[..., -3:], -1, 0)
         part = _BEHIND / reach

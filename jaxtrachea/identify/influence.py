@@ -157,7 +157,9 @@ def diagnose(
         left_out=shift * gone[:, None],
         curve_cook=jnp.einsum("ti,tij,tj->t", c, rise, c) - cook / jnp.maximum(jnp.sum(free), 1),
         curve_left_out=jnp.where(own, jnp.nan, jnp.einsum("tij,tj->ti", K, c)),
-        curve_share=jnp.where(variance > 0, by_curve / jnp.where(variance > 0, variance, 1), jnp.nan),
+        curve_share=jnp.where(
+            variance > 0, by_curve / jnp.where(variance > 0, variance, 1), jnp.nan
+        ),
     )
 
 
@@ -183,11 +185,11 @@ def _of_one_curve(problem: Problem, lane: Lane, free) -> Bool[Array, "T Jf"]:
 def _without_curve(J, gram, stiffness, pull, near, K, own):
     """What moves the unknowns, by H^-1, where a curve is left out; NaN where it is needed.
 
-    What the curve alone reads goes with it: a spring of any stiffness in its place holds it, and the
-    others do not notice, for nothing else is tied to it.
+    What the curve alone reads goes with it: a spring of any stiffness in its place holds it, and
+    the others do not notice, for nothing else is tied to it.
 
     Returns:
-        (T, Jf), and what is to be taken off the rise of the cost, times 2: unknowns that go with the
+        (T, Jf), and what is to be taken off twice the rise of the cost: unknowns that go with the
         curve follow the others as they like; (T,).
     """
     eye = jnp.eye(J.shape[1], dtype=J.dtype)[None]

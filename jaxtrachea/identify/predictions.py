@@ -164,7 +164,7 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
 
 
 def without(problem: Problem, held: Bool[np.ndarray, "lanes T"]) -> Problem:
-    """The same lanes, blind to the trials that are held back; what these alone read is no unknown."""
+    """The same lanes, blind to the trials held back; what these alone read is no unknown."""
     blind = lambda v: None if v is None else np.where(held[:, :, *[None] * (v.ndim - 2)], 0, v)  # noqa: E731
     lanes = problem.lanes
     seen = lanes._replace(

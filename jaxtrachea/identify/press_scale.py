@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.identify.first_touch import FirstTouch
+from jaxtrachea.identify.onset import touches
 from jaxtrachea.identify.parameters import DEFAULTS, OF_THE_PRESS
-from jaxtrachea.identify.problem import Problem, touches
+from jaxtrachea.identify.problem import Problem
 
 #: Half the width in which starts are drawn around a change point, of the press.
 _REACH = 0.1

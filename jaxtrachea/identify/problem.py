@@ -10,7 +10,6 @@ are compared with is in `residual`.
 
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -19,8 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import check_record, check_word
-from jaxtrachea.identify.first_touch import FirstTouch, blend_widths, first_touch
 from jaxtrachea.identify.measurements import Curve
+from jaxtrachea.identify.onset import blends, natural_steps, onset_is_sought, within_reach
 from jaxtrachea.identify.parameters import DEFAULTS, SKELETON, Parameter
 from jaxtrachea.model import Options
 from jaxtrachea.trachea.geometry import Geometry
@@ -264,7 +263,7 @@ def build(
         raise ValueError("parameters: every parameter is fixed; free at least one")
     for curve in curves:
         check_curve(curve, geometry, options)
-    parameters = _natural_steps(parameters, curves)
+    parameters = natural_steps(parameters, curves)
     joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1
     groups = group(curves, parameters, joint=joint)
@@ -284,8 +283,8 @@ def build(
     ]
     stacked = jax.tree.map(lambda *arrays: np.stack(arrays), *lanes)
     if onset_is_sought(parameters, options):
-        stacked = stacked._replace(blend=_blends(stacked, groups, noise, parameters, options))
-        stacked = _within_reach(stacked, parameters)
+        stacked = stacked._replace(blend=blends(stacked, groups, noise.force, parameters, options))
+        stacked = within_reach(stacked, parameters)
     known = noise.force is not None or all(c.sigma is not None for c in curves)
     return Problem(
         geometry=jax.tree.map(lambda v: np.asarray(v, np.float64), geometry),
@@ -406,74 +405,6 @@ def _lane(
             lane["joints"][t, :n, at] = np.where(seen, curve.joint_displacement, 0).T
             lane["joint_precision"][t, :n, at] = np.where(seen, weight, 0).T
     return Lane(**lane)
-
-
-def _natural_steps(
-    parameters: Sequence[Parameter], curves: Sequence[Curve]
-) -> tuple[Parameter, ...]:
-    """The table with the steps of a free onset and offset as large as the presses of the study.
-
-    A power of ten, not above the median over the curves: studies alike share compiled programs.
-    """
-    span = np.median([np.ptp(c.displacement) for c in curves])
-    peak = np.median([np.max(np.abs(c.force)) for c in curves])
-    size = {"onset": float(span), "force_offset": float(peak)}
-
-    def scaled(p: Parameter) -> Parameter:
-        if p.fixed or p.name not in size or p.step != DEFAULTS[p.name].step or not size[p.name] > 0:
-            return p
-        return dataclasses.replace(p, step=10.0 ** math.floor(math.log10(size[p.name])))
-
-    return tuple(map(scaled, parameters))
-
-
-def onset_is_sought(parameters: Sequence[Parameter], options: Options) -> bool:
-    """Whether the displacement at first touch is fitted, and is a corner of the curves."""
-    free = any(p.name == "onset" and not p.fixed for p in parameters)
-    return free and options.contact == "unilateral"
-
-
-def touches(lanes: Lane, parameters: Sequence[Parameter]) -> FirstTouch:
-    """Change point of every trial of every lane, see `first_touch`; (lanes, T) each."""
-    shape = lanes.s_c.shape
-    rows = (v.reshape(-1, v.shape[-1]) for v in (lanes.displacement, lanes.force))
-    seen = (lanes.precision > 0).reshape(-1, lanes.force.shape[-1])
-    known = next(p for p in parameters if p.name == "force_offset")
-    offset = np.full(len(seen), known.value) if known.fixed else None
-    found = first_touch(*rows, seen, offset)
-    return FirstTouch(*(v.reshape(shape) for v in found))
-
-
-def _blends(lanes: Lane, curves, noise: Noise, parameters, options: Options) -> np.ndarray:
-    """Width of the rounded corner of every trial, mm; (lanes, T)."""
-    given = np.full(lanes.s_c.shape, np.nan)
-    for row, lane in zip(given, curves, strict=True):
-        sigma = [noise.force if c.sigma is None else np.median(c.sigma) for c in lane]
-        row[: len(lane)] = [np.nan if v is None else v for v in sigma]
-    return blend_widths(touches(lanes, parameters), given, options.onset_width)
-
-
-def _within_reach(lanes: Lane, parameters: Sequence[Parameter]) -> Lane:
-    """Lanes whose onset, where its bounds are the default, lies within reach of the samples.
-
-    From one range of displacement before the first sample to the last one. A curve that does not
-    show its first touch is otherwise fitted with one anywhere before it.
-    """
-    column = next(j for j, p in enumerate(parameters) if p.name == "onset")
-    p, usual = parameters[column], DEFAULTS["onset"]
-    if p.scale != "linear" or (p.lower, p.upper) != (usual.lower, usual.upper):
-        return lanes
-    seen = lanes.precision > 0
-    first = np.min(np.where(seen, lanes.displacement, np.inf), axis=2)
-    last = np.max(np.where(seen, lanes.displacement, -np.inf), axis=2)
-    lower, upper = lanes.lower.copy(), lanes.upper.copy()
-    for lane, row in enumerate(lanes.index[:, :, column]):
-        for i in np.unique(row[row >= 0]):
-            low, high = np.min(first[lane][row == i]), np.max(last[lane][row == i])
-            if high > low:
-                lower[lane, i] = max(lower[lane, i], p.to_scaled(min(2 * low - high, p.value)))
-                upper[lane, i] = min(upper[lane, i], p.to_scaled(max(high, p.value)))
-    return lanes._replace(lower=lower, upper=upper)
 
 
 def _seen_joints(curve: Curve, geometry: Geometry, reach: float) -> np.ndarray:

@@ -36,8 +36,8 @@ def box(problem: Problem, decades: float) -> Box:
 
     Args:
         problem: the study.
-        decades: half the width of the box (scale `linear`: times 10 steps; onset and offset: times a
-            tenth of the press, around the change point of the curve).
+        decades: half the width of the box (scale `linear`: times 10 steps; onset and offset: times
+            a tenth of the press, around the change point of the curve).
     """
     guess = of_unknowns(problem, lambda p: p.to_scaled(p.value), 0.0)
     decade = lambda p: np.log(10) if p.scale == "log" else 10.0  # noqa: E731

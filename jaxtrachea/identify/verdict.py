@@ -128,7 +128,7 @@ def describe_flat(
 
 
 def _with_units(names, flat, flat_se, blind, press) -> str:
-    """As `describe_flat`, where an onset or an offset takes part: in its own unit, no power of it."""
+    """As `describe_flat`, where an onset or an offset takes part: in its unit, no power of it."""
     if np.isinf(flat_se):
         ways = flat[None] if blind is None or not np.any(blind) else blind
         parts = [n for i, n in enumerate(names) if np.any(np.abs(ways[:, i]) >= _PART)]
