@@ -24,7 +24,7 @@ def of_a_new_press(
         )
     theta = theta.copy()
     columns = [j for j in problem.free_columns if problem.parameters[j].scope == "trial"]
-    own = problem.lanes.index[lane, 0][:, columns]
+    own = np.asarray(problem.lanes.index)[lane, 0][:, columns]
     for g, k in enumerate(lane):
         for i, j in zip(own[g], columns, strict=True):
             every = problem.lanes.index[k, : len(problem.curves[k]), j]

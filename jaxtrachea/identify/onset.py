@@ -47,12 +47,13 @@ def onset_is_sought(parameters: Sequence[Parameter], options: Options) -> bool:
 
 def touches(lanes: "Lane", parameters: Sequence[Parameter]) -> FirstTouch:
     """Change point of every trial of every lane, see `first_touch`; (lanes, T) each."""
-    shape = lanes.s_c.shape
-    rows = (v.reshape(-1, v.shape[-1]) for v in (lanes.displacement, lanes.force))
-    seen = (lanes.precision > 0).reshape(-1, lanes.force.shape[-1])
+    shape, samples = lanes.s_c.shape, lanes.force.shape[-1]
+    displacement, force, precision = (
+        np.reshape(v, (-1, samples)) for v in (lanes.displacement, lanes.force, lanes.precision)
+    )
     known = next(p for p in parameters if p.name == "force_offset")
-    offset = np.full(len(seen), known.value) if known.fixed else None
-    found = first_touch(*rows, seen, offset)
+    offset = np.full(len(force), known.value) if known.fixed else None
+    found = first_touch(displacement, force, precision > 0, offset)
     return FirstTouch(*(v.reshape(shape) for v in found))
 
 
