@@ -30,6 +30,27 @@ def positive_part(x: Float[Array, "*n"], width: Float[Array, ""]) -> Float[Array
     return jnp.where((x < w) & ~sharp, blend, jnp.maximum(x, 0))
 
 
+def centred_hinge(x: Float[Array, "*n"], width: Float[Array, ""]) -> Float[Array, "*n"]:
+    r"""`max(x, 0)` with its corner rounded on both sides, and with the same integral.
+
+    0 for `x <= -width`, `x` for `x >= width`, C2; between, with t = x / w,
+    w (5/64 + t/2 + 45/64 t^2 - 25/64 t^4 + 7/64 t^6): `max(x, 0)` averaged over |t| <= 1 with the
+    fourth-order kernel 15/32 (1 - t^2) (3 - 7 t^2), whose second moment vanishes. Hence sums over
+    samples that lie closer than `width` keep their value, where a one-sided blend (`positive_part`)
+    makes them smaller. At most 0.078 w too large (at x = 0), 0.019 w too small (negative before 0).
+
+    Args:
+        x: any shape.
+        width: half the width of the rounded part, same unit as `x`; 0 or less: `max(x, 0)`.
+    """
+    sharp = width <= 0
+    w = jnp.where(sharp, 1, width).astype(x.dtype)
+    t = jnp.clip(x / w, -1, 1)
+    t2 = t * t
+    blend = w * (5 / 64 + t / 2 + t2 * (45 / 64 + t2 * (-25 / 64 + t2 * (7 / 64))))
+    return jnp.where((jnp.abs(x) < w) & ~sharp, blend, jnp.maximum(x, 0))
+
+
 @jax.custom_jvp
 def cubic_ratio(u: Float[Array, "*n"]) -> Float[Array, "*n"]:
     r"""Root g of g + (4/27) u g^3 = 1 on the branch through g(0) = 1.

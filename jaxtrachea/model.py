@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, check_record, real, shaped
-from jaxtrachea._numerics import positive_part
+from jaxtrachea._numerics import centred_hinge, positive_part
 from jaxtrachea.admission import Admitted, admit, hide, status_of
 from jaxtrachea.mechanics import beam as _beam
 from jaxtrachea.mechanics import equilibrium, force_law
@@ -117,11 +117,24 @@ def local_law(
 
 
 def touch(
-    displacement: Float[Array, "*n"], onset: Float[Array, ""], options: Options
+    displacement: Float[Array, "*n"],
+    onset: Float[Array, ""],
+    options: Options,
+    blend: Float[Array, ""] | None = None,
 ) -> Float[Array, "*n"]:
-    """Displacement after first touch: exactly 0 before it if unilateral, then smooth."""
+    """Displacement after first touch: exactly 0 before it if unilateral, then smooth.
+
+    Args:
+        displacement: mm; any shape.
+        onset: displacement at first touch, mm.
+        options: the kind of contact, and the width of the smooth touch.
+        blend: mm; where the onset itself is sought: the touch is smooth from `blend` before it to
+            `blend` after it, see `centred_hinge` (slightly negative before it).
+    """
     if options.contact == "bonded":
         return displacement - onset
+    if blend is not None:
+        return centred_hinge(displacement - onset, blend)
     return positive_part(displacement - onset, jnp.asarray(options.onset_width, displacement.dtype))
 
 
@@ -150,10 +163,11 @@ def respond(
     compliance: Float[Array, ""],
     law: force_law.Law,
     options: Options,
+    blend: Float[Array, ""] | None = None,
 ) -> equilibrium.Equilibrium:
-    """Force and local indentation for a skeleton of known compliance."""
+    """Force and local indentation for a skeleton of known compliance; `blend`: see `touch`."""
     solve = {"series": equilibrium.press_series, "total": equilibrium.press_total}[options.coupling]
-    return solve(touch(displacement, onset, options), compliance, law)
+    return solve(touch(displacement, onset, options, blend), compliance, law)
 
 
 def press(

@@ -9,6 +9,7 @@ from jaxtrachea.identify.bootstrap import FEWEST, Bootstrap
 from jaxtrachea.identify.effective import CORRELATED, Effective, effective
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
+from jaxtrachea.identify.parameters import OF_THE_PRESS
 from jaxtrachea.identify.population import Population, population_rows
 from jaxtrachea.identify.posterior import Posterior
 from jaxtrachea.identify.predictions import LeftOut, Prediction, rms
@@ -72,13 +73,18 @@ WIDENED_HEAD = [*ESTIMATE_HEAD[:-1], "95 % widened", ESTIMATE_HEAD[-1]]
 def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[list[str]]:
     """Over all succeeded lanes: parameter, lanes, median, quartiles, median standard error."""
     columns: dict[str, list[tuple[float, float, str]]] = {}
+    units: dict[str, str] = {}
     good = [k for k in range(result.lanes) if succeeded(result, k)]
     for lane in good:
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
             if said_before(result, good, lane, i):
                 continue
             verdict = verdict_of(result, lane, i, profiles)
-            entry = (float(result.value[lane, i]), float(result.relative_se[lane, i]), verdict)
+            press = p.name in OF_THE_PRESS and p.scale == "linear"
+            error = result.standard_error if press else result.relative_se
+            if press:
+                units[f"{p.name} [{p.unit}]"] = p.unit
+            entry = (float(result.value[lane, i]), float(error[lane, i]), verdict)
             columns.setdefault(f"{p.name} [{p.unit}]", []).append(entry)
     rows = []
     for name, entries in columns.items():
@@ -86,14 +92,17 @@ def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[lis
         low, mid, high = np.quantile(values, [0.25, 0.5, 0.75])
         relative = np.array([e[1] for e in entries])
         known = np.isfinite(relative)
-        se = f"{100 * np.median(relative[known]):.2g} %" if known.any() else "–"
+        middle = float(np.median(relative[known])) if known.any() else np.nan
+        unit = units.get(name)
+        se = f"{middle:.2g} {unit}" if unit else f"{100 * middle:.2g} %"
+        se = se if known.any() else "–"
         share = 100 * np.mean([e[2] == "identifiable" for e in entries])
         quartiles = f"{number(low)} … {number(high)}"
         rows.append([name, str(len(values)), number(mid), quartiles, se, f"{share:.0f} %"])
     return rows
 
 
-SPREAD_HEAD = ["parameter", "n", "median", "quartiles", "rel. error", "identifiable"]
+SPREAD_HEAD = ["parameter", "n", "median", "quartiles", "error", "identifiable"]
 
 
 def quality_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
@@ -147,6 +156,16 @@ def _percent(value: float) -> str:
     return "–" if np.isnan(value) else f"{100 * value:.2f} %"
 
 
+def own_touch_sentence(result: FitResult, which: str) -> list[str]:
+    """That a curve left out has an onset or an offset fitted to itself; empty where it has none."""
+    own = [p.name for p in result.problem.free if p.scope == "trial" and p.name in OF_THE_PRESS]
+    if not own:
+        return []
+    return [
+        f"{which} fits its own {' and '.join(own)}; all other unknowns are those of the others."
+    ]
+
+
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table."""
 
@@ -190,6 +209,7 @@ def report_text(
         parts += _bootstrapped(resampled)
     if left_out is not None:
         parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, left_out)]
+        parts += own_touch_sentence(result, "A curve left out")
     parts += more
     names = {"fit": "data and fit", "residuals": "residuals", "correlation": "correlation"}
     parts += [f"![{text}]({name}.png)" for name, text in names.items()]

@@ -110,7 +110,8 @@ def test_ten_thousand_candidates_in_a_second(known):
     """One guess, after compilation: sensitivities, scores and choice."""
     one = dataclasses.replace(
         known, lane=known.lane[:1], theta=known.theta[:1], base=known.base[:1],
-        relative=known.relative[:1], sigma=known.sigma[:1],
+        relative=known.relative[:1], sigma=known.sigma[:1], kept=known.kept[:1],
+        own=known.own[:1], prior=known.prior[:1],
     )  # fmt: skip
     candidates = grid((10.0, 150.0), (2.0, 6.0), 10_000)
     assert len(candidates.s) == 10_000
@@ -133,9 +134,9 @@ def test_map_knows_that_one_place_is_not_enough(known):
 
 def test_what_cannot_be_designed_is_said(result):
     force = simulated(BEFORE, 1, 1)
-    table = synthetic.parameters(force_offset={"fixed": False})
+    table = synthetic.parameters(**{n: {"scope": "trial"} for n in synthetic.NAMES})
     own = build(synthetic.curves(force, s_c=BEFORE), synthetic.GEOMETRY, synthetic.OPTIONS, table)
-    with pytest.raises(ValueError, match="force_offset belongs to single trials"):
+    with pytest.raises(ValueError, match="every free parameter belongs to single trials"):
         situation(dataclasses.replace(result, problem=own))
     nothing = np.full_like(result.status, FitStatus.MAX_ITERATIONS)
     with pytest.raises(ValueError, match="no lane has an estimate"):
@@ -170,7 +171,11 @@ def test_command_writes_its_files_or_nothing(tmp_path, monkeypatch, capsys):
     for line, says in (
         ('s = ["20 mm", "200 mm"]', "design.s: 20 to 200 mm, tube spans 0 to 160 mm"),
         ('s = ["90 mm", "20 mm"]', "swap them"),
-        ("[parameters]\nonset = {}", "onset belongs to single trials"),
+        (
+            "[parameters]\nonset = {}\n"
+            + "\n".join(f'{n} = {{ scope = "trial" }}' for n in synthetic.NAMES),
+            "every free parameter belongs to single trials",
+        ),
     ):
         Path("spec.toml").write_text(text + line)
         code, _, err = run(monkeypatch, capsys, "design", "spec.toml")

@@ -431,7 +431,7 @@ def test_the_lock_lasts_as_long_as_the_run(study, monkeypatch, capsys):
         return real(*arguments)
 
     monkeypatch.setattr("jaxtrachea.identify.fit.fit", fit_and_look)
-    monkeypatch.setattr("jaxtrachea.plots.draw_all", lambda *_: at_work() or [])
+    monkeypatch.setattr("jaxtrachea.plots.draw_all", lambda *_: at_work() or ([], {}))
     assert run(monkeypatch, capsys, *FIT)[0] == 0
     assert len(seen) == 4
     set_failed(study / "out" / "results.h5", [1])

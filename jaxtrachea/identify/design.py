@@ -5,6 +5,10 @@ the fit itself, so that model, scales and scopes are the same; its information a
 data (Fisher information of normal noise; Fedorov 1972). Relative coordinates: 1 is a change of
 100 %. Bounds count as a weak prior, of the variance of a uniform distribution between them, so that
 nothing is infinite where the data so far leave a combination undetermined.
+
+Unknowns of single trials (an onset, an offset) are told apart from those that are sought: a new
+press brings its own, about which nothing is known, and the measured curves keep theirs. Both are
+marginalised, so that information, scores and errors are those of the other unknowns.
 """
 
 import dataclasses
@@ -19,7 +23,9 @@ from jaxtyping import Float, Int
 from jaxtrachea._arguments import check_word
 from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.cost import assemble
+from jaxtrachea.identify.design_press import marginal, of_a_new_press
 from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.press_scale import relative_change
 from jaxtrachea.identify.problem import Lane, Problem
 from jaxtrachea.identify.residual import residual
 from jaxtrachea.identify.results import succeeded
@@ -51,18 +57,28 @@ class Situation:
         lane: lane of each guess; (G,).
         theta: guess, scaled coordinates; (G, P).
         relative: change of each scaled coordinate that makes a relative change of 1; (G, P).
-        base: information of the data so far and of the bounds, relative coordinates; (G, P, P).
+        base: information of the data so far and of the bounds on the Q unknowns that are not of
+            single trials, relative coordinates; (G, Q, Q).
         sigma: of a force sample, N; (G,).
         samples: of a curve.
+        kept: these unknowns; (G, Q).
+        own: unknowns of the first trial alone, which stand for those of a new press; `theta` has
+            the median of all trials there; (G, R).
+        prior: information of the bounds on all unknowns, relative coordinates; (G, P).
+        blend: rounded corner of a new curve, mm, see `Lane`; (G,); None where no onset is fitted.
     """
 
     problem: Problem
     lane: Int[np.ndarray, " G"]
     theta: Float[np.ndarray, "G P"]
     relative: Float[np.ndarray, "G P"]
-    base: Float[np.ndarray, "G P P"]
+    base: Float[np.ndarray, "G Q Q"]
     sigma: Float[np.ndarray, " G"]
     samples: int
+    kept: Int[np.ndarray, "G Q"]
+    own: Int[np.ndarray, "G R"]
+    prior: Float[np.ndarray, "G P"]
+    blend: Float[np.ndarray, " G"] | None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -99,8 +115,11 @@ def check(problem: Problem) -> None:
     """
     problem.refuse_joint("a design")
     own = [p.name for p in problem.free if p.scope == "trial"]
-    if own:
-        raise ValueError(f"{', '.join(own)} belongs to single trials; give it another scope")
+    if len(own) == len(problem.free):
+        raise ValueError(
+            f"{', '.join(own)}: every free parameter belongs to single trials, so that a further "
+            "press tells nothing of them; give one the scope 'specimen' or 'shared'"
+        )
 
 
 def situation(
@@ -131,48 +150,71 @@ def situation(
         found = [resampled.theta[k][resampled.usable[k]][:_DRAWS] for k in lanes]
         lane = np.repeat(lanes, [len(rows) for rows in found])
         theta = np.concatenate(found)
-    log = np.array([[p.scale == "log" for p, _, _ in u] + [True] * (problem.size - len(u))
-                    for u in problem.unknowns])[lane]  # fmt: skip
-    relative = np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))
+    kept, own, theta = of_a_new_press(problem, lane, theta)
+    relative = relative_change(problem.take(lane), theta)
+    absent = problem.lanes.active[lane] == 0
+    relative = np.where(absent, 1.0, relative)
     width = (problem.lanes.upper - problem.lanes.lower)[lane] / relative
-    base = np.eye(problem.size) * (12 / np.where(width > 0, width, 1) ** 2)[:, :, None]
+    prior = 12 / np.where(width > 0, width, 1) ** 2
+    base = np.eye(problem.size) * prior[:, :, None]
     if with_data:
         even = problem.lanes._replace(balance=np.ones_like(problem.lanes.balance))
         weighed = dataclasses.replace(problem, lanes=even)
         info = informations(weighed, lane, theta, result.whitened_sigma[lane])
         base = base + info.bread * relative[:, :, None] * relative[:, None]
     n = problem.lanes.force.shape[-1] if samples is None else samples
-    return Situation(problem, lane, theta, relative, base, result.sigma[lane, 0], n)
+    blends, counts = problem.lanes.blend, [len(c) for c in problem.curves]
+    blend = None
+    if blends is not None:
+        blend = np.array([np.median(blends[k, : counts[k]]) for k in lane])
+    return Situation(
+        problem=problem, lane=lane, theta=theta, relative=relative,
+        base=marginal(base, kept), sigma=result.sigma[lane, 0], samples=n,
+        kept=kept, own=own, prior=prior, blend=blend,
+    )  # fmt: skip
 
 
-def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C P P"]:
-    """Information of a press at every candidate, relative coordinates, for every guess."""
+def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q Q"]:
+    """Information of a press at every candidate on the unknowns it shares, for every guess.
+
+    In relative coordinates; what the press has of its own is eliminated.
+    """
     problem = known.problem
     run = _compiled(problem.program, known.samples)
     place = jnp.asarray(candidates.s), jnp.asarray(candidates.depth)
     parts = []
     for g, k in enumerate(known.lane):
         lanes = problem.lanes
-        rows = lanes.value[k, :1], lanes.index[k, :1]
+        blend = None if known.blend is None else jnp.asarray(known.blend[g : g + 1])
+        rows = lanes.value[k, :1], lanes.index[k, :1], blend
         matrix = run(jnp.asarray(known.theta[g]), *rows, *place) / known.sigma[g] ** 2
         parts.append(np.asarray(matrix) * known.relative[g][:, None] * known.relative[g])
-    return np.stack(parts)
+    added = np.stack(parts)
+    if known.own.shape[1] == 0:
+        return added
+    # What a press brings of its own is known no better than its bounds say.
+    for matrix, own, prior in zip(added, known.own, known.prior, strict=True):
+        matrix[:, own, own] += prior[own]
+    rows = np.concatenate([known.kept, known.own], axis=1)
+    of_press = np.stack([m[:, r[:, None], r[None]] for m, r in zip(added, rows, strict=True)])
+    shared = np.tile(np.arange(known.kept.shape[1]), (len(rows), 1))
+    return marginal(of_press, shared)
 
 
 @functools.lru_cache(maxsize=16)
 def _compiled(problem: Problem, samples: int):
-    def one(theta, value, index, s, depth):
+    def one(theta, value, index, blend, s, depth):
         displacement = depth * jnp.arange(1, samples + 1, dtype=theta.dtype)[None] / samples
         ones, size = jnp.ones_like(displacement), theta.shape[0]
         lane = Lane(
             s_c=s[None], displacement=displacement, force=0 * ones, precision=ones, joints=None,
-            joint_precision=None, balance=ones[:, 0], value=value, index=index,
+            joint_precision=None, balance=ones[:, 0], blend=blend, value=value, index=index,
             lower=jnp.zeros(size), upper=jnp.zeros(size), active=jnp.ones(size),
         )  # fmt: skip
         J = residual(problem, theta, lane).jacobian
         return assemble(problem, jnp.einsum("tim,tjm->tij", J, J), lane)
 
-    return jax.jit(jax.vmap(one, (None, None, None, 0, 0)))
+    return jax.jit(jax.vmap(one, (None, None, None, None, 0, 0)))
 
 
 def scores(information: Float[np.ndarray, "G C P P"], criterion: Criterion):

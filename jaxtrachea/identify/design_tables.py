@@ -10,9 +10,10 @@ from jaxtrachea.identify.results import unknown_label
 
 
 def names(known: Situation, result) -> list[str]:
-    """Unknowns of the first guess's lane; all lanes have the same parameters in the same order."""
+    """Unknowns of the first guess's lane that a new press shares; all lanes have the same ones."""
     lane = int(known.lane[0])
-    return [unknown_label(result, lane, i) for i in range(len(result.problem.unknowns[lane]))]
+    count = len(result.problem.unknowns[lane])
+    return [unknown_label(result, lane, int(i)) for i in known.kept[0] if i < count]
 
 
 def choice_rows(choice: Choice, at: Candidates, unknowns: list[str]) -> Iterator[dict[str, Any]]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtrachea._arguments import check_record
 from jaxtrachea.identify import descent, joint
 from jaxtrachea.identify.criteria import Criteria, criteria
+from jaxtrachea.identify.press_scale import relative_change
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.solve import Solved, Tolerances, chunk_size, levenberg_marquardt
 from jaxtrachea.identify.starts import best, completed, draw_starts, of_unknowns
@@ -67,7 +68,8 @@ class FitResult:
         standard_error: in the parameter's unit (delta method); (lanes, P).
         lower: 95 % interval, transformed from scaled coordinates; (lanes, P).
         upper: (lanes, P).
-        relative_se: standard error over the value (scale `log`: of the logarithm); (lanes, P).
+        relative_se: standard error over the value (scale `log`: of the logarithm; onset and offset:
+            over range and largest force of the press); (lanes, P).
         at_bound: (lanes, P).
         status: `FitStatus`; (lanes,).
         iterations: of the best start; (lanes,).
@@ -118,7 +120,7 @@ class FitResult:
     @property
     def relative(self) -> np.ndarray:
         """Change of each scaled coordinate that makes a relative change of 1; (lanes, P)."""
-        return np.where(_scales(self.problem)[0], 1.0, np.maximum(np.abs(self.theta), 1e-3))
+        return relative_change(self.problem, self.theta)
 
 
 def fit(
@@ -301,7 +303,7 @@ def _conclude(problem: Problem, solved: Solved, known, sigma, agree, tried) -> F
     present = lanes.active > 0
     at_bound &= present
     held = at_bound | ~present
-    relative = np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))
+    relative = relative_change(problem, theta)
     if problem.joint:
         pool = joint.marginal(problem, pool, held, alive)
         unknowns -= joint.held_count(problem, held, alive)

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxtrachea.identify.cost import assemble, entry_scale, robust
 from jaxtrachea.identify.estimate import hessian
@@ -47,7 +47,7 @@ class Diagnostics(NamedTuple):
             sample's value rises by one sigma; (T, Jf, m).
         left_out: the same where the sample is left out; (T, Jf, m).
         curve_cook: where the curve is left out; NaN where the others do not do without it; (T,).
-        curve_left_out: (T, Jf).
+        curve_left_out: NaN for unknowns that go with the curve; (T, Jf).
         curve_share: of the variance of the unknowns, by noise of this curve; (T, Jf).
     """
 
@@ -144,19 +144,22 @@ def diagnose(
     shift = jnp.einsum("tij,tjm->tim", K, J)
     gone = pull / (1 - stiffness * form(K))
     per_sigma = shift * stiffness[:, None]
-    c = _without_curve(J, gram(weight), gram(stiffness), pull, near, K)
+    own = _of_one_curve(problem, lane, free)
+    c, cook = _without_curve(J, gram(weight), gram(stiffness), pull, near, K, own)
     variance = jnp.diagonal(sandwich(inverse.full, whole(stiffness**2)))
     variance = jnp.diagonal(blocks(jnp.diag(variance)), axis1=1, axis2=2)
-    own = jnp.sum(per_sigma**2, axis=2)
+    by_curve = jnp.sum(per_sigma**2, axis=2)
     return Diagnostics(
         leverage=leverage,
         studentised=jnp.where(left > 1e-12, z / jnp.sqrt(jnp.maximum(left, 1e-12)), jnp.nan),
         cook=gone * gone * form(rise),
         per_sigma=per_sigma,
         left_out=shift * gone[:, None],
-        curve_cook=jnp.einsum("ti,tij,tj->t", c, rise, c),
-        curve_left_out=jnp.einsum("tij,tj->ti", K, c),
-        curve_share=jnp.where(variance > 0, own / jnp.where(variance > 0, variance, 1), jnp.nan),
+        curve_cook=jnp.einsum("ti,tij,tj->t", c, rise, c) - cook / jnp.maximum(jnp.sum(free), 1),
+        curve_left_out=jnp.where(own, jnp.nan, jnp.einsum("tij,tj->ti", K, c)),
+        curve_share=jnp.where(
+            variance > 0, by_curve / jnp.where(variance > 0, variance, 1), jnp.nan
+        ),
     )
 
 
@@ -168,13 +171,38 @@ def _blocks(problem: Problem, lane: Lane, matrix: Float[Array, "P P"]) -> Float[
     return jnp.where(there, matrix[at[:, :, None], at[:, None, :]], 0)
 
 
-def _without_curve(J, own, stiffness, pull, near, K) -> Float[Array, "T Jf"]:
-    """What moves the unknowns, by H^-1, where a curve is left out; NaN where it is needed."""
+def _of_one_curve(problem: Problem, lane: Lane, free) -> Bool[Array, "T Jf"]:
+    """Which free unknowns a curve alone reads; none where it shares no unknown with another."""
+    index = lane.index[:, problem.free_columns]
+    size = lane.lower.shape[0]
+    place = jnp.where(index >= 0, index, size)
+    readers = jnp.zeros(size + 1, index.dtype).at[place].add(1)
+    there = (index >= 0) & (jnp.append(free, 0)[place] > 0)
+    own = (readers[place] == 1) & there
+    return own & jnp.any(there & ~own, axis=1, keepdims=True)
+
+
+def _without_curve(J, gram, stiffness, pull, near, K, own):
+    """What moves the unknowns, by H^-1, where a curve is left out; NaN where it is needed.
+
+    What the curve alone reads goes with it: a spring of any stiffness in its place holds it, and
+    the others do not notice, for nothing else is tied to it.
+
+    Returns:
+        (T, Jf), and what is to be taken off twice the rise of the cost: unknowns that go with the
+        curve follow the others as they like; (T,).
+    """
     eye = jnp.eye(J.shape[1], dtype=J.dtype)[None]
     force = jnp.einsum("tim,tm->ti", J, pull)
-    moved = jnp.linalg.solve(eye - stiffness @ K, force[:, :, None])[:, :, 0]
-    alone = jnp.linalg.det(eye - own @ near) < _ALONE
-    return jnp.where(alone[:, None], jnp.nan, moved)
+    diagonal = jnp.diagonal(gram, axis1=1, axis2=2)
+    spring = jnp.where(own, jnp.where(diagonal > 0, diagonal, 1), 0)[:, :, None] * eye
+    moved = jnp.linalg.solve(eye - (stiffness - spring) @ K, force[:, :, None])[:, :, 0]
+    alone = jnp.linalg.det(eye - (gram - spring) @ near) < _ALONE
+    moved = jnp.where(alone[:, None], jnp.nan, moved)
+    pushed = jnp.where(own, jnp.einsum("tij,tjk,tk->ti", gram, K, moved), 0)
+    both = own[:, :, None] & own[:, None]
+    inner = jnp.where(both, gram, eye)
+    return moved, jnp.sum(pushed * jnp.linalg.solve(inner, pushed[:, :, None])[:, :, 0], axis=1)
 
 
 def influence(result: FitResult, chunk: int = 128) -> Influence:

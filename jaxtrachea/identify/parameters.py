@@ -149,6 +149,9 @@ DEFAULTS = {
 
 #: Parameters of the beam; all others act at the contact.
 SKELETON = ("EI_L", "GA_L", "k_M")
+#: Parameters of single presses that are no property of the specimen: errors are measured against
+#: the range of displacement and the largest force.
+OF_THE_PRESS = ("onset", "force_offset")
 
 
 def in_model(options: Options, *, joints: bool) -> list[str]:

@@ -6,11 +6,13 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jaxtrachea.identify.fit import FitResult, Settings, fit
+from jaxtrachea.identify.parameters import OF_THE_PRESS
 from jaxtrachea.identify.problem import Lane, Problem
 from jaxtrachea.identify.residual import residual_value
+from jaxtrachea.identify.starts import draw_starts
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -110,11 +112,11 @@ def curves_to_leave_out(problem: Problem) -> list[tuple[int, int]]:
     """Lane and trial of every curve that the others of its lane can predict.
 
     Raises:
-        ValueError: no lane has two curves, or an unknown belongs to a trial (a curve left out could
-            then not be predicted).
+        ValueError: no lane has two curves, or an unknown other than onset and offset belongs to a
+            trial (a curve left out could then not be predicted).
     """
     problem.refuse_joint("leaving curves out")
-    own = [p.name for p in problem.parameters if p.scope == "trial" and not p.fixed]
+    own = [p.name for p in problem.free if p.scope == "trial" and p.name not in OF_THE_PRESS]
     if own:
         raise ValueError(
             f"{', '.join(own)} belongs to single trials, which no other curve can tell; fix it, or "
@@ -128,6 +130,8 @@ def curves_to_leave_out(problem: Problem) -> list[tuple[int, int]]:
 
 def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOut:
     """Fit every lane once without each of its curves, and predict that curve.
+
+    A curve left out fits an onset or an offset of its own, all other unknowns kept.
 
     Args:
         problem: lanes with two curves or more are used.
@@ -144,7 +148,7 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
     held = np.zeros(lanes.s_c.shape, bool)
     held[rows, trial] = True
     result = fit(without(chosen, held), settings, progress)
-    seen = predictions(chosen, result.theta)
+    seen = predictions(chosen, with_own_touch(chosen, held, result.theta, settings))
     force, data = seen.force[rows, trial], lanes.force[rows, trial]
     model = np.where(lanes.precision[rows, trial] > 0, data + force, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -160,13 +164,56 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
 
 
 def without(problem: Problem, held: Bool[np.ndarray, "lanes T"]) -> Problem:
-    """The same lanes, blind to the trials that are held back."""
+    """The same lanes, blind to the trials held back; what these alone read is no unknown."""
     blind = lambda v: None if v is None else np.where(held[:, :, *[None] * (v.ndim - 2)], 0, v)  # noqa: E731
     lanes = problem.lanes
     seen = lanes._replace(
         precision=blind(lanes.precision), joint_precision=blind(lanes.joint_precision)
     )
+    own = own_unknowns(problem, held)
+    if own.any():
+        seen = seen._replace(active=np.where(own, 0, seen.active))
     return dataclasses.replace(problem, lanes=seen)
+
+
+def own_unknowns(
+    problem: Problem, held: Bool[np.ndarray, "lanes T"]
+) -> Bool[np.ndarray, "lanes P"]:
+    """Unknowns of single trials that none but the trials `held` read."""
+    own = np.zeros(problem.lanes.lower.shape, bool)
+    columns = [j for j in problem.free_columns if problem.parameters[j].scope == "trial"]
+    for lane, trial in np.argwhere(held) if columns else ():
+        own[lane, [i for i in problem.lanes.index[lane, trial, columns] if i >= 0]] = True
+    return own
+
+
+def with_own_touch(
+    problem: Problem,
+    held: Bool[np.ndarray, "lanes T"],
+    theta: Float[np.ndarray, "lanes P"],
+    settings: Settings,
+) -> Float[np.ndarray, "lanes P"]:
+    """Theta with onset and offset of the trials `held` fitted to them, all other unknowns kept.
+
+    Where the trials have none of their own, `theta` itself.
+
+    Args:
+        problem: the study, with all its data.
+        held: trials that took no part in the fit; at least one of each lane.
+        theta: the fit without them, scaled coordinates.
+        settings: of the fit; one that does not converge keeps its best point.
+    """
+    own = own_unknowns(problem, held)
+    if not own.any():
+        return theta
+    alone = without(problem, ~held)
+    alone = dataclasses.replace(
+        alone, lanes=alone.lanes._replace(active=np.where(own, problem.lanes.active, 0))
+    )
+    starts = draw_starts(alone, settings)
+    kept = np.repeat(np.where(own, np.nan, theta), settings.starts, axis=0)
+    starts = np.where(np.isnan(kept), starts, kept)
+    return fit(alone, settings, starts=starts).theta
 
 
 def rms(values: np.ndarray) -> np.ndarray | np.floating:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import check_record, check_word
 from jaxtrachea.identify.measurements import Curve
+from jaxtrachea.identify.onset import blends, natural_steps, onset_is_sought, within_reach
 from jaxtrachea.identify.parameters import DEFAULTS, SKELETON, Parameter
 from jaxtrachea.model import Options
 from jaxtrachea.trachea.geometry import Geometry
@@ -42,6 +43,8 @@ class Lane(NamedTuple):
         joints: marker displacement, mm; (T, N, rings); None without markers.
         joint_precision: as `precision`; None without markers.
         balance: weight of each trial against the others; (T,).
+        blend: smooth first touch of each trial, mm, see `first_touch`; (T,); None where no onset is
+            fitted.
         value: value of every model parameter, used where it is not free; (T, J).
         index: (T, J).
         lower: bounds of the unknowns in scaled coordinates; (P,).
@@ -56,6 +59,7 @@ class Lane(NamedTuple):
     joints: Float[Array, "*l T N rings"] | None
     joint_precision: Float[Array, "*l T N rings"] | None
     balance: Float[Array, "*l T"]
+    blend: Float[Array, "*l T"] | None
     value: Float[Array, "*l T J"]
     index: Int[Array, "*l T J"]
     lower: Float[Array, "*l P"]
@@ -259,6 +263,7 @@ def build(
         raise ValueError("parameters: every parameter is fixed; free at least one")
     for curve in curves:
         check_curve(curve, geometry, options)
+    parameters = natural_steps(parameters, curves)
     joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1
     groups = group(curves, parameters, joint=joint)
@@ -277,6 +282,9 @@ def build(
         for lane, names in zip(groups, unknowns, strict=True)
     ]
     stacked = jax.tree.map(lambda *arrays: np.stack(arrays), *lanes)
+    if onset_is_sought(parameters, options):
+        stacked = stacked._replace(blend=blends(stacked, groups, noise.force, parameters, options))
+        stacked = within_reach(stacked, parameters)
     known = noise.force is not None or all(c.sigma is not None for c in curves)
     return Problem(
         geometry=jax.tree.map(lambda v: np.asarray(v, np.float64), geometry),
@@ -369,6 +377,7 @@ def _lane(
         "joints": joints,
         "joint_precision": None if joints is None else joints.copy(),
         "balance": np.ones(T),
+        "blend": None,
         "value": np.tile([p.value for p in parameters], (T, 1)).astype(np.float64),
         "index": np.full((T, J), -1, np.int32),
         "lower": np.zeros(P),

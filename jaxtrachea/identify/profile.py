@@ -55,7 +55,7 @@ class Profiles:
         log = np.array([p.scale == "log" for p in parameters], bool)
         step = np.array([p.step for p in parameters])
         with np.errstate(divide="ignore", invalid="ignore"):
-            size = np.maximum(np.abs(self.result.theta[self.lane, self.unknown]), 1e-3)
+            size = self.result.relative[self.lane, self.unknown]
             linear = (self.upper - self.lower) / (step * size)
             width = np.where(log, np.log(self.upper / self.lower), linear)
         return width / (2 * np.sqrt(self.threshold))

@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.predictions import predictions, rms, without
+from jaxtrachea.identify.parameters import OF_THE_PRESS
+from jaxtrachea.identify.predictions import predictions, rms, with_own_touch, without
 from jaxtrachea.identify.problem import Problem
 
 
@@ -36,14 +37,14 @@ def repeats(problem: Problem) -> Repeats:
     """What each specimen repeats, within every lane.
 
     Contact positions where a specimen has several (repeats of a position go together), else its
-    trials; where all unknowns are shared, a specimen of one curve as a whole. None where an unknown
-    belongs to a single curve: no other tells of it.
+    trials; where all unknowns are shared, a specimen of one curve as a whole. None where a
+    stiffness belongs to a single curve: no other tells of it. (Its onset and offset are fitted.)
     """
     free = [p for p in problem.parameters if not p.fixed]
     width = problem.lanes.s_c.shape[1]
     lanes, held, kinds = [], [], []
-    own = any(p.scope == "trial" for p in free)
-    shared = all(p.scope == "shared" for p in free)
+    own = any(p.scope == "trial" and p.name not in OF_THE_PRESS for p in free)
+    shared = all(p.scope == "shared" or p.name in OF_THE_PRESS for p in free)
     for lane, curves in enumerate(() if own else problem.curves):
         for kind, groups in _groups(curves, shared=shared):
             for group in groups:
@@ -88,7 +89,8 @@ def leave_repeats_out(
 
     Returns:
         Root mean square force residual of the curves left out, over the lane's largest force;
-        (lanes,), NaN where nothing can be left out or a fit failed.
+        (lanes,), NaN where nothing can be left out or a fit failed. The onset and the force offset
+        of a curve left out are fitted to it, all else kept.
     """
     error = np.full(len(problem.curves), np.nan)
     lanes, held, _ = repeats(problem)
@@ -96,7 +98,7 @@ def leave_repeats_out(
         return error
     chosen = problem.take(lanes)
     result = fit(without(chosen, held), settings, progress)
-    seen = predictions(chosen, result.theta).force
+    seen = predictions(chosen, with_own_touch(chosen, held, result.theta, settings)).force
     solved = result.succeeded
     missed = np.where((held & solved[:, None])[:, :, None], seen, np.nan)
     for lane in np.unique(lanes):

@@ -25,10 +25,13 @@ class Residual(NamedTuple):
     Attributes:
         value: (T, m); force samples, then markers.
         jacobian: d value / d (free columns, scaled); (T, Jf, m).
+        bend: of the corner at the onset: second derivative of the value by the onset's column, as
+            far as it comes from the rounded corner; None where no onset is fitted; (T, m).
     """
 
     value: Float[Array, "T m"]
     jacobian: Float[Array, "T Jf m"]
+    bend: Float[Array, "T m"] | None = None
 
 
 class Skeleton(NamedTuple):
@@ -60,7 +63,7 @@ def residual_value(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> F
     def one(free, skeleton, trial):
         law, onset, offset = _at_contact(problem, free, trial)
         c = _felt(problem, skeleton)
-        force = respond(trial.displacement, onset, c, law, problem.options).force
+        force = respond(trial.displacement, onset, c, law, problem.options, trial.blend).force
         joints = None if skeleton.joints is None else _times(force, skeleton.joints)
         return _whitened(force + offset, joints, trial)
 
@@ -198,10 +201,12 @@ def _of_trial_with_jacobian(problem: Problem, free, skeleton, by_beam, trial: La
 
     d_skeleton = jax.tree.map(all_columns, by_beam)
     law, c = contact.law, _felt(problem, skeleton)
-    depth = respond(trial.displacement, contact.onset, c, law, problem.options).depth
+    D, blend = trial.displacement, trial.blend
+    depth = respond(D, contact.onset, c, law, problem.options, blend).depth
     by = sensitivity(depth, c, law)
-    at = lambda onset: touch(trial.displacement, onset, problem.options)  # noqa: E731
-    moved = jax.jvp(at, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
+    at = lambda onset: touch(D, onset, problem.options, blend)  # noqa: E731
+    slope = lambda onset: jax.jvp(at, (onset,), (jnp.ones_like(onset),))[1]  # noqa: E731
+    moved = slope(contact.onset)
     terms = {
         "compliance": (_felt(problem, d_skeleton), by.compliance),
         "k_1": (d_contact.law.k_1, by.k_1),
@@ -219,7 +224,12 @@ def _of_trial_with_jacobian(problem: Problem, free, skeleton, by_beam, trial: La
         d_joints = d_joints + jax.vmap(_times, (None, 0))(force, d_skeleton.joints)
     value = _whitened(force + contact.force_offset, joints, trial)
     row = lambda force, joints: _masked(force, joints, trial)  # noqa: E731
-    return value, jax.vmap(row)(d_force + d_contact.force_offset[:, None], d_joints)
+    bend = None
+    if blend is not None and joints is None:
+        curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
+        squared = jnp.sum(d_contact.onset**2)
+        bend = _masked(by.displacement * curved * squared, None, trial)
+    return value, jax.vmap(row)(d_force + d_contact.force_offset[:, None], d_joints), bend
 
 
 def _felt_through(problem: Problem) -> list[str]:

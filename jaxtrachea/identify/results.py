@@ -15,7 +15,9 @@ from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.journal import installed
 from jaxtrachea.identify.measurements import BadCurve
+from jaxtrachea.identify.parameters import OF_THE_PRESS
 from jaxtrachea.identify.population import Population
+from jaxtrachea.identify.press_scale import sizes_of_press
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.rows import row_places, samples_of, trials_of
 from jaxtrachea.identify.usage_tables import lane_cells
@@ -64,7 +66,19 @@ def flat_sentence(result: FitResult, lane: int) -> str:
         return "no estimate"
     names = [unknown_label(result, lane, i) for i in range(len(result.problem.unknowns[lane]))]
     u = result.uncertainty[lane]
-    return describe_flat(names, u.flat, float(u.flat_se), u.blind)
+    return describe_flat(names, u.flat, float(u.flat_se), u.blind, press_sizes(result, lane))
+
+
+def press_sizes(result: FitResult, lane: int) -> dict[int, tuple[float, str]]:
+    """Size of the press in the unit of each onset and offset of a lane, by place of the unknown."""
+    unknowns = result.problem.unknowns[lane]
+    places = [i for i, (p, _, _) in enumerate(unknowns) if p.name in OF_THE_PRESS]
+    places = [i for i in places if unknowns[i][0].scale == "linear"]
+    if not places:
+        return {}
+    sizes = sizes_of_press(result.problem.take(np.array([lane])))[0]
+    found = {i: (float(sizes[i]) * unknowns[i][0].step, unknowns[i][0].unit) for i in places}
+    return {i: v for i, v in found.items() if np.isfinite(v[0])}
 
 
 def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = None) -> str:

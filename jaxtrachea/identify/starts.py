@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.identify.parameters import Parameter
+from jaxtrachea.identify.press_scale import around_touch
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.solve import Solved
 from jaxtrachea.status import FitStatus
@@ -35,13 +36,15 @@ def box(problem: Problem, decades: float) -> Box:
 
     Args:
         problem: the study.
-        decades: half the width of the box (scale `linear`: times 10 steps).
+        decades: half the width of the box (scale `linear`: times 10 steps; onset and offset: times
+            a tenth of the press, around the change point of the curve).
     """
     guess = of_unknowns(problem, lambda p: p.to_scaled(p.value), 0.0)
     decade = lambda p: np.log(10) if p.scale == "log" else 10.0  # noqa: E731
     reach = decades * of_unknowns(problem, decade, 0.0)
     low = np.maximum(problem.lanes.lower, guess - reach)
-    return Box(guess, low, np.minimum(problem.lanes.upper, guess + reach))
+    high = np.minimum(problem.lanes.upper, guess + reach)
+    return Box(*around_touch(problem, guess, low, high, decades))
 
 
 def of_unknowns(problem: Problem, number: Callable[[Parameter], float], padding: float):

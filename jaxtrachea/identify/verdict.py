@@ -1,5 +1,8 @@
 """Verdicts in words: which parameters the data determine, and what they determine instead."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
@@ -89,6 +92,7 @@ def describe_flat(
     flat: Float[np.ndarray, " P"],
     flat_se: float,
     blind: Float[np.ndarray, "P P"] | None = None,
+    press: Mapping[int, tuple[float, str]] = MappingProxyType({}),
 ) -> str:
     """What the data leave open, in words.
 
@@ -97,9 +101,12 @@ def describe_flat(
         flat: least determined direction in relative coordinates, see `Uncertainty.flat`.
         flat_se: relative standard error along it.
         blind: all undetermined directions, see `Uncertainty.blind`; None: `flat` alone.
+        press: of unknowns that are measured against the press (by position), its size and unit.
     """
     if not np.any(flat):
         return "no free parameter"
+    if press and np.any(np.abs(flat[list(press)]) >= _PART * np.max(np.abs(flat))):
+        return _with_units(names, flat, flat_se, blind, press)
     if np.isfinite(flat_se) and flat_se <= WEAK:
         order = np.argsort(-np.abs(flat))
         main = [i for i in order if abs(flat[i]) >= 0.1 * abs(flat[order[0]])]
@@ -118,6 +125,27 @@ def describe_flat(
     if not products:
         return f"{_list(involved)} change{'s' if alone else ''} no curve at all"
     return f"{_list(involved)} only through {_list(products)}"
+
+
+def _with_units(names, flat, flat_se, blind, press) -> str:
+    """As `describe_flat`, where an onset or an offset takes part: in its unit, no power of it."""
+    if np.isinf(flat_se):
+        ways = flat[None] if blind is None or not np.any(blind) else blind
+        parts = [n for i, n in enumerate(names) if np.any(np.abs(ways[:, i]) >= _PART)]
+        alone = len(parts) == 1
+        return f"{_list(parts)} change{'s' if alone else ' together'} without a change of any curve"
+    order = np.argsort(-np.abs(flat))
+    main = [i for i in order if abs(flat[i]) >= 0.1 * abs(flat[order[0]])]
+    if len(main) == 1:
+        size, unit = press[int(main[0])]
+        return f"least determined: {names[main[0]]} alone, known to {flat_se * size:.2g} {unit}"
+    step = 0.1 / np.max(np.abs(flat))
+    moves = []
+    for i in main:
+        size, unit = press.get(int(i), (100.0, "%"))
+        moves.append(f"{names[i]} {step * flat[i] * size:+.3g} {unit}")
+    times = f"known to {flat_se / step:.2g} times that"
+    return f"least determined: {', '.join(moves)} together, {times}"
 
 
 def _moves(names, flat, main) -> str:
