@@ -6,12 +6,13 @@ import hashlib
 import json
 import platform
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import h5py
 import numpy as np
 
+from jaxtrachea.identify import stored
 from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.journal import installed
@@ -24,9 +25,9 @@ from jaxtrachea.identify.whole_files import hdf5_file
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 SCHEMA = "jaxtrachea-results"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 #: Fields of `Uncertainty` in the group of that name; the others stand with lanes and unknowns.
-MORE = ("se", "flat_se", "blind", "half_width", "along", "dispersion")
+MORE = ("se", "flat_se", "blind", "half_width", "along", "dispersion", "covariance")
 
 
 def unknown_label(result: FitResult, lane: int, i: int) -> str:
@@ -248,6 +249,7 @@ def write_hdf5(
     provenance: dict,
     profiles: Profiles | None = None,
     resampled: Bootstrap | None = None,
+    reading: Mapping[str, object] | None = None,
 ) -> None:
     """Write all numbers of a fit; the schema is described in docs/results.md.
 
@@ -257,12 +259,14 @@ def write_hdf5(
         provenance: stored as JSON in the root attribute of that name.
         profiles: makes the group `profiles`.
         resampled: makes the group `bootstrap`.
+        reading: how the data were read (the [data] section), for `predict`.
     """
     with hdf5_file(path) as file:
         file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
         file.attrs["provenance"] = json.dumps(provenance)
         _write_lanes(file.create_group("lanes"), result)
         _write_unknowns(file.create_group("unknowns"), result)
+        stored.write(file, result, provenance.get("inputs", {}), reading or {})
         group = file.create_group("uncertainty")
         for name in MORE:
             rows = np.stack([getattr(u, name) for u in result.uncertainty])

@@ -139,6 +139,8 @@ class Uncertainty(NamedTuple):
         dispersion: of twice the rise of the cost along each unknown: where the cost is a
             likelihood s^2, else such that its curvature gives `se` (Kent 1982,
             doi:10.1093/biomet/69.1.19); (P,).
+        covariance: of the estimates, scaled coordinates; 0 for held unknowns, and without the
+            `blind` directions, along which it is infinite; (P, P).
     """
 
     se: np.ndarray
@@ -150,6 +152,7 @@ class Uncertainty(NamedTuple):
     half_width: np.ndarray
     along: np.ndarray
     dispersion: np.ndarray
+    covariance: np.ndarray
 
 
 def analyse(
@@ -204,7 +207,10 @@ def analyse(
     whole = [np.trace(_scaled(np.asarray(m), relative), axis1=1, axis2=2) for m in info[:2]]
     dispersion = dpsi[:, None] * _ratio(along, meat, bread, whole[1] * kappa, whole[0])
     along = along * relative[:, None] / relative[:, :, None]
-    return Uncertainty(se, correlation, condition, flat, flat_se, silent, half, along, dispersion)
+    covariance = covariance * relative[:, :, None] * relative[:, None]
+    return Uncertainty(
+        se, correlation, condition, flat, flat_se, silent, half, along, dispersion, covariance
+    )
 
 
 def _along(values, vectors, free) -> np.ndarray:

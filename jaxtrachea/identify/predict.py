@@ -1,0 +1,399 @@
+"""Force, joints and reactions that a finished fit predicts, with 95 % bands.
+
+Two bands: of the curve itself (covariance of the parameters, through the exact Jacobian: the delta
+method) and of a new sample (with the noise). The delta method is linear. It stops being valid where
+the band is so wide that the model bends within it, where an unknown is held on its bound (its own
+uncertainty is left out) and where the data leave a combination of unknowns undetermined (the band
+is then infinite wherever that combination acts): each has a `PredictionStatus`.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from jaxtrachea.identify.problem import Problem
+from jaxtrachea.identify.residual import material_and_values
+from jaxtrachea.identify.sources import Source, source_of
+from jaxtrachea.identify.stored import StoredFit
+from jaxtrachea.model import press
+from jaxtrachea.status import PredictionStatus, PressStatus
+
+#: Slope along a blind direction, over what its terms add up to, from which it counts.
+_ACTS = 1e-6
+#: Error of the linear band at its ends, in half-widths, from which it is called bent.
+BENT = 0.25
+
+
+class Response(NamedTuple):
+    """The model's answer at one contact position; N displacements.
+
+    Attributes:
+        force: at the load cell, with its offset, N; (N,).
+        joints: deflection of the ligament at each ring, mm; (N, rings).
+        reactions: force of each ring against the load, N; (N, rings).
+    """
+
+    force: Float[Array, "*n"]
+    joints: Float[Array, "*n rings"]
+    reactions: Float[Array, "*n rings"]
+
+
+class Predicted(NamedTuple):
+    """A response with standard errors from the parameters alone; inf where undetermined.
+
+    Attributes:
+        value: the response.
+        se: its standard errors.
+        status: `PressStatus` of every displacement; (N,).
+        bend: error of the linear band of the force at its ends, in half-widths, at the deepest
+            displacement; NaN without a band.
+    """
+
+    value: Response
+    se: Response
+    status: Int[Array, "*n"]
+    bend: Float[Array, ""]
+
+
+def respond(
+    problem: Problem,
+    free: Float[Array, " F"],
+    value: Float[Array, " J"],
+    s_c: Float[Array, ""],
+    displacement: Float[Array, " N"],
+) -> tuple[Response, Int[Array, " N"]]:
+    """The fitted model at one position: response and `PressStatus`; pure.
+
+    Args:
+        problem: geometry, options and parameters (static).
+        free: free parameters, scaled coordinates.
+        value: all parameters in their units, used where they are not free.
+        s_c: mm.
+        displacement: mm.
+    """
+    material, values = material_and_values(problem, free, value)
+    geometry = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), problem.geometry)
+    solved = press(
+        geometry, material, s_c, displacement, problem.options, onset=values["onset"]
+    )  # fmt: skip
+    force = solved.force + values["force_offset"]
+    return Response(force, solved.joints, solved.reactions), solved.status
+
+
+def jacobian(problem: Problem, free, value, s_c, displacement):
+    """`respond`, its statuses, and its derivative by every free column, a leading axis (F, ...)."""
+
+    def push(tangent):
+        at = lambda free: respond(problem, free, value, s_c, displacement)  # noqa: E731
+        out, moved, status = jax.jvp(at, (free,), (tangent,), has_aux=True)
+        return out, status, moved
+
+    if not len(free):
+        out, status = respond(problem, free, value, s_c, displacement)
+        return out, status, jax.tree.map(lambda v: jnp.zeros((0, *v.shape), v.dtype), out)
+    eye = jnp.eye(free.shape[0], dtype=free.dtype)
+    return jax.vmap(push, out_axes=(None, None, 0))(eye)
+
+
+def standard_errors(
+    slope: Float[Array, "F *n"], covariance: Float[Array, "F F"], blind: Float[Array, "B F"]
+) -> Float[Array, "*n"]:
+    """Delta method: sqrt(J C J^T), inf where a blind direction changes the quantity."""
+    variance = jnp.einsum("f...,fg,g...->...", slope, covariance, slope)
+    along = jnp.abs(jnp.einsum("bf,f...->b...", blind, slope))
+    terms = jnp.einsum("bf,f...->b...", jnp.abs(blind), jnp.abs(slope))
+    least = max(_ACTS, 100 * float(jnp.finfo(slope.dtype).eps))
+    undetermined = jnp.any(along > least * terms, axis=0)
+    return jnp.where(undetermined, jnp.inf, jnp.sqrt(jnp.maximum(variance, 0)))
+
+
+def predicted(
+    problem: Problem,
+    free: Float[Array, " F"],
+    value: Float[Array, " J"],
+    covariance: Float[Array, "F F"],
+    blind: Float[Array, "B F"],
+    half_width: Float[Array, ""],
+    s_c: Float[Array, ""],
+    displacement: Float[Array, " N"],
+) -> Predicted:
+    """One curve with its standard errors; pure, for `jit` and `vmap`, float32 and float64.
+
+    Args:
+        problem: geometry, options and parameters (static).
+        free: estimates, scaled coordinates.
+        value: all parameters in their units, used where they are not free.
+        covariance: of `free`; 0 for what is held.
+        blind: rows: directions of `free` that the fit leaves undetermined.
+        half_width: of a 95 % interval in standard errors.
+        s_c: mm.
+        displacement: mm; at least one.
+    """
+    out, status, slopes = jacobian(problem, free, value, s_c, displacement)
+    se = jax.tree.map(lambda slope: standard_errors(slope, covariance, blind), slopes)
+    deepest = jnp.argmax(jnp.abs(displacement))
+    bend = _bend(
+        problem, free, value, covariance, half_width, s_c, displacement[deepest],
+        out.force[deepest], slopes.force[:, deepest],
+    )  # fmt: skip
+    return Predicted(out, se, status, bend)
+
+
+def _bend(problem, free, value, covariance, half_width, s_c, displacement, force, slope):
+    """How far the model leaves its tangent at both ends of the band, in half-widths."""
+    pull = covariance @ slope
+    se = jnp.sqrt(jnp.maximum(slope @ pull, 0))
+    known = (se > 0) & jnp.isfinite(half_width)
+    step = jnp.where(known, half_width / jnp.where(se > 0, se, 1), 0) * pull
+    half = half_width * se
+
+    def off(sign):
+        end, _ = respond(problem, free + sign * step, value, s_c, displacement[None])
+        return jnp.abs(end.force[0] - force - sign * half) / jnp.where(known, half, 1)
+
+    worst = jnp.maximum(off(1.0), off(-1.0))
+    # No solution within the band (past a fold): as bent as can be.
+    worst = jnp.where(jnp.isfinite(worst), worst, jnp.inf)
+    return jnp.where(known, worst, jnp.nan)
+
+
+@functools.lru_cache(maxsize=16)
+def compiled(problem: Problem):
+    """`predicted` for many curves at once; `problem` is a `Problem.program`."""
+    return jax.jit(jax.vmap(functools.partial(predicted, problem)))
+
+
+@functools.lru_cache(maxsize=16)
+def compiled_slopes(problem: Problem):
+    """Force and its derivative for many curves at once."""
+
+    def force(free, value, s_c, displacement):
+        out, _, slopes = jacobian(problem, free, value, s_c, displacement)
+        return out.force, slopes.force
+
+    return jax.jit(jax.vmap(force))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CurvePrediction:
+    """What a fit predicts for one curve of N displacements; numpy, float64.
+
+    Bands are 95 %: `curve_*` of the curve itself, from the covariance of the parameters; the others
+    of a new sample, with the noise.
+
+    Attributes:
+        specimen: name.
+        trial: name, or "".
+        s: contact position, mm; NaN if the model needs none.
+        displacement: mm; (N,).
+        force: N; NaN where there is none.
+        se: standard error of the force from the parameters, N.
+        half_width: of the intervals, in standard errors.
+        sigma: standard deviation of a force sample, N; (N,).
+        joints: deflection at each ring, mm; (N, rings), NaN where the skeleton is not in the model.
+        joints_se: from the parameters.
+        reactions: of each ring, N; (N, rings).
+        reactions_se: from the parameters.
+        joint_sigma: standard deviation of a marker, mm; NaN if the fit had none.
+        status: the worst there is to say.
+        message: in words.
+        press_status: `PressStatus`; (N,).
+    """
+
+    specimen: str
+    trial: str
+    s: float
+    displacement: np.ndarray
+    force: np.ndarray
+    se: np.ndarray
+    half_width: float
+    sigma: np.ndarray
+    joints: np.ndarray
+    joints_se: np.ndarray
+    reactions: np.ndarray
+    reactions_se: np.ndarray
+    joint_sigma: float
+    status: PredictionStatus
+    message: str
+    press_status: np.ndarray
+
+    @property
+    def curve_low95(self) -> np.ndarray:
+        """Lower end of the band of the curve itself, N."""
+        return self.force - self.half_width * self.se
+
+    @property
+    def curve_high95(self) -> np.ndarray:
+        """Upper end of the band of the curve itself, N."""
+        return self.force + self.half_width * self.se
+
+    @property
+    def low95(self) -> np.ndarray:
+        """Lower end of the band of a new sample, N."""
+        return self.force - self.half_width * np.hypot(self.se, self.sigma)
+
+    @property
+    def high95(self) -> np.ndarray:
+        """Upper end of the band of a new sample, N."""
+        return self.force + self.half_width * np.hypot(self.se, self.sigma)
+
+
+def predict_sources(
+    stored: StoredFit,
+    sources: list[Source],
+    s: list[float],
+    displacements: list[np.ndarray],
+    sigmas: list[np.ndarray | None] | None = None,
+    chunk: int = 64,
+) -> list[CurvePrediction]:
+    """Predictions for many curves in one program.
+
+    Args:
+        stored: the fit.
+        sources: with which parameters each curve is predicted.
+        s: contact position of each, mm; NaN without one.
+        displacements: of each, mm.
+        sigmas: noise of each sample, N, where it is not that of the fit.
+        chunk: curves computed together.
+    """
+    run = compiled(stored.problem.program)
+    most = max(map(len, displacements), default=1)
+    padded = np.stack([np.pad(d, (0, most - len(d)), mode="edge") for d in displacements])
+    places = np.where(np.isnan(s), float(stored.problem.geometry.length) / 2, s)
+    stack = lambda name: np.stack([getattr(source, name) for source in sources])  # noqa: E731
+    columns = [stack(n) for n in ("free", "value", "covariance", "blind", "half_width")]
+    out: list[CurvePrediction] = []
+    chunk = min(chunk, len(sources))
+    for first in range(0, len(sources), chunk):
+        rows = np.minimum(np.arange(first, first + chunk), len(sources) - 1)
+        part = run(*(jnp.asarray(v[rows]) for v in (*columns, places, padded)))
+        part = jax.tree.map(np.asarray, part)
+        for k in range(first, min(first + chunk, len(sources))):
+            own = jax.tree.map(lambda v, k=k: v[k - first], part)
+            sigma = None if sigmas is None else sigmas[k]
+            out.append(_on_host(stored, sources[k], s[k], displacements[k], own, sigma))
+    return out
+
+
+def _on_host(stored: StoredFit, source: Source, s, displacement, part: Predicted, sigma):
+    """One curve, cut to its length, with its status."""
+    n = len(displacement)
+    cut = lambda v: np.asarray(v[:n], np.float64)  # noqa: E731
+    value, se = jax.tree.map(cut, part.value), jax.tree.map(cut, part.se)
+    usable = source.status.predicts
+    hide = lambda v: v if usable else np.full_like(v, np.nan)  # noqa: E731
+    skeleton = any(p.name == "k_M" for p in stored.problem.parameters)
+    show = lambda v: hide(v) if skeleton else np.full_like(v, np.nan)  # noqa: E731
+    presses = np.asarray(part.status[:n])
+    status, message = _verdict(source, value, se, presses, float(part.bend))
+    return CurvePrediction(
+        specimen=source.specimen,
+        trial=source.trial,
+        s=float(s),
+        displacement=np.asarray(displacement, np.float64),
+        force=hide(value.force),
+        se=hide(se.force),
+        half_width=float(source.half_width),
+        sigma=np.full(n, source.sigma[0]) if sigma is None else sigma,
+        joints=show(value.joints),
+        joints_se=show(se.joints),
+        reactions=show(value.reactions),
+        reactions_se=show(se.reactions),
+        joint_sigma=float(source.sigma[1]),
+        status=status,
+        message=message,
+        press_status=presses,
+    )
+
+
+def _verdict(source: Source, value: Response, se: Response, presses, bend: float):
+    """The worst that is to be said of a predicted curve, and everything in words."""
+    found = [(source.status, source.message)]
+    if source.status.predicts:
+        lost = ~np.isfinite(value.force)
+        if lost.any():
+            word = PressStatus(int(presses[lost][0])).message
+            found.append((PredictionStatus.NO_SOLUTION, f"{int(lost.sum())} samples: {word}"))
+        if np.isinf(se.force).any() or np.isinf(source.half_width):
+            found.append((PredictionStatus.UNDETERMINED, ""))
+        if bend > BENT:
+            found.append((PredictionStatus.BENT, f"off by {bend:.2g} half-widths at the deepest"))
+    worst = max(status for status, _ in found)
+    said = [m for status, m in found if m] or []
+    return worst, "; ".join(dict.fromkeys([worst.message, *said]))
+
+
+def predict(
+    results: StoredFit,
+    *,
+    s: float,
+    displacement: ArrayLike,
+    specimen: str | None = None,
+    trial: str | None = None,
+) -> CurvePrediction:
+    """A curve that was not measured, from a finished fit.
+
+        results = jaxtrachea.read_results("out/fit")
+        curve = jaxtrachea.predict(results, s=75.0, displacement=[0.5, 1.0, 2.0])
+        print(curve.force, curve.low95, curve.high95)
+
+    Computed in float64 where JAX is set to it (`jax_enable_x64`), else in float32.
+
+    Args:
+        results: from `read_results`.
+        s: contact position, mm, on the tube.
+        displacement: of the tool from first touch, mm; one number or a vector.
+        specimen: whose parameters; may be left out where the fit has one specimen only, or shares
+            all parameters.
+        trial: of the fit, whose own parameters (onset, say) count; None: onset and force offset of
+            single trials are 0.
+
+    Raises:
+        ValueError: a position outside the tube, a displacement that is no finite number, a specimen
+            or trial that the fit does not have, one without an estimate; with the cure.
+    """
+    D = np.atleast_1d(np.asarray(displacement, np.float64))
+    if D.ndim != 1 or not D.size or not np.isfinite(D).all():
+        raise ValueError("displacement: expected a finite number or a vector of them, mm")
+    check_position(results, s)
+    if specimen is None:
+        specimen = _only_specimen(results)
+    elif specimen not in results.specimens:
+        raise ValueError(unknown_name("specimen", specimen, results.specimens))
+    source = source_of(results, specimen, trial)
+    if not source.status.predicts:
+        raise ValueError(f"{specimen}: {source.message or source.status.message}")
+    return predict_sources(results, [source], [float(s)], [D])[0]
+
+
+def check_position(results: StoredFit, s: float) -> None:
+    """Refuse a contact position that is not on the tube.
+
+    Raises:
+        ValueError: with what is expected.
+    """
+    length = float(results.problem.geometry.length)
+    if not 0 <= s <= length:
+        raise ValueError(f"s = {s:g} mm is not on the tube; expected 0 to {length:g} mm")
+
+
+def unknown_name(kind: str, name: str, known) -> str:
+    """Message for a name that the fit does not have."""
+    listed = ", ".join(map(repr, list(known)[:12])) + (", ..." if len(known) > 12 else "")
+    return f"{kind} {name!r} is not in this fit; expected one of {listed}"
+
+
+def _only_specimen(results: StoredFit) -> str:
+    names = results.specimens
+    shared = all(p.scope in ("shared", "trial") for p in results.problem.free)
+    if len(names) > 1 and not shared:
+        raise ValueError(
+            f"this fit has {len(names)} specimens with parameters of their own; give specimen=, "
+            f"one of {', '.join(map(repr, names[:12]))}{', ...' if len(names) > 12 else ''}"
+        )
+    return names[0]
