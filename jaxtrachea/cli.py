@@ -106,7 +106,8 @@ def check(spec: SpecArgument, data: DataOption = None) -> None:
     if len(curves) > MANY:
         out.print(f"... and {len(curves) - MANY} more")
     _print_usage(out, curves)
-    out.print(_parameter_table(problem.parameters))
+    if problem.free:
+        out.print(_parameter_table(problem.parameters))
     fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in problem.parameters if p.fixed)
     out.print(f"Fixed: {fixed or 'none'}", highlight=False)
     lanes, bad = len(problem.curves), len(measurements.bad)
@@ -146,6 +147,7 @@ def fit(
     options = [name for name, wanted in asked.items() if wanted]
     options = sorted({*options, *cli_fit.remembered(how)})
     loaded, measurements, problem = load(spec, data, refits=bool(options))
+    _has_unknowns(spec, loaded, problem, options)
     root = spec.parent if data is None else data
     now = cli_fit.describe(how, spec, root, loaded, measurements, problem, options)
     if meeting.process > 0:
@@ -175,6 +177,8 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
     from jaxtrachea.identify.study import candidates_of, settings_of
 
     loaded, measurements, problem = load(spec, data, refits=True)
+    if not problem.free:
+        raise Stop(f"{spec}: design: every parameter is fixed; free what the presses shall tell")
     try:
         candidates = candidates_of(loaded, problem)
     except SpecError as error:
@@ -220,6 +224,16 @@ def _design(folder: Path, loaded, found, candidates) -> list[dict[str, object]]:
     rings = np.asarray(found.result.problem.geometry.ring_positions)
     draw_design(folder / "identifiability.png", chart, candidates, choice, rings)
     return rows
+
+
+def _has_unknowns(path: Path, spec, problem, options: list[str]) -> None:
+    from jaxtrachea.config import SpecError
+    from jaxtrachea.identify.study import refuse_without_unknowns
+
+    try:
+        refuse_without_unknowns(spec, problem, options)
+    except SpecError as error:
+        raise Stop(f"{path}: {error}") from None
 
 
 def _can_leave_out(problem) -> None:

@@ -147,7 +147,8 @@ def show(found: Found, folder: Path) -> None:
     lanes = range(result.lanes)
     if result.lanes <= report.ONE_BY_ONE:
         rows = report.estimate_rows(result, lanes, found.profiles)
-        out.print(table("Estimates", report.ESTIMATE_HEAD, rows))
+        if rows:
+            out.print(table("Estimates", report.ESTIMATE_HEAD, rows))
         out.print(table("Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)))
         if found.profiles is not None:
             rows = report.profile_table(found.profiles, lanes)
@@ -158,6 +159,8 @@ def show(found: Found, folder: Path) -> None:
         for lane in lanes:
             text = f"{lane_label(result, lane)}: {verdict_sentence(result, lane, found.profiles)}"
             out.print(escape(text), highlight=False)
+    elif not result.problem.free:
+        out.print(f"{result.lanes} lanes: {verdict_sentence(result, 0)}")
     else:
         out.print(
             table(

@@ -35,8 +35,9 @@ def draw_all(
         figures = {
             "fit": draw_fit(result, prediction),
             "residuals": draw_residuals(result, prediction),
-            "correlation": draw_correlation(result),
         }
+        if result.problem.free:
+            figures["correlation"] = draw_correlation(result)
         if profiles is not None and len(profiles.lane):
             figures["profiles"] = draw_profiles(profiles)
         paths = []

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea.identify.bootstrap import FEWEST, Bootstrap
+from jaxtrachea.identify.evaluate import NOTHING_FITTED
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.population import Population, population_rows
@@ -179,7 +180,8 @@ def report_text(
     if left_out is not None:
         parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, left_out)]
     parts += more
-    names = {"fit": "data and fit", "residuals": "residuals", "correlation": "correlation"}
+    names = {"fit": "data and fit", "residuals": "residuals"}
+    names |= {"correlation": "correlation"} if result.problem.free else {}
     parts += [f"![{text}]({name}.png)" for name, text in names.items()]
     if bad:
         rows = [[b.specimen, b.trial, b.kind, b.message, b.cure] for b in bad]
@@ -191,11 +193,14 @@ def report_text(
 def _estimates(result: FitResult, profiles: Profiles | None) -> list[str]:
     """Values with their errors, and what the data leave open."""
     shown = range(min(result.lanes, ONE_BY_ONE))
-    if result.lanes <= ONE_BY_ONE:
+    if not result.problem.free:
+        table = f"None: {NOTHING_FITTED}."
+    elif result.lanes <= ONE_BY_ONE:
         table = markdown_table(ESTIMATE_HEAD, estimate_rows(result, shown, profiles))
     else:
         table = markdown_table(SPREAD_HEAD, spread_rows(result, profiles))
     fixed = [f"{p.name} = {p.value:g} {p.unit}" for p in result.problem.parameters if p.fixed]
+    shown = shown if result.problem.free else range(0)
     flat = [f"- {lane_label(result, k)}: {verdict_sentence(result, k, profiles)}." for k in shown]
     return [
         "## Estimates",

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxtrachea.identify import stored
 from jaxtrachea.identify.bootstrap import Bootstrap
+from jaxtrachea.identify.evaluate import NOTHING_FITTED
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.journal import installed
 from jaxtrachea.identify.measurements import BadCurve
@@ -62,6 +63,8 @@ def flat_sentence(result: FitResult, lane: int) -> str:
     """The least determined combination of a lane in words."""
     if not succeeded(result, lane):
         return "no estimate"
+    if not result.problem.free:
+        return NOTHING_FITTED
     names = [unknown_label(result, lane, i) for i in range(len(result.problem.unknowns[lane]))]
     u = result.uncertainty[lane]
     return describe_flat(names, u.flat, float(u.flat_se), u.blind)
@@ -71,6 +74,8 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
     """Which unknowns of a lane have which verdict, and what is least determined."""
     if not succeeded(result, lane):
         return "no estimate"
+    if not result.problem.free:
+        return NOTHING_FITTED
     groups: dict[str, list[str]] = {}
     for i in range(len(result.problem.unknowns[lane])):
         word = verdict_of(result, lane, i, profiles)
@@ -89,7 +94,7 @@ def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[d
             "specimen": specimen,
             "trial": trial,
             "status": status.name.lower(),
-            "message": status.message,
+            "message": status.message if result.problem.free else NOTHING_FITTED,
             "iterations": int(result.iterations[lane]),
             "starts_agreeing": int(result.converged_starts[lane]),
             "starts": int(result.tried[lane]),
