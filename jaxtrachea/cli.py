@@ -15,7 +15,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jaxtrachea import __version__, cli_compare, cli_fit, cli_scene, cli_selfcheck, cli_tradeoff
+from jaxtrachea import (
+    __version__,
+    cli_compare,
+    cli_fit,
+    cli_predict,
+    cli_scene,
+    cli_selfcheck,
+    cli_tradeoff,
+)
 from jaxtrachea.cli_load import load
 from jaxtrachea.cli_run import run, show, write
 from jaxtrachea.terminal import Kept, Stop, complain, into, table, to_stderr
@@ -81,7 +89,7 @@ def _not_shown(error: OSError) -> str:
 
 
 for _command in (
-    cli_compare.compare, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
+    cli_compare.compare, cli_predict.predict, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
     cli_selfcheck.selfcheck, cli_tradeoff.tradeoff,
 ):  # fmt: skip
     app.command()(_command)

@@ -23,8 +23,8 @@ class Compared:
     Attributes:
         curve: as read.
         prediction: at its displacements.
-        in_fit: "yes" if the fit has used these samples; "other samples" if it has used a curve of
-            the same name; else "no".
+        in_fit: "yes" if the fit has used these samples; "changed" if it has used a curve of the same
+            name with others; else "no".
     """
 
     curve: Curve
@@ -106,7 +106,7 @@ def _in_fit(used: Curve | None, curve: Curve) -> str:
     same = np.array_equal(used.force, curve.force)
     same = same and np.array_equal(used.displacement, curve.displacement)
     same = same and (used.s_c == curve.s_c)
-    return "yes" if same else "other samples"
+    return "yes" if same else "changed"
 
 
 def _sigma(stored: StoredFit, curve: Curve, source: Source) -> np.ndarray:
@@ -222,10 +222,14 @@ def _merged(stored: StoredFit, source: Source, own: _Own) -> Source:
     follow[np.ix_(moving, kept)] = -inverse @ (A.T @ B)
     covariance = follow @ source.covariance @ follow.T
     covariance[np.ix_(moving, moving)] += inverse
-    blind = source.blind @ follow.T
-    status = max(source.status, _own_status(own))
     return dataclasses.replace(
-        source, free=free, covariance=covariance, blind=blind, status=status, message=said
+        source,
+        free=free,
+        covariance=covariance,
+        blind=source.blind @ follow.T,
+        status=max(source.status, _own_status(own)),
+        message=said,
+        absorbed=(own.slopes[moving].T, inverse @ (A / own.sigma[:, None]).T),
     )
 
 

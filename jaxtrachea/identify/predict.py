@@ -50,14 +50,16 @@ class Predicted(NamedTuple):
         value: the response.
         se: its standard errors.
         status: `PressStatus` of every displacement; (N,).
-        bend: error of the linear band of the force at its ends, in half-widths, at the deepest
-            displacement; NaN without a band.
+        bend: how far the force leaves its tangent where the parameters move to either end of the
+            band at the deepest displacement, N; (2, N).
+        deepest: index of that displacement.
     """
 
     value: Response
     se: Response
     status: Int[Array, "*n"]
-    bend: Float[Array, ""]
+    bend: Float[Array, "2 *n"]
+    deepest: Int[Array, ""]
 
 
 def respond(
@@ -137,29 +139,17 @@ def predicted(
     out, status, slopes = jacobian(problem, free, value, s_c, displacement)
     se = jax.tree.map(lambda slope: standard_errors(slope, covariance, blind), slopes)
     deepest = jnp.argmax(jnp.abs(displacement))
-    bend = _bend(
-        problem, free, value, covariance, half_width, s_c, displacement[deepest],
-        out.force[deepest], slopes.force[:, deepest],
-    )  # fmt: skip
-    return Predicted(out, se, status, bend)
+    pull = covariance @ slopes.force[:, deepest]
+    along = jnp.sqrt(jnp.maximum(slopes.force[:, deepest] @ pull, 0))
+    known = (along > 0) & jnp.isfinite(half_width)
+    step = jnp.where(known, half_width / jnp.where(along > 0, along, 1), 0) * pull
+    straight = jnp.einsum("f...,f->...", slopes.force, step)
 
+    def bend(sign):
+        end, _ = respond(problem, free + sign * step, value, s_c, displacement)
+        return end.force - out.force - sign * straight
 
-def _bend(problem, free, value, covariance, half_width, s_c, displacement, force, slope):
-    """How far the model leaves its tangent at both ends of the band, in half-widths."""
-    pull = covariance @ slope
-    se = jnp.sqrt(jnp.maximum(slope @ pull, 0))
-    known = (se > 0) & jnp.isfinite(half_width)
-    step = jnp.where(known, half_width / jnp.where(se > 0, se, 1), 0) * pull
-    half = half_width * se
-
-    def off(sign):
-        end, _ = respond(problem, free + sign * step, value, s_c, displacement[None])
-        return jnp.abs(end.force[0] - force - sign * half) / jnp.where(known, half, 1)
-
-    worst = jnp.maximum(off(1.0), off(-1.0))
-    # No solution within the band (past a fold): as bent as can be.
-    worst = jnp.where(jnp.isfinite(worst), worst, jnp.inf)
-    return jnp.where(known, worst, jnp.nan)
+    return Predicted(out, se, status, jnp.stack([bend(1.0), bend(-1.0)]), deepest)
 
 
 @functools.lru_cache(maxsize=16)
@@ -290,7 +280,10 @@ def _on_host(stored: StoredFit, source: Source, s, displacement, part: Predicted
     skeleton = any(p.name == "k_M" for p in stored.problem.parameters)
     show = lambda v: hide(v) if skeleton else np.full_like(v, np.nan)  # noqa: E731
     presses = np.asarray(part.status[:n])
-    status, message = _verdict(source, value, se, presses, float(part.bend))
+    bend = _bend(source, cut(part.bend.T).T, value, se, int(part.deepest))
+    status, message = _verdict(source, value, se, presses, bend)
+    if usable and (beyond := _beyond(stored, source.lane, float(s), displacement)):
+        message = f"{message}; {beyond}"
     return CurvePrediction(
         specimen=source.specimen,
         trial=source.trial,
@@ -309,6 +302,33 @@ def _on_host(stored: StoredFit, source: Source, s, displacement, part: Predicted
         message=message,
         press_status=presses,
     )
+
+
+def _bend(source: Source, off: np.ndarray, value: Response, se: Response, deepest: int) -> float:
+    """Error of the linear band at its ends, at the deepest displacement, in half-widths.
+
+    What the curve's own parameters take up does not count: they are fitted to it.
+    """
+    half = float(source.half_width * se.force[deepest])
+    if not (np.isfinite(half) and half > 0 and np.isfinite(value.force[deepest])):
+        return 0.0
+    if source.absorbed is not None:
+        slope, gain = source.absorbed
+        off = off - (off @ gain.T) @ slope.T
+    worst = np.max(np.abs(off[:, deepest])) / half
+    # No solution within the band (past a fold): as bent as can be.
+    return float(worst) if np.isfinite(worst) else np.inf
+
+
+def _beyond(stored: StoredFit, lane: int, s: float, displacement: np.ndarray) -> str:
+    """What of a curve lies outside the data of its lane, in words; "" if nothing does."""
+    low, high, first, last = stored.spans[lane]
+    words = []
+    if displacement.max() > high + 1e-9 or displacement.min() < min(low, 0.0) - 1e-9:
+        words.append(f"D = {low:.3g} to {high:.3g} mm")
+    if s < first - 1e-9 or s > last + 1e-9:
+        words.append(f"s = {first:.4g} to {last:.4g} mm")
+    return f"extrapolated from data at {' and '.join(words)}" if words else ""
 
 
 def _verdict(source: Source, value: Response, se: Response, presses, bend: float):

@@ -28,6 +28,8 @@ class Source:
         own: free columns that are the curve's own and not in the fit.
         status: OK, or the worst there is to say.
         message: why, in words; "" if nothing is.
+        absorbed: what own parameters take up of a change of the curve: slopes (N, k) and the gain
+            that fits them (k, N); None if they are not fitted.
     """
 
     specimen: str
@@ -42,6 +44,7 @@ class Source:
     own: tuple[int, ...]
     status: PredictionStatus
     message: str
+    absorbed: tuple[np.ndarray, np.ndarray] | None = None
 
 
 def source_of(

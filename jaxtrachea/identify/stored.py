@@ -4,6 +4,7 @@ Numbers and JSON (as bytes) only; read through the audited door (`readers.safe_h
 """
 
 import dataclasses
+import functools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -83,6 +84,16 @@ class StoredFit:
     def specimens(self) -> tuple[str, ...]:
         """Names of the fitted specimens, in the order of the data."""
         return tuple(dict.fromkeys(c.specimen for c in self.curves))
+
+    @functools.cached_property
+    def spans(self) -> np.ndarray:
+        """Range of displacement and of contact position of the data of each lane, mm; (L, 4)."""
+        out = np.tile([np.inf, -np.inf] * 2, (len(self.status), 1))
+        for curve, lane in zip(self.curves, self.curve_lane, strict=True):
+            D, s = curve.displacement, np.nan if curve.s_c is None else curve.s_c
+            ends = [np.min(D), -np.max(D), s, -s]
+            out[lane] = np.fmin(out[lane] * [1, -1, 1, -1], ends) * [1, -1, 1, -1]
+        return out
 
     @property
     def tool_radius(self) -> float | None:
