@@ -206,6 +206,7 @@ def _measured(stored, given: Sequence[str]):
     if specs and len(given) > 1:
         raise Stop(f"--data: {specs[0]}: give one specification, or files, not both")
     notes = []
+    _refuse_results(given)
     try:
         if specs:
             path = Path(specs[0])
@@ -229,6 +230,26 @@ def _measured(stored, given: Sequence[str]):
             "understood); give --data a specification with a [data] section"
         ) from None
     return measurements, notes
+
+
+def _refuse_results(given: Sequence[str]) -> None:
+    """Results of a fit are no measured curves."""
+    import contextlib
+
+    from jaxtrachea.identify.measurements import DataError
+    from jaxtrachea.identify.readers.safe_hdf5 import attribute, opened
+    from jaxtrachea.identify.stored import SCHEMA
+
+    for name in given:
+        path = Path(name)
+        if path.suffix.lower() not in (".h5", ".hdf5") or not path.is_file():
+            continue
+        with contextlib.suppress(DataError), opened(path, audit=False) as file:
+            if attribute(file, "schema") == SCHEMA:
+                raise Stop(
+                    f"--data: {name} holds the results of a fit, not measured curves; give the "
+                    "files that were measured"
+                )
 
 
 def _as_written(reading) -> dict[str, object]:

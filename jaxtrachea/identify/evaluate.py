@@ -1,5 +1,6 @@
 """A study whose parameters are all fixed: no fit, but everything else that a fit says of the data."""
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.identify.cost import robust
@@ -96,7 +97,8 @@ def _cost(problem: Problem, seen, sigma: np.ndarray) -> np.ndarray:
     trials, total = problem.lanes.s_c.shape[1], np.zeros(len(sigma))
     for kind, part in enumerate(parts):
         weight = np.repeat(problem.lanes.balance, part.shape[1] // trials, axis=1) ** 2
-        rho, _ = robust(problem.loss, (part / sigma[:, kind, None]) ** 2, problem.loss_scale)
+        z2 = jnp.asarray((part / sigma[:, kind, None]) ** 2)
+        rho, _ = robust(problem.loss, z2, problem.loss_scale)
         total += 0.5 * np.sum(weight * np.asarray(rho), axis=1)
     return total
 

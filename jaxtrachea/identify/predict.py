@@ -9,6 +9,7 @@ is then infinite wherever that combination acts): each has a `PredictionStatus`.
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -252,13 +253,13 @@ def predict_sources(
         chunk: curves computed together.
     """
     run = compiled(stored.problem.program)
-    most = max(map(len, displacements), default=1)
+    most = _rounded(max(map(len, displacements)), 8)
     padded = np.stack([np.pad(d, (0, most - len(d)), mode="edge") for d in displacements])
     places = np.where(np.isnan(s), float(stored.problem.geometry.length) / 2, s)
     stack = lambda name: np.stack([getattr(source, name) for source in sources])  # noqa: E731
     columns = [stack(n) for n in ("free", "value", "covariance", "blind", "half_width")]
     out: list[CurvePrediction] = []
-    chunk = min(chunk, len(sources))
+    chunk = min(chunk, _rounded(len(sources), 1))
     for first in range(0, len(sources), chunk):
         rows = np.minimum(np.arange(first, first + chunk), len(sources) - 1)
         part = run(*(jnp.asarray(v[rows]) for v in (*columns, places, padded)))
@@ -268,6 +269,11 @@ def predict_sources(
             sigma = None if sigmas is None else sigmas[k]
             out.append(_on_host(stored, sources[k], s[k], displacements[k], own, sigma))
     return out
+
+
+def _rounded(count: int, least: int) -> int:
+    """The next power of two, so that few sizes are compiled."""
+    return max(least, 1 << (count - 1).bit_length())
 
 
 def _on_host(stored: StoredFit, source: Source, s, displacement, part: Predicted, sigma):
@@ -352,7 +358,7 @@ def predict(
     results: StoredFit,
     *,
     s: float,
-    displacement: ArrayLike,
+    displacement: ArrayLike | Sequence[float],
     specimen: str | None = None,
     trial: str | None = None,
 ) -> CurvePrediction:
