@@ -1,4 +1,4 @@
-"""The command predict: what a finished fit says of curves that it has not seen (docs/predict.md)."""
+"""The command predict: what a finished fit says of other curves (docs/predict.md)."""
 
 import dataclasses
 import hashlib
@@ -93,7 +93,9 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
         curves = predict_sources(stored, sources, s, depths)
         stop_if_asked()
         rings = np.asarray(stored.problem.geometry.ring_positions)
-        write_csv(folder / "predictions.csv", [r for p in curves for r in tables.prediction_rows(p)])
+        write_csv(
+            folder / "predictions.csv", [r for p in curves for r in tables.prediction_rows(p)]
+        )
         write_csv(folder / "bands.csv", [r for p in curves for r in tables.band_rows(p)])
         joints = [
             r for p in curves for r in tables.joint_rows(p, rings, range(len(p.displacement)))

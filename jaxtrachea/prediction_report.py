@@ -140,8 +140,8 @@ def report_data(
     parts.append("\n".join(f"- {t}." for t in outcomes([c.prediction for c in compared])))
     if used:
         parts.append(
-            f"{used} of {len(compared)} curves were used by the fit: for them this is its residual, "
-            "not a prediction."
+            f"{used} of {len(compared)} curves were used by the fit: for them this is its "
+            "residual, not a prediction."
         )
     parts += [f"{note}." for note in notes]
     parts += ["## Curves, worst first", _table(ERROR_HEAD, error_table(rows), "errors.csv")]

@@ -1,4 +1,6 @@
-"""A study whose parameters are all fixed: no fit, but everything else that a fit says of the data."""
+"""A study whose parameters are all fixed: no fit, but all else that a fit says of the data."""
+
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -78,7 +80,7 @@ def _information(problem: Problem, force, joints) -> Information:
         rows = [np.abs(v[o]) for v, o in zip(part, observed, strict=True)]
         return np.array([np.median(v) if len(v) else np.nan for v in rows])
 
-    return Information(
+    arrays: dict[str, Any] = dict(
         bread=np.zeros((lanes, 0, 0)),
         meat=np.zeros((lanes, 0, 0)),
         gradient=np.zeros((lanes, 0)),
@@ -89,6 +91,7 @@ def _information(problem: Problem, force, joints) -> Information:
         psi2=np.ones(lanes),
         dpsi=np.ones(lanes),
     )
+    return Information(**arrays)
 
 
 def _cost(problem: Problem, seen, sigma: np.ndarray) -> np.ndarray:

@@ -9,7 +9,8 @@ import numpy as np
 
 from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.measurements import BadCurve, Curve
-from jaxtrachea.identify.predict import CurvePrediction, compiled_slopes, predict_sources
+from jaxtrachea.identify.predict import CurvePrediction, predict_sources
+from jaxtrachea.identify.prediction_core import compiled_slopes
 from jaxtrachea.identify.problem import Problem, build, check_curve
 from jaxtrachea.identify.sources import Source, source_of
 from jaxtrachea.identify.stored import StoredFit
@@ -23,8 +24,8 @@ class Compared:
     Attributes:
         curve: as read.
         prediction: at its displacements.
-        in_fit: "yes" if the fit has used these samples; "changed" if it has used a curve of the same
-            name with others; else "no".
+        in_fit: "yes" if the fit has used these samples; "changed" if it has used others under the
+            same name; else "no".
     """
 
     curve: Curve

@@ -118,8 +118,8 @@ def error_rows(
         rows.append(_errors("all", good, tool_radius, rings))
     status = PredictionStatus.BAD_DATA.name.lower()
     for b in bad:
-        text = {"status": status, "message": b.reason}
-        rows.append({"of": "curve", "specimen": b.specimen, "trial": b.trial} | text)
+        row: Row = {"of": "curve", "specimen": b.specimen, "trial": b.trial, "status": status}
+        rows.append(row | {"message": b.reason})
     return rows
 
 
@@ -143,12 +143,13 @@ def _errors(of: str, group: Sequence[Compared], tool_radius, rings) -> Row:
         worst, at = float(residual[k]), float(depth[k])
         covered = float(np.mean(np.concatenate([c.covered for c in group])[known]))
     status = max(c.prediction.status for c in group)
+    used = sum(c.in_fit == "yes" for c in group)
     return {
         "of": of,
         "specimen": first.curve.specimen if one else "(all)",
         "trial": first.curve.trial if one else "(all)",
         "s [mm]": _cell(s[0]) if of != "all" else "",
-        "in_fit": first.in_fit if one else f"{sum(c.in_fit == 'yes' for c in group)} of {len(group)}",
+        "in_fit": first.in_fit if one else f"{used} of {len(group)}",
         "curves": len(group),
         "samples": int(known.sum()),
         "rms [N]": _cell(rms),
@@ -158,8 +159,8 @@ def _errors(of: str, group: Sequence[Compared], tool_radius, rings) -> Row:
         "rms / peak": _cell(rms / peak if peak > 0 else np.nan),
         "worst / peak": _cell(abs(worst) / peak if peak > 0 else np.nan),
         "coverage95": _cell(covered),
-        "rms joints [mm]": _cell(float(np.sqrt(np.mean(marker**2))) if len(marker) else np.nan),
-        "worst joint [mm]": _cell(float(marker[np.argmax(np.abs(marker))]) if len(marker) else np.nan),
+        "rms joints [mm]": float(np.sqrt(np.mean(marker**2))) if len(marker) else "",
+        "worst joint [mm]": _cell(float(marker[np.argmax(np.abs(marker))])) if len(marker) else "",
         "status": status.name.lower(),
         "message": first.prediction.message if one else status.message,
     }  # fmt: skip

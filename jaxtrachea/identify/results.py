@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from jaxtrachea.identify import stored
+from jaxtrachea.identify import store
 from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.evaluate import NOTHING_FITTED
 from jaxtrachea.identify.fit import FitResult
@@ -271,7 +271,7 @@ def write_hdf5(
         file.attrs["provenance"] = json.dumps(provenance)
         _write_lanes(file.create_group("lanes"), result)
         _write_unknowns(file.create_group("unknowns"), result)
-        stored.write(file, result, provenance.get("inputs", {}), reading or {})
+        store.write(file, result, provenance.get("inputs", {}), reading or {})
         group = file.create_group("uncertainty")
         for name in MORE:
             rows = np.stack([getattr(u, name) for u in result.uncertainty])

@@ -27,9 +27,7 @@ FILTERS = (1, 2, 3, 32000)
 
 
 @contextmanager
-def opened(
-    path: Path, *, audit: bool = True, read: tuple[str, ...] | None = None
-) -> Iterator[Any]:
+def opened(path: Path, *, audit: bool = True, read: tuple[str, ...] | None = None) -> Iterator[Any]:
     """Open an HDF5 file for reading after walking through all of it.
 
     Args:
