@@ -20,7 +20,7 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 import jaxtrachea
-from jaxtrachea.identify import held_out, results, stored
+from jaxtrachea.identify import former, held_out, results, stored
 from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.measurements import Curve
 from jaxtrachea.identify.parameters import DEFAULTS
@@ -616,6 +616,16 @@ def test_results_that_cannot_be_read(harm, says, study, tmp_path):
     harm(tmp_path / "r")
     with pytest.raises(jaxtrachea.NoResults, match=says):
         stored.read_results(tmp_path / "r")
+
+
+def test_schema_1_serves_to_fit_failed_lanes_again(study, tmp_path):
+    """What `--rerun-failed` needs is in it; the covariance follows from errors and correlation."""
+    shutil.copytree(study[0], tmp_path / "r")
+    old(tmp_path / "r")
+    again = former.read_hdf5(tmp_path / "r" / "results.h5", study[1].problem)
+    assert np.array_equal(again.theta, study[1].theta)
+    for mine, its in zip(again.uncertainty, study[1].uncertainty, strict=True):
+        assert np.allclose(mine.covariance, its.covariance, rtol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ def evaluated(problem: Problem) -> FitResult:
     info = _information(problem, seen.force, seen.joints)
     sigma = next_sigma(problem, info, first_sigma(problem))
     unit = precision_unit(problem)
-    finite = np.isfinite(info.squares).all(axis=1)
+    finite = np.asarray(np.isfinite(info.squares).all(axis=1))
     with np.errstate(invalid="ignore", divide="ignore"):
         rms = np.sqrt(info.squares / info.counts) * unit
     total = np.sum(info.counts, axis=1)

@@ -276,4 +276,4 @@ def _only_specimen(results: StoredFit) -> str:
             f"this fit has {len(names)} specimens with parameters of their own; give specimen=, "
             f"one of {', '.join(map(repr, names[:12]))}{', ...' if len(names) > 12 else ''}"
         )
-    return names[0]
+    return next(iter(names))
