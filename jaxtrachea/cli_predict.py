@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea.cli_load import print_bad
+from jaxtrachea.cli_predict_data import measured_curves
 from jaxtrachea.terminal import Stop, into, set_up_jax, table, to_stderr
 
 ResultsArgument = Annotated[
@@ -100,7 +101,8 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
         joints = [
             r for p in curves for r in tables.joint_rows(p, rings, range(len(p.displacement)))
         ]
-        write_csv(folder / "joints.csv", joints)
+        if any(p.has_skeleton for p in curves):
+            write_csv(folder / "joints.csv", joints)
         draw_predictions(folder / "predictions.png", curves)
         write_text(folder / "report.md", report.report_at(stored, digest, curves))
     rows, more = report.shortened(report.at_table(curves), "bands.csv")
@@ -151,7 +153,7 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
     from jaxtrachea.identify.results import write_csv, write_text
     from jaxtrachea.prediction_plots import draw_compared
 
-    measurements, notes = _measured(stored, given)
+    measurements, notes = measured_curves(stored, given)
     curves, unusable = pressable(stored, measurements.curves)
     bad = [*measurements.bad, *unusable]
     print_bad(dataclasses.replace(measurements, bad=tuple(bad)))
@@ -168,6 +170,8 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
             rows["bands"] += tables.band_rows(p, phi)
             deepest = [int(np.argmax(np.abs(p.displacement)))]
             rows["joints"] += tables.joint_rows(p, rings, deepest, _markers(c, len(rings)), phi)
+        if not any(c.prediction.has_skeleton for c in compared):
+            del rows["joints"]
         for name, content in rows.items():
             write_csv(folder / f"{name}.csv", content)
         errors = tables.error_rows(compared, bad, stored.tool_radius, rings)
@@ -194,99 +198,6 @@ def _markers(compared, rings: int):
     found = np.full((len(curve.force), rings), np.nan)
     found[:, curve.joint_rings] = curve.joint_displacement
     return found
-
-
-def _measured(stored, given: Sequence[str]):
-    """The measurements of --data, and what is to be said of how they were read."""
-    from pydantic import ValidationError
-
-    from jaxtrachea.config import FitSpec, SpecError, load_fit_spec
-    from jaxtrachea.identify.measurements import DataError
-    from jaxtrachea.identify.study import read_data
-
-    specs = [name for name in given if name.lower().endswith(".toml")]
-    if specs and len(given) > 1:
-        raise Stop(f"--data: {specs[0]}: give one specification, or files, not both")
-    notes = []
-    _refuse_results(given)
-    try:
-        if specs:
-            path = Path(specs[0])
-            spec, root = load_fit_spec(path), path.parent
-            _same_model(stored, path, spec)
-        else:
-            reading = _as_written(stored.reading)
-            spec = FitSpec.model_validate({"data": reading | {"files": list(given)}})
-            root = Path()
-            if reading.get("s") is not None:
-                notes.append(
-                    f"all curves are taken at s = {reading['s']}, as in the fit's specification; "
-                    "for others give a specification with its own [data]"
-                )
-        measurements = read_data(spec, root)
-    except (SpecError, DataError) as error:
-        raise Stop(f"--data: {error}") from None
-    except ValidationError:
-        raise Stop(
-            f"{stored.path}: damaged or of another version (how the data were read is not "
-            "understood); give --data a specification with a [data] section"
-        ) from None
-    return measurements, notes
-
-
-def _refuse_results(given: Sequence[str]) -> None:
-    """Results of a fit are no measured curves."""
-    import contextlib
-
-    from jaxtrachea.identify.measurements import DataError
-    from jaxtrachea.identify.readers.safe_hdf5 import attribute, opened
-    from jaxtrachea.identify.stored import SCHEMA
-
-    for name in given:
-        path = Path(name)
-        if path.suffix.lower() not in (".h5", ".hdf5") or not path.is_file():
-            continue
-        with contextlib.suppress(DataError), opened(path, audit=False) as file:
-            if attribute(file, "schema") == SCHEMA:
-                raise Stop(
-                    f"--data: {name} holds the results of a fit, not measured curves; give the "
-                    "files that were measured"
-                )
-
-
-def _as_written(reading) -> dict[str, object]:
-    """A stored [data] section as a user would write it: lengths with their unit."""
-    return {
-        key: f"{value!r} mm" if isinstance(value, float) else value
-        for key, value in reading.items()
-        if key != "files" and value is not None
-    }
-
-
-def _same_model(stored, path: Path, spec) -> None:
-    """Refuse a specification whose tube or model is not that of the fit; only [data] is used."""
-    import numpy as np
-
-    from jaxtrachea.identify.study import geometry_of
-    from jaxtrachea.model import Options
-
-    if "trachea" in spec.model_fields_set:
-        mine, its = stored.problem.geometry, geometry_of(spec.trachea)
-        same = float(mine.length) == float(its.length)
-        same = same and np.array_equal(mine.ring_positions, its.ring_positions)
-        if not same:
-            raise Stop(
-                f"{path}: trachea: {float(its.length):g} mm with {its.rings} rings, but the fit's "
-                f"is {float(mine.length):g} mm with {mine.rings}; predictions are made with the "
-                "fit's: leave the section out, or correct it"
-            )
-    if "model" in spec.model_fields_set and Options(**spec.model.model_dump()) != (
-        stored.problem.options
-    ):
-        raise Stop(
-            f"{path}: model: not that of the fit, with which predictions are made; leave the "
-            "section out, or fit again with it"
-        )
 
 
 def _show(title: str, head, rows, more: str) -> None:

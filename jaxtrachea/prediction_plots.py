@@ -76,7 +76,8 @@ def _one_panel(axis, members) -> None:
         if measured is not None:
             step = max(1, len(D) // 60)
             axis.plot(D[::step], measured[order][::step], ".", color=colour, ms=4)
-    axis.legend(ncols=1 + (len(members) > 5))
+    if any(line.get_label()[:1] != "_" for line in axis.lines):
+        axis.legend(ncols=1 + (len(members) > 5))
 
 
 def _against(compared: Sequence[Compared]) -> Figure:

@@ -31,7 +31,7 @@ ORDER = [
     {"prediction_plots"},
     {"tradeoff"},
     {"terminal", "processes"},
-    {"cli_load", "cli_run"},
+    {"cli_load", "cli_predict_data", "cli_run"},
     {"cli_scene", "cli_compare", "cli_fit", "cli_predict", "cli_selfcheck", "cli_tradeoff"},
     {"cli"},
     {"__main__"},

@@ -137,6 +137,7 @@ def test_three_lines_of_python(study):
     results = jaxtrachea.read_results(study[0])
     curve = jaxtrachea.predict(results, s=61.0, displacement=[1.0, 2.0], specimen="s0003")
     assert np.all((curve.low95 < curve.curve_low95) & (curve.curve_high95 < curve.high95))
+    assert np.isnan(curve.joint_sigma)  # this fit had no markers
     # Joints and reactions in equilibrium with each other: R = k_M w (paper 2.3).
     k_M = math.exp(results.theta[3, 1])
     assert np.allclose(curve.reactions, k_M * curve.joints, rtol=1e-12)

@@ -68,6 +68,11 @@ class CurvePrediction:
     press_status: np.ndarray
 
     @property
+    def has_skeleton(self) -> bool:
+        """Whether joints and reactions are predicted."""
+        return bool(np.isfinite(self.joints).any())
+
+    @property
     def curve_low95(self) -> np.ndarray:
         """Lower end of the band of the curve itself, N."""
         return self.force - self.half_width * self.se

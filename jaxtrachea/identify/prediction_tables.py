@@ -111,7 +111,8 @@ def error_rows(
     good = [c for c in compared if c.prediction.status.predicts]
     places: dict[float, list[Compared]] = {}
     for c in good:
-        places.setdefault(round(c.prediction.s, 6), []).append(c)
+        if not np.isnan(c.prediction.s):
+            places.setdefault(round(c.prediction.s, 6), []).append(c)
     for s in sorted(places):
         rows.append(_errors("position", places[s], tool_radius, rings))
     if good:

@@ -27,7 +27,8 @@ SCHEMA = "jaxtrachea-results"
 VERSION = 2
 #: Groups and datasets that are read; nothing else of the file is.
 READ = (
-    "/model", "/data", "/lanes/status", "/lanes/sigma", "/unknowns/theta", "/unknowns/at_bound",
+    "/model", "/data", "/lanes/status", "/lanes/sigma", "/lanes/rms", "/unknowns/theta",
+    "/unknowns/at_bound",
     "/uncertainty/covariance", "/uncertainty/blind", "/uncertainty/half_width",
 )  # fmt: skip
 #: 97.5 % quantile of the normal distribution, as `uncertainty.analyse` uses it.
@@ -40,9 +41,7 @@ class NoResults(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StoredFit:
-    """A finished fit as read back from its results.h5.
-
-    L lanes of up to P unknowns; scaled coordinates as in `Parameter`.
+    """A finished fit, read back. L lanes of up to P unknowns; scaled coordinates as in `Parameter`.
 
     Attributes:
         path: the file.
@@ -54,7 +53,8 @@ class StoredFit:
         blind: rows: directions that change no residual, scaled coordinates; (L, P, P).
         at_bound: (L, P).
         status: `FitStatus`; (L,).
-        sigma: standard deviation of force, N, and markers, mm, given or estimated; (L, 2).
+        sigma: standard deviation of force, N, and markers, mm, given or estimated; NaN without
+            samples of the kind; (L, 2).
         half_width: of a 95 % interval in standard errors; inf where the noise could not be
             estimated; (L,).
         curves: the data as used; `source` is the file's name and the place in it.
@@ -205,7 +205,7 @@ def _read(path: Path, file: Any) -> StoredFit:
         blind=blind * _relative(unknowns, theta)[:, None],
         at_bound=numeric(file["unknowns"], "at_bound") > 0,
         status=numeric(file["lanes"], "status").astype(int),
-        sigma=numeric(file["lanes"], "sigma"),
+        sigma=_sigma(file["lanes"]),
         half_width=_known_half_width(problem, numeric(file["uncertainty"], "half_width")),
         curves=curves,
         curve_lane=lane,
@@ -221,6 +221,13 @@ def _known_half_width(problem: Problem, half: np.ndarray) -> np.ndarray:
     `uncertainty.analyse` puts the normal quantile there, which Student's t never reaches.
     """
     return np.where((half == NORMAL) & ~np.array(problem.noise_given[0]), np.inf, half)
+
+
+def _sigma(lanes: Any) -> np.ndarray:
+    """Noise of each kind; NaN where a lane has no samples of it (a fit without markers, say)."""
+    sigma = numeric(lanes, "sigma")
+    rms = numeric(lanes, "rms")
+    return np.where(np.isnan(rms), np.nan, sigma) if rms.shape == sigma.shape else sigma
 
 
 def _json(group: Any) -> Any:
