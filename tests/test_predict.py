@@ -76,19 +76,24 @@ def write_curves(path, curves):
     return path
 
 
-@pytest.fixture(scope="module")
-def study(tmp_path_factory):
-    """600 specimens of one truth with noise of their own, pressed at four places; stored."""
-    rng = np.random.default_rng(7)
+def noisy_study(folder, noise, lanes, seed):
+    """Specimens of one truth with noise of their own, pressed at four places; stored."""
+    rng = np.random.default_rng(seed)
     force = np.stack([true_force(s) for s in SEEN])
-    force = force + NOISE * rng.normal(size=(LANES, *force.shape))
+    force = force + noise * rng.normal(size=(lanes, *force.shape))
     changes = {n: {"value": float(v)} for n, v in zip(synthetic.NAMES, TRUTH, strict=True)}
     curves = synthetic.curves(force, np.array(SEEN), DEPTHS)
     table = synthetic.parameters(**changes)
     result = fit(build(curves, table_1(), synthetic.OPTIONS, table), Settings(starts=1))
-    folder = tmp_path_factory.mktemp("fit")
     results.write_hdf5(folder / "results.h5", result, {"inputs": {"a.csv": "0" * 64}})
-    return folder, result
+    return result
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """Folder and result of 600 specimens."""
+    folder = tmp_path_factory.mktemp("fit")
+    return folder, noisy_study(folder, NOISE, LANES, 7)
 
 
 @pytest.fixture(scope="module")
@@ -96,22 +101,34 @@ def read(study):
     return jaxtrachea.read_results(study[0])
 
 
-def test_bands_cover_at_unseen_positions(read):
-    """Curve band: the true curve; with noise: new noisy samples. Truth from finite elements."""
-    rng = np.random.default_rng(8)
-    inside, new = [], []
+def check_coverage(read, noise):
+    """Curve band: the true curve; with noise: new noisy samples; 93 to 97 % over the depths."""
+    rng, lanes = np.random.default_rng(8), len(read.specimens)
+    sources = [source_of(read, name) for name in read.specimens]
     for s in UNSEEN:
-        sources = [source_of(read, name) for name in read.specimens]
-        found = predict_sources(read, sources, [s] * LANES, [DEPTHS] * LANES)
+        found = predict_sources(read, sources, [s] * lanes, [DEPTHS] * lanes)
         truth = true_force(s)
-        assert np.mean([p.status == PredictionStatus.OK for p in found]) > 0.9
-        sample = truth + NOISE * rng.normal(size=(LANES, len(DEPTHS)))
-        inside += [(p.curve_low95 <= truth) & (truth <= p.curve_high95) for p in found]
-        new += [(p.low95 <= y) & (y <= p.high95) for p, y in zip(found, sample, strict=True)]
-    for covered in (inside, new):
-        assert 0.93 <= np.mean(covered) <= 0.97, np.mean(covered)
-        each = np.mean(np.reshape(covered, (2, LANES, -1)), axis=1)
-        assert np.all(np.abs(each - 0.95) < 4 * math.sqrt(0.95 * 0.05 / LANES)), each
+        sample = truth + noise * rng.normal(size=(lanes, len(DEPTHS)))
+        inside = np.array([(p.curve_low95 <= truth) & (truth <= p.curve_high95) for p in found])
+        pairs = zip(found, sample, strict=True)
+        new = np.array([(p.low95 <= y) & (y <= p.high95) for p, y in pairs])
+        for covered in (inside, new):
+            assert 0.93 <= np.mean(covered) <= 0.97, np.mean(covered)
+            miss = np.max(np.abs(np.mean(covered, axis=0) - 0.95))
+            assert miss < 4 * math.sqrt(0.95 * 0.05 / lanes), miss
+
+
+def test_bands_cover_at_unseen_positions(read):
+    """Truth from finite elements; parameters known to 1 to 3 %."""
+    check_coverage(read, NOISE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.06, 0.15])
+def test_bands_cover_in_2000_noisier_fits(noise, tmp_path):
+    """Parameters known to 4 to 10 %, and to 10 to 24 %."""
+    noisy_study(tmp_path, noise, 2000, 70)
+    check_coverage(jaxtrachea.read_results(tmp_path), noise)
 
 
 def test_everything_comes_back_from_the_file(study, read):
@@ -393,6 +410,7 @@ def test_joint_fit_predicts_as_one_dense_lane(tmp_path):
     assert np.allclose(at[0].half_width, at[1].half_width)
 
 
+@pytest.mark.slow
 def test_core_in_float32(read):
     """Jitted and batched as the command uses it in float64, which other tests check."""
     sources = [source_of(read, f"s{i:04d}") for i in range(3)]
