@@ -161,14 +161,12 @@ def _study(stored: StoredFit, own, members) -> Problem:
         )
         for i, (_, c, s) in enumerate(members)
     ]
-    study = build(
-        curves, problem.geometry, problem.options, table, balance="sample", loss=problem.loss,
-        loss_scale=problem.loss_scale,
-    )  # fmt: skip
+    study = build(curves, problem.geometry, problem.options, table, balance="sample")
     value = study.lanes.value.copy()
     for k, (source, _, _) in enumerate(members):
         value[k] = _values(stored, source)
-    return dataclasses.replace(study, lanes=study.lanes._replace(value=value))
+    lanes = study.lanes._replace(value=value)
+    return dataclasses.replace(study, lanes=lanes, loss=problem.loss, loss_scale=problem.loss_scale)
 
 
 def _values(stored: StoredFit, source: Source) -> np.ndarray:
