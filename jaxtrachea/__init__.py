@@ -13,6 +13,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from jaxtrachea.identify.predict import CurvePrediction as CurvePrediction
+    from jaxtrachea.identify.predict import predict as predict
+    from jaxtrachea.identify.stored import NoResults as NoResults
+    from jaxtrachea.identify.stored import StoredFit as StoredFit
+    from jaxtrachea.identify.stored import read_results as read_results
     from jaxtrachea.mechanics.beam import Beam as Beam
     from jaxtrachea.mechanics.beam import contact_compliance as contact_compliance
     from jaxtrachea.mechanics.beam import deflect as deflect
@@ -40,6 +45,7 @@ if TYPE_CHECKING:
     from jaxtrachea.skeleton import Skeleton as Skeleton
     from jaxtrachea.skeleton import skeleton_response as skeleton_response
     from jaxtrachea.status import FitStatus as FitStatus
+    from jaxtrachea.status import PredictionStatus as PredictionStatus
     from jaxtrachea.status import PressStatus as PressStatus
     from jaxtrachea.trachea.geometry import Geometry as Geometry
     from jaxtrachea.trachea.geometry import table_1 as table_1
@@ -48,6 +54,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
+    "identify.predict": ("CurvePrediction", "predict"),
+    "identify.stored": ("NoResults", "StoredFit", "read_results"),
     "mechanics.beam": ("Beam", "contact_compliance", "deflect"),
     "mechanics.force_law": ("Law", "duffing"),
     "model": ("Options", "Press", "press"),
@@ -57,7 +65,7 @@ _HOME = {
     "scene.simulation": ("Simulation", "simulate", "sweep"),
     "scene.stage": ("Poses", "Presses", "Scene", "make_scene", "with_geometry"),
     "skeleton": ("Skeleton", "skeleton_response"),
-    "status": ("FitStatus", "PressStatus"),
+    "status": ("FitStatus", "PredictionStatus", "PressStatus"),
     "trachea.geometry": ("Geometry", "table_1"),
     "trachea.material": ("Material",),
 }

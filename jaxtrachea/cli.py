@@ -15,7 +15,15 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from jaxtrachea import __version__, cli_compare, cli_fit, cli_scene, cli_selfcheck, cli_tradeoff
+from jaxtrachea import (
+    __version__,
+    cli_compare,
+    cli_fit,
+    cli_predict,
+    cli_scene,
+    cli_selfcheck,
+    cli_tradeoff,
+)
 from jaxtrachea.cli_load import load
 from jaxtrachea.cli_run import posterior_failed, run, show, write
 from jaxtrachea.terminal import Kept, Stop, complain, into, say_lost, table, to_stderr
@@ -81,7 +89,7 @@ def _not_shown(error: OSError) -> str:
 
 
 for _command in (
-    cli_compare.compare, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
+    cli_compare.compare, cli_predict.predict, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
     cli_selfcheck.selfcheck, cli_tradeoff.tradeoff,
 ):  # fmt: skip
     app.command()(_command)
@@ -106,7 +114,8 @@ def check(spec: SpecArgument, data: DataOption = None) -> None:
     if len(curves) > MANY:
         out.print(f"... and {len(curves) - MANY} more")
     _print_usage(out, curves)
-    out.print(_parameter_table(problem.parameters))
+    if problem.free:
+        out.print(_parameter_table(problem.parameters))
     fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in problem.parameters if p.fixed)
     out.print(f"Fixed: {fixed or 'none'}", highlight=False)
     lanes, bad = len(problem.curves), len(measurements.bad)
@@ -146,6 +155,7 @@ def fit(
     options = [name for name, wanted in asked.items() if wanted]
     options = sorted({*options, *cli_fit.remembered(how)})
     loaded, measurements, problem = load(spec, data, refits=bool(options))
+    _has_unknowns(spec, loaded, problem, options)
     root = spec.parent if data is None else data
     now = cli_fit.describe(how, spec, root, loaded, measurements, problem, options)
     if meeting.process > 0:
@@ -175,6 +185,8 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
     from jaxtrachea.identify.study import candidates_of, settings_of
 
     loaded, measurements, problem = load(spec, data, refits=True)
+    if not problem.free:
+        raise Stop(f"{spec}: design: every parameter is fixed; free what the presses shall tell")
     try:
         candidates = candidates_of(loaded, problem)
     except SpecError as error:
@@ -220,6 +232,16 @@ def _design(folder: Path, loaded, found, candidates) -> list[dict[str, object]]:
     rings = np.asarray(found.result.problem.geometry.ring_positions)
     say_lost(draw_design(folder / "identifiability.png", chart, candidates, choice, rings))
     return rows
+
+
+def _has_unknowns(path: Path, spec, problem, options: list[str]) -> None:
+    from jaxtrachea.config import SpecError
+    from jaxtrachea.identify.study import refuse_without_unknowns
+
+    try:
+        refuse_without_unknowns(spec, problem, options)
+    except SpecError as error:
+        raise Stop(f"{path}: {error}") from None
 
 
 def _can_leave_out(problem) -> None:

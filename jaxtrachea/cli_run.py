@@ -124,7 +124,8 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
     made = results.provenance(
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
     ) | {"run": journal}
-    results.write_hdf5(folder / "results.h5", result, made, profiles, resampled)
+    reading = loaded.data.model_dump(mode="json")
+    results.write_hdf5(folder / "results.h5", result, made, profiles, resampled, reading)
     if found.posterior is not None:
         write_draws(folder / "results.h5", found.posterior)
     results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")

@@ -26,7 +26,9 @@ def overview(found: Any) -> Iterator[Table | str]:
     result, lanes = found.result, listed(found.result)
     cut = result.lanes > len(lanes)
     wide = effective(result, predictions(result.problem, result.theta))
-    if cut:
+    if not result.problem.free:
+        yield f"{result.lanes} lanes: {verdict_sentence(result, 0)}"
+    elif cut:
         spread = report.spread_rows(result, found.profiles)
         yield "Estimates over lanes", report.SPREAD_HEAD, spread
     else:
@@ -47,9 +49,9 @@ def overview(found: Any) -> Iterator[Table | str]:
     yield "Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)
     yield from _more(result.lanes, len(lanes), "summary.csv")
     yield from _further(found, lanes)
-    for lane in lanes if not cut else ():
+    for lane in lanes if result.problem.free and not cut else ():
         yield f"{lane_label(result, lane)}: {verdict_sentence(result, lane, found.profiles)}"
-    if cut:
+    if cut and result.problem.free:
         good = sum(succeeded(result, lane) for lane in range(result.lanes))
         yield f"{good} of {result.lanes} lanes succeeded"
     for sentence in sentences([c for curves in result.problem.curves for c in curves]):

@@ -35,7 +35,7 @@ STYLE: dict[Any, object] = {
 def draw_all(
     folder: Path, result: FitResult, prediction: Prediction, profiles: Profiles | None = None
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write fit.png, residuals.png, correlation.png, if given profiles.png.
+    """Write fit.png, residuals.png, if fitted correlation.png, if given profiles.png.
 
     Returns:
         The paths; and by file name, why a picture could not be drawn: it costs itself only.
@@ -43,8 +43,9 @@ def draw_all(
     drawings: dict[str, Any] = {
         "fit.png": partial(draw_fit, result, prediction),
         "residuals.png": partial(draw_residuals, result, prediction),
-        "correlation.png": partial(draw_correlation, result),
     }
+    if result.problem.free:
+        drawings["correlation.png"] = partial(draw_correlation, result)
     if profiles is not None and len(profiles.lane):
         drawings["profiles.png"] = partial(draw_profiles, profiles)
     with mpl.rc_context(STYLE):

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtrachea.doubts import distrust, doubts
 from jaxtrachea.identify.bootstrap import FEWEST, Bootstrap
 from jaxtrachea.identify.effective import CORRELATED, Effective, effective
+from jaxtrachea.identify.evaluate import NOTHING_FITTED
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.parameters import OF_THE_PRESS
@@ -211,7 +212,8 @@ def report_text(
         parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, left_out)]
         parts += own_touch_sentence(result, "A curve left out")
     parts += more
-    names = {"fit": "data and fit", "residuals": "residuals", "correlation": "correlation"}
+    names = {"fit": "data and fit", "residuals": "residuals"}
+    names |= {"correlation": "correlation"} if result.problem.free else {}
     parts += [f"![{text}]({name}.png)" for name, text in names.items()]
     if bad:
         rows = [[b.specimen, b.trial, b.kind, b.message, b.cure] for b in bad]
@@ -231,7 +233,10 @@ def _estimates(
     tables = [markdown_table(head, rows), *more_of(result, shown, "parameters.csv")]
     if result.lanes > len(shown):
         tables = [markdown_table(SPREAD_HEAD, spread_rows(result, profiles)), *tables]
+    if not result.problem.free:
+        tables = [f"None: {NOTHING_FITTED}."]
     fixed = [f"{p.name} = {p.value:g} {p.unit}" for p in result.problem.parameters if p.fixed]
+    shown = shown if result.problem.free else range(0)
     flat = [f"- {lane_label(result, k)}: {verdict_sentence(result, k, profiles)}." for k in shown]
     return [
         "## Estimates",

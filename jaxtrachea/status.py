@@ -63,6 +63,25 @@ class FitStatus(_Described):
         return self <= FitStatus.UNIDENTIFIABLE
 
 
+class PredictionStatus(_Described):
+    """What became of one predicted curve; the worst of what is to be said."""
+
+    OK = 0, "predicted"
+    AT_BOUND = 1, "predicted, but the bands leave out the uncertainty of an unknown on its bound"
+    BENT = 2, "predicted, but the model bends within the bands: the linear bands are off"
+    UNDETERMINED = 3, "predicted, but the data of the fit do not limit it: infinite bands"
+    NO_SOLUTION = 4, "no stable solution at some displacements"
+    NO_OWN = 5, "the curve's own parameters could not be fitted to it"
+    NO_ESTIMATE = 6, "the fit has no estimate for it"
+    UNKNOWN_SPECIMEN = 7, "the fit does not know this specimen"
+    BAD_DATA = 8, "the measurements could not be used"
+
+    @property
+    def predicts(self) -> bool:
+        """Whether there is a prediction (with its warnings)."""
+        return self <= PredictionStatus.NO_SOLUTION
+
+
 class RingStatus(_Described):
     """Whether a cartilage ring can answer a load at an angle."""
 

@@ -110,9 +110,10 @@ BAD_SPECS = {
     "fixed negative": (K1 + "{ fixed = -1 }", ["parameters.k_1: fixed: -1 N/mm", "more than 0"]),
     "fixed a truth": (K1 + "{ fixed = true }", ["parameters.k_1.fixed", "number", "True"]),
     "fixed and bounds": (K1 + "{ fixed = 1, scale = 'log' }", ["parameters.k_1: fixed excludes"]),
-    "nothing free": (
-        K1 + "{ fixed = 1 }\nk_3 = { fixed = 0 }\nEI_L = { fixed = 1 }\nk_M = { fixed = 1 }",
-        ["every parameter is fixed", "free at least one"],
+    "nothing free to be doubted": (
+        K1 + "{ fixed = 1 }\nk_3 = { fixed = 0 }\nEI_L = { fixed = 1 }\nk_M = { fixed = 1 }\n"
+        "[uncertainty]\nbootstrap = 40",
+        ["uncertainty.bootstrap: every parameter is fixed", "free a parameter"],
     ),
     "noise bare": (DATA + "[noise]\nforce = 0.1", ["noise.force: 0.1 has no unit", "0.1 N"]),
     "noise in mm": (DATA + '[noise]\nforce = "1 mm"', ["noise.force", "does not measure force"]),

@@ -115,7 +115,7 @@ class FitResult:
     @property
     def whitened_sigma(self) -> np.ndarray:
         """`sigma` in units of the lanes' precision, as `evaluate` wants it; (lanes, 2)."""
-        return self.sigma / _precision_unit(self.problem)
+        return self.sigma / precision_unit(self.problem)
 
     @property
     def relative(self) -> np.ndarray:
@@ -138,8 +138,13 @@ def fit(
         starts: where to start, scaled coordinates, (lanes * settings.starts, P); None: drawn.
 
     Returns:
-        The `FitResult`. It never raises for a lane's sake.
+        The `FitResult`. It never raises for a lane's sake. Without unknowns (every parameter is
+        fixed) nothing is solved: the model is evaluated.
     """
+    if problem.size == 0:
+        from jaxtrachea.identify.evaluate import evaluated
+
+        return evaluated(problem)
     sigma = first_sigma(problem)
     solved, agree, tried = _from_starts(problem, settings, starts, sigma, progress)
     for _ in range(_noise_rounds(problem)):
@@ -316,7 +321,7 @@ def _conclude(problem: Problem, solved: Solved, known, sigma, agree, tried) -> F
         rms = np.sqrt(info.squares / info.counts)
         standard_error = u.se * np.where(log, value, step)
         lower, upper = unscale(theta - half), unscale(theta + half)
-    unit = _precision_unit(problem)
+    unit = precision_unit(problem)
     samples = np.sum(info.counts, axis=1)
     left = np.sum(pool.counts, axis=1) - (np.sum(~held, axis=1) if unknowns is None else unknowns)
     status = _final_status(solved.status, u, at_bound, left)
@@ -344,7 +349,7 @@ def _final_status(status, u: Uncertainty, at_bound, dof) -> np.ndarray:
     return np.where(solved, np.where(dof < 0, FitStatus.TOO_FEW_DATA, fine), status).astype(int)
 
 
-def _precision_unit(problem: Problem) -> np.ndarray:
+def precision_unit(problem: Problem) -> np.ndarray:
     """Given sigma that one unit of whitened residual stands for (median); (lanes, 2)."""
 
     def typical(precision, given):

@@ -16,6 +16,9 @@ from jaxtrachea.identify.run_folder import NoRun
 from jaxtrachea.identify.uncertainty import Uncertainty
 from jaxtrachea.status import FitStatus
 
+#: Schema versions that are read; 1 has no covariance, which then follows from the standard errors.
+VERSIONS = (1, SCHEMA_VERSION)
+
 
 def read_hdf5(path: Path, problem: Problem) -> FitResult:
     """Read the fit back from results.h5, bit for bit.
@@ -29,13 +32,15 @@ def read_hdf5(path: Path, problem: Problem) -> FitResult:
     """
     try:
         with h5py.File(path) as file:
-            if (file.attrs["schema"], file.attrs["schema_version"]) != (SCHEMA, SCHEMA_VERSION):
+            if file.attrs["schema"] != SCHEMA or file.attrs["schema_version"] not in VERSIONS:
                 raise ValueError("another schema")
             found: dict[str, np.ndarray] = {}
             file.visititems(lambda name, item: _keep(found, name, item))
     except (OSError, KeyError, ValueError) as error:
         raise NoRun(f"{path} cannot be read back ({error})") from None
     try:
+        if "uncertainty/covariance" not in found:
+            found["uncertainty/covariance"] = _covariance(found)
         arrays = {name: found[_place(found, name)] for name in FIELDS}
         arrays |= {f"criteria.{name}": found[f"lanes/{name}"] for name in Criteria._fields}
         for name in Uncertainty._fields:
@@ -50,6 +55,15 @@ def read_hdf5(path: Path, problem: Problem) -> FitResult:
 def _keep(found: dict[str, np.ndarray], name: str, item: object) -> None:
     if isinstance(item, h5py.Dataset):
         found[name] = item[()]
+
+
+def _covariance(found: dict[str, np.ndarray]) -> np.ndarray:
+    """Of the estimates from standard errors and correlation; NaN along blind directions."""
+    se = found["uncertainty/se"]
+    with np.errstate(invalid="ignore"):
+        product = found["unknowns/correlation"] * se[:, :, None] * se[:, None]
+    held = np.isnan(se)
+    return np.where(held[:, :, None] | held[:, None], 0.0, product)
 
 
 def _place(found: dict[str, np.ndarray], name: str) -> str:

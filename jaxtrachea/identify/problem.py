@@ -206,8 +206,12 @@ class Noise:
 def group(
     curves: Sequence[Curve], parameters: Sequence[Parameter], *, joint: bool = False
 ) -> list[list[Curve]]:
-    """Divide curves into lanes by the widest scope among the free parameters; joint: specimens."""
+    """Divide curves into lanes by the widest scope among the free parameters.
+
+    By specimens if joint, or if none is free.
+    """
     scopes = {"specimen"} if joint else {p.scope for p in parameters if not p.fixed}
+    scopes = scopes or {"specimen"}
     if "shared" in scopes:
         return [list(curves)]
     lanes: dict[tuple[str, str], list[Curve]] = {}
@@ -247,9 +251,9 @@ def build(
             if there is but one specimen.
 
     Raises:
-        ValueError: an unknown `balance` or `loss`, no curve, no free parameter, a marker on a ring
-            that does not exist, a curve without a contact position where one is needed, with
-            specimen and trial named.
+        ValueError: an unknown `balance` or `loss`, no curve, a marker on a ring that does not
+            exist, a curve without a contact position where one is needed, with specimen and trial
+            named.
     """
     check_word("balance", balance, Balance)
     check_word("loss", loss, Loss)
@@ -259,8 +263,6 @@ def build(
         raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
     if not curves:
         raise ValueError("no usable curve; nothing to fit")
-    if all(p.fixed for p in parameters):
-        raise ValueError("parameters: every parameter is fixed; free at least one")
     for curve in curves:
         check_curve(curve, geometry, options)
     parameters = natural_steps(parameters, curves)

@@ -88,7 +88,7 @@ def _beam_columns(problem: Problem) -> tuple[int, ...]:
     return tuple(i for i, p in enumerate(problem.free) if p.name in SKELETON)
 
 
-def _material(problem: Problem, free, value) -> tuple[Material, dict[str, Array]]:
+def material_and_values(problem: Problem, free, value) -> tuple[Material, dict[str, Array]]:
     """Material of one trial, and the value of every parameter by name."""
     values = {p.name: value[j] for j, p in enumerate(problem.parameters)}
     for p, scaled in zip(problem.free, free, strict=True):
@@ -115,7 +115,7 @@ def _skeleton(problem: Problem, free, lane: Lane) -> Skeleton:
     geometry = _geometry(problem, free.dtype)
 
     def at(free, value, s_c):
-        material, _ = _material(problem, free, value)
+        material, _ = material_and_values(problem, free, value)
         if lane.joints is None:
             return Skeleton(compliance(geometry, material, s_c, problem.options), None)
         beam = ligament_beam(geometry, material, problem.options)
@@ -156,7 +156,7 @@ class _Contact(NamedTuple):
 
 
 def _at_contact(problem: Problem, free, trial: Lane) -> _Contact:
-    material, values = _material(problem, free, trial.value)
+    material, values = material_and_values(problem, free, trial.value)
     law = local_law(_geometry(problem, free.dtype), material, trial.s_c, problem.options)
     return _Contact(law, values["onset"], values["force_offset"])
 

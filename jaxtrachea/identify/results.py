@@ -5,13 +5,15 @@ import hashlib
 import json
 import platform
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import h5py
 import numpy as np
 
+from jaxtrachea.identify import store
 from jaxtrachea.identify.bootstrap import Bootstrap
+from jaxtrachea.identify.evaluate import NOTHING_FITTED
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.journal import installed
 from jaxtrachea.identify.measurements import BadCurve
@@ -27,9 +29,9 @@ from jaxtrachea.spreadsheet import write_csv as write_csv
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 SCHEMA = "jaxtrachea-results"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 #: Fields of `Uncertainty` in the group of that name; the others stand with lanes and unknowns.
-MORE = ("se", "flat_se", "blind", "half_width", "along", "dispersion")
+MORE = ("se", "flat_se", "blind", "half_width", "along", "dispersion", "covariance")
 
 
 def unknown_label(result: FitResult, lane: int, i: int) -> str:
@@ -64,6 +66,8 @@ def flat_sentence(result: FitResult, lane: int) -> str:
     """The least determined combination of a lane in words."""
     if not succeeded(result, lane):
         return "no estimate"
+    if not result.problem.free:
+        return NOTHING_FITTED
     names = [unknown_label(result, lane, i) for i in range(len(result.problem.unknowns[lane]))]
     u = result.uncertainty[lane]
     return describe_flat(names, u.flat, float(u.flat_se), u.blind, press_sizes(result, lane))
@@ -85,6 +89,8 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
     """Which unknowns of a lane have which verdict, and what is least determined."""
     if not succeeded(result, lane):
         return "no estimate"
+    if not result.problem.free:
+        return NOTHING_FITTED
     groups: dict[str, list[str]] = {}
     for i in range(len(result.problem.unknowns[lane])):
         word = verdict_of(result, lane, i, profiles)
@@ -112,7 +118,7 @@ def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[d
             "specimen": specimen,
             "trial": trial,
             "status": status.name.lower(),
-            "message": status.message,
+            "message": status.message if result.problem.free else NOTHING_FITTED,
             "iterations": int(result.iterations[lane]),
             "starts_agreeing": int(result.converged_starts[lane]),
             "starts": int(result.tried[lane]),
@@ -276,6 +282,7 @@ def write_hdf5(
     provenance: dict,
     profiles: Profiles | None = None,
     resampled: Bootstrap | None = None,
+    reading: Mapping[str, object] | None = None,
 ) -> None:
     """Write all numbers of a fit; the schema is described in docs/results.md.
 
@@ -285,12 +292,14 @@ def write_hdf5(
         provenance: stored as JSON in the root attribute of that name.
         profiles: makes the group `profiles`.
         resampled: makes the group `bootstrap`.
+        reading: how the data were read (the [data] section), for `predict`.
     """
     with hdf5_file(path) as file:
         file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
         file.attrs["provenance"] = json.dumps(provenance)
         _write_lanes(file.create_group("lanes"), result)
         _write_unknowns(file.create_group("unknowns"), result)
+        store.write(file, result, provenance.get("inputs", {}), reading or {})
         group = file.create_group("uncertainty")
         for name in MORE:
             rows = np.stack([getattr(u, name) for u in result.uncertainty])

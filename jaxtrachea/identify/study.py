@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import re
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -350,6 +351,31 @@ def profiled(spec: FitSpec, problem: Problem, *, asked: bool) -> tuple[str, ...]
                 f"{', '.join(free)}"
             )
     return free if "all" in names or (asked and not names) else tuple(names)
+
+
+def refuse_without_unknowns(spec: FitSpec, problem: Problem, options: Collection[str]) -> None:
+    """Say what has no meaning where every parameter is fixed.
+
+    Args:
+        spec: the specification.
+        problem: the study.
+        options: of the command line, without dashes.
+
+    Raises:
+        SpecError: something was asked for that needs a free parameter; it is named.
+    """
+    if problem.free:
+        return
+    u = spec.uncertainty
+    asked = {"profile": u.profile, "bootstrap": u.bootstrap, "posterior": u.posterior,
+             "influence": u.influence}  # fmt: skip
+    names = [f"--{name}" for name in options]
+    names += [f"uncertainty.{name}" for name, wanted in asked.items() if wanted]
+    if names:
+        raise SpecError(
+            f"{', '.join(names)}: every parameter is fixed, so that there is no estimate to be "
+            "doubted; leave it out (the model is then evaluated), or free a parameter"
+        )
 
 
 def candidates_of(spec: FitSpec, problem: Problem) -> Candidates:

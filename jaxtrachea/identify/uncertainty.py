@@ -139,6 +139,8 @@ class Uncertainty(NamedTuple):
         dispersion: of twice the rise of the cost along each unknown: where the cost is a
             likelihood s^2, else such that its curvature gives `se` (Kent 1982,
             doi:10.1093/biomet/69.1.19); (P,).
+        covariance: of the estimates, scaled coordinates; 0 for held unknowns, and without the
+            `blind` directions, along which it is infinite; (P, P).
     """
 
     se: np.ndarray
@@ -150,6 +152,7 @@ class Uncertainty(NamedTuple):
     half_width: np.ndarray
     along: np.ndarray
     dispersion: np.ndarray
+    covariance: np.ndarray
 
 
 def analyse(
@@ -175,9 +178,7 @@ def analyse(
     free = ~held
     total = np.sum(info.counts, axis=1)
     dof = total - (np.sum(free, axis=1) if unknowns is None else unknowns)
-    half = np.full(len(dof), 1.959963984540054)
-    if not noise_given:
-        half = np.where(dof > 0, stdtrit(np.maximum(dof, 1), 0.975), half)
+    half = half_widths(dof, noise_given=noise_given)
     usable = np.isfinite(info.bread).all(axis=(1, 2)) & (dof >= 0)
     free = free & usable[:, None]
     kappa = np.ones(len(dof)) if noise_given else np.asarray(info.psi2) * total / np.maximum(dof, 1)
@@ -204,7 +205,18 @@ def analyse(
     whole = [np.trace(_scaled(np.asarray(m), relative), axis1=1, axis2=2) for m in info[:2]]
     dispersion = dpsi[:, None] * _ratio(along, meat, bread, whole[1] * kappa, whole[0])
     along = along * relative[:, None] / relative[:, :, None]
-    return Uncertainty(se, correlation, condition, flat, flat_se, silent, half, along, dispersion)
+    covariance = covariance * relative[:, :, None] * relative[:, None]
+    return Uncertainty(
+        se, correlation, condition, flat, flat_se, silent, half, along, dispersion, covariance
+    )
+
+
+def half_widths(dof: np.ndarray, *, noise_given: bool) -> np.ndarray:
+    """Of 95 % intervals in standard errors: normal with given noise, else Student's t; (lanes,)."""
+    half = np.full(len(dof), 1.959963984540054)
+    if noise_given:
+        return half
+    return np.where(dof > 0, stdtrit(np.maximum(dof, 1), 0.975), half)
 
 
 def _along(values, vectors, free) -> np.ndarray:

@@ -27,12 +27,14 @@ FILTERS = (1, 2, 3, 32000)
 
 
 @contextmanager
-def opened(path: Path, *, audit: bool = True) -> Iterator[Any]:
+def opened(path: Path, *, audit: bool = True, read: tuple[str, ...] | None = None) -> Iterator[Any]:
     """Open an HDF5 file for reading after walking through all of it.
 
     Args:
         path: the file.
         audit: walk through it; without that only names may be asked for, no value be read.
+        read: groups and datasets, from the root, whose values will be read; None: all. Others may
+            hold text, and as much as they like.
 
     Yields:
         The open `h5py.File`.
@@ -50,7 +52,7 @@ def opened(path: Path, *, audit: bool = True) -> Iterator[Any]:
     with file:
         try:
             if audit:
-                _Audit(path).group(file, "", 0)
+                _Audit(path, read).group(file, "", 0)
         except DataError:
             raise
         except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
@@ -102,10 +104,11 @@ def _check_heaps(path: Path) -> None:
 class _Audit:
     """Walks a file and refuses what a measurement never needs."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, read: tuple[str, ...] | None = None) -> None:
         import h5py
 
         self.path = path
+        self.read = read
         self.h5: Any = h5py
         self.objects = 0
         self.elements = 0
@@ -153,6 +156,9 @@ class _Audit:
             raise self.refuse(name, "is a virtual dataset", "store the data itself")
         if plan.get_external_count() > 0:
             raise self.refuse(name, "keeps its data in another file", "store the data in this one")
+        read = self.read or ("",)
+        if not any(name == start or name.startswith(f"{start}/") for start in read):
+            return
         numeric = (self.h5.h5t.INTEGER, self.h5.h5t.FLOAT, self.h5.h5t.ENUM)
         kind = dataset.id.get_type()
         if kind.get_class() not in numeric or kind.get_size() > 16:

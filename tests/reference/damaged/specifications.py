@@ -149,7 +149,8 @@ WRONG = {
     "criterion mistyped": of(SPEC + '[design]\ncriterion = "G"', "design.criterion", "'D'"),
     "no data": of("[fit]\nstarts = 1", "data", "missing"),
     "nothing free": of(
-        K_1 + "{ fixed = 1 }\nk_3 = { fixed = 0 }\nEI_L = { fixed = 1 }\nk_M = { fixed = 1 }",
+        K_1 + "{ fixed = 1 }\nk_3 = { fixed = 0 }\nEI_L = { fixed = 1 }\nk_M = { fixed = 1 }\n"
+        "[uncertainty]\nbootstrap = 40",
         "every parameter is fixed",
     ),
 }

@@ -1,0 +1,114 @@
+"""Presses that a user asks a prediction for, as text: "s=75, D=0:6:0.5 mm, specimen=T01"."""
+
+import dataclasses
+import re
+
+import numpy as np
+
+from jaxtrachea.units import UnitError, convert, parse_quantity
+
+#: Presses that one text may stand for.
+MOST = 100_000
+_KEYS = {"s": "s", "D": "D", "d": "D", "displacement": "D", "phi": "phi",
+         "specimen": "specimen", "trial": "trial"}  # fmt: skip
+_START = re.compile(r",(?=\s*\w+\s*=)")
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_VALUES = re.compile(rf"(?P<numbers>{_NUMBER}(?:\s*:\s*{_NUMBER}){{0,2}})\s*(?P<unit>.*)")
+EXAMPLE = "as in s=75,D=0:6:0.5 or 's=7.5 cm,D=2 mm,specimen=T01'"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Presses:
+    """Contact positions and displacements.
+
+    Attributes:
+        s: mm; None if the model needs none.
+        displacement: mm.
+        specimen: only this one; None: all.
+        trial: of the fit, whose own parameters count; None: a new curve.
+    """
+
+    s: np.ndarray | None
+    displacement: np.ndarray
+    specimen: str | None
+    trial: str | None
+
+
+def parse_presses(text: str, *, needs_position: bool) -> Presses:
+    """Read presses from text.
+
+    Args:
+        text: KEY=VALUE, separated by commas; s and D are numbers (mm) with or without a unit, or
+            ranges START:STOP or START:STOP:STEP that include the end.
+        needs_position: whether s must be given.
+
+    Raises:
+        ValueError: what was found, and what is expected.
+    """
+    found: dict[str, str] = {}
+    for part in _START.split(text):
+        key, sign, value = (v.strip() for v in part.partition("="))
+        if not sign or key not in _KEYS or not value:
+            raise ValueError(
+                f"{part.strip()!r} is not understood; expected s, D, specimen or trial, {EXAMPLE}"
+            )
+        name = _KEYS[key]
+        if name in found:
+            raise ValueError(f"{name} is given twice; give --at once for each")
+        found[name] = value
+    if "D" not in found:
+        raise ValueError(f"no displacement D; give it, {EXAMPLE}")
+    if "s" not in found and needs_position:
+        raise ValueError(f"no contact position s; give it, {EXAMPLE}")
+    if "phi" in found and abs(_angle(found["phi"])) > 1e-6:
+        raise ValueError(
+            f"phi = {found['phi']}: this model presses on the anterior midline (phi = 0) only; "
+            "leave it out"
+        )
+    s = _lengths("s", found["s"]) if "s" in found else None
+    D = _lengths("D", found["D"])
+    if len(D) * (1 if s is None else len(s)) > MOST:
+        raise ValueError(f"{text!r} stands for more than {MOST} presses; take larger steps")
+    return Presses(s, D, found.get("specimen"), found.get("trial"))
+
+
+def _angle(text: str) -> float:
+    try:
+        return parse_quantity(text, "angle")
+    except UnitError as error:
+        try:
+            return float(text)
+        except ValueError:
+            raise ValueError(f"phi: {error}") from None
+
+
+def _lengths(name: str, text: str) -> np.ndarray:
+    """A number or a range, mm."""
+    match = _VALUES.fullmatch(text)
+    if match is None:
+        raise ValueError(
+            f"{name}={text!r} is neither a length nor a range START:STOP:STEP; write it {EXAMPLE}"
+        )
+    try:
+        numbers = [float(v) for v in match["numbers"].split(":")]
+        values = [convert(v, match["unit"] or "mm", "length") for v in numbers]
+    except UnitError as error:
+        raise ValueError(f"{name}={text!r}: {error}") from None
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name}={text!r}: expected finite numbers")
+    if len(values) == 1:
+        return np.array(values)
+    start, stop = values[:2]
+    step = values[2] if len(values) == 3 else (stop - start) / 20
+    if start == stop:
+        return np.array([start])
+    if step == 0 or (stop - start) / step < 0:
+        raise ValueError(
+            f"{name}={text!r}: steps of {step:g} mm do not lead from {start:g} to {stop:g} mm; "
+            "give START:STOP:STEP"
+        )
+    count = (stop - start) / step
+    if count > MOST:
+        raise ValueError(f"{name}={text!r}: more than {MOST} values; take larger steps")
+    whole = int(np.floor(count + 1e-9))
+    return start + step * np.arange(whole + 1)
