@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxtrachea.identify.bootstrap import FEWEST, Bootstrap
 from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.judgement import DETERMINED, judgement, verdict_of
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.population import Population, population_rows
 from jaxtrachea.identify.predictions import LeftOut, Prediction, lag_correlation, rms
@@ -17,7 +18,6 @@ from jaxtrachea.identify.results import (
     said_before,
     succeeded,
     unknown_label,
-    verdict_of,
     verdict_sentence,
 )
 from jaxtrachea.status import FitStatus, ProfileEnd
@@ -40,15 +40,15 @@ def estimate_rows(
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
             if said_before(result, lanes, lane, i):
                 continue
-            low, high = result.lower[lane, i], result.upper[lane, i]
+            judged = judgement(result, lane, i, profiles)
             rows.append(
                 [
                     lane_label(result, lane) if is_own(result, lane, i) else "(all)",
                     f"{unknown_label(result, lane, i)} [{p.unit}]",
                     number(result.value[lane, i]),
                     number(result.standard_error[lane, i], 2),
-                    "–" if np.isnan(low) else f"{number(low)} … {number(high)}",
-                    verdict_of(result, lane, i, profiles),
+                    interval(judged.low, judged.high, log=p.scale == "log"),
+                    judged.verdict,
                 ]
             )
     return rows
@@ -58,7 +58,10 @@ ESTIMATE_HEAD = ["specimen", "parameter", "value", "std. error", "95 % interval"
 
 
 def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[list[str]]:
-    """Over all succeeded lanes: parameter, lanes, median, quartiles, median standard error."""
+    """Parameter, estimates determined of all, their median, quartiles and median error, and share.
+
+    Determined: identifiable or weak; a median of others would say nothing.
+    """
     columns: dict[str, list[tuple[float, float, str]]] = {}
     good = [k for k in range(result.lanes) if succeeded(result, k)]
     for lane in good:
@@ -70,18 +73,19 @@ def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[lis
             columns.setdefault(f"{p.name} [{p.unit}]", []).append(entry)
     rows = []
     for name, entries in columns.items():
-        values = np.array([e[0] for e in entries])
-        low, mid, high = np.quantile(values, [0.25, 0.5, 0.75])
-        relative = np.array([e[1] for e in entries])
-        known = np.isfinite(relative)
-        se = f"{100 * np.median(relative[known]):.2g} %" if known.any() else "–"
-        share = 100 * np.mean([e[2] == "identifiable" for e in entries])
-        quartiles = f"{number(low)} … {number(high)}"
-        rows.append([name, str(len(values)), number(mid), quartiles, se, f"{share:.0f} %"])
+        told = np.array([e[:2] for e in entries if e[2] in DETERMINED]).reshape(-1, 2)
+        count = f"{len(told)} of {len(entries)}"
+        if not len(told):
+            rows.append([name, count, "–", "–", "–", "0 %"])
+            continue
+        low, mid, high = np.quantile(told[:, 0], [0.25, 0.5, 0.75])
+        error = f"{100 * np.median(told[:, 1]):.2g} %"
+        share = f"{100 * np.mean([e[2] == 'identifiable' for e in entries]):.0f} %"
+        rows.append([name, count, number(mid), f"{number(low)} … {number(high)}", error, share])
     return rows
 
 
-SPREAD_HEAD = ["parameter", "n", "median", "quartiles", "rel. error", "identifiable"]
+SPREAD_HEAD = ["parameter", "determined", "median", "quartiles", "rel. error", "identifiable"]
 
 
 def quality_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
@@ -203,14 +207,17 @@ def _estimates(result: FitResult, profiles: Profiles | None) -> list[str]:
         f"Fixed: {', '.join(fixed) or 'none'}.",
         "## What the data determine",
         "\n".join(flat),
-        "Identifiable: relative error up to 10 %; weak: up to 50 %; practically not: more, or a "
-        "profile that stays open; structurally not: no data from these contact points can tell, "
-        "however exact. Judged by the profile where there is one, else by the local standard error "
-        "(Gauss-Newton); neither says anything of what the model leaves out.",
+        "Identifiable: relative error up to 10 %; weak: up to 50 %; practically non-identifiable: "
+        "more, or open on a side; structurally non-identifiable: no data from these contact points "
+        "can tell, however exact; not shown: there was cause to doubt the local error, and the "
+        "profile could not be followed to its end. Where there is cause, intervals are those of "
+        "profile likelihood and of all other minima found; else of the local standard error "
+        "(Gauss-Newton). Neither says anything of what the model leaves out. Medians and "
+        "populations are of identifiable and weak estimates.",
     ]
 
 
-POPULATION_HEAD = ["parameter", "n", "mean", "95 % interval", "spread", "95 % interval"]
+POPULATION_HEAD = ["parameter", "n", "left out", "mean", "95 % interval", "spread", "95 % interval"]
 
 
 def population_table(population: Population) -> list[list[str]]:
@@ -223,6 +230,7 @@ def population_table(population: Population) -> list[list[str]]:
             [
                 f"{row['parameter']} [{row['unit']}]",
                 str(row["specimens"]),
+                str(row["left_out"]),
                 cell["mean"],
                 f"{cell['mean_low95']} … {cell['mean_high95']}",
                 f"{sign}{cell['spread']}",
@@ -237,10 +245,11 @@ def _sampled(population: Population) -> list[str]:
     return [
         "## Population",
         markdown_table(POPULATION_HEAD, population_table(population)),
-        "The specimens as a sample: their errors are taken out of the spread between them. Spread: "
-        "one standard deviation, with scale `log` as a factor, and the mean is then the geometric "
-        "one. Estimates drawn towards the mean by what they are uncertain: `shrunk` in "
-        "`parameters.csv`; all numbers: `population.csv` (docs/joint.md).",
+        "The specimens as a sample, those whose estimate is identifiable or weak: their errors are "
+        "taken out of the spread between them. Spread: one standard deviation, with scale `log` as "
+        "a factor, and the mean is then the geometric one. Estimates drawn towards the mean by "
+        "what they are uncertain: `shrunk` in `parameters.csv`; all numbers: `population.csv` "
+        "(docs/joint.md).",
     ]
 
 

@@ -111,13 +111,29 @@ def table(title: str, head, rows, text: tuple[str, ...] = ()) -> Table:
     made = Table(
         title=escape(title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
     )
+    cells = [[str(v) for v in column] for column in zip(head, *rows, strict=True)]
+    least = [max(len(word) for cell in column for word in cell.split() or [""]) for column in cells]
+    whole = [max(map(len, column)) for column in cells]
+    widths = _shared_out(least, whole, Console().width - 2 * len(head) - 1)
     for i, name in enumerate(head):
-        words = " ".join([name, *(row[i] for row in rows)]).split()
         side = "left" if i == 0 or name in text else "right"
-        made.add_column(escape(name), justify=side, min_width=max(map(len, words)), overflow="fold")
+        made.add_column(
+            escape(name), justify=side, min_width=least[i], width=widths[i], overflow="fold"
+        )
     for row in rows:
         made.add_row(*map(escape, row))
     return made
+
+
+def _shared_out(least: list[int], whole: list[int], width: int) -> list[int] | list[None]:
+    """Widths of columns that together fill `width`, none below its longest word; None: as they are.
+
+    Left to itself rich makes columns too narrow first, and then cuts what it widens again.
+    """
+    spare, wanted = width - sum(least), sum(whole) - sum(least)
+    if wanted <= spare or spare < 0:
+        return [None] * len(least)
+    return [a + (b - a) * spare // wanted for a, b in zip(least, whole, strict=True)]
 
 
 def progress_bar() -> Progress:

@@ -135,7 +135,8 @@ def leave_position_out(
     if not len(lanes):
         return error
     chosen = problem.take(lanes)
-    result = fit(without(chosen, held), settings, progress)
+    blind = dataclasses.replace(settings, scrutiny=False)
+    result = fit(without(chosen, held), blind, progress)
     seen = predictions(chosen, result.theta).force
     solved = result.succeeded
     missed = np.where((held & solved[:, None])[:, :, None], seen, np.nan)

@@ -143,7 +143,8 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
     rows = np.arange(len(lane))
     held = np.zeros(lanes.s_c.shape, bool)
     held[rows, trial] = True
-    result = fit(without(chosen, held), settings, progress)
+    blind = dataclasses.replace(settings, scrutiny=False)
+    result = fit(without(chosen, held), blind, progress)
     seen = predictions(chosen, result.theta)
     force, data = seen.force[rows, trial], lanes.force[rows, trial]
     model = np.where(lanes.precision[rows, trial] > 0, data + force, 0)
