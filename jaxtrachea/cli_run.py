@@ -69,18 +69,18 @@ def run(
                 result, draws=u.posterior, chains=u.posterior_chains, seed=spec.fit.seed,
                 progress=counted("drawing"),
             )  # fmt: skip
-        specimens = _population(spec, result)
+        specimens = _population(spec, result, profiled)
         return Found(result, left_out, profiled, resampled, found, drawn, specimens)
 
 
-def _population(spec, result):
+def _population(spec, result, profiled):
     """The specimens as a sample, or None with a word why not if it was asked for."""
     from jaxtrachea.identify.population import population, wanted
 
     if not wanted(spec.fit.population, result):
         return None
     try:
-        return population(result)
+        return population(result, profiled)
     except ValueError as error:
         to_stderr(f"[yellow]no population:[/] {escape(str(error))}")
         return None

@@ -9,6 +9,7 @@ from jaxtrachea.identify.bootstrap import FEWEST, Bootstrap
 from jaxtrachea.identify.effective import CORRELATED, Effective, effective
 from jaxtrachea.identify.evaluate import NOTHING_FITTED
 from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.judgement import DETERMINED, judgement, verdict_of
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.parameters import OF_THE_PRESS
 from jaxtrachea.identify.population import Population, population_rows
@@ -22,7 +23,6 @@ from jaxtrachea.identify.results import (
     said_before,
     succeeded,
     unknown_label,
-    verdict_of,
     verdict_sentence,
 )
 from jaxtrachea.identify.rows import ONE_BY_ONE, and_more, listed
@@ -46,16 +46,16 @@ def estimate_rows(
         for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
             if said_before(result, lanes, lane, i):
                 continue
-            low, high = result.lower[lane, i], result.upper[lane, i]
+            judged = judgement(result, lane, i, profiles)
             rows.append(
                 [
                     lane_label(result, lane) if is_own(result, lane, i) else "(all)",
                     f"{unknown_label(result, lane, i)} [{p.unit}]",
                     number(result.value[lane, i]),
                     number(result.standard_error[lane, i], 2),
-                    "–" if np.isnan(low) else f"{number(low)} … {number(high)}",
+                    interval(judged.low, judged.high, log=p.scale == "log"),
                     *([] if wide is None else [_widened(wide, lane, i, log=p.scale == "log")]),
-                    verdict_of(result, lane, i, profiles),
+                    judged.verdict,
                 ]
             )
     return rows
@@ -72,7 +72,10 @@ WIDENED_HEAD = [*ESTIMATE_HEAD[:-1], "95 % widened", ESTIMATE_HEAD[-1]]
 
 
 def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[list[str]]:
-    """Over all succeeded lanes: parameter, lanes, median, quartiles, median standard error."""
+    """Parameter, estimates determined of all, their median, quartiles and median error, and share.
+
+    Determined: identifiable or weak; a median of others would say nothing.
+    """
     columns: dict[str, list[tuple[float, float, str]]] = {}
     units: dict[str, str] = {}
     good = [k for k in range(result.lanes) if succeeded(result, k)]
@@ -89,21 +92,20 @@ def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[lis
             columns.setdefault(f"{p.name} [{p.unit}]", []).append(entry)
     rows = []
     for name, entries in columns.items():
-        values = np.array([e[0] for e in entries])
-        low, mid, high = np.quantile(values, [0.25, 0.5, 0.75])
-        relative = np.array([e[1] for e in entries])
-        known = np.isfinite(relative)
-        middle = float(np.median(relative[known])) if known.any() else np.nan
-        unit = units.get(name)
-        se = f"{middle:.2g} {unit}" if unit else f"{100 * middle:.2g} %"
-        se = se if known.any() else "–"
-        share = 100 * np.mean([e[2] == "identifiable" for e in entries])
-        quartiles = f"{number(low)} … {number(high)}"
-        rows.append([name, str(len(values)), number(mid), quartiles, se, f"{share:.0f} %"])
+        told = np.array([e[:2] for e in entries if e[2] in DETERMINED]).reshape(-1, 2)
+        count = f"{len(told)} of {len(entries)}"
+        if not len(told):
+            rows.append([name, count, "–", "–", "–", "0 %"])
+            continue
+        low, mid, high = np.quantile(told[:, 0], [0.25, 0.5, 0.75])
+        middle, unit = float(np.median(told[:, 1])), units.get(name)
+        error = f"{middle:.2g} {unit}" if unit else f"{100 * middle:.2g} %"
+        share = f"{100 * np.mean([e[2] == 'identifiable' for e in entries]):.0f} %"
+        rows.append([name, count, number(mid), f"{number(low)} … {number(high)}", error, share])
     return rows
 
 
-SPREAD_HEAD = ["parameter", "n", "median", "quartiles", "error", "identifiable"]
+SPREAD_HEAD = ["parameter", "determined", "median", "quartiles", "error", "identifiable"]
 
 
 def quality_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
@@ -246,10 +248,13 @@ def _estimates(
         "## What the data determine",
         "\n".join(flat),
         *more_of(result, shown, "summary.csv"),
-        "Identifiable: relative error up to 10 %; weak: up to 50 %; practically not: more, or a "
-        "profile that stays open; structurally not: no data from these contact points can tell, "
-        "however exact. Judged by the profile where there is one, else by the local standard error "
-        "(Gauss-Newton); neither says anything of what the model leaves out.",
+        "Identifiable: relative error up to 10 %; weak: up to 50 %; practically non-identifiable: "
+        "more, or open on a side; structurally non-identifiable: no data from these contact points "
+        "can tell, however exact; not shown: there was cause to doubt the local error, and the "
+        "profile could not be followed to its end. Where there is cause, intervals are those of "
+        "profile likelihood and of all other minima found; else of the local standard error "
+        "(Gauss-Newton). Neither says anything of what the model leaves out. Medians and "
+        "populations are of identifiable and weak estimates.",
     ]
 
 
@@ -259,7 +264,7 @@ def more_of(result: FitResult, shown: Sequence[int], file: str) -> list[str]:
     return [f"{text}."] if text else []
 
 
-POPULATION_HEAD = ["parameter", "n", "mean", "95 % interval", "spread", "95 % interval"]
+POPULATION_HEAD = ["parameter", "n", "left out", "mean", "95 % interval", "spread", "95 % interval"]
 
 
 def population_table(population: Population) -> list[list[str]]:
@@ -272,6 +277,7 @@ def population_table(population: Population) -> list[list[str]]:
             [
                 f"{row['parameter']} [{row['unit']}]",
                 str(row["specimens"]),
+                str(row["left_out"]),
                 cell["mean"],
                 f"{cell['mean_low95']} … {cell['mean_high95']}",
                 f"{sign}{cell['spread']}",
@@ -286,10 +292,11 @@ def _sampled(population: Population) -> list[str]:
     return [
         "## Population",
         markdown_table(POPULATION_HEAD, population_table(population)),
-        "The specimens as a sample: their errors are taken out of the spread between them. Spread: "
-        "one standard deviation, with scale `log` as a factor, and the mean is then the geometric "
-        "one. Estimates drawn towards the mean by what they are uncertain: `shrunk` in "
-        "`parameters.csv`; all numbers: `population.csv` (docs/joint.md).",
+        "The specimens as a sample, those whose estimate is identifiable or weak: their errors are "
+        "taken out of the spread between them. Spread: one standard deviation, with scale `log` as "
+        "a factor, and the mean is then the geometric one. Estimates drawn towards the mean by "
+        "what they are uncertain: `shrunk` in `parameters.csv`; all numbers: `population.csv` "
+        "(docs/joint.md).",
     ]
 
 

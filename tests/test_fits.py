@@ -102,7 +102,7 @@ def test_files_agree_with_each_other(folder):
             assert units[row["parameter"]] == row["unit"]
             label = f"{row['parameter']} [{row['unit']}]"
             assert float(row["value"]) == unknowns["value"][0, i] == float(summary[label])
-            for ours, theirs in (("se", "standard_error"), ("low95", "lower"), ("high95", "upper")):
+            for ours, theirs in (("se", "standard_error"), ("low95",) * 2, ("high95",) * 2):
                 values = [float(row[ours]), unknowns[theirs][0, i]]
                 values.append(float(summary[f"{row['parameter']} {ours}"]))
                 assert np.array_equal(values, [values[0]] * 3, equal_nan=True)

@@ -210,7 +210,9 @@ def test_rows_name_what_is_shared_once(linear):
 def test_population_and_its_page(linear):
     """Mean and spread of k_1 = 1 ... 2.9 in logarithms; columns as documented."""
     rows = list(population_rows(population(linear)))
-    assert list(rows[0]) == re.findall(r"^\| `(\w+)`", PAGE.split("## ")[3], re.M)
+    assert list(rows[0]) == re.findall(
+        r"^\| `(\w+)`", PAGE.partition("## population.csv")[2].split("\n## ")[0], re.M
+    )
     assert [r["parameter"] for r in rows] == ["k_1"]
     truth = np.log(1 + 0.1 * np.arange(LANES))
     np.testing.assert_allclose(np.log(rows[0]["mean"]), truth.mean(), atol=0.02)

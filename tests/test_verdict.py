@@ -14,23 +14,32 @@ def unit(*v):
     return np.array(v) / np.linalg.norm(v)
 
 
+CLOSED, BOUND, OPEN, FAILED = ProfileEnd
+
+
 @pytest.mark.parametrize(
-    ("case", "word"),
+    ("error", "more", "word"),
     [
-        ((0.1, False), "identifiable"),
-        ((0.3, False), "weak"),
-        ((0.51, False), "practically not"),
-        ((np.inf, False), "structurally not"),
-        ((np.nan, True), "at bound"),
-        ((0.05, False, (0.7, ProfileEnd.CLOSED)), "practically not"),
-        ((0.9, False, (0.2, ProfileEnd.BOUND)), "weak"),
-        ((0.3, False, (np.inf, ProfileEnd.OPEN)), "practically not"),
-        ((0.3, False, (np.nan, ProfileEnd.FAILED)), "weak"),
-        ((np.inf, False, (np.inf, ProfileEnd.OPEN)), "structurally not"),
+        (0.1, {}, "identifiable"),
+        (0.3, {}, "weak"),
+        (0.51, {}, "practically non-identifiable"),
+        (np.inf, {}, "practically non-identifiable"),
+        (np.nan, {"held": True}, "at bound"),
+        (0.05, {"structural": True}, "structurally non-identifiable"),
+        (np.nan, {"structural": True, "held": True}, "structurally non-identifiable"),
+        (0.7, {"ends": (CLOSED, CLOSED)}, "practically non-identifiable"),
+        (0.2, {"ends": (CLOSED, BOUND)}, "weak"),
+        (0.05, {"ends": (CLOSED, OPEN)}, "practically non-identifiable"),
+        (0.05, {"ends": (OPEN, FAILED)}, "practically non-identifiable"),
+        (0.05, {"ends": (FAILED, CLOSED)}, "not shown"),
+        (0.3, {"ends": (CLOSED, FAILED)}, "not shown"),
+        (0.7, {"ends": (CLOSED, FAILED)}, "practically non-identifiable"),
+        (0.05, {"unseen": True}, "not shown"),
+        (0.7, {"unseen": True}, "practically non-identifiable"),
     ],
 )
-def test_words(case, word):
-    assert verdict(*case) == word
+def test_words(error, more, word):
+    assert verdict(error, **more) == word
     assert word in VERDICTS
 
 

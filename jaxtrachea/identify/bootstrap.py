@@ -82,7 +82,7 @@ def bootstrap(
     result.problem.refuse_joint("the bootstrap")
     seen = predictions(result.problem, result.theta)
     chunk = chunk_size(max(result.lanes * settings.starts, 16), settings.chunk)
-    one = dataclasses.replace(settings, starts=1, chunk=chunk)
+    one = dataclasses.replace(settings, starts=1, chunk=chunk, scrutiny=False)
     thetas, usable = [], []
     together = max(_AT_ONCE // count, 1)
     for first in range(0, result.lanes, together):

@@ -45,7 +45,9 @@ def evaluated(problem: Problem) -> FitResult:
         status=np.where(finite, FitStatus.CONVERGED, FitStatus.NON_FINITE).astype(int),
         cost=_cost(problem, seen, sigma), converged_starts=finite.astype(int),
         sigma=sigma * unit, rms=rms, samples=total, criteria=criteria(problem, info, finite),
-        uncertainty=tuple(map(_no_uncertainty, half)), **counts,
+        uncertainty=tuple(map(_no_uncertainty, half)), undetermined=none.astype(bool),
+        evidence_low=none, evidence_high=none, evidence_end=np.zeros((lanes, 0, 2), int),
+        minima=np.ones(lanes, int), **counts,
     )  # fmt: skip
 
 
@@ -113,4 +115,5 @@ def _no_uncertainty(half: float) -> Uncertainty:
     return Uncertainty(
         se=none, correlation=square, condition=nan, flat=none, flat_se=nan, blind=square,
         half_width=np.asarray(half), along=square, dispersion=none, covariance=square,
+        silent=square,
     )  # fmt: skip

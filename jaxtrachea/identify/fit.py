@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -14,11 +14,22 @@ from jaxtrachea.identify.press_scale import relative_change
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.solve import Solved, Tolerances, chunk_size, levenberg_marquardt
 from jaxtrachea.identify.starts import best, completed, draw_starts, of_unknowns
+from jaxtrachea.identify.structure import (
+    Structure,
+    null_spaces,
+    reduced,
+    structure_of,
+    suspicious,
+)
 from jaxtrachea.identify.uncertainty import Information, Uncertainty, analyse, informations
 from jaxtrachea.status import FitStatus
 
 #: Lanes computed together where only a few are left.
 FEW = 16
+#: Condition number of the Jacobian up to which it proves that the structure leaves nothing open.
+PROVEN = 1e5
+#: Times that a better minimum found by the scrutiny takes the place of the estimate.
+REPLACED = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +47,9 @@ class Settings:
         chunk: lanes computed together.
         tolerances: when a lane is done.
         float32: compute in single precision (results are float64 all the same).
+        scrutiny: look for other minima and profile where an estimate gives cause; False: verdicts
+            rest on structure and local standard errors alone (for refits of which no one reads
+            the verdicts).
     """
 
     method: Literal["levenberg-marquardt", "lbfgs", "adam"] = "levenberg-marquardt"
@@ -46,6 +60,7 @@ class Settings:
     chunk: int = 128
     tolerances: Tolerances = Tolerances()
     float32: bool = False
+    scrutiny: bool = True
 
     def __post_init__(self):
         """Refuse words and numbers that mean nothing.
@@ -81,6 +96,15 @@ class FitResult:
         samples: observed entries; (lanes,).
         criteria: AIC, AICc, BIC of all lanes.
         uncertainty: `Uncertainty` of each lane.
+        undetermined: unknowns that the structure leaves open (`structure`); (lanes, P).
+        evidence_low: 95 % interval by profile and other minima, in the parameter's unit: -inf
+            (scale `log`: 0) where open, NaN where there was no cause to look; where an end is
+            `FAILED`, as far as the cost is known to stay below the threshold; (lanes, P).
+        evidence_high: (lanes, P).
+        evidence_end: `ProfileEnd` of its lower and upper end, -1 where there is none;
+            (lanes, P, 2).
+        minima: minima that fit within the likelihood's threshold, the best one included; those
+            that differ from it in an unknown that the structure does not leave open; (lanes,).
     """
 
     problem: Problem
@@ -101,6 +125,11 @@ class FitResult:
     samples: np.ndarray
     criteria: Criteria
     uncertainty: tuple[Uncertainty, ...]
+    undetermined: np.ndarray
+    evidence_low: np.ndarray
+    evidence_high: np.ndarray
+    evidence_end: np.ndarray
+    minima: np.ndarray
 
     @property
     def lanes(self) -> int:
@@ -123,13 +152,49 @@ class FitResult:
         return relative_change(self.problem, self.theta)
 
 
+class Minima(NamedTuple):
+    """The best of all starts of every lane, and where the others ended.
+
+    Attributes:
+        solved: best outcome of each lane.
+        agree: starts that ended in it; (lanes,).
+        tried: starts in all; (lanes,).
+        sigma: standard deviations that it was found with; (lanes, 2).
+        job: lane of every start; (jobs,).
+        end: where it ended; (jobs, P).
+        cost: that it ended at, with the noise that fits begin with; (jobs,).
+    """
+
+    solved: Solved
+    agree: np.ndarray
+    tried: np.ndarray
+    sigma: np.ndarray
+    job: np.ndarray
+    end: np.ndarray
+    cost: np.ndarray
+
+    def replaced(self, lanes: np.ndarray, by: "Minima") -> "Minima":
+        """With the rows `lanes` from `by`; where their own starts ended is not forgotten."""
+        rows = [np.array(v) for v in (*self.solved, self.agree, self.tried, self.sigma)]
+        for old, new in zip(rows, (*by.solved, by.agree, by.tried, by.sigma), strict=True):
+            old[lanes] = new
+        ends = (self.job, self.end, self.cost), (lanes[by.job], by.end, by.cost)
+        joined = (np.concatenate(pair) for pair in zip(*ends, strict=True))
+        return Minima(Solved(*rows[:4]), rows[4], rows[5], rows[6], *joined)
+
+
 def fit(
     problem: Problem,
     settings: Settings = Settings(),  # noqa: B008 (frozen)
     progress: Callable[[int, int], None] | None = None,
     starts: np.ndarray | None = None,
 ) -> FitResult:
-    """Fit every lane from every start and keep the best; failed lanes are rows with a status.
+    """Fit every lane from every start, keep the best, and find out what may be believed.
+
+    Failed lanes are rows with a status. Where the structure leaves a combination of unknowns open
+    (`structure`), one of them is held, so that there is no valley to follow; where an estimate
+    gives cause for doubt, other minima are looked for and unknowns are profiled (`scrutiny`). A
+    lane that gives no cause costs nothing more.
 
     Args:
         problem: from `problem.build`.
@@ -145,31 +210,114 @@ def fit(
         from jaxtrachea.identify.evaluate import evaluated
 
         return evaluated(problem)
+    known = structure_of(problem, suspicious(problem))
+    minima = _minima(problem, settings, starts, progress, known)
+    result = _conclude(problem, minima, known)
+    late = _unproven(result, known)
+    if late.any():
+        more = structure_of(problem, late)
+        known = more if problem.joint else Structure(*map(np.maximum, known, more))
+        rows = np.flatnonzero(late & (known.nullity > 0))
+        if len(rows) and not problem.joint and starts is None:
+            part = problem.take(rows)
+            again = _minima(part, settings, None, progress, known.take(rows))
+            minima = minima.replaced(rows, again)
+        if len(rows):
+            result = _conclude(problem, minima, known)
+    if not settings.scrutiny or problem.joint:
+        return result
+    return _scrutinised(result, minima, known, settings, progress)
+
+
+def _unproven(result: FitResult, known: Structure) -> np.ndarray:
+    """Lanes not looked at whose Jacobian at the estimate does not prove that nothing is open."""
+    condition = np.array([u.condition for u in result.uncertainty])
+    examined = suspicious(result.problem)
+    if result.problem.joint and examined.any():
+        examined[:] = True
+    return ~examined & ~(condition < PROVEN) & (known.nullity == 0)
+
+
+def _scrutinised(result, minima: Minima, known: Structure, settings, progress) -> FitResult:
+    """With the evidence of `scrutiny`; a better minimum found takes the estimate's place."""
+    from jaxtrachea.identify.scrutiny import doubtful, scrutinise
+
+    for turns_left in range(REPLACED, -1, -1):
+        doubts = doubtful(result, minima)
+        if not doubts.any():
+            break
+        evidence, better = scrutinise(
+            result, minima, doubts, settings, known, progress, last=not turns_left
+        )
+        rows = np.flatnonzero(np.isfinite(better).all(axis=1))
+        if not turns_left or not len(rows):
+            return dataclasses.replace(result, **evidence._asdict())
+        # As many as the fit computes together: the same program.
+        chunk = chunk_size(max(result.lanes * settings.starts, 16), settings.chunk)
+        full = rows[np.arange(max(len(rows), chunk)) % len(rows)]
+        part = reduced(result.problem.take(full), known.pinned[full])
+        solved, sigma = _with_noise(part, settings, None, minima.sigma[full], better[full])
+        solved = Solved(*(v[: len(rows)] for v in solved))
+        sigma = sigma[: len(rows)]
+        one, none = np.ones(len(rows), int), np.zeros(0, int)
+        moved = Minima(
+            solved, one, minima.tried[rows], sigma, none, np.zeros((0, part.size)), np.zeros(0)
+        )
+        minima = minima.replaced(rows, moved)
+        result = _conclude(result.problem, minima, known)
+    return result
+
+
+def _minima(problem: Problem, settings: Settings, starts, progress, known: Structure) -> Minima:
+    """The best of all starts of every lane, with the noise that goes with it."""
+    # Given starts are refits from an estimate: there the directions left open may be followed.
+    held = problem if problem.joint or starts is not None else reduced(problem, known.pinned)
     sigma = first_sigma(problem)
-    solved, agree, tried = _from_starts(problem, settings, starts, sigma, progress)
+    solved, agree, tried, *ends = _from_starts(held, settings, starts, sigma, progress)
+    if held is not problem:
+        solved = _released(problem, held, settings, solved, sigma)
+    solved, sigma = _with_noise(held, settings, solved, sigma)
+    return Minima(solved, agree, tried, sigma, *ends)
+
+
+def _released(problem: Problem, held: Problem, settings: Settings, solved: Solved, sigma) -> Solved:
+    """Lanes whose best lies on a bound because of what is held: fitted on with all free, once."""
+    lanes = held.lanes
+    on = (solved.theta <= lanes.lower) | (solved.theta >= lanes.upper)
+    pinned = (problem.lanes.active > 0) & (lanes.active == 0)
+    rows = np.flatnonzero((on & (lanes.active > 0)).any(axis=1) & pinned.any(axis=1))
+    if not len(rows):
+        return solved
+    free = _solve_more(problem, settings, sigma, None, rows, solved.theta[rows])
+    again = _solve_more(held, settings, sigma, None, rows, free.theta)
+    out = Solved(*map(np.array, solved))
+    better = again.cost < out.cost[rows]
+    for old, new in zip(out, again, strict=True):
+        old[rows[better]] = new[better]
+    return out
+
+
+def _with_noise(problem: Problem, settings: Settings, solved, sigma, theta=None):
+    """Fits and noise brought to agree; from `theta` where nothing is solved yet."""
+    if solved is None:
+        solved = _from_there(problem, settings, theta, sigma)
     for _ in range(_noise_rounds(problem)):
         _, pool, unknowns = _known(problem, solved, sigma)
         sigma = next_sigma(problem, pool, sigma, unknowns)
         again = _from_there(problem, settings, solved.theta, sigma)
         solved = again._replace(iterations=solved.iterations + again.iterations)
-    info, pool, unknowns = _known(problem, solved, sigma)
-    before, sigma = sigma, next_sigma(problem, pool, sigma, unknowns)
-    if problem.loss == "linear" and problem.lanes.joints is None:
-        ratio = before[:, 0] / sigma[:, 0]
-        info, pool = info.rescaled(ratio), pool.rescaled(ratio)
-    else:
-        info, pool, unknowns = _known(problem, solved, sigma)
-    return _conclude(problem, solved, (info, pool, unknowns), sigma, agree, tried)
+    return solved, sigma
 
 
 def _from_starts(problem: Problem, settings: Settings, starts, sigma, progress):
-    """The best of all starts of every lane, how many of them agree, and how many there were."""
+    """The best of all starts of every lane, how many agree, how many there were; all ends."""
     drawn = starts is None
     starts = draw_starts(problem, settings) if drawn else starts
     lanes = problem.lanes.lower.shape[0]
     if problem.joint:
         solved, agree = _solve_jointly(problem, settings, starts, sigma, progress)
-        return solved, np.full(lanes, agree), np.full(lanes, len(starts) // lanes)
+        tried = np.full(lanes, len(starts) // lanes)
+        return solved, np.full(lanes, agree), tried, np.arange(lanes), solved.theta, solved.cost
     jobs = np.repeat(np.arange(lanes), settings.starts)
     solved = _solve(problem, settings, jobs, starts, sigma[jobs], progress)
     if drawn:
@@ -178,7 +326,9 @@ def _from_starts(problem: Problem, settings: Settings, starts, sigma, progress):
             problem, settings, jobs, solved, data_weight(problem, sigma), again
         )
     found, agree = best(jobs, solved, lanes)
-    return Solved(*(v[found] for v in solved)), agree, np.bincount(jobs, minlength=lanes)
+    tried = np.bincount(jobs, minlength=lanes)
+    chosen = Solved(*(v[found] for v in solved))
+    return chosen, agree, tried, jobs, solved.theta, solved.cost
 
 
 def _from_there(problem: Problem, settings: Settings, theta, sigma) -> Solved:
@@ -295,13 +445,20 @@ def next_sigma(
     return np.where(keep, sigma, np.maximum(estimate, floor))
 
 
-def _conclude(problem: Problem, solved: Solved, known, sigma, agree, tried) -> FitResult:
-    """Standard errors, intervals and final statuses of all lanes; `known`: see `_known`."""
+def _conclude(problem: Problem, minima: Minima, structure: Structure) -> FitResult:
+    """Standard errors, intervals and final statuses of all lanes."""
+    solved, agree, tried, sigma = minima[:4]
+    info, pool, unknowns = _known(problem, solved, sigma)
+    before, sigma = sigma, next_sigma(problem, pool, sigma, unknowns)
+    if problem.loss == "linear" and problem.lanes.joints is None:
+        ratio = before[:, 0] / sigma[:, 0]
+        info, pool = info.rescaled(ratio), pool.rescaled(ratio)
+    else:
+        info, pool, unknowns = _known(problem, solved, sigma)
     lanes, theta = problem.lanes, solved.theta
-    info, pool, unknowns = known
     alive = solved.status <= FitStatus.STALLED
     gradient = joint.summed_gradient(problem, info, alive) if problem.joint else info.gradient
-    log, step = _scales(problem)
+    log, step = scales(problem)
     both = lanes.joints is None or problem.noise_given[1]
     at_bound = (theta <= lanes.lower) & (gradient > 0)
     at_bound |= (theta >= lanes.upper) & (gradient < 0)
@@ -311,9 +468,10 @@ def _conclude(problem: Problem, solved: Solved, known, sigma, agree, tried) -> F
     relative = relative_change(problem, theta)
     if problem.joint:
         pool = joint.marginal(problem, pool, held, alive)
-        unknowns -= joint.held_count(problem, held, alive)
+        unknowns = (unknowns or 0) - joint.held_count(problem, held, alive)
     noise_given = problem.noise_given[0] and both
-    u = analyse(pool, relative, held, noise_given=noise_given, unknowns=unknowns)
+    blind = _open_directions(problem, theta, structure)
+    u = analyse(pool, relative, held, noise_given=noise_given, unknowns=unknowns, structural=blind)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         unscale = lambda v: np.where(present, np.where(log, np.exp(v), v * step), np.nan)  # noqa: E731
         value = unscale(theta)
@@ -332,10 +490,26 @@ def _conclude(problem: Problem, solved: Solved, known, sigma, agree, tried) -> F
         converged_starts=agree, tried=tried, sigma=sigma * unit, rms=rms * unit, samples=samples,
         criteria=criteria(problem, info, alive),
         uncertainty=tuple(Uncertainty(*row) for row in zip(*u, strict=True)),
+        undetermined=structure.undetermined, evidence_low=np.full(theta.shape, np.nan),
+        evidence_high=np.full(theta.shape, np.nan),
+        evidence_end=np.full((*theta.shape, 2), -1), minima=np.ones(len(theta), int),
     )  # fmt: skip
 
 
-def _scales(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+def _open_directions(problem: Problem, theta, structure: Structure) -> np.ndarray:
+    """Directions that the structure leaves open, at the estimates; rows, the others 0."""
+    out = np.zeros((*theta.shape, theta.shape[1]))
+    lanes = np.arange(len(theta)) if problem.joint else np.flatnonzero(structure.nullity)
+    if not structure.nullity.any():
+        return out
+    theta = np.where(np.isfinite(theta), theta, 0)[lanes]
+    rows = null_spaces(problem, lanes, theta, structure.nullity[lanes])
+    for lane, directions in zip(lanes, rows, strict=True):
+        out[lane, : len(directions)] = directions
+    return out
+
+
+def scales(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Which unknowns have a logarithmic scale, and the step of the others; (lanes, P) each."""
     log = of_unknowns(problem, lambda p: p.scale == "log", 0.0) > 0
     return log, of_unknowns(problem, lambda p: p.step, 1.0)

@@ -138,7 +138,7 @@ def with_own(
             groups.setdefault(source.own, []).append(k)
     for own, members in groups.items():
         study = _study(stored, own, [(sources[k], curves[k], sigmas[k]) for k in members])
-        result = fit(study, Settings())
+        result = fit(study, Settings(scrutiny=False))
         slopes = _slopes(stored, own, [sources[k] for k in members], result.theta, study)
         for row, k in enumerate(members):
             status = FitStatus(int(result.status[row]))

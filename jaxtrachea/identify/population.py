@@ -17,11 +17,13 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.special import chdtri, stdtrit
 
 from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.judgement import relative_errors
 from jaxtrachea.identify.parameters import Parameter
+from jaxtrachea.identify.profile import Profiles
 
 #: Specimens below which no spread is estimated, and from which one is unasked.
 FEWEST, ENOUGH = 3, 5
@@ -201,8 +203,7 @@ class Population:
     Attributes:
         result: the fit.
         parameters: of scope `specimen`, q of them.
-        known: estimates that took part: of lanes that succeeded, determined, not on a bound;
-            (lanes, q).
+        known: estimates that took part: those that are identifiable or weak; (lanes, q).
         place: unknown of each lane and parameter, -1: none; (lanes, q).
         effects: in scaled coordinates.
     """
@@ -212,6 +213,11 @@ class Population:
     known: Bool[np.ndarray, "lanes q"]
     place: np.ndarray
     effects: Effects
+
+    @property
+    def left_out(self) -> Int[np.ndarray, " q"]:
+        """Specimens that have the parameter and whose estimate took no part; (q,)."""
+        return np.sum((self.place >= 0) & ~self.known, axis=0)
 
     def shrunk_cells(self, lane: int, i: int) -> dict[str, object]:
         """Columns `shrunk` and `shrunk_se` of parameters.csv for an unknown; none if not of it."""
@@ -231,10 +237,17 @@ def wanted(asked: bool | None, result: FitResult) -> bool:
     return asked or (asked is None and own and result.lanes >= ENOUGH)
 
 
-def population(result: FitResult) -> Population:
+def population(result: FitResult, profiles: Profiles | None = None) -> Population:
     """Mean and spread of all parameters that belong to specimens.
 
+    Estimates take part that are identifiable or weak, weighed by the larger of their local error
+    and that of their interval; what has another verdict has no error to be weighed by. Weak ones
+    left out as well would bias the mean: an error is relative, and small values have large ones.
     Parameters that fewer than three specimens determine are left out.
+
+    Args:
+        result: the fit.
+        profiles: further profiles, for the verdicts.
 
     Raises:
         ValueError: no parameter with the scope `specimen`, or none that three specimens determine.
@@ -252,8 +265,9 @@ def population(result: FitResult) -> Population:
                     place[lane, names.index(p.name)] = i
     row = np.arange(result.lanes)[:, None]
     se = np.stack([u.se for u in result.uncertainty])[row, place]
-    known = (place >= 0) & np.isfinite(se) & ~result.at_bound[row, place]
-    known &= result.succeeded[:, None]
+    error = (relative_errors(result, profiles) * result.relative)[row, place]
+    known = (place >= 0) & np.isfinite(se) & np.isfinite(error)
+    se = np.where(known, np.maximum(se, error), se)
     enough = known.sum(axis=0) >= FEWEST
     if not enough.any():
         raise ValueError(f"no parameter is determined in {FEWEST} specimens of their own")
@@ -313,6 +327,7 @@ def population_rows(of: Population) -> Iterator[dict[str, object]]:
             "parameter": p.name,
             "unit": p.unit,
             "specimens": count,
+            "left_out": int(of.left_out[j]),
             "mean": p.from_scaled(mean),
             "mean_se": slope * float(e.mean_se[j]),
             "mean_low95": p.from_scaled(mean - half),

@@ -147,8 +147,9 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
     rows = np.arange(len(lane))
     held = np.zeros(lanes.s_c.shape, bool)
     held[rows, trial] = True
-    result = fit(without(chosen, held), settings, progress)
-    seen = predictions(chosen, with_own_touch(chosen, held, result.theta, settings))
+    plain = dataclasses.replace(settings, scrutiny=False)
+    result = fit(without(chosen, held), plain, progress)
+    seen = predictions(chosen, with_own_touch(chosen, held, result.theta, plain))
     force, data = seen.force[rows, trial], lanes.force[rows, trial]
     model = np.where(lanes.precision[rows, trial] > 0, data + force, 0)
     with np.errstate(invalid="ignore", divide="ignore"):

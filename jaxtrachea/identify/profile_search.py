@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxtrachea.identify.fit import FitResult, Settings
 from jaxtrachea.identify.solve import Solved, chunk_size, levenberg_marquardt
+from jaxtrachea.identify.structure import leaving_alone, pins
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 #: Rounds of the search for the ends; each is one batched solve.
@@ -21,17 +22,29 @@ _AT_ONCE = 8192
 class Sides:
     """S one-sided profiles, downwards and upwards in turn, and how to refit at points of them."""
 
-    def __init__(self, result: FitResult, settings: Settings, lane, unknown, progress):
-        """`lane` and `unknown` of each side; all that is constant along a side is gathered here."""
+    def __init__(
+        self, result: FitResult, settings: Settings, lane, unknown, progress, *,
+        origin: np.ndarray | None = None, accuracy: float = _ACCURACY, rounds: int = _ROUNDS,
+    ):  # fmt: skip
+        """`lane` and `unknown` of each side; all that is constant along a side is gathered here.
+
+        `origin`: where the sides begin if not at the estimates, (S, P); the cost that counts is
+        that of the estimates all the same. `accuracy`: of sqrt(statistic) at an end, relative;
+        `rounds`: of the search for ends, each one batched solve.
+        """
+        self.accuracy, self.rounds, self.strict = accuracy, rounds, False
         self.result, self.settings, self.progress = result, settings, progress
         self.lane, self.unknown = lane, unknown
         self.sign = np.tile([-1.0, 1.0], len(lane) // 2)
-        self.best = result.theta[lane]
+        self.best = result.theta[lane] if origin is None else origin
         u = result.uncertainty
         pick = lambda rows: np.array([rows[k][i] for k, i in zip(lane, unknown, strict=True)])  # noqa: E731
         self.dispersion = pick([v.dispersion for v in u])
         size = result.theta.shape[1]
         self.along = pick([v.along for v in u]).reshape(-1, size) * self.sign[:, None]
+        if origin is not None:
+            self.along = np.zeros_like(self.along)
+        self.pinned = self._pinned()
         self.target = np.array([float(u[k].half_width) for k in lane])
         lanes = result.problem.lanes
         bound = np.where(self.sign < 0, lanes.lower[lane, unknown], lanes.upper[lane, unknown])
@@ -44,13 +57,36 @@ class Sides:
         self.sigma = result.whitened_sigma
         self.cost = self._costs_at_estimate()
 
+    def _pinned(self) -> np.ndarray:
+        """The profiled unknown, and those held so that the structure leaves nothing open; (S, P).
+
+        Whatever they are held at, the others can make up for it.
+        """
+        pinned = np.arange(self.best.shape[1])[None] == self.unknown[:, None]
+        for s in np.flatnonzero(self.result.undetermined[self.lane].any(axis=1)):
+            lane, i = int(self.lane[s]), int(self.unknown[s])
+            rows = self.result.uncertainty[lane].blind
+            rest = leaving_alone(rows[rows.any(axis=1)], i)
+            names = [p.name for p, _, _ in self.result.problem.unknowns[lane]]
+            pinned[s] |= pins(names, rest)
+        return pinned
+
+    def costs(self, lanes, theta) -> np.ndarray:
+        """Cost of `lanes` at `theta`, (n, P): a fit with everything pinned."""
+        everything = np.ones(theta.shape[1], bool)
+        return self._solve(lanes, theta, everything).cost
+
+    def solve(self, lanes, theta, pinned) -> tuple[np.ndarray, np.ndarray]:
+        """Where fits of `lanes` from `theta` end, and their costs; `pinned` (n, P) is held."""
+        solved = self._solve(lanes, theta, pinned)
+        return solved.theta, solved.cost
+
     def _costs_at_estimate(self) -> np.ndarray:
         """Cost of every lane with the final sigma: a fit with everything pinned."""
         lanes = np.unique(self.lane)
         cost = np.full(self.result.lanes, np.nan)
         if len(lanes):
-            everything = np.ones(self.result.theta.shape[1], bool)
-            cost[lanes] = self._solve(lanes, self.result.theta[lanes], everything).cost
+            cost[lanes] = self.costs(lanes, self.result.theta[lanes])
         return cost[self.lane]
 
     def _solve(self, lanes, start, pinned):
@@ -73,6 +109,9 @@ class Sides:
     def refit(self, side, distance, start):
         """Points at `distance` from the estimate on each of `side`, from `start` (n, P).
 
+        A fit that has not converged shows that the profile is no higher than where it stands, and
+        counts (unless `self.strict`) if that is below the threshold.
+
         Returns:
             theta (n, P), statistic (n,), NaN where the fit did not converge.
         """
@@ -80,11 +119,12 @@ class Sides:
         for first in range(0, len(side), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
             s, d = side[part], distance[part]
-            pinned = np.arange(start.shape[1])[None] == self.unknown[s][:, None]
             here = self.best[s] + (self.sign[s] * d)[:, None]
-            solved = self._solve(self.lane[s], np.where(pinned, here, start[part]), pinned)
+            own = np.arange(start.shape[1])[None] == self.unknown[s][:, None]
+            solved = self._solve(self.lane[s], np.where(own, here, start[part]), self.pinned[s])
             rise = 2 * (solved.cost - self.cost[s]) / self.dispersion[s]
-            good = (solved.status == FitStatus.CONVERGED) & np.isfinite(rise)
+            below = (not self.strict) & (rise <= self.target[s] ** 2)
+            good = ((solved.status == FitStatus.CONVERGED) | below) & np.isfinite(rise)
             thetas.append(solved.theta)
             statistics.append(np.where(good, rise, np.nan))
             if self.progress is not None:
@@ -210,7 +250,7 @@ def find_ends(sides: Sides):
     end[sides.limit <= 0] = ProfileEnd.OPEN
     end[~(sides.dispersion > 0)] = ProfileEnd.FAILED
     theta, failures = sides.best.copy(), np.zeros(len(where), int)
-    for _ in range(_ROUNDS):
+    for _ in range(sides.rounds):
         rows = np.flatnonzero(end < 0)
         if len(rows) == 0:
             break
@@ -218,7 +258,7 @@ def find_ends(sides: Sides):
         found, statistic = sides.refit(rows, d, path.start(rows, d))
         good = np.isfinite(statistic)
         excess = np.sqrt(np.maximum(statistic, 0)) - sides.target[rows]
-        close = good & (np.abs(excess) <= _ACCURACY * sides.target[rows])
+        close = good & (np.abs(excess) <= sides.accuracy * sides.target[rows])
         down = good & (excess <= 0)
         path.add(rows[down | close], d[down | close], found[down | close])
         theta[rows[down | close]] = found[down | close]
@@ -231,6 +271,8 @@ def find_ends(sides: Sides):
         # After a refit that failed: halfway back.
         following = np.where(good, bracket.next()[rows], (bracket.inner[rows] + d) / 2)
         where[rows] = np.where(end[rows] < 0, np.minimum(following, sides.limit[rows]), d)
+    near = (end < 0) & (bracket.outer - bracket.inner <= 10 * sides.accuracy * bracket.outer)
+    where[near], end[near] = bracket.outer[near], ProfileEnd.CLOSED
     end[end < 0] = ProfileEnd.FAILED
     end[(end == ProfileEnd.CLOSED) & sides.others_on_bound(theta)] = ProfileEnd.BOUND
     return np.where(end == ProfileEnd.FAILED, bracket.inner, where), end, path
@@ -242,7 +284,8 @@ def on_grid(sides: Sides, distance, end, path: Path, points: int):
     far = np.where(end <= ProfileEnd.BOUND, np.minimum(1.25 * distance, sides.limit), distance)
     grid = far[:, None] * np.arange(1, points + 1)[None] / points
     side = np.arange(S).repeat(points)
-    theta, statistic = sides.refit(side, grid.ravel(), path.start(side, grid.ravel()))
+    start, sides.strict = path.start(side, grid.ravel()), True
+    theta, statistic = sides.refit(side, grid.ravel(), start)
     theta = theta.reshape(S // 2, 2, points, P)
     statistic = statistic.reshape(S // 2, 2, points)
     down, up = theta[:, 0, ::-1], theta[:, 1]

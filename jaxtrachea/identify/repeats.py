@@ -1,5 +1,6 @@
 """Cross-validation of a model on what an experiment repeats: contact positions, else trials."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -97,8 +98,9 @@ def leave_repeats_out(
     if not len(lanes):
         return error
     chosen = problem.take(lanes)
-    result = fit(without(chosen, held), settings, progress)
-    seen = predictions(chosen, with_own_touch(chosen, held, result.theta, settings)).force
+    plain = dataclasses.replace(settings, scrutiny=False)
+    result = fit(without(chosen, held), plain, progress)
+    seen = predictions(chosen, with_own_touch(chosen, held, result.theta, plain)).force
     solved = result.succeeded
     missed = np.where((held & solved[:, None])[:, :, None], seen, np.nan)
     for lane in np.unique(lanes):

@@ -41,6 +41,41 @@ class Skeleton(NamedTuple):
     joints: Float[Array, "*T rings"] | None
 
 
+class Inputs(NamedTuple):
+    """All that the curves of one lane depend on, trial by trial.
+
+    Attributes:
+        compliance: of the skeleton as the force feels it, mm/N; (T,).
+        joints: motion of every ring under a unit force, mm/N; (T, rings); None without markers.
+        k_1: of the local law at the contact, N/mm; (T,).
+        k_3: N/mm^3; (T,).
+        onset: mm; (T,).
+        force_offset: N; (T,).
+    """
+
+    compliance: Float[Array, " T"]
+    joints: Float[Array, "T rings"] | None
+    k_1: Float[Array, " T"]
+    k_3: Float[Array, " T"]
+    onset: Float[Array, " T"]
+    force_offset: Float[Array, " T"]
+
+
+def inputs(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Inputs:
+    """What the curves of one lane see of its unknowns.
+
+    Args:
+        problem: static description.
+        theta: unknowns in scaled coordinates.
+        lane: the lane's arrays (no leading axis).
+    """
+    free = of_trials(problem, theta, lane)
+    skeleton = _skeleton(problem, free, lane)
+    contact = jax.vmap(lambda f, trial: _at_contact(problem, f, trial))(free, _trials(lane))
+    law, felt = contact.law, _felt(problem, skeleton)
+    return Inputs(felt, skeleton.joints, law.k_1, law.k_3, contact.onset, contact.force_offset)
+
+
 def residual(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Residual:
     """Residuals of one lane and their Jacobian, trial by trial.
 

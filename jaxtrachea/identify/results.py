@@ -16,6 +16,7 @@ from jaxtrachea.identify.bootstrap import Bootstrap
 from jaxtrachea.identify.evaluate import NOTHING_FITTED
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.journal import installed
+from jaxtrachea.identify.judgement import judgement, verdict_of
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.parameters import OF_THE_PRESS
 from jaxtrachea.identify.population import Population
@@ -23,7 +24,7 @@ from jaxtrachea.identify.press_scale import sizes_of_press
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.rows import row_places, samples_of, trials_of
 from jaxtrachea.identify.usage_tables import lane_cells
-from jaxtrachea.identify.verdict import VERDICTS, describe_flat, verdict
+from jaxtrachea.identify.verdict import VERDICTS, describe_flat
 from jaxtrachea.identify.whole_files import hdf5_file
 from jaxtrachea.spreadsheet import write_csv as write_csv
 from jaxtrachea.status import FitStatus, ProfileEnd
@@ -31,7 +32,7 @@ from jaxtrachea.status import FitStatus, ProfileEnd
 SCHEMA = "jaxtrachea-results"
 SCHEMA_VERSION = 2
 #: Fields of `Uncertainty` in the group of that name; the others stand with lanes and unknowns.
-MORE = ("se", "flat_se", "blind", "half_width", "along", "dispersion", "covariance")
+MORE = ("se", "flat_se", "blind", "half_width", "along", "dispersion", "covariance", "silent")
 
 
 def unknown_label(result: FitResult, lane: int, i: int) -> str:
@@ -54,7 +55,7 @@ def lane_label(result: FitResult, lane: int) -> str:
 
 def succeeded(result: FitResult, lane: int) -> bool:
     """Whether a lane has an estimate."""
-    return FitStatus(int(result.status[lane])).succeeded
+    return bool(result.succeeded[lane])
 
 
 def peak_force(result: FitResult, lane: int) -> float:
@@ -70,7 +71,10 @@ def flat_sentence(result: FitResult, lane: int) -> str:
         return NOTHING_FITTED
     names = [unknown_label(result, lane, i) for i in range(len(result.problem.unknowns[lane]))]
     u = result.uncertainty[lane]
-    return describe_flat(names, u.flat, float(u.flat_se), u.blind, press_sizes(result, lane))
+    return describe_flat(
+        names, u.flat, float(u.flat_se), u.blind, result.undetermined[lane],
+        press_sizes(result, lane),
+    )  # fmt: skip
 
 
 def press_sizes(result: FitResult, lane: int) -> dict[int, tuple[float, str]]:
@@ -96,7 +100,10 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
         word = verdict_of(result, lane, i, profiles)
         groups.setdefault(word, []).append(unknown_label(result, lane, i))
     said = [f"{word}: {', '.join(groups[word])}" for word in VERDICTS if word in groups]
-    return "; ".join([*said, flat_sentence(result, lane)])
+    said.append(flat_sentence(result, lane))
+    if result.minima[lane] > 1:
+        said.append("fits that end elsewhere are as good within the noise")
+    return "; ".join(said)
 
 
 def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[dict[str, object]]:
@@ -151,28 +158,16 @@ def _unknown_cells(
         if sum(unknowns[k][0].name == p.name for k in own) > 1:
             more.append(unknown_label(result, lane, i))
             continue
+        judged = judgement(result, lane, i, profiles)
         cells |= {
             f"{p.name} [{p.unit}]": float(result.value[lane, i]),
             f"{p.name} se": float(result.standard_error[lane, i]),
-            f"{p.name} low95": float(result.lower[lane, i]),
-            f"{p.name} high95": float(result.upper[lane, i]),
-            f"{p.name} verdict": verdict_of(result, lane, i, profiles),
+            f"{p.name} low95": judged.low,
+            f"{p.name} high95": judged.high,
+            f"{p.name} verdict": judged.verdict,
         }
     said = f"{', '.join(more)}: see parameters.csv" if more else ""
     return cells | ({"more": said} if more else {})
-
-
-def verdict_of(result: FitResult, lane: int, i: int, profiles: Profiles | None = None) -> str:
-    """One of `VERDICTS`, by the profile where there is one; "failed" without an estimate."""
-    if not succeeded(result, lane):
-        return "failed"
-    k = None if profiles is None else profiles.find(lane, i)
-    profile = None
-    if profiles is not None and k is not None:
-        ends = max(profiles.end[k, 0], profiles.end[k, 1])
-        profile = float(profiles.relative_error[k]), ProfileEnd(int(ends))
-    held = bool(result.at_bound[lane, i])
-    return verdict(float(result.relative_se[lane, i]), held, profile)
 
 
 def bad_row(bad: BadCurve) -> dict[str, object]:
@@ -212,6 +207,7 @@ def parameter_rows(
         for i, (p, specimen, trial) in enumerate(result.problem.unknowns[lane]):
             if said_before(result, every, lane, i):
                 continue
+            judged = judgement(result, lane, i, profiles)
             row = {
                 "specimen": (specimen or lane_specimen) if is_own(result, lane, i) else "(all)",
                 "trial": trial or "(all)",
@@ -219,10 +215,10 @@ def parameter_rows(
                 "unit": p.unit,
                 "value": float(result.value[lane, i]),
                 "se": float(result.standard_error[lane, i]),
-                "low95": float(result.lower[lane, i]),
-                "high95": float(result.upper[lane, i]),
+                "low95": judged.low,
+                "high95": judged.high,
                 "relative_se": float(result.relative_se[lane, i]),
-                "verdict": verdict_of(result, lane, i, profiles),
+                "verdict": judged.verdict,
             }
             row |= _profile_cells(profiles, lane, i) | _bootstrap_cells(resampled, lane, i)
             yield row if population is None else row | population.shrunk_cells(lane, i)
@@ -298,7 +294,7 @@ def write_hdf5(
         file.attrs["schema"], file.attrs["schema_version"] = SCHEMA, SCHEMA_VERSION
         file.attrs["provenance"] = json.dumps(provenance)
         _write_lanes(file.create_group("lanes"), result)
-        _write_unknowns(file.create_group("unknowns"), result)
+        _write_unknowns(file.create_group("unknowns"), result, profiles)
         store.write(file, result, provenance.get("inputs", {}), reading or {})
         group = file.create_group("uncertainty")
         for name in MORE:
@@ -327,7 +323,7 @@ def _write_lanes(group: h5py.Group, result: FitResult) -> None:
     group.create_dataset("trial", data=[n[1] for n in names], dtype=text)
     codes = group.create_dataset("status", data=result.status.astype(np.int8))
     codes.attrs["meaning"] = json.dumps({int(s): s.message for s in FitStatus})
-    for name in ("iterations", "cost", "converged_starts", "tried", "samples"):
+    for name in ("iterations", "cost", "converged_starts", "tried", "samples", "minima"):
         group.create_dataset(name, data=getattr(result, name))
     for name in ("unknowns", "deviance", "AIC", "AICc", "BIC"):
         group.create_dataset(name, data=getattr(result.criteria, name))
@@ -336,16 +332,24 @@ def _write_lanes(group: h5py.Group, result: FitResult) -> None:
     group.create_dataset("condition", data=[u.condition for u in result.uncertainty])
 
 
-def _write_unknowns(group: h5py.Group, result: FitResult) -> None:
+def _write_unknowns(group: h5py.Group, result: FitResult, profiles: Profiles | None = None) -> None:
     text, problem = h5py.string_dtype(), result.problem
     for field, pick in (("parameter", 0), ("specimen", 1), ("trial", 2)):
         cells = [[_cell(problem.unknowns[lane], i, pick) for i in range(problem.size)]
                  for lane in range(result.lanes)]  # fmt: skip
         group.create_dataset(field, data=cells, dtype=text)
+    judged = [[judgement(result, k, i, profiles) for i in range(len(problem.unknowns[k]))]
+              for k in range(result.lanes)]  # fmt: skip
+    words = [[j.verdict for j in row] + [""] * (problem.size - len(row)) for row in judged]
+    for name in ("low", "high"):
+        absent = [np.nan] * problem.size
+        ends = [([getattr(j, name) for j in row] + absent)[: problem.size] for row in judged]
+        group.create_dataset(f"{name}95", data=ends, compression="gzip")
+    group.create_dataset("verdict", data=words, dtype=text)
     arrays = {
         name: getattr(result, name)
         for name in ("value", "standard_error", "lower", "upper", "relative_se", "theta",
-                     "at_bound")
+                     "at_bound", "undetermined", "evidence_low", "evidence_high", "evidence_end")
     }  # fmt: skip
     arrays["correlation"] = np.stack([u.correlation for u in result.uncertainty])
     arrays["flat"] = np.stack([u.flat for u in result.uncertainty])

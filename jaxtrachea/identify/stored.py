@@ -29,7 +29,7 @@ VERSION = 2
 READ = (
     "/model", "/data", "/lanes/status", "/lanes/sigma", "/lanes/rms", "/unknowns/theta",
     "/unknowns/at_bound",
-    "/uncertainty/covariance", "/uncertainty/blind", "/uncertainty/half_width",
+    "/uncertainty/covariance", "/uncertainty/silent", "/uncertainty/half_width",
 )  # fmt: skip
 #: 97.5 % quantile of the normal distribution, as `uncertainty.analyse` uses it.
 NORMAL = 1.959963984540054
@@ -193,7 +193,7 @@ def _read(path: Path, file: Any) -> StoredFit:
         joint=bool(model["joint"]),
     )
     theta = numeric(file["unknowns"], "theta")
-    blind = numeric(file["uncertainty"], "blind")
+    silent = numeric(file["uncertainty"], "silent")
     curves, lane, files = _read_data(file["data"])
     stored = StoredFit(
         path=path,
@@ -202,7 +202,7 @@ def _read(path: Path, file: Any) -> StoredFit:
         lane_names=tuple((s, t) for s, t in model["lanes"]),
         theta=theta,
         covariance=numeric(file["uncertainty"], "covariance"),
-        blind=blind * _relative(unknowns, theta)[:, None],
+        blind=silent,
         at_bound=numeric(file["unknowns"], "at_bound") > 0,
         status=numeric(file["lanes"], "status").astype(int),
         sigma=_sigma(file["lanes"]),
@@ -237,16 +237,6 @@ def _json(group: Any) -> Any:
         ValueError: no such text.
     """
     return json.loads(numeric(group, "description").astype(np.uint8).tobytes().decode())
-
-
-def _relative(unknowns, theta: np.ndarray) -> np.ndarray:
-    """Change of each scaled coordinate that makes a relative change of 1; (L, P)."""
-    unit = np.ones_like(theta)
-    for k, lane in enumerate(unknowns):
-        for i, (p, _, _) in enumerate(lane):
-            if p.scale != "log":
-                unit[k, i] = max(abs(theta[k, i]), 1e-3)
-    return unit
 
 
 def _read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str]]:

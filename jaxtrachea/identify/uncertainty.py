@@ -19,6 +19,7 @@ from jaxtrachea.identify.cost import assemble, entry_scale, robust
 from jaxtrachea.identify.problem import Lane, Problem
 from jaxtrachea.identify.residual import observations, residual
 from jaxtrachea.identify.solve import chunk_size
+from jaxtrachea.identify.structure import leaving_alone
 
 #: Smallest ratio of singular values of the scaled Jacobian that float64 can tell from zero.
 SINGULAR = 1e-7
@@ -131,8 +132,8 @@ class Uncertainty(NamedTuple):
             coordinates (a change of 1 = 100 %); inf if singular.
         flat: unit vector, in relative coordinates, of the least determined combination; (P,).
         flat_se: its standard error (relative).
-        blind: all directions that change no residual, relative coordinates, orthonormal rows; the
-            other rows are 0; (P, P).
+        blind: directions that the structure leaves open (`structure`), relative coordinates,
+            orthonormal rows; the other rows are 0; (P, P).
         half_width: of the 95 % interval, in standard errors (Student's t).
         along: how all unknowns move where one is moved and the others follow in the least costly
             way, to first order, scaled coordinates; row i: by a unit change of unknown i; (P, P).
@@ -140,7 +141,9 @@ class Uncertainty(NamedTuple):
             likelihood s^2, else such that its curvature gives `se` (Kent 1982,
             doi:10.1093/biomet/69.1.19); (P,).
         covariance: of the estimates, scaled coordinates; 0 for held unknowns, and without the
-            `blind` directions, along which it is infinite; (P, P).
+            `silent` directions, along which it is infinite; (P, P).
+        silent: all directions that change no residual at the estimate, whatever the cause, scaled
+            coordinates, rows; the other rows are 0; (P, P).
     """
 
     se: np.ndarray
@@ -153,6 +156,7 @@ class Uncertainty(NamedTuple):
     along: np.ndarray
     dispersion: np.ndarray
     covariance: np.ndarray
+    silent: np.ndarray
 
 
 def analyse(
@@ -162,6 +166,7 @@ def analyse(
     *,
     noise_given: bool,
     unknowns: int | None = None,
+    structural: np.ndarray | None = None,
 ) -> Uncertainty:
     """Turn the information of all lanes into standard errors and directions.
 
@@ -171,6 +176,8 @@ def analyse(
         held: unknowns that are absent or on a bound; (lanes, P).
         noise_given: whether sigma is known, so that residuals do not scale the covariance.
         unknowns: estimated from the `counts`, if more than those of one lane.
+        structural: directions that the structure leaves open, relative coordinates, orthonormal
+            rows, the others 0; (lanes, P, P).
 
     Returns:
         One record whose arrays have the leading axis of lanes.
@@ -185,7 +192,8 @@ def analyse(
     dpsi = np.maximum(info.dpsi, 1e-3)
     kappa = kappa / dpsi**2
     unit = relative * free
-    bread = _scaled(np.asarray(info.bread), unit)
+    structural = np.zeros_like(info.bread) if structural is None else structural
+    bread = _without(_scaled(np.asarray(info.bread), unit), structural, free)
     values, vectors = _spectrum(bread, free)
     inverse = np.einsum("lpk,lk,lqk->lpq", vectors, 1 / values, vectors)
     meat = _scaled(np.asarray(info.meat), unit) * kappa[:, None, None]
@@ -198,17 +206,19 @@ def analyse(
     se = np.where(free, np.where(blind, np.inf, np.sqrt(variance)) * relative, np.nan)
     both = free[:, :, None] & free[:, None]
     condition, flat, flat_se = _flattest(values, vectors, free, covariance, usable)
-    lost = np.isinf(values) & (np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5)
-    silent = np.swapaxes(vectors, 1, 2) * lost[:, :, None] * free[:, None]
     correlation = np.where(both, correlation, np.nan)
     along = _along(values, vectors, free)
     whole = [np.trace(_scaled(np.asarray(m), relative), axis1=1, axis2=2) for m in info[:2]]
     dispersion = dpsi[:, None] * _ratio(along, meat, bread, whole[1] * kappa, whole[0])
     along = along * relative[:, None] / relative[:, :, None]
     covariance = covariance * relative[:, :, None] * relative[:, None]
+    lost = np.isinf(values) & (np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5)
+    silent = np.swapaxes(vectors, 1, 2) * lost[:, :, None] * (free * relative)[:, None]
     return Uncertainty(
-        se, correlation, condition, flat, flat_se, silent, half, along, dispersion, covariance
-    )
+        se=se, correlation=correlation, condition=condition, flat=flat, flat_se=flat_se,
+        blind=structural, half_width=half, along=along, dispersion=dispersion,
+        covariance=covariance, silent=silent,
+    )  # fmt: skip
 
 
 def half_widths(dof: np.ndarray, *, noise_given: bool) -> np.ndarray:
@@ -241,6 +251,18 @@ def _ratio(along, meat, bread, meat_trace, bread_trace) -> np.ndarray:
         return (form(meat) + 1e-12 * meat_trace[:, None]) / (
             form(bread) + 1e-12 * bread_trace[:, None]
         )
+
+
+def _without(matrix: np.ndarray, directions: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Matrices without what rounding has left in open directions of the free unknowns."""
+    matrix = matrix.copy()
+    for k in np.flatnonzero(directions.any(axis=(1, 2))):
+        rows = directions[k][directions[k].any(axis=1)]
+        for i in np.flatnonzero(~free[k]):
+            rows = leaving_alone(rows, int(i))
+        keep = np.eye(matrix.shape[1]) - rows.T @ rows
+        matrix[k] = keep @ matrix[k] @ keep
+    return matrix
 
 
 def _scaled(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:

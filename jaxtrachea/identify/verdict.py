@@ -5,40 +5,59 @@ from types import MappingProxyType
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxtrachea.status import ProfileEnd
 
 #: Relative standard error up to which a parameter counts as identifiable, and as weakly so.
 IDENTIFIABLE, WEAK = 0.1, 0.5
 #: All verdicts on an estimate, best first.
-VERDICTS = ("identifiable", "weak", "practically not", "structurally not", "at bound")
+VERDICTS = (
+    "identifiable",
+    "weak",
+    "practically non-identifiable",
+    "structurally non-identifiable",
+    "at bound",
+    "not shown",
+)
 #: Component of an undetermined direction, exponent of a combination: below, it is not named.
 _PART, _EXPONENT = 0.1, 0.02
 
 
-def verdict(relative_se: float, held: bool, profile: tuple[float, ProfileEnd] | None = None) -> str:
+def verdict(
+    relative_error: float,
+    *,
+    structural: bool = False,
+    held: bool = False,
+    ends: tuple[int, int] | None = None,
+    unseen: bool = False,
+) -> str:
     """One of `VERDICTS` for a parameter.
 
-    Structurally not: the model itself, at these contact points, does not let it be told, whatever
-    the noise (to first order at the estimate). Practically not: it would, but with this noise the
-    relative error exceeds 50 %, or the profile is open on a side.
+    Structurally non-identifiable: the model itself, at these contact points, does not let it be
+    told, whatever the noise. Practically: it would, but with this noise the relative error exceeds
+    50 %, or the interval is open on a side (terms of Raue et al. 2009,
+    doi:10.1093/bioinformatics/btp358). Not shown: it could not be found out.
 
     Args:
-        relative_se: local; inf where undetermined.
+        relative_error: of the estimate: the longer side of its 95 % interval over that of one
+            standard error, where there is more than the local one; inf where undetermined.
+        structural: the structure leaves it open.
         held: the estimate is on its bound.
-        profile: half the relative width of the profile interval over that of one standard error
-            (it then takes the place of `relative_se`), and the worse of its ends.
+        ends: `ProfileEnd` of the interval's sides; None: the error is local.
+        unseen: there was cause to look further than the local error, and it was not done.
     """
+    if structural:
+        return VERDICTS[3]
     if held:
         return "at bound"
-    if np.isinf(relative_se):
-        return "structurally not"
-    if profile is not None and profile[1] != ProfileEnd.FAILED:
-        relative_se = np.inf if profile[1] == ProfileEnd.OPEN else profile[0]
-    if relative_se <= IDENTIFIABLE:
-        return "identifiable"
-    return "weak" if relative_se <= WEAK else "practically not"
+    if ends is not None and ProfileEnd.OPEN in ends:
+        relative_error = np.inf
+    if not relative_error <= WEAK:
+        return VERDICTS[2]
+    if unseen or (ends is not None and ProfileEnd.FAILED in ends):
+        return "not shown"
+    return "identifiable" if relative_error <= IDENTIFIABLE else "weak"
 
 
 def combinations(names: list[str], blind: Float[np.ndarray, "m P"]) -> tuple[list[str], list[str]]:
@@ -92,6 +111,7 @@ def describe_flat(
     flat: Float[np.ndarray, " P"],
     flat_se: float,
     blind: Float[np.ndarray, "P P"] | None = None,
+    undetermined: Bool[np.ndarray, " P"] | None = None,
     press: Mapping[int, tuple[float, str]] = MappingProxyType({}),
 ) -> str:
     """What the data leave open, in words.
@@ -100,7 +120,9 @@ def describe_flat(
         names: unknowns, in the order of `flat`.
         flat: least determined direction in relative coordinates, see `Uncertainty.flat`.
         flat_se: relative standard error along it.
-        blind: all undetermined directions, see `Uncertainty.blind`; None: `flat` alone.
+        blind: directions that the structure leaves open, see `Uncertainty.blind`; None: `flat` if
+            its error is infinite.
+        undetermined: unknowns that it leaves open at generic points.
         press: of unknowns that are measured against the press (by position), its size and unit.
     """
     if not np.any(flat):
@@ -113,14 +135,22 @@ def describe_flat(
         one = f"{names[main[0]]} alone" if len(main) == 1 else None
         what = one or f"{_moves(names, flat, main)} together"
         return f"least determined: {what}, known to {_percent(flat_se)}"
-    ways = flat[None]
-    if blind is not None and np.isinf(flat_se) and np.any(blind):
-        ways = blind[np.any(blind, axis=1)]
+    structural = bool(np.any(blind)) if blind is not None else not np.isfinite(flat_se)
+    open_ways = flat[None] if blind is None else blind[np.any(blind, axis=1)]
+    ways = open_ways if structural else flat[None]
     involved, products = combinations(names, ways)
     alone = involved[0] if len(involved) == 1 else None
-    if np.isfinite(flat_se):
-        if alone:
+    open_ = [] if undetermined is None else np.flatnonzero(undetermined[: len(names)])
+    if structural and len(open_) > len(involved):
+        # At this estimate one of them has no effect left at all.
+        return f"{_list([names[i] for i in open_])} only in combination"
+    if not structural:
+        if alone and np.isfinite(flat_se):
             return f"{alone} alone is known to {_percent(flat_se)} only"
+        if alone or not products:
+            return (
+                f"{_list(involved)} change{'s' if alone else ''} the curves too little to be told"
+            )
         return f"{_list(involved)} little more than through {_list(products)}"
     if not products:
         return f"{_list(involved)} change{'s' if alone else ''} no curve at all"
