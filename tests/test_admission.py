@@ -22,7 +22,7 @@ import pytest
 import jaxtrachea
 from jaxtrachea.identify.fit import Settings
 from jaxtrachea.identify.parameters import DEFAULTS, Parameter
-from jaxtrachea.identify.problem import Noise
+from jaxtrachea.identify.problem import Lane, Noise
 from jaxtrachea.identify.solve import Tolerances
 from jaxtrachea.mechanics import beam
 from jaxtrachea.model import Options, press
@@ -110,6 +110,10 @@ def has_words(hint):
     return any(map(has_words, typing.get_args(hint)))
 
 
+#: Imported by some modules for their annotations only.
+FOR_TYPES = {"Lane": Lane}
+
+
 def takes_words():
     """Public functions of the package with an argument that is a `Literal`."""
     for path in sorted(PACKAGE.rglob("*.py")):
@@ -120,7 +124,7 @@ def takes_words():
         for node in functions:
             if not node.name.startswith("_"):
                 function = inspect.unwrap(getattr(importlib.import_module(name), node.name))
-                for argument, hint in typing.get_type_hints(function).items():
+                for argument, hint in typing.get_type_hints(function, localns=FOR_TYPES).items():
                     if argument != "return" and has_words(hint):
                         yield f"{name.removeprefix('jaxtrachea.')}.{node.name}", argument
 

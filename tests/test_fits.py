@@ -59,7 +59,7 @@ def test_run_writes_every_file_and_the_plots_decode(folder):
     names = {p.name for p in folder.iterdir()}
     assert names == {
         *("results.h5", "summary.csv", "parameters.csv", "report.md", "report.html"),
-        "curves.csv",
+        *("curves.csv", "left_out.csv"),
         "provenance.json",
         *("fit.png", "residuals.png", "correlation.png"),
     }

@@ -9,7 +9,6 @@ from scipy.integrate import quad
 from scipy.optimize import least_squares
 
 from jaxtrachea._numerics import centred_hinge
-from jaxtrachea.identify.comparison import leave_position_out
 from jaxtrachea.identify.design import Candidates, check, gains, situation
 from jaxtrachea.identify.first_touch import first_touch
 from jaxtrachea.identify.fit import Settings, fit
@@ -18,6 +17,7 @@ from jaxtrachea.identify.measurements import Curve
 from jaxtrachea.identify.parameters import in_model
 from jaxtrachea.identify.predictions import leave_one_out, without
 from jaxtrachea.identify.problem import build, default_parameters
+from jaxtrachea.identify.repeats import leave_repeats_out
 from jaxtrachea.identify.results import verdict_sentence
 from jaxtrachea.identify.verdict import describe_flat
 from jaxtrachea.model import Options, compliance
@@ -234,7 +234,7 @@ def test_a_curve_left_out_fits_its_own_onset(owned):
     r = own_misfit(gone, k_1, k_3, value[[2 + t, 6 + t]])
     expected = np.sqrt(np.mean(r**2)) / np.max(np.abs(gone.force))
     np.testing.assert_allclose(left.force[2], expected, rtol=0.01)
-    by_position = leave_position_out(owned.problem, ONE)
+    by_position = leave_repeats_out(owned.problem, ONE)
     assert np.isfinite(by_position).all()
     peak = max(np.max(np.abs(c.force)) for c in owned.problem.curves[0])
     each = left.force[:4] * [np.max(np.abs(c.force)) for c in owned.problem.curves[0]]
@@ -314,7 +314,7 @@ def test_errors_of_an_onset_are_of_the_press(owned):
 )
 def test_onset_in_words(flat, error, text):
     names = ["k_1", "k_3", "onset"]
-    assert describe_flat(names, np.array(flat, float), error, None, {2: (5.0, "mm")}) == text
+    assert describe_flat(names, np.array(flat, float), error, press={2: (5.0, "mm")}) == text
 
 
 def test_where_no_onset_is_fitted_nothing_changes():

@@ -238,9 +238,9 @@ def test_a_tolerance_needs_something_to_be_measured_by():
 def test_of_rungs_that_cost_the_same_the_best_is_taken():
     """Sharpness of the contact is free: the sharpest within the tolerance, and no other is kept."""
     full = full_scene(*staged())
-    rungs = {name: {"kept": i} for i, name in enumerate(("worst", "best", "good"))}
+    rungs = {name: {"kept": i} for i, name in enumerate(("worst", "best", "good"), 1)}
     ladder = Ladder("made up", "truncation", rungs | {"finest": {}}, {})
-    errors = {0: 0.5, 1: 0.001, 2: 0.01}
+    errors = {1: 0.5, 2: 0.001, 3: 0.01}
     trial = object.__new__(choosing._Trial)
     trial.full, trial.report, trial.saved = full, lambda text: None, lambda levels: 0.25
     trial.errors = lambda levels: Errors(errors[levels.kept], None, None, None, None, None)

@@ -13,13 +13,14 @@ from jaxtrachea import (
     Presses,
     Wishes,
     make_scene,
-    press,
     press_oblique,
     press_path,
     simulate,
 )
+from jaxtrachea.admission import without_negative
 from jaxtrachea.contact.patches import touch
 from jaxtrachea.contact.pose import Pose
+from jaxtrachea.model import ligament_beam, local_law, respond, unit_deflection
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.skeleton import local_frame
 from jaxtrachea.status import ContactStatus, PressStatus
@@ -34,8 +35,10 @@ def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **ho
 
     def run(scene, m, p):
         at = p.s[0], p.phi[0]
-        led, status = seated(p)
-        out = press_oblique(scene.geometry, m, *at, led, options, **how)
+        m, bad = admitted(m, **how)
+        led, status = seated(scene, p, bad)
+        s_c = onto_tube(scene, p.s)[0]
+        out = press_oblique(scene.geometry, m, s_c, p.phi[0], led, options, **how)
         seen = [led, out.force, out.depth, out.skeleton, status(out.status)]
         seen += [getattr(out, name) for name in more.split()]
         return (*seen, move_surface(scene, *at, out, surface)) if surface else seen
@@ -43,12 +46,42 @@ def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **ho
     return run
 
 
-def seated(p, unfit=None):
-    """The presses and their statuses; those at another point than the first are refused."""
-    refused = ~((jnp.abs(p.s - p.s[0]) <= 1e-4) & (jnp.abs(p.phi - p.phi[0]) <= 1e-4))
-    refused = refused if unfit is None else unfit | refused
-    led = jnp.where(refused[:, None], jnp.nan, p.displacement)
-    return led, lambda status: jnp.where(refused, PressStatus.OFF_PLAN, status)
+def admitted(m, *, rings="arch2", axial=True):
+    """The material without negative values, and whether a value that is read was one."""
+    used = ["EI_L", "k_M", "k_1"]
+    used += ["EI_C", "k_t"] if rings == "arch2" else []
+    used += ["EA_L", "k_A", "k_B"] if axial else []
+    used += ["EI_side"]
+    return without_negative(m, used)
+
+
+def onto_tube(scene, s):
+    """Places off the tube at its ends: their rows are refused."""
+    length = scene.geometry.length
+    return jnp.where(s < 0, 0, jnp.where(s > length, length, s))
+
+
+def seated(scene, p, bad, unfit=None):
+    """The presses and their statuses; rows off the tube or at another point are refused."""
+    off = (p.s < 0) | (p.s > scene.geometry.length)
+    moved = ~((jnp.abs(p.s - p.s[0]) <= 1e-4) & (jnp.abs(p.phi - p.phi[0]) <= 1e-4))
+    moved = moved if unfit is None else unfit | moved
+    return refuse(p, {PressStatus.OFF_TUBE: off, PressStatus.OFF_PLAN: moved}, bad)
+
+
+def refuse(p, refused, bad):
+    """Presses with NaN in refused rows, and what becomes of their statuses."""
+    refused = refused | {PressStatus.BAD_MATERIAL: jnp.broadcast_to(bad, p.s.shape)}
+    led = p.displacement
+    for rows in refused.values():
+        led = jnp.where(rows[:, None], jnp.nan, led)
+
+    def status(status):
+        for code, rows in refused.items():
+            status = jnp.where(rows, code, status)
+        return status.astype(jnp.int8)
+
+    return led, status
 
 
 def move_surface(scene, s, phi, out, kind):
@@ -76,26 +109,38 @@ def normal(scene, m, p):
     D = jnp.abs(p.displacement)
     oblique = jnp.maximum(D[:, 0], D[:, 2]) > 1e-4 * D[:, 1] + 1e-4
     unfit = ~(jnp.abs(p.phi) <= 1e-4) | oblique
-    led, status = seated(p, unfit)
-    inward = -led[:, 1]
-    out = press(scene.geometry, m, p.s[0], inward)
+    m, bad = without_negative(m, ["EI_L", "k_M", "k_1"])
+    led, status = seated(scene, p, bad, unfit)
+    inward, options, s_c = -led[:, 1], Options(), p.s[0]
+    unit = unit_deflection(ligament_beam(scene.geometry, m, options), s_c, options)
+    law = local_law(scene.geometry, m, s_c, options)
+    out = respond(inward, jnp.zeros_like(s_c), unit.w_C, law, options)
     F = -out.force  # outward is +y
-    y = F, -out.depth, F * out.compliance
+    y = F, -out.depth, F * unit.w_C
     vectors = [jnp.stack([jnp.zeros(3), v, jnp.zeros(3)], -1) for v in y]
     return led, vectors, status(out.status)
 
 
 def friction(scene, m, p):
     mu = scene.friction
-    led, status = seated(p)
-    out = press_path(scene.geometry, m, p.s[0], p.phi[0], led, mu, rings="mat")
+    m, bad = admitted(m, rings="mat")
+    led, status = seated(scene, p, bad | (mu < 0))
+    out = press_path(scene.geometry, m, onto_tube(scene, p.s)[0], p.phi[0], led, mu, rings="mat")
     f = out.press
     vectors = f.force, f.depth, f.skeleton, f.joints, f.loads, f.end_U, f.end_V
     return led, vectors, status(f.status), out.slip, out.dissipated
 
 
 def each(scene, m, p):
-    at = p.s, p.phi, p.displacement
+    m, bad = admitted(m, rings="mat", axial=False)
+    off = (p.s < 0) | (p.s > scene.geometry.length)
+    led, status = refuse(p, {PressStatus.OFF_TUBE: off}, bad)
+    *rest, found = pressed_each(scene, m, Presses(p.s, p.phi, led))
+    return *rest, status(found)
+
+
+def pressed_each(scene, m, p):
+    at = onto_tube(scene, p.s), p.phi, p.displacement
     one = lambda *at: press_oblique(scene.geometry, m, *at, rings="mat", axial=False)  # noqa: E731
     out = jax.vmap(one)(*at)
     return out.force, out.depth, out.skeleton, out.joints, out.loads, out.end_U, out.end_V, (
@@ -111,11 +156,12 @@ def tool(scene, m, p):
     inward = jax.vmap(lambda phi: local_frame(phi)[0])(seen.phi)
     outside = ~((seen.s >= 0) & (seen.s <= geometry.length))
     D = -seen.gap[:, None] * inward
-    refused = outside & (jnp.sum(D * inward, axis=1) > 0)
-    D = jnp.where(refused[:, None], jnp.nan, D)
-    out = each(scene, m, Presses(seen.s, seen.phi, D))
-    status = jnp.where((seen.status > ContactStatus.FLAT) & (out[-1] == PressStatus.OK), 9, out[-1])
-    return seen.gap, seen.s, seen.phi, D, out, jnp.where(refused, 8, status)
+    off = outside & (jnp.sum(D * inward, axis=1) > 0)
+    m, bad = admitted(m, rings="mat", axial=False)
+    led, status = refuse(Presses(seen.s, seen.phi, D), {PressStatus.OFF_TUBE: off}, bad)
+    out = pressed_each(scene, m, Presses(seen.s, seen.phi, led))
+    found = jnp.where((seen.status > ContactStatus.FLAT) & (out[-1] == PressStatus.OK), 9, out[-1])
+    return seen.gap, seen.s, seen.phi, led, out, status(found)
 
 
 BARE = {"want_surface": False}

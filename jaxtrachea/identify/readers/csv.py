@@ -227,6 +227,9 @@ def _constant(
         raise Fault(
             "position", f"{table.text.word} {line}: {role} is empty or NaN", "give it in every row"
         )
+    if not np.isfinite(column).all():
+        line = table.lines[picked[int(np.argmin(np.isfinite(column)))]]
+        raise Fault("position", f"{table.text.word} {line}: {role} is infinite", "correct it")
     if np.ptp(column) > STEADY[role]:
         raise Fault(
             "position",

@@ -1,5 +1,7 @@
 """Damaged CSV tables: cut off, flipped bits, dialects, encodings, values, units."""
 
+import dataclasses
+
 from damaged.case import GOOD, HEAD, OTHER, ROWS, SPEC, Case, flipped
 
 LONG = GOOD.replace("T01,1,35", '"T01",1,35')
@@ -101,7 +103,11 @@ VALUES = {
         }.items()
     },
     "displacement nan": changed("1,0.66", "nan,0.66", "line 4", "displacement"),
-    "displacement falls": changed("1,0.66", "0.2,0.66", "line 4", "turns back"),
+    # Not refused: check says how much of the curve is used (tests/test_segments.py).
+    "displacement falls": dataclasses.replace(changed("1,0.66", "0.2,0.66"), codes=(0,)),
+    "displacement must not fall": beside(
+        GOOD.replace("1,0.66", "0.2,0.66"), "line 4", spec='loading = "require-monotone"\n'
+    ),
     "displacement in km": changed("1.5,1.08", "1.5e6,1.08", "line 5", "unit"),
     "displacement tiny": beside(
         HEAD + "".join(f"T01,1,35,{i}e-9,{i}\n" for i in range(4)), "covers", "unit"
