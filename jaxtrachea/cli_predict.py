@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from jaxtrachea.cli_load import print_bad
 from jaxtrachea.cli_predict_data import measured_curves
-from jaxtrachea.terminal import Stop, into, set_up_jax, table, to_stderr
+from jaxtrachea.terminal import Stop, into, say_lost, set_up_jax, table, to_stderr
 
 ResultsArgument = Annotated[
     Path, typer.Argument(help="Folder of a finished fit, or its results.h5.")
@@ -87,6 +87,7 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
     from jaxtrachea.identify import prediction_tables as tables
     from jaxtrachea.identify.predict import predict_sources
     from jaxtrachea.identify.results import write_csv, write_text
+    from jaxtrachea.pictures import without_lost
     from jaxtrachea.prediction_plots import draw_predictions
 
     sources, s, depths = _asked(stored, texts)
@@ -103,8 +104,10 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
         ]
         if any(p.has_skeleton for p in curves):
             write_csv(folder / "joints.csv", joints)
-        draw_predictions(folder / "predictions.png", curves)
-        write_text(folder / "report.md", report.report_at(stored, digest, curves))
+        lost = draw_predictions(folder, curves)
+        say_lost(lost)
+        text = without_lost(report.report_at(stored, digest, curves), lost)
+        write_text(folder / "report.md", text)
     rows, more = report.shortened(report.at_table(curves), "bands.csv")
     _show("Predictions, at the deepest displacement", report.AT_HEAD, rows, more)
     _end(report.outcomes(curves), folder.parent)
@@ -151,6 +154,7 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
     from jaxtrachea.identify import prediction_tables as tables
     from jaxtrachea.identify.held_out import compare, pressable
     from jaxtrachea.identify.results import write_csv, write_text
+    from jaxtrachea.pictures import without_lost
     from jaxtrachea.prediction_plots import draw_compared
 
     measurements, notes = measured_curves(stored, given)
@@ -176,9 +180,10 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
             write_csv(folder / f"{name}.csv", content)
         errors = tables.error_rows(compared, bad, stored.tool_radius, rings)
         write_csv(folder / "errors.csv", errors)
-        draw_compared(folder, compared)
+        lost = draw_compared(folder, compared)
+        say_lost(lost)
         text = report.report_data(stored, digest, compared, bad, errors, notes)
-        write_text(folder / "report.md", text)
+        write_text(folder / "report.md", without_lost(text, lost))
     for note in notes:
         to_stderr(f"[yellow]note:[/] {escape(note)}")
     shown, more = report.shortened(report.error_table(errors), "errors.csv")

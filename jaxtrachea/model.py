@@ -178,6 +178,7 @@ def press(
     options: Options = Options(),  # noqa: B008 (frozen)
     *,
     onset: ArrayLike | None = None,
+    blend: ArrayLike | None = None,
 ) -> Press:
     """Press the tool along the inward normal at (s_c, phi = 0) and solve for force and skeleton.
 
@@ -193,6 +194,8 @@ def press(
         displacement: tool displacement along the inward normal, mm; any shape.
         options: what is modelled (static).
         onset: tool displacement at first touch, mm; 0 if None.
+        blend: mm, a scalar: the rounded corner of a curve whose onset was fitted, in the place of
+            `options.onset_width`, see `touch`.
 
     Returns:
         The `Press`; rows without a stable solution are NaN with a status, others are untouched.
@@ -206,8 +209,10 @@ def press(
     dtype = geometry.length.dtype
     displacement = real("displacement", displacement, dtype)
     onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=displacement.dtype)
+    if blend is not None:
+        blend = shaped("blend", blend, (), dtype=displacement.dtype)
     asked = admit(geometry, material, s_c, read_values(options))
-    return _press(geometry, asked, displacement, options, onset)
+    return _press(geometry, asked, displacement, options, onset, blend)
 
 
 def read_values(options: Options) -> tuple[str, ...]:
@@ -223,12 +228,13 @@ def _press(
     displacement: Float[Array, "*n"],
     options: Options,
     onset: Float[Array, ""],
+    blend: Float[Array, ""] | None = None,
 ) -> Press:
     """`press`, of arguments that are checked."""
     material, s_c, refused = asked
     unit = unit_deflection(ligament_beam(geometry, material, options), s_c, options)
     law = local_law(geometry, material, s_c, options)
-    solved = respond(displacement, onset, unit.w_C, law, options)
+    solved = respond(displacement, onset, unit.w_C, law, options, blend)
     unit, solved = hide(refused, unit, solved)
     per_ring = lambda v: solved.force[..., None] * v  # noqa: E731
     shape = (*displacement.shape, *unit.w.shape)

@@ -36,7 +36,7 @@ def overview(found: Any) -> Iterator[Table | str]:
         head = report.ESTIMATE_HEAD if widened is None else report.WIDENED_HEAD
         yield "Estimates", head, report.estimate_rows(result, lanes, found.profiles, widened)
     doubted = int(np.sum(wide.correlation > CORRELATED))
-    if doubted:
+    if doubted and result.problem.free:
         yield (
             f"Neighbouring residuals are correlated in {doubted} of {result.lanes} lanes: standard "
             "errors are too small there; wider intervals: low95_widened, high95_widened in "

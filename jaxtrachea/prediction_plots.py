@@ -1,6 +1,7 @@
 """Pictures of predictions: bands, and measured curves against them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import matplotlib as mpl
@@ -9,32 +10,44 @@ from matplotlib.figure import Figure
 
 from jaxtrachea.identify.held_out import Compared
 from jaxtrachea.identify.predict import CurvePrediction
+from jaxtrachea.pictures import plain, save_each
 from jaxtrachea.plots import STYLE
 
-#: Panels of a picture, and curves of a panel.
-PANELS, LINES = 12, 10
+#: Panels of a picture, curves of a panel, and curves of the picture of all samples.
+PANELS, LINES, MOST = 12, 10, 200
+_ALL = "all: predictions.csv"
 
 
-def draw_predictions(path: Path, curves: Sequence[CurvePrediction]) -> None:
-    """Predicted force with both bands; a panel for each specimen."""
+def draw_predictions(folder: Path, curves: Sequence[CurvePrediction]) -> dict[str, str]:
+    """Write predictions.png: predicted force with both bands, a panel for each specimen.
+
+    Returns:
+        By file name, why a picture could not be drawn: it costs itself only.
+    """
+    return _save(folder, {"predictions.png": partial(_panels, [(p, None) for p in curves])})
+
+
+def draw_compared(folder: Path, compared: Sequence[Compared]) -> dict[str, str]:
+    """Write curves.png and measured_predicted.png.
+
+    Returns:
+        As `draw_predictions`.
+    """
+    pairs = [(c.prediction, c.curve.force) for c in compared]
+    drawings = {
+        "curves.png": partial(_panels, pairs),
+        "measured_predicted.png": partial(_against, compared),
+    }
+    return _save(folder, drawings)
+
+
+def _save(folder: Path, drawings: Mapping[str, Callable[[], Figure]]) -> dict[str, str]:
     with mpl.rc_context(STYLE):
-        _panels([(p, None) for p in curves]).savefig(path, bbox_inches="tight")
-
-
-def draw_compared(folder: Path, compared: Sequence[Compared]) -> None:
-    """Write curves.png and measured_predicted.png."""
-    with mpl.rc_context(STYLE):
-        figure = _panels([(c.prediction, c.curve.force) for c in compared])
-        figure.savefig(folder / "curves.png", bbox_inches="tight")
-        _against(compared).savefig(folder / "measured_predicted.png", bbox_inches="tight")
-
-
-def _plain(text: str) -> str:
-    """A name as it is: no mathematics between dollars."""
-    return text.replace("$", r"\$")
+        return save_each(folder, drawings, bbox_inches="tight")[1]
 
 
 def _panels(curves: Sequence[tuple[CurvePrediction, np.ndarray | None]]) -> Figure:
+    """A panel for each specimen; of many specimens and curves the first ones."""
     groups: dict[str, list] = {}
     for pair in curves:
         groups.setdefault(pair[0].specimen, []).append(pair)
@@ -46,12 +59,15 @@ def _panels(curves: Sequence[tuple[CurvePrediction, np.ndarray | None]]) -> Figu
     for axis, (name, members) in zip(axes, shown, strict=False):
         _one_panel(axis, members[:LINES])
         left = len(members) - LINES
-        more = f" ({LINES} of {len(members)} curves)" if left > 0 else ""
-        axis.set(title=_plain(name) + more, xlabel="displacement [mm]", ylabel="force [N]")
+        more = f" (the first {LINES} of {len(members)} curves)" if left > 0 else ""
+        axis.set(title=plain(name) + more, xlabel="displacement [mm]", ylabel="force [N]")
     for axis in list(figure.axes)[len(shown) :]:
         axis.set_visible(False)
+    most = max(map(len, groups.values()), default=0)
     if len(groups) > PANELS:
-        figure.suptitle(f"{PANELS} of {len(groups)} specimens")
+        figure.suptitle(f"the first {PANELS} of {len(groups)} specimens; {_ALL}")
+    elif most > LINES:
+        figure.suptitle(_ALL)
     return figure
 
 
@@ -70,13 +86,13 @@ def _one_panel(axis, members) -> None:
                 D, low[order], high[order], where=known, color=colour, alpha=alpha, lw=0
             )
         place = "" if np.isnan(p.s) else f"s = {p.s:.4g} mm"
-        label = _plain(" ".join(filter(None, [p.trial, place])))
+        label = " ".join(filter(None, [plain(p.trial), place]))
         marker = "o" if len(D) == 1 else ""
         axis.plot(D, p.force[order], "-", marker=marker, color=colour, lw=1.2, label=label, ms=3)
         if measured is not None:
             step = max(1, len(D) // 60)
             axis.plot(D[::step], measured[order][::step], ".", color=colour, ms=4)
-    if any(line.get_label()[:1] != "_" for line in axis.lines):
+    if any(str(line.get_label())[:1] not in ("", "_") for line in axis.lines):
         axis.legend(ncols=1 + (len(members) > 5))
 
 
@@ -85,7 +101,7 @@ def _against(compared: Sequence[Compared]) -> Figure:
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     ends = [0.0]
-    for c in compared[:200]:
+    for c in compared[:MOST]:
         force, guess = c.curve.force, c.prediction.force
         known = np.isfinite(guess)
         new = c.in_fit != "yes"
@@ -97,4 +113,6 @@ def _against(compared: Sequence[Compared]) -> Figure:
     left.set(xlabel="measured [N]", ylabel="predicted [N]", title="+: used by the fit")
     right.axhline(0, color="k", lw=0.6)
     right.set(xlabel="displacement [mm]", ylabel="predicted - measured [N]", title="differences")
+    if len(compared) > MOST:
+        figure.suptitle(f"the first {MOST} of {len(compared)} curves; {_ALL}")
     return figure

@@ -238,7 +238,8 @@ def _estimates(
     if not result.problem.free:
         tables = [f"None: {NOTHING_FITTED}."]
     fixed = [f"{p.name} = {p.value:g} {p.unit}" for p in result.problem.parameters if p.fixed]
-    shown = shown if result.problem.free else range(0)
+    if not result.problem.free:
+        return ["## Estimates", *tables, f"Fixed: {', '.join(fixed)}."]
     flat = [f"- {lane_label(result, k)}: {verdict_sentence(result, k, profiles)}." for k in shown]
     return [
         "## Estimates",

@@ -319,6 +319,108 @@ def test_left_out_curve_is_that_of_leave_one_out(tmp_path):
         assert found.in_fit == "no"
 
 
+def touching(onsets=(0.3, 0.7, 1.1), reach=6.0, specimens=("T1", "T2")):
+    """Presses whose first touch lies among the samples, each with an offset of its own."""
+    rng = np.random.default_rng(9)
+    for i, name in enumerate(specimens):
+        for j, onset in enumerate(onsets):
+            D = np.linspace(0, reach, 61)
+            h = np.maximum(D - onset, 0)
+            force = (1.0 + 0.3 * i) * h + 0.1 * h**3 + 0.1 * j + 0.05 * rng.normal(size=61)
+            yield Curve(name, f"t{j}", 80.0, 0.0, D, force)
+
+
+def stiffness(read, lane):
+    """k_1 and k_3 in their units."""
+    pairs = zip(read.problem.free[:2], read.theta[lane, :2], strict=True)
+    return [p.from_scaled(v) for p, v in pairs]
+
+
+OWN = {"onset": {"fixed": False}, "force_offset": {"fixed": False}}
+
+
+@pytest.fixture(scope="module")
+def touched(tmp_path_factory):
+    """Three presses of two specimens, onset and offset of each its own: study and stored fit."""
+    problem = total_problem(touching(), OWN)
+    path = tmp_path_factory.mktemp("touched") / "r.h5"
+    return problem, stored_again(problem, path)
+
+
+def test_used_curves_come_back_with_the_corner_of_the_fit(touched):
+    """What the fit stored as predicted, to 1e-9 N: the same rounded corner."""
+    _, read = touched
+    with h5py.File(read.path) as file:
+        stored_force = np.split(file["data/predicted"][()], 6)
+    found = held_out.compare(read, read.curves)
+    assert {c.in_fit for c in found} == {"yes"}
+    for c, force in zip(found, stored_force, strict=True):
+        assert np.allclose(c.prediction.force, force, rtol=0, atol=1e-9)
+    # As a press that is asked for: with the trial its corner, else a sharp one at 0.
+    at = {"s": 80.0, "displacement": read.curves[1].displacement, "specimen": "T1"}
+    same = jaxtrachea.predict(read, trial="t1", **at)
+    assert np.allclose(same.force, stored_force[1], rtol=0, atol=1e-9)
+    new = jaxtrachea.predict(read, **at)
+    k_1, k_3 = stiffness(read, 0)
+    D = at["displacement"]
+    assert np.allclose(new.force, k_1 * D + k_3 * D**3, rtol=1e-9)
+
+
+def test_left_out_curve_with_its_own_onset_is_that_of_leave_one_out(touched, tmp_path):
+    """Fit without a curve, written, read, predicted: `leave_one_out` to 1e-6 of the peak."""
+    study, _ = touched
+    left = leave_one_out(study, TWO)
+    assert left.result.succeeded.all()
+    for row in (1, 5):
+        lane, trial = left.lane[row], left.trial[row]
+        out = study.curves[lane][trial]
+        others = [c for lane in study.curves for c in lane if c is not out]
+        read = stored_again(total_problem(others, OWN), tmp_path / f"{row}")
+        (found,) = held_out.compare(read, [out])
+        assert found.in_fit == "no"
+        peak = np.max(np.abs(out.force))
+        error = np.sqrt(np.mean(found.residual**2)) / peak
+        assert abs(error - left.force[row]) < 1e-6
+        _, sharp = least_touch(read, lane, out)
+        assert np.max(np.abs(found.prediction.force - sharp)) < 0.02 * peak
+
+
+def least_touch(read, lane, curve):
+    """Onset and offset of a curve by SciPy with a sharp corner, k_1 and k_3 kept; its force."""
+    k_1, k_3 = stiffness(read, lane)
+
+    def force(x):
+        h = np.maximum(curve.displacement - x[0], 0)
+        return k_1 * h + k_3 * h**3 + x[1]
+
+    found = least_squares(lambda x: force(x) - curve.force, [0.5, 0.0], x_scale="jac")
+    return found.x, force(found.x)
+
+
+def test_own_onset_of_a_press_of_another_size(touched):
+    """Steps follow the presses: one ten times as deep has others, and the same millimetres."""
+    _, read = touched
+    (deep,) = touching((3.0,), 60.0, ("T1",))
+    deep = dataclasses.replace(deep, trial="deep")
+    onset = next(p for p in read.problem.free if p.name == "onset")
+    (found,) = held_out.compare(read, [deep])
+    x, force = least_touch(read, 0, deep)
+    assert onset.step == 1.0
+    assert abs(x[0] - 3.0) < 0.2
+    assert np.max(np.abs(found.prediction.force - force)) < 1e-3 * np.max(deep.force)
+    # The band with nothing but the curve's own errors: SciPy's Jacobian, no kept covariance.
+    bare = dataclasses.replace(read, covariance=np.zeros_like(read.covariance))
+    (found,) = held_out.compare(bare, [deep])
+    D = deep.displacement
+    k_1, k_3 = stiffness(read, 0)
+    z = np.maximum(D - x[0], 0)
+    J = np.stack([-(k_1 + 3 * k_3 * z**2) * (z > 0), np.ones_like(D)])
+    own = read.sigma[0, 0] ** 2 * np.linalg.inv(J @ J.T)
+    expected = np.sqrt(np.einsum("in,ij,jn->n", J, own, J))
+    away = np.abs(D - x[0]) > 1.5
+    assert np.allclose(found.prediction.se[away], expected[away], rtol=0.02)
+
+
 @pytest.mark.slow
 def test_own_onset_is_fitted_and_its_band_is_that_of_least_squares(tmp_path):
     """A new curve's own onset, k_1 and k_3 kept; band by the law of errors."""
@@ -331,10 +433,12 @@ def test_own_onset_is_fitted_and_its_band_is_that_of_least_squares(tmp_path):
         "T1", "c", None, 0.0, depth, touched + 0.1 * touched**3 + 0.01 * rng.normal(size=41)
     )
     (found,) = held_out.compare(read, [new])
-    k_1, k_3 = read.theta[0, 0], 0.01 * read.theta[0, 1]
+    (width,) = held_out.measured_corners(read, [new], [np.zeros(41)])
+    assert 0.001 < width < 0.05
+    k_1, k_3 = stiffness(read, 0)
 
     def force(values):
-        d = np.maximum(depth - values[2], 0)
+        d = rounded(depth - values[2], width)
         return values[0] * d + values[1] * d**3
 
     alone = least_squares(
@@ -367,7 +471,7 @@ def only(read, lanes):
     count = int(np.sum(read.curve_lane < lanes))
     cut = {name: getattr(read, name)[:lanes] for name in fields}
     problem = dataclasses.replace(read.problem, unknowns=read.problem.unknowns[:lanes])
-    curves = {"curves": read.curves[:count], "curve_lane": read.curve_lane[:count]}
+    curves = {name: getattr(read, name)[:count] for name in ("curves", "curve_lane", "blend")}
     return dataclasses.replace(read, problem=problem, **cut, **curves)
 
 

@@ -13,6 +13,7 @@ from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.results import MORE, SCHEMA, SCHEMA_VERSION
 from jaxtrachea.identify.run_folder import NoRun
+from jaxtrachea.identify.starts import of_unknowns
 from jaxtrachea.identify.uncertainty import Uncertainty
 from jaxtrachea.status import FitStatus
 
@@ -47,9 +48,24 @@ def read_hdf5(path: Path, problem: Problem) -> FitResult:
             place = f"uncertainty/{name}" if name in MORE else _place(found, name)
             arrays[f"uncertainty.{name}"] = found[place]
         arrays["status"] = arrays["status"].astype(int)
-        return result_of(problem, arrays)
+        return _same_steps(result_of(problem, arrays))
     except (KeyError, ValueError) as error:
         raise NoRun(f"{path} is of another study or version ({error})") from None
+
+
+def _same_steps(result: FitResult) -> FitResult:
+    """The result, if its scaled coordinates mean its values.
+
+    Raises:
+        ValueError: they were written by a version that took other steps.
+    """
+    log = of_unknowns(result.problem, lambda p: p.scale == "log", 0.0) > 0
+    step = of_unknowns(result.problem, lambda p: p.step, 1.0)
+    meant = np.where(log, np.exp(np.where(log, result.theta, 0.0)), result.theta * step)
+    known = np.isfinite(meant) & np.isfinite(result.value) & (result.problem.lanes.active > 0)
+    if not np.allclose(meant[known], result.value[known], rtol=1e-9, atol=0):
+        raise ValueError("its scaled coordinates have other steps; fit again")
+    return result
 
 
 def _keep(found: dict[str, np.ndarray], name: str, item: object) -> None:

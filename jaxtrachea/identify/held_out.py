@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.measurements import BadCurve, Curve
+from jaxtrachea.identify.onset import onset_is_sought
 from jaxtrachea.identify.predict import CurvePrediction, predict_sources
 from jaxtrachea.identify.prediction_core import compiled_slopes
 from jaxtrachea.identify.problem import Problem, build, check_curve
@@ -75,7 +76,8 @@ def compare(
     """Predict measured curves.
 
     A curve that the fit has used is predicted with its own parameters of the fit. A new one has its
-    own (those of scope `trial`, such as onset) fitted to it, everything else kept.
+    own (those of scope `trial`, such as onset) fitted to it, everything else kept. Where an onset
+    was fitted, its corner is rounded as the fit does it.
 
     Args:
         stored: the fit.
@@ -95,6 +97,11 @@ def compare(
         sources.append(dataclasses.replace(source, trial=curve.trial))
         words.append(word)
     sigmas = [_sigma(stored, c, source) for c, source in zip(curves, sources, strict=True)]
+    rounded = zip(sources, measured_corners(stored, curves, sigmas), words, strict=True)
+    sources = [
+        source if word == "yes" else dataclasses.replace(source, blend=blend)
+        for source, blend, word in rounded
+    ]
     sources = with_own(stored, sources, curves, sigmas)
     s = [np.nan if c.s_c is None else c.s_c for c in curves]
     found = predict_sources(stored, sources, s, [c.displacement for c in curves], sigmas)
@@ -139,34 +146,68 @@ def with_own(
     for own, members in groups.items():
         study = _study(stored, own, [(sources[k], curves[k], sigmas[k]) for k in members])
         result = fit(study, Settings(scrutiny=False))
-        slopes = _slopes(stored, own, [sources[k] for k in members], result.theta, study)
+        theta = result.theta[:, : len(own)] * _steps(stored.problem, study, own)
+        slopes = _slopes(stored, own, [sources[k] for k in members], theta, study)
         for row, k in enumerate(members):
             status = FitStatus(int(result.status[row]))
             held = result.at_bound[row, : len(own)]
-            estimate = _Own(own, result.theta[row], status, held, slopes[row], sigmas[k])
+            estimate = _Own(own, theta[row], status, held, slopes[row], sigmas[k])
             out[k] = _merged(stored, sources[k], estimate)
     return out
+
+
+def measured_corners(
+    stored: StoredFit, curves: Sequence[Curve], sigmas: Sequence[np.ndarray]
+) -> list[float]:
+    """Rounded corner at the onset of new curves, mm, as the fit has its own; NaN without an onset.
+
+    Args:
+        stored: the fit.
+        curves: new ones, alone or of any specimen.
+        sigmas: noise of their samples; counts where that of the fit was given.
+    """
+    problem = stored.problem
+    if not onset_is_sought(problem.parameters, problem.options):
+        return [np.nan] * len(curves)
+    given = problem.noise_given[0]
+    alone = [
+        _apart(c, i, s if given and c.sigma is None else c.sigma)
+        for i, (c, s) in enumerate(zip(curves, sigmas, strict=True))
+    ]
+    study = build(alone, problem.geometry, problem.options, problem.parameters)
+    return [] if study.lanes.blend is None else np.ravel(study.lanes.blend).tolist()
+
+
+def _apart(curve: Curve, i: int, sigma: np.ndarray | None) -> Curve:
+    """A curve with a name of its own, so that curves of equal name stay apart; without markers."""
+    return dataclasses.replace(
+        curve, specimen=f"{i}", trial="", sigma=sigma, joint_rings=None, joint_displacement=None
+    )
 
 
 def _study(stored: StoredFit, own, members) -> Problem:
     """One lane per curve, whose unknowns are the own columns."""
     problem = stored.problem
     names = {problem.free[f].name for f in own}
-    table = [p if p.name in names else dataclasses.replace(p, fixed=True)
-             for p in problem.parameters]  # fmt: skip
-    # Names of their own, so that curves of equal name stay apart.
-    curves = [
-        dataclasses.replace(
-            c, specimen=f"{i}", trial="", sigma=s, joint_rings=None, joint_displacement=None
-        )
-        for i, (_, c, s) in enumerate(members)
+    known = np.stack([_values(stored, source) for source, _, _ in members])
+    # The values serve where starts are sought; what is kept has that of its curve, below.
+    table = [
+        p if p.name in names else dataclasses.replace(p, fixed=True, value=float(value))
+        for p, value in zip(problem.parameters, np.median(known, axis=0), strict=True)
     ]
+    curves = [_apart(c, i, s) for i, (_, c, s) in enumerate(members)]
     study = build(curves, problem.geometry, problem.options, table, balance="sample")
-    value = study.lanes.value.copy()
-    for k, (source, _, _) in enumerate(members):
-        value[k] = _values(stored, source)
-    lanes = study.lanes._replace(value=value)
+    blend = np.array([[source.blend] for source, _, _ in members])
+    lanes = study.lanes._replace(
+        value=known[:, None], blend=None if np.isnan(blend).all() else blend
+    )
     return dataclasses.replace(study, lanes=lanes, loss=problem.loss, loss_scale=problem.loss_scale)
+
+
+def _steps(problem: Problem, study: Problem, own) -> np.ndarray:
+    """Steps of the own columns in the study over those in the fit: each follows its own presses."""
+    pairs = zip(study.free, (problem.free[f] for f in own), strict=True)
+    return np.array([1.0 if q.scale == "log" else p.step / q.step for p, q in pairs])
 
 
 def _values(stored: StoredFit, source: Source) -> np.ndarray:
@@ -179,13 +220,17 @@ def _values(stored: StoredFit, source: Source) -> np.ndarray:
 
 
 def _slopes(stored: StoredFit, own, sources, theta, study: Problem) -> list[np.ndarray]:
-    """Derivative of the forces by all free columns, at the fitted own ones; (F, N) each."""
+    """Derivative of the forces by all free columns, at the fitted own ones; (F, N) each.
+
+    In the steps of the fit, as `theta` of the own columns.
+    """
     free = np.stack([source.free for source in sources])
-    free[:, list(own)] = np.where(np.isfinite(theta[:, : len(own)]), theta[:, : len(own)], 0.0)
+    free[:, list(own)] = np.where(np.isfinite(theta), theta, 0.0)
     lanes = study.lanes
     run = compiled_slopes(stored.problem.program)
     value = np.stack([source.value for source in sources])
-    columns = (free, value, lanes.s_c[:, 0], lanes.displacement[:, 0])
+    columns = [free, value, lanes.s_c[:, 0], lanes.displacement[:, 0]]
+    columns += [] if lanes.blend is None else [lanes.blend[:, 0]]
     _, slopes = run(*map(jnp.asarray, columns))
     return [np.asarray(slopes[k])[:, lanes.precision[k, 0] > 0] for k in range(len(sources))]
 
@@ -210,7 +255,7 @@ def _merged(stored: StoredFit, source: Source, own: _Own) -> Source:
         word = f"{names}: {own.status.message}"
         return dataclasses.replace(source, status=PredictionStatus.NO_OWN, message=word)
     free = source.free.copy()
-    free[columns] = own.theta[: len(columns)]
+    free[columns] = own.theta
     moving = [f for f, held in zip(columns, own.held, strict=True) if not held]
     A = (own.slopes[moving] / own.sigma).T
     inverse = np.linalg.pinv(A.T @ A, rcond=1e-14, hermitian=True)

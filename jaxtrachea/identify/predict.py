@@ -117,17 +117,22 @@ def predict_sources(
     places = np.where(np.isnan(s), float(stored.problem.geometry.length) / 2, s)
     stack = lambda name: np.stack([getattr(source, name) for source in sources])  # noqa: E731
     columns = [stack(n) for n in ("free", "value", "covariance", "blind", "half_width")]
-    out: list[CurvePrediction] = []
-    chunk = min(chunk, _rounded(len(sources), 1))
-    for first in range(0, len(sources), chunk):
-        rows = np.minimum(np.arange(first, first + chunk), len(sources) - 1)
-        part = run(*(jnp.asarray(v[rows]) for v in (*columns, places, padded)))
-        part = jax.tree.map(np.asarray, part)
-        for k in range(first, min(first + chunk, len(sources))):
-            own = jax.tree.map(lambda v, row=k - first: v[row], part)
-            sigma = None if sigmas is None else sigmas[k]
-            out.append(_on_host(stored, sources[k], s[k], displacements[k], own, sigma))
-    return out
+    columns += [places, padded]
+    blend = stack("blend")
+    out: dict[int, CurvePrediction] = {}
+    for members in (np.flatnonzero(np.isnan(blend)), np.flatnonzero(~np.isnan(blend))):
+        # A rounded corner is another program; mostly all curves have one, or none.
+        arrays = columns if np.isnan(blend[members]).all() else [*columns, blend]
+        size = min(chunk, _rounded(max(len(members), 1), 1))
+        for first in range(0, len(members), size):
+            at = members[first : first + size]
+            rows = np.pad(at, (0, size - len(at)), mode="edge")
+            part = jax.tree.map(np.asarray, run(*(jnp.asarray(v[rows]) for v in arrays)))
+            for row, k in enumerate(at):
+                own = jax.tree.map(lambda v, row=row: v[row], part)
+                sigma = None if sigmas is None else sigmas[k]
+                out[k] = _on_host(stored, sources[k], s[k], displacements[k], own, sigma)
+    return [out[k] for k in range(len(sources))]
 
 
 def _rounded(count: int, least: int) -> int:
@@ -235,8 +240,9 @@ def predict(
         displacement: of the tool from first touch, mm; one number or a vector.
         specimen: whose parameters; may be left out where the fit has one specimen only, or shares
             all parameters.
-        trial: of the fit, whose own parameters (onset, say) count; None: onset and force offset of
-            single trials are 0.
+        trial: of the fit, whose own parameters (onset, say) count, with the rounded corner of its
+            onset; None: onset and force offset of single trials are 0, the corner is sharp
+            (`onset_width` of the model).
 
     Raises:
         ValueError: a position outside the tube, a displacement that is no finite number, a specimen

@@ -58,6 +58,7 @@ def respond(
     value: Float[Array, " J"],
     s_c: Float[Array, ""],
     displacement: Float[Array, " N"],
+    blend: Float[Array, ""] | None = None,
 ) -> tuple[Response, Int[Array, " N"]]:
     """The fitted model at one position: response and `PressStatus`; pure.
 
@@ -67,26 +68,29 @@ def respond(
         value: all parameters in their units, used where they are not free.
         s_c: mm.
         displacement: mm.
+        blend: rounded corner of a curve whose onset was fitted, mm, see `Lane`; None: that of the
+            options.
     """
     material, values = material_and_values(problem, free, value)
     geometry = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), problem.geometry)
     solved = press(
-        geometry, material, s_c, displacement, problem.options, onset=values["onset"]
+        geometry, material, s_c, displacement, problem.options,
+        onset=values["onset"], blend=blend,
     )  # fmt: skip
     force = solved.force + values["force_offset"]
     return Response(force, solved.joints, solved.reactions), solved.status
 
 
-def jacobian(problem: Problem, free, value, s_c, displacement):
+def jacobian(problem: Problem, free, value, s_c, displacement, blend=None):
     """`respond`, its statuses, and its derivative by every free column, a leading axis (F, ...)."""
 
     def push(tangent):
-        at = lambda free: respond(problem, free, value, s_c, displacement)  # noqa: E731
+        at = lambda free: respond(problem, free, value, s_c, displacement, blend)  # noqa: E731
         out, moved, status = jax.jvp(at, (free,), (tangent,), has_aux=True)
         return out, status, moved
 
     if not len(free):
-        out, status = respond(problem, free, value, s_c, displacement)
+        out, status = respond(problem, free, value, s_c, displacement, blend)
         return out, status, jax.tree.map(lambda v: jnp.zeros((0, *v.shape), v.dtype), out)
     eye = jnp.eye(free.shape[0], dtype=free.dtype)
     return jax.vmap(push, out_axes=(None, None, 0))(eye)
@@ -113,6 +117,7 @@ def predicted(
     half_width: Float[Array, ""],
     s_c: Float[Array, ""],
     displacement: Float[Array, " N"],
+    blend: Float[Array, ""] | None = None,
 ) -> Predicted:
     """One curve with its standard errors; pure, for `jit` and `vmap`, float32 and float64.
 
@@ -125,8 +130,9 @@ def predicted(
         half_width: of a 95 % interval in standard errors.
         s_c: mm.
         displacement: mm; at least one.
+        blend: see `respond`.
     """
-    out, status, slopes = jacobian(problem, free, value, s_c, displacement)
+    out, status, slopes = jacobian(problem, free, value, s_c, displacement, blend)
     se = jax.tree.map(lambda slope: standard_errors(slope, covariance, blind), slopes)
     deepest = jnp.argmax(jnp.abs(displacement))
     pull = covariance @ slopes.force[:, deepest]
@@ -136,7 +142,7 @@ def predicted(
     straight = jnp.einsum("f...,f->...", slopes.force, step)
 
     def bend(sign):
-        end, _ = respond(problem, free + sign * step, value, s_c, displacement)
+        end, _ = respond(problem, free + sign * step, value, s_c, displacement, blend)
         return end.force - out.force - sign * straight
 
     return Predicted(out, se, status, jnp.stack([bend(1.0), bend(-1.0)]), deepest)
@@ -152,8 +158,8 @@ def compiled(problem: Problem):
 def compiled_slopes(problem: Problem):
     """Force and its derivative for many curves at once."""
 
-    def force(free, value, s_c, displacement):
-        out, _, slopes = jacobian(problem, free, value, s_c, displacement)
+    def force(free, value, s_c, displacement, blend=None):
+        out, _, slopes = jacobian(problem, free, value, s_c, displacement, blend)
         return out.force, slopes.force
 
     return jax.jit(jax.vmap(force))

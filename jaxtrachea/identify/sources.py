@@ -30,6 +30,8 @@ class Source:
         message: why, in words; "" if nothing is.
         absorbed: what own parameters take up of a change of the curve: slopes (N, k) and the gain
             that fits them (k, N); None if they are not fitted.
+        blend: rounded corner of a curve whose onset was fitted, mm, see `Lane`; NaN: that of the
+            options.
     """
 
     specimen: str
@@ -45,6 +47,7 @@ class Source:
     status: PredictionStatus
     message: str
     absorbed: tuple[np.ndarray, np.ndarray] | None = None
+    blend: float = np.nan
 
 
 def source_of(
@@ -84,7 +87,14 @@ def source_of(
     if lacking and not measured:
         text = f"{', '.join(lacking)} belongs to single trials; name one of the fit with trial="
         return _none(stored, specimen, trial, PredictionStatus.NO_ESTIMATE, text)
-    return _taken(stored, specimen, trial or "", lane, index, own, note)
+    taken = _taken(stored, specimen, trial or "", lane, index, own, note)
+    return dataclasses.replace(taken, blend=_corner(stored, used, trial))
+
+
+def _corner(stored: StoredFit, specimen: str, trial: str | None) -> float:
+    """Rounded corner that the fit used for this trial; NaN for a new one."""
+    pairs = zip(stored.curves, stored.blend.tolist(), strict=True)
+    return next((b for c, b in pairs if (c.specimen, c.trial) == (specimen, trial)), np.nan)
 
 
 def _whose(stored: StoredFit, specimen: str, as_specimen: str | None) -> tuple[str | None, str]:

@@ -74,6 +74,8 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
     group["samples"] = np.array([len(c.force) for c in curves], np.int64)
     group["s_c"] = np.array([np.nan if c.s_c is None else c.s_c for c in curves])
     group["phi_c"] = np.array([c.phi_c for c in curves])
+    blend = problem.lanes.blend
+    group["blend"] = np.array([np.nan if blend is None else blend[k, t] for k, t, _ in placed])
     seen = predictions(problem, result.theta)
     residual = [seen.force[k, t, : len(c.force)] for k, t, c in placed]
     columns = {

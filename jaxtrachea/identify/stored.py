@@ -59,6 +59,8 @@ class StoredFit:
             estimated; (L,).
         curves: the data as used; `source` is the file's name and the place in it.
         curve_lane: lane of each curve; (curves,).
+        blend: rounded corner at the onset of each curve, mm, see `Lane`; NaN where no onset was
+            fitted; (curves,).
         files: SHA-256 by file name.
     """
 
@@ -75,6 +77,7 @@ class StoredFit:
     half_width: np.ndarray
     curves: tuple[Curve, ...]
     curve_lane: np.ndarray
+    blend: np.ndarray
     files: Mapping[str, str]
 
     @property
@@ -209,6 +212,7 @@ def _read(path: Path, file: Any) -> StoredFit:
         half_width=_known_half_width(problem, numeric(file["uncertainty"], "half_width")),
         curves=curves,
         curve_lane=lane,
+        blend=numeric(file["data"], "blend"),
         files=files,
     )
     _check_shapes(stored)
@@ -275,6 +279,7 @@ def _check_shapes(stored: StoredFit) -> None:
     shapes = {
         "theta": (L, P), "covariance": (L, P, P), "blind": (L, P, P), "at_bound": (L, P),
         "status": (L,), "sigma": (L, 2), "half_width": (L,), "curve_lane": (len(stored.curves),),
+        "blend": (len(stored.curves),),
     }  # fmt: skip
     for name, shape in shapes.items():
         if getattr(stored, name).shape != shape:
