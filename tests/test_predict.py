@@ -26,7 +26,7 @@ from jaxtrachea.identify.measurements import Curve
 from jaxtrachea.identify.parameters import DEFAULTS
 from jaxtrachea.identify.predict import predict_sources
 from jaxtrachea.identify.prediction_core import predicted
-from jaxtrachea.identify.predictions import leave_one_out, predictions
+from jaxtrachea.identify.predictions import leave_one_out, predictions, with_own_touch
 from jaxtrachea.identify.presses import parse_presses
 from jaxtrachea.identify.problem import Noise, build
 from jaxtrachea.identify.sources import source_of
@@ -366,23 +366,47 @@ def test_used_curves_come_back_with_the_corner_of_the_fit(touched):
     assert np.allclose(new.force, k_1 * D + k_3 * D**3, rtol=1e-9)
 
 
-def test_left_out_curve_with_its_own_onset_is_that_of_leave_one_out(touched, tmp_path):
-    """Fit without a curve, written, read, predicted: `leave_one_out` to 1e-6 of the peak."""
-    study, _ = touched
+def left_out_pairs(study, changes, rows, folder):
+    """Curves left out: as `leave_one_out` predicts them, and as a stored fit of the others does."""
     left = leave_one_out(study, TWO)
     assert left.result.succeeded.all()
-    for row in (1, 5):
+    held = np.zeros(study.take(left.lane).lanes.s_c.shape, bool)
+    held[np.arange(len(held)), left.trial] = True
+    chosen = study.take(left.lane)
+    truth = predictions(chosen, with_own_touch(chosen, held, left.result.theta, TWO)).force
+    for row in rows:
         lane, trial = left.lane[row], left.trial[row]
         out = study.curves[lane][trial]
-        others = [c for lane in study.curves for c in lane if c is not out]
-        read = stored_again(total_problem(others, OWN), tmp_path / f"{row}")
+        others = [c for curves in study.curves for c in curves if c is not out]
+        read = stored_again(total_problem(others, changes), folder / f"{row}")
         (found,) = held_out.compare(read, [out])
         assert found.in_fit == "no"
         peak = np.max(np.abs(out.force))
-        error = np.sqrt(np.mean(found.residual**2)) / peak
-        assert abs(error - left.force[row]) < 1e-6
-        _, sharp = least_touch(read, lane, out)
+        assert np.allclose(found.residual, truth[row, trial], rtol=0, atol=1e-6 * peak)
+        rms = np.sqrt(np.mean(found.residual**2)) / peak
+        assert abs(rms - left.force[row]) < 1e-6
+        yield found, read, lane
+
+
+def test_left_out_curve_with_its_own_onset_is_that_of_leave_one_out(touched, tmp_path):
+    """Fit without a curve, written, read, predicted: every sample to 1e-6 of the peak."""
+    for found, read, lane in left_out_pairs(touched[0], OWN, (1, 5), tmp_path):
+        assert "onset, force_offset fitted to this curve" in found.prediction.message
+        _, sharp = least_touch(read, lane, found.curve)
+        peak = np.max(found.curve.force)
         assert np.max(np.abs(found.prediction.force - sharp)) < 0.02 * peak
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("own", ["onset", "force_offset"])
+def test_left_out_curve_with_one_number_of_its_own(own, tmp_path):
+    """The other one is the specimen's: 20 N, or 0.5 mm; the corner and the start know of it."""
+    changes = {n: {"fixed": False, "scope": "specimen"} for n in OWN}
+    changes[own] = {"fixed": False}
+    onsets = (0.3, 0.7, 1.1) if own == "onset" else (0.5, 0.5, 0.5)
+    curves = [dataclasses.replace(c, force=c.force + 20.0) for c in touching(onsets)]
+    for found, _, _ in left_out_pairs(total_problem(curves, changes), changes, (1,), tmp_path):
+        assert f"{own} fitted to this curve" in found.prediction.message
 
 
 def least_touch(read, lane, curve):

@@ -260,7 +260,7 @@ def _of_trial_with_jacobian(problem: Problem, free, skeleton, by_beam, trial: La
     value = _whitened(force + contact.force_offset, joints, trial)
     row = lambda force, joints: _masked(force, joints, trial)  # noqa: E731
     bend = None
-    if blend is not None and joints is None:
+    if blend is not None and joints is None and any(p.name == "onset" for p in problem.free):
         curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
         squared = jnp.sum(d_contact.onset**2)
         bend = _masked(by.displacement * curved * squared, None, trial)
