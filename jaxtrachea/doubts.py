@@ -15,7 +15,13 @@ def doubts(result: FitResult, wide: Effective) -> list[str]:
     """What speaks against the standard errors of this fit."""
     said = []
     lanes = np.flatnonzero(wide.correlation > CORRELATED)
-    if len(lanes):
+    if len(lanes) and not result.problem.free:
+        said.append(
+            f"Neighbouring force residuals are correlated in {len(lanes)} of {result.lanes} lanes: "
+            "the model misses the shape of these curves, or the noise is not independent from "
+            "sample to sample."
+        )
+    elif len(lanes):
         r = float(np.median(wide.correlation[lanes]))
         worth = float(np.median(wide.samples[lanes] / np.maximum(result.samples[lanes], 1)))
         few = int(np.sum(np.isinf(wide.factor[lanes])))

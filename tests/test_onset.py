@@ -12,13 +12,15 @@ from jaxtrachea._numerics import centred_hinge
 from jaxtrachea.identify.design import Candidates, check, gains, situation
 from jaxtrachea.identify.first_touch import first_touch
 from jaxtrachea.identify.fit import Settings, fit
+from jaxtrachea.identify.held_out import compare
 from jaxtrachea.identify.influence import influence
 from jaxtrachea.identify.measurements import Curve
 from jaxtrachea.identify.parameters import in_model
-from jaxtrachea.identify.predictions import leave_one_out, without
+from jaxtrachea.identify.predictions import leave_one_out, predictions, without
 from jaxtrachea.identify.problem import build, default_parameters
 from jaxtrachea.identify.repeats import leave_repeats_out
-from jaxtrachea.identify.results import verdict_sentence
+from jaxtrachea.identify.results import verdict_sentence, write_hdf5
+from jaxtrachea.identify.stored import read_results
 from jaxtrachea.identify.verdict import describe_flat
 from jaxtrachea.model import Options, compliance
 from jaxtrachea.trachea.material import Material
@@ -322,3 +324,21 @@ def test_where_no_onset_is_fitted_nothing_changes():
     problem = synthetic.problem(force)
     assert problem.lanes.blend is None
     assert problem.parameters[-1].step == 0.1
+
+
+def test_a_stored_fit_predicts_with_its_corners_and_in_its_steps(owned, tmp_path):
+    """Used curves come back to 1e-9 N; a press ten times as deep, in other steps: SciPy."""
+    write_hdf5(tmp_path / "results.h5", owned, {})
+    read = read_results(tmp_path)
+    (k_1, k_3), D = owned.value[0, :2], np.linspace(0, 50, 80)
+    force = k_1 * np.maximum(D - 4, 0) + k_3 * np.maximum(D - 4, 0) ** 3 + 0.2
+    force = force + 0.05 * np.random.default_rng(3).normal(size=80)
+    deep = Curve("s0", "deep", 20.0, 0.0, D, force)
+    *used, found = compare(read, [*read.curves, deep])
+    seen = predictions(owned.problem, owned.theta).force.reshape(8, 80)
+    assert {c.in_fit for c in used} == {"yes"}
+    np.testing.assert_allclose([c.residual for c in used], seen, rtol=0, atol=1e-9)
+    assert next(p.step for p in read.problem.free if p.name == "onset") == 1.0
+    np.testing.assert_allclose(
+        found.residual, own_misfit(deep, k_1, k_3, [4.0, 0.2]), atol=1e-4 * np.max(force)
+    )

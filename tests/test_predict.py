@@ -20,6 +20,7 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 import jaxtrachea
+from jaxtrachea import prediction_plots
 from jaxtrachea.identify import former, held_out, results, stored
 from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.measurements import Curve
@@ -29,6 +30,7 @@ from jaxtrachea.identify.prediction_core import predicted
 from jaxtrachea.identify.predictions import leave_one_out, predictions, with_own_touch
 from jaxtrachea.identify.presses import parse_presses
 from jaxtrachea.identify.problem import Noise, build
+from jaxtrachea.identify.run_folder import NoRun
 from jaxtrachea.identify.sources import source_of
 from jaxtrachea.model import Options
 from jaxtrachea.status import FitStatus, PredictionStatus
@@ -106,7 +108,7 @@ def check_coverage(read, noise):
     rng, lanes = np.random.default_rng(8), len(read.specimens)
     sources = [source_of(read, name) for name in read.specimens]
     for s in UNSEEN:
-        found = predict_sources(read, sources, [s] * lanes, [DEPTHS] * lanes)
+        found = predict_sources(read, sources, [s] * lanes, [DEPTHS] * lanes, chunk=8)
         truth = true_force(s)
         sample = truth + noise * rng.normal(size=(lanes, len(DEPTHS)))
         inside = np.array([(p.curve_low95 <= truth) & (truth <= p.curve_high95) for p in found])
@@ -118,6 +120,7 @@ def check_coverage(read, noise):
             assert miss < 4 * math.sqrt(0.95 * 0.05 / lanes), miss
 
 
+@pytest.mark.slow
 def test_bands_cover_at_unseen_positions(read):
     """Truth from finite elements; parameters known to 1 to 3 %."""
     check_coverage(read, NOISE)
@@ -279,6 +282,7 @@ def stored_again(problem, path):
     return jaxtrachea.read_results(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [None, 0.02])
 def test_linear_model_has_the_bands_of_the_text_book(given, tmp_path):
     """Least squares on D and D^3 (numpy): s^2 (X^T X)^-1, t or, with given noise, z."""
@@ -304,6 +308,7 @@ def test_linear_model_has_the_bands_of_the_text_book(given, tmp_path):
     assert np.allclose(found.prediction.sigma, 0.5 if given else s, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_left_out_curve_is_that_of_leave_one_out(tmp_path):
     """Fit without a curve, written, read, predicted: the residual of `leave_one_out` to 1e-9."""
     curves = list(pairs())
@@ -347,6 +352,7 @@ def touched(tmp_path_factory):
     return problem, stored_again(problem, path)
 
 
+@pytest.mark.slow
 def test_used_curves_come_back_with_the_corner_of_the_fit(touched):
     """What the fit stored as predicted, to 1e-9 N: the same rounded corner."""
     _, read = touched
@@ -388,6 +394,7 @@ def left_out_pairs(study, changes, rows, folder):
         yield found, read, lane
 
 
+@pytest.mark.slow
 def test_left_out_curve_with_its_own_onset_is_that_of_leave_one_out(touched, tmp_path):
     """Fit without a curve, written, read, predicted: every sample to 1e-6 of the peak."""
     for found, read, lane in left_out_pairs(touched[0], OWN, (1, 5), tmp_path):
@@ -421,6 +428,7 @@ def least_touch(read, lane, curve):
     return found.x, force(found.x)
 
 
+@pytest.mark.slow
 def test_own_onset_of_a_press_of_another_size(touched):
     """Steps follow the presses: one ten times as deep has others, and the same millimetres."""
     _, read = touched
@@ -443,6 +451,16 @@ def test_own_onset_of_a_press_of_another_size(touched):
     expected = np.sqrt(np.einsum("in,ij,jn->n", J, own, J))
     away = np.abs(D - x[0]) > 1.5
     assert np.allclose(found.prediction.se[away], expected[away], rtol=0.02)
+
+
+def rounded(x, width):
+    """`max(x, 0)` averaged with the kernel 15/32 (1 - t^2) (3 - 7 t^2) over `width`, by Gauss."""
+    t, weight = np.polynomial.legendre.leggauss(40)
+    # The kernel on either side of the corner by itself, where the integrand is a polynomial.
+    low = np.clip(x / width, -1, 1)[:, None]
+    u = (low + 1) / 2 * t - (1 - low) / 2  # from -1 to the corner: x - width u > 0
+    kernel = 15 / 32 * (1 - u * u) * (3 - 7 * u * u)
+    return np.sum(weight * kernel * (x[:, None] - width * u), axis=1) * (low[:, 0] + 1) / 2
 
 
 @pytest.mark.slow
@@ -555,6 +573,7 @@ def test_core_in_float32(read):
         assert np.allclose(batch.se.joints[k], curve.joints_se, rtol=1e-2, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_fixed_specification_is_evaluated(tmp_path):
     """Nothing free: residuals, cost and noise by hand; predicted with a band of noise alone."""
     curves = list(pairs())
@@ -578,6 +597,7 @@ def test_fixed_specification_is_evaluated(tmp_path):
     assert np.allclose(curve.high95 - 1.1, student.ppf(0.975, 60) * sigma)
 
 
+@pytest.mark.slow
 def test_fixed_specification_on_the_command_line(tmp_path, monkeypatch, capsys):
     """It is evaluated, its results predict; what doubts an estimate says that there is none."""
     text = '[data]\nfiles = "a.csv"\n[model]\ncoupling = "total"\n[parameters]\n'
@@ -592,7 +612,11 @@ def test_fixed_specification_on_the_command_line(tmp_path, monkeypatch, capsys):
              "residuals.png", "provenance.json"}  # fmt: skip
     assert names <= set(tree(out))
     assert "correlation.png" not in tree(out)
-    assert "None: every parameter is fixed" in (out / "report.md").read_text()
+    report = (out / "report.md").read_text()
+    assert "None: every parameter is fixed" in report
+    assert "What the data determine" not in report
+    assert "standard errors" not in report + said
+    assert "more, see" not in report
     assert [r["specimen"] for r in rows_of(out / "summary.csv")] == ["T1", "T2"]
     for option in ("--profile", "--leave-one-out", "--influence"):
         code, _, err = run(monkeypatch, capsys, "fit", spec, option)
@@ -691,6 +715,37 @@ def test_command_writes_what_the_page_says(study, tmp_path, monkeypatch, capsys)
     assert float(joints[-8]["reaction_low95 [N]"]) < float(joints[-8]["reaction [N]"])
 
 
+def test_pictures_say_what_they_leave_out_and_cost_themselves_only(read, tmp_path, monkeypatch):
+    """13 specimens, one of 11 curves, names that matplotlib would read; a picture that fails."""
+    at = {"s": 61.0, "displacement": DEPTHS}
+    one = jaxtrachea.predict(read, specimen="s0003", **at)
+    names = ["$T9 $x", "_hidden", *(f"s{i}" for i in range(11))]
+    many = [dataclasses.replace(one, specimen=name, trial="$a_$") for name in names]
+    titles = [axis.get_title() for axis in prediction_plots._panels(many_pairs(many)).axes]
+    assert titles[:2] == [r"\$T9 \$x", " _hidden"]
+    title = prediction_plots._panels(many_pairs(many)).get_suptitle()
+    assert title == "the first 12 of 13 specimens; all: predictions.csv"
+    figure = prediction_plots._panels(many_pairs([one] * 11))
+    assert figure.axes[0].get_title() == "s0003 (the first 10 of 11 curves)"
+    assert figure.get_suptitle() == "all: predictions.csv"
+    curve = dataclasses.replace(read.curves[0], displacement=DEPTHS)
+    compared = [held_out.Compared(curve, p, "no") for p in many[:2]]
+
+    def fail(*_):
+        raise ValueError("no room")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(prediction_plots, "_panels", fail)
+        lost = prediction_plots.draw_compared(tmp_path, compared)
+    assert lost == {"curves.png": "ValueError: no room"}
+    assert list(tree(tmp_path)) == ["measured_predicted.png"]
+    assert prediction_plots.draw_predictions(tmp_path, many[:2]) == {}
+
+
+def many_pairs(curves):
+    return [(curve, None) for curve in curves]
+
+
 def old(folder):
     """As schema 1 was written: no model, no data, no covariance."""
     with h5py.File(folder / "results.h5", "r+") as file:
@@ -774,6 +829,17 @@ def test_schema_1_serves_to_fit_failed_lanes_again(study, tmp_path):
     assert np.array_equal(again.theta, study[1].theta)
     for mine, its in zip(again.uncertainty, study[1].uncertainty, strict=True):
         assert np.allclose(mine.covariance, its.covariance, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_former_fit_with_other_steps_is_refused(touched):
+    """Its lanes would keep scaled coordinates that mean other numbers here."""
+    problem, read = touched
+    assert former.read_hdf5(read.path, problem).succeeded.all()
+    other = [dataclasses.replace(p, step=7 * p.step) if p.name == "onset" else p
+             for p in problem.parameters]  # fmt: skip
+    with pytest.raises(NoRun, match="other steps; fit again"):
+        former.read_hdf5(read.path, dataclasses.replace(problem, parameters=tuple(other)))
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ def predict_sources(
         chunk: curves computed together.
     """
     run = compiled(stored.problem.program)
-    most = _rounded(max(map(len, displacements)), 8)
+    most = _rounded(max(map(len, displacements)), 32)
     padded = np.stack([np.pad(d, (0, most - len(d)), mode="edge") for d in displacements])
     places = np.where(np.isnan(s), float(stored.problem.geometry.length) / 2, s)
     stack = lambda name: np.stack([getattr(source, name) for source in sources])  # noqa: E731
@@ -123,7 +123,7 @@ def predict_sources(
     for members in (np.flatnonzero(np.isnan(blend)), np.flatnonzero(~np.isnan(blend))):
         # A rounded corner is another program; mostly all curves have one, or none.
         arrays = columns if np.isnan(blend[members]).all() else [*columns, blend]
-        size = min(chunk, _rounded(max(len(members), 1), 1))
+        size = min(chunk, _rounded(max(len(members), 1), 8))
         for first in range(0, len(members), size):
             at = members[first : first + size]
             rows = np.pad(at, (0, size - len(at)), mode="edge")
