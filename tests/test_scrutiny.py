@@ -195,3 +195,34 @@ def test_truth_table(count, markers):
         wrong = (identifiable & false)[part]
         assert wrong.any(axis=1).mean() <= 0.05
         assert wrong.sum() <= 0.05 * max(identifiable[part].sum(), 20)
+
+
+def joint_study(seed, shared, count, share):
+    """Four specimens with some parameters in common, and their truths."""
+    truth = specimens.draw(5000 + seed, 4)
+    for name in shared:
+        truth[:, NAMES.index(name)] = truth[0, NAMES.index(name)]
+    pressed = specimens.press(truth, RINGS, LENGTH, POSITIONS[:count], digits=16)
+    data = curves(pressed, count, share, np.random.default_rng(seed))
+    changes = {name: {"scope": "shared"} for name in shared}
+    parameters = default_parameters(in_model(OPTIONS, joints=False), changes)
+    return build(list(data), GEOMETRY, OPTIONS, parameters, joint=True), truth
+
+
+@pytest.mark.parametrize(
+    ("seeds", "shared", "count"),
+    [
+        ((2,), ("EI_L",), 2),
+        pytest.param(range(12), ("EI_L",), 2, marks=pytest.mark.slow),
+        pytest.param(range(12), ("EI_L",), 1, marks=pytest.mark.slow),
+        pytest.param(range(12), ("k_1", "k_3"), 2, marks=pytest.mark.slow),
+    ],
+)
+def test_a_joint_fit_says_what_it_has_not_looked_at(seeds, shared, count):
+    """No wrong unknown is identifiable; with local errors alone 7 of 8, 30 of 53, 9 of 21 were."""
+    for seed in seeds:
+        problem, truth = joint_study(seed, shared, count, 0.002)
+        result = fit(problem, Settings(starts=4))
+        word, _, false = verdicts(result, truth)
+        assert not np.any(false & (word == "identifiable")), seed
+        assert np.any(word == "not shown")

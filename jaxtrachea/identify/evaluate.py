@@ -46,6 +46,7 @@ def evaluated(problem: Problem) -> FitResult:
         cost=_cost(problem, seen, sigma), converged_starts=finite.astype(int),
         sigma=sigma * unit, rms=rms, samples=total, criteria=criteria(problem, info, finite),
         uncertainty=tuple(map(_no_uncertainty, half)), undetermined=none.astype(bool),
+        unexamined=none.astype(bool),
         evidence_low=none, evidence_high=none, evidence_end=np.zeros((lanes, 0, 2), int),
         minima=np.ones(lanes, int), **counts,
     )  # fmt: skip

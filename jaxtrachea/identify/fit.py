@@ -97,6 +97,8 @@ class FitResult:
         criteria: AIC, AICc, BIC of all lanes.
         uncertainty: `Uncertainty` of each lane.
         undetermined: unknowns that the structure leaves open (`structure`); (lanes, P).
+        unexamined: unknowns that gave cause to look further than the local error, and nobody did:
+            in a joint fit, or without scrutiny; (lanes, P).
         evidence_low: 95 % interval by profile and other minima, in the parameter's unit: -inf
             (scale `log`: 0) where open, NaN where there was no cause to look; where an end is
             `FAILED`, as far as the cost is known to stay below the threshold; (lanes, P).
@@ -126,6 +128,7 @@ class FitResult:
     criteria: Criteria
     uncertainty: tuple[Uncertainty, ...]
     undetermined: np.ndarray
+    unexamined: np.ndarray
     evidence_low: np.ndarray
     evidence_high: np.ndarray
     evidence_end: np.ndarray
@@ -225,7 +228,9 @@ def fit(
         if len(rows):
             result = _conclude(problem, minima, known)
     if not settings.scrutiny or problem.joint:
-        return result
+        from jaxtrachea.identify.scrutiny import left_in_doubt
+
+        return dataclasses.replace(result, unexamined=left_in_doubt(result, minima))
     return _scrutinised(result, minima, known, settings, progress)
 
 
@@ -490,7 +495,8 @@ def _conclude(problem: Problem, minima: Minima, structure: Structure) -> FitResu
         converged_starts=agree, tried=tried, sigma=sigma * unit, rms=rms * unit, samples=samples,
         criteria=criteria(problem, info, alive),
         uncertainty=tuple(Uncertainty(*row) for row in zip(*u, strict=True)),
-        undetermined=structure.undetermined, evidence_low=np.full(theta.shape, np.nan),
+        undetermined=structure.undetermined,
+        unexamined=np.zeros(theta.shape, bool), evidence_low=np.full(theta.shape, np.nan),
         evidence_high=np.full(theta.shape, np.nan),
         evidence_end=np.full((*theta.shape, 2), -1), minima=np.ones(len(theta), int),
     )  # fmt: skip

@@ -3,14 +3,15 @@
 Terminal, report, tables, results.h5 and the population all ask here.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.profile import Profiles
-from jaxtrachea.identify.verdict import WEAK, verdict
+from jaxtrachea.identify.verdict import verdict
 from jaxtrachea.status import ProfileEnd
 
 #: Verdicts on estimates that enter medians and populations.
@@ -59,11 +60,12 @@ def judgement(result: FitResult, lane: int, i: int, profiles: Profiles | None = 
     if not found:
         word = verdict(
             float(result.relative_se[lane, i]), structural=structural, held=held,
-            unseen=bool(unseen(result)[lane]),
+            unseen=bool(result.unexamined[lane, i]),
         )  # fmt: skip
         return Judgement(word, low, high, None, float(result.relative_se[lane, i]))
-    low, high = min(v[0] for v in found), max(v[1] for v in found)
-    ends = max(v[2][0] for v in found), max(v[2][1] for v in found)
+    lows, highs = ([(v[side], v[2][side]) for v in found] for side in (0, 1))
+    (low, low_end), (high, high_end) = _farthest(lows, min), _farthest(highs, max)
+    ends = low_end, high_end
     value, unit = float(result.value[lane, i]), float(result.uncertainty[lane].half_width)
     with np.errstate(divide="ignore", invalid="ignore"):
         if p.scale == "log":
@@ -73,6 +75,12 @@ def judgement(result: FitResult, lane: int, i: int, profiles: Profiles | None = 
     error = float(longer) / unit
     word = verdict(error, structural=structural, held=held, ends=ends)
     return Judgement(word, low, high, ends, error)
+
+
+def _farthest(sides: list[tuple[float, int]], farther: Callable) -> tuple[float, int]:
+    """The farthest end of a side, and how it ends; one that was found comes before a lost one."""
+    known = [side for side in sides if side[1] != ProfileEnd.FAILED] or sides
+    return farther(value for value, _ in known), max(end for _, end in known)
 
 
 def _evidence(result: FitResult, lane: int, i: int, profiles: Profiles | None) -> list:
@@ -127,15 +135,3 @@ def natural_sizes(result: FitResult) -> Float[np.ndarray, "L P"]:
             if p.scale == "linear" and p.name in sizes:
                 out[lane, i] = max(out[lane, i], sizes[p.name][lane] / p.step)
     return out
-
-
-def unseen(result: FitResult) -> Bool[np.ndarray, " lanes"]:
-    """Lanes with cause to look further than the local error that no one has looked at.
-
-    Those of a joint fit, of which no profile is made, and of a fit without scrutiny.
-    """
-    local = (result.evidence_end < 0).all(axis=(1, 2))
-    error = result.relative_se * result.relative / natural_sizes(result)
-    error = np.where(result.undetermined | result.at_bound, 0, error)
-    long = (np.nan_to_num(error, posinf=np.inf) > WEAK).any(axis=1)
-    return local & result.succeeded & (long | result.at_bound.any(axis=1))

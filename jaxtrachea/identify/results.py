@@ -101,6 +101,8 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
         groups.setdefault(word, []).append(unknown_label(result, lane, i))
     said = [f"{word}: {', '.join(groups[word])}" for word in VERDICTS if word in groups]
     said.append(flat_sentence(result, lane))
+    if result.problem.joint and result.unexamined[lane].any():
+        said.append("not shown: only the local error was looked at; --profile looks further")
     if result.minima[lane] > 1:
         said.append("fits that end elsewhere are as good within the noise")
     return "; ".join(said)
@@ -349,7 +351,8 @@ def _write_unknowns(group: h5py.Group, result: FitResult, profiles: Profiles | N
     arrays = {
         name: getattr(result, name)
         for name in ("value", "standard_error", "lower", "upper", "relative_se", "theta",
-                     "at_bound", "undetermined", "evidence_low", "evidence_high", "evidence_end")
+                     "at_bound", "undetermined", "unexamined", "evidence_low", "evidence_high",
+                     "evidence_end")
     }  # fmt: skip
     arrays["correlation"] = np.stack([u.correlation for u in result.uncertainty])
     arrays["flat"] = np.stack([u.flat for u in result.uncertainty])

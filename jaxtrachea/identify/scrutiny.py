@@ -27,7 +27,7 @@ from jaxtrachea.identify.fit import (
     scales,
 )
 from jaxtrachea.identify.judgement import natural_sizes
-from jaxtrachea.identify.parameters import SKELETON
+from jaxtrachea.identify.parameters import OF_THE_PRESS, SKELETON
 from jaxtrachea.identify.problem import Problem
 from jaxtrachea.identify.profile_search import Sides, find_ends
 from jaxtrachea.identify.residual import inputs
@@ -95,6 +95,28 @@ def doubtful(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
     everything |= root.max(axis=1) > VERY_LONG
     everything |= _elsewhere_as_low(result, minima, se, natural) | barely_determined(result.problem)
     return present & (doubt | everything[:, None])
+
+
+def left_in_doubt(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
+    """`doubtful` unknowns of a fit that nothing further will look at.
+
+    An unknown that all lanes of a joint fit share is in doubt where half of them say so. What is
+    measured against the press (onset, offset) is seen by its own curve, whatever the others do: it
+    stands by its own error.
+    """
+    doubt = doubtful(result, minima)
+    problem = result.problem
+    shared = problem.shared
+    if shared.size:
+        row, good = np.arange(len(doubt))[:, None], result.succeeded
+        votes = doubt[row, shared][good]
+        doubt[row, shared] = np.mean(votes, axis=0) >= 0.5 if len(votes) else True
+    error = np.stack([u.se for u in result.uncertainty]) / natural_sizes(result)
+    for lane, unknowns in enumerate(problem.unknowns):
+        for i, (p, _, _) in enumerate(unknowns):
+            if p.name in OF_THE_PRESS:
+                doubt[lane, i] &= not error[lane, i] <= LONG
+    return doubt
 
 
 #: Lanes that have come to lie somewhere, if only in a valley.
