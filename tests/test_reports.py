@@ -372,7 +372,7 @@ def test_of_many_curves_left_out_report_and_terminal_show_the_worst_first(dense)
     items = list(overview(found(dense, left_out=left_out)))
     assert rows in [item[2] for item in items if not isinstance(item, str)]
     assert further in items
-    few = dataclasses.replace(left_out, lane=lane[:4], trial=trial[:4], force=force[:4])
+    few = LeftOut(lane[:4], trial[:4], force[:4], np.full(4, np.nan), force[:4], dense)
     assert [row[1] for row in left_out_table(dense, few)[0][:-1]] == ["1", "2", "1", "1"]
 
 

@@ -153,6 +153,8 @@ def test_widened_intervals_hold_the_plain_ones(result):
         result.evidence_low, result.evidence_high, result.evidence_end))  # fmt: skip
     sides, value = np.array([-0.4, 0.1]), result.value[5, 2]
     (low[5, 2], high[5, 2]), end[5, 2] = value * np.exp(sides), ProfileEnd.CLOSED
+    low[5, 3] = high[5, 3] = result.value[5, 3]
+    end[5, 3] = ProfileEnd.FAILED
     given = dataclasses.replace(result, evidence_low=low, evidence_high=high, evidence_end=end)
     slow = np.sin(np.arange(result.problem.lanes.force.shape[2]))
     seen = Prediction(np.where(result.problem.lanes.precision > 0, slow, np.nan), None)
@@ -170,6 +172,11 @@ def test_widened_intervals_hold_the_plain_ones(result):
     assert ratio > 1.5
     found = np.log([wide.lower[5, 2] / value, wide.upper[5, 2] / value])
     np.testing.assert_allclose(found, ratio * sides, rtol=1e-9)
+    # Where an end was not found, the local error is left.
+    local = np.array([result.lower[5, 3], result.upper[5, 3]]) - result.value[5, 3]
+    found = np.array([wide.lower[5, 3], wide.upper[5, 3]]) - result.value[5, 3]
+    assert np.all(np.abs(found) > 0)
+    np.testing.assert_allclose(found[1], ratio * local[1], rtol=0.2)
 
 
 def test_population_and_medians_take_what_is_identifiable(result):

@@ -25,6 +25,7 @@ from jaxtrachea.identify.judgement import interval95, within_bounds
 from jaxtrachea.identify.predictions import Prediction, lag_correlation
 from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.starts import of_unknowns
+from jaxtrachea.status import ProfileEnd
 
 #: Correlation of neighbouring residuals from which the report doubts plain standard errors.
 CORRELATED = 0.3
@@ -112,17 +113,21 @@ def _drawn_out(
     """Plain intervals with their sides `growth` times as long on the scaled coordinate."""
     problem = result.problem
     plain = np.full((2, *result.theta.shape), np.nan)
+    unfound = np.zeros(plain.shape, bool)
     for lane, unknowns in enumerate(problem.unknowns):
         for i in range(len(unknowns)):
-            plain[:, lane, i] = interval95(result, lane, i, profiles)
+            *plain[:, lane, i], ends = interval95(result, lane, i, profiles)
+            unfound[:, lane, i] = [end == ProfileEnd.FAILED for end in ends or ()] or False
+    # Of a side whose end was not found nothing is known but the local error.
+    local = np.fmin(plain[0], result.lower), np.fmax(plain[1], result.upper)
     log = of_unknowns(problem, lambda p: p.scale == "log", 0.0) > 0
     step = of_unknowns(problem, lambda p: p.step, 1.0)
+    sign, growth = np.array([-1.0, 1.0])[:, None, None], growth[:, None]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        side = np.where(log, np.log(plain), plain / step) - result.theta
-        # A side of no length, of an estimate on its bound, has none to draw out.
-        theta = result.theta + np.where(
-            (side == 0) & (growth >= 1)[:, None], 0, side * growth[:, None]
-        )
+        ends = np.where(unfound, local, plain)
+        side = np.abs(np.where(log, np.log(ends), ends / step) - result.theta)
+        # A side of no length, of an estimate on its bound, has no limit either where none has.
+        theta = result.theta + sign * np.where(np.isinf(growth), growth, side * growth)
         wide = np.where(log, np.exp(theta), theta * step)
     wide = np.stack([np.minimum(wide[0], plain[0]), np.maximum(wide[1], plain[1])])
     for lane, unknowns in enumerate(problem.unknowns):

@@ -71,10 +71,10 @@ def judgement(result: FitResult, lane: int, i: int, profiles: Profiles | None = 
 
 def interval95(
     result: FitResult, lane: int, i: int, profiles: Profiles | None = None
-) -> tuple[float, float]:
-    """The interval of `judgement` without its verdict, which asks for the whole fit."""
-    low, high, _ = _unbounded(result, lane, i, profiles)
-    return within_bounds(result, lane, i, low, high)
+) -> tuple[float, float, tuple[int, int] | None]:
+    """`low`, `high`, `ends` of `judgement` without its verdict, which asks for the whole fit."""
+    low, high, ends = _unbounded(result, lane, i, profiles)
+    return *within_bounds(result, lane, i, low, high), ends
 
 
 def within_bounds(
