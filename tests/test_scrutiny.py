@@ -173,10 +173,20 @@ def test_widened_intervals_hold_the_plain_ones(result):
     found = np.log([wide.lower[5, 2] / value, wide.upper[5, 2] / value])
     np.testing.assert_allclose(found, ratio * sides, rtol=1e-9)
     # Where an end was not found, the local error is left.
+    assert result.problem.free[3].scale == "linear"
     local = np.array([result.lower[5, 3], result.upper[5, 3]]) - result.value[5, 3]
     found = np.array([wide.lower[5, 3], wide.upper[5, 3]]) - result.value[5, 3]
-    assert np.all(np.abs(found) > 0)
-    np.testing.assert_allclose(found[1], ratio * local[1], rtol=0.2)
+    np.testing.assert_allclose(found, ratio * local, rtol=1e-9)
+
+
+def test_local_intervals_end_at_the_bounds(result):
+    """k_3 of [0, 1e6] had a low95 of -40."""
+    lower, upper = result.lower.copy(), result.upper.copy()
+    lower[5, 2:], upper[5, 2:] = (0.5, -40.0), (np.inf, 3.0)
+    judged = [
+        judgement(dataclasses.replace(result, lower=lower, upper=upper), 5, i) for i in (2, 3)
+    ]
+    assert [(j.low, j.high) for j in judged] == [(0.5, result.problem.free[2].upper), (0, 3)]
 
 
 def test_population_and_medians_take_what_is_identifiable(result):
