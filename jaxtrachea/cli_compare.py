@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea.cli_load import load
-from jaxtrachea.terminal import Stop, into, progress_bar, table
+from jaxtrachea.terminal import Stages, Stop, into, progress_bar, table
 
 SpecsArgument = Annotated[
     list[Path], typer.Argument(help="Fit specifications, two or more, of the same data.")
@@ -89,16 +89,8 @@ def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
 
     models = []
     with progress_bar() as bar:
-
-        def counted(text):
-            task = bar.add_task(text, total=None)
-
-            def advance(done, of):
-                stop_if_asked()
-                bar.update(task, advance=done, total=of or None)
-
-            return advance
-
+        stages = Stages(bar, stop_if_asked)
+        counted = stages.begin
         for (spec, _, problem), name in zip(loaded, names, strict=True):
             settings = settings_of(spec)
             result = fit(problem, settings, counted(name))
@@ -106,6 +98,7 @@ def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
             if cross_validation:
                 left = leave_repeats_out(problem, settings, counted(f"{name}, left out"))
             models.append(Model(name, result, left))
+        stages.close()
     return models
 
 

@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from jaxtrachea import processes
 from jaxtrachea.processes import Lost, Meeting
-from jaxtrachea.terminal import Kept, Stop, interrupts, progress_bar, to_stderr
+from jaxtrachea.terminal import Kept, Stages, Stop, interrupts, progress_bar, to_stderr
 
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on where OUT stopped.")]
 RerunOption = Annotated[
@@ -354,16 +354,17 @@ def help_out(how: How, now, problem, settings) -> None:
         watch = processes.Watch(run.chunks, me)
         try:
             with watch.watching(), progress_bar() as bar:
-                task = bar.add_task(f"fitting ({me.process} of {me.processes})", total=None)
 
-                def progress(done: int, of: int) -> None:
+                def look():
                     stop_if_asked()
                     watch.check()
-                    bar.update(task, advance=done, total=of or None)
 
+                stages = Stages(bar, look)
+                progress = stages.begin(f"fitting ({me.process} of {me.processes})")
                 settings = in_chunks.settings_for(run, settings)
                 mine = said["todo"][me.process :: me.processes]
                 in_chunks.fit_chunks(run, problem, settings, mine, progress)
+                stages.close()
                 watch.done()
                 watch.wait_for(0)
         except (KeyboardInterrupt, Lost, OSError) as error:

@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from jaxtrachea.terminal import progress_bar, say_lost, table, to_stderr
+from jaxtrachea.terminal import Stages, progress_bar, say_lost, table, to_stderr
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,18 +36,8 @@ def run(
     from jaxtrachea.identify.profile import profiles
 
     with progress_bar() as bar:
-
-        def counted(text):
-            task, finished = bar.add_task(text, total=None), 0
-
-            def advance(done, of):
-                nonlocal finished
-                stop_if_asked()
-                finished += done  # of a joint fit, lanes that fill up a chunk as well
-                bar.update(task, completed=min(finished, of or finished), total=of or None)
-
-            return advance
-
+        stages = Stages(bar, stop_if_asked)
+        counted = stages.begin
         result = (fit or in_one_go)(problem, settings, counted("fitting"))
         left_out = profiled = resampled = None
         if "leave-one-out" in options:
@@ -69,6 +59,7 @@ def run(
                 result, draws=u.posterior, chains=u.posterior_chains, seed=spec.fit.seed,
                 progress=counted("drawing"),
             )  # fmt: skip
+        stages.close()
         specimens = _population(spec, result, profiled)
         return Found(result, left_out, profiled, resampled, found, drawn, specimens)
 
@@ -107,14 +98,13 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
     _write_tables(folder, found, measurements.bad, seen)
     drawn, lost = draw_all(folder, result, seen, profiles)
     say_lost(lost)
-    left = None if found.left_out is None else report.left_out_rows(result, found.left_out)
     title = loaded.title or spec.stem
     results.write_csv(folder / "curves.csv", list(usage_rows(measurements.curves)))
     used = usage_section(measurements.curves)
     more = [*used, *write_more(folder, found.influence, found.posterior)]
     text = report.report_text(
-        title, result, measurements.bad, seen, left, profiles, resampled, more, found.population,
-        found.posterior,
+        title, result, measurements.bad, seen, found.left_out, profiles, resampled, more,
+        found.population, found.posterior,
     )  # fmt: skip
     text = without_lost(text, lost)
     results.write_text(folder / "report.md", text)
@@ -141,7 +131,8 @@ def _write_tables(folder: Path, found: Found, bad, seen) -> None:
     from jaxtrachea.identify.posterior_tables import rows_with_draws
     from jaxtrachea.identify.summary import left_out_cells, widened_rows, with_residuals
 
-    result, profiles, wide = found.result, found.profiles, effective(found.result, seen)
+    result, profiles = found.result, found.profiles
+    wide = effective(result, seen, profiles)
     rows = with_residuals(result, list(results.lane_rows(result, profiles)), seen, wide)
     results.write_csv(folder / "summary.csv", [*rows, *map(results.bad_row, bad)])
     rows = rows_with_draws(result, profiles, found.resampled, found.population, found.posterior)

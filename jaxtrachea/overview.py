@@ -10,7 +10,7 @@ from jaxtrachea.doubts import distrust
 from jaxtrachea.identify.effective import CORRELATED, effective
 from jaxtrachea.identify.predictions import LeftOut, predictions, rms
 from jaxtrachea.identify.results import lane_label, succeeded, verdict_sentence
-from jaxtrachea.identify.rows import ONE_BY_ONE, and_more, listed
+from jaxtrachea.identify.rows import and_more, listed
 from jaxtrachea.identify.usage_tables import sentences
 
 #: Title, head and rows of a table.
@@ -25,7 +25,7 @@ def overview(found: Any) -> Iterator[Table | str]:
     """
     result, lanes = found.result, listed(found.result)
     cut = result.lanes > len(lanes)
-    wide = effective(result, predictions(result.problem, result.theta))
+    wide = effective(result, predictions(result.problem, result.theta), found.profiles)
     if not result.problem.free:
         yield f"{result.lanes} lanes: {verdict_sentence(result, 0)}"
     elif cut:
@@ -86,13 +86,10 @@ def _further(found: Any, lanes: list[int]) -> Iterator[Table | str]:
 
 
 def _left_out(result, left_out: LeftOut) -> Iterator[Table | str]:
-    """Curves left out, the worst first, and their root mean square."""
-    *rows, mean = report.left_out_rows(result, left_out)
-    order = np.argsort(-np.nan_to_num(left_out.force, nan=np.inf), kind="stable")
-    if len(rows) > ONE_BY_ONE:
-        rows = [rows[k] for k in order[:ONE_BY_ONE]]
-    yield "Leaving one curve out", report.LEFT_OUT_HEAD, [*rows, mean]
-    yield from _more(len(left_out.force), len(rows), "left_out.csv")
+    """Curves left out, of many the worst first, and their root mean square."""
+    rows, further = report.left_out_table(result, left_out)
+    yield "Leaving one curve out", report.LEFT_OUT_HEAD, rows
+    yield from ([further] if further else [])
     if not np.isfinite(rms(left_out.force)):
         yield "no curve left out could be predicted"
 

@@ -9,7 +9,7 @@ from jaxtrachea.identify.bootstrap import FEWEST, Bootstrap
 from jaxtrachea.identify.effective import CORRELATED, Effective, effective
 from jaxtrachea.identify.evaluate import NOTHING_FITTED
 from jaxtrachea.identify.fit import FitResult
-from jaxtrachea.identify.judgement import DETERMINED, judgement, verdict_of
+from jaxtrachea.identify.judgement import DETERMINED, judgement, verdict_of, within_bounds
 from jaxtrachea.identify.measurements import BadCurve
 from jaxtrachea.identify.parameters import OF_THE_PRESS
 from jaxtrachea.identify.population import Population, population_rows
@@ -155,6 +155,16 @@ def left_out_rows(result: FitResult, left_out: LeftOut) -> list[list[str]]:
     return [*rows, ["(root mean square)", "", *map(_percent, mean)]]
 
 
+def left_out_table(result: FitResult, left_out: LeftOut) -> tuple[list[list[str]], str]:
+    """Rows of `left_out_rows` for people, and what follows: of many the worst, worst first."""
+    *rows, mean = left_out_rows(result, left_out)
+    if len(rows) <= ONE_BY_ONE:
+        return [*rows, mean], ""
+    order = np.argsort(-np.nan_to_num(left_out.force, nan=np.inf), kind="stable")
+    worst = [rows[k] for k in order[:ONE_BY_ONE]]
+    return [*worst, mean], and_more(len(rows), len(worst), "left_out.csv")
+
+
 def _percent(value: float) -> str:
     return "–" if np.isnan(value) else f"{100 * value:.2f} %"
 
@@ -184,7 +194,7 @@ def report_text(
     result: FitResult,
     bad: Sequence[BadCurve],
     prediction: Prediction,
-    left_out: Sequence[Sequence[str]] | None,
+    left_out: LeftOut | None,
     profiles: Profiles | None = None,
     resampled: Bootstrap | None = None,
     more: Sequence[str] = (),
@@ -193,7 +203,7 @@ def report_text(
 ) -> str:
     """The whole report.md; `more`: further sections, before the figures."""
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
-    wide = effective(result, prediction)
+    wide = effective(result, prediction, profiles)
     parts = [
         f"# {title or 'Fit'}",
         f"{result.lanes} lanes, {result.lanes - len(failed)} succeeded, {len(failed)} failed; "
@@ -211,7 +221,9 @@ def report_text(
     if resampled is not None:
         parts += _bootstrapped(resampled)
     if left_out is not None:
-        parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, left_out)]
+        rows, further = left_out_table(result, left_out)
+        parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, rows)]
+        parts += [f"{further}."] if further else []
         parts += own_touch_sentence(result, "A curve left out")
     parts += more
     names = {"fit": "data and fit", "residuals": "residuals"}
@@ -323,6 +335,7 @@ def profile_table(profiles: Profiles, lanes: Sequence[int]) -> list[list[str]]:
         p = result.problem.unknowns[lane][i][0]
         low, high = (ProfileEnd(int(e)).name.lower() for e in profiles.end[k])
         local = (float(v[lane, i]) for v in (result.lower, result.upper))
+        local = within_bounds(result, lane, i, *local)
         rows.append(
             [
                 lane_label(result, lane),

@@ -10,14 +10,23 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
+from rich.text import Text
 
 from jaxtrachea.pictures import sentence
 from jaxtrachea.terminal_table import wide_table as table
 
 __all__ = [
-    "Kept", "Stop", "cache_folder", "complain", "interrupts", "into", "progress_bar", "say_lost",
-    "set_up_jax", "table", "to_stderr",
+    "Kept", "Stages", "Stop", "cache_folder", "complain", "interrupts", "into", "progress_bar",
+    "say_lost", "set_up_jax", "table", "to_stderr",
 ]  # fmt: skip
 
 
@@ -115,11 +124,55 @@ def cache_folder() -> Path | None:
         return None
 
 
+class _Count(ProgressColumn):
+    """Steps done of all; without a total those done, and nothing before the first."""
+
+    def render(self, task: Task) -> Text:
+        """The cell of one task."""
+        done = f"{task.completed:.0f}" if task.completed else ""
+        return Text(f"{task.completed:.0f}/{task.total:.0f}" if task.total else done)
+
+
 def progress_bar() -> Progress:
     """A progress bar on stderr."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-               TimeElapsedColumn())  # fmt: skip
+    columns = (TextColumn("{task.description}"), BarColumn(), _Count(), TimeElapsedColumn())
     return Progress(*columns, console=Console(stderr=True))
+
+
+class Stages:
+    """Stages of a run on one progress bar, one line each; a stage ends when the next one begins."""
+
+    def __init__(self, bar: Progress, look: Callable[[], None]):
+        """`look`: called at every step; what it raises ends the work."""
+        self.bar, self.look = bar, look
+        self.task: TaskID | None = None
+        self.finished = self.total = self.before = self.last = 0
+
+    def begin(self, text: str) -> Callable[[int, int], None]:
+        """End the stage before; returns what its work reports to.
+
+        Its arguments are the steps done since the last call and all of the steps, 0 if unknown. The
+        total grows: a fit does some lanes again and again, with totals of their own.
+        """
+        self.close()
+        self.task = self.bar.add_task(text, total=None)
+        self.finished = self.total = self.before = self.last = 0
+        return self._advance
+
+    def _advance(self, done: int, of: int) -> None:
+        self.look()
+        if done and of and of != self.last:
+            self.before, self.last = self.finished, of
+        self.finished += done
+        known = of or self.total
+        self.total = max(self.total, self.before + of, self.finished) if known else 0
+        if self.task is not None:
+            self.bar.update(self.task, completed=self.finished, total=self.total or None)
+
+    def close(self) -> None:
+        """End the last stage: all of it is done."""
+        if self.task is not None:
+            self.bar.update(self.task, completed=self.finished, total=self.finished)
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
+from rich.progress import Progress
 from run_cli import run
 
 from jaxtrachea.identify import results
@@ -20,7 +21,7 @@ from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.influence import influence
 from jaxtrachea.identify.measurements import Curve, read_measurements
 from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.predictions import predictions
+from jaxtrachea.identify.predictions import LeftOut, predictions
 from jaxtrachea.identify.problem import Noise, build
 from jaxtrachea.identify.rows import worst_first
 from jaxtrachea.identify.summary import with_residuals
@@ -28,10 +29,11 @@ from jaxtrachea.model import Options
 from jaxtrachea.overview import overview
 from jaxtrachea.pictures import plain, save_each, without_lost
 from jaxtrachea.plots import STYLE, draw_all
-from jaxtrachea.report import report_text
+from jaxtrachea.report import left_out_table, report_text
 from jaxtrachea.sections import REASONS, influence_cell, influence_section
 from jaxtrachea.spreadsheet import quoted, read_csv, unquoted, write_csv
 from jaxtrachea.status import FitStatus
+from jaxtrachea.terminal import Stages, progress_bar
 from jaxtrachea.terminal_table import wide_table
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.webpage import page
@@ -316,8 +318,9 @@ def test_fewer_independent_samples_than_unknowns_leave_no_limit():
     wide = effective(result, predictions(result.problem, result.theta))
     assert wide.samples[0] < 2
     assert np.isinf(wide.factor[0])
-    assert np.isneginf(wide.lower[0]).all()
-    assert np.isposinf(wide.upper[0]).all()
+    # No limit but the bounds.
+    assert wide.lower[0].tolist() == [p.lower for p in result.problem.free]
+    assert wide.upper[0].tolist() == [p.upper for p in result.problem.free]
     text = report_text("T", result, [], predictions(result.problem, result.theta), None)
     assert "95 % widened" in text
     assert "no more independent samples than unknowns" in text
@@ -349,3 +352,48 @@ def test_the_command_with_names_of_mathematics(tmp_path, monkeypatch, capsys):
     parameters = read_csv(Path("o/parameters.csv"))
     assert {row["specimen"] for row in parameters} == {"$a$ $b$", r"$\frac{$", "=1+1"}
     assert all(float(row["low95_widened"]) <= float(row["value"]) for row in parameters)
+
+
+def test_of_many_curves_left_out_report_and_terminal_show_the_worst_first(dense):
+    """The report had them in the order of the file, the terminal the worst first."""
+    lane, trial = np.zeros(14, int), np.arange(14) % 4
+    force = 0.01 * np.array([3.0, 1, 14, 2, 4, np.nan, 5, 13, 6, 7, 8, 9, 10, 12])
+    left_out = LeftOut(lane, trial, force, np.full(14, np.nan), force, dense)
+    rows, further = left_out_table(dense, left_out)
+    shares = ["–", *(f"{v}.00 %" for v in (14, 13, 12, 10, 9, 8, 7, 6, 5, 4, 3))]
+    assert [row[3] for row in rows[:-1]] == shares
+    assert further == "Worst first; and 2 more, see left_out.csv"
+    seen = predictions(dense.problem, dense.theta)
+    text = report_text("T", dense, [], seen, left_out)
+    section = text.split("## Leaving one curve out")[1].split("##")[0]
+    lines = [line for line in section.splitlines() if line.startswith("| ")][2:14]
+    assert [line.split(" | ")[3] for line in lines] == shares
+    assert f"{further}." in section
+    items = list(overview(found(dense, left_out=left_out)))
+    assert rows in [item[2] for item in items if not isinstance(item, str)]
+    assert further in items
+    few = LeftOut(lane[:4], trial[:4], force[:4], np.full(4, np.nan), force[:4], dense)
+    assert [row[1] for row in left_out_table(dense, few)[0][:-1]] == ["1", "2", "1", "1"]
+
+
+def test_counts_of_the_progress_bar_never_pass_the_total():
+    """They ended in 60/32, where lanes were fitted again, and in 0/?, where none was counted."""
+    stream = io.StringIO()
+    bar = Progress(*progress_bar().columns, console=Console(file=stream, width=100), disable=True)
+    stages = Stages(bar, [].copy)
+    counted = stages.begin("fitting")
+    cells = []
+    for done, of in ((16, 32), (16, 32), (0, 32), (0, 0), (8, 10), (20, 10)):
+        counted(done, of)
+        cells.append(bar.columns[2].render(bar.tasks[0]).plain)
+    assert cells == ["16/32", "32/32", "32/32", "32/32", "40/42", "60/60"]
+    counted = stages.begin("profiling")
+    cells = []
+    for done in (0, 7, 5):
+        counted(done, 0)
+        cells.append(bar.columns[2].render(bar.tasks[1]).plain)
+    assert cells == ["", "7", "12"]
+    stages.begin("drawing")(0, 0)
+    stages.close()
+    assert [bar.columns[2].render(t).plain for t in bar.tasks] == ["60/60", "12/12", ""]
+    assert all(task.finished for task in bar.tasks)

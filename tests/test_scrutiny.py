@@ -7,15 +7,18 @@ import h5py
 import numpy as np
 import pytest
 import specimens
+from scipy.special import stdtrit
 from specimens import NAMES, POSITIONS, STIFF_CONTACT
 
 from jaxtrachea.identify import results, scrutiny
 from jaxtrachea.identify import structure as structures
+from jaxtrachea.identify.effective import effective
 from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.judgement import judgement, verdict_of
 from jaxtrachea.identify.measurements import Curve
 from jaxtrachea.identify.parameters import in_model
 from jaxtrachea.identify.population import population
+from jaxtrachea.identify.predictions import Prediction
 from jaxtrachea.identify.problem import build, default_parameters
 from jaxtrachea.model import Options
 from jaxtrachea.report import estimate_rows, spread_rows
@@ -138,6 +141,52 @@ def test_all_that_is_written_agrees(result, tmp_path):
     with (tmp_path / "p.csv").open(newline="") as stream:
         low = [float(row["low95"]) for row in csv.DictReader(stream)]
     assert low == [judgement(result, k, i).low for k in lanes for i in range(4)]
+
+
+def test_widened_intervals_hold_the_plain_ones(result):
+    """They were drawn about the estimate by its local error, inside the evidence.
+
+    Of a given interval each side grows by the ratio of the half widths, on the logarithm; none
+    leaves the bounds, and an open side is at them.
+    """
+    low, high, end = (v.copy() for v in (
+        result.evidence_low, result.evidence_high, result.evidence_end))  # fmt: skip
+    sides, value = np.array([-0.4, 0.1]), result.value[5, 2]
+    (low[5, 2], high[5, 2]), end[5, 2] = value * np.exp(sides), ProfileEnd.CLOSED
+    low[5, 3] = high[5, 3] = result.value[5, 3]
+    end[5, 3] = ProfileEnd.FAILED
+    given = dataclasses.replace(result, evidence_low=low, evidence_high=high, evidence_end=end)
+    slow = np.sin(np.arange(result.problem.lanes.force.shape[2]))
+    seen = Prediction(np.where(result.problem.lanes.precision > 0, slow, np.nan), None)
+    wide = effective(given, seen)
+    bounds = [(p.lower, p.upper) for p in given.problem.free]
+    for k in range(given.lanes):
+        for i, (least, most) in enumerate(bounds):
+            judged = judgement(given, k, i)
+            assert least <= wide.lower[k, i] <= judged.low <= given.value[k, i] * (1 + 1e-12)
+            assert given.value[k, i] * (1 - 1e-12) <= judged.high <= wide.upper[k, i] <= most
+            if judged.ends is not None and judged.ends[1] == ProfileEnd.OPEN:
+                assert judged.high == wide.upper[k, i] == most
+    left = wide.samples[5] - 4
+    ratio = stdtrit(left, 0.975) * wide.factor[5] / given.uncertainty[5].half_width
+    assert ratio > 1.5
+    found = np.log([wide.lower[5, 2] / value, wide.upper[5, 2] / value])
+    np.testing.assert_allclose(found, ratio * sides, rtol=1e-9)
+    # Where an end was not found, the local error is left.
+    assert result.problem.free[3].scale == "linear"
+    local = np.array([result.lower[5, 3], result.upper[5, 3]]) - result.value[5, 3]
+    found = np.array([wide.lower[5, 3], wide.upper[5, 3]]) - result.value[5, 3]
+    np.testing.assert_allclose(found, ratio * local, rtol=1e-9)
+
+
+def test_local_intervals_end_at_the_bounds(result):
+    """k_3 of [0, 1e6] had a low95 of -40."""
+    lower, upper = result.lower.copy(), result.upper.copy()
+    lower[5, 2:], upper[5, 2:] = (0.5, -40.0), (np.inf, 3.0)
+    judged = [
+        judgement(dataclasses.replace(result, lower=lower, upper=upper), 5, i) for i in (2, 3)
+    ]
+    assert [(j.low, j.high) for j in judged] == [(0.5, result.problem.free[2].upper), (0, 3)]
 
 
 def test_population_and_medians_take_what_is_identifiable(result):

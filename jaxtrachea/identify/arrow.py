@@ -10,6 +10,7 @@ in the order of the lanes.
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 from jaxtyping import Bool, Float, Int
 
 #: Eigenvalue, over the largest, of a lane's scaled matrix that counts as zero.
@@ -95,11 +96,11 @@ def within(
     values = np.maximum(values, 0)
     along = vectors.T @ gradient
     step = lambda damping: -along / (values + damping)  # noqa: E731
-    low, high = np.log(_SINGULAR * top), np.log(top + np.linalg.norm(along) / radius)
-    if np.linalg.norm(step(np.exp(low))) > radius:
+    low, high = np.log(_SINGULAR * top), np.log(top + scipy.linalg.norm(along) / radius)
+    if scipy.linalg.norm(step(np.exp(low))) > radius:
         for _ in range(60):
             middle = 0.5 * (low + high)
-            outside = np.linalg.norm(step(np.exp(middle))) > radius
+            outside = scipy.linalg.norm(step(np.exp(middle))) > radius
             low, high = (middle, high) if outside else (low, middle)
         low = high
     return vectors @ step(np.exp(low))

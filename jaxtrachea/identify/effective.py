@@ -21,8 +21,11 @@ from scipy.special import stdtrit
 
 from jaxtrachea.identify import joint
 from jaxtrachea.identify.fit import FitResult
+from jaxtrachea.identify.judgement import interval95, within_bounds
 from jaxtrachea.identify.predictions import Prediction, lag_correlation
+from jaxtrachea.identify.profile import Profiles
 from jaxtrachea.identify.starts import of_unknowns
+from jaxtrachea.status import ProfileEnd
 
 #: Correlation of neighbouring residuals from which the report doubts plain standard errors.
 CORRELATED = 0.3
@@ -35,7 +38,8 @@ class Effective(NamedTuple):
         correlation: of neighbouring force residuals; (lanes,).
         samples: how many independent ones the samples are worth; (lanes,).
         factor: by which standard errors grow; inf where no more than the unknowns; (lanes,).
-        lower: widened 95 % interval, in the parameter's unit; 0 or -inf where open; (lanes, P).
+        lower: widened 95 % interval, in the parameter's unit, within its bounds and nowhere inside
+            the plain one (`judgement`); the bound where open; (lanes, P).
         upper: (lanes, P).
     """
 
@@ -66,12 +70,17 @@ def effective_samples(seen: Prediction) -> Float[np.ndarray, " lanes"]:
     return total
 
 
-def effective(result: FitResult, seen: Prediction) -> Effective:
+def effective(result: FitResult, seen: Prediction, profiles: Profiles | None = None) -> Effective:
     """Widened intervals of all lanes; in a joint fit the samples of all lanes count together.
+
+    Each side of the plain interval, by profile and other minima where there is such evidence, is
+    drawn out from the estimate on the scaled coordinate, by what the half width of the local one
+    grows.
 
     Args:
         result: the fit.
         seen: its residuals.
+        profiles: those on which the plain intervals rest.
     """
     problem, lanes = result.problem, result.problem.lanes
     n, worth = np.asarray(result.samples, float), effective_samples(seen)
@@ -93,12 +102,35 @@ def effective(result: FitResult, seen: Prediction) -> Effective:
             factor = np.where(left > 0, np.sqrt(np.maximum((n - unknowns) / left, 1)), np.inf)
             half = np.where(left > 0, stdtrit(np.maximum(left, 1e-2), 0.975), plain)
         factor = np.where(np.isnan(worth), np.nan, factor)
-        se = np.stack([u.se for u in result.uncertainty])
-        width = (half * factor)[:, None] * se
-        log = of_unknowns(problem, lambda p: p.scale == "log", 0.0) > 0
-        step = of_unknowns(problem, lambda p: p.step, 1.0)
-        ends = [
-            np.where(present, np.where(log, np.exp(v), v * step), np.nan)
-            for v in (result.theta - width, result.theta + width)
-        ]
-    return Effective(lag_correlation(seen), worth, factor, *ends)
+        growth = np.maximum(half * factor / plain, 1)
+    lower, upper = _drawn_out(result, growth, profiles)
+    return Effective(lag_correlation(seen), worth, factor, lower, upper)
+
+
+def _drawn_out(
+    result: FitResult, growth: Float[np.ndarray, " lanes"], profiles: Profiles | None
+) -> tuple[Float[np.ndarray, "lanes P"], Float[np.ndarray, "lanes P"]]:
+    """Plain intervals with their sides `growth` times as long on the scaled coordinate."""
+    problem = result.problem
+    plain = np.full((2, *result.theta.shape), np.nan)
+    unfound = np.zeros(plain.shape, bool)
+    for lane, unknowns in enumerate(problem.unknowns):
+        for i in range(len(unknowns)):
+            *plain[:, lane, i], ends = interval95(result, lane, i, profiles)
+            unfound[:, lane, i] = [end == ProfileEnd.FAILED for end in ends or ()] or False
+    # Of a side whose end was not found nothing is known but the local error.
+    local = np.fmin(plain[0], result.lower), np.fmax(plain[1], result.upper)
+    log = of_unknowns(problem, lambda p: p.scale == "log", 0.0) > 0
+    step = of_unknowns(problem, lambda p: p.step, 1.0)
+    sign, growth = np.array([-1.0, 1.0])[:, None, None], growth[:, None]
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        ends = np.where(unfound, local, plain)
+        side = np.abs(np.where(log, np.log(ends), ends / step) - result.theta)
+        # A side of no length, of an estimate on its bound, has no limit either where none has.
+        theta = result.theta + sign * np.where(np.isinf(growth), growth, side * growth)
+        wide = np.where(log, np.exp(theta), theta * step)
+    wide = np.stack([np.minimum(wide[0], plain[0]), np.maximum(wide[1], plain[1])])
+    for lane, unknowns in enumerate(problem.unknowns):
+        for i in range(len(unknowns)):
+            wide[:, lane, i] = within_bounds(result, lane, i, *map(float, wide[:, lane, i]))
+    return wide[0], wide[1]

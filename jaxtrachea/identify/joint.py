@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._numerics import epsilon
@@ -170,7 +171,7 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
         finite = np.all(there.finite[alive])
         fall = np.sum(here.cost[alive] - there.cost[alive]) if finite else -np.inf
         promised = -(gradient @ step + 0.5 * step @ hessian @ step) + np.sum(reduced.gain[alive])
-        length = np.linalg.norm(step)
+        length = scipy.linalg.norm(step)
         if fall < 0.25 * promised:
             radius = 0.25 * (min(radius, length) if length > 0 else radius)
         elif fall > 0.75 * promised:

@@ -3,7 +3,6 @@
 Terminal, report, tables, results.h5 and the population all ask here.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -23,9 +22,9 @@ class Judgement(NamedTuple):
 
     Attributes:
         verdict: one of `VERDICTS`; "failed" without an estimate.
-        low: 95 % interval in the parameter's unit: by profile and other minima where there is such
-            evidence, else local; -inf (scale `log`: 0) where open.
-        high: inf where open.
+        low: 95 % interval in the parameter's unit, within its bounds: by profile and other minima
+            where there is such evidence, else local; the bound where open.
+        high: likewise.
         ends: `ProfileEnd` of the two; None where the interval is local.
         error: relative error that the verdict rests on: the longer side of the interval over that
             of one standard error, or the local one.
@@ -47,25 +46,18 @@ def judgement(result: FitResult, lane: int, i: int, profiles: Profiles | None = 
         i: unknown of the lane.
         profiles: further profiles, which come on top.
     """
-    low, high = float(result.lower[lane, i]), float(result.upper[lane, i])
+    low, high, ends = _unbounded(result, lane, i, profiles)
+    inside = within_bounds(result, lane, i, low, high)
     if not result.succeeded[lane]:
-        return Judgement("failed", low, high, None, np.nan)
+        return Judgement("failed", *inside, None, np.nan)
     p = result.problem.unknowns[lane][i][0]
-    open_low = 0.0 if p.scale == "log" else -np.inf
-    found = _evidence(result, lane, i, profiles)
-    structural = bool(result.undetermined[lane, i])
-    if structural and not found:
-        found = [(open_low, np.inf, (ProfileEnd.OPEN, ProfileEnd.OPEN))]
-    held = bool(result.at_bound[lane, i])
-    if not found:
+    structural, held = bool(result.undetermined[lane, i]), bool(result.at_bound[lane, i])
+    if ends is None:
         word = verdict(
             float(result.relative_se[lane, i]), structural=structural, held=held,
             unseen=bool(result.unexamined[lane, i]),
         )  # fmt: skip
-        return Judgement(word, low, high, None, float(result.relative_se[lane, i]))
-    lows, highs = ([(v[side], v[2][side]) for v in found] for side in (0, 1))
-    (low, low_end), (high, high_end) = _farthest(lows, min), _farthest(highs, max)
-    ends = low_end, high_end
+        return Judgement(word, *inside, None, float(result.relative_se[lane, i]))
     value, unit = float(result.value[lane, i]), float(result.uncertainty[lane].half_width)
     with np.errstate(divide="ignore", invalid="ignore"):
         if p.scale == "log":
@@ -74,13 +66,53 @@ def judgement(result: FitResult, lane: int, i: int, profiles: Profiles | None = 
             longer = max(high - value, value - low) / (p.step * result.relative[lane, i])
     error = float(longer) / unit
     word = verdict(error, structural=structural, held=held, ends=ends)
-    return Judgement(word, low, high, ends, error)
+    return Judgement(word, *inside, ends, error)
 
 
-def _farthest(sides: list[tuple[float, int]], farther: Callable) -> tuple[float, int]:
-    """The farthest end of a side, and how it ends; one that was found comes before a lost one."""
-    known = [side for side in sides if side[1] != ProfileEnd.FAILED] or sides
-    return farther(value for value, _ in known), max(end for _, end in known)
+def interval95(
+    result: FitResult, lane: int, i: int, profiles: Profiles | None = None
+) -> tuple[float, float, tuple[int, int] | None]:
+    """`low`, `high`, `ends` of `judgement` without its verdict, which asks for the whole fit."""
+    low, high, ends = _unbounded(result, lane, i, profiles)
+    return *within_bounds(result, lane, i, low, high), ends
+
+
+def within_bounds(
+    result: FitResult, lane: int, i: int, low: float, high: float
+) -> tuple[float, float]:
+    """An interval, in the parameter's unit, cut at the bounds of the fit; NaN stays.
+
+    The bounds are those of the lane: an onset is looked for near its own curve.
+    """
+    p, lanes = result.problem.unknowns[lane][i][0], result.problem.lanes
+    value = float(result.value[lane, i])
+    ends = []
+    for bound, theta in ((p.lower, lanes.lower[lane, i]), (p.upper, lanes.upper[lane, i])):
+        ends.append(bound if p.to_scaled(bound) == theta else p.from_scaled(float(theta)))
+    # An estimate on a bound may be off it by a rounding. NaN comes first, so that it stays.
+    return max(low, min(ends[0], value)), min(high, max(ends[1], value))
+
+
+def _unbounded(
+    result: FitResult, lane: int, i: int, profiles: Profiles | None
+) -> tuple[float, float, tuple[int, int] | None]:
+    """Interval and `ProfileEnd` of its sides, None if local; -inf (scale `log`: 0), inf if open."""
+    local = float(result.lower[lane, i]), float(result.upper[lane, i]), None
+    if not result.succeeded[lane]:
+        return local
+    found = _evidence(result, lane, i, profiles)
+    if not found and result.undetermined[lane, i]:
+        log = result.problem.unknowns[lane][i][0].scale == "log"
+        return 0.0 if log else -np.inf, np.inf, (ProfileEnd.OPEN, ProfileEnd.OPEN)
+    if not found:
+        return local
+    low_end, high_end = (_end([v[2][side] for v in found]) for side in (0, 1))
+    return min(v[0] for v in found), max(v[1] for v in found), (low_end, high_end)
+
+
+def _end(ends: list[int]) -> int:
+    """How a side ends by all that is known: an end that was found comes before a lost one."""
+    return max([end for end in ends if end != ProfileEnd.FAILED] or ends)
 
 
 def _evidence(result: FitResult, lane: int, i: int, profiles: Profiles | None) -> list:
