@@ -114,7 +114,7 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
     more = [*used, *write_more(folder, found.influence, found.posterior)]
     text = report.report_text(
         title, result, measurements.bad, seen, left, profiles, resampled, more, found.population,
-        found.posterior,
+        found.posterior, "" if found.left_out is None else found.left_out.sentence,
     )  # fmt: skip
     text = without_lost(text, lost)
     results.write_text(folder / "report.md", text)

@@ -93,6 +93,8 @@ def _left_out(result, left_out: LeftOut) -> Iterator[Table | str]:
         rows = [rows[k] for k in order[:ONE_BY_ONE]]
     yield "Leaving one curve out", report.LEFT_OUT_HEAD, [*rows, mean]
     yield from _more(len(left_out.force), len(rows), "left_out.csv")
+    if left_out.sentence:
+        yield left_out.sentence
     if not np.isfinite(rms(left_out.force)):
         yield "no curve left out could be predicted"
 

@@ -190,8 +190,12 @@ def report_text(
     more: Sequence[str] = (),
     population: Population | None = None,
     drawn: Posterior | None = None,
+    left_out_note: str = "",
 ) -> str:
-    """The whole report.md; `more`: further sections, before the figures."""
+    """The whole report.md; `more`: further sections, before the figures.
+
+    `left_out_note`: what became of the refits that left curves out, if not all is well.
+    """
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
     wide = effective(result, prediction)
     parts = [
@@ -213,6 +217,7 @@ def report_text(
     if left_out is not None:
         parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, left_out)]
         parts += own_touch_sentence(result, "A curve left out")
+        parts += [f"{left_out_note}."] if left_out_note else []
     parts += more
     names = {"fit": "data and fit", "residuals": "residuals"}
     names |= {"correlation": "correlation"} if result.problem.free else {}

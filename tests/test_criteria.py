@@ -207,7 +207,7 @@ def test_leaving_a_position_out_is_a_fit_without_it():
         b = np.linalg.lstsq(X, np.concatenate([c.force for c in kept]), rcond=None)[0]
         missed += [b[0] * DEPTH + b[1] - c.force for c in curves if c.s_c == s]
     want = np.sqrt(np.mean(np.square(missed))) / max(np.abs(c.force).max() for c in curves)
-    got = leave_repeats_out(problem, Settings(starts=1))
+    got = leave_repeats_out(problem, Settings(starts=1)).error
     np.testing.assert_allclose(got, [want], rtol=1e-6)
     assert repeats(problem).words == "positions"
 
@@ -218,7 +218,7 @@ def test_without_a_second_position_trials_are_left_out():
     plan = repeats(problem)
     assert (plan.words, plan.lanes.tolist()) == ("trials", [0, 0, 1, 1, 2, 2])
     assert plan.held.tolist() == [[True, False], [False, True]] * 3
-    got = leave_repeats_out(problem, Settings(starts=1))
+    got = leave_repeats_out(problem, Settings(starts=1)).error
     for lane, (a, b) in enumerate(zip(noisy()[::2], noisy()[1::2], strict=True)):
         missed = []
         for kept, out in ((a, b), (b, a)):
