@@ -164,7 +164,7 @@ def _left_out_notes(models) -> list[str]:
     for model in models:
         if model.left_out is None:
             continue
-        _, refits, unconverged, lost = (v.sum() for v in model.left_out)
+        refits, unconverged, lost = (int(v.sum()) for v in model.left_out[1:])
         if not refits:
             said.append(f"Nothing was left out of {model.name}: {_why_nothing(model)}.")
         elif words := refits_sentence(refits, unconverged, lost):
