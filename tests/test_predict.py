@@ -927,7 +927,7 @@ def test_a_lane_with_one_place_predicts_that_place(study, tmp_path):
     source = source_of(read, read.specimens[0])
     # EI_L on its upper bound: k_M is a direction by itself, whose slope is 1e-8 of the others'.
     free, blind = source.free.copy(), np.zeros_like(source.blind)
-    free[:2], blind[0, 1] = [np.log(1e7), np.log(1e-3)], 1.0
+    free[:2], blind[0, 1] = [np.log(1e7), np.log(1e-4)], 1.0
     covariance = np.zeros((4, 4))
     covariance[2, 2] = 1e-4
     lost = dataclasses.replace(source, free=free, blind=blind, covariance=covariance)
