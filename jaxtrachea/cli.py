@@ -115,7 +115,7 @@ def check(spec: SpecArgument, data: DataOption = None) -> None:
         out.print(f"... and {len(curves) - MANY} more")
     _print_usage(out, curves)
     if problem.free:
-        out.print(_parameter_table(problem.parameters))
+        out.print(_parameter_table(problem.parameters, problem.options))
     fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in problem.parameters if p.fixed)
     out.print(f"Fixed: {fixed or 'none'}", highlight=False)
     lanes, bad = len(problem.curves), len(measurements.bad)
@@ -299,10 +299,12 @@ def _curve_table(curves):
     return table(f"{len(curves)} usable curves", head, rows)
 
 
-def _parameter_table(parameters):
+def _parameter_table(parameters, options):
+    from jaxtrachea.identify.onset import where_sought
+
     head = ["free parameter", "what", "initial", "bounds", "scale", "scope"]
     rows = [
-        [f"{p.name} [{p.unit}]", p.description, f"{p.value:g}", f"{p.lower:g} … {p.upper:g}",
+        [f"{p.name} [{p.unit}]", p.description, *where_sought(p, parameters, options),
          p.scale, p.scope] for p in parameters if not p.fixed
     ]  # fmt: skip
     return table("Free parameters", head, rows)

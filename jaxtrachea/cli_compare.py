@@ -46,7 +46,7 @@ def compare(
         models = _fitted(loaded, names, cross_validation, stop_if_asked)
         clock.append(time.perf_counter())
         rows, failed, said = _write(folder, specs, loaded, models, clock)
-    _print(rows, said, failed, folder.parent)
+    _print(rows, said, failed, models, folder.parent)
     raise typer.Exit(1 if failed or loaded[0][1].bad else 0)
 
 
@@ -149,19 +149,32 @@ def _left_out_words(models) -> str:
     return repeats(models[0].result.problem).words or "curves"
 
 
-def _why_nothing(models) -> str:
-    """Why nothing was left out of a model that was to be cross-validated; "" if something was."""
+def _left_out_notes(models) -> list[str]:
+    """What is to be said of the refits behind the left-out column; nothing if all is well."""
+    from jaxtrachea.identify.predictions import refits_sentence
+
+    said = []
     for model in models:
-        problem = model.result.problem
-        own = [p.name for p in problem.free if p.scope == "trial"]
-        if model.left_out is not None and own:
-            return (
-                f"Nothing was left out: {', '.join(own)} of {model.name} belongs to single curves, "
-                "and no other curve tells of it."
-            )
-        if model.left_out is not None and not (model.left_out == model.left_out).any():
-            return "Nothing was left out: no specimen has a second position or trial."
-    return ""
+        if model.left_out is None:
+            continue
+        refits, unconverged, lost = (int(v.sum()) for v in model.left_out[1:])
+        if not refits:
+            said.append(f"Nothing was left out of {model.name}: {_why_nothing(model)}.")
+        elif words := refits_sentence(refits, unconverged, lost):
+            none = "; there the left-out column has no number" if lost else ""
+            said.append(f"Left out of {model.name}: {words}{none}.")
+    return said
+
+
+def _why_nothing(model) -> str:
+    """Why there was nothing to leave out of a model."""
+    from jaxtrachea.identify.parameters import OF_THE_PRESS
+
+    free = model.result.problem.free
+    own = [p.name for p in free if p.scope == "trial" and p.name not in OF_THE_PRESS]
+    if own:
+        return f"{', '.join(own)} belongs to single curves, and no other curve tells of it"
+    return "no specimen has a second position or trial"
 
 
 def _cells(rows) -> list[list[str]]:
@@ -181,7 +194,6 @@ def _percent(share: float) -> str:
 def _report(rows, said: dict[str, str], failed: int, models) -> str:
     from jaxtrachea.report import markdown_table
 
-    nothing = _why_nothing(models)
     parts = [
         "# Which model",
         "\n".join(f"- {specimen}: {text}." for specimen, text in said.items()),
@@ -193,14 +205,14 @@ def _report(rows, said: dict[str, str], failed: int, models) -> str:
         "10 or more so. weight: Akaike weight. left out: root mean square error of force of "
         f"{_left_out_words(models)} that took no part in the fit, over the largest force "
         "(docs/model_choice.md). All numbers: `compare.csv`.",
-        *([nothing] if nothing else []),
+        *_left_out_notes(models),
     ]
     if failed:
         parts.append(f"{failed} lanes could not be fitted by every model and count for none.")
     return "\n\n".join(parts) + "\n"
 
 
-def _print(rows, said, failed: int, folder: Path) -> None:
+def _print(rows, said, failed: int, models, folder: Path) -> None:
     out = Console()
     names = [name for name in said if name != "(all)"]
     if len(names) > MANY:  # what is decided says little more
@@ -212,6 +224,8 @@ def _print(rows, said, failed: int, folder: Path) -> None:
         out.print(escape(f"{name}: {said[name]}"), highlight=False, emoji=False)
     if len(names) > MANY:
         out.print(f"and {len(names) - MANY} more specimens, see compare.csv")
+    for note in _left_out_notes(models):
+        out.print(escape(note), highlight=False, emoji=False)
     if failed:
         out.print(f"{failed} lanes could not be fitted by every model and count for none")
     out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)

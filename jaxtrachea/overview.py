@@ -90,6 +90,8 @@ def _left_out(result, left_out: LeftOut) -> Iterator[Table | str]:
     rows, further = report.left_out_table(result, left_out)
     yield "Leaving one curve out", report.LEFT_OUT_HEAD, rows
     yield from ([further] if further else [])
+    if left_out.sentence:
+        yield left_out.sentence
     if not np.isfinite(rms(left_out.force)):
         yield "no curve left out could be predicted"
 

@@ -225,6 +225,7 @@ def report_text(
         parts += ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, rows)]
         parts += [f"{further}."] if further else []
         parts += own_touch_sentence(result, "A curve left out")
+        parts += [f"{left_out.sentence}."] if left_out.sentence else []
     parts += more
     names = {"fit": "data and fit", "residuals": "residuals"}
     names |= {"correlation": "correlation"} if result.problem.free else {}

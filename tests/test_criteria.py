@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -11,14 +12,18 @@ import scipy.stats
 import synthetic
 from run_cli import run
 
+from jaxtrachea.cli_compare import _left_out_notes
+from jaxtrachea.identify import repeats as repeats_module
 from jaxtrachea.identify.comparison import Model, Row, compared, same_data, sentence
 from jaxtrachea.identify.criteria import penalised, weights
 from jaxtrachea.identify.fit import Settings, fit
 from jaxtrachea.identify.measurements import Curve
+from jaxtrachea.identify.onset import where_sought
 from jaxtrachea.identify.parameters import DEFAULTS
 from jaxtrachea.identify.problem import Noise, build
-from jaxtrachea.identify.repeats import leave_repeats_out, repeats
+from jaxtrachea.identify.repeats import Missed, leave_repeats_out, repeats
 from jaxtrachea.model import Options, press
+from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
@@ -207,7 +212,7 @@ def test_leaving_a_position_out_is_a_fit_without_it():
         b = np.linalg.lstsq(X, np.concatenate([c.force for c in kept]), rcond=None)[0]
         missed += [b[0] * DEPTH + b[1] - c.force for c in curves if c.s_c == s]
     want = np.sqrt(np.mean(np.square(missed))) / max(np.abs(c.force).max() for c in curves)
-    got = leave_repeats_out(problem, Settings(starts=1))
+    got = leave_repeats_out(problem, Settings(starts=1)).error
     np.testing.assert_allclose(got, [want], rtol=1e-6)
     assert repeats(problem).words == "positions"
 
@@ -218,7 +223,7 @@ def test_without_a_second_position_trials_are_left_out():
     plan = repeats(problem)
     assert (plan.words, plan.lanes.tolist()) == ("trials", [0, 0, 1, 1, 2, 2])
     assert plan.held.tolist() == [[True, False], [False, True]] * 3
-    got = leave_repeats_out(problem, Settings(starts=1))
+    got = leave_repeats_out(problem, Settings(starts=1)).error
     for lane, (a, b) in enumerate(zip(noisy()[::2], noisy()[1::2], strict=True)):
         missed = []
         for kept, out in ((a, b), (b, a)):
@@ -226,6 +231,58 @@ def test_without_a_second_position_trials_are_left_out():
             missed.append(X @ np.linalg.lstsq(X, kept.force, rcond=None)[0] - out.force)
         peak = max(np.abs(c.force).max() for c in (a, b))
         np.testing.assert_allclose(got[lane], np.sqrt(np.mean(np.square(missed))) / peak, rtol=1e-6)
+
+
+def test_a_refit_that_does_not_converge_counts_and_is_said(monkeypatch):
+    """One of six stops short at its minimum: the numbers stay; one that is lost costs its lane."""
+    problem = linear_problem(noisy(), fixed=("k_3",))
+    want = leave_repeats_out(problem, Settings(starts=1))
+
+    def spoilt(status, theta):
+        def refit(*arguments):
+            found = fit(*arguments)
+            result = (found.status.copy(), found.theta.copy())
+            result[0][1], result[1][1] = status, theta * result[1][1]
+            return dataclasses.replace(found, status=result[0], theta=result[1])
+
+        monkeypatch.setattr(repeats_module, "fit", refit)
+        return leave_repeats_out(problem, Settings(starts=1))
+
+    slow = spoilt(FitStatus.MAX_ITERATIONS, 1.0)
+    np.testing.assert_allclose(slow.error, want.error, rtol=1e-12)
+    assert (slow.refits.tolist(), slow.unconverged.tolist()) == ([2, 2, 2], [1, 0, 0])
+    lost = spoilt(FitStatus.NON_FINITE, np.nan)
+    assert np.isnan(lost.error).tolist() == [True, False, False]
+    assert lost.lost.tolist() == [1, 0, 0]
+    result = fit(problem, Settings(starts=1))
+    assert _left_out_notes([Model("A", result, want)]) == []
+    for missed, says in ((slow, "1 of 6 refits did not"), (lost, "1 of 6 refits give no finite")):
+        (note,) = _left_out_notes([Model("A", result, missed)])
+        assert says in note
+    rows, _ = compared([Model("A", result, lost), Model("B", result, slow)])
+    assert np.isnan(rows[-2].left_out)
+    assert np.isfinite(rows[-1].left_out)
+
+
+def test_why_nothing_was_left_out():
+    """A stiffness of single curves; an onset of single curves is no reason."""
+    for names, says in ((("k_1", "onset"), "A: k_1 belongs to"), (("onset",), "no specimen has")):
+        free = [dataclasses.replace(DEFAULTS[n], fixed=False, scope="trial") for n in names]
+        result = SimpleNamespace(problem=SimpleNamespace(free=free))
+        none = Missed(np.full(1, np.nan), *np.zeros((3, 1), int))
+        (note,) = _left_out_notes([SimpleNamespace(name="A", result=result, left_out=none)])
+        assert says in note
+
+
+def test_check_says_where_onset_and_offset_start():
+    table = [dataclasses.replace(DEFAULTS[n], fixed=False) for n in ("onset", "force_offset")]
+    options = Options(contact="unilateral")
+    change, force = (where_sought(p, table, options) for p in table)
+    assert change == ("change point of the curve", "from its samples")
+    assert force == ("force before first touch", "-10000 … 10000")
+    given = dataclasses.replace(table[0], value=0.5, lower=-1.0)
+    assert where_sought(given, [given], options) == ("0.5", "-1 … 100")
+    assert where_sought(table[0], table, TOTAL) == ("0", "-100 … 100")
 
 
 def test_what_can_be_left_out_within_one_lane():

@@ -236,7 +236,7 @@ def test_a_curve_left_out_fits_its_own_onset(owned):
     r = own_misfit(gone, k_1, k_3, value[[2 + t, 6 + t]])
     expected = np.sqrt(np.mean(r**2)) / np.max(np.abs(gone.force))
     np.testing.assert_allclose(left.force[2], expected, rtol=0.01)
-    by_position = leave_repeats_out(owned.problem, ONE)
+    by_position = leave_repeats_out(owned.problem, ONE).error
     assert np.isfinite(by_position).all()
     peak = max(np.max(np.abs(c.force)) for c in owned.problem.curves[0])
     each = left.force[:4] * [np.max(np.abs(c.force)) for c in owned.problem.curves[0]]

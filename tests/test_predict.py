@@ -375,7 +375,7 @@ def left_out_pairs(study, changes, rows, folder):
     held = np.zeros(study.take(left.lane).lanes.s_c.shape, bool)
     held[np.arange(len(held)), left.trial] = True
     chosen = study.take(left.lane)
-    truth = predictions(chosen, with_own_touch(chosen, held, left.result.theta, TWO)).force
+    truth = predictions(chosen, with_own_touch(chosen, held, left.result.theta, TWO).theta).force
     for row in rows:
         lane, trial = left.lane[row], left.trial[row]
         out = study.curves[lane][trial]
@@ -913,3 +913,37 @@ def test_virtual_trachea_ten_positions_by_the_command(tmp_path, monkeypatch, cap
         mine = [float(r["predicted [N]"]) - float(r["force [N]"]) for r in rows]
         assert np.allclose(mine, truth[k, trial][: len(rows)], rtol=0, atol=1e-9), k
         assert json.loads((tmp_path / f"f{k}" / "provenance.json").read_text())["inputs"]
+
+
+def test_a_lane_with_one_place_predicts_that_place(study, tmp_path):
+    """k_M too small to be seen in one press: the press itself is known, one elsewhere is not."""
+    truth = true_force(75.0)
+    rng = np.random.default_rng(3)
+    force = truth + NOISE * rng.normal(size=(1, 1, len(DEPTHS)))
+    curves = synthetic.curves(force, np.array([75.0]), DEPTHS)
+    result = fit(build(curves, table_1(), synthetic.OPTIONS, synthetic.parameters()), TWO)
+    results.write_hdf5(tmp_path / "results.h5", result, {"inputs": {"a.csv": "0" * 64}})
+    read = jaxtrachea.read_results(tmp_path)
+    source = source_of(read, read.specimens[0])
+    # EI_L on its upper bound: k_M is a direction by itself, whose slope is 1e-8 of the others'.
+    free, blind = source.free.copy(), np.zeros_like(source.blind)
+    free[:2], blind[0, 1] = [np.log(1e7), np.log(1e-4)], 1.0
+    covariance = np.zeros((4, 4))
+    covariance[2, 2] = 1e-4
+    lost = dataclasses.replace(source, free=free, blind=blind, covariance=covariance)
+    near, far, deep = predict_sources(
+        read, [lost] * 3, [75.0, 61.0, 75.0], [DEPTHS, DEPTHS, 2 * DEPTHS]
+    )
+    assert np.isfinite(near.high95).all()
+    assert near.status < PredictionStatus.UNDETERMINED
+    assert np.isinf(far.se).any()
+    assert np.isinf(deep.se[DEPTHS > 3.001]).all()
+    # As the fit leaves it: a finite band of its own press, which covers it.
+    (own,) = predict_sources(read, [source], [75.0], [DEPTHS])
+    assert np.isfinite(own.high95).all()
+    inside = (own.low95 <= force[0, 0]) & (force[0, 0] <= own.high95)
+    assert np.mean(inside) >= 0.85
+    bent = dataclasses.replace(source, blind=0 * blind, covariance=1e12 * np.eye(4))
+    (worst,) = predict_sources(read, [bent], [75.0], [DEPTHS])
+    assert worst.status == PredictionStatus.BENT
+    assert " inf " not in worst.message

@@ -11,6 +11,7 @@ from jaxtrachea.identify.effective import CORRELATED, effective_samples
 from jaxtrachea.identify.fit import FitResult
 from jaxtrachea.identify.predictions import predictions, rms
 from jaxtrachea.identify.problem import Problem
+from jaxtrachea.identify.repeats import Missed
 
 #: Difference of AICc up to which models cannot be told apart, and from which on they clearly can
 #: (Burnham and Anderson 2002, sec. 2.6).
@@ -24,13 +25,12 @@ class Model:
     Attributes:
         name: for tables.
         result: the fit.
-        left_out: rms force residual of what was left out, over the largest force of the lane;
-            (lanes,), NaN where a lane repeats nothing; None: not asked for.
+        left_out: errors of what was left out, see `leave_repeats_out`; None: not asked for.
     """
 
     name: str
     result: FitResult
-    left_out: Float[np.ndarray, " lanes"] | None
+    left_out: Missed | None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -49,7 +49,9 @@ class Row:
         BIC: -
         delta: AICc less the smallest of the models.
         weight: Akaike weight.
-        left_out: as `Model.left_out`; of all lanes the root mean square.
+        left_out: rms force residual of what was left out, over the largest force of the lane; of
+            all lanes the root mean square; NaN where nothing was, or where a refit of one of them
+            predicts nothing.
         deflated: AICc with the deviance of as many samples as are independent, less the smallest of
             the models; see `deflated`.
         effective_samples: that many.
@@ -197,12 +199,22 @@ def _rows(
             BIC=total(c.BIC, at),
             delta=float(delta[i]),
             weight=float(weight[i]),
-            left_out=np.nan if m.left_out is None else float(rms(m.left_out[at])),
+            left_out=_left_out(m, at),
             deflated=float(fair[i]),
             effective_samples=independent,
         )
         for i, (m, c, at) in enumerate(zip(models, of, lanes, strict=True))
     ]
+
+
+def _left_out(model: Model, at: np.ndarray) -> float:
+    """Error of what was left out of some lanes; NaN where one of them lost what it should have.
+
+    To take the others would spare this model the lanes that it does worst on.
+    """
+    if model.left_out is None or model.left_out.lost[at].any():
+        return np.nan
+    return float(rms(model.left_out.error[at]))
 
 
 def sentence(rows: Sequence[Row], left: str = "positions") -> str:

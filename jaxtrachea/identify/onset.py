@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jaxtrachea.identify.first_touch import FirstTouch, blend_widths, first_touch
 from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import DEFAULTS, Parameter
+from jaxtrachea.identify.parameters import DEFAULTS, OF_THE_PRESS, Parameter
 from jaxtrachea.model import Options
 
 if TYPE_CHECKING:
@@ -78,6 +78,26 @@ def blends(
         sigma = [sigma_force if c.sigma is None else np.median(c.sigma) for c in lane]
         row[: len(lane)] = [np.nan if v is None else v for v in sigma]
     return blend_widths(touches(lanes, parameters), given, options.onset_width)
+
+
+def where_sought(
+    p: Parameter, parameters: Sequence[Parameter], options: Options
+) -> tuple[str, str]:
+    """Initial value and bounds of a free parameter in words, as the fit has them.
+
+    An onset or offset without an initial value starts where its curve shows it, and an onset
+    without bounds has those of `within_reach`.
+    """
+    initial, bounds = f"{p.value:g}", f"{p.lower:g} … {p.upper:g}"
+    if p.name not in OF_THE_PRESS or p.scale == "log":
+        return initial, bounds
+    usual = DEFAULTS[p.name]
+    if options.contact == "unilateral" and p.value == usual.value:
+        initial = "change point of the curve" if p.name == "onset" else "force before first touch"
+    near = p.name == "onset" and onset_is_sought(parameters, options)
+    if near and (p.lower, p.upper) == (usual.lower, usual.upper):
+        bounds = "from its samples"
+    return initial, bounds
 
 
 def within_reach(lanes: "Lane", parameters: Sequence[Parameter]) -> "Lane":

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxtrachea.identify.prediction_core import Predicted, Response, compiled
-from jaxtrachea.identify.sources import Source, source_of
+from jaxtrachea.identify.sources import Source, slack_of, source_of
 from jaxtrachea.identify.stored import StoredFit
 from jaxtrachea.status import PredictionStatus, PressStatus
 
@@ -118,6 +118,8 @@ def predict_sources(
     stack = lambda name: np.stack([getattr(source, name) for source in sources])  # noqa: E731
     columns = [stack(n) for n in ("free", "value", "covariance", "blind", "half_width")]
     columns += [places, padded]
+    presses = zip(sources, s, padded, strict=True)
+    slack = np.stack([slack_of(stored, source, float(at), D) for source, at, D in presses])
     blend = stack("blend")
     out: dict[int, CurvePrediction] = {}
     for members in (np.flatnonzero(np.isnan(blend)), np.flatnonzero(~np.isnan(blend))):
@@ -127,7 +129,10 @@ def predict_sources(
         for first in range(0, len(members), size):
             at = members[first : first + size]
             rows = np.pad(at, (0, size - len(at)), mode="edge")
-            part = jax.tree.map(np.asarray, run(*(jnp.asarray(v[rows]) for v in arrays)))
+            part = jax.tree.map(
+                np.asarray,
+                run(*(jnp.asarray(v[rows]) for v in arrays), slack=jnp.asarray(slack[rows])),
+            )
             for row, k in enumerate(at):
                 own = jax.tree.map(lambda v, row=row: v[row], part)
                 sigma = None if sigmas is None else sigmas[k]
@@ -212,7 +217,10 @@ def _verdict(source: Source, value: Response, se: Response, presses, bend: float
         if np.isinf(se.force).any() or np.isinf(source.half_width):
             found.append((PredictionStatus.UNDETERMINED, ""))
         if bend > BENT:
-            found.append((PredictionStatus.BENT, f"off by {bend:.2g} half-widths at the deepest"))
+            word = f"off by {bend:.2g} half-widths at the deepest"
+            if np.isinf(bend):
+                word = "at the deepest the model has no solution at an end of the band"
+            found.append((PredictionStatus.BENT, word))
     worst = max(status for status, _ in found)
     said = [m for status, m in found if m] or []
     return worst, "; ".join(dict.fromkeys([worst.message, *said]))

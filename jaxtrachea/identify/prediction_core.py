@@ -97,15 +97,33 @@ def jacobian(problem: Problem, free, value, s_c, displacement, blend=None):
 
 
 def standard_errors(
-    slope: Float[Array, "F ..."], covariance: Float[Array, "F F"], blind: Float[Array, "B F"]
+    slope: Float[Array, "F ..."],
+    covariance: Float[Array, "F F"],
+    blind: Float[Array, "B F"],
+    unseen: Float[Array, "..."] | None = None,
 ) -> Float[Array, "..."]:
-    """Delta method: sqrt(J C J^T), inf where a blind direction changes the quantity."""
+    """Delta method: sqrt(J C J^T), inf where a blind direction changes the quantity.
+
+    By more than `unseen`, the slope that the fit could not tell from zero there; None: 0.
+    """
     variance = jnp.einsum("f...,fg,g...->...", slope, covariance, slope)
     along = jnp.abs(jnp.einsum("bf,f...->b...", blind, slope))
     terms = jnp.einsum("bf,f...->b...", jnp.abs(blind), jnp.abs(slope))
     least = max(_ACTS, 100 * float(jnp.finfo(slope.dtype).eps))
-    undetermined = jnp.any(along > least * terms, axis=0)
+    least = least * terms if unseen is None else jnp.maximum(least * terms, unseen[None])
+    undetermined = jnp.any(along > least, axis=0)
     return jnp.where(undetermined, jnp.inf, jnp.sqrt(jnp.maximum(variance, 0)))
+
+
+def _unseen(slope: Float[Array, "F N"], slack: Float[Array, "N F"]) -> Float[Array, " N"]:
+    """Slope along a blind direction that the fit could not tell from zero, see `predicted`.
+
+    A direction is blind where the sum of squares of its slopes over the samples of the fit is a
+    tiny share of that of all slopes. Where the same place is pressed no deeper, its slope is at
+    most that share, however it compares with its own terms: a direction of one unknown has but one.
+    """
+    size = jnp.linalg.norm(slope.T * slack, axis=1)
+    return jnp.where(jnp.any(slack > 0, axis=1), jnp.max(size), 0)
 
 
 def predicted(
@@ -118,6 +136,7 @@ def predicted(
     s_c: Float[Array, ""],
     displacement: Float[Array, " N"],
     blend: Float[Array, ""] | None = None,
+    slack: Float[Array, "N F"] | None = None,
 ) -> Predicted:
     """One curve with its standard errors; pure, for `jit` and `vmap`, float32 and float64.
 
@@ -131,9 +150,14 @@ def predicted(
         s_c: mm.
         displacement: mm; at least one.
         blend: see `respond`.
+        slack: where the fit has pressed, how far it sees slopes: its least ratio of singular values
+            times the root of its samples, times the size of each unknown; elsewhere 0; None: 0.
     """
     out, status, slopes = jacobian(problem, free, value, s_c, displacement, blend)
     se = jax.tree.map(lambda slope: standard_errors(slope, covariance, blind), slopes)
+    if slack is not None:
+        unseen = _unseen(slopes.force, slack)
+        se = se._replace(force=standard_errors(slopes.force, covariance, blind, unseen))
     deepest = jnp.argmax(jnp.abs(displacement))
     pull = covariance @ slopes.force[:, deepest]
     along = jnp.sqrt(jnp.maximum(slopes.force[:, deepest] @ pull, 0))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -98,6 +99,8 @@ class LeftOut:
         ratio: measured over predicted force in the least-squares sense, minus 1 (for linear data:
             the relative error of the compliance).
         result: the fits, one lane per left-out curve.
+        converged: whether that fit converged, and the onset and offset of the curve left out; else
+            the errors are those of its best point, NaN where it predicts nothing.
     """
 
     lane: np.ndarray
@@ -106,6 +109,29 @@ class LeftOut:
     joints: np.ndarray
     ratio: np.ndarray
     result: FitResult
+    converged: np.ndarray
+
+    @property
+    def sentence(self) -> str:
+        """What of the fits did not converge or predicts nothing, in words; "" if all is well."""
+        lost = np.isnan(self.force)
+        return refits_sentence(len(lost), int(np.sum(~self.converged & ~lost)), int(np.sum(lost)))
+
+
+def refits_sentence(refits: int, unconverged: int, lost: int) -> str:
+    """What became of fits without a part of the data, in words; "" if all is well.
+
+    Args:
+        refits: in all.
+        unconverged: did not converge, yet predict.
+        lost: give no finite prediction of what they left out, converged or not.
+    """
+    said = []
+    if unconverged:
+        said.append(f"{unconverged} of {refits} refits did not converge; their best points count")
+    if lost:
+        said.append(f"{lost} of {refits} refits give no finite prediction of what they left out")
+    return "; ".join(said)
 
 
 def curves_to_leave_out(problem: Problem) -> list[tuple[int, int]]:
@@ -149,9 +175,12 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
     held[rows, trial] = True
     plain = dataclasses.replace(settings, scrutiny=False)
     result = fit(without(chosen, held), plain, progress)
-    seen = predictions(chosen, with_own_touch(chosen, held, result.theta, plain))
+    touched = with_own_touch(chosen, held, result.theta, plain)
+    seen = predictions(chosen, touched.theta)
     force, data = seen.force[rows, trial], lanes.force[rows, trial]
-    model = np.where(lanes.precision[rows, trial] > 0, data + force, 0)
+    observed = lanes.precision[rows, trial] > 0
+    lost = np.any(observed & ~np.isfinite(force), axis=1)
+    model = np.where(observed, data + force, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.sum(data * model, axis=1) / np.sum(model * model, axis=1) - 1
         peak = np.asarray(rms(force)) / np.max(np.abs(data), axis=1)
@@ -161,7 +190,15 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
         moved = D > 0.5 * np.max(D, axis=1, keepdims=True)
         share = seen.joints[rows, trial] / np.where(moved, D, np.nan)[:, :, None]
         joints = np.asarray(rms(share.reshape(len(lane), -1)))
-    return LeftOut(lane, trial, peak, joints, ratio, result)
+    return LeftOut(
+        lane=lane,
+        trial=trial,
+        force=np.where(lost, np.nan, peak),
+        joints=np.where(lost, np.nan, joints),
+        ratio=np.where(lost, np.nan, ratio),
+        result=result,
+        converged=result.succeeded & touched.converged,
+    )
 
 
 def without(problem: Problem, held: Bool[np.ndarray, "lanes T"]) -> Problem:
@@ -188,12 +225,24 @@ def own_unknowns(
     return own
 
 
+class OwnTouch(NamedTuple):
+    """Estimates with the onset and offset of curves left out.
+
+    Attributes:
+        theta: scaled coordinates; (lanes, P).
+        converged: whether the fit of these converged; true where there are none; (lanes,).
+    """
+
+    theta: Float[np.ndarray, "lanes P"]
+    converged: Bool[np.ndarray, " lanes"]
+
+
 def with_own_touch(
     problem: Problem,
     held: Bool[np.ndarray, "lanes T"],
     theta: Float[np.ndarray, "lanes P"],
     settings: Settings,
-) -> Float[np.ndarray, "lanes P"]:
+) -> OwnTouch:
     """Theta with onset and offset of the trials `held` fitted to them, all other unknowns kept.
 
     Where the trials have none of their own, `theta` itself.
@@ -206,7 +255,7 @@ def with_own_touch(
     """
     own = own_unknowns(problem, held)
     if not own.any():
-        return theta
+        return OwnTouch(theta, np.ones(len(theta), bool))
     alone = without(problem, ~held)
     alone = dataclasses.replace(
         alone, lanes=alone.lanes._replace(active=np.where(own, problem.lanes.active, 0))
@@ -214,7 +263,8 @@ def with_own_touch(
     starts = draw_starts(alone, settings)
     kept = np.repeat(np.where(own, np.nan, theta), settings.starts, axis=0)
     starts = np.where(np.isnan(kept), starts, kept)
-    return fit(alone, settings, starts=starts).theta
+    found = fit(alone, settings, starts=starts)
+    return OwnTouch(found.theta, found.succeeded | ~own.any(axis=1))
 
 
 def rms(values: np.ndarray) -> np.ndarray | np.floating:

@@ -14,6 +14,24 @@ from jaxtrachea.identify.predictions import predictions, rms, with_own_touch, wi
 from jaxtrachea.identify.problem import Problem
 
 
+class Missed(NamedTuple):
+    """Errors of what was left out of each lane, and what became of the refits behind them.
+
+    Attributes:
+        error: root mean square force residual of the curves left out, over the lane's largest
+            force; NaN where nothing can be left out or a refit predicts nothing; (lanes,).
+        refits: fits without a part of the lane; (lanes,).
+        unconverged: of them, those that did not converge (`FitStatus`) or left the onset or offset
+            of a curve left out so, yet predict: their best point counts; (lanes,).
+        lost: of them, those without a finite prediction of all that they left out; (lanes,).
+    """
+
+    error: Float[np.ndarray, " lanes"]
+    refits: Int[np.ndarray, " lanes"]
+    unconverged: Int[np.ndarray, " lanes"]
+    lost: Int[np.ndarray, " lanes"]
+
+
 class Repeats(NamedTuple):
     """What can be left out, one entry for each fit.
 
@@ -80,8 +98,12 @@ def _groups(curves: tuple[Curve, ...], *, shared: bool) -> list[tuple[str, list[
 
 def leave_repeats_out(
     problem: Problem, settings: Settings, progress: Callable[[int, int], None] | None = None
-) -> Float[np.ndarray, " lanes"]:
+) -> Missed:
     """Fit every lane without each of its `repeats` and predict the curves left out.
+
+    The onset and the force offset of a curve left out are fitted to it, all else kept. A refit that
+    does not converge predicts from its best point, and is counted: to leave it out would spare a
+    model the curves that it does worst on. One that predicts nothing makes its lane NaN.
 
     Args:
         problem: the study.
@@ -89,23 +111,29 @@ def leave_repeats_out(
         progress: as for `fit`.
 
     Returns:
-        Root mean square force residual of the curves left out, over the lane's largest force;
-        (lanes,), NaN where nothing can be left out or a fit failed. The onset and the force offset
-        of a curve left out are fitted to it, all else kept.
+        The `Missed` of all lanes.
     """
-    error = np.full(len(problem.curves), np.nan)
+    count = len(problem.curves)
     lanes, held, _ = repeats(problem)
     if not len(lanes):
-        return error
+        return Missed(np.full(count, np.nan), *np.zeros((3, count), int))
     chosen = problem.take(lanes)
     plain = dataclasses.replace(settings, scrutiny=False)
     result = fit(without(chosen, held), plain, progress)
-    seen = predictions(chosen, with_own_touch(chosen, held, result.theta, plain)).force
-    solved = result.succeeded
-    missed = np.where((held & solved[:, None])[:, :, None], seen, np.nan)
-    for lane in np.unique(lanes):
-        mine = lanes == lane
-        if solved[mine].all():
-            peak = np.max(np.abs(problem.lanes.force[lane]))
-            error[lane] = float(rms(missed[mine].ravel())) / peak
-    return error
+    touched = with_own_touch(chosen, held, result.theta, plain)
+    seen = predictions(chosen, touched.theta).force
+    observed = held[:, :, None] & (chosen.lanes.precision > 0)
+    lost = np.any(observed & ~np.isfinite(seen), axis=(1, 2))
+    converged = result.succeeded & touched.converged
+    of_lane = lambda jobs: np.bincount(lanes[jobs], minlength=count)  # noqa: E731
+    missed = Missed(
+        error=np.full(count, np.nan),
+        refits=of_lane(np.ones(len(lanes), bool)),
+        unconverged=of_lane(~converged & ~lost),
+        lost=of_lane(lost),
+    )
+    for lane in np.flatnonzero((missed.refits > 0) & (missed.lost == 0)):
+        jobs = lanes == lane
+        peak = np.max(np.abs(problem.lanes.force[lane]))
+        missed.error[lane] = float(rms(seen[jobs][observed[jobs]])) / peak
+    return missed

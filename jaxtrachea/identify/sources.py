@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 
 from jaxtrachea.identify.stored import StoredFit
+from jaxtrachea.identify.uncertainty import SINGULAR
 from jaxtrachea.status import FitStatus, PredictionStatus
 
 #: Parameters of a measurement, not of the specimen: zero where no measurement is meant.
@@ -195,3 +196,21 @@ def _none(stored: StoredFit, specimen, trial, status: PredictionStatus, message:
         status=status,
         message=message,
     )
+
+
+def slack_of(stored: StoredFit, source: Source, s: float, displacement: np.ndarray) -> np.ndarray:
+    """How far the fit sees slopes where it has pressed, see `prediction_core.predicted`; (N, F)."""
+    free = stored.problem.free
+    out = np.zeros((len(displacement), len(free)))
+    curves = [c for c, k in zip(stored.curves, stored.curve_lane, strict=True) if k == source.lane]
+    place = lambda c: np.nan if c.s_c is None else c.s_c  # noqa: E731
+    here = [c for c in curves if np.isclose(place(c), s, rtol=0, atol=1e-9, equal_nan=True)]
+    if not here or not source.blind.any():
+        return out
+    # Of a scaled coordinate; an onset's steps are as large as the presses.
+    size = [1.0 if p.scale == "log" or p.name in OF_MEASUREMENT else max(abs(v), 1e-3)
+            for p, v in zip(free, source.free, strict=True)]  # fmt: skip
+    samples = sum(len(c.force) for c in curves)
+    low, high = (f([f(c.displacement) for c in here]) for f in (np.min, np.max))
+    out[(displacement >= low - 1e-9) & (displacement <= high + 1e-9)] = size
+    return SINGULAR * np.sqrt(samples) * out

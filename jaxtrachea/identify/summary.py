@@ -53,10 +53,11 @@ def left_out_cells(result: FitResult, left_out: LeftOut) -> list[dict[str, objec
     """Rows of left_out.csv: a curve left out and its errors each."""
     errors = (left_out.ratio, left_out.force, left_out.joints)
     rows = []
-    for k, t, *values in zip(left_out.lane, left_out.trial, *errors, strict=True):
+    columns = (left_out.lane, left_out.trial, left_out.converged.tolist(), *errors)
+    for k, t, converged, *values in zip(*columns, strict=True):
         curve = result.problem.curves[k][t]
         names = ("force_over_model", "rms_over_peak", "rms_joints_over_displacement")
         row: dict[str, object] = {"specimen": curve.specimen, "trial": curve.trial}
         out = zip(names, values, strict=True)
-        rows.append(row | {name: float(v) for name, v in out})
+        rows.append(row | {name: float(v) for name, v in out} | {"converged": converged})
     return rows
