@@ -358,7 +358,9 @@ def test_of_many_curves_left_out_report_and_terminal_show_the_worst_first(dense)
     """The report had them in the order of the file, the terminal the worst first."""
     lane, trial = np.zeros(14, int), np.arange(14) % 4
     force = 0.01 * np.array([3.0, 1, 14, 2, 4, np.nan, 5, 13, 6, 7, 8, 9, 10, 12])
-    left_out = LeftOut(lane, trial, force, np.full(14, np.nan), force, dense)
+    left_out = LeftOut(
+        lane, trial, force, np.full(14, np.nan), force, dense, converged=np.ones(14, bool)
+    )
     rows, further = left_out_table(dense, left_out)
     shares = ["–", *(f"{v}.00 %" for v in (14, 13, 12, 10, 9, 8, 7, 6, 5, 4, 3))]
     assert [row[3] for row in rows[:-1]] == shares
@@ -372,7 +374,10 @@ def test_of_many_curves_left_out_report_and_terminal_show_the_worst_first(dense)
     items = list(overview(found(dense, left_out=left_out)))
     assert rows in [item[2] for item in items if not isinstance(item, str)]
     assert further in items
-    few = LeftOut(lane[:4], trial[:4], force[:4], np.full(4, np.nan), force[:4], dense)
+    few = LeftOut(
+        lane[:4], trial[:4], force[:4], np.full(4, np.nan), force[:4], dense,
+        converged=np.ones(4, bool),
+    )  # fmt: skip
     assert [row[1] for row in left_out_table(dense, few)[0][:-1]] == ["1", "2", "1", "1"]
 
 

@@ -63,6 +63,7 @@ def _same_steps(result: FitResult) -> FitResult:
     step = of_unknowns(result.problem, lambda p: p.step, 1.0)
     meant = np.where(log, np.exp(np.where(log, result.theta, 0.0)), result.theta * step)
     known = np.isfinite(meant) & np.isfinite(result.value) & (result.problem.lanes.active > 0)
+    known &= result.succeeded[:, None]
     if not np.allclose(meant[known], result.value[known], rtol=1e-9, atol=0):
         raise ValueError("its scaled coordinates have other steps; fit again")
     return result
