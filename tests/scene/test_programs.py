@@ -136,7 +136,7 @@ def each(scene, m, p):
     off = (p.s < 0) | (p.s > scene.geometry.length)
     led, status = refuse(p, {PressStatus.OFF_TUBE: off}, bad)
     *rest, found = pressed_each(scene, m, Presses(p.s, p.phi, led))
-    return *rest, status(found)
+    return led, *rest, status(found)
 
 
 def pressed_each(scene, m, p):
