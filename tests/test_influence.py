@@ -226,7 +226,9 @@ def test_estimate_follows_data_and_geometry(noisy):
 
     at = lane.force, lane.s_c, tube.ring_positions
     value, forward, reverse, difference = both(*at)
-    np.testing.assert_allclose(value, result.theta[0], atol=1e-8)
+    # Roundings of the cost hide a rise of it: 8 of them are this many standard errors.
+    hidden = np.sqrt(16 * np.finfo(float).eps * result.samples[0]) * result.uncertainty[0].se
+    assert np.all(np.abs(value - result.theta[0]) <= hidden)
     np.testing.assert_allclose(forward, difference, rtol=1e-3)
     products = sum(float(jnp.sum(r * d)) for r, d in zip(reverse, along, strict=True))
     np.testing.assert_allclose(products, float(forward @ weight), rtol=1e-9)
