@@ -19,6 +19,11 @@ STATIONS = 60
 ANGLES = 2 * math.pi * (np.arange(RAYS) + 0.5) / RAYS - math.pi
 #: The arc on which rings are looked for: the anterior side, clear of the rings' ends.
 ARC = np.abs(ANGLES) < 1.6
+#: What a row of rings is: their least number; distance of neighbours over the radius (17 rings of a
+#: human trachea: 0.7; table 1: 0.9); distance over the median one; share of the length they take.
+FEWEST, PITCH, EVEN, SHARE = 4, (0.2, 2.0), (0.4, 2.2), 0.4
+#: Cartilage may fork and join, which gives two crests near each other (Visible Human male: 0.35).
+FORKED = 0.2
 
 
 class Line(NamedTuple):
@@ -228,16 +233,21 @@ def locate(line: Line, points) -> Located:
 
 
 def _relief(shape: Shape) -> np.ndarray:
-    """How far the contour stands out of its surroundings along s, mm; NaN towards the ends."""
+    """How far the contour stands out of its surroundings along s, mm.
+
+    The surroundings: the mean over a window as long as the radius. Within half a window of an end
+    they are continued straight, so that a ring there is seen as any other.
+    """
     span = max(5, int(np.nanmean(shape.radius) / (shape.s[1] - shape.s[0])) | 1)
     if len(shape.s) <= 2 * span:
         return np.full_like(shape.radius, np.nan)
     window = np.ones(span) / span
     level = np.stack([np.convolve(v, window, "valid") for v in shape.radius.T], axis=1)
-    out = np.full_like(shape.radius, np.nan)
-    half = span // 2
-    out[half:-half] = shape.radius[half:-half] - level
-    return out
+    half, i = span // 2, np.arange(span // 2)[:, None]
+    slope = lambda first, last: (last - first) / (span - 1)  # noqa: E731
+    before = level[0] - slope(level[0], level[span - 1]) * (half - i)
+    after = level[-1] + slope(level[-span], level[-1]) * (i + 1)
+    return shape.radius - np.concatenate([before, level, after])
 
 
 def find_anterior(shape: Shape, given=None) -> Shape:
@@ -311,17 +321,17 @@ def find_rings(shape: Shape, positions=None, half_angle=None) -> Rings:
         profile = np.nan_to_num(np.mean(relief[:, ARC], axis=1))
         fall = max(0.01 * radius, 0.3 * float(np.ptp(profile)))
     n = max(1, round(1.2 / step))
-    smooth = np.convolve(profile, np.ones(n) / n, "same")
+    padded = np.pad(profile, (n // 2, n - 1 - n // 2), "edge")
+    smooth = np.convolve(padded, np.ones(n) / n, "valid")
     if positions is not None:
         found, source = np.asarray(positions, float), "the positions given"
     else:
-        found = shape.s[_peaks(smooth, fall)]
-        gaps = np.diff(found)
-        if len(found) < 2 or gaps.max() > 3.5 * gaps.min():
-            raise MeshError(
-                f"found {len(found)} rings in {source}, expected a row of them; give rings=, "
-                "the cartilage's own surface, or ring_positions="
-            )
+        if shape.cartilage is not None:  # which may begin or end with the surface
+            smooth = np.pad(smooth, 1)
+            found = shape.s[np.clip(_peaks(smooth, fall) - 1, 0, len(shape.s) - 1)]
+        else:
+            found = shape.s[_peaks(smooth, fall)]
+        _check_row(found, source, radius, shape.line.s[-1], shape.cartilage is not None)
     if half_angle is None:
         known = shape.cartilage is not None or positions is None
         half_angle = _half_angle(strength) if known else 2 * math.pi / 3
@@ -329,6 +339,37 @@ def find_rings(shape: Shape, positions=None, half_angle=None) -> Rings:
     if shape.cartilage is not None:
         height = float(profile.sum() * step / len(found))
     return Rings(found, half_angle, radius, height, source)
+
+
+def _check_row(found, source, radius, length, own) -> None:
+    """Refuse crests that are no row of rings.
+
+    Args:
+        found: their positions, mm.
+        source: in words.
+        radius: of the wall, mm.
+        length: of the tube, mm.
+        own: whether they come from the cartilage itself: then they may fork, and be fewer.
+    """
+    gaps, fewest = np.diff(found), 2 if own else FEWEST
+    pitch = float(np.median(gaps)) if len(gaps) else 0.0
+    least = FORKED if own else EVEN[0]
+    if len(found) < fewest:
+        fault = f"at least {fewest}"
+    elif not PITCH[0] * radius <= pitch <= PITCH[1] * radius:
+        fault = f"them {PITCH[0] * radius:.2g} to {PITCH[1] * radius:.2g} mm apart"
+    elif gaps.min() < least * pitch or gaps.max() > EVEN[1] * pitch:
+        fault = f"them even, {least * pitch:.2g} to {EVEN[1] * pitch:.2g} mm apart"
+    elif len(found) * pitch < SHARE * length and not own:
+        fault = f"them on {100 * SHARE:.0f} % of its {length:.4g} mm or more"
+    else:
+        return
+    at = ", ".join(f"{v:.1f}" for v in found[:8]) + (", ..." if len(found) > 8 else "")
+    raise MeshError(
+        f"found {len(found)} rings in {source}{f' (s = {at} mm)' if at else ''}, expected {fault}; "
+        "is it the outer wall and not the lumen? Give rings=, the cartilage's own surface, or "
+        "ring_positions="
+    )
 
 
 def _half_angle(strength) -> float:
@@ -341,7 +382,7 @@ def _half_angle(strength) -> float:
 
 def _peaks(profile, fall) -> np.ndarray:
     """Centres of the waves of `profile` that rise and fall by more than `fall`."""
-    found, high, low, rising = [], 0, 0, True
+    found, high, low, rising = [], 0, 0, False
     for i, value in enumerate(profile):
         if value > profile[high]:
             high = i
