@@ -367,7 +367,7 @@ def _check_row(found, source, radius, length, own) -> None:
     at = ", ".join(f"{v:.1f}" for v in found[:8]) + (", ..." if len(found) > 8 else "")
     raise MeshError(
         f"found {len(found)} rings in {source}{f' (s = {at} mm)' if at else ''}, expected {fault}; "
-        "is it the outer wall and not the lumen? Give rings=, the cartilage's own surface, or "
+        "a lumen shows none: give the outer wall, or rings=, the cartilage's own surface, or "
         "ring_positions="
     )
 
