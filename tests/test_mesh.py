@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxtrachea.trachea.centreline import contour
+from jaxtrachea.trachea.centreline import Cells, contour
 from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.imported import read_mesh
 from jaxtrachea.trachea.mesh import MeshError, edge_counts, place, volume
@@ -112,7 +112,9 @@ def test_bad_tubes(changes, message):
 def test_contour_of_a_box():
     """Rays from inside a cube meet its faces at the distance plane geometry gives."""
     box = trimesh.creation.box((2, 2, 2))
-    radius = contour(box.vertices, box.faces, np.array([0.1, 0, 0]), np.eye(3))
+    cells = Cells.of(box.vertices, box.faces)
+    centre = np.array([0.1, 0, 0])
+    radius = contour(cells.near(centre, X), centre, np.eye(3))
     angle = 2 * math.pi * (np.arange(72) + 0.5) / 72 - math.pi
     wanted = 1 / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))
     np.testing.assert_allclose(radius, wanted, rtol=1e-12)

@@ -22,9 +22,6 @@ from jaxtrachea.contact.shapes import ArrayLike, Shape
 PROBES = 2000
 #: A direction or face belongs to the side of the tube where its sine to the centreline is below.
 SIDEWAYS = 0.5
-#: Vertices are kept for directions whose sine to the centreline is below: the others meet the ends
-#: of a patch, inside its neighbours, or the tool comes from an end of the tube.
-STEEP = 0.75
 #: Planes straight across, which hold a patch together where no face looks sideways.
 ACROSS = 8
 #: Distance of the samples of a curved centreline, mm.
@@ -156,8 +153,7 @@ def _patch(inside, ends, own, station, rounding, most):
     core = HalfspaceIntersection(planes, middle).intersections
     core = core[ConvexHull(core).vertices]
     d = coarse_directions(PROBES)[0]
-    towards = d[np.abs(d @ t) < STEEP]
-    kept = core[_extreme(core @ towards.T, most)]
+    kept = core[_extreme(core @ d.T, most)]
     lost = (own @ d.T - (kept @ d.T).max(axis=0)).max() - r
     return kept.T, r, middle, max(lost, 0), max(filled, 0)
 

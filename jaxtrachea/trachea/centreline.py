@@ -80,9 +80,12 @@ class Shape(NamedTuple):
         """Cut the surface every 0.4 mm."""
         s = np.linspace(0, line.s[-1], max(50, int(line.s[-1] / 0.4)))[1:-1]
         points, frames = line.at(s)
-        cut = lambda v, f: np.stack(  # noqa: E731
-            [contour(v, f, p, q) for p, q in zip(points, frames, strict=True)]
-        )
+
+        def cut(vertices, faces):
+            cells = Cells.of(vertices, faces)
+            rows = zip(points, frames, strict=True)
+            return np.stack([contour(cells.near(p, q[:, 0]), p, q) for p, q in rows])
+
         hit = None if cartilage is None else np.isfinite(cut(*cartilage))
         return cls(line, s, cut(vertices, faces), hit)
 
@@ -92,18 +95,55 @@ class Shape(NamedTuple):
         return float(np.nanmean(self.radius[:n])), float(np.nanmean(self.radius[-n:]))
 
 
-def contour(vertices, faces, centre, frame) -> np.ndarray:
-    """Distance of the farthest hit of each ray in the plane across `frame`'s tangent, or NaN."""
-    across = (vertices - centre) @ frame
-    below = across[faces, 0] < 0
-    cut = faces[(below.sum(axis=1) % 3) != 0]
-    below = across[cut, 0] < 0
+class Cells(NamedTuple):
+    """Triangles sorted into small cubes, so that a plane meets few of them.
+
+    `corners` (faces, 3, 3) in the order of the cubes; `count` triangles in each; `centre` and
+    `reach`: a ball round those of each.
+    """
+
+    corners: np.ndarray
+    count: np.ndarray
+    centre: np.ndarray
+    reach: np.ndarray
+
+    @classmethod
+    def of(cls, vertices, faces) -> "Cells":
+        """Cubes with edges of a 64th of the surface."""
+        corners = vertices[faces]
+        middle = corners.mean(axis=1)
+        low, size = middle.min(axis=0), np.ptp(middle, axis=0).max() / 64 or 1.0
+        at = ((middle - low) / size).astype(int) @ [10000, 100, 1]
+        order = np.argsort(at, kind="stable")
+        first = np.unique(at[order], return_index=True)[1]
+        corners, count = corners[order], np.diff(first, append=len(order))
+        centre = np.add.reduceat(middle[order], first) / count[:, None]
+        away = np.linalg.norm(corners - np.repeat(centre, count, axis=0)[:, None], axis=2)
+        return cls(corners, count, centre, np.maximum.reduceat(away.max(axis=1), first))
+
+    def near(self, point, normal) -> np.ndarray:
+        """Corners of all triangles that a plane may cut, and of some others."""
+        hit = np.abs((self.centre - point) @ normal) <= self.reach * (1 + 1e-9)
+        return self.corners[np.repeat(hit, self.count)]
+
+
+def contour(corners, centre, frame) -> np.ndarray:
+    """Distance of the farthest hit of each ray in the plane across `frame`'s tangent, or NaN.
+
+    Args:
+        corners: of the triangles; shape (faces, 3, 3).
+        centre: from which the rays go.
+        frame: columns tangent, and the two axes of the plane.
+    """
+    below = (corners - centre) @ frame[:, 0] < 0
+    across = (corners[(below.sum(axis=1) % 3) != 0] - centre) @ frame
+    below = across[:, :, 0] < 0
     alone = np.where(below.sum(axis=1) == 1, below.argmax(axis=1), below.argmin(axis=1))
-    rows = np.arange(len(cut))
-    tip = across[cut[rows, alone]]
+    rows = np.arange(len(across))
+    tip = across[rows, alone]
     ends = []
     for step in (1, 2):
-        foot = across[cut[rows, (alone + step) % 3]]
+        foot = across[rows, (alone + step) % 3]
         way = tip[:, 0] / (tip[:, 0] - foot[:, 0])
         ends.append(tip[:, 1:] + way[:, None] * (foot - tip)[:, 1:])
     first, side = ends[0], ends[1] - ends[0]
@@ -140,9 +180,9 @@ def find_centreline(vertices, faces, given=None) -> Line:
     along = (vertices - centre) @ axes[:, 0]
     margin = 0.05 * np.ptp(along)
     stations = np.linspace(along.min() + margin, along.max() - margin, STATIONS)
-    curve = [np.zeros(1)] * 2
+    curve, cells = [np.zeros(1)] * 2, Cells.of(vertices, faces)
     for _ in range(4):
-        seen, off = _centres(vertices, faces, centre, axes, stations, curve)
+        seen, off = _centres(cells, centre, axes, stations, curve)
         if len(seen) < STATIONS / 2:
             raise MeshError(
                 f"only {len(seen)} of {STATIONS} cross-sections close round the axis; "
@@ -155,7 +195,7 @@ def find_centreline(vertices, faces, given=None) -> Line:
     return _over(vertices, _fine(centre + local @ axes.T))
 
 
-def _centres(vertices, faces, centre, axes, stations, curve):
+def _centres(cells, centre, axes, stations, curve):
     """Centroids of the whole outer contours, as (position along the axis, offset across it)."""
     value, slope = np.polynomial.polynomial.polyval, np.polynomial.polynomial.polyder
     found = []
@@ -163,7 +203,7 @@ def _centres(vertices, faces, centre, axes, stations, curve):
         here = centre + axes @ np.array([t, *(value(t, c) for c in curve)])
         tangent = axes @ np.array([1, *(value(t, slope(c)) for c in curve)])
         frame = _frame(tangent, axes[:, 1])
-        radius = contour(vertices, faces, here, frame)
+        radius = contour(cells.near(here, frame[:, 0]), here, frame)
         whole = np.isfinite(radius)
         if whole.mean() < 0.9:
             continue
@@ -217,15 +257,19 @@ def turned(line: Line) -> Line:
 
 def locate(line: Line, points) -> Located:
     """Skeleton coordinates of points: the nearest point of the line, and the angle round it."""
+    from scipy.spatial import cKDTree
+
     start, step = line.points[:-1], np.diff(line.points, axis=0)
     length = np.linalg.norm(step, axis=1)
-    s = np.empty(len(points))
-    for rows in np.array_split(np.arange(len(points)), len(points) // 2000 + 1):
-        away = points[rows, None] - start[None]
-        way = np.clip(np.sum(away * step, axis=2) / length**2, 0, 1)
-        miss = np.sum((away - way[:, :, None] * step) ** 2, axis=2)
-        best = miss.argmin(axis=1)
-        s[rows] = line.s[best] + way[np.arange(len(rows)), best] * length[best]
+    nearest = cKDTree(line.points).query(points)[1]
+    beside = np.clip(nearest[:, None] + np.arange(-2, 2), 0, len(start) - 1)
+    least, s = np.full(len(points), np.inf), np.empty(len(points))
+    for i in beside.T:
+        away = points - start[i]
+        way = np.clip(np.sum(away * step[i], axis=1) / length[i] ** 2, 0, 1)
+        miss = np.sum((away - way[:, None] * step[i]) ** 2, axis=1)
+        s = np.where(miss < least, line.s[i] + way * length[i], s)
+        least = np.minimum(miss, least)
     centre, frames = line.at(s)
     across = np.einsum("vji,vj->vi", frames, points - centre)
     phi = np.arctan2(across[:, 2], across[:, 1])
