@@ -54,7 +54,7 @@ def test_a_finer_mesh_moves_the_gap_by_less_than_0_03_mm():
     assert np.ptp(found, axis=0).max() < 0.03
     # Between the vertices of the coarse mesh: its facets lie R (1 - cos(pi / 35)) deeper.
     half = np.pi / 35
-    at = np.stack([s, 18.5 * np.cos(half), 18.5 * np.sin(half)], axis=1)
+    at = np.stack([s, 0 * s + 18.5 * np.cos(half), 0 * s + 18.5 * np.sin(half)], axis=1)
     found = np.stack([gaps(mesh, at, 6.0) for mesh in MESHES.values()])
     assert np.ptp(found, axis=0).max() < 0.03 + 12.6 * (1 - np.cos(half))
 
