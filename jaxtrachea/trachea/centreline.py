@@ -276,22 +276,32 @@ def locate(line: Line, points) -> Located:
     return Located(s, phi, np.hypot(across[:, 1], across[:, 2]), frames)
 
 
-def _relief(shape: Shape) -> np.ndarray:
+def _relief(shape: Shape, to_ends: bool = False) -> np.ndarray:
     """How far the contour stands out of its surroundings along s, mm.
 
     The surroundings: the mean over a window as long as the radius. Within half a window of an end
-    they are continued straight, so that a ring there is seen as any other.
+    the relief is NaN, or else they are continued straight, so that a ring there is seen too; NaN
+    then where the contour runs into a lid.
     """
-    span = max(5, int(np.nanmean(shape.radius) / (shape.s[1] - shape.s[0])) | 1)
+    step = shape.s[1] - shape.s[0]
+    span = max(5, int(np.nanmean(shape.radius) / step) | 1)
+    out = np.full_like(shape.radius, np.nan)
     if len(shape.s) <= 2 * span:
-        return np.full_like(shape.radius, np.nan)
-    window = np.ones(span) / span
+        return out
+    window, half = np.ones(span) / span, span // 2
     level = np.stack([np.convolve(v, window, "valid") for v in shape.radius.T], axis=1)
-    half, i = span // 2, np.arange(span // 2)[:, None]
+    out[half:-half] = shape.radius[half:-half] - level
+    if not to_ends:
+        return out
+    i = np.arange(half)[:, None]
     slope = lambda first, last: (last - first) / (span - 1)  # noqa: E731
-    before = level[0] - slope(level[0], level[span - 1]) * (half - i)
-    after = level[-1] + slope(level[-span], level[-1]) * (i + 1)
-    return shape.radius - np.concatenate([before, level, after])
+    out[:half] = shape.radius[:half] - level[0] + slope(level[0], level[span - 1]) * (half - i)
+    out[-half:] = shape.radius[-half:] - level[-1] - slope(level[-span], level[-1]) * (i + 1)
+    steep = np.abs(np.diff(shape.radius, axis=0)).mean(axis=1) > step  # a lid: more than 45 deg
+    low, high = np.flatnonzero(steep[:half]), np.flatnonzero(steep[-half:])
+    out[: low[-1] + 1 if len(low) else 0] = np.nan
+    out[len(out) - half + high[0] if len(high) else len(out) :] = np.nan
+    return out
 
 
 def find_anterior(shape: Shape, given=None) -> Shape:
@@ -362,8 +372,11 @@ def find_rings(shape: Shape, positions=None, half_angle=None) -> Rings:
     else:
         source, relief = "the relief of the wall", _relief(shape)
         strength = np.sqrt(np.nan_to_num(_middle(relief**2)))
-        profile = np.nan_to_num(np.mean(relief[:, ARC], axis=1))
-        fall = max(0.01 * radius, 0.3 * float(np.ptp(profile)))
+        inner = np.nan_to_num(np.mean(relief[:, ARC], axis=1))
+        fall = max(0.01 * radius, 0.3 * float(np.ptp(inner)))
+        profile = np.mean(_relief(shape, to_ends=True)[:, ARC], axis=1)
+        seen = np.flatnonzero(np.isfinite(profile))
+        profile = np.interp(np.arange(len(profile)), seen, profile[seen]) if len(seen) else inner
     n = max(1, round(1.2 / step))
     padded = np.pad(profile, (n // 2, n - 1 - n // 2), "edge")
     smooth = np.convolve(padded, np.ones(n) / n, "valid")
