@@ -8,7 +8,7 @@ closest of all triangles. On numbers, once; nothing here is traced.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from jaxtrachea.contact.patches import Patches
 from jaxtrachea.trachea.geometry import Geometry
@@ -141,7 +141,7 @@ def _distance(corners, points):
 
     middle = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middle[:, None], axis=2).max()
-    tree, found = cKDTree(middle), []
+    tree, found = KDTree(middle), []
     for point, least in zip(points, tree.query(points)[0], strict=True):
         near = corners[tree.query_ball_point(point, least + reach)]
         closest = trimesh.triangles.closest_point(near, np.tile(point, (len(near), 1)))
