@@ -39,7 +39,7 @@ ORDER = [
 ]
 #: Within `scene`, likewise: what is there, the program, files and pictures.
 SCENE = [
-    {"operations", "spec", "curve"},
+    {"operations", "spec", "curve", "wall_check"},
     {"plan"},
     {"rules"},
     {"stage"},

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxtrachea.trachea.centreline import contour
+from jaxtrachea.trachea.centreline import Cells, _check_row, contour
 from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.imported import read_mesh
 from jaxtrachea.trachea.mesh import MeshError, edge_counts, place, volume
@@ -112,7 +112,9 @@ def test_bad_tubes(changes, message):
 def test_contour_of_a_box():
     """Rays from inside a cube meet its faces at the distance plane geometry gives."""
     box = trimesh.creation.box((2, 2, 2))
-    radius = contour(box.vertices, box.faces, np.array([0.1, 0, 0]), np.eye(3))
+    cells = Cells.of(box.vertices, box.faces)
+    centre = np.array([0.1, 0, 0])
+    radius = contour(cells.near(centre, X), centre, np.eye(3))
     angle = 2 * math.pi * (np.arange(72) + 0.5) / 72 - math.pi
     wanted = 1 / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))
     np.testing.assert_allclose(radius, wanted, rtol=1e-12)
@@ -342,6 +344,45 @@ def test_bad_files(tmp_path, make, options, message):
         read_mesh(tmp_path / "bad.ply", **options)
 
 
+def lumen(bulges, height=0.1):
+    """A closed lumen: smooth, and wider in some places (s and half-length of each, mm)."""
+    vertices, faces = as_arrays(make_tube(GEOMETRY, around=32, along=100, relief=0.0, flatten=0.2))
+    away = np.array([(vertices[:, 0] - s) / half for s, half in bulges])
+    wide = 1 + height * np.sum(np.cos(np.pi / 2 * np.clip(away, -1, 1)) ** 2, axis=0)
+    return vertices * np.stack([np.ones_like(wide), wide, wide], 1), faces
+
+
+@pytest.mark.parametrize(
+    ("bulges", "message"),
+    [
+        ([(30, 4), (60, 4)], "found 2 rings .* expected at least 4"),
+        ([(20, 4), (27, 4), (34, 4), (60, 4), (70, 4)], "found 5 rings .* expected them even"),
+        ([(20, 3), (27, 3), (34, 3), (41, 3)], "found 4 rings .* on 40 % of its 92.04 mm"),
+    ],
+)
+def test_bulges_of_a_lumen_are_no_rings(tmp_path, bulges, message):
+    """The first was a trachea of two rings, with patches half its length."""
+    vertices, faces = lumen(bulges)
+    with pytest.raises(MeshError, match=message):
+        read_mesh(write(tmp_path / "t.stl", vertices=vertices, faces=faces), larynx=ROTATION @ X)
+
+
+def test_crests_too_far_apart_are_no_rings():
+    """25 mm on a tube of 10 mm radius: waves of a lumen, or of breathing."""
+    with pytest.raises(MeshError, match="found 4 rings .* expected them 2 to 20 mm apart"):
+        _check_row(np.array([10.0, 35, 60, 85]), "the relief", 10.0, 92.0, False)
+
+
+@pytest.mark.parametrize("end", [2.0, 4.0])
+def test_rings_near_the_ends_are_rings(tmp_path, end):
+    """14 rings, the first and last 2 or 4 mm from the ends: less than half the radius."""
+    rings = end + 6.5 * np.arange(14)
+    geometry = Geometry.create(rings[-1] + end, rings, radius=9.0)
+    mesh = make_tube(geometry, around=24, along=2 * int(rings[-1] + end))
+    found = read_mesh(write(tmp_path / "t.stl", mesh), larynx=ROTATION @ X)
+    np.testing.assert_allclose(found.geometry.ring_positions, rings, atol=0.35)
+
+
 def test_a_round_smooth_tube_has_no_front(tmp_path):
     smooth = make_tube(GEOMETRY, around=40, along=60, relief=0.0, flatten=0.0)
     with pytest.raises(MeshError, match="which side is anterior"):
@@ -393,5 +434,5 @@ def test_real_trachea_from_another_format(real):
 
 @needs_real
 def test_the_real_wall_alone_shows_no_rings():
-    with pytest.raises(MeshError, match="give rings="):
+    with pytest.raises(MeshError, match="or rings="):
         read_mesh(REAL / "wall_mm.stl")

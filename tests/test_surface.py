@@ -237,6 +237,37 @@ def test_phong_interpolates_magnitude_and_angle(sign, at_C):
     np.testing.assert_allclose(got, keyed(1.5, (at_C + 0.7) / 2, ALPHA / 2), atol=1e-5)
 
 
+@pytest.mark.parametrize("phi_c", [0.0, 0.4, 1.9, -1.9])
+@pytest.mark.parametrize("tilt", [0.0, 0.6, -0.9])
+def test_phong_moves_the_back_of_a_moving_tube_with_it(phi_c, tilt):
+    """A tube that moves as a whole, inwards at C or slanting, moves so everywhere: the back too."""
+    turn = phi_c + tilt
+    shift = -jnp.array([0.3 * tilt, math.cos(turn), math.sin(turn)])
+    rows = [jnp.tile(shift, (17, 1))] * 3
+    keys = regions.Keys(jnp.asarray(73.0), shift, *rows)
+    got = motion("phong", 42.0, np.linspace(-math.pi, math.pi, 61), phi_c, keys)
+    np.testing.assert_allclose(got, np.broadcast_to(shift, got.shape), atol=2e-6)  # fade 1 um
+
+
+def test_phong_on_the_back_of_a_flattened_tube():
+    """Ring ends that part and sink, mirror images: the angle to the normal is linear behind too.
+
+    At V the displacement stands at an angle b to the outward normal (counted towards the rear), at
+    U at -b; between them the tube's normal turns and the angle goes linearly through 0.
+    """
+    b, size = 0.5, 1.4
+    outward = lambda angle: np.array([0, math.cos(angle), math.sin(angle)])  # noqa: E731
+    U, V = size * outward(-ALPHA - b), size * outward(ALPHA + b)
+    rows = [jnp.tile(jnp.asarray(v), (17, 1)) for v in ([0.0, -2.0, 0.0], U, V)]
+    keys = regions.Keys(jnp.asarray(73.0), jnp.array([0.0, -2.0, 0.0]), *rows)
+    share = np.linspace(0, 1, 21)
+    phi = ALPHA + share * 2 * (math.pi - ALPHA)
+    angle = phi + b * (1 - 2 * share)
+    wanted = size * np.stack([0 * angle, np.cos(angle), np.sin(angle)], axis=1)
+    around = np.where(phi > math.pi, phi - 2 * math.pi, phi)
+    np.testing.assert_allclose(motion("phong", 42.0, around, 0.0, keys), wanted, atol=5e-6)
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("method", METHODS)
 def test_nothing_moves_nothing(method, dtype):

@@ -13,6 +13,7 @@ from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.contact import shapes
 from jaxtrachea.contact.pose import pose_from_vector
 from jaxtrachea.identify.study import geometry_of
+from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.plan import PlanError, Wishes
 from jaxtrachea.scene.rules import make_plan
@@ -31,6 +32,12 @@ STEPS = 10
 
 #: Longest table of points or poses that is read.
 MAX_BYTES = 64 * 2**20
+
+#: Meshes that scenes of `configs/` name, and where they come from.
+MESHES = {
+    "meshes/trachea.glb": "3D Reference Organ for Trachea, Male v1.0 (GLB, CC BY 4.0), "
+    "doi:10.48539/HBM969.WCCJ.636",
+}
 
 #: Arguments of `read_mesh` that a scene calls otherwise, or does not have.
 KEYS = {
@@ -76,11 +83,15 @@ def stage(spec: SceneSpec, folder: Path) -> Staged:
         )  # fmt: skip
     except PlanError as error:
         raise SpecError(f"effects.{error}") from None
+    except MeshError as error:
+        name = Path(spec.trachea.file or "").name
+        raise SpecError(f"trachea.file: {name}: {_in_keys(str(error))}") from None
     if scene.tube is not None and mesh is not None:
         lost, filled = float(scene.tube.lost.max()), float(scene.tube.filled.max())
         notes += (
             f"contact patches: the surface stands out of them by up to {lost:.2g} mm; hollows (and "
             f"an inner wall) are bridged up to {filled:.2g} mm deep",
+            wall_check.measure(mesh, geometry, scene.tube).sentence,
         )
     return Staged(scene, material, path, tuple(files), notes)
 
@@ -168,11 +179,15 @@ def _imported(section: SceneTracheaSection, folder: Path, files: list[Path]):
             anterior=section.anterior, ring_positions=rings, half_angle=section.half_angle,
         )  # fmt: skip
     except (MeshError, UnitError) as error:
-        said = str(error)
-        for argument, key in KEYS.items():
-            said = said.replace(argument, key)
-        raise SpecError(f"trachea.file: {said}") from None
+        raise SpecError(f"trachea.file: {_in_keys(str(error))}") from None
     return read.geometry, read.mesh, read.notes
+
+
+def _in_keys(message: str) -> str:
+    """The message with the keys of a scene for the arguments of `read_mesh`."""
+    for argument, key in KEYS.items():
+        message = message.replace(argument, key)
+    return message
 
 
 def _tool(section: ToolSection, folder: Path, files: list[Path]) -> shapes.Shape:
@@ -246,9 +261,19 @@ def _file(folder: Path, name: str, key: str, files: list[Path]) -> Path:
     except (OSError, ValueError):
         found = False
     if not found:
-        raise SpecError(f"{key}: there is no file {name!r} in the scene's folder; check the name")
+        from_where = _source(name) if key == "trachea.file" else ""
+        raise SpecError(
+            f"{key}: there is no file {name!r} in the scene's folder; check the name{from_where}"
+        )
     files.append(path)
     return path
+
+
+def _source(name: str) -> str:
+    """Where a mesh of `configs/` comes from, which the repository does not hold."""
+    if name not in MESHES:
+        return ""
+    return f", or fetch it: {MESHES[name]}, and save it under this name (docs/surface.md)"
 
 
 def _table(path: Path, key: str, needed: tuple[str, ...], optional: tuple[str, ...]) -> np.ndarray:

@@ -16,6 +16,7 @@ from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import STANDARD, Settings
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.contact.walls import patches_of
+from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.plan import Facts, Plan, PlanError, Wishes
 from jaxtrachea.scene.rules import make_plan
@@ -37,6 +38,9 @@ FOOTPRINT, LEAST = 0.6, 4.0
 NEAR = 2
 #: Patches of a mesh: their rounding, and corners of each (docs/scenes.md says what that loses).
 ROUNDED, CORNERS = 0.15, 128
+#: Longest patch over the usual distance of the rings (at most the radius): beyond the last ring a
+#: tube goes on, and one patch would bridge its bend.
+LONGEST = 1.5
 
 
 class Presses(eqx.Module):
@@ -189,6 +193,7 @@ def make_scene(
 
     Raises:
         PlanError: a wish that cannot be met.
+        MeshError: patches for the contact that are not where an imported mesh is.
         ValueError: a path without rows, arrays of a wrong length, or a negative friction.
     """
     check_path(path)
@@ -204,6 +209,8 @@ def make_scene(
     size, tube, near = LEAST, None, 1
     if tool is not None and isinstance(path, Poses):
         tube = _round(geometry, float(outer)) if mesh is None else _walls(geometry, mesh)
+        if mesh is not None and mesh.frames is not None:
+            wall_check.check(mesh, geometry, tube)
         near = _near_patches(tool, geometry, tube.centres.shape[0])
     if tool is not None:
         extent = np.ptp(np.asarray(tool.vertices), axis=1).min() / 2 + float(tool.radius)
@@ -247,7 +254,10 @@ def _round(geometry: Geometry, radius: float) -> Patches:
 
 
 def _walls(geometry: Geometry, mesh: Mesh) -> Patches:
-    """The surface of a mesh, cut midway between the rings: each patch bulges with its ring."""
+    """The surface of a mesh, cut midway between the rings: each patch bulges with its ring.
+
+    Spans longer than `LONGEST` says are cut evenly.
+    """
     numbers = (mesh.vertices, mesh.faces, mesh.s, mesh.phi, mesh.distance)
     vertices, faces, s, phi, distance = (np.asarray(v) for v in numbers)
     centres = frames = None
@@ -259,6 +269,10 @@ def _walls(geometry: Geometry, mesh: Mesh) -> Patches:
     ends = max(float(s.min()), 0.0), min(float(s.max()), float(geometry.length))
     between = (ring[1:] + ring[:-1]) / 2
     borders = np.array([ends[0], *between[(between > ends[0]) & (between < ends[1])], ends[1]])
+    usual = min([float(geometry.radius), *(np.median(np.diff(ring)),) * (len(ring) > 1)])
+    parts = np.ceil(np.diff(borders) / (LONGEST * usual) - 1e-4).astype(int)
+    spans = zip(borders[:-1], borders[1:], np.maximum(parts, 1), strict=True)
+    borders = np.concatenate([*(np.linspace(a, b, n + 1)[:-1] for a, b, n in spans), borders[-1:]])
     return patches_of(
         vertices, faces, s, borders, centres=centres, frames=frames, rounding=ROUNDED, most=CORNERS,
         dtype=geometry.length.dtype,

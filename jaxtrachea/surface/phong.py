@@ -1,8 +1,15 @@
-"""A displacement as magnitude, and angle and azimuth to the normal (for `regions`, `phong`)."""
+"""A displacement as magnitude and two angles (for `regions`, method `phong`).
+
+The pole is the normal at the contact C, inward for a press. The turn is the angle in the
+cross-section from the pole, the rise the angle out of the cross-section. Seen from the normal at
+phi, the turn is larger by phi - phi_C, which is linear in phi: so both are the printed angles to
+the normal, linear between the key points, but none of them passes over its own half-turn on the
+way round the tube, as angles counted from the normal of each key do on the back.
+"""
 
 import jax.numpy as jnp
 
-#: Displacement below which `phong` fades to the normal direction, mm.
+#: Displacement below which `phong` fades to the direction of the pole, mm.
 FADE = 1e-3
 
 
@@ -12,31 +19,29 @@ def radial(phi, vector):
 
 
 def encode(vector, phi, pole):
-    """Magnitude, and angle to the pole times (cos, sin) of the azimuth; rows, as is `vector`."""
+    """Magnitude, rise and turn; rows, as is `vector`.
+
+    Args:
+        vector: along (tangent, anterior, lateral), mm; shape (3, ...).
+        phi: of the pole, rad: the angle of contact, for all key points.
+        pole: -1: the pole is the inward normal there, 1: the outward one.
+    """
     normal = pole * radial(phi, vector)
     along, round_ = vector[0], jnp.cos(phi) * vector[2] - jnp.sin(phi) * vector[1]
     square = jnp.sum(vector**2, axis=0)
     size = jnp.sqrt(square + FADE**2)
     normal = normal + FADE**2 / size  # at rest the direction is the pole's
-    side = along**2 + round_**2
-    close = side <= (1e-4 * normal) ** 2
-    sideways = jnp.sqrt(jnp.where(close, 1, side))
-    per_length = jnp.where(
-        close & (normal > 0),
-        1 / jnp.where(normal > 0, normal, 1),
-        jnp.arctan2(sideways, normal) / sideways,
-    )
-    return jnp.stack([square / size, per_length * along, per_length * round_])
+    across = normal**2 + round_**2
+    none = across < FADE**2 * 1e-12  # along the tube, or at rest against the fade: no turn
+    rise = jnp.arctan2(along, jnp.sqrt(jnp.where(none, FADE**2 * 1e-12, across)))
+    turn = jnp.arctan2(jnp.where(none, 0, round_), jnp.where(none, 1, normal))
+    return jnp.stack([square / size, rise, turn])
 
 
 def decode(channels, phi, pole):
-    """The vector again; rows."""
-    magnitude, a, b = channels
-    square = a * a + b * b
-    small = square < 1e-8
-    angle = jnp.sqrt(jnp.where(small, 1, square))
-    sinc = jnp.where(small, 1 - square / 6, jnp.sin(angle) / angle)
-    normal = pole * magnitude * jnp.where(small, 1 - square / 2, jnp.cos(angle))
-    round_ = magnitude * sinc * b
+    """The vector again; rows. Arguments as for `encode`."""
+    magnitude, rise, turn = channels
+    across = magnitude * jnp.cos(rise)
+    normal, round_ = pole * across * jnp.cos(turn), across * jnp.sin(turn)
     c, s = jnp.cos(phi), jnp.sin(phi)
-    return jnp.stack([magnitude * sinc * a, c * normal - s * round_, s * normal + c * round_])
+    return jnp.stack([magnitude * jnp.sin(rise), c * normal - s * round_, s * normal + c * round_])

@@ -8,8 +8,9 @@ regions, U-J, J-V and the back V-U. The three lines are interpolated along s, th
 - `linear`: displacement vectors, linear between the key points.
 - `hermite` (default): the same, but the transverse displacement of the J line is the beam's cubic,
   exact for a beam without shear flexibility.
-- `phong`: as printed, magnitude and the angle to the outward normal are interpolated, linear
-  between the key points. One angle does not fix a direction, so the azimuth is carried with it.
+- `phong`: as printed, magnitude and the angle to the normal are interpolated, linear between the
+  key points. One angle does not fix a direction: it is carried as two, in the cross-section and
+  out of it (module `phong`).
 
 Vectors are along (tangent, anterior, lateral) of the centreline, in mm. `bind` is done once for a
 mesh, `weigh` once for an angle of contact.
@@ -321,16 +322,14 @@ def _insert(rows, row, below):
 
 
 def _phong(binding: Binding, weights: Weights, keys: Keys):
-    """Interpolate (magnitude, angle and azimuth to the normal), linear between the key points."""
-    # Angles are counted from the inward normal for a press, else from the outward one; the
-    # azimuth is undefined at the opposite pole only, far from where the displacements are.
-    alpha = binding.half_angle
-    drawn = phong.radial(weights.phi_c, keys.contact) > 0
-    pole = jnp.where(drawn, 1, -1).astype(alpha.dtype)
-    encode = lambda v, phi: phong.encode(v, phi, pole)  # noqa: E731
-    joints, contact = encode(keys.joints.T, weights.phi_c).T, encode(keys.contact, weights.phi_c)
+    """Interpolate magnitude and angles to the normal, linear between the key points."""
+    # The pole is the inward normal at C for a press, else the outward one; the turn jumps at the
+    # opposite pole only, far from where the displacements are.
+    phi_c = weights.phi_c
+    pole = jnp.where(phong.radial(phi_c, keys.contact) > 0, 1, -1).astype(phi_c.dtype)
+    encode = lambda v: phong.encode(v, phi_c, pole)  # noqa: E731
+    joints, contact = encode(keys.joints.T).T, encode(keys.contact)
     line = _joint_line(binding.nodes, keys.s_c, joints, contact)
-    U, V = encode(keys.U.T, -alpha).T, encode(keys.V.T, alpha).T
-    channels = _carry(binding, weights, keys.s_c, line, U, V)
-    u = phong.decode(channels.swapaxes(0, 1), binding.phi, pole).swapaxes(0, 1)
+    channels = _carry(binding, weights, keys.s_c, line, encode(keys.U.T).T, encode(keys.V.T).T)
+    u = phong.decode(channels.swapaxes(0, 1), phi_c, pole).swapaxes(0, 1)
     return to_vertices(u, binding.blocks)

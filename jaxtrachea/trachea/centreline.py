@@ -19,6 +19,11 @@ STATIONS = 60
 ANGLES = 2 * math.pi * (np.arange(RAYS) + 0.5) / RAYS - math.pi
 #: The arc on which rings are looked for: the anterior side, clear of the rings' ends.
 ARC = np.abs(ANGLES) < 1.6
+#: What a row of rings is: their least number; distance of neighbours over the radius (17 rings of a
+#: human trachea: 0.7; table 1: 0.9); distance over the median one; share of the length they take.
+FEWEST, PITCH, EVEN, SHARE = 4, (0.2, 2.0), (0.4, 2.2), 0.4
+#: Cartilage may fork and join, which gives two crests near each other (Visible Human male: 0.35).
+FORKED = 0.2
 
 
 class Line(NamedTuple):
@@ -75,9 +80,12 @@ class Shape(NamedTuple):
         """Cut the surface every 0.4 mm."""
         s = np.linspace(0, line.s[-1], max(50, int(line.s[-1] / 0.4)))[1:-1]
         points, frames = line.at(s)
-        cut = lambda v, f: np.stack(  # noqa: E731
-            [contour(v, f, p, q) for p, q in zip(points, frames, strict=True)]
-        )
+
+        def cut(vertices, faces):
+            cells = Cells.of(vertices, faces)
+            rows = zip(points, frames, strict=True)
+            return np.stack([contour(cells.near(p, q[:, 0]), p, q) for p, q in rows])
+
         hit = None if cartilage is None else np.isfinite(cut(*cartilage))
         return cls(line, s, cut(vertices, faces), hit)
 
@@ -87,18 +95,55 @@ class Shape(NamedTuple):
         return float(np.nanmean(self.radius[:n])), float(np.nanmean(self.radius[-n:]))
 
 
-def contour(vertices, faces, centre, frame) -> np.ndarray:
-    """Distance of the farthest hit of each ray in the plane across `frame`'s tangent, or NaN."""
-    across = (vertices - centre) @ frame
-    below = across[faces, 0] < 0
-    cut = faces[(below.sum(axis=1) % 3) != 0]
-    below = across[cut, 0] < 0
+class Cells(NamedTuple):
+    """Triangles sorted into small cubes, so that a plane meets few of them.
+
+    `corners` (faces, 3, 3) in the order of the cubes; `count` triangles in each; `centre` and
+    `reach`: a ball round those of each.
+    """
+
+    corners: np.ndarray
+    count: np.ndarray
+    centre: np.ndarray
+    reach: np.ndarray
+
+    @classmethod
+    def of(cls, vertices, faces) -> "Cells":
+        """Cubes with edges of a 64th of the surface."""
+        corners = vertices[faces]
+        middle = corners.mean(axis=1)
+        low, size = middle.min(axis=0), np.ptp(middle, axis=0).max() / 64 or 1.0
+        at = ((middle - low) / size).astype(int) @ [10000, 100, 1]
+        order = np.argsort(at, kind="stable")
+        first = np.unique(at[order], return_index=True)[1]
+        corners, count = corners[order], np.diff(first, append=len(order))
+        centre = np.add.reduceat(middle[order], first) / count[:, None]
+        away = np.linalg.norm(corners - np.repeat(centre, count, axis=0)[:, None], axis=2)
+        return cls(corners, count, centre, np.maximum.reduceat(away.max(axis=1), first))
+
+    def near(self, point, normal) -> np.ndarray:
+        """Corners of all triangles that a plane may cut, and of some others."""
+        hit = np.abs((self.centre - point) @ normal) <= self.reach * (1 + 1e-9)
+        return self.corners[np.repeat(hit, self.count)]
+
+
+def contour(corners, centre, frame) -> np.ndarray:
+    """Distance of the farthest hit of each ray in the plane across `frame`'s tangent, or NaN.
+
+    Args:
+        corners: of the triangles; shape (faces, 3, 3).
+        centre: from which the rays go.
+        frame: columns tangent, and the two axes of the plane.
+    """
+    below = (corners - centre) @ frame[:, 0] < 0
+    across = (corners[(below.sum(axis=1) % 3) != 0] - centre) @ frame
+    below = across[:, :, 0] < 0
     alone = np.where(below.sum(axis=1) == 1, below.argmax(axis=1), below.argmin(axis=1))
-    rows = np.arange(len(cut))
-    tip = across[cut[rows, alone]]
+    rows = np.arange(len(across))
+    tip = across[rows, alone]
     ends = []
     for step in (1, 2):
-        foot = across[cut[rows, (alone + step) % 3]]
+        foot = across[rows, (alone + step) % 3]
         way = tip[:, 0] / (tip[:, 0] - foot[:, 0])
         ends.append(tip[:, 1:] + way[:, None] * (foot - tip)[:, 1:])
     first, side = ends[0], ends[1] - ends[0]
@@ -135,9 +180,9 @@ def find_centreline(vertices, faces, given=None) -> Line:
     along = (vertices - centre) @ axes[:, 0]
     margin = 0.05 * np.ptp(along)
     stations = np.linspace(along.min() + margin, along.max() - margin, STATIONS)
-    curve = [np.zeros(1)] * 2
+    curve, cells = [np.zeros(1)] * 2, Cells.of(vertices, faces)
     for _ in range(4):
-        seen, off = _centres(vertices, faces, centre, axes, stations, curve)
+        seen, off = _centres(cells, centre, axes, stations, curve)
         if len(seen) < STATIONS / 2:
             raise MeshError(
                 f"only {len(seen)} of {STATIONS} cross-sections close round the axis; "
@@ -150,7 +195,7 @@ def find_centreline(vertices, faces, given=None) -> Line:
     return _over(vertices, _fine(centre + local @ axes.T))
 
 
-def _centres(vertices, faces, centre, axes, stations, curve):
+def _centres(cells, centre, axes, stations, curve):
     """Centroids of the whole outer contours, as (position along the axis, offset across it)."""
     value, slope = np.polynomial.polynomial.polyval, np.polynomial.polynomial.polyder
     found = []
@@ -158,7 +203,7 @@ def _centres(vertices, faces, centre, axes, stations, curve):
         here = centre + axes @ np.array([t, *(value(t, c) for c in curve)])
         tangent = axes @ np.array([1, *(value(t, slope(c)) for c in curve)])
         frame = _frame(tangent, axes[:, 1])
-        radius = contour(vertices, faces, here, frame)
+        radius = contour(cells.near(here, frame[:, 0]), here, frame)
         whole = np.isfinite(radius)
         if whole.mean() < 0.9:
             continue
@@ -212,31 +257,50 @@ def turned(line: Line) -> Line:
 
 def locate(line: Line, points) -> Located:
     """Skeleton coordinates of points: the nearest point of the line, and the angle round it."""
+    from scipy.spatial import KDTree
+
     start, step = line.points[:-1], np.diff(line.points, axis=0)
     length = np.linalg.norm(step, axis=1)
-    s = np.empty(len(points))
-    for rows in np.array_split(np.arange(len(points)), len(points) // 2000 + 1):
-        away = points[rows, None] - start[None]
-        way = np.clip(np.sum(away * step, axis=2) / length**2, 0, 1)
-        miss = np.sum((away - way[:, :, None] * step) ** 2, axis=2)
-        best = miss.argmin(axis=1)
-        s[rows] = line.s[best] + way[np.arange(len(rows)), best] * length[best]
+    nearest = KDTree(line.points).query(points)[1]
+    beside = np.clip(nearest[:, None] + np.arange(-2, 2), 0, len(start) - 1)
+    least, s = np.full(len(points), np.inf), np.empty(len(points))
+    for i in beside.T:
+        away = points - start[i]
+        way = np.clip(np.sum(away * step[i], axis=1) / length[i] ** 2, 0, 1)
+        miss = np.sum((away - way[:, None] * step[i]) ** 2, axis=1)
+        s = np.where(miss < least, line.s[i] + way * length[i], s)
+        least = np.minimum(miss, least)
     centre, frames = line.at(s)
     across = np.einsum("vji,vj->vi", frames, points - centre)
     phi = np.arctan2(across[:, 2], across[:, 1])
     return Located(s, phi, np.hypot(across[:, 1], across[:, 2]), frames)
 
 
-def _relief(shape: Shape) -> np.ndarray:
-    """How far the contour stands out of its surroundings along s, mm; NaN towards the ends."""
-    span = max(5, int(np.nanmean(shape.radius) / (shape.s[1] - shape.s[0])) | 1)
-    if len(shape.s) <= 2 * span:
-        return np.full_like(shape.radius, np.nan)
-    window = np.ones(span) / span
-    level = np.stack([np.convolve(v, window, "valid") for v in shape.radius.T], axis=1)
+def _relief(shape: Shape, to_ends: bool = False) -> np.ndarray:
+    """How far the contour stands out of its surroundings along s, mm.
+
+    The surroundings: the mean over a window as long as the radius. Within half a window of an end
+    the relief is NaN, or else they are continued straight, so that a ring there is seen too; NaN
+    then where the contour runs into a lid.
+    """
+    step = shape.s[1] - shape.s[0]
+    span = max(5, int(np.nanmean(shape.radius) / step) | 1)
     out = np.full_like(shape.radius, np.nan)
-    half = span // 2
+    if len(shape.s) <= 2 * span:
+        return out
+    window, half = np.ones(span) / span, span // 2
+    level = np.stack([np.convolve(v, window, "valid") for v in shape.radius.T], axis=1)
     out[half:-half] = shape.radius[half:-half] - level
+    if not to_ends:
+        return out
+    i = np.arange(half)[:, None]
+    slope = lambda first, last: (last - first) / (span - 1)  # noqa: E731
+    out[:half] = shape.radius[:half] - level[0] + slope(level[0], level[span - 1]) * (half - i)
+    out[-half:] = shape.radius[-half:] - level[-1] - slope(level[-span], level[-1]) * (i + 1)
+    steep = np.abs(np.diff(shape.radius, axis=0)).mean(axis=1) > step  # a lid: more than 45 deg
+    low, high = np.flatnonzero(steep[:half]), np.flatnonzero(steep[-half:])
+    out[: low[-1] + 1 if len(low) else 0] = np.nan
+    out[len(out) - half + high[0] if len(high) else len(out) :] = np.nan
     return out
 
 
@@ -308,20 +372,23 @@ def find_rings(shape: Shape, positions=None, half_angle=None) -> Rings:
     else:
         source, relief = "the relief of the wall", _relief(shape)
         strength = np.sqrt(np.nan_to_num(_middle(relief**2)))
-        profile = np.nan_to_num(np.mean(relief[:, ARC], axis=1))
-        fall = max(0.01 * radius, 0.3 * float(np.ptp(profile)))
+        inner = np.nan_to_num(np.mean(relief[:, ARC], axis=1))
+        fall = max(0.01 * radius, 0.3 * float(np.ptp(inner)))
+        profile = np.mean(_relief(shape, to_ends=True)[:, ARC], axis=1)
+        seen = np.flatnonzero(np.isfinite(profile))
+        profile = np.interp(np.arange(len(profile)), seen, profile[seen]) if len(seen) else inner
     n = max(1, round(1.2 / step))
-    smooth = np.convolve(profile, np.ones(n) / n, "same")
+    padded = np.pad(profile, (n // 2, n - 1 - n // 2), "edge")
+    smooth = np.convolve(padded, np.ones(n) / n, "valid")
     if positions is not None:
         found, source = np.asarray(positions, float), "the positions given"
     else:
-        found = shape.s[_peaks(smooth, fall)]
-        gaps = np.diff(found)
-        if len(found) < 2 or gaps.max() > 3.5 * gaps.min():
-            raise MeshError(
-                f"found {len(found)} rings in {source}, expected a row of them; give rings=, "
-                "the cartilage's own surface, or ring_positions="
-            )
+        if shape.cartilage is not None:  # which may begin or end with the surface
+            smooth = np.pad(smooth, 1)
+            found = shape.s[np.clip(_peaks(smooth, fall) - 1, 0, len(shape.s) - 1)]
+        else:
+            found = shape.s[_peaks(smooth, fall)]
+        _check_row(found, source, radius, shape.line.s[-1], shape.cartilage is not None)
     if half_angle is None:
         known = shape.cartilage is not None or positions is None
         half_angle = _half_angle(strength) if known else 2 * math.pi / 3
@@ -329,6 +396,37 @@ def find_rings(shape: Shape, positions=None, half_angle=None) -> Rings:
     if shape.cartilage is not None:
         height = float(profile.sum() * step / len(found))
     return Rings(found, half_angle, radius, height, source)
+
+
+def _check_row(found, source, radius, length, own) -> None:
+    """Refuse crests that are no row of rings.
+
+    Args:
+        found: their positions, mm.
+        source: in words.
+        radius: of the wall, mm.
+        length: of the tube, mm.
+        own: whether they come from the cartilage itself: then they may fork, and be fewer.
+    """
+    gaps, fewest = np.diff(found), 2 if own else FEWEST
+    pitch = float(np.median(gaps)) if len(gaps) else 0.0
+    least = FORKED if own else EVEN[0]
+    if len(found) < fewest:
+        fault = f"at least {fewest}"
+    elif not PITCH[0] * radius <= pitch <= PITCH[1] * radius:
+        fault = f"them {PITCH[0] * radius:.2g} to {PITCH[1] * radius:.2g} mm apart"
+    elif gaps.min() < least * pitch or gaps.max() > EVEN[1] * pitch:
+        fault = f"them even, {least * pitch:.2g} to {EVEN[1] * pitch:.2g} mm apart"
+    elif len(found) * pitch < SHARE * length and not own:
+        fault = f"them on {100 * SHARE:.0f} % of its {length:.4g} mm or more"
+    else:
+        return
+    at = ", ".join(f"{v:.1f}" for v in found[:8]) + (", ..." if len(found) > 8 else "")
+    raise MeshError(
+        f"found {len(found)} rings in {source}{f' (s = {at} mm)' if at else ''}, expected {fault}; "
+        "a lumen shows none: give the outer wall, or rings=, the cartilage's own surface, or "
+        "ring_positions="
+    )
 
 
 def _half_angle(strength) -> float:
@@ -341,7 +439,7 @@ def _half_angle(strength) -> float:
 
 def _peaks(profile, fall) -> np.ndarray:
     """Centres of the waves of `profile` that rise and fall by more than `fall`."""
-    found, high, low, rising = [], 0, 0, True
+    found, high, low, rising = [], 0, 0, False
     for i, value in enumerate(profile):
         if value > profile[high]:
             high = i

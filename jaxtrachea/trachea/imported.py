@@ -24,7 +24,14 @@ from jaxtrachea.trachea.centreline import (
     turned,
 )
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.mesh import Mesh, MeshError, edge_counts, vertex_normals, volume
+from jaxtrachea.trachea.mesh import (
+    Mesh,
+    MeshError,
+    edge_counts,
+    unique_rows,
+    vertex_normals,
+    volume,
+)
 from jaxtrachea.units import unit_factor
 
 #: Length of a trachea with its wall, infant to adult, mm: what a guess of the unit goes by.
@@ -208,10 +215,10 @@ def _clean(surface: _Surface) -> tuple[_Surface, list[str]]:
     if not size > 0:
         raise MeshError("all vertices lie in one point; expected the surface of a trachea")
     grid = np.round((surface.vertices - surface.vertices.min(axis=0)) / (1e-7 * size))
-    _, first, same = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    faces = same.ravel()[surface.faces]
+    first, same = unique_rows(grid)
+    faces = same[surface.faces]
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    once, _ = unique_rows(np.sort(faces, axis=1))
     keep = np.zeros(len(faces), bool)
     keep[once] = True
     keep &= whole
@@ -259,7 +266,7 @@ def _outward(surface: _Surface, notes: list[str]) -> _Surface:
     """Turn triangles outwards if the whole surface is inside out; refuse a mixed one."""
     vertices, faces = surface
     directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    if len(np.unique(directed, axis=0)) < len(directed):
+    if len(unique_rows(directed)[0]) < len(directed):
         pairs, count = edge_counts(faces)
         if np.any(count > 2):
             raise MeshError(

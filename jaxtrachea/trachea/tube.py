@@ -23,6 +23,7 @@ def make_tube(
 
     A grid of `around` x `along` quadrilaterals, each cut in two, and two lids of `around` - 2
     triangles: the defaults make 3,430 vertices and the paper's 6,856 triangles, watertight.
+    The rows are even but for one on the crest of each ring.
     Between the rings the radius is `geometry.radius` + `wall` / 2 - `relief`; a ring adds
     `relief` cos^2 over its height and fades out towards its ends.
 
@@ -54,7 +55,7 @@ def make_tube(
         )
     if not 0 <= flatten < 1:
         raise ValueError(f"flatten is {flatten:g}; expected a number in [0, 1)")
-    s = np.repeat(np.linspace(0, length, along + 1), around)
+    s = np.repeat(_rows(geometry, length, along), around)
     turn = 2 * math.pi * np.arange(around) / around
     phi = np.tile(np.where(turn > math.pi, turn - 2 * math.pi, turn), along + 1)
     distance = (outer + relief * _rings(geometry, s, phi)) * (1 - flatten * _back(phi, alpha))
@@ -67,6 +68,20 @@ def make_tube(
     floats = (vertices, vertex_normals(vertices, faces), s, phi, distance)
     vertices, normals, s, phi, distance = (jnp.asarray(v, dtype) for v in floats)
     return Mesh(vertices, jnp.asarray(faces, jnp.int32), normals, s, phi, distance)
+
+
+def _rows(geometry: Geometry, length, along):
+    """Rows along the tube: even, but with one on the crest of each ring where they are near enough.
+
+    Else the crest of a coarse mesh lies as far below the ring's as the rows happen to stand.
+    """
+    even = np.linspace(0, length, along + 1)
+    rings = np.asarray(geometry.ring_positions, float)
+    near = np.rint(rings * along / length)
+    if near[0] < 1 or near[-1] > along - 1 or np.any(np.diff(near) < 1):
+        return even  # more rings than rows
+    at = np.concatenate([[0], near, [along]])
+    return np.interp(np.arange(along + 1), at, np.concatenate([[0], rings, [length]]))
 
 
 def _rings(geometry: Geometry, s, phi):

@@ -1,0 +1,167 @@
+"""Whether the patches that a tool touches lie where the mesh is: gaps against its closest points.
+
+Balls stand beside points of the outer wall, drawn by area. The gap to the patches (sharp: without
+the smoothing of `Touch.gap`, which `Touch.bound` limits) is compared with the distance to the
+closest of all triangles. On numbers, once; nothing here is traced.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import ConvexHull, KDTree
+
+from jaxtrachea.contact.patches import Patches
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.mesh import Mesh, MeshError, face_vectors
+
+#: Balls that are tried.
+COUNT = 400
+#: Their radius, and how far they are moved off the wall at most, in and out; shares of the radius.
+BALL, AWAY = 0.3, 0.1
+#: By how much a patch runs on beyond each border, mm (`patches_of`).
+OVERLAP = 0.5
+#: Patches that are searched for each.
+NEAR = 4
+#: Sine of the least angle between a triangle of the outer wall and the radial direction.
+OUTWARD = 0.3
+#: The median may be this share of the limit of the worst.
+USUAL = 0.25
+
+
+class WallError(NamedTuple):
+    """Gap of the patches less that of the mesh, for a sample of balls beside the wall.
+
+    Attributes:
+        error: mm; positive: the tool touches too late; shape (balls,).
+        gap: of the mesh, mm.
+        s: position of the balls, mm.
+        limit: of the worst, mm; see `limit_of`.
+    """
+
+    error: np.ndarray
+    gap: np.ndarray
+    s: np.ndarray
+    limit: float
+
+    @property
+    def median(self) -> float:
+        """Median of |error|, mm."""
+        return float(np.median(np.abs(self.error)))
+
+    @property
+    def worst(self) -> float:
+        """Largest |error|, mm."""
+        return float(np.abs(self.error).max())
+
+    @property
+    def sentence(self) -> str:
+        """What `plan` tells."""
+        return (
+            f"contact gap against the mesh's closest points, {len(self.error)} balls beside the "
+            f"wall: median {self.median:.2g} mm, worst {self.worst:.2g} mm (limit "
+            f"{self.limit:.2g} mm)"
+        )
+
+
+def limit_of(geometry: Geometry) -> float:
+    """Largest error of the gap that a trachea explains, mm.
+
+    A patch is convex: it bridges a hollow as long as itself, p^2 / (8 R) deep if the wall bends
+    with the radius R. p: the median distance of the rings (at most R) and what a patch runs on
+    beyond its borders; R: the radius of the tube, the sharpest bend that its rings leave room for.
+    """
+    radius, rings = float(geometry.radius), np.asarray(geometry.ring_positions, float)
+    pitch = float(np.median(np.diff(rings))) if len(rings) > 1 else radius
+    return (min(pitch, radius) + 2 * OVERLAP) ** 2 / (8 * radius)
+
+
+def measure(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = COUNT) -> WallError:
+    """Gaps of balls beside the wall, from the first to the last ring.
+
+    Args:
+        mesh: the surface.
+        geometry: its skeleton.
+        patches: of its wall.
+        count: number of balls.
+    """
+    centres, s, radius = _balls(mesh, geometry, count)
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    gap = _distance(vertices[faces], centres) - radius
+    return WallError(_sharp_gap(patches, centres) - radius - gap, gap, s, limit_of(geometry))
+
+
+def check(mesh: Mesh, geometry: Geometry, patches: Patches) -> WallError:
+    """`measure`, and the limit.
+
+    Raises:
+        MeshError: the patches are not the wall.
+    """
+    seen = measure(mesh, geometry, patches)
+    if seen.worst <= seen.limit and seen.median <= USUAL * seen.limit:
+        return seen
+    at = float(seen.s[np.abs(seen.error).argmax()])
+    raise MeshError(
+        f"a tool would not touch it where it is: the contact gap is off by {seen.median:.2g} mm in "
+        f"the median and by {seen.worst:.2g} mm at worst (at s = {at:.3g} mm), expected at most "
+        f"{USUAL * seen.limit:.2g} and {seen.limit:.2g} mm for rings this far apart; is it the "
+        "outer wall, one tube without branches and sharp bends? Give that surface, or "
+        "ring_positions, where the rings are"
+    )
+
+
+def _balls(mesh, geometry, count):
+    """Centres beside the outer wall, s, and the radius of the balls."""
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    vector = face_vectors(vertices, faces)
+    area = np.linalg.norm(vector, axis=1)
+    normal = vector / np.where(area > 0, area, 1)[:, None]
+    phi, s = np.asarray(mesh.phi, float), np.asarray(mesh.s, float)
+    out = np.stack([0 * phi, np.cos(phi), np.sin(phi)], axis=1)
+    if mesh.frames is not None:
+        out = np.einsum("vij,vj->vi", np.asarray(mesh.frames, float), out)
+    rings = np.asarray(geometry.ring_positions, float)
+    at = s[faces]
+    weight = area * (np.einsum("fi,fi->f", normal, out[faces[:, 0]]) > OUTWARD)
+    weight *= (at.min(axis=1) >= rings[0]) & (at.max(axis=1) <= rings[-1])
+    if not weight.sum() > 0:
+        raise MeshError("no triangle between the rings faces outwards; expected an outer wall")
+    rng = np.random.default_rng(0)
+    face = rng.choice(len(faces), count, p=weight / weight.sum())
+    share = rng.dirichlet([1, 1, 1], count)
+    point = np.einsum("fi,fij->fj", share, vertices[faces[face]])
+    size = float(geometry.radius)
+    away = BALL * size + AWAY * size * rng.uniform(-1, 1, count)
+    centres = point + away[:, None] * normal[face]
+    return centres, np.sum(share * at[face], axis=1), BALL * size
+
+
+def _distance(corners, points):
+    """Of points to the closest of all triangles, each with a centre near enough to hold it."""
+    import trimesh  # only those who read meshes wait for it
+
+    middle = corners.mean(axis=1)
+    reach = np.linalg.norm(corners - middle[:, None], axis=2).max()
+    tree, found = KDTree(middle), []
+    for point, least in zip(points, tree.query(points)[0], strict=True):
+        near = corners[tree.query_ball_point(point, least + reach)]
+        closest = trimesh.triangles.closest_point(near, np.tile(point, (len(near), 1)))
+        found.append(np.linalg.norm(closest - point, axis=1).min())
+    return np.array(found)
+
+
+def _sharp_gap(patches: Patches, points):
+    """Signed distance of points to the union of the patches."""
+    cores = np.asarray(patches.shapes.vertices, float).transpose(0, 2, 1)
+    radius = np.asarray(patches.shapes.radius, float)
+    hulls = [ConvexHull(core) for core in cores]
+    depth = [(points @ h.equations[:, :3].T + h.equations[:, 3]).max(axis=1) for h in hulls]
+    bounds = np.stack(depth, axis=1) - radius  # exact inside a core, else a lower bound
+    found = np.full(len(points), np.inf)
+    for rank in np.argsort(bounds, axis=1)[:, :NEAR].T:
+        for i in np.unique(rank):
+            rows = np.flatnonzero(rank == i)
+            inside = depth[i][rows] <= 0
+            far = _distance(hulls[i].points[hulls[i].simplices], points[rows])
+            signed = np.where(inside, depth[i][rows], far) - radius[i]
+            found[rows] = np.minimum(found[rows], signed)
+    return found
