@@ -39,10 +39,11 @@ ORDER = [
 ]
 #: Within `scene`, likewise: what is there, the program, files and pictures.
 SCENE = [
-    {"operations", "spec", "curve"},
+    {"operations", "spec", "curve", "sizes"},
     {"plan"},
     {"rules"},
     {"stage"},
+    {"ranges"},
     {"approach"},
     {"deform"},
     {"simulation"},
