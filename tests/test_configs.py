@@ -72,6 +72,8 @@ def test_scene_runs(scene, monkeypatch, capsys):
     assert "operations for" in out
     code, out, err = run(monkeypatch, capsys, "simulate", scene.name, "--out", "result")
     assert (code, err) == (0, "")
+    # The notes of `plan` are those of `simulate`.
+    assert ("contact patches: " in out) == ("tool" in text)
     result = scene.parent / "result"
     output = text.get("output", {})
     files = {"simulation.h5", "provenance.json"}

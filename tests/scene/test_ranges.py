@@ -9,10 +9,12 @@ import pytest
 from scipy.integrate import solve_bvp
 from small_scenes import BALL, BARE, MATERIAL, OFF, SPRINGS, TUBE, ball, bend, poses
 
-from jaxtrachea import Presses, make_scene, press_oblique, simulate, sweep
+from jaxtrachea import Presses, Session, make_scene, press_oblique, simulate, sweep
 from jaxtrachea.contact.shapes import sphere
+from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.plan import Served
 from jaxtrachea.scene.sizes import SizeError
+from jaxtrachea.scene.spec import load_scene_spec
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.tube import make_tube
 
@@ -204,3 +206,27 @@ def test_a_tool_driven_through_the_tube_is_beyond_its_range(seat):
     if seat == "first":
         assert out.status[-1] == PressStatus.TOO_DEEP
         np.testing.assert_allclose(share[-1], 50 / 12.6, atol=0.02)
+
+
+def test_steps_of_a_session_are_refused_alike():
+    """In the lumen, out of it, a press, and a jump along the tube that kept the old place."""
+    scene = make_scene(TUBE, SPRINGS, ball([75, 1, 0], [75, -2, 0]), tool=BALL, wishes=ONE)
+    session, found = Session(scene, SPRINGS), []
+    for place in ([75, 0, 0], [75, 19, 0], [75, 16, 0], [95, 16, 0], [75, 19, 0], [75, -40, 0]):
+        found.append(int(session.step(np.eye(3), place).status))
+    assert found[:4] == [PressStatus.IN_LUMEN, PressStatus.NO_CONTACT, OK, OFF_PLAN]
+    assert found[4] == PressStatus.NO_CONTACT
+
+
+def test_what_is_dropped_is_said_with_the_scene(tmp_path):
+    """Only `plan` said it: a rough tool slides 40 mm without friction."""
+    path = tmp_path / "slide.toml"
+    path.write_text(
+        '[material]\nEI_L = "1.9 N mm^2"\nk_M = "0.1 N/mm"\nk_1 = "0.3 N/mm"\nk_3 = "0.02 N/mm^3"\n'
+        '[tool]\nshape = "sphere"\nradius = "5 mm"\nfriction = 0.5\n'
+        '[path]\nstart = ["60 mm", "16 mm", "0 mm"]\nend = ["100 mm", "16 mm", "0 mm"]\nsteps = 3\n'
+        "[output]\nsurface = false\n"
+    )
+    notes = stage(load_scene_spec(path), tmp_path).notes
+    assert any(note.startswith("contact patches: ") for note in notes)
+    assert any("friction: off, the contact does not keep its place" in note for note in notes)
