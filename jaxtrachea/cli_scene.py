@@ -66,6 +66,8 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     failed = (status > PressStatus.NO_CONTACT).sum()
     for code in np.unique(status[status > PressStatus.NO_CONTACT]):
         Console().print(f"{(status == code).sum()} row(s): {PressStatus(int(code)).message}")
+    for note in staged.notes:
+        Console().print(escape(note), highlight=False)
     if choice is not None:
         Console().print(choice.sentence, highlight=False)
     if last_solved(out) is None:
@@ -246,11 +248,14 @@ def _print_rows(out) -> None:
     count = len(out.s)
     pick = np.unique(np.linspace(0, count - 1, min(count, MANY)).round().astype(int))
     vector = lambda v: " ".join(f"{x:.3g}" for x in np.asarray(v).round(9) + 0.0)  # noqa: E731
+    share = lambda v: "–" if np.isnan(v) else f"{100 * v:.0f} %"  # noqa: E731
     rows = [
         [str(i + 1), f"{out.s[i]:.4g}", f"{np.degrees(out.phi[i]):.3g}",
          "–" if out.gap is None else f"{out.gap[i]:.3g}", vector(out.force[i]),
-         vector(out.skeleton[i]), PressStatus(int(out.status[i])).name.lower()]
+         vector(out.skeleton[i]), share(out.depth_share[i]),
+         PressStatus(int(out.status[i])).name.lower()]
         for i in pick
     ]  # fmt: skip
-    head = ["row", "s [mm]", "phi [deg]", "gap [mm]", "force [N]", "skeleton [mm]", "status"]
+    head = ["row", "s [mm]", "phi [deg]", "gap [mm]", "force [N]", "skeleton [mm]", "depth/radius"]
+    head.append("status")
     Console().print(table(f"{count} rows", head, rows))

@@ -28,11 +28,13 @@ class PressStatus(_Described):
     PULLS = 6, "unilateral contact: the tool would have to pull; it lets go or slides (friction)"
     OFF_PLAN = (
         7,
-        "off the midline, oblique or elsewhere, in a program made for presses that are not",
+        "off the midline, oblique, elsewhere or else, in a program made for less than that",
     )
     OFF_TUBE = 8, "the contact lies beyond an end of the tube"
     UNSURE = 9, "solved, but the tool reaches so deep that its contact may be another than found"
     BAD_MATERIAL = 10, "a stiffness or the coefficient of friction is negative"
+    IN_LUMEN = 11, "the tool lies within the tube and did not come through the wall"
+    TOO_DEEP = 12, "solved, but the wall is pressed in by more than the tube's radius"
 
 
 class ContactStatus(_Described):

@@ -39,10 +39,11 @@ ORDER = [
 ]
 #: Within `scene`, likewise: what is there, the program, files and pictures.
 SCENE = [
-    {"operations", "spec", "curve", "wall_check"},
+    {"operations", "spec", "curve", "sizes", "wall_check"},
     {"plan"},
     {"rules"},
     {"stage"},
+    {"ranges"},
     {"approach"},
     {"deform"},
     {"simulation"},

@@ -4,10 +4,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.scene.curve import frame_at
+from jaxtrachea.scene.ranges import in_lumen
 from jaxtrachea.scene.stage import Poses, Presses, Scene, at_row, followed, touch_tube
 from jaxtrachea.skeleton import local_frame
 
@@ -21,6 +22,8 @@ class Approach(NamedTuple):
         inward: normal of the straight tube at the contact; shape (rows, 3).
         first: row of first touch, where the tool stays; None: every row is a press of its own.
         frame: those directions as columns in the frame of the mesh; None: straight tube, identity.
+        own: contact of every row of `presses`: `seen`, but in a step of a session.
+        inside: whether the tool is in the lumen; shape (rows,).
     """
 
     seen: Touch
@@ -28,21 +31,27 @@ class Approach(NamedTuple):
     inward: Float[Array, "rows 3"]
     first: Int[Array, ""] | None
     frame: Float[Array, "rows 3 3"] | None
+    own: Touch
+    inside: Bool[Array, " rows"]
 
 
 def approach(scene: Scene, path: Poses) -> Approach:
     """Let the tool touch the tube at rest, and say what it does to the place it touches."""
     seen = touch_tube(scene, path)
+    inside = in_lumen(scene, path, seen)
     if scene.plan.seat == "each":
         inward, frame = _directions(scene, seen)
         presses = Presses(seen.s, seen.phi, -seen.gap[:, None] * inward)
-        return Approach(seen, presses, inward, None, frame)
-    touching = seen.gap < 0
-    first = jnp.where(jnp.any(touching), jnp.argmax(touching), jnp.argmin(seen.gap))
-    return seated(scene, path, seen, first)
+        return Approach(seen, presses, inward, None, frame, seen, inside)
+    touching = (seen.gap < 0) & ~inside
+    nearest = jnp.argmin(jnp.where(inside, jnp.inf, seen.gap))
+    first = jnp.where(jnp.any(touching), jnp.argmax(touching), nearest)
+    return seated(scene, path, seen, first, inside)
 
 
-def seated(scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""]) -> Approach:
+def seated(
+    scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""], inside: Bool[Array, " rows"]
+) -> Approach:
     """The path as presses on the place that row `first` touches."""
     inward, frame = _directions(scene, seen)
     rows = seen.gap.shape[0]
@@ -51,7 +60,8 @@ def seated(scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""]) -> App
         D = jnp.where((jnp.arange(rows) >= first)[:, None], D, 0)
     spread = lambda v: jnp.broadcast_to(at_row(v, first), v.shape)  # noqa: E731
     presses = Presses(spread(seen.s), spread(seen.phi), D)
-    return Approach(seen, presses, spread(inward), first, None if frame is None else spread(frame))
+    frames = None if frame is None else spread(frame)
+    return Approach(seen, presses, spread(inward), first, frames, seen, inside)
 
 
 def _directions(scene: Scene, seen: Touch):

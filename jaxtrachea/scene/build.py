@@ -18,6 +18,7 @@ from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.plan import PlanError, Wishes
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.simulation import simulate
+from jaxtrachea.scene.sizes import SizeError
 from jaxtrachea.scene.spec import PathSection, SceneSpec, SceneTracheaSection, ToolSection
 from jaxtrachea.scene.stage import Poses, Presses, Scene, facts_of, make_scene
 from jaxtrachea.trachea.geometry import Geometry
@@ -86,6 +87,8 @@ def stage(spec: SceneSpec, folder: Path) -> Staged:
     except MeshError as error:
         name = Path(spec.trachea.file or "").name
         raise SpecError(f"trachea.file: {name}: {_in_keys(str(error))}") from None
+    except SizeError as error:
+        raise SpecError(str(error).replace("geometry.", "trachea.")) from None
     if scene.tube is not None and mesh is not None:
         lost, filled = float(scene.tube.lost.max()), float(scene.tube.filled.max())
         notes += (
@@ -93,7 +96,15 @@ def stage(spec: SceneSpec, folder: Path) -> Staged:
             f"an inner wall) are bridged up to {filled:.2g} mm deep",
             wall_check.measure(mesh, geometry, scene.tube).sentence,
         )
-    return Staged(scene, material, path, tuple(files), notes)
+    return Staged(scene, material, path, tuple(files), notes + _dropped(scene))
+
+
+def _dropped(scene: Scene) -> tuple[str, ...]:
+    """Friction that was asked for and is not in the program, with its reason."""
+    if scene.friction is None or scene.plan.friction:
+        return ()
+    effect = next(e for e in scene.plan.effects if e.name == "friction")
+    return (f"friction: off, {effect.reason}",)
 
 
 def stage_sweep(spec: SceneSpec, staged: Staged, s: np.ndarray, phi: np.ndarray) -> Scene:

@@ -118,6 +118,25 @@ class Effect:
 
 
 @dataclasses.dataclass(frozen=True)
+class Served:
+    """Presses that a plan within a tolerance was measured for; rows beyond are off the plan.
+
+    Attributes:
+        s: lowest and highest contact position, mm.
+        angle: largest |phi|, rad.
+        along: largest axial motion, mm.
+        across: largest motion round the tube, mm.
+        inward: largest motion inwards, mm.
+    """
+
+    s: tuple[float, float]
+    angle: float
+    along: float
+    across: float
+    inward: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Plan:
     """The program of a scene; hashable, equal where the programs are. Fields as in `Wishes`.
 
@@ -125,6 +144,10 @@ class Plan:
         curved: motions of the tool are turned into the frame of the centreline at the contact.
         dent: number of centres, 0: off.
         options: of the model.
+        ignored: effects that stay off (the seat: that stays) whatever a path needs, because the
+            user wished it or a tolerance allows it. A row that needs any other effect that is off
+            is refused by status (`ranges.unserved`).
+        served: presses that a tolerance was measured for; None: no tolerance.
         effects: all decisions in words; they do not count in comparisons.
     """
 
@@ -141,6 +164,8 @@ class Plan:
     joints: bool
     ring_ends: bool
     options: Options
+    ignored: frozenset[str] = frozenset()
+    served: Served | None = None
     effects: tuple[Effect, ...] = dataclasses.field(default=(), compare=False, repr=False)
 
     def __post_init__(self):
@@ -152,7 +177,7 @@ class Plan:
         check_record(self, dent=0.0)
 
     def without(self, name: str) -> "Plan | None":
-        """The plan with one effect less, or None where none can be taken away alone."""
+        """The plan with one effect less on every path, or None where none goes alone."""
         off: dict[str, dict] = {
             "friction": {"friction": False},
             "axial": {"axial": False, "end_motion": False},
@@ -165,8 +190,12 @@ class Plan:
             "shear": {"options": dataclasses.replace(self.options, shear=False)},
             "two_material": {"options": dataclasses.replace(self.options, local="uniform")},
         }
-        if name == "second_plane" and self.second_plane and not self.friction:
-            return dataclasses.replace(self, second_plane=False, rings="mat", axial=False,
-                                       end_motion=False)  # fmt: skip
         less = dataclasses.replace(self, **off[name]) if name in off else self
-        return None if less == self else less
+        if name == "second_plane" and self.second_plane and not self.friction:
+            less = dataclasses.replace(self, second_plane=False, rings="mat", axial=False,
+                                       end_motion=False)  # fmt: skip
+        if less == self:
+            return None
+        gone = {name} | ({"rings", "axial", "end_motion"} if name == "second_plane" else set())
+        gone |= {"end_motion"} if name in ("axial", "surface") else set()
+        return dataclasses.replace(less, ignored=self.ignored | gone)

@@ -15,7 +15,8 @@ from jaxtrachea.status import PressStatus
 SCHEMA, SCHEMA_VERSION = "jaxtrachea-simulation", 1
 
 #: Unit of every series; what is not named is in mm.
-UNITS = {"phi": "rad", "force": "N", "loads": "N", "dissipated": "N mm", "status": "1"}
+UNITS = {"phi": "rad", "force": "N", "loads": "N", "dissipated": "N mm", "status": "1",
+         "depth_share": "1", "contact_share": "1"}  # fmt: skip
 
 
 def plan_rows(plan: Plan, shares: dict[str, float]) -> list[list[str]]:
@@ -51,7 +52,8 @@ def write_simulation(
 
 def write_sweep(path: Path, scene: Scene, s, phi, depth: float, out: Sweep, made: dict) -> None:
     """A sweep over a grid; datasets of shape (s, phi)."""
-    units = {"force": "N", "indentation": "mm", "compliance": "mm/N", "status": "1"}
+    units = {"force": "N", "indentation": "mm", "compliance": "mm/N", "depth_share": "1",
+             "status": "1"}  # fmt: skip
     with hdf5_file(path) as file:
         _head(file, made, scene.plan)
         file.create_dataset("s", data=s).attrs["unit"] = "mm"

@@ -13,13 +13,15 @@ from jaxtrachea.surface.regions import Method
 
 #: Angle (rad) and share of the motion below which something counts as not there.
 SMALL = 1e-6
+#: What the material must give for rings that bend.
+BENDS = frozenset({"EI_C", "k_t"})
 
 
 class _Decisions:
     """Effects decided so far."""
 
     def __init__(self, wishes: Wishes):
-        self.wishes, self.effects = wishes, []
+        self.wishes, self.effects, self.ignored = wishes, [], set()
 
     def switch(self, name: str, rule: bool, reason: str, cannot: str = "", must: str = "") -> bool:
         """Decide on or off.
@@ -38,6 +40,8 @@ class _Decisions:
         if wish == "off" and must:
             raise PlanError(f"{name}: 'off', but {must}; use 'auto'")
         self.note(name, "on" if on else "off", reason, wish != "auto")
+        if wish == "off":
+            self.ignored.add(name)
         return on
 
     def choose(self, name: str, rule: str, reason: str) -> str:
@@ -45,6 +49,8 @@ class _Decisions:
         wish = getattr(self.wishes, name)
         level = rule if wish == "auto" else wish
         self.note(name, level, reason, wish != "auto")
+        if wish != "auto":
+            self.ignored.add(name)
         return level
 
     def note(self, name: str, level: str, reason: str, forced: bool = False) -> None:
@@ -80,7 +86,7 @@ def make_plan(facts: Facts, wishes: Wishes = Wishes()) -> Plan:  # noqa: B008 (f
     # A press of its own is led along the normal: nothing of it is axial or lateral.
     leads = seat == "first" or not facts.poses
     second = _second_plane(d, facts, friction, off_middle, leads and sideways)
-    rings = _rings(d, facts, second, off_middle or (leads and facts.across > SMALL))
+    rings = _rings(d, facts, second)
     axial = _axial(d, facts, second, leads)
     springs = facts.known & {"k_A", "k_B"}
     surface = _surface(d, facts)
@@ -105,7 +111,8 @@ def make_plan(facts: Facts, wishes: Wishes = Wishes()) -> Plan:  # noqa: B008 (f
     )  # fmt: skip
     return Plan(
         facts.poses, curved, seat, friction, second, rings, axial, end_motion, surface, dent,
-        wishes.want_joints, wishes.want_ring_ends, options, tuple(d.effects),
+        wishes.want_joints, wishes.want_ring_ends, options, ignored=frozenset(d.ignored),
+        effects=tuple(d.effects),
     )  # fmt: skip
 
 
@@ -155,6 +162,8 @@ def _second_plane(d: _Decisions, facts: Facts, friction: bool, off_middle: bool,
         must = "friction works in the tangent plane"
     elif d.wishes.rings in ("arch", "arch2"):
         must = f"rings {d.wishes.rings!r} were asked for"
+    elif d.wishes.rings == "auto" and facts.known >= BENDS:
+        must = "rings bend (EI_C and k_t are given)"
     elif d.wishes.axial == "on":
         must = "axial motion was asked for"
     reason = must or "a normal press on the midline stays in one plane"
@@ -163,14 +172,15 @@ def _second_plane(d: _Decisions, facts: Facts, friction: bool, off_middle: bool,
     return d.switch("second_plane", bool(must), reason, must=must)
 
 
-def _rings(d: _Decisions, facts: Facts, second: bool, off: bool) -> Rings:
-    bends = {"EI_C", "k_t"} <= facts.known
-    if not off:
-        rule, reason = "mat", "on the midline a ring is its spring k_M (paper 2.3)"
-    elif bends:
-        rule, reason = "arch2", "off the midline a ring bends"
-    else:
+def _rings(d: _Decisions, facts: Facts, second: bool) -> Rings:
+    """What a ring is, by what the material gives: the same wherever the tool touches."""
+    bends = facts.known >= BENDS
+    if bends:
+        rule, reason = "arch2", "EI_C and k_t are given: a ring bends, on the midline and off it"
+    elif facts.angle > SMALL:
         rule, reason = "mat", "off the midline a ring would bend, but EI_C and k_t are not given"
+    else:
+        rule, reason = "mat", "EI_C and k_t are not given: a ring is its spring k_M (paper 2.3)"
     level = d.choose("rings", rule, reason)
     if level != "mat" and not bends:
         raise PlanError(f"rings: {level!r}, but EI_C or k_t is not given; give both, or use 'mat'")

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.scene.approach import Approach, approach, seated
+from jaxtrachea.scene.ranges import off_the_end, submerged
 from jaxtrachea.scene.simulation import Simulation, follow
 from jaxtrachea.scene.stage import Poses, Scene, touch_tube
 from jaxtrachea.trachea.material import Material
@@ -39,10 +40,12 @@ class Seat(NamedTuple):
         last: the step before.
         before: the step before the first touch.
         touch: the first touch.
+        outside: the tool was last seen outside the lumen, on the tube.
     """
 
     started: Bool[Array, ""]
     touching: Bool[Array, ""]
+    outside: Bool[Array, ""]
     last: Instant
     before: Instant
     touch: Instant
@@ -186,27 +189,30 @@ def _start(scene: Scene, rotation, translation) -> Seat:
         lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(touch_tube, scene, path)
     )
     no, nowhere = jnp.asarray(False), Instant(path, seen)
-    return Seat(no, no, nowhere, nowhere, nowhere)
+    return Seat(no, no, no, nowhere, nowhere, nowhere)
 
 
 def _step(scene: Scene, material: Material, seat: Seat, rotation, translation):
     """The next seat, and the result without its axis of rows."""
     path = Poses(rotation[None], translation[None])
     if scene.plan.seat == "each":
-        result = follow(scene, material, path, approach(scene, path))
-        return seat, jax.tree.map(lambda v: v[0], result)
+        made = approach(scene, path)
+        inside, outside = _sides(scene, seat, Instant(path, made.seen))
+        result = follow(scene, material, path, made._replace(inside=inside))
+        return seat._replace(outside=outside), jax.tree.map(lambda v: v[0], result)
     here = Instant(path, touch_tube(scene, path))
-    hit = here.seen.gap[0] < 0
+    inside, outside = _sides(scene, seat, here)
+    hit = (here.seen.gap[0] < 0) & ~inside[0]
     free = ~seat.touching
     if scene.plan.options.contact != "bonded":
         free |= ~hit
     pick = lambda when, a, b: jax.tree.map(lambda v, w: jnp.where(when, v, w), a, b)  # noqa: E731
     last = pick(seat.started, seat.last, here)
     before, touch = pick(free, last, seat.before), pick(free, here, seat.touch)
-    made = _seated(scene, before, touch, here)
-    result = follow(scene, material, touch.path, made)._replace(gap=here.seen.gap)
+    made = _seated(scene, before, touch, here)._replace(inside=inside)
+    result = follow(scene, material, touch.path, made)
     touching = hit | (seat.touching & ~free)
-    after = Seat(jnp.asarray(True), touching, here, before, touch)
+    after = Seat(jnp.asarray(True), touching, outside, here, before, touch)
     return after, jax.tree.map(lambda v: v[0], result)
 
 
@@ -214,6 +220,13 @@ def _seated(scene: Scene, before: Instant, touch: Instant, here: Instant) -> App
     """The tool's way from the step before its first touch to here, as one press."""
     join = lambda *v: jnp.concatenate(v)  # noqa: E731
     path, seen = jax.tree.map(join, tuple(before), tuple(touch), tuple(here))
-    made = seated(scene, path, seen, jnp.asarray(1))
+    made = seated(scene, path, seen, jnp.asarray(1), jnp.zeros(3, bool))
     now = jax.tree.map(lambda v: v[2:], made._replace(seen=None, first=None))
     return now._replace(seen=touch.seen, first=jnp.asarray(0))
+
+
+def _sides(scene: Scene, seat: Seat, here: Instant):
+    """Whether the tool is in the lumen (1,), and was last outside: as `in_lumen`, by steps."""
+    under, off = submerged(scene, *here), off_the_end(scene, here.seen)
+    outside = (~under & ~off)[0] | (seat.outside & ~off[0])
+    return under & ~outside, outside

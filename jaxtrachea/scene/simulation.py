@@ -3,7 +3,6 @@
 The program is put together from the scene's static `Plan`; what is off is not in it.
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -12,11 +11,13 @@ from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, shaped
 from jaxtrachea.admission import check_shapes, without_negative
+from jaxtrachea.mechanics.ring import on_ring
 from jaxtrachea.model import ligament_beam, local_law, read_values, respond, unit_deflection
 from jaxtrachea.oblique import press_oblique, press_path
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.deform import deform
-from jaxtrachea.scene.stage import COVERED, Poses, Presses, Scene, check_path
+from jaxtrachea.scene.ranges import DEEPEST, contact_share, depth_share, lacking, unserved
+from jaxtrachea.scene.stage import Poses, Presses, Scene, check_path
 from jaxtrachea.skeleton import local_frame
 from jaxtrachea.skeleton import read_values as skeleton_values
 from jaxtrachea.status import ContactStatus, PressStatus
@@ -47,6 +48,10 @@ class Simulation(NamedTuple):
         frame: columns tangent, anterior, lateral at the contact; shape (rows, 3, 3). None: the tube
             is straight, or the contact points are given.
         vertices: deformed surface in the frame of the mesh; shape (rows, vertices, 3).
+        depth_share: motion of the wall at the contact against the radius of the tube; beyond 1 the
+            status is TOO_DEEP (`ranges.DEEPEST` says why).
+        contact_share: penetration against what the contact is sure for (tool's radius and rounding
+            of the patches); NaN for sharp ones.
         status: a `PressStatus` per row.
     """
 
@@ -65,6 +70,8 @@ class Simulation(NamedTuple):
     dissipated: Float[Array, " rows"] | None
     frame: Float[Array, "rows 3 3"] | None
     vertices: Float[Array, "rows vertices 3"] | None
+    depth_share: Float[Array, " rows"]
+    contact_share: Float[Array, " rows"] | None
     status: Int[Array, " rows"]
 
 
@@ -75,12 +82,14 @@ class Sweep(NamedTuple):
         force: normal contact force, N; shape (points,).
         indentation: local, along the normal, mm.
         compliance: of the skeleton along the normal, mm/N; NaN where nothing moves.
+        depth_share: as in `Simulation`.
         status: a `PressStatus` each.
     """
 
     force: Float[Array, " points"]
     indentation: Float[Array, " points"]
     compliance: Float[Array, " points"]
+    depth_share: Float[Array, " points"]
     status: Int[Array, " points"]
 
 
@@ -88,11 +97,11 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
     """Follow a path through the program of `scene.plan`; pure, to be jitted and differentiated.
 
     The rows of a path with `seat` first belong together: the tool stays on the place that it
-    touched first. A row off the midline or oblique in a program of one plane, and a press at
-    another point than the first with `seat` first, is NaN with OFF_PLAN; one whose contact lies
-    beyond an end of the tube is NaN with OFF_TUBE; a negative stiffness or coefficient of friction
-    is NaN with BAD_MATERIAL in every row. Whatever else the plan leaves out (axial motion,
-    friction, bending rings) is left out of any path.
+    touched first. A row that needs what the plan has not (`ranges.unserved`) is NaN with OFF_PLAN;
+    one whose contact lies beyond an end of the tube or behind the ends of its rings with OFF_TUBE
+    or BEHIND_GAP, one of a tool in the lumen with IN_LUMEN; a negative stiffness or coefficient of
+    friction is NaN with BAD_MATERIAL in every row. What the user or a tolerance left out
+    (`Plan.ignored`), and what the material does not give, is left out of any path.
 
     Args:
         scene: from `make_scene`, or put together by hand.
@@ -118,19 +127,22 @@ def follow(
     """What follows from the presses of `path`, or of the tool's way `made` of it."""
     plan = scene.plan
     material, bad = _without_negative(scene, material)
-    presses, refused = _refuse(scene, path if isinstance(path, Presses) else None, made, bad)
-    moved = (_vectors if plan.second_plane else _one_plane)(scene, material, presses)
+    given = path if isinstance(path, Presses) else None
+    presses, used, refused = _refuse(scene, material, given, made, bad)
+    moved = (_vectors if plan.second_plane else _one_plane)(scene, material, used)
     vertices = None
     if plan.surface is not None:
-        vertices = deform(scene, material, presses, moved, path, made)
+        vertices = deform(scene, material, used, moved, path, made)
+    share = depth_share(scene, moved.depth, moved.skeleton)
     optional = lambda wanted, value: value if wanted else None  # noqa: E731
     return Simulation(
-        presses.s, presses.phi, None if made is None else made.seen.gap, presses.displacement,
+        presses.s, presses.phi, None if made is None else made.own.gap, presses.displacement,
         moved.force, moved.depth, moved.skeleton,
         optional(plan.joints, moved.joints), optional(plan.joints, moved.loads),
         optional(plan.ring_ends, moved.end_U), optional(plan.ring_ends, moved.end_V),
         moved.slip, moved.dissipated, None if made is None else made.frame, vertices,
-        _status(moved.status, made, refused),
+        share, None if made is None else contact_share(scene, made.own),
+        _status(moved.status, share, made, refused),
     )  # fmt: skip
 
 
@@ -149,33 +161,47 @@ def _without_negative(scene: Scene, material: Material):
     return material, bad
 
 
-def _refuse(scene: Scene, path: Presses | None, made: Approach | None, bad):
-    """The presses, NaN where they are refused; and the rows refused, by status."""
+def _refuse(scene: Scene, material: Material, path: Presses | None, made: Approach | None, bad):
+    """The presses, NaN where refused; the same as they are computed; and the refusals by status.
+
+    A row that does not press needs nothing of the plan, the rings and the tube: off the plan or
+    behind the ends of the rings it is computed as no motion, on the midline; off the tube at its
+    end. (What presses there is NaN by then.)
+    """
     presses = path if made is None else made.presses
     assert presses is not None
-    D, length, refused = presses.displacement, scene.geometry.length, {}
-    if made is None:
-        refused[PressStatus.OFF_TUBE] = (presses.s < 0) | (presses.s > length)
-    else:
-        outside = ~((presses.s >= 0) & (presses.s <= length))
-        presses_in = jnp.sum(D * made.inward, axis=1) > 0
-        refused[PressStatus.OFF_TUBE] = outside & presses_in
-    unlike = [] if scene.plan.second_plane else [_off_plan(presses)]
-    if made is None and scene.plan.seat == "first":
-        unlike.append(_elsewhere(presses))
-    if unlike:
-        refused[PressStatus.OFF_PLAN] = functools.reduce(jnp.logical_or, unlike)
+    D, phi, geometry = presses.displacement, presses.phi, scene.geometry
+    inward = jax.vmap(local_frame)(phi)[:, 0] if made is None else made.inward
+    pressing = ~(jnp.sum(D * inward, axis=1) <= 0)
+    acting = pressing
+    if scene.plan.options.contact == "bonded":
+        acting = ~jnp.all(D == 0, axis=1)
+    outside = ~((presses.s >= 0) & (presses.s <= geometry.length))
+    refused = {PressStatus.OFF_TUBE: outside & (pressing if made is not None else True)}
+    unlike = unserved(scene, material, presses, acting)
+    if unlike is not None:
+        refused[PressStatus.OFF_PLAN] = unlike
+    behind = ~on_ring(geometry.half_angle, phi)[0] & ~jnp.isnan(phi)
+    refused[PressStatus.BEHIND_GAP] = behind & acting
+    if made is not None:
+        refused[PressStatus.IN_LUMEN] = made.inside
     refused[PressStatus.BAD_MATERIAL] = jnp.broadcast_to(bad, presses.s.shape)
     for rows in refused.values():
         D = jnp.where(rows[:, None], jnp.nan, D)
-    return Presses(presses.s, presses.phi, D), refused
+    idle = (behind if scene.plan.second_plane else True) & ~acting
+    s, length = presses.s, geometry.length
+    s = jnp.where(s < 0, 0, jnp.where(s > length, length, s))
+    used = Presses(s, jnp.where(behind, 0, phi), jnp.where(idle[:, None], jnp.zeros_like(D), D))
+    return Presses(presses.s, phi, D), used, refused
 
 
-def _status(status, made: Approach | None, refused: dict[PressStatus, Array]):
-    """That of the press; of the contact where it is in doubt; of the rows refused."""
+def _status(status, share, made: Approach | None, refused: dict[PressStatus, Array]):
+    """That of the press; of depth and contact where they are in doubt; of the rows refused."""
+    status = jnp.where((status == PressStatus.OK) & (share > DEEPEST), PressStatus.TOO_DEEP, status)
     if made is not None:
-        seen = made.seen.status
-        seen = seen if made.first is None else jnp.broadcast_to(seen[made.first], seen.shape)
+        seen = made.own.status
+        if made.first is not None:
+            seen = jnp.maximum(seen, made.seen.status[made.first])
         unsure = (seen > ContactStatus.FLAT) & (status == PressStatus.OK)
         status = jnp.where(unsure, PressStatus.UNSURE, status)
     for code, rows in refused.items():
@@ -195,7 +221,8 @@ def sweep(
     """Press along the normal at many contact points, `chunk` of them at a time.
 
     Args:
-        scene: its geometry and the level of rings, shear and laws of its plan are used.
+        scene: its geometry and the level of rings, shear and laws of its plan are used; OFF_PLAN
+            where the material gives more than the plan has (as in `simulate`).
         material: -
         s: mm.
         phi: rad, within the half-angle of the rings.
@@ -212,6 +239,8 @@ def sweep(
         for name, value in (("phi", phi), ("depth", depth))
     )
 
+    unlike = set(lacking(scene, material)) - {"axial"}  # every press is along the normal
+
     def one(at):
         s_c, phi_c, d = at
         inward = local_frame(phi_c)[0]
@@ -219,10 +248,15 @@ def sweep(
             scene.geometry, material, s_c, phi_c, d * inward, scene.plan.options,
             rings=scene.plan.rings, axial=False,
         )  # fmt: skip
-        force, way = press.force @ inward, press.skeleton @ inward
+        force, way, depth = (v @ inward for v in (press.force, press.skeleton, press.depth))
         free = ~(force != 0)
         softness = jnp.where(free, jnp.nan, way / jnp.where(free, 1, force))
-        return Sweep(force, press.depth @ inward, softness, press.status)
+        share = depth_share(scene, depth, way)
+        status = _status(press.status, share, None, {})
+        if unlike:
+            force, depth, softness = (jnp.full_like(v, jnp.nan) for v in (force, depth, softness))
+            status = jnp.full_like(status, PressStatus.OFF_PLAN)
+        return Sweep(force, depth, softness, share, status)
 
     return jax.lax.map(one, (s, phi, depth), batch_size=chunk)
 
@@ -242,19 +276,6 @@ class _Moved(NamedTuple):
     status: Any
     slip: Any = None
     dissipated: Any = None
-
-
-def _off_plan(presses: Presses):
-    """Rows that are no normal presses on the midline."""
-    D = jnp.abs(presses.displacement)
-    oblique = jnp.maximum(D[:, 0], D[:, 2]) > COVERED * D[:, 1] + COVERED
-    return ~(jnp.abs(presses.phi) <= COVERED) | oblique
-
-
-def _elsewhere(presses: Presses):
-    """Rows at another contact point than the first."""
-    near = lambda v: jnp.abs(v - v[0]) <= COVERED  # noqa: E731
-    return ~(near(presses.s) & near(presses.phi))
 
 
 def _one_plane(scene: Scene, material: Material, presses: Presses) -> _Moved:
@@ -293,10 +314,6 @@ def _vectors(scene: Scene, material: Material, presses: Presses) -> _Moved:
     plan = scene.plan
     how = {"rings": plan.rings, "axial": plan.axial}
     fixed = scene.geometry, material
-    # Rows off the tube are refused already where they press; the others find no contact.
-    s, length = presses.s, scene.geometry.length
-    s = jnp.where(s < 0, 0, jnp.where(s > length, length, s))
-    presses = Presses(s, presses.phi, presses.displacement)
     if plan.friction:
         if scene.friction is None:
             raise ValueError("scene.friction is None; the plan has friction")

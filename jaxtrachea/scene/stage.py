@@ -20,6 +20,7 @@ from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.plan import Facts, Plan, PlanError, Wishes
 from jaxtrachea.scene.rules import make_plan
+from jaxtrachea.scene.sizes import check_sizes
 from jaxtrachea.skeleton import local_frame
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
@@ -34,6 +35,8 @@ COVERED = 1e-4
 #: Distance between the circles of the dent's centres: share of the tool's size; mm at least.
 FOOTPRINT, LEAST = 0.6, 4.0
 
+#: Wall of Table 1, mm, where nothing else is known of it.
+WALL = 2.6
 #: Patches of the tube searched for a contact with a tool shorter than one of them.
 NEAR = 2
 #: Patches of a mesh: their rounding, and corners of each (docs/scenes.md says what that loses).
@@ -188,12 +191,14 @@ def make_scene(
         tool: needed for `Poses`.
         friction: Coulomb's coefficient.
         mesh: the surface; without one `wishes.want_surface` must be false.
-        radius: of the tube's outside, mm; None: `geometry.radius` + 1.3 (half of Table 1's wall).
+        radius: of the tube's outside, mm; None: that of the mesh (of an imported one it is
+            `geometry.radius`); without a mesh `geometry.radius` + 1.3 (half of Table 1's wall).
         wishes: what is not left to the rules.
 
     Raises:
         PlanError: a wish that cannot be met.
         MeshError: patches for the contact that are not where an imported mesh is.
+        SizeError: a length that no trachea and no tool has: the unit is wrong, most likely.
         ValueError: a path without rows, arrays of a wrong length, or a negative friction.
     """
     check_path(path)
@@ -203,7 +208,8 @@ def make_scene(
     if friction is not None and not 0 <= float(friction) < np.inf:
         raise ValueError(f"friction is {friction}; expected a finite number, not negative")
     dtype = geometry.length.dtype
-    outer = geometry.radius + 1.3 if radius is None else jnp.asarray(radius, dtype)
+    outer = _outer(geometry, mesh) if radius is None else jnp.asarray(radius, dtype)
+    check_sizes(geometry, float(outer), tool)
     if isinstance(path, Poses) and tool is None:
         raise PlanError("contact: the path moves a tool, but there is none; give a tool")
     size, tube, near = LEAST, None, 1
@@ -225,6 +231,13 @@ def make_scene(
     if plan.surface is None or mesh is None:
         return Scene(*fixed, None, None, spacing, near, plan)
     return Scene(*fixed, mesh, binding, spacing, near, plan, runs=local.runs(mesh.s, spacing))
+
+
+def _outer(geometry: Geometry, mesh: Mesh | None):
+    """Radius of the outside, mm: of an imported mesh read with it, of a made one its crests."""
+    if mesh is None:
+        return geometry.radius + WALL / 2
+    return geometry.radius if mesh.frames is not None else jnp.max(mesh.distance)
 
 
 def with_geometry(scene: Scene, geometry: Geometry) -> Scene:

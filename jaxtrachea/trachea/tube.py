@@ -53,6 +53,11 @@ def make_tube(
             f"wall {wall:g} mm and relief {relief:g} mm leave a radius of {outer:g} mm; "
             "expected both not negative and a positive radius"
         )
+    if wall > radius:
+        raise ValueError(
+            f"wall is {wall:g} mm, thicker than the radius of {radius:g} mm; expected a thinner "
+            "one; check the units of both"
+        )
     if not 0 <= flatten < 1:
         raise ValueError(f"flatten is {flatten:g}; expected a number in [0, 1)")
     s = np.repeat(_rows(geometry, length, along), around)

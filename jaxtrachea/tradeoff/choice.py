@@ -18,8 +18,8 @@ import numpy as np
 from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.operations import count_operations
-from jaxtrachea.scene.plan import Effect, Plan, PlanError
-from jaxtrachea.scene.simulation import simulate
+from jaxtrachea.scene.plan import Effect, Plan, PlanError, Served
+from jaxtrachea.scene.simulation import Simulation, simulate
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.tradeoff.errors import Errors, compare
@@ -137,6 +137,8 @@ def choose(
             options[back.ladder].append(finer)
     scene, material, path = program(full, levels)
     scene = _explained(scene, picked, refused, returned)
+    plan = dataclasses.replace(scene.plan, served=_served(trial.reference))
+    scene = dataclasses.replace(scene, plan=plan)
     found = tuple(picked), tuple(refused), tuple(returned)
     cost = trial.cost(full.levels), trial.cost(levels)
     return Choice(scene, material, path, levels, tolerance, *found, errors, cost)
@@ -252,6 +254,17 @@ def _combined(full: Full, named: dict[str, Ladder], picked: list[Rung]) -> Level
     for rung in picked:
         changed |= named[rung.ladder].rungs[rung.level]
     return dataclasses.replace(full.levels, **changed)
+
+
+def _served(reference: Simulation) -> Served:
+    """What the sample paths press, all of them together."""
+    D, phi = reference.displacement, reference.phi
+    inward = -np.cos(phi) * D[..., 1] - np.sin(phi) * D[..., 2]
+    across = np.cos(phi) * D[..., 2] - np.sin(phi) * D[..., 1]
+    on = np.asarray(reference.force).any(axis=-1) & np.isfinite(inward)
+    most = lambda v: float(np.abs(v[on]).max())  # noqa: E731
+    s = float(reference.s[on].min()), float(reference.s[on].max())
+    return Served(s, most(phi), most(D[..., 0]), most(across), most(inward))
 
 
 def _explained(

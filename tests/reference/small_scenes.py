@@ -12,6 +12,8 @@ from jaxtrachea.trachea.tube import make_tube
 TUBE = table_1()
 OUTER = float(TUBE.radius) + 1.3
 MATERIAL = Material(EI_L=1.86, EA_L=3.9, EI_C=13.0, k_M=0.1, k_t=0.4, k_1=0.3, k_3=0.02)
+#: Without what bends a ring: one plane is enough on the midline.
+SPRINGS = dataclasses.replace(MATERIAL, EI_C=None, k_t=None)
 MESH = make_tube(TUBE, around=9, along=40)
 BALL = sphere(5.0)
 BARE = Wishes(want_surface=False)

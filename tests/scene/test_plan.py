@@ -25,7 +25,7 @@ def levels(**facts):
         ({"poses": True, "slip": 30.0, "spacing": 10.0}, {"seat": "each", "friction": "off"}),
         ({"slip": 2.0, "along": 0.5}, {"second_plane": "on", "axial": "off", "friction": "off"}),
         ({"slip": 2.0, "along": 0.5, "known": ALL}, {"axial": "on", "end_motion": "on",
-                                                     "rings": "mat", "shear": "on",
+                                                     "rings": "arch2", "shear": "on",
                                                      "two_material": "on"}),
         ({"slip": 2.0, "friction": True, "across": 0.1, "known": ALL}, {"friction": "on",
                                                                        "rings": "arch2"}),

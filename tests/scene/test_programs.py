@@ -1,6 +1,7 @@
 """What is compiled: as many operations as a program written by hand for that scene alone."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +18,14 @@ from jaxtrachea import (
     press_path,
     simulate,
 )
-from jaxtrachea.admission import without_negative
 from jaxtrachea.contact.patches import touch
 from jaxtrachea.contact.pose import Pose
 from jaxtrachea.model import ligament_beam, local_law, respond, unit_deflection
+from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.operations import count_operations
+from jaxtrachea.scene.ranges import contact_share, depth_share, in_lumen
+from jaxtrachea.scene.simulation import _refuse, _status, _without_negative
 from jaxtrachea.skeleton import local_frame
-from jaxtrachea.status import ContactStatus, PressStatus
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.mesh import place
 
@@ -34,54 +36,26 @@ def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **ho
     """A program for presses at one contact point."""
 
     def run(scene, m, p):
-        at = p.s[0], p.phi[0]
-        m, bad = admitted(m, **how)
-        led, status = seated(scene, p, bad)
-        s_c = onto_tube(scene, p.s)[0]
-        out = press_oblique(scene.geometry, m, s_c, p.phi[0], led, options, **how)
-        seen = [led, out.force, out.depth, out.skeleton, status(out.status)]
+        m, led, used, status = admitted(scene, m, p)
+        at = used.s[0], used.phi[0]
+        out = press_oblique(scene.geometry, m, *at, used.displacement, options, **how)
+        seen = [led, out.force, out.depth, out.skeleton, *status(out)]
         seen += [getattr(out, name) for name in more.split()]
         return (*seen, move_surface(scene, *at, out, surface)) if surface else seen
 
     return run
 
 
-def admitted(m, *, rings="arch2", axial=True):
-    """The material without negative values, and whether a value that is read was one."""
-    used = ["EI_L", "k_M", "k_1"]
-    used += ["EI_C", "k_t"] if rings == "arch2" else []
-    used += ["EA_L", "k_A", "k_B"] if axial else []
-    used += ["EI_side"]
-    return without_negative(m, used)
+def admitted(scene, m, p, made=None):
+    """Material and presses as computed, and how statuses are read: the same in all programs."""
+    m, bad = _without_negative(scene, m)
+    presses, used, refused = _refuse(scene, m, p, made, bad)
 
+    def status(out):
+        share = depth_share(scene, out.depth, out.skeleton)
+        return share, _status(out.status, share, made, refused)
 
-def onto_tube(scene, s):
-    """Places off the tube at its ends: their rows are refused."""
-    length = scene.geometry.length
-    return jnp.where(s < 0, 0, jnp.where(s > length, length, s))
-
-
-def seated(scene, p, bad, unfit=None):
-    """The presses and their statuses; rows off the tube or at another point are refused."""
-    off = (p.s < 0) | (p.s > scene.geometry.length)
-    moved = ~((jnp.abs(p.s - p.s[0]) <= 1e-4) & (jnp.abs(p.phi - p.phi[0]) <= 1e-4))
-    moved = moved if unfit is None else unfit | moved
-    return refuse(p, {PressStatus.OFF_TUBE: off, PressStatus.OFF_PLAN: moved}, bad)
-
-
-def refuse(p, refused, bad):
-    """Presses with NaN in refused rows, and what becomes of their statuses."""
-    refused = refused | {PressStatus.BAD_MATERIAL: jnp.broadcast_to(bad, p.s.shape)}
-    led = p.displacement
-    for rows in refused.values():
-        led = jnp.where(rows[:, None], jnp.nan, led)
-
-    def status(status):
-        for code, rows in refused.items():
-            status = jnp.where(rows, code, status)
-        return status.astype(jnp.int8)
-
-    return led, status
+    return m, presses.displacement, used, status
 
 
 def move_surface(scene, s, phi, out, kind):
@@ -106,62 +80,55 @@ def move_surface(scene, s, phi, out, kind):
 
 def normal(scene, m, p):
     """A normal press; its scalars as vectors, rows that are none of its kind refused."""
-    D = jnp.abs(p.displacement)
-    oblique = jnp.maximum(D[:, 0], D[:, 2]) > 1e-4 * D[:, 1] + 1e-4
-    unfit = ~(jnp.abs(p.phi) <= 1e-4) | oblique
-    m, bad = without_negative(m, ["EI_L", "k_M", "k_1"])
-    led, status = seated(scene, p, bad, unfit)
-    inward, options, s_c = -led[:, 1], Options(), p.s[0]
-    unit = unit_deflection(ligament_beam(scene.geometry, m, options), s_c, options)
-    law = local_law(scene.geometry, m, s_c, options)
-    out = respond(inward, jnp.zeros_like(s_c), unit.w_C, law, options)
+    m, led, used, status = admitted(scene, m, p)
+    inward = -used.displacement[:, 1]
+    s, options = used.s[0], Options()
+    unit = unit_deflection(ligament_beam(scene.geometry, m, options), s, options)
+    law = local_law(scene.geometry, m, s, options)
+    out = respond(inward, jnp.zeros_like(s), unit.w_C, law, options)
     F = -out.force  # outward is +y
     y = F, -out.depth, F * unit.w_C
-    vectors = [jnp.stack([jnp.zeros(3), v, jnp.zeros(3)], -1) for v in y]
-    return led, vectors, status(out.status)
+    force, depth, way = (jnp.stack([jnp.zeros(3), v, jnp.zeros(3)], -1) for v in y)
+    moved = SimpleNamespace(depth=depth, skeleton=way, status=out.status)
+    return led, force, depth, way, status(moved)
 
 
 def friction(scene, m, p):
     mu = scene.friction
-    m, bad = admitted(m, rings="mat")
-    led, status = seated(scene, p, bad | (mu < 0))
-    out = press_path(scene.geometry, m, onto_tube(scene, p.s)[0], p.phi[0], led, mu, rings="mat")
+    m, led, used, status = admitted(scene, m, p)
+    at = used.s[0], used.phi[0]
+    out = press_path(scene.geometry, m, *at, used.displacement, mu, rings="mat")
     f = out.press
     vectors = f.force, f.depth, f.skeleton, f.joints, f.loads, f.end_U, f.end_V
-    return led, vectors, status(f.status), out.slip, out.dissipated
+    return led, vectors, status(f), out.slip, out.dissipated
 
 
 def each(scene, m, p):
-    m, bad = admitted(m, rings="mat", axial=False)
-    off = (p.s < 0) | (p.s > scene.geometry.length)
-    led, status = refuse(p, {PressStatus.OFF_TUBE: off}, bad)
-    *rest, found = pressed_each(scene, m, Presses(p.s, p.phi, led))
-    return led, *rest, status(found)
+    m, led, used, status = admitted(scene, m, p)
+    return led, presses_of(scene, m, used, status)
 
 
-def pressed_each(scene, m, p):
-    at = onto_tube(scene, p.s), p.phi, p.displacement
+def presses_of(scene, m, used, status):
+    at = used.s, used.phi, used.displacement
     one = lambda *at: press_oblique(scene.geometry, m, *at, rings="mat", axial=False)  # noqa: E731
     out = jax.vmap(one)(*at)
     return out.force, out.depth, out.skeleton, out.joints, out.loads, out.end_U, out.end_V, (
-        out.status
+        status(out)
     )  # fmt: skip
 
 
 def tool(scene, m, p):
     """A tool led over the tube: every row presses along the normal where it touches."""
-    geometry, near = scene.geometry, scene.near
+    near = scene.near
     contact = lambda R, T: touch(scene.tool, Pose(R, T), scene.tube, near=near)  # noqa: E731
     seen = jax.vmap(contact)(p.rotation, p.translation)
     inward = jax.vmap(lambda phi: local_frame(phi)[0])(seen.phi)
-    D = -seen.gap[:, None] * inward
-    m, bad = admitted(m, rings="mat", axial=False)
-    outside = ~((seen.s >= 0) & (seen.s <= geometry.length))
-    off = outside & (jnp.sum(D * inward, axis=1) > 0)
-    led, status = refuse(Presses(seen.s, seen.phi, D), {PressStatus.OFF_TUBE: off}, bad)
-    out = pressed_each(scene, m, Presses(seen.s, seen.phi, led))
-    found = jnp.where((seen.status > ContactStatus.FLAT) & (out[-1] == PressStatus.OK), 9, out[-1])
-    return seen.gap, seen.s, seen.phi, led, out, status(found)
+    presses = Presses(seen.s, seen.phi, -seen.gap[:, None] * inward)
+    inside = in_lumen(scene, p, seen)
+    made = Approach(seen, presses, inward, None, None, seen, inside)
+    m, led, used, status = admitted(scene, m, None, made)
+    out = presses_of(scene, m, used, status)
+    return seen.gap, seen.s, seen.phi, led, out, contact_share(scene, seen)
 
 
 BARE = {"want_surface": False}
@@ -172,18 +139,18 @@ LED = ball([20, -1, 1.0], [130, -1, 2.0])
 MAT = {"rings": "mat"}
 #: name -> (path, wishes, program by hand)
 PROGRAMS = {
-    "normal": (DOWN, ONE, normal),
-    "oblique": (OBLIQUE, BARE, by_hand(**MAT)),
-    "force only": (OBLIQUE, ONE, by_hand(more="", **MAT)),
-    "bonded": (OBLIQUE, {**BARE, "contact": "bonded"}, by_hand(HELD, **MAT)),
-    "total": (OBLIQUE, {**BARE, "coupling": "total"}, by_hand(TOTAL, **MAT)),
-    "no axial": (OBLIQUE, {**BARE, "axial": "off"}, by_hand(axial=False, **MAT)),
+    "normal": (DOWN, {**ONE, **MAT}, normal),
+    "oblique": (OBLIQUE, {**BARE, **MAT}, by_hand(**MAT)),
+    "force only": (OBLIQUE, {**ONE, **MAT}, by_hand(more="", **MAT)),
+    "bonded": (OBLIQUE, {**BARE, **MAT, "contact": "bonded"}, by_hand(HELD, **MAT)),
+    "total": (OBLIQUE, {**BARE, **MAT, "coupling": "total"}, by_hand(TOTAL, **MAT)),
+    "no axial": (OBLIQUE, {**BARE, **MAT, "axial": "off"}, by_hand(axial=False, **MAT)),
     "off the midline": (OFF, BARE, by_hand(rings="arch2", axial=False)),
-    "friction": (OBLIQUE, BARE, friction),
+    "friction": (OBLIQUE, {**BARE, **MAT}, friction),
     "many places": (MANY, {**BARE, **MAT, "axial": "off"}, each),
     "tool": (LED, {**BARE, **MAT}, tool),
-    "surface": (OBLIQUE, {**SKIN, "dent": "off"}, by_hand(more="", surface="global", **MAT)),
-    "dent": (OBLIQUE, SKIN, by_hand(more="", surface="with a dent", **MAT)),
+    "surface": (OBLIQUE, {**SKIN, **MAT, "dent": "off"}, by_hand(more="", surface="global", **MAT)),
+    "dent": (OBLIQUE, {**SKIN, **MAT}, by_hand(more="", surface="with a dent", **MAT)),
 }
 
 

@@ -1,0 +1,183 @@
+"""Which rows a finished plan serves: those that a plan made for them alone would solve alike.
+
+What a row needs and the plan has not is a status, unless the user, or a tolerance, left it out
+(`Plan.ignored`). Where nothing is asked, nothing is added to the program.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from jaxtrachea.contact.patches import Touch
+from jaxtrachea.scene.plan import Served
+from jaxtrachea.scene.stage import COVERED, Poses, Presses, Scene
+from jaxtrachea.trachea.material import Material
+
+#: Largest inward motion of the wall, against the tube's radius. Ring and ligament are linear: a
+#: ring pinched between two points (inextensible elastica) is softer than its linear theory says by
+#: 15 % at a quarter of the radius, 25 % at a half and 35 % at the radius, where the wall has come
+#: to the axis of the tube.
+DEEPEST = 1.0
+
+#: Values of the material that each effect reads: where they are given, a path may need it.
+READ = {
+    "rings": ("EI_C", "k_t"),
+    "shear": ("GA_L",),
+    "two_material": ("k_1_ring",),
+    "axial": ("EA_L",),
+}
+
+
+def lacking(scene: Scene, material: Material) -> list[str]:
+    """Effects that the material gives, but not the plan; the user did not leave them out."""
+    plan = scene.plan
+    there = {
+        "rings": plan.rings != "mat", "shear": plan.options.shear, "axial": plan.axial,
+        "two_material": plan.options.local == "two-material",
+    }  # fmt: skip
+    given = [e for e, names in READ.items() if all(getattr(material, n) is not None for n in names)]
+    return [e for e in given if not there[e] and e not in plan.ignored]
+
+
+def unserved(
+    scene: Scene, material: Material, presses: Presses, pressing: Bool[Array, " rows"]
+) -> Bool[Array, " rows"] | None:
+    """Rows that press and need an effect that is off.
+
+    Off the midline or oblique without vectors, along the tube without stretch, along the surface
+    without friction, elsewhere or too far for one seat; or anywhere with a material that bends,
+    shears or has rings of their own where the plan did not.
+
+    Args:
+        scene: -
+        material: as given to `simulate`.
+        presses: of every row.
+        pressing: whether it does; shape (rows,). The others need nothing but their statuses.
+
+    Returns:
+        Per row; None where there is nothing to ask.
+    """
+    plan = scene.plan
+    presses = jax.lax.stop_gradient(presses)
+    D = presses.displacement
+    less, found = lacking(scene, material), []
+    given = not plan.contact
+    if not plan.second_plane:
+        found.append(_off_plane(presses))
+    elif "axial" in less and (given or plan.seat == "first"):
+        found.append(jnp.abs(D[:, 0]) > COVERED * _length(D) + COVERED)
+    if plan.seat == "first":
+        found += _seats(scene, presses) if given else _wandering(scene, presses)
+        if _frictionless(scene):
+            slides = pressing & (_along(presses) > COVERED * _length(D) + COVERED)
+            found.append(jnp.cumsum(slides) > 0)  # what slid leaves its trace in later rows
+    if plan.served is not None:
+        found.append(_beyond(plan.served, presses))
+    if set(less) & {"rings", "shear", "two_material"}:
+        found.append(jnp.ones_like(pressing))
+    return pressing & functools.reduce(jnp.logical_or, found) if found else None
+
+
+def _beyond(served: Served, presses: Presses):
+    """Rows outside of what the tolerance of the plan was measured for."""
+    D, phi, s = presses.displacement, presses.phi, presses.s
+    c, n = jnp.cos(phi), jnp.sin(phi)
+    reach = (
+        (jnp.abs(phi), served.angle), (jnp.abs(D[:, 0]), served.along),
+        (jnp.abs(c * D[:, 2] - n * D[:, 1]), served.across),
+        (-c * D[:, 1] - n * D[:, 2], served.inward), (s, served.s[1]), (-s, -served.s[0]),
+    )  # fmt: skip
+    beyond = [v > limit + COVERED * (1 + abs(limit)) for v, limit in reach]
+    return functools.reduce(jnp.logical_or, beyond)
+
+
+def _off_plane(presses: Presses):
+    """Rows that are no normal presses on the midline."""
+    D = jnp.abs(presses.displacement)
+    oblique = jnp.maximum(D[:, 0], D[:, 2]) > COVERED * D[:, 1] + COVERED
+    return ~(jnp.abs(presses.phi) <= COVERED) | oblique
+
+
+def _seats(scene: Scene, presses: Presses):
+    """Rows at another contact point than the first."""
+    near = lambda v: jnp.abs(v - v[0]) <= COVERED  # noqa: E731
+    return [~(near(presses.s) & near(presses.phi))]
+
+
+def _wandering(scene: Scene, presses: Presses):
+    """Rows of a tool that has left its seat: as `rules` has it, by half a ring spacing."""
+    if "seat" in scene.plan.ignored or scene.plan.options.contact == "bonded":
+        return []
+    x = scene.geometry.ring_positions
+    spacing = jnp.min(x[1:] - x[:-1]) if x.shape[0] > 1 else scene.geometry.length
+    return [_along(presses) > spacing / 2]
+
+
+def _frictionless(scene: Scene) -> bool:
+    """Whether there is a coefficient of friction that the plan does not use, but could."""
+    plan = scene.plan
+    fits = plan.options.contact == "unilateral" and plan.options.coupling == "series"
+    left_out = scene.friction is not None and not plan.friction
+    return left_out and fits and "friction" not in plan.ignored
+
+
+def _along(presses: Presses):
+    """Way along the surface at the contact, mm."""
+    c, s = jnp.cos(presses.phi), jnp.sin(presses.phi)
+    D = presses.displacement
+    return jnp.sqrt(D[:, 0] ** 2 + (c * D[:, 2] - s * D[:, 1]) ** 2)
+
+
+def _length(D):
+    return jnp.sqrt(jnp.sum(D * D, axis=-1))
+
+
+def depth_share(scene: Scene, depth, skeleton):
+    """Motion of the wall at the contact (indentation and skeleton) against the tube's radius.
+
+    Args:
+        scene: -
+        depth: local indentation, mm; shape (rows, 3), or (rows,) along the normal.
+        skeleton: displacement of C with the skeleton; likewise.
+    """
+    way = jax.lax.stop_gradient(depth + skeleton)
+    way = _length(way) if way.ndim > 1 else jnp.abs(way)
+    return way / scene.radius
+
+
+def contact_share(scene: Scene, seen: Touch):
+    """Penetration against what the search for a contact is sure of: radii of tool and patches."""
+    if scene.tool is None or scene.tube is None:
+        raise ValueError("scene.tool is None; contact needs a tool")
+    sure = scene.tool.radius + jnp.min(scene.tube.shapes.radius)
+    return jax.lax.stop_gradient(jnp.maximum(-seen.gap, 0) / jnp.where(sure > 0, sure, jnp.nan))
+
+
+def submerged(scene: Scene, path: Poses, seen: Touch) -> Bool[Array, " rows"]:
+    """Rows whose tool lies below the inner wall with all of its thickness along the normal."""
+    if scene.tool is None:
+        raise ValueError("scene.tool is None; contact needs a tool")
+    normal = jnp.einsum("rij,ri->rj", path.rotation, seen.normal)
+    up = normal @ scene.tool.vertices
+    thick = jnp.max(up, axis=1) - jnp.min(up, axis=1) + 2 * scene.tool.radius
+    wall = 2 * jnp.maximum(scene.radius - scene.geometry.radius, 0)
+    return seen.gap + thick + wall < 0
+
+
+def off_the_end(scene: Scene, seen: Touch) -> Bool[Array, " rows"]:
+    """Rows whose contact lies beyond an end of the tube."""
+    return (seen.s < 0) | (seen.s > scene.geometry.length)
+
+
+def in_lumen(scene: Scene, path: Poses, seen: Touch) -> Bool[Array, " rows"]:
+    """Rows whose tool lies within the tube, and that did not come there through the wall.
+
+    A tool that was outside, or half in the wall, before it went under is pressed in; one that
+    begins there, or that came over an end, is in the lumen.
+    """
+    under, off = submerged(scene, path, seen), off_the_end(scene, seen)
+    row = jnp.arange(under.shape[0])
+    last = lambda v: jax.lax.cummax(jnp.where(v, row, -1))  # noqa: E731
+    return under & (last(~under & ~off) <= last(off))

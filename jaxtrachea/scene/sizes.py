@@ -1,0 +1,64 @@
+"""Sizes that a trachea and its tools can have; beyond them the unit is most likely wrong."""
+
+import numpy as np
+
+from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.trachea.geometry import Geometry
+
+#: Length of a trachea, mm: from a newborn mouse's to more than a horse's (some 800 mm).
+LENGTHS = (2.0, 1000.0)
+#: Its radius, mm.
+RADII = (0.2, 100.0)
+#: Longest tool, mm.
+LONGEST_TOOL = 1000.0
+
+
+class SizeError(ValueError):
+    """A length that no trachea and no tool has: what, how long, what is expected, the cause."""
+
+
+def check_sizes(geometry: Geometry, outer: float, tool: Shape | None) -> None:
+    """Refuse lengths that are most likely given in another unit.
+
+    Args:
+        geometry: the tube at rest.
+        outer: radius of its outside, mm.
+        tool: or None.
+
+    Raises:
+        SizeError: the first of them.
+    """
+    length, radius = float(geometry.length), float(geometry.radius)
+    _within("geometry.length", length, LENGTHS)
+    _within("geometry.radius", radius, RADII)
+    if not radius / 2 <= outer <= 1.5 * radius:
+        raise SizeError(
+            f"radius of the outside is {outer:.4g} mm, that of the rings' line {radius:.4g} mm; "
+            "expected it half to one and a half times as large (a wall not thicker than the "
+            "radius); check the units of wall and radius"
+        )
+    if tool is not None:
+        corners = np.asarray(tool.vertices, float)
+        across = float(np.ptp(corners, axis=1).max() + 2 * float(tool.radius))
+        if not across <= LONGEST_TOOL:
+            raise SizeError(
+                f"tool is {across:.4g} mm across; expected at most {LONGEST_TOOL:g} mm; lengths "
+                f"are in mm: {_cause(across)}"
+            )
+
+
+def _within(name: str, value: float, limits: tuple[float, float]) -> None:
+    low, high = limits
+    if not low <= value <= high:
+        small = f"is the unit wrong (mm in place of m)? It would be {1000 * value:.4g} mm"
+        raise SizeError(
+            f"{name} is {value:.4g} mm; expected {low:g} to {high:g} mm; lengths are in mm: "
+            f"{_cause(value) if value > high else small}"
+        )
+
+
+def _cause(value: float) -> str:
+    return (
+        f"is the unit wrong (m or cm in place of mm)? It would be {value / 1000:.4g} mm or "
+        f"{value / 10:.4g} mm"
+    )

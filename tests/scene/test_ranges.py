@@ -1,0 +1,232 @@
+"""Where a plan and its levels hold: every row is answered as by a plan of its own, or refused."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_bvp
+from small_scenes import BALL, BARE, MATERIAL, OFF, SPRINGS, TUBE, ball, bend, poses
+
+from jaxtrachea import Presses, Session, make_scene, press_oblique, simulate, sweep
+from jaxtrachea.contact.shapes import sphere
+from jaxtrachea.scene.build import stage
+from jaxtrachea.scene.plan import Served
+from jaxtrachea.scene.sizes import SizeError
+from jaxtrachea.scene.spec import load_scene_spec
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.tube import make_tube
+
+run = jax.jit(simulate)
+OK, OFF_PLAN = PressStatus.OK, PressStatus.OFF_PLAN
+#: Forces only: quick to compile.
+ONE = dataclasses.replace(BARE, want_joints=False, want_ring_ends=False)
+VECTORS = dataclasses.replace(ONE, second_plane="on")
+
+
+def test_a_plan_without_stretch_refuses_a_path_along_the_tube():
+    """It gave 8 times the force with OK: the ligament cannot stretch in it."""
+    scene = make_scene(TUBE, SPRINGS, OFF, wishes=ONE)
+    assert not scene.plan.axial
+    path = Presses([75.0] * 3, [0.5] * 3, [[0, -3, -1.0], [0.5, -3, -1], [4, -3, -1]])
+    out = run(scene, SPRINGS, path)
+    assert out.status.tolist() == [OK, OFF_PLAN, OFF_PLAN]
+    assert np.isnan(out.force[1:]).all()
+    # Left out because the user says so, or because the material has no EA_L: as it was.
+    wished = dataclasses.replace(ONE, axial="off")
+    assert run(make_scene(TUBE, SPRINGS, OFF, wishes=wished), SPRINGS, path).status[2] == OK
+    stiff = dataclasses.replace(SPRINGS, EA_L=None)
+    assert run(scene, stiff, path).status.tolist() == [OK] * 3
+
+
+def test_a_plan_without_bending_rings_refuses_a_material_with_them():
+    """Rings as springs at 60 degrees were 83 % off, with OK, in sweeps too."""
+    path = Presses([75.0], [1.0], [[0, -2 * np.cos(1.0), -2 * np.sin(1.0)]])
+    scene = make_scene(TUBE, SPRINGS, path, wishes=ONE)
+    assert scene.plan.rings == "mat"
+    for material, expected in ((SPRINGS, OK), (MATERIAL, OFF_PLAN)):
+        assert run(scene, material, path).status.tolist() == [expected]
+        out = sweep(scene, material, [75.0], [1.0], [2.0])
+        assert out.status.tolist() == [expected]
+        assert np.isnan(out.force[0]) == (expected == OFF_PLAN)
+
+
+@pytest.mark.slow
+def test_a_plan_of_the_midline_bends_its_rings_off_it():
+    """Its rings were springs, and 83 % off at 60 degrees."""
+    path = Presses([75.0], [1.0], [[0, -2 * np.cos(1.0), -2 * np.sin(1.0)]])
+    single = jax.jit(lambda D: press_oblique(TUBE, MATERIAL, 75.0, 1.0, D, axial=False).force)
+    made = make_scene(TUBE, MATERIAL, Presses([75.0], [0.0], [[0, -2.0, 0]]), wishes=ONE)
+    right = single(path.displacement[0])
+    np.testing.assert_allclose(run(made, MATERIAL, path).force[0], right, rtol=1e-12)
+
+
+def test_a_plan_of_a_tolerance_serves_what_it_was_measured_for():
+    """Rings as springs, right within 1 % at the place measured, are nowhere near it elsewhere."""
+    served = Served((70.0, 80.0), angle=0.1, along=0.0, across=0.0, inward=3.0)
+    path = Presses(
+        [75.0, 75, 75, 75, 90], [0.0, 0.5, 0.0, 0.0, 0.0],
+        [[0, -3.0, 0], [0, -2, -1], [1, -3, 0], [0, -4, 0], [0, -3, 0]],
+    )  # fmt: skip
+    wishes = dataclasses.replace(ONE, rings="mat", axial="off")
+    scene = make_scene(TUBE, MATERIAL, path, wishes=wishes)
+    chosen = dataclasses.replace(scene, plan=dataclasses.replace(scene.plan, served=served))
+    assert run(scene, MATERIAL, path).status.tolist() == [OK] * 5
+    assert run(chosen, MATERIAL, path).status.tolist() == [OK] + [OFF_PLAN] * 4
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"length": 1600.0}, "geometry.length is 1600 mm"),
+        ({"length": 0.16}, "It would be 160 mm"),
+        ({"radius": 0.0113}, "geometry.radius is 0.0113 mm"),
+        ({"outer": 30.0}, "radius of the outside is 30 mm"),
+        ({"tool": 1000.0}, "tool is 2000 mm across; expected at most 1000 mm"),
+    ],
+)
+def test_sizes_of_another_unit_are_refused_with_the_cause(change, says):
+    """A tool of a metre's radius and a tube of 1.2 m were taken."""
+    own = {k: jnp.asarray(v) for k, v in change.items() if k in ("length", "radius")}
+    tube, path = dataclasses.replace(TUBE, **own), ball([0.08, 1, 0], [0.08, -2, 0])
+    tool = sphere(change.get("tool", 5.0))
+    with pytest.raises(SizeError, match=says) as caught:
+        make_scene(tube, MATERIAL, path, tool=tool, wishes=BARE, radius=change.get("outer"))
+    assert "unit" in str(caught.value)
+
+
+def test_a_wall_thicker_than_the_radius_is_refused():
+    with pytest.raises(ValueError, match=r"wall is 12 mm, thicker than the radius of 11.3 mm"):
+        make_tube(TUBE, wall=12.0)
+
+
+def test_the_outside_is_that_of_the_mesh():
+    """Of an imported mesh it was taken 1.3 mm too large."""
+    mesh, bare = make_tube(TUBE, around=36, along=160, wall=2.0), {"wishes": BARE}
+    assert float(make_scene(TUBE, MATERIAL, OFF, mesh=mesh, **bare).radius) == pytest.approx(12.3)
+    imported = dataclasses.replace(TUBE, radius=jnp.asarray(12.3))
+    scene = make_scene(imported, MATERIAL, OFF, mesh=bend(mesh, 200.0), **bare)
+    assert float(scene.radius) == pytest.approx(12.3)
+
+
+def test_what_a_linear_ring_leaves_out():
+    """The figures of `ranges.DEEPEST`: a pinched ring by the elastica, radius and EI 1."""
+    s = np.linspace(0, np.pi / 2, 40)
+    y, way = np.stack([s, np.ones(40), np.sin(s), 1 - np.cos(s)]), []
+
+    def curve(_, y, load):
+        return np.stack([y[1], load / 2 * np.cos(y[0]), np.cos(y[0]), np.sin(y[0])])
+
+    loads = np.linspace(0.5, 5.0, 10)
+    for load in loads:  # a quarter of the ring, from the point of the load to the side
+        found = solve_bvp(
+            lambda s, y: curve(s, y, load),  # noqa: B023
+            lambda a, b: np.array([a[0], b[0] - np.pi / 2, a[2], a[3]]), s, y, tol=1e-5,
+        )  # fmt: skip
+        assert found.success
+        y = found.sol(s)
+        way.append(2 - 2 * y[3, -1])
+    linear = loads * (np.pi / 4 - 2 / np.pi)
+    softer = [1 - np.interp(d, way, linear) / d for d in (0.25, 0.5, 1.0)]
+    np.testing.assert_allclose(softer, [0.15, 0.25, 0.35], atol=0.01)
+
+
+def test_friction_and_a_seat_that_the_plan_has_not_are_refused():
+    """A tool with friction was stuck along the surface, and dragged its first place anywhere."""
+    down, led = ball([75, 1, 0], [75, -2, 0]), ball([75, 1, 0], [78, -2, 0])
+    far = ball([75, -1, 0], [95, -1, 0])
+    unstretched = dataclasses.replace(VECTORS, axial="off")
+    rough = make_scene(TUBE, SPRINGS, down, tool=BALL, friction=0.66, wishes=unstretched)
+    smooth = make_scene(TUBE, SPRINGS, led, tool=BALL, wishes=ONE)
+    assert run(rough, SPRINGS, down).status.tolist() == [1, OK, OK, OK]
+    assert run(rough, SPRINGS, led).status.tolist() == [1, OFF_PLAN, OFF_PLAN, OFF_PLAN]
+    assert (smooth.plan.seat, smooth.plan.axial) == ("first", True)
+    assert run(smooth, SPRINGS, far).status.tolist() == [OK] + [OFF_PLAN] * 3
+
+
+@pytest.mark.parametrize(
+    ("material", "pressed"),
+    [(SPRINGS, [0, 7, 5]), pytest.param(MATERIAL, [0, 0, 5], marks=pytest.mark.slow)],
+)
+def test_rows_that_do_not_press_are_no_contact_wherever_they_are(material, pressed):
+    """Behind the ends they were NaN; off the midline OFF_PLAN in a program of one plane."""
+    around = [0.0, 0.5, 2.5]
+    normal = np.array([[0, np.cos(v), np.sin(v)] for v in around])
+    away = poses([75, 0, 0], [75, 0, 0], 3)
+    start = poses([40, 12, 0], [100, 12, 0], 3)
+    scene = make_scene(TUBE, material, start, tool=sphere(1.0), wishes=ONE)
+    assert (scene.plan.seat, scene.plan.second_plane) == ("each", material is MATERIAL)
+    for height, expected in ((14.0, [1, 1, 1]), (12.0, pressed)):
+        path = dataclasses.replace(away, translation=jnp.asarray(height * normal + [75, 0, 0]))
+        out = run(scene, material, path)
+        assert out.status.tolist() == expected
+        assert height < 14 or (np.asarray(out.force) == 0).all()
+
+
+@pytest.mark.parametrize("phi", [1e-3])
+def test_force_is_continuous_across_the_midline(phi):
+    """With EI_C and k_t: 0.351 N up to 5e-5 rad, 0.256 N from 1e-4 rad on."""
+    found = []
+    for at in (0.0, phi / 20, phi / 10.001, phi / 9.9, phi):
+        D = [[0, -2 * np.cos(at), -2 * np.sin(at)]]
+        path = Presses([75.0], [at], D)
+        scene = make_scene(TUBE, MATERIAL, path, wishes=ONE)
+        assert scene.plan.rings == "arch2"
+        found.append(float(jnp.linalg.norm(run(scene, MATERIAL, path).force[0])))
+    np.testing.assert_allclose(found, found[0], rtol=1e-5)
+
+
+def test_a_tool_in_the_lumen_has_no_force():
+    """Without a mesh the tube is solid: it was pressed out, 0.6 to 1.4 N with OK."""
+    lumen = poses([60, 0, 0], [90, 1, 0])
+    scene = make_scene(TUBE, SPRINGS, lumen, tool=sphere(3.0), wishes=ONE)
+    out = run(scene, SPRINGS, lumen)
+    assert out.status.tolist() == [PressStatus.IN_LUMEN] * 4
+    assert np.isnan(out.force).any(axis=1).all()
+    # In over the end is in the lumen; in through the wall is a press, and out is outside.
+    end = run(scene, SPRINGS, poses([-20, 0, 0], [60, 0, 0]))
+    assert end.status.tolist()[-1] == PressStatus.IN_LUMEN
+
+
+@pytest.mark.parametrize("seat", ["first", pytest.param("each", marks=pytest.mark.slow)])
+def test_a_tool_driven_through_the_tube_is_beyond_its_range(seat):
+    """It was OK with 3.5 to 5 N: the wall may go as far as the axis of the tube."""
+    path = ball([75, 1, 0], [75, -50, 0], 18)
+    wishes = dataclasses.replace(ONE, seat=seat)
+    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, wishes=wishes)
+    out = run(scene, SPRINGS, path)
+    depth = np.maximum(-(np.asarray(path.translation)[:, 1] - 5 - 12.6), 0)
+    deep = depth > 13.0
+    assert (np.asarray(out.status)[deep] != OK).all()
+    assert (np.asarray(out.status)[(depth > 0) & (depth < 12)] == OK).all()
+    shallow = (depth < 12) & (depth > 0)
+    share = np.asarray(out.depth_share)
+    np.testing.assert_allclose(share[shallow], depth[shallow] / 12.6, atol=0.02)
+    if seat == "first":
+        assert out.status[-1] == PressStatus.TOO_DEEP
+        np.testing.assert_allclose(share[-1], 50 / 12.6, atol=0.02)
+
+
+def test_steps_of_a_session_are_refused_alike():
+    """In the lumen, out of it, a press, and a jump along the tube that kept the old place."""
+    scene = make_scene(TUBE, SPRINGS, ball([75, 1, 0], [75, -2, 0]), tool=BALL, wishes=ONE)
+    session, found = Session(scene, SPRINGS), []
+    for place in ([75, 0, 0], [75, 19, 0], [75, 16, 0], [95, 16, 0], [75, 19, 0], [75, -40, 0]):
+        found.append(int(session.step(np.eye(3), place).status))
+    assert found[:4] == [PressStatus.IN_LUMEN, PressStatus.NO_CONTACT, OK, OFF_PLAN]
+    assert found[4] == PressStatus.NO_CONTACT
+
+
+def test_what_is_dropped_is_said_with_the_scene(tmp_path):
+    """Only `plan` said it: a rough tool slides 40 mm without friction."""
+    path = tmp_path / "slide.toml"
+    path.write_text(
+        '[material]\nEI_L = "1.9 N mm^2"\nk_M = "0.1 N/mm"\nk_1 = "0.3 N/mm"\nk_3 = "0.02 N/mm^3"\n'
+        '[tool]\nshape = "sphere"\nradius = "5 mm"\nfriction = 0.5\n'
+        '[path]\nstart = ["60 mm", "16 mm", "0 mm"]\nend = ["100 mm", "16 mm", "0 mm"]\nsteps = 3\n'
+        "[output]\nsurface = false\n"
+    )
+    notes = stage(load_scene_spec(path), tmp_path).notes
+    assert any(note.startswith("contact patches: ") for note in notes)
+    assert any("friction: off, the contact does not keep its place" in note for note in notes)
