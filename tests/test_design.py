@@ -116,7 +116,8 @@ def test_ten_thousand_candidates(known):
     candidates = grid((10.0, 150.0), (2.0, 6.0), 10_000)
     assert len(candidates.s) == 10_000
     choice = next_points(one, candidates)
-    assert choice.error.shape == (2, 4) and np.all(choice.error[1] < choice.error[0])
+    assert choice.error.shape == (2, 4)
+    assert np.all(choice.error[1] < choice.error[0])
 
 
 def test_map_knows_that_one_place_is_not_enough(known):
