@@ -98,7 +98,7 @@ def test_a_start_next_to_a_bound(gap):
 
 
 @pytest.mark.parametrize(
-    ("method", "blocks"), [("lbfgs", 60), pytest.param("adam", 100, marks=pytest.mark.slow)]
+    ("method", "blocks"), [("lbfgs", 60), pytest.param("adam", 300, marks=pytest.mark.slow)]
 )
 def test_first_order_methods_respect_bounds(method, blocks):
     problem, start = bounded.random_problem(11, 60)

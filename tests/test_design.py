@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import time
 from pathlib import Path
 
 import numpy as np
@@ -107,8 +106,8 @@ def test_criteria_are_their_definitions_and_greedy_takes_the_best(known):
     assert candidates.depth[next_points(known, candidates).chosen[0]] == 6.0
 
 
-def test_ten_thousand_candidates_in_a_second(known):
-    """One guess, after compilation: sensitivities, scores and choice."""
+def test_ten_thousand_candidates(known):
+    """More than are computed at a time; the error of every unknown falls."""
     one = dataclasses.replace(
         known, lane=known.lane[:1], theta=known.theta[:1], base=known.base[:1],
         relative=known.relative[:1], sigma=known.sigma[:1], kept=known.kept[:1],
@@ -116,10 +115,9 @@ def test_ten_thousand_candidates_in_a_second(known):
     )  # fmt: skip
     candidates = grid((10.0, 150.0), (2.0, 6.0), 10_000)
     assert len(candidates.s) == 10_000
-    next_points(one, candidates)
-    start = time.perf_counter()
-    next_points(one, candidates)
-    assert time.perf_counter() - start < 1.0
+    choice = next_points(one, candidates)
+    assert choice.error.shape == (2, 4)
+    assert np.all(choice.error[1] < choice.error[0])
 
 
 def test_map_knows_that_one_place_is_not_enough(known):

@@ -66,8 +66,8 @@ def _solver(form):
     return jax.jit(jax.vmap(jax.vmap(one, (*shared, None, 0)), (*shared, 0, None)))
 
 
-def measure(name, dtype, form="recursion"):
-    """{quantity: {k: worst error over the positions of C}}."""
+def cases(name, dtype, form="recursion"):
+    """Yields k, position of C, errors as in `compare`, exact solution."""
     x, length, positions = tube(name)
     solved = exact(name)
     ks = sorted({k for k, _ in solved})
@@ -75,13 +75,75 @@ def measure(name, dtype, form="recursion"):
     bending = np.full(len(x) + 1, EI, np.float32)
     arrays = (jnp.asarray(v, dtype) for v in (x, length, bending, stiffness, positions))
     got = _solver(form)(*arrays)
-    worst = {q: {} for q in QUANTITIES}
     for i, k in enumerate(ks):
         for j, s in enumerate(positions):
             entry = jax.tree.map(lambda v: v[i, j], got)  # noqa: B023
-            for q, error in compare(entry, solved[k, s]).items():
-                decade = float(f"{k:.0e}")
-                worst[q][decade] = max(worst[q].get(decade, 0.0), error)
+            yield k, s, compare(entry, solved[k, s]), solved[k, s]
+
+
+def measure(name, dtype, form="recursion"):
+    """{quantity: {k: worst error over the positions of C}}."""
+    worst = {q: {} for q in QUANTITIES}
+    for k, _, errors, _ in cases(name, dtype, form):
+        decade = float(f"{k:.0e}")
+        for q, error in errors.items():
+            worst[q][decade] = max(worst[q].get(decade, 0.0), error)
+    return worst
+
+
+def amplification(x, length, EI, k, GA, s, solution):
+    """What a rounding of the force that passes a ring does to the joints, over the largest joint.
+
+    From C to either clamp the force and moment (V, M) on the rest of the beam are carried from ring
+    to ring. Their entries are rounded at every ring, to first order relative to |T'| |(V, M)| (a
+    moment may cancel), and each of these errors moves that ring and those behind it by the
+    compliance G of the rest. Where a soft part hangs on a stiff one this is a large motion.
+
+    GA may be None; `solution` is exact, under any force at s. Returns {"w", "reaction", "theta"}:
+    the largest over rings and sources.
+    """
+    spans, m = np.diff([0, *x, length]), np.searchsorted(x, s)
+    softness = [1 / np.asarray(EI, float), np.zeros(len(EI)) if GA is None else 1 / np.asarray(GA)]
+    rotations = [*solution.theta, solution.theta_C]
+    peaks = [max(abs(float(v)) for v in of) for of in (solution.w, rotations, solution.reaction)]
+    worst = np.zeros(3)
+    for turn, count in ((1, m), (-1, len(x) - m)):
+        if count:
+            parts = [np.asarray(v, float)[::turn] for v in (spans, k, *softness)]
+            last = float(s - x[m - 1] if turn > 0 else x[m] - s)
+            tip = np.array([solution.w_C, turn * solution.theta_C], float)
+            worst = np.maximum(worst, _errors(*parts, count, last, tip) / np.array(peaks))
+    return dict(zip(("w", "theta", "reaction"), worst, strict=True))
+
+
+def _span(h, a, b):
+    """Transfer of motions over a span, and its compliance as a cantilever."""
+    bending = a * np.array([[h**3 / 3, h**2 / 2], [h**2 / 2, h]])
+    return np.array([[1, h], [0, 1]]), bending + np.array([[b * h, 0], [0, 0]])
+
+
+def _errors(spans, k, a, b, count, last, tip):
+    """Of w, theta and reactions of one side of C, seen from its clamp, per rounding."""
+    G, with_ring, passed, transfer = np.zeros((2, 2)), [], [], []
+    for h, stiffness, *soft in zip(spans[:count], k[:count], a[:count], b[:count], strict=True):
+        T, own = _span(h, *soft)
+        G = T @ G @ T.T + own
+        share = 1 / (1 + stiffness * G[0, 0])
+        passed.append(np.array([[share, -stiffness * share * G[0, 1]], [0, 1]]))
+        G = G - stiffness * share * np.outer(G[0], G[0])
+        with_ring.append(G)
+        transfer.append(T.T)
+    T, own = _span(last, a[count], b[count])
+    force = np.linalg.solve(T @ G @ T.T + own, tip)
+    worst, errors, step = np.zeros(3), np.zeros((2, 0)), T.T
+    for G, through, inner, stiffness in zip(
+        with_ring[::-1], passed[::-1], transfer[::-1], k[:count][::-1], strict=True
+    ):
+        rounded = np.abs(step) @ np.abs(force)
+        errors = np.concatenate([step @ errors, np.diag(rounded)], axis=1)
+        w, theta = np.abs(G @ errors).reshape(2, -1, 2).sum(2).max(1)
+        worst = np.maximum(worst, [w, theta, stiffness * w])
+        force, errors, step = through @ step @ force, through @ errors, inner
     return worst
 
 
