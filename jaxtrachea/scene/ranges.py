@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.scene.plan import Served
 from jaxtrachea.scene.stage import COVERED, Poses, Presses, Scene
+from jaxtrachea.surface import local
 from jaxtrachea.trachea.material import Material
 
 #: Largest inward motion of the wall, against the tube's radius. Ring and ligament are linear: a
@@ -38,6 +39,9 @@ def lacking(scene: Scene, material: Material) -> list[str]:
         "two_material": plan.options.local == "two-material",
     }  # fmt: skip
     given = [e for e, names in READ.items() if all(getattr(material, n) is not None for n in names)]
+    if plan.axial and plan.surface is not None and not plan.end_motion:
+        there["end_motion"] = False
+        given += ["end_motion"] * any(getattr(material, n) is not None for n in ("k_A", "k_B"))
     return [e for e in given if not there[e] and e not in plan.ignored]
 
 
@@ -47,8 +51,9 @@ def unserved(
     """Rows that press and need an effect that is off.
 
     Off the midline or oblique without vectors, along the tube without stretch, along the surface
-    without friction, elsewhere or too far for one seat; or anywhere with a material that bends,
-    shears or has rings of their own where the plan did not.
+    without friction, elsewhere or too far for one seat, near a surface without a dent; or anywhere
+    with a material that bends, shears, lets the ends move or has rings of their own where the plan
+    did not.
 
     Args:
         scene: -
@@ -75,8 +80,10 @@ def unserved(
             found.append(jnp.cumsum(slides) > 0)  # what slid leaves its trace in later rows
     if plan.served is not None:
         found.append(_beyond(plan.served, presses))
-    if set(less) & {"rings", "shear", "two_material"}:
+    if set(less) - {"axial"}:
         found.append(jnp.ones_like(pressing))
+    if plan.surface is not None and not plan.dent and "dent" not in plan.ignored:
+        found.append(_near_surface(scene, presses))
     return pressing & functools.reduce(jnp.logical_or, found) if found else None
 
 
@@ -104,6 +111,16 @@ def _seats(scene: Scene, presses: Presses):
     """Rows at another contact point than the first."""
     near = lambda v: jnp.abs(v - v[0]) <= COVERED  # noqa: E731
     return [~(near(presses.s) & near(presses.phi))]
+
+
+def _near_surface(scene: Scene, presses: Presses):
+    """Rows whose dent would reach a vertex."""
+    if scene.mesh is None:
+        raise ValueError("scene.mesh is None; the plan has a surface")
+    y, z = scene.radius * jnp.cos(presses.phi), scene.radius * jnp.sin(presses.phi)
+    at = jnp.stack([presses.s, y, z], axis=1)
+    away = jnp.sum((scene.mesh.straight[None] - at[:, None]) ** 2, axis=2)
+    return jnp.min(away, axis=1) < (local.REACH * scene.footprint) ** 2
 
 
 def _wandering(scene: Scene, presses: Presses):

@@ -8,7 +8,20 @@ import numpy as np
 import pytest
 from run_cli import run as run_cli
 from scipy.integrate import solve_bvp
-from small_scenes import BALL, BARE, DOWN, MATERIAL, OFF, SPRINGS, TUBE, ball, bend, poses
+from small_scenes import (
+    BALL,
+    BARE,
+    DOWN,
+    MATERIAL,
+    MESH,
+    OFF,
+    SPRINGS,
+    TUBE,
+    ball,
+    bend,
+    poses,
+    presses,
+)
 
 from jaxtrachea import Presses, Session, make_scene, press_oblique, simulate, sweep
 from jaxtrachea.contact.shapes import sphere
@@ -16,7 +29,9 @@ from jaxtrachea.scene.build import dropped_effects
 from jaxtrachea.scene.plan import Facts, Served
 from jaxtrachea.scene.ranges import lacking, unserved
 from jaxtrachea.scene.rules import make_plan
+from jaxtrachea.scene.simulation import _without_negative
 from jaxtrachea.scene.sizes import SizeError
+from jaxtrachea.scene.stage import with_mesh
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.tube import make_tube
 
@@ -75,6 +90,41 @@ def test_what_a_material_gives_and_a_plan_lacks():
     assert lacking(scene, more) == ["rings", "shear", "two_material", "axial"]
     assert needing_more(scene, SPRINGS, ASIDE) == [0]
     assert needing_more(scene, MATERIAL, ASIDE) == [1]
+
+
+def test_ends_that_move_and_a_dent_are_effects_too():
+    """The surface stayed at its ends, or flat under the tool, with OK."""
+    path = presses([-2, -4, 0], s=75.0)
+    scene = make_scene(TUBE, SPRINGS, path, mesh=MESH)
+    soft = dataclasses.replace(SPRINGS, k_A=jnp.array(0.2))
+    assert scene.plan.axial
+    assert needing_more(scene, SPRINGS, path) == [0, 0, 0]
+    assert needing_more(scene, soft, path) == [1, 1, 1]
+    held = dataclasses.replace(scene.plan, ignored=frozenset({"end_motion"}))
+    assert needing_more(dataclasses.replace(scene, plan=held), soft, path) == [0, 0, 0]
+    short = dataclasses.replace(MESH, s=MESH.s / 4)  # the surface ends at 40 mm
+    far = make_scene(TUBE, SPRINGS, path, mesh=short)
+    assert far.plan.dent == 0
+    assert needing_more(far, SPRINGS, path) == [0, 0, 0]
+    assert needing_more(far, SPRINGS, presses([-2, -4, 0], s=30.0)) == [1, 1, 1]
+
+
+def test_a_negative_friction_is_a_bad_material():
+    scene = make_scene(TUBE, SPRINGS, presses([-2, -4, 0]), friction=0.5, wishes=ONE)
+    assert scene.plan.friction
+    for mu, expected in ((0.5, False), (-0.1, True)):
+        scene = dataclasses.replace(scene, friction=jnp.asarray(mu))
+        assert bool(_without_negative(scene, SPRINGS)[1]) == expected
+
+
+def test_another_mesh_says_whether_it_is_bent():
+    """A program for a straight mesh took the motions of a bent one as they were."""
+    scene = make_scene(TUBE, SPRINGS, DOWN, mesh=MESH)
+    scene = dataclasses.replace(scene, plan=dataclasses.replace(scene.plan, contact=True))
+    assert not scene.plan.curved
+    bent = with_mesh(scene, bend(MESH, 200.0))
+    assert bent.plan.curved
+    assert not with_mesh(bent, MESH).plan.curved
 
 
 @pytest.mark.slow
