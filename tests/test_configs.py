@@ -184,6 +184,18 @@ BAD = {
         GOOD + PRESS + "phi = '20 deg'\n[effects]\nsecond_plane = 'off'",
         ["effects.second_plane", "20 deg off the midline", "auto"],
     ),
+    "tube of 1.2 m": (
+        GOOD + LINE + BALL + '[trachea]\nlength = "1.2 m"\nrings = ["0.4 m", "0.8 m"]',
+        ["trachea.length is 1200 mm", "expected 2 to 1000 mm", "is the unit wrong"],
+    ),
+    "wall thicker than the radius": (
+        GOOD + PRESS + '[trachea]\nwall = "26 mm"',
+        ["wall is 26 mm, thicker than the radius"],
+    ),
+    "tool of a metre's radius": (
+        GOOD + LINE + '[tool]\nshape = "sphere"\nradius = "1 m"',
+        ["tool is 2000 mm across", "is the unit wrong"],
+    ),
     "level unknown": (GOOD + PRESS + "[effects]\nrings = 'bow'", ["effects.rings", "'arch2'"]),
 }
 

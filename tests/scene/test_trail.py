@@ -46,6 +46,31 @@ def test_the_place_under_a_slip():
 TOOLS = {"ball": (sphere(5.0), 5.0), "capsule": (capsule(1.5, 3.0), 3.0)}
 
 
+def plane(dtype=float):
+    """A plane, sunk 0.7 mm under its middle, and the square of the distance from there."""
+    x, z = (v.ravel() for v in np.meshgrid(np.linspace(-6, 6, 25), np.linspace(-6, 6, 25)))
+    bump = 0.7 * np.exp(-(x * x + z * z) / 16)
+    arrays = x * x + z * z, np.stack([x, 0 * x, z], 1), np.stack([x, -bump, z], 1)
+    return tuple(jnp.asarray(v, dtype) for v in arrays)
+
+
+def test_the_scale_has_the_derivatives_of_finite_differences():
+    """By the ball's height: 1 over the dent's share where it touches; and not at all above."""
+
+    def depth(height):
+        pose = Poses(jnp.eye(3), jnp.zeros(3).at[1].set(height))
+        return -jnp.min(trail.touching(TOOLS["ball"][0], pose, *plane())[:, 1])
+
+    both = jax.jit(jax.vmap(jax.value_and_grad(depth)))
+    heights = np.array([3.7, 4.6, 5.2])
+    slope = both(jnp.asarray(heights))[1]
+    step = 1e-6
+    up, down = (both(jnp.asarray(heights + d))[0] for d in (step, -step))
+    np.testing.assert_allclose(slope, (up - down) / (2 * step), atol=1e-6)
+    assert slope[0] < -0.9
+    assert slope[2] == 0
+
+
 @pytest.mark.parametrize(
     ("name", "dtype"),
     [("ball", float), ("ball", "f4"), pytest.param("capsule", float, marks=pytest.mark.slow)],
@@ -53,19 +78,14 @@ TOOLS = {"ball": (sphere(5.0), 5.0), "capsule": (capsule(1.5, 3.0), 3.0)}
 def test_a_dent_is_scaled_until_it_touches(name, dtype):
     """A plane with a dent 0.7 mm deep; the tool reaches below it, less, or not to the plane."""
     tool, height = TOOLS[name]
-    x, z = (v.ravel() for v in np.meshgrid(np.linspace(-6, 6, 25), np.linspace(-6, 6, 25)))
-    bump = 0.7 * np.exp(-(x * x + z * z) / 16)
-    square, plane, dented = (
-        jnp.asarray(v, dtype)
-        for v in (x * x + z * z, np.stack([x, 0 * x, z], 1), np.stack([x, -bump, z], 1))
-    )
+    square, flat, dented = plane(dtype)
     tool = jax.tree.map(lambda v: jnp.asarray(v, dtype), tool)
     reaches = np.array([1.3, 0.4, -0.2])
     places = jnp.asarray(np.stack([0 * reaches, height - reaches, 0 * reaches], 1), dtype)
     poses = Poses(jnp.broadcast_to(jnp.eye(3, dtype=dtype), (3, 3, 3)), places)
     run = jax.jit(jax.vmap(trail.touching, (None, 0, None, None, None)))
-    surfaces = run(tool, poses, square, plane, dented)
-    assert surfaces.dtype == plane.dtype
+    surfaces = run(tool, poses, square, flat, dented)
+    assert surfaces.dtype == flat.dtype
     # The capsule's distance is that of its smoothed shape, up to log(2) / beta too small.
     smoothing = {"ball": 1e-5, "capsule": 0.01}[name]
     for place, reach, out in zip(places, reaches, np.asarray(surfaces, float), strict=True):
@@ -75,7 +95,7 @@ def test_a_dent_is_scaled_until_it_touches(name, dtype):
         under = np.asarray(square) <= 4
         apart = (np.linalg.norm(out - core, axis=1)[under] - height).min()
         np.testing.assert_allclose(apart, max(-reach, 0), atol=smoothing)
-    np.testing.assert_array_equal(surfaces[2], plane)
+    np.testing.assert_array_equal(surfaces[2], flat)
 
 
 @pytest.mark.slow
