@@ -180,7 +180,7 @@ def test_an_unused_effect_adds_no_operation(name):
 #: Operations of each row of a normal press for what a plan refuses, counted on paper.
 QUESTIONS = {
     "does it press? sine, cosine, two signs, product and sum with D, two comparisons": 10,
-    "is it on the tube? two comparisons, three logical": 5,
+    "is it on the tube? two comparisons, two logical": 4,
     "is it normal, on the midline? four sizes, a limit (three), two comparisons, two logical": 11,
     "is it where the first is? two differences with size and limit, three logical": 9,
     "does it press off the plan?": 1,
@@ -192,10 +192,11 @@ QUESTIONS = {
 }
 #: The same for a ball: is it in the lumen, and how sure is the contact.
 BALL_QUESTIONS = {
-    "normal in the frame of the tool, a product of three by three": 18,
-    "height of its one corner along it, greatest, smallest, difference, with the radius": 10,
-    "is it under? three": 3,
+    "place of its one corner, a product of three by three and a sum": 21,
+    "its distance from the axis: squares and sum; greatest, within the room: two": 5,
+    "is it under? it touches, two logical": 3,
     "is it off an end? two comparisons, one logical": 3,
+    "or on a face there? twice two comparisons and two logical": 8,
     "outside last, or over an end last? three logical, two choices and running maxima, two": 9,
     "share of what is sure: sign, limit, quotient": 3,
 }

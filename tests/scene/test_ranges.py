@@ -19,11 +19,12 @@ from small_scenes import (
     TUBE,
     ball,
     bend,
+    on_arc,
     poses,
     presses,
 )
 
-from jaxtrachea import Presses, Session, make_scene, press_oblique, simulate, sweep
+from jaxtrachea import Poses, Presses, Session, make_scene, press_oblique, simulate, sweep
 from jaxtrachea.contact.shapes import sphere
 from jaxtrachea.scene.build import dropped_effects
 from jaxtrachea.scene.plan import Facts, Served
@@ -347,6 +348,43 @@ def test_a_tool_in_the_lumen_has_no_force(through):
     # In over the end is in the lumen; in through the wall is a press, and out is outside.
     end = run(through[0], SPRINGS, poses([-20, 0, 0], [60, 0, 0], ROWS))
     assert end.status.tolist()[-1] == PressStatus.IN_LUMEN
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("radius", [None, 150.0])
+def test_a_tool_in_the_lumen_of_a_mesh_has_no_force(radius):
+    """Patches are closed: the gap was that to a face across the tube, or behind the rings.
+
+    Over the end it pressed on the face that closes the last patch.
+    """
+    mesh = make_tube(TUBE)
+    mesh = mesh if radius is None else bend(mesh, radius)
+
+    def led(s, height):
+        if radius is None:
+            places = np.stack([s, height, 0 * s], 1)
+        else:
+            centre, frame = on_arc(s, radius)
+            places = centre + height[:, None] * frame[:, :, 1]
+        return Poses(np.broadcast_to(np.eye(3), (ROWS, 3, 3)), places)
+
+    to = lambda a, b: np.linspace(a, b, ROWS)  # noqa: E731
+    down = led(to(75, 75), to(18.6, 15.0))
+    scene = make_scene(TUBE, SPRINGS, down, tool=BALL, mesh=mesh, wishes=ONE)
+    assert scene.plan.curved == (radius is not None)
+    pressed = run(scene, SPRINGS, down).status.tolist()
+    assert pressed == [PressStatus.NO_CONTACT] * pressed.count(1) + [OK] * pressed.count(OK)
+    assert OK in pressed
+    lumen, no = PressStatus.IN_LUMEN, PressStatus.NO_CONTACT
+    for s in (to(60, 90), to(100, 130)):
+        out = run(scene, SPRINGS, led(s, to(0, 1.0)))
+        assert out.status.tolist() == [lumen] * ROWS
+        assert np.isnan(out.force).any(axis=1).all()
+    for s in (to(-20, 60), to(180, 100)):
+        statuses = run(scene, SPRINGS, led(s, to(0, 0))).status.tolist()
+        outside = statuses.count(no)
+        assert statuses == [no] * outside + [lumen] * (ROWS - outside)
+        assert 2 < outside < 6
 
 
 def test_a_tool_behind_the_ends_of_the_rings_touches_or_does_not(through):
