@@ -213,7 +213,8 @@ def off_the_end(scene: Scene, seen: Touch) -> Bool[Array, " rows"]:
     if scene.tube is None:
         return beyond
     if scene.plan.curved:
-        tangent = jax.vmap(lambda v: point_at(scene.tube.line, v)[1])(s)
+        line = scene.tube.line
+        tangent = jax.vmap(lambda v: point_at(line, v)[1])(s)
         along = jnp.sum(seen.normal * tangent, axis=1)
     else:
         along = seen.normal[:, 0]
