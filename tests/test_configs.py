@@ -32,12 +32,16 @@ SHOWS = {
 
 
 def bent_tube(path):
-    """A trachea as a scanner might give it: bent, in metres, elsewhere, with relief."""
+    """A trachea as a scanner might give it: bent, in metres, elsewhere, with relief.
+
+    It bends as the one that `imported_tool.toml` is for: its middle lies behind the chord of its
+    ends, so that the tool presses it by 4 mm (on one bent the other way by 14: TOO_DEEP).
+    """
     mesh = make_tube(table_1(), around=40, along=120, flatten=0.25)
     x, y, z = np.asarray(mesh.vertices).T
     y, z = np.stack([y, z]) * (1 + 0.3 * np.exp(-x / 12))  # wider at the carina
-    a = x / 400
-    bent = np.stack([(400 + y) * np.sin(a), (400 + y) * np.cos(a) - 400, z], axis=1)
+    a = x / 900
+    bent = np.stack([(900 - y) * np.sin(a), 900 - (900 - y) * np.cos(a), z], axis=1)
     path.parent.mkdir(exist_ok=True)
     body = trimesh.Trimesh(1e-3 * (bent + 700), np.asarray(mesh.faces), process=False)
     body.export(path)
@@ -179,6 +183,18 @@ BAD = {
     "plane too few": (
         GOOD + PRESS + "phi = '20 deg'\n[effects]\nsecond_plane = 'off'",
         ["effects.second_plane", "20 deg off the midline", "auto"],
+    ),
+    "tube of 1.2 m": (
+        GOOD + LINE + BALL + '[trachea]\nlength = "1.2 m"\nrings = ["0.4 m", "0.8 m"]',
+        ["trachea.length is 1200 mm", "expected 2 to 1000 mm", "is the unit wrong"],
+    ),
+    "wall thicker than the radius": (
+        GOOD + PRESS + '[trachea]\nwall = "26 mm"',
+        ["wall is 26 mm, thicker than the radius"],
+    ),
+    "tool of a metre's radius": (
+        GOOD + LINE + '[tool]\nshape = "sphere"\nradius = "1 m"',
+        ["tool is 2000 mm across", "is the unit wrong"],
     ),
     "level unknown": (GOOD + PRESS + "[effects]\nrings = 'bow'", ["effects.rings", "'arch2'"]),
 }

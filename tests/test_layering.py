@@ -44,7 +44,7 @@ SCENE = [
     {"rules"},
     {"stage"},
     {"ranges"},
-    {"approach"},
+    {"approach", "trail"},
     {"deform"},
     {"simulation"},
     {"session"},

@@ -96,10 +96,10 @@ def stage(spec: SceneSpec, folder: Path) -> Staged:
             f"an inner wall) are bridged up to {filled:.2g} mm deep",
             wall_check.measure(mesh, geometry, scene.tube).sentence,
         )
-    return Staged(scene, material, path, tuple(files), notes + _dropped(scene))
+    return Staged(scene, material, path, tuple(files), notes + dropped_effects(scene))
 
 
-def _dropped(scene: Scene) -> tuple[str, ...]:
+def dropped_effects(scene: Scene) -> tuple[str, ...]:
     """Friction that was asked for and is not in the program, with its reason."""
     if scene.friction is None or scene.plan.friction:
         return ()

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.shapes import Shape, sphere
+from jaxtrachea.scene import trail
 from jaxtrachea.scene.approach import Approach, backed_out
 from jaxtrachea.scene.curve import distance_from, lay
 from jaxtrachea.scene.stage import Poses, Presses, Scene
@@ -44,8 +45,9 @@ def deform(
     if together:  # one contact point for all rows: what depends on it alone is computed once
         where = jax.tree.map(lambda v: v[0], where)
     weights = regions.weigh(binding, where[1]) if together else None
+    slides = plan.friction and runs is not None
 
-    def one(moved, where):
+    def one(moved, where, pose):
         s_c, phi_c, radius, tool = where
         ends = _ends(scene, material, s_c, moved) if plan.end_motion else (None, None)
         keys = regions.clamped(
@@ -54,13 +56,22 @@ def deform(
         )  # fmt: skip
         share = regions.weigh(binding, phi_c) if weights is None else weights
         u = regions.interpolate(binding, share, keys, method=method)
-        if runs is not None:
-            dent = _dent(scene, s_c, phi_c, radius, tool, moved.depth)
-            u = local.add_correction(u, dent, straight, runs, s_c)
-        return place(mesh, u)
+        if runs is None:
+            return place(mesh, u)
+        dent = _dent(scene, s_c, phi_c, radius, tool, moved.depth)
+        if slides:
+            r = scene.radius if radius is None else radius
+            s_c, turned = trail.slid(s_c, phi_c, r, moved.slip)
+            dent = trail.lay_at(dent, s_c - where[0], turned - phi_c)
+        dented = place(mesh, local.add_correction(u, dent, straight, runs, s_c))
+        if pose is None or scene.tool is None:
+            return dented
+        near = jnp.sum((straight - dent.centres[:1]) ** 2, axis=1)
+        return trail.touching(scene.tool, pose, near, place(mesh, u), dented)
 
-    moved = moved._replace(slip=None, dissipated=None, status=None)
-    return jax.vmap(one, (0, None if together else 0))(moved, where)
+    moved = moved._replace(dissipated=None, status=None)
+    led = path if slides and made is not None else None
+    return jax.vmap(one, (0, None if together else 0, 0))(moved, where, led)
 
 
 def _distances(scene: Scene, made: Approach):

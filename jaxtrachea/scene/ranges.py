@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from jaxtrachea.contact.line import Centreline, point_at
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.scene.plan import Served
 from jaxtrachea.scene.stage import COVERED, Poses, Presses, Scene
+from jaxtrachea.surface import local
 from jaxtrachea.trachea.material import Material
 
 #: Largest inward motion of the wall, against the tube's radius. Ring and ligament are linear: a
@@ -20,6 +22,10 @@ from jaxtrachea.trachea.material import Material
 #: 15 % at a quarter of the radius, 25 % at a half and 35 % at the radius, where the wall has come
 #: to the axis of the tube.
 DEEPEST = 1.0
+
+#: A contact on the face that closes a patch at an end of the tube: distance from the end, mm, and
+#: least part of the normal along the tube (that of a wall with relief is below 0.4).
+RIM, ALONG = 1.0, 0.8
 
 #: Values of the material that each effect reads: where they are given, a path may need it.
 READ = {
@@ -38,6 +44,9 @@ def lacking(scene: Scene, material: Material) -> list[str]:
         "two_material": plan.options.local == "two-material",
     }  # fmt: skip
     given = [e for e, names in READ.items() if all(getattr(material, n) is not None for n in names)]
+    if plan.axial and plan.surface is not None and not plan.end_motion:
+        there["end_motion"] = False
+        given += ["end_motion"] * any(getattr(material, n) is not None for n in ("k_A", "k_B"))
     return [e for e in given if not there[e] and e not in plan.ignored]
 
 
@@ -47,8 +56,9 @@ def unserved(
     """Rows that press and need an effect that is off.
 
     Off the midline or oblique without vectors, along the tube without stretch, along the surface
-    without friction, elsewhere or too far for one seat; or anywhere with a material that bends,
-    shears or has rings of their own where the plan did not.
+    without friction, elsewhere or too far for one seat, near a surface without a dent; or anywhere
+    with a material that bends, shears, lets the ends move or has rings of their own where the plan
+    did not.
 
     Args:
         scene: -
@@ -75,8 +85,10 @@ def unserved(
             found.append(jnp.cumsum(slides) > 0)  # what slid leaves its trace in later rows
     if plan.served is not None:
         found.append(_beyond(plan.served, presses))
-    if set(less) & {"rings", "shear", "two_material"}:
+    if set(less) - {"axial"}:
         found.append(jnp.ones_like(pressing))
+    if plan.surface is not None and not plan.dent and "dent" not in plan.ignored:
+        found.append(_near_surface(scene, presses))
     return pressing & functools.reduce(jnp.logical_or, found) if found else None
 
 
@@ -104,6 +116,16 @@ def _seats(scene: Scene, presses: Presses):
     """Rows at another contact point than the first."""
     near = lambda v: jnp.abs(v - v[0]) <= COVERED  # noqa: E731
     return [~(near(presses.s) & near(presses.phi))]
+
+
+def _near_surface(scene: Scene, presses: Presses):
+    """Rows whose dent would reach a vertex."""
+    if scene.mesh is None:
+        raise ValueError("scene.mesh is None; the plan has a surface")
+    y, z = scene.radius * jnp.cos(presses.phi), scene.radius * jnp.sin(presses.phi)
+    at = jnp.stack([presses.s, y, z], axis=1)
+    away = jnp.sum((scene.mesh.straight[None] - at[:, None]) ** 2, axis=2)
+    return jnp.min(away, axis=1) < (local.REACH * scene.footprint) ** 2
 
 
 def _wandering(scene: Scene, presses: Presses):
@@ -156,19 +178,47 @@ def contact_share(scene: Scene, seen: Touch):
 
 
 def submerged(scene: Scene, path: Poses, seen: Touch) -> Bool[Array, " rows"]:
-    """Rows whose tool lies below the inner wall with all of its thickness along the normal."""
-    if scene.tool is None:
+    """Rows whose tool is within the inner wall all round, and not before an end of the tube.
+
+    By its corners' distance from the centreline, not by the gap: patches of a mesh are closed, and
+    deep in one of them the nearest way out may be the one along the tube.
+    """
+    if scene.tool is None or scene.tube is None:
         raise ValueError("scene.tool is None; contact needs a tool")
-    normal = jnp.einsum("rij,ri->rj", path.rotation, seen.normal)
-    up = normal @ scene.tool.vertices
-    thick = jnp.max(up, axis=1) - jnp.min(up, axis=1) + 2 * scene.tool.radius
     wall = 2 * jnp.maximum(scene.radius - scene.geometry.radius, 0)
-    return seen.gap + thick + wall < 0
+    room = scene.radius - wall - scene.tool.radius
+    corners = path.rotation @ scene.tool.vertices + path.translation[:, :, None]
+    line = scene.tube.line if scene.plan.curved else None
+    square = jax.vmap(jax.vmap(functools.partial(_off_axis, line), 1))(corners)
+    return (jnp.max(square, axis=1) < room * room) & (room > 0) & (seen.gap < 0)
+
+
+def _off_axis(line: Centreline | None, point):
+    """Square of the distance from the centreline (by its nearest sample), mm^2."""
+    if line is None:
+        return jnp.sum(point[1:] ** 2)
+    away = point[None] - line.points
+    square = jnp.sum(away * away, axis=1)
+    nearest = jnp.argmin(square)
+    return square[nearest] - jnp.sum(away[nearest] * line.tangents[nearest]) ** 2
 
 
 def off_the_end(scene: Scene, seen: Touch) -> Bool[Array, " rows"]:
-    """Rows whose contact lies beyond an end of the tube."""
-    return (seen.s < 0) | (seen.s > scene.geometry.length)
+    """Rows whose contact lies beyond an end of the tube, or on the face that closes it.
+
+    Patches of a mesh are closed, the tube is not: at its ends there is no wall across.
+    """
+    s, length = seen.s, scene.geometry.length
+    beyond = (s < 0) | (s > length)
+    if scene.tube is None:
+        return beyond
+    if scene.plan.curved:
+        line = scene.tube.line
+        tangent = jax.vmap(lambda v: point_at(line, v)[1])(s)
+        along = jnp.sum(seen.normal * tangent, axis=1)
+    else:
+        along = seen.normal[:, 0]
+    return beyond | ((s < RIM) & (along < -ALONG)) | ((s > length - RIM) & (along > ALONG))
 
 
 def in_lumen(scene: Scene, path: Poses, seen: Touch) -> Bool[Array, " rows"]:

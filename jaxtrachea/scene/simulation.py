@@ -16,7 +16,14 @@ from jaxtrachea.model import ligament_beam, local_law, read_values, respond, uni
 from jaxtrachea.oblique import press_oblique, press_path
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.deform import deform
-from jaxtrachea.scene.ranges import DEEPEST, contact_share, depth_share, lacking, unserved
+from jaxtrachea.scene.ranges import (
+    DEEPEST,
+    contact_share,
+    depth_share,
+    lacking,
+    off_the_end,
+    unserved,
+)
 from jaxtrachea.scene.stage import Poses, Presses, Scene, check_path
 from jaxtrachea.skeleton import local_frame
 from jaxtrachea.skeleton import read_values as skeleton_values
@@ -177,7 +184,9 @@ def _refuse(scene: Scene, material: Material, path: Presses | None, made: Approa
     if scene.plan.options.contact == "bonded":
         acting = ~jnp.all(D == 0, axis=1)
     outside = ~((presses.s >= 0) & (presses.s <= geometry.length))
-    refused = {PressStatus.OFF_TUBE: outside & (pressing if made is not None else True)}
+    if made is not None:
+        outside = pressing & (outside | off_the_end(scene, made.own))
+    refused = {PressStatus.OFF_TUBE: outside}
     unlike = unserved(scene, material, presses, acting)
     if unlike is not None:
         refused[PressStatus.OFF_PLAN] = unlike

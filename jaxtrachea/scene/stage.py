@@ -253,10 +253,16 @@ def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
 
 
 def with_mesh(scene: Scene, mesh: Mesh) -> Scene:
-    """The scene with another surface: bound to the rings, and the wall that a tool touches."""
+    """The scene with another surface: bound to the rings, and the wall that a tool touches.
+
+    The program stays, but for `curved`, which says what the mesh is.
+    """
+    curved = scene.plan.contact and mesh.frames is not None
+    plan = dataclasses.replace(scene.plan, curved=curved)
     tube = None if scene.tube is None else _walls(scene.geometry, mesh)
     binding, runs = regions.bind(mesh, scene.geometry), local.runs(mesh.s, scene.footprint)
-    return dataclasses.replace(scene, mesh=mesh, binding=binding, tube=tube, runs=runs)
+    parts = {"mesh": mesh, "binding": binding, "tube": tube, "runs": runs, "plan": plan}
+    return dataclasses.replace(scene, **parts)
 
 
 def _round(geometry: Geometry, radius: float) -> Patches:

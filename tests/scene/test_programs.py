@@ -1,6 +1,7 @@
 """What is compiled: as many operations as a program written by hand for that scene alone."""
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 
 import jax
@@ -11,6 +12,7 @@ from small_scenes import BALL, DOWN, MATERIAL, MESH, OBLIQUE, OFF, TUBE, ball
 
 from jaxtrachea import (
     Options,
+    Poses,
     Presses,
     Wishes,
     make_scene,
@@ -25,6 +27,7 @@ from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.ranges import contact_share, depth_share, in_lumen
 from jaxtrachea.scene.simulation import _refuse, _status, _without_negative
+from jaxtrachea.scene.stage import touch_tube
 from jaxtrachea.skeleton import local_frame
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.mesh import place
@@ -154,6 +157,7 @@ PROGRAMS = {
 }
 
 
+@functools.cache
 def program(name):
     path, wishes, hand = PROGRAMS[name]
     mu = 0.66 if name == "friction" else None
@@ -171,6 +175,61 @@ def test_an_unused_effect_adds_no_operation(name):
     assert count_operations(simulate, scene, MATERIAL, path) == count_operations(
         hand, scene, MATERIAL, path
     )
+
+
+#: Operations of each row of a normal press for what a plan refuses, counted on paper.
+QUESTIONS = {
+    "does it press? sine, cosine, two signs, product and sum with D, two comparisons": 10,
+    "is it on the tube? two comparisons, two logical": 4,
+    "is it normal, on the midline? four sizes, a limit (three), two comparisons, two logical": 11,
+    "is it where the first is? two differences with size and limit, three logical": 9,
+    "does it press off the plan?": 1,
+    "is it behind the ends of the rings? size, limit, two for NaN, four logical": 8,
+    "three displacements are NaN for each of four refusals": 12,
+    "computed instead: two comparisons of s, two logical, three choices, one of three": 10,
+    "how deep is it? two vectors added, length (five), against the radius": 9,
+    "status: too deep (four), four refusals": 8,
+}
+#: The same for a ball: is it in the lumen, and how sure is the contact.
+BALL_QUESTIONS = {
+    "place of its one corner, a product of three by three and a sum": 21,
+    "its distance from the axis: squares and sum; greatest, within the room: two": 5,
+    "is it under? it touches, two logical": 3,
+    "is it off an end? two comparisons, one logical": 3,
+    "or on a face there? twice two comparisons and two logical": 8,
+    "outside last, or over an end last? three logical, two choices and running maxima, two": 9,
+    "share of what is sure: sign, limit, quotient": 3,
+}
+
+
+def per_row(function, scene, path):
+    """Operations for each row, those for all rows apart."""
+    both = jax.tree.map(lambda v: jnp.concatenate([v, v]), path)
+    more = count_operations(function, scene, MATERIAL, both)
+    return (more - count_operations(function, scene, MATERIAL, path)) / len(
+        jax.tree.leaves(path)[0]
+    )
+
+
+def test_refusals_cost_no_more_than_counted_on_paper():
+    """The programs by hand share them with `simulate`: these counts see what is added there."""
+
+    def refusals(scene, m, p):
+        *_, used, status = admitted(scene, m, p)
+        moved = SimpleNamespace(depth=p.displacement, skeleton=p.displacement)
+        moved.status = jnp.zeros(len(p.s), jnp.int8)
+        return used, status(moved)
+
+    def ball_in_lumen(scene, _, seen):
+        path = Poses(jnp.zeros((len(seen.s), 3, 3)), seen.point)
+        return in_lumen(scene, path, seen), contact_share(scene, seen)
+
+    scene, path, _ = program("normal")
+    assert per_row(refusals, scene, path) <= sum(QUESTIONS.values())
+    scene, path, _ = program("tool")
+    seen = jax.eval_shape(touch_tube, scene, path)
+    seen = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), seen)
+    assert per_row(ball_in_lumen, scene, seen) <= sum(BALL_QUESTIONS.values())
 
 
 @pytest.mark.slow
