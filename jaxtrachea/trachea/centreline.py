@@ -261,7 +261,7 @@ def locate(line: Line, points) -> Located:
 
     start, step = line.points[:-1], np.diff(line.points, axis=0)
     length = np.linalg.norm(step, axis=1)
-    nearest = KDTree(line.points).query(points)[1]
+    nearest = np.asarray(KDTree(line.points).query(points)[1])
     beside = np.clip(nearest[:, None] + np.arange(-2, 2), 0, len(start) - 1)
     least, s = np.full(len(points), np.inf), np.empty(len(points))
     for i in beside.T:
