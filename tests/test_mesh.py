@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxtrachea.trachea.centreline import Cells, _check_row, contour
 from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.imported import read_mesh
 from jaxtrachea.trachea.mesh import MeshError, edge_counts, place, volume
+from jaxtrachea.trachea.rings import _check_row
+from jaxtrachea.trachea.sections import Cells, contour
 from jaxtrachea.trachea.tube import make_tube
 
 ROOT = Path(__file__).parents[1]
