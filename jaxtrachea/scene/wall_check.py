@@ -22,6 +22,8 @@ BALL, AWAY = 0.3, 0.1
 OVERLAP = 0.5
 #: Patches that are searched for each.
 NEAR = 4
+#: Classes of triangles by size, each half of the next; points that are searched together.
+SIZES, CHUNK = 12, 100
 #: Sine of the least angle between a triangle of the outer wall and the radial direction.
 OUTWARD = 0.3
 #: The median may be this share of the limit of the worst.
@@ -136,17 +138,38 @@ def _balls(mesh, geometry, count):
 
 
 def _distance(corners, points):
-    """Of points to the closest of all triangles, each with a centre near enough to hold it."""
+    """Of points to the closest of all triangles, each with a centre near enough to hold it.
+
+    Triangles of about one size share a tree, so that a few large ones do not widen every search.
+    """
+    middle = corners.mean(axis=1)
+    reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    size = np.ceil(np.log2(np.maximum(reach / reach.max(), 2.0**-SIZES))).astype(int)
+    found = np.full(len(points), np.inf)
+    for one in np.unique(size):
+        rows = np.flatnonzero(size == one)
+        tree = KDTree(middle[rows])
+        away = np.minimum(tree.query(points)[0], found) + reach[rows].max()
+        for at in range(0, len(points), CHUNK):
+            some = slice(at, at + CHUNK)
+            near = tree.query_ball_point(points[some], away[some])
+            found[some] = np.minimum(found[some], _nearest(corners[rows], points[some], near))
+    return found
+
+
+def _nearest(corners, points, near):
+    """Distance of each point to the closest of the triangles listed for it; inf without any."""
     import trimesh  # only those who read meshes wait for it
 
-    middle = corners.mean(axis=1)
-    reach = np.linalg.norm(corners - middle[:, None], axis=2).max()
-    tree, found = KDTree(middle), []
-    for point, least in zip(points, tree.query(points)[0], strict=True):
-        near = corners[tree.query_ball_point(point, least + reach)]
-        closest = trimesh.triangles.closest_point(near, np.tile(point, (len(near), 1)))
-        found.append(np.linalg.norm(closest - point, axis=1).min())
-    return np.array(found)
+    count, found = np.array([len(v) for v in near]), np.full(len(points), np.inf)
+    listed = np.flatnonzero(count)
+    if not len(listed):
+        return found
+    point = np.repeat(points, count, axis=0)
+    closest = trimesh.triangles.closest_point(corners[np.concatenate(near).astype(int)], point)
+    first = np.concatenate([[0], np.cumsum(count[listed])[:-1]])
+    found[listed] = np.minimum.reduceat(np.linalg.norm(closest - point, axis=1), first)
+    return found
 
 
 def _sharp_gap(patches: Patches, points):
