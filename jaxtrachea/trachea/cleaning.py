@@ -49,28 +49,20 @@ def clean(surface: Surface) -> tuple[Surface, list[str]]:
     return _outward(cleaned, notes), notes
 
 
-def _labels(faces: np.ndarray, count: int) -> np.ndarray:
-    """Smallest vertex connected with each vertex."""
-    label = np.arange(count)
-    while True:
-        least = label[faces].min(axis=1)
-        lower = label.copy()
-        np.minimum.at(lower, faces.ravel(), np.repeat(least, 3))
-        lower = lower[lower]
-        if np.array_equal(lower, label):
-            return label
-        label = lower
-
-
 def _without_fragments(vertices, faces):
     """Pieces longer than a third of the longest; the rest is dust."""
-    label = _labels(faces, len(vertices))[faces[:, 0]]
-    extent = {
-        piece: np.linalg.norm(np.ptp(vertices[faces[label == piece].ravel()], axis=0))
-        for piece in np.unique(label)
-    }
-    longest = max(extent.values())
-    keep = np.isin(label, [piece for piece, size in extent.items() if size > longest / 3])
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    a, b, c = faces.T
+    links = np.concatenate([a, b]), np.concatenate([b, c])
+    graph = coo_array((np.ones(len(links[0]), bool), links), shape=(len(vertices),) * 2)
+    label = connected_components(graph, directed=False)[1]
+    order = np.argsort(label, kind="stable")
+    first = np.unique(label[order], return_index=True)[1]
+    low, high = (f.reduceat(vertices[order], first, axis=0) for f in (np.minimum, np.maximum))
+    size = np.linalg.norm(high - low, axis=1)
+    keep = size[label[a]] > size.max() / 3
     return faces[keep], int(np.sum(~keep))
 
 

@@ -5,7 +5,7 @@ the shape (unit, ends, centreline, anterior side, rings) can be given instead; w
 is refused.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import equinox as eqx
@@ -24,6 +24,8 @@ from jaxtrachea.units import unit_factor
 PLAUSIBLE = 40.0, 250.0
 #: Length of anything this can be used for, mm: a unit that says more or less is a mistake.
 POSSIBLE = 1.0, 5000.0
+#: Steps of reading that take time: the file, its repair, centreline, sections, places of vertices.
+STEPS = 5
 
 
 class Imported(eqx.Module):
@@ -58,6 +60,7 @@ def read_mesh(
     ring_positions: Sequence[float] | np.ndarray | None = None,
     half_angle: float | None = None,
     dtype=None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Imported:
     """Read a trachea from a surface file.
 
@@ -77,6 +80,7 @@ def read_mesh(
         ring_positions: s of the rings, mm from the carina's end.
         half_angle: of the rings, rad.
         dtype: of every array; the default float type of JAX if None.
+        progress: called with (steps done since the last call, steps in all).
 
     Raises:
         MeshError: the file, what was found, what is expected, the cure.
@@ -84,27 +88,33 @@ def read_mesh(
     path = Path(path)
     try:
         return _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
-                     half_angle, dtype)  # fmt: skip
+                     half_angle, dtype, progress)  # fmt: skip
     except MeshError as error:
         raise MeshError(f"{path.name}: {error}") from error.__cause__
 
 
-def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions, half_angle, dtype):
+def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions, half_angle, dtype,
+          progress):  # fmt: skip
+    step = lambda: None if progress is None else progress(1, STEPS)  # noqa: E731
     parts = _parts(path)
+    step()
     name = _wall(parts, part)
     notes = [f"wall: {name}"] if len(parts) > 1 else []
     surface, cleaned = clean(parts[name])
+    step()
     scale = _scale(surface, path, unit, notes)
     wall = Surface(surface.vertices * scale, surface.faces)
     cartilage = _cartilage(parts, name, rings, path, scale, notes)
     given = None if centreline is None else np.asarray(centreline, float) * scale
     line = find_centreline(wall.vertices, wall.faces, given)
+    step()
     scan = lambda line: Shape.scan(line, wall.vertices, wall.faces, cartilage)  # noqa: E731
     if larynx is not None:
         shape = scan(turned(line) if _points_back(line, larynx) else line)
     else:
         shape = scan(line)
         shape = scan(turned(line)) if _carina_is_last(shape) else shape
+    step()
     shape = find_anterior(shape, anterior)
     found = find_rings(shape, ring_positions, half_angle)
     where = locate(shape.line, wall.vertices)
@@ -119,6 +129,7 @@ def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
     fields = (normals, where.s, where.phi, where.distance, frames)
     cast = lambda v: jnp.asarray(v, dtype)  # noqa: E731
     mesh = Mesh(cast(vertices), jnp.asarray(wall.faces, jnp.int32), *(cast(v) for v in fields))
+    step()
     try:
         geometry = Geometry.create(
             shape.line.s[-1], found.positions, radius=found.radius, half_angle=found.half_angle,
