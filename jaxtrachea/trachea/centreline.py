@@ -10,6 +10,8 @@ from jaxtrachea.trachea.sections import ANGLES, Cells, contour
 
 #: Cross-sections through which the centreline is laid.
 STATIONS = 60
+#: Furthest turn of a centreline, degrees: a quarter circle, and what is found of it.
+TURN = 100.0
 
 
 class Line(NamedTuple):
@@ -162,6 +164,17 @@ def _framed(points) -> Line:
     for tangent in tangents[1:]:
         frames.append(_frame(tangent, frames[-1][:, 1]))
     return Line(points, s, np.stack(frames))
+
+
+def check_turn(line: Line) -> None:
+    """Refuse a line that turns further than `TURN`: its skeleton would be taken as straight."""
+    tangents = line.frames[::5, :, 0]
+    turn = math.degrees(math.acos(np.clip((tangents @ tangents.T).min(), -1, 1)))
+    if turn > TURN:
+        raise MeshError(
+            f"its centreline turns by {turn:.0f} degrees, expected at most {TURN:.0f}: its skeleton"
+            " is taken as straight; is it one trachea? Give centreline= if it was found wrong"
+        )
 
 
 def turned(line: Line) -> Line:

@@ -13,7 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtrachea.trachea.centreline import Line, Shape, find_centreline, locate, turned
+from jaxtrachea.trachea.centreline import (
+    Line,
+    Shape,
+    check_turn,
+    find_centreline,
+    locate,
+    turned,
+)
 from jaxtrachea.trachea.cleaning import Surface, clean
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh, MeshError, vertex_normals
@@ -107,6 +114,7 @@ def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
     cartilage = _cartilage(parts, name, rings, path, scale, notes)
     given = None if centreline is None else np.asarray(centreline, float) * scale
     line = find_centreline(wall.vertices, wall.faces, given)
+    check_turn(line)
     step()
     scan = lambda line: Shape.scan(line, wall.vertices, wall.faces, cartilage)  # noqa: E731
     if larynx is not None:
