@@ -122,6 +122,8 @@ def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
     else:
         shape = scan(line)
         shape = scan(turned(line)) if _carina_is_last(shape) else shape
+    if given is None:
+        shape.check_middle()
     step()
     shape = find_anterior(shape, anterior)
     found = find_rings(shape, ring_positions, half_angle)
