@@ -9,7 +9,16 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from jaxtrachea.terminal import Stop, interrupts, into, progress_bar, say_lost, set_up_jax, table
+from jaxtrachea.terminal import (
+    Stages,
+    Stop,
+    interrupts,
+    into,
+    progress_bar,
+    say_lost,
+    set_up_jax,
+    table,
+)
 
 SceneArgument = Annotated[Path, typer.Argument(help="TOML scene (docs/scenes.md).")]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
@@ -134,7 +143,10 @@ def _staged(path: Path):
         set_up_jax()
         from jaxtrachea.scene.build import stage
 
-        return spec, stage(spec, path.parent)
+        if spec.trachea.file is None:
+            return spec, stage(spec, path.parent)
+        with interrupts() as stop_if_asked, progress_bar(transient=True) as bar:
+            return spec, stage(spec, path.parent, Stages(bar, stop_if_asked).begin)
     except SpecError as error:
         text = str(error)
         raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None

@@ -31,7 +31,11 @@ class PressStatus(_Described):
         "off the midline, oblique, elsewhere or else, in a program made for less than that",
     )
     OFF_TUBE = 8, "the contact lies beyond an end of the tube"
-    UNSURE = 9, "solved, but the tool reaches so deep that its contact may be another than found"
+    UNSURE = (
+        9,
+        "solved, but the contact may be another than found: the tool reaches so deep, or touches "
+        "an imported mesh where its gap is off",
+    )
     BAD_MATERIAL = 10, "a stiffness or the coefficient of friction is negative"
     IN_LUMEN = 11, "the tool lies within the tube and did not come through the wall"
     TOO_DEEP = 12, "solved, but the wall is pressed in by more than the tube's radius"

@@ -133,10 +133,10 @@ class _Count(ProgressColumn):
         return Text(f"{task.completed:.0f}/{task.total:.0f}" if task.total else done)
 
 
-def progress_bar() -> Progress:
-    """A progress bar on stderr."""
+def progress_bar(*, transient: bool = False) -> Progress:
+    """A progress bar on stderr; a `transient` one goes when it is done."""
     columns = (TextColumn("{task.description}"), BarColumn(), _Count(), TimeElapsedColumn())
-    return Progress(*columns, console=Console(stderr=True))
+    return Progress(*columns, console=Console(stderr=True), transient=transient)
 
 
 class Stages:

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxtrachea.trachea.centreline import Cells, _check_row, contour
+from jaxtrachea.trachea.cleaning import Surface, clean
 from jaxtrachea.trachea.geometry import Geometry, table_1
-from jaxtrachea.trachea.imported import read_mesh
+from jaxtrachea.trachea.imported import STEPS, read_mesh
 from jaxtrachea.trachea.mesh import MeshError, edge_counts, place, volume
+from jaxtrachea.trachea.rings import _check_row
+from jaxtrachea.trachea.sections import Cells, contour
 from jaxtrachea.trachea.tube import make_tube
 
 ROOT = Path(__file__).parents[1]
@@ -258,6 +260,50 @@ def test_dirt_is_cleaned_and_told(tmp_path):
     told = " ".join(found.notes)
     for words in ("3 collapsed", "4 triangles of small loose", "inside out", "unit taken as mm"):
         assert words in told
+
+
+def test_much_dust(tmp_path):
+    """20,000 loose pieces, as a scan has: each was looked for in all triangles."""
+    vertices, faces = as_arrays(TUBE)
+    rng = np.random.default_rng(0)
+    bits = rng.uniform(-40, 40, (20_000, 1, 3)) + rng.uniform(0, 0.1, (20_000, 3, 3))
+    extra = np.arange(60_000).reshape(-1, 3) + len(vertices)
+    surface, notes = clean(
+        Surface(np.concatenate([vertices, bits.reshape(-1, 3)]), np.concatenate([faces, extra]))
+    )
+    assert "20000 triangles of small loose fragments dropped" in notes
+    np.testing.assert_array_equal(surface.faces.shape, faces.shape)
+    np.testing.assert_allclose(np.sort(surface.vertices, 0), np.sort(vertices, 0), atol=1e-12)
+
+
+def test_progress_comes_to_its_end(tmp_path):
+    seen = []
+    path = write(tmp_path / "t.stl")
+    read_mesh(path, larynx=ROTATION @ X, progress=lambda done, of: seen.append((done, of)))
+    assert seen == [(1, len(seen))] * len(seen)
+    assert len(seen) == STEPS
+
+
+@pytest.mark.parametrize("given", [{}, {"anterior": ROTATION @ Z, "ring_positions": RINGS}])
+@pytest.mark.parametrize(
+    ("angle", "message"),
+    [
+        (180, r"its centreline turns by 1\d\d degrees, expected at most 100"),
+        (120, r"centreline found runs 1\.\d mm beside the middle of its cross-sections"),
+    ],
+)
+def test_a_u_bend_is_refused(tmp_path, given, angle, message):
+    """With its rings and front given it was read: straight, and of another length."""
+    vertices, faces = as_arrays(TUBE)
+    radius = 92 / math.radians(angle)
+    around = bent(vertices * [1, -1, 1], radius)
+    path = write(tmp_path / "t.stl", vertices=around, faces=faces[:, ::-1])
+    with pytest.raises(MeshError, match=message):
+        read_mesh(path, larynx=ROTATION @ X, **given)
+    s = np.linspace(0, 92, 60)
+    line = bent(np.stack([s, 0 * s, 0 * s], axis=1), radius) @ ROTATION.T + SHIFT
+    with pytest.raises(MeshError, match=r"its centreline turns by 1[127]\d degrees"):
+        read_mesh(path, centreline=line, **given)
 
 
 def test_open_tube(tmp_path):

@@ -46,6 +46,7 @@ class Patches(eqx.Module):
         line: the centreline, for s and phi.
         lost: how far the surface at most stands out of each patch (thinning, rounding), mm.
         filled: how far it at most lies inside of it (hollows bridged), mm.
+        doubtful: patches that are not the surface; None: all are.
     """
 
     shapes: Shape
@@ -53,6 +54,7 @@ class Patches(eqx.Module):
     line: Centreline
     lost: Float[Array, " patches"]
     filled: Float[Array, " patches"]
+    doubtful: Bool[Array, " patches"] | None = None
 
 
 class Touch(eqx.Module):
@@ -153,7 +155,8 @@ def touch(
         search: over all directions, as `signed_distance`. Without, each patch starts from the
             direction of the broad phase, as `track`: several times faster and the same until the
             tool's core reaches into the core of a patch (penetration beyond both radii). Deeper,
-            the way out may be another than the shortest; the status is then NOT_CONVERGED.
+            the way out may be another than the shortest; the status is then NOT_CONVERGED, as it
+            is where a doubtful patch is touched.
 
     Returns:
         The `Touch`; differentiable in tool, pose and patches. Its gap changes with a shift of the
@@ -185,6 +188,9 @@ def touch(
     s, phi = skeleton_coordinates(patches.line, point)
     terms = patches.shapes.vertices.shape[2] * tool.vertices.shape[1] * near
     worst = jnp.max(jnp.where(weight > COUNTS, each.status, 0))
+    if patches.doubtful is not None:
+        doubt = jnp.any((weight > COUNTS) & patches.doubtful[chosen])
+        worst = jnp.where(doubt, jnp.maximum(worst, ContactStatus.NOT_CONVERGED), worst)
     if not search:
         deep = gap < -(tool.radius + jnp.min(shapes.radius))
         worst = jnp.where(deep, jnp.maximum(worst, ContactStatus.NOT_CONVERGED), worst)

@@ -9,6 +9,8 @@ a small angle theta; hollows are bridged. Both are measured and stored.
 On numbers, once; nothing here is traced.
 """
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
@@ -22,6 +24,8 @@ from jaxtrachea.contact.shapes import ArrayLike, Shape
 PROBES = 2000
 #: A direction or face belongs to the side of the tube where its sine to the centreline is below.
 SIDEWAYS = 0.5
+#: Planes that tell which points are shallow.
+FEW = 64
 #: Planes straight across, which hold a patch together where no face looks sideways.
 ACROSS = 8
 #: Distance of the samples of a curved centreline, mm.
@@ -40,6 +44,7 @@ def patches_of(
     overlap: float = 0.5,
     most: int = 32,
     dtype=None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Patches:
     """The convex patches of a surface, one between every two borders.
 
@@ -58,6 +63,7 @@ def patches_of(
         overlap: by how much a patch runs on beyond its borders before it is rounded, mm.
         most: vertices kept of each core, at least 4.
         dtype: of every array; the default float type of JAX if None.
+        progress: called with (patches done since the last call, patches in all).
 
     Raises:
         ValueError: naming the argument or the span.
@@ -78,7 +84,7 @@ def patches_of(
     if centres is not None and frames is not None:
         centres, frames = np.asarray(centres, float), np.asarray(frames, float)
     line = _line(s, centres, frames, at)
-    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    edges = _edges(faces, s)
     made = []
     for low, high in zip(at[:-1], at[1:], strict=True):
         try:
@@ -98,6 +104,8 @@ def patches_of(
                 f"the surface between s = {low:g} and {high:g} mm encloses nothing: "
                 f"{len(inside)} vertices; expected a tube round its centreline there"
             ) from error
+        if progress is not None:
+            progress(1, len(at) - 1)
     count = max(p[0].shape[1] for p in made)
     cores = np.stack([_filled_up(p[0], count) for p in made])
     cast = lambda x: jnp.asarray(np.asarray(x), jnp.zeros(0, dtype).dtype)  # noqa: E731
@@ -130,12 +138,18 @@ def _station(line, at):
     return pick(points, middle) + beyond * tangents[0], [pick(tangents, y) for y in (middle, *at)]
 
 
+def _edges(faces, s):
+    """Every edge that is not level once, from its lower end to its upper one; shape (2, edges)."""
+    i, j = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T.astype(np.int64)
+    low, high = np.where(s[i] <= s[j], i, j), np.where(s[i] <= s[j], j, i)
+    rising = s[high] > s[low]
+    both = np.unique(low[rising] * len(s) + high[rising])
+    return np.stack(np.divmod(both, len(s)))
+
+
 def _section(v, s, edges, at):
     """Points where the edges cross s = at; none beyond the ends."""
-    i, j = edges.T
-    i, j = np.where(s[i] <= s[j], i, j), np.where(s[i] <= s[j], j, i)
-    cut = (s[i] <= at) & (s[j] >= at) & (s[j] > s[i])
-    i, j = i[cut], j[cut]
+    i, j = edges[:, (s[edges[0]] <= at) & (s[edges[1]] >= at)]
     return v[i] + ((at - s[i]) / (s[j] - s[i]))[:, None] * (v[j] - v[i])
 
 
@@ -144,7 +158,7 @@ def _patch(inside, ends, own, station, rounding, most):
     middle, (t, t_low, t_high) = station
     side = _sides(np.concatenate([inside, *ends]), t)
     largest = (-(side[:, :3] @ middle) - side[:, 3]).min()
-    filled = (-(own @ side[:, :3].T) - side[:, 3]).min(axis=1).max()
+    filled = _deepest(own, side)
     r = rounding * largest
     caps = np.stack(
         [[*-t_low, (ends[0] @ t_low).min()], [*t_high, -(ends[1] @ t_high).max()]]
@@ -154,8 +168,23 @@ def _patch(inside, ends, own, station, rounding, most):
     core = core[ConvexHull(core).vertices]
     d = coarse_directions(PROBES)[0]
     kept = core[_extreme(core @ d.T, most)]
+    if len(own) > PROBES:  # those that stand out
+        own = own[ConvexHull(own).vertices]
     lost = (own @ d.T - (kept @ d.T).max(axis=0)).max() - r
     return kept.T, r, middle, max(lost, 0), max(filled, 0)
+
+
+def _deepest(points, planes):
+    """Largest depth of the points below all planes; most are shallow, as a few planes tell."""
+    depth = lambda points, planes: (-(points @ planes[:, :3].T) - planes[:, 3]).min(axis=1)  # noqa: E731
+    bound = depth(points, planes[:: max(1, len(planes) // FEW)])
+    order, deepest = np.argsort(-bound), -np.inf
+    for start in range(0, len(order), PROBES):
+        rows = order[start : start + PROBES]
+        if bound[rows[0]] <= deepest:
+            break
+        deepest = max(deepest, depth(points[rows], planes).max())
+    return deepest
 
 
 def _sides(points, t):

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -48,6 +49,10 @@ KEYS = {
 }
 
 
+#: Begins a stage of work by its name; returns what takes (steps done since, steps in all), or None.
+Counted = Callable[[str], Callable[[int, int], None] | None]
+
+
 class Staged(NamedTuple):
     """A scene ready to run: the scene, its material and path, the files read, notes on the mesh."""
 
@@ -58,18 +63,20 @@ class Staged(NamedTuple):
     notes: tuple[str, ...]
 
 
-def stage(spec: SceneSpec, folder: Path) -> Staged:
+def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Staged:
     """Read what the specification names and choose the program.
 
     Args:
         spec: the scene.
         folder: that relative file names start from.
+        counted: begins a stage of the work of this name; returns what its steps are told to.
 
     Raises:
         SpecError: a file or a value that cannot be used, with its key.
     """
     files: list[Path] = []
-    geometry, mesh, notes = _trachea(spec.trachea, folder, files)
+    counted = counted or _uncounted
+    geometry, mesh, notes = _trachea(spec.trachea, folder, files, counted)
     material = Material(**spec.material.model_dump())
     tool = None if spec.tool is None else _tool(spec.tool, folder, files)
     path = _path(spec, folder, files, geometry)
@@ -80,7 +87,7 @@ def stage(spec: SceneSpec, folder: Path) -> Staged:
     try:
         scene = make_scene(
             geometry, material, path, tool=tool, friction=friction, mesh=mesh, radius=radius,
-            wishes=wishes_of(spec),
+            wishes=wishes_of(spec), progress=counted("cutting its wall into patches"),
         )  # fmt: skip
     except PlanError as error:
         raise SpecError(f"effects.{error}") from None
@@ -96,7 +103,13 @@ def stage(spec: SceneSpec, folder: Path) -> Staged:
             f"an inner wall) are bridged up to {filled:.2g} mm deep",
             wall_check.measure(mesh, geometry, scene.tube).sentence,
         )
+        if doubt := wall_check.look_beyond(mesh, geometry, scene.tube).sentence:
+            notes += (doubt,)
     return Staged(scene, material, path, tuple(files), notes + dropped_effects(scene))
+
+
+def _uncounted(_: str) -> None:
+    """Nobody looks on."""
 
 
 def dropped_effects(scene: Scene) -> tuple[str, ...]:
@@ -161,9 +174,9 @@ def shares(staged: Staged) -> tuple[int, dict[str, float]]:
     return whole, found
 
 
-def _trachea(section: SceneTracheaSection, folder: Path, files: list[Path]):
+def _trachea(section: SceneTracheaSection, folder: Path, files: list[Path], counted: Counted):
     if section.file is not None:
-        return _imported(section, folder, files)
+        return _imported(section, folder, files, counted(f"reading {Path(section.file).name}"))
     named = section.model_fields_set & set(TracheaSection.model_fields)
     given = {name: getattr(section, name) for name in named}
     if isinstance(section.rings, EvenRings):
@@ -178,7 +191,7 @@ def _trachea(section: SceneTracheaSection, folder: Path, files: list[Path]):
     return geometry, mesh, ()
 
 
-def _imported(section: SceneTracheaSection, folder: Path, files: list[Path]):
+def _imported(section: SceneTracheaSection, folder: Path, files: list[Path], progress):
     path = _file(folder, section.file or "", "trachea.file", files)
     cartilage = section.cartilage
     if cartilage is not None and (folder / cartilage).is_file():
@@ -188,6 +201,7 @@ def _imported(section: SceneTracheaSection, folder: Path, files: list[Path]):
         read = read_mesh(
             path, unit=section.unit, part=section.part, rings=cartilage, larynx=section.larynx,
             anterior=section.anterior, ring_positions=rings, half_angle=section.half_angle,
+            progress=progress,
         )  # fmt: skip
     except (MeshError, UnitError) as error:
         raise SpecError(f"trachea.file: {_in_keys(str(error))}") from None

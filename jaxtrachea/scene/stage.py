@@ -1,6 +1,7 @@
 """The scene as arrays: trachea, tool, surface, path; and the facts the plan is made from."""
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -181,6 +182,7 @@ def make_scene(
     mesh: Mesh | None = None,
     radius: float | None = None,
     wishes: Wishes = Wishes(),  # noqa: B008 (frozen)
+    progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
     """Put a scene together and choose its program from the path (concrete numbers).
 
@@ -194,6 +196,7 @@ def make_scene(
         radius: of the tube's outside, mm; None: that of the mesh (of an imported one it is
             `geometry.radius`); without a mesh `geometry.radius` + 1.3 (half of Table 1's wall).
         wishes: what is not left to the rules.
+        progress: called with (patches of the wall done since the last call, patches in all).
 
     Raises:
         PlanError: a wish that cannot be met.
@@ -214,9 +217,10 @@ def make_scene(
         raise PlanError("contact: the path moves a tool, but there is none; give a tool")
     size, tube, near = LEAST, None, 1
     if tool is not None and isinstance(path, Poses):
-        tube = _round(geometry, float(outer)) if mesh is None else _walls(geometry, mesh)
-        if mesh is not None and mesh.frames is not None:
-            wall_check.check(mesh, geometry, tube)
+        if mesh is None:
+            tube = _round(geometry, float(outer))
+        else:
+            tube = _checked_walls(geometry, mesh, progress)
         near = _near_patches(tool, geometry, tube.centres.shape[0])
     if tool is not None:
         extent = np.ptp(np.asarray(tool.vertices), axis=1).min() / 2 + float(tool.radius)
@@ -256,10 +260,13 @@ def with_mesh(scene: Scene, mesh: Mesh) -> Scene:
     """The scene with another surface: bound to the rings, and the wall that a tool touches.
 
     The program stays, but for `curved`, which says what the mesh is.
+
+    Raises:
+        MeshError: patches for the contact that are not where an imported mesh is.
     """
     curved = scene.plan.contact and mesh.frames is not None
     plan = dataclasses.replace(scene.plan, curved=curved)
-    tube = None if scene.tube is None else _walls(scene.geometry, mesh)
+    tube = None if scene.tube is None else _checked_walls(scene.geometry, mesh)
     binding, runs = regions.bind(mesh, scene.geometry), local.runs(mesh.s, scene.footprint)
     parts = {"mesh": mesh, "binding": binding, "tube": tube, "runs": runs, "plan": plan}
     return dataclasses.replace(scene, **parts)
@@ -272,7 +279,17 @@ def _round(geometry: Geometry, radius: float) -> Patches:
     return straight_patches(borders, radius, dtype=geometry.length.dtype)
 
 
-def _walls(geometry: Geometry, mesh: Mesh) -> Patches:
+def _checked_walls(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
+    """The wall of a mesh; that of an imported one is checked against its triangles."""
+    tube = _walls(geometry, mesh, progress)
+    if mesh.frames is None:
+        return tube
+    wall_check.check(mesh, geometry, tube)
+    doubtful = wall_check.look_beyond(mesh, geometry, tube).doubtful
+    return dataclasses.replace(tube, doubtful=jnp.asarray(doubtful)) if doubtful.any() else tube
+
+
+def _walls(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
     """The surface of a mesh, cut midway between the rings: each patch bulges with its ring.
 
     Spans longer than `LONGEST` says are cut evenly.
@@ -294,7 +311,7 @@ def _walls(geometry: Geometry, mesh: Mesh) -> Patches:
     borders = np.concatenate([*(np.linspace(a, b, n + 1)[:-1] for a, b, n in spans), borders[-1:]])
     return patches_of(
         vertices, faces, s, borders, centres=centres, frames=frames, rounding=ROUNDED, most=CORNERS,
-        dtype=geometry.length.dtype,
+        dtype=geometry.length.dtype, progress=progress,
     )  # fmt: skip
 
 

@@ -2,9 +2,12 @@
 
 Balls stand beside points of the outer wall, drawn by area. The gap to the patches (sharp: without
 the smoothing of `Touch.gap`, which `Touch.bound` limits) is compared with the distance to the
-closest of all triangles. On numbers, once; nothing here is traced.
+closest of all triangles. Between the rings an error beyond the limit refuses the mesh; beyond them
+(forks, flares, open ends) it makes the patch a doubtful one. On numbers, once; nothing here is
+traced.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +25,8 @@ BALL, AWAY = 0.3, 0.1
 OVERLAP = 0.5
 #: Patches that are searched for each.
 NEAR = 4
+#: Classes of triangles by size, each half of the next; points that are searched together.
+SIZES, CHUNK = 12, 100
 #: Sine of the least angle between a triangle of the outer wall and the radial direction.
 OUTWARD = 0.3
 #: The median may be this share of the limit of the worst.
@@ -87,7 +92,7 @@ def measure(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = COUNT
     centres, s, radius = _balls(mesh, geometry, count)
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
     gap = _distance(vertices[faces], centres) - radius
-    return WallError(_sharp_gap(patches, centres) - radius - gap, gap, s, limit_of(geometry))
+    return WallError(_sharp_gap(patches, centres)[0] - radius - gap, gap, s, limit_of(geometry))
 
 
 def check(mesh: Mesh, geometry: Geometry, patches: Patches) -> WallError:
@@ -109,8 +114,56 @@ def check(mesh: Mesh, geometry: Geometry, patches: Patches) -> WallError:
     )
 
 
-def _balls(mesh, geometry, count):
-    """Centres beside the outer wall, s, and the radius of the balls."""
+class Beyond(NamedTuple):
+    """What balls beyond the first and the last ring say of the patches there.
+
+    Attributes:
+        doubtful: patches that are further off than the limit somewhere; shape (patches,).
+        worst: largest |error| there, mm; 0 without any.
+        s: first and last position of the balls of doubtful patches before the rings, and behind
+            them, mm; NaN without any.
+    """
+
+    doubtful: np.ndarray
+    worst: float
+    s: tuple[tuple[float, float], tuple[float, float]]
+
+    @property
+    def sentence(self) -> str:
+        """What `plan` tells; nothing where all is well."""
+        spans = [f"{a:.3g} to {b:.3g} mm" for a, b in self.s if a <= b]
+        if not spans:
+            return ""
+        return (
+            f"at s = {' and '.join(spans)}, beyond the rings, the contact gap is off by up to "
+            f"{self.worst:.2g} mm (a fork, an open end or a flare, bridged): touches there are "
+            "unsure"
+        )
+
+
+def look_beyond(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = COUNT) -> Beyond:
+    """Gaps of balls beside the wall beyond the first and the last ring. Arguments as `measure`."""
+    none = (math.nan, math.nan)
+    doubtful = np.zeros(patches.centres.shape[0], bool)
+    try:
+        centres, s, radius = _balls(mesh, geometry, count, beyond=True)
+    except MeshError:  # no wall there
+        return Beyond(doubtful, 0.0, (none, none))
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    signed, patch = _sharp_gap(patches, centres)
+    error = np.abs(signed - _distance(vertices[faces], centres))
+    doubtful[patch[error > limit_of(geometry)]] = True
+    rows = doubtful[patch]
+    if not rows.any():
+        return Beyond(doubtful, 0.0, (none, none))
+    middle = float(np.mean(np.asarray(geometry.ring_positions)))
+    span = lambda v: (float(v.min()), float(v.max())) if len(v) else none  # noqa: E731
+    ends = span(s[rows & (s < middle)]), span(s[rows & (s > middle)])
+    return Beyond(doubtful, float(error[rows].max()), ends)
+
+
+def _balls(mesh, geometry, count, beyond=False):
+    """Centres beside the outer wall between the rings, or else beyond them; s; their radius."""
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
     vector = face_vectors(vertices, faces)
     area = np.linalg.norm(vector, axis=1)
@@ -122,7 +175,8 @@ def _balls(mesh, geometry, count):
     rings = np.asarray(geometry.ring_positions, float)
     at = s[faces]
     weight = area * (np.einsum("fi,fi->f", normal, out[faces[:, 0]]) > OUTWARD)
-    weight *= (at.min(axis=1) >= rings[0]) & (at.max(axis=1) <= rings[-1])
+    between = (at.min(axis=1) >= rings[0]) & (at.max(axis=1) <= rings[-1])
+    weight *= ~between if beyond else between
     if not weight.sum() > 0:
         raise MeshError("no triangle between the rings faces outwards; expected an outer wall")
     rng = np.random.default_rng(0)
@@ -136,32 +190,54 @@ def _balls(mesh, geometry, count):
 
 
 def _distance(corners, points):
-    """Of points to the closest of all triangles, each with a centre near enough to hold it."""
+    """Of points to the closest of all triangles, each with a centre near enough to hold it.
+
+    Triangles of about one size share a tree, so that a few large ones do not widen every search.
+    """
+    middle = corners.mean(axis=1)
+    reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    size = np.ceil(np.log2(np.maximum(reach / reach.max(), 2.0**-SIZES))).astype(int)
+    found = np.full(len(points), np.inf)
+    for one in np.unique(size):
+        rows = np.flatnonzero(size == one)
+        tree = KDTree(middle[rows])
+        away = np.minimum(tree.query(points)[0], found) + reach[rows].max()
+        for at in range(0, len(points), CHUNK):
+            some = slice(at, at + CHUNK)
+            near = tree.query_ball_point(points[some], away[some])
+            found[some] = np.minimum(found[some], _nearest(corners[rows], points[some], near))
+    return found
+
+
+def _nearest(corners, points, near):
+    """Distance of each point to the closest of the triangles listed for it; inf without any."""
     import trimesh  # only those who read meshes wait for it
 
-    middle = corners.mean(axis=1)
-    reach = np.linalg.norm(corners - middle[:, None], axis=2).max()
-    tree, found = KDTree(middle), []
-    for point, least in zip(points, tree.query(points)[0], strict=True):
-        near = corners[tree.query_ball_point(point, least + reach)]
-        closest = trimesh.triangles.closest_point(near, np.tile(point, (len(near), 1)))
-        found.append(np.linalg.norm(closest - point, axis=1).min())
-    return np.array(found)
+    count, found = np.array([len(v) for v in near]), np.full(len(points), np.inf)
+    listed = np.flatnonzero(count)
+    if not len(listed):
+        return found
+    point = np.repeat(points, count, axis=0)
+    closest = trimesh.triangles.closest_point(corners[np.concatenate(near).astype(int)], point)
+    first = np.concatenate([[0], np.cumsum(count[listed])[:-1]])
+    found[listed] = np.minimum.reduceat(np.linalg.norm(closest - point, axis=1), first)
+    return found
 
 
 def _sharp_gap(patches: Patches, points):
-    """Signed distance of points to the union of the patches."""
+    """Signed distance of points to the union of the patches, and which patch is the nearest."""
     cores = np.asarray(patches.shapes.vertices, float).transpose(0, 2, 1)
     radius = np.asarray(patches.shapes.radius, float)
     hulls = [ConvexHull(core) for core in cores]
     depth = [(points @ h.equations[:, :3].T + h.equations[:, 3]).max(axis=1) for h in hulls]
     bounds = np.stack(depth, axis=1) - radius  # exact inside a core, else a lower bound
-    found = np.full(len(points), np.inf)
+    found, nearest = np.full(len(points), np.inf), np.zeros(len(points), int)
     for rank in np.argsort(bounds, axis=1)[:, :NEAR].T:
         for i in np.unique(rank):
             rows = np.flatnonzero(rank == i)
             inside = depth[i][rows] <= 0
             far = _distance(hulls[i].points[hulls[i].simplices], points[rows])
             signed = np.where(inside, depth[i][rows], far) - radius[i]
+            nearest[rows] = np.where(signed < found[rows], i, nearest[rows])
             found[rows] = np.minimum(found[rows], signed)
-    return found
+    return found, nearest

@@ -5,9 +5,8 @@ the shape (unit, ends, centreline, anterior side, rings) can be given instead; w
 is refused.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,29 +16,23 @@ from jaxtyping import Array, Float
 from jaxtrachea.trachea.centreline import (
     Line,
     Shape,
-    find_anterior,
+    check_turn,
     find_centreline,
-    find_rings,
     locate,
     turned,
 )
+from jaxtrachea.trachea.cleaning import Surface, clean
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.mesh import (
-    Mesh,
-    MeshError,
-    edge_counts,
-    unique_rows,
-    vertex_normals,
-    volume,
-)
+from jaxtrachea.trachea.mesh import Mesh, MeshError, vertex_normals
+from jaxtrachea.trachea.rings import find_anterior, find_rings
 from jaxtrachea.units import unit_factor
 
 #: Length of a trachea with its wall, infant to adult, mm: what a guess of the unit goes by.
 PLAUSIBLE = 40.0, 250.0
 #: Length of anything this can be used for, mm: a unit that says more or less is a mistake.
 POSSIBLE = 1.0, 5000.0
-#: Triangles of the coarsest tube that still shows a shape.
-FEWEST = 24
+#: Steps of reading that take time: the file, its repair, centreline, sections, places of vertices.
+STEPS = 5
 
 
 class Imported(eqx.Module):
@@ -74,6 +67,7 @@ def read_mesh(
     ring_positions: Sequence[float] | np.ndarray | None = None,
     half_angle: float | None = None,
     dtype=None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Imported:
     """Read a trachea from a surface file.
 
@@ -93,6 +87,7 @@ def read_mesh(
         ring_positions: s of the rings, mm from the carina's end.
         half_angle: of the rings, rad.
         dtype: of every array; the default float type of JAX if None.
+        progress: called with (steps done since the last call, steps in all).
 
     Raises:
         MeshError: the file, what was found, what is expected, the cure.
@@ -100,27 +95,36 @@ def read_mesh(
     path = Path(path)
     try:
         return _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
-                     half_angle, dtype)  # fmt: skip
+                     half_angle, dtype, progress)  # fmt: skip
     except MeshError as error:
         raise MeshError(f"{path.name}: {error}") from error.__cause__
 
 
-def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions, half_angle, dtype):
+def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions, half_angle, dtype,
+          progress):  # fmt: skip
+    step = lambda: None if progress is None else progress(1, STEPS)  # noqa: E731
     parts = _parts(path)
+    step()
     name = _wall(parts, part)
     notes = [f"wall: {name}"] if len(parts) > 1 else []
-    surface, cleaned = _clean(parts[name])
+    surface, cleaned = clean(parts[name])
+    step()
     scale = _scale(surface, path, unit, notes)
-    wall = _Surface(surface.vertices * scale, surface.faces)
+    wall = Surface(surface.vertices * scale, surface.faces)
     cartilage = _cartilage(parts, name, rings, path, scale, notes)
     given = None if centreline is None else np.asarray(centreline, float) * scale
     line = find_centreline(wall.vertices, wall.faces, given)
+    check_turn(line)
+    step()
     scan = lambda line: Shape.scan(line, wall.vertices, wall.faces, cartilage)  # noqa: E731
     if larynx is not None:
         shape = scan(turned(line) if _points_back(line, larynx) else line)
     else:
         shape = scan(line)
         shape = scan(turned(line)) if _carina_is_last(shape) else shape
+    if given is None:
+        shape.check_middle()
+    step()
     shape = find_anterior(shape, anterior)
     found = find_rings(shape, ring_positions, half_angle)
     where = locate(shape.line, wall.vertices)
@@ -135,6 +139,7 @@ def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
     fields = (normals, where.s, where.phi, where.distance, frames)
     cast = lambda v: jnp.asarray(v, dtype)  # noqa: E731
     mesh = Mesh(cast(vertices), jnp.asarray(wall.faces, jnp.int32), *(cast(v) for v in fields))
+    step()
     try:
         geometry = Geometry.create(
             shape.line.s[-1], found.positions, radius=found.radius, half_angle=found.half_angle,
@@ -145,12 +150,7 @@ def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
     return Imported(mesh, geometry, cast(rotation), cast(origin / scale), scale, tuple(notes))
 
 
-class _Surface(NamedTuple):
-    vertices: np.ndarray
-    faces: np.ndarray
-
-
-def _parts(path: Path) -> dict[str, _Surface]:
+def _parts(path: Path) -> dict[str, Surface]:
     """Objects of a file by name, in the file's common frame."""
     import trimesh  # only those who read meshes wait for it
 
@@ -167,7 +167,7 @@ def _parts(path: Path) -> dict[str, _Surface]:
             f"{f' ({said})' if said else ''}; expected STL, OBJ, PLY or GLB with triangles"
         ) from error
     parts = {
-        name: _Surface(
+        name: Surface(
             np.asarray(part.vertices, float) @ frame[:3, :3].T + frame[:3, 3],
             np.asarray(part.faces, np.int64),
         )
@@ -185,12 +185,12 @@ def _parts(path: Path) -> dict[str, _Surface]:
     return parts
 
 
-def _area(surface: _Surface) -> float:
+def _area(surface: Surface) -> float:
     a, b, c = (surface.vertices[surface.faces[:, i]] for i in range(3))
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
-def _wall(parts: dict[str, _Surface], part: str | None) -> str:
+def _wall(parts: dict[str, Surface], part: str | None) -> str:
     names = ", ".join(sorted(parts))
     if part is not None:
         if part not in parts:
@@ -205,85 +205,7 @@ def _wall(parts: dict[str, _Surface], part: str | None) -> str:
     return largest
 
 
-def _clean(surface: _Surface) -> tuple[_Surface, list[str]]:
-    """Join vertices at the same place; drop collapsed and repeated triangles and small fragments.
-
-    Slivers stay: they weigh nothing in normals or sections.
-    """
-    notes = []
-    size = np.ptp(surface.vertices, axis=0).max()
-    if not size > 0:
-        raise MeshError("all vertices lie in one point; expected the surface of a trachea")
-    grid = np.round((surface.vertices - surface.vertices.min(axis=0)) / (1e-7 * size))
-    first, same = unique_rows(grid)
-    faces = same[surface.faces]
-    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    once, _ = unique_rows(np.sort(faces, axis=1))
-    keep = np.zeros(len(faces), bool)
-    keep[once] = True
-    keep &= whole
-    if not keep.all():
-        notes.append(f"{np.sum(~keep)} collapsed or repeated triangles dropped")
-    vertices, faces = surface.vertices[first], faces[keep]
-    if not len(faces):
-        raise MeshError("every triangle is collapsed; expected the surface of a trachea")
-    if len(faces) < FEWEST:
-        raise MeshError(f"{len(faces)} triangles are no trachea; expected at least {FEWEST}")
-    faces, dropped = _without_fragments(vertices, faces)
-    if dropped:
-        notes.append(f"{dropped} triangles of small loose fragments dropped")
-    used, faces = np.unique(faces, return_inverse=True)
-    cleaned = _Surface(vertices[used], faces.reshape(-1, 3))
-    return _outward(cleaned, notes), notes
-
-
-def _labels(faces: np.ndarray, count: int) -> np.ndarray:
-    """Smallest vertex connected with each vertex."""
-    label = np.arange(count)
-    while True:
-        least = label[faces].min(axis=1)
-        lower = label.copy()
-        np.minimum.at(lower, faces.ravel(), np.repeat(least, 3))
-        lower = lower[lower]
-        if np.array_equal(lower, label):
-            return label
-        label = lower
-
-
-def _without_fragments(vertices, faces):
-    """Pieces longer than a third of the longest; the rest is dust."""
-    label = _labels(faces, len(vertices))[faces[:, 0]]
-    extent = {
-        piece: np.linalg.norm(np.ptp(vertices[faces[label == piece].ravel()], axis=0))
-        for piece in np.unique(label)
-    }
-    longest = max(extent.values())
-    keep = np.isin(label, [piece for piece, size in extent.items() if size > longest / 3])
-    return faces[keep], int(np.sum(~keep))
-
-
-def _outward(surface: _Surface, notes: list[str]) -> _Surface:
-    """Turn triangles outwards if the whole surface is inside out; refuse a mixed one."""
-    vertices, faces = surface
-    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    if len(unique_rows(directed)[0]) < len(directed):
-        pairs, count = edge_counts(faces)
-        if np.any(count > 2):
-            raise MeshError(
-                f"{np.sum(count > 2)} edges belong to more than two triangles; expected a surface "
-                "that does not branch: repair it first"
-            )
-        raise MeshError("neighbouring triangles face opposite ways; make the normals consistent")
-    if volume(vertices, faces) < 0:
-        notes.append("the surface was inside out: triangles turned")
-        return _Surface(vertices, faces[:, ::-1])
-    _, count = edge_counts(faces)
-    if np.any(count == 1):
-        notes.append(f"{np.sum(count == 1)} open edges")
-    return surface
-
-
-def _scale(surface: _Surface, path: Path, unit: str | None, notes: list[str]) -> float:
+def _scale(surface: Surface, path: Path, unit: str | None, notes: list[str]) -> float:
     """Millimetres per unit of the file."""
     size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     if unit is not None:
@@ -306,7 +228,7 @@ def _scale(surface: _Surface, path: Path, unit: str | None, notes: list[str]) ->
     return float(unit_factor(fits[0], "length"))
 
 
-def _cartilage(parts, wall, rings, path, scale, notes) -> _Surface | None:
+def _cartilage(parts, wall, rings, path, scale, notes) -> Surface | None:
     """The rings' own surface, mm, or None."""
     if rings is None:
         named = [
@@ -329,7 +251,7 @@ def _cartilage(parts, wall, rings, path, scale, notes) -> _Surface | None:
     shift = np.cumsum([0, *(len(f.vertices) for f in found[:-1])])
     vertices = np.concatenate([f.vertices for f in found]) * scale
     faces = np.concatenate([f.faces + at for f, at in zip(found, shift, strict=True)])
-    return _Surface(vertices, faces)
+    return Surface(vertices, faces)
 
 
 def _axes(along, anterior):

@@ -8,55 +8,101 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from small_scenes import BALL, MATERIAL, bend, poses
+from small_scenes import BALL, SPRINGS, bend, poses
 
-from jaxtrachea import Wishes, make_scene, table_1
+from jaxtrachea import Poses, Wishes, make_scene, simulate, table_1
 from jaxtrachea.config import SpecError
-from jaxtrachea.contact.patches import touch
-from jaxtrachea.contact.pose import Pose
-from jaxtrachea.contact.shapes import sphere
+from jaxtrachea.contact.shapes import Shape, sphere
 from jaxtrachea.scene import stage, wall_check
 from jaxtrachea.scene.build import stage as read_scene
 from jaxtrachea.scene.spec import load_scene_spec
+from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import MeshError
 from jaxtrachea.trachea.tube import make_tube
 
 TUBE = table_1()
-MESHES = {k: make_tube(TUBE, around=35 * k, along=97 * k) for k in (1, 2, 4)}
-BARE = Wishes(want_surface=False)
-quick = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
-def gaps(mesh, centres, radius):
-    """Of a ball, as a scene would find them; filled up so that all meshes share one program."""
-    wall = stage._walls(TUBE, mesh)
-    cores = np.asarray(wall.shapes.vertices)
+def imported(mesh):
+    """A straight tube as if read from a file: with frames."""
+    return dataclasses.replace(mesh, frames=jnp.tile(jnp.eye(3), (len(mesh.s), 1, 1)))
+
+
+MESHES = {k: imported(make_tube(TUBE, around=35 * k, along=97 * k)) for k in (1, 2, 4)}
+#: Height of the facets of the coarse mesh over those of the finer ones, midway between vertices.
+FACET = 12.6 * (1 - np.cos(np.pi / 35))
+ROWS = 41
+
+
+def filled_up(tube):
+    """The same patches, and one far away for each that lacks, so that all share one program."""
+    cores = np.asarray(tube.shapes.vertices)
     inside = np.repeat(cores.mean(axis=2, keepdims=True), stage.CORNERS - cores.shape[2], 2)
-    shapes = dataclasses.replace(
-        wall.shapes, vertices=jnp.asarray(np.concatenate([cores, inside], axis=2))
-    )
-    wall = dataclasses.replace(wall, shapes=shapes)
-    return np.asarray(GAP(wall, jnp.asarray(centres), jnp.asarray(radius)))
+    lacking = TUBE.rings - len(cores)
+    longer = lambda v, away=0.0: np.concatenate([v, np.repeat(v[:1], lacking, 0) + away])  # noqa: E731
+    cores = longer(np.concatenate([cores, inside], axis=2), 1e4)
+    doubtful = np.zeros(TUBE.rings, bool)
+    if tube.doubtful is not None:
+        doubtful[: len(tube.doubtful)] = tube.doubtful
+    return dataclasses.replace(
+        tube, shapes=Shape(jnp.asarray(cores), jnp.asarray(longer(tube.shapes.radius))),
+        centres=jnp.asarray(longer(tube.centres, 1e4)), lost=jnp.asarray(longer(tube.lost)),
+        filled=jnp.asarray(longer(tube.filled)), doubtful=jnp.asarray(doubtful),
+    )  # fmt: skip
 
 
-@quick
-@functools.partial(jax.vmap, in_axes=(None, 0, None))
-def GAP(wall, centre, radius):
-    return touch(sphere(radius), Pose(jnp.eye(3), centre), wall, near=3).gap
+@functools.cache
+def scene():
+    """A ball pressed in, every row a press of its own; rings are springs."""
+    path = poses([75, 18.5, 0], [75, 15.5, 0])
+    wishes = Wishes(want_surface=False, want_joints=False, want_ring_ends=False, seat="each",
+                    second_plane="on")  # fmt: skip
+    return make_scene(TUBE, SPRINGS, path, tool=sphere(6.0), radius=12.6, wishes=wishes)
 
 
-def test_a_finer_mesh_moves_the_gap_by_less_than_0_03_mm():
-    """Along the front, where vertices of all three stand; between them a coarse mesh is flat."""
-    s = np.linspace(70, 80, 41)
-    at = np.stack([s, 0 * s + 18.5, 0 * s], axis=1)
-    found = np.stack([gaps(mesh, at, 6.0) for mesh in MESHES.values()])
-    assert np.ptp(found, axis=0).max() < 0.03
-    # Between the vertices of the coarse mesh: its facets lie R (1 - cos(pi / 35)) deeper.
-    half = np.pi / 35
-    at = np.stack([s, 0 * s + 18.5 * np.cos(half), 0 * s + 18.5 * np.sin(half)], axis=1)
-    found = np.stack([gaps(mesh, at, 6.0) for mesh in MESHES.values()])
-    assert np.ptp(found, axis=0).max() < 0.03 + 12.6 * (1 - np.cos(half))
+run = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
+
+
+def pressed(tube, centres, radius=6.0):
+    """The scene on this wall, `ROWS` poses at a time."""
+    many = np.concatenate([centres, np.repeat(centres[-1:], -len(centres) % ROWS, 0)])
+    here = dataclasses.replace(scene(), tube=filled_up(tube), tool=sphere(radius), near=3)
+    turn, parts = jnp.tile(jnp.eye(3), (ROWS, 1, 1)), []
+    for at in many.reshape(-1, ROWS, 3):
+        out = run(here, SPRINGS, Poses(turn, jnp.asarray(at)))
+        parts.append((out.gap, out.force[:, 1], out.force[:, 2], out.status))
+    return [np.concatenate(v)[: len(centres)] for v in zip(*parts, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def spacings():
+    """Gap and force along the front and midway between vertices, light and 3 mm deep."""
+    s, found = np.linspace(70, 80, ROWS), {}
+    walls = [stage._walls(TUBE, mesh) for mesh in MESHES.values()]
+    for name, phi in (("on vertices", 0.0), ("between", np.pi / 35)):
+        for depth in (0.1, 3.0):
+            height = 18.6 - depth
+            at = np.stack([s, 0 * s + height * np.cos(phi), 0 * s + height * np.sin(phi)], axis=1)
+            rows = [pressed(wall, at) for wall in walls]
+            assert all((row[3] <= PressStatus.NO_CONTACT).all() for row in rows)
+            found[name, depth] = [np.stack(v) for v in zip(*(row[:3] for row in rows), strict=True)]
+    return found
+
+
+@pytest.mark.parametrize(("where", "limit"), [("on vertices", 0.03), ("between", FACET)])
+def test_a_finer_mesh_moves_the_gap_by_less_than_0_03_mm(spacings, where, limit):
+    """Between its vertices a coarse mesh is flat, up to R (1 - cos(pi / 35)) lower: 0.05 mm."""
+    for depth in (0.1, 3.0):
+        assert np.ptp(spacings[where, depth][0], axis=0).max() < limit
+
+
+@pytest.mark.parametrize("where", ["on vertices", "between"])
+def test_a_finer_mesh_moves_the_force_by_less_than_2_per_cent(spacings, where):
+    """3 mm deep: of that the facets of the coarse mesh, 0.05 mm, are 1.7 %."""
+    force = np.hypot(*spacings[where, 3.0][1:])
+    assert force.min() > 0.1
+    assert (np.ptp(force, axis=0) / force[2]).max() < 0.02
 
 
 @pytest.mark.parametrize("along", [40, 97, 111])
@@ -72,9 +118,9 @@ def test_crests_of_the_rings_are_as_high_in_every_mesh(along):
 def test_the_measure_is_the_gap_of_touch():
     """The same balls by `touch`, which smooths by at most its bound."""
     wall = stage._walls(TUBE, MESHES[1])
-    centres, _, radius = wall_check._balls(MESHES[1], TUBE, 41)
-    seen = wall_check.measure(MESHES[1], TUBE, wall, 41)
-    difference = gaps(MESHES[1], centres, radius) - (seen.gap + seen.error)
+    centres, _, radius = wall_check._balls(MESHES[1], TUBE, ROWS)
+    seen = wall_check.measure(MESHES[1], TUBE, wall, ROWS)
+    difference = pressed(wall, centres, radius)[0] - (seen.gap + seen.error)
     assert difference.max() < 1e-3
     assert difference.min() > -0.09
     mesh = trimesh.Trimesh(MESHES[1].vertices, MESHES[1].faces, process=False)
@@ -85,23 +131,59 @@ def test_the_measure_is_the_gap_of_touch():
     np.testing.assert_allclose(seen.gap[:5], distance - radius, atol=1e-12)
 
 
+def test_distance_to_triangles_of_very_different_sizes():
+    """Large ones are found from afar; against all of them, one by one."""
+    rng = np.random.default_rng(0)
+    size = 10.0 ** rng.uniform(-6, 2, (300, 1, 1))
+    corners = rng.uniform(-30, 30, (300, 1, 3)) + size * rng.normal(size=(300, 3, 3))
+    corners[0, 1:] = corners[0, 0]  # a point
+    points = rng.uniform(-50, 50, (150, 3))
+    every = trimesh.triangles.closest_point(
+        np.tile(corners, (len(points), 1, 1)), np.repeat(points, len(corners), 0)
+    ).reshape(len(points), -1, 3)
+    wanted = np.linalg.norm(every - points[:, None], axis=2).min(axis=1)
+    np.testing.assert_allclose(wall_check._distance(corners, points), wanted, rtol=1e-12)
+
+
 def test_limit_is_the_sagitta_of_a_bridged_hollow():
     """Rings 10 mm apart, patches of 11 mm: that far apart a circle of 11.3 mm is this deep."""
     exact = 11.3 - np.sqrt(11.3**2 - 5.5**2)
     np.testing.assert_allclose(wall_check.limit_of(TUBE), exact, rtol=0.1)  # p^2 / 8R: 7 % less
 
 
+def waist(mesh, at, depth, width):
+    """The mesh drawn in there."""
+    drawn = 1 - depth * np.exp(-(((np.asarray(mesh.s) - at) / width) ** 2))[:, None]
+    vertices = mesh.vertices * np.concatenate([np.ones_like(drawn), drawn, drawn], axis=1)
+    return dataclasses.replace(mesh, vertices=vertices, distance=mesh.distance * drawn[:, 0])
+
+
 def test_patches_beside_the_wall_are_refused():
     """A waist of 4 mm within one patch: a ball would touch where there is nothing."""
-    mesh = bend(MESHES[1], 300.0)
-    path = poses([75, 19, 0], [75, 17, 0])
-    good = make_scene(TUBE, MATERIAL, path, tool=BALL, mesh=mesh, wishes=BARE)
-    assert good.tube is not None
-    assert wall_check.check(mesh, TUBE, good.tube).worst < wall_check.limit_of(TUBE)
-    waist = 1 - 0.35 * np.exp(-(((np.asarray(MESHES[1].s) - 70) / 4) ** 2))
-    thin = dataclasses.replace(MESHES[1], distance=MESHES[1].distance * waist)
-    with pytest.raises(MeshError, match=r"gap is off by .* at worst \(at s = .* expected at most"):
-        make_scene(TUBE, MATERIAL, path, tool=BALL, mesh=bend(thin, 300.0), wishes=BARE)
+    thin = waist(MESHES[1], 70, 0.35, 4)
+    good = stage._checked_walls(TUBE, bend(MESHES[1], 300.0))
+    assert good.doubtful is None
+    says = r"gap is off by .* at worst \(at s = .* expected at most"
+    with pytest.raises(MeshError, match=says):
+        make_scene(TUBE, SPRINGS, poses([75, 19, 0], [75, 17, 0]), tool=BALL, mesh=thin)
+    with pytest.raises(MeshError, match=says):
+        stage.with_mesh(dataclasses.replace(scene(), tube=good), thin)
+
+
+def test_touches_beyond_the_rings_are_unsure_where_the_gap_is_off():
+    """The same waist beyond the last ring: no reason to refuse the mesh, but none for OK."""
+    rings = dataclasses.replace(TUBE, ring_positions=TUBE.ring_positions[:10])
+    mesh = waist(MESHES[1], 130, 0.35, 4)
+    tube = stage._checked_walls(rings, mesh)
+    beyond = wall_check.look_beyond(mesh, rings, tube)
+    (first, _), (low, high) = beyond.s
+    assert np.isnan(first)
+    assert 115 < low < 130 < high < 145
+    assert f"at s = {low:.3g} to {high:.3g} mm, beyond the rings" in beyond.sentence
+    s = np.array([75.0, 120, 130, 150])
+    status = pressed(tube, np.stack([s, 0 * s + 17, 0 * s], axis=1))[3]
+    np.testing.assert_array_equal(status == PressStatus.UNSURE, [False, False, True, False])
+    assert (status[[0, 1, 3]] == PressStatus.OK).all()
 
 
 SCENE = """
