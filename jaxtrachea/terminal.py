@@ -134,9 +134,11 @@ class _Count(ProgressColumn):
 
 
 def progress_bar(*, transient: bool = False) -> Progress:
-    """A progress bar on stderr; a `transient` one goes when it is done."""
+    """A progress bar on stderr; a `transient` one is for terminals only, and goes when done."""
     columns = (TextColumn("{task.description}"), BarColumn(), _Count(), TimeElapsedColumn())
-    return Progress(*columns, console=Console(stderr=True), transient=transient)
+    console = Console(stderr=True)
+    hidden = transient and not console.is_terminal
+    return Progress(*columns, console=console, transient=transient, disable=hidden)
 
 
 class Stages:
