@@ -13,9 +13,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea import skeleton
 from jaxtrachea._arguments import ArrayLike, check_word, last_axis, shaped
-from jaxtrachea.admission import admit, hide, status_of
+from jaxtrachea.admission import Admitted, admit, hide, status_of
 from jaxtrachea.mechanics import friction as _friction
 from jaxtrachea.mechanics import vector_equilibrium
+from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.model import Options, local_law, read_values, touch
 from jaxtrachea.skeleton import Rings, Skeleton, local_frame
 from jaxtrachea.status import PressStatus, RingStatus
@@ -58,6 +59,24 @@ class ObliquePath(NamedTuple):
     sliding: Bool[Array, " steps"]
 
 
+class Place(NamedTuple):
+    """A contact position, and what a press there needs of tube and material.
+
+    Attributes:
+        asked: checked position and material.
+        unit: what the skeleton does per unit force.
+        law: local law.
+        phi_c: contact angle, rad.
+        onset: inward displacement at first touch, mm.
+    """
+
+    asked: Admitted
+    unit: Skeleton
+    law: Law
+    phi_c: Float[Array, ""]
+    onset: Float[Array, ""]
+
+
 def press_oblique(
     geometry: Geometry,
     material: Material,
@@ -95,32 +114,34 @@ def press_oblique(
             argument that is no number, or an array of a wrong length.
     """
     _only_default(options)
-    dtype = geometry.length.dtype
-    displacement = last_axis("displacement", displacement, 3, dtype)
-    asked, unit, law, phi_c, onset = _begin(
-        geometry, material, s_c, phi_c, onset, options, rings, axial
-    )
-    normal = local_frame(phi_c)[0]
+    place = place_at(geometry, material, s_c, phi_c, options, onset=onset, rings=rings, axial=axial)
+    return press_at(place, last_axis("displacement", displacement, 3, place.phi_c.dtype), options)
+
+
+def press_at(place: Place, displacement: Float[Array, "*n 3"], options: Options) -> ObliquePress:
+    """As `press_oblique`, on a place that is known."""
+    normal = local_frame(place.phi_c)[0]
     inward = displacement @ normal
     if options.contact == "bonded":
-        moved = displacement - onset * jnp.broadcast_to(normal, displacement.shape)
+        moved = displacement - place.onset * jnp.broadcast_to(normal, displacement.shape)
     else:
-        share = touch(inward, onset, options) / jnp.where(inward > 0, inward, 1)
+        share = touch(inward, place.onset, options) / jnp.where(inward > 0, inward, 1)
         moved = displacement * share[..., None]
     solve = {
         "series": vector_equilibrium.press_vector,
         "total": vector_equilibrium.press_vector_total,
     }[options.coupling]
     flat = moved.reshape(-1, 3)
-    solved = jax.vmap(solve, (0, None, None))(flat, unit.compliance, law)
+    solved = jax.vmap(solve, (0, None, None))(flat, place.unit.compliance, place.law)
     force, depth = (v.reshape(displacement.shape) for v in (solved.force, solved.depth))
     status = solved.status.reshape(displacement.shape[:-1])
     if options.contact == "unilateral":
         pulls = force @ normal < 0
         force, depth = (jnp.where(pulls[..., None], jnp.nan, v) for v in (force, depth))
         status = jnp.where(pulls, PressStatus.PULLS, status)
-    unit, force, depth = hide(asked.refused, unit, force, depth)
-    return _assemble(unit, force, depth, status_of(asked.refused, status))
+    refused = place.asked.refused
+    unit, force, depth = hide(refused, place.unit, force, depth)
+    return _assemble(unit, force, depth, status_of(refused, status))
 
 
 def press_path(
@@ -169,8 +190,8 @@ def press_path(
         raise ValueError(f"rounding is {rounding}; expected a finite number, not negative")
     dtype = geometry.length.dtype
     displacement = shaped("displacement", displacement, ("steps", 3), dtype=dtype)
-    asked, unit, law, phi_c, onset = _begin(
-        geometry, material, s_c, phi_c, onset, options, rings, axial
+    asked, unit, law, phi_c, onset = place_at(
+        geometry, material, s_c, phi_c, options, onset=onset, rings=rings, axial=axial
     )
     mu = shaped("friction", friction, (), dtype=dtype)
     friction = jnp.where(mu < 0, 0, mu)
@@ -187,7 +208,17 @@ def press_path(
     return ObliquePath(press, slid.slip @ frame[1:], slid.dissipated, sliding)
 
 
-def _begin(geometry, material, s_c, phi_c, onset, options, rings, axial):
+def place_at(
+    geometry: Geometry,
+    material: Material,
+    s_c: ArrayLike,
+    phi_c: ArrayLike,
+    options: Options,
+    *,
+    rings: Rings,
+    axial: bool,
+    onset: ArrayLike | None = None,
+) -> Place:
     """Checked arguments, and the skeleton and the local law at the contact."""
     check_word("rings", rings, Rings)
     dtype = geometry.length.dtype
@@ -197,7 +228,8 @@ def _begin(geometry, material, s_c, phi_c, onset, options, rings, axial):
     used = (*read_values(options), *skeleton.read_values(rings, **levels))
     asked = admit(geometry, material, s_c, dict.fromkeys(used))
     unit = skeleton.respond(geometry, asked.material, asked.s_c, phi_c, rings=rings, **levels)
-    return asked, unit, local_law(geometry, asked.material, asked.s_c, options), phi_c, onset
+    law = local_law(geometry, asked.material, asked.s_c, options)
+    return Place(asked=asked, unit=unit, law=law, phi_c=phi_c, onset=onset)
 
 
 def _only_default(options: Options):

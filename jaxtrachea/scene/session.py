@@ -13,42 +13,46 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
-from jaxtrachea.contact.patches import Touch
-from jaxtrachea.scene.approach import Approach, approach, seated
+from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.ranges import off_the_end, submerged
+from jaxtrachea.scene.seat import (
+    Instant,
+    Seat,
+    anchored,
+    arrive,
+    as_approach,
+    drawn,
+    given_way,
+    grasp,
+    left,
+    place_of,
+    way_of,
+)
 from jaxtrachea.scene.simulation import Simulation, follow
 from jaxtrachea.scene.stage import Poses, Scene, touch_tube
+from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
 
 #: Borders of the histogram of latencies, s: four a decade from 10 us to 1 s.
 EDGES = np.logspace(-5, 0, 21)
 
 
-class Instant(NamedTuple):
-    """Where the tool was, and what it touched; leading axis 1."""
-
-    path: Poses
-    seen: Touch
-
-
-class Seat(NamedTuple):
+class State(NamedTuple):
     """What the next step must know.
 
     Attributes:
         started: there was a step.
-        touching: the tool is on the place of `touch`.
-        last: the step before.
-        before: the step before the first touch.
-        touch: the first touch.
+        touching: the tool is on its seat.
         outside: the tool was last seen outside the lumen, on the tube.
+        last: the step before.
+        seat: the place that the tool holds.
     """
 
     started: Bool[Array, ""]
     touching: Bool[Array, ""]
     outside: Bool[Array, ""]
     last: Instant
-    before: Instant
-    touch: Instant
+    seat: Seat
 
 
 class Latency(NamedTuple):
@@ -74,9 +78,11 @@ class Latency(NamedTuple):
 class Session:
     """A scene and its material, compiled for one pose at a time.
 
-    With `seat` first the tool stays on the place it touched first, as in `simulate`; it lets go
-    when it leaves the undeformed tube, and may then touch elsewhere (`simulate` keeps the first
-    place of its whole path; a bonded tool never lets go).
+    With `seat` first the tool stays on the place it touched first, as in `simulate`, until that
+    seat gives way (`scene.seat`): led along the surface by more than its depth the tool slides,
+    after a jump it grasps anew, and it lets go where it leaves the undeformed tube (`simulate`
+    keeps the first place of its whole path; a bonded tool never lets go). Force is continuous in
+    the pose. A pose that is not finite is a row of NaN with NON_FINITE and changes nothing else.
 
     A step gives up the arrays of the step before: copy what must last longer
     (`jax.tree.map(np.array, result)`). On the CPU 7 to 9 us of a step go away with
@@ -108,8 +114,8 @@ class Session:
         start = _start(scene, *pose)
 
         def run(packed, _, *pose):
-            seat, result = _step(scene, material, _unpack(packed, start), *pose)
-            return _pack(seat), result
+            state, result = _step(scene, material, _unpack(packed, start), *pose)
+            return _pack(state), result
 
         self._start = np.asarray(_pack(start))
         empty = jax.eval_shape(run, self._start, None, *pose)[1]
@@ -117,7 +123,7 @@ class Session:
         # Donated: the new state and result are written where the old ones were.
         made = jax.jit(run, donate_argnums=(0, 1), keep_unused=True)
         self._run = made.lower(self._start, zeros, *pose).compile()
-        self._seat, self._result = jnp.array(self._start), zeros
+        self._state, self._result = jnp.array(self._start), zeros
         self._seconds, self._steps = np.zeros(keep), 0
 
     def step(self, rotation: ArrayLike, translation: ArrayLike) -> Simulation:
@@ -139,7 +145,7 @@ class Session:
             raise ValueError(
                 f"rotation {pose[0].shape}, translation {pose[1].shape}; expected (3, 3) and (3,)"
             )
-        self._seat, self._result = self._run(self._seat, self._result, *pose)
+        self._state, self._result = self._run(self._state, self._result, *pose)
         jax.block_until_ready(self._result)
         self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin
         self._steps += 1
@@ -147,7 +153,7 @@ class Session:
 
     def reset(self) -> None:
         """Forget where the tool was, and all latencies."""
-        self._seat, self._steps = jnp.array(self._start), 0
+        self._state, self._steps = jnp.array(self._start), 0
 
     def latency(self, edges: Float[np.ndarray, " borders"] = EDGES) -> Latency:
         """Of the steps kept.
@@ -163,9 +169,9 @@ class Session:
         return Latency(len(taken), float(median), float(p99), float(taken.max()), edges, counts)
 
 
-def _pack(seat: Seat) -> Float[Array, " numbers"]:
-    """One array instead of 38: each costs some 2 us a step. All is held exactly."""
-    leaves = jax.tree.leaves(seat)
+def _pack(state: State) -> Float[Array, " numbers"]:
+    """One array instead of 30: each costs some 2 us a step. All is held exactly."""
+    leaves = jax.tree.leaves(state)
     widest = max((v.dtype for v in leaves if jnp.issubdtype(v.dtype, jnp.floating)), key=_bits)
     return jnp.concatenate([jnp.ravel(v).astype(widest) for v in leaves])
 
@@ -174,7 +180,7 @@ def _bits(dtype) -> int:
     return jnp.finfo(dtype).bits
 
 
-def _unpack(packed: Float[Array, " numbers"], like: Seat) -> Seat:
+def _unpack(packed: Float[Array, " numbers"], like: State) -> State:
     leaves, tree = jax.tree.flatten(like)
     ends = np.cumsum([np.size(v) for v in leaves])
     parts = jnp.split(packed, ends[:-1])
@@ -182,51 +188,68 @@ def _unpack(packed: Float[Array, " numbers"], like: Seat) -> Seat:
     return jax.tree.unflatten(tree, back)
 
 
-def _start(scene: Scene, rotation, translation) -> Seat:
-    """Before the first step; its instants are not read."""
+def _start(scene: Scene, rotation, translation) -> State:
+    """Before the first step; where the tool was is not read."""
     path = Poses(rotation[None], translation[None])
     seen = jax.tree.map(
         lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(touch_tube, scene, path)
     )
     no, nowhere = jnp.asarray(False), Instant(path, seen)
-    return Seat(no, no, no, nowhere, nowhere, nowhere)
+    return State(no, no, no, nowhere, grasp(scene, nowhere))
 
 
-def _step(scene: Scene, material: Material, seat: Seat, rotation, translation):
-    """The next seat, and the result without its axis of rows."""
+def _step(scene: Scene, material: Material, state: State, rotation, translation):
+    """The next state, and the result without its axis of rows."""
     path = Poses(rotation[None], translation[None])
     if scene.plan.seat == "each":
         made = approach(scene, path)
-        inside, outside = _sides(scene, seat, Instant(path, made.seen))
+        here = Instant(path, made.seen)
+        inside, outside = _sides(scene, state, here)
         result = follow(scene, material, path, made._replace(inside=inside))
-        return seat._replace(outside=outside), jax.tree.map(lambda v: v[0], result)
-    here = Instant(path, touch_tube(scene, path))
-    inside, outside = _sides(scene, seat, here)
-    hit = (here.seen.gap[0] < 0) & ~inside[0]
-    free = ~seat.touching
-    if scene.plan.options.contact != "bonded":
-        free |= ~hit
-    pick = lambda when, a, b: jax.tree.map(lambda v, w: jnp.where(when, v, w), a, b)  # noqa: E731
-    last = pick(seat.started, seat.last, here)
-    before, touch = pick(free, last, seat.before), pick(free, here, seat.touch)
-    made = _seated(scene, before, touch, here)._replace(inside=inside)
-    result = follow(scene, material, touch.path, made)
-    touching = hit | (seat.touching & ~free)
-    after = Seat(jnp.asarray(True), touching, outside, here, before, touch)
-    return after, jax.tree.map(lambda v: v[0], result)
+        after = state._replace(outside=outside)
+    else:
+        here = Instant(path, touch_tube(scene, path))
+        inside, outside = _sides(scene, state, here)
+        after, result = _held(scene, material, state, here, inside)
+        after = after._replace(outside=outside)
+    known = jnp.isfinite(jnp.sum(rotation) + jnp.sum(translation) + here.seen.gap[0])
+    result = jax.tree.map(lambda v: v[0], result)
+    wrong = jnp.asarray(PressStatus.NON_FINITE, result.status.dtype)
+    return _pick(known, after, state), result._replace(
+        status=jnp.where(known, result.status, wrong)
+    )
 
 
-def _seated(scene: Scene, before: Instant, touch: Instant, here: Instant) -> Approach:
-    """The tool's way from the step before its first touch to here, as one press."""
-    join = lambda *v: jnp.concatenate(v)  # noqa: E731
-    path, seen = jax.tree.map(join, tuple(before), tuple(touch), tuple(here))
-    made = seated(scene, path, seen, jnp.asarray(1), jnp.zeros(3, bool))
-    now = jax.tree.map(lambda v: v[2:], made._replace(seen=None, first=None))
-    return now._replace(seen=touch.seen, first=jnp.asarray(0))
+def _held(scene: Scene, material: Material, state: State, here: Instant, inside):
+    """A step of a tool that holds its place."""
+    depth = -here.seen.gap[0]
+    hit = (depth > 0) & ~inside[0]
+    last = _pick(state.started, state.last, here)
+    first = _pick(hit, arrive(scene, last, here), grasp(scene, here))
+    if scene.plan.options.contact == "bonded":
+        seat = _pick(state.touching, state.seat, first)
+        touching = hit | state.touching
+        place, way = place_of(scene, material, seat), way_of(scene, seat, here.path)
+        way = jnp.where(touching, way, 0)
+    else:
+        held = state.touching & hit
+        away = held & left(scene, state.seat, last, here)
+        seat = _pick(held, drawn(scene, state.seat, here), first)
+        seat, touching = _pick(away, grasp(scene, here), seat), hit
+        place, way = place_of(scene, material, seat), way_of(scene, seat, here.path)
+        way = jnp.where(hit, given_way(scene, way, jnp.where(hit, depth, 1), place), way)
+        seat = anchored(scene, seat, way, here.path)
+    rest, made = as_approach(scene, seat, way, here, inside)
+    result = follow(scene, material, rest, made, place)
+    return State(jnp.asarray(True), touching, state.outside, here, seat), result
 
 
-def _sides(scene: Scene, seat: Seat, here: Instant):
+def _sides(scene: Scene, state: State, here: Instant):
     """Whether the tool is in the lumen (1,), and was last outside: as `in_lumen`, by steps."""
     under, off = submerged(scene, *here), off_the_end(scene, here.seen)
-    outside = (~under & ~off)[0] | (seat.outside & ~off[0])
+    outside = (~under & ~off)[0] | (state.outside & ~off[0])
     return under & ~outside, outside
+
+
+def _pick(when, a, b):
+    return jax.tree.map(lambda v, w: jnp.where(when, v, w), a, b)

@@ -13,7 +13,7 @@ from jaxtrachea._arguments import ArrayLike, shaped
 from jaxtrachea.admission import check_shapes, without_negative
 from jaxtrachea.mechanics.ring import on_ring
 from jaxtrachea.model import ligament_beam, local_law, read_values, respond, unit_deflection
-from jaxtrachea.oblique import press_oblique, press_path
+from jaxtrachea.oblique import Place, press_at, press_oblique, press_path
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.deform import deform
 from jaxtrachea.scene.ranges import (
@@ -129,14 +129,24 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
 
 
 def follow(
-    scene: Scene, material: Material, path: Poses | Presses, made: Approach | None
+    scene: Scene,
+    material: Material,
+    path: Poses | Presses,
+    made: Approach | None,
+    place: Place | None = None,
 ) -> Simulation:
-    """What follows from the presses of `path`, or of the tool's way `made` of it."""
+    """What follows from the presses of `path`, or of the tool's way `made` of it.
+
+    `place`: where all rows press, if it is known already (a step of a session).
+    """
     plan = scene.plan
     material, bad = _without_negative(scene, material)
     given = path if isinstance(path, Presses) else None
     presses, used, refused = _refuse(scene, material, given, made, bad)
-    moved = (_vectors if plan.second_plane else _one_plane)(scene, material, used)
+    if place is not None:
+        moved = _Moved(*press_at(place, used.displacement, plan.options))
+    else:
+        moved = (_vectors if plan.second_plane else _one_plane)(scene, material, used)
     vertices = None
     if plan.surface is not None:
         vertices = deform(scene, material, used, moved, path, made)
@@ -190,7 +200,7 @@ def _refuse(scene: Scene, material: Material, path: Presses | None, made: Approa
     unlike = unserved(scene, material, presses, acting)
     if unlike is not None:
         refused[PressStatus.OFF_PLAN] = unlike
-    behind = ~on_ring(geometry.half_angle, phi)[0] & ~jnp.isnan(phi)
+    s, mid, behind = on_the_tube(scene, presses.s, phi)
     refused[PressStatus.BEHIND_GAP] = behind & acting
     if made is not None:
         refused[PressStatus.IN_LUMEN] = made.inside
@@ -198,10 +208,16 @@ def _refuse(scene: Scene, material: Material, path: Presses | None, made: Approa
     for rows in refused.values():
         D = jnp.where(rows[:, None], jnp.nan, D)
     idle = (behind if scene.plan.second_plane else True) & ~acting
-    s, length = presses.s, geometry.length
-    s = jnp.where(s < 0, 0, jnp.where(s > length, length, s))
-    used = Presses(s, jnp.where(behind, 0, phi), jnp.where(idle[:, None], jnp.zeros_like(D), D))
+    used = Presses(s, mid, jnp.where(idle[:, None], jnp.zeros_like(D), D))
     return Presses(presses.s, phi, D), used, refused
+
+
+def on_the_tube(scene: Scene, s: Float[Array, "*n"], phi: Float[Array, "*n"]):
+    """Contact positions to compute with (an end, the midline in place of none); who is behind."""
+    geometry = scene.geometry
+    behind = ~on_ring(geometry.half_angle, phi)[0] & ~jnp.isnan(phi)
+    s = jnp.where(s < 0, 0, jnp.where(s > geometry.length, geometry.length, s))
+    return s, jnp.where(behind, 0, phi), behind
 
 
 def _status(status, share, made: Approach | None, refused: dict[PressStatus, Array]):

@@ -1,0 +1,271 @@
+r"""The place of the tube that a tool holds from step to step, and how that place gives way.
+
+While the gap g of the undeformed tube is negative the tool is on the tube, pressed in by
+delta = -g. It holds the place that it touched first: with the way w that its body point there has
+gone since, that place presses by e = w, as in `simulate`. The seat gives way where
+
+    |e_t| > delta      (`HOLD`: it went further along the surface than in),
+    |e_n - delta| > delta / 2     (`APART`: turned or led off, it presses elsewhere), or
+    F_n < 0.1 F_n0     (`LEAST`: the seat alone would have to be pulled),
+
+by sliding: e moves on the straight line towards the press e_0 = delta (n + u) that has no
+tangential force (u from the skeleton, F_n0 its force), no further than to the border of these. The
+place follows the tool's contact at a distance of at most delta. Both borders close at delta = 0: so
+force is continuous in the pose, and 0 where the tool leaves the tube. A pose that comes again
+changes nothing. e_0 has the least energy of all e with its normal part, so that sliding takes
+energy out, as friction of about 45 degrees does; `tests/scene/test_session.py` holds the work over
+closed loops against 0. What sliding gains where the skeleton is stiffer at the new place is less
+than that as long as the deformed wall is inclined by less than 45 degrees.
+
+A tool that goes further along the tube in one step than its dent is wide has left its seat: it
+grasps anew where it is. A glued tool (`bonded`) holds its first place whatever it does.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxtrachea._numerics import solve_spd
+from jaxtrachea.contact.patches import Touch
+from jaxtrachea.contact.pose import Pose, inverse, transform
+from jaxtrachea.oblique import Place, place_at
+from jaxtrachea.scene.approach import Approach
+from jaxtrachea.scene.curve import frame_at
+from jaxtrachea.scene.simulation import on_the_tube
+from jaxtrachea.scene.stage import Poses, Presses, Scene, followed
+from jaxtrachea.skeleton import local_frame
+from jaxtrachea.trachea.material import Material
+
+#: Way along the surface that a seat holds, over the depth: as friction of 45 degrees.
+HOLD = 1.0
+#: Largest difference of the seat's press and the tool's depth, over the depth.
+APART = 0.5
+#: Least normal force, over that of the press without tangential force.
+LEAST = 0.1
+#: Place of that press: at most this share of the way to the border of `HOLD`.
+CENTRAL = 0.8
+#: Share of half a ring spacing that a seat holds at most: beyond it one place does not serve.
+NEAR = 0.99
+#: Length of the press over the depth, at most: with it the local law is at its stiffest.
+STRETCHED = 3.0
+
+
+class Instant(NamedTuple):
+    """Where the tool was, and what it touched; leading axis 1."""
+
+    path: Poses
+    seen: Touch
+
+
+class Seat(NamedTuple):
+    """The place that the tool holds, in the frame of the mesh.
+
+    Attributes:
+        s: its position, mm.
+        phi: its angle, rad.
+        point: of the tube at rest, mm; shape (3,).
+        body: point of the tool that holds it, in the tool's frame, mm; shape (3,).
+        anchor: where that point would be without a press, mm; shape (3,).
+        rotation: of the tool as it would stand there; shape (3, 3).
+        translation: likewise, mm; shape (3,).
+        status: `ContactStatus` of the contact it comes from.
+    """
+
+    s: Float[Array, ""]
+    phi: Float[Array, ""]
+    point: Float[Array, "3"]
+    body: Float[Array, "3"]
+    anchor: Float[Array, "3"]
+    rotation: Float[Array, "3 3"]
+    translation: Float[Array, "3"]
+    status: Int[Array, ""]
+
+
+def grasp(scene: Scene, here: Instant) -> Seat:
+    """The seat of a tool that stands on its contact, pressed straight in."""
+    path, seen = jax.tree.map(lambda v: v[0], tuple(here))
+    pose = Pose(path.rotation, path.translation)
+    body = transform(inverse(pose), seen.tool_point[:, None])[:, 0]
+    lift = seen.gap * (_axes(scene, seen.s) @ local_frame(seen.phi)[0])
+    return Seat(
+        s=seen.s,
+        phi=seen.phi,
+        point=seen.point,
+        body=body,
+        anchor=_at(path, body) + lift,
+        rotation=path.rotation,
+        translation=path.translation + lift,
+        status=seen.status,
+    )
+
+
+def arrive(scene: Scene, before: Instant, here: Instant) -> Seat:
+    """The seat of a first touch: the way along the surface since then counts."""
+    seat = grasp(scene, here)
+    both = jax.tree.map(lambda v, w: jnp.concatenate([v, w]), tuple(before), tuple(here))
+    axes = _axes(scene, seat.s)
+    inward = local_frame(seat.phi)[0]
+    way = followed(*both, jnp.asarray(1), inward, axes if scene.plan.curved else None)[1]
+    return seat._replace(anchor=_at(_one(here.path), seat.body) - axes @ way)
+
+
+def left(scene: Scene, seat: Seat, before: Instant, here: Instant) -> Bool[Array, ""]:
+    """Whether the tool went further along the tube in this step than its dent is wide."""
+    inward = _axes(scene, seat.s) @ local_frame(seat.phi)[0]
+    way = _at(_one(here.path), seat.body) - _at(_one(before.path), seat.body)
+    way = way - jnp.dot(way, inward) * inward
+    return _length(way) > scene.footprint + jnp.maximum(-here.seen.gap[0], 0)
+
+
+def drawn(scene: Scene, seat: Seat, here: Instant) -> Seat:
+    """The seat after its place has followed the tool's contact; its press is the same vector."""
+    now = grasp(scene, here)
+    turned = now.phi - seat.phi
+    turned = jnp.arctan2(jnp.sin(turned), jnp.cos(turned))
+    lag = jnp.stack([now.s - seat.s, scene.radius * turned])
+    share = 1 - _limit(_hold(scene, -here.seen.gap[0]), _length(lag))
+    mix = lambda old, new: old + share * (new - old)  # noqa: E731
+    body = mix(seat.body, now.body)
+    path = _one(here.path)
+    phi = seat.phi + share * turned
+    return Seat(
+        s=mix(seat.s, now.s),
+        phi=jnp.arctan2(jnp.sin(phi), jnp.cos(phi)),
+        point=mix(seat.point, now.point),
+        body=body,
+        anchor=seat.anchor + _at(path, body) - _at(path, seat.body),
+        rotation=_turned(mix(seat.rotation, now.rotation)),
+        translation=mix(seat.translation, now.translation),
+        status=jnp.where(share > 0, now.status, seat.status),
+    )
+
+
+def place_of(scene: Scene, material: Material, seat: Seat) -> Place | None:
+    """What the skeleton does at the seat; None if the plan has a single plane."""
+    plan = scene.plan
+    if not plan.second_plane:
+        return None
+    s, phi, _ = on_the_tube(scene, seat.s, seat.phi)
+    return place_at(
+        scene.geometry, material, s, phi, plan.options, rings=plan.rings, axial=plan.axial
+    )
+
+
+def way_of(scene: Scene, seat: Seat, path: Poses) -> Float[Array, "3"]:
+    """How far the tool has pressed its seat, mm: along (inward, tangent, round the tube)."""
+    way = _at(_one(path), seat.body) - seat.anchor
+    return local_frame(seat.phi) @ (way @ _axes(scene, seat.s))
+
+
+def given_way(
+    scene: Scene, way: Float[Array, "3"], depth: Float[Array, ""], place: Place | None
+) -> Float[Array, "3"]:
+    """What is left of a press after the seat has given way: no more than the borders allow.
+
+    Args:
+        scene: -
+        way: of the press, see `way_of`.
+        depth: -gap of the tool, mm; positive.
+        place: the skeleton at the seat.
+    """
+    hold = _hold(scene, depth)
+    across, row = _softest(scene, depth, place)
+    across = depth * across
+    across = across * _limit(CENTRAL * hold, _length(across))
+    centre = jnp.concatenate([depth[None], across])
+    off = way - centre
+    # |across + share off_t| = hold
+    b = jnp.dot(across, off[1:])
+    c = hold * hold - jnp.dot(across, across)
+    root = b + jnp.sqrt(b * b + jnp.dot(off[1:], off[1:]) * c)
+    share = jnp.minimum(_limit(c, root), _limit(APART * depth, jnp.abs(off[0])))
+    pull = (1 - LEAST) * jnp.dot(row, centre)
+    share = jnp.minimum(share, _limit(pull, -jnp.dot(row, off)))
+    return centre + share * off
+
+
+def _softest(scene: Scene, depth, place: Place | None):
+    """Softest way along the surface, per depth, and the row of the stiffness for the normal force.
+
+    Only rings as arches in two planes couple the normal with another direction.
+    """
+    plan = scene.plan
+    zero = jnp.zeros_like(depth)
+    normal = jnp.stack([zero + 1, zero, zero])
+    if place is None or plan.rings != "arch2" or plan.options.coupling != "series":
+        return normal[1:], normal
+    frame = local_frame(place.phi_c)
+    stretched = STRETCHED * depth
+    local = place.law.k_1 + jnp.maximum(place.law.k_3, 0) * stretched * stretched
+    C = frame @ place.unit.compliance @ frame.T
+    known = jnp.isfinite(jnp.sum(C) + local) & (local > 0)
+    M = jnp.where(known, C + jnp.eye(3, dtype=C.dtype) / local, jnp.eye(3, dtype=C.dtype))
+    return M[1:, 0] / M[0, 0], solve_spd(M, normal)
+
+
+def as_approach(
+    scene: Scene, seat: Seat, way: Float[Array, "3"], here: Instant, inside: Bool[Array, "1"]
+) -> tuple[Poses, Approach]:
+    """One row for `simulation.follow`: the tool as it stands on its seat, and what it does."""
+    frame = local_frame(seat.phi)
+    now = jax.tree.map(lambda v: v[0], here.seen)
+    seen = dataclasses.replace(
+        now, gap=jnp.zeros_like(now.gap), point=seat.point, s=seat.s, phi=seat.phi,
+        status=seat.status,
+    )  # fmt: skip
+    made = Approach(
+        seen=jax.tree.map(lambda v: v[None], seen),
+        presses=Presses(seat.s[None], seat.phi[None], (way @ frame)[None]),
+        inward=frame[:1],
+        first=jnp.asarray(0),
+        frame=_axes(scene, seat.s)[None] if scene.plan.curved else None,
+        own=here.seen,
+        inside=inside,
+    )
+    return Poses(seat.rotation[None], seat.translation[None]), made
+
+
+def anchored(scene: Scene, seat: Seat, way: Float[Array, "3"], path: Poses) -> Seat:
+    """The seat that this way presses, with the tool where it is."""
+    press = _axes(scene, seat.s) @ (way @ local_frame(seat.phi))
+    return seat._replace(anchor=_at(_one(path), seat.body) - press)
+
+
+def _hold(scene: Scene, depth):
+    """Way along the surface that a seat holds at this depth, mm."""
+    x = scene.geometry.ring_positions
+    spacing = jnp.min(x[1:] - x[:-1]) if x.shape[0] > 1 else scene.geometry.length
+    return jnp.minimum(HOLD * depth, NEAR * spacing / 2)
+
+
+def _axes(scene: Scene, s):
+    """Tangent, anterior and lateral direction as columns."""
+    if scene.plan.curved and scene.tube is not None:
+        return frame_at(scene.tube.line, s)
+    return jnp.eye(3, dtype=s.dtype)
+
+
+def _one(path: Poses) -> Poses:
+    return jax.tree.map(lambda v: v[0], path)
+
+
+def _at(pose: Poses, body):
+    return pose.rotation @ body + pose.translation
+
+
+def _limit(most, value):
+    """Share of `value` that is `most`; 1 where it is less, 0 where nothing is allowed."""
+    over = value > most
+    return jnp.where(over, jnp.maximum(most, 0) / jnp.where(over, value, 1), 1)
+
+
+def _length(v):
+    return jnp.sqrt(jnp.sum(v * v))
+
+
+def _turned(matrix):
+    """The rotation next to a mean of two, by one Newton step of its polar form."""
+    return 1.5 * matrix - 0.5 * matrix @ matrix.T @ matrix
