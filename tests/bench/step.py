@@ -1,0 +1,97 @@
+"""Latency of a `Session` step: two versions of the package in one run, with an empty jitted call.
+
+    python step.py PACKAGE_FOLDER OTHER_PACKAGE_FOLDER      (tests/reference on PYTHONPATH)
+
+Each version runs in a process of its own; they work in turns, 100 steps each, an empty call after
+every step. A ball goes up and down on the tube, a little aslant: forces only, and with the deformed
+surface of the generated trachea (6,856 triangles, dent of 16). Medians and 99 % in us, and ratios.
+"""
+
+import os
+import subprocess
+import sys
+import time
+
+BLOCK, BLOCKS = 100, 100
+KINDS = "forces", "surface"
+
+
+def work(kind: str) -> None:
+    """Steps in blocks, one for each line that comes in."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    import jax.numpy as jnp
+    import numpy as np
+    from small_scenes import BALL, BARE, MATERIAL, OUTER, TUBE, ball
+
+    from jaxtrachea import Session, Wishes, make_scene
+    from jaxtrachea.trachea.tube import make_tube
+
+    how = {"seat": "first", "rings": "arch2", "axial": "on", "second_plane": "on"}
+    wishes = Wishes(**{**vars(BARE), **how, "want_surface": kind == "surface"})
+    mesh = make_tube(TUBE, around=36, along=160) if kind == "surface" else None
+    start = ball([75, 1, 0], [76, -2, 1])
+    scene = make_scene(TUBE, MATERIAL, start, tool=BALL, mesh=mesh, wishes=wishes)
+    session, empty, zero = Session(scene, MATERIAL), jax.jit(jnp.negative), jnp.zeros(())
+    turn, angle = np.eye(3), np.linspace(0, 2 * np.pi, BLOCK)
+    down = np.maximum(0, 1.5 - 2 * np.cos(angle))
+    way = np.stack([75 + 0.3 * down, OUTER + 5.5 - down, 0.2 * down], axis=1)
+
+    def timed(call, *arguments):
+        begin = time.perf_counter()
+        jax.block_until_ready(call(*arguments))
+        return time.perf_counter() - begin
+
+    timed(empty, zero)
+    print("ready", flush=True)
+    for line in sys.stdin:
+        taken = [(timed(session.step, turn, p), timed(empty, zero)) for p in way]
+        print(" ".join(f"{v:.3e}" for pair in taken for v in pair), flush=True)
+        if line.strip() == "last":
+            break
+
+
+def main(folders: list[str]) -> None:
+    import numpy as np
+
+    for kind in KINDS:
+        running = []
+        for folder in folders:
+            path = os.pathsep.join([folder, os.environ["PYTHONPATH"]])
+            running.append(
+                subprocess.Popen(
+                    [sys.executable, __file__, "--work", kind], text=True, stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE, env=os.environ | {"PYTHONPATH": path},
+                )
+            )  # fmt: skip
+        for one in running:
+            assert one.stdout is not None
+            assert one.stdout.readline() == "ready\n", "a worker failed"
+        taken = [[] for _ in folders]
+        for block in range(BLOCKS):
+            for one, times in zip(running, taken, strict=True):
+                assert one.stdin is not None
+                assert one.stdout is not None
+                one.stdin.write("last\n" if block == BLOCKS - 1 else "go\n")
+                one.stdin.flush()
+                times += map(float, one.stdout.readline().split())
+        for one in running:
+            one.wait()
+        medians = []
+        for folder, times in zip(folders, taken, strict=True):
+            step, empty = 1e6 * np.array(times).reshape(-1, 2).T
+            medians.append(np.median(step))
+            print(
+                f"{kind}: {folder}: {len(step)} steps, median {np.median(step):.0f} us, 99 % "
+                f"{np.quantile(step, 0.99):.0f}; empty call {np.median(empty):.1f}, 99 % "
+                f"{np.quantile(empty, 0.99):.1f}"
+            )
+        print(f"{kind}: second over first {medians[1] / medians[0]:.3f}", flush=True)
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "--work":
+        work(sys.argv[2])
+    else:
+        main(sys.argv[1:])
