@@ -89,7 +89,7 @@ def grasp(scene: Scene, here: Instant) -> Seat:
     path, seen = jax.tree.map(lambda v: v[0], tuple(here))
     pose = Pose(path.rotation, path.translation)
     body = transform(inverse(pose), seen.tool_point[:, None])[:, 0]
-    lift = seen.gap * (_axes(scene, seen.s) @ local_frame(seen.phi)[0])
+    lift = seen.gap * _to_mesh(scene, seen.s, local_frame(seen.phi)[0])
     return Seat(
         s=seen.s,
         phi=seen.phi,
@@ -106,18 +106,15 @@ def arrive(scene: Scene, before: Instant, here: Instant) -> Seat:
     """The seat of a first touch: the way along the surface since then counts."""
     seat = grasp(scene, here)
     both = jax.tree.map(lambda v, w: jnp.concatenate([v, w]), tuple(before), tuple(here))
-    axes = _axes(scene, seat.s)
-    inward = local_frame(seat.phi)[0]
-    way = followed(*both, jnp.asarray(1), inward, axes if scene.plan.curved else None)[1]
-    return seat._replace(anchor=_at(_one(here.path), seat.body) - axes @ way)
+    frame = local_frame(seat.phi)
+    way = followed(*both, jnp.asarray(1), frame[0], _axes(scene, seat.s))[1]
+    return anchored(scene, seat, _times(frame, way), here.path)
 
 
 def left(scene: Scene, seat: Seat, before: Instant, here: Instant) -> Bool[Array, ""]:
     """Whether the tool went further along the tube in this step than its dent is wide."""
-    inward = _axes(scene, seat.s) @ local_frame(seat.phi)[0]
-    way = _at(_one(here.path), seat.body) - _at(_one(before.path), seat.body)
-    way = way - jnp.dot(way, inward) * inward
-    return _length(way) > scene.footprint + jnp.maximum(-here.seen.gap[0], 0)
+    way = way_of(scene, seat, here.path) - way_of(scene, seat, before.path)
+    return _length(way[1:]) > scene.footprint + jnp.maximum(-here.seen.gap[0], 0)
 
 
 def drawn(scene: Scene, seat: Seat, here: Instant) -> Seat:
@@ -157,7 +154,8 @@ def place_of(scene: Scene, material: Material, seat: Seat) -> Place | None:
 def way_of(scene: Scene, seat: Seat, path: Poses) -> Float[Array, "3"]:
     """How far the tool has pressed its seat, mm: along (inward, tangent, round the tube)."""
     way = _at(_one(path), seat.body) - seat.anchor
-    return local_frame(seat.phi) @ (way @ _axes(scene, seat.s))
+    axes = _axes(scene, seat.s)
+    return _times(local_frame(seat.phi), way if axes is None else _times(axes.T, way))
 
 
 def given_way(
@@ -178,12 +176,12 @@ def given_way(
     centre = jnp.concatenate([depth[None], across])
     off = way - centre
     # |across + share off_t| = hold
-    b = jnp.dot(across, off[1:])
-    c = hold * hold - jnp.dot(across, across)
-    root = b + jnp.sqrt(b * b + jnp.dot(off[1:], off[1:]) * c)
+    b = jnp.sum(across * off[1:])
+    c = hold * hold - jnp.sum(across * across)
+    root = b + jnp.sqrt(b * b + jnp.sum(off[1:] * off[1:]) * c)
     share = jnp.minimum(_limit(c, root), _limit(APART * depth, jnp.abs(off[0])))
-    pull = (1 - LEAST) * jnp.dot(row, centre)
-    share = jnp.minimum(share, _limit(pull, -jnp.dot(row, off)))
+    pull = (1 - LEAST) * jnp.sum(row * centre)
+    share = jnp.minimum(share, _limit(pull, -jnp.sum(row * off)))
     return centre + share * off
 
 
@@ -210,7 +208,7 @@ def as_approach(
     scene: Scene, seat: Seat, way: Float[Array, "3"], here: Instant, inside: Bool[Array, "1"]
 ) -> tuple[Poses, Approach]:
     """One row for `simulation.follow`: the tool as it stands on its seat, and what it does."""
-    frame = local_frame(seat.phi)
+    frame, axes = local_frame(seat.phi), _axes(scene, seat.s)
     now = jax.tree.map(lambda v: v[0], here.seen)
     seen = dataclasses.replace(
         now, gap=jnp.zeros_like(now.gap), point=seat.point, s=seat.s, phi=seat.phi,
@@ -218,10 +216,10 @@ def as_approach(
     )  # fmt: skip
     made = Approach(
         seen=jax.tree.map(lambda v: v[None], seen),
-        presses=Presses(seat.s[None], seat.phi[None], (way @ frame)[None]),
+        presses=Presses(seat.s[None], seat.phi[None], _times(frame.T, way)[None]),
         inward=frame[:1],
         first=jnp.asarray(0),
-        frame=_axes(scene, seat.s)[None] if scene.plan.curved else None,
+        frame=None if axes is None else axes[None],
         own=here.seen,
         inside=inside,
     )
@@ -230,7 +228,7 @@ def as_approach(
 
 def anchored(scene: Scene, seat: Seat, way: Float[Array, "3"], path: Poses) -> Seat:
     """The seat that this way presses, with the tool where it is."""
-    press = _axes(scene, seat.s) @ (way @ local_frame(seat.phi))
+    press = _to_mesh(scene, seat.s, _times(local_frame(seat.phi).T, way))
     return seat._replace(anchor=_at(_one(path), seat.body) - press)
 
 
@@ -241,11 +239,21 @@ def _hold(scene: Scene, depth):
     return jnp.minimum(HOLD * depth, NEAR * spacing / 2)
 
 
-def _axes(scene: Scene, s):
-    """Tangent, anterior and lateral direction as columns."""
+def _axes(scene: Scene, s) -> Float[Array, "3 3"] | None:
+    """Tangent, anterior and lateral direction as columns; None where the tube is straight."""
     if scene.plan.curved and scene.tube is not None:
         return frame_at(scene.tube.line, s)
-    return jnp.eye(3, dtype=s.dtype)
+    return None
+
+
+def _to_mesh(scene: Scene, s, vector):
+    axes = _axes(scene, s)
+    return vector if axes is None else _times(axes, vector)
+
+
+def _times(matrix, vector):
+    """Their product; for 3 numbers a sum is quicker than a call of a library."""
+    return jnp.sum(matrix * vector[None], axis=1)
 
 
 def _one(path: Poses) -> Poses:
@@ -253,7 +261,7 @@ def _one(path: Poses) -> Poses:
 
 
 def _at(pose: Poses, body):
-    return pose.rotation @ body + pose.translation
+    return _times(pose.rotation, body) + pose.translation
 
 
 def _limit(most, value):

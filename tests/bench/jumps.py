@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from small_scenes import BALL, BARE, MATERIAL, OUTER, TUBE, ball
-from tool_ways import Way, closed_loop, random_way, steps_between
+from tool_ways import Way, closed_loop, random_way, step_lengths
 
 from jaxtrachea import Presses, Session, make_scene, simulate
 from jaxtrachea.status import PressStatus
@@ -53,7 +53,7 @@ def ratios(force, gap, way: Way) -> np.ndarray:
     """Jumps over stiffness times step, from each finite pose to the next; inf to or from NaN."""
     good = np.isfinite(way.translation).all(axis=1)
     force, gap = force[good], gap[good]
-    step = steps_between(Way(way.rotation[good], way.translation[good]))
+    step = step_lengths(way.translation[good], way.rotation[good])
     jump = np.linalg.norm(np.diff(force, axis=0), axis=1)
     depth = np.maximum(-np.minimum(gap[1:], gap[:-1]), 0)
     ratio = jump / ((K_1 + 3 * K_3 * depth**2) * np.maximum(step, 1e-9))
@@ -70,7 +70,8 @@ def run_session(name: str) -> None:
     counts = {PressStatus(k).name: int((status == k).sum()) for k in np.unique(status)}
     print(f"{name}: {counts}; poses not finite {int((~good).sum())}")
     print(f"  no force at a finite pose: {int(lost.sum())}")
-    print(f"  largest jump over stiffness x step {finite.max():.3g}, 99 % {np.quantile(finite, 0.99):.3g}")
+    high = finite.max(), np.quantile(finite, 0.99)
+    print(f"  jump over stiffness x step: largest {high[0]:.3g}, 99 % {high[1]:.3g}")
     print(f"  above 1: {int((finite > 1).sum())}, above 2: {int((finite > 2).sum())}")
     np.savez(f"{name}_session.npz", ratio=ratio, force=force, gap=gap, status=status)
 
@@ -89,9 +90,10 @@ def run_loops(name: str) -> None:
             moved = np.nansum(np.maximum(part, 0))
         rows.append([*work, moved])
     rows = np.array(rows)
-    print(f"{name}: work over {LOOPS} closed loops, N mm: least {rows[:, 1].min():.4g} "
-          f"(400 steps {rows[:, 0].min():.4g}), median {np.median(rows[:, 1]):.3g}, "
-          f"most put in {rows[:, 2].max():.3g}; below zero {int((rows[:, 1] < 0).sum())}")  # fmt: skip
+    less, work, put_in = rows.T
+    print(f"{name}: work over {LOOPS} closed loops, N mm: least {work.min():.4g} (400 steps: "
+          f"{less.min():.4g}), below zero {int((work < 0).sum())}, median {np.median(work):.3g}; "
+          f"put in at most {put_in.max():.3g}")  # fmt: skip
     np.savez(f"{name}_loops.npz", rows=rows)
 
 
@@ -116,8 +118,8 @@ def run_scan(name: str) -> None:
         jump = np.linalg.norm(np.diff(force, axis=0), axis=1)
         ratio = jump / ((K_1 + 12 * K_3) * length)
         size = np.linalg.norm(force, axis=1)
-        print(f"{name}: against {label}: force {size.min():.4f} to {size.max():.4f} N, "
-              f"largest jump {jump.max():.3g} N, over stiffness x step {ratio.max():.3g}")  # fmt: skip
+        print(f"{name}: against {label}: {size.min():.4f} to {size.max():.4f} N, largest jump "
+              f"{jump.max():.3g} N, over stiffness x step {ratio.max():.3g}")  # fmt: skip
         out |= {label: at, f"force_{label}": size}
     np.savez(f"{name}_scan.npz", **out)
 

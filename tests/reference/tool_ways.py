@@ -13,7 +13,7 @@ RADIUS = 5.0
 
 
 class Way(NamedTuple):
-    """Poses in order, and how far each is from the last good one.
+    """Poses in order.
 
     Attributes:
         rotation: shape (poses, 3, 3).
@@ -92,18 +92,17 @@ def closed_loop(seed: int, steps: int, outer: float) -> np.ndarray:
     waves = np.arange(1, 4)[:, None]
     a, b = rng.normal(size=(2, 3, 3)) / np.arange(1, 4)
     wave = a @ np.sin(waves * t) + b @ (np.cos(waves * t) - 1)
-    size = np.array([rng.uniform(0.5, 4), rng.uniform(0.5, 4) / outer, 0.5])
-    depth = (1 - np.cos(t)) * rng.uniform(0.4, 2) - 0.3
-    mid = np.array([rng.uniform(30, 130), rng.uniform(-0.9, 0.9), 0])
+    size = np.array([rng.uniform(0.5, 4), rng.uniform(0.5, 2.5) / outer, 0.2])
+    depth = (1 - np.cos(t)) * rng.uniform(0.4, 1.7) - 0.3
+    mid = np.array([rng.uniform(30, 130), rng.uniform(-0.6, 0.6), 0])
     places = mid + (size[:, None] * wave).T
     places[:, 2] = depth * np.exp(places[:, 2])
     return placed(places, outer)
 
 
-def steps_between(way: Way) -> np.ndarray:
-    """Largest motion of a point of the ball since the last finite pose, mm; shape (poses - 1,).
-
-    NaN from and to a pose that is not finite is left out: those entries count from the one before.
-    """
-    turned = np.linalg.norm(np.diff(way.rotation, axis=0), axis=(1, 2)) / np.sqrt(2)
-    return np.linalg.norm(np.diff(way.translation, axis=0), axis=1) + RADIUS * turned
+def step_lengths(translation: np.ndarray, rotation: np.ndarray | None = None) -> np.ndarray:
+    """Largest motion of a point of the ball from pose to pose, mm; shape (poses - 1,)."""
+    size = np.linalg.norm(np.diff(translation, axis=0), axis=1)
+    if rotation is not None:
+        size += RADIUS * np.linalg.norm(np.diff(rotation, axis=0), axis=(1, 2)) / np.sqrt(2)
+    return size

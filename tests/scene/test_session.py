@@ -1,17 +1,37 @@
 """Steps of a session are rows of the simulation of their path."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_scenes import BALL, BARE, DOWN, MATERIAL, MESH, OUTER, TUBE, ball, bend, on_arc, poses
+from small_scenes import (
+    BALL,
+    BARE,
+    DOWN,
+    MATERIAL,
+    MESH,
+    OUTER,
+    SPRINGS,
+    TUBE,
+    ball,
+    bend,
+    on_arc,
+    poses,
+)
+from tool_ways import closed_loop, placed, random_way, step_lengths
 
-from jaxtrachea import Poses, Session, Wishes, make_scene, press, simulate
+from jaxtrachea import Poses, Session, Wishes, make_scene, press, press_oblique, simulate
 from jaxtrachea.status import PressStatus
 
 EYE = np.eye(3)
+OK, NO_CONTACT, NON_FINITE = PressStatus.OK, PressStatus.NO_CONTACT, PressStatus.NON_FINITE
+#: Every effect of a press that holds its place, forces only.
+HELD = dataclasses.replace(
+    BARE, seat="first", axial="on", second_plane="on", want_joints=False, want_ring_ends=False
+)
 # Comes down slanting, presses, and goes on along the tube, still in contact: s, height, z.
 WAY = np.array([[72, 3, 0], [73, 1, 0], [74, -1, 0], [74.5, -3, 0], [75, -4, 0.2], [74, -2, 0]])
 
@@ -60,10 +80,10 @@ def test_it_lets_go_and_touches_elsewhere():
     """Two presses with a way through the air between: each is a normal press where it stands."""
     path = ball([40, 1, 0], [40, -2, 0], rows=4), ball([90, 1, 0], [90, -3, 0], rows=5)
     wishes = dataclasses.replace(BARE, seat="first")
-    session = Session(make_scene(TUBE, MATERIAL, path[0], tool=BALL, wishes=wishes), MATERIAL)
+    session = Session(make_scene(TUBE, SPRINGS, path[0], tool=BALL, wishes=wishes), SPRINGS)
     for one, s, depth in zip(path, (40.0, 90.0), (2.0, 3.0), strict=True):
         last = rows(session, one)[-1]
-        known = press(TUBE, MATERIAL, jnp.asarray(s), jnp.asarray(depth))
+        known = press(TUBE, SPRINGS, jnp.asarray(s), jnp.asarray(depth))
         # The smoothed contact sees the ball a little early.
         np.testing.assert_allclose(-last.force[1], known.force, rtol=0.02)
         np.testing.assert_allclose(last.s, s, atol=0.2)
@@ -89,19 +109,182 @@ def test_nothing_is_compiled_or_allocated_by_a_step():
     assert 0 < told.median <= told.p99 <= told.worst < 10
 
 
-def test_float32_and_states_by_status():
-    tube, material, tool = jax.tree.map(lambda v: v.astype(np.float32), (TUBE, MATERIAL, BALL))
-    start = jax.tree.map(lambda v: v.astype(np.float32), ball([75, 1, 0], [75, -2, 0]))
-    session = Session(make_scene(tube, material, start, tool=tool, wishes=BARE), material)
-    step = session.step(EYE, [163, OUTER + 3, 0])
-    assert step.force.dtype == np.float32
+@pytest.fixture(scope="module", params=["float32", pytest.param("float64", marks=pytest.mark.slow)])
+def held(request):
+    """A session of a ball that holds its place; as float32 it is compiled for all tests here."""
+    cast = lambda tree: jax.tree.map(lambda v: v.astype(request.param), tree)  # noqa: E731
+    tube, material, tool = cast((TUBE, MATERIAL, BALL))
+    start = cast(ball([75, 1, 0], [76, -2, 0]))
+    return Session(make_scene(tube, material, start, tool=tool, wishes=HELD), material)
+
+
+def led(session, places, rotation=None):
+    """Forces, gaps, statuses and s along (s, phi, depth) of the ball's lowest point; afresh."""
+    session.reset()
+    centres = placed(places, OUTER)
+    turns = np.broadcast_to(EYE, (len(centres), 3, 3)) if rotation is None else rotation
+    return stepped(session, turns, centres)
+
+
+def stepped(session, rotation, translation):
+    found = [
+        (np.array(v.force, float), float(v.gap), int(v.status), float(v.s))
+        for v in map(session.step, rotation, translation)
+    ]
+    return tuple(np.array(v) for v in zip(*found, strict=True))
+
+
+def line(*corners, step=0.02):
+    """Places from corner to corner (s, phi, depth), `step` mm apart."""
+    rows = [np.asarray(corners[0], float)[None]]
+    for a, b in zip(corners, corners[1:], strict=False):
+        a, b = np.asarray(a, float), np.asarray(b, float)
+        count = int(np.ceil(np.linalg.norm((b - a) * [1, OUTER, 1]) / step))
+        rows.append(a + np.linspace(0, 1, count + 1)[1:, None] * (b - a))
+    return np.concatenate(rows)
+
+
+def check_jumps(force, gap, lengths):
+    """Each is below the stiffest tangent of the local law times the step (with its rounding)."""
+    assert np.isfinite(force).all()
+    jump = np.linalg.norm(np.diff(force, axis=0), axis=1)
+    depth = np.maximum(-np.minimum(gap[1:], gap[:-1]), 0)
+    stiffness = float(MATERIAL.k_1) + 3 * float(MATERIAL.k_3) * depth**2
+    assert (jump <= stiffness * (lengths + 1e-4)).all(), (jump / lengths).max()
+
+
+def test_float32_and_states_by_status(held):
+    held.reset()
+    step = held.step(EYE, [163, OUTER + 3, 0])
+    assert step.force.dtype == held.dtype
     assert step.status == PressStatus.OFF_TUBE
-    # It stays on the place beyond the end until it leaves the tube: dragged from there, no answer.
-    assert np.isnan(session.step(EYE, [75, OUTER + 3, 0]).force[1])
-    assert session.step(EYE, [75, OUTER + 6, 0]).force.tolist() == [0, 0, 0]
-    step = session.step(EYE, [75, OUTER + 3, 0])
-    assert step.status == PressStatus.OK
+    # It has left its seat beyond the end: it was dragged from there, without an answer.
+    step = held.step(EYE, [75, OUTER + 3, 0])
+    assert step.status == OK
     assert step.force[1] < -0.1
+    assert held.step(EYE, [75, OUTER + 6, 0]).force.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("by", [(3.0, 0.0), (0.0, 0.3), (-2.0, -0.2)])
+def test_force_ends_where_the_tool_leaves(held, by):
+    """Led along the surface and lifted: it fell to 0 within one step, at a gap of -0.2 mm."""
+    s, phi = 75 + by[0], by[1]
+    places = line([75, 0, -0.5], [75, 0, 2.0], [s, phi, 2.0], [s, phi, 0.1], [s + 1, phi, -0.5])
+    force, gap, status, _ = led(held, places)
+    assert np.linalg.norm(force, axis=1).max() > 0.1
+    np.testing.assert_array_equal(status, np.where(gap < 0, OK, NO_CONTACT))
+    check_jumps(force, gap, step_lengths(placed(places, OUTER)))
+
+
+def test_no_seat_pulls(held):
+    """Round the tube at 60 degrees: the seat would have to be pulled, NaN in mid-touch."""
+    places = line([75, 1.0, -0.2], [75, 1.0, 1.0], [75, 1.3, 1.0], [75, 0.7, 1.0], [75, 0.7, -0.2])
+    force, gap, status, _ = led(held, places)
+    np.testing.assert_array_equal(status, np.where(gap < 0, OK, NO_CONTACT))
+    inward = np.array([0, -np.cos(1.0), -np.sin(1.0)])
+    assert (force[gap < -0.5] @ inward > 0).all()
+    check_jumps(force, gap, step_lengths(placed(places, OUTER)))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_bad_pose_costs_itself_only(held, bad):
+    """All steps after it were NON_FINITE until lift-off."""
+    places = line([75, 0.2, -0.2], [75, 0.2, 1.5], [76, 0.2, 1.5], [76, 0.2, -0.2], step=0.1)
+    known = led(held, places)
+    held.reset()
+    for at, (place, *expected) in enumerate(zip(placed(places, OUTER), *known, strict=True)):
+        if at % 7 == 3:
+            wrong = (EYE * bad, place) if at % 2 else (EYE, place + [0, bad, 0])
+            step = held.step(*wrong)
+            assert step.status == NON_FINITE
+            assert np.isnan(step.force).all()
+        step = held.step(EYE, place)
+        np.testing.assert_array_equal(np.array(step.force), expected[0])
+        assert int(step.status) == expected[2]
+
+
+def test_a_jump_grasps_anew(held):
+    """The old seat was dragged along: 1.7 N along the tube, with OK, until the tool was lifted."""
+    jump = np.concatenate([line([75, 0, -0.5], [75, 0, 2.0], step=0.1), [[95, 0, 2.0]]])
+    force, gap, status, s = led(held, jump)
+    afresh = led(held, line([95, 0, -0.5], [95, 0, 2.0], step=0.1))
+    assert status[-1] == OK
+    np.testing.assert_allclose(force[-1], afresh[0][-1], atol=2e-5)
+    np.testing.assert_allclose(s[-1], 95, atol=0.01)
+
+
+@pytest.mark.slow
+def test_a_fresh_seat_is_pressed_straight_in(held):
+    """After a jump round the tube as well: the force of a single press there."""
+    single = jax.jit(partial(press_oblique, TUBE, MATERIAL, rings="arch2"))
+    force, gap, _, s = led(held, [[75, 0, -0.5], [75, 0, 2.0], [75, 0.8, 2.0], [75, -0.4, 2.0]])
+    for at, phi in ((2, 0.8), (3, -0.4)):
+        D = gap[at] * np.array([0, np.cos(phi), np.sin(phi)])
+        known = single(s_c=s[at], phi_c=phi, displacement=D).force
+        np.testing.assert_allclose(force[at], known, rtol=1e-3, atol=1e-4)
+
+
+def test_a_seat_follows_the_tool(held):
+    """Led 20 mm along the tube: its place is never further behind than the tool is deep."""
+    places = line([75, 0, -0.5], [75, 0, 2.0], [95, 0, 2.0], step=0.1)
+    force, gap, status, s = led(held, places)
+    touching = gap < 0
+    assert (status[touching] == OK).all()
+    assert (np.abs(s - places[:, 0])[touching] < np.maximum(-gap[touching], 0) + 0.02).all()
+    assert force[-1, 0] > 0.05  # it drags the tube along
+    # To and fro, without a step: the same pose, the same force.
+    again = stepped(held, EYE[None].repeat(3, 0), placed(places[-1:].repeat(3, 0), OUTER))[0]
+    np.testing.assert_allclose(again, force[-1:].repeat(3, 0), atol=2e-6)
+
+
+def check_way(session, count, seed):
+    """No jumps along a mixed way, and statuses by what the tool does."""
+    session.reset()
+    way = random_way(count, OUTER, seed)
+    force, gap, status, _ = stepped(session, *way)
+    good = np.isfinite(way.translation).all(axis=1)
+    np.testing.assert_array_equal(status[~good], NON_FINITE)
+    np.testing.assert_array_equal(status[good], np.where(gap < 0, OK, NO_CONTACT)[good])
+    check_jumps(force[good], gap[good], step_lengths(way.translation[good], way.rotation[good]))
+    return status
+
+
+def check_loop(session, seed, steps):
+    """Work over a closed loop is not negative, but for the trapezoidal rule."""
+    centres = closed_loop(seed, steps, OUTER)
+    session.reset()
+    force, gap, *_ = stepped(session, np.broadcast_to(EYE, (steps + 1, 3, 3)), centres)
+    assert gap[0] > 0 > gap.min()
+    work = np.sum((force[1:] + force[:-1]) / 2 * np.diff(centres, axis=0), axis=1)
+    assert work.sum() > -1e-5 * np.abs(work).sum()
+
+
+def test_force_is_continuous_along_a_way(held):
+    assert (np.bincount(check_way(held, 700, 1))[:2] > 50).all()
+    for seed in range(3):
+        check_loop(held, seed, 200)
+
+
+@pytest.mark.slow
+def test_force_is_continuous_along_many_ways(held):
+    assert NON_FINITE in check_way(held, 5000, 0)
+    for seed in range(40):
+        check_loop(held, seed, 400)
+
+
+@pytest.mark.slow
+def test_a_bonded_tool_holds_its_first_place():
+    """It pulled the tube before it had touched."""
+    path = ball([75, 1, 0], [78, -2, 0], 5)
+    path = Poses(*(jnp.concatenate([v, v[::-1]]) for v in (path.rotation, path.translation)))
+    scene = make_scene(
+        TUBE, MATERIAL, path, tool=BALL, wishes=dataclasses.replace(HELD, contact="bonded")
+    )
+    whole = jax.jit(simulate)(scene, MATERIAL, path)
+    force, _, status, _ = stepped(Session(scene, MATERIAL), path.rotation, path.translation)
+    np.testing.assert_allclose(force, whole.force, atol=1e-9)
+    np.testing.assert_array_equal(status, whole.status)
+    assert force[-1, 1] > 0.01  # drawn
 
 
 def test_refusals():
