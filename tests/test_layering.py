@@ -47,6 +47,7 @@ SCENE = [
     {"approach", "trail"},
     {"deform"},
     {"simulation"},
+    {"seat"},
     {"session"},
     {"build", "results"},
     {"plots"},

@@ -194,7 +194,7 @@ def test_a_bad_pose_costs_itself_only(held, bad):
     held.reset()
     for at, (place, *expected) in enumerate(zip(placed(places, OUTER), *known, strict=True)):
         if at % 7 == 3:
-            wrong = (EYE * bad, place) if at % 2 else (EYE, place + [0, bad, 0])
+            wrong = (EYE + bad, place) if at % 2 else (EYE, place + [0, bad, 0])
             step = held.step(*wrong)
             assert step.status == NON_FINITE
             assert np.isnan(step.force).all()
@@ -225,12 +225,15 @@ def test_a_fresh_seat_is_pressed_straight_in(held):
 
 
 def test_a_seat_follows_the_tool(held):
-    """Led 20 mm along the tube: its place is never further behind than the tool is deep."""
+    """Led 20 mm along the tube: its place is never further behind than the tool is deep.
+
+    Where two patches of the tube meet, the contact itself lies up to 0.036 mm beside the ball.
+    """
     places = line([75, 0, -0.5], [75, 0, 2.0], [95, 0, 2.0], step=0.1)
     force, gap, status, s = led(held, places)
     touching = gap < 0
     assert (status[touching] == OK).all()
-    assert (np.abs(s - places[:, 0])[touching] < np.maximum(-gap[touching], 0) + 0.02).all()
+    assert (np.abs(s - places[:, 0])[touching] < np.maximum(-gap[touching], 0) + 0.05).all()
     assert force[-1, 0] > 0.05  # it drags the tube along
     # To and fro, without a step: the same pose, the same force.
     again = stepped(held, EYE[None].repeat(3, 0), placed(places[-1:].repeat(3, 0), OUTER))[0]
