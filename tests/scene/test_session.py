@@ -24,6 +24,9 @@ from small_scenes import (
 from tool_ways import closed_loop, placed, random_way, step_lengths
 
 from jaxtrachea import Poses, Session, Wishes, make_scene, press, press_oblique, simulate
+from jaxtrachea.oblique import place_at
+from jaxtrachea.scene.seat import given_way
+from jaxtrachea.skeleton import local_frame
 from jaxtrachea.status import PressStatus
 
 EYE = np.eye(3)
@@ -238,6 +241,37 @@ def test_a_seat_follows_the_tool(held):
     # To and fro, without a step: the same pose, the same force.
     again = stepped(held, EYE[None].repeat(3, 0), placed(places[-1:].repeat(3, 0), OUTER))[0]
     np.testing.assert_allclose(again, force[-1:].repeat(3, 0), atol=2e-6)
+
+
+def test_what_gives_way_only_loses_energy(held):
+    """On stiff rings at 68 degrees, by numpy: no pull, less energy, and the same if repeated."""
+    own = {"k_M": 10.0, "k_1": 30.0, "k_3": 0.0}
+    stiff = dataclasses.replace(MATERIAL, **{k: jnp.asarray(v) for k, v in own.items()})
+    scene = dataclasses.replace(held.scene, geometry=TUBE)
+    way = np.random.default_rng(0).normal(size=(2000, 3)) * [2, 6, 6] + [2, 0, 0]
+
+    @jax.jit
+    def give(ways):
+        options = scene.plan.options
+        place = place_at(TUBE, stiff, 72.0, 1.19, options, rings="arch2", axial=True)
+        one = lambda way: given_way(scene, way, jnp.asarray(2.0), place)  # noqa: E731
+        once = jax.vmap(one)(ways)
+        return once, jax.vmap(one)(once), place.unit.compliance
+
+    once, twice, C = give(way)
+    frame = np.array(local_frame(jnp.asarray(1.19)))
+    stiffness = np.linalg.inv(frame @ C @ frame.T + np.eye(3) / 30)
+    energy = lambda e: np.einsum("ai,ij,aj->a", e, stiffness, e) / 2  # noqa: E731
+    moved = np.abs(once - way).max(axis=1) > 1e-9
+    assert 0.5 < moved.mean() < 1
+    np.testing.assert_allclose(twice, once, atol=1e-9)
+    assert (np.linalg.norm(once[:, 1:], axis=1) < 2 + 1e-9).all()
+    assert (np.abs(once[:, 0] - 2) < 1 + 1e-9).all()
+    force = once @ stiffness
+    assert (force[:, 0] > 0).all()
+    assert ((way @ stiffness)[:, 0] < 0).mean() > 0.2  # they would have to be pulled
+    deep = way[:, 0] > 2  # less deep they go on in, by the tool's own depth
+    assert (energy(once) <= energy(way) + 1e-9)[deep].all()
 
 
 def check_way(session, count, seed):
