@@ -1,21 +1,19 @@
 r"""The place of the tube that a tool holds from step to step, and how that place gives way.
 
-While the gap g of the undeformed tube is negative the tool is on the tube, pressed in by
-delta = -g. It holds the place that it touched first: with the way w that its body point there has
-gone since, that place presses by e = w, as in `simulate`. The seat gives way where
+While the gap of the undeformed tube is negative the tool is on the tube, pressed in by
+delta = -gap. It holds the place that it touched first: the way that its body point there has gone
+since is the press e of that place, as in `simulate`. The seat gives way where
 
-    |e_t| > delta      (`HOLD`: it went further along the surface than in),
-    |e_n - delta| > delta / 2     (`APART`: turned or led off, it presses elsewhere), or
-    F_n < 0.1 F_n0     (`LEAST`: the seat alone would have to be pulled),
+    |e_t| > delta               it went further along the surface than in (`HOLD`),
+    |e_n - delta| > delta / 2   turned or led off, it presses elsewhere (`APART`), or
+    F_n < 0.1 F_n0              the place would have to be pulled (`LEAST`),
 
-by sliding: e moves on the straight line towards the press e_0 = delta (n + u) that has no
-tangential force (u from the skeleton, F_n0 its force), no further than to the border of these. The
-place follows the tool's contact at a distance of at most delta. Both borders close at delta = 0: so
-force is continuous in the pose, and 0 where the tool leaves the tube. A pose that comes again
-changes nothing. e_0 has the least energy of all e with its normal part, so that sliding takes
-energy out, as friction of about 45 degrees does; `tests/scene/test_session.py` holds the work over
-closed loops against 0. What sliding gains where the skeleton is stiffer at the new place is less
-than that as long as the deformed wall is inclined by less than 45 degrees.
+by sliding: e moves straight towards the press delta n that goes straight in (of force F_0), as far
+as to the border of these. The place follows the tool's contact at a distance of at most delta. Both
+close in at delta = 0: so force is continuous in the pose, and 0 where the tool leaves the tube; the
+same pose again changes nothing. Sliding takes energy out, as friction of 45 degrees does, as long
+as the deformed wall is inclined by less than that at the contact, and a place pushed inwards would
+go less far aside than in: then the work over closed loops of the tool is not negative.
 
 A tool that goes further along the tube in one step than its dent is wide has left its seat: it
 grasps anew where it is. A glued tool (`bonded`) holds its first place whatever it does.
@@ -43,10 +41,8 @@ from jaxtrachea.trachea.material import Material
 HOLD = 1.0
 #: Largest difference of the seat's press and the tool's depth, over the depth.
 APART = 0.5
-#: Least normal force, over that of the press without tangential force.
+#: Least normal force, over that of a press straight in.
 LEAST = 0.1
-#: Place of that press: at most this share of the way to the border of `HOLD`.
-CENTRAL = 0.8
 #: Share of half a ring spacing that a seat holds at most: beyond it one place does not serve.
 NEAR = 0.99
 #: Length of the press over the depth, at most: with it the local law is at its stiffest.
@@ -169,39 +165,31 @@ def given_way(
         depth: -gap of the tool, mm; positive.
         place: the skeleton at the seat.
     """
-    hold = _hold(scene, depth)
-    across, row = _softest(scene, depth, place)
-    across = depth * across
-    across = across * _limit(CENTRAL * hold, _length(across))
-    centre = jnp.concatenate([depth[None], across])
-    off = way - centre
-    # |across + share off_t| = hold
-    b = jnp.sum(across * off[1:])
-    c = hold * hold - jnp.sum(across * across)
-    root = b + jnp.sqrt(b * b + jnp.sum(off[1:] * off[1:]) * c)
-    share = jnp.minimum(_limit(c, root), _limit(APART * depth, jnp.abs(off[0])))
-    pull = (1 - LEAST) * jnp.sum(row * centre)
-    share = jnp.minimum(share, _limit(pull, -jnp.sum(row * off)))
-    return centre + share * off
+    off = way - depth * jnp.eye(3, dtype=way.dtype)[0]
+    share = _limit(_hold(scene, depth), _length(off[1:]))
+    share = jnp.minimum(share, _limit(APART * depth, jnp.abs(off[0])))
+    row = _stiffness(scene, depth, place)
+    if row is not None:
+        share = jnp.minimum(share, _limit((1 - LEAST) * depth * row[0], -jnp.sum(row * off)))
+    return way - (1 - share) * off
 
 
-def _softest(scene: Scene, depth, place: Place | None):
-    """Softest way along the surface, per depth, and the row of the stiffness for the normal force.
+def _stiffness(scene: Scene, depth, place: Place | None) -> Float[Array, "3"] | None:
+    """Normal force per press along (inward, tangent, round the tube), N/mm.
 
-    Only rings as arches in two planes couple the normal with another direction.
+    None where a press along the surface makes none: only rings as arches in two planes couple them.
+    The local law is taken at its stiffest, where they are coupled most.
     """
     plan = scene.plan
-    zero = jnp.zeros_like(depth)
-    normal = jnp.stack([zero + 1, zero, zero])
     if place is None or plan.rings != "arch2" or plan.options.coupling != "series":
-        return normal[1:], normal
+        return None
     frame = local_frame(place.phi_c)
     stretched = STRETCHED * depth
     local = place.law.k_1 + jnp.maximum(place.law.k_3, 0) * stretched * stretched
     C = frame @ place.unit.compliance @ frame.T
+    one = jnp.eye(3, dtype=C.dtype)
     known = jnp.isfinite(jnp.sum(C) + local) & (local > 0)
-    M = jnp.where(known, C + jnp.eye(3, dtype=C.dtype) / local, jnp.eye(3, dtype=C.dtype))
-    return M[1:, 0] / M[0, 0], solve_spd(M, normal)
+    return solve_spd(jnp.where(known, C + one / jnp.where(known, local, 1), one), one[0])
 
 
 def as_approach(

@@ -244,22 +244,23 @@ def test_a_seat_follows_the_tool(held):
 
 
 def test_what_gives_way_only_loses_energy(held):
-    """On stiff rings at 68 degrees, by numpy: no pull, less energy, and the same if repeated."""
+    """Stiff rings at 57 degrees, by numpy: no pull, less energy, the same again."""
     own = {"k_M": 10.0, "k_1": 30.0, "k_3": 0.0}
     stiff = dataclasses.replace(MATERIAL, **{k: jnp.asarray(v) for k, v in own.items()})
     scene = dataclasses.replace(held.scene, geometry=TUBE)
-    way = np.random.default_rng(0).normal(size=(2000, 3)) * [2, 6, 6] + [2, 0, 0]
+    way = np.random.default_rng(0).normal(size=(4000, 3)) * [2, 6, 6] + [2, 0, 0]
+    way[::2] = 2 + (way[::2] - 2) * [0.1, 0.3, 0.3] - [0, 2, 2]  # near what a seat holds
 
     @jax.jit
     def give(ways):
         options = scene.plan.options
-        place = place_at(TUBE, stiff, 72.0, 1.19, options, rings="arch2", axial=True)
+        place = place_at(TUBE, stiff, 72.0, 1.0, options, rings="arch2", axial=True)
         one = lambda way: given_way(scene, way, jnp.asarray(2.0), place)  # noqa: E731
         once = jax.vmap(one)(ways)
         return once, jax.vmap(one)(once), place.unit.compliance
 
     once, twice, C = give(way)
-    frame = np.array(local_frame(jnp.asarray(1.19)))
+    frame = np.array(local_frame(jnp.asarray(1.0)))
     stiffness = np.linalg.inv(frame @ C @ frame.T + np.eye(3) / 30)
     energy = lambda e: np.einsum("ai,ij,aj->a", e, stiffness, e) / 2  # noqa: E731
     moved = np.abs(once - way).max(axis=1) > 1e-9
@@ -269,7 +270,7 @@ def test_what_gives_way_only_loses_energy(held):
     assert (np.abs(once[:, 0] - 2) < 1 + 1e-9).all()
     force = once @ stiffness
     assert (force[:, 0] > 0).all()
-    assert ((way @ stiffness)[:, 0] < 0).mean() > 0.2  # they would have to be pulled
+    assert ((way @ stiffness)[:, 0] < 0).mean() > 0.05  # they would have to be pulled
     deep = way[:, 0] > 2  # less deep they go on in, by the tool's own depth
     assert (energy(once) <= energy(way) + 1e-9)[deep].all()
 
