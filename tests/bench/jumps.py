@@ -78,7 +78,7 @@ def run_session(name: str) -> None:
 
 def run_loops(name: str) -> None:
     """Work by the trapezoidal rule in N and 2 N steps, and the elastic energy that goes round."""
-    steps, rows = session(), []
+    steps, rows, lost = session(), [], 0
     for seed in range(LOOPS):
         work = []
         for count in (400, 800):
@@ -87,13 +87,14 @@ def run_loops(name: str) -> None:
             force = follow(steps, np.broadcast_to(np.eye(3), (count + 1, 3, 3)), path)[0]
             part = np.sum((force[1:] + force[:-1]) / 2 * np.diff(path, axis=0), axis=1)
             work.append(np.nansum(part))
+            lost += int(np.isnan(part).sum())
             moved = np.nansum(np.maximum(part, 0))
         rows.append([*work, moved])
     rows = np.array(rows)
     less, work, put_in = rows.T
     print(f"{name}: work over {LOOPS} closed loops, N mm: least {work.min():.4g} (400 steps: "
           f"{less.min():.4g}), below zero {int((work < 0).sum())}, median {np.median(work):.3g}; "
-          f"put in at most {put_in.max():.3g}")  # fmt: skip
+          f"put in at most {put_in.max():.3g}; steps without a force {lost}")  # fmt: skip
     np.savez(f"{name}_loops.npz", rows=rows)
 
 
