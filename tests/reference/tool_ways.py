@@ -81,8 +81,8 @@ def random_way(count: int, outer: float, seed: int = 0, *, rolls: bool = True) -
                     still = still + more
                     turns.append(still)
         lead([*somewhere(places[-1], 1.5), -rng.uniform(0.2, 1)], step)
-    places, turns = np.array(places[:count]), np.array(turns[:count])
-    return Way(np.array([turn(v) for v in turns]), placed(places, outer))
+    turned = np.array([turn(v) for v in turns[:count]])
+    return Way(turned, placed(np.array(places[:count]), outer))
 
 
 def closed_loop(seed: int, steps: int, outer: float) -> np.ndarray:
