@@ -101,9 +101,11 @@ def grasp(scene: Scene, here: Instant) -> Seat:
 def arrive(scene: Scene, before: Instant, here: Instant) -> Seat:
     """The seat of a first touch: the way along the surface since then counts."""
     seat = grasp(scene, here)
-    both = jax.tree.map(lambda v, w: jnp.concatenate([v, w]), tuple(before), tuple(here))
+    join = lambda v, w: jnp.concatenate([v, w])  # noqa: E731
+    path = jax.tree.map(join, before.path, here.path)
+    seen = jax.tree.map(join, before.seen, here.seen)
     frame = local_frame(seat.phi)
-    way = followed(*both, jnp.asarray(1), frame[0], _axes(scene, seat.s))[1]
+    way = followed(path, seen, jnp.asarray(1), frame[0], _axes(scene, seat.s))[1]
     return anchored(scene, seat, _times(frame, way), here.path)
 
 
