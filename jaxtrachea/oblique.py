@@ -114,6 +114,7 @@ def press_oblique(
             argument that is no number, or an array of a wrong length.
     """
     _only_default(options)
+    check_word("rings", rings, Rings)
     place = place_at(geometry, material, s_c, phi_c, options, onset=onset, rings=rings, axial=axial)
     return press_at(place, last_axis("displacement", displacement, 3, place.phi_c.dtype), options)
 
@@ -190,6 +191,7 @@ def press_path(
         raise ValueError(f"rounding is {rounding}; expected a finite number, not negative")
     dtype = geometry.length.dtype
     displacement = shaped("displacement", displacement, ("steps", 3), dtype=dtype)
+    check_word("rings", rings, Rings)
     asked, unit, law, phi_c, onset = place_at(
         geometry, material, s_c, phi_c, options, onset=onset, rings=rings, axial=axial
     )

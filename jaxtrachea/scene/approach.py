@@ -44,7 +44,7 @@ def approach(scene: Scene, path: Poses) -> Approach:
         presses = Presses(seen.s, seen.phi, -seen.gap[:, None] * inward)
         return Approach(seen, presses, inward, None, frame, seen, inside)
     touching = (seen.gap < 0) & ~inside
-    nearest = jnp.argmin(jnp.where(inside, jnp.inf, seen.gap))
+    nearest = jnp.argmin(jnp.where(inside | jnp.isnan(seen.gap), jnp.inf, seen.gap))
     first = jnp.where(jnp.any(touching), jnp.argmax(touching), nearest)
     return seated(scene, path, seen, first, inside)
 

@@ -4,11 +4,13 @@ What a row needs and the plan has not is a status, unless the user, or a toleran
 (`Plan.ignored`). Where nothing is asked, nothing is added to the program.
 """
 
+import enum
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from jaxtrachea.contact.line import Centreline, point_at
 from jaxtrachea.contact.patches import Touch
@@ -177,20 +179,71 @@ def contact_share(scene: Scene, seen: Touch):
     return jax.lax.stop_gradient(jnp.maximum(-seen.gap, 0) / jnp.where(sure > 0, sure, jnp.nan))
 
 
-def submerged(scene: Scene, path: Poses, seen: Touch) -> Bool[Array, " rows"]:
-    """Rows whose tool is within the inner wall all round, and not before an end of the tube.
+class Side(enum.IntEnum):
+    """Where a tool is, as far as its way tells."""
 
-    By its corners' distance from the centreline, not by the gap: patches of a mesh are closed, and
-    deep in one of them the nearest way out may be the one along the tube.
+    UNTOLD = 0
+    BEFORE_AN_END = 1
+    IN_LUMEN = 2
+    OUTSIDE = 3
+
+
+class Whereabouts(NamedTuple):
+    """What a pose tells of it; shape (rows,) each.
+
+    Attributes:
+        known: the pose and its contact are finite.
+        off: the contact lies beyond an end, or on a face that closes it.
+        clear: the tool does not touch.
+        within: all of it lies within the inner wall.
+        centred: its middle lies within the middle of the wall.
+    """
+
+    known: Bool[Array, " rows"]
+    off: Bool[Array, " rows"]
+    clear: Bool[Array, " rows"]
+    within: Bool[Array, " rows"]
+    centred: Bool[Array, " rows"]
+
+
+def whereabouts(scene: Scene, path: Poses, seen: Touch) -> Whereabouts:
+    """Look at the place of the tool.
+
+    Its corners' distance from the centreline, not the gap, says what is within: patches of a mesh
+    are closed, and deep in one of them the nearest way out may be the one along the tube. The wall
+    of an imported mesh has no thickness here.
     """
     if scene.tool is None or scene.tube is None:
         raise ValueError("scene.tool is None; contact needs a tool")
+    gap = jax.lax.stop_gradient(seen.gap)
     wall = 2 * jnp.maximum(scene.radius - scene.geometry.radius, 0)
     room = scene.radius - wall - scene.tool.radius
     corners = path.rotation @ scene.tool.vertices + path.translation[:, :, None]
     line = scene.tube.line if scene.plan.curved else None
-    square = jax.vmap(jax.vmap(functools.partial(_off_axis, line), 1))(corners)
-    return (jnp.max(square, axis=1) < room * room) & (room > 0) & (seen.gap < 0)
+    off_axis = jax.vmap(functools.partial(_off_axis, line))
+    square = jax.vmap(off_axis, 2, 1)(corners)
+    return Whereabouts(
+        known=jnp.isfinite(jnp.sum(corners, axis=(1, 2)) + gap),
+        off=off_the_end(scene, seen),
+        clear=gap >= 0,
+        within=(jnp.max(square, axis=1) < room * room) & (room > 0),
+        centred=off_axis(jnp.mean(corners, axis=2)) < (scene.radius - wall / 2) ** 2,
+    )
+
+
+def next_side(side: Int[Array, ""], at: Whereabouts) -> Int[Array, ""]:
+    """The side after one more pose (fields of `at` without rows).
+
+    A tool that does not touch the tube beside its ends is outside; one that touches stays on its
+    side. A way that begins wholly within the inner wall begins in the lumen; a tool that comes
+    over an end is in the lumen if its middle is.
+    """
+    begins = jnp.where(side == Side.UNTOLD, at.within, at.centred)
+    inside = jnp.where(side <= Side.BEFORE_AN_END, begins, side == Side.IN_LUMEN)
+    touching = jnp.where(inside, Side.IN_LUMEN, Side.OUTSIDE)
+    beside = ~at.off | (at.within & ~at.clear)
+    new = jnp.where(at.clear, Side.OUTSIDE, touching)
+    return jnp.where(at.known, jnp.where(beside, new, Side.BEFORE_AN_END), side)
 
 
 def _off_axis(line: Centreline | None, point):
@@ -222,12 +275,11 @@ def off_the_end(scene: Scene, seen: Touch) -> Bool[Array, " rows"]:
 
 
 def in_lumen(scene: Scene, path: Poses, seen: Touch) -> Bool[Array, " rows"]:
-    """Rows whose tool lies within the tube, and that did not come there through the wall.
+    """Rows of a tool in the lumen, by its way so far (`next_side`)."""
+    at = whereabouts(scene, path, seen)
 
-    A tool that was outside, or half in the wall, before it went under is pressed in; one that
-    begins there, or that came over an end, is in the lumen.
-    """
-    under, off = submerged(scene, path, seen), off_the_end(scene, seen)
-    row = jnp.arange(under.shape[0])
-    last = lambda v: jax.lax.cummax(jnp.where(v, row, -1))  # noqa: E731
-    return under & (last(~under & ~off) <= last(off))
+    def step(side, at):
+        side = next_side(side, at)
+        return side, (side == Side.IN_LUMEN) & at.known
+
+    return jax.lax.scan(step, jnp.asarray(Side.UNTOLD), at)[1]

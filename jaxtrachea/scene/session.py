@@ -10,11 +10,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxtrachea.scene.approach import approach
-from jaxtrachea.scene.ranges import off_the_end, submerged
+from jaxtrachea.scene.ranges import Side, next_side, whereabouts
 from jaxtrachea.scene.seat import (
     Instant,
     Seat,
@@ -43,14 +43,14 @@ class State(NamedTuple):
     Attributes:
         started: there was a step.
         touching: the tool is on its seat.
-        outside: the tool was last seen outside the lumen, on the tube.
+        side: a `ranges.Side`.
         last: the step before.
         seat: the place that the tool holds.
     """
 
     started: Bool[Array, ""]
     touching: Bool[Array, ""]
-    outside: Bool[Array, ""]
+    side: Int[Array, ""]
     last: Instant
     seat: Seat
 
@@ -195,28 +195,28 @@ def _start(scene: Scene, rotation, translation) -> State:
         lambda v: jnp.zeros(v.shape, v.dtype), jax.eval_shape(touch_tube, scene, path)
     )
     no, nowhere = jnp.asarray(False), Instant(path, seen)
-    return State(no, no, no, nowhere, grasp(scene, nowhere))
+    side = jnp.asarray(Side.UNTOLD)
+    return State(no, no, side, nowhere, grasp(scene, nowhere))
 
 
 def _step(scene: Scene, material: Material, state: State, rotation, translation):
     """The next state, and the result without its axis of rows."""
     path = Poses(rotation[None], translation[None])
-    if scene.plan.seat == "each":
-        made = approach(scene, path)
-        here = Instant(path, made.seen)
-        inside, outside = _sides(scene, state, here)
-        result = follow(scene, material, path, made._replace(inside=inside))
-        after = state._replace(outside=outside)
-    else:
-        here = Instant(path, touch_tube(scene, path))
-        inside, outside = _sides(scene, state, here)
+    each = approach(scene, path) if scene.plan.seat == "each" else None
+    here = Instant(path, touch_tube(scene, path) if each is None else each.seen)
+    at = jax.tree.map(lambda v: v[0], whereabouts(scene, *here))
+    side = next_side(state.side, at)
+    inside = (side == Side.IN_LUMEN)[None]
+    if each is None:
         after, result = _held(scene, material, state, here, inside)
-        after = after._replace(outside=outside)
-    known = jnp.isfinite(jnp.sum(rotation) + jnp.sum(translation) + here.seen.gap[0])
+    else:
+        result = follow(scene, material, path, each._replace(inside=inside))
+        after = state
+    after = after._replace(side=side)
     result = jax.tree.map(lambda v: v[0], result)
     wrong = jnp.asarray(PressStatus.NON_FINITE, result.status.dtype)
-    return _pick(known, after, state), result._replace(
-        status=jnp.where(known, result.status, wrong)
+    return _pick(at.known, after, state), result._replace(
+        status=jnp.where(at.known, result.status, wrong)
     )
 
 
@@ -241,14 +241,7 @@ def _held(scene: Scene, material: Material, state: State, here: Instant, inside)
         seat = anchored(scene, seat, way, here.path)
     rest, made = as_approach(scene, seat, way, here, inside)
     result = follow(scene, material, rest, made, place)
-    return State(jnp.asarray(True), touching, state.outside, here, seat), result
-
-
-def _sides(scene: Scene, state: State, here: Instant):
-    """Whether the tool is in the lumen (1,), and was last outside: as `in_lumen`, by steps."""
-    under, off = submerged(scene, *here), off_the_end(scene, here.seen)
-    outside = (~under & ~off)[0] | (state.outside & ~off[0])
-    return under & ~outside, outside
+    return State(jnp.asarray(True), touching, state.side, here, seat), result
 
 
 def _pick(when, a, b):

@@ -139,8 +139,9 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
 def followed(path: Poses, seen: Touch, first, inward, frame):
     """Displacement of the tool's material point that touches first, from its first touch on.
 
-    Before the row of first touch the tool came in a straight line: the part of that step which it
-    still went along the surface counts, so that a finer path changes nothing.
+    Before the row of first touch the tool came in a straight line from the last row that is finite:
+    the part of that step which it still went along the surface counts, so that a finer path changes
+    nothing.
 
     Args:
         path: of the tool.
@@ -152,7 +153,9 @@ def followed(path: Poses, seen: Touch, first, inward, frame):
     Returns:
         mm, along (tangent, anterior, lateral); shape (rows, 3).
     """
-    before = jnp.maximum(first - 1, 0)
+    row = jnp.arange(seen.gap.shape[0])
+    earlier = jnp.max(jnp.where((row < first) & ~jnp.isnan(seen.gap), row, -1))
+    before = jnp.where(earlier < 0, first, earlier)
     pose = Pose(at_row(path.rotation, first), at_row(path.translation, first))
     body = transform(inverse(pose), at_row(seen.tool_point, first)[:, None])[:, 0]
     points = jax.vmap(lambda R, T: R @ body + T)(path.rotation, path.translation)

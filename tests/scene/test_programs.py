@@ -185,19 +185,24 @@ QUESTIONS = {
     "is it where the first is? two differences with size and limit, three logical": 9,
     "does it press off the plan?": 1,
     "is it behind the ends of the rings? size, limit, two for NaN, four logical": 8,
-    "three displacements are NaN for each of four refusals": 12,
+    "is it a number? a sum, a comparison": 2,
+    "three displacements are NaN for each of five refusals": 15,
     "computed instead: two comparisons of s, two logical, three choices, one of three": 10,
     "how deep is it? two vectors added, length (five), against the radius": 9,
-    "status: too deep (four), four refusals": 8,
+    "status: too deep (four), five refusals": 9,
 }
 #: The same for a ball: is it in the lumen, and how sure is the contact.
 BALL_QUESTIONS = {
     "place of its one corner, a product of three by three and a sum": 21,
-    "its distance from the axis: squares and sum; greatest, within the room: two": 5,
-    "is it under? it touches, two logical": 3,
+    "its distance from the axis: squares and sum; greatest, within the room: two, logical": 6,
+    "its middle: three quotients, distance, within the wall": 7,
+    "is it known? a sum of three and the gap, a comparison": 4,
+    "does it touch?": 1,
     "is it off an end? two comparisons, one logical": 3,
     "or on a face there? twice two comparisons and two logical": 8,
-    "outside last, or over an end last? three logical, two choices and running maxima, two": 9,
+    "its side: three comparisons, four logical, six choices": 13,
+    "is that the lumen? one comparison, one logical": 2,
+    "counting the rows": 2,
     "share of what is sure: sign, limit, quotient": 3,
 }
 

@@ -350,6 +350,53 @@ def test_a_tool_in_the_lumen_has_no_force(through):
     assert end.status.tolist()[-1] == PressStatus.IN_LUMEN
 
 
+def upright(*heights):
+    """The ball's centre at s = 75 mm, the last height kept to the end."""
+    heights = np.pad(np.asarray(heights, float), (0, ROWS - len(heights)), mode="edge")
+    places = np.stack([np.full(ROWS, 75.0), heights, np.zeros(ROWS)], 1)
+    return Poses(np.broadcast_to(np.eye(3), (ROWS, 3, 3)), places)
+
+
+#: Centres of the ball, which touches the inner wall from 7.6 mm on and the outer one below 17.6.
+LUMEN, NO, LOST = PressStatus.IN_LUMEN, PressStatus.NO_CONTACT, PressStatus.NON_FINITE
+WAYS = {
+    "from the lumen against the wall": ((0, 5, 8, 9, 5), [LUMEN] * 5),
+    "from the air, and back": ((19, 16, 12, 19), [NO, OK, OK, NO]),
+    "lost in the air": ((19, np.nan, 18, 16), [NO, LOST, NO, OK]),
+    "lost in touch": ((19, 16, np.nan, 15), [NO, OK, LOST, OK]),
+    "lost in the lumen": ((0, np.nan, 8, 0), [LUMEN, LOST, LUMEN, LUMEN]),
+    "never touching, lost": ((19, np.nan, 20), [NO, LOST, NO]),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_tool_keeps_its_side_of_the_wall(through, way):
+    """Against the inner wall it was pushed inwards, 0.3 N with OK; NaN spoiled all other rows."""
+    heights, expected = WAYS[way]
+    out = run(through[0], SPRINGS, upright(*heights))
+    assert out.status.tolist() == expected + expected[-1:] * (ROWS - len(heights))
+    assert (np.isfinite(out.force).all(axis=1) == np.isin(out.status, [OK, NO])).all()
+
+
+def test_a_lost_pose_leaves_the_others_as_they_are(through):
+    there = run(through[0], SPRINGS, upright(19, 18, 16, 15))
+    lost = run(through[0], SPRINGS, upright(19, np.nan, 16, 15))
+    np.testing.assert_allclose(np.asarray(lost.force)[2:], np.asarray(there.force)[2:], atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seat", ["first", "each"])
+def test_steps_keep_their_side_of_the_wall(seat):
+    wishes = dataclasses.replace(ONE, seat=seat)
+    scene = make_scene(TUBE, SPRINGS, upright(19, 16), tool=BALL, wishes=wishes)
+    session = Session(scene, SPRINGS)
+    for heights, expected in WAYS.values():
+        session.reset()
+        assert [int(session.step(np.eye(3), [75.0, y, 0.0]).status) for y in heights] == expected
+        paths = run(scene, SPRINGS, upright(*heights))
+        assert paths.status.tolist()[: len(expected)] == expected
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("radius", [None, 150.0])
 def test_a_tool_in_the_lumen_of_a_mesh_has_no_force(radius):
