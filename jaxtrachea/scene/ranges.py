@@ -158,17 +158,19 @@ def _length(D):
     return jnp.sqrt(jnp.sum(D * D, axis=-1))
 
 
-def depth_share(scene: Scene, depth, skeleton):
-    """Motion of the wall at the contact (indentation and skeleton) against the tube's radius.
+def depth_share(scene: Scene, depth, skeleton, inward):
+    """Inward motion of the wall at the contact (indentation and skeleton) over the tube's radius.
+
+    Motion outwards counts as 0, motion along the surface as nothing.
 
     Args:
         scene: -
-        depth: local indentation, mm; shape (rows, 3), or (rows,) along the normal.
-        skeleton: displacement of C with the skeleton; likewise.
+        depth: local indentation, mm; shape (..., 3).
+        skeleton: displacement of C with the skeleton, mm; likewise.
+        inward: inward normal of the tube at the contact; likewise.
     """
-    way = jax.lax.stop_gradient(depth + skeleton)
-    way = _length(way) if way.ndim > 1 else jnp.abs(way)
-    return way / scene.radius
+    way = jnp.sum((depth + skeleton) * inward, axis=-1)
+    return jax.lax.stop_gradient(jnp.maximum(way, 0) / scene.radius)
 
 
 def contact_share(scene: Scene, seen: Touch):

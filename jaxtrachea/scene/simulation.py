@@ -55,8 +55,8 @@ class Simulation(NamedTuple):
         frame: columns tangent, anterior, lateral at the contact; shape (rows, 3, 3). None: the tube
             is straight, or the contact points are given.
         vertices: deformed surface in the frame of the mesh; shape (rows, vertices, 3).
-        depth_share: motion of the wall at the contact against the radius of the tube; beyond 1 the
-            status is TOO_DEEP (`ranges.DEEPEST` says why).
+        depth_share: inward motion of the wall at the contact over the radius of the tube; beyond
+            1 the status is TOO_DEEP (`ranges.DEEPEST` says why).
         contact_share: penetration against what the contact is sure for (tool's radius and rounding
             of the patches); NaN for sharp ones.
         status: a `PressStatus` per row.
@@ -142,7 +142,7 @@ def follow(
     plan = scene.plan
     material, bad = _without_negative(scene, material)
     given = path if isinstance(path, Presses) else None
-    presses, used, refused = _refuse(scene, material, given, made, bad)
+    presses, used, inward, refused = _refuse(scene, material, given, made, bad)
     if place is not None:
         moved = _Moved(*press_at(place, used.displacement, plan.options))
     else:
@@ -150,7 +150,7 @@ def follow(
     vertices = None
     if plan.surface is not None:
         vertices = deform(scene, material, used, moved, path, made)
-    share = depth_share(scene, moved.depth, moved.skeleton)
+    share = depth_share(scene, moved.depth, moved.skeleton, inward)
     optional = lambda wanted, value: value if wanted else None  # noqa: E731
     return Simulation(
         presses.s, presses.phi, None if made is None else made.own.gap, presses.displacement,
@@ -179,7 +179,7 @@ def _without_negative(scene: Scene, material: Material):
 
 
 def _refuse(scene: Scene, material: Material, path: Presses | None, made: Approach | None, bad):
-    """The presses, NaN where refused; the same as they are computed; and the refusals by status.
+    """The presses, NaN where refused; the same as computed; inward normals; refusals by status.
 
     A row that does not press needs nothing of the plan, the rings and the tube: off the plan or
     behind the ends of the rings it is computed as no motion, on the midline; off the tube at its
@@ -210,7 +210,7 @@ def _refuse(scene: Scene, material: Material, path: Presses | None, made: Approa
         D = jnp.where(rows[:, None], jnp.nan, D)
     idle = (behind if scene.plan.second_plane else True) & ~acting
     used = Presses(s, mid, jnp.where(idle[:, None], jnp.zeros_like(D), D))
-    return Presses(presses.s, phi, D), used, refused
+    return Presses(presses.s, phi, D), used, inward, refused
 
 
 def on_the_tube(scene: Scene, s: Float[Array, "*n"], phi: Float[Array, "*n"]):
@@ -248,11 +248,11 @@ def sweep(
 
     Args:
         scene: its geometry and the level of rings, shear and laws of its plan are used; OFF_PLAN
-            where the material gives more than the plan has (as in `simulate`).
+            where a point presses and the material gives more than the plan has (as in `simulate`).
         material: -
         s: mm.
-        phi: rad, within the half-angle of the rings.
-        depth: of the tool along the inward normal, mm.
+        phi: rad, within the half-angle of the rings; else BEHIND_GAP where it presses.
+        depth: of the tool along the inward normal, mm; 0 and less: NO_CONTACT (see `Options`).
         chunk: points computed together.
 
     Raises:
@@ -269,6 +269,9 @@ def sweep(
 
     def one(at):
         s_c, phi_c, d = at
+        acting = d != 0 if scene.plan.options.contact == "bonded" else ~(d <= 0)
+        behind = on_the_tube(scene, s_c, phi_c)[2] & ~acting
+        phi_c, d = (jnp.where(behind, 0, v) for v in (phi_c, d))  # needs nothing of the rings
         inward = local_frame(phi_c)[0]
         press = press_oblique(
             scene.geometry, material, s_c, phi_c, d * inward, scene.plan.options,
@@ -277,11 +280,12 @@ def sweep(
         force, way, depth = (v @ inward for v in (press.force, press.skeleton, press.depth))
         free = ~(force != 0)
         softness = jnp.where(free, jnp.nan, way / jnp.where(free, 1, force))
-        share = depth_share(scene, depth, way)
-        status = _status(press.status, share, None, {})
+        share = depth_share(scene, press.depth, press.skeleton, inward)
+        status = _status(press.status, share, None, {PressStatus.OFF_PLAN: acting & bool(unlike)})
         if unlike:
-            force, depth, softness = (jnp.full_like(v, jnp.nan) for v in (force, depth, softness))
-            status = jnp.full_like(status, PressStatus.OFF_PLAN)
+            force, depth, softness = (
+                jnp.where(acting, jnp.nan, v) for v in (force, depth, softness)
+            )
         return Sweep(force, depth, softness, share, status)
 
     return jax.lax.map(one, (s, phi, depth), batch_size=chunk)

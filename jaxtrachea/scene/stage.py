@@ -308,13 +308,13 @@ def _walls(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
     ends = max(float(s.min()), 0.0), min(float(s.max()), float(geometry.length))
     between = (ring[1:] + ring[:-1]) / 2
     borders = np.array([ends[0], *between[(between > ends[0]) & (between < ends[1])], ends[1]])
-    usual = min([float(geometry.radius), *(np.median(np.diff(ring)),) * (len(ring) > 1)])
+    usual = wall_check.spacing_of(geometry)
     parts = np.ceil(np.diff(borders) / (LONGEST * usual) - 1e-4).astype(int)
     spans = zip(borders[:-1], borders[1:], np.maximum(parts, 1), strict=True)
     borders = np.concatenate([*(np.linspace(a, b, n + 1)[:-1] for a, b, n in spans), borders[-1:]])
     return patches_of(
         vertices, faces, s, borders, centres=centres, frames=frames, rounding=ROUNDED, most=CORNERS,
-        dtype=geometry.length.dtype, progress=progress,
+        overlap=wall_check.overlap_of(geometry), dtype=geometry.length.dtype, progress=progress,
     )  # fmt: skip
 
 

@@ -21,8 +21,10 @@ from jaxtrachea.trachea.mesh import Mesh, MeshError, face_vectors
 COUNT = 400
 #: Their radius, and how far they are moved off the wall at most, in and out; shares of the radius.
 BALL, AWAY = 0.3, 0.1
-#: By how much a patch runs on beyond each border, mm (`patches_of`).
-OVERLAP = 0.5
+#: By how much a patch runs on beyond each border, mm; at most this share of the rings' distance.
+OVERLAP, OVERLAP_SHARE = 0.5, 0.15
+#: Least limit of the worst, as a share of the radius: meshes are made of facets.
+LEAST_LIMIT = 0.02
 #: Patches that are searched for each.
 NEAR = 4
 #: Classes of triangles by size, each half of the next; points that are searched together.
@@ -72,12 +74,24 @@ def limit_of(geometry: Geometry) -> float:
     """Largest error of the gap that a trachea explains, mm.
 
     A patch is convex: it bridges a hollow as long as itself, p^2 / (8 R) deep if the wall bends
-    with the radius R. p: the median distance of the rings (at most R) and what a patch runs on
-    beyond its borders; R: the radius of the tube, the sharpest bend that its rings leave room for.
+    with the radius R. p: the median distance of the rings and what a patch runs on beyond its
+    borders (at most R in all); R: the radius of the tube, the sharpest bend that its rings leave
+    room for. At least `LEAST_LIMIT` of R.
     """
+    radius = float(geometry.radius)
+    p = min(spacing_of(geometry) + 2 * overlap_of(geometry), radius)
+    return max(p**2 / (8 * radius), LEAST_LIMIT * radius)
+
+
+def spacing_of(geometry: Geometry) -> float:
+    """Median distance of the rings, mm; at most the radius."""
     radius, rings = float(geometry.radius), np.asarray(geometry.ring_positions, float)
-    pitch = float(np.median(np.diff(rings))) if len(rings) > 1 else radius
-    return (min(pitch, radius) + 2 * OVERLAP) ** 2 / (8 * radius)
+    return min(float(np.median(np.diff(rings))), radius) if len(rings) > 1 else radius
+
+
+def overlap_of(geometry: Geometry) -> float:
+    """By how much a patch runs on beyond each border, mm: for small tubes less."""
+    return min(OVERLAP, OVERLAP_SHARE * spacing_of(geometry))
 
 
 def measure(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = COUNT) -> WallError:

@@ -52,10 +52,10 @@ def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **ho
 def admitted(scene, m, p, made=None):
     """Material and presses as computed, and how statuses are read: the same in all programs."""
     m, bad = _without_negative(scene, m)
-    presses, used, refused = _refuse(scene, m, p, made, bad)
+    presses, used, inward, refused = _refuse(scene, m, p, made, bad)
 
     def status(out):
-        share = depth_share(scene, out.depth, out.skeleton)
+        share = depth_share(scene, out.depth, out.skeleton, inward)
         return share, _status(out.status, share, made, refused)
 
     return m, presses.displacement, used, status
@@ -188,7 +188,7 @@ QUESTIONS = {
     "is it a number? a sum, a comparison": 2,
     "three displacements are NaN for each of five refusals": 15,
     "computed instead: two comparisons of s, two logical, three choices, one of three": 10,
-    "how deep is it? two vectors added, length (five), against the radius": 9,
+    "how deep? two vectors added, part inwards (five), not below 0, against the radius": 10,
     "status: too deep (four), five refusals": 9,
 }
 #: The same for a ball: is it in the lumen, and how sure is the contact.

@@ -28,9 +28,9 @@ from jaxtrachea import Poses, Presses, Session, make_scene, press_oblique, simul
 from jaxtrachea.contact.shapes import sphere
 from jaxtrachea.scene.build import dropped_effects
 from jaxtrachea.scene.plan import Facts, Served
-from jaxtrachea.scene.ranges import lacking, unserved
+from jaxtrachea.scene.ranges import depth_share, lacking, unserved
 from jaxtrachea.scene.rules import make_plan
-from jaxtrachea.scene.simulation import _without_negative
+from jaxtrachea.scene.simulation import _status, _without_negative
 from jaxtrachea.scene.sizes import SizeError
 from jaxtrachea.scene.stage import with_mesh
 from jaxtrachea.status import PressStatus
@@ -134,9 +134,10 @@ def test_a_plan_without_bending_rings_refuses_a_material_with_them(material, exp
     """Rings as springs at 60 degrees were 83 % off, with OK, in sweeps too."""
     scene = make_scene(TUBE, SPRINGS, ASIDE, wishes=ONE)
     assert run(scene, material, ASIDE).status.tolist() == [expected]
-    out = sweep(scene, material, [75.0], [1.0], [2.0])
-    assert out.status.tolist() == [expected]
+    out = sweep(scene, material, [75.0] * 3, [1.0] * 3, [2.0, 0.0, -1.0])
+    assert out.status.tolist() == [expected, PressStatus.NO_CONTACT, PressStatus.NO_CONTACT]
     assert np.isnan(out.force[0]) == (expected == OFF_PLAN)
+    assert out.force[1:].tolist() == [0, 0]
 
 
 @pytest.mark.slow
@@ -332,6 +333,32 @@ def test_a_tool_driven_through_the_tube_is_beyond_its_range(through):
     too_deep(*through[1:], "first")
 
 
+def test_only_motion_inwards_counts_as_depth(through):
+    """Drawn out by 20 mm, or 2 mm in and 14 mm along, was TOO_DEEP: "pressed in by more"."""
+    inward = -np.array([0, np.cos(0.5), np.sin(0.5)])
+    depth = np.stack([-15 * inward, 1.5 * inward + [10, 0, 0], 9 * inward, 9 * inward])
+    skeleton = np.stack([-5 * inward, 0.5 * inward + [4, 0, 0], 3.5 * inward, 4 * inward])
+    share = depth_share(through[0], depth, skeleton, np.tile(inward, (4, 1)))
+    np.testing.assert_allclose(share, [0, 2 / 12.6, 12.5 / 12.6, 13 / 12.6], rtol=1e-12)
+    status = _status(jnp.zeros(4, jnp.int8), share, None, {})
+    assert status.tolist() == [OK, OK, OK, PressStatus.TOO_DEEP]
+
+
+@pytest.mark.slow
+def test_a_tool_drawn_outwards_is_not_too_deep():
+    """Glued and drawn 20 mm: solved; pressed as far: too deep."""
+    out = presses([0, 20.0, 0])
+    wishes = dataclasses.replace(ONE, contact="bonded", second_plane="on")
+    scene = make_scene(TUBE, SPRINGS, out, wishes=wishes)
+    for sign, expected in ((1, OK), (-1, PressStatus.TOO_DEEP)):
+        path = dataclasses.replace(out, displacement=sign * jnp.asarray(out.displacement))
+        found = run(scene, SPRINGS, path)
+        assert found.status.tolist()[1:] == [OK, expected]
+        np.testing.assert_allclose(
+            found.depth_share, [0, 0, 0] if sign > 0 else [0, 10 / 12.6, 20 / 12.6], atol=1e-9
+        )
+
+
 @pytest.mark.slow
 def test_presses_of_their_own_through_the_tube_are_beyond_their_range(through):
     path = through[1]
@@ -451,7 +478,7 @@ def test_steps_of_a_session_are_refused_alike():
     for place in ([75, 0, 0], [75, 19, 0], [75, 16, 0], [95, 16, 0], [75, 19, 0], [75, -40, 0]):
         found.append(int(session.step(np.eye(3), place).status))
     assert found[:4] == [PressStatus.IN_LUMEN, PressStatus.NO_CONTACT, OK, OK]
-    assert found[4] == PressStatus.NO_CONTACT
+    assert found[4:] == [PressStatus.NO_CONTACT] * 2  # above the tube, and 27 mm below it
 
 
 def test_friction_that_a_plan_drops_is_said():

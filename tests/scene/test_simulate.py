@@ -137,8 +137,16 @@ def test_sweep_agrees_with_single_presses_whatever_the_chunk():
     grid = list(itertools.product((20.0, 75.0), (-0.4, 0.0, 0.4)))
     s, phi = (jnp.array(v) for v in zip(*grid, strict=True))
     depths = jnp.full(6, 2.0)
-    out = jax.jit(sweep, static_argnames="chunk")(scene, MATERIAL, s, phi, depths, chunk=4)
-    assert out.status.tolist() == [0] * 6
+    # Behind the ends of the rings: nothing pressed, drawn away, pressed; before them: likewise.
+    more = ([75.0] * 5, [2.8, 2.8, 2.8, 0.4, 0.4], [0.0, -1.0, 2.0, 0.0, -1.0])
+    points = [jnp.append(v, jnp.array(w)) for v, w in zip((s, phi, depths), more, strict=True)]
+    out = jax.jit(sweep, static_argnames="chunk")(scene, MATERIAL, *points, chunk=4)
+    none, behind = PressStatus.NO_CONTACT, PressStatus.BEHIND_GAP
+    assert out.status.tolist() == [0] * 6 + [none, none, behind, none, none]
+    idle = np.asarray(out.status) == none
+    for value in (out.force, out.indentation, out.depth_share):
+        assert (np.asarray(value)[idle] == 0).all()
+    assert np.isnan(out.force[8])
     i = 5
     inward = -jnp.array([0, jnp.cos(phi[i]), jnp.sin(phi[i])])
     single = jax.jit(lambda s, phi, D: press_oblique(TUBE, MATERIAL, s, phi, D, axial=False))

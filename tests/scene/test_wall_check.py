@@ -151,6 +151,34 @@ def test_limit_is_the_sagitta_of_a_bridged_hollow():
     np.testing.assert_allclose(wall_check.limit_of(TUBE), exact, rtol=0.1)  # p^2 / 8R: 7 % less
 
 
+@pytest.mark.parametrize(
+    ("radius", "pitch", "share"),
+    [(11.3, 10, 0.118), (0.7, 0.4, 0.069), (0.2, 0.2, 0.125), (11.3, 1, 0.02), (9.479, 5.617, None)],
+)
+def test_the_limit_is_a_small_share_of_the_radius_at_any_size(radius, pitch, share):
+    """For R = 0.2 mm it was 4.5 R. The last is the male trachea's, off by 0.54 mm at worst."""
+    geometry = Geometry.create(12.0 * pitch, pitch * np.arange(1.0, 11), radius=radius)
+    limit = wall_check.limit_of(geometry)
+    assert 0.02 <= limit / radius <= 0.15
+    if share is None:
+        np.testing.assert_allclose(limit, (pitch + 1) ** 2 / (8 * radius), rtol=1e-12)
+        assert limit > 0.54
+    else:
+        np.testing.assert_allclose(limit / radius, share, rtol=0.02)
+
+
+def test_a_small_tube_is_as_near_as_a_large_one():
+    """Table 1 at 1 : 16, R = 0.7 mm: patches ran on by 0.5 mm, most of a ring's distance."""
+    small = {"length": 10.0, "ring_positions": np.asarray(TUBE.ring_positions) / 16}
+    small |= {"radius": TUBE.radius / 16, "ring_height": TUBE.ring_height / 16}
+    small = dataclasses.replace(TUBE, **{k: jnp.asarray(v) for k, v in small.items()})
+    mesh = imported(make_tube(small, wall=2.6 / 16, relief=0.6 / 16))
+    off = wall_check.check(mesh, small, stage._walls(small, mesh))
+    large = wall_check.check(MESHES[1], TUBE, stage._walls(TUBE, MESHES[1]))
+    longer = (1 + 2 * 0.15) / (1 + 2 * 0.05)  # patches, over the rings' distance; hollows: squared
+    assert off.worst <= longer**2 * large.worst / 16
+
+
 def waist(mesh, at, depth, width):
     """The mesh drawn in there."""
     drawn = 1 - depth * np.exp(-(((np.asarray(mesh.s) - at) / width) ** 2))[:, None]
