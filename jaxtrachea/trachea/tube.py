@@ -23,7 +23,9 @@ def make_tube(
 
     A grid of `around` x `along` quadrilaterals, each cut in two, and two lids of `around` - 2
     triangles: the defaults make 3,430 vertices and the paper's 6,856 triangles, watertight.
-    The rows are even but for one on the crest of each ring.
+    Of the rows, the one nearest to each ring stands on its crest, and those between are evenly
+    spaced from crest to crest. Where rows are too few for that (two rings nearest to one row, or a
+    ring nearest to an end) all rows are evenly spaced, and crests lie lower than asked for.
     Between the rings the radius is `geometry.radius` + `wall` / 2 - `relief`; a ring adds
     `relief` cos^2 over its height and fades out towards its ends.
 

@@ -41,9 +41,9 @@ def session() -> Session:
 
 
 def follow(steps: Session, rotation, translation):
-    """Force, gap and status of every pose."""
+    """Force, gap, status and contact angle of every pose."""
     found = [
-        (np.array(v.force), float(v.gap), int(v.status))
+        (np.array(v.force), float(v.gap), int(v.status), float(v.phi))
         for v in map(steps.step, rotation, translation)
     ]
     return tuple(np.array(v) for v in zip(*found, strict=True))
@@ -60,9 +60,17 @@ def ratios(force, gap, way: Way) -> np.ndarray:
     return np.where(np.isfinite(jump), ratio, np.inf)
 
 
+def tangential(force, phi) -> np.ndarray:
+    """Force along the surface over that along the inward normal."""
+    inward = -np.stack([0 * phi, np.cos(phi), np.sin(phi)], axis=1)
+    normal = np.sum(force * inward, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.linalg.norm(force - normal[:, None] * inward, axis=1) / normal
+
+
 def run_session(name: str) -> None:
     way = random_way(POSES, OUTER)
-    force, gap, status = follow(session(), *way)
+    force, gap, status, phi = follow(session(), *way)
     ratio = ratios(force, gap, way)
     finite = ratio[np.isfinite(ratio)]
     good = np.isfinite(way.translation).all(axis=1)
@@ -73,6 +81,9 @@ def run_session(name: str) -> None:
     high = finite.max(), np.quantile(finite, 0.99)
     print(f"  jump over stiffness x step: largest {high[0]:.3g}, 99 % {high[1]:.3g}")
     print(f"  above 1: {int((finite > 1).sum())}, above 2: {int((finite > 2).sum())}")
+    aside = tangential(force, phi)[status == PressStatus.OK]
+    print(f"  tangential over normal force: median {np.median(aside):.2g}, 95 % "
+          f"{np.quantile(aside, 0.95):.2g}, largest {aside.max():.2g}")  # fmt: skip
     np.savez(f"{name}_session.npz", ratio=ratio, force=force, gap=gap, status=status)
 
 

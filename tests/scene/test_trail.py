@@ -98,6 +98,19 @@ def test_a_dent_is_scaled_until_it_touches(name, dtype):
     np.testing.assert_array_equal(surfaces[2], flat)
 
 
+def test_the_surface_is_continuous_where_the_dent_goes_to_nothing():
+    """A ball 0.3 mm inside: dents of 1e-2 to 1e-12 mm all moved it by 0.3 mm, none by 0."""
+    tool, height = TOOLS["ball"]
+    square, flat, dented = plane()
+    pose = Poses(jnp.eye(3), jnp.array([0, height - 0.3, 0]))
+    peaks = np.array([0.2, 0.1, 0.05, 1e-2, 1e-6, 1e-12, 0])
+    dents = jnp.asarray(np.asarray(flat) + (peaks / 0.7)[:, None, None] * np.asarray(dented - flat))
+    run = jax.jit(jax.vmap(trail.touching, (None, None, None, None, 0)))
+    lowest = -np.asarray(run(tool, pose, square, flat, dents))[:, :, 1].min(axis=1)
+    np.testing.assert_allclose(lowest[:2], 0.3, atol=1e-2)  # it touches, up to the edge of the dent
+    np.testing.assert_allclose(lowest[2:], 5 * peaks[2:], rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_the_ball_of_friction_toml_stays_out_of_the_surface():
     """From row 10 on it slides: the ball was 0.37 mm inside in row 14, 0.015 before it slid."""

@@ -153,7 +153,13 @@ def test_limit_is_the_sagitta_of_a_bridged_hollow():
 
 @pytest.mark.parametrize(
     ("radius", "pitch", "share"),
-    [(11.3, 10, 0.118), (0.7, 0.4, 0.069), (0.2, 0.2, 0.125), (11.3, 1, 0.02), (9.479, 5.617, None)],
+    [
+        (11.3, 10, 0.118),
+        (0.7, 0.4, 0.069),
+        (0.2, 0.2, 0.125),
+        (11.3, 1, 0.02),
+        (9.479, 5.617, None),
+    ],
 )
 def test_the_limit_is_a_small_share_of_the_radius_at_any_size(radius, pitch, share):
     """For R = 0.2 mm it was 4.5 R. The last is the male trachea's, off by 0.54 mm at worst."""
