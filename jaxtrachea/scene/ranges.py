@@ -25,9 +25,9 @@ from jaxtrachea.trachea.material import Material
 #: to the axis of the tube.
 DEEPEST = 1.0
 
-#: A contact on the face that closes a patch at an end of the tube: distance from the end, mm, and
-#: least part of the normal along the tube (that of a wall with relief is below 0.4).
-RIM, ALONG = 1.0, 0.8
+#: A contact on the face that closes a patch at an end of the tube: distance from the end over the
+#: radius, and least part of the normal along the tube (that of a wall with relief is below 0.4).
+RIM, ALONG = 0.08, 0.8
 
 #: Values of the material that each effect reads: where they are given, a path may need it.
 READ = {
@@ -273,7 +273,8 @@ def off_the_end(scene: Scene, seen: Touch) -> Bool[Array, " rows"]:
         along = jnp.sum(seen.normal * tangent, axis=1)
     else:
         along = seen.normal[:, 0]
-    return beyond | ((s < RIM) & (along < -ALONG)) | ((s > length - RIM) & (along > ALONG))
+    rim = RIM * scene.radius
+    return beyond | ((s < rim) & (along < -ALONG)) | ((s > length - rim) & (along > ALONG))
 
 
 def in_lumen(scene: Scene, path: Poses, seen: Touch) -> Bool[Array, " rows"]:

@@ -25,10 +25,11 @@ from small_scenes import (
 )
 
 from jaxtrachea import Poses, Presses, Session, make_scene, press_oblique, simulate, sweep
+from jaxtrachea.contact.patches import Touch
 from jaxtrachea.contact.shapes import sphere
 from jaxtrachea.scene.build import dropped_effects
 from jaxtrachea.scene.plan import Facts, Served
-from jaxtrachea.scene.ranges import depth_share, lacking, unserved
+from jaxtrachea.scene.ranges import depth_share, lacking, off_the_end, unserved
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.simulation import _status, _without_negative
 from jaxtrachea.scene.sizes import SizeError
@@ -342,6 +343,18 @@ def test_only_motion_inwards_counts_as_depth(through):
     np.testing.assert_allclose(share, [0, 2 / 12.6, 12.5 / 12.6, 13 / 12.6], rtol=1e-12)
     status = _status(jnp.zeros(4, jnp.int8), share, None, {})
     assert status.tolist() == [OK, OK, OK, PressStatus.TOO_DEEP]
+
+
+def test_the_face_that_closes_a_tube_is_as_thick_as_the_tube_is_large(through):
+    """It was 1 mm at any size: for R = 0.2 mm all of a tube of 2 mm."""
+    small = dataclasses.replace(TUBE, length=jnp.asarray(2.0))
+    scene = dataclasses.replace(through[0], geometry=small, radius=jnp.asarray(0.22))
+    s, along = jnp.array([0.01, 0.01, 0.5, 1.5, 1.99, -0.1]), jnp.array([-1.0, 0, -1, 1, 1, 0])
+    normal = jnp.stack([along, 1 - jnp.abs(along), 0 * s], 1)
+    no, point, none = jnp.asarray(0.0), jnp.zeros(3), jnp.asarray(0)
+    at = lambda s, n: Touch(no, point, point, n, s, no, none, no, no, none)  # noqa: E731
+    seen = jax.vmap(at)(s, normal)
+    assert off_the_end(scene, seen).tolist() == [True, False, False, False, True, True]
 
 
 @pytest.mark.slow
