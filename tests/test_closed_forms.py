@@ -92,13 +92,12 @@ def test_influence_of_a_curved_model_is_that_of_refits():
     rough = FORCE * np.where(np.arange(12) % 3 == 0, 0.3, 1.0)
     problem = line(rough, changes=changes, options=Options(), noise=Noise(force=0.1))
     found = influence(fit(problem, ONE))
-    _, jacobian, second = force_of_k_1(problem)
+    pressed, jacobian, second = force_of_k_1()
     k = found.result.value[0, 0]
 
     def slope(k, force):
-        return (problem_force(k) - force) @ jacobian(k)
+        return (pressed(k) - force) @ jacobian(k)
 
-    problem_force = force_of_k_1(problem)[0]
     per_sigma = []
     for e in np.eye(12) * 1e-4:
         up, down = (
@@ -106,13 +105,13 @@ def test_influence_of_a_curved_model_is_that_of_refits():
             for h in (e, -e)
         )
         per_sigma.append(0.1 * (up - down) / 2e-4)
-    curved = second(k) @ (problem_force(k) - rough)
+    curved = second(k) @ (pressed(k) - rough)
     assert abs(curved) > 0.01 * (jacobian(k) @ jacobian(k))  # Gauss and Newton would leave it out
     expected = np.array(per_sigma) / found.result.standard_error[0, 0]
     np.testing.assert_allclose(found.of.per_sigma[0, 0, 0], expected, rtol=1e-4)
 
 
-def force_of_k_1(problem):
+def force_of_k_1():
     """F(k), dF/dk, d2F/dk2 at D, by Newton on the indentation: D = c (k d + k_3 d^3) + d."""
     c, k_3 = compliance(), 0.3
 

@@ -134,9 +134,14 @@ def _wandering(scene: Scene, presses: Presses):
     """Rows of a tool that has left its seat: as `rules` has it, by half a ring spacing."""
     if "seat" in scene.plan.ignored or scene.plan.options.contact == "bonded":
         return []
+    return [_along(presses) > half_spacing(scene)]
+
+
+def half_spacing(scene: Scene):
+    """Half of the least distance of two rings, mm: as far one place serves."""
     x = scene.geometry.ring_positions
     spacing = jnp.min(x[1:] - x[:-1]) if x.shape[0] > 1 else scene.geometry.length
-    return [_along(presses) > spacing / 2]
+    return spacing / 2
 
 
 def _frictionless(scene: Scene) -> bool:

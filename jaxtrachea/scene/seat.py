@@ -37,6 +37,7 @@ from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.oblique import Place, place_at
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.curve import frame_at
+from jaxtrachea.scene.ranges import half_spacing
 from jaxtrachea.scene.simulation import on_the_tube
 from jaxtrachea.scene.stage import Poses, Presses, Scene, followed
 from jaxtrachea.skeleton import local_frame
@@ -229,9 +230,7 @@ def anchored(scene: Scene, seat: Seat, way: Float[Array, "3"], path: Poses) -> S
 
 def _hold(scene: Scene, depth):
     """Way along the surface that a seat holds at this depth, mm."""
-    x = scene.geometry.ring_positions
-    spacing = jnp.min(x[1:] - x[:-1]) if x.shape[0] > 1 else scene.geometry.length
-    return jnp.minimum(HOLD * depth, NEAR * spacing / 2)
+    return jnp.minimum(HOLD * depth, NEAR * half_spacing(scene))
 
 
 def _axes(scene: Scene, s) -> Float[Array, "3 3"] | None:
