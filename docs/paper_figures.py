@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrachea.model import Options
-from jaxtrachea.oblique import ObliquePress, press_oblique
+from jaxtrachea.mechanics.oblique import ObliquePress, press_oblique
+from jaxtrachea.mechanics.press import Options
 from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.plots import draw_surface
 from jaxtrachea.scene.simulation import simulate

@@ -1,7 +1,7 @@
 """A differentiable skeleton model of the trachea for parameter identification.
 
 Forward: `press(geometry, material, s_c, displacement, options)`. Identification from Python:
-`jaxtrachea.identify`; from the command line: `jaxtrachea check SPEC`, `jaxtrachea fit SPEC`.
+`jaxtrachea.fit`; from the command line: `jaxtrachea check SPEC`, `jaxtrachea fit SPEC`.
 Whole scenes, from the tool's pose to the deformed surface: `make_scene`, `simulate`, `sweep`.
 Units: mm, N, MPa, rad. The package never changes JAX's configuration; fits want float64
 (`jax.config.update("jax_enable_x64", True)`).
@@ -13,23 +13,25 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from jaxtrachea.identify.predict import CurvePrediction as CurvePrediction
-    from jaxtrachea.identify.predict import predict as predict
-    from jaxtrachea.identify.stored import NoResults as NoResults
-    from jaxtrachea.identify.stored import StoredFit as StoredFit
-    from jaxtrachea.identify.stored import read_results as read_results
+    from jaxtrachea.inference.predict import CurvePrediction as CurvePrediction
+    from jaxtrachea.inference.predict import predict as predict
+    from jaxtrachea.inference.stored import NoResults as NoResults
+    from jaxtrachea.inference.stored import StoredFit as StoredFit
+    from jaxtrachea.inference.stored import read_results as read_results
     from jaxtrachea.mechanics.beam import Beam as Beam
     from jaxtrachea.mechanics.beam import contact_compliance as contact_compliance
     from jaxtrachea.mechanics.beam import deflect as deflect
     from jaxtrachea.mechanics.force_law import Law as Law
     from jaxtrachea.mechanics.force_law import duffing as duffing
-    from jaxtrachea.model import Options as Options
-    from jaxtrachea.model import Press as Press
-    from jaxtrachea.model import press as press
-    from jaxtrachea.oblique import ObliquePath as ObliquePath
-    from jaxtrachea.oblique import ObliquePress as ObliquePress
-    from jaxtrachea.oblique import press_oblique as press_oblique
-    from jaxtrachea.oblique import press_path as press_path
+    from jaxtrachea.mechanics.oblique import ObliquePath as ObliquePath
+    from jaxtrachea.mechanics.oblique import ObliquePress as ObliquePress
+    from jaxtrachea.mechanics.oblique import press_oblique as press_oblique
+    from jaxtrachea.mechanics.oblique import press_path as press_path
+    from jaxtrachea.mechanics.press import Options as Options
+    from jaxtrachea.mechanics.press import Press as Press
+    from jaxtrachea.mechanics.press import press as press
+    from jaxtrachea.mechanics.skeleton import Skeleton as Skeleton
+    from jaxtrachea.mechanics.skeleton import skeleton_response as skeleton_response
     from jaxtrachea.scene.plan import Plan as Plan
     from jaxtrachea.scene.plan import PlanError as PlanError
     from jaxtrachea.scene.plan import Wishes as Wishes
@@ -42,8 +44,6 @@ if TYPE_CHECKING:
     from jaxtrachea.scene.stage import Scene as Scene
     from jaxtrachea.scene.stage import make_scene as make_scene
     from jaxtrachea.scene.stage import with_geometry as with_geometry
-    from jaxtrachea.skeleton import Skeleton as Skeleton
-    from jaxtrachea.skeleton import skeleton_response as skeleton_response
     from jaxtrachea.status import FitStatus as FitStatus
     from jaxtrachea.status import PredictionStatus as PredictionStatus
     from jaxtrachea.status import PressStatus as PressStatus
@@ -54,17 +54,17 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "identify.predict": ("CurvePrediction", "predict"),
-    "identify.stored": ("NoResults", "StoredFit", "read_results"),
+    "inference.predict": ("CurvePrediction", "predict"),
+    "inference.stored": ("NoResults", "StoredFit", "read_results"),
     "mechanics.beam": ("Beam", "contact_compliance", "deflect"),
     "mechanics.force_law": ("Law", "duffing"),
-    "model": ("Options", "Press", "press"),
-    "oblique": ("ObliquePath", "ObliquePress", "press_oblique", "press_path"),
+    "mechanics.press": ("Options", "Press", "press"),
+    "mechanics.oblique": ("ObliquePath", "ObliquePress", "press_oblique", "press_path"),
     "scene.plan": ("Plan", "PlanError", "Wishes"),
     "scene.session": ("Session",),
     "scene.simulation": ("Simulation", "simulate", "sweep"),
     "scene.stage": ("Poses", "Presses", "Scene", "make_scene", "with_geometry"),
-    "skeleton": ("Skeleton", "skeleton_response"),
+    "mechanics.skeleton": ("Skeleton", "skeleton_response"),
     "status": ("FitStatus", "PredictionStatus", "PressStatus"),
     "trachea.geometry": ("Geometry", "table_1"),
     "trachea.material": ("Material",),

@@ -18,8 +18,8 @@ from pydantic import (
     model_validator,
 )
 
-from jaxtrachea.spec_file import EVEN, LISTED, load_spec
-from jaxtrachea.spec_file import SpecError as SpecError
+from jaxtrachea.files.toml import EVEN, LISTED, load_spec
+from jaxtrachea.files.toml import SpecError as SpecError
 from jaxtrachea.units import UnitError, parse_quantity
 
 
@@ -50,7 +50,7 @@ def quantity(dimension: str, *, positive: bool = False, word: str | None = None)
 
 
 def _number_or_quantity(value: Any) -> Any:
-    """Checked against the parameter's unit later, in `identify.study`."""
+    """Checked against the parameter's unit later, in `fit.study`."""
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         raise ValueError("expected a number, or a quantity with its unit")
     if isinstance(value, int) and abs(value) > 1e300:
@@ -133,7 +133,7 @@ class TracheaSection(Section):
 
 
 class ModelSection(Section):
-    """[model]: what the forward model includes; see `jaxtrachea.model.Options`."""
+    """[model]: what the forward model includes; see `jaxtrachea.mechanics.press.Options`."""
 
     coupling: Literal["series", "total"] = "series"
     split: Literal["continuous", "independent"] = "continuous"
@@ -174,7 +174,7 @@ class NoiseSection(Section):
 
 
 class FitSection(Section):
-    """[fit]: how to weigh and solve; see `jaxtrachea.identify.fit.Settings`."""
+    """[fit]: how to weigh and solve; see `jaxtrachea.fit.fit.Settings`."""
 
     method: Literal["levenberg-marquardt", "lbfgs", "adam"] = "levenberg-marquardt"
     balance: Literal["curve", "sample"] = "curve"

@@ -20,17 +20,17 @@ import numpy as np
 import pytest
 
 import jaxtrachea
-from jaxtrachea.identify.fit import Settings
-from jaxtrachea.identify.parameters import DEFAULTS, Parameter
-from jaxtrachea.identify.problem import Lane, Noise
-from jaxtrachea.identify.solve import Tolerances
+from jaxtrachea.fit.fit import Settings
+from jaxtrachea.fit.levenberg_marquardt import Tolerances
+from jaxtrachea.fit.parameters import DEFAULTS, Parameter
+from jaxtrachea.fit.problem import Lane, Noise
 from jaxtrachea.mechanics import beam
-from jaxtrachea.model import Options, press
-from jaxtrachea.oblique import press_oblique, press_path
+from jaxtrachea.mechanics.oblique import press_oblique, press_path
+from jaxtrachea.mechanics.press import Options, press
+from jaxtrachea.mechanics.skeleton import skeleton_response
 from jaxtrachea.scene.plan import Wishes
 from jaxtrachea.scene.simulation import simulate, sweep
 from jaxtrachea.scene.stage import Poses, Presses, make_scene
-from jaxtrachea.skeleton import skeleton_response
 from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.material import Material
@@ -162,7 +162,7 @@ def test_no_function_runs_a_misspelt_word():
             any_words(real, argument)
     assert seen >= INNER | {
         "mechanics.beam.deflect",
-        "identify.problem.build",
+        "fit.problem.build",
         "oblique.press_path",
     }
 

@@ -11,12 +11,12 @@ import pytest
 import synthetic
 from run_cli import GOOD, run
 
-from jaxtrachea.identify.bootstrap import bootstrap
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.problem import build
-from jaxtrachea.model import Options
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.parameters import DEFAULTS
+from jaxtrachea.fit.problem import build
+from jaxtrachea.inference.bootstrap import bootstrap
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import table_1
 
 ONE = Settings(starts=1)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.identify import bootstrap as bootstraps
-from jaxtrachea.identify.descent import descend
-from jaxtrachea.identify.fit import Settings, first_sigma, fit
-from jaxtrachea.identify.problem import Noise, build
-from jaxtrachea.identify.profile import profiles
-from jaxtrachea.identify.solve import Tolerances, levenberg_marquardt
+from jaxtrachea.fit.descent import descend
+from jaxtrachea.fit.fit import Settings, first_sigma, fit
+from jaxtrachea.fit.levenberg_marquardt import Tolerances, levenberg_marquardt
+from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.inference import bootstrap as bootstraps
+from jaxtrachea.inference.profile import profiles
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 EPSILON = np.finfo(np.float64).eps

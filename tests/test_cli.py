@@ -12,7 +12,7 @@ import pytest
 from run_cli import GOOD, run, tree
 
 import jaxtrachea
-from jaxtrachea.identify import fit as fit_module
+from jaxtrachea.fit import fit as fit_module
 
 ROOT = Path(__file__).parents[1]
 HEAD = "specimen,trial,s [mm],displacement [mm],force [N]\n"
@@ -273,7 +273,7 @@ def test_stopped_run_leaves_nothing(error, code, out, study, monkeypatch, capsys
 
     (study / "there").mkdir()
     monkeypatch.chdir(study)
-    monkeypatch.setattr("jaxtrachea.identify.fit.fit", stop)
+    monkeypatch.setattr("jaxtrachea.fit.fit.fit", stop)
     before = tree(study)
     arguments = ("fit", "spec.toml", "--out", out)
     if code is None:
@@ -288,7 +288,7 @@ def jaxtrachea_command(*arguments, **kwargs):
     # A shell that starts the suite in the background lets it ignore interrupts.
     code = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "from jaxtrachea.cli import main; sys.exit(main())"
+        "from jaxtrachea.cli.main import main; sys.exit(main())"
     )
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)],
@@ -332,7 +332,7 @@ def test_interrupt_that_was_swallowed(study, monkeypatch, capsys):
         pytest.fail("went on after an interrupt")
 
     monkeypatch.chdir(study)
-    monkeypatch.setattr("jaxtrachea.identify.fit.fit", fit)
+    monkeypatch.setattr("jaxtrachea.fit.fit.fit", fit)
     previous = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         code, _, err = run(monkeypatch, capsys, "fit", "spec.toml")
@@ -367,7 +367,7 @@ def test_version_and_help(monkeypatch, capsys):
 def test_help_is_quick_and_loads_nothing_heavy():
     """Bar: 1 s of processor time, measured 0.5 s; jax, h5py and matplotlib would take 2 s more."""
     code = (
-        "import sys, jaxtrachea.cli\n"
+        "import sys, jaxtrachea.cli.main\n"
         "heavy = ('h5py', 'matplotlib', 'pydantic', 'optax', 'scipy')\n"
         "print([m for m in heavy if m in sys.modules])"
     )

@@ -15,18 +15,19 @@ import synthetic
 from small_scenes import MATERIAL, MESH, TUBE, presses
 
 from jaxtrachea import Wishes, make_scene, simulate
-from jaxtrachea.identify import bootstrap, solve
-from jaxtrachea.identify.cost import evaluate
-from jaxtrachea.identify.design import situation
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.influence import influence
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.predictions import Prediction
-from jaxtrachea.identify.problem import Noise, build
-from jaxtrachea.identify.solve import Tolerances
-from jaxtrachea.identify.starts import draw_starts
-from jaxtrachea.model import Options
+from jaxtrachea.fit import levenberg_marquardt as solve
+from jaxtrachea.fit.cost import evaluate
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.levenberg_marquardt import Tolerances
+from jaxtrachea.fit.parameters import DEFAULTS
+from jaxtrachea.fit.predictions import Prediction
+from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.fit.starts import draw_starts
+from jaxtrachea.inference import bootstrap
+from jaxtrachea.inference.design import situation
+from jaxtrachea.inference.influence import influence
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import table_1
 
 ONE = Settings(

@@ -8,7 +8,7 @@ import pytest
 
 from jaxtrachea import config
 from jaxtrachea.config import FitSpec, SpecError, load_fit_spec
-from jaxtrachea.identify.parameters import DEFAULTS
+from jaxtrachea.fit.parameters import DEFAULTS
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "fit_spec.md").read_text()

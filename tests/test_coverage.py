@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.profile import profiles
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.inference.profile import profiles
 
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
 

@@ -12,17 +12,17 @@ import scipy.stats
 import synthetic
 from run_cli import run
 
-from jaxtrachea.cli_compare import _left_out_notes
-from jaxtrachea.identify import repeats as repeats_module
-from jaxtrachea.identify.comparison import Model, Row, compared, same_data, sentence
-from jaxtrachea.identify.criteria import penalised, weights
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.onset import where_sought
-from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.problem import Noise, build
-from jaxtrachea.identify.repeats import Missed, leave_repeats_out, repeats
-from jaxtrachea.model import Options, press
+from jaxtrachea.cli.compare import _left_out_notes
+from jaxtrachea.fit.criteria import penalised, weights
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.onset import where_sought
+from jaxtrachea.fit.parameters import DEFAULTS
+from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.inference import repeats as repeats_module
+from jaxtrachea.inference.comparison import Model, Row, compared, same_data, sentence
+from jaxtrachea.inference.repeats import Missed, leave_repeats_out, repeats
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material

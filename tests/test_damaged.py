@@ -86,7 +86,7 @@ def test_damaged_in_a_process(name, folder):
     case = CASES[name]
     case.put(folder)
     before = entries(folder)
-    code = "from jaxtrachea.cli import main; main()"
+    code = "from jaxtrachea.cli.main import main; main()"
     done = subprocess.run(
         [sys.executable, "-c", code, *case.command], capture_output=True, text=True, timeout=60
     )

@@ -9,7 +9,9 @@ import pytest
 import synthetic
 from run_cli import run, tree
 
-from jaxtrachea.identify.design import (
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.inference.design import (
     Candidates,
     gains,
     grid,
@@ -18,8 +20,6 @@ from jaxtrachea.identify.design import (
     scores,
     situation,
 )
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.problem import Noise, build
 from jaxtrachea.status import FitStatus
 
 #: No one reads verdicts here.

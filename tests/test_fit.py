@@ -8,12 +8,12 @@ import pytest
 import synthetic
 from scipy.optimize import least_squares
 
-from jaxtrachea.identify.descent import descend
-from jaxtrachea.identify.fit import Settings, first_sigma, fit
-from jaxtrachea.identify.measurements import read_measurements
-from jaxtrachea.identify.problem import Noise, build
-from jaxtrachea.identify.solve import Tolerances, levenberg_marquardt
-from jaxtrachea.identify.verdict import describe_flat
+from jaxtrachea.fit.descent import descend
+from jaxtrachea.fit.fit import Settings, first_sigma, fit
+from jaxtrachea.fit.levenberg_marquardt import Tolerances, levenberg_marquardt
+from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.inference.verdict import describe_flat
+from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.status import FitStatus
 
 #: Truths that four curves with 1 % noise identify: a soft contact that hardens early.

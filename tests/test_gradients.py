@@ -12,7 +12,7 @@ from jaxtrachea.mechanics.axial import stretch
 from jaxtrachea.mechanics.beam import Beam, contact_compliance, deflect
 from jaxtrachea.mechanics.equilibrium import press_series, press_total
 from jaxtrachea.mechanics.force_law import Law, duffing, ring_weight
-from jaxtrachea.model import Options, press
+from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 

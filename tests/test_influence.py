@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.identify.estimate import estimate, lane_of
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.influence import influence
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.problem import Noise, build
-from jaxtrachea.identify.solve import Tolerances
-from jaxtrachea.model import Options
+from jaxtrachea.fit.estimate import estimate, lane_of
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.levenberg_marquardt import Tolerances
+from jaxtrachea.fit.parameters import DEFAULTS
+from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.inference.influence import influence
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import table_1
 
 SHARP = Settings(starts=1, tolerances=Tolerances(1e-15, 1e-15, 1e-15, 100))

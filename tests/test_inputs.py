@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from run_cli import GOOD
 
-from jaxtrachea.identify.measurements import DataError, ReadOptions, read_measurements
-from jaxtrachea.identify.names import appearance, look_alikes
-from jaxtrachea.identify.readers import lines, patterns, recognise, workbook
-from jaxtrachea.identify.readers.patterns import ensure_quick, is_plain
-from jaxtrachea.identify.readers.records import BadCurve, Curve
+from jaxtrachea.measurements.curve import BadCurve, Curve
+from jaxtrachea.measurements.names import appearance, look_alikes
+from jaxtrachea.measurements.read import DataError, ReadOptions, read_measurements
+from jaxtrachea.measurements.readers import lines, patterns, recognise, workbook
+from jaxtrachea.measurements.readers.patterns import ensure_quick, is_plain
 
 needs_openpyxl = pytest.mark.skipif(
     importlib.util.find_spec("openpyxl") is None, reason="openpyxl (extra 'xlsx') is not installed"

@@ -12,18 +12,22 @@ import synthetic
 from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
-from jaxtrachea.identify import arrow, joint, journal, results, study
-from jaxtrachea.identify import population as populations
-from jaxtrachea.identify.bootstrap import bootstrap
-from jaxtrachea.identify.design import check
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.population import population, population_rows, wanted
-from jaxtrachea.identify.predictions import curves_to_leave_out
-from jaxtrachea.identify.problem import Noise, build
-from jaxtrachea.identify.profile import profiles
-from jaxtrachea.model import Options, press
+from jaxtrachea.fit import schur as arrow
+from jaxtrachea.fit import shared as joint
+from jaxtrachea.fit import study
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.parameters import DEFAULTS
+from jaxtrachea.fit.predictions import curves_to_leave_out
+from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.inference import population as populations
+from jaxtrachea.inference import results
+from jaxtrachea.inference.bootstrap import bootstrap
+from jaxtrachea.inference.design import check
+from jaxtrachea.inference.population import population, population_rows, wanted
+from jaxtrachea.inference.profile import profiles
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options, press
+from jaxtrachea.runs import journal
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material

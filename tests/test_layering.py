@@ -98,10 +98,10 @@ def test_imports_only_from_above(path):
 @pytest.mark.parametrize(
     ("room", "source"),
     [
-        ("mechanics", "from jaxtrachea.model import press"),
+        ("mechanics", "from jaxtrachea.mechanics.press import press"),
         ("trachea", "def f():\n    import jaxtrachea.mechanics.beam as b"),
         ("model", "from jaxtrachea import identify"),
-        ("surface", "from jaxtrachea.model import press"),
+        ("surface", "from jaxtrachea.mechanics.press import press"),
         ("identify", "from jaxtrachea.scene.stage import Scene"),
         ("trachea", "from jaxtrachea.surface.regions import bind"),
         ("mechanics", "from jaxtrachea.surface import local"),
@@ -121,7 +121,7 @@ def test_the_walk_sees_a_fault_within_the_scene():
 def test_import_is_light():
     """Plots, meshes, the command line and file formats are loaded by those who use them."""
     code = (
-        "import sys, jaxtrachea, jaxtrachea.model, jaxtrachea.scene.simulation\n"
+        "import sys, jaxtrachea, jaxtrachea.mechanics.press, jaxtrachea.scene.simulation\n"
         "import jaxtrachea.surface.local, jaxtrachea.surface.regions, jaxtrachea.trachea.imported\n"
         f"print([m for m in {HEAVY!r} if m in sys.modules])"
     )

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from jaxtrachea.identify.measurements import (
+from jaxtrachea.measurements.read import (
     Curve,
     DataError,
     Measurements,
@@ -19,7 +19,7 @@ from jaxtrachea.identify.measurements import (
     read_measurements,
     write_hdf5,
 )
-from jaxtrachea.identify.readers import safe_hdf5
+from jaxtrachea.measurements.readers import safe_hdf5
 from jaxtrachea.units import UnitError
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -416,7 +416,7 @@ def test_options_with_wrong_units(options):
 
 def test_import_is_light():
     code = (
-        "import sys, jaxtrachea.identify.measurements;"
+        "import sys, jaxtrachea.measurements.read;"
         "sys.exit(bool({'jax', 'h5py', 'pandas', 'scipy'} & set(sys.modules)))"
     )
     root = str(Path(__file__).parents[1])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxtrachea.mechanics import beam, equilibrium, force_law
-from jaxtrachea.model import Options, ligament_beam, local_law, press, touch
+from jaxtrachea.mechanics.press import Options, ligament_beam, local_law, press, touch
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material

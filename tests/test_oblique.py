@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxtrachea.mechanics.oblique import ObliquePress, press_oblique, press_path
+from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.ring import Ring, ring_compliance
-from jaxtrachea.model import Options, press
-from jaxtrachea.oblique import ObliquePress, press_oblique, press_path
-from jaxtrachea.skeleton import local_frame, skeleton_response
+from jaxtrachea.mechanics.skeleton import local_frame, skeleton_response
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material

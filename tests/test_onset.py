@@ -9,20 +9,20 @@ from scipy.integrate import quad
 from scipy.optimize import least_squares
 
 from jaxtrachea._numerics import centred_hinge
-from jaxtrachea.identify.design import Candidates, check, gains, situation
-from jaxtrachea.identify.first_touch import first_touch
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.held_out import compare
-from jaxtrachea.identify.influence import influence
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import in_model
-from jaxtrachea.identify.predictions import leave_one_out, predictions, without
-from jaxtrachea.identify.problem import build, default_parameters
-from jaxtrachea.identify.repeats import leave_repeats_out
-from jaxtrachea.identify.results import verdict_sentence, write_hdf5
-from jaxtrachea.identify.stored import read_results
-from jaxtrachea.identify.verdict import describe_flat
-from jaxtrachea.model import Options, compliance
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.parameters import in_model
+from jaxtrachea.fit.predictions import leave_one_out, predictions, without
+from jaxtrachea.fit.problem import build, default_parameters
+from jaxtrachea.inference.design import Candidates, check, gains, situation
+from jaxtrachea.inference.held_out import compare
+from jaxtrachea.inference.influence import influence
+from jaxtrachea.inference.repeats import leave_repeats_out
+from jaxtrachea.inference.results import verdict_sentence, write_hdf5
+from jaxtrachea.inference.stored import read_results
+from jaxtrachea.inference.verdict import describe_flat
+from jaxtrachea.measurements.first_touch import first_touch
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options, compliance
 from jaxtrachea.trachea.material import Material
 
 ONE = Settings(starts=1)

@@ -13,20 +13,20 @@ import numpy as np
 import pytest
 from run_cli import GOOD, run
 
-from jaxtrachea.cli_run import Found, posterior_failed
-from jaxtrachea.identify.estimate import lane_of
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import DEFAULTS, in_model
-from jaxtrachea.identify.posterior import Posterior, log_density, posterior
-from jaxtrachea.identify.posterior_start import around_the_fit, mode
-from jaxtrachea.identify.posterior_tables import rows_with_draws
-from jaxtrachea.identify.predictions import predictions
-from jaxtrachea.identify.problem import Noise, build, default_parameters
-from jaxtrachea.model import Options
-from jaxtrachea.overview import overview
-from jaxtrachea.report import report_text
-from jaxtrachea.sections import posterior_rows
+from jaxtrachea.cli.run import Found, posterior_failed
+from jaxtrachea.fit.estimate import lane_of
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.parameters import DEFAULTS, in_model
+from jaxtrachea.fit.predictions import predictions
+from jaxtrachea.fit.problem import Noise, build, default_parameters
+from jaxtrachea.inference.posterior import Posterior, log_density, posterior
+from jaxtrachea.inference.posterior_start import around_the_fit, mode
+from jaxtrachea.inference.posterior_tables import rows_with_draws
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.report.fit import report_text
+from jaxtrachea.report.overview import overview
+from jaxtrachea.report.sections import posterior_rows
 from jaxtrachea.trachea.geometry import table_1
 
 ONE = Settings(starts=1)

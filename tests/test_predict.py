@@ -20,19 +20,20 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 import jaxtrachea
-from jaxtrachea import prediction_plots
-from jaxtrachea.identify import former, held_out, results, stored
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.predict import predict_sources
-from jaxtrachea.identify.prediction_core import predicted
-from jaxtrachea.identify.predictions import leave_one_out, predictions, with_own_touch
-from jaxtrachea.identify.presses import parse_presses
-from jaxtrachea.identify.problem import Noise, build
-from jaxtrachea.identify.run_folder import NoRun
-from jaxtrachea.identify.sources import source_of
-from jaxtrachea.model import Options
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.parameters import DEFAULTS
+from jaxtrachea.fit.predictions import leave_one_out, predictions, with_own_touch
+from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.inference import held_out, results, stored
+from jaxtrachea.inference.predict import predict_sources
+from jaxtrachea.inference.prediction_core import predicted
+from jaxtrachea.inference.sources import source_of
+from jaxtrachea.measurements.presses import parse_presses
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.report.fit import prediction_plots
+from jaxtrachea.runs import former
+from jaxtrachea.runs.folder import NoRun
 from jaxtrachea.status import FitStatus, PredictionStatus
 from jaxtrachea.trachea.geometry import table_1
 
@@ -885,8 +886,8 @@ def test_bad_input_ends_with_a_cure(arguments, says, study, tmp_path, monkeypatc
 def test_virtual_trachea_ten_positions_by_the_command(tmp_path, monkeypatch, capsys):
     """The command on fits of nine positions predicts the tenth as `--leave-one-out` does."""
     from jaxtrachea.config import load_fit_spec
-    from jaxtrachea.identify.measurements import Measurements, write_hdf5
-    from jaxtrachea.identify.study import problem_of, read_data, settings_of
+    from jaxtrachea.fit.study import problem_of, read_data, settings_of
+    from jaxtrachea.measurements.read import Measurements, write_hdf5
 
     spec = load_fit_spec(VIRTUAL / "fit.toml")
     measured = read_data(spec, VIRTUAL)

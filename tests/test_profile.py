@@ -12,15 +12,15 @@ import synthetic
 from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.problem import Noise, build
-from jaxtrachea.identify.profile import choose, profiles
-from jaxtrachea.identify.profile_search import Sides
-from jaxtrachea.identify.results import profile_rows
-from jaxtrachea.model import Options
-from jaxtrachea.report import interval
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.parameters import DEFAULTS
+from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.fit.profile_search import Sides
+from jaxtrachea.inference.profile import choose, profiles
+from jaxtrachea.inference.results import profile_rows
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.report.fit import interval
 from jaxtrachea.status import FitStatus, ProfileEnd
 from jaxtrachea.trachea.geometry import table_1
 

@@ -15,28 +15,28 @@ from rich.console import Console
 from rich.progress import Progress
 from run_cli import run
 
-from jaxtrachea.identify import results
-from jaxtrachea.identify.effective import effective, share_independent
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.influence import influence
-from jaxtrachea.identify.measurements import Curve, read_measurements
-from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.predictions import LeftOut, predictions
-from jaxtrachea.identify.problem import Noise, build
-from jaxtrachea.identify.rows import worst_first
-from jaxtrachea.identify.summary import with_residuals
-from jaxtrachea.model import Options
-from jaxtrachea.overview import overview
-from jaxtrachea.pictures import plain, save_each, without_lost
-from jaxtrachea.plots import STYLE, draw_all
-from jaxtrachea.report import left_out_table, report_text
-from jaxtrachea.sections import REASONS, influence_cell, influence_section
-from jaxtrachea.spreadsheet import quoted, read_csv, unquoted, write_csv
+from jaxtrachea.cli.terminal import Stages, progress_bar
+from jaxtrachea.cli.terminal_table import wide_table
+from jaxtrachea.files.html import page
+from jaxtrachea.files.pictures import plain, save_each, without_lost
+from jaxtrachea.files.tables import quoted, read_csv, unquoted, write_csv
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.parameters import DEFAULTS
+from jaxtrachea.fit.predictions import LeftOut, predictions
+from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.fit.rows import worst_first
+from jaxtrachea.inference import results
+from jaxtrachea.inference.effective import effective, share_independent
+from jaxtrachea.inference.influence import influence
+from jaxtrachea.inference.summary import with_residuals
+from jaxtrachea.measurements.read import Curve, read_measurements
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.report.fit import left_out_table, report_text
+from jaxtrachea.report.overview import overview
+from jaxtrachea.report.plots import STYLE, draw_all
+from jaxtrachea.report.sections import REASONS, influence_cell, influence_section
 from jaxtrachea.status import FitStatus
-from jaxtrachea.terminal import Stages, progress_bar
-from jaxtrachea.terminal_table import wide_table
 from jaxtrachea.trachea.geometry import table_1
-from jaxtrachea.webpage import page
 
 NAMES = ["$a$", "a_b$", r"$\frac{$", "=1+1", "<script>", "a|b", "two\nlines", "x" * 200, "🫁",
          "_hidden", "[bold]", ":smile:", r"\$x$"]  # fmt: skip
@@ -173,7 +173,7 @@ def test_a_picture_that_fails_costs_itself(many, tmp_path, monkeypatch):
     def broken(*_):
         raise ValueError("no such $ colour")
 
-    monkeypatch.setattr("jaxtrachea.plots.draw_residuals", broken)
+    monkeypatch.setattr("jaxtrachea.report.plots.draw_residuals", broken)
     seen = predictions(many.problem, many.theta)
     paths, lost = draw_all(tmp_path, many, seen)
     assert [p.name for p in paths] == ["fit.png", "correlation.png"]

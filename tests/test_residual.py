@@ -10,11 +10,11 @@ import pytest
 import synthetic
 from scipy.integrate import quad
 
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import in_model
-from jaxtrachea.identify.problem import Noise, build, default_parameters
-from jaxtrachea.identify.residual import residual, residual_value
-from jaxtrachea.model import Options, press
+from jaxtrachea.fit.parameters import in_model
+from jaxtrachea.fit.problem import Noise, build, default_parameters
+from jaxtrachea.fit.residual import residual, residual_value
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.material import Material
 
 FREE = {"fixed": False}

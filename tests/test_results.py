@@ -10,12 +10,10 @@ import h5py
 import numpy as np
 import pytest
 
-from jaxtrachea.identify import results
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.measurements import BadCurve, Curve
-from jaxtrachea.identify.output import OutputExists, new_directory, new_output
-from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.predictions import (
+from jaxtrachea.files.output import OutputExists, new_directory, new_output
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.parameters import DEFAULTS
+from jaxtrachea.fit.predictions import (
     Prediction,
     curves_to_leave_out,
     lag_correlation,
@@ -23,10 +21,12 @@ from jaxtrachea.identify.predictions import (
     predictions,
     rms,
 )
-from jaxtrachea.identify.problem import build
-from jaxtrachea.model import Options
-from jaxtrachea.plots import draw_all
-from jaxtrachea.report import left_out_rows, markdown_table, number, report_text
+from jaxtrachea.fit.problem import build
+from jaxtrachea.inference import results
+from jaxtrachea.measurements.read import BadCurve, Curve
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.report.fit import left_out_rows, markdown_table, number, report_text
+from jaxtrachea.report.plots import draw_all
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
 

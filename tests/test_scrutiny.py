@@ -10,18 +10,19 @@ import specimens
 from scipy.special import stdtrit
 from specimens import NAMES, POSITIONS, STIFF_CONTACT
 
-from jaxtrachea.identify import results, scrutiny
-from jaxtrachea.identify import structure as structures
-from jaxtrachea.identify.effective import effective
-from jaxtrachea.identify.fit import Settings, fit
-from jaxtrachea.identify.judgement import judgement, verdict_of
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import in_model
-from jaxtrachea.identify.population import population
-from jaxtrachea.identify.predictions import Prediction
-from jaxtrachea.identify.problem import build, default_parameters
-from jaxtrachea.model import Options
-from jaxtrachea.report import estimate_rows, spread_rows
+from jaxtrachea.fit import scrutiny
+from jaxtrachea.fit import structure as structures
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.parameters import in_model
+from jaxtrachea.fit.predictions import Prediction
+from jaxtrachea.fit.problem import build, default_parameters
+from jaxtrachea.inference import results
+from jaxtrachea.inference.effective import effective
+from jaxtrachea.inference.judgement import judgement, verdict_of
+from jaxtrachea.inference.population import population
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.report.fit import estimate_rows, spread_rows
 from jaxtrachea.status import FitStatus, ProfileEnd
 from jaxtrachea.trachea.geometry import table_1
 

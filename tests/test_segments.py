@@ -7,13 +7,13 @@ import load_hold
 import numpy as np
 import pytest
 
-from jaxtrachea.identify.measurements import BadCurve, ReadOptions
-from jaxtrachea.identify.readers.checks import finish
-from jaxtrachea.identify.readers.plausible import doubt
-from jaxtrachea.identify.readers.records import RawCurve
-from jaxtrachea.identify.readers.segments import NoLoading, segment
-from jaxtrachea.identify.readers.turning import noise, turned_back, turning_points
-from jaxtrachea.identify.usage_tables import lane_cells, sentences, usage_lines, usage_rows
+from jaxtrachea.measurements.checks import finish
+from jaxtrachea.measurements.curve import RawCurve
+from jaxtrachea.measurements.plausible import doubt
+from jaxtrachea.measurements.read import BadCurve, ReadOptions
+from jaxtrachea.measurements.segments import NoLoading, segment
+from jaxtrachea.measurements.turning import noise, turned_back, turning_points
+from jaxtrachea.measurements.usage_tables import lane_cells, sentences, usage_lines, usage_rows
 
 UP = np.linspace(0, 4, 200)
 DOWN = UP[::-1]

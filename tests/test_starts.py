@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.identify.fit import Settings
-from jaxtrachea.identify.solve import Solved
-from jaxtrachea.identify.starts import REDRAWS, best, completed, draw_starts
+from jaxtrachea.fit.fit import Settings
+from jaxtrachea.fit.levenberg_marquardt import Solved
+from jaxtrachea.fit.starts import REDRAWS, best, completed, draw_starts
 from jaxtrachea.status import FitStatus
 
 #: Lanes of the tests, and the cost of the deep and the shallow minimum.

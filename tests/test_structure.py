@@ -6,11 +6,11 @@ import beam_fem
 import numpy as np
 import pytest
 
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import in_model
-from jaxtrachea.identify.problem import build, default_parameters
-from jaxtrachea.identify.structure import null_spaces, pins, structure, suspicious
-from jaxtrachea.model import Options
+from jaxtrachea.fit.parameters import in_model
+from jaxtrachea.fit.problem import build, default_parameters
+from jaxtrachea.fit.structure import null_spaces, pins, structure, suspicious
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import table_1
 
 GEOMETRY = table_1()

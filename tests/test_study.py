@@ -9,16 +9,10 @@ import pytest
 from run_cli import run
 
 from jaxtrachea.config import FitSpec, SpecError, TracheaSection, load_fit_spec
-from jaxtrachea.identify.measurements import Curve, DataError, Measurements, write_hdf5
-from jaxtrachea.identify.parameters import DEFAULTS
-from jaxtrachea.identify.study import (
-    find_files,
-    geometry_of,
-    parameters_of,
-    read_data,
-    usable,
-)
-from jaxtrachea.model import Options
+from jaxtrachea.fit.parameters import DEFAULTS
+from jaxtrachea.fit.study import find_files, geometry_of, parameters_of, read_data, usable
+from jaxtrachea.measurements.read import Curve, DataError, Measurements, write_hdf5
+from jaxtrachea.mechanics.press import Options
 
 SPEC = """
 [data]

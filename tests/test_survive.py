@@ -20,22 +20,17 @@ from interrupted import finish, kill_often, numbers, start, wait_for, write_stud
 from run_cli import run, tree
 
 import jaxtrachea
-from jaxtrachea import cli, processes
+from jaxtrachea.cli.main import main as cli
+from jaxtrachea.cli.terminal import set_up_jax
 from jaxtrachea.config import load_fit_spec
-from jaxtrachea.identify import (
-    chunks,
-    fit,
-    former,
-    in_chunks,
-    journal,
-    output,
-    run_folder,
-    run_lock,
-    solve,
-)
-from jaxtrachea.identify.study import problem_of, read_data
-from jaxtrachea.processes import Lost, Meeting, Watch
-from jaxtrachea.terminal import set_up_jax
+from jaxtrachea.files import lock as run_lock
+from jaxtrachea.files import output
+from jaxtrachea.fit import fit
+from jaxtrachea.fit import levenberg_marquardt as solve
+from jaxtrachea.fit.study import problem_of, read_data
+from jaxtrachea.runs import chunks, former, in_chunks, journal, processes
+from jaxtrachea.runs import folder as run_folder
+from jaxtrachea.runs.processes import Lost, Meeting, Watch
 
 FIT = ("fit", "spec.toml", "--out", "out")
 
@@ -57,8 +52,8 @@ def peace(tmp_path_factory):
 def quietly(patch, folder):
     """Work in `folder`, without plots."""
     patch.chdir(folder)
-    patch.setattr("jaxtrachea.plots.draw_all", lambda *_: ([], {}))
-    patch.setattr("jaxtrachea.webpage.page", lambda *_: "")
+    patch.setattr("jaxtrachea.report.plots.draw_all", lambda *_: ([], {}))
+    patch.setattr("jaxtrachea.files.html.page", lambda *_: "")
 
 
 @pytest.fixture
@@ -80,7 +75,7 @@ def stop_at(patch, k, error=KeyboardInterrupt):
             raise error
         return real(problem, settings, progress)
 
-    patch.setattr("jaxtrachea.identify.fit.fit", stopping)
+    patch.setattr("jaxtrachea.fit.fit.fit", stopping)
     return asked
 
 
@@ -112,11 +107,11 @@ def test_stopped_and_resumed(peace, study, monkeypatch, capsys):
 def test_an_error_while_files_are_written_keeps_the_chunks(peace, study, monkeypatch, capsys):
     with monkeypatch.context() as patch:
         patch.setattr(
-            "jaxtrachea.plots.draw_all", lambda *_: (_ for _ in ()).throw(OSError(28, ""))
+            "jaxtrachea.report.plots.draw_all", lambda *_: (_ for _ in ()).throw(OSError(28, ""))
         )
         code, _, err = run(patch, capsys, *FIT)
     assert (code, "3 of 3 chunks are kept" in err) == (2, True)
-    monkeypatch.setattr("jaxtrachea.identify.fit.fit", None)
+    monkeypatch.setattr("jaxtrachea.fit.fit.fit", None)
     assert run(monkeypatch, capsys, *FIT, "--resume")[0] == 0
     assert numbers(study / "out") == numbers(peace / "out")
 
@@ -126,7 +121,7 @@ def test_stopped_while_files_move(peace, study, monkeypatch, capsys):
     shutil.copytree(peace / "out", study / "out" / ".written")
     (study / "out" / ".run").mkdir()
     (study / "out" / ".written" / "summary.csv").replace(study / "out" / "summary.csv")
-    monkeypatch.setattr("jaxtrachea.identify.fit.fit", None)
+    monkeypatch.setattr("jaxtrachea.fit.fit.fit", None)
     code, _, err = run(monkeypatch, capsys, *FIT, "--resume")
     assert (code, "out is finished" in err) == (0, True)
     assert tree(study / "out") == tree(peace / "out")
@@ -180,7 +175,7 @@ def test_refusals(peace, study, monkeypatch, capsys):
         stop_at(patch, 2)
         assert run(patch, capsys, *FIT)[0] == 130
     shutil.copytree(peace / "out", study / "finished")
-    monkeypatch.setattr("jaxtrachea.identify.fit.fit", None)
+    monkeypatch.setattr("jaxtrachea.fit.fit.fit", None)
     refused(*FIT, "--rerun-failed", says=["not finished; use --resume first"])
     for change, says in CHANGES.values():
         kept = {p.name: p.read_text() for p in (study / "spec.toml", study / "curves.csv")}
@@ -235,7 +230,7 @@ def test_failed_lanes_are_fitted_again(peace, study, monkeypatch, capsys):
         seen.append((problem.lanes.lower.shape[0], settings.starts, settings.seed))
         return real(problem, settings, progress)
 
-    monkeypatch.setattr("jaxtrachea.identify.fit.fit", fit_and_tell)
+    monkeypatch.setattr("jaxtrachea.fit.fit.fit", fit_and_tell)
     code, _, err = run(monkeypatch, capsys, *FIT, "--rerun-failed")
     assert code == 0, err
     assert seen == [(2, 8, 1)]
@@ -380,7 +375,7 @@ def begun(peace, study, monkeypatch, capsys):
 HOLD = """
 import sys
 from pathlib import Path
-from jaxtrachea.identify.run_lock import take
+from jaxtrachea.files.lock import take
 lock = take(Path("out"))
 print("held", "jax" in sys.modules, flush=True)
 sys.stdin.read()
@@ -431,8 +426,8 @@ def test_the_lock_lasts_as_long_as_the_run(study, monkeypatch, capsys):
         at_work()
         return real(*arguments)
 
-    monkeypatch.setattr("jaxtrachea.identify.fit.fit", fit_and_look)
-    monkeypatch.setattr("jaxtrachea.plots.draw_all", lambda *_: at_work() or ([], {}))
+    monkeypatch.setattr("jaxtrachea.fit.fit.fit", fit_and_look)
+    monkeypatch.setattr("jaxtrachea.report.plots.draw_all", lambda *_: at_work() or ([], {}))
     assert run(monkeypatch, capsys, *FIT)[0] == 0
     assert len(seen) == 4
     set_failed(study / "out" / "results.h5", [1])
@@ -503,8 +498,8 @@ def test_a_disk_that_fills_up(peace, study, monkeypatch, capsys, code):
 
     With room again the run goes on to the same numbers.
     """
-    monkeypatch.setattr("jaxtrachea.identify.fit.fit", from_peace(peace))
-    monkeypatch.setattr("jaxtrachea.cli_run.show", lambda *_: None)
+    monkeypatch.setattr("jaxtrachea.fit.fit.fit", from_peace(peace))
+    monkeypatch.setattr("jaxtrachea.cli.run.show", lambda *_: None)
     out, expected = study / "out", numbers(peace / "out")
     with Disk(out).watched() as disk:
         assert run(monkeypatch, capsys, *FIT)[0] == 0
@@ -560,7 +555,7 @@ def test_hdf5_on_a_full_disk(tmp_path):
     code = f"""
 import resource
 from pathlib import Path
-from jaxtrachea.identify.whole_files import hdf5_file
+from jaxtrachea.files.atomic import hdf5_file
 resource.setrlimit(resource.RLIMIT_FSIZE, (5000, resource.RLIM_INFINITY))
 try:
     with hdf5_file(Path({str(tmp_path / "a.h5")!r})) as file:
@@ -600,7 +595,7 @@ def test_a_damaged_journal_costs_no_chunk(peace, study, monkeypatch, capsys):
             shutil.copy(peace / "curves.csv", study)
             asked = []
             patch.setattr(
-                "jaxtrachea.identify.fit.fit", lambda p, *a, n=asked: n.append(p) or fitted(p, *a)
+                "jaxtrachea.fit.fit.fit", lambda p, *a, n=asked: n.append(p) or fitted(p, *a)
             )
             code, _, err = run(patch, capsys, *FIT, "--resume")
         assert code == 0, err
@@ -634,7 +629,7 @@ def test_options_and_force_outlive_the_journal(peace, study, monkeypatch, capsys
         path.unlink()
     assert run_folder.known_journal(study / "out")[0] == journal.from_dict(json.loads(text))
     (folder / "previous-run.json").unlink()
-    monkeypatch.setattr("jaxtrachea.identify.fit.fit", from_peace(peace))
+    monkeypatch.setattr("jaxtrachea.fit.fit.fit", from_peace(peace))
     shutil.copy(peace / "curves.csv", study)
     code, _, err = run(monkeypatch, capsys, *FIT, "--resume")
     assert (code, "nothing was saved yet" in err) == (0, True), err

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from run_cli import GOOD, run
 
-from jaxtrachea.webpage import ROWS, page
+from jaxtrachea.files.html import ROWS, page
 
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 VOID = {"meta", "img"}

@@ -13,7 +13,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from jaxtrachea.identify.measurements import Curve, Measurements, write_hdf5
+from jaxtrachea.measurements.read import Curve, Measurements, write_hdf5
 
 HERE = Path(__file__).parent
 ATTRS = {

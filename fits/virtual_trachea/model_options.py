@@ -14,10 +14,10 @@ import jax
 import numpy as np
 
 from jaxtrachea.config import FitSpec, load_fit_spec
-from jaxtrachea.identify.fit import FitResult, fit
-from jaxtrachea.identify.predictions import leave_one_out, rms
-from jaxtrachea.identify.results import peak_force
-from jaxtrachea.identify.study import problem_of, read_data, settings_of
+from jaxtrachea.fit.fit import FitResult, fit
+from jaxtrachea.fit.predictions import leave_one_out, rms
+from jaxtrachea.fit.study import problem_of, read_data, settings_of
+from jaxtrachea.inference.results import peak_force
 from jaxtrachea.status import FitStatus
 
 HERE = Path(__file__).parent

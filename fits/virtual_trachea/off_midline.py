@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrachea.model import Options
-from jaxtrachea.oblique import local_frame, press_oblique
+from jaxtrachea.mechanics.oblique import local_frame, press_oblique
+from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 

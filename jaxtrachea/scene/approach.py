@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea.contact.patches import Touch
+from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.ranges import in_lumen
 from jaxtrachea.scene.stage import Poses, Presses, Scene, at_row, followed, touch_tube
-from jaxtrachea.skeleton import local_frame
 
 
 class Approach(NamedTuple):

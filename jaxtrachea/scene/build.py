@@ -13,7 +13,7 @@ import numpy as np
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.contact import shapes
 from jaxtrachea.contact.pose import pose_from_vector
-from jaxtrachea.identify.study import geometry_of
+from jaxtrachea.fit.study import geometry_of
 from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.plan import PlanError, Wishes

@@ -9,8 +9,8 @@ import math
 from typing import Literal
 
 from jaxtrachea._arguments import check_record
-from jaxtrachea.model import Options
-from jaxtrachea.skeleton import Rings
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.skeleton import Rings
 from jaxtrachea.surface.regions import Method
 
 Switch = Literal["auto", "on", "off"]

@@ -12,7 +12,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from jaxtrachea.pictures import plain
+from jaxtrachea.files.pictures import plain
 from jaxtrachea.scene.simulation import Simulation, Sweep
 from jaxtrachea.scene.stage import Scene
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from jaxtrachea.identify.whole_files import hdf5_file
+from jaxtrachea.files.atomic import hdf5_file
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.simulation import Simulation, Sweep
 from jaxtrachea.scene.stage import Poses, Presses, Scene

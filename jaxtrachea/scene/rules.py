@@ -6,9 +6,9 @@ What is not wished for is chosen here; a wish that cannot be met is refused, nev
 import math
 from typing import Literal, get_args
 
-from jaxtrachea.model import Options
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.skeleton import Rings
 from jaxtrachea.scene.plan import Effect, Facts, Plan, PlanError, Wishes
-from jaxtrachea.skeleton import Rings
 from jaxtrachea.surface.regions import Method
 
 #: Angle (rad) and share of the motion below which something counts as not there.

@@ -34,13 +34,13 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtrachea._numerics import solve_spd
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.contact.pose import Pose, inverse, transform
-from jaxtrachea.oblique import Place, place_at
+from jaxtrachea.mechanics.oblique import Place, place_at
+from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.ranges import half_spacing
 from jaxtrachea.scene.simulation import on_the_tube
 from jaxtrachea.scene.stage import Poses, Presses, Scene, followed
-from jaxtrachea.skeleton import local_frame
 from jaxtrachea.trachea.material import Material
 
 #: Way along the surface that a seat holds, over the depth.

@@ -10,10 +10,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, shaped
-from jaxtrachea.admission import check_shapes, without_negative
+from jaxtrachea.mechanics.admission import check_shapes, without_negative
+from jaxtrachea.mechanics.oblique import Place, press_at, press_oblique, press_path
+from jaxtrachea.mechanics.press import (
+    ligament_beam,
+    local_law,
+    read_values,
+    respond,
+    unit_deflection,
+)
 from jaxtrachea.mechanics.ring import on_ring
-from jaxtrachea.model import ligament_beam, local_law, read_values, respond, unit_deflection
-from jaxtrachea.oblique import Place, press_at, press_oblique, press_path
+from jaxtrachea.mechanics.skeleton import local_frame
+from jaxtrachea.mechanics.skeleton import read_values as skeleton_values
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.deform import deform
 from jaxtrachea.scene.ranges import (
@@ -25,8 +33,6 @@ from jaxtrachea.scene.ranges import (
     unserved,
 )
 from jaxtrachea.scene.stage import Poses, Presses, Scene, check_path
-from jaxtrachea.skeleton import local_frame
-from jaxtrachea.skeleton import read_values as skeleton_values
 from jaxtrachea.status import ContactStatus, PressStatus
 from jaxtrachea.trachea.material import Material
 

@@ -161,7 +161,7 @@ class PathSection(Section):
 
 
 class LawSection(Section):
-    """[model]: the contact law; see `jaxtrachea.model.Options`."""
+    """[model]: the contact law; see `jaxtrachea.mechanics.press.Options`."""
 
     coupling: Literal["series", "total"] = "series"
     contact: Literal["unilateral", "bonded"] = "unilateral"

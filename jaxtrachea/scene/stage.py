@@ -11,18 +11,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import real, shaped
-from jaxtrachea.admission import check_shapes
 from jaxtrachea.contact.patches import Patches, Touch, straight_patches, touch
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import STANDARD, Settings
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.contact.walls import patches_of
+from jaxtrachea.mechanics.admission import check_shapes
+from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.plan import Facts, Plan, PlanError, Wishes
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import check_sizes
-from jaxtrachea.skeleton import local_frame
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material

@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.shapes import Shape, sphere
+from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.stage import Poses
-from jaxtrachea.skeleton import local_frame
 from jaxtrachea.surface import local
 
 #: Vertices nearest to the tool's place that may touch it, and the least share of the dent's peak

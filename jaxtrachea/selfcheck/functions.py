@@ -18,11 +18,11 @@ from jaxtrachea.mechanics.beam import Beam, deflect
 from jaxtrachea.mechanics.equilibrium import press_series, press_total
 from jaxtrachea.mechanics.force_law import Law, ring_weight
 from jaxtrachea.mechanics.friction import slide
+from jaxtrachea.mechanics.oblique import press_oblique
+from jaxtrachea.mechanics.press import Options, compliance, press
+from jaxtrachea.mechanics.press import respond as touch_and_respond
 from jaxtrachea.mechanics.ring import Ring, respond, ring_compliance
 from jaxtrachea.mechanics.vector_equilibrium import press_vector
-from jaxtrachea.model import Options, compliance, press
-from jaxtrachea.model import respond as touch_and_respond
-from jaxtrachea.oblique import press_oblique
 from jaxtrachea.surface.local import correction, fit
 from jaxtrachea.surface.regions import Binding, Keys, clamped, interpolate, weigh
 from jaxtrachea.trachea.geometry import Geometry

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtrachea._arguments import check_record
 from jaxtrachea.contact.search import FINE
 from jaxtrachea.mechanics.beam import Form, Split
+from jaxtrachea.mechanics.skeleton import Rings
 from jaxtrachea.scene.build import Staged, wishes_of
 from jaxtrachea.scene.plan import Effect, Facts, Plan, PlanError, Wishes
 from jaxtrachea.scene.rules import make_plan
@@ -28,7 +29,6 @@ from jaxtrachea.scene.stage import (
     with_geometry,
     with_mesh,
 )
-from jaxtrachea.skeleton import Rings
 from jaxtrachea.surface.regions import Method
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material

@@ -6,8 +6,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxtrachea.pictures import plain
-from jaxtrachea.plots import STYLE
+from jaxtrachea.files.pictures import plain
+from jaxtrachea.report.plots import STYLE
 
 #: An error up to this is drawn as exact, left of all others.
 EXACT = 1e-17

@@ -18,8 +18,8 @@ import common
 import fitting
 import numpy as np
 
-from jaxtrachea.identify import fit
-from jaxtrachea.identify.measurements import Measurements, write_hdf5
+from jaxtrachea.fit import fit
+from jaxtrachea.measurements.read import Measurements, write_hdf5
 
 SPECIMENS, SAMPLE, ROUNDS = 10_000, 20, 3
 SPOTS, DEPTHS = np.array([15.0, 30.0, 45.0, 65.0, 80.0]), np.linspace(0.03, 6.0, 200)
@@ -32,7 +32,7 @@ def command(problem) -> dict:
         curves = tuple(curve for lane in problem.curves for curve in lane)
         write_hdf5(folder / "cohort.h5", Measurements(curves, (), ()))
         (folder / "spec.toml").write_text('[data]\nfiles = ["cohort.h5"]\n')
-        code = "from jaxtrachea.cli import main; main()"
+        code = "from jaxtrachea.cli.main import main; main()"
         run = [sys.executable, "-c", code, "fit", "spec.toml", "--out", "out"]
         begin = time.perf_counter()
         done = subprocess.run(run, cwd=folder, stdout=subprocess.DEVNULL)

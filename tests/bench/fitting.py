@@ -16,11 +16,12 @@ import numpy as np
 import optimistix
 from scipy.optimize import least_squares
 
-from jaxtrachea.identify import fit, solve
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import in_model
-from jaxtrachea.identify.problem import Lane, build, default_parameters
-from jaxtrachea.model import Options, press
+from jaxtrachea.fit import fit
+from jaxtrachea.fit import levenberg_marquardt as solve
+from jaxtrachea.fit.parameters import in_model
+from jaxtrachea.fit.problem import Lane, build, default_parameters
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 

@@ -15,7 +15,8 @@ import numpy as np
 import update
 
 from jaxtrachea import Material, press, simulate, table_1
-from jaxtrachea.identify import cost, fit, residual, solve
+from jaxtrachea.fit import cost, fit, residual
+from jaxtrachea.fit import levenberg_marquardt as solve
 from jaxtrachea.scene.stage import Poses
 
 jax.config.update("jax_cpu_enable_async_dispatch", False)

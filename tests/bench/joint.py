@@ -16,7 +16,7 @@ import numpy as np
 sys.path.insert(0, str(common.FOLDER.parent / "reference"))
 import synthetic  # noqa: E402
 
-from jaxtrachea.identify.fit import Settings, fit  # noqa: E402
+from jaxtrachea.fit.fit import Settings, fit
 
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
 SIZES = {"joint": (10, 30, 100, 300, 1000, 3000, 10_000), "dense": (10, 20, 40, 80)}

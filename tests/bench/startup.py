@@ -21,7 +21,7 @@ START = "begin = time.perf_counter()\n"
 STOP = "print(json.dumps(time.perf_counter() - begin))\n"
 MODEL = """
 import jax, jax.numpy as jnp
-from jaxtrachea.model import press
+from jaxtrachea.mechanics.press import press
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 g, D = table_1(), jnp.linspace(0.0, 6.0, 50)
@@ -39,7 +39,7 @@ print(json.dumps(first - later))
 """
 FIT = """
 import fitting, jax, numpy as np
-from jaxtrachea.identify import fit, solve
+from jaxtrachea.fit import fit, levenberg_marquardt
 fitting.SPECIMENS = 256
 p, *_ = fitting.study()
 s = fit.Settings(starts=1)
@@ -49,8 +49,8 @@ f = lambda *a: solve.levenberg_marquardt(*a).theta
 CASES = {
     "import jax (alone)": START + "import json, jax\n" + STOP,
     "import jaxtrachea": START + "import json, jaxtrachea\n" + STOP,
-    "import jaxtrachea.model": START + "import json, jaxtrachea.model\n" + STOP,
-    "import jaxtrachea.identify.fit": START + "import json, jaxtrachea.identify.fit\n" + STOP,
+    "import jaxtrachea.mechanics.press": START + "import json, jaxtrachea.mechanics.press\n" + STOP,
+    "import jaxtrachea.fit.fit": START + "import json, jaxtrachea.fit.fit\n" + STOP,
     "compile press, 50 displacements": "import json" + MODEL + "f = jax.jit(value)" + TIMED,
     "compile gradient of press, 5 arguments": "import json"
     + MODEL
@@ -70,7 +70,7 @@ COUNTED = """
 import collections, sys, jax
 seen = collections.Counter()
 jax.monitoring.register_event_listener(lambda name, **_: seen.update([name.rsplit("/")[-1]]))
-from jaxtrachea.cli import main
+from jaxtrachea.cli.main import main
 try:
     sys.exit(main())
 finally:

@@ -20,7 +20,7 @@ import pytest
 import skeleton
 import update
 
-from jaxtrachea.identify import fit
+from jaxtrachea.fit import fit
 
 TURNS = 7
 SPECIMENS, SAMPLE = 500, 10

@@ -49,7 +49,7 @@ def full_of(name: str, coupling: str | None = None):
 
 def scene(name: str, settings) -> None:
     """Measure one scene; writes its JSON lines and its picture."""
-    from jaxtrachea.cli_tradeoff import measured_curves
+    from jaxtrachea.cli.tradeoff import measured_curves
     from jaxtrachea.tradeoff.measure import measure
     from jaxtrachea.tradeoff.page import lines
     from jaxtrachea.tradeoff.plots import draw

@@ -8,9 +8,9 @@ import numpy as np
 import synthetic
 from scipy.optimize import least_squares
 
-from jaxtrachea.identify.cost import evaluate
-from jaxtrachea.identify.problem import Problem
-from jaxtrachea.identify.residual import residual_value
+from jaxtrachea.fit.cost import evaluate
+from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.residual import residual_value
 
 #: Truths that four curves with 1 % noise identify: a soft contact that hardens early.
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])

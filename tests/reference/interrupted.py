@@ -56,7 +56,7 @@ def start(folder: Path, *arguments, **more) -> subprocess.Popen:
     """`jaxtrachea ARGUMENTS` in a process of its own, programs kept in `folder`/cache."""
     code = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "from jaxtrachea.cli import main; sys.exit(main())"
+        "from jaxtrachea.cli.main import main; sys.exit(main())"
     )
     kept = {
         "JAX_ENABLE_COMPILATION_CACHE": "true",

@@ -167,11 +167,11 @@ def fitted(chosen):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from jaxtrachea.identify.fit import Settings, fit
-    from jaxtrachea.identify.measurements import Curve
-    from jaxtrachea.identify.parameters import in_model
-    from jaxtrachea.identify.problem import build, default_parameters
-    from jaxtrachea.model import Options
+    from jaxtrachea.fit.fit import Settings, fit
+    from jaxtrachea.fit.parameters import in_model
+    from jaxtrachea.fit.problem import build, default_parameters
+    from jaxtrachea.measurements.read import Curve
+    from jaxtrachea.mechanics.press import Options
     from jaxtrachea.trachea.geometry import table_1
 
     options = Options(coupling="total")
@@ -195,7 +195,7 @@ def fitted(chosen):
 
 def summary(used=fitted):
     """Rows of the table: rule, records used, samples, errors of k_1 in % (median, 90 %, worst)."""
-    from jaxtrachea.identify.readers.segments import segment
+    from jaxtrachea.measurements.segments import segment
 
     found = records()
     rules = {

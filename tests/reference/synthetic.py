@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrachea.identify.measurements import Curve
-from jaxtrachea.identify.parameters import in_model
-from jaxtrachea.identify.problem import build, default_parameters
-from jaxtrachea.model import Options, press
+from jaxtrachea.fit.parameters import in_model
+from jaxtrachea.fit.problem import build, default_parameters
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 

@@ -22,13 +22,13 @@ from jaxtrachea import (
 )
 from jaxtrachea.contact.patches import touch
 from jaxtrachea.contact.pose import Pose
-from jaxtrachea.model import ligament_beam, local_law, respond, unit_deflection
+from jaxtrachea.mechanics.press import ligament_beam, local_law, respond, unit_deflection
+from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.ranges import contact_share, depth_share, in_lumen
 from jaxtrachea.scene.simulation import _refuse, _status, _without_negative
 from jaxtrachea.scene.stage import touch_tube
-from jaxtrachea.skeleton import local_frame
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.mesh import place
 

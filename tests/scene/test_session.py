@@ -24,9 +24,9 @@ from small_scenes import (
 from tool_ways import closed_loop, placed, random_way, step_lengths
 
 from jaxtrachea import Poses, Session, Wishes, make_scene, press, press_oblique, simulate
-from jaxtrachea.oblique import place_at
+from jaxtrachea.mechanics.oblique import place_at
+from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.seat import given_way
-from jaxtrachea.skeleton import local_frame
 from jaxtrachea.status import PressStatus
 
 EYE = np.eye(3)

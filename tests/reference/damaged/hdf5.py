@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from damaged.case import OTHER, Case, flipped
-from jaxtrachea.identify.measurements import Curve, Measurements, write_hdf5
+from jaxtrachea.measurements.read import Curve, Measurements, write_hdf5
 
 TRIAL = "specimens/T01/1"
 BESIDE = '[data]\nfiles = ["data.h5", "good.csv"]\n'

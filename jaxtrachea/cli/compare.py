@@ -1,0 +1,231 @@
+"""The command compare: which of several models the same curves prefer (docs/model_choice.md)."""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from jaxtrachea.cli.load import load
+from jaxtrachea.cli.terminal import Stages, Stop, into, progress_bar, table
+
+SpecsArgument = Annotated[
+    list[Path], typer.Argument(help="Fit specifications, two or more, of the same data.")
+]
+DataOption = Annotated[
+    Path | None, typer.Option("--data", help="Folder the data paths start from (default: SPEC's).")
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
+CrossOption = Annotated[
+    bool, typer.Option(help="Also predict every position, or trial, from the others.")
+]
+#: Specimens of a terminal table; the files hold all.
+MANY = 8
+HEAD = ["specimen", "model", "k", "-2 ln L", "dAICc", "deflated", "weight", "BIC", "left out"]
+
+
+def compare(
+    specs: SpecsArgument,
+    data: DataOption = None,
+    out_dir: OutOption = None,
+    cross_validation: CrossOption = True,
+) -> None:
+    """Fit the same data by several models: which one they prefer."""
+    clock = [time.perf_counter()]
+    if len(specs) < 2:
+        raise Stop("compare: one model has nothing to be compared with; give two or more SPEC")
+    loaded = [_loaded(path, data, first=i == 0) for i, path in enumerate(specs)]
+    names = _names(specs, [spec.title for spec, _, _ in loaded])
+    _same_data(specs, loaded, names)
+    clock.append(time.perf_counter())
+    default = Path("out") / f"{specs[0].absolute().parent.name}-compare"
+    with into(out_dir, default) as (folder, stop_if_asked):
+        models = _fitted(loaded, names, cross_validation, stop_if_asked)
+        clock.append(time.perf_counter())
+        rows, failed, said = _write(folder, specs, loaded, models, clock)
+    _print(rows, said, failed, models, folder.parent)
+    raise typer.Exit(1 if failed or loaded[0][1].bad else 0)
+
+
+def _loaded(path: Path, data: Path | None, *, first: bool):
+    """As `load`; curves that cannot be used are named once."""
+    if first:
+        return load(path, data, refits=True)
+    return load(path, data, refits=True, quiet=True)
+
+
+def _names(specs: list[Path], titles: list[str]) -> list[str]:
+    """Titles where every model has its own, else file names, else paths."""
+    for names in (titles, [path.stem for path in specs], [str(path) for path in specs]):
+        if all(names) and len(set(names)) == len(names):
+            return names
+    raise Stop("compare: the same specification is given twice; give different ones")
+
+
+def _same_data(specs, loaded, names) -> None:
+    from jaxtrachea.inference.comparison import same_data
+
+    digests = [sorted(measured.sha256().values()) for _, measured, _ in loaded]
+    for path, digest in zip(specs[1:], digests[1:], strict=True):
+        if digest != digests[0]:
+            raise Stop(
+                f"{path}: data.files: other content than that of {specs[0]} (SHA-256 differs); "
+                "give both the same files"
+            )
+    try:
+        same_data([problem for _, _, problem in loaded], names)
+    except ValueError as error:
+        raise Stop(f"compare: {error}") from None
+
+
+def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
+    from jaxtrachea.fit.fit import fit
+    from jaxtrachea.fit.study import settings_of
+    from jaxtrachea.inference.comparison import Model
+    from jaxtrachea.inference.repeats import leave_repeats_out
+
+    models = []
+    with progress_bar() as bar:
+        stages = Stages(bar, stop_if_asked)
+        counted = stages.begin
+        for (spec, _, problem), name in zip(loaded, names, strict=True):
+            settings = settings_of(spec)
+            result = fit(problem, settings, counted(name))
+            left = None
+            if cross_validation:
+                left = leave_repeats_out(problem, settings, counted(f"{name}, left out"))
+            models.append(Model(name, result, left))
+        stages.close()
+    return models
+
+
+def _write(folder: Path, specs, loaded, models, clock):
+    """compare.csv, report.md, provenance.json; returns the rows, failed lanes and sentences."""
+    import json
+    from hashlib import sha256 as digest
+
+    import jax
+
+    from jaxtrachea.inference import results
+    from jaxtrachea.inference.comparison import compared
+
+    rows, failed = compared(models)
+    said = _sentences(models, rows)
+    results.write_csv(folder / "compare.csv", [dataclasses.asdict(row) for row in rows])
+    results.write_text(folder / "report.md", _report(rows, said, failed, models))
+    ends = [*clock, time.perf_counter()]
+    timings = {n: ends[i + 1] - ends[i] for i, n in enumerate(("read", "fit", "write"))}
+    measured, precision = loaded[0][1], loaded[0][0].fit.precision
+    device = str(jax.devices()[0])
+    made = results.provenance(specs[0], measured.sha256(), device, precision, timings)
+    made["specifications"] = [
+        {"file": path.name, "model": m.name, "sha256": digest(path.read_bytes()).hexdigest()}
+        for path, m in zip(specs, models, strict=True)
+    ]
+    del made["specification"]
+    results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+    return rows, failed, said
+
+
+def _sentences(models, rows) -> dict[str, str]:
+    """Specimen to what its data prefer; the sum last."""
+    from jaxtrachea.inference.comparison import sentence
+
+    left = _left_out_words(models)
+    said = {}
+    for specimen in dict.fromkeys(row.specimen for row in rows):
+        own = [row for row in rows if row.specimen == specimen]
+        said[specimen] = sentence(own, left)
+    return said
+
+
+def _left_out_words(models) -> str:
+    """What was left out, in words; "curves" if nothing was."""
+    from jaxtrachea.inference.repeats import repeats
+
+    return repeats(models[0].result.problem).words or "curves"
+
+
+def _left_out_notes(models) -> list[str]:
+    """What is to be said of the refits behind the left-out column; nothing if all is well."""
+    from jaxtrachea.fit.predictions import refits_sentence
+
+    said = []
+    for model in models:
+        if model.left_out is None:
+            continue
+        refits, unconverged, lost = (int(v.sum()) for v in model.left_out[1:])
+        if not refits:
+            said.append(f"Nothing was left out of {model.name}: {_why_nothing(model)}.")
+        elif words := refits_sentence(refits, unconverged, lost):
+            none = "; there the left-out column has no number" if lost else ""
+            said.append(f"Left out of {model.name}: {words}{none}.")
+    return said
+
+
+def _why_nothing(model) -> str:
+    """Why there was nothing to leave out of a model."""
+    from jaxtrachea.fit.parameters import OF_THE_PRESS
+
+    free = model.result.problem.free
+    own = [p.name for p in free if p.scope == "trial" and p.name not in OF_THE_PRESS]
+    if own:
+        return f"{', '.join(own)} belongs to single curves, and no other curve tells of it"
+    return "no specimen has a second position or trial"
+
+
+def _cells(rows) -> list[list[str]]:
+    from jaxtrachea.report.fit import number
+
+    return [
+        [row.specimen, row.model, str(row.unknowns), number(row.deviance, 6), number(row.delta, 3),
+         number(row.deflated, 3), number(row.weight, 2), number(row.BIC, 6), _percent(row.left_out)]
+        for row in rows
+    ]  # fmt: skip
+
+
+def _percent(share: float) -> str:
+    return "–" if share != share else f"{100 * share:.2f} %"
+
+
+def _report(rows, said: dict[str, str], failed: int, models) -> str:
+    from jaxtrachea.report.fit import markdown_table
+
+    parts = [
+        "# Which model",
+        "\n".join(f"- {specimen}: {text}." for specimen, text in said.items()),
+        markdown_table(HEAD, _cells(rows)),
+        "k: fitted parameters and estimated standard deviations. dAICc: above the best model; "
+        "below 2 models cannot be told apart, from 10 on the worse one has next to no support. "
+        "deflated: the same where the likelihood counts only as many samples as are independent, "
+        "by the correlation of neighbouring residuals of the best model; decisive is what stays at "
+        "10 or more so. weight: Akaike weight. left out: root mean square error of force of "
+        f"{_left_out_words(models)} that took no part in the fit, over the largest force "
+        "(docs/model_choice.md). All numbers: `compare.csv`.",
+        *_left_out_notes(models),
+    ]
+    if failed:
+        parts.append(f"{failed} lanes could not be fitted by every model and count for none.")
+    return "\n\n".join(parts) + "\n"
+
+
+def _print(rows, said, failed: int, models, folder: Path) -> None:
+    out = Console()
+    names = [name for name in said if name != "(all)"]
+    if len(names) > MANY:  # what is decided says little more
+        names.sort(key=lambda name: "decisively (" in said[name])
+    shown = names[:MANY] + [name for name in said if name == "(all)"]
+    for name in shown:
+        cells = _cells([row for row in rows if row.specimen == name])
+        out.print(table("Models", HEAD, cells))
+        out.print(escape(f"{name}: {said[name]}"), highlight=False, emoji=False)
+    if len(names) > MANY:
+        out.print(f"and {len(names) - MANY} more specimens, see compare.csv")
+    for note in _left_out_notes(models):
+        out.print(escape(note), highlight=False, emoji=False)
+    if failed:
+        out.print(f"{failed} lanes could not be fitted by every model and count for none")
+    out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)

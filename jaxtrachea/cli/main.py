@@ -1,0 +1,308 @@
+"""The command line: the only room that turns errors into messages and exit codes.
+
+Exit codes: 0 everything converged, 1 some lane failed, some curve could not be used or the chains
+of a posterior are poor, 2 bad input, 3 another process was lost, 130 stopped by the user. What is
+heavy is imported inside the commands.
+"""
+
+import contextlib
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from jaxtrachea import __version__
+from jaxtrachea.cli import compare as cli_compare
+from jaxtrachea.cli import fit as cli_fit
+from jaxtrachea.cli import predict as cli_predict
+from jaxtrachea.cli import scene as cli_scene
+from jaxtrachea.cli import selfcheck as cli_selfcheck
+from jaxtrachea.cli import tradeoff as cli_tradeoff
+from jaxtrachea.cli.load import load
+from jaxtrachea.cli.run import posterior_failed, run, show, write
+from jaxtrachea.cli.terminal import Kept, Stop, complain, into, say_lost, table, to_stderr
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Trachea mechanics: identify them from force-displacement curves, simulate scenes.",
+)
+#: Rows of a terminal table; the files hold all.
+MANY = 40
+
+SpecArgument = Annotated[Path, typer.Argument(help="TOML specification of the fit.")]
+DataOption = Annotated[
+    Path | None, typer.Option("--data", help="Folder the data paths start from (default: SPEC's).")
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
+LeaveOption = Annotated[
+    bool, typer.Option("--leave-one-out", help="Also predict every curve from the others.")
+]
+ProfileOption = Annotated[
+    bool, typer.Option("--profile", help="Also profile the likelihood of the parameters.")
+]
+InfluenceOption = Annotated[
+    bool, typer.Option("--influence", help="Also say which samples and curves the estimates need.")
+]
+
+
+def main() -> None:
+    """Entry point: every expected error becomes one message on stderr and an exit code."""
+    try:
+        code = app(prog_name="jaxtrachea", standalone_mode=False)
+    except Stop as stop:
+        code = complain(str(stop))
+    except Kept as stop:
+        to_stderr(str(stop))
+        sys.exit(stop.code)
+    except typer.Exit as stop:
+        code = stop.exit_code
+    except (typer.Abort, KeyboardInterrupt):
+        code = 130
+    except OSError as error:  # none of the folders: those say where and what is kept
+        code = complain(_not_shown(error))
+    except Exception as error:
+        # Usage errors come from click or from typer's own copy of it, whichever is installed.
+        usage = getattr(error, "format_message", None)
+        if usage is None:
+            raise
+        code = complain(usage())
+    if code == 130:  # some versions of typer turn Ctrl-C into this exit code themselves
+        to_stderr("stopped; nothing was written")
+    sys.exit(code or 0)
+
+
+def _not_shown(error: OSError) -> str:
+    """What is said where the terminal, or what stands for it, takes no more text."""
+    with contextlib.suppress(OSError):
+        sys.stdout.close()  # not tried again as Python ends
+    reason = error.strerror or str(error)
+    return f"{error.filename or 'the output'}: {reason}; files said to be kept or written are there"
+
+
+for _command in (
+    cli_compare.compare, cli_predict.predict, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
+    cli_selfcheck.selfcheck, cli_tradeoff.tradeoff,
+):  # fmt: skip
+    app.command()(_command)
+
+
+@app.callback(invoke_without_command=True)
+def _options(
+    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+) -> None:
+    if version:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.command()
+def check(spec: SpecArgument, data: DataOption = None) -> None:
+    """Read everything, fit nothing, say what was found."""
+    _, measurements, problem = load(spec, data)
+    out = Console()
+    curves = measurements.curves
+    out.print(_curve_table(curves))
+    if len(curves) > MANY:
+        out.print(f"... and {len(curves) - MANY} more")
+    _print_usage(out, curves)
+    if problem.free:
+        out.print(_parameter_table(problem.parameters, problem.options))
+    fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in problem.parameters if p.fixed)
+    out.print(f"Fixed: {fixed or 'none'}", highlight=False)
+    lanes, bad = len(problem.curves), len(measurements.bad)
+    joint = ", fitted jointly" if problem.joint else ""
+    out.print(f"{lanes} lane(s){joint} of up to {problem.size} unknowns, {bad} bad curves")
+    raise typer.Exit(1 if bad else 0)
+
+
+@app.command()
+def fit(
+    spec: SpecArgument,
+    data: DataOption = None,
+    out_dir: OutOption = None,
+    leave_one_out: LeaveOption = False,
+    profile: ProfileOption = False,
+    influence: InfluenceOption = False,
+    resume: cli_fit.ResumeOption = False,
+    rerun_failed: cli_fit.RerunOption = False,
+    force: cli_fit.ForceOption = False,
+    no_lock: cli_fit.NoLockOption = False,
+    distributed: cli_fit.DistributedOption = False,
+    coordinator: cli_fit.CoordinatorOption = None,
+    processes: cli_fit.ProcessesOption = None,
+    process: cli_fit.ProcessOption = None,
+    patience: cli_fit.PatienceOption = 100.0,
+) -> None:
+    """Fit, write results.h5, tables, report, plots."""
+    from jaxtrachea.fit.study import settings_of
+    from jaxtrachea.inference.results import succeeded
+
+    clock = [time.perf_counter()]
+    meeting = cli_fit.meet(distributed, coordinator, processes, process, patience)
+    default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
+    how = cli_fit.How(out_dir, default, resume, rerun_failed, force, meeting, not no_lock)
+    cli_fit.check_options(how)
+    asked = {"leave-one-out": leave_one_out, "profile": profile, "influence": influence}
+    options = [name for name, wanted in asked.items() if wanted]
+    options = sorted({*options, *cli_fit.remembered(how)})
+    loaded, measurements, problem = load(spec, data, refits=bool(options))
+    _has_unknowns(spec, loaded, problem, options)
+    root = spec.parent if data is None else data
+    now = cli_fit.describe(how, spec, root, loaded, measurements, problem, options)
+    if meeting.process > 0:
+        cli_fit.help_out(how, now, problem, settings_of(loaded))
+        raise typer.Exit(0)
+    if "leave-one-out" in options:
+        _can_leave_out(problem)
+    names = _names_to_profile(spec, loaded, problem, "profile" in options)
+    if loaded.uncertainty.posterior:
+        _can_draw(spec)
+    clock.append(time.perf_counter())
+    with cli_fit.running(how, now, problem, settings_of(loaded)) as under:
+        found = run(
+            loaded, problem, under.settings, under.options, names, under.stop_if_asked, under.fit
+        )
+        clock.append(time.perf_counter())
+        write(under.folder, spec, loaded, measurements, found, clock, under.journal)
+    show(found, under.folder.parent)
+    failed = any(not succeeded(found.result, lane) for lane in range(found.result.lanes))
+    raise typer.Exit(1 if failed or measurements.bad or posterior_failed(found) else 0)
+
+
+@app.command()
+def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = None) -> None:
+    """Fit, then say where the next presses tell most."""
+    from jaxtrachea.config import SpecError
+    from jaxtrachea.fit.study import candidates_of, settings_of
+
+    loaded, measurements, problem = load(spec, data, refits=True)
+    if not problem.free:
+        raise Stop(f"{spec}: design: every parameter is fixed; free what the presses shall tell")
+    try:
+        candidates = candidates_of(loaded, problem)
+    except SpecError as error:
+        raise Stop(f"{spec}: {error}") from None
+    if loaded.uncertainty.posterior:
+        _can_draw(spec)
+    default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}-design"
+    with into(out_dir, default) as (folder, stop_if_asked):
+        found = run(loaded, problem, settings_of(loaded), (), (), stop_if_asked)
+        try:
+            rows = _design(folder, loaded, found, candidates)
+        except ValueError as error:
+            raise Stop(f"{spec}: {error}") from None
+    errors = [k.removesuffix(" relative se") for k in rows[0] if k.endswith(" relative se")]
+    head = ["press", "s [mm]", "depth [mm]", *errors]
+    cells = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
+    out = Console()
+    out.print(table("Next presses, relative errors expected after each", head, cells))
+    out.print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
+    raise typer.Exit(1 if measurements.bad else 0)
+
+
+def _design(folder: Path, loaded, found, candidates) -> list[dict[str, object]]:
+    """Choose, write the files, return the rows of the choice."""
+    import numpy as np
+
+    from jaxtrachea.inference import design as designs
+    from jaxtrachea.inference import design_tables as tables
+    from jaxtrachea.inference.results import write_csv
+    from jaxtrachea.report.plots import draw_design
+
+    section = loaded.design
+    known = designs.situation(found.result, found.resampled)
+    unknowns = tables.names(known, found.result)
+    choice = designs.next_points(known, candidates, section.points, section.criterion)
+    s = np.linspace(candidates.s.min(), candidates.s.max(), 121)
+    chart = designs.identifiability(known, s, float(candidates.depth.max()))
+    rows = list(tables.choice_rows(choice, candidates, unknowns))
+    write_csv(folder / "next_points.csv", rows)
+    gains = designs.gains(known, candidates)
+    write_csv(folder / "candidates.csv", list(tables.candidate_rows(known, gains, candidates)))
+    write_csv(folder / "identifiability.csv", list(tables.map_rows(chart, unknowns)))
+    rings = np.asarray(found.result.problem.geometry.ring_positions)
+    say_lost(draw_design(folder / "identifiability.png", chart, candidates, choice, rings))
+    return rows
+
+
+def _has_unknowns(path: Path, spec, problem, options: list[str]) -> None:
+    from jaxtrachea.config import SpecError
+    from jaxtrachea.fit.study import refuse_without_unknowns
+
+    try:
+        refuse_without_unknowns(spec, problem, options)
+    except SpecError as error:
+        raise Stop(f"{path}: {error}") from None
+
+
+def _can_leave_out(problem) -> None:
+    from jaxtrachea.fit.predictions import curves_to_leave_out
+
+    try:
+        curves_to_leave_out(problem)
+    except ValueError as error:
+        raise Stop(f"--leave-one-out: {error}") from None
+
+
+def _can_draw(spec: Path) -> None:
+    from jaxtrachea.inference.posterior import MissingSampler, sampler
+
+    try:
+        sampler()
+    except MissingSampler as error:
+        raise Stop(f"{spec}: uncertainty.posterior: {error}") from None
+
+
+def _names_to_profile(path: Path, spec, problem, asked: bool) -> tuple[str, ...]:
+    from jaxtrachea.config import SpecError
+    from jaxtrachea.fit.study import profiled
+
+    try:
+        return profiled(spec, problem, asked=asked)
+    except SpecError as error:
+        raise Stop(f"{path}: {error}") from None
+
+
+def _print_usage(out: Console, curves) -> None:
+    """What is used of the curves that are not used whole, and what is doubtful about them."""
+    from jaxtrachea.measurements.usage_tables import sentences, usage_lines
+
+    told = [c for c in curves if usage_lines([c])]
+    for line in usage_lines(told[:MANY]):
+        out.print(escape(line), highlight=False)
+    if len(told) > MANY:
+        out.print(f"... and {len(told) - MANY} more curves not used whole; a fit lists all")
+    for sentence in sentences(curves):
+        out.print(escape(f"{sentence[:1].upper()}{sentence[1:]}."), highlight=False)
+
+
+def _curve_table(curves):
+    rows = []
+    for curve in curves[:MANY]:
+        where = "–" if curve.s_c is None else f"{curve.s_c:.4g}"
+        markers = 0 if curve.joint_displacement is None else curve.joint_displacement.shape[1]
+        spans = [f"{v.min():.3g} … {v.max():.3g}" for v in (curve.displacement, curve.force)]
+        recorded = len(curve.force) if curve.usage is None else curve.usage.recorded
+        counts = [str(len(curve.force)), str(recorded)]
+        row = [curve.specimen, curve.trial, where, *counts, *spans, str(markers)]
+        rows.append(row)
+    head = ["specimen", "trial", "s [mm]", "n", "of", "D [mm]", "F [N]", "markers"]
+    return table(f"{len(curves)} usable curves", head, rows)
+
+
+def _parameter_table(parameters, options):
+    from jaxtrachea.fit.onset import where_sought
+
+    head = ["free parameter", "what", "initial", "bounds", "scale", "scope"]
+    rows = [
+        [f"{p.name} [{p.unit}]", p.description, *where_sought(p, parameters, options),
+         p.scale, p.scope] for p in parameters if not p.fixed
+    ]  # fmt: skip
+    return table("Free parameters", head, rows)

@@ -1,0 +1,220 @@
+"""The command predict: what a finished fit says of other curves (docs/predict.md)."""
+
+import dataclasses
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from jaxtrachea.cli.load import print_bad
+from jaxtrachea.cli.predict_data import measured_curves
+from jaxtrachea.cli.terminal import Stop, into, say_lost, set_up_jax, table, to_stderr
+
+ResultsArgument = Annotated[
+    Path, typer.Argument(help="Folder of a finished fit, or its results.h5.")
+]
+FilesArgument = Annotated[
+    list[str] | None, typer.Argument(metavar="[FILE]...", help="Further files of --data.")
+]
+AtOption = Annotated[
+    list[str] | None,
+    typer.Option("--at", metavar="s=75,D=0:6:0.5", help="Where and how deep; may be repeated."),
+]
+DataOption = Annotated[
+    list[str] | None,
+    typer.Option("--data", metavar="SPEC|FILE", help="Measured curves to compare with."),
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the predictions.")]
+AsOption = Annotated[
+    str | None,
+    typer.Option("--as", metavar="SPECIMEN", help="Predict unknown specimens as this one."),
+]
+
+
+def predict(
+    results: ResultsArgument,
+    files: FilesArgument = None,
+    at: AtOption = None,
+    data: DataOption = None,
+    out_dir: OutOption = None,
+    as_specimen: AsOption = None,
+) -> None:
+    """Predict curves from a finished fit, with 95 % bands."""
+    from jaxtrachea.inference.stored import NoResults, read_results
+
+    set_up_jax()
+    given = [*(data or []), *(files or [])]
+    if bool(at) == bool(given):
+        raise Stop(
+            "predict: give either --at (where and how deep, as in --at s=75,D=0:6:0.5) or --data "
+            "(a specification or files of measured curves)"
+        )
+    if files and not data:
+        raise Stop(f"predict: {files[0]}: files of measured curves come after --data")
+    try:
+        stored = read_results(results)
+    except NoResults as error:
+        raise Stop(str(error)) from None
+    except OSError as error:
+        raise Stop(f"{results}: cannot be read ({error.strerror}); check its rights") from None
+    if as_specimen is not None and as_specimen not in stored.specimens:
+        raise Stop(f"--as: {_unknown('specimen', as_specimen, stored.specimens)}")
+    name = (stored.path.parent if results.is_dir() else stored.path.absolute().parent).absolute()
+    default = Path("out") / f"{name.name}-predict"
+    digest = hashlib.sha256(stored.path.read_bytes()).hexdigest()
+    if at:
+        code = _predict_at(stored, at, out_dir, default, digest)
+    else:
+        code = _predict_data(stored, given, as_specimen, out_dir, default, digest)
+    raise typer.Exit(code)
+
+
+def _unknown(kind: str, name: str, known) -> str:
+    from jaxtrachea.inference.predict import unknown_name
+
+    return unknown_name(kind, name, known)
+
+
+def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: str) -> int:
+    """Predictions at chosen positions; returns the exit code."""
+    import numpy as np
+
+    from jaxtrachea.files.pictures import without_lost
+    from jaxtrachea.inference import prediction_tables as tables
+    from jaxtrachea.inference.predict import predict_sources
+    from jaxtrachea.inference.results import write_csv, write_text
+    from jaxtrachea.report import prediction as report
+    from jaxtrachea.report.prediction_plots import draw_predictions
+
+    sources, s, depths = _asked(stored, texts)
+    with into(out_dir, default) as (folder, stop_if_asked):
+        curves = predict_sources(stored, sources, s, depths)
+        stop_if_asked()
+        rings = np.asarray(stored.problem.geometry.ring_positions)
+        write_csv(
+            folder / "predictions.csv", [r for p in curves for r in tables.prediction_rows(p)]
+        )
+        write_csv(folder / "bands.csv", [r for p in curves for r in tables.band_rows(p)])
+        joints = [
+            r for p in curves for r in tables.joint_rows(p, rings, range(len(p.displacement)))
+        ]
+        if any(p.has_skeleton for p in curves):
+            write_csv(folder / "joints.csv", joints)
+        lost = draw_predictions(folder, curves)
+        say_lost(lost)
+        text = without_lost(report.report_at(stored, digest, curves), lost)
+        write_text(folder / "report.md", text)
+    rows, more = report.shortened(report.at_table(curves), "bands.csv")
+    _show("Predictions, at the deepest displacement", report.AT_HEAD, rows, more)
+    _end(report.outcomes(curves), folder.parent)
+    return 0 if all(p.status.predicts for p in curves) else 1
+
+
+def _asked(stored, texts: Sequence[str]):
+    """Sources, positions and displacements of every --at."""
+    from jaxtrachea.inference.predict import check_position
+    from jaxtrachea.inference.sources import source_of
+    from jaxtrachea.measurements.presses import parse_presses
+
+    needs = stored.problem.options.coupling == "series"
+    sources, places, depths = [], [], []
+    for text in texts:
+        try:
+            asked = parse_presses(text, needs_position=needs)
+            names = stored.specimens if asked.specimen is None else (asked.specimen,)
+            if asked.specimen is not None and asked.specimen not in stored.specimens:
+                raise ValueError(_unknown("specimen", asked.specimen, stored.specimens))
+            s = [float("nan")] if asked.s is None else asked.s.tolist()
+            for place in s:
+                if asked.s is not None:
+                    check_position(stored, place)
+            trials = dict.fromkeys(c.trial for c in stored.curves if c.specimen in names)
+            if asked.trial is not None and asked.trial not in trials:
+                raise ValueError(_unknown("trial", asked.trial, tuple(trials)))
+        except ValueError as error:
+            raise Stop(f"--at {text}: {error}") from None
+        for name in names:
+            source = source_of(stored, name, asked.trial)
+            for place in s:
+                sources.append(source)
+                places.append(place)
+                depths.append(asked.displacement)
+    return sources, places, depths
+
+
+def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, digest) -> int:
+    """Measured curves against predictions; returns the exit code."""
+    import numpy as np
+
+    from jaxtrachea.files.pictures import without_lost
+    from jaxtrachea.inference import prediction_tables as tables
+    from jaxtrachea.inference.held_out import compare, pressable
+    from jaxtrachea.inference.results import write_csv, write_text
+    from jaxtrachea.report import prediction as report
+    from jaxtrachea.report.prediction_plots import draw_compared
+
+    measurements, notes = measured_curves(stored, given)
+    curves, unusable = pressable(stored, measurements.curves)
+    bad = [*measurements.bad, *unusable]
+    print_bad(dataclasses.replace(measurements, bad=tuple(bad)))
+    if not curves:
+        raise Stop("--data: no usable curve; nothing was predicted, nothing was written")
+    with into(out_dir, default) as (folder, stop_if_asked):
+        compared = compare(stored, curves, as_specimen=as_specimen)
+        stop_if_asked()
+        rings = np.asarray(stored.problem.geometry.ring_positions)
+        rows = {"predictions": [], "bands": [], "joints": []}
+        for c in compared:
+            p, phi = c.prediction, c.curve.phi_c
+            rows["predictions"] += tables.prediction_rows(p, c.curve.force, phi)
+            rows["bands"] += tables.band_rows(p, phi)
+            deepest = [int(np.argmax(np.abs(p.displacement)))]
+            rows["joints"] += tables.joint_rows(p, rings, deepest, _markers(c, len(rings)), phi)
+        if not any(c.prediction.has_skeleton for c in compared):
+            del rows["joints"]
+        for name, content in rows.items():
+            write_csv(folder / f"{name}.csv", content)
+        errors = tables.error_rows(compared, bad, stored.tool_radius, rings)
+        write_csv(folder / "errors.csv", errors)
+        lost = draw_compared(folder, compared)
+        say_lost(lost)
+        text = report.report_data(stored, digest, compared, bad, errors, notes)
+        write_text(folder / "report.md", without_lost(text, lost))
+    for note in notes:
+        to_stderr(f"[yellow]note:[/] {escape(note)}")
+    shown, more = report.shortened(report.error_table(errors), "errors.csv")
+    _show("Measured against predicted, worst first", report.ERROR_HEAD, shown, more)
+    _end(report.outcomes([c.prediction for c in compared]), folder.parent)
+    good = all(c.prediction.status.predicts for c in compared)
+    return 0 if good and not bad else 1
+
+
+def _markers(compared, rings: int):
+    """Markers in the columns of their rings, or None."""
+    import numpy as np
+
+    curve = compared.curve
+    if curve.joint_displacement is None:
+        return None
+    found = np.full((len(curve.force), rings), np.nan)
+    found[:, curve.joint_rings] = curve.joint_displacement
+    return found
+
+
+def _show(title: str, head, rows, more: str) -> None:
+    out = Console()
+    if rows:
+        out.print(table(title, head, rows))
+    if more:
+        out.print(more)
+
+
+def _end(lines: Sequence[str], folder: Path) -> None:
+    out = Console()
+    for line in lines:
+        out.print(escape(line), highlight=False)
+    out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)

@@ -1,0 +1,273 @@
+"""The commands for scenes: plan, simulate, sweep. What is heavy is imported inside the commands."""
+
+import time
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from jaxtrachea.cli.terminal import (
+    Stages,
+    Stop,
+    interrupts,
+    into,
+    progress_bar,
+    say_lost,
+    set_up_jax,
+    table,
+)
+
+SceneArgument = Annotated[Path, typer.Argument(help="TOML scene (docs/scenes.md).")]
+OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
+#: Rows of a terminal table; the files hold all.
+MANY = 12
+
+
+def plan(scene: SceneArgument) -> None:
+    """Say which effects a scene calls for, and why."""
+    from jaxtrachea.scene.build import shares
+    from jaxtrachea.scene.results import plan_rows
+
+    spec, staged = _staged(scene)
+    swept = None if spec.sweep is None else _for_sweep(scene, spec, staged)[0]
+    staged, choice = _chosen(scene, spec, staged)
+    whole, found = shares(staged)
+    out = Console()
+    head = ["effect", "level", "chosen", "operations", "reason"]
+    out.print(table("Plan", head, plan_rows(staged.scene.plan, found), ("reason",)))
+    out.print(f"{whole:,} operations for {_rows(staged)} rows", highlight=False)
+    if choice is not None:
+        out.print(choice.sentence, highlight=False)
+    if swept is not None:
+        out.print(_rings_of(swept), highlight=False)
+    for note in staged.notes:
+        out.print(escape(note), highlight=False)
+
+
+def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
+    """Follow the path: forces, deformed mesh, pictures."""
+    import jax
+    import numpy as np
+
+    from jaxtrachea.scene.results import last_solved, write_meshes, write_simulation
+    from jaxtrachea.scene.simulation import simulate as run
+    from jaxtrachea.status import PressStatus
+
+    clock = [time.perf_counter()]
+    spec, staged = _staged(scene)
+    staged, choice = _chosen(scene, spec, staged)
+    clock.append(time.perf_counter())
+    with into(out_dir, _default(scene)) as (folder, stop_if_asked):
+        out = jax.block_until_ready(jax.jit(run)(staged.scene, staged.material, staged.path))
+        clock.append(time.perf_counter())
+        stop_if_asked()
+        write_meshes(folder, staged.scene, out)
+        if spec.output.pictures:
+            _draw(folder, spec.title or scene.stem, staged.scene, out)
+        made = _provenance(scene, staged, clock)
+        write_simulation(folder / "simulation.h5", staged.scene, staged.path, out, made)
+        _write_json(folder, made)
+    status = np.asarray(out.status)
+    _print_rows(out)
+    failed = (status > PressStatus.NO_CONTACT).sum()
+    for code in np.unique(status[status > PressStatus.NO_CONTACT]):
+        Console().print(f"{(status == code).sum()} row(s): {PressStatus(int(code)).message}")
+    for note in staged.notes:
+        Console().print(escape(note), highlight=False)
+    if choice is not None:
+        Console().print(choice.sentence, highlight=False)
+    if last_solved(out) is None:
+        Console().print("no row was solved: no mesh, no picture of the surface")
+    Console().print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
+    raise typer.Exit(1 if failed else 0)
+
+
+def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
+    """Press everywhere: maps of force and compliance."""
+    import jax
+    import numpy as np
+
+    from jaxtrachea.files.pictures import save_each
+    from jaxtrachea.scene.plots import draw_sweep
+    from jaxtrachea.scene.results import write_sweep
+    from jaxtrachea.scene.simulation import sweep as run
+    from jaxtrachea.status import PressStatus
+
+    clock = [time.perf_counter()]
+    spec, staged = _staged(scene)
+    want = spec.sweep
+    if want is None:
+        raise Stop(f"{scene}: sweep: missing; give a table [sweep] with a depth")
+    swept, s, phi = _for_sweep(scene, spec, staged)
+    points = [v.ravel() for v in np.meshgrid(s, phi, indexing="ij")]
+    clock.append(time.perf_counter())
+    with into(out_dir, _default(scene, "-sweep")) as (folder, stop_if_asked):
+        compute = jax.jit(run, static_argnames="chunk")
+        size, parts, total = want.chunk, [], len(points[0])
+        with progress_bar() as bar:
+            task = bar.add_task("sweeping", total=total)
+            for start in range(0, total, size):
+                stop_if_asked()
+                rows = [v[np.minimum(np.arange(start, start + size), total - 1)] for v in points]
+                depth = np.full(size, want.depth)
+                part = compute(swept, staged.material, *rows, depth, chunk=size)
+                parts.append(jax.tree.map(lambda v: np.asarray(v)[: total - start], part))  # noqa: B023
+                bar.update(task, completed=min(start + size, total))
+        out = jax.tree.map(lambda *v: np.concatenate(v), *parts)
+        clock.append(time.perf_counter())
+        say_lost(save_each(folder, draw_sweep(s, phi, out))[1])
+        made = _provenance(scene, staged, clock)
+        write_sweep(folder / "sweep.h5", swept, s, phi, want.depth, out, made)
+        _write_json(folder, made)
+    failed = int((np.asarray(out.status) > PressStatus.NO_CONTACT).sum())
+    console = Console()
+    console.print(_rings_of(swept), highlight=False)
+    console.print(
+        f"{total} contact points, {failed} without a solution, "
+        f"{clock[2] - clock[1]:.2f} s with compilation", highlight=False,
+    )  # fmt: skip
+    console.print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
+    raise typer.Exit(1 if failed else 0)
+
+
+def _staged(path: Path):
+    """Specification and scene; input errors become `Stop`."""
+    from jaxtrachea.config import SpecError
+    from jaxtrachea.scene.spec import load_scene_spec
+
+    try:
+        spec = load_scene_spec(path)
+        set_up_jax()
+        from jaxtrachea.scene.build import stage
+
+        if spec.trachea.file is None:
+            return spec, stage(spec, path.parent)
+        with interrupts() as stop_if_asked, progress_bar(transient=True) as bar:
+            return spec, stage(spec, path.parent, Stages(bar, stop_if_asked).begin)
+    except SpecError as error:
+        text = str(error)
+        raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
+
+
+def _chosen(path: Path, spec, staged):
+    """The scene with the plan within its tolerance, and that choice; as it is without tolerance."""
+    if spec.plan is None:
+        return staged, None
+    from jaxtrachea.scene.plan import PlanError
+    from jaxtrachea.tradeoff.choice import choose
+    from jaxtrachea.tradeoff.levels import full_scene
+
+    try:
+        full = full_scene(spec, staged)
+    except PlanError as error:
+        raise Stop(f"{path}: effects.{error}") from None
+    with interrupts() as stop_if_asked, progress_bar() as bar:
+        task = bar.add_task("choosing", total=None)
+
+        def report(text: str) -> None:
+            stop_if_asked()
+            bar.update(task, description=f"choosing: {text}", advance=1)
+
+        wish = spec.plan
+        try:
+            choice = choose(full, wish.tolerance, report, precision=wish.precision)
+        except PlanError as error:
+            raise Stop(f"{path}: plan.tolerance: {error}") from None
+    chosen = {name: getattr(choice, name) for name in ("scene", "material", "path")}
+    return staged._replace(**chosen), choice
+
+
+def _for_sweep(path: Path, spec, staged):
+    """The scene with the program of its sweep, and the s and phi of the grid."""
+    import numpy as np
+
+    from jaxtrachea.scene.build import stage_sweep
+
+    want, geometry = spec.sweep, staged.scene.geometry
+    alpha = float(geometry.half_angle)
+    widest = alpha if want.phi_max is None else want.phi_max
+    if not 0 <= widest <= alpha:
+        raise Stop(
+            f"{path}: sweep.phi_max: {np.degrees(widest):.4g} deg; expected 0 to "
+            f"{np.degrees(alpha):.4g} deg, the ends of the rings"
+        )
+    s = (np.arange(want.s_count) + 0.5) * float(geometry.length) / want.s_count
+    phi = np.linspace(-widest, widest, want.phi_count) if want.phi_count > 1 else np.zeros(1)
+    # The widest angle of the grid decides, wherever it is.
+    return stage_sweep(spec, staged, np.full_like(phi, s[0]), phi), s, phi
+
+
+def _rings_of(scene) -> str:
+    """Which rings a sweep presses on, and why."""
+    rings = next(e for e in scene.plan.effects if e.name == "rings")
+    return f"sweep: rings {rings.level!r}, {rings.reason}"
+
+
+def _default(scene: Path, ending: str = "") -> Path:
+    return Path("out") / f"{scene.stem}{ending}"
+
+
+def _rows(staged) -> int:
+    from jaxtrachea.scene.stage import Presses
+
+    path = staged.path
+    return len(path.s if isinstance(path, Presses) else path.translation)
+
+
+def _draw(folder: Path, title: str, scene, out) -> None:
+    import numpy as np
+
+    from jaxtrachea.files.pictures import save_each
+    from jaxtrachea.scene.plots import draw_series, draw_surface
+    from jaxtrachea.scene.results import last_solved
+
+    drawings = {"series.png": partial(draw_series, out)}
+    row = last_solved(out)
+    if out.vertices is not None and row is not None:
+        drawings["surface.png"] = partial(draw_surface, scene, np.asarray(out.vertices[row]), title)
+    say_lost(save_each(folder, drawings)[1])
+
+
+def _provenance(scene: Path, staged, clock: list[float]) -> dict:
+    import hashlib
+
+    import jax
+
+    from jaxtrachea.inference.results import provenance
+
+    inputs = {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in staged.files}
+    seconds = {name: clock[i + 1] - clock[i] for i, name in enumerate(("read", "compute"))}
+    dtype = str(staged.material.k_1.dtype)
+    return provenance(scene, inputs, str(jax.devices()[0]), dtype, seconds)
+
+
+def _write_json(folder: Path, made: dict) -> None:
+    import json
+
+    from jaxtrachea.inference.results import write_text
+
+    write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+
+
+def _print_rows(out) -> None:
+    import numpy as np
+
+    from jaxtrachea.status import PressStatus
+
+    count = len(out.s)
+    pick = np.unique(np.linspace(0, count - 1, min(count, MANY)).round().astype(int))
+    vector = lambda v: " ".join(f"{x:.3g}" for x in np.asarray(v).round(9) + 0.0)  # noqa: E731
+    share = lambda v: "–" if np.isnan(v) else f"{100 * v:.0f} %"  # noqa: E731
+    rows = [
+        [str(i + 1), f"{out.s[i]:.4g}", f"{np.degrees(out.phi[i]):.3g}",
+         "–" if out.gap is None else f"{out.gap[i]:.3g}", vector(out.force[i]),
+         vector(out.skeleton[i]), share(out.depth_share[i]),
+         PressStatus(int(out.status[i])).name.lower()]
+        for i in pick
+    ]  # fmt: skip
+    head = ["row", "s [mm]", "phi [deg]", "gap [mm]", "force [N]", "skeleton [mm]", "depth/radius"]
+    head.append("status")
+    Console().print(table(f"{count} rows", head, rows))

@@ -1,0 +1,118 @@
+"""The command selfcheck: the hard cases on the user's own device (docs/hard_cases.md)."""
+
+import enum
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from jaxtrachea.cli.terminal import Stop, set_up_jax, table
+
+DtypeOption = Annotated[str, typer.Option("--dtype", help="float32, float64 or both.")]
+OnlyOption = Annotated[
+    list[str] | None, typer.Option("--only", help="Only this case or function; may be repeated.")
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for selfcheck.json.")]
+QuickOption = Annotated[
+    bool,
+    typer.Option(
+        "--quick", help="Compile without optimisation: not your usual programs, but soon."
+    ),
+]
+HEAD = ["case", "dtype", "value", "gradient", "not finite", "verdict"]
+
+
+class _Dtype(enum.Enum):
+    both = ("float64", "float32")
+    float64 = ("float64",)
+    float32 = ("float32",)
+
+
+def selfcheck(
+    dtype: DtypeOption = "both",
+    only: OnlyOption = None,
+    out_dir: OutOption = None,
+    quick: QuickOption = False,
+) -> None:
+    """Run the hard cases here: errors against 25-digit truth."""
+    from jaxtrachea.selfcheck.table import read_cases, read_truth
+
+    start = time.perf_counter()
+    if dtype not in _Dtype.__members__:
+        raise Stop(f"--dtype {dtype}: expected float32, float64 or both")
+    cases = _chosen(read_cases(), only)
+    if out_dir is not None and out_dir.exists():
+        raise Stop(f"{out_dir}: exists; choose another --out")
+    set_up_jax()
+    from jaxtrachea.selfcheck.run import run_table
+
+    out, found = Console(), []
+    found = list(run_table(cases, read_truth(), _Dtype[dtype].value, quick=quick))
+    if not found:
+        raise Stop(f"--only, --dtype {dtype}: none of these cases is run in this dtype")
+    seconds = time.perf_counter() - start
+    out.print(table("Errors over their tolerance", HEAD, [_row(o) for o in found]))
+    for outcome in found:
+        for fault in outcome.faults:
+            out.print(f"{outcome.case} ({outcome.dtype}): {fault}", markup=False, highlight=False)
+    failed = sum(not o.passed for o in found)
+    out.print(_summary(found, failed, seconds), highlight=False)
+    if out_dir is not None:
+        _write(out_dir, found, seconds, quick)
+        out.print(f"written to {out_dir}", markup=False, highlight=False, soft_wrap=True)
+    raise typer.Exit(1 if failed else 0)
+
+
+def _chosen(cases, only):
+    """The rows asked for by their name or their function's."""
+    if not only:
+        return cases
+    known = {c.name for c in cases} | {c.function for c in cases}
+    for name in only:
+        if name not in known:
+            near = [n for n in sorted(known) if name.lower() in n.lower()][:5]
+            hint = f"; similar: {', '.join(map(repr, near))}" if near else ""
+            functions = ", ".join(dict.fromkeys(c.function for c in cases))
+            raise Stop(f"--only {name!r}: no such case{hint}; functions: {functions}")
+    return [c for c in cases if c.name in only or c.function in only]
+
+
+def _row(outcome) -> list[str]:
+    verdict = "ok" if outcome.passed else "FAILED"
+    errors = [f"{v:.2g}" for v in (outcome.value, outcome.gradient)]
+    return [outcome.case, outcome.dtype, *errors, str(outcome.nans), verdict]
+
+
+def _summary(found, failed, seconds) -> str:
+    import jax
+
+    cases = len({o.case for o in found})
+    device = jax.devices()[0]
+    said = "all within tolerance" if not failed else f"{failed} NOT within tolerance"
+    return f"{cases} cases, {len(found)} rows: {said}; {seconds:.1f} s on {device.device_kind}"
+
+
+def _write(folder: Path, found, seconds, quick) -> None:
+    import jax
+
+    from jaxtrachea import __version__
+    from jaxtrachea.selfcheck.page import as_dict
+
+    made = {
+        "version": __version__,
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+        "seconds": round(seconds, 2),
+        "optimised": not quick,
+        "rows": [as_dict(o) for o in found],
+    }
+    try:
+        folder.mkdir(parents=True)
+        (folder / "selfcheck.json").write_text(json.dumps(made, indent=1) + "\n")
+    except OSError as error:
+        raise Stop(
+            f"{folder}: cannot be written ({error.strerror}); choose another --out"
+        ) from None

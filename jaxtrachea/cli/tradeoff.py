@@ -1,0 +1,144 @@
+"""The command `tradeoff`: what every accuracy choice of a scene errs and costs."""
+
+import time
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from jaxtrachea.cli.terminal import Stop, into, progress_bar, say_lost, table
+
+SceneArgument = Annotated[
+    Path | None, typer.Argument(help="TOML scene (default: a ball on the trachea of Table 1).")
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
+CallsOption = Annotated[int, typer.Option("--calls", min=10, help="Timed calls of each rung.")]
+LanesOption = Annotated[int, typer.Option("--lanes", min=0, help="Poses of one batch; 0: none.")]
+QuickOption = Annotated[
+    bool, typer.Option("--quick", help="Three rungs a ladder, 100 calls, no batches.")
+]
+DataOption = Annotated[
+    Path | None, typer.Option("--data", help="Fit specification: its curves are the truth too.")
+]
+
+
+def tradeoff(
+    scene: SceneArgument = None,
+    out_dir: OutOption = None,
+    calls: CallsOption = 1000,
+    lanes: LanesOption = 64,
+    quick: QuickOption = False,
+    data: DataOption = None,
+) -> None:
+    """Error against time of every accuracy choice of a scene."""
+    clock = [time.perf_counter()]
+    name = "table-1" if scene is None else scene.stem
+    full = _full(scene)
+    curves, radius, inputs = measured_curves(data)
+    from jaxtrachea.tradeoff.measure import Settings, measure
+
+    settings = Settings(100, 0, True) if quick else Settings(calls, lanes)
+    clock.append(time.perf_counter())
+    with into(out_dir, Path("out") / f"{name}-tradeoff") as (folder, stop_if_asked):
+        with progress_bar() as bar:
+            task = bar.add_task("starting", total=None)
+
+            def report(text: str) -> None:
+                stop_if_asked()
+                bar.update(task, description=text, advance=1)
+
+            try:
+                rows = measure(name, full, settings, report, curves, radius)
+            except ValueError as error:
+                if not curves:
+                    raise
+                raise Stop(f"{data}: {error}") from None
+        clock.append(time.perf_counter())
+        _write(folder, name, rows, scene, inputs, clock)
+    _print(rows)
+    Console().print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
+
+
+def _full(scene: Path | None):
+    """The scene at its finest; input errors become `Stop`."""
+    import jax
+
+    from jaxtrachea.config import SpecError
+    from jaxtrachea.scene.spec import SceneSpec, load_scene_spec
+
+    try:
+        spec = None if scene is None else load_scene_spec(scene)
+        jax.config.update("jax_enable_x64", True)
+        jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
+        jax.config.update("jax_cpu_enable_async_dispatch", False)  # no hand-over to a thread
+        from jaxtrachea.scene.build import stage
+        from jaxtrachea.scene.plan import PlanError
+        from jaxtrachea.tradeoff.levels import BUILT_IN, full_scene
+
+        spec = spec or SceneSpec.model_validate(BUILT_IN)
+        try:
+            staged = stage(spec, Path() if scene is None else scene.parent)
+            return full_scene(spec, staged, coupling="series")
+        except PlanError as error:
+            raise SpecError(f"effects.{error}") from None
+    except SpecError as error:
+        text = str(error)
+        raise Stop(text if text.startswith(str(scene)) else f"{scene}: {text}") from None
+
+
+def measured_curves(data: Path | None):
+    """Measured curves, the radius of the tool that made them, digests of their files."""
+    if data is None:
+        return (), -1.0, {}
+    from jaxtrachea.cli.load import load
+
+    spec, measurements, _ = load(data, None)
+    radius = spec.data.tool_radius
+    return measurements.curves, -1.0 if radius is None else radius, measurements.sha256()
+
+
+def _write(folder: Path, name: str, rows, scene: Path | None, inputs, clock) -> None:
+    import json
+
+    import jax
+
+    from jaxtrachea.files.pictures import save_each, without_lost
+    from jaxtrachea.inference.results import provenance, write_text
+    from jaxtrachea.tradeoff.levels import BUILT_IN
+    from jaxtrachea.tradeoff.page import lines, scene_text
+    from jaxtrachea.tradeoff.plots import draw
+
+    if scene is None:
+        scene = folder / "scene.json"
+        write_text(scene, json.dumps(BUILT_IN, indent=2) + "\n")
+
+    write_text(folder / "tradeoff.jsonl", lines(rows))
+    picture = "tradeoff.png"
+    points = [row for row in rows if "left_out" not in row]
+    lost = save_each(folder, {picture: partial(draw, points, name)})[1]
+    say_lost(lost)
+    text = f"# {name}\n\n{scene_text(rows, picture)}"
+    write_text(folder / "tradeoff.md", without_lost(text, lost))
+    seconds = {k: clock[i + 1] - clock[i] for i, k in enumerate(("read", "compute"))}
+    made = provenance(scene, inputs, str(jax.devices()[0]), "float64, float32", seconds)
+    write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+
+
+def _print(rows) -> None:
+    from jaxtrachea.tradeoff.page import HEAD, KINDS, cells
+
+    out = Console()
+    points = [row for row in rows if "left_out" not in row]
+    keep = [i for i, name in enumerate(HEAD) if name not in ("99 %", "compile [s]", "lane [µs]")]
+    for kind, title in KINDS.items():
+        body = [cells(point) for point in points if point["kind"] == kind]
+        if body:
+            head = [HEAD[i] for i in keep]
+            out.print(table(title, head, [[row[i] for i in keep] for row in body], ("level",)))
+    for row in rows:
+        if "left_out" in row:
+            text = f"left out: {row['ladder']}: {row['left_out']}"
+            out.print(escape(text), highlight=False)

@@ -1,0 +1,1 @@
+"""From curves and a model to estimates: problem, residual, solver, covariance."""

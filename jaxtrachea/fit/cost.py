@@ -1,0 +1,109 @@
+"""What is minimised: robust loss, weights of curves and noise, and the normal equations."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxtrachea.fit import residual as _residual
+from jaxtrachea.fit.problem import Lane, Problem
+
+
+class Point(NamedTuple):
+    """One lane evaluated: whitened residual, cost and normal equations.
+
+    Attributes:
+        value: as `Residual.value`; (T, m).
+        jacobian: sqrt(weight) d value / d (free columns); (T, Jf, m).
+        cost: half the weighted sum of rho.
+        gradient: of the cost; (P,).
+        hessian: Gauss-Newton; (P, P).
+    """
+
+    value: Float[Array, "T m"]
+    jacobian: Float[Array, "T Jf m"]
+    cost: Float[Array, ""]
+    gradient: Float[Array, " P"]
+    hessian: Float[Array, "P P"]
+
+
+def robust(name: str, z2: Float[Array, "*n"], scale: float) -> tuple[Array, Array]:
+    """rho(z^2) and rho'(z^2) of a loss, quadratic up to about `scale` standard deviations."""
+    s2 = scale * scale
+    u = z2 / s2
+    if name == "linear":
+        return z2, jnp.ones_like(z2)
+    if name == "huber":
+        root = jnp.sqrt(jnp.maximum(u, 1))
+        return s2 * jnp.where(u <= 1, u, 2 * root - 1), 1 / root
+    if name == "soft_l1":
+        root = jnp.sqrt(1 + u)
+        return s2 * 2 * (root - 1), 1 / root
+    if name == "cauchy":
+        return s2 * jnp.log1p(u), 1 / (1 + u)
+    raise ValueError(f"loss is {name!r}; expected linear, huber, soft_l1 or cauchy")
+
+
+def entry_scale(lane: Lane, sigma: Float[Array, "2"]) -> Float[Array, " m"]:
+    """1 / sigma of each residual entry: forces by sigma[0], markers by sigma[1]."""
+    forces = jnp.arange(_residual.size(lane)) < lane.force.shape[-1]
+    return jnp.where(forces, 1 / sigma[0], 1 / sigma[1])
+
+
+def weights(problem: Problem, value, lane: Lane, sigma: Float[Array, "2"]):
+    """Weighted loss of each entry, and the root of the weight of its square; (T, m) each."""
+    scale = entry_scale(lane, sigma)[None]
+    balance = lane.balance[:, None]
+    if problem.loss == "linear":
+        root = balance * scale
+        return (root * value) ** 2, jnp.broadcast_to(root, value.shape)
+    rho, slope = robust(problem.loss, (value * scale) ** 2, problem.loss_scale)
+    return balance * balance * rho, balance * jnp.sqrt(slope) * scale
+
+
+def evaluate(
+    problem: Problem, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
+) -> Point:
+    """Residual, cost and normal equations of one lane; cost O(trials) in the Jacobian."""
+    r = _residual.residual(problem, theta, lane)
+    rho, root = weights(problem, r.value, lane, sigma)
+    J, z = r.jacobian * root[:, None], r.value * root
+    hessian = jnp.einsum("tim,tjm->tij", J, J)
+    if r.bend is not None:
+        hessian = hessian + _corner(problem, jnp.sum(z * root * r.bend, axis=1), hessian)
+    return Point(
+        value=r.value,
+        jacobian=J,
+        cost=0.5 * jnp.sum(rho),
+        gradient=assemble(problem, jnp.einsum("tim,tm->ti", J, z), lane),
+        hessian=assemble(problem, hessian, lane),
+    )
+
+
+def _corner(problem: Problem, bend: Float[Array, " T"], hessian) -> Float[Array, "T Jf Jf"]:
+    """What the corner at the onset adds to the Gauss-Newton matrix of each trial.
+
+    The rounded corner is the one place where the model bends within the noise of a sample; left
+    out, steps of the onset overshoot. Only where it stiffens: the matrix stays positive definite.
+    """
+    i = [p.name for p in problem.free].index("onset")
+    return jnp.zeros_like(hessian).at[:, i, i].set(jnp.maximum(bend, 0))
+
+
+def assemble(problem: Problem, parts: Array, lane: Lane) -> Array:
+    """Sum what each trial gives for its columns into the unknowns they read.
+
+    Args:
+        problem: static description.
+        parts: (T, Jf) or (T, Jf, Jf).
+        lane: tells which unknown each column reads.
+    """
+    if problem.common == "all":
+        return jnp.sum(parts, axis=0)
+    size = lane.lower.shape[0]
+    index = lane.index[:, problem.free_columns]
+    place = jnp.where(index >= 0, index, size)
+    if parts.ndim == 2:
+        return jnp.zeros(size, parts.dtype).at[place].add(parts, mode="drop")
+    zero = jnp.zeros((size, size), parts.dtype)
+    return zero.at[place[:, :, None], place[:, None, :]].add(parts, mode="drop")

@@ -1,0 +1,310 @@
+"""What the data say about each unknown: standard errors, correlation, flat combinations.
+
+Everything is local, from the Jacobian at the estimate (Gauss-Newton information matrix); profile
+likelihood and bootstrap, which are not, are separate. With curve weights or a robust loss the
+covariance is the sandwich kappa A^-1 B A^-1 (Huber 1981, ch. 7); otherwise it reduces to the usual
+s^2 (J^T J)^-1.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.special import stdtrit
+
+from jaxtrachea.fit.cost import assemble, entry_scale, robust
+from jaxtrachea.fit.levenberg_marquardt import chunk_size
+from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.residual import observations, residual
+from jaxtrachea.fit.structure import leaving_alone
+
+#: Smallest ratio of singular values of the scaled Jacobian that float64 can tell from zero.
+SINGULAR = 1e-7
+
+
+class Information(NamedTuple):
+    """One lane at its estimate; m entries of the residual, P unknowns.
+
+    Attributes:
+        bread: sum of b^2 J^T J (b: curve weight), whitened; (P, P).
+        meat: sum of b^4 J^T J; (P, P).
+        gradient: of the cost; (P,).
+        squares: sum of squared residuals of force (N^2) and markers (mm^2) in units of the given
+            precision; (2,).
+        weighted: the same with the squares of the curve weights; (2,).
+        counts: observed entries of each; (2,).
+        spread: median absolute residual of each, same units, 0 with a linear loss; (2,).
+        psi2: mean of psi(z)^2 over observed entries.
+        dpsi: mean of psi'(z).
+    """
+
+    bread: Float[Array, "P P"]
+    meat: Float[Array, "P P"]
+    gradient: Float[Array, " P"]
+    squares: Float[Array, "2"]
+    weighted: Float[Array, "2"]
+    counts: Float[Array, "2"]
+    spread: Float[Array, "2"]
+    psi2: Float[Array, ""]
+    dpsi: Float[Array, ""]
+
+    def rescaled(self, ratio: np.ndarray) -> "Information":
+        """The same lanes with sigma smaller by `ratio`, (lanes,): linear loss, no markers."""
+        square = ratio * ratio
+        return self._replace(
+            bread=self.bread * square[:, None, None],
+            meat=self.meat * square[:, None, None],
+            gradient=self.gradient * square[:, None],
+            psi2=self.psi2 * square,
+        )
+
+
+def information(
+    problem: Problem, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
+) -> Information:
+    """Information matrices and residual statistics of one lane."""
+    r = residual(problem, theta, lane)
+    seen, forces = observations(lane)
+    scale = entry_scale(lane, sigma)
+    z = r.value * scale[None]
+    J = r.jacobian * (scale[None] * seen)[:, None]
+    b2 = (lane.balance * lane.balance)[:, None, None]
+    _, slope = robust(problem.loss, z * z, problem.loss_scale)
+    psi = lambda z: z * robust(problem.loss, z * z, problem.loss_scale)[1]  # noqa: E731
+    _, dpsi = jax.jvp(psi, (z,), (jnp.ones_like(z),))
+    gram = jnp.einsum("tim,tjm->tij", J, J)
+    gradient = jnp.einsum("tim,tm->ti", J * b2, z * slope)
+    total = jnp.sum(seen)
+    kinds = jnp.arange(seen.shape[1]) < forces
+    by_kind = lambda v: jnp.stack([jnp.sum(v[:, :forces]), jnp.sum(v[:, forces:])])  # noqa: E731
+
+    def spread(force):
+        # A sort, and the dearest part of all this: only where the noise is taken from it.
+        if problem.loss == "linear":
+            return jnp.zeros((), theta.dtype)
+        mine = (seen > 0) & (kinds == force)[None]
+        return jnp.nanmedian(jnp.where(mine, jnp.abs(r.value), jnp.nan))
+
+    return Information(
+        bread=assemble(problem, b2 * gram, lane),
+        meat=assemble(problem, b2 * b2 * gram, lane),
+        gradient=assemble(problem, gradient, lane),
+        squares=by_kind(r.value**2 * seen),
+        weighted=by_kind(r.value**2 * seen * b2[:, 0]),
+        counts=by_kind(seen),
+        spread=jnp.stack([spread(True), spread(False)]),
+        psi2=jnp.sum(psi(z) ** 2 * seen) / total,
+        dpsi=jnp.sum(dpsi * seen) / total,
+    )
+
+
+def informations(
+    problem: Problem, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, chunk: int = 128
+) -> Information:
+    """`information` of many lanes, on the host; leading axis = order of `lanes`."""
+    chunk = chunk_size(len(lanes), chunk)
+    run = _compiled(problem.program)
+    parts = []
+    for first in range(0, len(lanes), chunk):
+        of = np.minimum(np.arange(first, first + chunk), len(lanes) - 1)
+        lane = jax.tree.map(lambda v, row=lanes[of]: v[row], problem.lanes)
+        part = run(jnp.asarray(theta[of]), lane, jnp.asarray(sigma[of]))
+        left = len(lanes) - first
+        parts.append(jax.tree.map(lambda v, left=left: np.asarray(v)[:left], part))
+    return jax.tree.map(lambda *v: np.concatenate(v), *parts)
+
+
+@functools.lru_cache(maxsize=32)
+def _compiled(problem: Problem):
+    return jax.jit(jax.vmap(functools.partial(information, problem)))
+
+
+class Uncertainty(NamedTuple):
+    """Local uncertainty of a lane's unknowns, numpy; NaN where an unknown is held on a bound.
+
+    Attributes:
+        se: standard error in scaled coordinates; inf where undetermined; (P,).
+        correlation: (P, P).
+        condition: ratio of the largest to the smallest singular value of the Jacobian in relative
+            coordinates (a change of 1 = 100 %); inf if singular.
+        flat: unit vector, in relative coordinates, of the least determined combination; (P,).
+        flat_se: its standard error (relative).
+        blind: directions that the structure leaves open (`structure`), relative coordinates,
+            orthonormal rows; the other rows are 0; (P, P).
+        half_width: of the 95 % interval, in standard errors (Student's t).
+        along: how all unknowns move where one is moved and the others follow in the least costly
+            way, to first order, scaled coordinates; row i: by a unit change of unknown i; (P, P).
+        dispersion: of twice the rise of the cost along each unknown: where the cost is a
+            likelihood s^2, else such that its curvature gives `se` (Kent 1982,
+            doi:10.1093/biomet/69.1.19); (P,).
+        covariance: of the estimates, scaled coordinates; 0 for held unknowns, and without the
+            `silent` directions, along which it is infinite; (P, P).
+        silent: all directions that change no residual at the estimate, whatever the cause, scaled
+            coordinates, rows; the other rows are 0; (P, P).
+    """
+
+    se: np.ndarray
+    correlation: np.ndarray
+    condition: np.ndarray
+    flat: np.ndarray
+    flat_se: np.ndarray
+    blind: np.ndarray
+    half_width: np.ndarray
+    along: np.ndarray
+    dispersion: np.ndarray
+    covariance: np.ndarray
+    silent: np.ndarray
+
+
+def analyse(
+    info: Information,
+    relative: np.ndarray,
+    held: np.ndarray,
+    *,
+    noise_given: bool,
+    unknowns: int | None = None,
+    structural: np.ndarray | None = None,
+) -> Uncertainty:
+    """Turn the information of all lanes into standard errors and directions.
+
+    Args:
+        info: numpy, leading axis = lanes.
+        relative: change of each scaled coordinate that makes a relative change of 1; (lanes, P).
+        held: unknowns that are absent or on a bound; (lanes, P).
+        noise_given: whether sigma is known, so that residuals do not scale the covariance.
+        unknowns: estimated from the `counts`, if more than those of one lane.
+        structural: directions that the structure leaves open, relative coordinates, orthonormal
+            rows, the others 0; (lanes, P, P).
+
+    Returns:
+        One record whose arrays have the leading axis of lanes.
+    """
+    free = ~held
+    total = np.sum(info.counts, axis=1)
+    dof = total - (np.sum(free, axis=1) if unknowns is None else unknowns)
+    half = half_widths(dof, noise_given=noise_given)
+    usable = np.isfinite(info.bread).all(axis=(1, 2)) & (dof >= 0)
+    free = free & usable[:, None]
+    kappa = np.ones(len(dof)) if noise_given else np.asarray(info.psi2) * total / np.maximum(dof, 1)
+    dpsi = np.maximum(info.dpsi, 1e-3)
+    kappa = kappa / dpsi**2
+    unit = relative * free
+    structural = np.zeros_like(info.bread) if structural is None else structural
+    bread = _without(_scaled(np.asarray(info.bread), unit), structural, free)
+    values, vectors = _spectrum(bread, free)
+    inverse = np.einsum("lpk,lk,lqk->lpq", vectors, 1 / values, vectors)
+    meat = _scaled(np.asarray(info.meat), unit) * kappa[:, None, None]
+    covariance = inverse @ meat @ inverse
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    blind = np.any((np.abs(vectors) > 1e-3) & np.isinf(values)[:, None], axis=2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        root = np.sqrt(variance)
+        correlation = covariance / root[:, :, None] / root[:, None]
+    se = np.where(free, np.where(blind, np.inf, np.sqrt(variance)) * relative, np.nan)
+    both = free[:, :, None] & free[:, None]
+    condition, flat, flat_se = _flattest(values, vectors, free, covariance, usable)
+    correlation = np.where(both, correlation, np.nan)
+    along = _along(values, vectors, free)
+    whole = [np.trace(_scaled(np.asarray(m), relative), axis1=1, axis2=2) for m in info[:2]]
+    dispersion = dpsi[:, None] * _ratio(along, meat, bread, whole[1] * kappa, whole[0])
+    along = along * relative[:, None] / relative[:, :, None]
+    covariance = covariance * relative[:, :, None] * relative[:, None]
+    lost = np.isinf(values) & (np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5)
+    silent = np.swapaxes(vectors, 1, 2) * lost[:, :, None] * (free * relative)[:, None]
+    return Uncertainty(
+        se=se, correlation=correlation, condition=condition, flat=flat, flat_se=flat_se,
+        blind=structural, half_width=half, along=along, dispersion=dispersion,
+        covariance=covariance, silent=silent,
+    )  # fmt: skip
+
+
+def half_widths(dof: np.ndarray, *, noise_given: bool) -> np.ndarray:
+    """Of 95 % intervals in standard errors: normal with given noise, else Student's t; (lanes,)."""
+    half = np.full(len(dof), 1.959963984540054)
+    if noise_given:
+        return half
+    return np.where(dof > 0, stdtrit(np.maximum(dof, 1), 0.975), half)
+
+
+def _along(values, vectors, free) -> np.ndarray:
+    """Columns of the inverse over their diagonal, in relative coordinates; singular ones too."""
+    largest = np.max(np.where(np.isfinite(values), values, 0), axis=1, keepdims=True)
+    floor = SINGULAR**2 * np.where(largest > 0, largest, 1)
+    own = np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5
+    weight = np.where(own, 1 / np.where(np.isfinite(values), values, floor), 0)
+    inverse = np.einsum("lpk,lk,lqk->lpq", vectors, weight, vectors)
+    both = free[:, :, None] & free[:, None]
+    diagonal = np.where(free, np.diagonal(inverse, axis1=1, axis2=2), 1)
+    return np.where(both, inverse / diagonal[:, :, None], np.eye(values.shape[1]))
+
+
+def _ratio(along, meat, bread, meat_trace, bread_trace) -> np.ndarray:
+    """What the meat is of the bread along each row, or in the mean where both vanish.
+
+    The traces are of the whole matrices: those of all unknowns, held ones too.
+    """
+    form = lambda m: np.einsum("lip,lpq,liq->li", along, m, along)  # noqa: E731
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (form(meat) + 1e-12 * meat_trace[:, None]) / (
+            form(bread) + 1e-12 * bread_trace[:, None]
+        )
+
+
+def _without(matrix: np.ndarray, directions: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Matrices without what rounding has left in open directions of the free unknowns."""
+    matrix = matrix.copy()
+    for k in np.flatnonzero(directions.any(axis=(1, 2))):
+        rows = directions[k][directions[k].any(axis=1)]
+        for i in np.flatnonzero(~free[k]):
+            rows = leaving_alone(rows, int(i))
+        keep = np.eye(matrix.shape[1]) - rows.T @ rows
+        matrix[k] = keep @ matrix[k] @ keep
+    return matrix
+
+
+def _scaled(matrix: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Matrices in relative coordinates; rows and columns of held unknowns are zero."""
+    product = unit[:, :, None] * unit[:, None]
+    return np.where(product != 0, matrix, 0) * product
+
+
+def _spectrum(matrix: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues and vectors of the free block; inf for a held direction or a singular one.
+
+    Held unknowns get a diagonal entry within the spectrum of the others, so that they neither mix
+    with them nor set its ends.
+    """
+    top = np.max(np.diagonal(matrix, axis1=1, axis2=2), axis=1)
+    top = np.where(top > 0, top, 1)[:, None]
+    eye = np.eye(matrix.shape[1])
+    values, vectors = np.linalg.eigh(matrix + eye * (~free * top)[:, :, None])
+    own = np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5
+    largest = np.max(np.where(own, values, 0), axis=1, keepdims=True)
+    keep = own & (values > SINGULAR**2 * largest)
+    return np.where(keep, values, np.inf), vectors
+
+
+def _flattest(values, vectors, free, covariance, usable):
+    """Condition number, least determined direction and its standard error, of all lanes.
+
+    Where every unknown is held nothing is left undetermined: 1, no direction, no error.
+    """
+    lanes = np.arange(len(values))
+    own = np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5
+    singular = np.any(np.isinf(values) & own, axis=1) | ~usable
+    nothing = usable & ~free.any(axis=1)
+    order = np.where(own, np.where(np.isinf(values), -1, values), np.inf)
+    flattest = np.argmin(order, axis=1)
+    v = vectors[lanes, :, flattest] * free
+    sign = np.sign(v[lanes, np.argmax(np.abs(v), axis=1)])
+    flat = v * sign[:, None]
+    variance = np.einsum("lp,lpq,lq->l", flat, covariance, flat)
+    largest = np.max(np.where(own & np.isfinite(values), values, 0), axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        condition = np.sqrt(largest / values[lanes, flattest])
+    flat_se = np.where(singular, np.inf, np.sqrt(np.maximum(variance, 0)))
+    condition = np.where(nothing, 1, np.where(singular, np.inf, condition))
+    return condition, np.where(nothing[:, None], 0, flat), np.where(nothing, 0, flat_se)

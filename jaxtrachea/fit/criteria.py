@@ -1,0 +1,99 @@
+"""Information criteria of a fit: what a model's fit is worth after its unknowns are paid for.
+
+Akaike (1974, doi:10.1109/TAC.1974.1100705), corrected for few samples by Hurvich and Tsai (1989,
+doi:10.1093/biomet/76.2.297); Schwarz (1978, doi:10.1214/aos/1176344136).
+"""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxtrachea.fit.covariance import Information
+from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.shared import unknown_count
+
+#: Share of the largest datum that its own rounding may be: no residual counts for less.
+ROUNDING = 1e-15
+
+
+class Criteria(NamedTuple):
+    """Of every lane; smaller is better, and differences between models of the same data count.
+
+    Attributes:
+        unknowns: k: fitted parameters, those on a bound or undetermined included, and every
+            standard deviation that is estimated; (lanes,).
+        deviance: -2 ln L at the estimate, normal residuals; NaN with a robust loss; (lanes,).
+        AIC: deviance + 2 k.
+        AICc: AIC + 2 k (k + 1) / (n - k - 1); inf where n <= k + 1.
+        BIC: deviance + k ln n.
+    """
+
+    unknowns: Int[np.ndarray, " lanes"]
+    deviance: Float[np.ndarray, " lanes"]
+    AIC: Float[np.ndarray, " lanes"]
+    AICc: Float[np.ndarray, " lanes"]
+    BIC: Float[np.ndarray, " lanes"]
+
+
+def criteria(problem: Problem, info: Information, alive: Bool[np.ndarray, " lanes"]) -> Criteria:
+    """Criteria of all lanes; in a joint problem those of the whole study, the same in every lane.
+
+    With a given standard deviation the deviance is sum(z^2 + ln(2 pi sigma^2)), with an estimated
+    one n (ln(2 pi S / n) + 1), forces and markers each with their own. S is the sum of squares that
+    the fit minimises, curve weights included; they average to one.
+
+    Args:
+        problem: what was fitted.
+        info: of all lanes at their estimates.
+        alive: lanes that count in a joint problem.
+    """
+    lanes, estimated = problem.lanes, [not given for given in problem.noise_given]
+
+    def whole(v, combine=np.sum):
+        return np.broadcast_to(combine(v[alive], axis=0), v.shape) if problem.joint else v
+
+    counts, squares = whole(np.asarray(info.counts, float)), whole(np.asarray(info.weighted))
+    deviance = np.zeros(len(counts))
+    kinds = ((lanes.precision, lanes.force), (lanes.joint_precision, lanes.joints))
+    for kind, (precision, data) in enumerate(kinds):
+        n, S = counts[:, kind], squares[:, kind]
+        if precision is None or data is None:
+            continue
+        flat = lambda v: v.reshape(len(v), -1)  # noqa: E731
+        if estimated[kind]:
+            peak = np.max(np.abs(flat(data * precision)), axis=1, initial=0)
+            peak = whole(peak, functools.partial(np.max, initial=0))
+            S = np.maximum(S, np.maximum(n, 1) * (ROUNDING * peak) ** 2)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                deviance += np.where(n > 0, n * (np.log(2 * np.pi * S / n) + 1), 0)
+        else:
+            seen = flat(precision)
+            logs = np.log(seen, where=seen > 0, out=np.zeros(seen.shape)).sum(axis=1)
+            deviance += S + n * np.log(2 * np.pi) - 2 * whole(logs)
+    if problem.loss != "linear":
+        deviance = np.full(len(counts), np.nan)
+    own = np.sum(lanes.active, axis=1)
+    if problem.joint:
+        own = np.full(len(own), unknown_count(problem, alive))
+    k = own + np.sum((counts > 0) * np.array(estimated), axis=1)
+    return penalised(deviance, k.astype(int), np.sum(counts, axis=1))
+
+
+def penalised(deviance: np.ndarray, k: np.ndarray, n: np.ndarray) -> Criteria:
+    """Criteria from -2 ln L, unknowns and samples."""
+    left = n - k - 1
+    with np.errstate(divide="ignore", invalid="ignore"):
+        more = np.where(left > 0, 2 * k * (k + 1) / left, np.inf)
+        return Criteria(k, deviance, deviance + 2 * k, deviance + 2 * k + more,
+                        deviance + k * np.log(n))  # fmt: skip
+
+
+def weights(values: Float[np.ndarray, " models"]) -> Float[np.ndarray, " models"]:
+    """Akaike weights exp(-difference / 2) over their sum (Burnham and Anderson 2002, sec. 2.9)."""
+    values = np.where(np.isnan(values), np.inf, values)
+    if not np.isfinite(values).any():
+        return np.full(len(values), np.nan)
+    w = np.exp(-0.5 * (values - np.min(values)))
+    return w / np.sum(w)

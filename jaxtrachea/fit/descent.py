@@ -1,0 +1,127 @@
+"""The same cost by optax: L-BFGS or Adam, for users who put the model into a larger loss.
+
+`cost` is the scalar to embed; `descend` runs it by itself, with the box kept by projection. Slower
+than `solve.levenberg_marquardt` for a plain fit; use it where the loss is not a sum of squares.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from jaxtrachea._arguments import check_word
+from jaxtrachea.fit.cost import entry_scale, evaluate, robust
+from jaxtrachea.fit.levenberg_marquardt import Solved, Tolerances, held, promise, rounding_cost
+from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.residual import residual_value
+from jaxtrachea.status import FitStatus
+
+#: Cosine between residual and Jacobian up to which a point counts as a minimum.
+NEARLY_FLAT = 1e-2
+
+
+def cost(
+    problem: Problem, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
+) -> Float[Array, ""]:
+    """Half the weighted sum of rho(residual^2) of one lane; differentiable in all arrays.
+
+    Args:
+        problem: static description.
+        theta: unknowns in scaled coordinates (`Parameter.to_scaled`).
+        lane: arrays of the lane.
+        sigma: standard deviation of force and markers in units of the lane's precision.
+    """
+    z = residual_value(problem, theta, lane) * entry_scale(lane, sigma)[None]
+    rho, _ = robust(problem.loss, z * z, problem.loss_scale)
+    return 0.5 * jnp.sum(rho * (lane.balance * lane.balance)[:, None])
+
+
+def descend(
+    problem: Problem,
+    jobs: np.ndarray,
+    starts: np.ndarray,
+    sigma: np.ndarray,
+    *,
+    method: Literal["lbfgs", "adam"] = "lbfgs",
+    tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
+    chunk: int = 256,
+    learning_rate: float = 0.03,
+    progress: Callable[[int], None] | None = None,
+    dtype=np.float64,
+) -> Solved:
+    """Minimise every job by a first-order method; arguments and result as `levenberg_marquardt`.
+
+    `tolerances.iterations` counts tens of steps for L-BFGS and hundreds for Adam; a job is done
+    when the relative change of its cost over such a block is below `tolerances.cost` per step.
+    Where an unknown alone could still lower the residual's norm by more than `NEARLY_FLAT`, it has
+    stalled.
+    """
+    check_word("method", method, Literal["lbfgs", "adam"])
+    block = {"lbfgs": 10, "adam": 100}[method]
+    run = _compiled(problem.program, method, learning_rate, block, tolerances)
+    cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype)  # noqa: E731
+    parts = []
+    for first in range(0, len(jobs), chunk):
+        of = jobs[first : first + chunk]
+        lane = jax.tree.map(lambda v, of=of: cast(v[of]), problem.lanes)
+        rows = slice(first, first + chunk)
+        # optax mixes integer widths in its counters
+        with jax.numpy_dtype_promotion("standard"):
+            done = run(cast(starts[rows]), lane, cast(sigma[rows]))
+        parts.append([np.asarray(v) for v in done])
+        if progress is not None:
+            progress(len(parts[-1][0]))
+    theta, value, status, iterations = (np.concatenate(v) for v in zip(*parts, strict=True))
+    return Solved(theta.astype(float), value.astype(float), status.astype(int), iterations)
+
+
+@functools.lru_cache(maxsize=8)
+def _compiled(problem: Problem, method, learning_rate, block, tolerances):
+    one = functools.partial(_descend, problem, method, learning_rate, block, tolerances)
+    return jax.jit(jax.vmap(one))
+
+
+def _descend(problem, method, learning_rate, block, tolerances, start, lane, sigma):
+    """One job: blocks of steps until the cost settles."""
+    loss = lambda theta: cost(problem, theta, lane, sigma)  # noqa: E731
+    box = lambda theta: jnp.clip(theta, lane.lower, lane.upper)  # noqa: E731
+    optimiser = optax.lbfgs() if method == "lbfgs" else optax.adam(learning_rate)
+
+    def step(_, carry):
+        theta, state = carry
+        value, gradient = jax.value_and_grad(loss)(theta)
+        # What a bound holds does not move, and the others do not count on it.
+        gradient = jnp.where(held(theta, gradient, lane), 0, gradient)
+        extra = {"value": value, "grad": gradient, "value_fn": loss} if method == "lbfgs" else {}
+        updates, state = optimiser.update(gradient, state, theta, **extra)
+        return box(optax.apply_updates(theta, updates)), state
+
+    def more(carry):
+        _, _, value, previous, blocks = carry
+        change = jnp.abs(previous - value) > block * tolerances.cost * jnp.abs(value)
+        return (blocks < tolerances.iterations) & jnp.isfinite(value) & (change | (blocks == 0))
+
+    def advance(carry):
+        theta, state, value, _, blocks = carry
+        theta, state = jax.lax.fori_loop(0, block, step, (theta, state))
+        return theta, state, loss(theta), value, blocks + 1
+
+    theta = box(start)
+    value = loss(theta)
+    first = (theta, optimiser.init(theta), value, value, jnp.asarray(0))
+    theta, _, value, _, blocks = jax.lax.while_loop(more, advance, first)
+    status = jnp.where(
+        blocks >= tolerances.iterations, FitStatus.MAX_ITERATIONS, FitStatus.CONVERGED
+    )
+    point = evaluate(problem, theta, lane, sigma)
+    left = jnp.max(promise(theta, point, lane))
+    steep = left > NEARLY_FLAT * jnp.sqrt(2 * point.cost)
+    steep &= (status == FitStatus.CONVERGED) & (value > rounding_cost(lane, sigma))
+    status = jnp.where(steep, FitStatus.STALLED, status)
+    bad = jnp.where(blocks == 0, FitStatus.INFEASIBLE_START, FitStatus.NON_FINITE)
+    return theta, value, jnp.where(jnp.isfinite(value), status, bad), block * blocks

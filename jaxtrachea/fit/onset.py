@@ -1,0 +1,123 @@
+"""What a study gets where the displacement at first touch is fitted, or the zero of the force.
+
+Steps as large as the presses, a rounded corner for each curve, bounds within reach of the samples.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxtrachea.fit.parameters import DEFAULTS, OF_THE_PRESS, Parameter
+from jaxtrachea.measurements.first_touch import FirstTouch, blend_widths, first_touch
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
+
+if TYPE_CHECKING:
+    from jaxtrachea.fit.problem import Lane
+
+
+def natural_steps(
+    parameters: Sequence[Parameter], curves: Sequence[Curve]
+) -> tuple[Parameter, ...]:
+    """The table with the steps of a free onset and offset as large as the presses of the study.
+
+    A power of ten, not above the median over the curves: studies alike share compiled programs.
+    """
+    span = np.median([np.ptp(c.displacement) for c in curves])
+    peak = np.median([np.max(np.abs(c.force)) for c in curves])
+    size = {"onset": float(span), "force_offset": float(peak)}
+
+    def scaled(p: Parameter) -> Parameter:
+        if p.fixed or p.name not in size or p.step != DEFAULTS[p.name].step or not size[p.name] > 0:
+            return p
+        return dataclasses.replace(p, step=10.0 ** math.floor(math.log10(size[p.name])))
+
+    return tuple(map(scaled, parameters))
+
+
+def onset_is_sought(parameters: Sequence[Parameter], options: Options) -> bool:
+    """Whether the displacement at first touch is fitted, and is a corner of the curves."""
+    free = any(p.name == "onset" and not p.fixed for p in parameters)
+    return free and options.contact == "unilateral"
+
+
+def touches(lanes: "Lane", parameters: Sequence[Parameter]) -> FirstTouch:
+    """Change point of every trial of every lane, see `first_touch`; (lanes, T) each."""
+    shape, samples = lanes.s_c.shape, lanes.force.shape[-1]
+    displacement, force, precision = (
+        np.reshape(v, (-1, samples)) for v in (lanes.displacement, lanes.force, lanes.precision)
+    )
+    known = next(p for p in parameters if p.name == "force_offset")
+    offset = np.full(len(force), known.value) if known.fixed else None
+    found = first_touch(displacement, force, precision > 0, offset)
+    return FirstTouch(*(v.reshape(shape) for v in found))
+
+
+def blends(
+    lanes: "Lane",
+    curves: Sequence[Sequence[Curve]],
+    sigma_force: float | None,
+    parameters: Sequence[Parameter],
+    options: Options,
+) -> Float[np.ndarray, "lanes T"]:
+    """Width of the rounded corner of every trial, mm.
+
+    Args:
+        lanes: all data.
+        curves: of each lane.
+        sigma_force: given standard deviation, N; a curve's own comes before it; None: estimated.
+        parameters: the table.
+        options: `onset_width` is the least width.
+    """
+    given = np.full(lanes.s_c.shape, np.nan)
+    for row, lane in zip(given, curves, strict=True):
+        sigma = [sigma_force if c.sigma is None else np.median(c.sigma) for c in lane]
+        row[: len(lane)] = [np.nan if v is None else v for v in sigma]
+    return blend_widths(touches(lanes, parameters), given, options.onset_width)
+
+
+def where_sought(
+    p: Parameter, parameters: Sequence[Parameter], options: Options
+) -> tuple[str, str]:
+    """Initial value and bounds of a free parameter in words, as the fit has them.
+
+    An onset or offset without an initial value starts where its curve shows it, and an onset
+    without bounds has those of `within_reach`.
+    """
+    initial, bounds = f"{p.value:g}", f"{p.lower:g} … {p.upper:g}"
+    if p.name not in OF_THE_PRESS or p.scale == "log":
+        return initial, bounds
+    usual = DEFAULTS[p.name]
+    if options.contact == "unilateral" and p.value == usual.value:
+        initial = "change point of the curve" if p.name == "onset" else "force before first touch"
+    near = p.name == "onset" and onset_is_sought(parameters, options)
+    if near and (p.lower, p.upper) == (usual.lower, usual.upper):
+        bounds = "from its samples"
+    return initial, bounds
+
+
+def within_reach(lanes: "Lane", parameters: Sequence[Parameter]) -> "Lane":
+    """Lanes whose onset, where its bounds are the default, lies within reach of the samples.
+
+    From one range of displacement before the first sample to the last one. A curve that does not
+    show its first touch is otherwise fitted with one anywhere before it.
+    """
+    column = next(j for j, p in enumerate(parameters) if p.name == "onset")
+    p, usual = parameters[column], DEFAULTS["onset"]
+    if p.scale != "linear" or (p.lower, p.upper) != (usual.lower, usual.upper):
+        return lanes
+    seen = lanes.precision > 0
+    first = np.min(np.where(seen, lanes.displacement, np.inf), axis=2)
+    last = np.max(np.where(seen, lanes.displacement, -np.inf), axis=2)
+    lower, upper = lanes.lower.copy(), lanes.upper.copy()
+    for lane, row in enumerate(lanes.index[:, :, column]):
+        for i in np.unique(row[row >= 0]):
+            low, high = np.min(first[lane][row == i]), np.max(last[lane][row == i])
+            if high > low:
+                lower[lane, i] = max(lower[lane, i], p.to_scaled(min(2 * low - high, p.value)))
+                upper[lane, i] = min(upper[lane, i], p.to_scaled(max(high, p.value)))
+    return lanes._replace(lower=lower, upper=upper)

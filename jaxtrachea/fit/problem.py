@@ -1,0 +1,432 @@
+"""From curves to a least-squares problem: lanes of padded arrays.
+
+A *lane* is the smallest set of curves that share unknowns: the whole study if any parameter is
+shared, one specimen otherwise, one trial if all free parameters belong to trials. In a *joint*
+problem lanes are specimens although they share unknowns: every lane holds a copy of the shared
+ones, and the solver keeps the copies equal. Lanes have equal shapes (curves of unequal length are
+padded with weight zero), so that one compiled program fits any number of them at once. What they
+are compared with is in `residual`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxtrachea._arguments import check_record, check_word
+from jaxtrachea.fit.onset import blends, natural_steps, onset_is_sought, within_reach
+from jaxtrachea.fit.parameters import DEFAULTS, SKELETON, Parameter
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.trachea.geometry import Geometry
+
+Common = Literal["all", "beam", "nothing"]
+Balance = Literal["curve", "sample"]
+Loss = Literal["linear", "huber", "soft_l1", "cauchy"]
+
+
+class Lane(NamedTuple):
+    """Everything of one lane (or, with a leading axis, of many); T trials of N samples.
+
+    `index` says for each trial and free column which unknown it reads (-1: keeps `value`). Weights
+    are square roots of what multiplies a squared residual; zero marks padding and missing samples.
+
+    Attributes:
+        s_c: contact position, mm; (T,).
+        displacement: mm; (T, N).
+        force: N; (T, N).
+        precision: 1 / sigma of each force sample, or 1 where the noise is estimated; (T, N).
+        joints: marker displacement, mm; (T, N, rings); None without markers.
+        joint_precision: as `precision`; None without markers.
+        balance: weight of each trial against the others; (T,).
+        blend: smooth first touch of each trial, mm, see `first_touch`; (T,); None where no onset is
+            fitted.
+        value: value of every model parameter, used where it is not free; (T, J).
+        index: (T, J).
+        lower: bounds of the unknowns in scaled coordinates; (P,).
+        upper: (P,).
+        active: whether the unknown exists in this lane; (P,).
+    """
+
+    s_c: Float[Array, "*l T"]
+    displacement: Float[Array, "*l T N"]
+    force: Float[Array, "*l T N"]
+    precision: Float[Array, "*l T N"]
+    joints: Float[Array, "*l T N rings"] | None
+    joint_precision: Float[Array, "*l T N rings"] | None
+    balance: Float[Array, "*l T"]
+    blend: Float[Array, "*l T"] | None
+    value: Float[Array, "*l T J"]
+    index: Int[Array, "*l T J"]
+    lower: Float[Array, "*l P"]
+    upper: Float[Array, "*l P"]
+    active: Float[Array, "*l P"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
+    """A study ready to be fitted.
+
+    Attributes:
+        geometry: the tube, float64 numpy.
+        options: the model (static).
+        parameters: all parameters of the model, free and fixed, in column order.
+        lanes: stacked arrays with the leading axis `lanes`, numpy.
+        curves: for each lane, its curves in trial order.
+        unknowns: for each lane, the (parameter, specimen or "", trial or "") of every unknown.
+        loss: `linear`, `huber`, `soft_l1` or `cauchy`.
+        loss_scale: residual, in standard deviations, where the loss turns robust.
+        noise_given: whether sigma of (force, markers) is known.
+        common: what all trials of a lane have in common, in every lane: `all` unknowns, the `beam`,
+            or `nothing`.
+        joint: whether shared unknowns are one and the same in all lanes.
+    """
+
+    geometry: Geometry
+    options: Options
+    parameters: tuple[Parameter, ...]
+    lanes: Lane
+    curves: tuple[tuple[Curve, ...], ...]
+    unknowns: tuple[tuple[tuple[Parameter, str, str], ...], ...]
+    loss: str
+    loss_scale: float
+    noise_given: tuple[bool, bool]
+    common: Common
+    joint: bool = False
+
+    @property
+    def free(self) -> tuple[Parameter, ...]:
+        """Parameters that are fitted, in column order."""
+        return tuple(p for p in self.parameters if not p.fixed)
+
+    @property
+    def free_columns(self) -> tuple[int, ...]:
+        """Columns of the parameter table that are fitted."""
+        return tuple(j for j, p in enumerate(self.parameters) if not p.fixed)
+
+    @property
+    def size(self) -> int:
+        """Unknowns per lane, padding included."""
+        return self.lanes.lower.shape[1]
+
+    @property
+    def shared(self) -> Int[np.ndarray, "lanes k"]:
+        """Where the unknowns that all lanes of a joint problem share stand in each lane."""
+        names = [p.name for p in self.free if p.scope == "shared"] if self.joint else []
+        rows = [{p.name: i for i, (p, _, _) in enumerate(lane)} for lane in self.unknowns]
+        return np.array([[row[name] for name in names] for row in rows], int).reshape(
+            len(self.unknowns), len(names)
+        )
+
+    @property
+    def program(self) -> "Problem":
+        """This problem without its data: the same object for all that compile to one program."""
+        leaves, tree = jax.tree.flatten(self.geometry)
+        numbers = tuple((np.shape(v), tuple(np.ravel(v).tolist())) for v in leaves)
+        columns = tuple(
+            dataclasses.replace(p, description="", value=1.0, lower=1.0, upper=2.0, scope="shared")
+            for p in self.parameters
+        )
+        same = self.options, columns, self.loss, self.loss_scale, self.common
+        return _program(tree, numbers, *same)
+
+    def refuse_joint(self, what: str) -> None:
+        """Say that something is made for lanes that are fitted one by one.
+
+        Raises:
+            ValueError: the problem is joint.
+        """
+        if self.joint:
+            raise ValueError(f"{what} needs lanes without shared unknowns; build with joint=False")
+
+    def take(self, lanes: Int[np.ndarray, " n"]) -> "Problem":
+        """The same study with these lanes, in this order; a lane may come more than once."""
+        return dataclasses.replace(
+            self,
+            lanes=jax.tree.map(lambda v: v[lanes], self.lanes),
+            curves=tuple(self.curves[k] for k in lanes),
+            unknowns=tuple(self.unknowns[k] for k in lanes),
+        )
+
+    def lane_name(self, lane: int) -> tuple[str, str]:
+        """Specimen and trial of a lane; "(all)" where it spans several."""
+        one = lambda names: names.pop() if len(names) == 1 else "(all)"  # noqa: E731
+        curves = self.curves[lane]
+        return one({c.specimen for c in curves}), one({c.trial for c in curves})
+
+
+@functools.lru_cache(maxsize=64)
+def _program(tree, numbers, options, parameters, loss, loss_scale, common) -> Problem:
+    leaves = [np.reshape(np.array(v, np.float64), shape) for shape, v in numbers]
+    arrays: dict[str, Any] = dict.fromkeys(Lane._fields, np.zeros((0, 0)))
+    return Problem(
+        geometry=jax.tree.unflatten(tree, leaves),
+        options=options,
+        parameters=parameters,
+        lanes=Lane(**arrays),
+        curves=(),
+        unknowns=(),
+        loss=loss,
+        loss_scale=loss_scale,
+        noise_given=(False, False),
+        common=common,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise:
+    """Standard deviations; None: estimated from the residuals.
+
+    Attributes:
+        force: N; a curve's own per-sample sigma comes before it.
+        joints: mm.
+    """
+
+    force: float | None = None
+    joints: float | None = None
+
+    def __post_init__(self):
+        """Refuse words and numbers that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_record(self)
+        for name in ("force", "joints"):
+            if (value := getattr(self, name)) is not None and value <= 0:
+                raise ValueError(
+                    f"{name} is {value:g}; expected a standard deviation of more than 0, or None"
+                )
+
+
+def group(
+    curves: Sequence[Curve], parameters: Sequence[Parameter], *, joint: bool = False
+) -> list[list[Curve]]:
+    """Divide curves into lanes by the widest scope among the free parameters.
+
+    By specimens if joint, or if none is free.
+    """
+    scopes = {"specimen"} if joint else {p.scope for p in parameters if not p.fixed}
+    scopes = scopes or {"specimen"}
+    if "shared" in scopes:
+        return [list(curves)]
+    lanes: dict[tuple[str, str], list[Curve]] = {}
+    for curve in curves:
+        key = (curve.specimen, "" if "specimen" in scopes else curve.trial)
+        lanes.setdefault(key, []).append(curve)
+    return list(lanes.values())
+
+
+def build(
+    curves: Sequence[Curve],
+    geometry: Geometry,
+    options: Options,
+    parameters: Sequence[Parameter],
+    *,
+    noise: Noise = Noise(),  # noqa: B008 (frozen)
+    balance: Balance = "curve",
+    loss: Loss = "linear",
+    loss_scale: float = 1.345,
+    tool_radius: float | None = None,
+    joint: bool = False,
+) -> Problem:
+    """Put curves and parameters together.
+
+    Args:
+        curves: at least one; `s_c` set wherever the skeleton enters.
+        geometry: the tube at rest (converted to float64).
+        options: what the model includes.
+        parameters: those of `parameters.in_model`, in that order.
+        noise: known standard deviations.
+        balance: `curve` (every curve weighs the same, however long) or `sample`.
+        loss: see `Problem`.
+        loss_scale: see `Problem`.
+        tool_radius: mm; markers closer to the contact are held by the tool and left out. None: all
+            are used.
+        joint: one lane per specimen even if parameters are shared; without effect if none is, or
+            if there is but one specimen.
+
+    Raises:
+        ValueError: an unknown `balance` or `loss`, no curve, a marker on a ring that does not
+            exist, a curve without a contact position where one is needed, with specimen and trial
+            named.
+    """
+    check_word("balance", balance, Balance)
+    check_word("loss", loss, Loss)
+    if not 0 < loss_scale < np.inf:
+        raise ValueError(f"loss_scale is {loss_scale}; expected a finite number, more than 0")
+    if tool_radius is not None and not 0 <= tool_radius < np.inf:
+        raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
+    if not curves:
+        raise ValueError("no usable curve; nothing to fit")
+    for curve in curves:
+        check_curve(curve, geometry, options)
+    parameters = natural_steps(parameters, curves)
+    joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
+    joint = joint and len({c.specimen for c in curves}) > 1
+    groups = group(curves, parameters, joint=joint)
+    unknowns = [_unknowns(lane, parameters) for lane in groups]
+    sizes = _Sizes(
+        trials=max(map(len, groups)),
+        samples=max(len(c.force) for c in curves),
+        rings=geometry.rings,
+        unknowns=max(map(len, unknowns)),
+        joints=any(c.joint_displacement is not None for c in curves),
+    )
+    mean_length = float(np.mean([len(c.force) for c in curves]))
+    reach = -1.0 if tool_radius is None else tool_radius
+    lanes = [
+        _lane(lane, names, parameters, geometry, noise, balance, mean_length, reach, sizes)
+        for lane, names in zip(groups, unknowns, strict=True)
+    ]
+    stacked = jax.tree.map(lambda *arrays: np.stack(arrays), *lanes)
+    if onset_is_sought(parameters, options):
+        stacked = stacked._replace(blend=blends(stacked, groups, noise.force, parameters, options))
+        stacked = within_reach(stacked, parameters)
+    known = noise.force is not None or all(c.sigma is not None for c in curves)
+    return Problem(
+        geometry=jax.tree.map(lambda v: np.asarray(v, np.float64), geometry),
+        options=options,
+        parameters=tuple(parameters),
+        lanes=stacked,
+        curves=tuple(map(tuple, groups)),
+        unknowns=tuple(map(tuple, unknowns)),
+        loss=loss,
+        loss_scale=loss_scale,
+        noise_given=(known, noise.joints is not None),
+        common=_common(unknowns, parameters),
+        joint=joint,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sizes:
+    trials: int
+    samples: int
+    rings: int
+    unknowns: int
+    joints: bool
+
+
+def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
+    """Refuse a curve that the model cannot press.
+
+    Raises:
+        ValueError: no contact position, one outside the tube or off the midline, a marker on a ring
+            that does not exist; specimen and trial are named.
+    """
+    where = f"specimen {curve.specimen!r} trial {curve.trial!r}"
+    length, rings = float(geometry.length), geometry.rings
+    if curve.s_c is None:
+        if options.coupling == "series":
+            raise ValueError(
+                f"{where}: no contact position; give a column s, or data.s for all curves "
+                "(coupling = 'total' needs none)"
+            )
+    elif not 0 <= curve.s_c <= length:
+        raise ValueError(
+            f"{where}: contact at s = {curve.s_c:g} mm, expected on the tube, 0 to {length:g} mm"
+        )
+    if options.coupling == "series" and abs(curve.phi_c) > 1e-6:
+        raise ValueError(
+            f"{where}: contact at phi = {np.degrees(curve.phi_c):.3g} deg; this model presses on "
+            "the anterior midline (phi = 0) only"
+        )
+    if curve.joint_rings is not None and np.any(curve.joint_rings >= rings):
+        raise ValueError(f"{where}: marker on ring {curve.joint_rings.max() + 1} of {rings}")
+
+
+def _unknowns(lane: list[Curve], parameters) -> list[tuple[Parameter, str, str]]:
+    """Distinct unknowns of a lane, in parameter order."""
+    names: dict[tuple[Parameter, str, str], None] = {}
+    for p in parameters:
+        if not p.fixed:
+            for curve in lane:
+                names.setdefault(_key(p, curve))
+    return list(names)
+
+
+def _common(unknowns, parameters) -> Common:
+    """See `Problem.common`."""
+    free = [p.name for p in parameters if not p.fixed]
+    names = [[p.name for p, _, _ in lane] for lane in unknowns]
+    if all(lane == free for lane in names):
+        return "all"
+    beams = ([name for name in lane if name in SKELETON] for lane in names)
+    return "beam" if all(len(b) == len(set(b)) for b in beams) else "nothing"
+
+
+def _key(p: Parameter, curve: Curve) -> tuple[Parameter, str, str]:
+    specimen = "" if p.scope == "shared" else curve.specimen
+    return p, specimen, curve.trial if p.scope == "trial" else ""
+
+
+def _lane(
+    curves, unknowns, parameters, geometry, noise, balance, mean_length, reach, sizes
+) -> Lane:
+    """One lane as padded float64 arrays."""
+    T, N, J, P = sizes.trials, sizes.samples, len(parameters), sizes.unknowns
+    joints = np.zeros((T, N, sizes.rings)) if sizes.joints else None
+    lane: dict[str, Any] = {
+        "s_c": np.full(T, float(geometry.length) / 2),
+        "displacement": np.zeros((T, N)),
+        "force": np.zeros((T, N)),
+        "precision": np.zeros((T, N)),
+        "joints": joints,
+        "joint_precision": None if joints is None else joints.copy(),
+        "balance": np.ones(T),
+        "blend": None,
+        "value": np.tile([p.value for p in parameters], (T, 1)).astype(np.float64),
+        "index": np.full((T, J), -1, np.int32),
+        "lower": np.zeros(P),
+        "upper": np.zeros(P),
+        "active": np.zeros(P),
+    }
+    place = {key: i for i, key in enumerate(unknowns)}
+    for i, (p, _, _) in enumerate(unknowns):
+        lane["lower"][i], lane["upper"][i] = p.to_scaled(p.lower), p.to_scaled(p.upper)
+        lane["active"][i] = 1
+    for t, curve in enumerate(curves):
+        n = len(curve.force)
+        if curve.s_c is not None:
+            lane["s_c"][t] = curve.s_c
+        lane["displacement"][t, :n], lane["force"][t, :n] = curve.displacement, curve.force
+        sigma = curve.sigma if curve.sigma is not None else noise.force
+        lane["precision"][t, :n] = 1.0 if sigma is None else 1 / np.asarray(sigma)
+        lane["balance"][t] = np.sqrt(mean_length / n) if balance == "curve" else 1.0
+        for j, p in enumerate(parameters):
+            if not p.fixed:
+                lane["index"][t, j] = place[_key(p, curve)]
+        if curve.joint_displacement is not None and curve.joint_rings is not None:
+            weight = 1.0 if noise.joints is None else 1 / noise.joints
+            seen, at = _seen_joints(curve, geometry, reach), curve.joint_rings
+            lane["joints"][t, :n, at] = np.where(seen, curve.joint_displacement, 0).T
+            lane["joint_precision"][t, :n, at] = np.where(seen, weight, 0).T
+    return Lane(**lane)
+
+
+def _seen_joints(curve: Curve, geometry: Geometry, reach: float) -> np.ndarray:
+    """Which markers of a curve count: observed, and not under the tool; (N, M)."""
+    seen = np.isfinite(np.asarray(curve.joint_displacement))
+    x = np.asarray(geometry.ring_positions)[curve.joint_rings]
+    return seen if curve.s_c is None else seen & (np.abs(x - curve.s_c) > reach)
+
+
+def default_parameters(
+    names: Sequence[str], changes: Mapping[str, Mapping[str, object]]
+) -> tuple[Parameter, ...]:
+    """Table rows for `names` with the user's changes.
+
+    Raises:
+        ValueError: a change names a parameter that the chosen model does not contain.
+    """
+    unknown = [name for name in changes if name not in names]
+    if unknown:
+        raise ValueError(
+            f"parameters.{unknown[0]}: not part of this model, which has {', '.join(names)}"
+        )
+    return tuple(dataclasses.replace(DEFAULTS[n], **changes.get(n, {})) for n in names)

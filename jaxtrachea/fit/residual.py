@@ -1,0 +1,297 @@
+"""Model minus data of one lane, with its Jacobian: one definition for fit, uncertainty and plots.
+
+A curve sees the skeleton and the local law through few numbers, its `Inputs`. The Jacobian is taken
+in two stages, inputs by parameters and forces by inputs: the beam is differentiated once for each
+position, by the beam's own parameters, and not for each sample.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxtrachea.fit.parameters import SKELETON
+from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.mechanics.equilibrium import sensitivity
+from jaxtrachea.mechanics.force_law import Law, duffing
+from jaxtrachea.mechanics.press import (
+    compliance,
+    ligament_beam,
+    local_law,
+    respond,
+    touch,
+    unit_deflection,
+)
+from jaxtrachea.trachea.material import Material
+
+
+class Residual(NamedTuple):
+    """Whitened differences model - data of one lane.
+
+    Attributes:
+        value: (T, m); force samples, then markers.
+        jacobian: d value / d (free columns, scaled); (T, Jf, m).
+        bend: of the corner at the onset: second derivative of the value by the onset's column, as
+            far as it comes from the rounded corner; None where no onset is fitted; (T, m).
+    """
+
+    value: Float[Array, "T m"]
+    jacobian: Float[Array, "T Jf m"]
+    bend: Float[Array, "T m"] | None = None
+
+
+class Skeleton(NamedTuple):
+    """Motion under a unit force at C: of C, mm/N, and of every ring (None without markers)."""
+
+    compliance: Float[Array, "*T"]
+    joints: Float[Array, "*T rings"] | None
+
+
+class Inputs(NamedTuple):
+    """All that the curves of one lane depend on, trial by trial.
+
+    Attributes:
+        compliance: of the skeleton as the force feels it, mm/N; (T,).
+        joints: motion of every ring under a unit force, mm/N; (T, rings); None without markers.
+        k_1: of the local law at the contact, N/mm; (T,).
+        k_3: N/mm^3; (T,).
+        onset: mm; (T,).
+        force_offset: N; (T,).
+    """
+
+    compliance: Float[Array, " T"]
+    joints: Float[Array, "T rings"] | None
+    k_1: Float[Array, " T"]
+    k_3: Float[Array, " T"]
+    onset: Float[Array, " T"]
+    force_offset: Float[Array, " T"]
+
+
+def inputs(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Inputs:
+    """What the curves of one lane see of its unknowns.
+
+    Args:
+        problem: static description.
+        theta: unknowns in scaled coordinates.
+        lane: the lane's arrays (no leading axis).
+    """
+    free = of_trials(problem, theta, lane)
+    skeleton = _skeleton(problem, free, lane)
+    contact = jax.vmap(lambda f, trial: _at_contact(problem, f, trial))(free, _trials(lane))
+    law, felt = contact.law, _felt(problem, skeleton)
+    return Inputs(felt, skeleton.joints, law.k_1, law.k_3, contact.onset, contact.force_offset)
+
+
+def residual(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Residual:
+    """Residuals of one lane and their Jacobian, trial by trial.
+
+    Args:
+        problem: static description.
+        theta: unknowns in scaled coordinates.
+        lane: the lane's arrays (no leading axis).
+    """
+    free = of_trials(problem, theta, lane)
+    skeleton, by_beam = _skeleton_and_derivative(problem, free, lane)
+    one = lambda *trial: _of_trial_with_jacobian(problem, *trial)  # noqa: E731
+    return Residual(*jax.vmap(one)(free, skeleton, by_beam, _trials(lane)))
+
+
+def residual_value(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Float[Array, "T m"]:
+    """`residual` without its Jacobian."""
+    free = of_trials(problem, theta, lane)
+    skeleton = _skeleton(problem, free, lane)
+
+    def one(free, skeleton, trial):
+        law, onset, offset = _at_contact(problem, free, trial)
+        c = _felt(problem, skeleton)
+        force = respond(trial.displacement, onset, c, law, problem.options, trial.blend).force
+        joints = None if skeleton.joints is None else _times(force, skeleton.joints)
+        return _whitened(force + offset, joints, trial)
+
+    return jax.vmap(one)(free, skeleton, _trials(lane))
+
+
+def of_trials(problem: Problem, v: Float[Array, " P"], lane: Lane) -> Float[Array, "T Jf"]:
+    """Entries of a vector over the unknowns for every free column in every trial; 0 where none."""
+    if problem.common == "all":
+        return jnp.broadcast_to(v, (lane.s_c.shape[0], v.shape[0]))
+    index = lane.index[:, problem.free_columns]
+    return jnp.where(index >= 0, v[jnp.maximum(index, 0)], 0)
+
+
+def _trials(lane: Lane) -> Lane:
+    """The arrays of a lane that have a trial axis."""
+    return lane._replace(lower=None, upper=None, active=None, index=None)
+
+
+def _beam_columns(problem: Problem) -> tuple[int, ...]:
+    """Which free columns change the skeleton's compliance."""
+    return tuple(i for i, p in enumerate(problem.free) if p.name in SKELETON)
+
+
+def material_and_values(problem: Problem, free, value) -> tuple[Material, dict[str, Array]]:
+    """Material of one trial, and the value of every parameter by name."""
+    values = {p.name: value[j] for j, p in enumerate(problem.parameters)}
+    for p, scaled in zip(problem.free, free, strict=True):
+        values[p.name] = jnp.exp(scaled) if p.scale == "log" else scaled * p.step
+    one = jnp.ones((), free.dtype)  # where the skeleton is not part of the model
+    material = Material(
+        EI_L=values.get("EI_L", one),
+        k_M=values.get("k_M", one),
+        k_1=values["k_1"],
+        k_3=values["k_3"],
+        GA_L=values.get("GA_L"),
+        k_1_ring=values.get("k_1_ring"),
+        k_3_ring=values.get("k_3_ring"),
+    )
+    return material, values
+
+
+def _geometry(problem: Problem, dtype):
+    return jax.tree.map(lambda v: jnp.asarray(v, dtype), problem.geometry)
+
+
+def _skeleton(problem: Problem, free, lane: Lane) -> Skeleton:
+    """What moves under a unit force in every trial."""
+    geometry = _geometry(problem, free.dtype)
+
+    def at(free, value, s_c):
+        material, _ = material_and_values(problem, free, value)
+        if lane.joints is None:
+            return Skeleton(compliance(geometry, material, s_c, problem.options), None)
+        beam = ligament_beam(geometry, material, problem.options)
+        unit = unit_deflection(beam, s_c, problem.options)
+        return Skeleton(unit.w_C, unit.w)
+
+    if problem.options.coupling == "total" and lane.joints is None:
+        return Skeleton(jnp.zeros_like(lane.s_c), None)
+    if problem.common != "nothing" and lane.joints is None:
+        return at(free[0], lane.value[0], lane.s_c)
+    return jax.vmap(at)(free, lane.value, lane.s_c)
+
+
+def _skeleton_and_derivative(problem: Problem, free, lane: Lane) -> tuple[Skeleton, Skeleton]:
+    """`_skeleton` and its derivative by each of `_beam_columns`, an axis after that of the trials.
+
+    A trial reads its own row of `free` alone, so that one tangent serves all trials.
+    """
+    columns = _beam_columns(problem)
+    if not columns:
+        skeleton = _skeleton(problem, free, lane)
+        return skeleton, jax.tree.map(lambda v: jnp.zeros((v.shape[0], 0, *v.shape[1:])), skeleton)
+    along = jnp.eye(free.shape[1], dtype=free.dtype)[jnp.array(columns)]
+
+    def push(tangent):
+        tangents = jnp.broadcast_to(tangent, free.shape)
+        return jax.jvp(lambda free: _skeleton(problem, free, lane), (free,), (tangents,))
+
+    return jax.vmap(push, out_axes=(None, 1))(along)
+
+
+class _Contact(NamedTuple):
+    """What one trial's force depends on besides the skeleton; scalars."""
+
+    law: Law
+    onset: Float[Array, ""]
+    force_offset: Float[Array, ""]
+
+
+def _at_contact(problem: Problem, free, trial: Lane) -> _Contact:
+    material, values = material_and_values(problem, free, trial.value)
+    law = local_law(_geometry(problem, free.dtype), material, trial.s_c, problem.options)
+    return _Contact(law, values["onset"], values["force_offset"])
+
+
+def _felt(problem: Problem, skeleton: Skeleton):
+    """Compliance that the contact force depends on: none with the paper's total coupling."""
+    c = skeleton.compliance
+    return c if problem.options.coupling == "series" else jnp.zeros_like(c)
+
+
+def _times(force: Float[Array, " N"], joints: Float[Array, " rings"]) -> Float[Array, "N rings"]:
+    """Motion of every ring at every sample."""
+    return force[:, None] * joints[None]
+
+
+def _whitened(force, joints, trial: Lane) -> Float[Array, " m"]:
+    """Difference to the data of one trial over its standard deviation, forces then markers."""
+    return _masked(force - trial.force, None if joints is None else joints - trial.joints, trial)
+
+
+def _masked(force, joints, trial: Lane) -> Float[Array, " m"]:
+    """Observed entries over their standard deviation, exact zeros elsewhere; in one row."""
+    seen = lambda v, precision: jnp.where(precision > 0, v, 0) * precision  # noqa: E731
+    r = seen(force, trial.precision)
+    if joints is None:
+        return r
+    markers = seen(joints, trial.joint_precision)
+    return jnp.concatenate([r, markers.reshape(*r.shape[:-1], -1)], axis=-1)
+
+
+def _of_trial_with_jacobian(problem: Problem, free, skeleton, by_beam, trial: Lane):
+    """Whitened residual of one trial, (m,), and its Jacobian by the free columns, (Jf, m)."""
+    eye = jnp.eye(free.shape[0], dtype=free.dtype)
+    push = lambda t: jax.jvp(lambda f: _at_contact(problem, f, trial), (free,), (t,))  # noqa: E731
+    contact, d_contact = jax.vmap(push, out_axes=(None, 0))(eye)
+    of_beam = _beam_columns(problem)
+
+    def all_columns(v):
+        zero = jnp.zeros(v.shape[1:], v.dtype)
+        rows = range(len(eye))
+        return jnp.stack([v[of_beam.index(i)] if i in of_beam else zero for i in rows])
+
+    d_skeleton = jax.tree.map(all_columns, by_beam)
+    law, c = contact.law, _felt(problem, skeleton)
+    D, blend = trial.displacement, trial.blend
+    depth = respond(D, contact.onset, c, law, problem.options, blend).depth
+    by = sensitivity(depth, c, law)
+    at = lambda onset: touch(D, onset, problem.options, blend)  # noqa: E731
+    slope = lambda onset: jax.jvp(at, (onset,), (jnp.ones_like(onset),))[1]  # noqa: E731
+    moved = slope(contact.onset)
+    terms = {
+        "compliance": (_felt(problem, d_skeleton), by.compliance),
+        "k_1": (d_contact.law.k_1, by.k_1),
+        "k_3": (d_contact.law.k_3, by.k_3),
+        "onset": (d_contact.onset, by.displacement * moved),
+    }
+    d_force = jnp.zeros((len(eye), *depth.shape), depth.dtype)
+    for d_input, by_input in (terms[name] for name in _felt_through(problem)):
+        d_force = d_force + d_input[:, None] * by_input[None]
+    force = duffing(depth, law)
+    joints, d_joints = None, None
+    if skeleton.joints is not None and d_skeleton.joints is not None:
+        joints = _times(force, skeleton.joints)
+        d_joints = jax.vmap(_times, (0, None))(d_force, skeleton.joints)
+        d_joints = d_joints + jax.vmap(_times, (None, 0))(force, d_skeleton.joints)
+    value = _whitened(force + contact.force_offset, joints, trial)
+    row = lambda force, joints: _masked(force, joints, trial)  # noqa: E731
+    bend = None
+    if blend is not None and joints is None and any(p.name == "onset" for p in problem.free):
+        curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
+        squared = jnp.sum(d_contact.onset**2)
+        bend = _masked(by.displacement * curved * squared, None, trial)
+    return value, jax.vmap(row)(d_force + d_contact.force_offset[:, None], d_joints), bend
+
+
+def _felt_through(problem: Problem) -> list[str]:
+    """Through what the free parameters act on the contact force: only these terms are computed."""
+    through = {
+        "compliance" if p.name in SKELETON else p.name.removesuffix("_ring") for p in problem.free
+    }
+    return [name for name in ("compliance", "k_1", "k_3", "onset") if name in through]
+
+
+def observations(lane: Lane) -> tuple[Float[Array, "T m"], int]:
+    """Which entries of the residual are observed (1 or 0), and how many of them are forces."""
+    seen = lane.precision > 0
+    if lane.joint_precision is not None:
+        markers = (lane.joint_precision > 0).reshape(*seen.shape[:-1], -1)
+        seen = jnp.concatenate([seen, markers], axis=-1)
+    return seen.astype(lane.force.dtype), lane.force.shape[-1]
+
+
+def size(lane: Lane) -> int:
+    """Entries of the residual per trial (static)."""
+    samples = lane.force.shape[-1]
+    return samples if lane.joints is None else samples * (1 + lane.joints.shape[-1])

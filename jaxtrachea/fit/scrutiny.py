@@ -1,0 +1,475 @@
+"""Doubts about estimates, and what is done about them: other minima, valleys, profiles.
+
+A local standard error says nothing of a second minimum, nor of a valley that bends away. A lane
+gives cause for doubt where a direction is long (relative standard error above `LONG`) or the
+Jacobian ill-conditioned, where an unknown is on its bound, or where another start has ended as low
+elsewhere. Such a lane is fitted again from starts that make the local law the soft part, then the
+skeleton, and from where the cost passes the likelihood's threshold along the least determined
+direction; then its unknowns are profiled. Every point whose cost lies within the threshold belongs
+to the confidence region, whatever way it was found: the interval of an unknown reaches at least as
+far (likelihood region; Raue et al. 2009, doi:10.1093/bioinformatics/btp358).
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxtrachea.fit.fit import FitResult, Minima, Settings, data_weight, first_sigma, scales
+from jaxtrachea.fit.parameters import OF_THE_PRESS, SKELETON
+from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.profile_search import Sides, find_ends
+from jaxtrachea.fit.residual import inputs
+from jaxtrachea.fit.starts import EXACT, box
+from jaxtrachea.fit.structure import Structure, positions
+from jaxtrachea.inference.judgement import natural_sizes
+from jaxtrachea.status import FitStatus, ProfileEnd
+
+#: Relative standard error along a direction, and condition number, from which there is doubt about
+#: the unknowns with a part in it; and from which there is about all unknowns.
+LONG, ILL_CONDITIONED, VERY_LONG = 0.1, 1e4, 0.3
+#: Part of an unknown's relative error by a doubtful direction, below which it is left in peace.
+PART = 0.02
+#: Relative distance from which two points are two.
+APART = 0.05
+#: Indentation over skeleton deflection, and its inverse, of the two starts.
+SOFT = 19.0
+#: Skeletons with the same compliances: how many are tried, and the grid they are looked for on
+#: (half width in natural logarithms, points of each axis).
+TWINS, TWIN_REACH, TWIN_POINTS = 3, 9.0, 41
+#: Where the cost is looked up along the least determined direction, in half widths of its interval.
+WALK = np.geomspace(0.5, 64, 15)
+#: Longest walk, in relative coordinates (log: seven decades).
+FAR = 16.0
+#: Relative accuracy of sqrt(statistic) at the ends of profiles, and rounds to find them.
+ACCURACY, ROUNDS = 3e-3, 20
+#: Fall of the statistic below the estimate's from which a point is a better minimum.
+BETTER = 1e-2
+
+
+class Evidence(NamedTuple):
+    """Fields of `FitResult` that rest on more than the local standard error."""
+
+    status: np.ndarray
+    evidence_low: np.ndarray
+    evidence_high: np.ndarray
+    evidence_end: np.ndarray
+    minima: np.ndarray
+
+
+def doubtful(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
+    """Unknowns of succeeded lanes that give cause, other than those that the structure leaves open.
+
+    Args:
+        result: of lanes fitted by themselves.
+        minima: where all starts ended.
+    """
+    alive = np.isin(result.status, _TO_LOOK_AT)
+    present = (result.problem.lanes.active > 0) & ~result.undetermined & alive[:, None]
+    doubt = np.zeros(present.shape, bool)
+    natural = natural_sizes(result)
+    se = np.stack([u.se for u in result.uncertainty]) / natural
+    known = present & np.isfinite(se)
+    se = np.where(known, se, 0)
+    correlation = np.stack([u.correlation for u in result.uncertainty])
+    both = known[:, :, None] & known[:, None]
+    covariance = np.where(both, correlation, 0) * se[:, :, None] * se[:, None]
+    values, vectors = np.linalg.eigh(np.nan_to_num(covariance))
+    root = np.sqrt(np.maximum(values, 0))
+    least = np.min(np.where(np.sum(vectors**2 * known[:, :, None], axis=1) > 0.5, root, np.inf), 1)
+    long = (root > LONG) | (root > ILL_CONDITIONED * least[:, None])
+    doubt |= np.any(long[:, None] & (np.abs(vectors) * root[:, None] > PART), axis=2)
+    failed = result.status > FitStatus.UNIDENTIFIABLE
+    lost = present & ~np.isfinite(se + np.where(known, 0, np.inf)) & ~result.at_bound
+    everything = result.at_bound.any(axis=1) | lost.any(axis=1) | failed
+    everything |= root.max(axis=1) > VERY_LONG
+    everything |= _elsewhere_as_low(result, minima, se, natural) | barely_determined(result.problem)
+    return present & (doubt | everything[:, None])
+
+
+def left_in_doubt(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
+    """`doubtful` unknowns of a fit that nothing further will look at.
+
+    An unknown that all lanes of a joint fit share is in doubt where half of them say so. What is
+    measured against the press (onset, offset) is seen by its own curve, whatever the others do: it
+    stands by its own error.
+    """
+    doubt = doubtful(result, minima)
+    problem = result.problem
+    shared = problem.shared
+    if shared.size:
+        row, good = np.arange(len(doubt))[:, None], result.succeeded
+        votes = doubt[row, shared][good]
+        doubt[row, shared] = np.mean(votes, axis=0) >= 0.5 if len(votes) else True
+    error = np.stack([u.se for u in result.uncertainty]) / natural_sizes(result)
+    for lane, unknowns in enumerate(problem.unknowns):
+        for i, (p, _, _) in enumerate(unknowns):
+            if p.name in OF_THE_PRESS:
+                doubt[lane, i] &= not error[lane, i] <= LONG
+    return doubt
+
+
+#: Lanes that have come to lie somewhere, if only in a valley.
+_TO_LOOK_AT = [
+    *(s for s in FitStatus if s.succeeded), FitStatus.MAX_ITERATIONS, FitStatus.STALLED,
+]  # fmt: skip
+
+
+def _elsewhere_as_low(result: FitResult, minima: Minima, se, natural) -> Bool[np.ndarray, " lanes"]:
+    """Lanes of which a start has ended apart from the estimate, at a cost that is no worse.
+
+    By the covariance at the estimate: what it calls within the interval is no other minimum.
+    """
+    out = np.zeros(result.lanes, bool)
+    lane = minima.job
+    apart = np.abs(minima.end - result.theta[lane]) / natural[lane]
+    own = (result.problem.lanes.active[lane] > 0) & ~result.undetermined[lane]
+    rows = np.flatnonzero(np.any(own & (apart > np.maximum(APART, 2 * se[lane])), axis=1))
+    if len(rows):
+        low = np.full(result.lanes, np.inf)
+        np.minimum.at(low, lane, np.where(np.isfinite(minima.cost), minima.cost, np.inf))
+        scale = (first_sigma(result.problem) / result.whitened_sigma)[lane[rows], 0] ** 2
+        dispersion = np.array([np.nanmin(u.dispersion) for u in result.uncertainty])[lane[rows]]
+        half = np.array([u.half_width for u in result.uncertainty])[lane[rows]]
+        with np.errstate(invalid="ignore"):
+            rise = 2 * (minima.cost[rows] - low[lane[rows]]) * scale
+        out[lane[rows[rise <= 4 * dispersion * half**2]]] = True
+    return out
+
+
+class _Region:
+    """Points within the likelihood's threshold of each lane, whatever way they were found."""
+
+    def __init__(self, sides: Sides, lanes: Int[np.ndarray, " n"]):
+        """Nothing but the estimates of `lanes`."""
+        result = self.result = sides.result
+        self.sides = sides
+        self.cost = np.full(result.lanes, np.nan)
+        self.cost[lanes] = sides.costs(lanes, result.theta[lanes])
+        self.dispersion = np.stack([u.dispersion for u in result.uncertainty])
+        self.threshold = np.array([float(u.half_width) for u in result.uncertainty]) ** 2
+        self.floor = EXACT * data_weight(result.problem, result.whitened_sigma)
+        self.low, self.high = result.theta.copy(), result.theta.copy()
+        self.at_low = np.repeat(result.theta[:, None], result.theta.shape[1], axis=1)
+        self.at_high = self.at_low.copy()
+        self.better = np.full(result.theta.shape, np.nan)
+        self.lowest = self.cost.copy()
+
+    def add(self, lane, theta, cost) -> Bool[np.ndarray, " n"]:
+        """Take in points (n, P) that lie within; whether each does for any unknown.
+
+        One that lies clearly below the estimate is remembered as the better minimum.
+        """
+        with np.errstate(invalid="ignore", divide="ignore"):
+            rise = 2 * (cost - self.cost[lane])[:, None] / self.dispersion[lane]
+        within = (rise <= self.threshold[lane][:, None]) & np.isfinite(theta)
+        for n in np.flatnonzero(within.any(axis=1)):
+            k, w = lane[n], within[n]
+            lower, upper = w & (theta[n] < self.low[k]), w & (theta[n] > self.high[k])
+            self.low[k][lower], self.high[k][upper] = theta[n][lower], theta[n][upper]
+            self.at_low[k][lower], self.at_high[k][upper] = theta[n], theta[n]
+            fall = self.cost[k] - cost[n]
+            least = 0.5 * BETTER * np.nanmin(self.dispersion[k])
+            if fall > max(least, self.floor[k]) and cost[n] < self.lowest[k]:
+                self.lowest[k], self.better[k] = cost[n], theta[n]
+        return within.any(axis=1)
+
+
+def scrutinise(
+    result: FitResult,
+    minima: Minima,
+    doubts: Bool[np.ndarray, "lanes P"],
+    settings: Settings,
+    known: Structure,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    last: bool = False,
+) -> tuple[Evidence, Float[np.ndarray, "lanes P"]]:
+    """Look for other minima of the lanes in doubt and profile their unknowns.
+
+    Args:
+        result: the fit.
+        minima: where all starts ended.
+        doubts: as `doubtful` gives them.
+        settings: of the fit.
+        known: structure of the lanes.
+        progress: called with (0, 0) as the work goes on.
+        last: no better minimum will be followed: gather all evidence in any case.
+
+    Returns:
+        The evidence, and a better minimum of each lane where one was found, NaN elsewhere: then
+        the evidence is not about the right estimate.
+    """
+    lanes = np.flatnonzero(doubts.any(axis=1))
+    alive = None if progress is None else lambda *_: progress(0, 0)
+    region = _Region(_sides(result, settings, doubts, alive), lanes)
+    of_lanes = np.isin(minima.job, lanes)
+    lane, end = minima.job[of_lanes], minima.end[of_lanes]
+    region.add(lane, end, region.sides.costs(lane, end))
+    several = _other_minima(region, lanes, known)
+    evidence = _unseen(result)
+    evidence.minima[lanes] = several
+    if np.isfinite(region.better).any() and not last:
+        return evidence, region.better
+    present = (result.problem.lanes.active > 0) & ~result.undetermined
+    doubts = doubts | (present & (evidence.minima > 1)[:, None])
+    region.sides = _sides(result, settings, doubts, alive)
+    _profiled(region, evidence)
+    settled = (result.status > FitStatus.UNIDENTIFIABLE) & doubts.any(axis=1)
+    evidence.status[settled] = FitStatus.UNIDENTIFIABLE
+    return evidence, region.better
+
+
+def _sides(result: FitResult, settings: Settings, doubts, progress) -> Sides:
+    """Both sides of the profile of every unknown in doubt."""
+    lane, unknown = (v.repeat(2) for v in np.nonzero(doubts))
+    return Sides(result, settings, lane, unknown, progress, accuracy=ACCURACY, rounds=ROUNDS)
+
+
+def _unseen(result: FitResult) -> Evidence:
+    """No evidence yet."""
+    none = np.full(result.theta.shape, np.nan)
+    end = np.full((*none.shape, 2), -1)
+    return Evidence(result.status.copy(), none, none.copy(), end, np.ones(result.lanes, int))
+
+
+def _other_minima(region: _Region, lanes, known: Structure) -> Int[np.ndarray, " n"]:
+    """Fits from further starts, added to the region; minima within the threshold, by lane."""
+    starts = [
+        *_soft_starts(region.result, lanes),
+        *_walks(region, lanes),
+        *_twins(region, lanes),
+        region.result.theta[lanes],
+    ]
+    theta, cost = region.sides.solve(
+        np.tile(lanes, len(starts)),
+        np.concatenate(starts),
+        np.tile(known.pinned[lanes], (len(starts), 1)),
+    )
+    within = region.add(np.tile(lanes, len(starts)), theta, cost).reshape(len(starts), -1)
+    theta = theta.reshape(len(starts), len(lanes), -1)
+    natural = natural_sizes(region.result)
+    ends = (theta[within[:, n], n] for n in range(len(lanes)))
+    return np.array(
+        [
+            _distinct(region.result, int(k), of_lane, natural[k])
+            for k, of_lane in zip(lanes, ends, strict=True)
+        ],
+        int,
+    )
+
+
+def _distinct(
+    result: FitResult, lane: int, ends: Float[np.ndarray, "n P"], natural: Float[np.ndarray, " P"]
+) -> int:
+    """Distinct minima among the estimate and `ends`, in unknowns that can be told."""
+    own = (result.problem.lanes.active[lane] > 0) & ~result.undetermined[lane]
+    relative = natural[own]
+    kept = [result.theta[lane][own]]
+    for end in ends[:, own]:
+        if min(np.max(np.abs(end - other) / relative) for other in kept) > APART:
+            kept.append(end)
+    return len(kept)
+
+
+def _soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
+    """The local law as the soft part of the curve's secant stiffness, then the skeleton as it."""
+    problem = result.problem
+    if not any(p.name in SKELETON for p in problem.free) or problem.options.coupling != "series":
+        return []
+    guess, low, high = box(problem, 0.0)[0][lanes], problem.lanes.lower, problem.lanes.upper
+    compliance = _compliances(problem, lanes, guess)
+    data = problem.lanes
+    seen = data.precision[lanes] > 0
+    force = np.where(seen, np.abs(data.force[lanes]), 0)
+    deepest = np.argmax(force, axis=2)[..., None]
+    peak = np.take_along_axis(force, deepest, 2)[..., 0]
+    depth = np.abs(np.take_along_axis(np.asarray(data.displacement)[lanes], deepest, 2)[..., 0])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        stiffness = np.nanmedian(np.where(depth > 0, peak / depth, np.nan), axis=1)
+        depth = np.nanmedian(np.where(depth > 0, depth, np.nan), axis=1)
+    share = 1 / (1 + SOFT)
+    out = []
+    for of_skeleton in (share, 1 - share):
+        k_1 = stiffness / (1 - of_skeleton)
+        softer = of_skeleton / stiffness / compliance
+        start = result.theta[lanes].copy()
+        for n, lane in enumerate(lanes):
+            for i, (p, _, _) in enumerate(problem.unknowns[lane]):
+                if p.name in SKELETON:
+                    start[n, i] = guess[n, i] - np.log(softer[n])
+                elif p.name.startswith("k_1"):
+                    start[n, i] = p.to_scaled(max(k_1[n], 1e-300))
+                elif p.name.startswith("k_3"):
+                    start[n, i] = p.to_scaled(0.1 * k_1[n] / (depth[n] * (1 - of_skeleton)) ** 2)
+        out.append(np.clip(np.nan_to_num(start), low[lanes], high[lanes]))
+    return out
+
+
+def _compliances(problem: Problem, lanes, theta) -> Float[np.ndarray, " n"]:
+    """Mean compliance of the observed trials, mm/N."""
+    observed = (problem.lanes.precision[lanes] > 0).any(axis=2)
+    c = [_compliance(problem, int(k), row[None])[0] for k, row in zip(lanes, theta, strict=True)]
+    return np.sum(np.array(c) * observed, axis=1) / np.sum(observed, axis=1)
+
+
+def _compliance(problem: Problem, lane: int, theta) -> Float[np.ndarray, "n T"]:
+    """Compliance at every trial of a lane, mm/N, at many points."""
+    row = jax.tree.map(lambda v: v[lane], problem.lanes)
+    return np.asarray(_compiled(problem.program)(theta, row))
+
+
+@functools.lru_cache(maxsize=16)
+def _compiled(problem: Problem):
+    of_point = lambda theta, lane: inputs(problem, theta, lane).compliance  # noqa: E731
+    return jax.jit(jax.vmap(of_point, (0, None)))
+
+
+def barely_determined(problem: Problem) -> Bool[np.ndarray, " lanes"]:
+    """Lanes without markers with at most one position more than unknowns of the skeleton.
+
+    With as many equations as unknowns other skeletons may have the same compliances exactly, with
+    one more nearly the same, each a sharp minimum of its own.
+    """
+    beam = [[p.name in SKELETON for p, _, _ in u] for u in problem.unknowns]
+    count = np.array([sum(row) for row in beam])
+    marked = problem.lanes.joint_precision
+    seen = np.zeros(len(count), bool) if marked is None else (marked > 0).any(axis=(1, 2, 3))
+    return (positions(problem) <= count + 1) & (count > 1) & ~seen
+
+
+def _twins(region: _Region, lanes) -> list[Float[np.ndarray, "n P"]]:
+    """Starts at other skeletons with nearly the same compliances, by a grid of EI_L and k_M.
+
+    Local minima of the squared difference of ln c on the grid, the `TWINS` lowest of each lane;
+    the estimate where there are fewer.
+    """
+    result, problem = region.result, region.result.problem
+    out = np.repeat(result.theta[lanes][None], TWINS, axis=0)
+    for n, lane in enumerate(lanes):
+        place = {p.name: i for i, (p, _, _) in enumerate(problem.unknowns[lane])}
+        if not {"EI_L", "k_M"} <= place.keys() or positions(problem)[lane] < 2:
+            continue
+        low, high, best = (
+            v[lane] for v in (problem.lanes.lower, problem.lanes.upper, result.theta)
+        )
+        beam = [place["EI_L"], place["k_M"]]
+        axes = [_axis(float(best[i]), float(low[i]), float(high[i])) for i in beam]
+        mesh = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+        theta = np.repeat(best[None], len(mesh) + 1, axis=0)
+        theta[1:, beam] = mesh
+        observed = (problem.lanes.precision[lane] > 0).any(axis=1)
+        c = _compliance(problem, int(lane), theta)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            change = np.log(c[1:] / c[0])[:, observed]
+        misfit = np.sum(change**2, axis=1).reshape(*map(len, axes))
+        for k, cell in enumerate(_valleys(misfit)[:TWINS]):
+            out[k, n, beam] = mesh[cell]
+    return list(out)
+
+
+def _axis(middle: float, low: float, high: float) -> Float[np.ndarray, " n"]:
+    """Grid of a logarithmic coordinate around the estimate, inside the bounds."""
+    return np.linspace(max(low, middle - TWIN_REACH), min(high, middle + TWIN_REACH), TWIN_POINTS)
+
+
+def _valleys(misfit: Float[np.ndarray, "a b"]) -> Int[np.ndarray, " n"]:
+    """Cells that are lower than all their neighbours, lowest first."""
+    padded = np.pad(np.nan_to_num(misfit, nan=np.inf), 1, constant_values=np.inf)
+    shape = misfit.shape
+    around = [
+        padded[1 + i : 1 + i + shape[0], 1 + j : 1 + j + shape[1]]
+        for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)
+    ]  # fmt: skip
+    cells = np.flatnonzero((misfit <= np.min(around, axis=0)).ravel())
+    return cells[np.argsort(misfit.ravel()[cells])]
+
+
+def _walks(region: _Region, lanes) -> list[Float[np.ndarray, "n P"]]:
+    """From where the cost passes the threshold along the least determined direction, both ways.
+
+    On the way every point within the threshold is added to the region.
+    """
+    result, sides = region.result, region.sides
+    u = [result.uncertainty[k] for k in lanes]
+    flat = np.stack([v.flat for v in u]) * result.relative[lanes]
+    half = np.array([v.half_width * v.flat_se for v in u])
+    half = np.where(np.isfinite(half), half, 1.0)
+    steps = np.minimum(half[:, None] * WALK, FAR)
+    data, out = result.problem.lanes, []
+    for sign in (-1.0, 1.0):
+        theta = result.theta[lanes][:, None] + sign * steps[..., None] * flat[:, None]
+        theta = np.clip(theta, data.lower[lanes][:, None], data.upper[lanes][:, None])
+        lane = np.repeat(lanes, len(WALK))
+        cost = sides.costs(lane, theta.reshape(len(lane), -1))
+        within = region.add(lane, theta.reshape(len(lane), -1), cost).reshape(len(lanes), -1)
+        first = np.argmax(~within, axis=1)
+        first = np.where(within.all(axis=1), len(WALK) - 1, first)
+        out.append(theta[np.arange(len(lanes)), first])
+    return out
+
+
+def _profiled(region: _Region, evidence: Evidence) -> None:
+    """Profile all sides, and on from where the region reaches further than the profile."""
+    result, sides = region.result, region.sides
+    lane, unknown = sides.lane[::2], sides.unknown[::2]
+    distance, end, path = find_ends(sides)
+    _add_path(region, sides, path)
+    distance, end = distance.reshape(-1, 2), end.reshape(-1, 2)
+    best = result.theta[lane, unknown]
+    low, high = best - distance[:, 0], best + distance[:, 1]
+    low, high = _further(region, lane, unknown, low, high, end)
+    low, high = (
+        np.minimum(low, region.low[lane, unknown]),
+        np.maximum(high, region.high[lane, unknown]),
+    )
+    open_ = end == ProfileEnd.OPEN
+    low, high = np.where(open_[:, 0], -np.inf, low), np.where(open_[:, 1], np.inf, high)
+    log, step = scales(result.problem)
+    with np.errstate(over="ignore"):
+        unscale = lambda v: np.where(log[lane, unknown], np.exp(v), v * step[lane, unknown])  # noqa: E731
+        evidence.evidence_low[lane, unknown] = unscale(low)
+        evidence.evidence_high[lane, unknown] = unscale(high)
+    evidence.evidence_end[lane, unknown] = end
+
+
+def _add_path(region: _Region, sides: Sides, path) -> None:
+    """Add the points of profiles."""
+    side, theta = np.concatenate(path.side), np.concatenate(path.theta)
+    region.add(sides.lane[side], theta, sides.costs(sides.lane[side], theta))
+
+
+def _further(region: _Region, lane, unknown, low, high, end):
+    """Ends searched anew from the outermost points of the region, where they lie outside.
+
+    Changes `end` where it does.
+    """
+    tolerance = 1e-3 * (high - low)
+    beyond = np.stack(
+        [
+            region.low[lane, unknown] < low - tolerance,
+            region.high[lane, unknown] > high + tolerance,
+        ],
+        axis=1,
+    ) & (end != ProfileEnd.OPEN)
+    rows = np.flatnonzero(beyond.any(axis=1))
+    if not len(rows):
+        return low, high
+    pick = lane[rows], unknown[rows]
+    origin = np.stack([region.at_low[pick], region.at_high[pick]], axis=1)
+    origin = origin.reshape(2 * len(rows), -1)
+    sides = Sides(
+        region.result, region.sides.settings, lane[rows].repeat(2), unknown[rows].repeat(2),
+        region.sides.progress, origin=origin, accuracy=ACCURACY, rounds=ROUNDS,
+    )  # fmt: skip
+    distance, ends, path = find_ends(sides)
+    _add_path(region, sides, path)
+    reach = origin[np.arange(len(origin)), sides.unknown] + sides.sign * distance
+    for side, found in enumerate((low, high)):
+        moved = rows[beyond[rows, side]]
+        found[moved] = reach.reshape(-1, 2)[beyond[rows, side], side]
+        end[moved, side] = ends.reshape(-1, 2)[beyond[rows, side], side]
+    return low, high

@@ -1,0 +1,424 @@
+"""Joint fit: unknowns of every specimen and unknowns that all share, linear in the specimens.
+
+Each iteration is a Gauss-Newton step on the arrow matrix (`arrow`) with one trust region, on the
+shared unknowns: all others follow by substitution. A lane that this leaves well above its own
+minimum is fitted anew with the shared unknowns pinned, by the solver of single lanes; near the
+solution none is. Bounds by an active set. A lane that cannot be evaluated is left out and marked.
+
+Starts: every lane is first fitted by itself from its draw, as if nothing were shared; the shared
+unknowns begin at the median over the lanes. That is robust against specimens without information
+and outliers, where the mean of the estimates is not.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxtrachea._numerics import epsilon
+from jaxtrachea.fit import schur as arrow
+from jaxtrachea.fit.cost import evaluate
+from jaxtrachea.fit.covariance import Information
+from jaxtrachea.fit.levenberg_marquardt import Solved, Tolerances, chunk_size, levenberg_marquardt
+from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.residual import observations, residual_value
+from jaxtrachea.status import FitStatus
+
+#: First radius of the trust region of the shared unknowns, scaled coordinates.
+_FIRST_RADIUS = 2.0
+#: A lane is fitted anew if it is above its own minimum by more than this share of its cost, or of
+#: what it has moved through (a Gauss-Newton step that works leaves far less).
+_POOR, _LEFT = 0.01, 0.1
+#: Iterations granted after the shared unknowns have come to rest, or when the cost falls no more.
+_PATIENCE = 10
+
+
+class Settled(NamedTuple):
+    """All lanes at one point of the shared unknowns.
+
+    Attributes:
+        theta: (L, P).
+        cost: inf where a lane cannot be evaluated; (L,).
+        gradient: (L, P).
+        hessian: (L, P, P).
+    """
+
+    theta: Float[np.ndarray, "L P"]
+    cost: Float[np.ndarray, " L"]
+    gradient: Float[np.ndarray, "L P"]
+    hessian: Float[np.ndarray, "L P P"]
+
+    @property
+    def finite(self) -> Bool[np.ndarray, " L"]:
+        """Which lanes could be evaluated."""
+        return np.isfinite(self.cost)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Task:
+    """What stays the same during a descent."""
+
+    problem: Problem
+    sigma: np.ndarray
+    tolerances: Tolerances
+    chunk: int
+    dtype: Any
+    shared: Int[np.ndarray, "L k"]
+
+    @property
+    def tolerance(self) -> float:
+        """Relative fall of the cost that does not count."""
+        return max(self.tolerances.cost, 4 * epsilon(self.dtype))
+
+
+def solve_jointly(
+    problem: Problem,
+    starts: Float[np.ndarray, "starts L P"],
+    sigma: Float[np.ndarray, "L 2"],
+    *,
+    alone: bool,
+    tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
+    chunk: int = 128,
+    progress: Callable[[int], None] | None = None,
+    dtype=np.float64,
+) -> tuple[Solved, int]:
+    """Fit all lanes together from every start and keep the best.
+
+    Args:
+        problem: a joint one.
+        starts: scaled coordinates.
+        sigma: of each lane, as for `levenberg_marquardt`.
+        alone: fit every lane by itself first; else a start is a point near the solution.
+        tolerances: when all is done; the cost's is per lane.
+        chunk: lanes computed together, always as many.
+        progress: as for `levenberg_marquardt`; also called with 0 in every joint iteration.
+        dtype: of the computation; sums over lanes are float64.
+
+    Returns:
+        The best outcome, one row per lane, and how many starts ended in it.
+    """
+    task = _Task(problem, sigma, tolerances, chunk, dtype, problem.shared)
+    if alone:
+        starts = _fitted_alone(task, starts, progress)
+    solved = [_descend(task, start, progress) for start in starts]
+    there = [s.status <= FitStatus.STALLED for s in solved]
+    # The cost of a start that lost a lane is not comparable: most lanes first.
+    most = max(int(np.sum(t)) for t in there)
+    cost = np.array([np.sum(s.cost[t]) for s, t in zip(solved, there, strict=True)])
+    cost = np.where([np.sum(t) == most for t in there], cost, np.inf)
+    well = np.array([np.any(s.status == FitStatus.CONVERGED) for s in solved])
+    near = cost <= np.min(cost) * (1 + 1e-6) + 1e-300
+    best = int(np.argmin(np.where(near & well, -1.0, cost)))
+    return solved[best], int(np.sum(near & well))
+
+
+def _fitted_alone(task: _Task, starts, progress) -> np.ndarray:
+    """Lanes fitted by themselves from every start, then the shared unknowns at their median."""
+    count, lanes, P = starts.shape
+    jobs = np.tile(np.arange(lanes), count)
+    found = _single(task, task.problem, jobs, starts.reshape(-1, P), progress)
+    usable = (found.status <= FitStatus.STALLED).reshape(count, lanes)
+    theta = np.where(usable[..., None], found.theta.reshape(starts.shape), starts)
+    row = np.arange(lanes)[:, None]
+    for of, good in zip(theta, usable, strict=True):
+        values = of[row, task.shared]
+        of[row, task.shared] = np.median(values[good] if good.any() else values, axis=0)
+    return theta
+
+
+def _single(task: _Task, problem: Problem, jobs, starts, progress=None) -> Solved:
+    """The solver of single lanes; always in chunks of one size, so that it is compiled once."""
+    total = len(jobs)
+    missing = max(0, task.chunk - total)
+    pad = lambda v: np.concatenate([v, np.repeat(v[:1], missing, axis=0)])  # noqa: E731
+    solved = levenberg_marquardt(
+        problem, pad(jobs), pad(starts), pad(task.sigma[jobs]), tolerances=task.tolerances,
+        chunk=task.chunk, progress=progress, dtype=task.dtype,
+    )  # fmt: skip
+    return Solved(*(v[:total] for v in solved))
+
+
+def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
+    """One start: iterations until the shared unknowns and all lanes rest."""
+    lanes = task.problem.lanes
+    clip = lambda theta: np.clip(theta, lanes.lower, lanes.upper)  # noqa: E731
+    here = _settle(task, clip(start), None, np.ones(len(start), bool))
+    alive = here.finite
+    radius, status, patience, n = _FIRST_RADIUS, FitStatus.MAX_ITERATIONS, _PATIENCE, 0
+    fall = np.inf
+    restless = np.zeros(len(alive), bool)
+    while alive.any() and n < task.tolerances.iterations:
+        n += 1
+        if progress is not None:
+            progress(0)
+        reduced, moving, gradient, hessian = _reduce(task, here, alive)
+        step, shared = _shared_step(task, here, alive, radius, moving, gradient, hessian)
+        resting, restless = _at_rest(task, here, alive, reduced, gradient, hessian, moving)
+        patience -= resting or fall <= _floor(task, here, alive)
+        if (resting and not restless.any()) or patience == 0:
+            status = FitStatus.CONVERGED
+            break
+        trial = clip(here.theta + reduced.step + reduced.follow @ step)
+        trial[np.arange(len(trial))[:, None], task.shared] = shared
+        trial = np.where(alive[:, None], trial, here.theta)
+        there = _settle(task, trial, here, alive)
+        finite = np.all(there.finite[alive])
+        fall = np.sum(here.cost[alive] - there.cost[alive]) if finite else -np.inf
+        promised = -(gradient @ step + 0.5 * step @ hessian @ step) + np.sum(reduced.gain[alive])
+        length = scipy.linalg.norm(step)
+        if fall < 0.25 * promised:
+            radius = 0.25 * (min(radius, length) if length > 0 else radius)
+        elif fall > 0.75 * promised:
+            radius = max(radius, 2 * length)
+        if fall > 0:
+            here = there
+        elif promised <= _rounding(task, here, alive):
+            status = FitStatus.CONVERGED
+            break
+        elif radius < task.tolerances.step:
+            status = FitStatus.STALLED
+            break
+    codes = np.where(restless & ~_nearly_flat(task, here), FitStatus.MAX_ITERATIONS, status)
+    codes = np.where(alive, codes, FitStatus.INFEASIBLE_START)
+    return Solved(here.theta, here.cost, codes, np.full(len(alive), n))
+
+
+def _shared_step(task: _Task, here: Settled, alive, radius, moving, gradient, hessian):
+    """Step of the shared unknowns within the radius, and where it leads; (k,) each.
+
+    What the step would carry over a bound stops on it, and the others are minimal given that.
+    """
+    theta, box = _of_shared(task, here.theta, alive)
+    step, stops = np.zeros(len(gradient)), np.zeros(len(gradient), bool)
+    while True:
+        free = moving & ~stops
+        if free.any():
+            pull = gradient[free] + hessian[np.ix_(free, stops)] @ step[stops]
+            step[free] = arrow.within(radius, pull, hessian[np.ix_(free, free)])
+        ahead = theta + step
+        crossing = free & ((ahead < box.lower) | (ahead > box.upper))
+        if not crossing.any():
+            # Not by the difference: theta + (bound - theta) may miss the bound by a rounding.
+            bound = np.where(step > 0, box.upper, box.lower)
+            return step, np.where(stops & (step != 0), bound, ahead)
+        step[crossing] = np.clip(ahead, box.lower, box.upper)[crossing] - theta[crossing]
+        stops |= crossing
+
+
+def _of_shared(task: _Task, theta, alive):
+    """The shared unknowns and their bounds."""
+    row, lanes = int(np.argmax(alive)), task.problem.lanes
+    at = lambda v: v[row, task.shared[row]]  # noqa: E731
+    return at(theta), Bounds(at(lanes.lower), at(lanes.upper))
+
+
+def _reduce(task: _Task, here: Settled, alive):
+    """Elimination at a point: lanes reduced, which shared unknowns move, and their equations."""
+    g = np.where(alive[:, None], here.gradient, 0)
+    H = np.where(alive[:, None, None], here.hessian, 0)
+    reduced = arrow.eliminate(g, H, task.shared, ~_held(here.theta, g, task.problem.lanes))
+    gradient, hessian = reduced.gradient.sum(axis=0), reduced.hessian.sum(axis=0)
+    theta, box = _of_shared(task, here.theta, alive)
+    return reduced, ~_held(theta, gradient, box), gradient, hessian
+
+
+class Bounds(NamedTuple):
+    """Bounds of some unknowns."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+def _held(theta, gradient, box) -> np.ndarray:
+    """Unknowns on a bound that the gradient pushes against."""
+    return ((theta <= box.lower) & (gradient >= 0)) | ((theta >= box.upper) & (gradient <= 0))
+
+
+def _at_rest(task: _Task, here: Settled, alive, reduced, gradient, hessian, moving):
+    """Whether the shared unknowns have nothing left to gain, and which lanes have."""
+    floor = _floor(task, here, alive)
+    newton = np.linalg.lstsq(hessian[np.ix_(moving, moving)], gradient[moving], rcond=None)[0]
+    resting = 0.5 * newton @ gradient[moving] <= floor
+    return bool(resting), alive & (reduced.gain > floor)
+
+
+def _nearly_flat(task: _Task, here: Settled) -> np.ndarray:
+    """Lanes whose residual is all but orthogonal to their Jacobian, as for single lanes; (L,)."""
+    diagonal = np.diagonal(here.hessian, axis1=1, axis2=2)
+    own = ~_held(here.theta, here.gradient, task.problem.lanes) & (diagonal > 0)
+    own[np.arange(len(own))[:, None], task.shared] = False
+    cosine = np.abs(here.gradient) / np.sqrt(np.where(own, diagonal, 1)) * own
+    tolerance = max(task.tolerances.gradient, 4 * epsilon(task.dtype))
+    return np.max(cosine, axis=1) <= 1e3 * tolerance**0.5 * np.sqrt(2 * here.cost)
+
+
+def _floor(task: _Task, here: Settled, alive) -> float:
+    """Fall of the cost that is not worth a step, for the shared unknowns and for each lane.
+
+    A share of the cost of one lane, or what rounding leaves where the data are exact: a share of
+    the whole cost would let errors grow with the number of lanes.
+    """
+    alive = alive & here.finite
+    if not alive.any():
+        return 0.0
+    lanes = task.problem.lanes
+    data = np.sum((lanes.force * lanes.precision)[alive] ** 2) / task.sigma[alive][0, 0] ** 2
+    total = 0.01 * task.tolerance * np.sum(here.cost[alive])
+    return (total + 0.5 * data * (10 * epsilon(task.dtype)) ** 2) / np.sum(alive)
+
+
+def _rounding(task: _Task, here: Settled, alive) -> float:
+    """Promise too small to be seen in the cost."""
+    total = np.sum(here.cost[alive])
+    return task.tolerance * total / np.sum(alive) + 100 * epsilon(task.dtype) * total
+
+
+def _settle(task: _Task, theta: np.ndarray, before: Settled | None, alive) -> Settled:
+    """Evaluate all lanes; those far above their own minimum are fitted with shared ones pinned.
+
+    Args:
+        task: the descent.
+        theta: trial; (L, P).
+        before: its own unknowns are a second start of such a fit.
+        alive: lanes that count; (L,).
+    """
+    here = _evaluated(task, theta)
+    if task.problem.size == task.shared.shape[1]:
+        return here
+    lanes = task.problem.lanes
+    finite = here.finite
+    g = np.where(finite[:, None], here.gradient, 0)
+    H = np.where(finite[:, None, None], here.hessian, 0)
+    gain = arrow.eliminate(g, H, task.shared, ~_held(theta, g, lanes)).gain
+    floor = _floor(task, here, alive)
+    poor = ~finite | (gain > _POOR * here.cost)
+    if before is not None:
+        moved = theta - before.theta
+        through = 0.5 * np.einsum("lp,lpq,lq->l", moved, before.hessian, moved)
+        poor |= (gain > _LEFT * through) & (gain > floor)
+    poor = np.flatnonzero(alive & poor)
+    if not len(poor):
+        return here
+    row = np.arange(len(theta))[:, None]
+    starts = [theta]
+    if before is not None:
+        starts.append(before.theta.copy())
+        starts[1][row, task.shared] = theta[row, task.shared]
+    lower, upper = lanes.lower.copy(), lanes.upper.copy()
+    for side in (lower, upper):
+        side[row, task.shared] = theta[row, task.shared]
+    pinned = dataclasses.replace(task.problem, lanes=lanes._replace(lower=lower, upper=upper))
+    jobs = np.tile(poor, len(starts))
+    found = _single(task, pinned, jobs, np.concatenate([s[poor] for s in starts]))
+    cost = np.where(np.isfinite(found.cost), found.cost, np.inf).reshape(len(starts), -1)
+    best = np.argmin(cost, axis=0)
+    again = theta.copy()
+    again[poor] = found.theta.reshape(len(starts), len(poor), -1)[best, np.arange(len(poor))]
+    return _evaluated(task, again)
+
+
+def _evaluated(task: _Task, theta: Float[np.ndarray, "L P"]) -> Settled:
+    """Cost and normal equations of all lanes, a chunk at a time."""
+    run = _compiled(task.problem.program)
+    settings = task.sigma, task.chunk, task.dtype
+    cost, gradient, hessian = in_chunks(run, task.problem, theta, *settings)
+    finite = np.isfinite(cost) & np.isfinite(hessian).all(axis=(1, 2))
+    finite &= np.isfinite(gradient).all(axis=1)
+    return Settled(theta, np.where(finite, cost, np.inf), gradient, hessian)
+
+
+def in_chunks(run, problem: Problem, theta, sigma, chunk: int, dtype) -> tuple[np.ndarray, ...]:
+    """A function of (theta, lane, sigma) over all lanes; float64 on the host."""
+    count, parts = len(theta), []
+    chunk = chunk_size(count, chunk)
+    cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype)  # noqa: E731
+    for first in range(0, count, chunk):
+        of = np.minimum(np.arange(first, first + chunk), count - 1)
+        lane = jax.tree.map(lambda v, of=of: cast(v[of]), problem.lanes)
+        part = run(cast(theta[of]), lane, cast(sigma[of]))
+        parts.append([np.asarray(v, np.float64)[: count - first] for v in part])
+    return tuple(np.concatenate(v) for v in zip(*parts, strict=True))
+
+
+@functools.lru_cache(maxsize=16)
+def _compiled(problem: Problem):
+    def normal(theta: Array, lane: Lane, sigma: Array):
+        point = evaluate(problem, theta, lane, sigma)
+        return point.cost, point.gradient, point.hessian
+
+    return jax.jit(jax.vmap(normal))
+
+
+@functools.lru_cache(maxsize=16)
+def _compiled_residual(problem: Problem):
+    def absolute(theta: Array, lane: Lane, sigma: Array):
+        seen, _ = observations(lane)
+        return (jnp.where(seen > 0, jnp.abs(residual_value(problem, theta, lane)), jnp.nan),)
+
+    return jax.jit(jax.vmap(absolute))
+
+
+def pooled(
+    problem: Problem, info: Information, theta: np.ndarray, alive: Bool[np.ndarray, " L"]
+) -> Information:
+    """Residual statistics of the study in place of each lane's: the noise is one and the same.
+
+    Args:
+        problem: a joint one.
+        info: of each lane.
+        theta: where it was taken.
+        alive: lanes that count.
+    """
+    squares, counts = info.squares[alive].sum(axis=0), info.counts[alive].sum(axis=0)
+    of_lane = info.counts[alive].sum(axis=1)
+    mean = lambda v: np.sum(v[alive] * of_lane) / max(np.sum(of_lane), 1)  # noqa: E731
+    spread = np.zeros(2)
+    if problem.loss != "linear":
+        run, forces = _compiled_residual(problem.program), problem.lanes.force.shape[-1]
+        r = in_chunks(run, problem, theta, np.ones_like(info.counts), 128, np.float64)[0][alive]
+        kinds = (r[..., :forces], r[..., forces:])
+        spread = np.array([np.nanmedian(v) if np.any(np.isfinite(v)) else 0.0 for v in kinds])
+    every = lambda v: np.tile(v, (len(alive), *[1] * np.ndim(v)))  # noqa: E731
+    return info._replace(
+        squares=every(squares), counts=every(counts), spread=every(spread),
+        psi2=every(mean(info.psi2)), dpsi=every(mean(info.dpsi)),
+    )  # fmt: skip
+
+
+def summed_gradient(problem: Problem, info: Information, alive: Bool[np.ndarray, " L"]):
+    """Gradient of the whole cost by every lane's unknowns; (L, P)."""
+    gradient, shared = info.gradient.copy(), problem.shared
+    row = np.arange(len(gradient))[:, None]
+    gradient[row, shared] = gradient[row, shared][alive].sum(axis=0)
+    return gradient
+
+
+def marginal(
+    problem: Problem, info: Information, held: Bool[np.ndarray, "L P"], alive
+) -> Information:
+    """Information on each lane's unknowns, those of all other lanes eliminated."""
+    bread = np.where(alive[:, None, None], info.bread, 0)
+    meat = np.where(alive[:, None, None], info.meat, 0)
+    bread, meat = arrow.marginal(bread, meat, problem.shared, ~held)
+    lost = ~alive[:, None, None]
+    return info._replace(bread=np.where(lost, np.nan, bread), meat=np.where(lost, np.nan, meat))
+
+
+def unknown_count(problem: Problem, alive: Bool[np.ndarray, " L"]) -> int:
+    """Distinct unknowns of the lanes that count."""
+    k = problem.shared.shape[1]
+    return int(problem.lanes.active[alive].sum()) - k * max(int(np.sum(alive)) - 1, 0)
+
+
+def held_count(problem: Problem, held: Bool[np.ndarray, "L P"], alive) -> int:
+    """Distinct unknowns of the lanes that count and are held on a bound."""
+    row, shared = np.arange(len(held))[:, None], problem.shared
+    mine = (held & (problem.lanes.active > 0))[alive]
+    repeated = held[row, shared][alive]
+    return int(mine.sum() - repeated.sum() + repeated.any(axis=0).sum())

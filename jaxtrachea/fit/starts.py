@@ -1,0 +1,167 @@
+"""Where a fit starts, and what is done where starts fail: drawn anew, or more of them.
+
+What is drawn for a lane beyond its first starts depends on the seed and the lane's name alone, not
+on the lanes beside it.
+"""
+
+import hashlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxtrachea.fit.levenberg_marquardt import Solved
+from jaxtrachea.fit.parameters import Parameter
+from jaxtrachea.fit.press_scale import around_touch
+from jaxtrachea.fit.problem import Problem
+from jaxtrachea.status import FitStatus
+
+#: Times that an infeasible start is drawn again, each time from twice the box.
+REDRAWS = 4
+#: Share of the data's own weight below which a cost is rounding, and says nothing of a minimum.
+EXACT = 1e-18
+
+
+class Box(NamedTuple):
+    """Where starts are drawn, in scaled coordinates; (lanes, P) each."""
+
+    guess: Float[np.ndarray, "lanes P"]
+    low: Float[np.ndarray, "lanes P"]
+    high: Float[np.ndarray, "lanes P"]
+
+
+def box(problem: Problem, decades: float) -> Box:
+    """The guess of every lane and the box around it, inside the bounds.
+
+    Args:
+        problem: the study.
+        decades: half the width of the box (scale `linear`: times 10 steps; onset and offset: times
+            a tenth of the press, around the change point of the curve).
+    """
+    guess = of_unknowns(problem, lambda p: p.to_scaled(p.value), 0.0)
+    decade = lambda p: np.log(10) if p.scale == "log" else 10.0  # noqa: E731
+    reach = decades * of_unknowns(problem, decade, 0.0)
+    low = np.maximum(problem.lanes.lower, guess - reach)
+    high = np.minimum(problem.lanes.upper, guess + reach)
+    return Box(*around_touch(problem, guess, low, high, decades))
+
+
+def of_unknowns(problem: Problem, number: Callable[[Parameter], float], padding: float):
+    """A number of each unknown's parameter, `padding` where a lane has fewer; (lanes, P)."""
+    known = {p.name: float(number(p)) for p in problem.free}
+    rows = np.full(problem.lanes.lower.shape, padding)
+    for row, unknowns in zip(rows, problem.unknowns, strict=True):
+        row[: len(unknowns)] = [known[p.name] for p, _, _ in unknowns]
+    return rows
+
+
+def draw_starts(problem: Problem, settings) -> np.ndarray:
+    """Starts of every lane: the guess, then a Latin hypercube around it, the same for all lanes.
+
+    Returns:
+        (lanes * starts, P), lane by lane, in scaled coordinates.
+    """
+    rng = np.random.default_rng(settings.seed)
+    P, others = problem.size, settings.starts - 1
+    guess, low, high = box(problem, settings.decades)
+    strata = (
+        rng.permuted(np.tile(np.arange(others), (P, 1)), axis=1).T if others else np.zeros((0, P))
+    )
+    unit = (strata + rng.uniform(size=(others, P))) / max(others, 1)
+    drawn = low[:, None] + unit[None] * (high - low)[:, None]
+    return np.concatenate([guess[:, None], drawn], axis=1).reshape(-1, P)
+
+
+Solve = Callable[[np.ndarray, np.ndarray], Solved]
+
+
+def completed(
+    problem: Problem, settings, jobs: Int[np.ndarray, " jobs"], solved: Solved, weight, solve: Solve
+) -> tuple[Int[np.ndarray, " more"], Solved]:
+    """First starts with infeasible ones drawn anew, and more starts for lanes in doubt.
+
+    Costs nothing where all starts are feasible and agree.
+
+    Args:
+        problem: the study.
+        settings: of the fit; `more_starts` 0: all stays as it is.
+        jobs: lane of each start.
+        solved: what they came to.
+        weight: half the weighted sum of squares of the data; (lanes,).
+        solve: fits (lanes, starts).
+
+    Returns:
+        Lane and outcome of every start, the first ones first.
+    """
+    if not settings.more_starts:
+        return jobs, solved
+    slots = np.arange(len(jobs)) % settings.starts
+    solved = _feasible(problem, settings, jobs, slots, solved, solve)
+    doubt = np.flatnonzero(in_doubt(jobs, solved, weight))
+    if not len(doubt):
+        return jobs, solved
+    more = np.repeat(doubt, settings.more_starts)
+    slots = settings.starts + np.tile(np.arange(settings.more_starts), len(doubt))
+    added = solve(more, _drawn(problem, settings, more, slots, 0))
+    added = _feasible(problem, settings, more, slots, added, solve)
+    both = (np.concatenate(pair) for pair in zip(solved, added, strict=True))
+    return np.concatenate([jobs, more]), Solved(*both)
+
+
+def best(jobs: np.ndarray, solved: Solved, lanes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Start with the lowest cost of each lane (converged ones first), and how many agree.
+
+    Args:
+        jobs: lane of each start; every lane has one.
+        solved: what they came to.
+        lanes: number of lanes.
+    """
+    cost = np.where(np.isfinite(solved.cost), solved.cost, np.inf)
+    low = np.full(lanes, np.inf)
+    np.minimum.at(low, jobs, cost)
+    agree = (cost <= low[jobs] * (1 + 1e-6) + 1e-300) & (solved.status == FitStatus.CONVERGED)
+    order = np.lexsort((np.arange(len(jobs)), np.where(agree, -1.0, cost), jobs))
+    _, first = np.unique(jobs[order], return_index=True)
+    return order[first], np.bincount(jobs, agree, lanes).astype(int)
+
+
+def in_doubt(jobs: np.ndarray, solved: Solved, weight: np.ndarray) -> Bool[np.ndarray, " lanes"]:
+    """Lanes without a converged start, or with several starts of which one alone came lowest."""
+    lanes = len(weight)
+    found, agree = best(jobs, solved, lanes)
+    exact = solved.cost[found] <= EXACT * weight
+    alone = (agree == 1) & (np.bincount(jobs, minlength=lanes) > 1) & ~exact
+    return (agree == 0) | alone
+
+
+def _feasible(problem, settings, jobs, slots, solved: Solved, solve: Solve) -> Solved:
+    """`solved` with infeasible starts drawn anew, all together, a few times."""
+    solved = Solved(*map(np.array, solved))
+    for turn in range(1, REDRAWS + 1):
+        rows = np.flatnonzero(solved.status == FitStatus.INFEASIBLE_START)
+        if not len(rows):
+            break
+        starts = _drawn(problem, settings, jobs[rows], slots[rows], turn)
+        for old, new in zip(solved, solve(jobs[rows], starts), strict=True):
+            old[rows] = new
+    return solved
+
+
+def _drawn(problem: Problem, settings, jobs, slots, turn: int) -> Float[np.ndarray, "jobs P"]:
+    """A start for each job, uniform in a box 2^turn times as wide, from the lane's own numbers."""
+    _, low, high = box(problem, settings.decades * 2**turn)
+    unit = np.stack(
+        [
+            np.random.default_rng(
+                [settings.seed, _number(problem.lane_name(lane)), slot, turn]
+            ).uniform(size=problem.size)
+            for lane, slot in zip(jobs.tolist(), slots.tolist(), strict=True)
+        ]
+    )
+    return low[jobs] + unit * (high - low)[jobs]
+
+
+def _number(name: tuple[str, str]) -> int:
+    """A number that stands for a lane's name."""
+    return int.from_bytes(hashlib.sha256("\0".join(name).encode()).digest()[:8], "little")

@@ -1,0 +1,325 @@
+r"""Structure: which unknowns the curves can tell at all, from contact points, markers and options.
+
+A curve sees the unknowns through its inputs alone: the compliance of the skeleton at the contact,
+the coefficients of the local law, onset and offset, and the motion of the marked rings under a unit
+force. With J the derivative of the inputs by the unknowns, in relative coordinates, and V the
+combinations of inputs that one curve (however exact and deep) can tell apart, an unknown is
+structurally non-identifiable (Raue et al. 2009, doi:10.1093/bioinformatics/btp358) if it has a part
+in the null space of V J at generic points. Neither measured forces nor noise nor an estimate enter.
+The rank is the largest over points drawn in a box around the initial guess: at single points
+distant positions may see the same compliance to rounding.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxtrachea.fit.parameters import SKELETON
+from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.residual import inputs
+from jaxtrachea.fit.starts import box
+from jaxtrachea.mechanics.force_law import Law
+from jaxtrachea.mechanics.press import respond
+
+#: Points of the parameter box, and half its width in decades.
+POINTS, DECADES = 8, 2.0
+#: Ratio of singular values, and part of an unknown in a direction, that are taken as zero.
+ZERO, NO_PART = 1e-7, 1e-3
+#: Lanes computed together.
+_LANES = 64
+#: Tool displacements of a generic curve, mm; with c, k_1 and k_3 near 1 it is as bent as can be.
+_GENERIC_DEPTHS = np.linspace(0.2, 3.0, 24)
+
+
+class Structure(NamedTuple):
+    """What the curves of every lane leave open whatever they measure.
+
+    Attributes:
+        undetermined: unknowns with a part in the null space; (lanes, P).
+        nullity: dimension of the null space; (lanes,).
+        pinned: as many unknowns of each lane as its nullity; with these held the others are
+            determined; (lanes, P).
+    """
+
+    undetermined: Bool[np.ndarray, "lanes P"]
+    nullity: Int[np.ndarray, " lanes"]
+    pinned: Bool[np.ndarray, "lanes P"]
+
+    def take(self, lanes: Int[np.ndarray, " n"]) -> "Structure":
+        """Rows of some lanes."""
+        return Structure(*(v[lanes] for v in self))
+
+
+def nothing_open(problem: Problem) -> Structure:
+    """As if every lane could tell all of its unknowns."""
+    none = np.zeros(problem.lanes.lower.shape, bool)
+    return Structure(none, np.zeros(len(none), int), none.copy())
+
+
+def structure_of(problem: Problem, lanes: Bool[np.ndarray, " lanes"]) -> Structure:
+    """`structure` of some lanes (of all, if joint and any), the others taken as determined."""
+    if problem.joint and lanes.any():
+        return structure(problem)
+    known, rows = nothing_open(problem), np.flatnonzero(lanes)
+    if len(rows):
+        for old, new in zip(known, structure(problem.take(rows)), strict=True):
+            old[rows] = new
+    return known
+
+
+def suspicious(problem: Problem) -> Bool[np.ndarray, " lanes"]:
+    """Lanes that may leave something open: a count of positions, which needs no program.
+
+    Whatever this misses shows in a singular Jacobian at the estimate: one that is regular proves
+    the full rank.
+    """
+    lanes = problem.lanes
+    beam = sum(p.name in SKELETON for p in problem.free)
+    places = positions(problem)
+    if lanes.joint_precision is not None:
+        marked = (lanes.joint_precision > 0).any(axis=2).sum(axis=2)
+        places = places + marked.max(axis=1)
+    names = {p.name for p in problem.free}
+    needed = beam
+    if not _hardens(problem):  # a slope of each curve, in place of its shape
+        needed += len(names & {"k_1", "k_1_ring"})
+        if {"onset", "force_offset"} <= names:
+            return np.ones(len(places), bool)
+    return places < needed
+
+
+def positions(problem: Problem) -> Int[np.ndarray, " lanes"]:
+    """Different contact positions of each lane; mirror images about the middle are one."""
+    lanes, middle = problem.lanes, float(problem.geometry.length) / 2
+    observed = (lanes.precision > 0).any(axis=2)
+    folded = np.where(observed, np.round(np.abs(lanes.s_c - middle), 6), -1.0)
+    return np.array([len(np.unique(row[row >= 0])) for row in folded])
+
+
+def structure(problem: Problem) -> Structure:
+    """Rank and null space of every lane at generic points; equal lanes are computed once."""
+    kinds, kind_of = _kinds(problem)
+    points = _points(problem)
+    bases = [null_spaces(problem, kinds, points[kinds, k]) for k in range(POINTS)]
+    if problem.joint:
+        kind_of = np.arange(len(kind_of))
+    nullity = np.min([[len(rows) for rows in of_point] for of_point in bases], axis=0)
+    P = problem.size
+    parts = np.zeros((len(nullity), P))
+    pinned = np.zeros((len(nullity), P), bool)
+    names = [[p.name for p, _, _ in problem.unknowns[k]] for k in kinds]
+    for i, least in enumerate(nullity):
+        generic = [of_point[i] for of_point in bases if len(of_point[i]) == least]
+        if not least:
+            continue
+        parts[i] = np.mean([np.any(np.abs(rows) > NO_PART, axis=0) for rows in generic], axis=0)
+        pinned[i] = pins(names[i], generic[0])
+    return Structure(parts[kind_of] > 0.5, nullity[kind_of], pinned[kind_of])
+
+
+def reduced(problem: Problem, pinned: Bool[np.ndarray, "lanes P"]) -> Problem:
+    """The same study with these unknowns held wherever they start."""
+    active = np.where(pinned, 0.0, problem.lanes.active)
+    return dataclasses.replace(problem, lanes=problem.lanes._replace(active=active))
+
+
+def pins(names: list[str], null_space: Float[np.ndarray, "r P"]) -> Bool[np.ndarray, " P"]:
+    """Unknowns to hold so that no direction of the null space is left.
+
+    Those of the skeleton come first, from the last in the table: with k_M held, EI_L can still
+    give any compliance; with EI_L held, k_M cannot.
+    """
+    size = null_space.shape[1]
+    held = np.zeros(size, bool)
+    order = [i for i in reversed(range(len(names))) if names[i] in SKELETON]
+    order += [i for i in reversed(range(len(names))) if names[i] not in SKELETON]
+    rest = null_space
+    for i in order:
+        if not len(rest):
+            break
+        if np.max(np.abs(rest[:, i])) > 0.1:
+            held[i] = True
+            rest = leaving_alone(rest, i)
+    return held
+
+
+def leaving_alone(null_space: Float[np.ndarray, "r P"], i: int) -> Float[np.ndarray, "q P"]:
+    """Directions of a null space, orthonormal rows, that leave unknown i alone."""
+    column = null_space[:, i : i + 1]
+    if not len(null_space) or np.max(np.abs(column)) <= NO_PART:
+        return null_space
+    _, _, rotation = np.linalg.svd(column.T)
+    return rotation[1:] @ null_space
+
+
+def null_spaces(
+    problem: Problem,
+    lanes: Int[np.ndarray, " n"],
+    theta: Float[np.ndarray, "n P"],
+    nullity: Int[np.ndarray, " n"] | None = None,
+) -> list[Float[np.ndarray, "r P"]]:
+    """Orthonormal rows that change no curve of each lane, relative coordinates.
+
+    Args:
+        problem: the study; of a joint one `lanes` are all.
+        lanes: whose.
+        theta: where, scaled coordinates.
+        nullity: of each lane; None: by the singular values.
+    """
+    J = _seen(problem, lanes, theta)
+    active = problem.lanes.active[lanes] > 0
+    if not problem.joint:
+        ranks = [None] * len(lanes) if nullity is None else nullity
+        return [_null(j, a, r) for j, a, r in zip(J, active, ranks, strict=True)]
+    return _joint_null_spaces(problem, J, active, nullity)
+
+
+def _null(J, active, nullity=None) -> Float[np.ndarray, "r P"]:
+    """Null space of one matrix within the unknowns that exist."""
+    columns = np.flatnonzero(active)
+    out = np.zeros((0, len(active)))
+    if not len(columns):
+        return out
+    J = J[:, columns]
+    J = np.concatenate([J, np.zeros((max(len(columns) - len(J), 0), len(columns)))])
+    _, values, vectors = np.linalg.svd(J, full_matrices=False)
+    r = int(np.sum(values <= ZERO * max(values[0], 1e-300))) if nullity is None else int(nullity)
+    out = np.zeros((r, len(active)))
+    out[:, columns] = vectors[len(columns) - r :]
+    return out
+
+
+def _joint_null_spaces(problem: Problem, J, active, nullity) -> list[np.ndarray]:
+    """Null space of the whole study, as each lane sees it: shared unknowns move in all at once."""
+    shared, P = problem.shared, problem.size
+    rest = []
+    for j, k in zip(J, shared, strict=True):
+        own = np.setdiff1d(np.arange(P), k)
+        u, values, _ = np.linalg.svd(j[:, own], full_matrices=False)
+        basis = u[:, values > ZERO * max(values[0] if len(values) else 0.0, 1e-300)]
+        rest.append(np.linalg.qr(j[:, k] - basis @ (basis.T @ j[:, k]), mode="r"))
+    common = _null(np.concatenate(rest), np.ones(shared.shape[1], bool))
+    out = []
+    for i, (j, k) in enumerate(zip(J, shared, strict=True)):
+        own = np.setdiff1d(np.arange(P), k)
+        both = np.concatenate([j[:, own], j[:, k] @ common.T], axis=1)
+        exists = np.concatenate([active[i, own], np.ones(len(common), bool)])
+        found = _null(both, exists, None if nullity is None else nullity[i])
+        rows = np.zeros((len(found), P))
+        rows[:, own] = found[:, : len(own)]
+        rows[:, k] = found[:, len(own) :] @ common
+        out.append(np.linalg.qr(rows.T)[0].T if len(rows) else rows)
+    return out
+
+
+def _seen(problem: Problem, lanes, theta) -> Float[np.ndarray, "n m P"]:
+    """V J of each lane: all combinations of inputs that its curves tell, by the unknowns."""
+    run, parts = _compiled(problem.program), []
+    for first in range(0, len(lanes), _LANES):
+        rows = np.minimum(np.arange(first, first + _LANES), len(lanes) - 1)
+        lane = jax.tree.map(lambda v, of=lanes[rows]: v[of], _without_curves(problem))
+        parts.append(np.asarray(run(jnp.asarray(theta[rows]), lane))[: len(lanes) - first])
+    J = np.concatenate(parts)
+    log = _log(problem)[lanes]
+    J = J * np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))[:, None, None]
+    V = _curve_sees(problem)
+    n = V.shape[1]
+    of_curve = np.einsum("vn,ltnp->ltvp", V, J[:, :, :n])
+    motion = J[:, :, n:]
+    if problem.lanes.joint_precision is not None:
+        visible = (problem.lanes.joint_precision[lanes] > 0).any(axis=2)
+        motion = motion * visible[..., None]
+    observed = (problem.lanes.precision[lanes] > 0).any(axis=2)
+    J = np.concatenate([of_curve, motion], axis=2) * observed[:, :, None, None]
+    return np.nan_to_num(J).reshape(len(lanes), -1, J.shape[-1])
+
+
+@functools.lru_cache(maxsize=16)
+def _compiled(problem: Problem):
+    def relative_inputs(theta, lane):
+        x = inputs(problem, theta, lane)
+        c = jnp.maximum(x.compliance, jnp.finfo(theta.dtype).tiny)
+        felt = problem.options.coupling == "series"
+        rows = [jnp.log(c) if felt else jnp.zeros_like(c), jnp.log(x.k_1), x.k_3]
+        rows = jnp.stack([*rows, x.onset, x.force_offset], axis=1)
+        if x.joints is None:
+            return rows
+        size = jnp.max(jnp.abs(jax.lax.stop_gradient(x.joints)), axis=1, keepdims=True)
+        return jnp.concatenate([rows, x.joints / size], axis=1)
+
+    def jacobian(theta: Array, lane: Lane):
+        k_3 = jax.lax.stop_gradient(inputs(problem, theta, lane).k_3)
+        J = jax.jacfwd(relative_inputs)(theta, lane)
+        return J.at[:, 2].divide(jnp.where(k_3 != 0, k_3, 1)[:, None])
+
+    return jax.jit(jax.vmap(jacobian))
+
+
+@functools.lru_cache(maxsize=64)
+def _generic(options, hardens: bool) -> Float[np.ndarray, "r n"]:
+    def curve(v):
+        k_3 = (1 + v[2]) if hardens else v[2]
+        law = Law(jnp.exp(v[1]), k_3)
+        depths = jnp.asarray(_GENERIC_DEPTHS)
+        return respond(depths, v[3], jnp.exp(v[0]), law, options).force + v[4]
+
+    J = np.asarray(jax.jit(jax.jacfwd(curve))(jnp.zeros(5)))
+    _, values, vectors = np.linalg.svd(J if hardens else J[:, [0, 1, 3, 4]], full_matrices=False)
+    seen = vectors[values > 1e-6 * values[0]]
+    return seen if hardens else np.insert(seen, 2, 0, axis=1)
+
+
+def _curve_sees(problem: Problem) -> Float[np.ndarray, "r n"]:
+    """Combinations of (log c, log k_1, k_3, onset, offset) that one curve tells; rows."""
+    return _generic(problem.options, _hardens(problem))
+
+
+def _hardens(problem: Problem) -> bool:
+    """Whether the local law has a cubic part."""
+    cubic = [p for p in problem.parameters if p.name.startswith("k_3")]
+    return any(not p.fixed or p.value != 0 for p in cubic)
+
+
+def _kinds(problem: Problem) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " lanes"]]:
+    """One lane of every kind (all of a joint problem), and the kind of each lane."""
+    lanes = problem.lanes
+    count = len(lanes.s_c)
+    if problem.joint:
+        return np.arange(count), np.arange(count)
+    marked = lanes.joint_precision
+    parts = [lanes.s_c, lanes.index, lanes.value, lanes.active, lanes.lower, lanes.upper]
+    parts.append((lanes.precision > 0).any(axis=2))
+    if marked is not None:
+        parts.append((marked > 0).any(axis=2))
+    table = np.concatenate([np.asarray(v, float).reshape(count, -1) for v in parts], axis=1)
+    _, first, kind = np.unique(table, axis=0, return_index=True, return_inverse=True)
+    return first, kind.reshape(-1)
+
+
+def _points(problem: Problem) -> Float[np.ndarray, "lanes points P"]:
+    """Generic points of every lane's box; shared unknowns are the same in all lanes."""
+    _, low, high = box(problem, DECADES)
+    unit = np.random.default_rng(20091).uniform(0.02, 0.98, (POINTS, problem.size))
+    return low[:, None] + unit * (high - low)[:, None]
+
+
+def _log(problem: Problem) -> Bool[np.ndarray, "lanes P"]:
+    """Which unknowns have a logarithmic scale."""
+    size = problem.size
+    return np.array(
+        [[p.scale == "log" for p, _, _ in u] + [True] * (size - len(u)) for u in problem.unknowns]
+    )
+
+
+def _without_curves(problem: Problem) -> Lane:
+    """Lanes whose curves have one sample: what the inputs need and no more."""
+    lanes = problem.lanes
+    one = {name: getattr(lanes, name)[:, :, :1] for name in ("displacement", "force", "precision")}
+    if lanes.joints is not None:
+        one |= {name: getattr(lanes, name)[:, :, :1] for name in ("joints", "joint_precision")}
+    return lanes._replace(**one)

@@ -1,1 +1,0 @@
-"""From measurements to parameters and what can be said of them."""

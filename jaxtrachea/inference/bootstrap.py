@@ -1,0 +1,181 @@
+"""Bootstrap: the estimate repeated on data as they might have come out, all in batched fits.
+
+`parametric`: model at the estimate plus normal noise of the fitted or given sigma. `residual`: plus
+residuals drawn with replacement from the same curve, centred and enlarged by sqrt(n / (n - P))
+(Efron and Tibshirani 1993, ch. 9); in blocks of neighbouring samples, wrapped around the end, where
+the noise is correlated along the curve (Kuensch 1989, doi:10.1214/aos/1176347265). All markers of a
+sample are drawn together.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxtrachea._arguments import check_word
+from jaxtrachea.fit.fit import FitResult, Settings, fit
+from jaxtrachea.fit.levenberg_marquardt import chunk_size
+from jaxtrachea.fit.predictions import Prediction, predictions
+from jaxtrachea.fit.problem import Lane
+
+Kind = Literal["parametric", "residual"]
+#: Refits handed to the solver at a time; bounds the memory.
+_AT_ONCE = 4096
+#: Replicates below which the ends of a 95 % interval are not read off.
+FEWEST = 40
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bootstrap:
+    """Replicates of every lane and percentile intervals; P unknowns, B replicates.
+
+    Attributes:
+        result: the fit they belong to.
+        kind: how data were drawn.
+        block: samples drawn together.
+        theta: estimates, scaled coordinates; (lanes, B, P).
+        usable: replicates that converged; (lanes, B).
+        lower: 2.5 % quantile in the parameter's unit; NaN with fewer than `FEWEST` usable
+            replicates; (lanes, P).
+        upper: 97.5 % quantile; (lanes, P).
+        standard_error: standard deviation in scaled coordinates times the slope of the unit, as for
+            the local one; (lanes, P).
+    """
+
+    result: FitResult
+    kind: Kind
+    block: int
+    theta: Float[np.ndarray, "lanes B P"]
+    usable: Bool[np.ndarray, "lanes B"]
+    lower: Float[np.ndarray, "lanes P"]
+    upper: Float[np.ndarray, "lanes P"]
+    standard_error: Float[np.ndarray, "lanes P"]
+
+
+def bootstrap(
+    result: FitResult,
+    settings: Settings = Settings(),  # noqa: B008 (frozen)
+    *,
+    count: int = 200,
+    kind: Kind = "parametric",
+    block: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> Bootstrap:
+    """Refit `count` resampled data sets of every lane, from the estimate, weights and noise anew.
+
+    What a lane draws depends on the seed and its place alone.
+
+    Args:
+        result: the fit.
+        settings: of the refits (a single start); `seed` of the drawing.
+        count: replicates.
+        kind: `parametric` or `residual`.
+        block: neighbouring samples drawn together (`residual`).
+        progress: called with (refits done since the last call, refits in all).
+
+    Raises:
+        ValueError: too few replicates, an impossible block, or a joint problem.
+    """
+    _check(count, kind, block)
+    result.problem.refuse_joint("the bootstrap")
+    seen = predictions(result.problem, result.theta)
+    chunk = chunk_size(max(result.lanes * settings.starts, 16), settings.chunk)
+    one = dataclasses.replace(settings, starts=1, chunk=chunk, scrutiny=False)
+    thetas, usable = [], []
+    together = max(_AT_ONCE // count, 1)
+    for first in range(0, result.lanes, together):
+        lanes = np.arange(first, min(first + together, result.lanes))
+        drawn = _draw(result, seen, lanes, count, kind, block, settings.seed)
+        rows = lanes.repeat(count)
+        chosen = result.problem.take(rows)
+        again = fit(dataclasses.replace(chosen, lanes=drawn), one, starts=result.theta[rows])
+        thetas.append(again.theta.reshape(len(lanes), count, -1))
+        usable.append(again.succeeded.reshape(len(lanes), count))
+        if progress is not None:
+            progress(len(rows), result.lanes * count)
+    theta, good = np.concatenate(thetas), np.concatenate(usable)
+    return Bootstrap(result, kind, block, theta, good, *_summary(result, theta, good))
+
+
+def _check(count, kind, block) -> None:
+    check_word("kind", kind, Kind)
+    if count < FEWEST:
+        raise ValueError(f"count is {count}; expected at least {FEWEST} for a 95 % interval")
+    if block < 1 or (block > 1 and kind == "parametric"):
+        raise ValueError(f"block is {block}; expected 1, or more with kind 'residual'")
+
+
+def _draw(result: FitResult, seen: Prediction, lanes, count, kind, block, seed) -> Lane:
+    """Lanes of `count` resampled data sets of each of `lanes`."""
+    data = result.problem.lanes
+    draw = _normal if kind == "parametric" else _blocks
+    force, joints = [], []
+    for lane in lanes:
+        rng = np.random.default_rng([seed, int(lane)])
+        noise, marker_noise = draw(rng, result, seen, lane, count, block)
+        force.append(data.force[lane] + np.nan_to_num(seen.force[lane]) + noise)
+        if data.joints is not None and seen.joints is not None and marker_noise is not None:
+            joints.append(data.joints[lane] + np.nan_to_num(seen.joints[lane]) + marker_noise)
+    drawn = result.problem.take(lanes.repeat(count)).lanes
+    drawn = drawn._replace(force=np.concatenate(force))
+    return drawn._replace(joints=np.concatenate(joints)) if joints else drawn
+
+
+def _normal(rng, result: FitResult, seen: Prediction, lane, count, block):
+    """Normal noise of every observed entry, N and mm; (count, T, N) and (count, T, N, rings)."""
+    data, sigma = result.problem.lanes, result.whitened_sigma[lane]
+
+    def noise(precision, sigma):
+        seen = precision > 0
+        level = np.where(seen, sigma / np.where(seen, precision, 1), 0)
+        return level * rng.normal(size=(count, *precision.shape))
+
+    markers = None if data.joint_precision is None else noise(data.joint_precision[lane], sigma[1])
+    return noise(data.precision[lane], sigma[0]), markers
+
+
+def _blocks(rng, result: FitResult, seen: Prediction, lane, count, block):
+    """Residuals of each curve drawn in blocks, in units of their own sigma; as `_normal`."""
+    data = result.problem.lanes
+    total = float(result.samples[lane])
+    unknowns = float(data.active[lane].sum())
+    enlarge = np.sqrt(total / max(total - unknowns, 1))
+    noise = np.zeros((count, *data.force[lane].shape))
+    markers = None if data.joints is None else np.zeros((count, *data.joints[lane].shape))
+    for t, curve in enumerate(result.problem.curves[lane]):
+        n = len(curve.force)
+        starts = rng.integers(n, size=(count, -(-n // block)))
+        at = ((starts[:, :, None] + np.arange(block)) % n).reshape(count, -1)[:, :n]
+        r, precision = seen.force[lane, t, :n], data.precision[lane, t, :n]
+        noise[:, t, :n] = enlarge * _resample(r, precision, at)
+        if markers is not None and seen.joints is not None and data.joint_precision is not None:
+            r, precision = seen.joints[lane, t, :n], data.joint_precision[lane, t, :n]
+            markers[:, t, :n] = enlarge * _resample(r, precision, at)
+    return noise, markers
+
+
+def _resample(residual, precision, at) -> np.ndarray:
+    """Centred residuals of the samples `at`, brought to the precision of where they are put."""
+    known = np.isfinite(residual)
+    white = np.where(known, residual, 0) * precision
+    mean = white.sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    white = np.where(known, white - mean, 0)
+    return np.where(known, white[at] / np.where(known, precision, 1), 0)
+
+
+def _summary(result: FitResult, theta, usable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Percentile interval and standard error, units of the parameters."""
+    lower, upper, error = (np.full(result.theta.shape, np.nan) for _ in range(3))
+    for lane, unknowns in enumerate(result.problem.unknowns):
+        good = theta[lane][usable[lane]]
+        if len(good) < FEWEST:
+            continue
+        ends = np.quantile(good, [0.025, 0.975], axis=0)
+        spread = np.std(good, axis=0, ddof=1)
+        for i, (p, _, _) in enumerate(unknowns):
+            lower[lane, i], upper[lane, i] = (p.from_scaled(float(v)) for v in ends[:, i])
+            slope = result.value[lane, i] if p.scale == "log" else p.step
+            error[lane, i] = spread[i] * slope
+    return lower, upper, error

@@ -1,0 +1,283 @@
+"""Measured curves against what a finished fit predicts for them."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.onset import onset_is_sought
+from jaxtrachea.fit.problem import Problem, build, check_curve
+from jaxtrachea.inference.predict import CurvePrediction, predict_sources
+from jaxtrachea.inference.prediction_core import compiled_slopes
+from jaxtrachea.inference.sources import Source, source_of
+from jaxtrachea.inference.stored import StoredFit
+from jaxtrachea.measurements.read import BadCurve, Curve
+from jaxtrachea.status import FitStatus, PredictionStatus
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Compared:
+    """One measured curve and its prediction.
+
+    Attributes:
+        curve: as read.
+        prediction: at its displacements.
+        in_fit: "yes" if the fit has used these samples; "changed" if it has used others under the
+            same name; else "no".
+    """
+
+    curve: Curve
+    prediction: CurvePrediction
+    in_fit: str
+
+    @property
+    def residual(self) -> np.ndarray:
+        """Predicted minus measured force, N; (N,)."""
+        return self.prediction.force - self.curve.force
+
+    @property
+    def covered(self) -> np.ndarray:
+        """Which samples lie in the 95 % band of a new sample; (N,)."""
+        p = self.prediction
+        return (p.low95 <= self.curve.force) & (self.curve.force <= p.high95)
+
+    def joint_residual(self, tool_radius: float | None, rings: np.ndarray) -> np.ndarray:
+        """Predicted minus measured marker displacement, mm, NaN under the tool; (N, M)."""
+        curve = self.curve
+        if curve.joint_displacement is None or curve.joint_rings is None:
+            return np.zeros((len(curve.force), 0))
+        found = self.prediction.joints[:, curve.joint_rings] - curve.joint_displacement
+        if tool_radius is not None and curve.s_c is not None:
+            found[:, np.abs(rings[curve.joint_rings] - curve.s_c) <= tool_radius] = np.nan
+        return found
+
+
+def pressable(stored: StoredFit, curves: Sequence[Curve]) -> tuple[list[Curve], list[BadCurve]]:
+    """Curves that the model of the fit can press, and the others with the reason."""
+    good, bad = [], []
+    for curve in curves:
+        try:
+            check_curve(curve, stored.problem.geometry, stored.problem.options)
+        except ValueError as error:
+            text = str(error).split(": ", 1)[-1]
+            cure = "correct the file; tube and model are those of the fit"
+            bad.append(BadCurve(curve.specimen, curve.trial, curve.source, "position", text, cure))
+        else:
+            good.append(curve)
+    return good, bad
+
+
+def compare(
+    stored: StoredFit, curves: Sequence[Curve], *, as_specimen: str | None = None
+) -> list[Compared]:
+    """Predict measured curves.
+
+    A curve that the fit has used is predicted with its own parameters of the fit. A new one has its
+    own (those of scope `trial`, such as onset) fitted to it, everything else kept. Where an onset
+    was fitted, its corner is rounded as the fit does it.
+
+    Args:
+        stored: the fit.
+        curves: from `pressable`.
+        as_specimen: of the fit, in the place of one that it does not know.
+    """
+    if not curves:
+        return []
+    used = {(c.specimen, c.trial): c for c in stored.curves}
+    sources, words = [], []
+    for curve in curves:
+        word = _in_fit(used.get((curve.specimen, curve.trial)), curve)
+        trial = curve.trial if word == "yes" else None
+        source = source_of(
+            stored, curve.specimen, trial, as_specimen=as_specimen, measured=True
+        )  # fmt: skip
+        sources.append(dataclasses.replace(source, trial=curve.trial))
+        words.append(word)
+    sigmas = [_sigma(stored, c, source) for c, source in zip(curves, sources, strict=True)]
+    rounded = zip(sources, measured_corners(stored, curves, sigmas), words, strict=True)
+    sources = [
+        source if word == "yes" else dataclasses.replace(source, blend=blend)
+        for source, blend, word in rounded
+    ]
+    sources = with_own(stored, sources, curves, sigmas)
+    s = [np.nan if c.s_c is None else c.s_c for c in curves]
+    found = predict_sources(stored, sources, s, [c.displacement for c in curves], sigmas)
+    return [Compared(*row) for row in zip(curves, found, words, strict=True)]
+
+
+def _in_fit(used: Curve | None, curve: Curve) -> str:
+    if used is None:
+        return "no"
+    same = np.array_equal(used.force, curve.force)
+    same = same and np.array_equal(used.displacement, curve.displacement)
+    same = same and (used.s_c == curve.s_c)
+    return "yes" if same else "changed"
+
+
+def _sigma(stored: StoredFit, curve: Curve, source: Source) -> np.ndarray:
+    """Noise of the samples of a curve, N: its own where that of the fit was given, else the fit's.
+
+    In a fit whose noise was estimated, a sigma of single curves was a weight, not a noise.
+    """
+    if curve.sigma is not None and stored.problem.noise_given[0]:
+        return np.asarray(curve.sigma)
+    return np.full(len(curve.force), source.sigma[0])
+
+
+def with_own(
+    stored: StoredFit,
+    sources: Sequence[Source],
+    curves: Sequence[Curve],
+    sigmas: Sequence[np.ndarray],
+) -> list[Source]:
+    """Sources whose own parameters are fitted to their curves, all others kept as they are.
+
+    The covariance of what is kept and of what is fitted follows to first order: d own / d kept is
+    that of the least-squares solution, and the noise of the curve comes on top.
+    """
+    out = list(sources)
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for k, source in enumerate(sources):
+        if source.own and source.status.predicts:
+            groups.setdefault(source.own, []).append(k)
+    for own, members in groups.items():
+        study = _study(stored, own, [(sources[k], curves[k], sigmas[k]) for k in members])
+        result = fit(study, Settings(scrutiny=False))
+        theta = result.theta[:, : len(own)] * _steps(stored.problem, study, own)
+        slopes = _slopes(stored, own, [sources[k] for k in members], theta, study)
+        for row, k in enumerate(members):
+            status = FitStatus(int(result.status[row]))
+            held = result.at_bound[row, : len(own)]
+            estimate = _Own(own, theta[row], status, held, slopes[row], sigmas[k])
+            out[k] = _merged(stored, sources[k], estimate)
+    return out
+
+
+def measured_corners(
+    stored: StoredFit, curves: Sequence[Curve], sigmas: Sequence[np.ndarray]
+) -> list[float]:
+    """Rounded corner at the onset of new curves, mm, as the fit has its own; NaN without an onset.
+
+    Args:
+        stored: the fit.
+        curves: new ones, alone or of any specimen.
+        sigmas: noise of their samples; counts where that of the fit was given.
+    """
+    problem = stored.problem
+    if not onset_is_sought(problem.parameters, problem.options):
+        return [np.nan] * len(curves)
+    given = problem.noise_given[0]
+    alone = [
+        _apart(c, i, s if given and c.sigma is None else c.sigma)
+        for i, (c, s) in enumerate(zip(curves, sigmas, strict=True))
+    ]
+    study = build(alone, problem.geometry, problem.options, problem.parameters)
+    return [] if study.lanes.blend is None else np.ravel(study.lanes.blend).tolist()
+
+
+def _apart(curve: Curve, i: int, sigma: np.ndarray | None) -> Curve:
+    """A curve with a name of its own, so that curves of equal name stay apart; without markers."""
+    return dataclasses.replace(
+        curve, specimen=f"{i}", trial="", sigma=sigma, joint_rings=None, joint_displacement=None
+    )
+
+
+def _study(stored: StoredFit, own, members) -> Problem:
+    """One lane per curve, whose unknowns are the own columns."""
+    problem = stored.problem
+    names = {problem.free[f].name for f in own}
+    known = np.stack([_values(stored, source) for source, _, _ in members])
+    # The values serve where starts are sought; what is kept has that of its curve, below.
+    table = [
+        p if p.name in names else dataclasses.replace(p, fixed=True, value=float(value))
+        for p, value in zip(problem.parameters, np.median(known, axis=0), strict=True)
+    ]
+    curves = [_apart(c, i, s) for i, (_, c, s) in enumerate(members)]
+    study = build(curves, problem.geometry, problem.options, table, balance="sample")
+    blend = np.array([[source.blend] for source, _, _ in members])
+    lanes = study.lanes._replace(
+        value=known[:, None], blend=None if np.isnan(blend).all() else blend
+    )
+    return dataclasses.replace(study, lanes=lanes, loss=problem.loss, loss_scale=problem.loss_scale)
+
+
+def _steps(problem: Problem, study: Problem, own) -> np.ndarray:
+    """Steps of the own columns in the study over those in the fit: each follows its own presses."""
+    pairs = zip(study.free, (problem.free[f] for f in own), strict=True)
+    return np.array([1.0 if q.scale == "log" else p.step / q.step for p, q in pairs])
+
+
+def _values(stored: StoredFit, source: Source) -> np.ndarray:
+    """All parameters in their units, the free ones as estimated; (J,)."""
+    value = source.value.copy()
+    for f, j in enumerate(stored.problem.free_columns):
+        if f not in source.own:
+            value[j] = stored.problem.parameters[j].from_scaled(float(source.free[f]))
+    return value
+
+
+def _slopes(stored: StoredFit, own, sources, theta, study: Problem) -> list[np.ndarray]:
+    """Derivative of the forces by all free columns, at the fitted own ones; (F, N) each.
+
+    In the steps of the fit, as `theta` of the own columns.
+    """
+    free = np.stack([source.free for source in sources])
+    free[:, list(own)] = np.where(np.isfinite(theta), theta, 0.0)
+    lanes = study.lanes
+    run = compiled_slopes(stored.problem.program)
+    value = np.stack([source.value for source in sources])
+    columns = [free, value, lanes.s_c[:, 0], lanes.displacement[:, 0]]
+    columns += [] if lanes.blend is None else [lanes.blend[:, 0]]
+    _, slopes = run(*map(jnp.asarray, columns))
+    return [np.asarray(slopes[k])[:, lanes.precision[k, 0] > 0] for k in range(len(sources))]
+
+
+class _Own(NamedTuple):
+    """What a curve's own parameters came to; `slopes`: (F, N)."""
+
+    columns: tuple[int, ...]
+    theta: np.ndarray
+    status: FitStatus
+    held: np.ndarray
+    slopes: np.ndarray
+    sigma: np.ndarray
+
+
+def _merged(stored: StoredFit, source: Source, own: _Own) -> Source:
+    """The source with its own parameters and the covariance of all."""
+    columns = list(own.columns)
+    names = ", ".join(stored.problem.free[f].name for f in columns)
+    said = "; ".join(filter(None, [source.message, f"{names} fitted to this curve"]))
+    if not own.status.succeeded:
+        word = f"{names}: {own.status.message}"
+        return dataclasses.replace(source, status=PredictionStatus.NO_OWN, message=word)
+    free = source.free.copy()
+    free[columns] = own.theta
+    moving = [f for f, held in zip(columns, own.held, strict=True) if not held]
+    A = (own.slopes[moving] / own.sigma).T
+    inverse = np.linalg.pinv(A.T @ A, rcond=1e-14, hermitian=True)
+    follow = np.eye(len(free))  # rows: how all columns move with each
+    kept = [f for f in range(len(free)) if f not in columns]
+    follow[moving] = 0.0
+    B = (own.slopes[kept] / own.sigma).T
+    follow[np.ix_(moving, kept)] = -inverse @ (A.T @ B)
+    covariance = follow @ source.covariance @ follow.T
+    covariance[np.ix_(moving, moving)] += inverse
+    return dataclasses.replace(
+        source,
+        free=free,
+        covariance=covariance,
+        blind=source.blind @ follow.T,
+        status=max(source.status, _own_status(own)),
+        message=said,
+        absorbed=(own.slopes[moving].T, inverse @ (A / own.sigma[:, None]).T),
+    )
+
+
+def _own_status(own: _Own) -> PredictionStatus:
+    if own.status == FitStatus.UNIDENTIFIABLE:
+        return PredictionStatus.UNDETERMINED
+    return PredictionStatus.AT_BOUND if own.held.any() else PredictionStatus.OK

@@ -1,0 +1,341 @@
+r"""Population of specimens: mean and spread of a parameter, and estimates that borrow from it.
+
+Empirical Bayes on the estimates, in scaled coordinates: \theta_i ~ N(\mu, diag(\tau^2)) between
+specimens, \hat\theta_i ~ N(\theta_i, C_i) with C_i the covariance of specimen i's own estimates.
+\tau^2 maximises the restricted likelihood (REML; Patterson and Thompson 1971,
+doi:10.1093/biomet/58.3.545), by Fisher scoring with bounds at zero; \mu is then the generalised
+least-squares mean.
+
+In a joint fit the errors of all specimens move together with that of the shared parameters. C_i is
+then the covariance at given shared parameters, which is independent from specimen to specimen, and
+tau is found at their estimates; their own error, by which the mean and all estimates move together,
+is added to the standard errors of the mean and of the estimates.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.special import chdtri, stdtrit
+
+from jaxtrachea.fit.fit import FitResult
+from jaxtrachea.fit.parameters import Parameter
+from jaxtrachea.inference.judgement import relative_errors
+from jaxtrachea.inference.profile import Profiles
+
+#: Specimens below which no spread is estimated, and from which one is unasked.
+FEWEST, ENOUGH = 3, 5
+#: Stands for "not known" beside the variances of estimates, in units of the largest.
+_UNKNOWN = 1e8
+
+
+class Effects(NamedTuple):
+    """Random effects of m specimens in q coordinates.
+
+    Attributes:
+        mean: of the population; (q,).
+        mean_se: its standard error, tau taken as known; (q,).
+        sd: between specimens, tau; (q,).
+        sd_se: its standard error (delta method on tau^2); NaN at tau = 0; (q,).
+        sd_low: 95 % interval of tau; (q,).
+        sd_high: (q,).
+        shrunk: mean of each specimen given its estimate and the population; (m, q).
+        shrunk_sd: standard deviation, that of the mean included, tau taken as known; (m, q).
+    """
+
+    mean: Float[np.ndarray, " q"]
+    mean_se: Float[np.ndarray, " q"]
+    sd: Float[np.ndarray, " q"]
+    sd_se: Float[np.ndarray, " q"]
+    sd_low: Float[np.ndarray, " q"]
+    sd_high: Float[np.ndarray, " q"]
+    shrunk: Float[np.ndarray, "m q"]
+    shrunk_sd: Float[np.ndarray, "m q"]
+
+
+class Common(NamedTuple):
+    """What the errors of all specimens have in common: those of k shared unknowns.
+
+    Attributes:
+        follow: how the estimates of each specimen follow the shared unknowns; (m, q, k).
+        covariance: of the shared unknowns; (k, k).
+    """
+
+    follow: Float[np.ndarray, "m q k"]
+    covariance: Float[np.ndarray, "k k"]
+
+
+class _Restricted(NamedTuple):
+    """Restricted likelihood at tau^2: its value, slope and expected information, and the mean."""
+
+    value: float
+    slope: Float[np.ndarray, " q"]
+    information: Float[np.ndarray, "q q"]
+    weight: Float[np.ndarray, "m q q"]
+    mean: Float[np.ndarray, " q"]
+    mean_covariance: Float[np.ndarray, "q q"]
+
+
+def _restricted(tau2, estimate, covariance) -> _Restricted:
+    """Everything at one tau^2; with W_i = (diag(tau^2) + C_i)^-1 and Q = (sum W_i)^-1."""
+    W = np.linalg.inv(covariance + np.diag(tau2))
+    Q = np.linalg.inv(W.sum(axis=0))
+    mean = Q @ np.einsum("mij,mj->i", W, estimate)
+    r = estimate - mean
+    Wr = np.einsum("mij,mj->mi", W, r)
+    value = 0.5 * np.sum(np.linalg.slogdet(W)[1]) - 0.5 * np.sum(r * Wr)
+    value += 0.5 * np.linalg.slogdet(Q)[1]
+    inner = W - W @ Q @ W
+    slope = 0.5 * np.sum(Wr**2, axis=0) - 0.5 * np.einsum("mjj->j", inner)
+    # tr(P A_j P A_k) / 2, P = W - W 1 Q 1' W the projected weight and A_j of coordinate j.
+    information = np.sum(W * W - 2 * W * (W @ Q @ W), axis=0)
+    F = np.einsum("maj,mjb->jab", W, W)
+    information = 0.5 * (information + np.einsum("ab,jbc,cd,kda->jk", Q, F, Q, F))
+    return _Restricted(float(value), slope, information, W, mean, Q)
+
+
+def random_effects(
+    estimate: Float[np.ndarray, "m q"],
+    covariance: Float[np.ndarray, "m q q"],
+    known: Bool[np.ndarray, "m q"] | None = None,
+    common: Common | None = None,
+) -> Effects:
+    """Mean and spread behind estimates of unequal precision.
+
+    The interval of tau is exact where all specimens are known equally well (chi^2 of m - 1 degrees
+    of freedom for tau^2 + C, less C); else C stands for what gives tau^2 its information.
+
+    Args:
+        estimate: of each specimen.
+        covariance: of its errors, without what they have in common.
+        known: which estimates exist; None: all.
+        common: None: the errors are independent.
+
+    Raises:
+        ValueError: fewer than three specimens have an estimate of some coordinate.
+    """
+    known = np.ones(estimate.shape, bool) if known is None else known
+    count = known.sum(axis=0)
+    if np.any(count < FEWEST):
+        raise ValueError(f"a population needs {FEWEST} specimens, found {count.min()}")
+    both = known[:, :, None] & known[:, None]
+    covariance = np.where(both, covariance, 0)
+    typical = np.array([np.median(estimate[k, j]) for j, k in enumerate(known.T)])
+    spread = np.array([np.var(estimate[k, j], ddof=1) for j, k in enumerate(known.T)])
+    largest = np.maximum(np.diagonal(covariance, axis1=1, axis2=2).max(axis=0), spread)
+    largest = np.where(largest > 0, largest, 1)
+    absent = np.where(known, 0, _UNKNOWN * largest)
+    covariance = covariance + absent[:, :, None] * np.eye(len(count))
+    estimate = np.where(known, estimate, typical)
+    # Where all is equal and exact, a variance of rounding keeps matrices regular.
+    tau2, here = _maximum(spread, estimate, covariance, 1e-24 * largest)
+    variance = 1 / np.diagonal(here.information)
+    free = tau2 > 0
+    if free.sum() > 1:
+        inverse = np.linalg.inv(here.information[np.ix_(free, free)])
+        variance[free] = np.diagonal(inverse)
+    sd = np.sqrt(tau2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sd_se = np.where(free, 0.5 * np.sqrt(variance) / sd, np.nan)
+    low, high = _interval(tau2, variance, count - 1)
+    follow = np.zeros((*estimate.shape, 0)) if common is None else known[:, :, None] * common.follow
+    shared = np.zeros((0, 0)) if common is None else common.covariance
+    shrunk, shrunk_sd, mean_se = _posterior(tau2, here, estimate, follow, shared)
+    return Effects(here.mean, mean_se, sd, sd_se, low, high, shrunk, shrunk_sd)
+
+
+def _maximum(tau2, estimate, covariance, floor) -> tuple[np.ndarray, _Restricted]:
+    """Fisher scoring: a spread that the likelihood pushes below zero stays at zero."""
+    exact = np.diagonal(covariance, axis1=1, axis2=2).min(axis=0) <= 0
+    least = np.where(exact, floor, 0)
+    tau2 = np.maximum(tau2, least)
+    here = _restricted(tau2, estimate, covariance)
+    for _ in range(200):
+        free = (tau2 > least) | (here.slope > 0)
+        step = np.zeros_like(tau2)
+        block = here.information[np.ix_(free, free)]
+        step[free] = np.linalg.solve(block, here.slope[free])
+        part = 1.0
+        while True:
+            trial = np.maximum(tau2 + part * step, least)
+            there = _restricted(trial, estimate, covariance)
+            if there.value >= here.value or part < 1e-10:
+                break
+            part *= 0.5
+        moved = np.max(np.abs(trial - tau2) / np.sqrt(1 / np.diagonal(here.information)))
+        if there.value >= here.value:
+            tau2, here = trial, there
+        if moved < 1e-10 or part < 1e-10:
+            break
+    return np.where(tau2 > least, tau2, 0), here
+
+
+def _interval(tau2, variance, dof) -> tuple[np.ndarray, np.ndarray]:
+    """95 % interval of tau; see `random_effects`."""
+    total = np.maximum(np.sqrt(0.5 * variance * dof), tau2)
+    error = total - tau2
+    ends = [total * dof / chdtri(dof, p) - error for p in (0.025, 0.975)]
+    low, high = (np.sqrt(np.maximum(v, 0)) for v in ends)
+    return low, high
+
+
+def _posterior(tau2, here: _Restricted, estimate, follow, shared):
+    """Mean and standard deviation of every specimen given all estimates, and that of the mean."""
+    prior = np.diag(tau2)
+    pull = prior @ here.weight
+    shrunk = here.mean + np.einsum("mij,mj->mi", pull, estimate - here.mean)
+    rest = np.eye(len(tau2)) - pull
+    moves = here.mean_covariance @ np.sum(here.weight @ follow, axis=0)
+    of_mean = here.mean_covariance + moves @ shared @ moves.T
+    moves = pull @ follow + rest @ moves
+    covariance = prior - pull @ prior + moves @ shared @ np.swapaxes(moves, 1, 2)
+    covariance = covariance + rest @ here.mean_covariance @ np.swapaxes(rest, 1, 2)
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    return shrunk, np.sqrt(np.maximum(variance, 0)), np.sqrt(np.diagonal(of_mean))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Population:
+    """The specimens of a fit as a sample.
+
+    Attributes:
+        result: the fit.
+        parameters: of scope `specimen`, q of them.
+        known: estimates that took part: those that are identifiable or weak; (lanes, q).
+        place: unknown of each lane and parameter, -1: none; (lanes, q).
+        effects: in scaled coordinates.
+    """
+
+    result: FitResult
+    parameters: tuple[Parameter, ...]
+    known: Bool[np.ndarray, "lanes q"]
+    place: np.ndarray
+    effects: Effects
+
+    @property
+    def left_out(self) -> Int[np.ndarray, " q"]:
+        """Specimens that have the parameter and whose estimate took no part; (q,)."""
+        return np.sum((self.place >= 0) & ~self.known, axis=0)
+
+    def shrunk_cells(self, lane: int, i: int) -> dict[str, object]:
+        """Columns `shrunk` and `shrunk_se` of parameters.csv for an unknown; none if not of it."""
+        found = np.flatnonzero(self.place[lane] == i)
+        if not len(found) or not self.known[lane].any():
+            return {}
+        j = int(found[0])
+        p = self.parameters[j]
+        value = p.from_scaled(float(self.effects.shrunk[lane, j]))
+        slope = value if p.scale == "log" else p.step
+        return {"shrunk": value, "shrunk_se": slope * float(self.effects.shrunk_sd[lane, j])}
+
+
+def wanted(asked: bool | None, result: FitResult) -> bool:
+    """Whether to take the specimens as a sample: as asked, else if there are enough of them."""
+    own = any(p.scope == "specimen" for p in result.problem.free)
+    return asked or (asked is None and own and result.lanes >= ENOUGH)
+
+
+def population(result: FitResult, profiles: Profiles | None = None) -> Population:
+    """Mean and spread of all parameters that belong to specimens.
+
+    Estimates take part that are identifiable or weak, weighed by the larger of their local error
+    and that of their interval; what has another verdict has no error to be weighed by. Weak ones
+    left out as well would bias the mean: an error is relative, and small values have large ones.
+    Parameters that fewer than three specimens determine are left out.
+
+    Args:
+        result: the fit.
+        profiles: further profiles, for the verdicts.
+
+    Raises:
+        ValueError: no parameter with the scope `specimen`, or none that three specimens determine.
+    """
+    parameters = tuple(p for p in result.problem.free if p.scope == "specimen")
+    if not parameters:
+        raise ValueError("no free parameter has the scope 'specimen'; a population needs one")
+    names = [p.name for p in parameters]
+    place = np.full((result.lanes, len(names)), -1)
+    separate = {c.specimen for lane in result.problem.curves for c in lane}
+    for lane, unknowns in enumerate(result.problem.unknowns):
+        if len(separate) == result.lanes:
+            for i, (p, _, _) in enumerate(unknowns):
+                if p.name in names:
+                    place[lane, names.index(p.name)] = i
+    row = np.arange(result.lanes)[:, None]
+    se = np.stack([u.se for u in result.uncertainty])[row, place]
+    error = (relative_errors(result, profiles) * result.relative)[row, place]
+    known = (place >= 0) & np.isfinite(se) & np.isfinite(error)
+    se = np.where(known, np.maximum(se, error), se)
+    enough = known.sum(axis=0) >= FEWEST
+    if not enough.any():
+        raise ValueError(f"no parameter is determined in {FEWEST} specimens of their own")
+    place, known, se = place[:, enough], known[:, enough], se[:, enough]
+    correlation = np.stack([u.correlation for u in result.uncertainty])
+    correlation = correlation[row[:, :, None], place[:, :, None], place[:, None]]
+    se = np.where(known, se, 0)
+    covariance = np.nan_to_num(correlation) * se[:, :, None] * se[:, None]
+    theta = np.where(known, result.theta[row, place], 0)
+    common = _common(result, place, se) if result.problem.joint else None
+    if common is not None:
+        together = common.follow @ common.covariance @ np.swapaxes(common.follow, 1, 2)
+        covariance = _not_negative(covariance - together, covariance)
+    effects = random_effects(theta, covariance, known, common)
+    chosen = tuple(p for p, e in zip(parameters, enough, strict=True) if e)
+    return Population(result, chosen, known, place, effects)
+
+
+def _common(result: FitResult, place, se: Float[np.ndarray, "lanes q"]) -> Common:
+    """How the estimates of a joint fit follow what is shared; `place`: see `Population`."""
+    row, shared = np.arange(result.lanes)[:, None], result.problem.shared
+    own = np.stack([u.se for u in result.uncertainty])[row, shared]
+    own = np.where(np.isfinite(own), own, 0)
+    full = np.nan_to_num(np.stack([u.correlation for u in result.uncertainty]))
+    between = full[row[:, :, None], shared[:, :, None], shared[:, None]]
+    across = full[row[:, :, None], place[:, :, None], shared[:, None]]
+    first = int(np.argmax(result.succeeded))
+    known = (own[first] > 0)[:, None] & (own[first] > 0)
+    inverse = np.linalg.pinv(np.where(known, between[first], 0), rcond=1e-12, hermitian=True)
+    scale = np.where(own[first] > 0, 1 / np.where(own[first] > 0, own[first], 1), 0)
+    follow = se[:, :, None] * (across @ inverse) * scale
+    return Common(follow, between[first] * own[first][:, None] * own[first])
+
+
+def _not_negative(rest: Float[np.ndarray, "m q q"], of: Float[np.ndarray, "m q q"]):
+    """A difference of covariances without what rounding has made negative."""
+    scale = np.sqrt(np.diagonal(of, axis1=1, axis2=2))
+    unit = np.where(scale > 0, scale, 1)
+    both = unit[:, :, None] * unit[:, None]
+    values, vectors = np.linalg.eigh(rest / both)
+    vectors = vectors * np.sqrt(np.maximum(values, 0))[:, None]
+    return both * (vectors @ np.swapaxes(vectors, 1, 2))
+
+
+def population_rows(of: Population) -> Iterator[dict[str, object]]:
+    """One row per parameter for population.csv; intervals with Student's t, m - 1."""
+    e = of.effects
+    for j, p in enumerate(of.parameters):
+        count = int(of.known[:, j].sum())
+        half = float(stdtrit(count - 1, 0.975) * e.mean_se[j])
+        log = p.scale == "log"
+        ends = np.array([e.sd[j], e.sd_low[j], e.sd_high[j]])
+        spread, low, high = map(float, np.exp(ends) if log else ends * p.step)
+        mean = float(e.mean[j])
+        slope = p.from_scaled(mean) if log else p.step
+        yield {
+            "parameter": p.name,
+            "unit": p.unit,
+            "specimens": count,
+            "left_out": int(of.left_out[j]),
+            "mean": p.from_scaled(mean),
+            "mean_se": slope * float(e.mean_se[j]),
+            "mean_low95": p.from_scaled(mean - half),
+            "mean_high95": p.from_scaled(mean + half),
+            "spread_is": "factor" if log else p.unit,
+            "spread": spread,
+            "spread_low95": low,
+            "spread_high95": high,
+            "sd_scaled": float(e.sd[j]),
+            "sd_scaled_se": float(e.sd_se[j]),
+        }

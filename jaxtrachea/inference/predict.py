@@ -1,0 +1,298 @@
+"""Force, joints and reactions that a finished fit predicts, with 95 % bands.
+
+Two bands: of the curve itself (covariance of the parameters, through the exact Jacobian: the delta
+method) and of a new sample (with the noise). The delta method is linear. It stops being valid where
+the band is so wide that the model bends within it, where an unknown is held on its bound (its own
+uncertainty is left out) and where the data leave a combination of unknowns undetermined (the band
+is then infinite wherever that combination acts): each has a `PredictionStatus`.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from jaxtrachea.inference.prediction_core import Predicted, Response, compiled
+from jaxtrachea.inference.sources import Source, slack_of, source_of
+from jaxtrachea.inference.stored import StoredFit
+from jaxtrachea.status import PredictionStatus, PressStatus
+
+#: Error of the linear band at its ends, in half-widths, from which it is called bent.
+BENT = 0.5
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CurvePrediction:
+    """What a fit predicts for one curve of N displacements; numpy, float64.
+
+    Bands are 95 %: `curve_*` of the curve itself, from the covariance of the parameters; the others
+    of a new sample, with the noise.
+
+    Attributes:
+        specimen: name.
+        trial: name, or "".
+        s: contact position, mm; NaN if the model needs none.
+        displacement: mm; (N,).
+        force: N; NaN where there is none.
+        se: standard error of the force from the parameters, N.
+        half_width: of the intervals, in standard errors.
+        sigma: standard deviation of a force sample, N; (N,).
+        joints: deflection at each ring, mm; (N, rings), NaN where the skeleton is not in the model.
+        joints_se: from the parameters.
+        reactions: of each ring, N; (N, rings).
+        reactions_se: from the parameters.
+        joint_sigma: standard deviation of a marker, mm; NaN if the fit had none.
+        status: the worst there is to say.
+        message: in words.
+        press_status: `PressStatus`; (N,).
+    """
+
+    specimen: str
+    trial: str
+    s: float
+    displacement: np.ndarray
+    force: np.ndarray
+    se: np.ndarray
+    half_width: float
+    sigma: np.ndarray
+    joints: np.ndarray
+    joints_se: np.ndarray
+    reactions: np.ndarray
+    reactions_se: np.ndarray
+    joint_sigma: float
+    status: PredictionStatus
+    message: str
+    press_status: np.ndarray
+
+    @property
+    def has_skeleton(self) -> bool:
+        """Whether joints and reactions are predicted."""
+        return bool(np.isfinite(self.joints).any())
+
+    @property
+    def curve_low95(self) -> np.ndarray:
+        """Lower end of the band of the curve itself, N."""
+        return self.force - self.half_width * self.se
+
+    @property
+    def curve_high95(self) -> np.ndarray:
+        """Upper end of the band of the curve itself, N."""
+        return self.force + self.half_width * self.se
+
+    @property
+    def low95(self) -> np.ndarray:
+        """Lower end of the band of a new sample, N."""
+        return self.force - self.half_width * np.hypot(self.se, self.sigma)
+
+    @property
+    def high95(self) -> np.ndarray:
+        """Upper end of the band of a new sample, N."""
+        return self.force + self.half_width * np.hypot(self.se, self.sigma)
+
+
+def predict_sources(
+    stored: StoredFit,
+    sources: list[Source],
+    s: list[float],
+    displacements: list[np.ndarray],
+    sigmas: Sequence[np.ndarray | None] | None = None,
+    chunk: int = 64,
+) -> list[CurvePrediction]:
+    """Predictions for many curves in one program.
+
+    Args:
+        stored: the fit.
+        sources: with which parameters each curve is predicted.
+        s: contact position of each, mm; NaN without one.
+        displacements: of each, mm.
+        sigmas: noise of each sample, N, where it is not that of the fit.
+        chunk: curves computed together.
+    """
+    run = compiled(stored.problem.program)
+    most = _rounded(max(map(len, displacements)), 32)
+    padded = np.stack([np.pad(d, (0, most - len(d)), mode="edge") for d in displacements])
+    places = np.where(np.isnan(s), float(stored.problem.geometry.length) / 2, s)
+    stack = lambda name: np.stack([getattr(source, name) for source in sources])  # noqa: E731
+    columns = [stack(n) for n in ("free", "value", "covariance", "blind", "half_width")]
+    columns += [places, padded]
+    presses = zip(sources, s, padded, strict=True)
+    slack = np.stack([slack_of(stored, source, float(at), D) for source, at, D in presses])
+    blend = stack("blend")
+    out: dict[int, CurvePrediction] = {}
+    for members in (np.flatnonzero(np.isnan(blend)), np.flatnonzero(~np.isnan(blend))):
+        # A rounded corner is another program; mostly all curves have one, or none.
+        arrays = columns if np.isnan(blend[members]).all() else [*columns, blend]
+        size = min(chunk, _rounded(max(len(members), 1), 8))
+        for first in range(0, len(members), size):
+            at = members[first : first + size]
+            rows = np.pad(at, (0, size - len(at)), mode="edge")
+            part = jax.tree.map(
+                np.asarray,
+                run(*(jnp.asarray(v[rows]) for v in arrays), slack=jnp.asarray(slack[rows])),
+            )
+            for row, k in enumerate(at):
+                own = jax.tree.map(lambda v, row=row: v[row], part)
+                sigma = None if sigmas is None else sigmas[k]
+                out[k] = _on_host(stored, sources[k], s[k], displacements[k], own, sigma)
+    return [out[k] for k in range(len(sources))]
+
+
+def _rounded(count: int, least: int) -> int:
+    """The next power of two, so that few sizes are compiled."""
+    return max(least, 1 << (count - 1).bit_length())
+
+
+def _on_host(stored: StoredFit, source: Source, s, displacement, part: Predicted, sigma):
+    """One curve, cut to its length, with its status."""
+    n = len(displacement)
+    cut = lambda v: np.asarray(v[:n], np.float64)  # noqa: E731
+    value, se = jax.tree.map(cut, part.value), jax.tree.map(cut, part.se)
+    usable = source.status.predicts
+    hide = lambda v: v if usable else np.full_like(v, np.nan)  # noqa: E731
+    skeleton = any(p.name == "k_M" for p in stored.problem.parameters)
+    show = lambda v: hide(v) if skeleton else np.full_like(v, np.nan)  # noqa: E731
+    presses = np.asarray(part.status[:n])
+    bend = _bend(source, cut(part.bend.T).T, value, se, int(part.deepest))
+    status, message = _verdict(source, value, se, presses, bend)
+    if usable and (beyond := _beyond(stored, source.lane, float(s), displacement)):
+        message = f"{message}; {beyond}"
+    return CurvePrediction(
+        specimen=source.specimen,
+        trial=source.trial,
+        s=float(s),
+        displacement=np.asarray(displacement, np.float64),
+        force=hide(value.force),
+        se=hide(se.force),
+        half_width=float(source.half_width),
+        sigma=np.full(n, source.sigma[0]) if sigma is None else sigma,
+        joints=show(value.joints),
+        joints_se=show(se.joints),
+        reactions=show(value.reactions),
+        reactions_se=show(se.reactions),
+        joint_sigma=float(source.sigma[1]),
+        status=status,
+        message=message,
+        press_status=presses,
+    )
+
+
+def _bend(source: Source, off: np.ndarray, value: Response, se: Response, deepest: int) -> float:
+    """Error of the linear band at its ends, at the deepest displacement, in half-widths.
+
+    What the curve's own parameters take up does not count: they are fitted to it.
+    """
+    half = float(source.half_width * se.force[deepest])
+    if not (np.isfinite(half) and half > 0 and np.isfinite(value.force[deepest])):
+        return 0.0
+    if source.absorbed is not None:
+        slope, gain = source.absorbed
+        off = off - (off @ gain.T) @ slope.T
+    worst = np.max(np.abs(off[:, deepest])) / half
+    # No solution within the band (past a fold): as bent as can be.
+    return float(worst) if np.isfinite(worst) else np.inf
+
+
+def _beyond(stored: StoredFit, lane: int, s: float, displacement: np.ndarray) -> str:
+    """What of a curve lies outside the data of its lane, in words; "" if nothing does."""
+    low, high, first, last = stored.spans[lane]
+    words = []
+    if displacement.max() > high + 1e-9 or displacement.min() < min(low, 0.0) - 1e-9:
+        words.append(f"D = {low:.3g} to {high:.3g} mm")
+    if s < first - 1e-9 or s > last + 1e-9:
+        words.append(f"s = {first:.4g} to {last:.4g} mm")
+    return f"extrapolated from data at {' and '.join(words)}" if words else ""
+
+
+def _verdict(source: Source, value: Response, se: Response, presses, bend: float):
+    """The worst that is to be said of a predicted curve, and everything in words."""
+    found = [(source.status, source.message)]
+    if source.status.predicts:
+        lost = ~np.isfinite(value.force)
+        if lost.any():
+            word = PressStatus(int(presses[lost][0])).message
+            found.append((PredictionStatus.NO_SOLUTION, f"{int(lost.sum())} samples: {word}"))
+        if np.isinf(se.force).any() or np.isinf(source.half_width):
+            found.append((PredictionStatus.UNDETERMINED, ""))
+        if bend > BENT:
+            word = f"off by {bend:.2g} half-widths at the deepest"
+            if np.isinf(bend):
+                word = "at the deepest the model has no solution at an end of the band"
+            found.append((PredictionStatus.BENT, word))
+    worst = max(status for status, _ in found)
+    said = [m for status, m in found if m] or []
+    return worst, "; ".join(dict.fromkeys([worst.message, *said]))
+
+
+def predict(
+    results: StoredFit,
+    *,
+    s: float,
+    displacement: ArrayLike | Sequence[float],
+    specimen: str | None = None,
+    trial: str | None = None,
+) -> CurvePrediction:
+    """A curve that was not measured, from a finished fit.
+
+        results = jaxtrachea.read_results("out/fit")
+        curve = jaxtrachea.predict(results, s=75.0, displacement=[0.5, 1.0, 2.0])
+        print(curve.force, curve.low95, curve.high95)
+
+    Computed in float64 where JAX is set to it (`jax_enable_x64`), else in float32.
+
+    Args:
+        results: from `read_results`.
+        s: contact position, mm, on the tube.
+        displacement: of the tool from first touch, mm; one number or a vector.
+        specimen: whose parameters; may be left out where the fit has one specimen only, or shares
+            all parameters.
+        trial: of the fit, whose own parameters (onset, say) count, with the rounded corner of its
+            onset; None: onset and force offset of single trials are 0, the corner is sharp
+            (`onset_width` of the model).
+
+    Raises:
+        ValueError: a position outside the tube, a displacement that is no finite number, a specimen
+            or trial that the fit does not have, one without an estimate; with the cure.
+    """
+    D = np.atleast_1d(np.asarray(displacement, np.float64))
+    if D.ndim != 1 or not D.size or not np.isfinite(D).all():
+        raise ValueError("displacement: expected a finite number or a vector of them, mm")
+    check_position(results, s)
+    if specimen is None:
+        specimen = _only_specimen(results)
+    elif specimen not in results.specimens:
+        raise ValueError(unknown_name("specimen", specimen, results.specimens))
+    source = source_of(results, specimen, trial)
+    if not source.status.predicts:
+        raise ValueError(f"{specimen}: {source.message or source.status.message}")
+    return predict_sources(results, [source], [float(s)], [D])[0]
+
+
+def check_position(results: StoredFit, s: float) -> None:
+    """Refuse a contact position that is not on the tube.
+
+    Raises:
+        ValueError: with what is expected.
+    """
+    length = float(results.problem.geometry.length)
+    if not 0 <= s <= length:
+        raise ValueError(f"s = {s:g} mm is not on the tube; expected 0 to {length:g} mm")
+
+
+def unknown_name(kind: str, name: str, known) -> str:
+    """Message for a name that the fit does not have."""
+    listed = ", ".join(map(repr, list(known)[:12])) + (", ..." if len(known) > 12 else "")
+    return f"{kind} {name!r} is not in this fit; expected one of {listed}"
+
+
+def _only_specimen(results: StoredFit) -> str:
+    names = results.specimens
+    shared = all(p.scope in ("shared", "trial") for p in results.problem.free)
+    if len(names) > 1 and not shared:
+        raise ValueError(
+            f"this fit has {len(names)} specimens with parameters of their own; give specimen=, "
+            f"one of {', '.join(map(repr, names[:12]))}{', ...' if len(names) > 12 else ''}"
+        )
+    return next(iter(names))

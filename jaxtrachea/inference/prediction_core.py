@@ -1,0 +1,189 @@
+"""The model's answer and its standard errors, as pure functions for `jit` and `vmap`.
+
+Standard errors by the delta method: covariance of the estimates through the exact Jacobian. What it
+cannot do is said in `inference.predict`.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.residual import material_and_values
+from jaxtrachea.mechanics.press import press
+
+#: Slope along a blind direction, over what its terms add up to, from which it counts.
+_ACTS = 1e-6
+
+
+class Response(NamedTuple):
+    """The model's answer at one contact position; N displacements.
+
+    Attributes:
+        force: at the load cell, with its offset, N; (N,).
+        joints: deflection of the ligament at each ring, mm; (N, rings).
+        reactions: force of each ring against the load, N; (N, rings).
+    """
+
+    force: Float[Array, "*n"]
+    joints: Float[Array, "*n rings"]
+    reactions: Float[Array, "*n rings"]
+
+
+class Predicted(NamedTuple):
+    """A response with standard errors from the parameters alone; inf where undetermined.
+
+    Attributes:
+        value: the response.
+        se: its standard errors.
+        status: `PressStatus` of every displacement; (N,).
+        bend: how far the force leaves its tangent where the parameters move to either end of the
+            band at the deepest displacement, N; (2, N).
+        deepest: index of that displacement.
+    """
+
+    value: Response
+    se: Response
+    status: Int[Array, "*n"]
+    bend: Float[Array, "2 ..."]
+    deepest: Int[Array, ""]
+
+
+def respond(
+    problem: Problem,
+    free: Float[Array, " F"],
+    value: Float[Array, " J"],
+    s_c: Float[Array, ""],
+    displacement: Float[Array, " N"],
+    blend: Float[Array, ""] | None = None,
+) -> tuple[Response, Int[Array, " N"]]:
+    """The fitted model at one position: response and `PressStatus`; pure.
+
+    Args:
+        problem: geometry, options and parameters (static).
+        free: free parameters, scaled coordinates.
+        value: all parameters in their units, used where they are not free.
+        s_c: mm.
+        displacement: mm.
+        blend: rounded corner of a curve whose onset was fitted, mm, see `Lane`; None: that of the
+            options.
+    """
+    material, values = material_and_values(problem, free, value)
+    geometry = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), problem.geometry)
+    solved = press(
+        geometry, material, s_c, displacement, problem.options,
+        onset=values["onset"], blend=blend,
+    )  # fmt: skip
+    force = solved.force + values["force_offset"]
+    return Response(force, solved.joints, solved.reactions), solved.status
+
+
+def jacobian(problem: Problem, free, value, s_c, displacement, blend=None):
+    """`respond`, its statuses, and its derivative by every free column, a leading axis (F, ...)."""
+
+    def push(tangent):
+        at = lambda free: respond(problem, free, value, s_c, displacement, blend)  # noqa: E731
+        out, moved, status = jax.jvp(at, (free,), (tangent,), has_aux=True)
+        return out, status, moved
+
+    if not len(free):
+        out, status = respond(problem, free, value, s_c, displacement, blend)
+        return out, status, jax.tree.map(lambda v: jnp.zeros((0, *v.shape), v.dtype), out)
+    eye = jnp.eye(free.shape[0], dtype=free.dtype)
+    return jax.vmap(push, out_axes=(None, None, 0))(eye)
+
+
+def standard_errors(
+    slope: Float[Array, "F ..."],
+    covariance: Float[Array, "F F"],
+    blind: Float[Array, "B F"],
+    unseen: Float[Array, "..."] | None = None,
+) -> Float[Array, "..."]:
+    """Delta method: sqrt(J C J^T), inf where a blind direction changes the quantity.
+
+    By more than `unseen`, the slope that the fit could not tell from zero there; None: 0.
+    """
+    variance = jnp.einsum("f...,fg,g...->...", slope, covariance, slope)
+    along = jnp.abs(jnp.einsum("bf,f...->b...", blind, slope))
+    terms = jnp.einsum("bf,f...->b...", jnp.abs(blind), jnp.abs(slope))
+    least = max(_ACTS, 100 * float(jnp.finfo(slope.dtype).eps))
+    least = least * terms if unseen is None else jnp.maximum(least * terms, unseen[None])
+    undetermined = jnp.any(along > least, axis=0)
+    return jnp.where(undetermined, jnp.inf, jnp.sqrt(jnp.maximum(variance, 0)))
+
+
+def _unseen(slope: Float[Array, "F N"], slack: Float[Array, "N F"]) -> Float[Array, " N"]:
+    """Slope along a blind direction that the fit could not tell from zero, see `predicted`.
+
+    A direction is blind where the sum of squares of its slopes over the samples of the fit is a
+    tiny share of that of all slopes. Where the same place is pressed no deeper, its slope is at
+    most that share, however it compares with its own terms: a direction of one unknown has but one.
+    """
+    size = jnp.linalg.norm(slope.T * slack, axis=1)
+    return jnp.where(jnp.any(slack > 0, axis=1), jnp.max(size), 0)
+
+
+def predicted(
+    problem: Problem,
+    free: Float[Array, " F"],
+    value: Float[Array, " J"],
+    covariance: Float[Array, "F F"],
+    blind: Float[Array, "B F"],
+    half_width: Float[Array, ""],
+    s_c: Float[Array, ""],
+    displacement: Float[Array, " N"],
+    blend: Float[Array, ""] | None = None,
+    slack: Float[Array, "N F"] | None = None,
+) -> Predicted:
+    """One curve with its standard errors; pure, for `jit` and `vmap`, float32 and float64.
+
+    Args:
+        problem: geometry, options and parameters (static).
+        free: estimates, scaled coordinates.
+        value: all parameters in their units, used where they are not free.
+        covariance: of `free`; 0 for what is held.
+        blind: rows: directions of `free` that the fit leaves undetermined.
+        half_width: of a 95 % interval in standard errors.
+        s_c: mm.
+        displacement: mm; at least one.
+        blend: see `respond`.
+        slack: where the fit has pressed, how far it sees slopes: its least ratio of singular values
+            times the root of its samples, times the size of each unknown; elsewhere 0; None: 0.
+    """
+    out, status, slopes = jacobian(problem, free, value, s_c, displacement, blend)
+    se = jax.tree.map(lambda slope: standard_errors(slope, covariance, blind), slopes)
+    if slack is not None:
+        unseen = _unseen(slopes.force, slack)
+        se = se._replace(force=standard_errors(slopes.force, covariance, blind, unseen))
+    deepest = jnp.argmax(jnp.abs(displacement))
+    pull = covariance @ slopes.force[:, deepest]
+    along = jnp.sqrt(jnp.maximum(slopes.force[:, deepest] @ pull, 0))
+    known = (along > 0) & jnp.isfinite(half_width)
+    step = jnp.where(known, half_width / jnp.where(along > 0, along, 1), 0) * pull
+    straight = jnp.einsum("f...,f->...", slopes.force, step)
+
+    def bend(sign):
+        end, _ = respond(problem, free + sign * step, value, s_c, displacement, blend)
+        return end.force - out.force - sign * straight
+
+    return Predicted(out, se, status, jnp.stack([bend(1.0), bend(-1.0)]), deepest)
+
+
+@functools.lru_cache(maxsize=16)
+def compiled(problem: Problem):
+    """`predicted` for many curves at once; `problem` is a `Problem.program`."""
+    return jax.jit(jax.vmap(functools.partial(predicted, problem)))
+
+
+@functools.lru_cache(maxsize=16)
+def compiled_slopes(problem: Problem):
+    """Force and its derivative for many curves at once."""
+
+    def force(free, value, s_c, displacement, blend=None):
+        out, _, slopes = jacobian(problem, free, value, s_c, displacement, blend)
+        return out.force, slopes.force
+
+    return jax.jit(jax.vmap(force))

@@ -1,0 +1,216 @@
+"""With which parameters of a finished fit a curve is predicted, and why perhaps with none."""
+
+import dataclasses
+
+import numpy as np
+
+from jaxtrachea.fit.covariance import SINGULAR
+from jaxtrachea.inference.stored import StoredFit
+from jaxtrachea.status import FitStatus, PredictionStatus
+
+#: Parameters of a measurement, not of the specimen: zero where no measurement is meant.
+OF_MEASUREMENT = ("onset", "force_offset")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Source:
+    """Parameters of one curve; F free columns, J parameters.
+
+    Attributes:
+        specimen: that the curve belongs to.
+        trial: that it belongs to; "" if none is meant.
+        lane: of the fit; -1 if none.
+        free: estimates of the free columns, scaled coordinates; 0 where the fit has none; (F,).
+        value: all parameters in their units; (J,).
+        covariance: of `free`; (F, F).
+        blind: directions that the fit leaves undetermined, rows; (P, F).
+        half_width: of a 95 % interval in standard errors.
+        sigma: of force, N, and markers, mm; (2,).
+        own: free columns that are the curve's own and not in the fit.
+        status: OK, or the worst there is to say.
+        message: why, in words; "" if nothing is.
+        absorbed: what own parameters take up of a change of the curve: slopes (N, k) and the gain
+            that fits them (k, N); None if they are not fitted.
+        blend: rounded corner of a curve whose onset was fitted, mm, see `Lane`; NaN: that of the
+            options.
+    """
+
+    specimen: str
+    trial: str
+    lane: int
+    free: np.ndarray
+    value: np.ndarray
+    covariance: np.ndarray
+    blind: np.ndarray
+    half_width: np.ndarray
+    sigma: np.ndarray
+    own: tuple[int, ...]
+    status: PredictionStatus
+    message: str
+    absorbed: tuple[np.ndarray, np.ndarray] | None = None
+    blend: float = np.nan
+
+
+def source_of(
+    stored: StoredFit,
+    specimen: str,
+    trial: str | None = None,
+    *,
+    as_specimen: str | None = None,
+    measured: bool = False,
+) -> Source:
+    """The parameters to predict a curve with.
+
+    Args:
+        stored: the fit.
+        specimen: of the curve.
+        trial: of the fit whose own parameters count; None: a new curve.
+        as_specimen: of the fit, in the place of one that it does not know.
+        measured: the curve has samples that its own parameters can be fitted to; else onset and
+            force offset are 0, and no others can be its own.
+    """
+    used, note = _whose(stored, specimen, as_specimen)
+    if used is None:
+        return _none(stored, specimen, trial, PredictionStatus.UNKNOWN_SPECIMEN, note)
+    lane = _lane(stored, used, trial)
+    if lane is None:
+        known = [c.trial for c in stored.curves if c.specimen == used]
+        text = f"trial {trial!r} is not in this fit; expected one of " + ", ".join(
+            map(repr, known[:12])
+        )
+        return _none(stored, specimen, trial, PredictionStatus.UNKNOWN_SPECIMEN, text)
+    status = FitStatus(int(stored.status[lane]))
+    if not status.succeeded:
+        return _none(stored, specimen, trial, PredictionStatus.NO_ESTIMATE, status.message)
+    index, own = _columns(stored, lane, used, trial)
+    lacking = [stored.problem.free[f].name for f in own]
+    lacking = [name for name in lacking if name not in OF_MEASUREMENT]
+    if lacking and not measured:
+        text = f"{', '.join(lacking)} belongs to single trials; name one of the fit with trial="
+        return _none(stored, specimen, trial, PredictionStatus.NO_ESTIMATE, text)
+    taken = _taken(stored, specimen, trial or "", lane, index, own, note)
+    return dataclasses.replace(taken, blend=_corner(stored, used, trial))
+
+
+def _corner(stored: StoredFit, specimen: str, trial: str | None) -> float:
+    """Rounded corner that the fit used for this trial; NaN for a new one."""
+    pairs = zip(stored.curves, stored.blend.tolist(), strict=True)
+    return next((b for c, b in pairs if (c.specimen, c.trial) == (specimen, trial)), np.nan)
+
+
+def _whose(stored: StoredFit, specimen: str, as_specimen: str | None) -> tuple[str | None, str]:
+    """Specimen of the fit that stands for this one, and what is to be said of it."""
+    names = stored.specimens
+    if specimen in names:
+        return specimen, ""
+    if as_specimen is not None:
+        return as_specimen, f"predicted as specimen {as_specimen!r}"
+    own = [p.name for p in stored.problem.free if p.scope == "specimen"]
+    if not own:
+        return names[0], "a new specimen: predicted with what all specimens share"
+    if len(names) == 1:
+        return names[0], f"a new specimen: predicted as the only one of the fit, {names[0]!r}"
+    return None, (
+        f"specimen {specimen!r} is not in this fit, where {', '.join(own)} belongs to each of "
+        f"{len(names)} specimens; name the one to predict it as with --as"
+    )
+
+
+def _lane(stored: StoredFit, specimen: str, trial: str | None) -> int | None:
+    """Lane that holds this specimen, and trial if one is named; one with an estimate if any has."""
+    pairs = zip(stored.curves, stored.curve_lane.tolist(), strict=True)
+    lanes = [
+        k for c, k in pairs if c.specimen == specimen and (trial is None or c.trial == trial)
+    ]  # fmt: skip
+    if not lanes:
+        return None
+    good = [k for k in lanes if FitStatus(int(stored.status[k])).succeeded]
+    return (good or lanes)[0]
+
+
+def _columns(stored: StoredFit, lane: int, specimen: str, trial: str | None):
+    """Unknown that every free column reads, -1 for those that the fit does not have; and these."""
+    place = {(p.name, s, t): i for i, (p, s, t) in enumerate(stored.problem.unknowns[lane])}
+    index, own = [], []
+    for f, p in enumerate(stored.problem.free):
+        key = (
+            p.name,
+            "" if p.scope == "shared" else specimen,
+            (trial or "") if p.scope == "trial" else "",
+        )
+        index.append(place.get(key, -1) if p.scope != "trial" or trial else -1)
+        if index[-1] < 0:
+            own.append(f)
+    return np.array(index, int), tuple(own)
+
+
+def _taken(stored: StoredFit, specimen, trial, lane: int, index, own, note: str) -> Source:
+    """The rows of the fit in the order of the free columns."""
+    known = index >= 0
+    pick = np.where(known, index, 0)
+    both = known[:, None] & known[None]
+    free = np.where(known, stored.theta[lane][pick] if known.any() else 0.0, 0.0)
+    covariance = np.zeros(both.shape)
+    blind = np.zeros((max(stored.theta.shape[1], 1), len(index)))
+    said = [note] if note else []
+    status = PredictionStatus.OK
+    if known.any():
+        covariance = np.where(both, stored.covariance[lane][np.ix_(pick, pick)], 0.0)
+        blind = np.where(known, stored.blind[lane][:, pick], 0.0)
+        held = [p.name for p, k, i in zip(stored.problem.free, known, pick, strict=True)
+                if k and stored.at_bound[lane, i]]  # fmt: skip
+        if held:
+            status = PredictionStatus.AT_BOUND
+            said.append(f"{', '.join(held)} held")
+    return Source(
+        specimen=specimen,
+        trial=trial,
+        lane=lane,
+        free=free,
+        value=np.array([p.value for p in stored.problem.parameters]),
+        covariance=covariance,
+        blind=blind,
+        half_width=np.asarray(stored.half_width[lane]),
+        sigma=stored.sigma[lane],
+        own=own,
+        status=status,
+        message="; ".join(said),
+    )
+
+
+def _none(stored: StoredFit, specimen, trial, status: PredictionStatus, message: str) -> Source:
+    """No parameters, and why; arrays of the usual shapes, so that one program serves all."""
+    F, J = len(stored.problem.free), len(stored.problem.parameters)
+    nan = np.full(F, np.nan)
+    return Source(
+        specimen=specimen,
+        trial=trial or "",
+        lane=-1,
+        free=nan,
+        value=np.full(J, np.nan),
+        covariance=np.full((F, F), np.nan),
+        blind=np.zeros((max(stored.theta.shape[1], 1), F)),
+        half_width=np.asarray(np.nan),
+        sigma=np.full(2, np.nan),
+        own=(),
+        status=status,
+        message=message,
+    )
+
+
+def slack_of(stored: StoredFit, source: Source, s: float, displacement: np.ndarray) -> np.ndarray:
+    """How far the fit sees slopes where it has pressed, see `prediction_core.predicted`; (N, F)."""
+    free = stored.problem.free
+    out = np.zeros((len(displacement), len(free)))
+    curves = [c for c, k in zip(stored.curves, stored.curve_lane, strict=True) if k == source.lane]
+    place = lambda c: np.nan if c.s_c is None else c.s_c  # noqa: E731
+    here = [c for c in curves if np.isclose(place(c), s, rtol=0, atol=1e-9, equal_nan=True)]
+    if not here or not source.blind.any():
+        return out
+    # Of a scaled coordinate; an onset's steps are as large as the presses.
+    size = [1.0 if p.scale == "log" or p.name in OF_MEASUREMENT else max(abs(v), 1e-3)
+            for p, v in zip(free, source.free, strict=True)]  # fmt: skip
+    samples = sum(len(c.force) for c in curves)
+    low, high = (f([f(c.displacement) for c in here]) for f in (np.min, np.max))
+    out[(displacement >= low - 1e-9) & (displacement <= high + 1e-9)] = size
+    return SINGULAR * np.sqrt(samples) * out

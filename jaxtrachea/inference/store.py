@@ -1,0 +1,112 @@
+"""The groups of results.h5 that let a fit predict by itself: model, estimates, data as used.
+
+Numbers and JSON (as bytes) only; `stored` reads them back.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import h5py
+import numpy as np
+
+from jaxtrachea.fit.fit import FitResult
+from jaxtrachea.fit.predictions import predictions
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.trachea.geometry import Geometry
+
+#: Arrays of the tube.
+GEOMETRY = tuple(f.name for f in dataclasses.fields(Geometry))
+
+
+def write(
+    file: h5py.File, result: FitResult, files: Mapping[str, str], reading: Mapping[str, Any]
+) -> None:
+    """Add the groups `model` and `data` to results.h5.
+
+    Args:
+        file: open for writing.
+        result: the fit.
+        files: SHA-256 by file name.
+        reading: the [data] section.
+    """
+    problem = result.problem
+    place = {p.name: j for j, p in enumerate(problem.parameters)}
+    unknowns = [[[place[p.name], *names] for p, *names in lane] for lane in problem.unknowns]
+    group = file.create_group("model")
+    _write_json(
+        group,
+        {
+            "options": dataclasses.asdict(problem.options),
+            "parameters": [dataclasses.asdict(p) for p in problem.parameters],
+            "unknowns": unknowns,
+            "lanes": [problem.lane_name(lane) for lane in range(result.lanes)],
+            "loss": problem.loss,
+            "loss_scale": problem.loss_scale,
+            "noise_given": problem.noise_given,
+            "joint": problem.joint,
+            "reading": dict(reading),
+            "units": {"length": "mm", "force": "N", "angle": "rad"},
+        },
+    )
+    for name in GEOMETRY:
+        group.create_dataset(name, data=np.asarray(getattr(problem.geometry, name), np.float64))
+    _write_data(file.create_group("data"), result, files)
+
+
+def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) -> None:
+    """Every curve as it was used, with the model's answer at the estimate; samples end to end."""
+    problem = result.problem
+    placed = [(k, t, c) for k, lane in enumerate(problem.curves) for t, c in enumerate(lane)]
+    curves = [c for _, _, c in placed]
+    names = sorted(files, key=len, reverse=True)
+    _write_json(
+        group,
+        {
+            "specimen": [c.specimen for c in curves],
+            "trial": [c.trial for c in curves],
+            "source": [_short_source(c.source, names) for c in curves],
+            "files": dict(files),
+        },
+    )
+    group["lane"] = np.array([k for k, _, _ in placed], np.int32)
+    group["samples"] = np.array([len(c.force) for c in curves], np.int64)
+    group["s_c"] = np.array([np.nan if c.s_c is None else c.s_c for c in curves])
+    group["phi_c"] = np.array([c.phi_c for c in curves])
+    blend = problem.lanes.blend
+    group["blend"] = np.array([np.nan if blend is None else blend[k, t] for k, t, _ in placed])
+    seen = predictions(problem, result.theta)
+    residual = [seen.force[k, t, : len(c.force)] for k, t, c in placed]
+    columns = {
+        "displacement": [c.displacement for c in curves],
+        "force": [c.force for c in curves],
+        "sigma": [np.full(len(c.force), np.nan) if c.sigma is None else c.sigma for c in curves],
+        "residual": residual,
+        "predicted": [c.force + r for c, r in zip(curves, residual, strict=True)],
+    }
+    if seen.joints is not None and problem.lanes.joints is not None:
+        found = [seen.joints[k, t, : len(c.force)] for k, t, c in placed]
+        columns["joint_residual"] = found
+        columns["joints"] = [_on_rings(c, problem.geometry.rings) for c in curves]
+    for name, parts in columns.items():
+        group.create_dataset(name, data=np.concatenate(parts), compression="gzip")
+
+
+def _on_rings(curve: Curve, rings: int) -> np.ndarray:
+    """Marker displacements in the columns of their rings, NaN elsewhere; (N, rings)."""
+    table = np.full((len(curve.force), rings), np.nan)
+    if curve.joint_displacement is not None and curve.joint_rings is not None:
+        table[:, curve.joint_rings] = curve.joint_displacement
+    return table
+
+
+def _short_source(source: str, names: Sequence[str]) -> str:
+    """A source without the folders before the file's name."""
+    found = next((name for name in names if name in source), None)
+    return source.rpartition("/")[2] if found is None else source[source.index(found) :]
+
+
+def _write_json(group: h5py.Group, content: object) -> None:
+    data = np.frombuffer(json.dumps(content).encode(), np.uint8)
+    group.create_dataset("description", data=data, compression="gzip")

@@ -1,0 +1,294 @@
+"""A finished fit read back from its results.h5 (schema 2), so that it predicts by itself.
+
+Through the audited door for files that nobody vouches for (`readers.safe_hdf5`).
+"""
+
+import dataclasses
+import functools
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxtrachea.fit.parameters import Parameter
+from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.inference.store import GEOMETRY
+from jaxtrachea.measurements.curve import Fault
+from jaxtrachea.measurements.read import Curve, DataError
+from jaxtrachea.measurements.readers.safe_hdf5 import attribute, numeric, opened
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.status import FitStatus
+from jaxtrachea.trachea.geometry import Geometry
+
+SCHEMA = "jaxtrachea-results"
+VERSION = 2
+#: Groups and datasets that are read; nothing else of the file is.
+READ = (
+    "/model", "/data", "/lanes/status", "/lanes/sigma", "/lanes/rms", "/unknowns/theta",
+    "/unknowns/at_bound",
+    "/uncertainty/covariance", "/uncertainty/silent", "/uncertainty/half_width",
+)  # fmt: skip
+#: 97.5 % quantile of the normal distribution, as `uncertainty.analyse` uses it.
+NORMAL = 1.959963984540054
+
+
+class NoResults(ValueError):
+    """No finished results, or such that cannot predict; the message names the cure."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StoredFit:
+    """A finished fit, read back. L lanes of up to P unknowns; scaled coordinates as in `Parameter`.
+
+    Attributes:
+        path: the file.
+        problem: geometry, options, parameters and unknowns; no data.
+        reading: how the data were read, as in the [data] section.
+        lane_names: specimen and trial of each lane, "(all)" where it spans several.
+        theta: estimates; (L, P).
+        covariance: of the estimates; 0 for what is held, without the blind directions; (L, P, P).
+        blind: rows: directions that change no residual, scaled coordinates; (L, P, P).
+        at_bound: (L, P).
+        status: `FitStatus`; (L,).
+        sigma: standard deviation of force, N, and markers, mm, given or estimated; NaN without
+            samples of the kind; (L, 2).
+        half_width: of a 95 % interval in standard errors; inf where the noise could not be
+            estimated; (L,).
+        curves: the data as used; `source` is the file's name and the place in it.
+        curve_lane: lane of each curve; (curves,).
+        blend: rounded corner at the onset of each curve, mm, see `Lane`; NaN where no onset was
+            fitted; (curves,).
+        files: SHA-256 by file name.
+    """
+
+    path: Path
+    problem: Problem
+    reading: Mapping[str, Any]
+    lane_names: tuple[tuple[str, str], ...]
+    theta: np.ndarray
+    covariance: np.ndarray
+    blind: np.ndarray
+    at_bound: np.ndarray
+    status: np.ndarray
+    sigma: np.ndarray
+    half_width: np.ndarray
+    curves: tuple[Curve, ...]
+    curve_lane: np.ndarray
+    blend: np.ndarray
+    files: Mapping[str, str]
+
+    @property
+    def specimens(self) -> tuple[str, ...]:
+        """Names of the fitted specimens, in the order of the data."""
+        return tuple(dict.fromkeys(c.specimen for c in self.curves))
+
+    @functools.cached_property
+    def spans(self) -> np.ndarray:
+        """Range of displacement and of contact position of the data of each lane, mm; (L, 4)."""
+        out = np.tile([np.inf, -np.inf] * 2, (len(self.status), 1))
+        for curve, lane in zip(self.curves, self.curve_lane, strict=True):
+            D, s = curve.displacement, np.nan if curve.s_c is None else curve.s_c
+            ends = [np.min(D), -np.max(D), s, -s]
+            out[lane] = np.fmin(out[lane] * [1, -1, 1, -1], ends) * [1, -1, 1, -1]
+        return out
+
+    @property
+    def tool_radius(self) -> float | None:
+        """Distance from the contact within which markers are held by the tool, mm."""
+        return self.reading.get("tool_radius")
+
+    def __repr__(self) -> str:
+        """One line: what was fitted to what."""
+        free = ", ".join(p.name for p in self.problem.free) or "nothing"
+        return (
+            f"StoredFit({str(self.path)!r}: {free} fitted to {len(self.curves)} curves of "
+            f"{len(self.specimens)} specimen(s))"
+        )
+
+
+def read_results(path: Path | str) -> StoredFit:
+    """Read a finished fit for prediction.
+
+    Args:
+        path: the folder of a finished `jaxtrachea fit`, or its results.h5.
+
+    Raises:
+        NoResults: no such folder or file, an unfinished run, a damaged file, one of another kind or
+            of an earlier version; with the cure.
+    """
+    path = _file_of(Path(path))
+    try:
+        with opened(path, read=READ) as file:
+            _check_schema(path, attribute(file, "schema"), attribute(file, "schema_version"))
+            return _read(path, file)
+    except DataError as error:
+        raise NoResults(str(error)) from None
+    except (Fault, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        if isinstance(error, NoResults):
+            raise
+        reason = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise NoResults(
+            f"{path}: damaged or not written by this program ({reason}); fit again"
+        ) from None
+
+
+def _file_of(path: Path) -> Path:
+    """The results.h5 that is meant."""
+    if path.is_dir():
+        if (path / "results.h5").is_file():
+            return path / "results.h5"
+        if (path / ".run").is_dir():
+            raise NoResults(
+                f"{path}: this fit has not ended; go on with it: "
+                f"jaxtrachea fit SPEC --out {path} --resume"
+            )
+        raise NoResults(
+            f"{path}: no results.h5 in this folder; name the folder that a fit was written to"
+        )
+    if not path.exists():
+        raise NoResults(
+            f"{path}: no such folder or file; name the folder that a fit was written to"
+        )
+    return path
+
+
+def _check_schema(path: Path, schema: object, version: object) -> None:
+    if schema != SCHEMA:
+        raise NoResults(
+            f"{path}: schema is {schema!r}, expected {SCHEMA!r}; name the results of a fit "
+            "(its folder, or results.h5 in it)"
+        )
+    if version == 1:
+        raise NoResults(
+            f"{path}: schema version 1 does not keep model, covariance and data; fit again with "
+            "this version: jaxtrachea fit SPEC"
+        )
+    if version != VERSION:
+        raise NoResults(
+            f"{path}: schema version is {version}, this program reads {VERSION}; use the program "
+            "that wrote it, or fit again"
+        )
+
+
+def _read(path: Path, file: Any) -> StoredFit:
+    model = _json(file["model"])
+    parameters = tuple(Parameter(**row) for row in model["parameters"])
+    geometry = Geometry(**{name: numeric(file["model"], name) for name in GEOMETRY})
+    unknowns = tuple(
+        tuple((parameters[j], specimen, trial) for j, specimen, trial in lane)
+        for lane in model["unknowns"]
+    )
+    empty: dict[str, Any] = dict.fromkeys(Lane._fields, np.zeros((0, 0)))
+    problem = Problem(
+        geometry=jax.tree.map(lambda v: np.asarray(v, np.float64), geometry),
+        options=Options(**model["options"]),
+        parameters=parameters,
+        lanes=Lane(**empty),
+        curves=(),
+        unknowns=unknowns,
+        loss=model["loss"],
+        loss_scale=model["loss_scale"],
+        noise_given=(bool(model["noise_given"][0]), bool(model["noise_given"][1])),
+        common="nothing",
+        joint=bool(model["joint"]),
+    )
+    theta = numeric(file["unknowns"], "theta")
+    silent = numeric(file["uncertainty"], "silent")
+    curves, lane, files = _read_data(file["data"])
+    stored = StoredFit(
+        path=path,
+        problem=problem,
+        reading=model["reading"],
+        lane_names=tuple((s, t) for s, t in model["lanes"]),
+        theta=theta,
+        covariance=numeric(file["uncertainty"], "covariance"),
+        blind=silent,
+        at_bound=numeric(file["unknowns"], "at_bound") > 0,
+        status=numeric(file["lanes"], "status").astype(int),
+        sigma=_sigma(file["lanes"]),
+        half_width=_known_half_width(problem, numeric(file["uncertainty"], "half_width")),
+        curves=curves,
+        curve_lane=lane,
+        blend=numeric(file["data"], "blend"),
+        files=files,
+    )
+    _check_shapes(stored)
+    return stored
+
+
+def _known_half_width(problem: Problem, half: np.ndarray) -> np.ndarray:
+    """Infinite where noise that should be estimated has no sample left to be estimated from.
+
+    `uncertainty.analyse` puts the normal quantile there, which Student's t never reaches.
+    """
+    return np.where((half == NORMAL) & ~np.array(problem.noise_given[0]), np.inf, half)
+
+
+def _sigma(lanes: Any) -> np.ndarray:
+    """Noise of each kind; NaN where a lane has no samples of it (a fit without markers, say)."""
+    sigma = numeric(lanes, "sigma")
+    rms = numeric(lanes, "rms")
+    return np.where(np.isnan(rms), np.nan, sigma) if rms.shape == sigma.shape else sigma
+
+
+def _json(group: Any) -> Any:
+    """The JSON text of a group.
+
+    Raises:
+        ValueError: no such text.
+    """
+    return json.loads(numeric(group, "description").astype(np.uint8).tobytes().decode())
+
+
+def _read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str]]:
+    """Curves without markers, the lane of each, and SHA-256 by file name."""
+    names = _json(group)
+    samples = numeric(group, "samples").astype(int)
+    ends = np.cumsum(samples)
+    column = {c: numeric(group, c) for c in ("displacement", "force", "sigma", "s_c", "phi_c")}
+    curves = []
+    texts = zip(names["specimen"], names["trial"], names["source"], strict=True)
+    for i, (specimen, trial, source) in enumerate(texts):
+        part = slice(ends[i] - samples[i], ends[i])
+        sigma = column["sigma"][part]
+        curves.append(
+            Curve(
+                specimen=specimen,
+                trial=trial,
+                s_c=None if np.isnan(column["s_c"][i]) else float(column["s_c"][i]),
+                phi_c=float(column["phi_c"][i]),
+                displacement=column["displacement"][part],
+                force=column["force"][part],
+                sigma=None if np.isnan(sigma).all() else sigma,
+                source=source,
+            )
+        )
+    return tuple(curves), numeric(group, "lane").astype(int), names["files"]
+
+
+def _check_shapes(stored: StoredFit) -> None:
+    """Refuse arrays that do not belong together.
+
+    Raises:
+        ValueError: naming the array.
+    """
+    L, P = len(stored.problem.unknowns), stored.theta.shape[-1]
+    shapes = {
+        "theta": (L, P), "covariance": (L, P, P), "blind": (L, P, P), "at_bound": (L, P),
+        "status": (L,), "sigma": (L, 2), "half_width": (L,), "curve_lane": (len(stored.curves),),
+        "blend": (len(stored.curves),),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        if getattr(stored, name).shape != shape:
+            raise ValueError(f"{name} has shape {getattr(stored, name).shape}, expected {shape}")
+    known = {int(s) for s in FitStatus}
+    if max(map(len, stored.problem.unknowns), default=0) > P or set(stored.status) - known:
+        raise ValueError("unknowns or statuses that do not belong together")
+    lanes = set(stored.curve_lane.tolist())
+    if not stored.curves or not lanes <= set(range(L)):
+        raise ValueError("curves that belong to no lane")
+    if any(not len(c.force) or len(c.force) != len(c.displacement) for c in stored.curves):
+        raise ValueError("curves without samples")

@@ -1,0 +1,1 @@
+"""Measured force-displacement curves: readers, checks, loading rule; no JAX, no model."""

@@ -1,0 +1,209 @@
+"""The checks every curve passes, whatever its file: sign, loading branch, window, plausibility."""
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from jaxtrachea.measurements.curve import BadCurve, Curve, Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.loading import check_one_loading, segments_of, selection, usage_of
+
+#: Positions that differ by less, mm and rad, are one: a stage of the rig stands no steadier.
+STEADY = {"s": 0.05, "phi": 1e-3}
+#: Below this correlation of force with displacement a curve has its force upside down.
+UPSIDE_DOWN = -0.5
+
+
+def finish(raw: RawCurve, options: ReadOptions) -> Curve | BadCurve:
+    """Turn what a reader found into a usable curve, or into the reason why it is none.
+
+    Order: shapes, finite numbers, signs, plausible size, segments, displacement window, number of
+    points, monotone displacement (where required), signal.
+
+    Args:
+        raw: the curve as read, in mm, N, rad.
+        options: signs, loading rule, window and limits.
+
+    Returns:
+        The curve with its own float64 arrays, or a `BadCurve`.
+    """
+    try:
+        return _finish(raw, options)
+    except Fault as fault:
+        return bad(raw.specimen, raw.trial, raw.source, fault)
+
+
+def bad(specimen: str, trial: str, source: str, fault: Fault) -> BadCurve:
+    """The record of a fault, its message headed by the place and kept on one line."""
+    message = " ".join(f"{source}: {fault.message}".split())
+    return BadCurve(specimen, trial, source, fault.kind, message, fault.cure)
+
+
+def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
+    _check_shapes(raw)
+    _check_finite(raw)
+    s_c = _position("s", raw.s, options.s_mm, "mm")
+    phi_c = _position("phi", raw.phi, options.phi_rad, "rad") or 0.0
+    if abs(phi_c) > 2 * math.pi:
+        raise Fault(
+            "absurd_scale", f"phi is {phi_c:g} rad, more than a turn", "is its unit deg, not rad?"
+        )
+    displacement = options.displacement_sign * raw.displacement
+    force = options.force_sign * raw.force
+    _check_scale(raw, displacement, force, options)
+    found = segments_of(raw, displacement, force, options)
+    keep = selection(displacement, found, options)
+    _check_amount(keep, displacement, options)
+    if options.loading == "require-monotone":
+        check_one_loading(raw, displacement, keep, found)
+    _check_signal(displacement[keep], force[keep])
+    joints = raw.joint_displacement
+    return Curve(
+        specimen=raw.specimen,
+        trial=raw.trial,
+        s_c=s_c,
+        phi_c=float(phi_c),
+        displacement=np.ascontiguousarray(displacement[keep], dtype=np.float64),
+        force=np.ascontiguousarray(force[keep], dtype=np.float64),
+        sigma=None if raw.sigma is None else raw.sigma[keep].astype(np.float64),
+        joint_rings=None if raw.joint_rings is None else raw.joint_rings.astype(np.int64),
+        joint_displacement=None if joints is None else joints[keep].astype(np.float64),
+        source=raw.source,
+        usage=usage_of(raw, displacement, force, keep, found, options),
+    )
+
+
+def _check_shapes(raw: RawCurve) -> None:
+    n = raw.displacement.shape
+    if len(n) != 1 or raw.force.shape != n or (raw.sigma is not None and raw.sigma.shape != n):
+        sigma = "" if raw.sigma is None else f", sigma {raw.sigma.shape}"
+        raise Fault(
+            "shape",
+            f"displacement has shape {n}, force {raw.force.shape}{sigma};"
+            " expected one value per sample in each",
+            "store vectors of one length",
+        )
+    if n[0] == 0:
+        raise Fault("empty", "there are no samples", "remove the curve or export it again")
+    if raw.time is not None and raw.time.shape != n:
+        raise Fault("shape", f"time has shape {raw.time.shape}, displacement {n}", "store both")
+    rings, joints = raw.joint_rings, raw.joint_displacement
+    if (rings is None) != (joints is None):
+        raise Fault(
+            "shape", "joint displacements and ring numbers must come together", "store both"
+        )
+    if rings is None or joints is None:
+        return
+    if rings.ndim != 1 or joints.shape != (n[0], rings.size):
+        raise Fault(
+            "shape",
+            f"joint displacements have shape {joints.shape},"
+            f" expected {(n[0], rings.size)} (samples, markers)",
+            "store one row per sample and one column per ring",
+        )
+    if rings.size and (rings.min() < 0 or np.unique(rings).size != rings.size):
+        raise Fault(
+            "shape", "a ring number is repeated or below 1", "give each ring once, counted from 1"
+        )
+
+
+def _listed(rows: Iterable, word: str) -> str:
+    """``lines 3, 4, 9 and 12 more``."""
+    rows = [int(row) for row in rows]
+    more = f" and {len(rows) - 5} more" if len(rows) > 5 else ""
+    return f"{word}{'s' if len(rows) > 1 else ''} {', '.join(map(str, rows[:5]))}{more}"
+
+
+def _check_finite(raw: RawCurve) -> None:
+    columns = {"displacement": raw.displacement, "force": raw.force, "sigma": raw.sigma}
+    columns["time"] = raw.time
+    for name, values in columns.items():
+        if values is not None and not np.isfinite(values).all():
+            rows = raw.rows[~np.isfinite(values)]
+            raise Fault(
+                "non_finite",
+                f"{name} is empty, NaN or infinite in {_listed(rows, raw.row_word)}",
+                "remove these samples from the file",
+            )
+    if raw.joint_displacement is not None and np.isinf(raw.joint_displacement).any():
+        rows = raw.rows[np.isinf(raw.joint_displacement).any(axis=1)]
+        raise Fault(
+            "non_finite",
+            f"a joint displacement is infinite in {_listed(rows, raw.row_word)}",
+            "leave a marker that was not seen empty or NaN",
+        )
+    if raw.sigma is not None and not (raw.sigma > 0).all():
+        raise Fault(
+            "bad_sigma",
+            f"sigma is not positive in {_listed(raw.rows[~(raw.sigma > 0)], raw.row_word)}",
+            "give the standard deviation of the force, or no sigma at all",
+        )
+
+
+def _position(name: str, own: float | None, common: float | None, unit: str) -> float | None:
+    """Position of the curve from the file and from the options, which must agree."""
+    for value in (own, common):
+        if value is not None and not abs(value) <= 1e5:
+            raise Fault("position", f"{name} is {value:g} {unit}", "give a finite position")
+    if own is None or common is None:
+        return common if own is None else own
+    if abs(own - common) > STEADY[name]:
+        raise Fault(
+            "position",
+            f"{name} is {own:g} {unit} in the file but {common:g} {unit} in the options",
+            f"remove {name} from the options if the files give it",
+        )
+    return own
+
+
+def _check_scale(
+    raw: RawCurve, displacement: np.ndarray, force: np.ndarray, options: ReadOptions
+) -> None:
+    limits = (
+        ("displacement", displacement, options.max_displacement, "mm"),
+        ("force", force, options.max_force, "N"),
+    )
+    for name, values, limit, unit in limits:
+        worst = int(np.argmax(np.abs(values)))
+        if abs(values[worst]) > limit:
+            raise Fault(
+                "absurd_scale",
+                f"{name} reaches {values[worst]:.4g} {unit} in {raw.row_word} {raw.rows[worst]};"
+                f" at most {limit:g} {unit} is plausible",
+                f"check the unit of the {name} (in Python also ReadOptions(max_{name}=...))",
+            )
+
+
+def _check_amount(keep: np.ndarray, displacement: np.ndarray, options: ReadOptions) -> None:
+    if keep.sum() < options.min_points:
+        left = "" if keep.all() else f" of {keep.size} after choosing branch and window"
+        raise Fault(
+            "too_few_points",
+            f"{keep.sum()} samples{left}, expected at least {options.min_points}",
+            "record more samples, or widen displacement_min and displacement_max",
+        )
+    extent = float(np.ptp(displacement[keep]))
+    if extent < options.min_range:
+        raise Fault(
+            "absurd_scale",
+            f"displacement covers {extent:.4g} mm; at least {options.min_range:g} mm is plausible",
+            "check the unit of the displacement (in Python also ReadOptions(min_range=...))",
+        )
+
+
+def _check_signal(displacement: np.ndarray, force: np.ndarray) -> None:
+    if np.ptp(force) == 0:
+        raise Fault(
+            "no_signal",
+            f"force is {force[0]:g} N in every sample",
+            "check that the load cell was connected and the right column read",
+        )
+    # Scaled to unit range first: the squares of tiny forces would underflow.
+    scaled = (displacement / np.ptp(displacement), force / np.ptp(force))
+    if np.corrcoef(*scaled)[0, 1] < UPSIDE_DOWN:
+        raise Fault(
+            "sign",
+            "force falls while displacement grows; inward displacement and resisting force count"
+            " positive",
+            "use force_sign = -1 or displacement_sign = -1 as the file counts them",
+        )

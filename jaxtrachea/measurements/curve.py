@@ -1,0 +1,306 @@
+"""What a reader hands over: curves, what could not be used, and the errors in between."""
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Integer
+
+from jaxtrachea.measurements.usage import Usage
+from jaxtrachea.units import UnitError, parse_quantity, unit_factor
+
+
+class DataError(ValueError):
+    """A whole file or study cannot be read; the message names file, place, expectation and cure."""
+
+
+class Fault(Exception):
+    """One curve cannot be used; becomes a `BadCurve`, or a `DataError` if it spoils the file."""
+
+    def __init__(self, kind: str, message: str, cure: str) -> None:
+        """Say what is wrong.
+
+        Args:
+            kind: short code, see `BadCurve.kind`.
+            message: what was found where, and what was expected.
+            cure: what to do about it.
+        """
+        super().__init__(f"{message}; {cure}")
+        self.kind, self.message, self.cure = kind, message, cure
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One trial: force against displacement at one contact point, in mm, N, rad.
+
+    Attributes:
+        specimen: name of the specimen.
+        trial: name of the trial, unique within the specimen.
+        s_c: contact position along the centreline, mm; None if the file does not say.
+        phi_c: contact angle from the anterior midline, rad.
+        displacement: (N,) mm, positive inward (press).
+        force: (N,) N, positive resisting.
+        sigma: (N,) N, standard deviation of each force sample, or None.
+        joint_rings: (M,) 0-based ring index of each marker, or None.
+        joint_displacement: (N, M) mm along the inward normal, NaN where not observed, or None.
+        source: file, and lines or group, it came from.
+        usage: what of the record this is, or None if nobody says.
+    """
+
+    specimen: str
+    trial: str
+    s_c: float | None
+    phi_c: float
+    displacement: Float64[np.ndarray, " n"]
+    force: Float64[np.ndarray, " n"]
+    sigma: Float64[np.ndarray, " n"] | None = None
+    joint_rings: Integer[np.ndarray, " m"] | None = None
+    joint_displacement: Float64[np.ndarray, "n m"] | None = None
+    source: str = ""
+    usage: Usage | None = None
+
+
+@dataclass(frozen=True)
+class BadCurve:
+    """What could not be used, one per (specimen, trial).
+
+    Attributes:
+        specimen: name of the specimen.
+        trial: name of the trial.
+        source: file, and lines or group, it came from.
+        kind: short code: "empty", "too_few_points", "unparsable", "ragged", "column_missing",
+            "ambiguous", "unit_missing", "unit_unknown", "shape", "non_finite", "bad_sigma",
+            "position", "absurd_scale", "time", "non_monotone", "no_signal", "sign",
+            "metadata_missing", "unreadable".
+        message: one line: file, place, what was found and what expected.
+        cure: one line.
+    """
+
+    specimen: str
+    trial: str
+    source: str
+    kind: str
+    message: str
+    cure: str
+
+    @property
+    def reason(self) -> str:
+        """Kind, place, what is wrong and the cure, in one line."""
+        place = "" if self.message.startswith(self.source) else f"{self.source}: "
+        return f"{self.kind}: {place}{self.message}; {self.cure}"
+
+
+@dataclass(frozen=True, eq=False)
+class RawCurve:
+    """A curve as a reader found it: units converted (mm, N, rad), nothing else checked or changed.
+
+    `rows` numbers the samples for messages: lines of a text file, or samples counted from 1.
+    """
+
+    specimen: str
+    trial: str
+    source: str
+    displacement: np.ndarray
+    force: np.ndarray
+    rows: np.ndarray
+    row_word: str = "line"
+    s: float | None = None
+    phi: float | None = None
+    sigma: np.ndarray | None = None
+    joint_rings: np.ndarray | None = None
+    joint_displacement: np.ndarray | None = None
+    time: np.ndarray | None = None
+
+
+FORMATS = ("auto", "tidy", "machine", "hdf5", "afmformats")
+#: "loading" is the former name of "first".
+LOADINGS = ("last", "first", "loading", "all", "require-monotone")
+ROLE_DIMENSIONS = {
+    "s": "length",
+    "phi": "angle",
+    "displacement": "length",
+    "force": "force",
+    "sigma": "force",
+    "time": "time",
+    "joint": "length",
+}
+ROLES = ("specimen", "trial", *ROLE_DIMENSIONS)
+# A marker column in a header, and its role: ring numbers count from 1 at the carina end.
+JOINT = re.compile(r"joint[ _]?(\d{1,4})")
+JOINT_ROLE = re.compile(r"joint_[1-9]\d{0,3}")
+
+
+def role_dimension(role: str) -> str:
+    """Dimension of a role, e.g. ``"length"`` for ``"displacement"`` or ``"joint_7"``."""
+    return ROLE_DIMENSIONS["joint" if JOINT_ROLE.fullmatch(role) else role]
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    r"""How to read the files of one study.
+
+    Attributes:
+        format: "auto" (by content), "tidy", "machine", "hdf5" or "afmformats".
+        columns: role -> column name. Roles: specimen, trial, s, phi, displacement, force, sigma,
+            time, and ``joint_7`` for the marker of ring number 7 (counted from 1).
+        units: role -> unit, for a file that names none; against what the file says, it is an error.
+        specimen: how a file name gives specimen and trial: a template ``"{specimen}_A{trial}"`` for
+            the name without suffix, or a regular expression searched in the name, such as
+            ``r"(?P<specimen>EF\d+_\w+T)_A(?P<trial>\d)"``. ``s`` and ``phi`` may be named
+            too; their units then stand in `units`.
+        s: position of all curves along the centreline as a quantity, ``"35 mm"``.
+        phi: contact angle of all curves as a quantity, ``"30 deg"``.
+        displacement_min: drop samples below, mm.
+        displacement_max: drop samples above, mm.
+        loading: "last" or "first" (that full loading, from its foot to its peak, without holds;
+            "loading" is "first"), "all" (every sample) or "require-monotone" (a record that is
+            more than one loading, or holds its peak, is bad).
+        force_sign: -1 if the file counts the resisting force negative.
+        displacement_sign: -1 if the file counts inward displacement negative.
+        sheet: which sheet of a workbook holds the table; None: the first that is not hidden.
+        min_points: fewest samples of a curve.
+        max_displacement: largest plausible displacement, mm.
+        min_range: smallest plausible range of displacement, mm.
+        max_force: largest plausible force, N.
+
+    Raises:
+        ValueError: an option is none of the possible ones (`UnitError` for units).
+    """
+
+    format: str = "auto"
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    specimen: str | None = None
+    s: str | None = None
+    phi: str | None = None
+    displacement_min: float | None = None
+    displacement_max: float | None = None
+    loading: str = "last"
+    force_sign: int = 1
+    displacement_sign: int = 1
+    sheet: str | None = None
+    min_points: int = 2
+    max_displacement: float = 1000.0
+    min_range: float = 1e-6
+    max_force: float = 1e5
+
+    def __post_init__(self) -> None:
+        """Refuse what can never work before any file is opened."""
+        _one_of("format", self.format, FORMATS)
+        _one_of("loading", self.loading, LOADINGS)
+        _one_of("force_sign", self.force_sign, (1, -1))
+        _one_of("displacement_sign", self.displacement_sign, (1, -1))
+        for role in [*self.columns, *self.units]:
+            if role not in ROLES and not JOINT_ROLE.fullmatch(role):
+                table = "columns" if role in self.columns else "units"
+                known = ", ".join(ROLES)
+                raise ValueError(f"role {role!r} in {table}; expected one of {known}, joint_<ring>")
+        if "joint" in self.columns:
+            raise ValueError("columns: say which ring the marker is on, as in joint_7")
+        for role, unit in self.units.items():
+            if role in ("specimen", "trial"):
+                raise ValueError(f"units: {role} is a name and has no unit; remove it")
+            _named(f"units.{role}", unit_factor, unit, role_dimension(role))
+        if self.min_points < 2:
+            raise ValueError(f"min_points must be at least 2, got {self.min_points}")
+        low, high = self.displacement_min, self.displacement_max
+        if low is not None and high is not None and not low < high:
+            raise ValueError(f"displacement_min {low} mm must lie below displacement_max {high} mm")
+        for name in ("max_displacement", "min_range", "max_force"):
+            if not (getattr(self, name) > 0 and math.isfinite(getattr(self, name))):
+                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
+        _ = self.s_mm, self.phi_rad, self.name_pattern
+
+    @property
+    def s_mm(self) -> float | None:
+        """Common position along the centreline, mm."""
+        return None if self.s is None else _named("s", parse_quantity, self.s, "length")
+
+    @property
+    def phi_rad(self) -> float | None:
+        """Common contact angle, rad."""
+        return None if self.phi is None else _named("phi", parse_quantity, self.phi, "angle")
+
+    @property
+    def name_pattern(self) -> re.Pattern | None:
+        """`specimen` as a regular expression to search in a file name."""
+        if self.specimen is None:
+            return None
+        text = self.specimen
+        if "(?P<" not in text:
+            parts = re.split(r"\{(\w+)\}", text)
+            parts = [f"(?P<{p}>.+?)" if i % 2 else re.escape(p) for i, p in enumerate(parts)]
+            text = "^" + "".join(parts) + r"(?:\.\w+)?(?:\.gz)?$"
+        try:
+            pattern = re.compile(text)
+        except re.error as error:
+            raise ValueError(
+                f"specimen pattern {self.specimen!r} is no regular expression: {error}; correct it,"
+                ' or write a template "{specimen}_A{trial}"'
+            ) from None
+        if "specimen" not in pattern.groupindex:
+            raise ValueError(
+                f"specimen pattern {self.specimen!r} names no specimen: write it as a template"
+                ' "{specimen}_A{trial}" or with a group (?P<specimen>...)'
+            )
+        return pattern
+
+
+def _named(key: str, convert: Callable, *arguments: object) -> Any:
+    """`convert(*arguments)`, with the key before what it refuses."""
+    try:
+        return convert(*arguments)
+    except UnitError as error:
+        raise UnitError(f"{key}: {error}") from None
+
+
+def _one_of(name: str, value: object, allowed: tuple) -> None:
+    if value not in allowed:
+        raise ValueError(f"{name} must be one of {', '.join(map(str, allowed))}, got {value!r}")
+
+
+@dataclass(frozen=True)
+class FileIdentity:
+    """What the name of a file says about its curves: s in mm, phi in rad, None if not said."""
+
+    specimen: str
+    trial: str | None
+    s: float | None
+    phi: float | None
+
+
+def identify_file(path: Path, options: ReadOptions) -> FileIdentity:
+    """Specimen, trial and position from a file name by `ReadOptions.specimen`.
+
+    Without a pattern the specimen is the file name without its suffix (``.csv`` or ``.csv.gz``).
+
+    Raises:
+        DataError: the pattern does not fit, or s or phi is no number or has no unit.
+    """
+    pattern = options.name_pattern
+    if pattern is None:
+        name = path.with_suffix("") if path.suffix.lower() == ".gz" else path
+        return FileIdentity(name.stem, None, None, None)
+    match = pattern.search(path.name)
+    if match is None:
+        raise DataError(
+            f"{path}: the file name does not fit the specimen pattern {options.specimen!r};"
+            " correct the pattern or leave the file out"
+        )
+    found = match.groupdict()
+    position: dict[str, float | None] = {"s": None, "phi": None}
+    for role in position:
+        if found.get(role) is not None:
+            try:
+                position[role] = parse_quantity(
+                    f"{found[role]} {options.units.get(role, '')}", role_dimension(role)
+                )
+            except ValueError as error:
+                raise DataError(
+                    f"{path}: {role} in the file name: {error}; give its unit in units"
+                ) from None
+    return FileIdentity(found["specimen"], found.get("trial"), position["s"], position["phi"])

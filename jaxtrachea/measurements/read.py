@@ -1,0 +1,226 @@
+"""Measured force-displacement curves: the data model and the one door through which files come in.
+
+Everything past this door is in mm, N, rad, float64 on the host. One bad curve costs only itself: it
+comes back as a `BadCurve` with its reason, and only what spoils a whole file or study raises
+`DataError`. The formats are described in docs/measurements.md.
+"""
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxtrachea.measurements.checks import finish
+from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.readers import afmformats, csv, hdf5, machine_csv
+from jaxtrachea.measurements.readers.lines import Line, Text, is_comment, read_lines
+from jaxtrachea.measurements.readers.patterns import ensure_quick
+from jaxtrachea.measurements.readers.recognise import kind_of
+from jaxtrachea.measurements.readers.safe_hdf5 import opened
+from jaxtrachea.measurements.readers.text import ALIASES, guess_delimiter, split_cells
+from jaxtrachea.measurements.readers.workbook import listed, read_sheet
+from jaxtrachea.units import column_unit
+
+__all__ = [
+    "BadCurve",
+    "Curve",
+    "DataError",
+    "Measurements",
+    "ReadOptions",
+    "read_measurements",
+    "write_hdf5",
+]
+
+_TEXT_READERS = {"tidy": csv.read, "machine": machine_csv.read}
+_FILE_READERS = {"hdf5": hdf5.read, "afmformats": afmformats.read}
+#: What another sheet of the same workbook may mend.
+_OF_THE_SHEET = ("empty", "column_missing")
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """The curves of a study.
+
+    Attributes:
+        curves: usable curves, in the order of the files and within them.
+        bad: what could not be used, in the same order.
+        files: the files read.
+        notes: what a user should know of how they were read, in a line each.
+    """
+
+    curves: tuple[Curve, ...]
+    bad: tuple[BadCurve, ...]
+    files: tuple[Path, ...]
+    notes: tuple[str, ...] = ()
+
+    def sha256(self) -> dict[str, str]:
+        """SHA-256 of each file as it is now, in hexadecimal, by its path as given.
+
+        Raises:
+            OSError: a file has gone.
+        """
+        digests = {}
+        for path in self.files:
+            with path.open("rb") as stream:
+                digests[str(path)] = hashlib.file_digest(stream, "sha256").hexdigest()
+        return digests
+
+
+def read_measurements(
+    paths: Sequence[Path | str], options: ReadOptions | None = None
+) -> Measurements:
+    """Read measured curves from files of one study.
+
+    Args:
+        paths: the files, at least one.
+        options: how to read them; by default by content.
+
+    Returns:
+        Usable curves and bad ones, in mm, N, rad.
+
+    Raises:
+        DataError: a file is missing, unreadable, hostile or of no known format, its table is
+            malformed, a (specimen, trial) comes twice, or the specimen pattern backtracks for
+            seconds on the name of a file.
+    """
+    options = options or ReadOptions()
+    if isinstance(paths, (str, bytes)) or not paths:
+        raise DataError(f"paths is {paths!r}; expected a list of at least one file")
+    files = tuple(Path(path) for path in paths)
+    curves: list[Curve] = []
+    bad: list[BadCurve] = []
+    notes: list[str] = []
+    if options.name_pattern is not None:
+        ensure_quick(options.name_pattern, [path.name for path in files])
+    seen: dict[tuple[str, str], str] = {}
+    for path in files:
+        _check_file(path)
+        records, said = _read_file(path, options)
+        notes.extend(said)
+        for record in records:
+            key = (record.specimen, record.trial)
+            if key in seen:
+                raise DataError(
+                    f"{record.source}: specimen {key[0]!r} trial {key[1]!r} was already in"
+                    f" {seen[key]}; rename one, or give a specimen pattern that tells files apart"
+                )
+            seen[key] = record.source
+            done = record if isinstance(record, BadCurve) else finish(record, options)
+            if isinstance(done, BadCurve):
+                bad.append(done)
+            else:
+                curves.append(done)
+    return Measurements(tuple(curves), tuple(bad), files, tuple(notes))
+
+
+def write_hdf5(
+    path: Path | str,
+    measurements: Measurements,
+    *,
+    attrs: Mapping[str, str | int | float] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write the usable curves in the project's own HDF5 schema; bad ones are not written.
+
+    The file is written beside its place and then moved there, so it is complete or absent.
+
+    Args:
+        path: the file to write.
+        measurements: the curves.
+        attrs: further root attributes, such as licence and source.
+        overwrite: replace an existing file.
+
+    Raises:
+        FileExistsError: `path` exists and `overwrite` is False.
+        ValueError: `attrs` sets the schema, or a (specimen, trial) comes twice.
+    """
+    hdf5.write(Path(path), measurements.curves, dict(attrs or {}), overwrite)
+
+
+def _check_file(path: Path) -> None:
+    if not path.exists():
+        raise DataError(f"{path}: no such file; check the path")
+    if not path.is_file():
+        what = "a folder, so is no file" if path.is_dir() else "a device or a pipe, so is no file"
+        raise DataError(f"{path}: is {what}; list files with curves instead")
+
+
+def _read_file(path: Path, options: ReadOptions) -> tuple[list[RawCurve | BadCurve], list[str]]:
+    """What one file holds, and what should be said of it.
+
+    Raises:
+        DataError: as `read_measurements`.
+    """
+    asked = None if options.format == "auto" else options.format
+    named_hdf5 = path.suffix.lower() in (".h5", ".hdf5")
+    found = "hdf5" if named_hdf5 and asked is None else kind_of(path)
+    if found == "hdf5" and asked is None:
+        asked = _sniff_hdf5(path)
+    if asked in _FILE_READERS and found != "xlsx":
+        return _FILE_READERS[asked](path, options), []
+    if found == "xlsx" and asked not in _FILE_READERS:
+        return _read_workbook(path, asked, options)
+    if found != "text":
+        what = "HDF5" if found == "hdf5" else "a workbook (xlsx)"
+        raise DataError(f"{path}: is {what}, but data.format is {asked!r}; remove data.format")
+    text = Text(path, read_lines(path))
+    kind = asked or _sniff(text.lines)
+    if kind == "afmformats":
+        return afmformats.read(path, options), []
+    return _TEXT_READERS[kind](text, options), []
+
+
+def _read_workbook(
+    path: Path, asked: str | None, options: ReadOptions
+) -> tuple[list[RawCurve | BadCurve], list[str]]:
+    """The curves of a sheet, and which sheet it is if there are several.
+
+    Raises:
+        DataError: the workbook or the table of the sheet cannot be read.
+    """
+    text, sheets = read_sheet(path, options.sheet)
+    others = listed([name for name in sheets if name != text.sheet])
+    hint = f", or choose another sheet with data.sheet ({others})" if others else ""
+    kind = asked or _sniff(text.lines)
+    try:
+        records = _TEXT_READERS["tidy" if kind == "afmformats" else kind](text, options)
+    except DataError as error:
+        raise DataError(f"{error}{hint}") from None
+    records = [
+        dataclasses.replace(r, cure=r.cure + hint)
+        if isinstance(r, BadCurve) and r.kind in _OF_THE_SHEET
+        else r
+        for r in records
+    ]
+    note = f"{path}: sheet {text.sheet!r} was read, not {others}; data.sheet chooses another"
+    return records, [note] if others else []
+
+
+def _sniff(lines: list[Line]) -> str:
+    """Format of a text by its lines."""
+    if any("BEGIN METADATA" in line.text for line in lines[:10]):
+        return "afmformats"
+    content = [line.text for line in lines if not is_comment(line)]
+    if not content:
+        return "machine"
+    if content[0].lstrip().startswith("{"):
+        return "tidy"
+    try:
+        cells = split_cells(content[0], guess_delimiter(content[0]))
+    except Fault:
+        return "machine"
+    names = {column_unit(cell)[0].lower() for cell in cells}
+    return "tidy" if names & set(ALIASES["specimen"]) else "machine"
+
+
+def _sniff_hdf5(path: Path) -> str:
+    with opened(path, audit=False) as file:
+        if "schema" in file.attrs:
+            return "hdf5"
+        if any(name.isdecimal() for name in file):
+            return "afmformats"
+    raise DataError(
+        f"{path}: HDF5 of no known layout; expected root attribute schema ="
+        f' "{hdf5.SCHEMA}", or groups 0, 1, ... of afmformats'
+    )

@@ -1,0 +1,242 @@
+"""Force-distance curves exported by afmformats (HDF5 or tab), in its layout of version 0.13.
+
+A cantilever pushes with its free end: while its base advances by the fall of the height, its
+bending takes back F/k. The displacement of the tip, counted from the first sample, is
+
+    D_i = (h_0 - h_i) - (F_i - F_0) / k,
+
+h: "height (measured)", which falls on approach; F: force, positive when repelled; k: the metadata
+"spring constant". Where the file holds "tip position" p, D_i = p_0 - p_i. Approach before contact
+counts into D, and force offsets stay: finding the contact point is not the reader's business. Only
+segment 0 (approach) is kept, unless every sample is asked for with ``loading = "all"``.
+"""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxtrachea.measurements.checks import bad
+from jaxtrachea.measurements.curve import (
+    BadCurve,
+    DataError,
+    Fault,
+    FileIdentity,
+    RawCurve,
+    ReadOptions,
+    identify_file,
+)
+from jaxtrachea.measurements.readers.lines import Line, read_lines
+from jaxtrachea.measurements.readers.safe_hdf5 import attribute, numeric, opened, unit_of
+from jaxtrachea.measurements.readers.text import numbers, read_rows, resolve_unit
+from jaxtrachea.units import convert
+
+# afmformats fixes the unit of each column to SI; its tab files do not repeat it.
+SI_UNITS = {
+    "force": "N",
+    "height (measured)": "m",
+    "height (piezo)": "m",
+    "tip position": "m",
+    "time": "s",
+    "segment": "",
+    "index": "",
+}
+
+
+def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
+    """Read the curves of an afmformats file; `columns.displacement` may name another height column.
+
+    Args:
+        path: the file, HDF5 or tab (told apart by content).
+        options: naming, loading rule, columns.
+
+    Returns:
+        One record per curve, in the order of their numbers.
+
+    Raises:
+        DataError: damaged or hostile file, or one without curves.
+    """
+    who = identify_file(path, options)
+    with path.open("rb") as stream:
+        is_hdf5 = stream.read(8) == b"\x89HDF\r\n\x1a\n"
+    return _read_hdf5(path, who, options) if is_hdf5 else [_read_tab(path, who, options)]
+
+
+def _read_hdf5(path: Path, who: FileIdentity, options: ReadOptions) -> list[RawCurve | BadCurve]:
+    found: list[RawCurve | BadCurve] = []
+    with opened(path) as file:
+        names = sorted((name for name in file if re.fullmatch(r"\d{1,9}", name)), key=int)
+        for name in names:
+            source = f"{path}:/{name}"
+            trial = (
+                name
+                if who.trial is None
+                else who.trial
+                if len(names) == 1
+                else f"{who.trial}-{name}"
+            )
+            group = file[name]
+            try:
+                if not hasattr(group, "items"):
+                    raise Fault("shape", "is a dataset, expected a group", "export the file again")
+                columns = {key: numeric(group, key) for key in group if key in _wanted(options)}
+                units = {key: unit_of(group, key) for key in columns}
+                metadata = {"spring constant": attribute(group, "spring constant")}
+                rows = (
+                    np.arange(1, columns["force"].size + 1) if "force" in columns else np.zeros(0)
+                )
+                found.append(
+                    _curve(
+                        columns,
+                        units,
+                        metadata,
+                        rows,
+                        "sample",
+                        (who, trial, source),
+                        options,
+                    )
+                )
+            except Fault as fault:
+                found.append(bad(who.specimen, trial, source, fault))
+    if not found:
+        raise DataError(
+            f"{path}: no groups 0, 1, ... as afmformats writes them; export the file again"
+        )
+    return found
+
+
+def _read_tab(path: Path, who: FileIdentity, options: ReadOptions) -> RawCurve | BadCurve:
+    trial = who.trial or "0"
+    source = str(path)
+    try:
+        lines = read_lines(path)
+        names, metadata, lines = _tab_head(path, lines)
+        line_numbers, rows = read_rows(lines, len(names), "\t")
+        columns = {}
+        for i, name in enumerate(names):
+            if name in _wanted(options):
+                cells = [_truth(row[i]) if name == "segment" else row[i] for row in rows]
+                columns[name] = numbers(cells, line_numbers, name, ",")
+        units = {name: SI_UNITS.get(name) for name in columns}
+        place = (who, trial, source)
+        return _curve(columns, units, metadata, np.array(line_numbers), "line", place, options)
+    except Fault as fault:
+        return bad(who.specimen, trial, source, fault)
+
+
+def _wanted(options: ReadOptions) -> set[str]:
+    chosen = {options.columns[r] for r in ("displacement", "force") if r in options.columns}
+    return {"force", "height (measured)", "tip position", "segment"} | chosen
+
+
+def _truth(cell: str) -> str:
+    return {"True": "1", "False": "0"}.get(cell, cell)
+
+
+def _tab_head(path: Path, lines: list[Line]) -> tuple[list[str], Mapping[str, Any], list[Line]]:
+    """Metadata and column names, both in comments; the rows are what is left."""
+    texts = [line.text.strip().removeprefix("#").strip() for line in lines]
+    if "BEGIN METADATA" not in texts or "END METADATA" not in texts:
+        raise Fault(
+            "metadata_missing", "no BEGIN METADATA ... END METADATA", "export the file again"
+        )
+    begin, end = texts.index("BEGIN METADATA"), texts.index("END METADATA")
+    try:
+        metadata = json.loads("\n".join(texts[begin + 1 : end]))
+    except (ValueError, RecursionError) as error:
+        raise Fault(
+            "metadata_missing", f"the metadata are no JSON ({error})", "export the file again"
+        ) from None
+    if not isinstance(metadata, dict):
+        raise Fault("metadata_missing", "the metadata are no JSON object", "export the file again")
+    for i in range(end + 1, len(lines)):
+        if lines[i].text.startswith("#") and texts[i]:
+            names, first = _split_glued(texts[i].split("\t"))
+            return names, metadata, [Line(lines[i].number, row) for row in first] + lines[i + 1 :]
+    raise DataError(f"{path}: no line with column names after the metadata; export the file again")
+
+
+def _split_glued(cells: list[str]) -> tuple[list[str], list[str]]:
+    """Names, and the first row if it hangs on the header, as version 0.13.3 leaves it."""
+    for i, cell in enumerate(cells):
+        for name in SI_UNITS:
+            if cell.startswith(name) and re.fullmatch(
+                r"[-+.\deE]+|True|False|nan", cell[len(name) :]
+            ):
+                if len(cells) == 2 * i + 1:
+                    return [*cells[:i], name], ["\t".join([cell[len(name) :], *cells[i + 1 :]])]
+    return cells, []
+
+
+def _curve(
+    columns: Mapping[str, np.ndarray],
+    units: Mapping[str, str | None],
+    metadata: Mapping[str, Any],
+    rows: np.ndarray,
+    row_word: str,
+    place: tuple[FileIdentity, str, str],
+    options: ReadOptions,
+) -> RawCurve:
+    """Force and tip displacement of one curve, from its columns in file units."""
+    who, trial, source = place
+    force = _column(options.columns.get("force", "force"), "force", columns, units, source, options)
+    position = _tip_position(force, columns, units, metadata, source, options)
+    keep = np.ones(force.shape, dtype=bool)
+    if "segment" in columns and options.loading != "all":
+        if columns["segment"].shape != force.shape:
+            raise Fault("shape", "segment and force differ in length", "export again")
+        keep = columns["segment"] == 0
+    position, force, rows = position[keep], force[keep], rows[keep]
+    displacement = position[:1] - position if position.size else position
+    return RawCurve(
+        who.specimen, trial, source, displacement, force, rows, row_word, s=who.s, phi=who.phi
+    )
+
+
+def _tip_position(
+    force: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+    units: Mapping[str, str | None],
+    metadata: Mapping[str, Any],
+    source: str,
+    options: ReadOptions,
+) -> np.ndarray:
+    """Position of the tip, mm, falling towards the sample: h + F/k, or as the file gives it."""
+    default = "tip position" if "tip position" in columns else "height (measured)"
+    name = options.columns.get("displacement", default)
+    length = _column(name, "displacement", columns, units, source, options)
+    if length.shape != force.shape:
+        raise Fault(
+            "shape", f"force {force.shape} and {name} {length.shape} differ", "export again"
+        )
+    if "height" not in name:
+        return length
+    spring = metadata.get("spring constant")
+    if not isinstance(spring, (int, float, np.number)) or not 0 < spring < 1e9:
+        raise Fault(
+            "metadata_missing",
+            f"spring constant is {spring!r}; the bending cannot be taken out of the height",
+            'export with metadata "spring constant" (N/m), or with a column "tip position"',
+        )
+    return length + force / convert(float(spring), "N/m", "stiffness")
+
+
+def _column(
+    name: str,
+    role: str,
+    columns: Mapping[str, np.ndarray],
+    units: Mapping[str, str | None],
+    source: str,
+    options: ReadOptions,
+) -> np.ndarray:
+    if name not in columns:
+        raise Fault(
+            "column_missing",
+            f"no column {name!r}; there are {sorted(columns)}",
+            "export it as well",
+        )
+    unit = resolve_unit(role, units[name], options, f"{source}/{name}")
+    return np.atleast_1d(convert(columns[name], unit, "force" if role == "force" else "length"))

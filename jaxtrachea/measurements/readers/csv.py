@@ -1,0 +1,239 @@
+"""Tidy CSV or TSV: one row per sample, one table for a whole study."""
+
+import json
+
+import numpy as np
+
+from jaxtrachea.files.tables import unquoted
+from jaxtrachea.measurements.checks import STEADY, bad
+from jaxtrachea.measurements.curve import (
+    BadCurve,
+    DataError,
+    Fault,
+    RawCurve,
+    ReadOptions,
+    identify_file,
+    role_dimension,
+)
+from jaxtrachea.measurements.readers.lines import Line, Text, is_comment
+from jaxtrachea.measurements.readers.text import (
+    Table,
+    find_roles,
+    guess_delimiter,
+    read_rows,
+    require_roles,
+    resolve_unit,
+    role_values,
+    split_cells,
+    time_values,
+)
+from jaxtrachea.units import column_unit, parse_quantity
+
+NUMERIC = ("s", "phi", "displacement", "force", "sigma")
+
+
+def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
+    """Read a tidy table; see docs/measurements.md for the format.
+
+    Args:
+        text: the lines of the file.
+        options: columns, units and naming.
+
+    Returns:
+        One record per (specimen, trial) in file order.
+
+    Raises:
+        DataError: the header, a unit or the shape of the table is wrong.
+    """
+    place, lines = text.place, [line for line in text.lines if not is_comment(line)]
+    try:
+        state, lines = _state(lines, text.word)
+        table = _table(text, lines)
+        roles = find_roles(table.names, options)
+        require_roles(roles, table.names)
+        units = {
+            role: resolve_unit(role, table.units[i], options, f"column {table.names[i]!r}")
+            for role, i in roles.items()
+            if role in NUMERIC or role.startswith("joint_")
+        }
+    except Fault as fault:
+        raise DataError(f"{place}: {fault}") from None
+    except DataError as error:
+        raise DataError(str(error) if place in str(error) else f"{place}: {error}") from None
+    twice = [key for key in state if key in roles]
+    if twice:
+        raise DataError(f"{place}: {twice[0]} stands in the first line and in a column; remove one")
+    groups = _group(table, roles, state, options)
+    return [
+        _curve(table, roles, units, state, key, picked, options) for key, picked in groups.items()
+    ]
+
+
+def _state(lines: list[Line], word: str) -> tuple[dict, list[Line]]:
+    """The optional JSON object on the first line: what holds for the whole table."""
+    if not lines or not lines[0].text.lstrip().startswith("{"):
+        return {}, lines
+    try:
+        state = json.loads(lines[0].text)
+    except (ValueError, RecursionError) as error:
+        raise DataError(
+            f"{word} {lines[0].number}: not a JSON object ({error}); correct it"
+        ) from None
+    known: dict = {key: str(state[key]) for key in ("specimen", "trial") if key in state}
+    for key in ("s", "phi"):
+        if key in state:
+            if not isinstance(state[key], str | int | float):
+                raise DataError(
+                    f"{word} {lines[0].number}: {key}: expected a quantity with its unit,"
+                    ' as "17 mm"'
+                )
+            try:
+                known[key] = parse_quantity(state[key], role_dimension(key))
+            except (ValueError, TypeError) as error:
+                raise DataError(f"{word} {lines[0].number}: {key}: {error}") from None
+    return known, lines[1:]
+
+
+def _table(text: Text, lines: list[Line]) -> Table:
+    if not lines:
+        raise DataError(f"{text.place}: is empty; expected a header with displacement and force")
+    delimiter = guess_delimiter(lines[0].text)
+    header = split_cells(lines[0].text, delimiter)
+    while header and header[-1] == "":
+        header.pop()
+    names, units = zip(*map(column_unit, header), strict=True)
+    repeated = {name for name in names if name and names.count(name) > 1}
+    if repeated:
+        raise DataError(
+            f"{text.place}: {text.word} {lines[0].number}: column {min(repeated)!r} is there"
+            " twice; rename one"
+        )
+    numbers, rows = read_rows(lines[1:], len(header), delimiter, text.word)
+    if not rows:
+        raise DataError(
+            f"{text.place}: no rows below the header in {text.word} {lines[0].number};"
+            " export it again"
+        )
+    return Table(
+        text=text,
+        names=list(names),
+        units=list(units),
+        header_line=lines[0].number,
+        lines=numbers,
+        rows=rows,
+        delimiter=delimiter,
+    )
+
+
+def _group(
+    table: Table, roles: dict[str, int], state: dict, options: ReadOptions
+) -> dict[tuple[str, str], list[int]]:
+    """Row indices of each (specimen, trial); a curve must be one block, or it is there twice."""
+    name = None if "specimen" in {**roles, **state} else identify_file(table.text.path, options)
+    fixed = {
+        "specimen": name.specimen if name else "",
+        "trial": (name and name.trial) or "1",
+        **state,
+    }
+    groups: dict[tuple[str, str], list[int]] = {}
+    last = None
+    for i, row in enumerate(table.rows):
+        specimen, trial = (
+            unquoted(row[roles[role]]) if role in roles else fixed[role]
+            for role in ("specimen", "trial")
+        )
+        key = (specimen, trial)
+        if key == last:
+            groups[key].append(i)
+            continue
+        if fault := _name_fault(table, "specimen", specimen) or _name_fault(table, "trial", trial):
+            raise DataError(f"{table.text.place}: {table.text.word} {table.lines[i]}: {fault}")
+        if key in groups:
+            first = table.lines[groups[key][0]]
+            raise DataError(
+                f"{table.text.place}: specimen {key[0]!r} trial {key[1]!r} starts in"
+                f" {table.text.word} {first} and again in {table.text.word} {table.lines[i]};"
+                " keep the rows of a curve together, or rename it"
+            )
+        groups[key], last = [i], key
+    return groups
+
+
+def _name_fault(table: Table, role: str, name: str) -> str:
+    """What is wrong with a name and its cure; empty if nothing is."""
+    if not name:
+        cure = "name it in every row"
+        if table.text.sheet is not None:
+            cure += " (merged cells hold their value in the first alone: unmerge and fill down)"
+        return f"{role} is empty; {cure}"
+    if name.startswith("=") and table.text.sheet is not None:
+        return (
+            f"{role} {name!r} is a formula without a stored value; open the file in a spreadsheet"
+            " program and save it, or write the name itself"
+        )
+    hidden = [c for c in name if not c.isprintable()]
+    if hidden:
+        return f"{role} {name!a} holds the unprintable character U+{ord(hidden[0]):04X}; rename it"
+    return ""
+
+
+def _curve(
+    table: Table,
+    roles: dict[str, int],
+    units: dict[str, str],
+    state: dict,
+    key: tuple[str, str],
+    picked: list[int],
+    options: ReadOptions,
+) -> RawCurve | BadCurve:
+    rows = np.array([table.lines[i] for i in picked])
+    source = f"{table.text.place}:{rows[0]}-{rows[-1]}"
+    try:
+        values = {
+            role: role_values(table, role, roles[role], picked, unit)
+            for role, unit in units.items()
+        }
+        joints = [role for role in values if role.startswith("joint_")]
+        return RawCurve(
+            *key,
+            source,
+            values["displacement"],
+            values["force"],
+            rows,
+            table.text.word,
+            s=_constant("s", values, state, table, picked),
+            phi=_constant("phi", values, state, table, picked),
+            sigma=values.get("sigma"),
+            joint_rings=np.array([int(r[6:]) - 1 for r in joints]) if joints else None,
+            joint_displacement=np.stack([values[r] for r in joints], axis=1) if joints else None,
+            time=time_values(table, roles, picked, options),
+        )
+    except Fault as fault:
+        return bad(*key, source, fault)
+
+
+def _constant(
+    role: str, values: dict[str, np.ndarray], state: dict, table: Table, picked: list[int]
+) -> float | None:
+    """Position of a curve, which must be the same in all its rows; None if all are empty."""
+    column = values.get(role)
+    if column is None:
+        return state.get(role)
+    if np.isnan(column).all():
+        return None
+    unknown = np.isnan(column)
+    if unknown.any():
+        line = table.lines[picked[int(np.argmax(unknown))]]
+        raise Fault(
+            "position", f"{table.text.word} {line}: {role} is empty or NaN", "give it in every row"
+        )
+    if not np.isfinite(column).all():
+        line = table.lines[picked[int(np.argmin(np.isfinite(column)))]]
+        raise Fault("position", f"{table.text.word} {line}: {role} is infinite", "correct it")
+    if np.ptp(column) > STEADY[role]:
+        raise Fault(
+            "position",
+            f"{role} varies from {np.nanmin(column):g} to {np.nanmax(column):g} within the curve",
+            "give each position its own trial",
+        )
+    return float(column[0] if np.ptp(column) == 0 else column.mean())

@@ -1,0 +1,211 @@
+"""The project's own HDF5 schema, ``specimens/<name>/<trial>``; see docs/measurements.md."""
+
+import os
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from jaxtrachea.measurements.checks import bad
+from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.readers.safe_hdf5 import (
+    attribute,
+    numeric,
+    opened,
+    text_attribute,
+    unit_of,
+)
+from jaxtrachea.measurements.readers.text import resolve_unit
+from jaxtrachea.units import convert
+
+SCHEMA = "jaxtrachea-measurements"
+SCHEMA_VERSION = 1
+# Below this a chunk's overhead outweighs compression.
+COMPRESS_FROM = 512
+
+
+def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
+    """Read every trial; a fault within one costs this trial only.
+
+    Args:
+        path: the file.
+        options: units for datasets that have none.
+
+    Returns:
+        One record per trial, in the order of the file.
+
+    Raises:
+        DataError: damaged or hostile file, another schema or version, or no trial in it.
+    """
+    with opened(path) as file:
+        _check_schema(path, file)
+        found: list[RawCurve | BadCurve] = []
+        for specimen, group in file["specimens"].items():
+            if not hasattr(group, "items") or len(group) == 0:
+                fault = Fault("empty", "the specimen has no trials", "add one group per trial")
+                found.append(bad(unquote(specimen), "-", f"{path}:/specimens/{specimen}", fault))
+                continue
+            for trial, item in group.items():
+                source = f"{path}:/specimens/{specimen}/{trial}"
+                key = (unquote(specimen), unquote(trial))
+                try:
+                    found.append(_trial(item, key, source, options))
+                except Fault as fault:
+                    found.append(bad(*key, source, fault))
+    if not found:
+        raise DataError(f"{path}: /specimens is empty; add one group per specimen and trial")
+    return found
+
+
+def _check_schema(path: Path, file: Any) -> None:
+    try:
+        schema = text_attribute(file, "schema")
+        version = attribute(file, "schema_version")
+    except Fault as fault:
+        raise DataError(f"{path}: {fault}") from None
+    if schema != SCHEMA:
+        raise DataError(
+            f"{path}: root attribute schema is {schema!r}, expected {SCHEMA!r};"
+            " see docs/measurements.md"
+        )
+    if not isinstance(version, (int, np.integer)) or version != SCHEMA_VERSION:
+        raise DataError(
+            f"{path}: schema_version is {version}, this program reads {SCHEMA_VERSION};"
+            " update the program or the file"
+        )
+    if not hasattr(file.get("specimens"), "items"):
+        raise DataError(f"{path}: no group /specimens; expected specimens/<name>/<trial>")
+
+
+def _trial(group: Any, key: tuple[str, str], source: str, options: ReadOptions) -> RawCurve:
+    if not hasattr(group, "items"):
+        raise Fault(
+            "shape", "is a dataset, expected a group for the trial", "store a group per trial"
+        )
+    displacement = _quantity(group, "displacement", "displacement", source, options)
+    rings = joints = None
+    if "joint_displacement" in group or "joint_ring_number" in group:
+        joints = _quantity(group, "joint_displacement", "joint", source, options)
+        rings = numeric(group, "joint_ring_number")
+        if not (np.isfinite(rings).all() and (rings == np.round(rings)).all()):
+            raise Fault("shape", "joint_ring_number is not whole", "number rings 1, 2, ...")
+        rings = rings.astype(np.int64) - 1
+    return RawCurve(
+        *key,
+        source,
+        displacement,
+        _quantity(group, "force", "force", source, options),
+        np.arange(1, displacement.size + 1),
+        "sample",
+        s=_position(group, "s", source, options),
+        phi=_position(group, "phi", source, options),
+        sigma=_quantity(group, "sigma", "sigma", source, options) if "sigma" in group else None,
+        joint_rings=rings,
+        joint_displacement=joints,
+        time=_time(group, source, options),
+    )
+
+
+def _time(group: Any, source: str, options: ReadOptions) -> np.ndarray | None:
+    """Time of a trial, s, where it is stored with a unit."""
+    if "time" not in group or (unit_of(group, "time") or options.units.get("time")) is None:
+        return None
+    unit = resolve_unit("time", unit_of(group, "time"), options, f"{source}/time")
+    return np.atleast_1d(convert(numeric(group, "time"), unit, "time"))
+
+
+def _quantity(group: Any, name: str, role: str, source: str, options: ReadOptions) -> np.ndarray:
+    values = numeric(group, name)
+    unit = resolve_unit(role, unit_of(group, name), options, f"{source}/{name}")
+    return np.atleast_1d(convert(values, unit, "force" if role in ("force", "sigma") else "length"))
+
+
+def _position(group: Any, role: str, source: str, options: ReadOptions) -> float | None:
+    """Attribute ``s_c`` or ``phi_c`` of a trial; its unit is in ``s_c_unit``, ``phi_c_unit``."""
+    name = f"{role}_c"
+    value = attribute(group, name)
+    if value is None:
+        return None
+    if np.ndim(value) != 0 or not isinstance(value, (int, float, np.number)):
+        raise Fault("position", f"attribute {name} is {value!r}", "store one number")
+    unit = resolve_unit(role, text_attribute(group, f"{name}_unit"), options, f"{source}@{name}")
+    return float(convert(float(value), unit, "length" if role == "s" else "angle"))
+
+
+def write(
+    path: Path, curves: Iterable[Curve], attrs: Mapping[str, str | int | float], overwrite: bool
+) -> None:
+    """Write curves in the schema; the file appears complete or not at all.
+
+    Args:
+        path: the file to write, in an existing folder.
+        curves: what to write, in this order.
+        attrs: further root attributes (licence, source, ...).
+        overwrite: replace an existing file.
+
+    Raises:
+        FileExistsError: `path` exists and `overwrite` is False.
+        ValueError: `attrs` touches schema or schema_version, or a (specimen, trial) comes twice.
+    """
+    import h5py
+
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists; choose another name or pass overwrite=True")
+    if {"schema", "schema_version"} & set(attrs):
+        raise ValueError("attrs must not set schema or schema_version; they are fixed")
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+    os.close(handle)
+    try:
+        with h5py.File(name, "w") as file:
+            file.attrs.update({**attrs, "schema": SCHEMA, "schema_version": SCHEMA_VERSION})
+            specimens = file.create_group("specimens", track_order=True)
+            for curve in curves:
+                _write_curve(specimens, curve)
+        with open(name, "rb") as written:
+            os.fsync(written.fileno())
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        os.unlink(name)
+        raise
+
+
+def _group_name(name: str) -> str:
+    """A name as an HDF5 link: ``/`` would nest and ``.`` means the group itself."""
+    if not name:
+        raise ValueError("specimen and trial must have names")
+    quoted = name.replace("%", "%25").replace("/", "%2F").replace("\0", "%00")
+    return quoted.replace(".", "%2E") if set(quoted) == {"."} else quoted
+
+
+def _write_curve(specimens: Any, curve: Curve) -> None:
+    specimen, trial = _group_name(curve.specimen), _group_name(curve.trial)
+    if specimen not in specimens:
+        specimens.create_group(specimen, track_order=True)
+    if trial in specimens[specimen]:
+        raise ValueError(
+            f"specimen {curve.specimen!r} trial {curve.trial!r} comes twice; rename one"
+        )
+    group = specimens[specimen].create_group(trial)
+    if curve.s_c is not None:
+        group.attrs.update({"s_c": float(curve.s_c), "s_c_unit": "mm"})
+    group.attrs.update({"phi_c": float(curve.phi_c), "phi_c_unit": "rad", "source": curve.source})
+    _write_dataset(group, "displacement", curve.displacement, "mm")
+    _write_dataset(group, "force", curve.force, "N")
+    if curve.sigma is not None:
+        _write_dataset(group, "sigma", curve.sigma, "N")
+    if curve.joint_rings is not None and curve.joint_displacement is not None:
+        _write_dataset(group, "joint_displacement", curve.joint_displacement, "mm")
+        _write_dataset(group, "joint_ring_number", np.asarray(curve.joint_rings) + 1, None)
+
+
+def _write_dataset(group: Any, name: str, values: np.ndarray, unit: str | None) -> None:
+    packed = {"compression": "gzip", "shuffle": True, "fletcher32": True}
+    dataset = group.create_dataset(
+        name, data=values, **(packed if values.size >= COMPRESS_FROM else {})
+    )
+    if unit:
+        dataset.attrs["unit"] = unit

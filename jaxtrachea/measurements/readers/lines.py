@@ -1,0 +1,151 @@
+"""Lines of a text file, packed or not: bounded reading, encoding, line ends."""
+
+import gzip
+import re
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxtrachea.measurements.curve import DataError
+
+MAX_TEXT_BYTES = 256 * 2**20
+BLOCK = 2**20
+GZIP = b"\x1f\x8b"
+#: What spreadsheets write in place of a number; a line that starts so is no comment.
+CELL_ERRORS = ("#N/A", "#NV", "#REF!", "#VALUE!", "#DIV/0!", "#NUM!", "#NAME?", "#NULL!")
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a text file or row of a sheet, and its number, counted from 1."""
+
+    number: int
+    text: str
+
+
+@dataclass(frozen=True)
+class Text:
+    """The lines of a text file, or the rows of a sheet as lines separated by tabs.
+
+    Attributes:
+        path: the file.
+        lines: those that hold something.
+        sheet: name of the sheet, None for a text file.
+    """
+
+    path: Path
+    lines: list[Line]
+    sheet: str | None = None
+
+    @property
+    def place(self) -> str:
+        """The file, and the sheet if it has any, for messages."""
+        return str(self.path) if self.sheet is None else f"{self.path} sheet {self.sheet!r}"
+
+    @property
+    def word(self) -> str:
+        """What its lines are called."""
+        return "line" if self.sheet is None else "row"
+
+
+def first_bytes(path: Path, count: int) -> bytes:
+    """The beginning of a file.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return stream.read(count)
+    except OSError as error:
+        raise _unreadable(path, error) from None
+
+
+def first_unpacked(path: Path, count: int) -> bytes:
+    """The beginning of what a gzip file holds.
+
+    Raises:
+        DataError: it cannot be read, or is damaged.
+    """
+    try:
+        with gzip.open(path) as stream:
+            return stream.read(count)
+    except (OSError, EOFError, zlib.error) as error:
+        raise _damaged_gzip(path, error) from None
+
+
+def read_lines(path: Path) -> list[Line]:
+    """All lines of a text file that hold something, with their numbers.
+
+    UTF-8 (with or without byte-order mark) and UTF-16 with one are decoded; other bytes are taken
+    for Latin-1, in which many instruments write µ and °. Unix, DOS and old Mac line ends. A file
+    packed by gzip is unpacked in memory.
+
+    Raises:
+        DataError: the file is too large, packed or unpacked, or unreadable, damaged or binary.
+    """
+    packed = first_bytes(path, 2) == GZIP
+    data = _unpacked(path) if packed else _bytes(path)
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        text = data.decode("utf-16", errors="replace")
+    else:
+        try:
+            text = data.decode("utf-8")
+        except UnicodeDecodeError:
+            text = data.decode("latin-1")
+    text = text.lstrip("\ufeff")
+    if "\0" in text:
+        raise DataError(
+            f"{path}: holds zero bytes, so it is no text table; export it as CSV or HDF5"
+        )
+    lines = re.split(r"\r\n|\n|\r", text)
+    return [Line(i, line) for i, line in enumerate(lines, 1) if line.strip()]
+
+
+def is_comment(line: Line) -> bool:
+    """Whether a line is a ``#`` comment; ``#N/A`` and the like are cells of a spreadsheet."""
+    text = line.text.lstrip()
+    return text.startswith("#") and not text.upper().startswith(CELL_ERRORS)
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(MAX_TEXT_BYTES + 1)
+    except OSError as error:
+        raise _unreadable(path, error) from None
+    if len(data) > MAX_TEXT_BYTES:
+        raise DataError(
+            f"{path}: more than {MAX_TEXT_BYTES} bytes of text, at most so many are read;"
+            " split it or use HDF5"
+        )
+    return data
+
+
+def _unpacked(path: Path) -> bytes:
+    """Content of a gzip file. It is unpacked twice: a bomb is refused before any of it is kept."""
+    try:
+        size = 0
+        with gzip.open(path) as stream:
+            while block := stream.read(BLOCK):
+                size += len(block)
+                if size > MAX_TEXT_BYTES:
+                    raise DataError(
+                        f"{path}: unpacks to more than {MAX_TEXT_BYTES} bytes of text, at most so"
+                        " many are read; unpack it and split it, or use HDF5"
+                    )
+        with gzip.open(path) as stream:
+            return stream.read(size)
+    except (OSError, EOFError, zlib.error) as error:
+        raise _damaged_gzip(path, error) from None
+
+
+def _unreadable(path: Path, error: OSError) -> DataError:
+    return DataError(f"{path}: cannot be read ({error.strerror}); check the permissions")
+
+
+def _damaged_gzip(path: Path, error: Exception) -> DataError:
+    # BadGzipFile is an OSError, but its reason is in its text.
+    return DataError(
+        f"{path}: a gzip file, cut off or damaged ({str(error)[:80]}); copy or pack it again"
+    )

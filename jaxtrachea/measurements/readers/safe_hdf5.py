@@ -1,0 +1,268 @@
+"""Opening HDF5 files that nobody vouches for.
+
+An HDF5 file can name other files (external links, external raw storage, virtual datasets), declare
+exabytes in a few bytes, or loop. The whole file is walked through before a single value is read,
+and anything of the kind refuses the file; links other than hard ones are never followed.
+"""
+
+import math
+import mmap
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxtrachea.measurements.curve import DataError, Fault
+
+MAX_ELEMENTS = 10_000_000
+MAX_TOTAL_ELEMENTS = 100_000_000
+MAX_OBJECTS = 200_000
+MAX_DEPTH = 8
+MAX_ATTRIBUTES = 256
+MAX_ATTRIBUTE_BYTES = 2**20
+# deflate, shuffle, fletcher32, lzf: others would load plug-ins chosen by the file.
+FILTERS = (1, 2, 3, 32000)
+
+
+@contextmanager
+def opened(path: Path, *, audit: bool = True, read: tuple[str, ...] | None = None) -> Iterator[Any]:
+    """Open an HDF5 file for reading after walking through all of it.
+
+    Args:
+        path: the file.
+        audit: walk through it; without that only names may be asked for, no value be read.
+        read: groups and datasets, from the root, whose values will be read; None: all. Others may
+            hold text, and as much as they like.
+
+    Yields:
+        The open `h5py.File`.
+
+    Raises:
+        DataError: not HDF5, truncated, damaged, or refused for what it contains.
+    """
+    import h5py
+
+    try:
+        _check_heaps(path)
+        file = h5py.File(path, "r")
+    except (OSError, RuntimeError, ValueError) as error:
+        raise _damaged(path, error) from None
+    with file:
+        try:
+            if audit:
+                _Audit(path, read).group(file, "", 0)
+        except DataError:
+            raise
+        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+            # The library reports a damaged file by whichever of these its error code maps to.
+            raise _damaged(path, error) from None
+        try:
+            yield file
+        except (OSError, RuntimeError, KeyError) as error:
+            raise _damaged(path, error) from None
+
+
+def _damaged(path: Path, error: Exception) -> DataError:
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return DataError(
+        f"{path}: not a readable HDF5 file, truncated or damaged ({reason});"
+        " copy or export it again"
+    )
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuse a file whose damage would make the library loop for ever over a text attribute.
+
+    Global heap collections ("GCOL") hold variable-length text as a chain of objects, each with its
+    size; the library steps from one to the next and never arrives if the free space claims size 0.
+    Layout: HDF5 File Format Specification 3.0, section III.E, with lengths of 8 bytes.
+
+    Raises:
+        OSError: such a chain, or a file that cannot be read.
+    """
+    if path.stat().st_size == 0:
+        raise OSError("the file is empty")
+    with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        # Collections do not overlap, which bounds the steps; a file made of overlaps is refused.
+        steps = len(data) // 16
+        start = data.find(b"GCOL\1\0\0\0")
+        while start >= 0:
+            end = min(start + int.from_bytes(data[start + 8 : start + 16], "little"), len(data))
+            at = start + 16
+            while at + 16 <= end:
+                steps -= 1
+                size = int.from_bytes(data[at + 8 : at + 16], "little")
+                free = data[at : at + 2] == b"\0\0"
+                if steps < 0 or (free and size < 16):
+                    raise OSError(f"global heap at byte {start} is damaged")
+                at += size if free else 16 + (size + 7) // 8 * 8
+            start = data.find(b"GCOL\1\0\0\0", start + 4)
+
+
+class _Audit:
+    """Walks a file and refuses what a measurement never needs."""
+
+    def __init__(self, path: Path, read: tuple[str, ...] | None = None) -> None:
+        import h5py
+
+        self.path = path
+        self.read = read
+        self.h5: Any = h5py
+        self.objects = 0
+        self.elements = 0
+        self.groups: set = set()
+
+    def refuse(self, name: str, what: str, cure: str) -> DataError:
+        return DataError(f"{self.path}:{name or '/'}: {what}; {cure}")
+
+    def group(self, group: Any, name: str, depth: int) -> None:
+        info = self.h5.h5o.get_info(group.id)
+        if (info.fileno, info.addr) in self.groups:
+            raise self.refuse(
+                name, "is linked from several places or from within itself", "store it once"
+            )
+        self.groups.add((info.fileno, info.addr))
+        if depth > MAX_DEPTH:
+            raise self.refuse(name, f"nested deeper than {MAX_DEPTH} groups", "flatten the file")
+        self.attributes(group, name)
+        links = group.id.links
+        for child in group.id:
+            self.objects += 1
+            if self.objects > MAX_OBJECTS:
+                raise self.refuse(name, f"more than {MAX_OBJECTS} objects in the file", "split it")
+            text = child.decode("utf-8", "replace")
+            where = f"{name}/{text}"
+            if not text.isprintable() or "\ufffd" in text:
+                raise self.refuse(f"{name}/{text!r}", "name with control characters", "rename it")
+            if links.get_info(child).type != self.h5.h5l.TYPE_HARD:
+                raise self.refuse(
+                    where, "is a soft or external link", "store the data itself in its place"
+                )
+            self.member(self.h5.h5o.open(group.id, child), where, depth)
+
+    def member(self, identifier: Any, where: str, depth: int) -> None:
+        if isinstance(identifier, self.h5.h5g.GroupID):
+            self.group(self.h5.Group(identifier), where, depth + 1)
+        elif isinstance(identifier, self.h5.h5d.DatasetID):
+            self.dataset(self.h5.Dataset(identifier), where)
+        else:
+            raise self.refuse(where, "is neither group nor dataset", "remove it")
+
+    def dataset(self, dataset: Any, name: str) -> None:
+        plan = dataset.id.get_create_plist()
+        if plan.get_layout() == self.h5.h5d.VIRTUAL:
+            raise self.refuse(name, "is a virtual dataset", "store the data itself")
+        if plan.get_external_count() > 0:
+            raise self.refuse(name, "keeps its data in another file", "store the data in this one")
+        read = self.read or ("",)
+        if not any(name == start or name.startswith(f"{start}/") for start in read):
+            return
+        numeric = (self.h5.h5t.INTEGER, self.h5.h5t.FLOAT, self.h5.h5t.ENUM)
+        kind = dataset.id.get_type()
+        if kind.get_class() not in numeric or kind.get_size() > 16:
+            raise self.refuse(
+                name,
+                "holds no plain numbers (but object, reference, text, compound or variable length)",
+                "store numbers as integers or floats and text in attributes",
+            )
+        filters = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
+        if any(code not in FILTERS for code in filters):
+            raise self.refuse(name, f"needs compression filters {filters}", "use gzip")
+        size = math.prod(dataset.id.get_space().get_simple_extent_dims() or ())
+        self.elements += size
+        if size > MAX_ELEMENTS or self.elements > MAX_TOTAL_ELEMENTS:
+            raise self.refuse(
+                name,
+                f"declares {size} elements ({self.elements} in the file so far),"
+                f" at most {MAX_ELEMENTS} ({MAX_TOTAL_ELEMENTS}) are read",
+                "thin out or split the recording",
+            )
+        self.attributes(dataset, name)
+
+    def attributes(self, holder: Any, name: str) -> None:
+        count = self.h5.h5a.get_num_attrs(holder.id)
+        if count > MAX_ATTRIBUTES:
+            raise self.refuse(name, f"{count} attributes, at most {MAX_ATTRIBUTES}", "remove some")
+        plain = (self.h5.h5t.INTEGER, self.h5.h5t.FLOAT, self.h5.h5t.ENUM, self.h5.h5t.STRING)
+        for i in range(count):
+            attribute = self.h5.h5a.open(holder.id, index=i)
+            kind = attribute.get_type()
+            label = f"{name or '/'}@{attribute.name.decode('utf-8', 'replace')}"
+            if kind.get_class() not in plain:
+                raise self.refuse(label, "attribute is neither number nor text", "remove it")
+            size = kind.get_size() * math.prod(attribute.shape or ())
+            if size > MAX_ATTRIBUTE_BYTES:
+                raise self.refuse(label, f"attribute of {size} bytes", "remove it")
+
+
+def numeric(group: Any, name: str) -> np.ndarray:
+    """Values of a dataset in an audited file, as float64.
+
+    Raises:
+        Fault: no such dataset ("column_missing"), or its bytes are damaged ("unreadable").
+    """
+    dataset = group.get(name)
+    if dataset is None or hasattr(dataset, "items"):
+        raise Fault(
+            "column_missing",
+            f"no dataset {name!r}; there are {', '.join(map(repr, group)) or 'none'}",
+            "store it, or correct its name",
+        )
+    if dataset.shape is None:
+        raise Fault("shape", f"dataset {name!r} has no shape", "store a vector")
+    try:
+        return np.asarray(dataset[()], dtype=np.float64)
+    except (OSError, RuntimeError, ValueError, TypeError) as error:
+        raise Fault(
+            "unreadable", f"dataset {name!r} is damaged ({error})", "copy the file again"
+        ) from None
+
+
+def unit_of(group: Any, name: str) -> str | None:
+    """Text of the attribute ``unit`` (or ``units``) of a dataset; None if there is none.
+
+    Raises:
+        Fault: the attribute is no text, or the two differ.
+    """
+    dataset = group[name]
+    texts = {text_attribute(dataset, key) for key in ("unit", "units")} - {None}
+    if len(texts) > 1:
+        raise Fault(
+            "unit_unknown", f"{name!r} has two units, {sorted(map(str, texts))}", "remove one"
+        )
+    return texts.pop() if texts else None
+
+
+def text_attribute(holder: Any, name: str) -> str | None:
+    """A text attribute; None if there is none.
+
+    Raises:
+        Fault: it is no text.
+    """
+    value = attribute(holder, name)
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "replace")
+    if value is not None and not isinstance(value, str):
+        raise Fault(
+            "shape", f"attribute {name!r} is {value!r}, expected text", "store it as a string"
+        )
+    return value
+
+
+def attribute(holder: Any, name: str) -> Any:
+    """An attribute of a group or dataset; None if there is none.
+
+    Raises:
+        Fault: its bytes are damaged ("unreadable").
+    """
+    import h5py
+
+    try:
+        # Far cheaper than the exception behind `attrs.get`.
+        return holder.attrs[name] if h5py.h5a.exists(holder.id, name.encode()) else None
+    except (OSError, RuntimeError, ValueError, TypeError) as error:
+        raise Fault(
+            "unreadable", f"attribute {name!r} is damaged ({error})", "copy the file again"
+        ) from None

@@ -1,0 +1,287 @@
+"""What all tables share: cells, numbers, units, and which column plays which role."""
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxtrachea.measurements.curve import JOINT, DataError, Fault, ReadOptions, role_dimension
+from jaxtrachea.measurements.readers.lines import Line, Text, is_comment
+from jaxtrachea.units import UnitError, column_unit, convert, unit_factor
+
+# Column names understood without `ReadOptions.columns`, in lower case.
+ALIASES = {
+    "specimen": ("specimen",),
+    "trial": ("trial",),
+    "s": ("s", "s_c"),
+    "phi": ("phi", "phi_c"),
+    "displacement": ("displacement", "compression", "indentation", "compressive displacement"),
+    "force": ("force", "load", "compressive load", "compressive force"),
+    "sigma": ("sigma", "force_sigma", "force_noise"),
+}
+# Columns of time, taken where they have a unit; they tell the duration of holds.
+TIMES = ("time", "elapsed time", "total time", "test time", "running time")
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_DATE = re.compile(r"\d{4}-\d\d-\d\d|\d\d:\d\d:\d\d")
+
+
+def split_cells(text: str, delimiter: str) -> list[str]:
+    """Cells of one line, stripped; quotes as in CSV.
+
+    Raises:
+        Fault: an unbalanced quote.
+    """
+    if '"' not in text:
+        return [cell.strip() for cell in text.split(delimiter)]
+    try:
+        rows = list(csv.reader([text], delimiter=delimiter, strict=True, skipinitialspace=True))
+    except csv.Error as error:
+        raise Fault(
+            "unparsable", f"quotes do not match ({error})", "close every quote on its line"
+        ) from None
+    return [cell.strip() for cell in rows[0]]
+
+
+def guess_delimiter(header: str) -> str:
+    """Tab, semicolon or comma, whichever comes first in that order."""
+    return next((d for d in "\t;" if d in header), ",")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A header and rows of as many cells.
+
+    Attributes:
+        text: where it comes from.
+        names: column names without units.
+        units: column units, None where the header gives none.
+        header_line: number of the header, in the file or sheet.
+        lines: number of each row.
+        rows: the cells.
+        delimiter: what separates them.
+    """
+
+    text: Text
+    names: list[str]
+    units: list[str | None]
+    header_line: int
+    lines: list[int]
+    rows: list[list[str]]
+    delimiter: str
+
+    def column(self, index: int) -> list[str]:
+        """Cells of one column."""
+        return [row[index] for row in self.rows]
+
+
+def read_rows(
+    lines: Sequence[Line], width: int, delimiter: str, word: str = "line"
+) -> tuple[list[int], list[list[str]]]:
+    """Cells of the rows of a table; empty cells beyond the header are dropped.
+
+    Raises:
+        Fault: a row that has not `width` cells ("ragged"), or unbalanced quotes.
+    """
+    numbers, rows = [], []
+    for line in lines:
+        if is_comment(line):
+            continue
+        try:
+            cells = split_cells(line.text, delimiter)
+        except Fault as fault:
+            raise Fault(fault.kind, f"{word} {line.number}: {fault.message}", fault.cure) from None
+        if not any(cells):
+            continue
+        while len(cells) > width and cells[-1] == "":
+            cells.pop()
+        if len(cells) != width:
+            cure = "complete or remove the row"
+            if word == "row" and len(cells) > width:
+                cure = "clear the cells beside the table, or give their columns a header"
+            elif delimiter == "," and len(cells) > width:
+                cure += "; decimal commas need ; or tab between the columns"
+            raise Fault(
+                "ragged",
+                f"{word} {line.number} has {len(cells)} cells, the header has {width}",
+                cure,
+            )
+        numbers.append(line.number)
+        rows.append(cells)
+    return numbers, rows
+
+
+def find_roles(names: Sequence[str], options: ReadOptions) -> dict[str, int]:
+    """Which column plays which role: by `ReadOptions.columns`, else by the names in `ALIASES`.
+
+    Args:
+        names: column names without units.
+        options: explicit names.
+
+    Returns:
+        Role -> column index, for the roles found.
+
+    Raises:
+        Fault: a named column is absent ("column_missing") or a role has several ("ambiguous").
+    """
+    lower = [name.lower() for name in names]
+    found: dict[str, int] = {}
+    for role in {**ALIASES, **options.columns}:
+        wanted = options.columns.get(role)
+        if wanted is None:
+            hits = [i for i, name in enumerate(lower) if name in ALIASES[role]]
+        else:
+            full = {wanted.strip(), column_unit(wanted)[0]}
+            hits = [i for i, name in enumerate(names) if name in full]
+            if not hits:
+                raise _no_column(wanted, role, names)
+        if len(hits) > 1:
+            several = ", ".join(repr(names[i]) for i in hits)
+            raise Fault(
+                "ambiguous",
+                f"{several} can all be the {role}",
+                f"name the one meant in columns.{role}",
+            )
+        if hits:
+            found[role] = hits[0]
+    for i, name in enumerate(lower):
+        match = JOINT.fullmatch(name)
+        if match and i not in found.values():
+            role = f"joint_{int(match[1])}"
+            if int(match[1]) < 1 or role in found:
+                raise Fault(
+                    "ambiguous", f"column {names[i]!r}: ring below 1 or given twice", "count from 1"
+                )
+            found[role] = i
+    return found
+
+
+def _no_column(wanted: str, role: str, names: Sequence[str]) -> Fault:
+    shown = [repr(name if len(name) <= 60 else f"{name[:56]} ...") for name in names[:30]]
+    more = f" and {len(names) - 30} more" if len(names) > 30 else ""
+    return Fault(
+        "column_missing",
+        f"no column {wanted!r} for the {role}; the columns are {', '.join(shown)}{more}",
+        f"name it in columns.{role}",
+    )
+
+
+def require_roles(roles: dict[str, int], names: Sequence[str]) -> None:
+    """Refuse a table without displacement or force."""
+    for role in ("displacement", "force"):
+        if role not in roles:
+            raise _no_column(role, role, names)
+
+
+def resolve_unit(role: str, found: str | None, options: ReadOptions, place: str) -> str:
+    """The unit of a role, from the file or from the options, which must not contradict.
+
+    Args:
+        role: e.g. ``"force"`` or ``"joint_7"``.
+        found: the unit the file gives, or None.
+        options: units for files that give none.
+        place: for messages, e.g. ``"column 'Load'"``.
+
+    Raises:
+        Fault: no unit ("unit_missing") or an unknown one ("unit_unknown").
+        DataError: file and options contradict each other.
+    """
+    general = "joint" if role.startswith("joint_") else role
+    given = options.units.get(role, options.units.get(general))
+    unit = given if found is None else found
+    if unit is None:
+        raise Fault(
+            "unit_missing",
+            f"{place} has no unit",
+            f"write it in the file, or give units.{general} if it has none",
+        )
+    try:
+        factor = unit_factor(unit, role_dimension(role))
+    except UnitError as error:
+        raise Fault(
+            "unit_unknown", f"{place}: {error}", "write one of the accepted units"
+        ) from None
+    if given is not None and unit_factor(given, role_dimension(role)) != factor:
+        raise DataError(
+            f"{place} is in {found} but units.{general} says {given}; remove the wrong one"
+        )
+    return unit
+
+
+def numbers(
+    cells: Sequence[str], lines: Sequence[int], name: str, delimiter: str, word: str = "line"
+) -> np.ndarray:
+    """Numbers of one column; empty cells become NaN.
+
+    A comma counts as the decimal sign where it does not separate the columns, unless another
+    cell of the column has a point: then one of the two separates thousands, and both are refused.
+
+    Raises:
+        Fault: a cell is no number ("unparsable").
+    """
+    values = np.full(len(cells), np.nan)
+    pointed = delimiter == "," or any("." in cell for cell in cells)
+    for i, cell in enumerate(cells):
+        if not cell:
+            continue
+        if not pointed and _DECIMAL_COMMA.fullmatch(cell):
+            cell = cell.replace(",", ".")
+        try:
+            # float() takes 1_000, which no instrument means.
+            values[i] = float("_" if "_" in cell else cell)
+        except ValueError:
+            shown = cell if len(cell) <= 80 else f"{cell[:76]} ..."
+            raise Fault(
+                "unparsable",
+                f"{word} {lines[i]}: {name} {shown!r} is not a number",
+                _number_cure(cell),
+            ) from None
+    return values
+
+
+def _number_cure(cell: str) -> str:
+    """What to do about a cell that is no number."""
+    if cell.startswith("="):
+        return "open the file in a spreadsheet program and save it, so that formulas have values"
+    if _DATE.match(cell):
+        return "a spreadsheet took it for a date: set the column to numbers and write it anew"
+    if "," in cell:
+        return "use one decimal sign throughout and no thousands separator"
+    return "write numbers as 1.5 or 1.5e-3, and leave a missing value empty"
+
+
+def role_values(
+    table: Table, role: str, index: int, picked: Sequence[int], unit: str
+) -> np.ndarray:
+    """Numbers of some rows of a role's column, in internal units (mm, N, rad, s)."""
+    cells = [table.rows[i][index] for i in picked]
+    lines = [table.lines[i] for i in picked]
+    values = numbers(cells, lines, table.names[index], table.delimiter, table.text.word)
+    return convert(values, unit, role_dimension(role))
+
+
+def time_values(
+    table: Table, roles: dict[str, int], picked: Sequence[int], options: ReadOptions
+) -> np.ndarray | None:
+    """Time of some rows, s: of `columns.time`, else of the only column named so, if usable.
+
+    Returns:
+        The values, or None: there is no such column, it has no unit, or holds no numbers.
+
+    Raises:
+        Fault: the column named in the options has no unit or holds text.
+    """
+    if "time" in roles:
+        i = roles["time"]
+        unit = resolve_unit("time", table.units[i], options, f"column {table.names[i]!r}")
+        return role_values(table, "time", i, picked, unit)
+    hits = [i for i, name in enumerate(table.names) if name.lower() in TIMES]
+    if len(hits) != 1:
+        return None
+    try:
+        unit = resolve_unit("time", table.units[hits[0]], options, "column of time")
+        values = role_values(table, "time", hits[0], picked, unit)
+    except Fault:
+        return None
+    return values if np.isfinite(values).all() else None

@@ -1,0 +1,257 @@
+"""Presses in any direction, anywhere on the rings: the companion of `model.press`.
+
+Contact force, local indentation and skeleton in one; with friction along a path. All vectors are in
+the frame of the tube: x along s towards the larynx, y anterior, z to the side of positive phi.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxtrachea._arguments import ArrayLike, check_word, last_axis, shaped
+from jaxtrachea.mechanics import friction as _friction
+from jaxtrachea.mechanics import skeleton, vector_equilibrium
+from jaxtrachea.mechanics.admission import Admitted, admit, hide, status_of
+from jaxtrachea.mechanics.force_law import Law
+from jaxtrachea.mechanics.press import Options, local_law, read_values, touch
+from jaxtrachea.mechanics.skeleton import Rings, Skeleton, local_frame
+from jaxtrachea.status import PressStatus, RingStatus
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+
+
+class ObliquePress(NamedTuple):
+    """A press at one contact position along any number of tool displacements; mm and N.
+
+    `force`, `depth` (local indentation), `skeleton` (displacement of C): shape (*n, 3); the other
+    fields as in `Skeleton`, times the force; `status`: a `PressStatus` each.
+    """
+
+    force: Float[Array, "*n 3"]
+    depth: Float[Array, "*n 3"]
+    skeleton: Float[Array, "*n 3"]
+    slope_C: Float[Array, "*n 2"]
+    joints: Float[Array, "*n rings 3"]
+    slopes: Float[Array, "*n rings 2"]
+    loads: Float[Array, "*n rings 3"]
+    end_U: Float[Array, "*n rings 3"]
+    end_V: Float[Array, "*n rings 3"]
+    status: Int[Array, "*n"]
+
+
+class ObliquePath(NamedTuple):
+    """A press along a path with friction.
+
+    Attributes:
+        press: one entry per step.
+        slip: way the tool has slid over the surface, mm; shape (steps, 3).
+        dissipated: work lost to friction in each step, N mm.
+        sliding: whether each step slides.
+    """
+
+    press: ObliquePress
+    slip: Float[Array, "steps 3"]
+    dissipated: Float[Array, " steps"]
+    sliding: Bool[Array, " steps"]
+
+
+class Place(NamedTuple):
+    """A contact position, and what a press there needs of tube and material.
+
+    Attributes:
+        asked: checked position and material.
+        unit: what the skeleton does per unit force.
+        law: local law.
+        phi_c: contact angle, rad.
+        onset: inward displacement at first touch, mm.
+    """
+
+    asked: Admitted
+    unit: Skeleton
+    law: Law
+    phi_c: Float[Array, ""]
+    onset: Float[Array, ""]
+
+
+def press_oblique(
+    geometry: Geometry,
+    material: Material,
+    s_c: ArrayLike,
+    phi_c: ArrayLike,
+    displacement: ArrayLike,
+    options: Options = Options(),  # noqa: B008 (frozen)
+    *,
+    rings: Rings = "arch2",
+    axial: bool = True,
+    onset: ArrayLike | None = None,
+) -> ObliquePress:
+    """Move the tool, stuck to the surface at (s_c, phi_c), by a vector.
+
+    `bonded` contact presses or draws in any direction. `unilateral` holds on while it presses: the
+    tool comes from rest in a straight line and first touches at `onset`; where holding on would
+    need a pull the row is NaN with PULLS. Small deflections, linear skeleton, no torsion.
+
+    Args:
+        geometry: the tube at rest.
+        material: as for `skeleton_response`, and the local law.
+        s_c: contact position, mm, in [0, length].
+        phi_c: contact angle from the anterior midline, rad, in [-alpha, alpha].
+        displacement: of the tool, x, y, z, mm; inward along the normal: (0, -cos phi, -sin phi).
+        options: as for `press`; `split` and `form` have no other choice here.
+        rings: see `skeleton_response`.
+        axial: see `skeleton_response`.
+        onset: inward displacement at first touch, mm; 0 if None.
+
+    Returns:
+        The `ObliquePress`; as for `press`, OFF_TUBE and BAD_MATERIAL are NaN throughout.
+
+    Raises:
+        ValueError: an option that is not for oblique presses, a missing value of the material, an
+            argument that is no number, or an array of a wrong length.
+    """
+    _only_default(options)
+    check_word("rings", rings, Rings)
+    place = place_at(geometry, material, s_c, phi_c, options, onset=onset, rings=rings, axial=axial)
+    return press_at(place, last_axis("displacement", displacement, 3, place.phi_c.dtype), options)
+
+
+def press_at(place: Place, displacement: Float[Array, "*n 3"], options: Options) -> ObliquePress:
+    """As `press_oblique`, on a place that is known."""
+    normal = local_frame(place.phi_c)[0]
+    inward = displacement @ normal
+    if options.contact == "bonded":
+        moved = displacement - place.onset * jnp.broadcast_to(normal, displacement.shape)
+    else:
+        share = touch(inward, place.onset, options) / jnp.where(inward > 0, inward, 1)
+        moved = displacement * share[..., None]
+    solve = {
+        "series": vector_equilibrium.press_vector,
+        "total": vector_equilibrium.press_vector_total,
+    }[options.coupling]
+    flat = moved.reshape(-1, 3)
+    solved = jax.vmap(solve, (0, None, None))(flat, place.unit.compliance, place.law)
+    force, depth = (v.reshape(displacement.shape) for v in (solved.force, solved.depth))
+    status = solved.status.reshape(displacement.shape[:-1])
+    if options.contact == "unilateral":
+        pulls = force @ normal < 0
+        force, depth = (jnp.where(pulls[..., None], jnp.nan, v) for v in (force, depth))
+        status = jnp.where(pulls, PressStatus.PULLS, status)
+    refused = place.asked.refused
+    unit, force, depth = hide(refused, place.unit, force, depth)
+    return _assemble(unit, force, depth, status_of(refused, status))
+
+
+def press_path(
+    geometry: Geometry,
+    material: Material,
+    s_c: ArrayLike,
+    phi_c: ArrayLike,
+    displacement: ArrayLike,
+    friction: ArrayLike,
+    options: Options = Options(),  # noqa: B008 (frozen)
+    *,
+    rings: Rings = "arch2",
+    axial: bool = True,
+    onset: ArrayLike | None = None,
+    rounding: float = 0.0,
+) -> ObliquePath:
+    """Lead the tool along a path; it sticks and slides by Coulomb's law (unilateral, `series`).
+
+    The contact keeps its place (s_c, phi_c): for slips small against the ring distance.
+
+    Args:
+        geometry: as for `press_oblique`, like all that is not named here.
+        material: -
+        s_c: -
+        phi_c: -
+        displacement: of the tool at the end of each step, from rest, mm; (steps, 3).
+        friction: Coulomb's mu (paper, Table 1: 0.66).
+        options: -
+        rings: -
+        axial: -
+        onset: -
+        rounding: see `mechanics.friction.slide`.
+
+    Returns:
+        The `ObliquePath`; OFF_TUBE and BAD_MATERIAL (also: a negative mu) are NaN throughout.
+
+    Raises:
+        ValueError: as `press_oblique`; `rounding` below 0.
+    """
+    _only_default(options)
+    if options.contact != "unilateral" or options.coupling != "series":
+        raise ValueError(
+            "friction needs options.contact='unilateral' and options.coupling='series'"
+        )
+    if not 0 <= rounding < math.inf:
+        raise ValueError(f"rounding is {rounding}; expected a finite number, not negative")
+    dtype = geometry.length.dtype
+    displacement = shaped("displacement", displacement, ("steps", 3), dtype=dtype)
+    check_word("rings", rings, Rings)
+    asked, unit, law, phi_c, onset = place_at(
+        geometry, material, s_c, phi_c, options, onset=onset, rings=rings, axial=axial
+    )
+    mu = shaped("friction", friction, (), dtype=dtype)
+    friction = jnp.where(mu < 0, 0, mu)
+    refused = jnp.where(mu < 0, PressStatus.BAD_MATERIAL, asked.refused).astype(jnp.int8)
+    frame = local_frame(phi_c)
+    D = displacement @ frame.T
+    D = D.at[:, 0].set(touch(D[:, 0], onset, options))
+    C = frame @ unit.compliance @ frame.T
+    slid = _friction.slide_path(D, C, law, friction, rounding=rounding)
+    unit, slid = hide(refused, unit, slid)
+    status = status_of(refused, slid.status)
+    press = _assemble(unit, slid.force @ frame, slid.depth @ frame, status)
+    sliding = slid.sliding & (refused == PressStatus.OK)
+    return ObliquePath(press, slid.slip @ frame[1:], slid.dissipated, sliding)
+
+
+def place_at(
+    geometry: Geometry,
+    material: Material,
+    s_c: ArrayLike,
+    phi_c: ArrayLike,
+    options: Options,
+    *,
+    rings: Rings,
+    axial: bool,
+    onset: ArrayLike | None = None,
+) -> Place:
+    """Checked arguments, and the skeleton and the local law at the contact."""
+    check_word("rings", rings, Rings)
+    dtype = geometry.length.dtype
+    phi_c = shaped("phi_c", phi_c, (), dtype=dtype)
+    onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=dtype)
+    levels = {"axial": axial, "shear": options.shear}
+    used = (*read_values(options), *skeleton.read_values(rings, **levels))
+    asked = admit(geometry, material, s_c, dict.fromkeys(used))
+    unit = skeleton.respond(geometry, asked.material, asked.s_c, phi_c, rings=rings, **levels)
+    law = local_law(geometry, asked.material, asked.s_c, options)
+    return Place(asked=asked, unit=unit, law=law, phi_c=phi_c, onset=onset)
+
+
+def _only_default(options: Options):
+    if options.split != "continuous" or options.form != "recursion":
+        raise ValueError("oblique presses need options.split='continuous' and form='recursion'")
+
+
+def _assemble(unit: Skeleton, force, depth, status) -> ObliquePress:
+    """The skeleton's response times the forces; the ring's status where it has one."""
+    per_ring = lambda v: jnp.einsum("...q,ipq->...ip", force, v)  # noqa: E731
+    behind = unit.status == RingStatus.BEHIND_GAP
+    status = jnp.where(behind, PressStatus.BEHIND_GAP, status).astype(jnp.int8)
+    return ObliquePress(
+        force=force,
+        depth=depth,
+        skeleton=force @ unit.compliance.T,
+        slope_C=force @ unit.slope_C.T,
+        joints=per_ring(unit.joints),
+        slopes=per_ring(unit.slopes),
+        loads=per_ring(unit.loads),
+        end_U=per_ring(unit.end_U),
+        end_V=per_ring(unit.end_V),
+        status=status,
+    )

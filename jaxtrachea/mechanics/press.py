@@ -1,0 +1,249 @@
+"""The forward model: the only place that knows the order of the rooms."""
+
+import dataclasses
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxtrachea._arguments import ArrayLike, check_record, real, shaped
+from jaxtrachea._numerics import centred_hinge, positive_part
+from jaxtrachea.mechanics import beam as _beam
+from jaxtrachea.mechanics import equilibrium, force_law
+from jaxtrachea.mechanics.admission import Admitted, admit, hide, status_of
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the model includes; static, it selects the program that is compiled.
+
+    Attributes:
+        coupling: `series` (tool displacement = local indentation + skeleton deflection) or `total`
+            (as printed: the local law takes the whole displacement).
+        split: `continuous` (deflection and rotation agree at C) or `independent` (paper eq. 3).
+        form: `recursion`, or `reactions` for the paper's dense force method.
+        shear: the ligament also deforms in shear (needs `Material.GA_L`).
+        local: one law everywhere (`uniform`), or `two-material`: a law of its own on the rings
+            (needs `Material.k_1_ring`; `k_3_ring` if it also hardens there).
+        contact: `unilateral` (no force before first touch) or `bonded` (press or draw, odd law).
+        onset_width: width of the smooth first touch, mm; no force before touch, none changed after.
+        transition: distance from a ring's centre at which the ligament's own local law is reached,
+            mm; None: half the smallest distance between two rings.
+    """
+
+    coupling: Literal["series", "total"] = "series"
+    split: _beam.Split = "continuous"
+    form: _beam.Form = "recursion"
+    shear: bool = False
+    local: Literal["uniform", "two-material"] = "uniform"
+    contact: Literal["unilateral", "bonded"] = "unilateral"
+    onset_width: float = 1e-3
+    transition: float | None = None
+
+    def __post_init__(self):
+        """Refuse words and numbers that no model has.
+
+        Raises:
+            ValueError: naming the option, what was found and what is expected.
+        """
+        check_record(self, onset_width=0.0)
+        if self.transition is not None and self.transition <= 0:
+            raise ValueError(f"transition is {self.transition:g} mm; expected more than 0, or None")
+
+
+class Press(NamedTuple):
+    """A normal press at one contact position, along any number of tool displacements.
+
+    Attributes:
+        force: contact force, N; shape of the displacement.
+        depth: local indentation, mm; same shape.
+        skeleton: deflection of C by the skeleton, mm; same shape.
+        joints: deflection of the ligament at each ring, mm; shape (*n, rings).
+        reactions: force of each ring against the load, N; shape (*n, rings).
+        compliance: deflection of C per unit force, mm/N; scalar.
+        status: a `PressStatus` per displacement.
+    """
+
+    force: Float[Array, "*n"]
+    depth: Float[Array, "*n"]
+    skeleton: Float[Array, "*n"]
+    joints: Float[Array, "*n rings"]
+    reactions: Float[Array, "*n rings"]
+    compliance: Float[Array, ""]
+    status: Int[Array, "*n"]
+
+
+def ligament_beam(geometry: Geometry, material: Material, options: Options) -> _beam.Beam:
+    """The ligament as a `Beam` on the rings, scalars spread over spans and rings.
+
+    Raises:
+        ValueError: `options.shear` without `material.GA_L`.
+    """
+    x = geometry.ring_positions
+    spans = (x.shape[0] + 1,)
+    GA = None
+    if options.shear:
+        if material.GA_L is None:
+            raise ValueError("options.shear needs Material.GA_L (N); it is None")
+        GA = jnp.broadcast_to(material.GA_L, spans)
+    EI, k = jnp.broadcast_to(material.EI_L, spans), jnp.broadcast_to(material.k_M, x.shape)
+    return _beam.Beam(x, geometry.length, EI, k, GA)
+
+
+def local_law(
+    geometry: Geometry, material: Material, s_c: Float[Array, ""], options: Options
+) -> force_law.Law:
+    """The local contact law at s_c.
+
+    Raises:
+        ValueError: `two-material` without `material.k_1_ring`.
+    """
+    ligament = force_law.Law(material.k_1, material.k_3)
+    if options.local == "uniform":
+        return ligament
+    if material.k_1_ring is None:
+        raise ValueError("options.local='two-material' needs Material.k_1_ring (N/mm); it is None")
+    on_ring = material.k_3 if material.k_3_ring is None else material.k_3_ring
+    x = geometry.ring_positions
+    if options.transition is not None:
+        transition = jnp.asarray(options.transition, x.dtype)
+    else:
+        ends = jnp.concatenate([-x[:1], x, 2 * geometry.length - x[-1:]])
+        transition = jnp.min(jnp.diff(ends)) / 2
+    weight = force_law.ring_weight(s_c, x, transition)
+    return force_law.blend(ligament, force_law.Law(material.k_1_ring, on_ring), weight)
+
+
+def touch(
+    displacement: Float[Array, "*n"],
+    onset: Float[Array, ""],
+    options: Options,
+    blend: Float[Array, ""] | None = None,
+) -> Float[Array, "*n"]:
+    """Displacement after first touch: exactly 0 before it if unilateral, then smooth.
+
+    Args:
+        displacement: mm; any shape.
+        onset: displacement at first touch, mm.
+        options: the kind of contact, and the width of the smooth touch.
+        blend: mm; where the onset itself is sought: the touch is smooth from `blend` before it to
+            `blend` after it, see `centred_hinge` (slightly negative before it).
+    """
+    if options.contact == "bonded":
+        return displacement - onset
+    if blend is not None:
+        return centred_hinge(displacement - onset, blend)
+    return positive_part(displacement - onset, jnp.asarray(options.onset_width, displacement.dtype))
+
+
+def compliance(
+    geometry: Geometry, material: Material, s_c: Float[Array, "*m"], options: Options
+) -> Float[Array, "*m"]:
+    """Deflection of C per unit force at C, mm/N, at one or many contact positions.
+
+    Far cheaper than `press` where the joints are not asked for: many positions share one sweep
+    over the rings.
+    """
+    beam = ligament_beam(geometry, material, options)
+    if options.form == "recursion":
+        return _beam.contact_compliance(beam, s_c, split=options.split)
+    return jnp.vectorize(lambda s: unit_deflection(beam, s, options).w_C)(s_c)
+
+
+def unit_deflection(beam: _beam.Beam, s_c: Float[Array, ""], options: Options) -> _beam.Deflection:
+    """Everything that moves under a unit force at C."""
+    return _beam.deflect(beam, s_c, jnp.ones_like(s_c), split=options.split, form=options.form)
+
+
+def respond(
+    displacement: Float[Array, "*n"],
+    onset: Float[Array, ""],
+    compliance: Float[Array, ""],
+    law: force_law.Law,
+    options: Options,
+    blend: Float[Array, ""] | None = None,
+) -> equilibrium.Equilibrium:
+    """Force and local indentation for a skeleton of known compliance; `blend`: see `touch`."""
+    solve = {"series": equilibrium.press_series, "total": equilibrium.press_total}[options.coupling]
+    return solve(touch(displacement, onset, options, blend), compliance, law)
+
+
+def press(
+    geometry: Geometry,
+    material: Material,
+    s_c: ArrayLike,
+    displacement: ArrayLike,
+    options: Options = Options(),  # noqa: B008 (frozen)
+    *,
+    onset: ArrayLike | None = None,
+    blend: ArrayLike | None = None,
+) -> Press:
+    """Press the tool along the inward normal at (s_c, phi = 0) and solve for force and skeleton.
+
+    Small deflections; rings are springs k_M (paper: the cartilage is taken as rigid against the
+    muscle); the skeleton is linear, so at finite strain the arch's flattening is not seen
+    (docs/model.md). Off the midline or oblique: not in this function.
+
+    Args:
+        geometry: the tube at rest.
+        material: stiffness values; floating dtype of the result follows the arrays, that of Python
+            numbers and lists the geometry.
+        s_c: contact position, mm, in [0, length]; a scalar.
+        displacement: tool displacement along the inward normal, mm; any shape.
+        options: what is modelled (static).
+        onset: tool displacement at first touch, mm; 0 if None.
+        blend: mm, a scalar: the rounded corner of a curve whose onset was fitted, in the place of
+            `options.onset_width`, see `touch`.
+
+    Returns:
+        The `Press`; rows without a stable solution are NaN with a status, others are untouched.
+        A contact off the tube (OFF_TUBE) and a negative stiffness (BAD_MATERIAL) are NaN
+        throughout; a stiffness of zero is the limit of a small one where that exists.
+
+    Raises:
+        ValueError: an argument that is no number, an array of a length that does not fit the tube,
+            or a value of the material that the options need.
+    """
+    dtype = geometry.length.dtype
+    displacement = real("displacement", displacement, dtype)
+    onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=displacement.dtype)
+    if blend is not None:
+        blend = shaped("blend", blend, (), dtype=displacement.dtype)
+    asked = admit(geometry, material, s_c, read_values(options))
+    return _press(geometry, asked, displacement, options, onset, blend)
+
+
+def read_values(options: Options) -> tuple[str, ...]:
+    """Values of the material that a press reads and that must not be negative."""
+    names = ("EI_L", "k_M", "k_1")
+    names += ("GA_L",) if options.shear else ()
+    return names + (("k_1_ring",) if options.local == "two-material" else ())
+
+
+def _press(
+    geometry: Geometry,
+    asked: Admitted,
+    displacement: Float[Array, "*n"],
+    options: Options,
+    onset: Float[Array, ""],
+    blend: Float[Array, ""] | None = None,
+) -> Press:
+    """`press`, of arguments that are checked."""
+    material, s_c, refused = asked
+    unit = unit_deflection(ligament_beam(geometry, material, options), s_c, options)
+    law = local_law(geometry, material, s_c, options)
+    solved = respond(displacement, onset, unit.w_C, law, options, blend)
+    unit, solved = hide(refused, unit, solved)
+    per_ring = lambda v: solved.force[..., None] * v  # noqa: E731
+    shape = (*displacement.shape, *unit.w.shape)
+    return Press(
+        force=solved.force,
+        depth=solved.depth,
+        skeleton=unit.w_C * solved.force,
+        joints=per_ring(jnp.broadcast_to(unit.w, shape)),
+        reactions=per_ring(jnp.broadcast_to(unit.reaction, shape)),
+        compliance=unit.w_C,
+        status=status_of(refused, solved.status),
+    )

@@ -1,0 +1,1 @@
+"""What a user reads of a fit: report, tables, figures."""

@@ -1,0 +1,1 @@
+"""How a long run survives: shards, manifest, lock, several processes."""

@@ -1,0 +1,183 @@
+"""A long fit in chunks of lanes: fitted by themselves, saved by themselves, joined at the end.
+
+What a chunk gives depends on its own lanes and on the settings alone, and all chunks are as large
+as each other (within one lane), so that one compiled program serves them. Hence the result does not
+depend on when a run was stopped, nor on which process or device fitted which chunk.
+"""
+
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxtrachea.files.atomic import write_whole
+from jaxtrachea.fit import residual
+from jaxtrachea.fit.covariance import Uncertainty
+from jaxtrachea.fit.criteria import Criteria
+from jaxtrachea.fit.fit import FitResult
+from jaxtrachea.fit.problem import Problem
+from jaxtrachea.runs import journal as journals
+from jaxtrachea.runs.journal import Journal
+
+#: Lanes of a chunk at most, and its residual entries times starts at most: about ten seconds of
+#: one core.
+MOST_LANES, MOST_ENTRIES = 4096, 4_000_000
+#: Lanes computed together at most, and the part of the free memory that they may take.
+MOST_SEATS, PART_OF_MEMORY = 128, 0.5
+_APART = ("problem", "criteria", "uncertainty")
+#: Fields of a result that are arrays with the leading axis of lanes.
+FIELDS = tuple(f.name for f in dataclasses.fields(FitResult) if f.name not in _APART)
+
+
+def lanes_per_chunk(problem: Problem, starts: int) -> int:
+    """Lanes saved together, by the size of the study alone: the same on every machine.
+
+    All of a joint problem.
+    """
+    if problem.joint:
+        return len(problem.curves)
+    trials = problem.lanes.s_c.shape[1]
+    entries = trials * residual.size(problem.lanes) * starts
+    return max(1, min(MOST_LANES, MOST_ENTRIES // entries))
+
+
+def divide(lanes: int, most: int) -> list[np.ndarray]:
+    """Lanes of every chunk: at most `most`, in order, as equal as can be."""
+    return np.array_split(np.arange(lanes), -(-lanes // most))
+
+
+def bytes_per_seat(problem: Problem) -> int:
+    """Memory that one of the lanes computed together takes, from above.
+
+    Five numbers per residual entry and free column, as XLA counts them for a Levenberg-Marquardt
+    step in float64 (3.7 to 5 in ten studies), and the matrices of the unknowns.
+    """
+    entries = problem.lanes.s_c.shape[1] * residual.size(problem.lanes)
+    return 8 * (5 * len(problem.free) * entries + 8 * problem.size**2 + 500)
+
+
+def seats(problem: Problem, free: float, most: int = MOST_SEATS) -> int:
+    """Lanes that can be computed together, a power of two.
+
+    Args:
+        problem: the study.
+        free: memory of the device that is free, bytes.
+        most: upper bound.
+    """
+    fitting = max(1, int(PART_OF_MEMORY * free) // bytes_per_seat(problem))
+    return min(most, 1 << (fitting.bit_length() - 1))
+
+
+def free_memory() -> float:
+    """Bytes free on the first device; of the machine's memory its share where devices share it."""
+    import jax
+
+    device = jax.local_devices()[0]
+    known = device.memory_stats() or {}
+    if "bytes_limit" in known:
+        return known["bytes_limit"] - known.get("bytes_in_use", 0)
+    with contextlib.suppress(OSError, StopIteration):
+        with open("/proc/meminfo", encoding="ascii") as stream:
+            line = next(line for line in stream if line.startswith("MemAvailable"))
+        return 1024 * int(line.split()[1]) / jax.local_device_count()
+    with contextlib.suppress(AttributeError, ValueError, OSError):
+        pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        return pages / jax.local_device_count()
+    return np.inf
+
+
+def arrays_of(result: FitResult) -> dict[str, np.ndarray]:
+    """Everything of a result but its problem, by name; of criteria and uncertainty `PART.NAME`."""
+    arrays = {name: np.asarray(getattr(result, name)) for name in FIELDS}
+    arrays |= {f"criteria.{name}": v for name, v in result.criteria._asdict().items()}
+    for name in Uncertainty._fields:
+        rows = [getattr(u, name) for u in result.uncertainty]
+        arrays[f"uncertainty.{name}"] = np.stack(rows)
+    return arrays
+
+
+def result_of(problem: Problem, arrays: dict[str, np.ndarray]) -> FitResult:
+    """The result that `arrays_of` took apart.
+
+    Raises:
+        KeyError: an array is missing.
+        ValueError: an array does not fit the problem.
+    """
+    lanes = problem.lanes.lower.shape[0]
+    for name, array in arrays.items():
+        if array.shape[:1] != (lanes,):
+            raise ValueError(f"{name} has shape {array.shape}; expected {lanes} lanes")
+    if arrays["theta"].shape != (lanes, problem.size):
+        raise ValueError(f"theta has shape {arrays['theta'].shape}")
+    parts = (arrays[f"uncertainty.{name}"] for name in Uncertainty._fields)
+    rows = tuple(Uncertainty(*row) for row in zip(*parts, strict=True))
+    said = Criteria(*(arrays[f"criteria.{name}"] for name in Criteria._fields))
+    fields = {name: arrays[name] for name in FIELDS}
+    return FitResult(problem=problem, criteria=said, uncertainty=rows, **fields)
+
+
+def join(problem: Problem, parts: list[FitResult]) -> FitResult:
+    """One result out of those of consecutive lanes; `problem` holds all of them."""
+    each = [arrays_of(part) for part in parts]
+    return result_of(problem, {name: np.concatenate([a[name] for a in each]) for name in each[0]})
+
+
+def replaced(result: FitResult, lanes: np.ndarray, by: FitResult) -> FitResult:
+    """The same result with the rows `lanes` from `by` where it succeeded; the others untouched."""
+    better = by.succeeded
+    arrays, new = arrays_of(result), arrays_of(by)
+    for name, array in arrays.items():
+        arrays[name] = array.copy()
+        arrays[name][lanes[better]] = new[name][better]
+    return result_of(result.problem, arrays)
+
+
+def save(path: Path, journal: Journal, lanes: np.ndarray, result: FitResult) -> None:
+    """Write a chunk at once or not at all, and onto the disk.
+
+    Args:
+        path: file, replaced if it exists.
+        journal: of the run it belongs to; stored whole, for the case that the run's own is lost.
+        lanes: that were fitted.
+        result: of these lanes.
+    """
+    image = io.BytesIO()
+    text = json.dumps(journals.as_dict(journal))
+    arrays: dict[str, Any] = {"run": np.array(journal.id), "journal": np.array(text)}
+    arrays |= {"lanes": lanes} | arrays_of(result)
+    np.savez(image, **arrays)
+    write_whole(path, image.getvalue())
+
+
+def read_journal(path: Path) -> Journal | None:
+    """The journal in a saved chunk, or None where there is none to be read."""
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            return journals.from_dict(json.loads(str(file["journal"])))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def load(path: Path, run: str, lanes: np.ndarray, problem: Problem) -> FitResult | None:
+    """A saved chunk, or None where there is none, or a damaged one, or one of another run.
+
+    Args:
+        path: file.
+        run: name of the run it must belong to.
+        lanes: that it must hold.
+        problem: of these lanes.
+    """
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        arrays.pop("journal", None)
+        mine = arrays.pop("run") == run and np.array_equal(arrays.pop("lanes"), lanes)
+        return result_of(problem, arrays) if mine else None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None

@@ -1,0 +1,195 @@
+"""What decides the numbers of a run, kept beside its chunks, so that no other run goes on there."""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import uuid
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import get_args, get_origin, get_type_hints
+
+import jaxtrachea
+from jaxtrachea.files.atomic import write_whole
+
+SCHEMA = "jaxtrachea-run"
+SCHEMA_VERSION = 1
+_PACKAGES = ("jax", "jaxlib", "numpy", "scipy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Rerun:
+    """Fitting the failed lanes of a finished run again.
+
+    Attributes:
+        former: SHA-256 of the results.h5 that holds the others.
+        lanes: that are fitted again.
+        count: how often this was done, this time included.
+    """
+
+    former: str
+    lanes: list[int]
+    count: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Journal:
+    """A run.
+
+    Attributes:
+        id: name of this run, in all its chunks.
+        specification: SHA-256.
+        inputs: SHA-256 by file, seen from the folder of the data.
+        versions: of what computes.
+        dtype: of the computation.
+        device: kind of device.
+        lanes: of the whole study.
+        chunk: lanes computed together.
+        save_every: lanes saved together, at most.
+        options: of the command that need nothing but the fit: they are done at its end.
+        rerun: None when all lanes are fitted.
+        forced: differences that the user passed over with --force.
+    """
+
+    id: str
+    specification: str
+    inputs: dict[str, str]
+    versions: dict[str, str]
+    dtype: str
+    device: str
+    lanes: int
+    chunk: int
+    save_every: int
+    options: list[str]
+    rerun: Rerun | None = None
+    forced: list[str] = dataclasses.field(default_factory=list)
+
+
+def describe(
+    spec: Path, root: Path, inputs: dict[str, str], dtype: str, device: str, **sizes
+) -> Journal:
+    """The journal of a run that starts now.
+
+    Args:
+        spec: the specification file.
+        root: folder of the data.
+        inputs: SHA-256 by measurement file.
+        dtype: of the computation.
+        device: kind of device.
+        sizes: the other attributes of `Journal`.
+    """
+    return Journal(
+        id=uuid.uuid4().hex,
+        specification=hashlib.sha256(spec.read_bytes()).hexdigest(),
+        inputs={os.path.relpath(name, root): digest for name, digest in inputs.items()},
+        versions={"jaxtrachea": jaxtrachea.__version__} | {p: installed(p) for p in _PACKAGES},
+        dtype=dtype,
+        device=device,
+        **sizes,
+    )
+
+
+def installed(package: str) -> str:
+    """Version of a package, in words where there is none."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def differences(was: Journal, now: Journal) -> Iterator[str]:
+    """What differs between two runs that should give the same numbers, in words."""
+    if was.specification != now.specification:
+        yield "the specification has changed"
+    for name in sorted(was.inputs.keys() | now.inputs.keys()):
+        if name not in now.inputs:
+            yield f"{name} is no longer read"
+        elif name not in was.inputs:
+            yield f"{name} is new"
+        elif was.inputs[name] != now.inputs[name]:
+            yield f"{name} has changed"
+    for name, new in now.versions.items():
+        if (old := was.versions.get(name)) != new:
+            yield f"{name} was {old} and is {new}"
+    for name in ("dtype", "device", "lanes"):
+        if (old := getattr(was, name)) != (new := getattr(now, name)):
+            more = [f"--{option}" for option in now.options if option not in was.options]
+            why = f" ({', '.join(more)} of a joint fit needs one lane)" if more and new == 1 else ""
+            yield f"{name} was {old} and is {new}{why}"
+
+
+def as_dict(journal: Journal) -> dict[str, object]:
+    """What is stored of a journal."""
+    return {"schema": SCHEMA, "schema_version": SCHEMA_VERSION} | dataclasses.asdict(journal)
+
+
+def write(path: Path, journal: Journal) -> None:
+    """Write a journal at once or not at all; the former one stays beside it (`previous`).
+
+    Raises:
+        OSError: it could not be written; the one that was there still is.
+    """
+    with contextlib.suppress(OSError, ValueError):
+        if read(path) == journal:
+            return
+        write_whole(previous(path), path.read_bytes())
+    write_whole(path, json.dumps(as_dict(journal), indent=2).encode())
+
+
+def previous(path: Path) -> Path:
+    """Where the former journal lies."""
+    return path.with_name(f"previous-{path.name}")
+
+
+def read(path: Path) -> Journal:
+    """Read a journal.
+
+    Raises:
+        OSError: there is none, or it cannot be read.
+        ValueError: it is damaged, or of another version.
+    """
+    try:
+        return from_dict(json.loads(path.read_text(encoding="utf-8")))
+    except RecursionError:
+        raise ValueError("nested too deeply for the journal of a run") from None
+
+
+def from_dict(content: object) -> Journal:
+    """A journal from what `as_dict` gives.
+
+    Raises:
+        ValueError: it is none, or of another version.
+    """
+    if not isinstance(content, dict):
+        raise ValueError(f"not the journal of a run, but {type(content).__name__}")
+    found = dict(content)
+    if (found.pop("schema", None), found.pop("schema_version", None)) != (SCHEMA, SCHEMA_VERSION):
+        raise ValueError("not the journal of a run, or one of another version")
+    try:
+        rerun = found.pop("rerun")
+        _check_types(Journal, found, {"rerun"})
+        if rerun is not None:
+            _check_types(Rerun, rerun, set())
+        return Journal(**found, rerun=None if rerun is None else Rerun(**rerun))
+    except (TypeError, KeyError) as error:
+        raise ValueError(f"not the journal of a run: {error}") from None
+
+
+def _check_types(kind: type, found: dict, apart: set[str]) -> None:
+    """Refuse values that are not of the field's type.
+
+    Raises:
+        TypeError: naming the field.
+    """
+    for name, hint in get_type_hints(kind).items():
+        if name in apart:
+            continue
+        wanted = get_origin(hint) or hint
+        if not isinstance(found[name], wanted) or isinstance(found[name], bool):
+            raise TypeError(f"{name} is {found[name]!r}; expected {wanted.__name__}")
+        inner = get_args(hint)[-1:]
+        parts = found[name].values() if isinstance(found[name], dict) else found[name]
+        if inner and not all(isinstance(part, inner) for part in parts):
+            raise TypeError(f"{name} holds something else than {inner[0].__name__}")
