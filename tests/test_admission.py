@@ -20,10 +20,11 @@ import numpy as np
 import pytest
 
 import jaxtrachea
-from jaxtrachea.fit.fit import Settings
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS, Parameter
-from jaxtrachea.fit.problem import Lane, Noise
+from jaxtrachea.fit.problem import Noise
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.mechanics import beam
 from jaxtrachea.mechanics.oblique import press_oblique, press_path
 from jaxtrachea.mechanics.press import Options, press
@@ -144,8 +145,8 @@ def any_words(function, argument):
 
 #: Called by what checks the word, with its own word; never from outside.
 INNER = {
-    "mechanics.compliance.divide_load", "mechanics.reactions.deflect_dense", "skeleton.respond",
-    "skeleton.read_values",
+    "mechanics.compliance.divide_load", "mechanics.reactions.deflect_dense",
+    "mechanics.skeleton.respond", "mechanics.skeleton.read_values",
 }  # fmt: skip
 
 
@@ -163,7 +164,7 @@ def test_no_function_runs_a_misspelt_word():
     assert seen >= INNER | {
         "mechanics.beam.deflect",
         "fit.problem.build",
-        "oblique.press_path",
+        "mechanics.oblique.press_path",
     }
 
 

@@ -11,9 +11,10 @@ import pytest
 import synthetic
 from run_cli import GOOD, run
 
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.problem import build
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.inference.bootstrap import bootstrap
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options

@@ -8,9 +8,11 @@ import pytest
 import synthetic
 
 from jaxtrachea.fit.descent import descend
-from jaxtrachea.fit.fit import Settings, first_sigma, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances, levenberg_marquardt
+from jaxtrachea.fit.noise import first_sigma
 from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.inference import bootstrap as bootstraps
 from jaxtrachea.inference.profile import profiles
 from jaxtrachea.status import FitStatus, ProfileEnd

@@ -17,11 +17,12 @@ from small_scenes import MATERIAL, MESH, TUBE, presses
 from jaxtrachea import Wishes, make_scene, simulate
 from jaxtrachea.fit import levenberg_marquardt as solve
 from jaxtrachea.fit.cost import evaluate
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.predictions import Prediction
 from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.starts import draw_starts
 from jaxtrachea.inference import bootstrap
 from jaxtrachea.inference.design import situation

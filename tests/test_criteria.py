@@ -14,13 +14,14 @@ from run_cli import run
 
 from jaxtrachea.cli.compare import _left_out_notes
 from jaxtrachea.fit.criteria import penalised, weights
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.onset import where_sought
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.inference import repeats as repeats_module
 from jaxtrachea.inference.comparison import Model, Row, compared, same_data, sentence
-from jaxtrachea.inference.repeats import Missed, leave_repeats_out, repeats
+from jaxtrachea.inference.cross_validation import Missed, leave_repeats_out, repeats
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.status import FitStatus

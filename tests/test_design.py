@@ -9,8 +9,9 @@ import pytest
 import synthetic
 from run_cli import run, tree
 
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.inference.design import (
     Candidates,
     gains,

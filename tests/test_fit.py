@@ -9,9 +9,11 @@ import synthetic
 from scipy.optimize import least_squares
 
 from jaxtrachea.fit.descent import descend
-from jaxtrachea.fit.fit import Settings, first_sigma, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances, levenberg_marquardt
+from jaxtrachea.fit.noise import first_sigma
 from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.inference.verdict import describe_flat
 from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.status import FitStatus

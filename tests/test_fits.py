@@ -13,7 +13,7 @@ import pytest
 from run_cli import run
 
 from jaxtrachea.config import load_fit_spec
-from jaxtrachea.fit.study import read_data
+from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.status import FitStatus
 
 ROOT = Path(__file__).parents[1]

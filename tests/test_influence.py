@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.fit.estimate import estimate, lane_of
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.fit.result import Settings
+from jaxtrachea.inference.estimate import estimate, lane_of
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options

@@ -15,13 +15,14 @@ from scipy.optimize import least_squares
 from jaxtrachea.fit import schur as arrow
 from jaxtrachea.fit import shared as joint
 from jaxtrachea.fit import study
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.predictions import curves_to_leave_out
 from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.inference import population as populations
 from jaxtrachea.inference import results
 from jaxtrachea.inference.bootstrap import bootstrap
+from jaxtrachea.inference.cross_validation import curves_to_leave_out
 from jaxtrachea.inference.design import check
 from jaxtrachea.inference.population import population, population_rows, wanted
 from jaxtrachea.inference.profile import profiles

@@ -10,48 +10,88 @@ import pytest
 import jaxtrachea
 
 PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
+#: Rooms from the bottom up; `fit` and `scene` are neighbours, neither knows the other.
 ORDER = [
-    {"units", "status", "_numerics", "_arguments", "webpage", "spreadsheet", "pictures"},
-    {"spec_file"},
+    {"units", "status", "_numerics", "_arguments"},
+    {"files"},
     {"config"},
     {"trachea"},
-    {"admission"},
     {"contact"},
     {"mechanics"},
-    {"skeleton"},
-    {"surface"},
-    {"model"},
-    {"oblique"},
-    {"identify"},
-    {"scene"},
-    {"selfcheck"},
-    {"doubts"},
+    {"surface", "measurements"},
+    {"fit", "scene", "selfcheck"},
+    {"inference"},
+    {"runs"},
     {"report"},
-    {"prediction_report"},
-    {"plots", "sections", "viewer", "study"},
-    {"tradeoff", "overview", "prediction_plots"},
-    {"terminal_table"},
-    {"terminal", "processes"},
-    {"cli_load", "cli_predict_data", "cli_run"},
-    {"cli_scene", "cli_compare", "cli_fit", "cli_predict", "cli_selfcheck", "cli_tradeoff"},
+    {"tradeoff"},
     {"cli"},
     {"__main__"},
 ]
-#: Within `scene`, likewise: what is there, the program, files and pictures.
-SCENE = [
-    {"operations", "spec", "curve", "sizes", "wall_check"},
-    {"plan"},
-    {"rules"},
-    {"stage"},
-    {"ranges"},
-    {"approach", "trail"},
-    {"deform"},
-    {"simulation"},
-    {"seat"},
-    {"session"},
-    {"build", "results"},
-    {"plots"},
-]
+#: Neighbours that stand on different levels.
+STRANGERS = [("scene", {"fit", "inference", "runs"}), ("inference", {"scene"}), ("runs", {"scene"}),
+             ("measurements", {"contact", "mechanics", "trachea"})]  # fmt: skip
+#: Modules within the larger rooms, from the bottom up.
+WITHIN = {
+    "scene": [
+        {"operations", "spec", "curve", "sizes", "wall_check"},
+        {"plan"},
+        {"rules"},
+        {"stage"},
+        {"ranges"},
+        {"approach", "trail"},
+        {"deform"},
+        {"simulation"},
+        {"seat"},
+        {"session"},
+        {"build", "results"},
+        {"plots"},
+    ],
+    "measurements": [
+        {"presses", "turning", "plausible", "first_touch"},
+        {"holds"},
+        {"parts"},
+        {"segments"},
+        {"usage"},
+        {"curve"},
+        {"loading", "names"},
+        {"checks"},
+        {"readers"},
+        {"read"},
+        {"data_files", "usage_tables"},
+    ],
+    "fit": [
+        {"parameters", "lane", "schur"},
+        {"onset"},
+        {"problem"},
+        {"press_scale", "residual"},
+        {"cost"},
+        {"levenberg_marquardt"},
+        {"descent", "starts"},
+        {"structure"},
+        {"covariance"},
+        {"noise", "shared"},
+        {"criteria"},
+        {"result"},
+        {"minima", "natural_sizes", "predictions", "profile_search", "study"},
+        {"evaluate", "scrutiny"},
+        {"fit"},
+    ],
+    "inference": [
+        {"verdict", "rows", "chains", "estimate", "store", "design_press", "prediction_core"},
+        {"cross_validation", "bootstrap", "profile", "posterior_start"},
+        {"judgement", "stored"},
+        {"effective", "population", "sources"},
+        {"comparison", "predict", "results"},
+        {"design", "held_out", "influence", "posterior", "summary"},
+        {"design_tables", "influence_tables", "posterior_tables", "prediction_tables"},
+    ],
+    "runs": [{"processes", "journal"}, {"chunks"}, {"folder"}, {"former"}, {"in_chunks"}],
+    "report": [{"doubts", "plots"}, {"fit", "prediction_plots"}, {"prediction", "sections"},
+               {"overview"}],
+    "cli": [{"terminal_table"}, {"terminal"},
+            {"fit", "load", "predict_data", "run", "scene", "selfcheck"},
+            {"compare", "predict", "tradeoff"}, {"main"}],
+}  # fmt: skip
 #: Rooms that only read or write: they may be told of, but not tell, the physics.
 HEAVY = ["matplotlib", "trimesh", "typer", "rich", "pydantic", "h5py"]
 MODULES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")
@@ -91,18 +131,42 @@ def test_imports_only_from_above(path):
     inside = path.relative_to(PACKAGE).with_suffix("").parts
     package, source = ("jaxtrachea", *inside[:-1]), path.read_text()
     assert not faults(inside[0], source, package)
-    if inside[0] == "scene" and inside[1] != "__init__":
-        assert not faults(inside[1], source, package, SCENE, "jaxtrachea.scene")
+    if inside[0] in WITHIN and inside[1] != "__init__":
+        room = f"jaxtrachea.{inside[0]}"
+        assert not faults(inside[1], source, package, WITHIN[inside[0]], room)
+
+
+@pytest.mark.parametrize(("room", "others"), STRANGERS)
+def test_neighbours_do_not_know_each_other(room, others):
+    for path in (PACKAGE / room).rglob("*.py"):
+        names = imported(path.read_text(), ["jaxtrachea", *path.relative_to(PACKAGE).parts[:-1]])
+        rooms = {name.split(".")[1] for name in names if name.startswith("jaxtrachea.")}
+        assert not rooms & others, path
+
+
+def test_no_room_in_the_lists_that_does_not_exist():
+    there = lambda folder: {p.stem for p in folder.iterdir() if p.suffix == ".py" or p.is_dir()}  # noqa: E731
+    assert set().union(*ORDER) <= there(PACKAGE)
+    for room, order in WITHIN.items():
+        assert set().union(*order) <= there(PACKAGE / room), room
+
+
+def test_no_room_holds_too_much_of_the_package():
+    lines = {p: len(p.read_text().splitlines()) for p in PACKAGE.rglob("*.py")}
+    rooms = {p.relative_to(PACKAGE).parts[0] for p in lines}
+    share = {r: sum(n for p, n in lines.items() if p.relative_to(PACKAGE).parts[0] == r)
+             for r in rooms}  # fmt: skip
+    assert max(share.values()) <= 0.16 * sum(lines.values())
 
 
 @pytest.mark.parametrize(
     ("room", "source"),
     [
-        ("mechanics", "from jaxtrachea.mechanics.press import press"),
+        ("mechanics", "from jaxtrachea.surface import phong"),
         ("trachea", "def f():\n    import jaxtrachea.mechanics.beam as b"),
-        ("model", "from jaxtrachea import identify"),
-        ("surface", "from jaxtrachea.mechanics.press import press"),
-        ("identify", "from jaxtrachea.scene.stage import Scene"),
+        ("trachea", "from jaxtrachea import fit"),
+        ("surface", "from jaxtrachea.fit.fit import fit"),
+        ("fit", "from jaxtrachea.scene.stage import Scene"),
         ("trachea", "from jaxtrachea.surface.regions import bind"),
         ("mechanics", "from jaxtrachea.surface import local"),
         ("_numerics", "from .trachea import geometry"),
@@ -114,8 +178,10 @@ def test_the_walk_sees_a_fault(room, source):
 
 def test_the_walk_sees_a_fault_within_the_scene():
     source = "from jaxtrachea.scene import simulation"
-    assert faults("plan", source, order=SCENE, within="jaxtrachea.scene") == ["simulation"]
-    assert not faults("plots", source, order=SCENE, within="jaxtrachea.scene")
+    assert faults("plan", source, order=WITHIN["scene"], within="jaxtrachea.scene") == [
+        "simulation"
+    ]
+    assert not faults("plots", source, order=WITHIN["scene"], within="jaxtrachea.scene")
 
 
 def test_import_is_light():

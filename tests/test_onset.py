@@ -9,14 +9,15 @@ from scipy.integrate import quad
 from scipy.optimize import least_squares
 
 from jaxtrachea._numerics import centred_hinge
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import in_model
-from jaxtrachea.fit.predictions import leave_one_out, predictions, without
+from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.problem import build, default_parameters
+from jaxtrachea.fit.result import Settings
+from jaxtrachea.inference.cross_validation import leave_one_out, leave_repeats_out, without
 from jaxtrachea.inference.design import Candidates, check, gains, situation
 from jaxtrachea.inference.held_out import compare
 from jaxtrachea.inference.influence import influence
-from jaxtrachea.inference.repeats import leave_repeats_out
 from jaxtrachea.inference.results import verdict_sentence, write_hdf5
 from jaxtrachea.inference.stored import read_results
 from jaxtrachea.inference.verdict import describe_flat

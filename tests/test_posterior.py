@@ -14,11 +14,12 @@ import pytest
 from run_cli import GOOD, run
 
 from jaxtrachea.cli.run import Found, posterior_failed
-from jaxtrachea.fit.estimate import lane_of
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS, in_model
 from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.problem import Noise, build, default_parameters
+from jaxtrachea.fit.result import Settings
+from jaxtrachea.inference.estimate import lane_of
 from jaxtrachea.inference.posterior import Posterior, log_density, posterior
 from jaxtrachea.inference.posterior_start import around_the_fit, mode
 from jaxtrachea.inference.posterior_tables import rows_with_draws

@@ -20,11 +20,13 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 import jaxtrachea
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.predictions import leave_one_out, predictions, with_own_touch
+from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.problem import Noise, build
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.inference import held_out, results, stored
+from jaxtrachea.inference.cross_validation import leave_one_out, with_own_touch
 from jaxtrachea.inference.predict import predict_sources
 from jaxtrachea.inference.prediction_core import predicted
 from jaxtrachea.inference.sources import source_of
@@ -886,7 +888,8 @@ def test_bad_input_ends_with_a_cure(arguments, says, study, tmp_path, monkeypatc
 def test_virtual_trachea_ten_positions_by_the_command(tmp_path, monkeypatch, capsys):
     """The command on fits of nine positions predicts the tenth as `--leave-one-out` does."""
     from jaxtrachea.config import load_fit_spec
-    from jaxtrachea.fit.study import problem_of, read_data, settings_of
+    from jaxtrachea.fit.study import problem_of, settings_of
+    from jaxtrachea.measurements.data_files import read_data
     from jaxtrachea.measurements.read import Measurements, write_hdf5
 
     spec = load_fit_spec(VIRTUAL / "fit.toml")

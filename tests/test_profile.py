@@ -12,10 +12,11 @@ import synthetic
 from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.problem import Noise, build
 from jaxtrachea.fit.profile_search import Sides
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.inference.profile import choose, profiles
 from jaxtrachea.inference.results import profile_rows
 from jaxtrachea.measurements.read import Curve

@@ -40,7 +40,7 @@ def test_python_example_runs_and_says_plausible_things():
 
 def test_specification_in_the_readme_is_valid():
     from jaxtrachea.config import FitSpec
-    from jaxtrachea.fit.study import geometry_of
+    from jaxtrachea.trachea.section import geometry_of
 
     spec = FitSpec.model_validate(tomllib.loads(block("toml")))
     assert geometry_of(spec.trachea).rings == 16

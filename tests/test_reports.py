@@ -20,14 +20,16 @@ from jaxtrachea.cli.terminal_table import wide_table
 from jaxtrachea.files.html import page
 from jaxtrachea.files.pictures import plain, save_each, without_lost
 from jaxtrachea.files.tables import quoted, read_csv, unquoted, write_csv
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.predictions import LeftOut, predictions
+from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.problem import Noise, build
-from jaxtrachea.fit.rows import worst_first
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.inference import results
+from jaxtrachea.inference.cross_validation import LeftOut
 from jaxtrachea.inference.effective import effective, share_independent
 from jaxtrachea.inference.influence import influence
+from jaxtrachea.inference.rows import worst_first
 from jaxtrachea.inference.summary import with_residuals
 from jaxtrachea.measurements.read import Curve, read_measurements
 from jaxtrachea.mechanics.press import Options

@@ -11,18 +11,13 @@ import numpy as np
 import pytest
 
 from jaxtrachea.files.output import OutputExists, new_directory, new_output
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.predictions import (
-    Prediction,
-    curves_to_leave_out,
-    lag_correlation,
-    leave_one_out,
-    predictions,
-    rms,
-)
+from jaxtrachea.fit.predictions import Prediction, lag_correlation, predictions, rms
 from jaxtrachea.fit.problem import build
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.inference import results
+from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.report.fit import left_out_rows, markdown_table, number, report_text

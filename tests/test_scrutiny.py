@@ -12,10 +12,11 @@ from specimens import NAMES, POSITIONS, STIFF_CONTACT
 
 from jaxtrachea.fit import scrutiny
 from jaxtrachea.fit import structure as structures
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import in_model
 from jaxtrachea.fit.predictions import Prediction
 from jaxtrachea.fit.problem import build, default_parameters
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.inference import results
 from jaxtrachea.inference.effective import effective
 from jaxtrachea.inference.judgement import judgement, verdict_of

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.fit.fit import Settings
 from jaxtrachea.fit.levenberg_marquardt import Solved
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.starts import REDRAWS, best, completed, draw_starts
 from jaxtrachea.status import FitStatus
 

@@ -10,9 +10,11 @@ from run_cli import run
 
 from jaxtrachea.config import FitSpec, SpecError, TracheaSection, load_fit_spec
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.study import find_files, geometry_of, parameters_of, read_data, usable
+from jaxtrachea.fit.study import parameters_of, usable
+from jaxtrachea.measurements.data_files import find_files, read_data
 from jaxtrachea.measurements.read import Curve, DataError, Measurements, write_hdf5
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.trachea.section import geometry_of
 
 SPEC = """
 [data]

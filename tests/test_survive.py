@@ -27,7 +27,8 @@ from jaxtrachea.files import lock as run_lock
 from jaxtrachea.files import output
 from jaxtrachea.fit import fit
 from jaxtrachea.fit import levenberg_marquardt as solve
-from jaxtrachea.fit.study import problem_of, read_data
+from jaxtrachea.fit.study import problem_of
+from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.runs import chunks, former, in_chunks, journal, processes
 from jaxtrachea.runs import folder as run_folder
 from jaxtrachea.runs.processes import Lost, Meeting, Watch

@@ -14,10 +14,13 @@ import jax
 import numpy as np
 
 from jaxtrachea.config import FitSpec, load_fit_spec
-from jaxtrachea.fit.fit import FitResult, fit
-from jaxtrachea.fit.predictions import leave_one_out, rms
-from jaxtrachea.fit.study import problem_of, read_data, settings_of
+from jaxtrachea.fit.fit import fit
+from jaxtrachea.fit.predictions import rms
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.study import problem_of, settings_of
+from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.inference.results import peak_force
+from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.status import FitStatus
 
 HERE = Path(__file__).parent

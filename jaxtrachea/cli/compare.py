@@ -85,7 +85,7 @@ def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
     from jaxtrachea.fit.fit import fit
     from jaxtrachea.fit.study import settings_of
     from jaxtrachea.inference.comparison import Model
-    from jaxtrachea.inference.repeats import leave_repeats_out
+    from jaxtrachea.inference.cross_validation import leave_repeats_out
 
     models = []
     with progress_bar() as bar:
@@ -109,24 +109,26 @@ def _write(folder: Path, specs, loaded, models, clock):
 
     import jax
 
+    from jaxtrachea.files.provenance import provenance
+    from jaxtrachea.files.tables import write_text
     from jaxtrachea.inference import results
     from jaxtrachea.inference.comparison import compared
 
     rows, failed = compared(models)
     said = _sentences(models, rows)
     results.write_csv(folder / "compare.csv", [dataclasses.asdict(row) for row in rows])
-    results.write_text(folder / "report.md", _report(rows, said, failed, models))
+    write_text(folder / "report.md", _report(rows, said, failed, models))
     ends = [*clock, time.perf_counter()]
     timings = {n: ends[i + 1] - ends[i] for i, n in enumerate(("read", "fit", "write"))}
     measured, precision = loaded[0][1], loaded[0][0].fit.precision
     device = str(jax.devices()[0])
-    made = results.provenance(specs[0], measured.sha256(), device, precision, timings)
+    made = provenance(specs[0], measured.sha256(), device, precision, timings)
     made["specifications"] = [
         {"file": path.name, "model": m.name, "sha256": digest(path.read_bytes()).hexdigest()}
         for path, m in zip(specs, models, strict=True)
     ]
     del made["specification"]
-    results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+    write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
     return rows, failed, said
 
 
@@ -144,14 +146,14 @@ def _sentences(models, rows) -> dict[str, str]:
 
 def _left_out_words(models) -> str:
     """What was left out, in words; "curves" if nothing was."""
-    from jaxtrachea.inference.repeats import repeats
+    from jaxtrachea.inference.cross_validation import repeats
 
     return repeats(models[0].result.problem).words or "curves"
 
 
 def _left_out_notes(models) -> list[str]:
     """What is to be said of the refits behind the left-out column; nothing if all is well."""
-    from jaxtrachea.fit.predictions import refits_sentence
+    from jaxtrachea.inference.cross_validation import refits_sentence
 
     said = []
     for model in models:

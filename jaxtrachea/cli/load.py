@@ -20,7 +20,8 @@ def load(path: Path, data: Path | None, *, refits: bool = False, quiet: bool = F
         Stop: nothing can be fitted.
     """
     from jaxtrachea.config import SpecError, load_fit_spec
-    from jaxtrachea.fit.study import problem_of, read_data, usable
+    from jaxtrachea.fit.study import problem_of, usable
+    from jaxtrachea.measurements.data_files import read_data
     from jaxtrachea.measurements.read import DataError
 
     try:

@@ -180,7 +180,8 @@ def fit(
 def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = None) -> None:
     """Fit, then say where the next presses tell most."""
     from jaxtrachea.config import SpecError
-    from jaxtrachea.fit.study import candidates_of, settings_of
+    from jaxtrachea.fit.study import settings_of
+    from jaxtrachea.inference.design import candidates_of
 
     loaded, measurements, problem = load(spec, data, refits=True)
     if not problem.free:
@@ -243,7 +244,7 @@ def _has_unknowns(path: Path, spec, problem, options: list[str]) -> None:
 
 
 def _can_leave_out(problem) -> None:
-    from jaxtrachea.fit.predictions import curves_to_leave_out
+    from jaxtrachea.inference.cross_validation import curves_to_leave_out
 
     try:
         curves_to_leave_out(problem)

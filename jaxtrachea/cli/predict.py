@@ -84,9 +84,10 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
     import numpy as np
 
     from jaxtrachea.files.pictures import without_lost
+    from jaxtrachea.files.tables import write_text
     from jaxtrachea.inference import prediction_tables as tables
     from jaxtrachea.inference.predict import predict_sources
-    from jaxtrachea.inference.results import write_csv, write_text
+    from jaxtrachea.inference.results import write_csv
     from jaxtrachea.report import prediction as report
     from jaxtrachea.report.prediction_plots import draw_predictions
 
@@ -151,9 +152,10 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
     import numpy as np
 
     from jaxtrachea.files.pictures import without_lost
+    from jaxtrachea.files.tables import write_text
     from jaxtrachea.inference import prediction_tables as tables
     from jaxtrachea.inference.held_out import compare, pressable
-    from jaxtrachea.inference.results import write_csv, write_text
+    from jaxtrachea.inference.results import write_csv
     from jaxtrachea.report import prediction as report
     from jaxtrachea.report.prediction_plots import draw_compared
 

@@ -19,7 +19,7 @@ def measured_curves(stored, given: Sequence[str]):
     from pydantic import ValidationError
 
     from jaxtrachea.config import FitSpec, SpecError, load_fit_spec
-    from jaxtrachea.fit.study import read_data
+    from jaxtrachea.measurements.data_files import read_data
     from jaxtrachea.measurements.read import DataError
 
     specs = [name for name in given if name.lower().endswith(".toml")]
@@ -85,8 +85,8 @@ def _same_model(stored, path: Path, spec) -> None:
     """Refuse a specification whose tube or model is not that of the fit; only [data] is used."""
     import numpy as np
 
-    from jaxtrachea.fit.study import geometry_of
     from jaxtrachea.mechanics.press import Options
+    from jaxtrachea.trachea.section import geometry_of
 
     if "trachea" in spec.model_fields_set:
         mine, its = stored.problem.geometry, geometry_of(spec.trachea)

@@ -29,8 +29,8 @@ def run(
 ) -> Found:
     """Fit, by `fit` if given, then what needs a fit; all with `settings`."""
     from jaxtrachea.fit.fit import fit as in_one_go
-    from jaxtrachea.fit.predictions import leave_one_out
     from jaxtrachea.inference.bootstrap import bootstrap
+    from jaxtrachea.inference.cross_validation import leave_one_out
     from jaxtrachea.inference.influence import influence as diagnose
     from jaxtrachea.inference.posterior import posterior as draw
     from jaxtrachea.inference.profile import profiles
@@ -85,6 +85,8 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
 
     from jaxtrachea.files.html import page
     from jaxtrachea.files.pictures import without_lost
+    from jaxtrachea.files.provenance import provenance
+    from jaxtrachea.files.tables import write_text
     from jaxtrachea.fit.predictions import predictions
     from jaxtrachea.inference import results
     from jaxtrachea.inference.posterior_tables import write_draws
@@ -107,20 +109,20 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
         found.population, found.posterior,
     )  # fmt: skip
     text = without_lost(text, lost)
-    results.write_text(folder / "report.md", text)
+    write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")
     timings = {name: ends[i + 1] - ends[i] for i, name in enumerate(phases)}
-    made = results.provenance(
+    made = provenance(
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
     ) | {"run": journal}
     reading = loaded.data.model_dump(mode="json")
     results.write_hdf5(folder / "results.h5", result, made, profiles, resampled, reading)
     if found.posterior is not None:
         write_draws(folder / "results.h5", found.posterior)
-    results.write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+    write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
     pictures = {path.name: path.read_bytes() for path in drawn}
-    results.write_text(folder / "report.html", page(text, pictures, made))
+    write_text(folder / "report.html", page(text, pictures, made))
 
 
 def _write_tables(folder: Path, found: Found, bad, seen) -> None:

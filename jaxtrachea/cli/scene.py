@@ -236,7 +236,7 @@ def _provenance(scene: Path, staged, clock: list[float]) -> dict:
 
     import jax
 
-    from jaxtrachea.inference.results import provenance
+    from jaxtrachea.files.provenance import provenance
 
     inputs = {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in staged.files}
     seconds = {name: clock[i + 1] - clock[i] for i, name in enumerate(("read", "compute"))}
@@ -247,7 +247,7 @@ def _provenance(scene: Path, staged, clock: list[float]) -> dict:
 def _write_json(folder: Path, made: dict) -> None:
     import json
 
-    from jaxtrachea.inference.results import write_text
+    from jaxtrachea.files.tables import write_text
 
     write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
 

@@ -106,7 +106,8 @@ def _write(folder: Path, name: str, rows, scene: Path | None, inputs, clock) -> 
     import jax
 
     from jaxtrachea.files.pictures import save_each, without_lost
-    from jaxtrachea.inference.results import provenance, write_text
+    from jaxtrachea.files.provenance import provenance
+    from jaxtrachea.files.tables import write_text
     from jaxtrachea.tradeoff.levels import BUILT_IN
     from jaxtrachea.tradeoff.page import lines, scene_text
     from jaxtrachea.tradeoff.plots import draw

@@ -43,3 +43,8 @@ def read_csv(path: Path) -> list[dict[str, Any]]:
     with path.open(encoding="utf-8", newline="") as stream:
         rows = csv.DictReader(stream)
         return [{unquoted(k): unquoted(v) for k, v in row.items()} for row in rows]
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file."""
+    path.write_text(text, encoding="utf-8")

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrachea.fit import residual as _residual
-from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.lane import Lane
+from jaxtrachea.fit.problem import Problem
 
 
 class Point(NamedTuple):

@@ -16,8 +16,9 @@ from jaxtyping import Array, Float
 from scipy.special import stdtrit
 
 from jaxtrachea.fit.cost import assemble, entry_scale, robust
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import chunk_size
-from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.residual import observations, residual
 from jaxtrachea.fit.structure import leaving_alone
 

@@ -16,8 +16,9 @@ from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.fit.cost import entry_scale, evaluate, robust
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import Solved, Tolerances, held, promise, rounding_cost
-from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.residual import residual_value
 from jaxtrachea.status import FitStatus
 

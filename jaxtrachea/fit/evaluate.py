@@ -8,9 +8,10 @@ import numpy as np
 from jaxtrachea.fit.cost import robust
 from jaxtrachea.fit.covariance import Information, Uncertainty, half_widths
 from jaxtrachea.fit.criteria import criteria
-from jaxtrachea.fit.fit import FitResult, first_sigma, next_sigma, precision_unit
+from jaxtrachea.fit.noise import first_sigma, next_sigma, precision_unit
 from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.status import FitStatus
 
 #: What reports say in the place of estimates.

@@ -25,7 +25,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import epsilon, solve_spd
 from jaxtrachea.fit.cost import Point, assemble, entry_scale, evaluate, weights
-from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.lane import Lane
+from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.residual import of_trials, residual_value, size
 from jaxtrachea.status import FitStatus
 
@@ -377,3 +378,7 @@ def _idle(problem: Problem, lanes: Lane, chunk: int, dtype) -> State:
 def _compiled(problem: Problem, tolerances: Tolerances, rounds: int):
     run = functools.partial(_advance, problem, tolerances, rounds)
     return jax.jit(run, donate_argnums=4)
+
+
+#: Lanes computed together at most, and the part of the free memory that they may take.
+MOST_SEATS, PART_OF_MEMORY = 128, 0.5

@@ -6,18 +6,15 @@ Steps as large as the presses, a rounded corner for each curve, bounds within re
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.parameters import DEFAULTS, OF_THE_PRESS, Parameter
 from jaxtrachea.measurements.first_touch import FirstTouch, blend_widths, first_touch
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
-
-if TYPE_CHECKING:
-    from jaxtrachea.fit.problem import Lane
 
 
 def natural_steps(
@@ -45,7 +42,7 @@ def onset_is_sought(parameters: Sequence[Parameter], options: Options) -> bool:
     return free and options.contact == "unilateral"
 
 
-def touches(lanes: "Lane", parameters: Sequence[Parameter]) -> FirstTouch:
+def touches(lanes: Lane, parameters: Sequence[Parameter]) -> FirstTouch:
     """Change point of every trial of every lane, see `first_touch`; (lanes, T) each."""
     shape, samples = lanes.s_c.shape, lanes.force.shape[-1]
     displacement, force, precision = (
@@ -58,7 +55,7 @@ def touches(lanes: "Lane", parameters: Sequence[Parameter]) -> FirstTouch:
 
 
 def blends(
-    lanes: "Lane",
+    lanes: Lane,
     curves: Sequence[Sequence[Curve]],
     sigma_force: float | None,
     parameters: Sequence[Parameter],
@@ -100,7 +97,7 @@ def where_sought(
     return initial, bounds
 
 
-def within_reach(lanes: "Lane", parameters: Sequence[Parameter]) -> "Lane":
+def within_reach(lanes: Lane, parameters: Sequence[Parameter]) -> Lane:
     """Lanes whose onset, where its bounds are the default, lies within reach of the samples.
 
     From one range of displacement before the first sample to the last one. A curve that does not

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from jaxtrachea.fit.fit import FitResult, Settings
 from jaxtrachea.fit.levenberg_marquardt import Solved, chunk_size, levenberg_marquardt
+from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.structure import leaving_alone, pins
 from jaxtrachea.status import FitStatus, ProfileEnd
 

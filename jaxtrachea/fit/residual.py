@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.parameters import SKELETON
-from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.problem import Problem
 from jaxtrachea.mechanics.equilibrium import sensitivity
 from jaxtrachea.mechanics.force_law import Law, duffing
 from jaxtrachea.mechanics.press import (

@@ -18,14 +18,16 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fit.fit import FitResult, Minima, Settings, data_weight, first_sigma, scales
+from jaxtrachea.fit.minima import Minima, data_weight
+from jaxtrachea.fit.natural_sizes import natural_sizes
+from jaxtrachea.fit.noise import first_sigma
 from jaxtrachea.fit.parameters import OF_THE_PRESS, SKELETON
 from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.profile_search import Sides, find_ends
 from jaxtrachea.fit.residual import inputs
-from jaxtrachea.fit.starts import EXACT, box
+from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.starts import EXACT, box, scales
 from jaxtrachea.fit.structure import Structure, positions
-from jaxtrachea.inference.judgement import natural_sizes
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 #: Relative standard error along a direction, and condition number, from which there is doubt about

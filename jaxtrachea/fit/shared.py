@@ -25,8 +25,9 @@ from jaxtrachea._numerics import epsilon
 from jaxtrachea.fit import schur as arrow
 from jaxtrachea.fit.cost import evaluate
 from jaxtrachea.fit.covariance import Information
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import Solved, Tolerances, chunk_size, levenberg_marquardt
-from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.residual import observations, residual_value
 from jaxtrachea.status import FitStatus
 

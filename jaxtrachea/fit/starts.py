@@ -165,3 +165,9 @@ def _drawn(problem: Problem, settings, jobs, slots, turn: int) -> Float[np.ndarr
 def _number(name: tuple[str, str]) -> int:
     """A number that stands for a lane's name."""
     return int.from_bytes(hashlib.sha256("\0".join(name).encode()).digest()[:8], "little")
+
+
+def scales(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Which unknowns have a logarithmic scale, and the step of the others; (lanes, P) each."""
+    log = of_unknowns(problem, lambda p: p.scale == "log", 0.0) > 0
+    return log, of_unknowns(problem, lambda p: p.step, 1.0)

@@ -19,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.parameters import SKELETON
-from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.residual import inputs
 from jaxtrachea.fit.starts import box
 from jaxtrachea.mechanics.force_law import Law

@@ -15,10 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea.fit.fit import FitResult, Settings, fit
+from jaxtrachea.fit.fit import fit
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import chunk_size
 from jaxtrachea.fit.predictions import Prediction, predictions
-from jaxtrachea.fit.problem import Lane
+from jaxtrachea.fit.result import FitResult, Settings
 
 Kind = Literal["parametric", "residual"]
 #: Refits handed to the solver at a time; bounds the memory.

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.fit.criteria import Criteria, weights
-from jaxtrachea.fit.fit import FitResult
 from jaxtrachea.fit.predictions import predictions, rms
 from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.inference.cross_validation import Missed
 from jaxtrachea.inference.effective import CORRELATED, effective_samples
-from jaxtrachea.inference.repeats import Missed
 
 #: Difference of AICc up to which models cannot be told apart, and from which on they clearly can
 #: (Burnham and Anderson 2002, sec. 2.6).

@@ -21,12 +21,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxtrachea._arguments import check_word
+from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.fit.cost import assemble
 from jaxtrachea.fit.covariance import informations
-from jaxtrachea.fit.fit import FitResult
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.press_scale import relative_change
-from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.residual import residual
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.bootstrap import Bootstrap
 from jaxtrachea.inference.design_press import marginal, of_a_new_press
 from jaxtrachea.inference.results import succeeded
@@ -288,3 +290,25 @@ def identifiability(known: Situation, s: Float[np.ndarray, " n"], depth: float) 
         low = np.maximum(values[..., 0], 1e-14 * values[..., -1])
         total = total + 0.5 * np.log(values[..., -1] / low)
     return Map(s, condition, weakest * np.sign(largest), np.exp(total / len(added)))
+
+
+def candidates_of(spec: FitSpec, problem: Problem) -> Candidates:
+    """The presses of the [design] section; left out: first to last ring, half to full depth.
+
+    Raises:
+        SpecError: positions outside the tube, or unknowns that a new curve would not share.
+    """
+    try:
+        check(problem)
+    except ValueError as error:
+        raise SpecError(f"parameters: {error}") from None
+    section, length = spec.design, float(problem.geometry.length)
+    deepest = float(np.max(problem.lanes.displacement))
+    rings = problem.geometry.ring_positions
+    s = (float(rings[0]), float(rings[-1])) if section.s is None else section.s
+    if s[0] < 0 or s[1] > length:
+        raise SpecError(
+            f"design.s: {s[0]:g} to {s[1]:g} mm, tube spans 0 to {length:g} mm; give places on it"
+        )
+    depth = (0.5 * deepest, deepest) if section.depth is None else section.depth
+    return grid(s, depth, section.candidates)

@@ -20,8 +20,8 @@ from jaxtyping import Float
 from scipy.special import stdtrit
 
 from jaxtrachea.fit import shared as joint
-from jaxtrachea.fit.fit import FitResult
 from jaxtrachea.fit.predictions import Prediction, lag_correlation
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.starts import of_unknowns
 from jaxtrachea.inference.judgement import interval95, within_bounds
 from jaxtrachea.inference.profile import Profiles

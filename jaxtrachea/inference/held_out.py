@@ -7,9 +7,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrachea.fit.fit import Settings, fit
+from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.onset import onset_is_sought
 from jaxtrachea.fit.problem import Problem, build, check_curve
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.inference.predict import CurvePrediction, predict_sources
 from jaxtrachea.inference.prediction_core import compiled_slopes
 from jaxtrachea.inference.sources import Source, source_of

@@ -25,11 +25,12 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrachea.fit.cost import assemble, entry_scale, robust
 from jaxtrachea.fit.covariance import SINGULAR
-from jaxtrachea.fit.estimate import hessian
-from jaxtrachea.fit.fit import FitResult
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import chunk_size
-from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.residual import observations, residual
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.inference.estimate import hessian
 from jaxtrachea.inference.results import succeeded
 
 #: det(1 - hat matrix of a curve) below which the curve alone determines some combination.

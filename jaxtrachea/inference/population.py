@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import chdtri, stdtrit
 
-from jaxtrachea.fit.fit import FitResult
 from jaxtrachea.fit.parameters import Parameter
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.judgement import relative_errors
 from jaxtrachea.inference.profile import Profiles
 

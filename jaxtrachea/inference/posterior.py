@@ -24,10 +24,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea.fit.cost import weights
-from jaxtrachea.fit.fit import FitResult
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import chunk_size
-from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.residual import observations, residual_value
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.chains import grade, lenient, mixing, quantiles
 from jaxtrachea.inference.posterior_start import Start, around_the_draws, around_the_fit, mode
 from jaxtrachea.inference.results import succeeded

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxtrachea.fit.fit import FitResult, Settings, fit
+from jaxtrachea.fit.fit import fit
+from jaxtrachea.fit.result import FitResult, Settings
 
 #: Nearest that the centre comes to a bound, as a share of the width: what float64 can tell.
 _EDGE = 1e-12

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxtrachea.files.atomic import hdf5_file
-from jaxtrachea.fit.fit import FitResult
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.bootstrap import Bootstrap
 from jaxtrachea.inference.population import Population
 from jaxtrachea.inference.posterior import Posterior

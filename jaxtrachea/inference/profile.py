@@ -15,8 +15,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fit.fit import FitResult, Settings
 from jaxtrachea.fit.profile_search import Sides, find_ends, on_grid
+from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 

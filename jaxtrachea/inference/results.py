@@ -1,10 +1,6 @@
 """What a fit found, as rows and files: HDF5, CSV, provenance (docs/results.md)."""
 
-import datetime
-import hashlib
 import json
-import platform
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -14,19 +10,18 @@ import numpy as np
 from jaxtrachea.files.atomic import hdf5_file
 from jaxtrachea.files.tables import write_csv as write_csv
 from jaxtrachea.fit.evaluate import NOTHING_FITTED
-from jaxtrachea.fit.fit import FitResult
 from jaxtrachea.fit.parameters import OF_THE_PRESS
 from jaxtrachea.fit.press_scale import sizes_of_press
-from jaxtrachea.fit.rows import row_places, samples_of, trials_of
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference import store
 from jaxtrachea.inference.bootstrap import Bootstrap
 from jaxtrachea.inference.judgement import judgement, verdict_of
 from jaxtrachea.inference.population import Population
 from jaxtrachea.inference.profile import Profiles
+from jaxtrachea.inference.rows import row_places, samples_of, trials_of
 from jaxtrachea.inference.verdict import VERDICTS, describe_flat
 from jaxtrachea.measurements.read import BadCurve
 from jaxtrachea.measurements.usage_tables import lane_cells
-from jaxtrachea.runs.journal import installed
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 SCHEMA = "jaxtrachea-results"
@@ -269,11 +264,6 @@ def profile_rows(profiles: Profiles) -> Iterator[dict[str, object]]:
             }
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file."""
-    path.write_text(text, encoding="utf-8")
-
-
 def write_hdf5(
     path: Path,
     result: FitResult,
@@ -367,33 +357,3 @@ def _cell(unknowns, i: int, pick: int) -> str:
     if i >= len(unknowns):
         return ""
     return unknowns[i][0].name if pick == 0 else unknowns[i][pick]
-
-
-def provenance(
-    spec: Path, inputs: dict[str, str], device: str, dtype: str, timings: dict[str, float]
-) -> dict[str, object]:
-    """Everything needed to repeat a run: versions, device, dtype, SHA-256 of every input.
-
-    Args:
-        spec: the specification file.
-        inputs: SHA-256 by measurement file.
-        device: as JAX names it.
-        dtype: of the computation.
-        timings: seconds by phase.
-    """
-    versions = {"python": platform.python_version(), "platform": platform.platform()}
-    for name in ("jaxtrachea", "jax", "jaxlib", "numpy", "scipy", "equinox", "optax", "h5py"):
-        versions[name] = installed(name)
-    return {
-        "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "versions": versions,
-        "device": device,
-        "dtype": dtype,
-        "specification": {
-            "file": spec.name,
-            "sha256": hashlib.sha256(spec.read_bytes()).hexdigest(),
-        },
-        "inputs": {Path(name).name: digest for name, digest in inputs.items()},
-        "seconds": {name: round(value, 3) for name, value in timings.items()},
-    }

@@ -13,8 +13,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.parameters import Parameter
-from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.problem import Problem
 from jaxtrachea.inference.store import GEOMETRY
 from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.read import Curve, DataError

@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from jaxtrachea.fit.fit import FitResult
-from jaxtrachea.fit.predictions import LeftOut, Prediction, rms
-from jaxtrachea.fit.rows import row_places, trials_of
+from jaxtrachea.fit.predictions import Prediction, rms
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.inference.cross_validation import LeftOut
 from jaxtrachea.inference.effective import Effective
 from jaxtrachea.inference.results import said_before
+from jaxtrachea.inference.rows import row_places, trials_of
 
 
 def with_residuals(

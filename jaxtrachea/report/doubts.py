@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxtrachea.fit.fit import FitResult
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.effective import CORRELATED, Effective
 from jaxtrachea.inference.posterior import Posterior
 from jaxtrachea.inference.results import lane_label

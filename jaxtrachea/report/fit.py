@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea.fit.evaluate import NOTHING_FITTED
-from jaxtrachea.fit.fit import FitResult
 from jaxtrachea.fit.parameters import OF_THE_PRESS
-from jaxtrachea.fit.predictions import LeftOut, Prediction, rms
-from jaxtrachea.fit.rows import ONE_BY_ONE, and_more, listed
+from jaxtrachea.fit.predictions import Prediction, rms
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.bootstrap import FEWEST, Bootstrap
+from jaxtrachea.inference.cross_validation import LeftOut
 from jaxtrachea.inference.effective import CORRELATED, Effective, effective
 from jaxtrachea.inference.judgement import DETERMINED, judgement, verdict_of, within_bounds
 from jaxtrachea.inference.population import Population, population_rows
@@ -24,6 +24,7 @@ from jaxtrachea.inference.results import (
     unknown_label,
     verdict_sentence,
 )
+from jaxtrachea.inference.rows import ONE_BY_ONE, and_more, listed
 from jaxtrachea.measurements.read import BadCurve
 from jaxtrachea.report.doubts import distrust, doubts
 from jaxtrachea.status import FitStatus, ProfileEnd

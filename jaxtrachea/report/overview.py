@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxtrachea.fit.predictions import LeftOut, predictions, rms
-from jaxtrachea.fit.rows import and_more, listed
+from jaxtrachea.fit.predictions import predictions, rms
+from jaxtrachea.inference.cross_validation import LeftOut
 from jaxtrachea.inference.effective import CORRELATED, effective
 from jaxtrachea.inference.results import lane_label, succeeded, verdict_sentence
+from jaxtrachea.inference.rows import and_more, listed
 from jaxtrachea.measurements.usage_tables import sentences
 from jaxtrachea.report import fit as report
 from jaxtrachea.report import sections

@@ -9,12 +9,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxtrachea.files.pictures import plain, save_each
-from jaxtrachea.fit.fit import FitResult
 from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.rows import ONE_BY_ONE, listed, worst_first
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.design import Candidates, Choice, Map
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.results import lane_label, unknown_label
+from jaxtrachea.inference.rows import ONE_BY_ONE, listed, worst_first
 
 #: Lanes that have a line of their own in a picture of all; of more, the worst.
 LINES = 200

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxtrachea.fit.rows import ONE_BY_ONE, and_more, listed
 from jaxtrachea.inference.influence import Influence
 from jaxtrachea.inference.influence_tables import curve_rows, sample_label, sample_rows, top_samples
 from jaxtrachea.inference.posterior import Posterior
 from jaxtrachea.inference.results import lane_label, succeeded, unknown_label, write_csv
+from jaxtrachea.inference.rows import ONE_BY_ONE, and_more, listed
 from jaxtrachea.report.doubts import distrust
 from jaxtrachea.report.fit import markdown_table, more_of, number
 

@@ -20,16 +20,15 @@ from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.fit import residual
 from jaxtrachea.fit.covariance import Uncertainty
 from jaxtrachea.fit.criteria import Criteria
-from jaxtrachea.fit.fit import FitResult
+from jaxtrachea.fit.levenberg_marquardt import MOST_SEATS, PART_OF_MEMORY
 from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.runs import journal as journals
 from jaxtrachea.runs.journal import Journal
 
 #: Lanes of a chunk at most, and its residual entries times starts at most: about ten seconds of
 #: one core.
 MOST_LANES, MOST_ENTRIES = 4096, 4_000_000
-#: Lanes computed together at most, and the part of the free memory that they may take.
-MOST_SEATS, PART_OF_MEMORY = 128, 0.5
 _APART = ("problem", "criteria", "uncertainty")
 #: Fields of a result that are arrays with the leading axis of lanes.
 FIELDS = tuple(f.name for f in dataclasses.fields(FitResult) if f.name not in _APART)

@@ -8,8 +8,8 @@ import numpy as np
 
 from jaxtrachea.fit.covariance import Uncertainty
 from jaxtrachea.fit.criteria import Criteria
-from jaxtrachea.fit.fit import FitResult
 from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.starts import of_unknowns
 from jaxtrachea.inference.results import MORE, SCHEMA, SCHEMA_VERSION
 from jaxtrachea.runs import journal as journals

@@ -9,9 +9,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxtrachea.fit.fit import FitResult, Settings
 from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.inference.effective import effective
 from jaxtrachea.inference.results import lane_rows, write_csv
 from jaxtrachea.inference.summary import with_residuals

@@ -7,12 +7,12 @@ import json
 import os
 import uuid
 from collections.abc import Iterator
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import get_args, get_origin, get_type_hints
 
 import jaxtrachea
 from jaxtrachea.files.atomic import write_whole
+from jaxtrachea.files.provenance import installed
 
 SCHEMA = "jaxtrachea-run"
 SCHEMA_VERSION = 1
@@ -89,14 +89,6 @@ def describe(
         device=device,
         **sizes,
     )
-
-
-def installed(package: str) -> str:
-    """Version of a package, in words where there is none."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def differences(was: Journal, now: Journal) -> Iterator[str]:

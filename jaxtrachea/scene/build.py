@@ -13,7 +13,6 @@ import numpy as np
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.contact import shapes
 from jaxtrachea.contact.pose import pose_from_vector
-from jaxtrachea.fit.study import geometry_of
 from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.plan import PlanError, Wishes
@@ -26,6 +25,7 @@ from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.imported import read_mesh
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import MeshError
+from jaxtrachea.trachea.section import geometry_of
 from jaxtrachea.trachea.tube import make_tube
 from jaxtrachea.units import UnitError, column_unit, convert
 

@@ -19,6 +19,7 @@ import fitting
 import numpy as np
 
 from jaxtrachea.fit import fit
+from jaxtrachea.fit.result import Settings
 from jaxtrachea.measurements.read import Measurements, write_hdf5
 
 SPECIMENS, SAMPLE, ROUNDS = 10_000, 20, 3
@@ -50,7 +51,7 @@ def main() -> None:
     problem, model, forces = fitting.study(SPECIMENS, SPOTS, DEPTHS)
     few = forces[:SAMPLE]
     cases = {
-        "jaxtrachea: fit with standard errors": lambda: fit.fit(problem, fit.Settings(starts=1)),
+        "jaxtrachea: fit with standard errors": lambda: fit.fit(problem, Settings(starts=1)),
         "scipy least_squares lm, numpy residual and Jacobian": fitting.one_by_one(
             model, few, lambda i: fitting.with_scipy(model.value, model.jacobian)
         ),

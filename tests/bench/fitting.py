@@ -18,8 +18,12 @@ from scipy.optimize import least_squares
 
 from jaxtrachea.fit import fit
 from jaxtrachea.fit import levenberg_marquardt as solve
+from jaxtrachea.fit.lane import Lane
+from jaxtrachea.fit.noise import first_sigma
 from jaxtrachea.fit.parameters import in_model
-from jaxtrachea.fit.problem import Lane, build, default_parameters
+from jaxtrachea.fit.problem import build, default_parameters
+from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.starts import draw_starts
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.geometry import table_1
@@ -242,9 +246,9 @@ def main() -> None:
     out = common.Writer("fitting", "scipy", "lmfit", "optimistix")
     problem, model, forces = study()
     check(problem, model, forces)
-    settings = fit.Settings(starts=1)
-    jobs, sigma = np.arange(SPECIMENS), fit.first_sigma(problem)
-    starts = fit.draw_starts(problem, settings)
+    settings = Settings(starts=1)
+    jobs, sigma = np.arange(SPECIMENS), first_sigma(problem)
+    starts = draw_starts(problem, settings)
     first = {}
 
     def ours():
@@ -296,7 +300,7 @@ def agreement(results, count) -> dict[str, dict]:
     """Cost of every solver against the lowest found for the specimen, and evaluations."""
     costs, evaluations = {}, {}
     for name, found in results.items():
-        if isinstance(found, fit.FitResult):
+        if isinstance(found, FitResult):
             # Cost is in units of the estimated sigma; recompute it from the residuals.
             total = found.rms[:, 0] ** 2 * found.samples / 2
             costs[name], evaluations[name] = total, found.iterations

@@ -15,8 +15,11 @@ import numpy as np
 import update
 
 from jaxtrachea import Material, press, simulate, table_1
-from jaxtrachea.fit import cost, fit, residual
+from jaxtrachea.fit import cost, residual
 from jaxtrachea.fit import levenberg_marquardt as solve
+from jaxtrachea.fit.noise import first_sigma
+from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.starts import draw_starts
 from jaxtrachea.scene.stage import Poses
 
 jax.config.update("jax_cpu_enable_async_dispatch", False)
@@ -116,9 +119,9 @@ def fits(out: common.Writer) -> None:
     """Residual of a fit, with its Jacobian, and a whole step of Levenberg-Marquardt; 512 lanes."""
     problem, *_ = fitting.study(FITS)
     program, lanes = problem.program, jax.device_put(problem.lanes)
-    settings = fit.Settings(starts=1)
-    theta = jnp.asarray(fit.draw_starts(problem, settings))
-    sigma = jnp.asarray(fit.first_sigma(problem))
+    settings = Settings(starts=1)
+    theta = jnp.asarray(draw_starts(problem, settings))
+    sigma = jnp.asarray(first_sigma(problem))
     of = lambda f: jax.vmap(functools.partial(f, program))  # noqa: E731
     point = jax.jit(of(cost.evaluate))(theta, lanes, sigma)
     same = lambda v, dtype: jnp.full(FITS, v, dtype)  # noqa: E731

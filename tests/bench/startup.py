@@ -39,12 +39,15 @@ print(json.dumps(first - later))
 """
 FIT = """
 import fitting, jax, numpy as np
-from jaxtrachea.fit import fit, levenberg_marquardt
+from jaxtrachea.fit.levenberg_marquardt import levenberg_marquardt
+from jaxtrachea.fit.noise import first_sigma
+from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.starts import draw_starts
 fitting.SPECIMENS = 256
 p, *_ = fitting.study()
-s = fit.Settings(starts=1)
-args = (p, np.arange(256), fit.draw_starts(p, s), fit.first_sigma(p))
-f = lambda *a: solve.levenberg_marquardt(*a).theta
+s = Settings(starts=1)
+args = (p, np.arange(256), draw_starts(p, s), first_sigma(p))
+f = lambda *a: levenberg_marquardt(*a).theta
 """
 CASES = {
     "import jax (alone)": START + "import json, jax\n" + STOP,

@@ -21,6 +21,7 @@ import skeleton
 import update
 
 from jaxtrachea.fit import fit
+from jaxtrachea.fit.result import Settings
 
 TURNS = 7
 SPECIMENS, SAMPLE = 500, 10
@@ -122,7 +123,7 @@ def fits() -> dict[str, Case]:
     """A batch with standard errors against solvers that take one specimen at a time."""
     problem, model, forces = fitting.study(SPECIMENS)
     fitting.check(problem, model, forces)
-    settings = fit.Settings(starts=1)
+    settings = Settings(starts=1)
     solvers = {
         "scipy least_squares lm": lambda i: fitting.with_scipy(model.value, model.jacobian),
         "lmfit leastsq": lambda i: fitting.with_lmfit(model),

@@ -167,9 +167,10 @@ def fitted(chosen):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from jaxtrachea.fit.fit import Settings, fit
+    from jaxtrachea.fit.fit import fit
     from jaxtrachea.fit.parameters import in_model
     from jaxtrachea.fit.problem import build, default_parameters
+    from jaxtrachea.fit.result import Settings
     from jaxtrachea.measurements.read import Curve
     from jaxtrachea.mechanics.press import Options
     from jaxtrachea.trachea.geometry import table_1

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea.fit.cost import Point, evaluate
+from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import FIRST_RADIUS, RUNNING, State, Tolerances, iterate
-from jaxtrachea.fit.problem import Lane, Problem
+from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.residual import size
 from jaxtrachea.trachea.geometry import Geometry
 

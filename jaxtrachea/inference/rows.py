@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxtrachea.fit.fit import FitResult
+from jaxtrachea.fit.result import FitResult
 
 #: Lanes that are listed and drawn one by one; of more, the worst.
 ONE_BY_ONE = 12

@@ -1,0 +1,46 @@
+"""What a result comes from: versions, command, digests of every input."""
+
+import datetime
+import hashlib
+import platform
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+
+def installed(package: str) -> str:
+    """Version of a package, in words where there is none."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def provenance(
+    spec: Path, inputs: dict[str, str], device: str, dtype: str, timings: dict[str, float]
+) -> dict[str, object]:
+    """Everything needed to repeat a run: versions, device, dtype, SHA-256 of every input.
+
+    Args:
+        spec: the specification file.
+        inputs: SHA-256 by measurement file.
+        device: as JAX names it.
+        dtype: of the computation.
+        timings: seconds by phase.
+    """
+    versions = {"python": platform.python_version(), "platform": platform.platform()}
+    for name in ("jaxtrachea", "jax", "jaxlib", "numpy", "scipy", "equinox", "optax", "h5py"):
+        versions[name] = installed(name)
+    return {
+        "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "versions": versions,
+        "device": device,
+        "dtype": dtype,
+        "specification": {
+            "file": spec.name,
+            "sha256": hashlib.sha256(spec.read_bytes()).hexdigest(),
+        },
+        "inputs": {Path(name).name: digest for name, digest in inputs.items()},
+        "seconds": {name: round(value, 3) for name, value in timings.items()},
+    }

@@ -1,0 +1,149 @@
+"""The files that a specification names, found and read; what is wrong is said with its key."""
+
+import contextlib
+import dataclasses
+import re
+from pathlib import Path
+
+from jaxtrachea.config import FitSpec, SpecError
+from jaxtrachea.measurements.names import appearance
+from jaxtrachea.measurements.read import (
+    BadCurve,
+    DataError,
+    Measurements,
+    ReadOptions,
+    read_measurements,
+)
+from jaxtrachea.measurements.readers.patterns import ensure_quick
+from jaxtrachea.measurements.readers.recognise import is_workbook
+
+
+def find_files(spec: FitSpec, root: Path) -> list[Path]:
+    """Files of `data.files`, patterns expanded, sorted within each pattern.
+
+    Args:
+        spec: the specification.
+        root: folder that relative paths start from.
+
+    Raises:
+        SpecError: a path or pattern matches nothing.
+    """
+    found: dict[Path, None] = {}
+    for i, pattern in enumerate(spec.data.files):
+        try:
+            matches = _matches(root, pattern)
+        except (ValueError, NotImplementedError, IndexError, OSError) as error:
+            raise SpecError(
+                f"data.files.{i}: {_short(pattern)} is no usable path ({_reason(error)}); "
+                "name files, or a pattern such as 'curves/*.csv'"
+            ) from None
+        files = [path for path in matches if path.is_file()]
+        if not files:
+            raise SpecError(
+                f"data.files.{i}: {_short(pattern)} matches in {root} "
+                f"{_what(matches) if matches else _nothing(root / pattern)}"
+            )
+        found.update(dict.fromkeys(files))
+    return list(found)
+
+
+def _short(pattern: str) -> str:
+    """A pattern for a message."""
+    return repr(pattern if len(pattern) < 200 else f"{pattern[:196]} ...")
+
+
+def _what(matches: list[Path]) -> str:
+    """What a pattern leads to that is no file, and the cure."""
+    if matches[0].is_dir():
+        return "a folder; list the files in it, as in 'folder/*.csv'"
+    return "a device or a pipe; expected a file"
+
+
+def _nothing(path: Path) -> str:
+    """That there is no such file, the one whose name looks like it if there is any, the cure."""
+    with contextlib.suppress(OSError):
+        names = sorted(other.name for other in path.parent.iterdir())
+        for name in names:
+            if name != path.name and appearance(name) == appearance(path.name):
+                return f"no file; {ascii(name)}, which looks alike, is there; write its name so"
+    return "no file; check the name, or say where the data are with --data"
+
+
+def _reason(error: Exception) -> str:
+    """Why, without repeating the path."""
+    return (isinstance(error, OSError) and error.strerror) or str(error)
+
+
+def _matches(root: Path, pattern: str) -> list[Path]:
+    """Files and folders that a path or pattern names; a name that exists is taken as it is."""
+    path = root / pattern
+    if pattern and path.exists():
+        return [path]
+    relative = path.relative_to(path.anchor) if Path(pattern).is_absolute() else pattern
+    # Folders below folders once: pathlib walks through all of them for every further "**/".
+    once = re.sub(r"(?:\*\*/)+", "**/", str(relative))
+    return sorted((Path(path.anchor) if Path(pattern).is_absolute() else root).glob(once))
+
+
+def read_data(spec: FitSpec, root: Path) -> Measurements:
+    """Read all files of a specification.
+
+    Of several files, one that cannot be read at all costs one `BadCurve` named after it.
+
+    Raises:
+        SpecError: no file, or reading options that contradict each other.
+        DataError: the only file cannot be read, or two files hold the same specimen and trial.
+    """
+    names = {f.name for f in dataclasses.fields(ReadOptions)}
+    try:
+        options = ReadOptions(**{k: v for k, v in spec.data.model_dump().items() if k in names})
+    except ValueError as error:
+        raise SpecError(f"data: {error}") from None
+    files = find_files(spec, root)
+    if options.name_pattern is not None:
+        try:
+            ensure_quick(options.name_pattern, [path.name for path in files])
+        except DataError as error:
+            raise SpecError(f"data.specimen: {error}") from None
+    if options.sheet is not None and not any(map(is_workbook, files)):
+        raise SpecError("data.sheet: none of the files is a workbook (xlsx); remove it")
+    if len(files) == 1:
+        return read_measurements(files, options)
+    parts = [_read_one(path, options) for path in files]
+    curves = [curve for part in parts for curve in part.curves]
+    bad = [curve for part in parts for curve in part.bad]
+    notes = [note for part in parts for note in part.notes]
+    _refuse_twice(parts)
+    return Measurements(tuple(curves), tuple(bad), tuple(files), tuple(notes))
+
+
+def _read_one(path: Path, options: ReadOptions) -> Measurements:
+    """One file of several; what spoils it becomes its only row."""
+    try:
+        return read_measurements([path], options)
+    except DataError as error:
+        text = str(error).removeprefix(f"{path}: ")
+        message, _, cure = text.rpartition("; ")
+        bad = BadCurve(
+            path.stem,
+            "(all)",
+            str(path),
+            "unreadable",
+            message or text,
+            cure if message else "repair the file or leave it out",
+        )
+        return Measurements((), (bad,), (path,))
+
+
+def _refuse_twice(parts: list[Measurements]) -> None:
+    """Refuse a specimen and trial that two files hold."""
+    seen: dict[tuple[str, str], str] = {}
+    for part in parts:
+        for curve in (*part.curves, *(b for b in part.bad if b.trial != "(all)")):
+            key = (curve.specimen, curve.trial)
+            if key in seen:
+                raise DataError(
+                    f"{curve.source}: specimen {key[0]!r} trial {key[1]!r} was already in "
+                    f"{seen[key]}; rename one, or give a specimen pattern that tells files apart"
+                )
+            seen[key] = curve.source

@@ -1,0 +1,31 @@
+"""The tube of a [trachea] section."""
+
+import numpy as np
+
+from jaxtrachea.config import EvenRings, SpecError, TracheaSection
+from jaxtrachea.trachea.geometry import Geometry, table_1
+
+
+def geometry_of(section: TracheaSection) -> Geometry:
+    """The tube of a [trachea] section.
+
+    Raises:
+        SpecError: impossible dimensions, with the key.
+    """
+    preset = table_1()
+    length = float(preset.length) if section.length is None else section.length
+    rings = section.rings
+    if rings is None:
+        rings = np.asarray(preset.ring_positions, np.float64)
+    if isinstance(rings, EvenRings):
+        rings = np.linspace(rings.first, rings.last, rings.count)
+    try:
+        return Geometry.create(
+            length,
+            rings,
+            radius=section.radius,
+            half_angle=section.half_angle,
+            ring_height=section.ring_height,
+        )
+    except ValueError as error:
+        raise SpecError(f"trachea.{str(error).replace('ring_positions', 'rings')}") from None
