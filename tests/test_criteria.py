@@ -19,7 +19,7 @@ from jaxtrachea.fit.onset import where_sought
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.problem import Noise, build
 from jaxtrachea.fit.result import Settings
-from jaxtrachea.inference import repeats as repeats_module
+from jaxtrachea.inference import cross_validation
 from jaxtrachea.inference.comparison import Model, Row, compared, same_data, sentence
 from jaxtrachea.inference.cross_validation import Missed, leave_repeats_out, repeats
 from jaxtrachea.measurements.read import Curve
@@ -246,7 +246,7 @@ def test_a_refit_that_does_not_converge_counts_and_is_said(monkeypatch):
             result[0][1], result[1][1] = status, theta * result[1][1]
             return dataclasses.replace(found, status=result[0], theta=result[1])
 
-        monkeypatch.setattr(repeats_module, "fit", refit)
+        monkeypatch.setattr(cross_validation, "fit", refit)
         return leave_repeats_out(problem, Settings(starts=1))
 
     slow = spoilt(FitStatus.MAX_ITERATIONS, 1.0)

@@ -33,7 +33,7 @@ from jaxtrachea.inference.sources import source_of
 from jaxtrachea.measurements.presses import parse_presses
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.report.fit import prediction_plots
+from jaxtrachea.report import prediction_plots
 from jaxtrachea.runs import former
 from jaxtrachea.runs.folder import NoRun
 from jaxtrachea.status import FitStatus, PredictionStatus
