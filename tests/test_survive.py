@@ -20,7 +20,7 @@ from interrupted import finish, kill_often, numbers, start, wait_for, write_stud
 from run_cli import run, tree
 
 import jaxtrachea
-from jaxtrachea.cli.main import main as cli
+from jaxtrachea.cli import main as cli
 from jaxtrachea.cli.terminal import set_up_jax
 from jaxtrachea.config import load_fit_spec
 from jaxtrachea.files import lock as run_lock

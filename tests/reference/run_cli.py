@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxtrachea.cli.main import main as cli
+from jaxtrachea.cli import main as cli
 
 GOOD = """specimen,trial,s [mm],displacement [mm],force [N]
 T01,1,35,0.0,0.00
