@@ -76,6 +76,17 @@ Some `code` & **bold** <i>text</i>.
     assert read.tags.count("li") == 2
 
 
+NAMES = ["_a_", "*a*", "__a__", "a*b*c", r"C:\_x\*y", "<b>", "[a](b)", "~~a~~", "&amp;", "1. a"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_are_no_markup(name):
+    """What a specimen may be called is shown as it is, in a table and in a line of text."""
+    read = Reader(page(f"# T\n\n| n |\n| --- |\n| {name} |\n\nOf {name} alone.\n", {}, {}))
+    assert read.tables[0] == [["n"], [name]]
+    assert not {"em", "strong", "a", "b", "s"} & set(read.tags)
+
+
 def test_long_tables_end_with_a_note():
     rows = "\n".join(f"| {i} |" for i in range(ROWS + 5))
     made = page(f"# T\n\n| n |\n| --- |\n{rows}\n", {}, {})

@@ -1,14 +1,18 @@
 """The written report as one HTML file: no network, no script, pictures inside.
 
-It is made from the text of report.md, which has headings, paragraphs, lists, tables and pictures,
-each between blank lines, and within a line `code` and **bold**. All else is text, and escaped.
+It is rendered from the text of report.md by markdown-it-py, with those rules alone that a report
+uses: headings, paragraphs, lists, tables, pictures, `code` and **bold**. All else is text, and
+escaped, so that no name of a specimen becomes markup.
 """
 
 import base64
 import html
 import json
-import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from markdown_it import MarkdownIt
+from markdown_it.token import Token
 
 #: Rows of a table; beyond it a note says where the rest is.
 ROWS = 200
@@ -40,8 +44,7 @@ def page(text: str, pictures: Mapping[str, bytes], provenance: Mapping[str, obje
     Raises:
         KeyError: `text` shows a picture that is not given.
     """
-    blocks = [block for block in text.strip().split("\n\n") if block.strip()]
-    title = blocks[0].removeprefix("# ")
+    title = text.strip().partition("\n")[0].removeprefix("# ")
     rows = [
         [name, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)]
         for name, value in provenance.items()
@@ -51,60 +54,87 @@ def page(text: str, pictures: Mapping[str, bytes], provenance: Mapping[str, obje
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f"<title>{html.escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>",
-            *(_block(block, pictures) for block in blocks),
+            _rendered(text, pictures),
             "<h2>Provenance</h2>",
-            _table(["what", "value"], rows),
+            _plain_table(["what", "value"], rows),
             "</body>\n</html>\n",
         ]
     )
 
 
-def _block(block: str, pictures: Mapping[str, bytes]) -> str:
-    """One block of the text."""
-    if heading := re.fullmatch(r"(#{1,6}) (.*)", block):
-        level = len(heading[1])
-        return f"<h{level}>{_inline(heading[2])}</h{level}>"
-    if picture := re.fullmatch(r"!\[(.*)\]\(([\w.-]+)\)", block):
-        return _figure(picture[1], pictures[picture[2]])
-    lines = block.split("\n")
-    if all(line.startswith("- ") for line in lines):
-        items = "\n".join(f"<li>{_inline(line[2:])}</li>" for line in lines)
-        return f"<ul>\n{items}\n</ul>"
-    if len(lines) > 1 and lines[0].startswith("| ") and lines[1].startswith("| ---"):
-        head, _, *rows = map(_cells, lines)
-        return _table(head, rows)
-    return f"<p>{_inline(block)}</p>"
+def _rendered(text: str, pictures: Mapping[str, bytes]) -> str:
+    """The text as HTML; pictures inside, long tables cut with a note."""
+    rules = ["heading", "list", "table", "backticks", "emphasis", "image"]
+    markdown = MarkdownIt("zero").enable(rules)
+    markdown.add_render_rule("image", _figure)
+    for name in ("em_open", "em_close", "strong_open", "strong_close"):
+        markdown.add_render_rule(name, _emphasis)
+    tokens = _short_tables(markdown.parse(text))
+    for before, inline, after in zip(tokens, tokens[1:], tokens[2:], strict=False):
+        # A figure is a block of its own, not part of a paragraph.
+        if [child.type for child in inline.children or ()] == ["image"]:
+            before.hidden = after.hidden = True
+    return markdown.renderer.render(tokens, markdown.options, {"pictures": pictures})
 
 
-def _cells(line: str) -> list[str]:
-    """Cells of a line of a table, bars in them no longer escaped."""
-    parts = re.split(r"(?<!\\)\|", line.strip())[1:-1]
-    return [part.strip().replace("\\|", "|") for part in parts]
+def _short_tables(tokens: Sequence[Token]) -> list[Token]:
+    """Tables that scroll by themselves, of at most `ROWS` rows and a note where the rest is."""
+    kept: list[Token] = []
+    rows = 0
+    for token in tokens:
+        if token.type == "table_open":
+            kept.append(_markup('<div class="wide">'))
+            rows = -1  # the head
+        if token.type == "tr_open":
+            rows += 1
+        if rows <= ROWS or not _in_row(token):
+            kept.append(token)
+        if token.type == "table_close":
+            kept.append(_markup(f"</div>{_note(rows)}\n"))
+    return kept
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    """A table of at most `ROWS` rows."""
-    line = lambda tag, cells: "".join(f"<{tag}>{_inline(cell)}</{tag}>" for cell in cells)  # noqa: E731
-    body = "\n".join(f"<tr>{line('td', row)}</tr>" for row in rows[:ROWS])
-    note = ""
-    if len(rows) > ROWS:
-        note = f'\n<p class="note">The first {ROWS} of {len(rows)} rows; the CSV files beside this '
-        note += "page and report.md hold all.</p>"
+def _in_row(token: Token) -> bool:
+    """Whether a token of a table belongs to one of its rows."""
+    return token.type in ("inline", "tr_open", "tr_close", "td_open", "td_close")
+
+
+def _markup(text: str) -> Token:
+    """HTML of our own between that of the text."""
+    return Token("html_block", "", 0, content=text)
+
+
+def _note(rows: int) -> str:
+    """Where the rows are that a table does not show."""
+    if rows <= ROWS:
+        return ""
     return (
-        f'<div class="wide"><table>\n<thead><tr>{line("th", head)}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody>\n</table></div>{note}"
+        f'\n<p class="note">The first {ROWS} of {rows} rows; the CSV files beside this page and '
+        "report.md hold all.</p>"
     )
 
 
-def _figure(caption: str, png: bytes) -> str:
+def _figure(renderer, tokens: Sequence[Token], i: int, options, env: Mapping[str, Any]) -> str:
     """A picture inside the page."""
-    data, text = base64.b64encode(png).decode(), html.escape(caption)
-    image = f'<img alt="{text}" src="data:image/png;base64,{data}">'
-    return f"<figure>{image}<figcaption>{text}</figcaption></figure>"
+    caption = html.escape(tokens[i].content)
+    data = base64.b64encode(env["pictures"][tokens[i].attrs["src"]]).decode()
+    image = f'<img alt="{caption}" src="data:image/png;base64,{data}">'
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
 
 
-def _inline(text: str) -> str:
-    """Text with `code` and **bold**, escaped first."""
-    safe = html.escape(text)
-    safe = re.sub(r"`([^`]+)`", r"<code>\1</code>", safe)
-    return re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", safe)
+def _emphasis(renderer, tokens: Sequence[Token], i: int, options, env) -> str:
+    """**Bold** alone is markup; stars and underscores of names stay what they are."""
+    token = tokens[i]
+    if token.markup != "**":
+        return token.markup
+    return f"<{'/' if token.nesting < 0 else ''}strong>"
+
+
+def _plain_table(head: list[str], rows: list[list[str]]) -> str:
+    """A table of text without any markup."""
+    cells = [[html.escape(cell) for cell in row] for row in rows]
+    body = "\n".join(f"<tr><td>{'</td><td>'.join(row)}</td></tr>" for row in cells)
+    return (
+        f'<div class="wide"><table>\n<thead><tr><th>{"</th><th>".join(head)}</th></tr></thead>\n'
+        f"<tbody>\n{body}\n</tbody>\n</table></div>"
+    )
