@@ -23,8 +23,8 @@ import jaxtrachea
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS, Parameter
-from jaxtrachea.fit.problem import Noise
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Noise
 from jaxtrachea.mechanics import beam
 from jaxtrachea.mechanics.oblique import press_oblique, press_path
 from jaxtrachea.mechanics.press import Options, press
@@ -163,7 +163,7 @@ def test_no_function_runs_a_misspelt_word():
             any_words(real, argument)
     assert seen >= INNER | {
         "mechanics.beam.deflect",
-        "fit.problem.build",
+        "fit.study.build_study",
         "mechanics.oblique.press_path",
     }
 
@@ -190,7 +190,7 @@ def test_no_record_keeps_a_misspelt_word():
 
 
 #: Made by the package out of words that were checked.
-RESULTS = {"Bootstrap", "Problem", "Situation", "Choice", "Ladder"}
+RESULTS = {"Bootstrap", "Study", "Situation", "Choice", "Ladder"}
 
 
 @functools.cache

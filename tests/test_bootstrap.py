@@ -13,8 +13,8 @@ from run_cli import GOOD, run
 
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.problem import build
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import build_study
 from jaxtrachea.inference.bootstrap import bootstrap
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
@@ -24,7 +24,7 @@ ONE = Settings(starts=1)
 PAGES = Path(__file__).parents[1] / "docs"
 
 
-def study(noises):
+def make_study(noises):
     """F = 1.3 D + 0.4 D^3 + noise, two curves of equal length for each specimen."""
     linear = {"scale": "linear", "lower": -100.0, "upper": 100.0, "step": 0.1}
     rows = [dataclasses.replace(DEFAULTS[n], **linear, value=1.0) for n in ("k_1", "k_3")]
@@ -36,14 +36,14 @@ def study(noises):
         for i, specimen in enumerate(noises)
         for j, noise in enumerate(specimen)
     ]
-    return build(curves, table_1(), Options(coupling="total", onset_width=0.0), rows)
+    return build_study(curves, table_1(), Options(coupling="total", onset_width=0.0), rows)
 
 
 @pytest.mark.parametrize("kind", ["parametric", "residual"])
 def test_white_noise_gives_the_standard_error_of_the_covariance(kind):
     """1,000 replicates tell a standard deviation to 2.2 %; bar four of them; and 1.96 of it."""
     noise = 0.05 * np.random.default_rng(1).normal(size=(3, 2, 60))
-    result = fit(study(noise), ONE)
+    result = fit(make_study(noise), ONE)
     found = bootstrap(result, ONE, count=1000, kind=kind)
     assert found.usable.all()
     np.testing.assert_allclose(found.standard_error, result.standard_error, rtol=0.09)
@@ -65,7 +65,7 @@ def test_blocks_see_correlated_noise():
     for i in range(n):
         noise[..., i] = r * noise[..., i - 1] * (i > 0) + white[..., i]
     noise *= 0.05 * np.sqrt(1 - r * r)
-    result = fit(study(noise), ONE)
+    result = fit(make_study(noise), ONE)
     depth = np.linspace(0.02, 2, n)
     J = np.stack([depth, depth**3], axis=1)
     lag = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
@@ -88,7 +88,7 @@ def test_blocks_see_correlated_noise():
     ],
 )
 def test_impossible_settings_are_refused(change, says):
-    result = fit(study(np.random.default_rng(1).normal(size=(1, 2, 12))), ONE)
+    result = fit(make_study(np.random.default_rng(1).normal(size=(1, 2, 12))), ONE)
     with pytest.raises(ValueError, match=says):
         bootstrap(result, ONE, **change)
 
@@ -138,7 +138,7 @@ def test_markers_are_resampled_as_well(kind):
         for i, c in enumerate(synthetic.curves(force))
     ]
     table = synthetic.parameters(joints=True)
-    result = fit(build(data, synthetic.GEOMETRY, synthetic.OPTIONS, table), ONE)
+    result = fit(build_study(data, synthetic.GEOMETRY, synthetic.OPTIONS, table), ONE)
     found = bootstrap(result, ONE, count=400, kind=kind)
     assert found.usable.all()
     np.testing.assert_allclose(found.standard_error, result.standard_error, rtol=0.15)

@@ -11,8 +11,8 @@ from jaxtrachea.fit.descent import descend
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances, levenberg_marquardt
 from jaxtrachea.fit.noise import first_sigma
-from jaxtrachea.fit.problem import Noise, build
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import bootstrap as bootstraps
 from jaxtrachea.inference.profile import profiles
 from jaxtrachea.status import FitStatus, ProfileEnd
@@ -30,32 +30,32 @@ def promise_allowed(dtype):
     return np.sqrt(200 * max(1e-10, 4 * float(np.finfo(dtype).eps)))
 
 
-def parted_from_bounds(problem, theta):
+def parted_from_bounds(study, theta):
     """Unknowns that are next to a bound, by less than a part in 1e9, and not on it."""
-    lanes = problem.lanes
+    lanes = study.lanes
     gap = np.minimum(theta - lanes.lower, lanes.upper - theta)
     return (gap != 0) & (gap < 1e-9 * (1 + np.abs(theta)))
 
 
 def check_lanes(count, dtype):
-    problem, start = bounded.random_problem(11, count)
-    sigma = first_sigma(problem)
-    solved = levenberg_marquardt(problem, np.arange(count), start, sigma, dtype=dtype)
+    study, start = bounded.random_study(11, count)
+    sigma = first_sigma(study)
+    solved = levenberg_marquardt(study, np.arange(count), start, sigma, dtype=dtype)
     assert np.all(solved.status == FitStatus.CONVERGED), np.bincount(solved.status)
-    assert np.max(bounded.kkt_residual(problem, solved.theta, sigma)) <= promise_allowed(dtype)
-    assert not np.any(parted_from_bounds(problem, solved.theta))
-    return problem, start, sigma, solved
+    assert np.max(bounded.kkt_residual(study, solved.theta, sigma)) <= promise_allowed(dtype)
+    assert not np.any(parted_from_bounds(study, solved.theta))
+    return study, start, sigma, solved
 
 
-def check_nothing_lower(problem, sigma, solved, dtype):
+def check_nothing_lower(study, sigma, solved, dtype):
     """`trf` from where the lanes end finds nothing lower that matters; returns the costs.
 
     The difference is twice the log-likelihood ratio of 100 samples: 1e-4 standard errors in double
     precision, 0.2 in single. Single precision sees no slope at all on plateaus (a contact so stiff
     that k_3 hardly counts): 8 of 1,000 lanes stop there.
     """
-    cost = bounded.costs(problem, solved.theta, sigma)
-    excess = 100 * (cost / bounded.scipy_costs(problem, solved.theta, sigma) - 1)
+    cost = bounded.costs(study, solved.theta, sigma)
+    excess = 100 * (cost / bounded.scipy_costs(study, solved.theta, sigma) - 1)
     limit, share = {np.float64: (1e-8, 0.0), np.float32: (0.04, 0.01)}[dtype]
     assert np.mean(excess > limit) <= share
     return cost
@@ -64,33 +64,33 @@ def check_nothing_lower(problem, sigma, solved, dtype):
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_random_bounds_against_scipy(dtype):
     """Most lanes end on a bound."""
-    problem, _, sigma, solved = check_lanes(60, dtype)
-    lanes = problem.lanes
+    study, _, sigma, solved = check_lanes(60, dtype)
+    lanes = study.lanes
     assert np.mean(np.any((solved.theta == lanes.lower) | (solved.theta == lanes.upper), 1)) > 0.7
-    check_nothing_lower(problem, sigma, solved, dtype)
+    check_nothing_lower(study, sigma, solved, dtype)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_1000_random_bounds(dtype):
     """From the same starts SciPy and we end in the same minimum, but for 4 % of the lanes."""
-    problem, start, sigma, solved = check_lanes(1000, dtype)
-    cost = check_nothing_lower(problem, sigma, solved, dtype)
-    other = bounded.scipy_costs(problem, start, sigma)
+    study, start, sigma, solved = check_lanes(1000, dtype)
+    cost = check_nothing_lower(study, sigma, solved, dtype)
+    other = bounded.scipy_costs(study, start, sigma)
     assert np.sum(np.abs(cost / other - 1) > 1e-3) <= 40
 
 
 @pytest.mark.parametrize("gap", [0.0, 5e-14, 1e-9])
 def test_a_start_next_to_a_bound(gap):
     """The free optimum lies beyond: the others must not stay where it has them."""
-    problem, _ = bounded.random_problem(11, 60)
-    wide = problem.lanes._replace(lower=np.full((60, 4), -12.0), upper=np.full((60, 4), 12.0))
-    sigma, jobs = first_sigma(problem), np.arange(60)
+    study, _ = bounded.random_study(11, 60)
+    wide = study.lanes._replace(lower=np.full((60, 4), -12.0), upper=np.full((60, 4), 12.0))
+    sigma, jobs = first_sigma(study), np.arange(60)
     guess = np.tile(np.log(bounded.CLEAR), (60, 1))
-    best = levenberg_marquardt(bounded.with_lanes(problem, wide), jobs, guess, sigma)
+    best = levenberg_marquardt(bounded.with_lanes(study, wide), jobs, guess, sigma)
     upper = wide.upper.copy()
     upper[:, 2] = best.theta[:, 2] - 0.3
-    tight = bounded.with_lanes(problem, wide._replace(upper=upper))
+    tight = bounded.with_lanes(study, wide._replace(upper=upper))
     start = best.theta.copy()
     start[:, 2] = upper[:, 2] - gap
     solved = levenberg_marquardt(tight, jobs, start, sigma)
@@ -103,14 +103,14 @@ def test_a_start_next_to_a_bound(gap):
     ("method", "blocks"), [("lbfgs", 60), pytest.param("adam", 300, marks=pytest.mark.slow)]
 )
 def test_first_order_methods_respect_bounds(method, blocks):
-    problem, start = bounded.random_problem(11, 60)
-    sigma, jobs = first_sigma(problem), np.arange(60)
+    study, start = bounded.random_study(11, 60)
+    sigma, jobs = first_sigma(study), np.arange(60)
     solved = descend(
-        problem, jobs, start, sigma, method=method, tolerances=Tolerances(iterations=blocks)
+        study, jobs, start, sigma, method=method, tolerances=Tolerances(iterations=blocks)
     )
     assert np.all(solved.status == FitStatus.CONVERGED)
     # Their tolerance is on the cost over a block of steps, no better than its square root.
-    assert np.max(bounded.kkt_residual(problem, solved.theta, sigma)) <= 1e-3
+    assert np.max(bounded.kkt_residual(study, solved.theta, sigma)) <= 1e-3
 
 
 def joint_study(seed, specimens=3):
@@ -136,7 +136,7 @@ def joint_study(seed, specimens=3):
             "scale": "log",
         }
     return functools.partial(
-        build,
+        build_study,
         synthetic.curves(force, displacement=depths),
         synthetic.GEOMETRY,
         synthetic.OPTIONS,
@@ -149,7 +149,7 @@ def joint_study(seed, specimens=3):
     "seeds", [range(100, 102), pytest.param(range(102, 130), marks=pytest.mark.slow)]
 )
 def test_joint_fits_with_bounds(seeds):
-    """The dense problem's KKT conditions hold at the joint estimate; SciPy finds nothing lower."""
+    """The dense study's KKT conditions hold at the joint estimate; SciPy finds nothing lower."""
     for seed in seeds:
         study = joint_study(seed)
         joint, dense = study(joint=True), study()
@@ -165,8 +165,8 @@ def test_joint_fits_with_bounds(seeds):
 
 @pytest.fixture(scope="module")
 def fitted():
-    problem, start = bounded.random_problem(5, 40)
-    result = fit(problem, Settings(starts=1, more_starts=0), starts=start)
+    study, start = bounded.random_study(5, 40)
+    result = fit(study, Settings(starts=1, more_starts=0), starts=start)
     assert np.all(result.succeeded)
     return result
 
@@ -181,7 +181,7 @@ def test_profiles_with_bounds(fitted):
     assert np.mean(good) > 0.99
     assert np.mean(curves.end == ProfileEnd.FAILED) < 0.01
     k, at = np.nonzero(good)
-    chosen = fitted.problem.take(curves.lane[k])
+    chosen = fitted.study.take(curves.lane[k])
     active = chosen.lanes.active.copy()
     active[np.arange(len(k)), curves.unknown[k]] = 0
     pinned = bounded.with_lanes(chosen, chosen.lanes._replace(active=active))
@@ -194,16 +194,16 @@ def test_bootstrap_with_bounds(fitted, monkeypatch):
     """Every replicate is a minimum of its own data in the box."""
     seen = []
 
-    def recorded(problem, *args, **keys):
-        result = fit(problem, *args, **keys)
-        seen.append((problem, result))
+    def recorded(study, *args, **keys):
+        result = fit(study, *args, **keys)
+        seen.append((study, result))
         return result
 
     monkeypatch.setattr(bootstraps, "fit", recorded)
     bootstraps.bootstrap(fitted, Settings(starts=1), count=bootstraps.FEWEST)
-    problem, result = seen[0]
+    study, result = seen[0]
     assert np.mean(result.succeeded) > 0.99
     rows = np.flatnonzero(result.succeeded)
-    kkt = bounded.kkt_residual(problem.take(rows), result.theta[rows], result.whitened_sigma[rows])
+    kkt = bounded.kkt_residual(study.take(rows), result.theta[rows], result.whitened_sigma[rows])
     assert np.max(kkt) <= promise_allowed(np.float64)
-    assert not np.any(parted_from_bounds(problem, result.theta)[rows])
+    assert not np.any(parted_from_bounds(study, result.theta)[rows])

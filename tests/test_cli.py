@@ -326,7 +326,7 @@ def test_interrupt_that_was_swallowed(study, monkeypatch, capsys):
         def __del__(self):
             signal.raise_signal(signal.SIGINT)
 
-    def fit(problem, settings, progress):
+    def fit(study, settings, progress):
         Dropped()
         progress(0, 1)
         pytest.fail("went on after an interrupt")

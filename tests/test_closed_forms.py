@@ -21,9 +21,9 @@ from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.problem import Noise, build
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.starts import draw_starts
+from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import bootstrap
 from jaxtrachea.inference.design import situation
 from jaxtrachea.inference.influence import influence
@@ -50,7 +50,9 @@ def line(force, *, changes=None, options=Options(coupling="total"), **how):  # n
         for n, v in (free | still | (changes or {})).items()
     ]  # fmt: skip
     curves = [Curve("T", f"t{i}", 75.0, 0.0, D, f) for i, f in enumerate(np.atleast_2d(force))]
-    return build(curves, table_1(), dataclasses.replace(options, onset_width=0.0), rows, **how)
+    return build_study(
+        curves, table_1(), dataclasses.replace(options, onset_width=0.0), rows, **how
+    )
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +71,7 @@ def test_standard_error_of_a_robust_fit_is_huber_s(robust):
     """sigma^2 E psi^2 / (E psi')^2 / sum D^2, with n / (n - 1) (Huber 1973)."""
     k, sigma = robust.value[0, 0], robust.sigma[0, 0]
     z = (k * D - FORCE) / robust.whitened_sigma[0, 0]
-    limit = robust.problem.loss_scale
+    limit = robust.study.model.loss_scale
     assert 0.05 < np.mean(np.abs(z) > limit) < 0.6  # so that psi' is neither 0 nor 1
     psi = np.clip(z, -limit, limit)
     slope = np.mean(np.abs(z) <= limit)
@@ -92,8 +94,8 @@ def test_influence_of_a_curved_model_is_that_of_refits():
     """k_1 in series with the skeleton beside a fixed k_3: residuals change the curvature."""
     changes = {"k_3": {"lower": 0.0, "value": 0.3, "fixed": True}}
     rough = FORCE * np.where(np.arange(12) % 3 == 0, 0.3, 1.0)
-    problem = line(rough, changes=changes, options=Options(), noise=Noise(force=0.1))
-    found = influence(fit(problem, ONE))
+    study = line(rough, changes=changes, options=Options(), noise=Noise(force=0.1))
+    found = influence(fit(study, ONE))
     pressed, jacobian, second = force_of_k_1()
     k = found.result.value[0, 0]
 
@@ -145,13 +147,12 @@ def compliance():
 def test_a_step_is_bent_by_the_second_derivative():
     """F = exp(theta) D, exact data: the step v is bent by -v^2 / 2 (Transtrum and Sethna 2012)."""
     changes = {"k_1": {"scale": "log", "lower": 1e-3, "upper": 1e3, "value": 1.0, "step": 0.5}}
-    problem = line(1.3 * D, changes=changes)
-    lane = jax.tree.map(lambda v: v[0], problem.lanes)
+    study = line(1.3 * D, changes=changes)
+    lane = jax.tree.map(lambda v: v[0], study.lanes)
     sigma, theta = jnp.ones(2), jnp.log(jnp.array([1.0]))
-    state = solve.State(
-        theta, evaluate(problem, theta, lane, sigma), jnp.array(10.0), jnp.array(1), jnp.array(0)
-    )
-    step = solve._step(problem, state, lane, sigma)
+    point = evaluate(study.model, theta, lane, sigma)
+    state = solve.State(theta, point, jnp.array(10.0), jnp.array(1), jnp.array(0))
+    step = solve._step(study.model, state, lane, sigma)
     v = 0.3  # (1.3 - 1) / 1, undamped within the trust region
     np.testing.assert_allclose(step.straight, v, rtol=1e-6)
     np.testing.assert_allclose(step.delta[0], v - v * v / 2, rtol=0.01)
@@ -168,7 +169,7 @@ def test_bounds_alone_are_known_as_uniform_distributions():
 def test_starts_of_a_latin_hypercube_are_paired_at_random():
     """Each stratum once for each unknown, and no unknown in step with another."""
     force, _ = synthetic.forces(synthetic.draw(1, 1, 2.0))
-    starts = draw_starts(synthetic.problem(force), Settings(starts=201))[1:]
+    starts = draw_starts(synthetic.study(force), Settings(starts=201))[1:]
     ranks = np.argsort(np.argsort(starts, axis=0), axis=0)
     low, high = starts.min(axis=0), starts.max(axis=0)
     strata = np.floor((starts - low) / (high - low) * 200).clip(0, 199)

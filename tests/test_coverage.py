@@ -28,7 +28,7 @@ def covered(level, count):
     force = force + level * np.abs(force).max((1, 2), keepdims=True) * noise
     changes = {n: {"value": float(v)} for n, v in zip(synthetic.NAMES, CLEAR, strict=True)}
     one = Settings(starts=1)
-    result = fit(synthetic.problem(force, changes=changes), one)
+    result = fit(synthetic.study(force, changes=changes), one)
     found = profiles(result, one, points=2)
     lanes = found.lane[::4]
     assert len(lanes) >= 0.99 * count

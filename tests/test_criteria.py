@@ -17,8 +17,8 @@ from jaxtrachea.fit.criteria import penalised, weights
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.onset import where_sought
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.problem import Noise, build
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import cross_validation
 from jaxtrachea.inference.comparison import Model, Row, compared, same_data, sentence
 from jaxtrachea.inference.cross_validation import Missed, leave_repeats_out, repeats
@@ -44,7 +44,7 @@ def noisy(seed=0, specimens=3):
     ]  # fmt: skip
 
 
-def linear_problem(curves, fixed=(), **settings):
+def linear_study(curves, fixed=(), **settings):
     """Force is linear in k_1, k_3 and the offset: least squares in closed form."""
     table = [
         dataclasses.replace(
@@ -53,7 +53,7 @@ def linear_problem(curves, fixed=(), **settings):
         for name in ("k_1", "k_3", "force_offset")
     ]
     onset = DEFAULTS["onset"]
-    return build(curves, table_1(), TOTAL, [*table[:2], onset, table[2]], **settings)
+    return build_study(curves, table_1(), TOTAL, [*table[:2], onset, table[2]], **settings)
 
 
 def by_hand(curves, powers, sigma=None):
@@ -70,7 +70,7 @@ def test_linear_case_in_closed_form(sigma):
     """Deviance, AIC, AICc and BIC of three unknowns; statsmodels counts sigma only in the first."""
     curves = noisy()
     noise = Noise(force=sigma)
-    result = fit(linear_problem(curves, noise=noise), Settings(starts=1))
+    result = fit(linear_study(curves, noise=noise), Settings(starts=1))
     found = result.criteria
     for lane in range(3):
         d, k, n = by_hand(curves[2 * lane : 2 * lane + 2], (1, 3, 0), sigma)
@@ -83,7 +83,7 @@ def test_linear_case_in_closed_form(sigma):
 
 @pytest.mark.slow
 def test_robust_losses_have_no_likelihood():
-    result = fit(linear_problem(noisy(), loss="huber"), Settings(starts=1))
+    result = fit(linear_study(noisy(), loss="huber"), Settings(starts=1))
     assert np.isnan(result.criteria.AIC).all()
 
 
@@ -156,7 +156,7 @@ def test_deflated_difference_is_that_by_hand():
             force = 1.5 * DEPTH + 0.05 * DEPTH**3 + SIGMA * noise
             curves.append(Curve(f"T{i}", trial, None, 0.0, DEPTH, force))
     fits = [
-        Model(name, fit(linear_problem(curves, fixed=fixed), Settings(starts=1)), None)
+        Model(name, fit(linear_study(curves, fixed=fixed), Settings(starts=1)), None)
         for name, fixed in (("cubic", ("force_offset",)), ("straight", ("k_3", "force_offset")))
     ]
     rows, failed = compared(fits)
@@ -183,17 +183,17 @@ def test_deflated_difference_is_that_by_hand():
 
 def test_other_data_or_noise_are_refused():
     curves = noisy()
-    a = linear_problem(curves)
-    same_data([a, linear_problem(curves, fixed=("k_3",))], "ab")
+    a = linear_study(curves)
+    same_data([a, linear_study(curves, fixed=("k_3",))], "ab")
     for other, says in (
-        (linear_problem(curves[:-1]), "different samples"),
-        (linear_problem(noisy(1)), "different samples"),
-        (linear_problem(curves, noise=Noise(force=0.1)), "noise or curves"),
-        (linear_problem(curves, loss="huber"), "likelihood"),
+        (linear_study(curves[:-1]), "different samples"),
+        (linear_study(noisy(1)), "different samples"),
+        (linear_study(curves, noise=Noise(force=0.1)), "noise or curves"),
+        (linear_study(curves, loss="huber"), "likelihood"),
     ):
         with pytest.raises(ValueError, match=says):
             same_data([a, other], "ab")
-    given = [linear_problem(curves, noise=Noise(force=s)) for s in (0.1, 0.2)]
+    given = [linear_study(curves, noise=Noise(force=s)) for s in (0.1, 0.2)]
     with pytest.raises(ValueError, match="noise or curves"):
         same_data(given, "ab")
 
@@ -205,7 +205,7 @@ def test_leaving_a_position_out_is_a_fit_without_it():
         Curve("T", f"{s}{t}", s, 0.0, DEPTH, 1.5 * DEPTH + 0.01 * s + 0.1 * rng.normal(size=20))
         for s in (30.0, 60.0, 90.0) for t in "ab"
     ]  # fmt: skip
-    problem = linear_problem(curves, fixed=("k_3",))
+    study = linear_study(curves, fixed=("k_3",))
     missed = []
     for s in (30.0, 60.0, 90.0):
         kept = [c for c in curves if c.s_c != s]
@@ -213,18 +213,18 @@ def test_leaving_a_position_out_is_a_fit_without_it():
         b = np.linalg.lstsq(X, np.concatenate([c.force for c in kept]), rcond=None)[0]
         missed += [b[0] * DEPTH + b[1] - c.force for c in curves if c.s_c == s]
     want = np.sqrt(np.mean(np.square(missed))) / max(np.abs(c.force).max() for c in curves)
-    got = leave_repeats_out(problem, Settings(starts=1)).error
+    got = leave_repeats_out(study, Settings(starts=1)).error
     np.testing.assert_allclose(got, [want], rtol=1e-6)
-    assert repeats(problem).words == "positions"
+    assert repeats(study).words == "positions"
 
 
 def test_without_a_second_position_trials_are_left_out():
     """As `sklearn.model_selection.LeaveOneGroupOut`: each trial once, specimens by themselves."""
-    problem = linear_problem(noisy(), fixed=("k_3",))
-    plan = repeats(problem)
+    study = linear_study(noisy(), fixed=("k_3",))
+    plan = repeats(study)
     assert (plan.words, plan.lanes.tolist()) == ("trials", [0, 0, 1, 1, 2, 2])
     assert plan.held.tolist() == [[True, False], [False, True]] * 3
-    got = leave_repeats_out(problem, Settings(starts=1)).error
+    got = leave_repeats_out(study, Settings(starts=1)).error
     for lane, (a, b) in enumerate(zip(noisy()[::2], noisy()[1::2], strict=True)):
         missed = []
         for kept, out in ((a, b), (b, a)):
@@ -236,8 +236,8 @@ def test_without_a_second_position_trials_are_left_out():
 
 def test_a_refit_that_does_not_converge_counts_and_is_said(monkeypatch):
     """One of six stops short at its minimum: the numbers stay; one that is lost costs its lane."""
-    problem = linear_problem(noisy(), fixed=("k_3",))
-    want = leave_repeats_out(problem, Settings(starts=1))
+    study = linear_study(noisy(), fixed=("k_3",))
+    want = leave_repeats_out(study, Settings(starts=1))
 
     def spoilt(status, theta):
         def refit(*arguments):
@@ -247,7 +247,7 @@ def test_a_refit_that_does_not_converge_counts_and_is_said(monkeypatch):
             return dataclasses.replace(found, status=result[0], theta=result[1])
 
         monkeypatch.setattr(cross_validation, "fit", refit)
-        return leave_repeats_out(problem, Settings(starts=1))
+        return leave_repeats_out(study, Settings(starts=1))
 
     slow = spoilt(FitStatus.MAX_ITERATIONS, 1.0)
     np.testing.assert_allclose(slow.error, want.error, rtol=1e-12)
@@ -255,7 +255,7 @@ def test_a_refit_that_does_not_converge_counts_and_is_said(monkeypatch):
     lost = spoilt(FitStatus.NON_FINITE, np.nan)
     assert np.isnan(lost.error).tolist() == [True, False, False]
     assert lost.lost.tolist() == [1, 0, 0]
-    result = fit(problem, Settings(starts=1))
+    result = fit(study, Settings(starts=1))
     assert _left_out_notes([Model("A", result, want)]) == []
     for missed, says in ((slow, "1 of 6 refits did not"), (lost, "1 of 6 refits give no finite")):
         (note,) = _left_out_notes([Model("A", result, missed)])
@@ -269,7 +269,7 @@ def test_why_nothing_was_left_out():
     """A stiffness of single curves; an onset of single curves is no reason."""
     for names, says in ((("k_1", "onset"), "A: k_1 belongs to"), (("onset",), "no specimen has")):
         free = [dataclasses.replace(DEFAULTS[n], fixed=False, scope="trial") for n in names]
-        result = SimpleNamespace(problem=SimpleNamespace(free=free))
+        result = SimpleNamespace(study=SimpleNamespace(free=free))
         none = Missed(np.full(1, np.nan), *np.zeros((3, 1), int))
         (note,) = _left_out_notes([SimpleNamespace(name="A", result=result, left_out=none)])
         assert says in note
@@ -297,7 +297,7 @@ def test_what_can_be_left_out_within_one_lane():
             dataclasses.replace(DEFAULTS[n], **LINEAR | {"scope": scope}, fixed=n != "k_1")
             for n in ("k_1", "k_3", "onset", "force_offset")
         ]
-        found = repeats(build(curves, table_1(), TOTAL, table))
+        found = repeats(build_study(curves, table_1(), TOTAL, table))
         return found.words, [np.flatnonzero(row).tolist() for row in found.held]
 
     both = [[0, 1], [2], [3], [4]]
@@ -412,7 +412,9 @@ def test_simulated_data_choose_the_beam_they_came_from(shear):
     AICc = [
         np.sum(
             fit(
-                build(synthetic.curves(force), synthetic.GEOMETRY, o, synthetic.parameters(o)),
+                build_study(
+                    synthetic.curves(force), synthetic.GEOMETRY, o, synthetic.parameters(o)
+                ),
                 Settings(starts=2),
             ).criteria.AICc
         )

@@ -10,8 +10,8 @@ import synthetic
 from run_cli import run, tree
 
 from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.problem import Noise, build
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference.design import (
     Candidates,
     gains,
@@ -30,9 +30,9 @@ BEFORE = np.array([22.0, 75.0, 80.0])
 SIGMA = 0.05
 
 
-def study(force, s_c):
+def make_study(force, s_c):
     changes = {n: {"value": float(v)} for n, v in zip(synthetic.NAMES, CLEAR, strict=True)}
-    return build(
+    return build_study(
         synthetic.curves(force, s_c=s_c),
         synthetic.GEOMETRY,
         synthetic.OPTIONS,
@@ -49,7 +49,7 @@ def simulated(s_c, count, seed):
 
 @pytest.fixture(scope="module")
 def result():
-    return fit(study(simulated(BEFORE, 4, 1), BEFORE), ONE)
+    return fit(make_study(simulated(BEFORE, 4, 1), BEFORE), ONE)
 
 
 @pytest.fixture(scope="module")
@@ -63,11 +63,11 @@ def test_predicted_errors_come_true(known):
     choice = next_points(known, grid((10.0, 150.0), (depth, depth), 500))
     s = grid((10.0, 150.0), (depth, depth), 500).s[choice.chosen[0]]
     after = np.append(BEFORE, s)
-    done = fit(study(simulated(after, 1000, 2), after), ONE)
+    done = fit(make_study(simulated(after, 1000, 2), after), ONE)
     realised = np.std(done.theta, axis=0)
     np.testing.assert_allclose(choice.error[1], realised, rtol=0.2)
     # And the point was worth it: the error without it is larger than what was realised.
-    without = fit(study(simulated(BEFORE, 1000, 3), BEFORE), ONE)
+    without = fit(make_study(simulated(BEFORE, 1000, 3), BEFORE), ONE)
     assert np.exp(np.mean(np.log(realised / np.std(without.theta, axis=0)))) < 0.9
 
 
@@ -135,9 +135,11 @@ def test_map_knows_that_one_place_is_not_enough(known):
 def test_what_cannot_be_designed_is_said(result):
     force = simulated(BEFORE, 1, 1)
     table = synthetic.parameters(**{n: {"scope": "trial"} for n in synthetic.NAMES})
-    own = build(synthetic.curves(force, s_c=BEFORE), synthetic.GEOMETRY, synthetic.OPTIONS, table)
+    own = build_study(
+        synthetic.curves(force, s_c=BEFORE), synthetic.GEOMETRY, synthetic.OPTIONS, table
+    )
     with pytest.raises(ValueError, match="every free parameter belongs to single trials"):
-        situation(dataclasses.replace(result, problem=own))
+        situation(dataclasses.replace(result, study=own))
     nothing = np.full_like(result.status, FitStatus.MAX_ITERATIONS)
     with pytest.raises(ValueError, match="no lane has an estimate"):
         situation(dataclasses.replace(result, status=nothing))

@@ -12,8 +12,8 @@ from jaxtrachea.fit.descent import descend
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances, levenberg_marquardt
 from jaxtrachea.fit.noise import first_sigma
-from jaxtrachea.fit.problem import Noise, build
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference.verdict import describe_flat
 from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.status import FitStatus
@@ -40,7 +40,7 @@ def test_noise_free_data_give_back_the_parameters():
     """
     truth = synthetic.draw(1, 1000, 10.0)
     force, _ = synthetic.forces(truth)
-    result = fit(synthetic.problem(force), Settings(starts=4))
+    result = fit(synthetic.study(force), Settings(starts=4))
     error = np.abs(result.value / truth - 1).max(1)
     condition = np.array([u.condition for u in result.uncertainty])
     peak = np.abs(force).max((1, 2))
@@ -66,12 +66,12 @@ def _coverage(count, given):
             dataclasses.replace(c, sigma=np.full(50, sigma[int(c.specimen[1:]), 0, 0]))
             for c in synthetic.curves(force)
         ]
-        problem = build(
+        study = build_study(
             data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(**changes)
         )
     else:
-        problem = synthetic.problem(force, changes=changes)
-    result = fit(problem, Settings(starts=1))
+        study = synthetic.study(force, changes=changes)
+    result = fit(study, Settings(starts=1))
     assert np.all(result.status == FitStatus.CONVERGED)
     return np.mean((result.lower <= truth) & (truth <= result.upper), axis=0)
 
@@ -94,11 +94,11 @@ def test_intervals_cover_5000(given):
 def test_a_batch_is_its_lanes_one_by_one(noisy, loss):
     """The same lane alone, in a batch, elsewhere in the chunk and among others: to 1e-8."""
     _, force, _ = noisy
-    problem = synthetic.problem(force, loss=loss)
-    starts = np.tile([p.to_scaled(p.value) for p, _, _ in problem.unknowns[0]], (20, 1))
-    sigma = first_sigma(problem)
+    study = synthetic.study(force, loss=loss)
+    starts = np.tile([p.to_scaled(p.value) for p, _, _ in study.unknowns[0]], (20, 1))
+    sigma = first_sigma(study)
     solve = lambda jobs: levenberg_marquardt(  # noqa: E731
-        problem, jobs, starts[jobs], sigma[jobs], tolerances=Tolerances(iterations=60)
+        study, jobs, starts[jobs], sigma[jobs], tolerances=Tolerances(iterations=60)
     )
     batch = solve(np.arange(20))
     order = np.random.default_rng(0).permutation(20)
@@ -147,7 +147,7 @@ def test_bad_specimens_cost_only_themselves(tmp_path):
     read = read_measurements([tmp_path / n for n in ("all.csv", "s006.csv", "s007.csv")])
     assert {b.specimen for b in read.bad} == {f"s{i:03d}" for i in range(1, 8)}
     assert {b.kind for b in read.bad} >= {"non_finite", "too_few_points", "non_monotone", "empty"}
-    study = lambda curves: build(  # noqa: E731
+    study = lambda curves: build_study(  # noqa: E731
         curves, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters()
     )
     with_bad = fit(study(read.curves), Settings(starts=1))
@@ -169,7 +169,7 @@ def test_an_infeasible_start_is_a_status_and_disturbs_nobody(noisy):
         dataclasses.replace(c, specimen="x" + c.specimen)
         for c in synthetic.curves(near, displacement=shallow)
     ]
-    make = lambda data: build(data, synthetic.GEOMETRY, synthetic.OPTIONS, table)  # noqa: E731
+    make = lambda data: build_study(data, synthetic.GEOMETRY, synthetic.OPTIONS, table)  # noqa: E731
     together = fit(make([*rest[:4], *deep, *rest[4:]]), Settings(starts=1, more_starts=0))
     alone = fit(make(rest), Settings(starts=1))
     assert together.status[1] == FitStatus.INFEASIBLE_START
@@ -182,15 +182,15 @@ def test_an_infeasible_start_is_a_status_and_disturbs_nobody(noisy):
     assert np.all(np.abs(again.value[1] - truth[0]) < 4 * again.standard_error[1])
     np.testing.assert_array_equal(again.tried, [1, 1, 1, 1])
     np.testing.assert_array_equal(again.theta[[0, 2, 3]], together.theta[[0, 2, 3]])
-    rescued = fit(again.problem.take(np.array([2, 1])), Settings(starts=1))
+    rescued = fit(again.study.take(np.array([2, 1])), Settings(starts=1))
     np.testing.assert_allclose(rescued.theta[1], again.theta[1], rtol=0, atol=1e-8)
 
 
 def test_same_optimum_and_errors_as_scipy(noisy):
     """20 lanes against MINPACK's lmder with the same residual."""
     _, force, _ = noisy
-    problem = synthetic.problem(force)
-    result = fit(problem, Settings(starts=1))
+    study = synthetic.study(force)
+    result = fit(study, Settings(starts=1))
 
     def scipy(i):
         def residual(theta):
@@ -226,8 +226,8 @@ def test_one_position_leaves_skeleton_undetermined():
     """As on an elastic foundation (c ~ EI^-1/4 k_M^-3/4) only EI k_M^3 is seen from one place."""
     force, _ = synthetic.forces(np.array([[100.0, 1.0, 2.0, 0.2]]), s_c=np.array([75.0]))
     data = synthetic.curves(force, s_c=np.array([75.0]))
-    problem = build(data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters())
-    result = fit(problem, Settings(starts=2))
+    study = build_study(data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters())
+    result = fit(study, Settings(starts=2))
     assert result.status[0] == FitStatus.UNIDENTIFIABLE
     flat = result.uncertainty[0].flat
     ratio = flat[0] / flat[1]
@@ -236,7 +236,7 @@ def test_one_position_leaves_skeleton_undetermined():
     assert np.all(np.isinf(result.standard_error[0, :2]))
     assert np.all(np.isfinite(result.standard_error[0, 2:]))
     u = result.uncertainty[0]
-    words = describe_flat([p.name for p, _, _ in problem.unknowns[0]], u.flat, np.inf, u.blind)
+    words = describe_flat([p.name for p, _, _ in study.unknowns[0]], u.flat, np.inf, u.blind)
     shape = re.fullmatch(r"EI_L and k_M only through EI_L k_M\^([\d.]+)", words)
     assert shape is not None
     assert float(shape[1]) == pytest.approx(-ratio, rel=1e-2)
@@ -246,10 +246,8 @@ def test_a_bound_is_hit_and_said(noisy):
     """k_1 cannot reach its optimum: estimate on the bound, flagged, without a standard error."""
     truth, force, _ = noisy
     upper = 0.8 * truth[:, 2].min()
-    problem = synthetic.problem(
-        force, changes={"k_1": {"value": 0.2, "lower": 0.1, "upper": upper}}
-    )
-    result = fit(problem, Settings(starts=1))
+    study = synthetic.study(force, changes={"k_1": {"value": 0.2, "lower": 0.1, "upper": upper}})
+    result = fit(study, Settings(starts=1))
     assert np.all(result.status == FitStatus.AT_BOUND)
     np.testing.assert_allclose(result.value[:, 2], upper, rtol=1e-12)
     assert result.at_bound[:, 2].all()
@@ -262,7 +260,7 @@ def test_scopes_count_their_unknowns(scope, lanes, unknowns):
     truth = np.tile(CLEAR, (3, 1))
     force, _ = synthetic.forces(truth)
     changes = {name: {"scope": scope} for name in synthetic.NAMES}
-    result = fit(synthetic.problem(force, changes=changes), Settings(starts=1))
+    result = fit(synthetic.study(force, changes=changes), Settings(starts=1))
     assert result.value.shape == (lanes, unknowns)
     np.testing.assert_allclose(result.value, np.tile(CLEAR, (lanes, 1)), rtol=1e-6)
 
@@ -273,9 +271,9 @@ def test_shared_and_specimen_mix():
     truth[:, 2] *= [0.8, 1.0, 1.2]
     force, _ = synthetic.forces(truth)
     changes = {name: {"scope": "shared"} for name in ("EI_L", "k_M")}
-    result = fit(synthetic.problem(force, changes=changes), Settings(starts=1))
+    result = fit(synthetic.study(force, changes=changes), Settings(starts=1))
     assert result.value.shape == (1, 8)
-    names = [(p.name, specimen) for p, specimen, _ in result.problem.unknowns[0]]
+    names = [(p.name, specimen) for p, specimen, _ in result.study.unknowns[0]]
     value = dict(zip(names, result.value[0], strict=True))
     np.testing.assert_allclose(value["EI_L", ""], CLEAR[0], rtol=1e-6)
     k_1 = [value["k_1", f"s{i:04d}"] for i in range(3)]
@@ -295,9 +293,9 @@ def test_onset_and_offset_of_each_trial_are_recovered():
         "onset": {"fixed": False, "value": 0.3, "lower": 0.0, "upper": 3.0},
         "force_offset": {"fixed": False},
     }
-    result = fit(synthetic.problem(force, changes=changes), Settings(starts=1))
+    result = fit(synthetic.study(force, changes=changes), Settings(starts=1))
     assert result.value.shape == (1, 12)
-    value = {(p.name, t): v for (p, _, t), v in zip(result.problem.unknowns[0], result.value[0])}  # noqa: B905
+    value = {(p.name, t): v for (p, _, t), v in zip(result.study.unknowns[0], result.value[0])}  # noqa: B905
     np.testing.assert_allclose([value["onset", f"t{j}"] for j in range(4)], onset, atol=1e-5)
     np.testing.assert_allclose(
         [value["force_offset", f"t{j}"] for j in range(4)], offset, atol=1e-5
@@ -316,7 +314,7 @@ def test_unequal_lengths_do_not_change_results():
         )
         for c in synthetic.curves(force[1:])
     ]
-    make = lambda data: build(  # noqa: E731
+    make = lambda data: build_study(  # noqa: E731
         data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(), balance="sample"
     )
     both = fit(make([*long, *short]), Settings(starts=1))
@@ -328,8 +326,8 @@ def test_unequal_lengths_do_not_change_results():
 
 def test_float32_agrees(noisy):
     _, force, _ = noisy
-    double = fit(synthetic.problem(force), Settings(starts=1))
-    single = fit(synthetic.problem(force), Settings(starts=1, float32=True))
+    double = fit(synthetic.study(force), Settings(starts=1))
+    single = fit(synthetic.study(force), Settings(starts=1, float32=True))
     assert single.value.dtype == np.float64
     # A thousandth, or a thirtieth of the standard error where the data say less than that.
     allowed = np.maximum(1e-3, double.relative_se / 30)
@@ -338,8 +336,8 @@ def test_float32_agrees(noisy):
 
 def test_more_starts_never_cost_more(noisy):
     _, force, _ = noisy
-    one = fit(synthetic.problem(force), Settings(starts=1))
-    four = fit(synthetic.problem(force), Settings(starts=4))
+    one = fit(synthetic.study(force), Settings(starts=1))
+    four = fit(synthetic.study(force), Settings(starts=4))
     assert np.all(four.cost <= one.cost * (1 + 1e-6))
     assert np.all((four.converged_starts >= 1) & (four.converged_starts <= 4))
     np.testing.assert_allclose(four.value, one.value, rtol=1e-4)
@@ -357,12 +355,14 @@ def test_markers_with_both_noise_levels_estimated():
         dataclasses.replace(c, joint_rings=rings, joint_displacement=seen[i // 4, i % 4])
         for i, c in enumerate(synthetic.curves(force))
     ]
-    problem = build(data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(joints=True))
-    result = fit(problem, Settings(starts=1))
+    study = build_study(
+        data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(joints=True)
+    )
+    result = fit(study, Settings(starts=1))
     # 200 and 600 samples: sd of an estimated level 5 % and 3 %; four of them.
     np.testing.assert_allclose(result.sigma[:, 0], level, rtol=0.2)
     np.testing.assert_allclose(result.sigma[:, 1], 0.02, rtol=0.12)
-    force_only = fit(synthetic.problem(force), Settings(starts=1))
+    force_only = fit(synthetic.study(force), Settings(starts=1))
     assert np.all(result.standard_error[:, 1] < force_only.standard_error[:, 1])
 
 
@@ -374,8 +374,8 @@ def test_robust_losses_as_scipy(noisy, loss):
     _, force, sigma = noisy
     force, level = force[:1].copy(), float(sigma[0, 0, 0])
     force[0, :, ::9] += 20 * level
-    problem = synthetic.problem(force, loss=loss, noise=Noise(force=level))
-    result = fit(problem, Settings(starts=1))
+    study = synthetic.study(force, loss=loss, noise=Noise(force=level))
+    result = fit(study, Settings(starts=1))
     assert result.status[0] == FitStatus.CONVERGED
 
     def residual(theta):
@@ -387,7 +387,7 @@ def test_robust_losses_as_scipy(noisy, loss):
     )  # fmt: skip
     assert result.cost[0] <= other.cost * (1 + 1e-8)
     np.testing.assert_allclose(result.theta[0], other.x, rtol=0, atol=1e-3)
-    plain = fit(synthetic.problem(force, noise=Noise(force=level)), Settings(starts=1))
+    plain = fit(synthetic.study(force, noise=Noise(force=level)), Settings(starts=1))
     truth = noisy[0][0]
     stray = lambda r: np.abs(np.log(r.value[0] / truth)).max()  # noqa: E731
     assert stray(result) < stray(plain)
@@ -396,12 +396,12 @@ def test_robust_losses_as_scipy(noisy, loss):
 @pytest.mark.parametrize(("method", "blocks"), [("lbfgs", 60), ("adam", 100)])
 def test_descent_reaches_the_same_minimum(noisy, method, blocks):
     _, force, _ = noisy
-    problem = synthetic.problem(force)
-    sigma = first_sigma(problem)[:2]
+    study = synthetic.study(force)
+    sigma = first_sigma(study)[:2]
     truth = np.log(noisy[0][:2])
-    best = levenberg_marquardt(problem, np.arange(2), truth, sigma)
+    best = levenberg_marquardt(study, np.arange(2), truth, sigma)
     other = descend(
-        problem, np.arange(2), truth, sigma, method=method, tolerances=Tolerances(iterations=blocks)
+        study, np.arange(2), truth, sigma, method=method, tolerances=Tolerances(iterations=blocks)
     )
     assert np.all(other.cost <= best.cost * (1 + 1e-3))
     assert np.all(other.cost >= best.cost * (1 - 1e-9))

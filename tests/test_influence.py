@@ -12,8 +12,8 @@ import synthetic
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.problem import Noise, build
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference.estimate import estimate, lane_of
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.measurements.read import Curve
@@ -34,14 +34,14 @@ def linear_study(lengths, balance="curve", **noise):
         D = np.linspace(0.2, 2, n)
         curves.append(Curve("T", f"t{j}", None, 0.0, D, 1.3 * D + 0.05 * rng.normal(size=n)))
     options = Options(coupling="total", onset_width=0.0)
-    return build(curves, table_1(), options, rows, balance=balance, noise=Noise(**noise))
+    return build_study(curves, table_1(), options, rows, balance=balance, noise=Noise(**noise))
 
 
 @pytest.mark.parametrize("noise", [{}, {"force": 0.05}])
 def test_one_unknown_is_the_textbook(noise):
     """Leverage D^2 / sum D^2, e / (s sqrt(1 - h)), s without the sample, Cook t^2 h / (1 - h)."""
     found = influence(fit(linear_study((12,), **noise), SHARP))
-    curve = found.result.problem.curves[0][0]
+    curve = found.result.study.curves[0][0]
     D, F = curve.displacement, curve.force
     k = (D @ F) / (D @ D)
     e, h = k * D - F, D * D / (D @ D)
@@ -63,7 +63,7 @@ def test_one_unknown_is_the_textbook(noise):
 def test_curves_of_unequal_weight():
     """Weights b^2 = mean length / n: variance of residuals by the whole hat matrix, lost curves."""
     found = influence(fit(linear_study((30, 10)), SHARP))
-    curves = found.result.problem.curves[0]
+    curves = found.result.study.curves[0]
     D = np.concatenate([c.displacement for c in curves])
     F = np.concatenate([c.force for c in curves])
     first = np.arange(40) < 30
@@ -87,9 +87,9 @@ def test_curves_of_unequal_weight():
     assert np.isnan(found.of.leverage[0, 1, 10:]).all()
 
 
-def moved(problem, force, precision=None):
+def moved(study, force, precision=None):
     """Estimates of lane 0 with each of these forces (B, T, N) in its place."""
-    many = problem.take(np.zeros(len(force), int))
+    many = study.take(np.zeros(len(force), int))
     lanes = many.lanes._replace(force=force)
     if precision is not None:
         lanes = lanes._replace(precision=precision)
@@ -123,8 +123,8 @@ def quiet():
 @pytest.mark.parametrize("name", list(CASES))
 def test_four_unknowns_against_refits(noisy, name):
     """Central differences of refits; a hat matrix of trace P."""
-    problem = synthetic.problem(noisy, **CASES[name])
-    result = fit(problem, SHARP)
+    study = synthetic.study(noisy, **CASES[name])
+    result = fit(study, SHARP)
     found = influence(result)
     np.testing.assert_allclose(np.nansum(found.of.leverage), 4, rtol=1e-9)
     places = PLACES
@@ -136,8 +136,8 @@ def test_four_unknowns_against_refits(noisy, name):
         shift[2 * k, t, e], shift[2 * k + 1, t, e] = step, -step
     se = result.uncertainty[0].se
     start = lambda n: np.repeat(result.theta, n, axis=0)  # noqa: E731
-    data = problem.lanes.force + shift
-    again = fit(moved(problem, data), SHARP, starts=start(len(data))).theta
+    data = study.lanes.force + shift
+    again = fit(moved(study, data), SHARP, starts=start(len(data))).theta
     slope = (again[::2] - again[1::2]) / (2 * step) * sigma / se
     of = [found.of.per_sigma[0, t, :, e] for t, e in places]
     np.testing.assert_allclose(of, slope, rtol=1e-3, atol=1e-4 * np.abs(slope).max())
@@ -146,15 +146,15 @@ def test_four_unknowns_against_refits(noisy, name):
 @pytest.mark.slow
 def test_left_out_is_a_refit_to_first_order(quiet):
     """Shifts of up to half a standard error, of a nearly linear model: to 5 % of the largest."""
-    problem = synthetic.problem(quiet)
-    result = fit(problem, SHARP)
+    study = synthetic.study(quiet)
+    result = fit(study, SHARP)
     found, places = influence(result), PLACES
-    precision = np.repeat(problem.lanes.precision, len(places), axis=0)
+    precision = np.repeat(study.lanes.precision, len(places), axis=0)
     for k, (t, e) in enumerate(places):
         precision[k, t, e] = 0
-    held = problem.lanes.force.repeat(len(places), axis=0)
+    held = study.lanes.force.repeat(len(places), axis=0)
     starts = np.repeat(result.theta, len(places), axis=0)
-    gone = fit(moved(problem, held, precision), SHARP, starts=starts).theta
+    gone = fit(moved(study, held, precision), SHARP, starts=starts).theta
     exact = (gone - result.theta) / result.uncertainty[0].se
     first = np.array([found.of.left_out[0, t, :, e] for t, e in places])
     np.testing.assert_allclose(first, exact, atol=0.05 * np.abs(exact).max())
@@ -164,7 +164,7 @@ def test_left_out_is_a_refit_to_first_order(quiet):
 def test_an_unknown_on_its_bound_is_held(noisy):
     """An unknown on its bound is held: it carries nothing, and the others as if it were fixed."""
     low = {"k_M": {"value": 2.0, "lower": 1.6}}
-    found = influence(fit(synthetic.problem(noisy, changes=low), SHARP))
+    found = influence(fit(synthetic.study(noisy, changes=low), SHARP))
     assert found.result.at_bound[0].tolist() == [False, True, False, False]
     np.testing.assert_allclose(np.nansum(found.of.leverage), 3, rtol=1e-9)
     assert np.isnan(found.of.per_sigma[0, :, 1]).all()
@@ -174,13 +174,13 @@ def test_an_unknown_on_its_bound_is_held(noisy):
 @pytest.mark.slow
 def test_estimate_of_one_unknown_is_differentiable():
     """k_1 = D F / D D: derivatives by force and, forward over reverse, by D; many lanes at once."""
-    problem = linear_study((12,))
-    lane, sigma = lane_of(problem, 0), jnp.ones(2)
+    study = linear_study((12,))
+    lane, sigma = lane_of(study, 0), jnp.ones(2)
     start = jnp.array([1.0])
 
     def k(force, D):
         data = lane._replace(force=force, displacement=D)
-        return 0.5 * estimate(problem, start, data, sigma).theta[0]
+        return 0.5 * estimate(study.model, start, data, sigma).theta[0]
 
     D, F = lane.displacement, lane.force
     by = jax.grad(k, argnums=(0, 1))
@@ -201,11 +201,11 @@ def test_estimate_of_one_unknown_is_differentiable():
 @pytest.mark.slow
 def test_estimate_follows_data_and_geometry(noisy):
     """Forward = reverse = central differences of the solver, by force, contact and rings."""
-    problem = synthetic.problem(noisy)
-    result = fit(problem, SHARP)
-    lane, start = lane_of(problem, 0), jnp.asarray(result.theta[0])
+    study = synthetic.study(noisy)
+    result = fit(study, SHARP)
+    lane, start = lane_of(study, 0), jnp.asarray(result.theta[0])
     sigma = jnp.asarray(result.whitened_sigma[0])
-    tube = jax.tree.map(jnp.asarray, problem.geometry)
+    tube = jax.tree.map(jnp.asarray, study.model.geometry)
     rng = np.random.default_rng(0)
     along = [jnp.asarray(rng.normal(size=v.shape)) for v in (lane.force, lane.s_c)]
     along = (0.1 * along[0], along[1], jnp.asarray(rng.normal(size=15)))
@@ -214,7 +214,7 @@ def test_estimate_follows_data_and_geometry(noisy):
     def theta(force, s_c, rings):
         moved = lane._replace(force=force, s_c=s_c)
         geometry = dataclasses.replace(tube, ring_positions=rings)
-        return estimate(problem, start, moved, sigma, geometry, SHARP.tolerances).theta
+        return estimate(study.model, start, moved, sigma, geometry, SHARP.tolerances).theta
 
     @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
     def both(*at):

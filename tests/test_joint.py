@@ -14,11 +14,11 @@ from scipy.optimize import least_squares
 
 from jaxtrachea.fit import schur as arrow
 from jaxtrachea.fit import shared as joint
-from jaxtrachea.fit import study
+from jaxtrachea.fit import specification
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.problem import Noise, build
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import population as populations
 from jaxtrachea.inference import results
 from jaxtrachea.inference.bootstrap import bootstrap
@@ -56,7 +56,7 @@ def linear_curves(seed=0):
             yield Curve(f"s{i:02d}", f"t{t}", None, 0.0, DEPTH, force + 0.03 * rng.normal(size=12))
 
 
-def linear_problem(curves=None, k_3=None, **settings):
+def linear_study(curves=None, k_3=None, **settings):
     changes = {"k_3": {"scope": "shared"} | (k_3 or {}), "force_offset": {"fixed": False}}
     table = [
         dataclasses.replace(DEFAULTS[n], **changes.get(n, {}))
@@ -64,15 +64,15 @@ def linear_problem(curves=None, k_3=None, **settings):
     ]
     curves = list(linear_curves()) if curves is None else curves
     settings = {"joint": True, "balance": "sample"} | settings
-    return build(curves, table_1(), TOTAL, table, **settings)
+    return build_study(curves, table_1(), TOTAL, table, **settings)
 
 
-def linear_truth(problem):
+def linear_truth(study):
     """Dense least squares: value and standard error of (k_1, k_3, offsets) of every lane."""
-    sizes = [1 + len(c) for c in problem.curves]
+    sizes = [1 + len(c) for c in study.curves]
     first = np.concatenate([[1], 1 + np.cumsum(sizes)])
     A, b, places = [], [], []
-    for lane, at in zip(problem.curves, first, strict=False):
+    for lane, at in zip(study.curves, first, strict=False):
         place = [at, 0, *range(at + 1, at + 1 + len(lane))]
         rows = np.zeros((12 * len(lane), first[-1]))
         rows[:, place] = columns(len(lane))
@@ -93,7 +93,7 @@ def agrees(result, lane, value, error, tolerance):
 
 @pytest.fixture(scope="module")
 def linear():
-    return fit(linear_problem(), ONE_START)
+    return fit(linear_study(), ONE_START)
 
 
 def test_elimination_is_the_dense_solution():
@@ -143,7 +143,7 @@ def test_the_step_of_the_trust_region():
 
 
 def test_linear_model_is_linear_least_squares(linear):
-    value, error = linear_truth(linear.problem)
+    value, error = linear_truth(linear.study)
     assert linear.lanes == LANES
     assert np.all(linear.status == FitStatus.CONVERGED)
     for lane in range(LANES):
@@ -154,26 +154,26 @@ def test_linear_model_is_linear_least_squares(linear):
 
 
 def test_a_lane_that_cannot_be_evaluated_costs_itself(linear):
-    problem = linear_problem()
-    problem.lanes.force[3, 0, 2] = np.nan
-    result = fit(problem, ONE_START)
+    study = linear_study()
+    study.lanes.force[3, 0, 2] = np.nan
+    result = fit(study, ONE_START)
     rest = np.delete(np.arange(LANES), 3)
     assert result.status[3] == FitStatus.INFEASIBLE_START
     assert np.all(result.status[rest] == FitStatus.CONVERGED)
     without = [c for c in linear_curves() if c.specimen != "s03"]
-    value, error = linear_truth(linear_problem(without))
+    value, error = linear_truth(linear_study(without))
     for i, lane in enumerate(rest):
         agrees(result, lane, value[i], error[i], 1e-8)
-    problem.lanes.force[:] = np.nan
-    assert np.all(fit(problem, ONE_START).status == FitStatus.INFEASIBLE_START)
+    study.lanes.force[:] = np.nan
+    assert np.all(fit(study, ONE_START).status == FitStatus.INFEASIBLE_START)
 
 
 @pytest.mark.slow
 def test_result_does_not_depend_on_chunks_nor_much_on_precision(linear):
-    other = fit(linear_problem(), dataclasses.replace(ONE_START, chunk=7, starts=2))
+    other = fit(linear_study(), dataclasses.replace(ONE_START, chunk=7, starts=2))
     np.testing.assert_allclose(other.theta, linear.theta, rtol=1e-9, atol=1e-9)
     assert np.all(other.converged_starts == 2)
-    single = fit(linear_problem(), dataclasses.replace(ONE_START, float32=True))
+    single = fit(linear_study(), dataclasses.replace(ONE_START, float32=True))
     assert np.all(single.status == FitStatus.CONVERGED)
     shift = (single.value - linear.value) / linear.standard_error
     assert np.nanmax(np.abs(shift)) < 1e-2
@@ -183,19 +183,19 @@ def test_result_does_not_depend_on_chunks_nor_much_on_precision(linear):
 def test_bounds_of_shared_and_of_own_unknowns():
     """A bound on k_3 takes it out: the others are least squares with k_3 there."""
     curves = list(linear_curves())
-    result = fit(linear_problem(curves, {"upper": 0.05, "value": 0.01}), ONE_START)
+    result = fit(linear_study(curves, {"upper": 0.05, "value": 0.01}), ONE_START)
     assert np.all(result.status == FitStatus.AT_BOUND)
     assert np.all(result.value[:, 1] == 0.05)
     assert np.isnan(result.standard_error[:, 1]).all()
     at, squares = np.delete(columns(2), 1, axis=1), 0.0
-    force = np.concatenate([c.force - 0.05 * DEPTH**3 for c in result.problem.curves[1]])
+    force = np.concatenate([c.force - 0.05 * DEPTH**3 for c in result.study.curves[1]])
     np.testing.assert_allclose(
         np.delete(result.value[1], 1), np.linalg.lstsq(at, force)[0], rtol=1e-7
     )
-    for lane in result.problem.curves:
+    for lane in result.study.curves:
         force = np.concatenate([c.force - 0.05 * DEPTH**3 for c in lane])
         squares += np.linalg.lstsq(np.delete(columns(len(lane)), 1, axis=1), force)[1][0]
-    dof = sum(12 * len(c) - 1 - len(c) for c in result.problem.curves)
+    dof = sum(12 * len(c) - 1 - len(c) for c in result.study.curves)
     np.testing.assert_allclose(result.sigma[0, 0], np.sqrt(squares / dof), rtol=0.01)
 
 
@@ -233,9 +233,9 @@ def test_population_knows_what_errors_have_in_common(linear, monkeypatch):
     monkeypatch.setattr(populations, "random_effects", keep)
     population(linear)
     (_, covariance, _, common), scale = seen[0], linear.standard_error[:, 0] / linear.value[:, 0]
-    sigma, k_1, i = linear.sigma[0, 0], linear.value[:, 0], linear.problem.shared[0, 0]
-    step = linear.problem.unknowns[0][i][0].step
-    for lane, curves in enumerate(linear.problem.curves):
+    sigma, k_1, i = linear.sigma[0, 0], linear.value[:, 0], linear.study.shared[0, 0]
+    step = linear.study.unknowns[0][i][0].step
+    for lane, curves in enumerate(linear.study.curves):
         X = columns(len(curves))
         own, shared = np.delete(X, 1, axis=1), X[:, 1]
         error = sigma * np.sqrt(np.linalg.inv(own.T @ own)[0, 0]) / k_1[lane]
@@ -254,7 +254,7 @@ def test_command_line_fits_jointly_what_is_shared(tmp_path, monkeypatch, capsys)
     monkeypatch.chdir(tmp_path)
     code, out, _ = run(monkeypatch, capsys, "check", "spec.toml")
     assert (code, "2 lane(s), fitted jointly of up to 4" in out) == (0, True)
-    monkeypatch.setattr(study, "MOST_DENSE", 6)
+    monkeypatch.setattr(specification, "MOST_DENSE", 6)
     code, _, err = run(monkeypatch, capsys, "fit", "spec.toml", "--profile")
     assert code == 2
     assert "parameters.k_M: shared, so that 7 unknowns" in err
@@ -276,13 +276,13 @@ def test_what_refits_single_lanes_is_refused(linear):
     for call in (
         lambda: profiles(linear),
         lambda: bootstrap(linear),
-        lambda: curves_to_leave_out(linear.problem),
-        lambda: check(linear.problem),
+        lambda: curves_to_leave_out(linear.study),
+        lambda: check(linear.study),
     ):
         with pytest.raises(ValueError, match="joint=False"):
             call()
     with pytest.raises(ValueError, match="levenberg-marquardt"):
-        fit(linear.problem, Settings(method="adam"))
+        fit(linear.study, Settings(method="adam"))
 
 
 def skeleton_study(count, joint=True, **settings):
@@ -293,7 +293,7 @@ def skeleton_study(count, joint=True, **settings):
     sigma = 0.01 * np.abs(force).max((1, 2), keepdims=True)
     force = force + sigma * np.random.default_rng(8).normal(size=force.shape)
     changes = {name: {"scope": "shared"} for name in ("EI_L", "k_M")}
-    return force, synthetic.problem(force, changes=changes, joint=joint, **settings)
+    return force, synthetic.study(force, changes=changes, joint=joint, **settings)
 
 
 def dense_reference(force):
@@ -329,8 +329,8 @@ def dense_reference(force):
 @pytest.mark.slow
 def test_twenty_specimens_are_the_dense_fit_of_scipy():
     """Estimates and standard errors within 1e-6 (relative)."""
-    force, problem = skeleton_study(20)
-    result = fit(problem, dataclasses.replace(ONE_START, chunk=32))
+    force, study = skeleton_study(20)
+    result = fit(study, dataclasses.replace(ONE_START, chunk=32))
     x, se = dense_reference(force)
     value = np.exp(np.concatenate([np.tile(x[:2], (20, 1)), x[2:].reshape(20, 2)], axis=1))
     error = np.concatenate([np.tile(se[:2], (20, 1)), se[2:].reshape(20, 2)], axis=1)
@@ -344,11 +344,11 @@ def test_twenty_specimens_are_the_dense_fit_of_scipy():
 )
 def test_twenty_specimens_are_one_dense_lane(settings):
     """Sandwich covariance, robust loss, given noise: as the path without Schur complements."""
-    _, problem = skeleton_study(20, **settings)
+    _, study = skeleton_study(20, **settings)
     _, dense = skeleton_study(20, joint=False, **settings)
-    found, expected = fit(problem, Settings(starts=1)), fit(dense, Settings(starts=1))
+    found, expected = fit(study, Settings(starts=1)), fit(dense, Settings(starts=1))
     places = {(p.name, s): i for i, (p, s, _) in enumerate(dense.unknowns[0])}
-    for lane, unknowns in enumerate(problem.unknowns):
+    for lane, unknowns in enumerate(study.unknowns):
         at = [places[p.name, s] for p, s, _ in unknowns]
         for name in ("value", "standard_error", "lower", "upper"):
             np.testing.assert_allclose(
@@ -368,11 +368,11 @@ def test_a_thousand_specimens():
 
 
 def test_held_unknowns_are_counted_once():
-    problem = linear_problem()
-    held = np.zeros(problem.lanes.lower.shape, bool)
-    held[np.arange(LANES), problem.shared[:, 0]] = True
+    study = linear_study()
+    held = np.zeros(study.lanes.lower.shape, bool)
+    held[np.arange(LANES), study.shared[:, 0]] = True
     held[4, 0] = True
     everyone = np.ones(LANES, bool)
-    assert joint.held_count(problem, held, everyone) == 2
+    assert joint.held_count(study, held, everyone) == 2
     # k_3, 20 k_1, and an offset of each of 30 curves.
-    assert joint.unknown_count(problem, everyone) == 51
+    assert joint.unknown_count(study, everyone) == 51

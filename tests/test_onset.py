@@ -12,8 +12,8 @@ from jaxtrachea._numerics import centred_hinge
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import in_model
 from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.problem import build, default_parameters
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import build_study, default_parameters
 from jaxtrachea.inference.cross_validation import leave_one_out, leave_repeats_out, without
 from jaxtrachea.inference.design import Candidates, check, gains, situation
 from jaxtrachea.inference.held_out import compare
@@ -92,16 +92,16 @@ def noisy_curves(count, seed, samples=60):
     return curves, np.array(truth)
 
 
-def pressed_problem(curves, **changes):
+def pressed_study(curves, **changes):
     fixed = {"EI_L": {"fixed": True, "value": 300.0}, "k_M": {"fixed": True, "value": 1.0}}
     table = default_parameters(in_model(Options(), joints=False), fixed | OWN | changes)
-    return build(curves, synthetic.GEOMETRY, Options(), table)
+    return build_study(curves, synthetic.GEOMETRY, Options(), table)
 
 
 @pytest.fixture(scope="module")
 def studied():
     curves, truth = noisy_curves(150, 1)
-    return fit(pressed_problem(curves), Settings(more_starts=0)), truth
+    return fit(pressed_study(curves), Settings(more_starts=0)), truth
 
 
 def coverage(result, truth):
@@ -128,7 +128,7 @@ def test_rounding_moves_the_onset_by_little_of_its_error(studied):
     """SciPy with the sharp hinge: onset scanned, all else least squares; 3 curves."""
     result, truth = studied
     for k in np.flatnonzero(~result.at_bound.any(axis=1))[:3]:
-        curve, c = result.problem.curves[k][0], truth[k, 4]
+        curve, c = result.study.curves[k][0], truth[k, 4]
         best = (np.inf, np.nan)
         value = result.value[k]
         for onset in value[2] + result.standard_error[k, 2] * np.linspace(-0.5, 0.5, 41):
@@ -146,7 +146,7 @@ def test_rounding_moves_the_onset_by_little_of_its_error(studied):
 def test_intervals_of_many_noisy_curves_cover():
     """1,500 curves: 95 % intervals of k_1 hold it in 93 to 97 %, and the onset hardly fewer."""
     curves, truth = noisy_curves(1500, 2, samples=120)
-    result = fit(pressed_problem(curves), Settings())
+    result = fit(pressed_study(curves), Settings())
     assert result.succeeded.mean() >= 0.999
     inner = ~result.at_bound.any(axis=1)
     inside, z = coverage(result, truth)
@@ -193,7 +193,7 @@ def own_study(noise, trials=4, **changes):
             curves.append(Curve(f"s{i}", f"t{j}", 20.0 + 30 * j, 0.0, D, force))
     options = Options(coupling="total")
     table = default_parameters(in_model(options, joints=False), OWN | changes)
-    return build(curves, synthetic.GEOMETRY, options, table)
+    return build_study(curves, synthetic.GEOMETRY, options, table)
 
 
 @pytest.fixture(scope="module")
@@ -226,41 +226,41 @@ def own_misfit(curve, k_1, k_3, start):
 
 def test_a_curve_left_out_fits_its_own_onset(owned):
     """SciPy: others fitted, then the curve's own two numbers with their k_1 and k_3."""
-    left = leave_one_out(owned.problem, ONE)
+    left = leave_one_out(owned.study, ONE)
     assert left.result.succeeded.all()
     assert len(left.trial) == 8
     lane, t = 0, 2
-    curves, value = list(owned.problem.curves[lane]), owned.value[lane]
+    curves, value = list(owned.study.curves[lane]), owned.value[lane]
     gone = curves.pop(t)
     start = np.delete(value, [2 + t, 6 + t])
     k_1, k_3 = scipy_fit(curves, start)[:2]
     r = own_misfit(gone, k_1, k_3, value[[2 + t, 6 + t]])
     expected = np.sqrt(np.mean(r**2)) / np.max(np.abs(gone.force))
     np.testing.assert_allclose(left.force[2], expected, rtol=0.01)
-    by_position = leave_repeats_out(owned.problem, ONE).error
+    by_position = leave_repeats_out(owned.study, ONE).error
     assert np.isfinite(by_position).all()
-    peak = max(np.max(np.abs(c.force)) for c in owned.problem.curves[0])
-    each = left.force[:4] * [np.max(np.abs(c.force)) for c in owned.problem.curves[0]]
+    peak = max(np.max(np.abs(c.force)) for c in owned.study.curves[0])
+    each = left.force[:4] * [np.max(np.abs(c.force)) for c in owned.study.curves[0]]
     np.testing.assert_allclose(by_position[0], np.sqrt(np.mean(each**2)) / peak, rtol=1e-6)
 
 
 def test_a_stiffness_of_one_curve_is_still_refused():
-    problem = own_study(0.05, k_1={"scope": "trial"})
+    study = own_study(0.05, k_1={"scope": "trial"})
     with pytest.raises(ValueError, match="k_1 belongs to single trials"):
-        leave_one_out(problem, ONE)
+        leave_one_out(study, ONE)
 
 
 def test_influence_of_a_curve_with_its_own_onset(owned):
     """First order against the refit without the curve; what goes with the curve is a dash."""
     found = influence(owned).of
-    problem = owned.problem
-    names = [p.name for p in problem.free]
+    study = owned.study
+    names = [p.name for p in study.free]
     own = [names.index(n) for n in ("onset", "force_offset")]
     common = [names.index(n) for n in ("k_1", "k_3")]
     assert np.isnan(found.curve_left_out[:, :, own]).all()
-    held = np.zeros(problem.lanes.s_c.shape, bool)
+    held = np.zeros(study.lanes.s_c.shape, bool)
     held[:, 1] = True
-    again = fit(without(problem, held), ONE)
+    again = fit(without(study, held), ONE)
     moved = (again.theta - owned.theta)[:, common]
     se = np.stack([u.se for u in owned.uncertainty])[:, common]
     np.testing.assert_allclose(found.curve_left_out[:, 1, common], moved / se, atol=0.1)
@@ -289,11 +289,11 @@ def test_a_new_press_brings_its_own_onset(owned):
 
 def test_errors_of_an_onset_are_of_the_press(owned):
     """The range is 5 mm: 0.28 mm is 5.6 %, and not 28,000 % of 1e-3 mm."""
-    names = [p.name for p, _, _ in owned.problem.unknowns[0]]
+    names = [p.name for p, _, _ in owned.study.unknowns[0]]
     at = names.index("onset")
     expected = owned.standard_error[0, at] / 5.0
     np.testing.assert_allclose(owned.relative_se[0, at], expected, rtol=1e-12)
-    peak = np.max(np.abs(owned.problem.curves[0][0].force))
+    peak = np.max(np.abs(owned.study.curves[0][0].force))
     at = names.index("force_offset")
     np.testing.assert_allclose(
         owned.relative_se[0, at], owned.standard_error[0, at] / peak, rtol=1e-12
@@ -322,9 +322,9 @@ def test_onset_in_words(flat, error, text):
 
 def test_where_no_onset_is_fitted_nothing_changes():
     force, _ = synthetic.forces(np.array([[300.0, 1.0, 0.5, 0.2]]))
-    problem = synthetic.problem(force)
-    assert problem.lanes.blend is None
-    assert problem.parameters[-1].step == 0.1
+    study = synthetic.study(force)
+    assert study.lanes.blend is None
+    assert study.parameters[-1].step == 0.1
 
 
 def test_a_stored_fit_predicts_with_its_corners_and_in_its_steps(owned, tmp_path):
@@ -336,10 +336,10 @@ def test_a_stored_fit_predicts_with_its_corners_and_in_its_steps(owned, tmp_path
     force = force + 0.05 * np.random.default_rng(3).normal(size=80)
     deep = Curve("s0", "deep", 20.0, 0.0, D, force)
     *used, found = compare(read, [*read.curves, deep])
-    seen = predictions(owned.problem, owned.theta).force.reshape(8, 80)
+    seen = predictions(owned.study, owned.theta).force.reshape(8, 80)
     assert {c.in_fit for c in used} == {"yes"}
     np.testing.assert_allclose([c.residual for c in used], seen, rtol=0, atol=1e-9)
-    assert next(p.step for p in read.problem.free if p.name == "onset") == 1.0
+    assert next(p.step for p in read.study.free if p.name == "onset") == 1.0
     np.testing.assert_allclose(
         found.residual, own_misfit(deep, k_1, k_3, [4.0, 0.2]), atol=1e-4 * np.max(force)
     )

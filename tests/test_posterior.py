@@ -17,8 +17,8 @@ from jaxtrachea.cli.run import Found, posterior_failed
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS, in_model
 from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.problem import Noise, build, default_parameters
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Noise, build_study, default_parameters
 from jaxtrachea.inference.estimate import lane_of
 from jaxtrachea.inference.posterior import Posterior, log_density, posterior
 from jaxtrachea.inference.posterior_start import around_the_fit, mode
@@ -34,7 +34,7 @@ ONE = Settings(starts=1)
 SPEC = '[data]\nfiles = "good.csv"\n[model]\ncoupling = "total"\n[uncertainty]\nposterior = 100\n'
 
 
-def study(force, depth, noise=None, scale="linear"):
+def make_study(force, depth, noise=None, scale="linear"):
     """F = k_1 D + k_3 D^3, both free: linear, or their logarithms within narrow bounds."""
     bounds = {"lower": -1e3, "upper": 1e3} if scale == "linear" else {"lower": 0.1, "upper": 30.0}
     change = {"scale": scale, "value": 1.0, "step": 0.1} | bounds
@@ -42,7 +42,7 @@ def study(force, depth, noise=None, scale="linear"):
     rows += [DEFAULTS[n] for n in ("onset", "force_offset")]
     curve = Curve("T", "t", None, 0.0, depth, force)
     options = Options(coupling="total", onset_width=0.0)
-    return build([curve], table_1(), options, rows, noise=Noise(force=noise))
+    return build_study([curve], table_1(), options, rows, noise=Noise(force=noise))
 
 
 @pytest.fixture
@@ -55,10 +55,10 @@ def test_density_is_that_of_the_normal_noise():
     rng = np.random.default_rng(0)
     depth = np.linspace(0.1, 2, 12)
     force = 1.3 * depth + 0.4 * depth**3 + 0.1 * rng.normal(size=12)
-    problem = study(force, depth, scale="log")
-    lane, sigma = lane_of(problem, 0), jnp.array([0.2, 1.0])
+    study = make_study(force, depth, scale="log")
+    lane, sigma = lane_of(study, 0), jnp.array([0.2, 1.0])
     points = jnp.asarray(rng.normal(size=(20, 3)))
-    density = lambda x: log_density(problem, (True, False), lane, sigma, x)  # noqa: E731
+    density = lambda x: log_density(study.model, (True, False), lane, sigma, x)  # noqa: E731
     found = np.asarray(jax.jit(jax.vmap(density))(points))
     share = 1 / (1 + np.exp(-np.asarray(points[:, :2])))
     k = np.exp(np.log(0.1) + np.log(300.0) * share)
@@ -71,7 +71,7 @@ def test_density_is_that_of_the_normal_noise():
 
 def made(rhat, ess, lost):
     """A posterior of one unknown with these diagnostics."""
-    result = fit(study(np.linspace(1, 3, 5), np.linspace(1, 3, 5)), ONE)
+    result = fit(make_study(np.linspace(1, 3, 5), np.linspace(1, 3, 5)), ONE)
     theta, divergent = np.zeros((1, 2, 100, 2)), np.zeros((1, 2, 100), bool)
     divergent[0, 0, :lost] = True
     pair = lambda v: np.array([[v, v]])  # noqa: E731
@@ -112,7 +112,7 @@ def test_linear_model_is_the_closed_form(blackjax):
     rng = np.random.default_rng(1)
     depth = np.linspace(0.1, 2, 24)
     force = 1.3 * depth + 0.4 * depth**3 + 0.05 * rng.normal(size=24)
-    drawn = posterior(fit(study(force, depth), ONE), draws=2000, seed=3)
+    drawn = posterior(fit(make_study(force, depth), ONE), draws=2000, seed=3)
     assert drawn.verdict(0).startswith("good")
     J = np.stack([depth, depth**3], axis=1)
     best, squares, *_ = np.linalg.lstsq(J, force)
@@ -133,7 +133,7 @@ def test_curved_posterior_is_that_of_quadrature(blackjax):
     """Logarithms of k_1 and k_3 from 5 poor samples: skewed, both cut by bounds."""
     depth = np.linspace(0.3, 1.2, 5)
     force = 1.0 * depth + 0.2 * depth**3 + 0.3 * np.array([0.5, -1, 0.8, 0.1, -0.4])
-    drawn = posterior(fit(study(force, depth, 0.3, "log"), ONE), draws=4000, seed=1)
+    drawn = posterior(fit(make_study(force, depth, 0.3, "log"), ONE), draws=4000, seed=1)
     assert not drawn.verdict(0).startswith("poor")
     grid = np.linspace(np.log(0.1), np.log(30.0), 1501)
     a, b = np.meshgrid(np.exp(grid), np.exp(grid), indexing="ij")
@@ -163,7 +163,7 @@ def default_study(truths, seed=0):
     ]  # fmt: skip
     options = Options(coupling="total", onset_width=0.0)
     table = default_parameters(in_model(options, joints=False), {})
-    return build(curves, table_1(), options, table)
+    return build_study(curves, table_1(), options, table)
 
 
 def quadrature(curve):
@@ -191,7 +191,7 @@ def test_chains_start_where_the_estimate_is():
         start = around_the_fit(result, lane, (True, False), 200, 0)
         x = start.centre + start.y @ start.root.T
         share = 1 / (1 + np.exp(-x[:, :2]))
-        low, high = result.problem.lanes.lower[lane], result.problem.lanes.upper[lane]
+        low, high = result.study.lanes.lower[lane], result.study.lanes.upper[lane]
         theta = low + (high - low) * share
         se = result.uncertainty[lane].se
         np.testing.assert_allclose(theta.mean(axis=0), result.theta[lane], atol=0.3 * se.max())
@@ -211,8 +211,8 @@ def test_chains_start_at_the_mode_of_the_posterior():
     rows = [dataclasses.replace(DEFAULTS["k_1"], scale="linear", value=1.0)]
     zero = {"lower": -1.0, "value": 0.0, "fixed": True}
     rows += [dataclasses.replace(DEFAULTS[n], **zero) for n in ("k_3", "onset", "force_offset")]
-    problem = build(curves, table_1(), Options(coupling="total", onset_width=0.0), rows)
-    result = fit(problem, ONE)
+    study = build_study(curves, table_1(), Options(coupling="total", onset_width=0.0), rows)
+    result = fit(study, ONE)
     D, F = (np.concatenate([getattr(c, n) for c in curves]) for n in ("displacement", "force"))
     best = (D @ F) / (D @ D)
     assert abs(result.value[0, 0] - best) > 0.03
@@ -222,7 +222,7 @@ def test_chains_start_at_the_mode_of_the_posterior():
 def test_poor_chains_are_said_beside_the_estimates():
     """No interval in report and table, a sentence under the estimates, empty cells, exit code 1."""
     drawn = made(1.55, 8.0, 0)
-    seen = predictions(drawn.result.problem, drawn.result.theta)
+    seen = predictions(drawn.result.study, drawn.result.theta)
     text = report_text("T", drawn.result, [], seen, None, drawn=drawn)
     estimates = text.partition("## Estimates")[2].partition("## What")[0]
     assert "The posterior of 1 of 1 lanes is not to be trusted" in estimates
@@ -248,7 +248,7 @@ def test_well_conditioned_lanes_are_those_of_quadrature(blackjax):
     for lane in range(3):
         assert drawn.rhat[lane].max() < 1.01
         assert drawn.ess[lane].min() > 400
-        low, _, high = quadrature(result.problem.curves[lane][0])
+        low, _, high = quadrature(result.study.curves[lane][0])
         width = high - low
         assert np.all(np.abs(drawn.lower[lane] - low) < 0.1 * width)
         assert np.all(np.abs(drawn.upper[lane] - high) < 0.1 * width)

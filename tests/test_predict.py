@@ -21,10 +21,11 @@ from scipy.stats import t as student
 
 import jaxtrachea
 from jaxtrachea.fit.fit import fit
+from jaxtrachea.fit.model import columns_of
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.problem import Noise, build
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import held_out, results, stored
 from jaxtrachea.inference.cross_validation import leave_one_out, with_own_touch
 from jaxtrachea.inference.predict import predict_sources
@@ -90,7 +91,7 @@ def noisy_study(folder, noise, lanes, seed):
     curves = synthetic.curves(force, np.array(SEEN), DEPTHS)
     table = synthetic.parameters(**changes)
     result = fit(
-        build(curves, table_1(), synthetic.OPTIONS, table), Settings(starts=1, scrutiny=False)
+        build_study(curves, table_1(), synthetic.OPTIONS, table), Settings(starts=1, scrutiny=False)
     )
     results.write_hdf5(folder / "results.h5", result, {"inputs": {"a.csv": "0" * 64}})
     return result
@@ -136,19 +137,19 @@ def test_bands_cover_in_2000_fits(noise, tmp_path):
 def test_everything_comes_back_from_the_file(study, read):
     _, result = study
     assert np.array_equal(read.theta, result.theta)
-    assert read.problem.parameters == result.problem.parameters
-    assert read.problem.options == result.problem.options
+    assert read.study.parameters == result.study.parameters
+    assert read.study.model.options == result.study.model.options
     u = result.uncertainty[3]
     se = np.sqrt(np.diag(read.covariance[3]))
     assert np.allclose(se, u.se, rtol=1e-12)
     assert np.allclose(read.covariance[3], u.correlation * np.outer(se, se), rtol=1e-9)
     for mine, its in zip(
-        read.curves, (c for lane in result.problem.curves for c in lane), strict=True
+        read.curves, (c for lane in result.study.curves for c in lane), strict=True
     ):
         assert np.array_equal(mine.force, its.force)
         assert (mine.specimen, mine.trial, mine.s_c) == (its.specimen, its.trial, its.s_c)
     with h5py.File(read.path) as file:
-        seen = predictions(result.problem, result.theta)
+        seen = predictions(result.study, result.theta)
         assert np.array_equal(file["data/residual"][: len(DEPTHS)], seen.force[0, 0])
 
 
@@ -261,22 +262,22 @@ def pairs(onset=0.0):
             yield Curve(name, trial, None, 0.0, depth, force)
 
 
-def total_problem(curves, more=None, **settings):
+def total_study(curves, more=None, **settings):
     """F = k_1 D + k_3 D^3, linear in both."""
     straight = {"scale": "linear", "lower": 0.0}
     changes = {"k_1": straight, "k_3": straight} | (more or {})
     names = ["k_1", "k_3", "onset", "force_offset"]
     table = [dataclasses.replace(DEFAULTS[n], **changes.get(n, {})) for n in names]
-    return build(list(curves), table_1(), TOTAL, table, **settings)
+    return build_study(list(curves), table_1(), TOTAL, table, **settings)
 
 
 #: Always two lanes at once, so that one program serves.
 TWO = Settings(starts=1, chunk=2, scrutiny=False)
 
 
-def stored_again(problem, path):
-    """A fit of a problem, written and read."""
-    result = fit(problem, TWO)
+def stored_again(study, path):
+    """A fit of a study, written and read."""
+    result = fit(study, TWO)
     results.write_hdf5(path, result, {})
     return jaxtrachea.read_results(path)
 
@@ -286,7 +287,7 @@ def stored_again(problem, path):
 def test_linear_model_has_the_bands_of_the_text_book(given, tmp_path):
     """Least squares on D and D^3 (numpy): s^2 (X^T X)^-1, t or, with given noise, z."""
     curves = list(pairs())
-    read = stored_again(total_problem(curves, noise=Noise(force=given)), tmp_path / "r.h5")
+    read = stored_again(total_study(curves, noise=Noise(force=given)), tmp_path / "r.h5")
     D, F = (np.concatenate([getattr(c, n) for c in curves[:2]]) for n in ("displacement", "force"))
     X = np.stack([D, D**3], axis=1)
     beta, rss, *_ = np.linalg.lstsq(X, F, rcond=None)
@@ -311,13 +312,13 @@ def test_linear_model_has_the_bands_of_the_text_book(given, tmp_path):
 def test_left_out_curve_is_that_of_leave_one_out(tmp_path):
     """Fit without a curve, written, read, predicted: the residual of `leave_one_out` to 1e-9."""
     curves = list(pairs())
-    study = total_problem(curves)
+    study = total_study(curves)
     left = leave_one_out(study, TWO)
     truth = predictions(study.take(left.lane), left.result.theta).force
     for row in (0, 3):
         lane, trial = left.lane[row], left.trial[row]
         out = study.curves[lane][trial]
-        read = stored_again(total_problem([c for c in curves if c is not out]), tmp_path / f"{row}")
+        read = stored_again(total_study([c for c in curves if c is not out]), tmp_path / f"{row}")
         (found,) = held_out.compare(read, [out])
         assert np.allclose(found.residual, truth[row, trial], rtol=0, atol=1e-9)
         assert found.in_fit == "no"
@@ -336,7 +337,7 @@ def touching(onsets=(0.3, 0.7, 1.1), reach=6.0, specimens=("T1", "T2")):
 
 def stiffness(read, lane):
     """k_1 and k_3 in their units."""
-    pairs = zip(read.problem.free[:2], read.theta[lane, :2], strict=True)
+    pairs = zip(read.study.free[:2], read.theta[lane, :2], strict=True)
     return [p.from_scaled(v) for p, v in pairs]
 
 
@@ -346,9 +347,9 @@ OWN = {"onset": {"fixed": False}, "force_offset": {"fixed": False}}
 @pytest.fixture(scope="module")
 def touched(tmp_path_factory):
     """Three presses of two specimens, onset and offset of each its own: study and stored fit."""
-    problem = total_problem(touching(), OWN)
+    study = total_study(touching(), OWN)
     path = tmp_path_factory.mktemp("touched") / "r.h5"
-    return problem, stored_again(problem, path)
+    return study, stored_again(study, path)
 
 
 @pytest.mark.slow
@@ -383,7 +384,7 @@ def left_out_pairs(study, changes, rows, folder):
         lane, trial = left.lane[row], left.trial[row]
         out = study.curves[lane][trial]
         others = [c for curves in study.curves for c in curves if c is not out]
-        read = stored_again(total_problem(others, changes), folder / f"{row}")
+        read = stored_again(total_study(others, changes), folder / f"{row}")
         (found,) = held_out.compare(read, [out])
         assert found.in_fit == "no"
         peak = np.max(np.abs(out.force))
@@ -411,7 +412,7 @@ def test_left_out_curve_with_one_number_of_its_own(own, tmp_path):
     changes[own] = {"fixed": False}
     onsets = (0.3, 0.7, 1.1) if own == "onset" else (0.5, 0.5, 0.5)
     curves = [dataclasses.replace(c, force=c.force + 20.0) for c in touching(onsets)]
-    for found, _, _ in left_out_pairs(total_problem(curves, changes), changes, (1,), tmp_path):
+    for found, _, _ in left_out_pairs(total_study(curves, changes), changes, (1,), tmp_path):
         assert f"{own} fitted to this curve" in found.prediction.message
 
 
@@ -433,7 +434,7 @@ def test_own_onset_of_a_press_of_another_size(touched):
     _, read = touched
     (deep,) = touching((3.0,), 60.0, ("T1",))
     deep = dataclasses.replace(deep, trial="deep")
-    onset = next(p for p in read.problem.free if p.name == "onset")
+    onset = next(p for p in read.study.free if p.name == "onset")
     (found,) = held_out.compare(read, [deep])
     x, force = least_touch(read, 0, deep)
     assert onset.step == 1.0
@@ -466,7 +467,7 @@ def rounded(x, width):
 def test_own_onset_is_fitted_and_its_band_is_that_of_least_squares(tmp_path):
     """A new curve's own onset, k_1 and k_3 kept; band by the law of errors."""
     curves = list(pairs(onset=0.1))
-    read = stored_again(total_problem(curves, {"onset": {"fixed": False}}), tmp_path / "r.h5")
+    read = stored_again(total_study(curves, {"onset": {"fixed": False}}), tmp_path / "r.h5")
     depth = np.linspace(0.0, 2, 41)
     rng = np.random.default_rng(6)
     touched = np.maximum(depth - 0.3, 0)
@@ -511,9 +512,9 @@ def only(read, lanes):
               "lane_names")  # fmt: skip
     count = int(np.sum(read.curve_lane < lanes))
     cut = {name: getattr(read, name)[:lanes] for name in fields}
-    problem = dataclasses.replace(read.problem, unknowns=read.problem.unknowns[:lanes])
+    study = dataclasses.replace(read.study, unknowns=read.study.unknowns[:lanes])
     curves = {name: getattr(read, name)[:count] for name in ("curves", "curve_lane", "blend")}
-    return dataclasses.replace(read, problem=problem, **cut, **curves)
+    return dataclasses.replace(read, study=study, **cut, **curves)
 
 
 def test_unknown_specimens(read):
@@ -528,14 +529,14 @@ def test_unknown_specimens(read):
     assert "predicted as specimen 's0002'" in found.prediction.message
     assert np.array_equal(found.prediction.force, known.prediction.force)
     share = lambda p: dataclasses.replace(p, scope="specimen" if p.fixed else "shared")  # noqa: E731
-    problem = dataclasses.replace(
-        read.problem,
-        parameters=tuple(map(share, read.problem.parameters)),
+    study = dataclasses.replace(
+        read.study,
+        parameters=tuple(map(share, read.study.parameters)),
         unknowns=tuple(
-            tuple((share(p), "", "") for p, _, _ in lane) for lane in read.problem.unknowns
+            tuple((share(p), "", "") for p, _, _ in lane) for lane in read.study.unknowns
         ),
     )
-    for one in (only(read, 1), dataclasses.replace(read, problem=problem)):
+    for one in (only(read, 1), dataclasses.replace(read, study=study)):
         (found,) = held_out.compare(one, [new])
         assert "a new specimen" in found.prediction.message
         assert np.isfinite(found.prediction.high95).all()
@@ -546,9 +547,9 @@ def test_joint_fit_predicts_as_one_dense_lane(tmp_path):
     """A shared parameter: joint lanes carry the whole covariance, the common error included."""
     at = []
     for joint in (True, False):
-        study = total_problem(pairs(), {"k_3": {"scope": "shared"}}, joint=joint)
+        study = total_study(pairs(), {"k_3": {"scope": "shared"}}, joint=joint)
         read = stored_again(study, tmp_path / f"{joint}.h5")
-        assert read.problem.joint == joint
+        assert read.study.joint == joint
         at.append(jaxtrachea.predict(read, s=80.0, displacement=[1.0, 2.0], specimen="T2"))
     assert np.allclose(at[0].force, at[1].force, rtol=1e-7)
     assert np.allclose(at[0].se, at[1].se, rtol=1e-5)
@@ -562,7 +563,7 @@ def test_core_in_float32(read):
     names = ("free", "value", "covariance", "blind", "half_width")
     args = [np.stack([getattr(s, n) for s in sources]).astype(np.float32) for n in names]
     place, depth = np.full(3, 61.0, np.float32), np.tile(np.float32([1.0, 4.0]), (3, 1))
-    program = functools.partial(predicted, read.problem.program)
+    program = functools.partial(predicted, read.study.model)
     batch = jax.jit(jax.vmap(program))(*map(jnp.asarray, (*args, place, depth)))
     assert batch.value.force.dtype == batch.se.joints.dtype == np.float32
     exact = predict_sources(read, sources, [61.0] * 3, [np.array([1.0, 4.0])] * 3)
@@ -577,7 +578,7 @@ def test_fixed_specification_is_evaluated(tmp_path):
     """Nothing free: residuals, cost and noise by hand; predicted with a band of noise alone."""
     curves = list(pairs())
     fixed = {"k_1": {"value": 1.0, "fixed": True}, "k_3": {"value": 0.1, "fixed": True}}
-    result = fit(total_problem(curves, fixed))
+    result = fit(total_study(curves, fixed))
     D, F = curves[0].displacement, np.concatenate([c.force for c in curves[:2]])
     residual = np.tile(D + 0.1 * D**3, 2) - F
     sigma = np.sqrt(np.mean(residual**2))
@@ -824,7 +825,7 @@ def test_schema_1_serves_to_fit_failed_lanes_again(study, tmp_path):
     """What `--rerun-failed` needs is in it; the covariance follows from errors and correlation."""
     shutil.copytree(study[0], tmp_path / "r")
     old(tmp_path / "r")
-    again = former.read_hdf5(tmp_path / "r" / "results.h5", study[1].problem)
+    again = former.read_hdf5(tmp_path / "r" / "results.h5", study[1].study)
     assert np.array_equal(again.theta, study[1].theta)
     for mine, its in zip(again.uncertainty, study[1].uncertainty, strict=True):
         assert np.allclose(mine.covariance, its.covariance, rtol=1e-9)
@@ -833,12 +834,14 @@ def test_schema_1_serves_to_fit_failed_lanes_again(study, tmp_path):
 @pytest.mark.slow
 def test_a_former_fit_with_other_steps_is_refused(touched):
     """Its lanes would keep scaled coordinates that mean other numbers here."""
-    problem, read = touched
-    assert former.read_hdf5(read.path, problem).succeeded.all()
+    study, read = touched
+    assert former.read_hdf5(read.path, study).succeeded.all()
     other = [dataclasses.replace(p, step=7 * p.step) if p.name == "onset" else p
-             for p in problem.parameters]  # fmt: skip
+             for p in study.parameters]  # fmt: skip
+    model = dataclasses.replace(study.model, columns=columns_of(other))
+    study = dataclasses.replace(study, model=model, parameters=tuple(other))
     with pytest.raises(NoRun, match="other steps; fit again"):
-        former.read_hdf5(read.path, dataclasses.replace(problem, parameters=tuple(other)))
+        former.read_hdf5(read.path, study)
 
 
 @pytest.mark.parametrize(
@@ -888,13 +891,13 @@ def test_bad_input_ends_with_a_cure(arguments, says, study, tmp_path, monkeypatc
 def test_virtual_trachea_ten_positions_by_the_command(tmp_path, monkeypatch, capsys):
     """The command on fits of nine positions predicts the tenth as `--leave-one-out` does."""
     from jaxtrachea.config import load_fit_spec
-    from jaxtrachea.fit.study import problem_of, settings_of
+    from jaxtrachea.fit.specification import settings_of, study_of
     from jaxtrachea.measurements.data_files import read_data
     from jaxtrachea.measurements.read import Measurements, write_hdf5
 
     spec = load_fit_spec(VIRTUAL / "fit.toml")
     measured = read_data(spec, VIRTUAL)
-    study = problem_of(spec, measured, refits=True)
+    study = study_of(spec, measured, refits=True)
     left = leave_one_out(study, settings_of(spec))
     truth = predictions(study.take(left.lane), left.result.theta).force
     text = (VIRTUAL / "fit.toml").read_text()
@@ -925,7 +928,7 @@ def test_a_lane_with_one_place_predicts_that_place(study, tmp_path):
     rng = np.random.default_rng(3)
     force = truth + NOISE * rng.normal(size=(1, 1, len(DEPTHS)))
     curves = synthetic.curves(force, np.array([75.0]), DEPTHS)
-    result = fit(build(curves, table_1(), synthetic.OPTIONS, synthetic.parameters()), TWO)
+    result = fit(build_study(curves, table_1(), synthetic.OPTIONS, synthetic.parameters()), TWO)
     results.write_hdf5(tmp_path / "results.h5", result, {"inputs": {"a.csv": "0" * 64}})
     read = jaxtrachea.read_results(tmp_path)
     source = source_of(read, read.specimens[0])

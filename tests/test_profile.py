@@ -14,9 +14,9 @@ from scipy.optimize import least_squares
 
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.problem import Noise, build
 from jaxtrachea.fit.profile_search import Sides
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference.profile import choose, profiles
 from jaxtrachea.inference.results import profile_rows
 from jaxtrachea.measurements.read import Curve
@@ -43,7 +43,7 @@ def linear_study(noise=Noise(), **table):  # noqa: B008 (frozen)
     change = {"k_1": linear | {"value": 1.0}, "k_3": linear} | table
     rows = [dataclasses.replace(DEFAULTS[n], **change.get(n, {})) for n in names]
     options = Options(coupling="total", onset_width=0.0)
-    return build(curves, table_1(), options, rows, noise=noise)
+    return build_study(curves, table_1(), options, rows, noise=noise)
 
 
 @pytest.mark.parametrize("noise", [Noise(), Noise(force=0.05)], ids=["estimated", "given"])
@@ -69,7 +69,7 @@ def curved():
     force, _ = synthetic.forces(synthetic.draw(7, 3, 1.3, CLEAR))
     noise = np.random.default_rng(8).normal(size=force.shape)
     force = force + 0.02 * np.abs(force).max((1, 2), keepdims=True) * noise
-    result = fit(synthetic.problem(force), ONE)
+    result = fit(synthetic.study(force), ONE)
     return force, result, profiles(result, ONE, points=4)
 
 
@@ -116,7 +116,7 @@ def test_what_one_position_cannot_tell_is_open():
     force = force + 0.01 * force.max() * np.random.default_rng(0).normal(size=force.shape)
     data = synthetic.curves(force, s_c=np.array([75.0]))
     result = fit(
-        build(data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters()),
+        build_study(data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters()),
         Settings(starts=2),
     )
     found = profiles(result, ONE)

@@ -23,8 +23,8 @@ from jaxtrachea.files.tables import quoted, read_csv, unquoted, write_csv
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.problem import Noise, build
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import results
 from jaxtrachea.inference.cross_validation import LeftOut
 from jaxtrachea.inference.effective import effective, share_independent
@@ -66,11 +66,11 @@ def curve(specimen, trial="a", k=1.0, noise=0.0, seed=0):
 def many():
     """Fourteen lanes, the later the noisier, of names that no program expects; the third failed."""
     names = [*NAMES, "last"]
-    problem = build(
+    study = build_study(
         [curve(n, noise=1e-3 * (i + 1), seed=i) for i, n in enumerate(names)],
         table_1(), BONDED, table(),
     )  # fmt: skip
-    result = fit(problem, ONE)
+    result = fit(study, ONE)
     status = result.status.copy()
     status[2] = FitStatus.MAX_ITERATIONS
     return dataclasses.replace(result, status=status)
@@ -145,7 +145,7 @@ def test_names_are_plain_text_in_pictures(name):
 
 def test_a_run_of_such_names_writes_all_its_files(many, tmp_path):
     """Every picture and the page; markup and formulas as text; tables say what they leave out."""
-    seen = predictions(many.problem, many.theta)
+    seen = predictions(many.study, many.theta)
     paths, lost = draw_all(tmp_path, many, seen)
     assert lost == {}
     assert all(p.read_bytes()[:4] == b"\x89PNG" for p in paths)
@@ -176,7 +176,7 @@ def test_a_picture_that_fails_costs_itself(many, tmp_path, monkeypatch):
         raise ValueError("no such $ colour")
 
     monkeypatch.setattr("jaxtrachea.report.plots.draw_residuals", broken)
-    seen = predictions(many.problem, many.theta)
+    seen = predictions(many.study, many.theta)
     paths, lost = draw_all(tmp_path, many, seen)
     assert [p.name for p in paths] == ["fit.png", "correlation.png"]
     assert lost == {"residuals.png": "ValueError: no such $ colour"}
@@ -232,13 +232,13 @@ def dense():
     curves = [curve(n, t, noise=0.01, seed=i) for i, (n, t) in
               enumerate((("A", "1"), ("A", "2"), ("B", "1"), ("C", "1")))]  # fmt: skip
     changes = {"k_1": {"scope": "shared"}, "force_offset": {"fixed": False, "scope": "trial"}}
-    return fit(build(curves, table_1(), BONDED, table(**changes)), ONE)
+    return fit(build_study(curves, table_1(), BONDED, table(**changes)), ONE)
 
 
 def test_one_lane_of_several_specimens_has_a_row_for_each(dense):
     """All columns of a specimen's own unknowns; what it has several of is named, not dropped."""
     assert dense.lanes == 1
-    seen = predictions(dense.problem, dense.theta)
+    seen = predictions(dense.study, dense.theta)
     rows = with_residuals(dense, list(results.lane_rows(dense)), seen, effective(dense, seen))
     assert [(r["specimen"], r["trial"]) for r in rows] == [("A", "(all)"), ("B", "1"), ("C", "1")]
     labels = [results.unknown_label(dense, 0, i) for i in range(8)]
@@ -259,14 +259,14 @@ def test_one_lane_of_several_specimens_has_a_row_for_each(dense):
 def test_influence_says_why_there_is_no_number(dense):
     """An unknown of one curve is its own; a lane without an estimate has none; bounds hold."""
     diagnosed = influence(dense)
-    problem = dense.problem
+    study = dense.study
     assert influence_cell(diagnosed, 0, 0, 2).endswith(", own")
     text = "\n".join(influence_section(diagnosed))
     assert REASONS in text
     status = np.array([FitStatus.MAX_ITERATIONS])
     failed = dataclasses.replace(diagnosed, result=dataclasses.replace(dense, status=status))
     assert influence_cell(failed, 0, 0, 0) == "no estimate"
-    bound = np.zeros((1, problem.size), bool)
+    bound = np.zeros((1, study.size), bool)
     bound[0, 0] = True
     held = dataclasses.replace(diagnosed, result=dataclasses.replace(dense, at_bound=bound))
     assert influence_cell(held, 0, 0, 0) == "held"
@@ -294,8 +294,8 @@ def test_widened_intervals_cover(given):
         for i, t in enumerate("ab")
     ]
     level = Noise(force=0.05 if given else None)
-    result = fit(build(curves, table_1(), BONDED, table(), noise=level), ONE)
-    wide = effective(result, predictions(result.problem, result.theta))
+    result = fit(build_study(curves, table_1(), BONDED, table(), noise=level), ONE)
+    wide = effective(result, predictions(result.study, result.theta))
     truth = np.array([1.3, 0.4])
     inside = lambda low, high: np.mean((low <= truth) & (truth <= high), axis=0)  # noqa: E731
     plain_share = inside(result.lower, result.upper)
@@ -316,14 +316,14 @@ def test_fewer_independent_samples_than_unknowns_leave_no_limit():
     """A straight line through a bent curve: residuals of one sign, one after the other."""
     depth = np.linspace(0, 1, 40)
     bent = Curve("T", "a", None, 0.0, depth, depth + 0.2 * np.sin(3 * depth))
-    result = fit(build([bent], table_1(), BONDED, table()), ONE)
-    wide = effective(result, predictions(result.problem, result.theta))
+    result = fit(build_study([bent], table_1(), BONDED, table()), ONE)
+    wide = effective(result, predictions(result.study, result.theta))
     assert wide.samples[0] < 2
     assert np.isinf(wide.factor[0])
     # No limit but the bounds.
-    assert wide.lower[0].tolist() == [p.lower for p in result.problem.free]
-    assert wide.upper[0].tolist() == [p.upper for p in result.problem.free]
-    text = report_text("T", result, [], predictions(result.problem, result.theta), None)
+    assert wide.lower[0].tolist() == [p.lower for p in result.study.free]
+    assert wide.upper[0].tolist() == [p.upper for p in result.study.free]
+    text = report_text("T", result, [], predictions(result.study, result.theta), None)
     assert "95 % widened" in text
     assert "no more independent samples than unknowns" in text
     assert "correlated in 1 of 1 lanes" in " ".join(shown(overview(found(result))).split())
@@ -367,7 +367,7 @@ def test_of_many_curves_left_out_report_and_terminal_show_the_worst_first(dense)
     shares = ["–", *(f"{v}.00 %" for v in (14, 13, 12, 10, 9, 8, 7, 6, 5, 4, 3))]
     assert [row[3] for row in rows[:-1]] == shares
     assert further == "Worst first; and 2 more, see left_out.csv"
-    seen = predictions(dense.problem, dense.theta)
+    seen = predictions(dense.study, dense.theta)
     text = report_text("T", dense, [], seen, left_out)
     section = text.split("## Leaving one curve out")[1].split("##")[0]
     lines = [line for line in section.splitlines() if line.startswith("| ")][2:14]

@@ -11,8 +11,8 @@ import synthetic
 from scipy.integrate import quad
 
 from jaxtrachea.fit.parameters import in_model
-from jaxtrachea.fit.problem import Noise, build, default_parameters
 from jaxtrachea.fit.residual import residual, residual_value
+from jaxtrachea.fit.study import Noise, build_study, default_parameters
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.material import Material
@@ -45,8 +45,8 @@ EACH = [pytest.param(n, marks=pytest.mark.slow if n in LATER else ()) for n in C
 QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
 
 
-def study(name):
-    """Problem of two specimens, of three curves and two, of unequal length and varying sigma."""
+def make_study(name):
+    """Study of two specimens, of three curves and two, of unequal length and varying sigma."""
     options, markers, changes = CASES[name]
     rng = np.random.default_rng(5)
     found = []
@@ -61,16 +61,16 @@ def study(name):
         found.append(Curve(f"s{i // 3}", f"t{i}", s, 0.0, D, F, sigma=sigma, **seen))
     parameters = default_parameters(in_model(options, joints=markers), changes)
     noise = Noise(force=0.3, joints=0.7)
-    return build(found, synthetic.GEOMETRY, options, parameters, noise=noise)
+    return build_study(found, synthetic.GEOMETRY, options, parameters, noise=noise)
 
 
-def lane_and_point(problem, k, dtype=np.float64):
+def lane_and_point(study, k, dtype=np.float64):
     """Arrays of lane k and unknowns near the guess."""
     cast = lambda v: v if v.dtype == np.int32 else v.astype(dtype)  # noqa: E731
-    lane = jax.tree.map(lambda v: jnp.asarray(cast(v[k])), problem.lanes)
+    lane = jax.tree.map(lambda v: jnp.asarray(cast(v[k])), study.lanes)
     rng = np.random.default_rng(k)
-    guess = [p.to_scaled(p.value) for p, _, _ in problem.unknowns[k]]
-    theta = np.zeros(problem.size)
+    guess = [p.to_scaled(p.value) for p, _, _ in study.unknowns[k]]
+    theta = np.zeros(study.size)
     theta[: len(guess)] = np.array(guess) + 0.3 * rng.normal(size=len(guess))
     return lane, jnp.asarray(theta, dtype)
 
@@ -78,14 +78,15 @@ def lane_and_point(problem, k, dtype=np.float64):
 @functools.cache
 def evaluated(name):
     """Residual with Jacobian, residual alone, and its derivative by jax; of every lane."""
-    problem = study(name)
+    study = make_study(name)
 
     @functools.partial(jax.jit, compiler_options=QUICK)
     def both(theta, lane):
-        value = functools.partial(residual_value, problem)
-        return residual(problem, theta, lane), value(theta, lane), jax.jacfwd(value)(theta, lane)
+        model = study.model
+        value = functools.partial(residual_value, model)
+        return residual(model, theta, lane), value(theta, lane), jax.jacfwd(value)(theta, lane)
 
-    return [both(*reversed(lane_and_point(problem, k))) for k in range(len(problem.curves))]
+    return [both(*reversed(lane_and_point(study, k))) for k in range(len(study.curves))]
 
 
 def rounded(x, width):
@@ -95,18 +96,18 @@ def rounded(x, width):
     return quad(lambda u: kernel(u) * max(x - width * u, 0), -1, 1, points=corner, epsabs=1e-13)[0]
 
 
-def pressed(problem, theta, k, t):
+def pressed(study, theta, k, t):
     """Force and joints of trial t of lane k by the public `press`."""
-    curve = problem.curves[k][t]
-    values = {p.name: p.value for p in problem.parameters}
-    for (p, specimen, trial), scaled in zip(problem.unknowns[k], np.asarray(theta), strict=False):
+    curve = study.curves[k][t]
+    values = {p.name: p.value for p in study.parameters}
+    for (p, specimen, trial), scaled in zip(study.unknowns[k], np.asarray(theta), strict=False):
         if specimen in ("", curve.specimen) and trial in ("", curve.trial):
             values[p.name] = p.from_scaled(float(scaled))
     onset, offset = values.pop("onset"), values.pop("force_offset")
     material = Material(**{"EI_L": 1.0, "k_M": 1.0} | values)
-    D, options = jnp.asarray(curve.displacement), problem.options
-    if problem.lanes.blend is not None:  # a fitted onset: the corner is rounded on both sides
-        D = jnp.asarray([rounded(d - onset, problem.lanes.blend[k, t]) for d in curve.displacement])
+    D, options = jnp.asarray(curve.displacement), study.model.options
+    if study.lanes.blend is not None:  # a fitted onset: the corner is rounded on both sides
+        D = jnp.asarray([rounded(d - onset, study.lanes.blend[k, t]) for d in curve.displacement])
         onset, options = 0.0, dataclasses.replace(options, contact="bonded")
     at = jnp.asarray(curve.s_c), jnp.asarray(onset)
     force, joints = _press(options, material, *at, jnp.pad(D, (0, 7 - len(D))))
@@ -121,14 +122,14 @@ def _press(options, material, s_c, onset, displacement):
 
 @pytest.mark.parametrize("name", EACH)
 def test_is_model_minus_data(name):
-    problem = study(name)
-    for k, curves in enumerate(problem.curves):
-        lane, theta = lane_and_point(problem, k)
+    study = make_study(name)
+    for k, curves in enumerate(study.curves):
+        lane, theta = lane_and_point(study, k)
         value = np.asarray(evaluated(name)[k][1])
         samples = lane.force.shape[-1]
         for t, curve in enumerate(curves):
             n = len(curve.force)
-            force, joints = pressed(problem, theta, k, t)
+            force, joints = pressed(study, theta, k, t)
             sigma = 0.3 if curve.sigma is None else curve.sigma
             expected = (force - curve.force) / sigma
             np.testing.assert_allclose(value[t, :n], expected, rtol=1e-9, atol=1e-11)
@@ -147,29 +148,29 @@ def test_is_model_minus_data(name):
 
 @pytest.mark.parametrize("name", EACH)
 def test_jacobian_is_that_of_the_value(name):
-    problem = study(name)
-    for k, curves in enumerate(problem.curves):
-        lane, _ = lane_and_point(problem, k)
+    study = make_study(name)
+    for k, curves in enumerate(study.curves):
+        lane, _ = lane_and_point(study, k)
         found, value, truth = evaluated(name)[k]
         np.testing.assert_allclose(found.value, value, rtol=1e-12, atol=1e-12)
         truth = np.asarray(truth)
-        index = np.asarray(lane.index)[:, problem.free_columns]
+        index = np.asarray(lane.index)[:, study.free_columns]
         for t in range(len(curves)):
             for column, unknown in enumerate(index[t]):
                 scale = np.abs(truth[t]).max()
                 np.testing.assert_allclose(
                     found.jacobian[t, column], truth[t, :, unknown], rtol=1e-9, atol=1e-11 * scale
                 )
-            others = np.setdiff1d(np.arange(problem.size), index[t])
+            others = np.setdiff1d(np.arange(study.size), index[t])
             assert np.all(truth[t][:, others] == 0)
 
 
 @pytest.mark.parametrize("name", ["all", "several beams", "total, markers"])
 def test_float32_follows_float64(name):
-    problem = study(name)
+    study = make_study(name)
     both = jax.jit(residual, static_argnums=0)
-    for k in range(len(problem.curves)):
-        coarse = both(problem, *reversed(lane_and_point(problem, k, np.float32)))
+    for k in range(len(study.curves)):
+        coarse = both(study.model, *reversed(lane_and_point(study, k, np.float32)))
         coarse, fine = jax.tree.leaves(coarse), jax.tree.leaves(evaluated(name)[k][0])
         for a, b in zip(map(np.asarray, coarse), map(np.asarray, fine), strict=True):
             assert a.dtype == np.float32
@@ -182,4 +183,4 @@ def test_float32_follows_float64(name):
      ("several beams", "nothing")],
 )  # fmt: skip
 def test_what_trials_of_a_lane_have_in_common(name, common):
-    assert study(name).common == common
+    assert make_study(name).model.common == common

@@ -14,8 +14,8 @@ from jaxtrachea.files.output import OutputExists, new_directory, new_output
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.predictions import Prediction, lag_correlation, predictions, rms
-from jaxtrachea.fit.problem import build
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import build_study
 from jaxtrachea.inference import results
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
 from jaxtrachea.measurements.read import BadCurve, Curve
@@ -38,17 +38,17 @@ def curves():
             yield Curve(s, trial, None, 0.0, depth, factor * (k_1 * depth + 0.1 * depth**3))
 
 
-def problem(**changes):
+def make_study(**changes):
     names = ["k_1", "k_3", "onset", "force_offset"]
     table = [dataclasses.replace(DEFAULTS[n], **changes.get(n, {})) for n in names]
-    return build(list(curves()), table_1(), TOTAL, table)
+    return build_study(list(curves()), table_1(), TOTAL, table)
 
 
 @pytest.fixture(scope="module")
 def result():
     """Specimen-wise k_1 and k_3, trial-wise offset."""
     offset = {"fixed": False}
-    return fit(problem(force_offset=offset), Settings(starts=1))
+    return fit(make_study(force_offset=offset), Settings(starts=1))
 
 
 def columns(heading):
@@ -101,7 +101,7 @@ def test_failed_lane_keeps_its_row_and_is_called_failed(result):
     assert bad["message"] == FitStatus.MAX_ITERATIONS.message
     assert bad["k_1 verdict"] == "failed"
     assert results.flat_sentence(failed, 1) == "no estimate"
-    text = report_text("T", failed, [BAD], predictions(result.problem, result.theta), None)
+    text = report_text("T", failed, [BAD], predictions(result.study, result.theta), None)
     assert "2 lanes, 1 succeeded, 1 failed; 1 curves could not be used" in text
     assert "| T9 | 1 | non_finite | line 3: force is nan | leave it out |" in text
     assert "max iterations" in text
@@ -132,7 +132,7 @@ def test_rows_with_different_keys_make_one_table(tmp_path, result):
 
 def test_leaving_out_predicts_from_the_other_trial():
     """The trial left out is 2 % stiffer or softer than the one that predicts it; exact data."""
-    study = problem()
+    study = make_study()
     left_out = leave_one_out(study, Settings(starts=1))
     assert curves_to_leave_out(study) == [(0, 0), (0, 1), (1, 0), (1, 1)]
     assert np.allclose(left_out.ratio, [1 / 1.02 - 1, 0.02] * 2, atol=1e-6)
@@ -143,10 +143,10 @@ def test_leaving_out_predicts_from_the_other_trial():
 
 
 def test_predictions_are_model_minus_data(result):
-    seen = predictions(result.problem, result.theta)
+    seen = predictions(result.study, result.theta)
     for lane in range(2):
         k_1, k_3, *offsets = result.value[lane]
-        for t, curve in enumerate(result.problem.curves[lane]):
+        for t, curve in enumerate(result.study.curves[lane]):
             model = k_1 * curve.displacement + k_3 * curve.displacement**3 + offsets[t]
             # The smooth touch (1 micrometre) shifts the displacement by less than 1e-5 mm here.
             assert np.allclose(seen.force[lane, t], model - curve.force, atol=1e-4)
@@ -156,7 +156,7 @@ def test_predictions_are_model_minus_data(result):
 
 
 def test_plots_of_many_lanes_and_of_nothing_finite(result, tmp_path):
-    seen = predictions(result.problem, result.theta)
+    seen = predictions(result.study, result.theta)
     for name, one in (
         ("all", seen),
         ("none", dataclasses.replace(seen, force=np.full_like(seen.force, np.nan))),
@@ -217,7 +217,7 @@ def test_correlated_residuals_are_found():
 
 
 def test_report_doubts_what_it_should(result):
-    seen = predictions(result.problem, result.theta)
+    seen = predictions(result.study, result.theta)
     shape = seen.force.shape
     bend = dataclasses.replace(seen, force=np.tile(np.linspace(1, 2, shape[-1]), (*shape[:2], 1)))
     noise = dataclasses.replace(seen, force=np.tile([1.0, -1.0], (*shape[:2], shape[-1] // 2)))

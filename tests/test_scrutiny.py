@@ -15,8 +15,8 @@ from jaxtrachea.fit import structure as structures
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import in_model
 from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.problem import build, default_parameters
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import build_study, default_parameters
 from jaxtrachea.inference import results
 from jaxtrachea.inference.effective import effective
 from jaxtrachea.inference.judgement import judgement, verdict_of
@@ -53,10 +53,10 @@ def curves(pressed, count, share, rng, name="s", markers=False):
             yield curve
 
 
-def study(data, markers=False):
+def make_study(data, markers=False):
     """A study with the defaults of the package."""
     parameters = default_parameters(in_model(OPTIONS, joints=markers), {})
-    return build(list(data), GEOMETRY, OPTIONS, parameters)
+    return build_study(list(data), GEOMETRY, OPTIONS, parameters)
 
 
 def verdicts(result, truth):
@@ -68,7 +68,7 @@ def verdicts(result, truth):
     word = np.array([[j.verdict for j in row] for row in judged])
     low, high = (np.array([[getattr(j, name) for j in row] for row in judged])
                  for name in ("low", "high"))  # fmt: skip
-    assert [p.name for p in result.problem.free] == list(NAMES)
+    assert [p.name for p in result.study.free] == list(NAMES)
     value = np.maximum(result.value, 1e-300)
     with np.errstate(divide="ignore", over="ignore"):
         far_low = value * np.exp(3 / 1.96 * np.log(np.maximum(low, 0) / value))
@@ -86,7 +86,7 @@ def pressed():
 
 
 @pytest.fixture(scope="module")
-def problem(pressed):
+def study(pressed):
     """One press of the first four, two of the twin, four of the clear one."""
     rng = np.random.default_rng(3)
     parts = (slice(4), 1, 0.002), (slice(4, 5), 2, 0.002), (slice(5, 6), 4, 1e-4)
@@ -94,13 +94,13 @@ def problem(pressed):
     for part, count, share in parts:
         of_part = specimens.Specimens(*(v[part] for v in pressed))
         data += curves(of_part, count, share, rng, f"p{count}")
-    return study(data)
+    return make_study(data)
 
 
 @pytest.fixture(scope="module")
-def result(problem):
+def result(study):
     """All of them, fitted together."""
-    return fit(problem)
+    return fit(study)
 
 
 def test_the_specimens_are_those_of_the_case(pressed):
@@ -158,10 +158,10 @@ def test_widened_intervals_hold_the_plain_ones(result):
     low[5, 3] = high[5, 3] = result.value[5, 3]
     end[5, 3] = ProfileEnd.FAILED
     given = dataclasses.replace(result, evidence_low=low, evidence_high=high, evidence_end=end)
-    slow = np.sin(np.arange(result.problem.lanes.force.shape[2]))
-    seen = Prediction(np.where(result.problem.lanes.precision > 0, slow, np.nan), None)
+    slow = np.sin(np.arange(result.study.lanes.force.shape[2]))
+    seen = Prediction(np.where(result.study.lanes.precision > 0, slow, np.nan), None)
     wide = effective(given, seen)
-    bounds = [(p.lower, p.upper) for p in given.problem.free]
+    bounds = [(p.lower, p.upper) for p in given.study.free]
     for k in range(given.lanes):
         for i, (least, most) in enumerate(bounds):
             judged = judgement(given, k, i)
@@ -175,7 +175,7 @@ def test_widened_intervals_hold_the_plain_ones(result):
     found = np.log([wide.lower[5, 2] / value, wide.upper[5, 2] / value])
     np.testing.assert_allclose(found, ratio * sides, rtol=1e-9)
     # Where an end was not found, the local error is left.
-    assert result.problem.free[3].scale == "linear"
+    assert result.study.free[3].scale == "linear"
     local = np.array([result.lower[5, 3], result.upper[5, 3]]) - result.value[5, 3]
     found = np.array([wide.lower[5, 3], wide.upper[5, 3]]) - result.value[5, 3]
     np.testing.assert_allclose(found, ratio * local, rtol=1e-9)
@@ -188,7 +188,7 @@ def test_local_intervals_end_at_the_bounds(result):
     judged = [
         judgement(dataclasses.replace(result, lower=lower, upper=upper), 5, i) for i in (2, 3)
     ]
-    assert [(j.low, j.high) for j in judged] == [(0.5, result.problem.free[2].upper), (0, 3)]
+    assert [(j.low, j.high) for j in judged] == [(0.5, result.study.free[2].upper), (0, 3)]
 
 
 def test_population_and_medians_take_what_is_identifiable(result):
@@ -213,9 +213,9 @@ def test_an_end_that_was_not_found_is_no_proof(result):
     assert words == ["identifiable", "not shown"]
 
 
-def test_no_doubt_costs_nothing(problem, monkeypatch):
+def test_no_doubt_costs_nothing(study, monkeypatch):
     """Nothing is looked for where nothing gives cause: the estimate is that of the plain fit."""
-    clear = problem.take(np.full(6, 5))
+    clear = study.take(np.full(6, 5))
     plain = fit(clear, Settings(scrutiny=False))
     for module, name in ((scrutiny, "scrutinise"), (structures, "structure")):
         monkeypatch.setattr(module, name, None)
@@ -238,7 +238,7 @@ def test_truth_table(count, markers):
     rng = np.random.default_rng(2025)
     data = [c for share, name in ((0.002, "a"), (0.02, "b"))
             for c in curves(pressed, count, share, rng, name, markers)]  # fmt: skip
-    found = fit(study(data, markers))
+    found = fit(make_study(data, markers))
     assert found.succeeded.all()
     word, _, false = verdicts(found, np.tile(pressed.truth, (2, 1)))
     identifiable = word == "identifiable"
@@ -257,7 +257,7 @@ def joint_study(seed, shared, count, share):
     data = curves(pressed, count, share, np.random.default_rng(seed))
     changes = {name: {"scope": "shared"} for name in shared}
     parameters = default_parameters(in_model(OPTIONS, joints=False), changes)
-    return build(list(data), GEOMETRY, OPTIONS, parameters, joint=True), truth
+    return build_study(list(data), GEOMETRY, OPTIONS, parameters, joint=True), truth
 
 
 @pytest.mark.parametrize(
@@ -273,8 +273,8 @@ def test_a_joint_fit_says_what_it_has_not_looked_at(seeds, shared, count):
     """No wrong unknown is identifiable; with local errors alone 7 of 8, 30 of 53, 9 of 21 were."""
     words = []
     for seed in seeds:
-        problem, truth = joint_study(seed, shared, count, 0.002)
-        word, _, false = verdicts(fit(problem, Settings(starts=4)), truth)
+        study, truth = joint_study(seed, shared, count, 0.002)
+        word, _, false = verdicts(fit(study, Settings(starts=4)), truth)
         assert not np.any(false & (word == "identifiable")), seed
         words.append(word)
     assert np.any(np.array(words) == "not shown")

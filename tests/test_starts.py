@@ -16,9 +16,9 @@ LANES, DEEP, SHALLOW = 6, 1.0, 2.0
 
 
 @pytest.fixture(scope="module")
-def problem():
+def study():
     force, _ = synthetic.forces(synthetic.draw(1, LANES, 2.0))
-    return synthetic.problem(force)
+    return synthetic.study(force)
 
 
 @dataclasses.dataclass
@@ -44,11 +44,11 @@ class Wells:
         return Solved(np.array(starts), cost, status.astype(int), np.ones(len(jobs), int))
 
 
-def run(problem, wells, settings):
-    lanes = len(problem.curves)
+def run(study, wells, settings):
+    lanes = len(study.curves)
     jobs = np.repeat(np.arange(lanes), settings.starts)
-    first = wells(jobs, draw_starts(problem, settings))
-    jobs, solved = completed(problem, settings, jobs, first, np.ones(lanes), wells)
+    first = wells(jobs, draw_starts(study, settings))
+    jobs, solved = completed(study, settings, jobs, first, np.ones(lanes), wells)
     return (*best(jobs, solved, lanes), jobs, solved)
 
 
@@ -60,62 +60,62 @@ def one_well(wall=-np.inf):
     return Wells(np.full(LANES, GUESS), np.full(LANES, np.inf), wall)
 
 
-def test_where_all_starts_agree_nothing_is_solved_again(problem):
+def test_where_all_starts_agree_nothing_is_solved_again(study):
     wells = one_well()
-    _, agree, jobs, _ = run(problem, wells, Settings(starts=4))
+    _, agree, jobs, _ = run(study, wells, Settings(starts=4))
     assert len(wells.calls) == 1
     assert len(jobs) == 4 * LANES
     np.testing.assert_array_equal(agree, 4)
 
 
-def test_a_well_that_one_start_found_is_confirmed(problem):
+def test_a_well_that_one_start_found_is_confirmed(study):
     """Only lanes with the narrow well are in doubt; more starts find it again."""
     settings = Settings(starts=4, more_starts=40)
-    drawn = draw_starts(problem, settings).reshape(LANES, 4, -1)[:, :, 0]
+    drawn = draw_starts(study, settings).reshape(LANES, 4, -1)[:, :, 0]
     wells = Wells(drawn[:, 2], np.where(np.arange(LANES) < 2, 0.2, 50.0))
-    found, agree, jobs, solved = run(problem, wells, settings)
+    found, agree, jobs, solved = run(study, wells, settings)
     assert set(wells.calls[1][0]) == {0, 1}
     np.testing.assert_array_equal(solved.cost[found], DEEP)
     assert np.all(agree[:2] >= 2)
     np.testing.assert_array_equal(np.bincount(jobs), [44, 44, 4, 4, 4, 4])
 
 
-def test_infeasible_starts_are_drawn_anew_together_and_not_for_ever(problem):
+def test_infeasible_starts_are_drawn_anew_together_and_not_for_ever(study):
     wells = one_well(GUESS + 0.5)
     settings = Settings(starts=1)
-    found, _, jobs, solved = run(problem, wells, settings)
+    found, _, jobs, solved = run(study, wells, settings)
     np.testing.assert_array_equal(solved.status[found], FitStatus.CONVERGED)
     assert len(jobs) == LANES
     assert 2 <= len(wells.calls) <= 1 + REDRAWS
     sizes = [len(jobs) for jobs, _ in wells.calls[1:]]
     assert sizes == sorted(sizes, reverse=True)
     nowhere = one_well(np.inf)
-    found, agree, _, solved = run(problem, nowhere, settings)
+    found, agree, _, solved = run(study, nowhere, settings)
     assert len(nowhere.calls) == 2 * (1 + REDRAWS)
     np.testing.assert_array_equal(solved.status[found], FitStatus.INFEASIBLE_START)
     np.testing.assert_array_equal(agree, 0)
 
 
-def test_draws_stay_in_the_bounds_and_belong_to_the_lane(problem):
+def test_draws_stay_in_the_bounds_and_belong_to_the_lane(study):
     """Alone, in another order or among others a lane draws the same; another seed, others."""
     settings = Settings(starts=2, more_starts=5)
 
-    def draws(problem, settings, lane):
+    def draws(study, settings, lane):
         wells = one_well(np.inf)
-        run(problem, wells, settings)
+        run(study, wells, settings)
         return np.concatenate([starts[jobs == lane] for jobs, starts in wells.calls[1:]])
 
-    mine = draws(problem, settings, 3)
+    mine = draws(study, settings, 3)
     assert len(np.unique(mine, axis=0)) == len(mine) == 2 * REDRAWS + 5 * (1 + REDRAWS)
-    np.testing.assert_array_equal(draws(problem.take(np.array([5, 3, 0])), settings, 1), mine)
-    other = draws(problem, dataclasses.replace(settings, seed=1), 3)
+    np.testing.assert_array_equal(draws(study.take(np.array([5, 3, 0])), settings, 1), mine)
+    other = draws(study, dataclasses.replace(settings, seed=1), 3)
     assert not np.any(np.isin(other, mine))
-    assert np.all((mine >= problem.lanes.lower[3]) & (mine <= problem.lanes.upper[3]))
+    assert np.all((mine >= study.lanes.lower[3]) & (mine <= study.lanes.upper[3]))
 
 
-def test_none_asked_for(problem):
+def test_none_asked_for(study):
     wells = one_well(np.inf)
-    run(problem, wells, Settings(starts=2, more_starts=0))
+    run(study, wells, Settings(starts=2, more_starts=0))
     assert len(wells.calls) == 1
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jaxtrachea.fit.parameters import in_model
-from jaxtrachea.fit.problem import build, default_parameters
 from jaxtrachea.fit.structure import null_spaces, pins, structure, suspicious
+from jaxtrachea.fit.study import build_study, default_parameters
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import table_1
@@ -19,7 +19,7 @@ FIXED_K_3 = {"k_3": {"fixed": True, "value": 0.0}}
 DEPTHS = np.linspace(0.1, 3, 6)
 
 
-def study(positions, markers=False, joint=False, changes=None):
+def make_study(positions, markers=False, joint=False, changes=None):
     """One specimen for every tuple of positions; what is measured does not matter."""
     curves = []
     for i, of_specimen in enumerate(positions):
@@ -32,7 +32,7 @@ def study(positions, markers=False, joint=False, changes=None):
                 )
             curves.append(curve)
     parameters = default_parameters(in_model(Options(), joints=markers), changes or {})
-    return build(curves, GEOMETRY, Options(), parameters, joint=joint)
+    return build_study(curves, GEOMETRY, Options(), parameters, joint=joint)
 
 
 #: Positions of specimens, changes of parameters, and the unknowns left open in each specimen: as
@@ -59,37 +59,37 @@ CASES = [
 
 @pytest.mark.parametrize(("positions", "changes", "left_open"), CASES, ids=["law", "line", "zero"])
 def test_unknowns_left_open(positions, changes, left_open):
-    problem = study(positions, changes=changes)
-    found = structure(problem)
-    names = [[p.name for p, _, _ in u] for u in problem.unknowns]
+    study = make_study(positions, changes=changes)
+    found = structure(study)
+    names = [[p.name for p, _, _ in u] for u in study.unknowns]
     told = [{n for n, open_ in zip(u, row, strict=False) if open_}
             for u, row in zip(names, found.undetermined, strict=True)]  # fmt: skip
     assert told == left_open
     # A count of positions must not pass over what the rank finds.
-    assert np.all(suspicious(problem) | (found.nullity == 0))
+    assert np.all(suspicious(study) | (found.nullity == 0))
     np.testing.assert_array_equal(found.pinned.sum(axis=1), found.nullity)
 
 
 def test_markers_tell_the_skeleton_from_one_position():
-    assert not structure(study([(75.0,)], markers=True)).nullity.any()
+    assert not structure(make_study([(75.0,)], markers=True)).nullity.any()
 
 
 def test_shared_skeleton_is_told_by_specimens_together():
     shared = {name: {"scope": "shared"} for name in ("EI_L", "k_M")}
-    together = structure(study([(75.0,), (22.0,)], joint=True, changes=shared))
+    together = structure(make_study([(75.0,), (22.0,)], joint=True, changes=shared))
     assert not together.nullity.any()
-    alike = structure(study([(75.0,), (75.0,)], joint=True, changes=shared))
+    alike = structure(make_study([(75.0,), (75.0,)], joint=True, changes=shared))
     assert alike.nullity.tolist() == [1, 1]
     assert alike.undetermined[:, :2].all()
 
 
 def test_direction_left_open_by_an_independent_beam():
     """At two truths: along it the compliance of the finite-element beam stays (to 1e-5)."""
-    problem = study([(75.0,)])
+    study = make_study([(75.0,)])
     for EI, k in ((900.0, 0.7), (30.0, 0.2)):
         theta = np.log([[EI, k, 1.0, 1.0]])
         theta[0, 3] = 1.0
-        (direction,) = null_spaces(problem, np.array([0]), theta)[0]
+        (direction,) = null_spaces(study, np.array([0]), theta)[0]
 
         def compliance(step, EI=EI, k=k, direction=direction):
             moved = np.exp(np.log([EI, k]) + step * direction[:2])

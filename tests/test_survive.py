@@ -27,7 +27,7 @@ from jaxtrachea.files import lock as run_lock
 from jaxtrachea.files import output
 from jaxtrachea.fit import fit
 from jaxtrachea.fit import levenberg_marquardt as solve
-from jaxtrachea.fit.study import problem_of
+from jaxtrachea.fit.specification import study_of
 from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.runs import chunks, former, in_chunks, journal, processes
 from jaxtrachea.runs import folder as run_folder
@@ -70,11 +70,11 @@ def stop_at(patch, k, error=KeyboardInterrupt):
     """Let fits before the k-th through, stop that one; counts them in the list it returns."""
     asked, real = [], fit.fit
 
-    def stopping(problem, settings, progress):
-        asked.append(problem.lanes.lower.shape[0])
+    def stopping(study, settings, progress):
+        asked.append(study.lanes.lower.shape[0])
         if len(asked) == k:
             raise error
-        return real(problem, settings, progress)
+        return real(study, settings, progress)
 
     patch.setattr("jaxtrachea.fit.fit.fit", stopping)
     return asked
@@ -227,9 +227,9 @@ def test_failed_lanes_are_fitted_again(peace, study, monkeypatch, capsys):
     seen = []
     real = fit.fit
 
-    def fit_and_tell(problem, settings, progress):
-        seen.append((problem.lanes.lower.shape[0], settings.starts, settings.seed))
-        return real(problem, settings, progress)
+    def fit_and_tell(part, settings, progress):
+        seen.append((part.lanes.lower.shape[0], settings.starts, settings.seed))
+        return real(part, settings, progress)
 
     monkeypatch.setattr("jaxtrachea.fit.fit.fit", fit_and_tell)
     code, _, err = run(monkeypatch, capsys, *FIT, "--rerun-failed")
@@ -257,51 +257,49 @@ def set_failed(path, lanes):
 def load_peace(peace):
     set_up_jax()
     spec = load_fit_spec(peace / "spec.toml")
-    return problem_of(spec, read_data(spec, peace))
+    return study_of(spec, read_data(spec, peace))
 
 
 def test_results_are_read_back_bit_for_bit(peace, tmp_path):
     """What write_hdf5 and save wrote comes back; damaged, foreign and truncated chunks do not."""
-    problem = load_peace(peace)
-    result = former.read_hdf5(peace / "out" / "results.h5", problem)
+    study = load_peace(peace)
+    result = former.read_hdf5(peace / "out" / "results.h5", study)
     lanes, path = np.arange(9), tmp_path / "0.npz"
     run_of_it = former.read_journal(peace / "out" / "results.h5")
     chunks.save(path, dataclasses.replace(run_of_it, id="me"), lanes, result)
     assert chunks.read_journal(path) == dataclasses.replace(run_of_it, id="me")
-    found = chunks.load(path, "me", lanes, problem)
+    found = chunks.load(path, "me", lanes, study)
     assert found is not None
     expected = chunks.arrays_of(result)
     for name, array in chunks.arrays_of(found).items():
         assert array.dtype == expected[name].dtype
         assert array.tobytes() == expected[name].tobytes(), name
-    parts = [chunks.load(path, "me", lanes, problem) for _ in range(2)]
-    assert chunks.join(problem.take(np.tile(lanes, 2)), parts).lanes == 18
-    assert chunks.load(path, "another", lanes, problem) is None
-    assert chunks.load(path, "me", lanes[::-1], problem) is None
+    parts = [chunks.load(path, "me", lanes, study) for _ in range(2)]
+    assert chunks.join(study.take(np.tile(lanes, 2)), parts).lanes == 18
+    assert chunks.load(path, "another", lanes, study) is None
+    assert chunks.load(path, "me", lanes[::-1], study) is None
     whole = path.read_bytes()
     for length in np.linspace(0, len(whole) - 1, 40).astype(int):
         path.write_bytes(whole[:length])
-        assert chunks.load(path, "me", lanes, problem) is None
+        assert chunks.load(path, "me", lanes, study) is None
     # Within an array: a byte between them may be one that nobody reads.
     middle = whole.index(result.theta.tobytes()) + result.theta.nbytes // 2
     path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
-    assert chunks.load(path, "me", lanes, problem) is None
+    assert chunks.load(path, "me", lanes, study) is None
     with pytest.raises(run_folder.NoRun, match="another study"):
-        former.read_hdf5(peace / "out" / "results.h5", problem.take(lanes[:8]))
+        former.read_hdf5(peace / "out" / "results.h5", study.take(lanes[:8]))
 
 
 def test_sizes_of_chunks(peace):
     """Equal chunks; fewer lanes together where lanes are long or memory is short."""
     assert [len(c) for c in chunks.divide(10, 4)] == [4, 3, 3]
     assert np.array_equal(np.concatenate(chunks.divide(1000, 7)), np.arange(1000))
-    problem = load_peace(peace)
-    assert chunks.lanes_per_chunk(problem, 2) == 4096
-    long = dataclasses.replace(
-        problem, lanes=problem.lanes._replace(force=np.zeros((1, 2, 100_000)))
-    )
+    study = load_peace(peace)
+    assert chunks.lanes_per_chunk(study, 2) == 4096
+    long = dataclasses.replace(study, lanes=study.lanes._replace(force=np.zeros((1, 2, 100_000))))
     assert chunks.lanes_per_chunk(long, 4) == 5
-    each = chunks.bytes_per_seat(problem)
-    assert [chunks.seats(problem, m) for m in (0.0, 2.1 * each, 65.0 * each, 1e12)] == [
+    each = chunks.bytes_per_seat(study)
+    assert [chunks.seats(study, m) for m in (0.0, 2.1 * each, 65.0 * each, 1e12)] == [
         *(1, 1, 32, 128)
     ]
     assert chunks.free_memory() > 1e6
@@ -310,15 +308,15 @@ def test_sizes_of_chunks(peace):
 @pytest.mark.slow
 def test_memory_of_a_lane_is_what_xla_counts(peace):
     """The estimate bounds XLA's own figure, by at most a factor of 3."""
-    problem, count = load_peace(peace), 32
-    lanes = jax.tree.map(lambda v: np.repeat(v[:1], count, axis=0), problem.lanes)
-    state = solve._idle(problem, problem.lanes, count, np.float64)
-    step = solve._compiled(problem.program, solve.Tolerances(), 4)
-    starts, sigma = np.zeros((count, problem.size)), np.ones((count, 2))
+    study, count = load_peace(peace), 32
+    lanes = jax.tree.map(lambda v: np.repeat(v[:1], count, axis=0), study.lanes)
+    state = solve._idle(study, study.lanes, count, np.float64)
+    step = solve._compiled(study.model, solve.Tolerances(), 4)
+    starts, sigma = np.zeros((count, study.size)), np.ones((count, 2))
     lowered = step.lower(lanes, sigma, starts, np.ones(count, bool), state)
     used = lowered.compile().memory_analysis()
     total = used.temp_size_in_bytes + used.argument_size_in_bytes
-    assert total / count <= chunks.bytes_per_seat(problem) <= 3 * total / count
+    assert total / count <= chunks.bytes_per_seat(study) <= 3 * total / count
 
 
 def test_devices_share_the_work_and_its_end():
@@ -480,15 +478,15 @@ def test_a_file_system_without_locks(peace, study, monkeypatch, capsys):
     assert numbers(study / "out") == numbers(peace / "out")
 
 
-def from_peace(problem):
+def from_peace(folder):
     """Stand in for `fit.fit`: the same numbers, read back."""
-    whole = former.read_hdf5(problem / "out" / "results.h5", load_peace(problem))
-    names = [curves[0].specimen for curves in whole.problem.curves]
+    whole = former.read_hdf5(folder / "out" / "results.h5", load_peace(folder))
+    names = [curves[0].specimen for curves in whole.study.curves]
     arrays = chunks.arrays_of(whole)
 
-    def fitted(problem, settings, progress):
-        rows = np.array([names.index(curves[0].specimen) for curves in problem.curves])
-        return chunks.result_of(problem, {name: v[rows] for name, v in arrays.items()})
+    def fitted(study, settings, progress):
+        rows = np.array([names.index(curves[0].specimen) for curves in study.curves])
+        return chunks.result_of(study, {name: v[rows] for name, v in arrays.items()})
 
     return fitted
 

@@ -17,7 +17,7 @@ from jaxtrachea.config import FitSpec, load_fit_spec
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.predictions import rms
 from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.study import problem_of, settings_of
+from jaxtrachea.fit.specification import settings_of, study_of
 from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.inference.results import peak_force
 from jaxtrachea.measurements.data_files import read_data
@@ -45,7 +45,7 @@ def record(result: FitResult) -> dict:
                 "se": None if result.at_bound[0, i] else float(result.standard_error[0, i]),
                 "unit": p.unit,
             }
-            for i, (p, _, _) in enumerate(result.problem.unknowns[0])
+            for i, (p, _, _) in enumerate(result.study.unknowns[0])
         },
         "rms_over_peak": float(result.rms[0, 0]) / peak_force(result, 0),
         "rms_joints_mm": float(result.rms[0, 1]),
@@ -56,12 +56,12 @@ def small_strain(shear: bool, local: str) -> dict:
     """Fit and left-out errors of one option."""
     path = HERE / "fit.toml"
     spec = changed(load_fit_spec(path), "model", shear=shear, local=local)
-    problem = problem_of(spec, read_data(spec, HERE))
-    left_out = leave_one_out(problem, settings_of(spec))
+    study = study_of(spec, read_data(spec, HERE))
+    left_out = leave_one_out(study, settings_of(spec))
     return {
         "shear": shear,
         "local": local,
-        **record(fit(problem, settings_of(spec))),
+        **record(fit(study, settings_of(spec))),
         "left_out_compliance": float(rms(left_out.ratio)),
         "left_out_joints": float(rms(left_out.joints)),
     }
@@ -75,7 +75,7 @@ def finite_strain(depth: float) -> dict:
     start = [c.force[1] / c.displacement[1] for c in measured.curves]
     return {
         "depth_mm": depth,
-        **record(fit(problem_of(spec, measured), settings_of(spec))),
+        **record(fit(study_of(spec, measured), settings_of(spec))),
         "secant_over_first": float(np.mean(np.divide(secant, start))),
     }
 

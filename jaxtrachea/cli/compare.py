@@ -76,14 +76,14 @@ def _same_data(specs, loaded, names) -> None:
                 "give both the same files"
             )
     try:
-        same_data([problem for _, _, problem in loaded], names)
+        same_data([study for _, _, study in loaded], names)
     except ValueError as error:
         raise Stop(f"compare: {error}") from None
 
 
 def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
     from jaxtrachea.fit.fit import fit
-    from jaxtrachea.fit.study import settings_of
+    from jaxtrachea.fit.specification import settings_of
     from jaxtrachea.inference.comparison import Model
     from jaxtrachea.inference.cross_validation import leave_repeats_out
 
@@ -91,12 +91,12 @@ def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
     with progress_bar() as bar:
         stages = Stages(bar, stop_if_asked)
         counted = stages.begin
-        for (spec, _, problem), name in zip(loaded, names, strict=True):
+        for (spec, _, study), name in zip(loaded, names, strict=True):
             settings = settings_of(spec)
-            result = fit(problem, settings, counted(name))
+            result = fit(study, settings, counted(name))
             left = None
             if cross_validation:
-                left = leave_repeats_out(problem, settings, counted(f"{name}, left out"))
+                left = leave_repeats_out(study, settings, counted(f"{name}, left out"))
             models.append(Model(name, result, left))
         stages.close()
     return models
@@ -148,7 +148,7 @@ def _left_out_words(models) -> str:
     """What was left out, in words; "curves" if nothing was."""
     from jaxtrachea.inference.cross_validation import repeats
 
-    return repeats(models[0].result.problem).words or "curves"
+    return repeats(models[0].result.study).words or "curves"
 
 
 def _left_out_notes(models) -> list[str]:
@@ -172,7 +172,7 @@ def _why_nothing(model) -> str:
     """Why there was nothing to leave out of a model."""
     from jaxtrachea.fit.parameters import OF_THE_PRESS
 
-    free = model.result.problem.free
+    free = model.result.study.free
     own = [p.name for p in free if p.scope == "trial" and p.name not in OF_THE_PRESS]
     if own:
         return f"{', '.join(own)} belongs to single curves, and no other curve tells of it"

@@ -130,25 +130,25 @@ def remembered(how: How) -> list[str]:
         return []
 
 
-def describe(how: How, spec: Path, root: Path, loaded, measurements, problem, options: list[str]):
+def describe(how: How, spec: Path, root: Path, loaded, measurements, study, options: list[str]):
     """The journal of what would be run now."""
     import jax
 
-    from jaxtrachea.fit.study import settings_of
+    from jaxtrachea.fit.specification import settings_of
     from jaxtrachea.runs import chunks, journal
 
     asked, settings = loaded.fit, settings_of(loaded)
-    chunk, every = asked.chunk, "auto" if problem.joint else asked.save_every
+    chunk, every = asked.chunk, "auto" if study.joint else asked.save_every
     return journal.describe(
         spec, root, measurements.sha256(), asked.precision, jax.local_devices()[0].device_kind,
-        lanes=problem.lanes.lower.shape[0],
-        chunk=chunks.seats(problem, chunks.free_memory()) if chunk == "auto" else chunk,
-        save_every=chunks.lanes_per_chunk(problem, settings.starts) if every == "auto" else every,
+        lanes=study.lanes.lower.shape[0],
+        chunk=chunks.seats(study, chunks.free_memory()) if chunk == "auto" else chunk,
+        save_every=chunks.lanes_per_chunk(study, settings.starts) if every == "auto" else every,
         options=options,
     )  # fmt: skip
 
 
-def open_run(how: How, now, problem):
+def open_run(how: How, now, study):
     """New, resumed or rerun, as the user asks; ends the command where there is nothing to do.
 
     The folder is locked until `RunFolder.release`.
@@ -162,7 +162,7 @@ def open_run(how: How, now, problem):
         if written or (going_on and unfinished) or again:
             lock = take(target)
     try:
-        run = _opened(how, now, problem)
+        run = _opened(how, now, study)
     except BaseException:
         if lock is not None:
             lock.release()
@@ -170,7 +170,7 @@ def open_run(how: How, now, problem):
     return run if lock is None else dataclasses.replace(run, lock=lock)
 
 
-def _opened(how: How, now, problem):
+def _opened(how: How, now, study):
     """As `open_run`; a folder that is there is locked already."""
     from jaxtrachea.files.output import InUse, OutputExists
     from jaxtrachea.runs import folder as run_folder
@@ -189,14 +189,14 @@ def _opened(how: How, now, problem):
             raise Stop(f"{error}" + (", or go on with --resume" if hint else "")) from None
     unfinished = (target / ".run").is_dir()
     if not unfinished and (target / "results.h5").exists():
-        return _finished(how, target, now, problem)
+        return _finished(how, target, now, study)
     run = run_folder.go_on(target, now, force=how.force)
     if how.rerun_failed and run.journal.rerun is None:
         raise Stop(f"{target} is not finished; use --resume first")
     return run
 
 
-def _finished(how: How, target: Path, now, problem):
+def _finished(how: How, target: Path, now, study):
     """A rerun of the failed lanes of a finished run, if that is asked for."""
     from jaxtrachea.runs import folder as run_folder
     from jaxtrachea.runs import former, journal
@@ -208,11 +208,11 @@ def _finished(how: How, target: Path, now, problem):
     if how.resume:
         to_stderr(f"{escape(str(target))} is finished; there is nothing to go on with")
         raise typer.Exit(0)
-    if problem.joint:
+    if study.joint:
         raise Stop(
             "--rerun-failed: specimens of a joint fit are fitted together; change [fit] starts"
         )
-    result = former.read_hdf5(target / "results.h5", problem)
+    result = former.read_hdf5(target / "results.h5", study)
     failed = former.failed_lanes(result)
     if not failed:
         to_stderr(f"no lane of {escape(str(target))} failed; there is nothing to fit again")
@@ -221,23 +221,23 @@ def _finished(how: How, target: Path, now, problem):
 
 
 @contextlib.contextmanager
-def running(how: How, now, problem, settings) -> Iterator[Run]:
+def running(how: How, now, study, settings) -> Iterator[Run]:
     """The run, opened, watched over, and put into place at the end; or what is kept is said.
 
     Args:
         how: what the user asks.
         now: journal of what would be run now.
-        problem: the study.
+        study: the study.
         settings: of the solver.
     """
     from jaxtrachea.runs import folder as run_folder
     from jaxtrachea.runs import in_chunks, journal
 
     with _said(how), interrupts() as stop_if_asked:
-        run = open_run(how, now, problem)
+        run = open_run(how, now, study)
         try:
-            todo, damaged = in_chunks.missing(run, problem)
-            _say_what_is_there(run, problem, todo, damaged)
+            todo, damaged = in_chunks.missing(run, study)
+            _say_what_is_there(run, study, todo, damaged)
             watch = processes.Watch(run.chunks, how.meeting)
             with _watched(watch, todo=todo):
 
@@ -248,10 +248,10 @@ def running(how: How, now, problem, settings) -> Iterator[Run]:
                 def fit(_, settings, progress):
                     mine = todo[0 :: how.meeting.processes]
                     in_chunks.fit_chunks(
-                        run, problem, in_chunks.settings_for(run, settings), mine, progress
+                        run, study, in_chunks.settings_for(run, settings), mine, progress
                     )
                     watch.wait_for_others()
-                    return in_chunks.collect(run, problem)
+                    return in_chunks.collect(run, study)
 
                 settings = dataclasses.replace(settings, chunk=run.journal.chunk)
                 staged, options = run_folder.stage(run), run.journal.options
@@ -261,7 +261,7 @@ def running(how: How, now, problem, settings) -> Iterator[Run]:
         except BaseException as error:
             kept = run_folder.abandon(run, shared=how.meeting.processes > 1)
             if kept and isinstance(error, KeyboardInterrupt | Lost | OSError):
-                raise _kept(how, run, problem, error) from None
+                raise _kept(how, run, study, error) from None
             raise
         finally:
             run.release()
@@ -303,10 +303,10 @@ def _unwritable(how: How, error: OSError) -> str:
     return f"{text}{cure(error)}, then give the same command again"
 
 
-def _say_what_is_there(run, problem, todo: list[int], damaged: list[int]) -> None:
+def _say_what_is_there(run, study, todo: list[int], damaged: list[int]) -> None:
     from jaxtrachea.runs import in_chunks
 
-    count = in_chunks.count(run, problem)
+    count = in_chunks.count(run, study)
     if run.note:
         to_stderr(f"[yellow]note:[/] {escape(f'{run.target}: {run.note}')}")
     if damaged:
@@ -317,17 +317,17 @@ def _say_what_is_there(run, problem, todo: list[int], damaged: list[int]) -> Non
         to_stderr(f"going on in {where}: {count - len(todo)} of {count} chunks are there")
 
 
-def _kept(how: How, run, problem, error: BaseException) -> Kept:
+def _kept(how: How, run, study, error: BaseException) -> Kept:
     """What is kept of a run that was stopped, and how to go on; writes the lanes so far."""
     from jaxtrachea.files.atomic import cure
     from jaxtrachea.runs import folder as run_folder
     from jaxtrachea.runs import in_chunks
 
-    done, count = run.finished(), in_chunks.count(run, problem)
+    done, count = run.finished(), in_chunks.count(run, study)
     text = f"{done} of {count} chunks are kept in {run.target}"
     if run.journal.rerun is None and how.meeting.process == 0 and done:
         with contextlib.suppress(OSError):
-            in_chunks.write_so_far(run.target / run_folder.SO_FAR, run, problem)
+            in_chunks.write_so_far(run.target / run_folder.SO_FAR, run, study)
             text += f", their lanes in {run_folder.SO_FAR}"
     first = f"{cure(error)}, then " if isinstance(error, OSError) else ""
     text = escape(f"{text}; {first}go on with --out {run.target} --resume")
@@ -339,7 +339,7 @@ def _kept(how: How, run, problem, error: BaseException) -> Kept:
     )
 
 
-def help_out(how: How, now, problem, settings) -> None:
+def help_out(how: How, now, study, settings) -> None:
     """Fit this process's chunks of a run that process 0 has opened, and wait for its end."""
     from jaxtrachea.runs import folder as run_folder
     from jaxtrachea.runs import in_chunks
@@ -368,9 +368,9 @@ def help_out(how: How, now, problem, settings) -> None:
                 progress = stages.begin(f"fitting ({me.process} of {me.processes})")
                 settings = in_chunks.settings_for(run, settings)
                 mine = said["todo"][me.process :: me.processes]
-                in_chunks.fit_chunks(run, problem, settings, mine, progress)
+                in_chunks.fit_chunks(run, study, settings, mine, progress)
                 stages.close()
                 watch.done()
                 watch.wait_for(0)
         except (KeyboardInterrupt, Lost, OSError) as error:
-            raise _kept(how, run, problem, error) from None
+            raise _kept(how, run, study, error) from None

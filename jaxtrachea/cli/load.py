@@ -8,19 +8,19 @@ from jaxtrachea.cli.terminal import Stop, set_up_jax, to_stderr
 
 
 def load(path: Path, data: Path | None, *, refits: bool = False, quiet: bool = False):
-    """Specification, measurements and problem; what is wrong with curves is said on stderr.
+    """Specification, measurements and study; what is wrong with curves is said on stderr.
 
     Args:
         path: the specification.
         data: folder its paths start from; None: its own.
-        refits: single curves will be left out, or unknowns held (see `study.problem_of`).
+        refits: single curves will be left out, or unknowns held (see `specification.study_of`).
         quiet: name no curve that cannot be used.
 
     Raises:
         Stop: nothing can be fitted.
     """
     from jaxtrachea.config import SpecError, load_fit_spec
-    from jaxtrachea.fit.study import problem_of, usable
+    from jaxtrachea.fit.specification import study_of, usable
     from jaxtrachea.measurements.data_files import read_data
     from jaxtrachea.measurements.read import DataError
 
@@ -35,7 +35,7 @@ def load(path: Path, data: Path | None, *, refits: bool = False, quiet: bool = F
             print_notes(measurements)
         if not measurements.curves:
             raise Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
-        return spec, measurements, problem_of(spec, measurements, refits=refits)
+        return spec, measurements, study_of(spec, measurements, refits=refits)
     except SpecError as error:
         text = str(error)
         raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None

@@ -105,20 +105,20 @@ def _options(
 @app.command()
 def check(spec: SpecArgument, data: DataOption = None) -> None:
     """Read everything, fit nothing, say what was found."""
-    _, measurements, problem = load(spec, data)
+    _, measurements, study = load(spec, data)
     out = Console()
     curves = measurements.curves
     out.print(_curve_table(curves))
     if len(curves) > MANY:
         out.print(f"... and {len(curves) - MANY} more")
     _print_usage(out, curves)
-    if problem.free:
-        out.print(_parameter_table(problem.parameters, problem.options))
-    fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in problem.parameters if p.fixed)
+    if study.free:
+        out.print(_parameter_table(study.parameters, study.model.options))
+    fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in study.parameters if p.fixed)
     out.print(f"Fixed: {fixed or 'none'}", highlight=False)
-    lanes, bad = len(problem.curves), len(measurements.bad)
-    joint = ", fitted jointly" if problem.joint else ""
-    out.print(f"{lanes} lane(s){joint} of up to {problem.size} unknowns, {bad} bad curves")
+    lanes, bad = len(study.curves), len(measurements.bad)
+    joint = ", fitted jointly" if study.joint else ""
+    out.print(f"{lanes} lane(s){joint} of up to {study.size} unknowns, {bad} bad curves")
     raise typer.Exit(1 if bad else 0)
 
 
@@ -141,7 +141,7 @@ def fit(
     patience: cli_fit.PatienceOption = 100.0,
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
-    from jaxtrachea.fit.study import settings_of
+    from jaxtrachea.fit.specification import settings_of
     from jaxtrachea.inference.results import succeeded
 
     clock = [time.perf_counter()]
@@ -152,22 +152,22 @@ def fit(
     asked = {"leave-one-out": leave_one_out, "profile": profile, "influence": influence}
     options = [name for name, wanted in asked.items() if wanted]
     options = sorted({*options, *cli_fit.remembered(how)})
-    loaded, measurements, problem = load(spec, data, refits=bool(options))
-    _has_unknowns(spec, loaded, problem, options)
+    loaded, measurements, study = load(spec, data, refits=bool(options))
+    _has_unknowns(spec, loaded, study, options)
     root = spec.parent if data is None else data
-    now = cli_fit.describe(how, spec, root, loaded, measurements, problem, options)
+    now = cli_fit.describe(how, spec, root, loaded, measurements, study, options)
     if meeting.process > 0:
-        cli_fit.help_out(how, now, problem, settings_of(loaded))
+        cli_fit.help_out(how, now, study, settings_of(loaded))
         raise typer.Exit(0)
     if "leave-one-out" in options:
-        _can_leave_out(problem)
-    names = _names_to_profile(spec, loaded, problem, "profile" in options)
+        _can_leave_out(study)
+    names = _names_to_profile(spec, loaded, study, "profile" in options)
     if loaded.uncertainty.posterior:
         _can_draw(spec)
     clock.append(time.perf_counter())
-    with cli_fit.running(how, now, problem, settings_of(loaded)) as under:
+    with cli_fit.running(how, now, study, settings_of(loaded)) as under:
         found = run(
-            loaded, problem, under.settings, under.options, names, under.stop_if_asked, under.fit
+            loaded, study, under.settings, under.options, names, under.stop_if_asked, under.fit
         )
         clock.append(time.perf_counter())
         write(under.folder, spec, loaded, measurements, found, clock, under.journal)
@@ -180,21 +180,21 @@ def fit(
 def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = None) -> None:
     """Fit, then say where the next presses tell most."""
     from jaxtrachea.config import SpecError
-    from jaxtrachea.fit.study import settings_of
+    from jaxtrachea.fit.specification import settings_of
     from jaxtrachea.inference.design import candidates_of
 
-    loaded, measurements, problem = load(spec, data, refits=True)
-    if not problem.free:
+    loaded, measurements, study = load(spec, data, refits=True)
+    if not study.free:
         raise Stop(f"{spec}: design: every parameter is fixed; free what the presses shall tell")
     try:
-        candidates = candidates_of(loaded, problem)
+        candidates = candidates_of(loaded, study)
     except SpecError as error:
         raise Stop(f"{spec}: {error}") from None
     if loaded.uncertainty.posterior:
         _can_draw(spec)
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}-design"
     with into(out_dir, default) as (folder, stop_if_asked):
-        found = run(loaded, problem, settings_of(loaded), (), (), stop_if_asked)
+        found = run(loaded, study, settings_of(loaded), (), (), stop_if_asked)
         try:
             rows = _design(folder, loaded, found, candidates)
         except ValueError as error:
@@ -228,26 +228,26 @@ def _design(folder: Path, loaded, found, candidates) -> list[dict[str, object]]:
     gains = designs.gains(known, candidates)
     write_csv(folder / "candidates.csv", list(tables.candidate_rows(known, gains, candidates)))
     write_csv(folder / "identifiability.csv", list(tables.map_rows(chart, unknowns)))
-    rings = np.asarray(found.result.problem.geometry.ring_positions)
+    rings = np.asarray(found.result.study.model.geometry.ring_positions)
     say_lost(draw_design(folder / "identifiability.png", chart, candidates, choice, rings))
     return rows
 
 
-def _has_unknowns(path: Path, spec, problem, options: list[str]) -> None:
+def _has_unknowns(path: Path, spec, study, options: list[str]) -> None:
     from jaxtrachea.config import SpecError
-    from jaxtrachea.fit.study import refuse_without_unknowns
+    from jaxtrachea.fit.specification import refuse_without_unknowns
 
     try:
-        refuse_without_unknowns(spec, problem, options)
+        refuse_without_unknowns(spec, study, options)
     except SpecError as error:
         raise Stop(f"{path}: {error}") from None
 
 
-def _can_leave_out(problem) -> None:
+def _can_leave_out(study) -> None:
     from jaxtrachea.inference.cross_validation import curves_to_leave_out
 
     try:
-        curves_to_leave_out(problem)
+        curves_to_leave_out(study)
     except ValueError as error:
         raise Stop(f"--leave-one-out: {error}") from None
 
@@ -261,12 +261,12 @@ def _can_draw(spec: Path) -> None:
         raise Stop(f"{spec}: uncertainty.posterior: {error}") from None
 
 
-def _names_to_profile(path: Path, spec, problem, asked: bool) -> tuple[str, ...]:
+def _names_to_profile(path: Path, spec, study, asked: bool) -> tuple[str, ...]:
     from jaxtrachea.config import SpecError
-    from jaxtrachea.fit.study import profiled
+    from jaxtrachea.fit.specification import profiled
 
     try:
-        return profiled(spec, problem, asked=asked)
+        return profiled(spec, study, asked=asked)
     except SpecError as error:
         raise Stop(f"{path}: {error}") from None
 

@@ -95,7 +95,7 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
     with into(out_dir, default) as (folder, stop_if_asked):
         curves = predict_sources(stored, sources, s, depths)
         stop_if_asked()
-        rings = np.asarray(stored.problem.geometry.ring_positions)
+        rings = np.asarray(stored.study.model.geometry.ring_positions)
         write_csv(
             folder / "predictions.csv", [r for p in curves for r in tables.prediction_rows(p)]
         )
@@ -121,7 +121,7 @@ def _asked(stored, texts: Sequence[str]):
     from jaxtrachea.inference.sources import source_of
     from jaxtrachea.measurements.presses import parse_presses
 
-    needs = stored.problem.options.coupling == "series"
+    needs = stored.study.model.options.coupling == "series"
     sources, places, depths = [], [], []
     for text in texts:
         try:
@@ -168,7 +168,7 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
     with into(out_dir, default) as (folder, stop_if_asked):
         compared = compare(stored, curves, as_specimen=as_specimen)
         stop_if_asked()
-        rings = np.asarray(stored.problem.geometry.ring_positions)
+        rings = np.asarray(stored.study.model.geometry.ring_positions)
         rows = {"predictions": [], "bands": [], "joints": []}
         for c in compared:
             p, phi = c.prediction, c.curve.phi_c

@@ -89,7 +89,7 @@ def _same_model(stored, path: Path, spec) -> None:
     from jaxtrachea.trachea.section import geometry_of
 
     if "trachea" in spec.model_fields_set:
-        mine, its = stored.problem.geometry, geometry_of(spec.trachea)
+        mine, its = stored.study.model.geometry, geometry_of(spec.trachea)
         same = float(mine.length) == float(its.length)
         same = same and np.array_equal(mine.ring_positions, its.ring_positions)
         if not same:
@@ -99,7 +99,7 @@ def _same_model(stored, path: Path, spec) -> None:
                 "fit's: leave the section out, or correct it"
             )
     if "model" in spec.model_fields_set and Options(**spec.model.model_dump()) != (
-        stored.problem.options
+        stored.study.model.options
     ):
         raise Stop(
             f"{path}: model: not that of the fit, with which predictions are made; leave the "

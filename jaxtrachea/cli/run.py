@@ -24,9 +24,7 @@ class Found:
     population: Any = None
 
 
-def run(
-    spec, problem, settings, options, profile: tuple[str, ...], stop_if_asked, fit=None
-) -> Found:
+def run(spec, study, settings, options, profile: tuple[str, ...], stop_if_asked, fit=None) -> Found:
     """Fit, by `fit` if given, then what needs a fit; all with `settings`."""
     from jaxtrachea.fit.fit import fit as in_one_go
     from jaxtrachea.inference.bootstrap import bootstrap
@@ -38,10 +36,10 @@ def run(
     with progress_bar() as bar:
         stages = Stages(bar, stop_if_asked)
         counted = stages.begin
-        result = (fit or in_one_go)(problem, settings, counted("fitting"))
+        result = (fit or in_one_go)(study, settings, counted("fitting"))
         left_out = profiled = resampled = None
         if "leave-one-out" in options:
-            left_out = leave_one_out(problem, settings, counted("leaving curves out"))
+            left_out = leave_one_out(study, settings, counted("leaving curves out"))
         if profile:
             points, report = spec.uncertainty.profile_points, counted("profiling")
             profiled = profiles(result, settings, profile, points=points, progress=report)
@@ -96,7 +94,7 @@ def write(folder: Path, spec: Path, loaded, measurements, found: Found, clock, j
     from jaxtrachea.report.sections import write_more
 
     result, profiles, resampled = found.result, found.profiles, found.resampled
-    seen = predictions(result.problem, result.theta)
+    seen = predictions(result.study, result.theta)
     _write_tables(folder, found, measurements.bad, seen)
     drawn, lost = draw_all(folder, result, seen, profiles)
     say_lost(lost)

@@ -1,1 +1,1 @@
-"""From curves and a model to estimates: problem, residual, solver, covariance."""
+"""From curves and a model to estimates: study, residual, solver, covariance."""

@@ -7,7 +7,8 @@ from jaxtyping import Array, Float
 
 from jaxtrachea.fit import residual as _residual
 from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.model import FitModel
+from jaxtrachea.trachea.geometry import Geometry
 
 
 class Point(NamedTuple):
@@ -51,58 +52,62 @@ def entry_scale(lane: Lane, sigma: Float[Array, "2"]) -> Float[Array, " m"]:
     return jnp.where(forces, 1 / sigma[0], 1 / sigma[1])
 
 
-def weights(problem: Problem, value, lane: Lane, sigma: Float[Array, "2"]):
+def weights(model: FitModel, value, lane: Lane, sigma: Float[Array, "2"]):
     """Weighted loss of each entry, and the root of the weight of its square; (T, m) each."""
     scale = entry_scale(lane, sigma)[None]
     balance = lane.balance[:, None]
-    if problem.loss == "linear":
+    if model.loss == "linear":
         root = balance * scale
         return (root * value) ** 2, jnp.broadcast_to(root, value.shape)
-    rho, slope = robust(problem.loss, (value * scale) ** 2, problem.loss_scale)
+    rho, slope = robust(model.loss, (value * scale) ** 2, model.loss_scale)
     return balance * balance * rho, balance * jnp.sqrt(slope) * scale
 
 
 def evaluate(
-    problem: Problem, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
+    model: FitModel,
+    theta: Float[Array, " P"],
+    lane: Lane,
+    sigma: Float[Array, "2"],
+    geometry: Geometry | None = None,
 ) -> Point:
     """Residual, cost and normal equations of one lane; cost O(trials) in the Jacobian."""
-    r = _residual.residual(problem, theta, lane)
-    rho, root = weights(problem, r.value, lane, sigma)
+    r = _residual.residual(model, theta, lane, geometry)
+    rho, root = weights(model, r.value, lane, sigma)
     J, z = r.jacobian * root[:, None], r.value * root
     hessian = jnp.einsum("tim,tjm->tij", J, J)
     if r.bend is not None:
-        hessian = hessian + _corner(problem, jnp.sum(z * root * r.bend, axis=1), hessian)
+        hessian = hessian + _corner(model, jnp.sum(z * root * r.bend, axis=1), hessian)
     return Point(
         value=r.value,
         jacobian=J,
         cost=0.5 * jnp.sum(rho),
-        gradient=assemble(problem, jnp.einsum("tim,tm->ti", J, z), lane),
-        hessian=assemble(problem, hessian, lane),
+        gradient=assemble(model, jnp.einsum("tim,tm->ti", J, z), lane),
+        hessian=assemble(model, hessian, lane),
     )
 
 
-def _corner(problem: Problem, bend: Float[Array, " T"], hessian) -> Float[Array, "T Jf Jf"]:
+def _corner(model: FitModel, bend: Float[Array, " T"], hessian) -> Float[Array, "T Jf Jf"]:
     """What the corner at the onset adds to the Gauss-Newton matrix of each trial.
 
     The rounded corner is the one place where the model bends within the noise of a sample; left
     out, steps of the onset overshoot. Only where it stiffens: the matrix stays positive definite.
     """
-    i = [p.name for p in problem.free].index("onset")
+    i = [p.name for p in model.free].index("onset")
     return jnp.zeros_like(hessian).at[:, i, i].set(jnp.maximum(bend, 0))
 
 
-def assemble(problem: Problem, parts: Array, lane: Lane) -> Array:
+def assemble(model: FitModel, parts: Array, lane: Lane) -> Array:
     """Sum what each trial gives for its columns into the unknowns they read.
 
     Args:
-        problem: static description.
+        model: what is fitted (static).
         parts: (T, Jf) or (T, Jf, Jf).
         lane: tells which unknown each column reads.
     """
-    if problem.common == "all":
+    if model.common == "all":
         return jnp.sum(parts, axis=0)
     size = lane.lower.shape[0]
-    index = lane.index[:, problem.free_columns]
+    index = lane.index[:, model.free_columns]
     place = jnp.where(index >= 0, index, size)
     if parts.ndim == 2:
         return jnp.zeros(size, parts.dtype).at[place].add(parts, mode="drop")

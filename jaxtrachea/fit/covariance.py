@@ -18,9 +18,10 @@ from scipy.special import stdtrit
 from jaxtrachea.fit.cost import assemble, entry_scale, robust
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import chunk_size
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import observations, residual
 from jaxtrachea.fit.structure import leaving_alone
+from jaxtrachea.fit.study import Study
 
 #: Smallest ratio of singular values of the scaled Jacobian that float64 can tell from zero.
 SINGULAR = 1e-7
@@ -64,17 +65,17 @@ class Information(NamedTuple):
 
 
 def information(
-    problem: Problem, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
+    model: FitModel, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
 ) -> Information:
     """Information matrices and residual statistics of one lane."""
-    r = residual(problem, theta, lane)
+    r = residual(model, theta, lane)
     seen, forces = observations(lane)
     scale = entry_scale(lane, sigma)
     z = r.value * scale[None]
     J = r.jacobian * (scale[None] * seen)[:, None]
     b2 = (lane.balance * lane.balance)[:, None, None]
-    _, slope = robust(problem.loss, z * z, problem.loss_scale)
-    psi = lambda z: z * robust(problem.loss, z * z, problem.loss_scale)[1]  # noqa: E731
+    _, slope = robust(model.loss, z * z, model.loss_scale)
+    psi = lambda z: z * robust(model.loss, z * z, model.loss_scale)[1]  # noqa: E731
     _, dpsi = jax.jvp(psi, (z,), (jnp.ones_like(z),))
     gram = jnp.einsum("tim,tjm->tij", J, J)
     gradient = jnp.einsum("tim,tm->ti", J * b2, z * slope)
@@ -84,15 +85,15 @@ def information(
 
     def spread(force):
         # A sort, and the dearest part of all this: only where the noise is taken from it.
-        if problem.loss == "linear":
+        if model.loss == "linear":
             return jnp.zeros((), theta.dtype)
         mine = (seen > 0) & (kinds == force)[None]
         return jnp.nanmedian(jnp.where(mine, jnp.abs(r.value), jnp.nan))
 
     return Information(
-        bread=assemble(problem, b2 * gram, lane),
-        meat=assemble(problem, b2 * b2 * gram, lane),
-        gradient=assemble(problem, gradient, lane),
+        bread=assemble(model, b2 * gram, lane),
+        meat=assemble(model, b2 * b2 * gram, lane),
+        gradient=assemble(model, gradient, lane),
         squares=by_kind(r.value**2 * seen),
         weighted=by_kind(r.value**2 * seen * b2[:, 0]),
         counts=by_kind(seen),
@@ -103,15 +104,15 @@ def information(
 
 
 def informations(
-    problem: Problem, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, chunk: int = 128
+    study: Study, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, chunk: int = 128
 ) -> Information:
     """`information` of many lanes, on the host; leading axis = order of `lanes`."""
     chunk = chunk_size(len(lanes), chunk)
-    run = _compiled(problem.program)
+    run = _compiled(study.model)
     parts = []
     for first in range(0, len(lanes), chunk):
         of = np.minimum(np.arange(first, first + chunk), len(lanes) - 1)
-        lane = jax.tree.map(lambda v, row=lanes[of]: v[row], problem.lanes)
+        lane = jax.tree.map(lambda v, row=lanes[of]: v[row], study.lanes)
         part = run(jnp.asarray(theta[of]), lane, jnp.asarray(sigma[of]))
         left = len(lanes) - first
         parts.append(jax.tree.map(lambda v, left=left: np.asarray(v)[:left], part))
@@ -119,8 +120,8 @@ def informations(
 
 
 @functools.lru_cache(maxsize=32)
-def _compiled(problem: Problem):
-    return jax.jit(jax.vmap(functools.partial(information, problem)))
+def _compiled(model: FitModel):
+    return jax.jit(jax.vmap(functools.partial(information, model)))
 
 
 class Uncertainty(NamedTuple):

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fit.covariance import Information
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.shared import unknown_count
+from jaxtrachea.fit.study import Study
 
 #: Share of the largest datum that its own rounding may be: no residual counts for less.
 ROUNDING = 1e-15
@@ -37,22 +37,22 @@ class Criteria(NamedTuple):
     BIC: Float[np.ndarray, " lanes"]
 
 
-def criteria(problem: Problem, info: Information, alive: Bool[np.ndarray, " lanes"]) -> Criteria:
-    """Criteria of all lanes; in a joint problem those of the whole study, the same in every lane.
+def criteria(study: Study, info: Information, alive: Bool[np.ndarray, " lanes"]) -> Criteria:
+    """Criteria of all lanes; in a joint study those of the whole study, the same in every lane.
 
     With a given standard deviation the deviance is sum(z^2 + ln(2 pi sigma^2)), with an estimated
     one n (ln(2 pi S / n) + 1), forces and markers each with their own. S is the sum of squares that
     the fit minimises, curve weights included; they average to one.
 
     Args:
-        problem: what was fitted.
+        study: what was fitted.
         info: of all lanes at their estimates.
-        alive: lanes that count in a joint problem.
+        alive: lanes that count in a joint study.
     """
-    lanes, estimated = problem.lanes, [not given for given in problem.noise_given]
+    lanes, estimated = study.lanes, [not given for given in study.noise_given]
 
     def whole(v, combine=np.sum):
-        return np.broadcast_to(combine(v[alive], axis=0), v.shape) if problem.joint else v
+        return np.broadcast_to(combine(v[alive], axis=0), v.shape) if study.joint else v
 
     counts, squares = whole(np.asarray(info.counts, float)), whole(np.asarray(info.weighted))
     deviance = np.zeros(len(counts))
@@ -72,11 +72,11 @@ def criteria(problem: Problem, info: Information, alive: Bool[np.ndarray, " lane
             seen = flat(precision)
             logs = np.log(seen, where=seen > 0, out=np.zeros(seen.shape)).sum(axis=1)
             deviance += S + n * np.log(2 * np.pi) - 2 * whole(logs)
-    if problem.loss != "linear":
+    if study.model.loss != "linear":
         deviance = np.full(len(counts), np.nan)
     own = np.sum(lanes.active, axis=1)
-    if problem.joint:
-        own = np.full(len(own), unknown_count(problem, alive))
+    if study.joint:
+        own = np.full(len(own), unknown_count(study, alive))
     k = own + np.sum((counts > 0) * np.array(estimated), axis=1)
     return penalised(deviance, k.astype(int), np.sum(counts, axis=1))
 

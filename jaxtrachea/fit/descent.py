@@ -18,8 +18,9 @@ from jaxtrachea._arguments import check_word
 from jaxtrachea.fit.cost import entry_scale, evaluate, robust
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import Solved, Tolerances, held, promise, rounding_cost
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import residual_value
+from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus
 
 #: Cosine between residual and Jacobian up to which a point counts as a minimum.
@@ -27,23 +28,23 @@ NEARLY_FLAT = 1e-2
 
 
 def cost(
-    problem: Problem, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
+    model: FitModel, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
 ) -> Float[Array, ""]:
     """Half the weighted sum of rho(residual^2) of one lane; differentiable in all arrays.
 
     Args:
-        problem: static description.
+        model: what is fitted (static).
         theta: unknowns in scaled coordinates (`Parameter.to_scaled`).
         lane: arrays of the lane.
         sigma: standard deviation of force and markers in units of the lane's precision.
     """
-    z = residual_value(problem, theta, lane) * entry_scale(lane, sigma)[None]
-    rho, _ = robust(problem.loss, z * z, problem.loss_scale)
+    z = residual_value(model, theta, lane) * entry_scale(lane, sigma)[None]
+    rho, _ = robust(model.loss, z * z, model.loss_scale)
     return 0.5 * jnp.sum(rho * (lane.balance * lane.balance)[:, None])
 
 
 def descend(
-    problem: Problem,
+    study: Study,
     jobs: np.ndarray,
     starts: np.ndarray,
     sigma: np.ndarray,
@@ -64,12 +65,12 @@ def descend(
     """
     check_word("method", method, Literal["lbfgs", "adam"])
     block = {"lbfgs": 10, "adam": 100}[method]
-    run = _compiled(problem.program, method, learning_rate, block, tolerances)
+    run = _compiled(study.model, method, learning_rate, block, tolerances)
     cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype)  # noqa: E731
     parts = []
     for first in range(0, len(jobs), chunk):
         of = jobs[first : first + chunk]
-        lane = jax.tree.map(lambda v, of=of: cast(v[of]), problem.lanes)
+        lane = jax.tree.map(lambda v, of=of: cast(v[of]), study.lanes)
         rows = slice(first, first + chunk)
         # optax mixes integer widths in its counters
         with jax.numpy_dtype_promotion("standard"):
@@ -82,14 +83,14 @@ def descend(
 
 
 @functools.lru_cache(maxsize=8)
-def _compiled(problem: Problem, method, learning_rate, block, tolerances):
-    one = functools.partial(_descend, problem, method, learning_rate, block, tolerances)
+def _compiled(model: FitModel, method, learning_rate, block, tolerances):
+    one = functools.partial(_descend, model, method, learning_rate, block, tolerances)
     return jax.jit(jax.vmap(one))
 
 
-def _descend(problem, method, learning_rate, block, tolerances, start, lane, sigma):
+def _descend(model, method, learning_rate, block, tolerances, start, lane, sigma):
     """One job: blocks of steps until the cost settles."""
-    loss = lambda theta: cost(problem, theta, lane, sigma)  # noqa: E731
+    loss = lambda theta: cost(model, theta, lane, sigma)  # noqa: E731
     box = lambda theta: jnp.clip(theta, lane.lower, lane.upper)  # noqa: E731
     optimiser = optax.lbfgs() if method == "lbfgs" else optax.adam(learning_rate)
 
@@ -119,7 +120,7 @@ def _descend(problem, method, learning_rate, block, tolerances, start, lane, sig
     status = jnp.where(
         blocks >= tolerances.iterations, FitStatus.MAX_ITERATIONS, FitStatus.CONVERGED
     )
-    point = evaluate(problem, theta, lane, sigma)
+    point = evaluate(model, theta, lane, sigma)
     left = jnp.max(promise(theta, point, lane))
     steep = left > NEARLY_FLAT * jnp.sqrt(2 * point.cost)
     steep &= (status == FitStatus.CONVERGED) & (value > rounding_cost(lane, sigma))

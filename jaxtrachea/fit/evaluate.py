@@ -10,42 +10,42 @@ from jaxtrachea.fit.covariance import Information, Uncertainty, half_widths
 from jaxtrachea.fit.criteria import criteria
 from jaxtrachea.fit.noise import first_sigma, next_sigma, precision_unit
 from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus
 
 #: What reports say in the place of estimates.
 NOTHING_FITTED = "every parameter is fixed: nothing was fitted, the model was evaluated"
 
 
-def evaluated(problem: Problem) -> FitResult:
-    """Cost, residuals, noise and criteria of a problem without unknowns.
+def evaluated(study: Study) -> FitResult:
+    """Cost, residuals, noise and criteria of a study without unknowns.
 
     Args:
-        problem: whose `size` is 0.
+        study: whose `size` is 0.
 
     Returns:
         A `FitResult` with 0 unknowns and iterations; lanes without finite forces are NON_FINITE.
     """
-    lanes = len(problem.lanes.s_c)
-    seen = predictions(problem, np.zeros((lanes, 0)))
-    info = _information(problem, seen.force, seen.joints)
-    sigma = next_sigma(problem, info, first_sigma(problem))
-    unit = precision_unit(problem)
+    lanes = len(study.lanes.s_c)
+    seen = predictions(study, np.zeros((lanes, 0)))
+    info = _information(study, seen.force, seen.joints)
+    sigma = next_sigma(study, info, first_sigma(study))
+    unit = precision_unit(study)
     finite = np.asarray(np.isfinite(info.squares).all(axis=1))
     with np.errstate(invalid="ignore", divide="ignore"):
         rms = np.sqrt(info.squares / info.counts) * unit
     total = np.sum(info.counts, axis=1)
-    both = problem.lanes.joints is None or problem.noise_given[1]
-    half = half_widths(total, noise_given=problem.noise_given[0] and both)
+    both = study.lanes.joints is None or study.noise_given[1]
+    half = half_widths(total, noise_given=study.noise_given[0] and both)
     none = np.zeros((lanes, 0))
     counts = {"iterations": np.zeros(lanes, int), "tried": np.ones(lanes, int)}
     return FitResult(
-        problem=problem, theta=none, value=none, standard_error=none, lower=none, upper=none,
+        study=study, theta=none, value=none, standard_error=none, lower=none, upper=none,
         relative_se=none, at_bound=none.astype(bool),
         status=np.where(finite, FitStatus.CONVERGED, FitStatus.NON_FINITE).astype(int),
-        cost=_cost(problem, seen, sigma), converged_starts=finite.astype(int),
-        sigma=sigma * unit, rms=rms, samples=total, criteria=criteria(problem, info, finite),
+        cost=_cost(study, seen, sigma), converged_starts=finite.astype(int),
+        sigma=sigma * unit, rms=rms, samples=total, criteria=criteria(study, info, finite),
         uncertainty=tuple(map(_no_uncertainty, half)), undetermined=none.astype(bool),
         unexamined=none.astype(bool),
         evidence_low=none, evidence_high=none, evidence_end=np.zeros((lanes, 0, 2), int),
@@ -53,9 +53,9 @@ def evaluated(problem: Problem) -> FitResult:
     )  # fmt: skip
 
 
-def _whitened(problem: Problem, force, joints) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _whitened(study: Study, force, joints) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Residuals of forces and markers in units of their precision, and which are observed."""
-    lanes, parts, seen = problem.lanes, [], []
+    lanes, parts, seen = study.lanes, [], []
     pairs = ((force, lanes.precision), (joints, lanes.joint_precision))
     for residual, precision in pairs:
         if residual is None or precision is None:
@@ -66,20 +66,20 @@ def _whitened(problem: Problem, force, joints) -> tuple[list[np.ndarray], list[n
     return parts, seen
 
 
-def _information(problem: Problem, force, joints) -> Information:
+def _information(study: Study, force, joints) -> Information:
     """Residual statistics; the matrices are empty."""
-    parts, seen = _whitened(problem, force, joints)
-    lanes, trials = problem.lanes.s_c.shape
+    parts, seen = _whitened(study, force, joints)
+    lanes, trials = study.lanes.s_c.shape
     zero = np.zeros(lanes)
 
     def both(values):
         return np.stack([*values, *[zero] * (2 - len(values))], axis=1)
 
     def balance(part):
-        return np.repeat(problem.lanes.balance, part.shape[1] // trials, axis=1)
+        return np.repeat(study.lanes.balance, part.shape[1] // trials, axis=1)
 
     def spread(part, observed):
-        if problem.loss == "linear":
+        if study.model.loss == "linear":
             return zero
         rows = [np.abs(v[o]) for v, o in zip(part, observed, strict=True)]
         return np.array([np.median(v) if len(v) else np.nan for v in rows])
@@ -98,14 +98,14 @@ def _information(problem: Problem, force, joints) -> Information:
     return Information(**arrays)
 
 
-def _cost(problem: Problem, seen, sigma: np.ndarray) -> np.ndarray:
+def _cost(study: Study, seen, sigma: np.ndarray) -> np.ndarray:
     """Half the weighted sum of the loss."""
-    parts, _ = _whitened(problem, seen.force, seen.joints)
-    trials, total = problem.lanes.s_c.shape[1], np.zeros(len(sigma))
+    parts, _ = _whitened(study, seen.force, seen.joints)
+    trials, total = study.lanes.s_c.shape[1], np.zeros(len(sigma))
     for kind, part in enumerate(parts):
-        weight = np.repeat(problem.lanes.balance, part.shape[1] // trials, axis=1) ** 2
+        weight = np.repeat(study.lanes.balance, part.shape[1] // trials, axis=1) ** 2
         z2 = jnp.asarray((part / sigma[:, kind, None]) ** 2)
-        rho, _ = robust(problem.loss, z2, problem.loss_scale)
+        rho, _ = robust(study.model.loss, z2, study.model.loss_scale)
         total += 0.5 * np.sum(weight * np.asarray(rho), axis=1)
     return total
 

@@ -1,4 +1,4 @@
-"""One fit from problem to result: starts, noise levels, best start, what may be believed."""
+"""One fit from study to result: starts, noise levels, best start, what may be believed."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,11 +18,11 @@ from jaxtrachea.fit.minima import (
 )
 from jaxtrachea.fit.noise import next_sigma, precision_unit
 from jaxtrachea.fit.press_scale import relative_change
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.scrutiny import doubtful, left_in_doubt, scrutinise
 from jaxtrachea.fit.starts import scales
 from jaxtrachea.fit.structure import Structure, null_spaces, reduced, structure_of, suspicious
+from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus
 
 #: Condition number of the Jacobian up to which it proves that the structure leaves nothing open.
@@ -32,7 +32,7 @@ REPLACED = 3
 
 
 def fit(
-    problem: Problem,
+    study: Study,
     settings: Settings = Settings(),  # noqa: B008 (frozen)
     progress: Callable[[int, int], None] | None = None,
     starts: np.ndarray | None = None,
@@ -45,7 +45,7 @@ def fit(
     lane that gives no cause costs nothing more.
 
     Args:
-        problem: from `problem.build`.
+        study: from `study.build_study`.
         settings: how to solve.
         progress: called with (jobs finished since the last call, jobs in all).
         starts: where to start, scaled coordinates, (lanes * settings.starts, P); None: drawn.
@@ -54,23 +54,23 @@ def fit(
         The `FitResult`. It never raises for a lane's sake. Without unknowns (every parameter is
         fixed) nothing is solved: the model is evaluated.
     """
-    if problem.size == 0:
-        return evaluated(problem)
-    known = structure_of(problem, suspicious(problem))
-    minima = lowest_minima(problem, settings, starts, progress, known)
-    result = _conclude(problem, minima, known)
+    if study.size == 0:
+        return evaluated(study)
+    known = structure_of(study, suspicious(study))
+    minima = lowest_minima(study, settings, starts, progress, known)
+    result = _conclude(study, minima, known)
     late = _unproven(result, known)
     if late.any():
-        more = structure_of(problem, late)
-        known = more if problem.joint else Structure(*map(np.maximum, known, more))
+        more = structure_of(study, late)
+        known = more if study.joint else Structure(*map(np.maximum, known, more))
         rows = np.flatnonzero(late & (known.nullity > 0))
-        if len(rows) and not problem.joint and starts is None:
-            part = problem.take(rows)
+        if len(rows) and not study.joint and starts is None:
+            part = study.take(rows)
             again = lowest_minima(part, settings, None, progress, known.take(rows))
             minima = minima.replaced(rows, again)
         if len(rows):
-            result = _conclude(problem, minima, known)
-    if not settings.scrutiny or problem.joint:
+            result = _conclude(study, minima, known)
+    if not settings.scrutiny or study.joint:
         return dataclasses.replace(result, unexamined=left_in_doubt(result, minima))
     return _scrutinised(result, minima, known, settings, progress)
 
@@ -78,8 +78,8 @@ def fit(
 def _unproven(result: FitResult, known: Structure) -> np.ndarray:
     """Lanes not looked at whose Jacobian at the estimate does not prove that nothing is open."""
     condition = np.array([u.condition for u in result.uncertainty])
-    examined = suspicious(result.problem)
-    if result.problem.joint and examined.any():
+    examined = suspicious(result.study)
+    if result.study.joint and examined.any():
         examined[:] = True
     return ~examined & ~(condition < PROVEN) & (known.nullity == 0)
 
@@ -99,7 +99,7 @@ def _scrutinised(result, minima: Minima, known: Structure, settings, progress) -
         # As many as the fit computes together: the same program.
         chunk = chunk_size(max(result.lanes * settings.starts, 16), settings.chunk)
         full = rows[np.arange(max(len(rows), chunk)) % len(rows)]
-        part = reduced(result.problem.take(full), known.pinned[full])
+        part = reduced(result.study.take(full), known.pinned[full])
         solved, sigma = refit_with_noise(part, settings, None, minima.sigma[full], better[full])
         solved = Solved(*(v[: len(rows)] for v in solved))
         sigma = sigma[: len(rows)]
@@ -108,36 +108,36 @@ def _scrutinised(result, minima: Minima, known: Structure, settings, progress) -
             solved, one, minima.tried[rows], sigma, none, np.zeros((0, part.size)), np.zeros(0)
         )
         minima = minima.replaced(rows, moved)
-        result = _conclude(result.problem, minima, known)
+        result = _conclude(result.study, minima, known)
     return result
 
 
-def _conclude(problem: Problem, minima: Minima, structure: Structure) -> FitResult:
+def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
     """Standard errors, intervals and final statuses of all lanes."""
     solved, agree, tried, sigma = minima[:4]
-    info, pool, unknowns = information_per_lane(problem, solved, sigma)
-    before, sigma = sigma, next_sigma(problem, pool, sigma, unknowns)
-    if problem.loss == "linear" and problem.lanes.joints is None:
+    info, pool, unknowns = information_per_lane(study, solved, sigma)
+    before, sigma = sigma, next_sigma(study, pool, sigma, unknowns)
+    if study.model.loss == "linear" and study.lanes.joints is None:
         ratio = before[:, 0] / sigma[:, 0]
         info, pool = info.rescaled(ratio), pool.rescaled(ratio)
     else:
-        info, pool, unknowns = information_per_lane(problem, solved, sigma)
-    lanes, theta = problem.lanes, solved.theta
+        info, pool, unknowns = information_per_lane(study, solved, sigma)
+    lanes, theta = study.lanes, solved.theta
     alive = solved.status <= FitStatus.STALLED
-    gradient = joint.summed_gradient(problem, info, alive) if problem.joint else info.gradient
-    log, step = scales(problem)
-    both = lanes.joints is None or problem.noise_given[1]
+    gradient = joint.summed_gradient(study, info, alive) if study.joint else info.gradient
+    log, step = scales(study)
+    both = lanes.joints is None or study.noise_given[1]
     at_bound = (theta <= lanes.lower) & (gradient > 0)
     at_bound |= (theta >= lanes.upper) & (gradient < 0)
     present = lanes.active > 0
     at_bound &= present
     held = at_bound | ~present
-    relative = relative_change(problem, theta)
-    if problem.joint:
-        pool = joint.marginal(problem, pool, held, alive)
-        unknowns = (unknowns or 0) - joint.held_count(problem, held, alive)
-    noise_given = problem.noise_given[0] and both
-    blind = _open_directions(problem, theta, structure)
+    relative = relative_change(study, theta)
+    if study.joint:
+        pool = joint.marginal(study, pool, held, alive)
+        unknowns = (unknowns or 0) - joint.held_count(study, held, alive)
+    noise_given = study.noise_given[0] and both
+    blind = _open_directions(study, theta, structure)
     u = analyse(pool, relative, held, noise_given=noise_given, unknowns=unknowns, structural=blind)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         unscale = lambda v: np.where(present, np.where(log, np.exp(v), v * step), np.nan)  # noqa: E731
@@ -146,16 +146,16 @@ def _conclude(problem: Problem, minima: Minima, structure: Structure) -> FitResu
         rms = np.sqrt(info.squares / info.counts)
         standard_error = u.se * np.where(log, value, step)
         lower, upper = unscale(theta - half), unscale(theta + half)
-    unit = precision_unit(problem)
+    unit = precision_unit(study)
     samples = np.sum(info.counts, axis=1)
     left = np.sum(pool.counts, axis=1) - (np.sum(~held, axis=1) if unknowns is None else unknowns)
     status = _final_status(solved.status, u, at_bound, left)
     return FitResult(
-        problem=problem, theta=theta, value=value, standard_error=standard_error,
+        study=study, theta=theta, value=value, standard_error=standard_error,
         lower=lower, upper=upper, relative_se=u.se / relative,
         at_bound=at_bound, status=status, iterations=solved.iterations, cost=solved.cost,
         converged_starts=agree, tried=tried, sigma=sigma * unit, rms=rms * unit, samples=samples,
-        criteria=criteria(problem, info, alive),
+        criteria=criteria(study, info, alive),
         uncertainty=tuple(Uncertainty(*row) for row in zip(*u, strict=True)),
         undetermined=structure.undetermined,
         unexamined=np.zeros(theta.shape, bool), evidence_low=np.full(theta.shape, np.nan),
@@ -164,14 +164,14 @@ def _conclude(problem: Problem, minima: Minima, structure: Structure) -> FitResu
     )  # fmt: skip
 
 
-def _open_directions(problem: Problem, theta, structure: Structure) -> np.ndarray:
+def _open_directions(study: Study, theta, structure: Structure) -> np.ndarray:
     """Directions that the structure leaves open, at the estimates; rows, the others 0."""
     out = np.zeros((*theta.shape, theta.shape[1]))
-    lanes = np.arange(len(theta)) if problem.joint else np.flatnonzero(structure.nullity)
+    lanes = np.arange(len(theta)) if study.joint else np.flatnonzero(structure.nullity)
     if not structure.nullity.any():
         return out
     theta = np.where(np.isfinite(theta), theta, 0)[lanes]
-    rows = null_spaces(problem, lanes, theta, structure.nullity[lanes])
+    rows = null_spaces(study, lanes, theta, structure.nullity[lanes])
     for lane, directions in zip(lanes, rows, strict=True):
         out[lane, : len(directions)] = directions
     return out

@@ -26,9 +26,11 @@ from jaxtyping import Array, Float, Int
 from jaxtrachea._numerics import epsilon, solve_spd
 from jaxtrachea.fit.cost import Point, assemble, entry_scale, evaluate, weights
 from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import of_trials, residual_value, size
+from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus
+from jaxtrachea.trachea.geometry import Geometry
 
 RUNNING = -1
 #: First radius of the trust region, in scaled coordinates (log: a factor of 7).
@@ -171,7 +173,7 @@ def _length(v):
     return jnp.sqrt(jnp.maximum(jnp.sum(v * v), jnp.finfo(v.dtype).tiny))
 
 
-def _step(problem: Problem, state: State, lane: Lane, sigma) -> _Step:
+def _step(model: FitModel, state: State, lane: Lane, sigma, geometry=None) -> _Step:
     """Step of the trust region inside the box, bent by the residual's curvature along it."""
     point, theta = state.point, state.theta
     g, H = point.gradient, point.hessian
@@ -181,12 +183,12 @@ def _step(problem: Problem, state: State, lane: Lane, sigma) -> _Step:
     box = lambda theta: jnp.clip(theta, lane.lower, lane.upper)  # noqa: E731
     straight = box(theta + straight) - theta
     predicted = -jnp.sum(straight * (g + 0.5 * jnp.sum(H * straight[None], axis=1)))
-    along = of_trials(problem, straight, lane)
-    ahead = residual_value(problem, theta + _LOOK * straight, lane)
-    _, root = weights(problem, point.value, lane, sigma)
+    along = of_trials(model, straight, lane)
+    ahead = residual_value(model, theta + _LOOK * straight, lane, geometry)
+    _, root = weights(model, point.value, lane, sigma)
     linear = jnp.einsum("tim,ti->tm", point.jacobian, along)
     curvature = 2 / _LOOK * ((ahead - point.value) / _LOOK * root - linear)
-    pull = assemble(problem, jnp.einsum("tim,tm->ti", point.jacobian, curvature), lane)
+    pull = assemble(model, jnp.einsum("tim,tm->ti", point.jacobian, curvature), lane)
     bend = 0.5 * solve_spd(damped, jnp.where(free & ~stops, -pull, 0))
     # Of no use where the expansion fails, nor where the step is so short that its difference is
     # rounding.
@@ -200,14 +202,19 @@ def _step(problem: Problem, state: State, lane: Lane, sigma) -> _Step:
 
 
 def iterate(
-    problem: Problem, tolerances: Tolerances, state: State, lane: Lane, sigma: Float[Array, "2"]
+    model: FitModel,
+    tolerances: Tolerances,
+    state: State,
+    lane: Lane,
+    sigma: Float[Array, "2"],
+    geometry: Geometry | None = None,
 ) -> State:
     """One iteration of one lane. The first one only evaluates the start (cost is inf before)."""
     old = state.point
     fresh = jnp.isinf(old.cost)
-    step = _step(problem, state, lane, sigma)
+    step = _step(model, state, lane, sigma, geometry)
     trial = jnp.where(fresh, state.theta, step.trial)
-    new = evaluate(problem, trial, lane, sigma)
+    new = evaluate(model, trial, lane, sigma, geometry)
     finite = jnp.isfinite(new.cost) & jnp.all(jnp.isfinite(new.hessian))
     finite &= jnp.all(jnp.isfinite(new.gradient))
     actual = old.cost - new.cost
@@ -256,7 +263,7 @@ def _status(tolerances, old_cost, new, lane, sigma, fresh, finite, step, actual)
     return jnp.where(fresh & ~finite, FitStatus.INFEASIBLE_START, status).astype(jnp.int8)
 
 
-def _advance(problem, tolerances, rounds, lane, sigma, start, refill, state):
+def _advance(model, tolerances, rounds, lane, sigma, start, refill, state):
     """Put fresh lanes where asked, then up to `rounds` iterations of the whole chunk."""
     put = lambda new, old: jnp.where(refill.reshape(-1, *[1] * (old.ndim - 1)), new, old)  # noqa: E731
     # An infinite cost is the mark of a fresh lane; its point is evaluated before it is used.
@@ -267,7 +274,7 @@ def _advance(problem, tolerances, rounds, lane, sigma, start, refill, state):
         iteration=put(0, state.iteration),
         status=put(jnp.int8(RUNNING), state.status),
     )
-    one = jax.vmap(functools.partial(iterate, problem, tolerances))
+    one = jax.vmap(functools.partial(iterate, model, tolerances))
 
     def body(carry):
         i, state = carry
@@ -286,7 +293,7 @@ def chunk_size(total: int, most: int) -> int:
 
 
 def levenberg_marquardt(
-    problem: Problem,
+    study: Study,
     jobs: np.ndarray,
     starts: np.ndarray,
     sigma: np.ndarray,
@@ -300,7 +307,7 @@ def levenberg_marquardt(
     """Fit every job: a lane from one start.
 
     Args:
-        problem: the study.
+        study: the study.
         jobs: lane of each job, int; (jobs,).
         starts: start of each job, scaled coordinates; (jobs, P).
         sigma: standard deviation of (force, markers) of each job in units of the lane's precision
@@ -317,15 +324,15 @@ def levenberg_marquardt(
     total = len(jobs)
     chunk = chunk_size(total, chunk)
     cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype, copy=False)  # noqa: E731
-    lanes = jax.tree.map(cast, problem.lanes)
-    advance = _compiled(problem.program, tolerances, rounds)
-    state = _idle(problem, lanes, chunk, dtype)
+    lanes = jax.tree.map(cast, study.lanes)
+    advance = _compiled(study.model, tolerances, rounds)
+    state = _idle(study, lanes, chunk, dtype)
     # What the lanes of the chunk compute with; rewritten only where a lane takes its place.
     seats = jax.tree.map(
         lambda v: np.repeat(v[:1], chunk, axis=0), (lanes, cast(sigma), cast(starts))
     )
     out = Solved(
-        np.zeros((total, problem.size)), np.full(total, np.inf), np.zeros(total, int),
+        np.zeros((total, study.size)), np.full(total, np.inf), np.zeros(total, int),
         np.zeros(total, int),
     )  # fmt: skip
     owner = np.full(chunk, -1)
@@ -348,7 +355,7 @@ def levenberg_marquardt(
         rows = owner[done]
         if len(rows):
             theta = np.asarray(state.theta)[done]
-            out.theta[rows] = _on_bounds(theta, problem.lanes, jobs[rows])
+            out.theta[rows] = _on_bounds(theta, study.lanes, jobs[rows])
             out.cost[rows] = np.asarray(state.point.cost)[done]
             out.status[rows] = status[done]
             out.iterations[rows] = np.asarray(state.iteration)[done]
@@ -365,9 +372,9 @@ def _on_bounds(theta, lanes: Lane, rows) -> np.ndarray:
     return np.where(upper - inside <= _rounding(upper, theta.dtype), upper, inside)
 
 
-def _idle(problem: Problem, lanes: Lane, chunk: int, dtype) -> State:
+def _idle(study: Study, lanes: Lane, chunk: int, dtype) -> State:
     """A chunk of places nobody works at."""
-    P, Jf, T, m = problem.size, len(problem.free), lanes.s_c.shape[1], size(lanes)
+    P, Jf, T, m = study.size, len(study.free), lanes.s_c.shape[1], size(lanes)
     zeros = lambda *shape: jnp.zeros((chunk, *shape), dtype)  # noqa: E731
     point = Point(zeros(T, m), zeros(T, Jf, m), zeros(), zeros(P), zeros(P, P))
     done = jnp.full(chunk, FitStatus.CONVERGED, jnp.int8)
@@ -375,8 +382,8 @@ def _idle(problem: Problem, lanes: Lane, chunk: int, dtype) -> State:
 
 
 @functools.lru_cache(maxsize=32)
-def _compiled(problem: Problem, tolerances: Tolerances, rounds: int):
-    run = functools.partial(_advance, problem, tolerances, rounds)
+def _compiled(model: FitModel, tolerances: Tolerances, rounds: int):
+    run = functools.partial(_advance, model, tolerances, rounds)
     return jax.jit(run, donate_argnums=4)
 
 

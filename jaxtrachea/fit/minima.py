@@ -11,10 +11,10 @@ from jaxtrachea.fit import shared as joint
 from jaxtrachea.fit.covariance import Information, informations
 from jaxtrachea.fit.levenberg_marquardt import Solved, chunk_size, levenberg_marquardt
 from jaxtrachea.fit.noise import first_sigma, next_sigma, noise_rounds
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.starts import best, completed, draw_starts
 from jaxtrachea.fit.structure import Structure, reduced
+from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus
 
 #: Lanes computed together where only a few are left.
@@ -52,29 +52,27 @@ class Minima(NamedTuple):
         return Minima(Solved(*rows[:4]), rows[4], rows[5], rows[6], *joined)
 
 
-def lowest_minima(
-    problem: Problem, settings: Settings, starts, progress, known: Structure
-) -> Minima:
+def lowest_minima(study: Study, settings: Settings, starts, progress, known: Structure) -> Minima:
     """The best of all starts of every lane, with the noise that goes with it."""
     # Given starts are refits from an estimate: there the directions left open may be followed.
-    held = problem if problem.joint or starts is not None else reduced(problem, known.pinned)
-    sigma = first_sigma(problem)
+    held = study if study.joint or starts is not None else reduced(study, known.pinned)
+    sigma = first_sigma(study)
     solved, agree, tried, *ends = _from_starts(held, settings, starts, sigma, progress)
-    if held is not problem:
-        solved = _released(problem, held, settings, solved, sigma)
+    if held is not study:
+        solved = _released(study, held, settings, solved, sigma)
     solved, sigma = refit_with_noise(held, settings, solved, sigma)
     return Minima(solved, agree, tried, sigma, *ends)
 
 
-def _released(problem: Problem, held: Problem, settings: Settings, solved: Solved, sigma) -> Solved:
+def _released(study: Study, held: Study, settings: Settings, solved: Solved, sigma) -> Solved:
     """Lanes whose best lies on a bound because of what is held: fitted on with all free, once."""
     lanes = held.lanes
     on = (solved.theta <= lanes.lower) | (solved.theta >= lanes.upper)
-    pinned = (problem.lanes.active > 0) & (lanes.active == 0)
+    pinned = (study.lanes.active > 0) & (lanes.active == 0)
     rows = np.flatnonzero((on & (lanes.active > 0)).any(axis=1) & pinned.any(axis=1))
     if not len(rows):
         return solved
-    free = _solve_more(problem, settings, sigma, None, rows, solved.theta[rows])
+    free = _solve_more(study, settings, sigma, None, rows, solved.theta[rows])
     again = _solve_more(held, settings, sigma, None, rows, free.theta)
     out = Solved(*map(np.array, solved))
     better = again.cost < out.cost[rows]
@@ -83,82 +81,80 @@ def _released(problem: Problem, held: Problem, settings: Settings, solved: Solve
     return out
 
 
-def refit_with_noise(problem: Problem, settings: Settings, solved, sigma, theta=None):
+def refit_with_noise(study: Study, settings: Settings, solved, sigma, theta=None):
     """Fits and noise brought to agree; from `theta` where nothing is solved yet."""
     if solved is None:
-        solved = refit_with_sigma(problem, settings, theta, sigma)
-    for _ in range(noise_rounds(problem)):
-        _, pool, unknowns = information_per_lane(problem, solved, sigma)
-        sigma = next_sigma(problem, pool, sigma, unknowns)
-        again = refit_with_sigma(problem, settings, solved.theta, sigma)
+        solved = refit_with_sigma(study, settings, theta, sigma)
+    for _ in range(noise_rounds(study)):
+        _, pool, unknowns = information_per_lane(study, solved, sigma)
+        sigma = next_sigma(study, pool, sigma, unknowns)
+        again = refit_with_sigma(study, settings, solved.theta, sigma)
         solved = again._replace(iterations=solved.iterations + again.iterations)
     return solved, sigma
 
 
-def _from_starts(problem: Problem, settings: Settings, starts, sigma, progress):
+def _from_starts(study: Study, settings: Settings, starts, sigma, progress):
     """The best of all starts of every lane, how many agree, how many there were; all ends."""
     drawn = starts is None
-    starts = draw_starts(problem, settings) if drawn else starts
-    lanes = problem.lanes.lower.shape[0]
-    if problem.joint:
-        solved, agree = _solve_jointly(problem, settings, starts, sigma, progress)
+    starts = draw_starts(study, settings) if drawn else starts
+    lanes = study.lanes.lower.shape[0]
+    if study.joint:
+        solved, agree = _solve_jointly(study, settings, starts, sigma, progress)
         tried = np.full(lanes, len(starts) // lanes)
         return solved, np.full(lanes, agree), tried, np.arange(lanes), solved.theta, solved.cost
     jobs = np.repeat(np.arange(lanes), settings.starts)
-    solved = _solve(problem, settings, jobs, starts, sigma[jobs], progress)
+    solved = _solve(study, settings, jobs, starts, sigma[jobs], progress)
     if drawn:
-        again = functools.partial(_solve_more, problem, settings, sigma, progress)
-        jobs, solved = completed(
-            problem, settings, jobs, solved, data_weight(problem, sigma), again
-        )
+        again = functools.partial(_solve_more, study, settings, sigma, progress)
+        jobs, solved = completed(study, settings, jobs, solved, data_weight(study, sigma), again)
     found, agree = best(jobs, solved, lanes)
     tried = np.bincount(jobs, minlength=lanes)
     chosen = Solved(*(v[found] for v in solved))
     return chosen, agree, tried, jobs, solved.theta, solved.cost
 
 
-def refit_with_sigma(problem: Problem, settings: Settings, theta, sigma) -> Solved:
+def refit_with_sigma(study: Study, settings: Settings, theta, sigma) -> Solved:
     """Solved anew from near the minimum, with other noise."""
-    if problem.joint:
-        return _solve_jointly(problem, settings, theta, sigma, None, near=True)[0]
-    return _solve(problem, settings, np.arange(len(theta)), theta, sigma, None)
+    if study.joint:
+        return _solve_jointly(study, settings, theta, sigma, None, near=True)[0]
+    return _solve(study, settings, np.arange(len(theta)), theta, sigma, None)
 
 
-def _solve_more(problem, settings, sigma, progress, jobs, starts) -> Solved:
+def _solve_more(study, settings, sigma, progress, jobs, starts) -> Solved:
     """Further starts of a few lanes; their chunk does not depend on how many there are."""
     settings = dataclasses.replace(settings, chunk=min(settings.chunk, FEW))
     rows = np.arange(max(len(jobs), 2)) % len(jobs)  # one alone would be another program
     alive = None if progress is None else lambda done, of: progress(0, of)
-    solved = _solve(problem, settings, jobs[rows], starts[rows], sigma[jobs[rows]], alive)
+    solved = _solve(study, settings, jobs[rows], starts[rows], sigma[jobs[rows]], alive)
     return Solved(*(v[: len(jobs)] for v in solved))
 
 
-def data_weight(problem: Problem, sigma: np.ndarray) -> np.ndarray:
+def data_weight(study: Study, sigma: np.ndarray) -> np.ndarray:
     """Half the weighted sum of squares of the measured forces; (lanes,)."""
-    lanes = problem.lanes
+    lanes = study.lanes
     z = lanes.force * lanes.precision * lanes.balance[:, :, None] / sigma[:, :1, None]
     return 0.5 * np.sum(z * z, axis=(1, 2))
 
 
-def _solve(problem: Problem, settings: Settings, jobs, starts, sigma, progress) -> Solved:
+def _solve(study: Study, settings: Settings, jobs, starts, sigma, progress) -> Solved:
     common = _common(settings, len(jobs), progress)
     if settings.method == "levenberg-marquardt":
-        return levenberg_marquardt(problem, jobs, starts, sigma, **common)
-    return descent.descend(problem, jobs, starts, sigma, method=settings.method, **common)
+        return levenberg_marquardt(study, jobs, starts, sigma, **common)
+    return descent.descend(study, jobs, starts, sigma, method=settings.method, **common)
 
 
 def _solve_jointly(
-    problem: Problem, settings: Settings, starts, sigma, progress, *, near=False
+    study: Study, settings: Settings, starts, sigma, progress, *, near=False
 ) -> tuple[Solved, int]:
     """The best of the starts of the whole study, and how many agree; `near`: only one start."""
     if settings.method != "levenberg-marquardt":
-        raise ValueError(f"a joint problem needs levenberg-marquardt, not {settings.method}")
-    lanes = problem.lanes.lower.shape[0]
+        raise ValueError(f"a joint study needs levenberg-marquardt, not {settings.method}")
+    lanes = study.lanes.lower.shape[0]
     common = _common(settings, len(starts), progress)
     # One size for all calls, so that it is compiled once.
     common["chunk"] = chunk_size(lanes * settings.starts, settings.chunk)
     of_starts = np.swapaxes(starts.reshape(lanes, len(starts) // lanes, -1), 0, 1)
-    return joint.solve_jointly(problem, of_starts, sigma, alone=not near, **common)
+    return joint.solve_jointly(study, of_starts, sigma, alone=not near, **common)
 
 
 def _common(settings: Settings, jobs: int, progress) -> dict[str, Any]:
@@ -169,16 +165,16 @@ def _common(settings: Settings, jobs: int, progress) -> dict[str, Any]:
 
 
 def information_per_lane(
-    problem: Problem, solved: Solved, sigma
+    study: Study, solved: Solved, sigma
 ) -> tuple[Information, Information, int | None]:
     """What each lane knows, what is known of the noise, and the unknowns that this is shared by.
 
-    By itself a lane knows its own noise; the lanes of a joint problem have it in common.
+    By itself a lane knows its own noise; the lanes of a joint study have it in common.
     """
     every = np.arange(len(solved.theta))
-    info = informations(problem, every, solved.theta, sigma)
-    if not problem.joint:
+    info = informations(study, every, solved.theta, sigma)
+    if not study.joint:
         return info, info, None
     alive = solved.status <= FitStatus.STALLED
-    pool = joint.pooled(problem, info, solved.theta, alive)
-    return info, pool, joint.unknown_count(problem, alive)
+    pool = joint.pooled(study, info, solved.theta, alive)
+    return info, pool, joint.unknown_count(study, alive)

@@ -3,40 +3,38 @@
 import numpy as np
 
 from jaxtrachea.fit.covariance import Information
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.study import Study
 
 
-def noise_rounds(problem: Problem) -> int:
+def noise_rounds(study: Study) -> int:
     """Re-weightings: needed where an estimated sigma changes the estimate, not only its error."""
-    both = problem.lanes.joints is not None
-    estimated = not (problem.noise_given[0] and (problem.noise_given[1] or not both))
-    return 4 if estimated and (both or problem.loss != "linear") else 0
+    both = study.lanes.joints is not None
+    estimated = not (study.noise_given[0] and (study.noise_given[1] or not both))
+    return 4 if estimated and (both or study.model.loss != "linear") else 0
 
 
-def first_sigma(problem: Problem) -> np.ndarray:
+def first_sigma(study: Study) -> np.ndarray:
     """Standard deviations to begin with: 1 where given, else 2 % of the peak; (lanes, 2).
 
     Of the lane's peak, or that of the study if it is fitted jointly.
     """
-    lanes = problem.lanes
+    lanes = study.lanes
 
     def peak(v):
         of_lane = np.maximum(np.abs(v).reshape(len(v), -1).max(axis=1), 1e-300)
         return (
-            np.full(len(v), np.max(np.nan_to_num(of_lane, nan=1e-300)))
-            if problem.joint
-            else of_lane
+            np.full(len(v), np.max(np.nan_to_num(of_lane, nan=1e-300))) if study.joint else of_lane
         )
 
-    force = np.ones(len(lanes.s_c)) if problem.noise_given[0] else 0.02 * peak(lanes.force)
+    force = np.ones(len(lanes.s_c)) if study.noise_given[0] else 0.02 * peak(lanes.force)
     joints = np.ones(len(lanes.s_c))
-    if lanes.joints is not None and not problem.noise_given[1]:
+    if lanes.joints is not None and not study.noise_given[1]:
         joints = 0.02 * peak(lanes.joints)
     return np.stack([force, joints], axis=1)
 
 
 def next_sigma(
-    problem: Problem, info: Information, sigma: np.ndarray, unknowns: int | None = None
+    study: Study, info: Information, sigma: np.ndarray, unknowns: int | None = None
 ) -> np.ndarray:
     """Standard deviations from the residuals, where they are not given.
 
@@ -44,25 +42,25 @@ def next_sigma(
     loss 1.4826 times the median.
     """
     total = info.counts.sum(axis=1, keepdims=True)
-    own = problem.lanes.active.sum(axis=1)[:, None] if unknowns is None else unknowns
+    own = study.lanes.active.sum(axis=1)[:, None] if unknowns is None else unknowns
     share = np.maximum(1 - own / np.maximum(total, 1), 0.05)
     with np.errstate(invalid="ignore", divide="ignore"):
         estimate = np.sqrt(info.squares / (info.counts * share))
-        if problem.loss != "linear":
+        if study.model.loss != "linear":
             estimate = 1.4826 * info.spread
-    keep = np.array(problem.noise_given)[None] | ~np.isfinite(estimate) | (info.counts == 0)
-    floor = 1e-9 * first_sigma(problem)
+    keep = np.array(study.noise_given)[None] | ~np.isfinite(estimate) | (info.counts == 0)
+    floor = 1e-9 * first_sigma(study)
     return np.where(keep, sigma, np.maximum(estimate, floor))
 
 
-def precision_unit(problem: Problem) -> np.ndarray:
+def precision_unit(study: Study) -> np.ndarray:
     """Given sigma that one unit of whitened residual stands for (median); (lanes, 2)."""
 
     def typical(precision, given):
         if precision is None or not given:
-            return np.ones(len(problem.lanes.s_c))
+            return np.ones(len(study.lanes.s_c))
         flat = precision.reshape(len(precision), -1)
         return np.array([1 / np.median(row[row > 0]) if np.any(row > 0) else 1.0 for row in flat])
 
-    lanes, (force, joints) = problem.lanes, problem.noise_given
+    lanes, (force, joints) = study.lanes, study.noise_given
     return np.stack([typical(lanes.precision, force), typical(lanes.joint_precision, joints)], 1)

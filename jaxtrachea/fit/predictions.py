@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import residual_value
 from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.study import Study
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -29,7 +30,7 @@ class Prediction:
         """The largest force residual in words."""
         size = np.where(np.isfinite(self.force), np.abs(self.force), -1)
         lane, trial, sample = np.unravel_index(np.argmax(size), size.shape)
-        curves = result.problem.curves[lane]
+        curves = result.study.curves[lane]
         if size[lane, trial, sample] < 0:
             return "none, no finite prediction"
         curve = curves[trial]
@@ -54,17 +55,17 @@ def lag_correlation(prediction: Prediction) -> np.ndarray:
         return np.where(np.sum(pair, axis=(1, 2)) >= 10, both / ends, np.nan)
 
 
-def predictions(problem: Problem, theta: np.ndarray, chunk: int = 256) -> Prediction:
+def predictions(study: Study, theta: np.ndarray, chunk: int = 256) -> Prediction:
     """Residuals of all lanes at `theta` (lanes, P), in N and mm."""
-    run = _compiled(problem.program)
+    run = _compiled(study.model)
     count = len(theta)
     parts = []
     for first in range(0, count, chunk):
         of = np.arange(first, min(first + chunk, count))
-        lane = jax.tree.map(lambda v, of=of: v[of], problem.lanes)
+        lane = jax.tree.map(lambda v, of=of: v[of], study.lanes)
         parts.append(np.asarray(run(jnp.asarray(theta[of]), lane)))
     value = np.concatenate(parts)
-    lanes = problem.lanes
+    lanes = study.lanes
     samples = lanes.force.shape[-1]
     with np.errstate(invalid="ignore", divide="ignore"):
         force = np.where(lanes.precision > 0, value[..., :samples] / lanes.precision, np.nan)
@@ -76,9 +77,9 @@ def predictions(problem: Problem, theta: np.ndarray, chunk: int = 256) -> Predic
 
 
 @functools.lru_cache(maxsize=8)
-def _compiled(problem: Problem):
+def _compiled(model: FitModel):
     def value(theta, lane: Lane):
-        return residual_value(problem, theta, lane)
+        return residual_value(model, theta, lane)
 
     return jax.jit(jax.vmap(value))
 

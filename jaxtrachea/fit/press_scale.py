@@ -10,53 +10,53 @@ from jaxtyping import Float
 
 from jaxtrachea.fit.onset import touches
 from jaxtrachea.fit.parameters import DEFAULTS, OF_THE_PRESS
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.study import Study
 from jaxtrachea.measurements.first_touch import FirstTouch
 
 #: Half the width in which starts are drawn around a change point, of the press.
 _REACH = 0.1
 
 
-def sizes_of_press(problem: Problem) -> Float[np.ndarray, "lanes P"]:
+def sizes_of_press(study: Study) -> Float[np.ndarray, "lanes P"]:
     """Range of displacement (onset) and largest force (offset) of the presses that read an unknown.
 
     In scaled coordinates; NaN for all other unknowns, and where no sample is seen.
     """
-    out = np.full(problem.lanes.lower.shape, np.nan)
-    columns = _columns(problem)
+    out = np.full(study.lanes.lower.shape, np.nan)
+    columns = _columns(study)
     if not columns:
         return out
-    lanes = problem.lanes
+    lanes = study.lanes
     seen = lanes.precision > 0
     pick = lambda v, fill: np.where(seen, v, fill)  # noqa: E731
     span = np.max(pick(lanes.displacement, -np.inf), axis=2)
     span = span - np.min(pick(lanes.displacement, np.inf), axis=2)
     peak = np.max(pick(np.abs(lanes.force), -np.inf), axis=2)
     for name, column, step in columns:
-        size = _of_unknowns(problem, column, (span if name == "onset" else peak) / step)
+        size = _of_unknowns(study, column, (span if name == "onset" else peak) / step)
         out = np.where(size > 0, size, out)
     return out
 
 
 def relative_change(
-    problem: Problem, theta: Float[np.ndarray, "lanes P"]
+    study: Study, theta: Float[np.ndarray, "lanes P"]
 ) -> Float[np.ndarray, "lanes P"]:
     """Change of each scaled coordinate that counts as a relative change of 1.
 
     With scale `log` 1; for an onset or an offset the size of the press; else the value itself.
     """
-    rows = [[p.scale == "log" for p, _, _ in unknowns] for unknowns in problem.unknowns]
-    log = np.array([row + [False] * (problem.size - len(row)) for row in rows], bool)
-    size = sizes_of_press(problem)
+    rows = [[p.scale == "log" for p, _, _ in unknowns] for unknowns in study.unknowns]
+    log = np.array([row + [False] * (study.size - len(row)) for row in rows], bool)
+    size = sizes_of_press(study)
     linear = np.where(np.isnan(size), np.maximum(np.abs(theta), 1e-3), size)
     return np.where(log.reshape(theta.shape), 1.0, linear)
 
 
-def around_touch(problem: Problem, guess, low, high, decades: float):
+def around_touch(study: Study, guess, low, high, decades: float):
     """The box of starts with onset and offset where the change point of each curve has them.
 
     Args:
-        problem: the study.
+        study: the study.
         guess: first start, scaled coordinates; (lanes, P).
         low: lower end of the box; (lanes, P).
         high: (lanes, P).
@@ -65,31 +65,31 @@ def around_touch(problem: Problem, guess, low, high, decades: float):
     Returns:
         `guess`, `low` and `high` anew; a guess that the user gave stays, and is in the box.
     """
-    columns = _columns(problem)
-    if not columns or problem.options.contact != "unilateral":
+    columns = _columns(study)
+    if not columns or study.model.options.contact != "unilateral":
         return guess, low, high
-    found = touches(problem.lanes, problem.parameters)
+    found = touches(study.lanes, study.parameters)
     for name, column, step in columns:
-        parameter = problem.parameters[column]
+        parameter = study.parameters[column]
         if parameter.scale == "log":
             continue
-        at = _of_unknowns(problem, column, _estimate(found, name) / step, middle=True)
+        at = _of_unknowns(study, column, _estimate(found, name) / step, middle=True)
         size = found.span if name == "onset" else found.peak
-        reach = decades * _REACH * _of_unknowns(problem, column, size / step)
+        reach = decades * _REACH * _of_unknowns(study, column, size / step)
         known = np.isfinite(at) & np.isfinite(reach)
         start = at if parameter.value == DEFAULTS[name].value else guess
         low = np.where(known, np.minimum(at - reach, start), low)
         high = np.where(known, np.maximum(at + reach, start), high)
         guess = np.where(known, start, guess)
-    inside = lambda v: np.clip(v, problem.lanes.lower, problem.lanes.upper)  # noqa: E731
+    inside = lambda v: np.clip(v, study.lanes.lower, study.lanes.upper)  # noqa: E731
     return inside(guess), inside(low), inside(high)
 
 
-def _columns(problem: Problem) -> list[tuple[str, int, float]]:
+def _columns(study: Study) -> list[tuple[str, int, float]]:
     """Name, column and step of the free parameters that are measured against the press."""
     return [
         (p.name, j, p.step)
-        for j, p in enumerate(problem.parameters)
+        for j, p in enumerate(study.parameters)
         if not p.fixed and p.name in OF_THE_PRESS
     ]
 
@@ -98,10 +98,10 @@ def _estimate(found: FirstTouch, name: str) -> Float[np.ndarray, "lanes T"]:
     return found.onset if name == "onset" else found.force_offset
 
 
-def _of_unknowns(problem: Problem, column: int, of_trial, *, middle: bool = False):
+def _of_unknowns(study: Study, column: int, of_trial, *, middle: bool = False):
     """A number of the trials that read each unknown of a column: the largest, or the median."""
-    index = problem.lanes.index[:, :, column]
-    out = np.full(problem.lanes.lower.shape, np.nan)
+    index = study.lanes.index[:, :, column]
+    out = np.full(study.lanes.lower.shape, np.nan)
     for lane, row in enumerate(index):
         for i in np.unique(row[row >= 0]):
             values = of_trial[lane][row == i]

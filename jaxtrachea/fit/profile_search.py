@@ -46,7 +46,7 @@ class Sides:
             self.along = np.zeros_like(self.along)
         self.pinned = self._pinned()
         self.target = np.array([float(u[k].half_width) for k in lane])
-        lanes = result.problem.lanes
+        lanes = result.study.lanes
         bound = np.where(self.sign < 0, lanes.lower[lane, unknown], lanes.upper[lane, unknown])
         here = self.best[np.arange(len(lane)), unknown]
         self.limit = np.maximum(self.sign * (bound - here), 0)
@@ -67,7 +67,7 @@ class Sides:
             lane, i = int(self.lane[s]), int(self.unknown[s])
             rows = self.result.uncertainty[lane].blind
             rest = leaving_alone(rows[rows.any(axis=1)], i)
-            names = [p.name for p, _, _ in self.result.problem.unknowns[lane]]
+            names = [p.name for p, _, _ in self.result.study.unknowns[lane]]
             pinned[s] |= pins(names, rest)
         return pinned
 
@@ -91,11 +91,11 @@ class Sides:
 
     def _solve(self, lanes, start, pinned):
         """Fit `lanes` from `start` with the unknowns `pinned` (n, P) staying there."""
-        problem = self.result.problem
+        study = self.result.study
         # Never fewer jobs than places: every call then runs the one compiled program.
         fill = max(self.chunk - len(lanes), 0)
         pad = lambda v: np.concatenate([v, v[-1:].repeat(fill, axis=0)])  # noqa: E731
-        chosen = problem.take(pad(lanes))
+        chosen = study.take(pad(lanes))
         pinned = pad(np.broadcast_to(pinned, start.shape))
         start = np.clip(pad(start), chosen.lanes.lower, chosen.lanes.upper)
         active = np.where(pinned, 0, chosen.lanes.active)
@@ -136,7 +136,7 @@ class Sides:
 
         The profiled unknown does not count.
         """
-        lanes = self.result.problem.lanes
+        lanes = self.result.study.lanes
         on = (theta <= lanes.lower[self.lane]) | (theta >= lanes.upper[self.lane])
         on &= (lanes.active[self.lane] > 0) & ~self.result.at_bound[self.lane]
         on[np.arange(len(on)), self.unknown] = False

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrachea.fit.lane import Lane
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.parameters import SKELETON
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.mechanics.equilibrium import sensitivity
 from jaxtrachea.mechanics.force_law import Law, duffing
 from jaxtrachea.mechanics.press import (
@@ -24,6 +24,7 @@ from jaxtrachea.mechanics.press import (
     touch,
     unit_deflection,
 )
+from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 
 
@@ -69,55 +70,63 @@ class Inputs(NamedTuple):
     force_offset: Float[Array, " T"]
 
 
-def inputs(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Inputs:
+def inputs(
+    model: FitModel, theta: Float[Array, " P"], lane: Lane, geometry: Geometry | None = None
+) -> Inputs:
     """What the curves of one lane see of its unknowns.
 
     Args:
-        problem: static description.
+        model: what is fitted (static).
         theta: unknowns in scaled coordinates.
         lane: the lane's arrays (no leading axis).
+        geometry: the tube, may be traced; None: of the model.
     """
-    free = of_trials(problem, theta, lane)
-    skeleton = _skeleton(problem, free, lane)
-    contact = jax.vmap(lambda f, trial: _at_contact(problem, f, trial))(free, _trials(lane))
-    law, felt = contact.law, _felt(problem, skeleton)
+    free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
+    skeleton = _skeleton(model, free, lane, tube)
+    contact = jax.vmap(lambda f, trial: _at_contact(model, f, trial, tube))(free, _trials(lane))
+    law, felt = contact.law, _felt(model, skeleton)
     return Inputs(felt, skeleton.joints, law.k_1, law.k_3, contact.onset, contact.force_offset)
 
 
-def residual(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Residual:
+def residual(
+    model: FitModel, theta: Float[Array, " P"], lane: Lane, geometry: Geometry | None = None
+) -> Residual:
     """Residuals of one lane and their Jacobian, trial by trial.
 
     Args:
-        problem: static description.
+        model: what is fitted (static).
         theta: unknowns in scaled coordinates.
         lane: the lane's arrays (no leading axis).
+        geometry: the tube, may be traced; None: of the model.
     """
-    free = of_trials(problem, theta, lane)
-    skeleton, by_beam = _skeleton_and_derivative(problem, free, lane)
-    one = lambda *trial: _of_trial_with_jacobian(problem, *trial)  # noqa: E731
+    free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
+    skeleton, by_beam = _skeleton_and_derivative(model, free, lane, tube)
+    one = lambda *trial: _of_trial_with_jacobian(model, tube, *trial)  # noqa: E731
     return Residual(*jax.vmap(one)(free, skeleton, by_beam, _trials(lane)))
 
 
-def residual_value(problem: Problem, theta: Float[Array, " P"], lane: Lane) -> Float[Array, "T m"]:
+def residual_value(
+    model: FitModel, theta: Float[Array, " P"], lane: Lane, geometry: Geometry | None = None
+) -> Float[Array, "T m"]:
     """`residual` without its Jacobian."""
-    free = of_trials(problem, theta, lane)
-    skeleton = _skeleton(problem, free, lane)
+    free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
+    skeleton = _skeleton(model, free, lane, tube)
 
     def one(free, skeleton, trial):
-        law, onset, offset = _at_contact(problem, free, trial)
-        c = _felt(problem, skeleton)
-        force = respond(trial.displacement, onset, c, law, problem.options, trial.blend).force
+        law, onset, offset = _at_contact(model, free, trial, tube)
+        c = _felt(model, skeleton)
+        force = respond(trial.displacement, onset, c, law, model.options, trial.blend).force
         joints = None if skeleton.joints is None else _times(force, skeleton.joints)
         return _whitened(force + offset, joints, trial)
 
     return jax.vmap(one)(free, skeleton, _trials(lane))
 
 
-def of_trials(problem: Problem, v: Float[Array, " P"], lane: Lane) -> Float[Array, "T Jf"]:
+def of_trials(model: FitModel, v: Float[Array, " P"], lane: Lane) -> Float[Array, "T Jf"]:
     """Entries of a vector over the unknowns for every free column in every trial; 0 where none."""
-    if problem.common == "all":
+    if model.common == "all":
         return jnp.broadcast_to(v, (lane.s_c.shape[0], v.shape[0]))
-    index = lane.index[:, problem.free_columns]
+    index = lane.index[:, model.free_columns]
     return jnp.where(index >= 0, v[jnp.maximum(index, 0)], 0)
 
 
@@ -126,15 +135,15 @@ def _trials(lane: Lane) -> Lane:
     return lane._replace(lower=None, upper=None, active=None, index=None)
 
 
-def _beam_columns(problem: Problem) -> tuple[int, ...]:
+def _beam_columns(model: FitModel) -> tuple[int, ...]:
     """Which free columns change the skeleton's compliance."""
-    return tuple(i for i, p in enumerate(problem.free) if p.name in SKELETON)
+    return tuple(i for i, p in enumerate(model.free) if p.name in SKELETON)
 
 
-def material_and_values(problem: Problem, free, value) -> tuple[Material, dict[str, Array]]:
+def material_and_values(model: FitModel, free, value) -> tuple[Material, dict[str, Array]]:
     """Material of one trial, and the value of every parameter by name."""
-    values = {p.name: value[j] for j, p in enumerate(problem.parameters)}
-    for p, scaled in zip(problem.free, free, strict=True):
+    values = {p.name: value[j] for j, p in enumerate(model.columns)}
+    for p, scaled in zip(model.free, free, strict=True):
         values[p.name] = jnp.exp(scaled) if p.scale == "log" else scaled * p.step
     one = jnp.ones((), free.dtype)  # where the skeleton is not part of the model
     material = Material(
@@ -149,43 +158,46 @@ def material_and_values(problem: Problem, free, value) -> tuple[Material, dict[s
     return material, values
 
 
-def _geometry(problem: Problem, dtype):
-    return jax.tree.map(lambda v: jnp.asarray(v, dtype), problem.geometry)
+def _tube(model: FitModel, geometry: Geometry | None, dtype) -> Geometry:
+    """The geometry as arrays; that of the model where none is given."""
+    of = model.geometry if geometry is None else geometry
+    return jax.tree.map(lambda v: jnp.asarray(v, dtype), of)
 
 
-def _skeleton(problem: Problem, free, lane: Lane) -> Skeleton:
+def _skeleton(model: FitModel, free, lane: Lane, tube: Geometry) -> Skeleton:
     """What moves under a unit force in every trial."""
-    geometry = _geometry(problem, free.dtype)
 
     def at(free, value, s_c):
-        material, _ = material_and_values(problem, free, value)
+        material, _ = material_and_values(model, free, value)
         if lane.joints is None:
-            return Skeleton(compliance(geometry, material, s_c, problem.options), None)
-        beam = ligament_beam(geometry, material, problem.options)
-        unit = unit_deflection(beam, s_c, problem.options)
+            return Skeleton(compliance(tube, material, s_c, model.options), None)
+        beam = ligament_beam(tube, material, model.options)
+        unit = unit_deflection(beam, s_c, model.options)
         return Skeleton(unit.w_C, unit.w)
 
-    if problem.options.coupling == "total" and lane.joints is None:
+    if model.options.coupling == "total" and lane.joints is None:
         return Skeleton(jnp.zeros_like(lane.s_c), None)
-    if problem.common != "nothing" and lane.joints is None:
+    if model.common != "nothing" and lane.joints is None:
         return at(free[0], lane.value[0], lane.s_c)
     return jax.vmap(at)(free, lane.value, lane.s_c)
 
 
-def _skeleton_and_derivative(problem: Problem, free, lane: Lane) -> tuple[Skeleton, Skeleton]:
+def _skeleton_and_derivative(
+    model: FitModel, free, lane: Lane, tube: Geometry
+) -> tuple[Skeleton, Skeleton]:
     """`_skeleton` and its derivative by each of `_beam_columns`, an axis after that of the trials.
 
     A trial reads its own row of `free` alone, so that one tangent serves all trials.
     """
-    columns = _beam_columns(problem)
+    columns = _beam_columns(model)
     if not columns:
-        skeleton = _skeleton(problem, free, lane)
+        skeleton = _skeleton(model, free, lane, tube)
         return skeleton, jax.tree.map(lambda v: jnp.zeros((v.shape[0], 0, *v.shape[1:])), skeleton)
     along = jnp.eye(free.shape[1], dtype=free.dtype)[jnp.array(columns)]
 
     def push(tangent):
         tangents = jnp.broadcast_to(tangent, free.shape)
-        return jax.jvp(lambda free: _skeleton(problem, free, lane), (free,), (tangents,))
+        return jax.jvp(lambda free: _skeleton(model, free, lane, tube), (free,), (tangents,))
 
     return jax.vmap(push, out_axes=(None, 1))(along)
 
@@ -198,16 +210,16 @@ class _Contact(NamedTuple):
     force_offset: Float[Array, ""]
 
 
-def _at_contact(problem: Problem, free, trial: Lane) -> _Contact:
-    material, values = material_and_values(problem, free, trial.value)
-    law = local_law(_geometry(problem, free.dtype), material, trial.s_c, problem.options)
+def _at_contact(model: FitModel, free, trial: Lane, tube: Geometry) -> _Contact:
+    material, values = material_and_values(model, free, trial.value)
+    law = local_law(tube, material, trial.s_c, model.options)
     return _Contact(law, values["onset"], values["force_offset"])
 
 
-def _felt(problem: Problem, skeleton: Skeleton):
+def _felt(model: FitModel, skeleton: Skeleton):
     """Compliance that the contact force depends on: none with the paper's total coupling."""
     c = skeleton.compliance
-    return c if problem.options.coupling == "series" else jnp.zeros_like(c)
+    return c if model.options.coupling == "series" else jnp.zeros_like(c)
 
 
 def _times(force: Float[Array, " N"], joints: Float[Array, " rings"]) -> Float[Array, "N rings"]:
@@ -230,12 +242,13 @@ def _masked(force, joints, trial: Lane) -> Float[Array, " m"]:
     return jnp.concatenate([r, markers.reshape(*r.shape[:-1], -1)], axis=-1)
 
 
-def _of_trial_with_jacobian(problem: Problem, free, skeleton, by_beam, trial: Lane):
+def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, trial: Lane):
     """Whitened residual of one trial, (m,), and its Jacobian by the free columns, (Jf, m)."""
     eye = jnp.eye(free.shape[0], dtype=free.dtype)
-    push = lambda t: jax.jvp(lambda f: _at_contact(problem, f, trial), (free,), (t,))  # noqa: E731
+    at_contact = lambda free: _at_contact(model, free, trial, tube)  # noqa: E731
+    push = lambda t: jax.jvp(at_contact, (free,), (t,))  # noqa: E731
     contact, d_contact = jax.vmap(push, out_axes=(None, 0))(eye)
-    of_beam = _beam_columns(problem)
+    of_beam = _beam_columns(model)
 
     def all_columns(v):
         zero = jnp.zeros(v.shape[1:], v.dtype)
@@ -243,21 +256,21 @@ def _of_trial_with_jacobian(problem: Problem, free, skeleton, by_beam, trial: La
         return jnp.stack([v[of_beam.index(i)] if i in of_beam else zero for i in rows])
 
     d_skeleton = jax.tree.map(all_columns, by_beam)
-    law, c = contact.law, _felt(problem, skeleton)
+    law, c = contact.law, _felt(model, skeleton)
     D, blend = trial.displacement, trial.blend
-    depth = respond(D, contact.onset, c, law, problem.options, blend).depth
+    depth = respond(D, contact.onset, c, law, model.options, blend).depth
     by = sensitivity(depth, c, law)
-    at = lambda onset: touch(D, onset, problem.options, blend)  # noqa: E731
+    at = lambda onset: touch(D, onset, model.options, blend)  # noqa: E731
     slope = lambda onset: jax.jvp(at, (onset,), (jnp.ones_like(onset),))[1]  # noqa: E731
     moved = slope(contact.onset)
     terms = {
-        "compliance": (_felt(problem, d_skeleton), by.compliance),
+        "compliance": (_felt(model, d_skeleton), by.compliance),
         "k_1": (d_contact.law.k_1, by.k_1),
         "k_3": (d_contact.law.k_3, by.k_3),
         "onset": (d_contact.onset, by.displacement * moved),
     }
     d_force = jnp.zeros((len(eye), *depth.shape), depth.dtype)
-    for d_input, by_input in (terms[name] for name in _felt_through(problem)):
+    for d_input, by_input in (terms[name] for name in _felt_through(model)):
         d_force = d_force + d_input[:, None] * by_input[None]
     force = duffing(depth, law)
     joints, d_joints = None, None
@@ -268,17 +281,17 @@ def _of_trial_with_jacobian(problem: Problem, free, skeleton, by_beam, trial: La
     value = _whitened(force + contact.force_offset, joints, trial)
     row = lambda force, joints: _masked(force, joints, trial)  # noqa: E731
     bend = None
-    if blend is not None and joints is None and any(p.name == "onset" for p in problem.free):
+    if blend is not None and joints is None and any(p.name == "onset" for p in model.free):
         curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
         squared = jnp.sum(d_contact.onset**2)
         bend = _masked(by.displacement * curved * squared, None, trial)
     return value, jax.vmap(row)(d_force + d_contact.force_offset[:, None], d_joints), bend
 
 
-def _felt_through(problem: Problem) -> list[str]:
+def _felt_through(model: FitModel) -> list[str]:
     """Through what the free parameters act on the contact force: only these terms are computed."""
     through = {
-        "compliance" if p.name in SKELETON else p.name.removesuffix("_ring") for p in problem.free
+        "compliance" if p.name in SKELETON else p.name.removesuffix("_ring") for p in model.free
     }
     return [name for name in ("compliance", "k_1", "k_3", "onset") if name in through]
 

@@ -11,7 +11,7 @@ from jaxtrachea.fit.criteria import Criteria
 from jaxtrachea.fit.levenberg_marquardt import Tolerances
 from jaxtrachea.fit.noise import precision_unit
 from jaxtrachea.fit.press_scale import relative_change
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus
 
 
@@ -57,10 +57,10 @@ class Settings:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FitResult:
-    """Estimates of every lane; leading axis = lanes of the problem, P unknowns each.
+    """Estimates of every lane; leading axis = lanes of the study, P unknowns each.
 
     Attributes:
-        problem: what was fitted.
+        study: what was fitted.
         theta: estimate in scaled coordinates; (lanes, P).
         value: estimate in the parameter's unit; (lanes, P).
         standard_error: in the parameter's unit (delta method); (lanes, P).
@@ -92,7 +92,7 @@ class FitResult:
             that differ from it in an unknown that the structure does not leave open; (lanes,).
     """
 
-    problem: Problem
+    study: Study
     theta: np.ndarray
     value: np.ndarray
     standard_error: np.ndarray
@@ -130,9 +130,9 @@ class FitResult:
     @property
     def whitened_sigma(self) -> np.ndarray:
         """`sigma` in units of the lanes' precision, as `evaluate` wants it; (lanes, 2)."""
-        return self.sigma / precision_unit(self.problem)
+        return self.sigma / precision_unit(self.study)
 
     @property
     def relative(self) -> np.ndarray:
         """Change of each scaled coordinate that makes a relative change of 1; (lanes, P)."""
-        return relative_change(self.problem, self.theta)
+        return relative_change(self.study, self.theta)

@@ -19,15 +19,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fit.minima import Minima, data_weight
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.natural_sizes import natural_sizes
 from jaxtrachea.fit.noise import first_sigma
 from jaxtrachea.fit.parameters import OF_THE_PRESS, SKELETON
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.profile_search import Sides, find_ends
 from jaxtrachea.fit.residual import inputs
 from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.starts import EXACT, box, scales
 from jaxtrachea.fit.structure import Structure, positions
+from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 #: Relative standard error along a direction, and condition number, from which there is doubt about
@@ -70,7 +71,7 @@ def doubtful(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
         minima: where all starts ended.
     """
     alive = np.isin(result.status, _TO_LOOK_AT)
-    present = (result.problem.lanes.active > 0) & ~result.undetermined & alive[:, None]
+    present = (result.study.lanes.active > 0) & ~result.undetermined & alive[:, None]
     doubt = np.zeros(present.shape, bool)
     natural = natural_sizes(result)
     se = np.stack([u.se for u in result.uncertainty]) / natural
@@ -88,7 +89,7 @@ def doubtful(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
     lost = present & ~np.isfinite(se + np.where(known, 0, np.inf)) & ~result.at_bound
     everything = result.at_bound.any(axis=1) | lost.any(axis=1) | failed
     everything |= root.max(axis=1) > VERY_LONG
-    everything |= _elsewhere_as_low(result, minima, se, natural) | barely_determined(result.problem)
+    everything |= _elsewhere_as_low(result, minima, se, natural) | barely_determined(result.study)
     return present & (doubt | everything[:, None])
 
 
@@ -100,14 +101,14 @@ def left_in_doubt(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes 
     stands by its own error.
     """
     doubt = doubtful(result, minima)
-    problem = result.problem
-    shared = problem.shared
+    study = result.study
+    shared = study.shared
     if shared.size:
         row, good = np.arange(len(doubt))[:, None], result.succeeded
         votes = doubt[row, shared][good]
         doubt[row, shared] = np.mean(votes, axis=0) >= 0.5 if len(votes) else True
     error = np.stack([u.se for u in result.uncertainty]) / natural_sizes(result)
-    for lane, unknowns in enumerate(problem.unknowns):
+    for lane, unknowns in enumerate(study.unknowns):
         for i, (p, _, _) in enumerate(unknowns):
             if p.name in OF_THE_PRESS:
                 doubt[lane, i] &= not error[lane, i] <= LONG
@@ -128,12 +129,12 @@ def _elsewhere_as_low(result: FitResult, minima: Minima, se, natural) -> Bool[np
     out = np.zeros(result.lanes, bool)
     lane = minima.job
     apart = np.abs(minima.end - result.theta[lane]) / natural[lane]
-    own = (result.problem.lanes.active[lane] > 0) & ~result.undetermined[lane]
+    own = (result.study.lanes.active[lane] > 0) & ~result.undetermined[lane]
     rows = np.flatnonzero(np.any(own & (apart > np.maximum(APART, 2 * se[lane])), axis=1))
     if len(rows):
         low = np.full(result.lanes, np.inf)
         np.minimum.at(low, lane, np.where(np.isfinite(minima.cost), minima.cost, np.inf))
-        scale = (first_sigma(result.problem) / result.whitened_sigma)[lane[rows], 0] ** 2
+        scale = (first_sigma(result.study) / result.whitened_sigma)[lane[rows], 0] ** 2
         dispersion = np.array([np.nanmin(u.dispersion) for u in result.uncertainty])[lane[rows]]
         half = np.array([u.half_width for u in result.uncertainty])[lane[rows]]
         with np.errstate(invalid="ignore"):
@@ -153,7 +154,7 @@ class _Region:
         self.cost[lanes] = sides.costs(lanes, result.theta[lanes])
         self.dispersion = np.stack([u.dispersion for u in result.uncertainty])
         self.threshold = np.array([float(u.half_width) for u in result.uncertainty]) ** 2
-        self.floor = EXACT * data_weight(result.problem, result.whitened_sigma)
+        self.floor = EXACT * data_weight(result.study, result.whitened_sigma)
         self.low, self.high = result.theta.copy(), result.theta.copy()
         self.at_low = np.repeat(result.theta[:, None], result.theta.shape[1], axis=1)
         self.at_high = self.at_low.copy()
@@ -216,7 +217,7 @@ def scrutinise(
     evidence.minima[lanes] = several
     if np.isfinite(region.better).any() and not last:
         return evidence, region.better
-    present = (result.problem.lanes.active > 0) & ~result.undetermined
+    present = (result.study.lanes.active > 0) & ~result.undetermined
     doubts = doubts | (present & (evidence.minima > 1)[:, None])
     region.sides = _sides(result, settings, doubts, alive)
     _profiled(region, evidence)
@@ -268,7 +269,7 @@ def _distinct(
     result: FitResult, lane: int, ends: Float[np.ndarray, "n P"], natural: Float[np.ndarray, " P"]
 ) -> int:
     """Distinct minima among the estimate and `ends`, in unknowns that can be told."""
-    own = (result.problem.lanes.active[lane] > 0) & ~result.undetermined[lane]
+    own = (result.study.lanes.active[lane] > 0) & ~result.undetermined[lane]
     relative = natural[own]
     kept = [result.theta[lane][own]]
     for end in ends[:, own]:
@@ -279,12 +280,12 @@ def _distinct(
 
 def _soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     """The local law as the soft part of the curve's secant stiffness, then the skeleton as it."""
-    problem = result.problem
-    if not any(p.name in SKELETON for p in problem.free) or problem.options.coupling != "series":
+    study = result.study
+    if not any(p.name in SKELETON for p in study.free) or study.model.options.coupling != "series":
         return []
-    guess, low, high = box(problem, 0.0)[0][lanes], problem.lanes.lower, problem.lanes.upper
-    compliance = _compliances(problem, lanes, guess)
-    data = problem.lanes
+    guess, low, high = box(study, 0.0)[0][lanes], study.lanes.lower, study.lanes.upper
+    compliance = _compliances(study, lanes, guess)
+    data = study.lanes
     seen = data.precision[lanes] > 0
     force = np.where(seen, np.abs(data.force[lanes]), 0)
     deepest = np.argmax(force, axis=2)[..., None]
@@ -300,7 +301,7 @@ def _soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
         softer = of_skeleton / stiffness / compliance
         start = result.theta[lanes].copy()
         for n, lane in enumerate(lanes):
-            for i, (p, _, _) in enumerate(problem.unknowns[lane]):
+            for i, (p, _, _) in enumerate(study.unknowns[lane]):
                 if p.name in SKELETON:
                     start[n, i] = guess[n, i] - np.log(softer[n])
                 elif p.name.startswith("k_1"):
@@ -311,36 +312,36 @@ def _soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     return out
 
 
-def _compliances(problem: Problem, lanes, theta) -> Float[np.ndarray, " n"]:
+def _compliances(study: Study, lanes, theta) -> Float[np.ndarray, " n"]:
     """Mean compliance of the observed trials, mm/N."""
-    observed = (problem.lanes.precision[lanes] > 0).any(axis=2)
-    c = [_compliance(problem, int(k), row[None])[0] for k, row in zip(lanes, theta, strict=True)]
+    observed = (study.lanes.precision[lanes] > 0).any(axis=2)
+    c = [_compliance(study, int(k), row[None])[0] for k, row in zip(lanes, theta, strict=True)]
     return np.sum(np.array(c) * observed, axis=1) / np.sum(observed, axis=1)
 
 
-def _compliance(problem: Problem, lane: int, theta) -> Float[np.ndarray, "n T"]:
+def _compliance(study: Study, lane: int, theta) -> Float[np.ndarray, "n T"]:
     """Compliance at every trial of a lane, mm/N, at many points."""
-    row = jax.tree.map(lambda v: v[lane], problem.lanes)
-    return np.asarray(_compiled(problem.program)(theta, row))
+    row = jax.tree.map(lambda v: v[lane], study.lanes)
+    return np.asarray(_compiled(study.model)(theta, row))
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled(problem: Problem):
-    of_point = lambda theta, lane: inputs(problem, theta, lane).compliance  # noqa: E731
+def _compiled(model: FitModel):
+    of_point = lambda theta, lane: inputs(model, theta, lane).compliance  # noqa: E731
     return jax.jit(jax.vmap(of_point, (0, None)))
 
 
-def barely_determined(problem: Problem) -> Bool[np.ndarray, " lanes"]:
+def barely_determined(study: Study) -> Bool[np.ndarray, " lanes"]:
     """Lanes without markers with at most one position more than unknowns of the skeleton.
 
     With as many equations as unknowns other skeletons may have the same compliances exactly, with
     one more nearly the same, each a sharp minimum of its own.
     """
-    beam = [[p.name in SKELETON for p, _, _ in u] for u in problem.unknowns]
+    beam = [[p.name in SKELETON for p, _, _ in u] for u in study.unknowns]
     count = np.array([sum(row) for row in beam])
-    marked = problem.lanes.joint_precision
+    marked = study.lanes.joint_precision
     seen = np.zeros(len(count), bool) if marked is None else (marked > 0).any(axis=(1, 2, 3))
-    return (positions(problem) <= count + 1) & (count > 1) & ~seen
+    return (positions(study) <= count + 1) & (count > 1) & ~seen
 
 
 def _twins(region: _Region, lanes) -> list[Float[np.ndarray, "n P"]]:
@@ -349,22 +350,20 @@ def _twins(region: _Region, lanes) -> list[Float[np.ndarray, "n P"]]:
     Local minima of the squared difference of ln c on the grid, the `TWINS` lowest of each lane;
     the estimate where there are fewer.
     """
-    result, problem = region.result, region.result.problem
+    result, study = region.result, region.result.study
     out = np.repeat(result.theta[lanes][None], TWINS, axis=0)
     for n, lane in enumerate(lanes):
-        place = {p.name: i for i, (p, _, _) in enumerate(problem.unknowns[lane])}
-        if not {"EI_L", "k_M"} <= place.keys() or positions(problem)[lane] < 2:
+        place = {p.name: i for i, (p, _, _) in enumerate(study.unknowns[lane])}
+        if not {"EI_L", "k_M"} <= place.keys() or positions(study)[lane] < 2:
             continue
-        low, high, best = (
-            v[lane] for v in (problem.lanes.lower, problem.lanes.upper, result.theta)
-        )
+        low, high, best = (v[lane] for v in (study.lanes.lower, study.lanes.upper, result.theta))
         beam = [place["EI_L"], place["k_M"]]
         axes = [_axis(float(best[i]), float(low[i]), float(high[i])) for i in beam]
         mesh = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
         theta = np.repeat(best[None], len(mesh) + 1, axis=0)
         theta[1:, beam] = mesh
-        observed = (problem.lanes.precision[lane] > 0).any(axis=1)
-        c = _compliance(problem, int(lane), theta)
+        observed = (study.lanes.precision[lane] > 0).any(axis=1)
+        c = _compliance(study, int(lane), theta)
         with np.errstate(divide="ignore", invalid="ignore"):
             change = np.log(c[1:] / c[0])[:, observed]
         misfit = np.sum(change**2, axis=1).reshape(*map(len, axes))
@@ -401,7 +400,7 @@ def _walks(region: _Region, lanes) -> list[Float[np.ndarray, "n P"]]:
     half = np.array([v.half_width * v.flat_se for v in u])
     half = np.where(np.isfinite(half), half, 1.0)
     steps = np.minimum(half[:, None] * WALK, FAR)
-    data, out = result.problem.lanes, []
+    data, out = result.study.lanes, []
     for sign in (-1.0, 1.0):
         theta = result.theta[lanes][:, None] + sign * steps[..., None] * flat[:, None]
         theta = np.clip(theta, data.lower[lanes][:, None], data.upper[lanes][:, None])
@@ -430,7 +429,7 @@ def _profiled(region: _Region, evidence: Evidence) -> None:
     )
     open_ = end == ProfileEnd.OPEN
     low, high = np.where(open_[:, 0], -np.inf, low), np.where(open_[:, 1], np.inf, high)
-    log, step = scales(result.problem)
+    log, step = scales(result.study)
     with np.errstate(over="ignore"):
         unscale = lambda v: np.where(log[lane, unknown], np.exp(v), v * step[lane, unknown])  # noqa: E731
         evidence.evidence_low[lane, unknown] = unscale(low)

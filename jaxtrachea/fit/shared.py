@@ -27,8 +27,9 @@ from jaxtrachea.fit.cost import evaluate
 from jaxtrachea.fit.covariance import Information
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import Solved, Tolerances, chunk_size, levenberg_marquardt
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import observations, residual_value
+from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus
 
 #: First radius of the trust region of the shared unknowns, scaled coordinates.
@@ -65,7 +66,7 @@ class Settled(NamedTuple):
 class _Task:
     """What stays the same during a descent."""
 
-    problem: Problem
+    study: Study
     sigma: np.ndarray
     tolerances: Tolerances
     chunk: int
@@ -79,7 +80,7 @@ class _Task:
 
 
 def solve_jointly(
-    problem: Problem,
+    study: Study,
     starts: Float[np.ndarray, "starts L P"],
     sigma: Float[np.ndarray, "L 2"],
     *,
@@ -92,7 +93,7 @@ def solve_jointly(
     """Fit all lanes together from every start and keep the best.
 
     Args:
-        problem: a joint one.
+        study: a joint one.
         starts: scaled coordinates.
         sigma: of each lane, as for `levenberg_marquardt`.
         alone: fit every lane by itself first; else a start is a point near the solution.
@@ -104,7 +105,7 @@ def solve_jointly(
     Returns:
         The best outcome, one row per lane, and how many starts ended in it.
     """
-    task = _Task(problem, sigma, tolerances, chunk, dtype, problem.shared)
+    task = _Task(study, sigma, tolerances, chunk, dtype, study.shared)
     if alone:
         starts = _fitted_alone(task, starts, progress)
     solved = [_descend(task, start, progress) for start in starts]
@@ -123,7 +124,7 @@ def _fitted_alone(task: _Task, starts, progress) -> np.ndarray:
     """Lanes fitted by themselves from every start, then the shared unknowns at their median."""
     count, lanes, P = starts.shape
     jobs = np.tile(np.arange(lanes), count)
-    found = _single(task, task.problem, jobs, starts.reshape(-1, P), progress)
+    found = _single(task, task.study, jobs, starts.reshape(-1, P), progress)
     usable = (found.status <= FitStatus.STALLED).reshape(count, lanes)
     theta = np.where(usable[..., None], found.theta.reshape(starts.shape), starts)
     row = np.arange(lanes)[:, None]
@@ -133,13 +134,13 @@ def _fitted_alone(task: _Task, starts, progress) -> np.ndarray:
     return theta
 
 
-def _single(task: _Task, problem: Problem, jobs, starts, progress=None) -> Solved:
+def _single(task: _Task, study: Study, jobs, starts, progress=None) -> Solved:
     """The solver of single lanes; always in chunks of one size, so that it is compiled once."""
     total = len(jobs)
     missing = max(0, task.chunk - total)
     pad = lambda v: np.concatenate([v, np.repeat(v[:1], missing, axis=0)])  # noqa: E731
     solved = levenberg_marquardt(
-        problem, pad(jobs), pad(starts), pad(task.sigma[jobs]), tolerances=task.tolerances,
+        study, pad(jobs), pad(starts), pad(task.sigma[jobs]), tolerances=task.tolerances,
         chunk=task.chunk, progress=progress, dtype=task.dtype,
     )  # fmt: skip
     return Solved(*(v[:total] for v in solved))
@@ -147,7 +148,7 @@ def _single(task: _Task, problem: Problem, jobs, starts, progress=None) -> Solve
 
 def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
     """One start: iterations until the shared unknowns and all lanes rest."""
-    lanes = task.problem.lanes
+    lanes = task.study.lanes
     clip = lambda theta: np.clip(theta, lanes.lower, lanes.upper)  # noqa: E731
     here = _settle(task, clip(start), None, np.ones(len(start), bool))
     alive = here.finite
@@ -214,7 +215,7 @@ def _shared_step(task: _Task, here: Settled, alive, radius, moving, gradient, he
 
 def _of_shared(task: _Task, theta, alive):
     """The shared unknowns and their bounds."""
-    row, lanes = int(np.argmax(alive)), task.problem.lanes
+    row, lanes = int(np.argmax(alive)), task.study.lanes
     at = lambda v: v[row, task.shared[row]]  # noqa: E731
     return at(theta), Bounds(at(lanes.lower), at(lanes.upper))
 
@@ -223,7 +224,7 @@ def _reduce(task: _Task, here: Settled, alive):
     """Elimination at a point: lanes reduced, which shared unknowns move, and their equations."""
     g = np.where(alive[:, None], here.gradient, 0)
     H = np.where(alive[:, None, None], here.hessian, 0)
-    reduced = arrow.eliminate(g, H, task.shared, ~_held(here.theta, g, task.problem.lanes))
+    reduced = arrow.eliminate(g, H, task.shared, ~_held(here.theta, g, task.study.lanes))
     gradient, hessian = reduced.gradient.sum(axis=0), reduced.hessian.sum(axis=0)
     theta, box = _of_shared(task, here.theta, alive)
     return reduced, ~_held(theta, gradient, box), gradient, hessian
@@ -252,7 +253,7 @@ def _at_rest(task: _Task, here: Settled, alive, reduced, gradient, hessian, movi
 def _nearly_flat(task: _Task, here: Settled) -> np.ndarray:
     """Lanes whose residual is all but orthogonal to their Jacobian, as for single lanes; (L,)."""
     diagonal = np.diagonal(here.hessian, axis1=1, axis2=2)
-    own = ~_held(here.theta, here.gradient, task.problem.lanes) & (diagonal > 0)
+    own = ~_held(here.theta, here.gradient, task.study.lanes) & (diagonal > 0)
     own[np.arange(len(own))[:, None], task.shared] = False
     cosine = np.abs(here.gradient) / np.sqrt(np.where(own, diagonal, 1)) * own
     tolerance = max(task.tolerances.gradient, 4 * epsilon(task.dtype))
@@ -268,7 +269,7 @@ def _floor(task: _Task, here: Settled, alive) -> float:
     alive = alive & here.finite
     if not alive.any():
         return 0.0
-    lanes = task.problem.lanes
+    lanes = task.study.lanes
     data = np.sum((lanes.force * lanes.precision)[alive] ** 2) / task.sigma[alive][0, 0] ** 2
     total = 0.01 * task.tolerance * np.sum(here.cost[alive])
     return (total + 0.5 * data * (10 * epsilon(task.dtype)) ** 2) / np.sum(alive)
@@ -290,9 +291,9 @@ def _settle(task: _Task, theta: np.ndarray, before: Settled | None, alive) -> Se
         alive: lanes that count; (L,).
     """
     here = _evaluated(task, theta)
-    if task.problem.size == task.shared.shape[1]:
+    if task.study.size == task.shared.shape[1]:
         return here
-    lanes = task.problem.lanes
+    lanes = task.study.lanes
     finite = here.finite
     g = np.where(finite[:, None], here.gradient, 0)
     H = np.where(finite[:, None, None], here.hessian, 0)
@@ -314,7 +315,7 @@ def _settle(task: _Task, theta: np.ndarray, before: Settled | None, alive) -> Se
     lower, upper = lanes.lower.copy(), lanes.upper.copy()
     for side in (lower, upper):
         side[row, task.shared] = theta[row, task.shared]
-    pinned = dataclasses.replace(task.problem, lanes=lanes._replace(lower=lower, upper=upper))
+    pinned = dataclasses.replace(task.study, lanes=lanes._replace(lower=lower, upper=upper))
     jobs = np.tile(poor, len(starts))
     found = _single(task, pinned, jobs, np.concatenate([s[poor] for s in starts]))
     cost = np.where(np.isfinite(found.cost), found.cost, np.inf).reshape(len(starts), -1)
@@ -326,52 +327,52 @@ def _settle(task: _Task, theta: np.ndarray, before: Settled | None, alive) -> Se
 
 def _evaluated(task: _Task, theta: Float[np.ndarray, "L P"]) -> Settled:
     """Cost and normal equations of all lanes, a chunk at a time."""
-    run = _compiled(task.problem.program)
+    run = _compiled(task.study.model)
     settings = task.sigma, task.chunk, task.dtype
-    cost, gradient, hessian = in_chunks(run, task.problem, theta, *settings)
+    cost, gradient, hessian = in_chunks(run, task.study, theta, *settings)
     finite = np.isfinite(cost) & np.isfinite(hessian).all(axis=(1, 2))
     finite &= np.isfinite(gradient).all(axis=1)
     return Settled(theta, np.where(finite, cost, np.inf), gradient, hessian)
 
 
-def in_chunks(run, problem: Problem, theta, sigma, chunk: int, dtype) -> tuple[np.ndarray, ...]:
+def in_chunks(run, study: Study, theta, sigma, chunk: int, dtype) -> tuple[np.ndarray, ...]:
     """A function of (theta, lane, sigma) over all lanes; float64 on the host."""
     count, parts = len(theta), []
     chunk = chunk_size(count, chunk)
     cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype)  # noqa: E731
     for first in range(0, count, chunk):
         of = np.minimum(np.arange(first, first + chunk), count - 1)
-        lane = jax.tree.map(lambda v, of=of: cast(v[of]), problem.lanes)
+        lane = jax.tree.map(lambda v, of=of: cast(v[of]), study.lanes)
         part = run(cast(theta[of]), lane, cast(sigma[of]))
         parts.append([np.asarray(v, np.float64)[: count - first] for v in part])
     return tuple(np.concatenate(v) for v in zip(*parts, strict=True))
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled(problem: Problem):
+def _compiled(model: FitModel):
     def normal(theta: Array, lane: Lane, sigma: Array):
-        point = evaluate(problem, theta, lane, sigma)
+        point = evaluate(model, theta, lane, sigma)
         return point.cost, point.gradient, point.hessian
 
     return jax.jit(jax.vmap(normal))
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled_residual(problem: Problem):
+def _compiled_residual(model: FitModel):
     def absolute(theta: Array, lane: Lane, sigma: Array):
         seen, _ = observations(lane)
-        return (jnp.where(seen > 0, jnp.abs(residual_value(problem, theta, lane)), jnp.nan),)
+        return (jnp.where(seen > 0, jnp.abs(residual_value(model, theta, lane)), jnp.nan),)
 
     return jax.jit(jax.vmap(absolute))
 
 
 def pooled(
-    problem: Problem, info: Information, theta: np.ndarray, alive: Bool[np.ndarray, " L"]
+    study: Study, info: Information, theta: np.ndarray, alive: Bool[np.ndarray, " L"]
 ) -> Information:
     """Residual statistics of the study in place of each lane's: the noise is one and the same.
 
     Args:
-        problem: a joint one.
+        study: a joint one.
         info: of each lane.
         theta: where it was taken.
         alive: lanes that count.
@@ -380,9 +381,9 @@ def pooled(
     of_lane = info.counts[alive].sum(axis=1)
     mean = lambda v: np.sum(v[alive] * of_lane) / max(np.sum(of_lane), 1)  # noqa: E731
     spread = np.zeros(2)
-    if problem.loss != "linear":
-        run, forces = _compiled_residual(problem.program), problem.lanes.force.shape[-1]
-        r = in_chunks(run, problem, theta, np.ones_like(info.counts), 128, np.float64)[0][alive]
+    if study.model.loss != "linear":
+        run, forces = _compiled_residual(study.model), study.lanes.force.shape[-1]
+        r = in_chunks(run, study, theta, np.ones_like(info.counts), 128, np.float64)[0][alive]
         kinds = (r[..., :forces], r[..., forces:])
         spread = np.array([np.nanmedian(v) if np.any(np.isfinite(v)) else 0.0 for v in kinds])
     every = lambda v: np.tile(v, (len(alive), *[1] * np.ndim(v)))  # noqa: E731
@@ -392,34 +393,32 @@ def pooled(
     )  # fmt: skip
 
 
-def summed_gradient(problem: Problem, info: Information, alive: Bool[np.ndarray, " L"]):
+def summed_gradient(study: Study, info: Information, alive: Bool[np.ndarray, " L"]):
     """Gradient of the whole cost by every lane's unknowns; (L, P)."""
-    gradient, shared = info.gradient.copy(), problem.shared
+    gradient, shared = info.gradient.copy(), study.shared
     row = np.arange(len(gradient))[:, None]
     gradient[row, shared] = gradient[row, shared][alive].sum(axis=0)
     return gradient
 
 
-def marginal(
-    problem: Problem, info: Information, held: Bool[np.ndarray, "L P"], alive
-) -> Information:
+def marginal(study: Study, info: Information, held: Bool[np.ndarray, "L P"], alive) -> Information:
     """Information on each lane's unknowns, those of all other lanes eliminated."""
     bread = np.where(alive[:, None, None], info.bread, 0)
     meat = np.where(alive[:, None, None], info.meat, 0)
-    bread, meat = arrow.marginal(bread, meat, problem.shared, ~held)
+    bread, meat = arrow.marginal(bread, meat, study.shared, ~held)
     lost = ~alive[:, None, None]
     return info._replace(bread=np.where(lost, np.nan, bread), meat=np.where(lost, np.nan, meat))
 
 
-def unknown_count(problem: Problem, alive: Bool[np.ndarray, " L"]) -> int:
+def unknown_count(study: Study, alive: Bool[np.ndarray, " L"]) -> int:
     """Distinct unknowns of the lanes that count."""
-    k = problem.shared.shape[1]
-    return int(problem.lanes.active[alive].sum()) - k * max(int(np.sum(alive)) - 1, 0)
+    k = study.shared.shape[1]
+    return int(study.lanes.active[alive].sum()) - k * max(int(np.sum(alive)) - 1, 0)
 
 
-def held_count(problem: Problem, held: Bool[np.ndarray, "L P"], alive) -> int:
+def held_count(study: Study, held: Bool[np.ndarray, "L P"], alive) -> int:
     """Distinct unknowns of the lanes that count and are held on a bound."""
-    row, shared = np.arange(len(held))[:, None], problem.shared
-    mine = (held & (problem.lanes.active > 0))[alive]
+    row, shared = np.arange(len(held))[:, None], study.shared
+    mine = (held & (study.lanes.active > 0))[alive]
     repeated = held[row, shared][alive]
     return int(mine.sum() - repeated.sum() + repeated.any(axis=0).sum())

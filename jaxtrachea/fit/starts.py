@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from jaxtrachea.fit.levenberg_marquardt import Solved
 from jaxtrachea.fit.parameters import Parameter
 from jaxtrachea.fit.press_scale import around_touch
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus
 
 #: Times that an infeasible start is drawn again, each time from twice the box.
@@ -31,40 +31,40 @@ class Box(NamedTuple):
     high: Float[np.ndarray, "lanes P"]
 
 
-def box(problem: Problem, decades: float) -> Box:
+def box(study: Study, decades: float) -> Box:
     """The guess of every lane and the box around it, inside the bounds.
 
     Args:
-        problem: the study.
+        study: the study.
         decades: half the width of the box (scale `linear`: times 10 steps; onset and offset: times
             a tenth of the press, around the change point of the curve).
     """
-    guess = of_unknowns(problem, lambda p: p.to_scaled(p.value), 0.0)
+    guess = of_unknowns(study, lambda p: p.to_scaled(p.value), 0.0)
     decade = lambda p: np.log(10) if p.scale == "log" else 10.0  # noqa: E731
-    reach = decades * of_unknowns(problem, decade, 0.0)
-    low = np.maximum(problem.lanes.lower, guess - reach)
-    high = np.minimum(problem.lanes.upper, guess + reach)
-    return Box(*around_touch(problem, guess, low, high, decades))
+    reach = decades * of_unknowns(study, decade, 0.0)
+    low = np.maximum(study.lanes.lower, guess - reach)
+    high = np.minimum(study.lanes.upper, guess + reach)
+    return Box(*around_touch(study, guess, low, high, decades))
 
 
-def of_unknowns(problem: Problem, number: Callable[[Parameter], float], padding: float):
+def of_unknowns(study: Study, number: Callable[[Parameter], float], padding: float):
     """A number of each unknown's parameter, `padding` where a lane has fewer; (lanes, P)."""
-    known = {p.name: float(number(p)) for p in problem.free}
-    rows = np.full(problem.lanes.lower.shape, padding)
-    for row, unknowns in zip(rows, problem.unknowns, strict=True):
+    known = {p.name: float(number(p)) for p in study.free}
+    rows = np.full(study.lanes.lower.shape, padding)
+    for row, unknowns in zip(rows, study.unknowns, strict=True):
         row[: len(unknowns)] = [known[p.name] for p, _, _ in unknowns]
     return rows
 
 
-def draw_starts(problem: Problem, settings) -> np.ndarray:
+def draw_starts(study: Study, settings) -> np.ndarray:
     """Starts of every lane: the guess, then a Latin hypercube around it, the same for all lanes.
 
     Returns:
         (lanes * starts, P), lane by lane, in scaled coordinates.
     """
     rng = np.random.default_rng(settings.seed)
-    P, others = problem.size, settings.starts - 1
-    guess, low, high = box(problem, settings.decades)
+    P, others = study.size, settings.starts - 1
+    guess, low, high = box(study, settings.decades)
     strata = (
         rng.permuted(np.tile(np.arange(others), (P, 1)), axis=1).T if others else np.zeros((0, P))
     )
@@ -77,14 +77,14 @@ Solve = Callable[[np.ndarray, np.ndarray], Solved]
 
 
 def completed(
-    problem: Problem, settings, jobs: Int[np.ndarray, " jobs"], solved: Solved, weight, solve: Solve
+    study: Study, settings, jobs: Int[np.ndarray, " jobs"], solved: Solved, weight, solve: Solve
 ) -> tuple[Int[np.ndarray, " more"], Solved]:
     """First starts with infeasible ones drawn anew, and more starts for lanes in doubt.
 
     Costs nothing where all starts are feasible and agree.
 
     Args:
-        problem: the study.
+        study: the study.
         settings: of the fit; `more_starts` 0: all stays as it is.
         jobs: lane of each start.
         solved: what they came to.
@@ -97,14 +97,14 @@ def completed(
     if not settings.more_starts:
         return jobs, solved
     slots = np.arange(len(jobs)) % settings.starts
-    solved = _feasible(problem, settings, jobs, slots, solved, solve)
+    solved = _feasible(study, settings, jobs, slots, solved, solve)
     doubt = np.flatnonzero(in_doubt(jobs, solved, weight))
     if not len(doubt):
         return jobs, solved
     more = np.repeat(doubt, settings.more_starts)
     slots = settings.starts + np.tile(np.arange(settings.more_starts), len(doubt))
-    added = solve(more, _drawn(problem, settings, more, slots, 0))
-    added = _feasible(problem, settings, more, slots, added, solve)
+    added = solve(more, _drawn(study, settings, more, slots, 0))
+    added = _feasible(study, settings, more, slots, added, solve)
     both = (np.concatenate(pair) for pair in zip(solved, added, strict=True))
     return np.concatenate([jobs, more]), Solved(*both)
 
@@ -135,27 +135,27 @@ def in_doubt(jobs: np.ndarray, solved: Solved, weight: np.ndarray) -> Bool[np.nd
     return (agree == 0) | alone
 
 
-def _feasible(problem, settings, jobs, slots, solved: Solved, solve: Solve) -> Solved:
+def _feasible(study, settings, jobs, slots, solved: Solved, solve: Solve) -> Solved:
     """`solved` with infeasible starts drawn anew, all together, a few times."""
     solved = Solved(*map(np.array, solved))
     for turn in range(1, REDRAWS + 1):
         rows = np.flatnonzero(solved.status == FitStatus.INFEASIBLE_START)
         if not len(rows):
             break
-        starts = _drawn(problem, settings, jobs[rows], slots[rows], turn)
+        starts = _drawn(study, settings, jobs[rows], slots[rows], turn)
         for old, new in zip(solved, solve(jobs[rows], starts), strict=True):
             old[rows] = new
     return solved
 
 
-def _drawn(problem: Problem, settings, jobs, slots, turn: int) -> Float[np.ndarray, "jobs P"]:
+def _drawn(study: Study, settings, jobs, slots, turn: int) -> Float[np.ndarray, "jobs P"]:
     """A start for each job, uniform in a box 2^turn times as wide, from the lane's own numbers."""
-    _, low, high = box(problem, settings.decades * 2**turn)
+    _, low, high = box(study, settings.decades * 2**turn)
     unit = np.stack(
         [
             np.random.default_rng(
-                [settings.seed, _number(problem.lane_name(lane)), slot, turn]
-            ).uniform(size=problem.size)
+                [settings.seed, _number(study.lane_name(lane)), slot, turn]
+            ).uniform(size=study.size)
             for lane, slot in zip(jobs.tolist(), slots.tolist(), strict=True)
         ]
     )
@@ -167,7 +167,7 @@ def _number(name: tuple[str, str]) -> int:
     return int.from_bytes(hashlib.sha256("\0".join(name).encode()).digest()[:8], "little")
 
 
-def scales(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+def scales(study: Study) -> tuple[np.ndarray, np.ndarray]:
     """Which unknowns have a logarithmic scale, and the step of the others; (lanes, P) each."""
-    log = of_unknowns(problem, lambda p: p.scale == "log", 0.0) > 0
-    return log, of_unknowns(problem, lambda p: p.step, 1.0)
+    log = of_unknowns(study, lambda p: p.scale == "log", 0.0) > 0
+    return log, of_unknowns(study, lambda p: p.step, 1.0)

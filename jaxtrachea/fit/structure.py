@@ -20,10 +20,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea.fit.lane import Lane
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.parameters import SKELETON
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.residual import inputs
 from jaxtrachea.fit.starts import box
+from jaxtrachea.fit.study import Study
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.press import respond
 
@@ -56,64 +57,64 @@ class Structure(NamedTuple):
         return Structure(*(v[lanes] for v in self))
 
 
-def nothing_open(problem: Problem) -> Structure:
+def nothing_open(study: Study) -> Structure:
     """As if every lane could tell all of its unknowns."""
-    none = np.zeros(problem.lanes.lower.shape, bool)
+    none = np.zeros(study.lanes.lower.shape, bool)
     return Structure(none, np.zeros(len(none), int), none.copy())
 
 
-def structure_of(problem: Problem, lanes: Bool[np.ndarray, " lanes"]) -> Structure:
+def structure_of(study: Study, lanes: Bool[np.ndarray, " lanes"]) -> Structure:
     """`structure` of some lanes (of all, if joint and any), the others taken as determined."""
-    if problem.joint and lanes.any():
-        return structure(problem)
-    known, rows = nothing_open(problem), np.flatnonzero(lanes)
+    if study.joint and lanes.any():
+        return structure(study)
+    known, rows = nothing_open(study), np.flatnonzero(lanes)
     if len(rows):
-        for old, new in zip(known, structure(problem.take(rows)), strict=True):
+        for old, new in zip(known, structure(study.take(rows)), strict=True):
             old[rows] = new
     return known
 
 
-def suspicious(problem: Problem) -> Bool[np.ndarray, " lanes"]:
+def suspicious(study: Study) -> Bool[np.ndarray, " lanes"]:
     """Lanes that may leave something open: a count of positions, which needs no program.
 
     Whatever this misses shows in a singular Jacobian at the estimate: one that is regular proves
     the full rank.
     """
-    lanes = problem.lanes
-    beam = sum(p.name in SKELETON for p in problem.free)
-    places = positions(problem)
+    lanes = study.lanes
+    beam = sum(p.name in SKELETON for p in study.free)
+    places = positions(study)
     if lanes.joint_precision is not None:
         marked = (lanes.joint_precision > 0).any(axis=2).sum(axis=2)
         places = places + marked.max(axis=1)
-    names = {p.name for p in problem.free}
+    names = {p.name for p in study.free}
     needed = beam
-    if not _hardens(problem):  # a slope of each curve, in place of its shape
+    if not _hardens(study):  # a slope of each curve, in place of its shape
         needed += len(names & {"k_1", "k_1_ring"})
         if {"onset", "force_offset"} <= names:
             return np.ones(len(places), bool)
     return places < needed
 
 
-def positions(problem: Problem) -> Int[np.ndarray, " lanes"]:
+def positions(study: Study) -> Int[np.ndarray, " lanes"]:
     """Different contact positions of each lane; mirror images about the middle are one."""
-    lanes, middle = problem.lanes, float(problem.geometry.length) / 2
+    lanes, middle = study.lanes, float(study.model.geometry.length) / 2
     observed = (lanes.precision > 0).any(axis=2)
     folded = np.where(observed, np.round(np.abs(lanes.s_c - middle), 6), -1.0)
     return np.array([len(np.unique(row[row >= 0])) for row in folded])
 
 
-def structure(problem: Problem) -> Structure:
+def structure(study: Study) -> Structure:
     """Rank and null space of every lane at generic points; equal lanes are computed once."""
-    kinds, kind_of = _kinds(problem)
-    points = _points(problem)
-    bases = [null_spaces(problem, kinds, points[kinds, k]) for k in range(POINTS)]
-    if problem.joint:
+    kinds, kind_of = _kinds(study)
+    points = _points(study)
+    bases = [null_spaces(study, kinds, points[kinds, k]) for k in range(POINTS)]
+    if study.joint:
         kind_of = np.arange(len(kind_of))
     nullity = np.min([[len(rows) for rows in of_point] for of_point in bases], axis=0)
-    P = problem.size
+    P = study.size
     parts = np.zeros((len(nullity), P))
     pinned = np.zeros((len(nullity), P), bool)
-    names = [[p.name for p, _, _ in problem.unknowns[k]] for k in kinds]
+    names = [[p.name for p, _, _ in study.unknowns[k]] for k in kinds]
     for i, least in enumerate(nullity):
         generic = [of_point[i] for of_point in bases if len(of_point[i]) == least]
         if not least:
@@ -123,10 +124,10 @@ def structure(problem: Problem) -> Structure:
     return Structure(parts[kind_of] > 0.5, nullity[kind_of], pinned[kind_of])
 
 
-def reduced(problem: Problem, pinned: Bool[np.ndarray, "lanes P"]) -> Problem:
+def reduced(study: Study, pinned: Bool[np.ndarray, "lanes P"]) -> Study:
     """The same study with these unknowns held wherever they start."""
-    active = np.where(pinned, 0.0, problem.lanes.active)
-    return dataclasses.replace(problem, lanes=problem.lanes._replace(active=active))
+    active = np.where(pinned, 0.0, study.lanes.active)
+    return dataclasses.replace(study, lanes=study.lanes._replace(active=active))
 
 
 def pins(names: list[str], null_space: Float[np.ndarray, "r P"]) -> Bool[np.ndarray, " P"]:
@@ -159,7 +160,7 @@ def leaving_alone(null_space: Float[np.ndarray, "r P"], i: int) -> Float[np.ndar
 
 
 def null_spaces(
-    problem: Problem,
+    study: Study,
     lanes: Int[np.ndarray, " n"],
     theta: Float[np.ndarray, "n P"],
     nullity: Int[np.ndarray, " n"] | None = None,
@@ -167,17 +168,17 @@ def null_spaces(
     """Orthonormal rows that change no curve of each lane, relative coordinates.
 
     Args:
-        problem: the study; of a joint one `lanes` are all.
+        study: the study; of a joint one `lanes` are all.
         lanes: whose.
         theta: where, scaled coordinates.
         nullity: of each lane; None: by the singular values.
     """
-    J = _seen(problem, lanes, theta)
-    active = problem.lanes.active[lanes] > 0
-    if not problem.joint:
+    J = _seen(study, lanes, theta)
+    active = study.lanes.active[lanes] > 0
+    if not study.joint:
         ranks = [None] * len(lanes) if nullity is None else nullity
         return [_null(j, a, r) for j, a, r in zip(J, active, ranks, strict=True)]
-    return _joint_null_spaces(problem, J, active, nullity)
+    return _joint_null_spaces(study, J, active, nullity)
 
 
 def _null(J, active, nullity=None) -> Float[np.ndarray, "r P"]:
@@ -195,9 +196,9 @@ def _null(J, active, nullity=None) -> Float[np.ndarray, "r P"]:
     return out
 
 
-def _joint_null_spaces(problem: Problem, J, active, nullity) -> list[np.ndarray]:
+def _joint_null_spaces(study: Study, J, active, nullity) -> list[np.ndarray]:
     """Null space of the whole study, as each lane sees it: shared unknowns move in all at once."""
-    shared, P = problem.shared, problem.size
+    shared, P = study.shared, study.size
     rest = []
     for j, k in zip(J, shared, strict=True):
         own = np.setdiff1d(np.arange(P), k)
@@ -218,34 +219,34 @@ def _joint_null_spaces(problem: Problem, J, active, nullity) -> list[np.ndarray]
     return out
 
 
-def _seen(problem: Problem, lanes, theta) -> Float[np.ndarray, "n m P"]:
+def _seen(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     """V J of each lane: all combinations of inputs that its curves tell, by the unknowns."""
-    run, parts = _compiled(problem.program), []
+    run, parts = _compiled(study.model), []
     for first in range(0, len(lanes), _LANES):
         rows = np.minimum(np.arange(first, first + _LANES), len(lanes) - 1)
-        lane = jax.tree.map(lambda v, of=lanes[rows]: v[of], _without_curves(problem))
+        lane = jax.tree.map(lambda v, of=lanes[rows]: v[of], _without_curves(study))
         parts.append(np.asarray(run(jnp.asarray(theta[rows]), lane))[: len(lanes) - first])
     J = np.concatenate(parts)
-    log = _log(problem)[lanes]
+    log = _log(study)[lanes]
     J = J * np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))[:, None, None]
-    V = _curve_sees(problem)
+    V = _curve_sees(study)
     n = V.shape[1]
     of_curve = np.einsum("vn,ltnp->ltvp", V, J[:, :, :n])
     motion = J[:, :, n:]
-    if problem.lanes.joint_precision is not None:
-        visible = (problem.lanes.joint_precision[lanes] > 0).any(axis=2)
+    if study.lanes.joint_precision is not None:
+        visible = (study.lanes.joint_precision[lanes] > 0).any(axis=2)
         motion = motion * visible[..., None]
-    observed = (problem.lanes.precision[lanes] > 0).any(axis=2)
+    observed = (study.lanes.precision[lanes] > 0).any(axis=2)
     J = np.concatenate([of_curve, motion], axis=2) * observed[:, :, None, None]
     return np.nan_to_num(J).reshape(len(lanes), -1, J.shape[-1])
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled(problem: Problem):
+def _compiled(model: FitModel):
     def relative_inputs(theta, lane):
-        x = inputs(problem, theta, lane)
+        x = inputs(model, theta, lane)
         c = jnp.maximum(x.compliance, jnp.finfo(theta.dtype).tiny)
-        felt = problem.options.coupling == "series"
+        felt = model.options.coupling == "series"
         rows = [jnp.log(c) if felt else jnp.zeros_like(c), jnp.log(x.k_1), x.k_3]
         rows = jnp.stack([*rows, x.onset, x.force_offset], axis=1)
         if x.joints is None:
@@ -254,7 +255,7 @@ def _compiled(problem: Problem):
         return jnp.concatenate([rows, x.joints / size], axis=1)
 
     def jacobian(theta: Array, lane: Lane):
-        k_3 = jax.lax.stop_gradient(inputs(problem, theta, lane).k_3)
+        k_3 = jax.lax.stop_gradient(inputs(model, theta, lane).k_3)
         J = jax.jacfwd(relative_inputs)(theta, lane)
         return J.at[:, 2].divide(jnp.where(k_3 != 0, k_3, 1)[:, None])
 
@@ -275,22 +276,22 @@ def _generic(options, hardens: bool) -> Float[np.ndarray, "r n"]:
     return seen if hardens else np.insert(seen, 2, 0, axis=1)
 
 
-def _curve_sees(problem: Problem) -> Float[np.ndarray, "r n"]:
+def _curve_sees(study: Study) -> Float[np.ndarray, "r n"]:
     """Combinations of (log c, log k_1, k_3, onset, offset) that one curve tells; rows."""
-    return _generic(problem.options, _hardens(problem))
+    return _generic(study.model.options, _hardens(study))
 
 
-def _hardens(problem: Problem) -> bool:
+def _hardens(study: Study) -> bool:
     """Whether the local law has a cubic part."""
-    cubic = [p for p in problem.parameters if p.name.startswith("k_3")]
+    cubic = [p for p in study.parameters if p.name.startswith("k_3")]
     return any(not p.fixed or p.value != 0 for p in cubic)
 
 
-def _kinds(problem: Problem) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " lanes"]]:
-    """One lane of every kind (all of a joint problem), and the kind of each lane."""
-    lanes = problem.lanes
+def _kinds(study: Study) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " lanes"]]:
+    """One lane of every kind (all of a joint study), and the kind of each lane."""
+    lanes = study.lanes
     count = len(lanes.s_c)
-    if problem.joint:
+    if study.joint:
         return np.arange(count), np.arange(count)
     marked = lanes.joint_precision
     parts = [lanes.s_c, lanes.index, lanes.value, lanes.active, lanes.lower, lanes.upper]
@@ -302,24 +303,24 @@ def _kinds(problem: Problem) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " l
     return first, kind.reshape(-1)
 
 
-def _points(problem: Problem) -> Float[np.ndarray, "lanes points P"]:
+def _points(study: Study) -> Float[np.ndarray, "lanes points P"]:
     """Generic points of every lane's box; shared unknowns are the same in all lanes."""
-    _, low, high = box(problem, DECADES)
-    unit = np.random.default_rng(20091).uniform(0.02, 0.98, (POINTS, problem.size))
+    _, low, high = box(study, DECADES)
+    unit = np.random.default_rng(20091).uniform(0.02, 0.98, (POINTS, study.size))
     return low[:, None] + unit * (high - low)[:, None]
 
 
-def _log(problem: Problem) -> Bool[np.ndarray, "lanes P"]:
+def _log(study: Study) -> Bool[np.ndarray, "lanes P"]:
     """Which unknowns have a logarithmic scale."""
-    size = problem.size
+    size = study.size
     return np.array(
-        [[p.scale == "log" for p, _, _ in u] + [True] * (size - len(u)) for u in problem.unknowns]
+        [[p.scale == "log" for p, _, _ in u] + [True] * (size - len(u)) for u in study.unknowns]
     )
 
 
-def _without_curves(problem: Problem) -> Lane:
+def _without_curves(study: Study) -> Lane:
     """Lanes whose curves have one sample: what the inputs need and no more."""
-    lanes = problem.lanes
+    lanes = study.lanes
     one = {name: getattr(lanes, name)[:, :, :1] for name in ("displacement", "force", "precision")}
     if lanes.joints is not None:
         one |= {name: getattr(lanes, name)[:, :, :1] for name in ("joints", "joint_precision")}

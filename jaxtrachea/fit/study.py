@@ -1,225 +1,399 @@
-"""From a fit specification to a problem: opens the files, names what is wrong, builds the lanes."""
+"""From curves to a study: lanes of padded arrays, with the model they are fitted by.
+
+A *lane* is the smallest set of curves that share unknowns: the whole study if any parameter is
+shared, one specimen otherwise, one trial if all free parameters belong to trials. In a *joint*
+study lanes are specimens although they share unknowns: every lane holds a copy of the shared
+ones, and the solver keeps the copies equal. Lanes have equal shapes (curves of unequal length are
+padded with weight zero), so that one compiled program fits any number of them at once. What they
+are compared with is in `residual`.
+"""
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Literal
 
-from jaxtrachea.config import FitSpec, ParameterSection, SpecError
-from jaxtrachea.fit.levenberg_marquardt import MOST_SEATS, Tolerances
-from jaxtrachea.fit.parameters import DEFAULTS, Parameter, in_model
-from jaxtrachea.fit.problem import Noise, Problem, build, check_curve
-from jaxtrachea.fit.result import Settings
-from jaxtrachea.measurements.read import (
-    BadCurve,
-    Measurements,
-)
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from jaxtrachea._arguments import check_record, check_word
+from jaxtrachea.fit.lane import Lane
+from jaxtrachea.fit.model import Common, FitModel, Loss, columns_of, numbers_of
+from jaxtrachea.fit.onset import blends, natural_steps, onset_is_sought, within_reach
+from jaxtrachea.fit.parameters import DEFAULTS, SKELETON, Parameter, in_model
+from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.trachea.section import geometry_of
-from jaxtrachea.units import parse_quantity
+from jaxtrachea.trachea.geometry import Geometry
+
+Balance = Literal["curve", "sample"]
+#: The table of parameters, or what differs from the defaults of the model, by name.
+Table = Sequence[Parameter] | Mapping[str, Mapping[str, object]]
 
 
-def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Parameter, ...]:
-    """The parameter table of the chosen model with the user's changes.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Study:
+    """Measurements divided into lanes, ready to be fitted with a model; from `build_study`.
+
+    Attributes:
+        model: what is fitted (static); programs are compiled for it.
+        parameters: all parameters of the model, free and fixed, in column order.
+        lanes: stacked arrays with the leading axis `lanes`, numpy.
+        curves: for each lane, its curves in trial order.
+        unknowns: for each lane, the (parameter, specimen or "", trial or "") of every unknown.
+        noise_given: whether sigma of (force, markers) is known.
+        joint: whether shared unknowns are one and the same in all lanes.
+    """
+
+    model: FitModel
+    parameters: tuple[Parameter, ...]
+    lanes: Lane
+    curves: tuple[tuple[Curve, ...], ...]
+    unknowns: tuple[tuple[tuple[Parameter, str, str], ...], ...]
+    noise_given: tuple[bool, bool]
+    joint: bool = False
+
+    def __post_init__(self):
+        """Refuse a model of another parameter table.
+
+        Raises:
+            ValueError: with the columns of both.
+        """
+        if (of_table := columns_of(self.parameters)) != self.model.columns:
+            raise ValueError(
+                f"the model has the columns {self.model.columns}, the parameter table gives "
+                f"{of_table}; replace both together"
+            )
+
+    @property
+    def free(self) -> tuple[Parameter, ...]:
+        """Parameters that are fitted, in column order."""
+        return tuple(p for p in self.parameters if not p.fixed)
+
+    @property
+    def free_columns(self) -> tuple[int, ...]:
+        """Columns of the parameter table that are fitted."""
+        return tuple(j for j, p in enumerate(self.parameters) if not p.fixed)
+
+    @property
+    def size(self) -> int:
+        """Unknowns per lane, padding included."""
+        return self.lanes.lower.shape[1]
+
+    @property
+    def shared(self) -> Int[np.ndarray, "lanes k"]:
+        """Where the unknowns that all lanes of a joint study share stand in each lane."""
+        names = [p.name for p in self.free if p.scope == "shared"] if self.joint else []
+        rows = [{p.name: i for i, (p, _, _) in enumerate(lane)} for lane in self.unknowns]
+        return np.array([[row[name] for name in names] for row in rows], int).reshape(
+            len(self.unknowns), len(names)
+        )
+
+    def refuse_joint(self, what: str) -> None:
+        """Say that something is made for lanes that are fitted one by one.
+
+        Raises:
+            ValueError: the study is joint.
+        """
+        if self.joint:
+            raise ValueError(f"{what} needs lanes without shared unknowns; build with joint=False")
+
+    def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":
+        """The same study with these lanes, in this order; a lane may come more than once."""
+        return dataclasses.replace(
+            self,
+            lanes=jax.tree.map(lambda v: v[lanes], self.lanes),
+            curves=tuple(self.curves[k] for k in lanes),
+            unknowns=tuple(self.unknowns[k] for k in lanes),
+        )
+
+    def lane_name(self, lane: int) -> tuple[str, str]:
+        """Specimen and trial of a lane; "(all)" where it spans several."""
+        one = lambda names: names.pop() if len(names) == 1 else "(all)"  # noqa: E731
+        curves = self.curves[lane]
+        return one({c.specimen for c in curves}), one({c.trial for c in curves})
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise:
+    """Standard deviations; None: estimated from the residuals.
+
+    Attributes:
+        force: N; a curve's own per-sample sigma comes before it.
+        joints: mm.
+    """
+
+    force: float | None = None
+    joints: float | None = None
+
+    def __post_init__(self):
+        """Refuse words and numbers that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_record(self)
+        for name in ("force", "joints"):
+            if (value := getattr(self, name)) is not None and value <= 0:
+                raise ValueError(
+                    f"{name} is {value:g}; expected a standard deviation of more than 0, or None"
+                )
+
+
+def group(
+    curves: Sequence[Curve], parameters: Sequence[Parameter], *, joint: bool = False
+) -> list[list[Curve]]:
+    """Divide curves into lanes by the widest scope among the free parameters.
+
+    By specimens if joint, or if none is free.
+    """
+    scopes = {"specimen"} if joint else {p.scope for p in parameters if not p.fixed}
+    scopes = scopes or {"specimen"}
+    if "shared" in scopes:
+        return [list(curves)]
+    lanes: dict[tuple[str, str], list[Curve]] = {}
+    for curve in curves:
+        key = (curve.specimen, "" if "specimen" in scopes else curve.trial)
+        lanes.setdefault(key, []).append(curve)
+    return list(lanes.values())
+
+
+def build_study(
+    curves: Sequence[Curve],
+    geometry: Geometry,
+    options: Options = Options(),  # noqa: B008 (frozen)
+    parameters: Table | None = None,
+    *,
+    noise: Noise = Noise(),  # noqa: B008 (frozen)
+    balance: Balance = "curve",
+    loss: Loss = "linear",
+    loss_scale: float = 1.345,
+    tool_radius: float | None = None,
+    joint: bool = False,
+) -> Study:
+    """Put curves, model and parameters together.
+
+    Args:
+        curves: at least one; `s_c` set wherever the skeleton enters.
+        geometry: the tube at rest (`Geometry.create` takes plain numbers; kept as float64).
+        options: what the model includes.
+        parameters: the table, in the order of `parameters.in_model`; or changes to the defaults of
+            the model, `{"k_1": {"value": 2.0}, "EI_L": {"fixed": True}}`; None: the defaults.
+        noise: known standard deviations.
+        balance: `curve` (every curve weighs the same, however long) or `sample`.
+        loss: see `FitModel`.
+        loss_scale: see `FitModel`.
+        tool_radius: mm; markers closer to the contact are held by the tool and left out. None: all
+            are used.
+        joint: one lane per specimen even if parameters are shared; without effect if none is, or
+            if there is but one specimen.
 
     Raises:
-        SpecError: a parameter the model does not have, or values that contradict each other.
+        ValueError: an unknown `balance` or `loss`, no curve, a marker on a ring that does not
+            exist, a curve without a contact position where one is needed, with specimen and trial
+            named; a parameter that the model does not have.
+    """
+    check_word("balance", balance, Balance)
+    check_word("loss", loss, Loss)
+    if not 0 < loss_scale < np.inf:
+        raise ValueError(f"loss_scale is {loss_scale}; expected a finite number, more than 0")
+    if tool_radius is not None and not 0 <= tool_radius < np.inf:
+        raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
+    if not curves:
+        raise ValueError("no usable curve; nothing to fit")
+    for curve in curves:
+        check_curve(curve, geometry, options)
+    parameters = natural_steps(_table(parameters, options, curves), curves)
+    joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
+    joint = joint and len({c.specimen for c in curves}) > 1
+    groups = group(curves, parameters, joint=joint)
+    unknowns = [_unknowns(lane, parameters) for lane in groups]
+    sizes = _Sizes(
+        trials=max(map(len, groups)),
+        samples=max(len(c.force) for c in curves),
+        rings=geometry.rings,
+        unknowns=max(map(len, unknowns)),
+        joints=any(c.joint_displacement is not None for c in curves),
+    )
+    mean_length = float(np.mean([len(c.force) for c in curves]))
+    reach = -1.0 if tool_radius is None else tool_radius
+    lanes = [
+        _lane(lane, names, parameters, geometry, noise, balance, mean_length, reach, sizes)
+        for lane, names in zip(groups, unknowns, strict=True)
+    ]
+    stacked = jax.tree.map(lambda *arrays: np.stack(arrays), *lanes)
+    if onset_is_sought(parameters, options):
+        stacked = stacked._replace(blend=blends(stacked, groups, noise.force, parameters, options))
+        stacked = within_reach(stacked, parameters)
+    known = noise.force is not None or all(c.sigma is not None for c in curves)
+    model = FitModel(
+        tube=numbers_of(geometry),
+        options=options,
+        columns=columns_of(parameters),
+        loss=loss,
+        loss_scale=float(loss_scale),
+        common=_common(unknowns, parameters),
+    )
+    return Study(
+        model=model,
+        parameters=tuple(parameters),
+        lanes=stacked,
+        curves=tuple(map(tuple, groups)),
+        unknowns=tuple(map(tuple, unknowns)),
+        noise_given=(known, noise.joints is not None),
+        joint=joint,
+    )
+
+
+def _table(parameters: Table | None, options: Options, curves) -> Sequence[Parameter]:
+    """The table itself, or the defaults of the model with changes."""
+    if parameters is not None and not isinstance(parameters, Mapping):
+        return parameters
+    changes = parameters or {}
+    joints = any(c.joint_displacement is not None for c in curves)
+    return default_parameters(table_names(options, changes, joints=joints), changes)
+
+
+def table_names(options: Options, changed: Collection[str], *, joints: bool) -> list[str]:
+    """Names of `parameters.in_model` that make a table where `changed` are asked for.
+
+    Unless asked for, a ring hardens like the ligament: k_3_ring is then k_3, not a parameter.
     """
     names = in_model(options, joints=joints)
-    for name in spec.parameters:
-        if name not in names:
-            known = "not a parameter" if name not in DEFAULTS else "not seen by this model"
-            raise SpecError(f"parameters.{name}: {known}; expected one of {', '.join(names)}")
-    # Unless asked for, a ring hardens like the ligament: k_3_ring is then k_3, not a parameter.
-    names = [n for n in names if n != "k_3_ring" or n in spec.parameters]
-    return tuple(_parameter(DEFAULTS[n], spec.parameters.get(n)) for n in names)
+    return [name for name in names if name != "k_3_ring" or name in changed]
 
 
-def _parameter(default: Parameter, section: ParameterSection | None) -> Parameter:
-    """One row of the table.
-
-    Raises:
-        SpecError: with the dotted key.
-    """
-    if section is None:
-        return default
-    try:
-        if section.fixed is not None:
-            return _fixed(default, section.fixed)
-        return _free(default, section)
-    except ValueError as error:
-        text = str(error).removeprefix(f"{default.name}: ")
-        raise SpecError(f"parameters.{default.name}: {text}") from None
+@dataclasses.dataclass(frozen=True)
+class _Sizes:
+    trials: int
+    samples: int
+    rings: int
+    unknowns: int
+    joints: bool
 
 
-def _number(default: Parameter, key: str, value: str | float | int) -> float:
-    """A value in the parameter's unit; a bare number is in it already."""
-    if not isinstance(value, str):
-        return float(value)
-    try:
-        return parse_quantity(value, default.dimension)
-    except ValueError as error:
-        raise ValueError(f"{key}: {error}") from None
-
-
-def _fixed(default: Parameter, given: str | float | int) -> Parameter:
-    value = _number(default, "fixed", given)
-    if default.scale == "log" and value <= 0:
-        raise ValueError(f"fixed: {value:g} {default.unit} is no stiffness; expected more than 0")
-    return dataclasses.replace(default, value=value, fixed=True)
-
-
-def _free(default: Parameter, section: ParameterSection) -> Parameter:
-    lower, upper = default.lower, default.upper
-    scale = section.scale or default.scale
-    if section.bounds is not None:
-        lower, upper = (_number(default, "bounds", v) for v in section.bounds)
-    elif scale == "log":
-        lower = max(lower, 1e-9)
-    if section.initial is not None:
-        value = _number(default, "initial", section.initial)
-    else:
-        value = min(max(default.value, lower), upper)
-    scope = section.scope or default.scope
-    return dataclasses.replace(
-        default, value=value, lower=lower, upper=upper, scale=scale, scope=scope, fixed=False
-    )
-
-
-def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
-    """The measurements with curves that this tube and model cannot press moved to the bad ones.
+def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
+    """Refuse a curve that the model cannot press.
 
     Raises:
-        SpecError: not one curve is left; the message is that of the first.
+        ValueError: no contact position, one outside the tube or off the midline, a marker on a ring
+            that does not exist; specimen and trial are named.
     """
-    geometry, options = geometry_of(spec.trachea), Options(**spec.model.model_dump())
-    good, bad = [], list(measurements.bad)
-    reasons = []
-    for curve in measurements.curves:
-        try:
-            check_curve(curve, geometry, options)
-        except ValueError as error:
-            text = str(error)
-            reasons.append(f"{curve.source}: {text}")
-            text = text.split(": ", 1)[-1]
-            cure = "correct the file, or the trachea and model sections"
-            bad.append(BadCurve(curve.specimen, curve.trial, curve.source, "position", text, cure))
-        else:
-            good.append(curve)
-    if reasons and not good:
-        raise SpecError(reasons[0])
-    return dataclasses.replace(measurements, curves=tuple(good), bad=tuple(bad))
-
-
-#: Unknowns up to which a study with shared parameters is refitted as one dense lane.
-MOST_DENSE = 500
-
-
-def problem_of(spec: FitSpec, measurements: Measurements, *, refits: bool = False) -> Problem:
-    """Everything together; parameters that are shared are fitted jointly, specimens as lanes.
-
-    What looks at whole lanes (profiles, bootstrap, posterior, influence, leaving out, design,
-    comparison) and methods other than
-    Levenberg-Marquardt get one dense lane in place of the joint problem.
-
-    Args:
-        spec: the specification.
-        measurements: what to fit.
-        refits: something that refits lanes was asked for outside the specification.
-
-    Raises:
-        SpecError: with the key, or the specimen and trial, that cannot be used.
-    """
-    u = spec.uncertainty
-    asked = u.profile or u.bootstrap or u.posterior or u.influence
-    joint = not (refits or asked or spec.fit.method != "levenberg-marquardt")
-    problem = _built(spec, measurements, joint)
-    shared = [p.name for p in problem.free if p.scope == "shared"]
-    if shared and not joint and problem.size > MOST_DENSE:
-        raise SpecError(
-            f"parameters.{shared[0]}: shared, so that {problem.size} unknowns depend on each "
-            "other; profiles, bootstrap, posterior, influence, --leave-one-out, design, compare "
-            f"and methods other than levenberg-marquardt take at most {MOST_DENSE}; leave them out "
-            "(the joint fit has no limit), or give it the scope 'specimen'"
-        )
-    return problem
-
-
-def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Problem:
-    options = Options(**spec.model.model_dump())
-    curves = measurements.curves
-    joints = any(c.joint_displacement is not None for c in curves)
-    given = (spec.noise.force, spec.noise.joints)
-    noise = Noise(*(None if sigma == "estimate" else sigma for sigma in given))
-    try:
-        return build(
-            curves,
-            geometry_of(spec.trachea),
-            options,
-            parameters_of(spec, options, joints=joints),
-            noise=noise,
-            balance=spec.fit.balance,
-            loss=spec.fit.loss,
-            loss_scale=spec.fit.loss_scale,
-            tool_radius=spec.data.tool_radius,
-            joint=joint,
-        )
-    except SpecError:
-        raise
-    except ValueError as error:
-        raise SpecError(str(error)) from None
-
-
-def profiled(spec: FitSpec, problem: Problem, *, asked: bool) -> tuple[str, ...]:
-    """Names of the parameters to profile: those of the specification, all if only asked for.
-
-    Raises:
-        SpecError: one is not fitted.
-    """
-    names, free = spec.uncertainty.profile, tuple(p.name for p in problem.free)
-    for name in names:
-        if name not in (*free, "all"):
-            raise SpecError(
-                f"uncertainty.profile: {name!r} is not fitted; expected 'all' or names out of "
-                f"{', '.join(free)}"
+    where = f"specimen {curve.specimen!r} trial {curve.trial!r}"
+    length, rings = float(geometry.length), geometry.rings
+    if curve.s_c is None:
+        if options.coupling == "series":
+            raise ValueError(
+                f"{where}: no contact position; give a column s, or data.s for all curves "
+                "(coupling = 'total' needs none)"
             )
-    return free if "all" in names or (asked and not names) else tuple(names)
+    elif not 0 <= curve.s_c <= length:
+        raise ValueError(
+            f"{where}: contact at s = {curve.s_c:g} mm, expected on the tube, 0 to {length:g} mm"
+        )
+    if options.coupling == "series" and abs(curve.phi_c) > 1e-6:
+        raise ValueError(
+            f"{where}: contact at phi = {np.degrees(curve.phi_c):.3g} deg; this model presses on "
+            "the anterior midline (phi = 0) only"
+        )
+    if curve.joint_rings is not None and np.any(curve.joint_rings >= rings):
+        raise ValueError(f"{where}: marker on ring {curve.joint_rings.max() + 1} of {rings}")
 
 
-def refuse_without_unknowns(spec: FitSpec, problem: Problem, options: Collection[str]) -> None:
-    """Say what has no meaning where every parameter is fixed.
+def _unknowns(lane: list[Curve], parameters) -> list[tuple[Parameter, str, str]]:
+    """Distinct unknowns of a lane, in parameter order."""
+    names: dict[tuple[Parameter, str, str], None] = {}
+    for p in parameters:
+        if not p.fixed:
+            for curve in lane:
+                names.setdefault(_key(p, curve))
+    return list(names)
 
-    Args:
-        spec: the specification.
-        problem: the study.
-        options: of the command line, without dashes.
+
+def _common(unknowns, parameters) -> Common:
+    """See `FitModel.common`."""
+    free = [p.name for p in parameters if not p.fixed]
+    names = [[p.name for p, _, _ in lane] for lane in unknowns]
+    if all(lane == free for lane in names):
+        return "all"
+    beams = ([name for name in lane if name in SKELETON] for lane in names)
+    return "beam" if all(len(b) == len(set(b)) for b in beams) else "nothing"
+
+
+def _key(p: Parameter, curve: Curve) -> tuple[Parameter, str, str]:
+    specimen = "" if p.scope == "shared" else curve.specimen
+    return p, specimen, curve.trial if p.scope == "trial" else ""
+
+
+def _lane(
+    curves, unknowns, parameters, geometry, noise, balance, mean_length, reach, sizes
+) -> Lane:
+    """One lane as padded float64 arrays."""
+    T, N, J, P = sizes.trials, sizes.samples, len(parameters), sizes.unknowns
+    joints = np.zeros((T, N, sizes.rings)) if sizes.joints else None
+    lane: dict[str, Any] = {
+        "s_c": np.full(T, float(geometry.length) / 2),
+        "displacement": np.zeros((T, N)),
+        "force": np.zeros((T, N)),
+        "precision": np.zeros((T, N)),
+        "joints": joints,
+        "joint_precision": None if joints is None else joints.copy(),
+        "balance": np.ones(T),
+        "blend": None,
+        "value": np.tile([p.value for p in parameters], (T, 1)).astype(np.float64),
+        "index": np.full((T, J), -1, np.int32),
+        "lower": np.zeros(P),
+        "upper": np.zeros(P),
+        "active": np.zeros(P),
+    }
+    place = {key: i for i, key in enumerate(unknowns)}
+    for i, (p, _, _) in enumerate(unknowns):
+        lane["lower"][i], lane["upper"][i] = p.to_scaled(p.lower), p.to_scaled(p.upper)
+        lane["active"][i] = 1
+    for t, curve in enumerate(curves):
+        n = len(curve.force)
+        if curve.s_c is not None:
+            lane["s_c"][t] = curve.s_c
+        lane["displacement"][t, :n], lane["force"][t, :n] = curve.displacement, curve.force
+        sigma = curve.sigma if curve.sigma is not None else noise.force
+        lane["precision"][t, :n] = 1.0 if sigma is None else 1 / np.asarray(sigma)
+        lane["balance"][t] = np.sqrt(mean_length / n) if balance == "curve" else 1.0
+        for j, p in enumerate(parameters):
+            if not p.fixed:
+                lane["index"][t, j] = place[_key(p, curve)]
+        if curve.joint_displacement is not None and curve.joint_rings is not None:
+            weight = 1.0 if noise.joints is None else 1 / noise.joints
+            seen, at = _seen_joints(curve, geometry, reach), curve.joint_rings
+            lane["joints"][t, :n, at] = np.where(seen, curve.joint_displacement, 0).T
+            lane["joint_precision"][t, :n, at] = np.where(seen, weight, 0).T
+    return Lane(**lane)
+
+
+def _seen_joints(curve: Curve, geometry: Geometry, reach: float) -> np.ndarray:
+    """Which markers of a curve count: observed, and not under the tool; (N, M)."""
+    seen = np.isfinite(np.asarray(curve.joint_displacement))
+    x = np.asarray(geometry.ring_positions)[curve.joint_rings]
+    return seen if curve.s_c is None else seen & (np.abs(x - curve.s_c) > reach)
+
+
+def default_parameters(
+    names: Sequence[str], changes: Mapping[str, Mapping[str, object]]
+) -> tuple[Parameter, ...]:
+    """Table rows for `names` with the user's changes.
 
     Raises:
-        SpecError: something was asked for that needs a free parameter; it is named.
+        ValueError: a change names a parameter that the chosen model does not contain, or something
+            that a parameter does not have.
     """
-    if problem.free:
-        return
-    u = spec.uncertainty
-    asked = {"profile": u.profile, "bootstrap": u.bootstrap, "posterior": u.posterior,
-             "influence": u.influence}  # fmt: skip
-    names = [f"--{name}" for name in options]
-    names += [f"uncertainty.{name}" for name, wanted in asked.items() if wanted]
-    if names:
-        raise SpecError(
-            f"{', '.join(names)}: every parameter is fixed, so that there is no estimate to be "
-            "doubted; leave it out (the model is then evaluated), or free a parameter"
+    unknown = [name for name in changes if name not in names]
+    if unknown:
+        raise ValueError(
+            f"parameters.{unknown[0]}: not part of this model, which has {', '.join(names)}"
         )
-
-
-def settings_of(spec: FitSpec) -> Settings:
-    """Solver settings of the [fit] section; `chunk` is its upper bound if left to the machine."""
-    f = spec.fit
-    limits = Tolerances(f.tolerance, f.tolerance, f.tolerance, f.max_iterations)
-    return Settings(
-        method=f.method,
-        starts=f.starts,
-        decades=f.start_decades,
-        seed=f.seed,
-        more_starts=f.more_starts,
-        chunk=MOST_SEATS if f.chunk == "auto" else f.chunk,
-        tolerances=limits,
-        float32=f.precision == "float32",
-    )
+    known = [f.name for f in dataclasses.fields(Parameter) if f.name != "name"]
+    for name, change in changes.items():
+        for key in change:
+            if key not in known:
+                raise ValueError(
+                    f"parameters.{name}: {key!r} is not known; expected one of {', '.join(known)}"
+                )
+    return tuple(dataclasses.replace(DEFAULTS[n], **changes.get(n, {})) for n in names)

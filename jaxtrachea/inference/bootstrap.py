@@ -77,11 +77,11 @@ def bootstrap(
         progress: called with (refits done since the last call, refits in all).
 
     Raises:
-        ValueError: too few replicates, an impossible block, or a joint problem.
+        ValueError: too few replicates, an impossible block, or a joint study.
     """
     _check(count, kind, block)
-    result.problem.refuse_joint("the bootstrap")
-    seen = predictions(result.problem, result.theta)
+    result.study.refuse_joint("the bootstrap")
+    seen = predictions(result.study, result.theta)
     chunk = chunk_size(max(result.lanes * settings.starts, 16), settings.chunk)
     one = dataclasses.replace(settings, starts=1, chunk=chunk, scrutiny=False)
     thetas, usable = [], []
@@ -90,7 +90,7 @@ def bootstrap(
         lanes = np.arange(first, min(first + together, result.lanes))
         drawn = _draw(result, seen, lanes, count, kind, block, settings.seed)
         rows = lanes.repeat(count)
-        chosen = result.problem.take(rows)
+        chosen = result.study.take(rows)
         again = fit(dataclasses.replace(chosen, lanes=drawn), one, starts=result.theta[rows])
         thetas.append(again.theta.reshape(len(lanes), count, -1))
         usable.append(again.succeeded.reshape(len(lanes), count))
@@ -110,7 +110,7 @@ def _check(count, kind, block) -> None:
 
 def _draw(result: FitResult, seen: Prediction, lanes, count, kind, block, seed) -> Lane:
     """Lanes of `count` resampled data sets of each of `lanes`."""
-    data = result.problem.lanes
+    data = result.study.lanes
     draw = _normal if kind == "parametric" else _blocks
     force, joints = [], []
     for lane in lanes:
@@ -119,14 +119,14 @@ def _draw(result: FitResult, seen: Prediction, lanes, count, kind, block, seed) 
         force.append(data.force[lane] + np.nan_to_num(seen.force[lane]) + noise)
         if data.joints is not None and seen.joints is not None and marker_noise is not None:
             joints.append(data.joints[lane] + np.nan_to_num(seen.joints[lane]) + marker_noise)
-    drawn = result.problem.take(lanes.repeat(count)).lanes
+    drawn = result.study.take(lanes.repeat(count)).lanes
     drawn = drawn._replace(force=np.concatenate(force))
     return drawn._replace(joints=np.concatenate(joints)) if joints else drawn
 
 
 def _normal(rng, result: FitResult, seen: Prediction, lane, count, block):
     """Normal noise of every observed entry, N and mm; (count, T, N) and (count, T, N, rings)."""
-    data, sigma = result.problem.lanes, result.whitened_sigma[lane]
+    data, sigma = result.study.lanes, result.whitened_sigma[lane]
 
     def noise(precision, sigma):
         seen = precision > 0
@@ -139,13 +139,13 @@ def _normal(rng, result: FitResult, seen: Prediction, lane, count, block):
 
 def _blocks(rng, result: FitResult, seen: Prediction, lane, count, block):
     """Residuals of each curve drawn in blocks, in units of their own sigma; as `_normal`."""
-    data = result.problem.lanes
+    data = result.study.lanes
     total = float(result.samples[lane])
     unknowns = float(data.active[lane].sum())
     enlarge = np.sqrt(total / max(total - unknowns, 1))
     noise = np.zeros((count, *data.force[lane].shape))
     markers = None if data.joints is None else np.zeros((count, *data.joints[lane].shape))
-    for t, curve in enumerate(result.problem.curves[lane]):
+    for t, curve in enumerate(result.study.curves[lane]):
         n = len(curve.force)
         starts = rng.integers(n, size=(count, -(-n // block)))
         at = ((starts[:, :, None] + np.arange(block)) % n).reshape(count, -1)[:, :n]
@@ -169,7 +169,7 @@ def _resample(residual, precision, at) -> np.ndarray:
 def _summary(result: FitResult, theta, usable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Percentile interval and standard error, units of the parameters."""
     lower, upper, error = (np.full(result.theta.shape, np.nan) for _ in range(3))
-    for lane, unknowns in enumerate(result.problem.unknowns):
+    for lane, unknowns in enumerate(result.study.unknowns):
         good = theta[lane][usable[lane]]
         if len(good) < FEWEST:
             continue

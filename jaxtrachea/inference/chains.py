@@ -50,7 +50,7 @@ def quantiles(
 ) -> Float[np.ndarray, "3 P"]:
     """Median and 95 % interval of every unknown in its unit; (3, P)."""
     out = np.full((3, theta.shape[-1]), np.nan)
-    for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+    for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
         if np.isfinite(theta[..., i]).all():
             ends = np.quantile(theta[..., i], [0.5, 0.025, 0.975])
             out[:, i] = [p.from_scaled(float(v)) for v in ends]

@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from jaxtrachea.fit.criteria import Criteria, weights
 from jaxtrachea.fit.predictions import predictions, rms
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.cross_validation import Missed
 from jaxtrachea.inference.effective import CORRELATED, effective_samples
 
@@ -73,44 +73,44 @@ class Row:
     effective_samples: float
 
 
-def same_data(problems: Sequence[Problem], names: Sequence[str]) -> None:
+def same_data(studies: Sequence[Study], names: Sequence[str]) -> None:
     """Refuse models that were not fitted to the same samples in the same way.
 
     Raises:
         ValueError: which two differ, in what, and the cure.
     """
-    first = problems[0]
-    for problem, name in zip(problems[1:], names[1:], strict=True):
+    first = studies[0]
+    for study, name in zip(studies[1:], names[1:], strict=True):
         pair = f"{names[0]} and {name}"
-        if problem.loss != "linear" or first.loss != "linear":
+        if study.model.loss != "linear" or first.model.loss != "linear":
             raise ValueError(f"fit.loss of {pair}: criteria need a likelihood; use 'linear'")
-        if _curves(problem) != _curves(first):
+        if _curves(study) != _curves(first):
             raise ValueError(f"{pair} use different samples; give both the same [data] section")
-        if problem.noise_given != first.noise_given or not _same_noise(problem, first):
+        if study.noise_given != first.noise_given or not _same_noise(study, first):
             raise ValueError(
                 f"{pair} count noise or curves differently; give both the same [noise], "
                 "fit.balance and data.tool_radius"
             )
 
 
-def _curves(problem: Problem) -> set[tuple]:
+def _curves(study: Study) -> set[tuple]:
     """Every curve as something that can be compared."""
     said = lambda v: None if v is None else v.tobytes()  # noqa: E731
     return {
         (c.specimen, c.trial, c.s_c, *map(said, (c.displacement, c.force, c.joint_displacement)))
-        for lane in problem.curves
+        for lane in study.curves
         for c in lane
     }
 
 
-def _same_noise(a: Problem, b: Problem) -> bool:
+def _same_noise(a: Study, b: Study) -> bool:
     """Whether weights of samples agree, in whatever lanes they are."""
 
-    def known(problem):
-        lanes = problem.lanes
+    def known(study):
+        lanes = study.lanes
         seen = [lanes.precision, lanes.joint_precision]
         weighted = (np.ravel(v) for v in seen if v is not None)
-        curves = sum(map(len, problem.curves))
+        curves = sum(map(len, study.curves))
         balance = np.ravel(lanes.balance * np.any(lanes.precision > 0, axis=2))
         parts = [*weighted, balance]
         return curves, [np.sort(v[v > 0]) for v in parts]
@@ -126,7 +126,7 @@ def compared(models: Sequence[Model]) -> tuple[list[Row], int]:
     Lanes that a model could not fit count for none. Where the models divide the study in different
     lanes (one shares a parameter, another not) only the sum is compared.
     """
-    names = [[m.result.problem.lane_name(k) for k in range(m.result.lanes)] for m in models]
+    names = [[m.result.study.lane_name(k) for k in range(m.result.lanes)] for m in models]
     worth = [_worth(m) for m in models]
     if any(n != names[0] for n in names):
         usable = [m.result.succeeded for m in models]
@@ -148,7 +148,7 @@ def compared(models: Sequence[Model]) -> tuple[list[Row], int]:
 def _worth(model: Model) -> Float[np.ndarray, " lanes"]:
     """Independent samples that those of each lane are worth by the residuals of a model."""
     result = model.result
-    worth = effective_samples(predictions(result.problem, result.theta))
+    worth = effective_samples(predictions(result.study, result.theta))
     return np.where(np.isnan(worth), np.asarray(result.samples, float), worth)
 
 

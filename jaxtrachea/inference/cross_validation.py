@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, Int
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import OF_THE_PRESS
 from jaxtrachea.fit.predictions import predictions, rms
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.starts import draw_starts
+from jaxtrachea.fit.study import Study
 from jaxtrachea.measurements.read import Curve
 
 
@@ -21,7 +21,7 @@ class LeftOut:
     """Errors of curves that took no part in the fit that predicts them.
 
     Attributes:
-        lane: lane of each, in the original problem.
+        lane: lane of each, in the original study.
         trial: index of the left-out trial.
         force: rms force residual over the curve's peak force.
         joints: rms of marker residual over tool displacement (beyond half the largest one); NaN
@@ -64,41 +64,41 @@ def refits_sentence(refits: int, unconverged: int, lost: int) -> str:
     return "; ".join(said)
 
 
-def curves_to_leave_out(problem: Problem) -> list[tuple[int, int]]:
+def curves_to_leave_out(study: Study) -> list[tuple[int, int]]:
     """Lane and trial of every curve that the others of its lane can predict.
 
     Raises:
         ValueError: no lane has two curves, or an unknown other than onset and offset belongs to a
             trial (a curve left out could then not be predicted).
     """
-    problem.refuse_joint("leaving curves out")
-    own = [p.name for p in problem.free if p.scope == "trial" and p.name not in OF_THE_PRESS]
+    study.refuse_joint("leaving curves out")
+    own = [p.name for p in study.free if p.scope == "trial" and p.name not in OF_THE_PRESS]
     if own:
         raise ValueError(
             f"{', '.join(own)} belongs to single trials, which no other curve can tell; fix it, or "
             "give it the scope 'specimen' or 'shared'"
         )
-    pairs = [(k, t) for k, c in enumerate(problem.curves) if len(c) > 1 for t in range(len(c))]
+    pairs = [(k, t) for k, c in enumerate(study.curves) if len(c) > 1 for t in range(len(c))]
     if not pairs:
         raise ValueError("needs at least two curves that share their parameters; found none")
     return pairs
 
 
-def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOut:
+def leave_one_out(study: Study, settings: Settings, progress=None) -> LeftOut:
     """Fit every lane once without each of its curves, and predict that curve.
 
     A curve left out fits an onset or an offset of its own, all other unknowns kept.
 
     Args:
-        problem: lanes with two curves or more are used.
+        study: lanes with two curves or more are used.
         settings: as for `fit`.
         progress: as for `fit`.
 
     Raises:
         ValueError: as `curves_to_leave_out`.
     """
-    lane, trial = (np.array(v) for v in zip(*curves_to_leave_out(problem), strict=True))
-    chosen = problem.take(lane)
+    lane, trial = (np.array(v) for v in zip(*curves_to_leave_out(study), strict=True))
+    chosen = study.take(lane)
     lanes = chosen.lanes
     rows = np.arange(len(lane))
     held = np.zeros(lanes.s_c.shape, bool)
@@ -131,27 +131,25 @@ def leave_one_out(problem: Problem, settings: Settings, progress=None) -> LeftOu
     )
 
 
-def without(problem: Problem, held: Bool[np.ndarray, "lanes T"]) -> Problem:
+def without(study: Study, held: Bool[np.ndarray, "lanes T"]) -> Study:
     """The same lanes, blind to the trials held back; what these alone read is no unknown."""
     blind = lambda v: None if v is None else np.where(held[:, :, *[None] * (v.ndim - 2)], 0, v)  # noqa: E731
-    lanes = problem.lanes
+    lanes = study.lanes
     seen = lanes._replace(
         precision=blind(lanes.precision), joint_precision=blind(lanes.joint_precision)
     )
-    own = own_unknowns(problem, held)
+    own = own_unknowns(study, held)
     if own.any():
         seen = seen._replace(active=np.where(own, 0, seen.active))
-    return dataclasses.replace(problem, lanes=seen)
+    return dataclasses.replace(study, lanes=seen)
 
 
-def own_unknowns(
-    problem: Problem, held: Bool[np.ndarray, "lanes T"]
-) -> Bool[np.ndarray, "lanes P"]:
+def own_unknowns(study: Study, held: Bool[np.ndarray, "lanes T"]) -> Bool[np.ndarray, "lanes P"]:
     """Unknowns of single trials that none but the trials `held` read."""
-    own = np.zeros(problem.lanes.lower.shape, bool)
-    columns = [j for j in problem.free_columns if problem.parameters[j].scope == "trial"]
+    own = np.zeros(study.lanes.lower.shape, bool)
+    columns = [j for j in study.free_columns if study.parameters[j].scope == "trial"]
     for lane, trial in np.argwhere(held) if columns else ():
-        own[lane, [i for i in problem.lanes.index[lane, trial, columns] if i >= 0]] = True
+        own[lane, [i for i in study.lanes.index[lane, trial, columns] if i >= 0]] = True
     return own
 
 
@@ -168,7 +166,7 @@ class OwnTouch(NamedTuple):
 
 
 def with_own_touch(
-    problem: Problem,
+    study: Study,
     held: Bool[np.ndarray, "lanes T"],
     theta: Float[np.ndarray, "lanes P"],
     settings: Settings,
@@ -178,17 +176,17 @@ def with_own_touch(
     Where the trials have none of their own, `theta` itself.
 
     Args:
-        problem: the study, with all its data.
+        study: the study, with all its data.
         held: trials that took no part in the fit; at least one of each lane.
         theta: the fit without them, scaled coordinates.
         settings: of the fit; one that does not converge keeps its best point.
     """
-    own = own_unknowns(problem, held)
+    own = own_unknowns(study, held)
     if not own.any():
         return OwnTouch(theta, np.ones(len(theta), bool))
-    alone = without(problem, ~held)
+    alone = without(study, ~held)
     alone = dataclasses.replace(
-        alone, lanes=alone.lanes._replace(active=np.where(own, problem.lanes.active, 0))
+        alone, lanes=alone.lanes._replace(active=np.where(own, study.lanes.active, 0))
     )
     starts = draw_starts(alone, settings)
     kept = np.repeat(np.where(own, np.nan, theta), settings.starts, axis=0)
@@ -235,19 +233,19 @@ class Repeats(NamedTuple):
         return " and ".join(kind for kind in order if kind in self.kinds)
 
 
-def repeats(problem: Problem) -> Repeats:
+def repeats(study: Study) -> Repeats:
     """What each specimen repeats, within every lane.
 
     Contact positions where a specimen has several (repeats of a position go together), else its
     trials; where all unknowns are shared, a specimen of one curve as a whole. None where a
     stiffness belongs to a single curve: no other tells of it. (Its onset and offset are fitted.)
     """
-    free = [p for p in problem.parameters if not p.fixed]
-    width = problem.lanes.s_c.shape[1]
+    free = [p for p in study.parameters if not p.fixed]
+    width = study.lanes.s_c.shape[1]
     lanes, held, kinds = [], [], []
     own = any(p.scope == "trial" and p.name not in OF_THE_PRESS for p in free)
     shared = all(p.scope == "shared" or p.name in OF_THE_PRESS for p in free)
-    for lane, curves in enumerate(() if own else problem.curves):
+    for lane, curves in enumerate(() if own else study.curves):
         for kind, groups in _groups(curves, shared=shared):
             for group in groups:
                 row = np.zeros(width, bool)
@@ -280,7 +278,7 @@ def _groups(curves: tuple[Curve, ...], *, shared: bool) -> list[tuple[str, list[
 
 
 def leave_repeats_out(
-    problem: Problem, settings: Settings, progress: Callable[[int, int], None] | None = None
+    study: Study, settings: Settings, progress: Callable[[int, int], None] | None = None
 ) -> Missed:
     """Fit every lane without each of its `repeats` and predict the curves left out.
 
@@ -289,18 +287,18 @@ def leave_repeats_out(
     model the curves that it does worst on. One that predicts nothing makes its lane NaN.
 
     Args:
-        problem: the study.
+        study: the study.
         settings: as for `fit`.
         progress: as for `fit`.
 
     Returns:
         The `Missed` of all lanes.
     """
-    count = len(problem.curves)
-    lanes, held, _ = repeats(problem)
+    count = len(study.curves)
+    lanes, held, _ = repeats(study)
     if not len(lanes):
         return Missed(np.full(count, np.nan), *np.zeros((3, count), int))
-    chosen = problem.take(lanes)
+    chosen = study.take(lanes)
     plain = dataclasses.replace(settings, scrutiny=False)
     result = fit(without(chosen, held), plain, progress)
     touched = with_own_touch(chosen, held, result.theta, plain)
@@ -317,6 +315,6 @@ def leave_repeats_out(
     )
     for lane in np.flatnonzero((missed.refits > 0) & (missed.lost == 0)):
         jobs = lanes == lane
-        peak = np.max(np.abs(problem.lanes.force[lane]))
+        peak = np.max(np.abs(study.lanes.force[lane]))
         missed.error[lane] = float(rms(seen[jobs][observed[jobs]])) / peak
     return missed

@@ -25,10 +25,11 @@ from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.fit.cost import assemble
 from jaxtrachea.fit.covariance import informations
 from jaxtrachea.fit.lane import Lane
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.press_scale import relative_change
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.residual import residual
 from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.bootstrap import Bootstrap
 from jaxtrachea.inference.design_press import marginal, of_a_new_press
 from jaxtrachea.inference.results import succeeded
@@ -55,7 +56,7 @@ class Situation:
     """What is known before the next press, for G guesses of the truth (lanes, replicates).
 
     Attributes:
-        problem: the study.
+        study: the study.
         lane: lane of each guess; (G,).
         theta: guess, scaled coordinates; (G, P).
         relative: change of each scaled coordinate that makes a relative change of 1; (G, P).
@@ -70,7 +71,7 @@ class Situation:
         blend: rounded corner of a new curve, mm, see `Lane`; (G,); None where no onset is fitted.
     """
 
-    problem: Problem
+    study: Study
     lane: Int[np.ndarray, " G"]
     theta: Float[np.ndarray, "G P"]
     relative: Float[np.ndarray, "G P"]
@@ -109,15 +110,15 @@ def grid(s: tuple[float, float], depth: tuple[float, float], count: int = 10_000
     return Candidates(at.ravel(), down.ravel())
 
 
-def check(problem: Problem) -> None:
+def check(study: Study) -> None:
     """Refuse a study whose unknowns a new curve would not share.
 
     Raises:
-        ValueError: naming the parameters; or a joint problem.
+        ValueError: naming the parameters; or a joint study.
     """
-    problem.refuse_joint("a design")
-    own = [p.name for p in problem.free if p.scope == "trial"]
-    if len(own) == len(problem.free):
+    study.refuse_joint("a design")
+    own = [p.name for p in study.free if p.scope == "trial"]
+    if len(own) == len(study.free):
         raise ValueError(
             f"{', '.join(own)}: every free parameter belongs to single trials, so that a further "
             "press tells nothing of them; give one the scope 'specimen' or 'shared'"
@@ -142,8 +143,8 @@ def situation(
     Raises:
         ValueError: no lane succeeded, or as `check`.
     """
-    problem = result.problem
-    check(problem)
+    study = result.study
+    check(study)
     lanes = np.array([k for k in range(result.lanes) if succeeded(result, k)], int)
     if len(lanes) == 0:
         raise ValueError("no lane has an estimate; nothing to design from")
@@ -152,25 +153,25 @@ def situation(
         found = [resampled.theta[k][resampled.usable[k]][:_DRAWS] for k in lanes]
         lane = np.repeat(lanes, [len(rows) for rows in found])
         theta = np.concatenate(found)
-    kept, own, theta = of_a_new_press(problem, lane, theta)
-    relative = relative_change(problem.take(lane), theta)
-    absent = problem.lanes.active[lane] == 0
+    kept, own, theta = of_a_new_press(study, lane, theta)
+    relative = relative_change(study.take(lane), theta)
+    absent = study.lanes.active[lane] == 0
     relative = np.where(absent, 1.0, relative)
-    width = (problem.lanes.upper - problem.lanes.lower)[lane] / relative
+    width = (study.lanes.upper - study.lanes.lower)[lane] / relative
     prior = 12 / np.where(width > 0, width, 1) ** 2
-    base = np.eye(problem.size) * prior[:, :, None]
+    base = np.eye(study.size) * prior[:, :, None]
     if with_data:
-        even = problem.lanes._replace(balance=np.ones_like(problem.lanes.balance))
-        weighed = dataclasses.replace(problem, lanes=even)
+        even = study.lanes._replace(balance=np.ones_like(study.lanes.balance))
+        weighed = dataclasses.replace(study, lanes=even)
         info = informations(weighed, lane, theta, result.whitened_sigma[lane])
         base = base + info.bread * relative[:, :, None] * relative[:, None]
-    n = problem.lanes.force.shape[-1] if samples is None else samples
-    blends, counts = problem.lanes.blend, [len(c) for c in problem.curves]
+    n = study.lanes.force.shape[-1] if samples is None else samples
+    blends, counts = study.lanes.blend, [len(c) for c in study.curves]
     blend = None
     if blends is not None:
         blend = np.array([np.median(blends[k, : counts[k]]) for k in lane])
     return Situation(
-        problem=problem, lane=lane, theta=theta, relative=relative,
+        study=study, lane=lane, theta=theta, relative=relative,
         base=marginal(base, kept), sigma=result.sigma[lane, 0], samples=n,
         kept=kept, own=own, prior=prior, blend=blend,
     )  # fmt: skip
@@ -181,12 +182,12 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
 
     In relative coordinates; what the press has of its own is eliminated.
     """
-    problem = known.problem
-    run = _compiled(problem.program, known.samples)
+    study = known.study
+    run = _compiled(study.model, known.samples)
     place = jnp.asarray(candidates.s), jnp.asarray(candidates.depth)
     parts = []
     for g, k in enumerate(known.lane):
-        lanes = problem.lanes
+        lanes = study.lanes
         blend = None if known.blend is None else jnp.asarray(known.blend[g : g + 1])
         rows = lanes.value[k, :1], lanes.index[k, :1], blend
         matrix = run(jnp.asarray(known.theta[g]), *rows, *place) / known.sigma[g] ** 2
@@ -204,7 +205,7 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
 
 
 @functools.lru_cache(maxsize=16)
-def _compiled(problem: Problem, samples: int):
+def _compiled(model: FitModel, samples: int):
     def one(theta, value, index, blend, s, depth):
         displacement = depth * jnp.arange(1, samples + 1, dtype=theta.dtype)[None] / samples
         ones, size = jnp.ones_like(displacement), theta.shape[0]
@@ -213,8 +214,8 @@ def _compiled(problem: Problem, samples: int):
             joint_precision=None, balance=ones[:, 0], blend=blend, value=value, index=index,
             lower=jnp.zeros(size), upper=jnp.zeros(size), active=jnp.ones(size),
         )  # fmt: skip
-        J = residual(problem, theta, lane).jacobian
-        return assemble(problem, jnp.einsum("tim,tjm->tij", J, J), lane)
+        J = residual(model, theta, lane).jacobian
+        return assemble(model, jnp.einsum("tim,tjm->tij", J, J), lane)
 
     return jax.jit(jax.vmap(one, (None, None, None, None, 0, 0)))
 
@@ -292,19 +293,19 @@ def identifiability(known: Situation, s: Float[np.ndarray, " n"], depth: float) 
     return Map(s, condition, weakest * np.sign(largest), np.exp(total / len(added)))
 
 
-def candidates_of(spec: FitSpec, problem: Problem) -> Candidates:
+def candidates_of(spec: FitSpec, study: Study) -> Candidates:
     """The presses of the [design] section; left out: first to last ring, half to full depth.
 
     Raises:
         SpecError: positions outside the tube, or unknowns that a new curve would not share.
     """
     try:
-        check(problem)
+        check(study)
     except ValueError as error:
         raise SpecError(f"parameters: {error}") from None
-    section, length = spec.design, float(problem.geometry.length)
-    deepest = float(np.max(problem.lanes.displacement))
-    rings = problem.geometry.ring_positions
+    section, length = spec.design, float(study.model.geometry.length)
+    deepest = float(np.max(study.lanes.displacement))
+    rings = study.model.geometry.ring_positions
     s = (float(rings[0]), float(rings[-1])) if section.s is None else section.s
     if s[0] < 0 or s[1] > length:
         raise SpecError(

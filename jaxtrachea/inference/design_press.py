@@ -3,31 +3,31 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.study import Study
 
 
 def of_a_new_press(
-    problem: Problem, lane: Int[np.ndarray, " G"], theta: Float[np.ndarray, "G P"]
+    study: Study, lane: Int[np.ndarray, " G"], theta: Float[np.ndarray, "G P"]
 ) -> tuple[Int[np.ndarray, "G Q"], Int[np.ndarray, "G R"], Float[np.ndarray, "G P"]]:
     """Unknowns that a new press shares, its own ones, and theta with typical values of these.
 
     Its own stand where the first trial has them.
     """
-    scopes = [[p.scope for p, _, _ in u] + ["specimen"] * (problem.size - len(u))
-              for u in problem.unknowns]  # fmt: skip
+    scopes = [[p.scope for p, _, _ in u] + ["specimen"] * (study.size - len(u))
+              for u in study.unknowns]  # fmt: skip
     shared = np.array(scopes)[lane] != "trial"
     if shared.all():
         return (
-            np.tile(np.arange(problem.size), (len(lane), 1)),
+            np.tile(np.arange(study.size), (len(lane), 1)),
             np.zeros((len(lane), 0), int),
             theta,
         )
     theta = theta.copy()
-    columns = [j for j in problem.free_columns if problem.parameters[j].scope == "trial"]
-    own = np.asarray(problem.lanes.index)[lane, 0][:, columns]
+    columns = [j for j in study.free_columns if study.parameters[j].scope == "trial"]
+    own = np.asarray(study.lanes.index)[lane, 0][:, columns]
     for g, k in enumerate(lane):
         for i, j in zip(own[g], columns, strict=True):
-            every = problem.lanes.index[k, : len(problem.curves[k]), j]
+            every = study.lanes.index[k, : len(study.curves[k]), j]
             theta[g, i] = np.median(theta[g, every])
     return np.stack([np.flatnonzero(row) for row in _as_many(shared)]), own, theta
 

@@ -12,7 +12,7 @@ from jaxtrachea.inference.results import unknown_label
 def names(known: Situation, result) -> list[str]:
     """Unknowns of the first guess's lane that a new press shares; all lanes have the same ones."""
     lane = int(known.lane[0])
-    count = len(result.problem.unknowns[lane])
+    count = len(result.study.unknowns[lane])
     return [unknown_label(result, lane, int(i)) for i in known.kept[0] if i < count]
 
 

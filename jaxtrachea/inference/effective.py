@@ -82,17 +82,17 @@ def effective(result: FitResult, seen: Prediction, profiles: Profiles | None = N
         seen: its residuals.
         profiles: those on which the plain intervals rest.
     """
-    problem, lanes = result.problem, result.problem.lanes
+    study, lanes = result.study, result.study.lanes
     n, worth = np.asarray(result.samples, float), effective_samples(seen)
     present = lanes.active > 0
     held = result.at_bound | ~present
     unknowns = np.sum(~held, axis=1).astype(float)
-    if problem.joint:
+    if study.joint:
         alive = result.succeeded
-        P = joint.unknown_count(problem, alive) - joint.held_count(problem, held, alive)
+        P = joint.unknown_count(study, alive) - joint.held_count(study, held, alive)
         unknowns = np.full(len(n), float(P))
         n, worth = (np.full(len(n), np.nansum(v[alive])) for v in (n, worth))
-    given = problem.noise_given[0] and (lanes.joints is None or problem.noise_given[1])
+    given = study.noise_given[0] and (lanes.joints is None or study.noise_given[1])
     plain = np.array([float(u.half_width) for u in result.uncertainty])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         left = worth - unknowns
@@ -111,17 +111,17 @@ def _drawn_out(
     result: FitResult, growth: Float[np.ndarray, " lanes"], profiles: Profiles | None
 ) -> tuple[Float[np.ndarray, "lanes P"], Float[np.ndarray, "lanes P"]]:
     """Plain intervals with their sides `growth` times as long on the scaled coordinate."""
-    problem = result.problem
+    study = result.study
     plain = np.full((2, *result.theta.shape), np.nan)
     unfound = np.zeros(plain.shape, bool)
-    for lane, unknowns in enumerate(problem.unknowns):
+    for lane, unknowns in enumerate(study.unknowns):
         for i in range(len(unknowns)):
             *plain[:, lane, i], ends = interval95(result, lane, i, profiles)
             unfound[:, lane, i] = [end == ProfileEnd.FAILED for end in ends or ()] or False
     # Of a side whose end was not found nothing is known but the local error.
     local = np.fmin(plain[0], result.lower), np.fmax(plain[1], result.upper)
-    log = of_unknowns(problem, lambda p: p.scale == "log", 0.0) > 0
-    step = of_unknowns(problem, lambda p: p.step, 1.0)
+    log = of_unknowns(study, lambda p: p.scale == "log", 0.0) > 0
+    step = of_unknowns(study, lambda p: p.step, 1.0)
     sign, growth = np.array([-1.0, 1.0])[:, None, None], growth[:, None]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         ends = np.where(unfound, local, plain)
@@ -130,7 +130,7 @@ def _drawn_out(
         theta = result.theta + sign * np.where(np.isinf(growth), growth, side * growth)
         wide = np.where(log, np.exp(theta), theta * step)
     wide = np.stack([np.minimum(wide[0], plain[0]), np.maximum(wide[1], plain[1])])
-    for lane, unknowns in enumerate(problem.unknowns):
+    for lane, unknowns in enumerate(study.unknowns):
         for i in range(len(unknowns)):
             wide[:, lane, i] = within_bounds(result, lane, i, *map(float, wide[:, lane, i]))
     return wide[0], wide[1]

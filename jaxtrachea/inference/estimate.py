@@ -5,7 +5,6 @@ d theta = -H^-1 (dg / d data) d data with the full Hessian H, curvature of the m
 unknown on its bound moves with the bound alone. Forward and reverse mode, any order, `jit`, `vmap`.
 """
 
-import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -16,8 +15,9 @@ from jaxtyping import Array, Float, Int
 from jaxtrachea.fit.cost import Point, evaluate
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import FIRST_RADIUS, RUNNING, State, Tolerances, iterate
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import size
+from jaxtrachea.fit.study import Study
 from jaxtrachea.trachea.geometry import Geometry
 
 
@@ -33,57 +33,60 @@ class Estimate(NamedTuple):
     status: Int[Array, ""]
 
 
-def lane_of(problem: Problem, lane: int) -> Lane:
+def lane_of(study: Study, lane: int) -> Lane:
     """Arrays of one lane, for `estimate`."""
-    return jax.tree.map(lambda v: jnp.asarray(v[lane]), problem.lanes)
+    return jax.tree.map(lambda v: jnp.asarray(v[lane]), study.lanes)
 
 
 def estimate(
-    problem: Problem,
+    model: FitModel,
     start: Float[Array, " P"],
     lane: Lane,
     sigma: Float[Array, "2"],
     geometry: Geometry | None = None,
     tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
 ) -> Estimate:
-    """Fit one lane from one start; differentiable by everything but start, problem, tolerances.
+    """Fit one lane from one start; differentiable by everything but start, model, tolerances.
 
     Sigma is held where it is estimated; with forces alone and a linear loss the estimate does not
     depend on it.
 
     Args:
-        problem: model, parameters and loss; its own data are not used.
+        model: of the fit.
         start: scaled coordinates, as `FitResult.theta`.
         lane: data, contact positions, bounds; see `lane_of`.
         sigma: of forces and markers, as `FitResult.whitened_sigma`.
-        geometry: the tube; None: of the problem.
+        geometry: the tube; None: of the model.
         tolerances: when the fit is done.
     """
-    tube = jax.tree.map(jnp.asarray, problem.geometry if geometry is None else geometry)
+    tube = jax.tree.map(jnp.asarray, model.geometry if geometry is None else geometry)
     data = (lane, sigma, tube)
-    state = _solve(problem, tolerances, *jax.lax.stop_gradient((start, data)))
-    return Estimate(_implicit(problem, state.theta, data), state.status)
+    state = _solve(model, tolerances, *jax.lax.stop_gradient((start, data)))
+    return Estimate(_implicit(model, state.theta, data), state.status)
 
 
 def gradient(
-    problem: Problem, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
+    model: FitModel,
+    theta: Float[Array, " P"],
+    lane: Lane,
+    sigma: Float[Array, "2"],
+    geometry: Geometry | None = None,
 ) -> Float[Array, " P"]:
     """Of the cost."""
-    return evaluate(problem, theta, lane, sigma).gradient
+    return evaluate(model, theta, lane, sigma, geometry).gradient
 
 
 def hessian(
-    problem: Problem, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
+    model: FitModel, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
 ) -> Float[Array, "P P"]:
     """Of the cost, with the curvature of the model that Gauss-Newton leaves out."""
-    return jax.jacfwd(functools.partial(gradient, problem))(theta, lane, sigma)
+    return jax.jacfwd(functools.partial(gradient, model))(theta, lane, sigma)
 
 
-def _solve(problem: Problem, tolerances: Tolerances, start, data) -> State:
+def _solve(model: FitModel, tolerances: Tolerances, start, data) -> State:
     """Levenberg-Marquardt of one lane, as a loop inside the program."""
     lane, sigma, tube = data
-    problem = dataclasses.replace(problem, geometry=tube)
-    P, Jf, T, m = start.shape[0], len(problem.free), lane.s_c.shape[0], size(lane)
+    P, Jf, T, m = start.shape[0], len(model.free), lane.s_c.shape[0], size(lane)
     zeros = lambda *shape: jnp.zeros(shape, start.dtype)  # noqa: E731
     point = Point(
         zeros(T, m), zeros(T, Jf, m), jnp.full((), jnp.inf, start.dtype), zeros(P), zeros(P, P)
@@ -92,29 +95,28 @@ def _solve(problem: Problem, tolerances: Tolerances, start, data) -> State:
     state = State(start, point, radius, jnp.int32(0), jnp.int8(RUNNING))
     return jax.lax.while_loop(
         lambda state: state.status == RUNNING,
-        lambda state: iterate(problem, tolerances, state, lane, sigma),
+        lambda state: iterate(model, tolerances, state, lane, sigma, tube),
         state,
     )
 
 
-def _gradient(problem: Problem, theta, data):
-    lane, sigma, tube = data
-    return gradient(dataclasses.replace(problem, geometry=tube), theta, lane, sigma)
+def _gradient(model: FitModel, theta, data):
+    return gradient(model, theta, *data)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _implicit(problem: Problem, theta: Float[Array, " P"], data: Any) -> Float[Array, " P"]:
+def _implicit(model: FitModel, theta: Float[Array, " P"], data: Any) -> Float[Array, " P"]:
     """Theta itself, with the derivative of the minimum by the data."""
     return theta
 
 
 @_implicit.defjvp
-def _implicit_jvp(problem: Problem, primals, tangents):
-    theta, data = _implicit(problem, *primals), primals[1]
+def _implicit_jvp(model: FitModel, primals, tangents):
+    theta, data = _implicit(model, *primals), primals[1]
     tangent = tangents[1]
     lane, d_lane = data[0], tangent[0]
-    g, d_g = jax.jvp(lambda data: _gradient(problem, theta, data), (data,), (tangent,))
-    H = jax.jacfwd(lambda theta: _gradient(problem, theta, data))(theta)
+    g, d_g = jax.jvp(lambda data: _gradient(model, theta, data), (data,), (tangent,))
+    H = jax.jacfwd(lambda theta: _gradient(model, theta, data))(theta)
     low = (theta <= lane.lower) & (g > 0)
     high = (theta >= lane.upper) & (g < 0)
     free = ~low & ~high & (lane.active > 0)

@@ -9,8 +9,8 @@ import numpy as np
 
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.onset import onset_is_sought
-from jaxtrachea.fit.problem import Problem, build, check_curve
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Study, build_study, check_curve
 from jaxtrachea.inference.predict import CurvePrediction, predict_sources
 from jaxtrachea.inference.prediction_core import compiled_slopes
 from jaxtrachea.inference.sources import Source, source_of
@@ -61,7 +61,7 @@ def pressable(stored: StoredFit, curves: Sequence[Curve]) -> tuple[list[Curve], 
     good, bad = [], []
     for curve in curves:
         try:
-            check_curve(curve, stored.problem.geometry, stored.problem.options)
+            check_curve(curve, stored.study.model.geometry, stored.study.model.options)
         except ValueError as error:
             text = str(error).split(": ", 1)[-1]
             cure = "correct the file; tube and model are those of the fit"
@@ -123,7 +123,7 @@ def _sigma(stored: StoredFit, curve: Curve, source: Source) -> np.ndarray:
 
     In a fit whose noise was estimated, a sigma of single curves was a weight, not a noise.
     """
-    if curve.sigma is not None and stored.problem.noise_given[0]:
+    if curve.sigma is not None and stored.study.noise_given[0]:
         return np.asarray(curve.sigma)
     return np.full(len(curve.force), source.sigma[0])
 
@@ -145,10 +145,10 @@ def with_own(
         if source.own and source.status.predicts:
             groups.setdefault(source.own, []).append(k)
     for own, members in groups.items():
-        study = _study(stored, own, [(sources[k], curves[k], sigmas[k]) for k in members])
-        result = fit(study, Settings(scrutiny=False))
-        theta = result.theta[:, : len(own)] * _steps(stored.problem, study, own)
-        slopes = _slopes(stored, own, [sources[k] for k in members], theta, study)
+        own_study = _own_study(stored, own, [(sources[k], curves[k], sigmas[k]) for k in members])
+        result = fit(own_study, Settings(scrutiny=False))
+        theta = result.theta[:, : len(own)] * _steps(stored.study, own_study, own)
+        slopes = _slopes(stored, own, [sources[k] for k in members], theta, own_study)
         for row, k in enumerate(members):
             status = FitStatus(int(result.status[row]))
             held = result.at_bound[row, : len(own)]
@@ -167,16 +167,16 @@ def measured_corners(
         curves: new ones, alone or of any specimen.
         sigmas: noise of their samples; counts where that of the fit was given.
     """
-    problem = stored.problem
-    if not onset_is_sought(problem.parameters, problem.options):
+    study = stored.study
+    if not onset_is_sought(study.parameters, study.model.options):
         return [np.nan] * len(curves)
-    given = problem.noise_given[0]
+    given = study.noise_given[0]
     alone = [
         _apart(c, i, s if given and c.sigma is None else c.sigma)
         for i, (c, s) in enumerate(zip(curves, sigmas, strict=True))
     ]
-    study = build(alone, problem.geometry, problem.options, problem.parameters)
-    return [] if study.lanes.blend is None else np.ravel(study.lanes.blend).tolist()
+    own_study = build_study(alone, study.model.geometry, study.model.options, study.parameters)
+    return [] if own_study.lanes.blend is None else np.ravel(own_study.lanes.blend).tolist()
 
 
 def _apart(curve: Curve, i: int, sigma: np.ndarray | None) -> Curve:
@@ -186,49 +186,53 @@ def _apart(curve: Curve, i: int, sigma: np.ndarray | None) -> Curve:
     )
 
 
-def _study(stored: StoredFit, own, members) -> Problem:
+def _own_study(stored: StoredFit, own, members) -> Study:
     """One lane per curve, whose unknowns are the own columns."""
-    problem = stored.problem
-    names = {problem.free[f].name for f in own}
+    study = stored.study
+    names = {study.free[f].name for f in own}
     known = np.stack([_values(stored, source) for source, _, _ in members])
     # The values serve where starts are sought; what is kept has that of its curve, below.
     table = [
         p if p.name in names else dataclasses.replace(p, fixed=True, value=float(value))
-        for p, value in zip(problem.parameters, np.median(known, axis=0), strict=True)
+        for p, value in zip(study.parameters, np.median(known, axis=0), strict=True)
     ]
     curves = [_apart(c, i, s) for i, (_, c, s) in enumerate(members)]
-    study = build(curves, problem.geometry, problem.options, table, balance="sample")
+    model = study.model
+    own_study = build_study(
+        curves, model.geometry, model.options, table, balance="sample", loss=model.loss,
+        loss_scale=model.loss_scale,
+    )  # fmt: skip
     blend = np.array([[source.blend] for source, _, _ in members])
-    lanes = study.lanes._replace(
+    lanes = own_study.lanes._replace(
         value=known[:, None], blend=None if np.isnan(blend).all() else blend
     )
-    return dataclasses.replace(study, lanes=lanes, loss=problem.loss, loss_scale=problem.loss_scale)
+    return dataclasses.replace(own_study, lanes=lanes)
 
 
-def _steps(problem: Problem, study: Problem, own) -> np.ndarray:
+def _steps(study: Study, own_study: Study, own) -> np.ndarray:
     """Steps of the own columns in the study over those in the fit: each follows its own presses."""
-    pairs = zip(study.free, (problem.free[f] for f in own), strict=True)
+    pairs = zip(own_study.free, (study.free[f] for f in own), strict=True)
     return np.array([1.0 if q.scale == "log" else p.step / q.step for p, q in pairs])
 
 
 def _values(stored: StoredFit, source: Source) -> np.ndarray:
     """All parameters in their units, the free ones as estimated; (J,)."""
     value = source.value.copy()
-    for f, j in enumerate(stored.problem.free_columns):
+    for f, j in enumerate(stored.study.free_columns):
         if f not in source.own:
-            value[j] = stored.problem.parameters[j].from_scaled(float(source.free[f]))
+            value[j] = stored.study.parameters[j].from_scaled(float(source.free[f]))
     return value
 
 
-def _slopes(stored: StoredFit, own, sources, theta, study: Problem) -> list[np.ndarray]:
+def _slopes(stored: StoredFit, own, sources, theta, own_study: Study) -> list[np.ndarray]:
     """Derivative of the forces by all free columns, at the fitted own ones; (F, N) each.
 
     In the steps of the fit, as `theta` of the own columns.
     """
     free = np.stack([source.free for source in sources])
     free[:, list(own)] = np.where(np.isfinite(theta), theta, 0.0)
-    lanes = study.lanes
-    run = compiled_slopes(stored.problem.program)
+    lanes = own_study.lanes
+    run = compiled_slopes(stored.study.model)
     value = np.stack([source.value for source in sources])
     columns = [free, value, lanes.s_c[:, 0], lanes.displacement[:, 0]]
     columns += [] if lanes.blend is None else [lanes.blend[:, 0]]
@@ -250,7 +254,7 @@ class _Own(NamedTuple):
 def _merged(stored: StoredFit, source: Source, own: _Own) -> Source:
     """The source with its own parameters and the covariance of all."""
     columns = list(own.columns)
-    names = ", ".join(stored.problem.free[f].name for f in columns)
+    names = ", ".join(stored.study.free[f].name for f in columns)
     said = "; ".join(filter(None, [source.message, f"{names} fitted to this curve"]))
     if not own.status.succeeded:
         word = f"{names}: {own.status.message}"

@@ -27,9 +27,10 @@ from jaxtrachea.fit.cost import assemble, entry_scale, robust
 from jaxtrachea.fit.covariance import SINGULAR
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import chunk_size
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import observations, residual
 from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.estimate import hessian
 from jaxtrachea.inference.results import succeeded
 
@@ -106,7 +107,7 @@ def _invert(A, H, relative, free) -> _Inverses:
 
 
 def diagnose(
-    problem: Problem,
+    model: FitModel,
     theta: Float[Array, " P"],
     lane: Lane,
     sigma: Float[Array, "2"],
@@ -116,26 +117,26 @@ def diagnose(
     """Diagnostics of one lane at its estimate.
 
     Args:
-        problem: static description.
+        model: what is fitted (static).
         theta: estimate, scaled coordinates.
         lane: the lane's arrays.
         sigma: as for `evaluate`.
         relative: change of each scaled coordinate that makes a relative change of 1.
         free: 1 for unknowns that exist and are not on a bound, else 0; (P,).
     """
-    r, (seen, _) = residual(problem, theta, lane), observations(lane)
+    r, (seen, _) = residual(model, theta, lane), observations(lane)
     scale = entry_scale(lane, sigma)[None]
     z, J = r.value * scale, r.jacobian * (scale * seen)[:, None]
-    psi = lambda z: z * robust(problem.loss, z * z, problem.loss_scale)[1]  # noqa: E731
-    slope = robust(problem.loss, z * z, problem.loss_scale)[1]
+    psi = lambda z: z * robust(model.loss, z * z, model.loss_scale)[1]  # noqa: E731
+    slope = robust(model.loss, z * z, model.loss_scale)[1]
     pull, stiffness = jax.jvp(psi, (z,), (jnp.ones_like(z),))
     b2 = (lane.balance * lane.balance)[:, None]
     weight, pull, stiffness = b2 * slope, b2 * pull, b2 * stiffness
     gram = lambda w: jnp.einsum("tim,tm,tjm->tij", J, w, J)  # noqa: E731
-    whole = lambda w: assemble(problem, gram(w), lane)  # noqa: E731
+    whole = lambda w: assemble(model, gram(w), lane)  # noqa: E731
     A = whole(weight)
-    inverse = _invert(A, hessian(problem, theta, lane, sigma), relative, free)
-    blocks = functools.partial(_blocks, problem, lane)
+    inverse = _invert(A, hessian(model, theta, lane, sigma), relative, free)
+    blocks = functools.partial(_blocks, model, lane)
     near, K = blocks(inverse.gauss_newton), blocks(inverse.full)
     form = lambda block: jnp.einsum("tim,tij,tjm->tm", J, block, J)  # noqa: E731
     sandwich = lambda outer, m: outer @ m @ outer  # noqa: E731
@@ -145,7 +146,7 @@ def diagnose(
     shift = jnp.einsum("tij,tjm->tim", K, J)
     gone = pull / (1 - stiffness * form(K))
     per_sigma = shift * stiffness[:, None]
-    own = _of_one_curve(problem, lane, free)
+    own = _of_one_curve(model, lane, free)
     c, cook = _without_curve(J, gram(weight), gram(stiffness), pull, near, K, own)
     variance = jnp.diagonal(sandwich(inverse.full, whole(stiffness**2)))
     variance = jnp.diagonal(blocks(jnp.diag(variance)), axis1=1, axis2=2)
@@ -164,17 +165,17 @@ def diagnose(
     )
 
 
-def _blocks(problem: Problem, lane: Lane, matrix: Float[Array, "P P"]) -> Float[Array, "T Jf Jf"]:
+def _blocks(model: FitModel, lane: Lane, matrix: Float[Array, "P P"]) -> Float[Array, "T Jf Jf"]:
     """Of a matrix over the unknowns, the part that each curve reads; 0 where it reads none."""
-    index = lane.index[:, problem.free_columns]
+    index = lane.index[:, model.free_columns]
     at = jnp.maximum(index, 0)
     there = (index >= 0)[:, :, None] & (index >= 0)[:, None]
     return jnp.where(there, matrix[at[:, :, None], at[:, None, :]], 0)
 
 
-def _of_one_curve(problem: Problem, lane: Lane, free) -> Bool[Array, "T Jf"]:
+def _of_one_curve(model: FitModel, lane: Lane, free) -> Bool[Array, "T Jf"]:
     """Which free unknowns a curve alone reads; none where it shares no unknown with another."""
-    index = lane.index[:, problem.free_columns]
+    index = lane.index[:, model.free_columns]
     size = lane.lower.shape[0]
     place = jnp.where(index >= 0, index, size)
     readers = jnp.zeros(size + 1, index.dtype).at[place].add(1)
@@ -213,14 +214,14 @@ def influence(result: FitResult, chunk: int = 128) -> Influence:
         result: the fit.
         chunk: lanes computed together.
     """
-    problem, lanes = result.problem, result.lanes
+    study, lanes = result.study, result.lanes
     chunk = chunk_size(lanes, chunk)
-    run = _compiled(problem.program)
-    free = problem.lanes.active * ~result.at_bound
+    run = _compiled(study.model)
+    free = study.lanes.active * ~result.at_bound
     sigma, relative, parts = result.whitened_sigma, result.relative, []
     for first in range(0, lanes, chunk):
         of = np.minimum(np.arange(first, first + chunk), lanes - 1)
-        lane = jax.tree.map(lambda v, of=of: v[of], problem.lanes)
+        lane = jax.tree.map(lambda v, of=of: v[of], study.lanes)
         part = run(result.theta[of], lane, sigma[of], relative[of], free[of])
         parts.append(jax.tree.map(lambda v: np.asarray(v)[: lanes - first], part))  # noqa: B023
     found = jax.tree.map(lambda *v: np.concatenate(v), *parts)
@@ -228,20 +229,20 @@ def influence(result: FitResult, chunk: int = 128) -> Influence:
 
 
 @functools.lru_cache(maxsize=8)
-def _compiled(problem: Problem):
-    return jax.jit(jax.vmap(functools.partial(diagnose, problem)))
+def _compiled(model: FitModel):
+    return jax.jit(jax.vmap(functools.partial(diagnose, model)))
 
 
 def _conclude(result: FitResult, found: Diagnostics) -> Influence:
     """Unknowns in standard errors, NaN where there is nothing, sigma as the others give it."""
-    problem, lanes = result.problem, result.problem.lanes
-    columns = lanes.index[:, :, problem.free_columns]
+    study, lanes = result.study, result.study.lanes
+    columns = lanes.index[:, :, study.free_columns]
     rows = np.arange(result.lanes)[:, None, None]
     se = np.stack([u.se for u in result.uncertainty])[rows, np.maximum(columns, 0)]
     se = np.where((columns >= 0) & np.isfinite(se) & (se > 0), se, np.nan)
     good = np.array([succeeded(result, k) for k in range(result.lanes)])
-    seen = _seen(problem) & good[:, None, None]
-    curve = good[:, None] & np.array([np.arange(columns.shape[1]) < len(c) for c in problem.curves])
+    seen = _seen(study) & good[:, None, None]
+    curve = good[:, None] & np.array([np.arange(columns.shape[1]) < len(c) for c in study.curves])
     at = lambda v, there: np.where(there, v, np.nan)  # noqa: E731
     moved = lambda v: at(v / se[..., None], seen[:, :, None])  # noqa: E731
     found = found._replace(
@@ -257,9 +258,9 @@ def _conclude(result: FitResult, found: Diagnostics) -> Influence:
     return Influence(result, found, _external(result, np.asarray(found.studentised)))
 
 
-def _seen(problem: Problem) -> np.ndarray:
+def _seen(study: Study) -> np.ndarray:
     """Observed entries of the residual; (lanes, T, m)."""
-    lanes = problem.lanes
+    lanes = study.lanes
     seen = np.asarray(lanes.precision) > 0
     if lanes.joint_precision is None:
         return seen
@@ -269,13 +270,13 @@ def _seen(problem: Problem) -> np.ndarray:
 
 def _external(result: FitResult, t: np.ndarray) -> np.ndarray:
     """Studentised t times sqrt((n - 1) / (n - t^2)), n degrees of freedom; t if sigma is given."""
-    problem, samples = result.problem, result.problem.lanes.force.shape[-1]
-    if problem.loss != "linear":
+    study, samples = result.study, result.study.lanes.force.shape[-1]
+    if study.model.loss != "linear":
         return t
-    seen = _seen(problem)
-    share = 1 - problem.lanes.active.sum(axis=1) / np.maximum(seen.sum(axis=(1, 2)), 1)
+    seen = _seen(study)
+    share = 1 - study.lanes.active.sum(axis=1) / np.maximum(seen.sum(axis=(1, 2)), 1)
     out = t.copy()
-    for part, given in zip((np.s_[..., :samples], np.s_[..., samples:]), problem.noise_given,
+    for part, given in zip((np.s_[..., :samples], np.s_[..., samples:]), study.noise_given,
                            strict=True):  # fmt: skip
         dof = (seen[part].sum(axis=(1, 2)) * share)[:, None, None]
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -10,9 +10,9 @@ from jaxtrachea.inference.influence import Influence
 
 def sample_rows(found: Influence) -> Iterator[dict[str, Any]]:
     """One row per observed force and marker for influence.csv."""
-    problem, of = found.result.problem, found.of
-    names = [p.name for p in problem.free]
-    for lane, curves in enumerate(problem.curves):
+    study, of = found.result.study, found.of
+    names = [p.name for p in study.free]
+    for lane, curves in enumerate(study.curves):
         for t, curve in enumerate(curves):
             for e in np.flatnonzero(np.isfinite(of.leverage[lane, t])):
                 at = lane, t, e
@@ -36,9 +36,9 @@ def sample_rows(found: Influence) -> Iterator[dict[str, Any]]:
 
 def curve_rows(found: Influence) -> Iterator[dict[str, Any]]:
     """One row per curve for influence_curves.csv."""
-    problem, of = found.result.problem, found.of
-    names = [p.name for p in problem.free]
-    for lane, curves in enumerate(problem.curves):
+    study, of = found.result.study, found.of
+    names = [p.name for p in study.free]
+    for lane, curves in enumerate(study.curves):
         for t, curve in enumerate(curves):
             r = of.studentised[lane, t]
             worst = np.nanmax(np.abs(r)) if np.isfinite(r).any() else np.nan
@@ -65,7 +65,7 @@ def top_samples(found: Influence, count: int) -> list[tuple[int, int, int]]:
 
 def _place(found: Influence, entry: int) -> tuple[int, int | None]:
     """Sample and ring (None: a force) of an entry of the residual."""
-    lanes = found.result.problem.lanes
+    lanes = found.result.study.lanes
     samples = lanes.force.shape[-1]
     if entry < samples or lanes.joints is None:
         return entry, None
@@ -76,5 +76,5 @@ def _place(found: Influence, entry: int) -> tuple[int, int | None]:
 def sample_label(found: Influence, lane: int, t: int, entry: int) -> str:
     """Where a sample is, in words: 2.5 mm, or 2.5 mm, ring 3."""
     sample, ring = _place(found, entry)
-    where = f"{found.result.problem.curves[lane][t].displacement[sample]:.3g} mm"
+    where = f"{found.result.study.curves[lane][t].displacement[sample]:.3g} mm"
     return where if ring is None else f"{where}, ring {ring + 1}"

@@ -50,7 +50,7 @@ def judgement(result: FitResult, lane: int, i: int, profiles: Profiles | None = 
     inside = within_bounds(result, lane, i, low, high)
     if not result.succeeded[lane]:
         return Judgement("failed", *inside, None, np.nan)
-    p = result.problem.unknowns[lane][i][0]
+    p = result.study.unknowns[lane][i][0]
     structural, held = bool(result.undetermined[lane, i]), bool(result.at_bound[lane, i])
     if ends is None:
         word = verdict(
@@ -84,7 +84,7 @@ def within_bounds(
 
     The bounds are those of the lane: an onset is looked for near its own curve.
     """
-    p, lanes = result.problem.unknowns[lane][i][0], result.problem.lanes
+    p, lanes = result.study.unknowns[lane][i][0], result.study.lanes
     value = float(result.value[lane, i])
     ends = []
     for bound, theta in ((p.lower, lanes.lower[lane, i]), (p.upper, lanes.upper[lane, i])):
@@ -102,7 +102,7 @@ def _unbounded(
         return local
     found = _evidence(result, lane, i, profiles)
     if not found and result.undetermined[lane, i]:
-        log = result.problem.unknowns[lane][i][0].scale == "log"
+        log = result.study.unknowns[lane][i][0].scale == "log"
         return 0.0 if log else -np.inf, np.inf, (ProfileEnd.OPEN, ProfileEnd.OPEN)
     if not found:
         return local
@@ -140,7 +140,7 @@ def relative_errors(
 ) -> Float[np.ndarray, "L P"]:
     """Relative error of what is determined: of identifiable and weak unknowns; NaN elsewhere."""
     out = np.full(result.theta.shape, np.nan)
-    for lane, unknowns in enumerate(result.problem.unknowns):
+    for lane, unknowns in enumerate(result.study.unknowns):
         for i in range(len(unknowns)):
             judged = judgement(result, lane, i, profiles)
             if judged.verdict in DETERMINED:

@@ -233,7 +233,7 @@ class Population:
 
 def wanted(asked: bool | None, result: FitResult) -> bool:
     """Whether to take the specimens as a sample: as asked, else if there are enough of them."""
-    own = any(p.scope == "specimen" for p in result.problem.free)
+    own = any(p.scope == "specimen" for p in result.study.free)
     return asked or (asked is None and own and result.lanes >= ENOUGH)
 
 
@@ -252,13 +252,13 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
     Raises:
         ValueError: no parameter with the scope `specimen`, or none that three specimens determine.
     """
-    parameters = tuple(p for p in result.problem.free if p.scope == "specimen")
+    parameters = tuple(p for p in result.study.free if p.scope == "specimen")
     if not parameters:
         raise ValueError("no free parameter has the scope 'specimen'; a population needs one")
     names = [p.name for p in parameters]
     place = np.full((result.lanes, len(names)), -1)
-    separate = {c.specimen for lane in result.problem.curves for c in lane}
-    for lane, unknowns in enumerate(result.problem.unknowns):
+    separate = {c.specimen for lane in result.study.curves for c in lane}
+    for lane, unknowns in enumerate(result.study.unknowns):
         if len(separate) == result.lanes:
             for i, (p, _, _) in enumerate(unknowns):
                 if p.name in names:
@@ -277,7 +277,7 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
     se = np.where(known, se, 0)
     covariance = np.nan_to_num(correlation) * se[:, :, None] * se[:, None]
     theta = np.where(known, result.theta[row, place], 0)
-    common = _common(result, place, se) if result.problem.joint else None
+    common = _common(result, place, se) if result.study.joint else None
     if common is not None:
         together = common.follow @ common.covariance @ np.swapaxes(common.follow, 1, 2)
         covariance = _not_negative(covariance - together, covariance)
@@ -288,7 +288,7 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
 
 def _common(result: FitResult, place, se: Float[np.ndarray, "lanes q"]) -> Common:
     """How the estimates of a joint fit follow what is shared; `place`: see `Population`."""
-    row, shared = np.arange(result.lanes)[:, None], result.problem.shared
+    row, shared = np.arange(result.lanes)[:, None], result.study.shared
     own = np.stack([u.se for u in result.uncertainty])[row, shared]
     own = np.where(np.isfinite(own), own, 0)
     full = np.nan_to_num(np.stack([u.correlation for u in result.uncertainty]))

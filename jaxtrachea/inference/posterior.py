@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtrachea.fit.cost import weights
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import chunk_size
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import observations, residual_value
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.chains import grade, lenient, mixing, quantiles
@@ -107,12 +107,12 @@ def from_line(x: Float[Array, " P"], lane: Lane) -> Float[Array, " P"]:
 
 
 def log_density(
-    problem: Problem, drawn: tuple[bool, bool], lane: Lane, sigma: Float[Array, "2"], x: Array
+    model: FitModel, drawn: tuple[bool, bool], lane: Lane, sigma: Float[Array, "2"], x: Array
 ) -> Float[Array, ""]:
     """Log posterior on the real line, up to a constant.
 
     Args:
-        problem: static description.
+        model: what is fitted (static).
         drawn: whether sigma of forces and of markers is unknown.
         lane: the lane's arrays.
         sigma: as for `evaluate`; where it is unknown, what the drawn one is relative to.
@@ -121,8 +121,8 @@ def log_density(
     P = lane.lower.shape[0]
     u, log_noise = x[:P], _spread(drawn, x[P:])
     lane = lane._replace(balance=jnp.ones_like(lane.balance))
-    value = residual_value(problem, from_line(u, lane), lane)
-    rho, _ = weights(problem, value, lane, sigma * jnp.exp(log_noise))
+    value = residual_value(model, from_line(u, lane), lane)
+    rho, _ = weights(model, value, lane, sigma * jnp.exp(log_noise))
     seen, forces = observations(lane)
     counts = jnp.stack([jnp.sum(seen[:, :forces]), jnp.sum(seen[:, forces:])])
     volume = jax.nn.log_sigmoid(u) + jax.nn.log_sigmoid(-u)
@@ -137,16 +137,16 @@ def _spread(drawn: tuple[bool, bool], values: Array) -> Float[Array, "2"]:
     return out.at[jnp.flatnonzero(jnp.array(drawn), size=sum(drawn))].set(values)
 
 
-def _density(problem: Problem, drawn, lane: Lane, sigma, centre, root):
+def _density(model: FitModel, drawn, lane: Lane, sigma, centre, root):
     """Log posterior where the sampler moves, and the way from there to the real line."""
     to_x = lambda y: centre + jnp.sum(root * y[None], axis=1)  # noqa: E731
-    return lambda y: log_density(problem, drawn, lane, sigma, to_x(y)), to_x
+    return lambda y: log_density(model, drawn, lane, sigma, to_x(y)), to_x
 
 
-def _warm_up(problem: Problem, drawn, acceptance, lane: Lane, sigma, centre, root, y, key):
+def _warm_up(model: FitModel, drawn, acceptance, lane: Lane, sigma, centre, root, y, key):
     """Place, step and inverse mass matrix of one chain after its warm-up."""
     blackjax = sampler()
-    density, _ = _density(problem, drawn, lane, sigma, centre, root)
+    density, _ = _density(model, drawn, lane, sigma, centre, root)
     adaptation = blackjax.window_adaptation(
         blackjax.nuts, density, is_mass_matrix_diagonal=False, max_num_doublings=_DOUBLINGS,
         target_acceptance_rate=acceptance, adaptation_info_fn=lambda *_: None,
@@ -155,10 +155,10 @@ def _warm_up(problem: Problem, drawn, acceptance, lane: Lane, sigma, centre, roo
     return state.position, tuned["step_size"], tuned["inverse_mass_matrix"]
 
 
-def _draw(problem: Problem, drawn, draws: int, lane: Lane, sigma, centre, root, warm, key):
+def _draw(model: FitModel, drawn, draws: int, lane: Lane, sigma, centre, root, warm, key):
     """Draws of one chain on the real line, (D, Q), whether each diverged, and its last place."""
     blackjax = sampler()
-    density, to_x = _density(problem, drawn, lane, sigma, centre, root)
+    density, to_x = _density(model, drawn, lane, sigma, centre, root)
     y, step_size, inverse_mass = warm
     kernel = blackjax.nuts(density, step_size, inverse_mass, max_num_doublings=_DOUBLINGS)
 
@@ -171,16 +171,16 @@ def _draw(problem: Problem, drawn, draws: int, lane: Lane, sigma, centre, root, 
 
 
 @functools.lru_cache(maxsize=8)
-def _compiled(problem: Problem, drawn: tuple[bool, bool], draws: int):
+def _compiled(model: FitModel, drawn: tuple[bool, bool], draws: int):
     """Warm-up and drawing of many lanes of many chains."""
 
     def many(chain):
         return jax.vmap(jax.vmap(chain, (None, None, None, None, 0, 0)))
 
     def warm_up(acceptance, *lanes):
-        return many(functools.partial(_warm_up, problem, drawn, acceptance))(*lanes)
+        return many(functools.partial(_warm_up, model, drawn, acceptance))(*lanes)
 
-    return jax.jit(warm_up), jax.jit(many(functools.partial(_draw, problem, drawn, draws)))
+    return jax.jit(warm_up), jax.jit(many(functools.partial(_draw, model, drawn, draws)))
 
 
 def posterior(
@@ -211,9 +211,9 @@ def posterior(
     if draws < 100 or chains < 2:
         raise ValueError(f"{draws} draws of {chains} chains; expected 100 of 2, or more")
     sampler()
-    problem, base = result.problem, mode(result)
-    markers = problem.lanes.joints is not None
-    drawn = (not problem.noise_given[0], markers and not problem.noise_given[1])
+    study, base = result.study, mode(result)
+    markers = study.lanes.joints is not None
+    drawn = (not study.noise_given[0], markers and not study.noise_given[1])
     good = np.array([k for k in range(result.lanes) if succeeded(result, k)], int)
     found = _empty(result, chains, draws)
     chunk = chunk_size(max(len(good), 1), chunk)
@@ -248,11 +248,11 @@ def _run(base: FitResult, drawn, draws: int, times: int, start: dict[int, Start]
     """
     lanes = list(start)
     of = np.array(lanes + [lanes[-1]] * (chunk - len(lanes)))
-    lane = jax.tree.map(lambda v: v[of], base.problem.lanes)
+    lane = jax.tree.map(lambda v: v[of], base.study.lanes)
     chains, (seed, again) = len(start[lanes[0]].y), salt
     places = map(np.stack, zip(*(start[int(k)] for k in of), strict=True))
     centre, root, y = places
-    warm_up, draw = _compiled(base.problem.program, drawn, draws)
+    warm_up, draw = _compiled(base.study.model, drawn, draws)
 
     def keys(turn: int):
         key = jax.random.fold_in(jax.random.key(seed), again * 1000 + turn)
@@ -271,7 +271,7 @@ def _run(base: FitResult, drawn, draws: int, times: int, start: dict[int, Start]
 
 def _keep(found: Posterior, base: FitResult, drawn, start, x, lost) -> dict[int, Start]:
     """Put the draws of some lanes in their places; returns where those not good go on."""
-    lanes, P = base.problem.lanes, base.problem.size
+    lanes, P = base.study.lanes, base.study.size
     more = {}
     for lane, own, failed in zip(start, x, lost, strict=True):
         low, high = lanes.lower[lane], lanes.upper[lane]

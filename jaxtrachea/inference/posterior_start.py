@@ -43,12 +43,12 @@ def mode(result: FitResult) -> FitResult:
     The chains begin there; with curve weights the estimate can lie many standard errors away. A
     lane that does not converge so keeps the estimate that it has.
     """
-    problem = result.problem
-    if np.all(problem.lanes.balance == 1) or problem.joint:
+    study = result.study
+    if np.all(study.lanes.balance == 1) or study.joint:
         return result
-    flat = problem.lanes._replace(balance=np.ones_like(problem.lanes.balance))
+    flat = study.lanes._replace(balance=np.ones_like(study.lanes.balance))
     settings = Settings(starts=1, more_starts=0)
-    again = fit(dataclasses.replace(problem, lanes=flat), settings, starts=result.theta)
+    again = fit(dataclasses.replace(study, lanes=flat), settings, starts=result.theta)
     worse = ~again.succeeded
     keep = lambda new, old: np.where(worse.reshape(-1, *[1] * (new.ndim - 1)), old, new)  # noqa: E731
     return dataclasses.replace(
@@ -70,8 +70,8 @@ def around_the_fit(
     An estimate nearer to a bound than its standard error, or on it, is centred one standard error
     away, where half of the posterior's mass is about.
     """
-    lanes, u = result.problem.lanes, result.uncertainty[lane]
-    P, active = result.problem.size, lanes.active[lane] > 0
+    lanes, u = result.study.lanes, result.uncertainty[lane]
+    P, active = result.study.size, lanes.active[lane] > 0
     width = np.where(active, lanes.upper[lane] - lanes.lower[lane], 1)
     low = np.where(active, lanes.lower[lane], -0.5)
     se = np.where(np.isfinite(u.se), u.se, _conditional(result, lane, width))

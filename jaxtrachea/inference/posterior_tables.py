@@ -32,7 +32,7 @@ def rows_with_draws(
     if drawn is None:
         yield from rows
         return
-    places = ((k, i) for k, unknowns in enumerate(result.problem.unknowns)
+    places = ((k, i) for k, unknowns in enumerate(result.study.unknowns)
               for i in range(len(unknowns)))  # fmt: skip
     for (lane, i), row in zip(places, rows, strict=True):
         verdict = drawn.verdict(lane)

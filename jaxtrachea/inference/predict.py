@@ -111,10 +111,10 @@ def predict_sources(
         sigmas: noise of each sample, N, where it is not that of the fit.
         chunk: curves computed together.
     """
-    run = compiled(stored.problem.program)
+    run = compiled(stored.study.model)
     most = _rounded(max(map(len, displacements)), 32)
     padded = np.stack([np.pad(d, (0, most - len(d)), mode="edge") for d in displacements])
-    places = np.where(np.isnan(s), float(stored.problem.geometry.length) / 2, s)
+    places = np.where(np.isnan(s), float(stored.study.model.geometry.length) / 2, s)
     stack = lambda name: np.stack([getattr(source, name) for source in sources])  # noqa: E731
     columns = [stack(n) for n in ("free", "value", "covariance", "blind", "half_width")]
     columns += [places, padded]
@@ -152,7 +152,7 @@ def _on_host(stored: StoredFit, source: Source, s, displacement, part: Predicted
     value, se = jax.tree.map(cut, part.value), jax.tree.map(cut, part.se)
     usable = source.status.predicts
     hide = lambda v: v if usable else np.full_like(v, np.nan)  # noqa: E731
-    skeleton = any(p.name == "k_M" for p in stored.problem.parameters)
+    skeleton = any(p.name == "k_M" for p in stored.study.parameters)
     show = lambda v: hide(v) if skeleton else np.full_like(v, np.nan)  # noqa: E731
     presses = np.asarray(part.status[:n])
     bend = _bend(source, cut(part.bend.T).T, value, se, int(part.deepest))
@@ -276,7 +276,7 @@ def check_position(results: StoredFit, s: float) -> None:
     Raises:
         ValueError: with what is expected.
     """
-    length = float(results.problem.geometry.length)
+    length = float(results.study.model.geometry.length)
     if not 0 <= s <= length:
         raise ValueError(f"s = {s:g} mm is not on the tube; expected 0 to {length:g} mm")
 
@@ -289,7 +289,7 @@ def unknown_name(kind: str, name: str, known) -> str:
 
 def _only_specimen(results: StoredFit) -> str:
     names = results.specimens
-    shared = all(p.scope in ("shared", "trial") for p in results.problem.free)
+    shared = all(p.scope in ("shared", "trial") for p in results.study.free)
     if len(names) > 1 and not shared:
         raise ValueError(
             f"this fit has {len(names)} specimens with parameters of their own; give specimen=, "

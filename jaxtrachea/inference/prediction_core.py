@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import material_and_values
 from jaxtrachea.mechanics.press import press
 
@@ -53,7 +53,7 @@ class Predicted(NamedTuple):
 
 
 def respond(
-    problem: Problem,
+    model: FitModel,
     free: Float[Array, " F"],
     value: Float[Array, " J"],
     s_c: Float[Array, ""],
@@ -63,7 +63,7 @@ def respond(
     """The fitted model at one position: response and `PressStatus`; pure.
 
     Args:
-        problem: geometry, options and parameters (static).
+        model: of the fit (static).
         free: free parameters, scaled coordinates.
         value: all parameters in their units, used where they are not free.
         s_c: mm.
@@ -71,26 +71,26 @@ def respond(
         blend: rounded corner of a curve whose onset was fitted, mm, see `Lane`; None: that of the
             options.
     """
-    material, values = material_and_values(problem, free, value)
-    geometry = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), problem.geometry)
+    material, values = material_and_values(model, free, value)
+    geometry = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), model.geometry)
     solved = press(
-        geometry, material, s_c, displacement, problem.options,
+        geometry, material, s_c, displacement, model.options,
         onset=values["onset"], blend=blend,
     )  # fmt: skip
     force = solved.force + values["force_offset"]
     return Response(force, solved.joints, solved.reactions), solved.status
 
 
-def jacobian(problem: Problem, free, value, s_c, displacement, blend=None):
+def jacobian(model: FitModel, free, value, s_c, displacement, blend=None):
     """`respond`, its statuses, and its derivative by every free column, a leading axis (F, ...)."""
 
     def push(tangent):
-        at = lambda free: respond(problem, free, value, s_c, displacement, blend)  # noqa: E731
+        at = lambda free: respond(model, free, value, s_c, displacement, blend)  # noqa: E731
         out, moved, status = jax.jvp(at, (free,), (tangent,), has_aux=True)
         return out, status, moved
 
     if not len(free):
-        out, status = respond(problem, free, value, s_c, displacement, blend)
+        out, status = respond(model, free, value, s_c, displacement, blend)
         return out, status, jax.tree.map(lambda v: jnp.zeros((0, *v.shape), v.dtype), out)
     eye = jnp.eye(free.shape[0], dtype=free.dtype)
     return jax.vmap(push, out_axes=(None, None, 0))(eye)
@@ -127,7 +127,7 @@ def _unseen(slope: Float[Array, "F N"], slack: Float[Array, "N F"]) -> Float[Arr
 
 
 def predicted(
-    problem: Problem,
+    model: FitModel,
     free: Float[Array, " F"],
     value: Float[Array, " J"],
     covariance: Float[Array, "F F"],
@@ -141,7 +141,7 @@ def predicted(
     """One curve with its standard errors; pure, for `jit` and `vmap`, float32 and float64.
 
     Args:
-        problem: geometry, options and parameters (static).
+        model: of the fit (static).
         free: estimates, scaled coordinates.
         value: all parameters in their units, used where they are not free.
         covariance: of `free`; 0 for what is held.
@@ -153,7 +153,7 @@ def predicted(
         slack: where the fit has pressed, how far it sees slopes: its least ratio of singular values
             times the root of its samples, times the size of each unknown; elsewhere 0; None: 0.
     """
-    out, status, slopes = jacobian(problem, free, value, s_c, displacement, blend)
+    out, status, slopes = jacobian(model, free, value, s_c, displacement, blend)
     se = jax.tree.map(lambda slope: standard_errors(slope, covariance, blind), slopes)
     if slack is not None:
         unseen = _unseen(slopes.force, slack)
@@ -166,24 +166,24 @@ def predicted(
     straight = jnp.einsum("f...,f->...", slopes.force, step)
 
     def bend(sign):
-        end, _ = respond(problem, free + sign * step, value, s_c, displacement, blend)
+        end, _ = respond(model, free + sign * step, value, s_c, displacement, blend)
         return end.force - out.force - sign * straight
 
     return Predicted(out, se, status, jnp.stack([bend(1.0), bend(-1.0)]), deepest)
 
 
 @functools.lru_cache(maxsize=16)
-def compiled(problem: Problem):
-    """`predicted` for many curves at once; `problem` is a `Problem.program`."""
-    return jax.jit(jax.vmap(functools.partial(predicted, problem)))
+def compiled(model: FitModel):
+    """`predicted` for many curves at once; `model` is a `FitModel`."""
+    return jax.jit(jax.vmap(functools.partial(predicted, model)))
 
 
 @functools.lru_cache(maxsize=16)
-def compiled_slopes(problem: Problem):
+def compiled_slopes(model: FitModel):
     """Force and its derivative for many curves at once."""
 
     def force(free, value, s_c, displacement, blend=None):
-        out, _, slopes = jacobian(problem, free, value, s_c, displacement, blend)
+        out, _, slopes = jacobian(model, free, value, s_c, displacement, blend)
         return out.force, slopes.force
 
     return jax.jit(jax.vmap(force))

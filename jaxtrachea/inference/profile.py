@@ -51,7 +51,7 @@ class Profiles:
     @property
     def relative_error(self) -> Float[np.ndarray, " K"]:
         """Half the width of the interval in relative coordinates, over the half width in errors."""
-        parameters = [self.result.problem.unknowns[k][i][0] for k, i in self.pairs]
+        parameters = [self.result.study.unknowns[k][i][0] for k, i in self.pairs]
         log = np.array([p.scale == "log" for p in parameters], bool)
         step = np.array([p.step for p in parameters])
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -87,7 +87,7 @@ def choose(result: FitResult, names: Sequence[str] | None) -> tuple[np.ndarray, 
     Raises:
         ValueError: a name is not among the free parameters.
     """
-    free = [p.name for p in result.problem.free]
+    free = [p.name for p in result.study.free]
     for name in names or ():
         if name not in free:
             raise ValueError(f"{name!r} is not fitted, only {', '.join(free)} are")
@@ -95,7 +95,7 @@ def choose(result: FitResult, names: Sequence[str] | None) -> tuple[np.ndarray, 
         (lane, i)
         for lane in range(result.lanes)
         if FitStatus(int(result.status[lane])).succeeded
-        for i, (p, _, _) in enumerate(result.problem.unknowns[lane])
+        for i, (p, _, _) in enumerate(result.study.unknowns[lane])
         if names is None or p.name in names
     ]
     pairs = np.array(chosen, int).reshape(-1, 2)
@@ -120,9 +120,9 @@ def profiles(
         progress: called with (refits done since the last call, 0 for unknown in all).
 
     Raises:
-        ValueError: as `choose`, or a joint problem.
+        ValueError: as `choose`, or a joint study.
     """
-    result.problem.refuse_joint("a profile")
+    result.study.refuse_joint("a profile")
     lane, unknown = choose(result, names)
     sides = Sides(result, settings, lane.repeat(2), unknown.repeat(2), progress)
     distance, end, path = find_ends(sides)
@@ -130,7 +130,7 @@ def profiles(
     best = np.take_along_axis(result.theta[lane], unknown[:, None], axis=1)[:, 0]
     reach = np.where(end == ProfileEnd.OPEN, np.inf, distance)
     reach = np.where(end == ProfileEnd.FAILED, np.nan, reach).reshape(-1, 2)
-    parameters = [result.problem.unknowns[k][i][0] for k, i in zip(lane, unknown, strict=True)]
+    parameters = [result.study.unknowns[k][i][0] for k, i in zip(lane, unknown, strict=True)]
     log = np.array([p.scale == "log" for p in parameters], bool)
     step = np.array([p.step for p in parameters])
     with np.errstate(over="ignore"):

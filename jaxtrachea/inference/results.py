@@ -32,7 +32,7 @@ MORE = ("se", "flat_se", "blind", "half_width", "along", "dispersion", "covarian
 
 def unknown_label(result: FitResult, lane: int, i: int) -> str:
     """Name of an unknown: k_M, or onset[t03], or k_M[T01] where a lane holds several of them."""
-    unknowns = result.problem.unknowns[lane]
+    unknowns = result.study.unknowns[lane]
     p, specimen, trial = unknowns[i]
     same = [u for u in unknowns if u[0].name == p.name]
     if len(same) == 1:
@@ -44,7 +44,7 @@ def unknown_label(result: FitResult, lane: int, i: int) -> str:
 
 def lane_label(result: FitResult, lane: int) -> str:
     """Specimen of a lane, and its trial if it holds a single one."""
-    specimen, trial = result.problem.lane_name(lane)
+    specimen, trial = result.study.lane_name(lane)
     return specimen if trial == "(all)" else f"{specimen} {trial}"
 
 
@@ -55,16 +55,16 @@ def succeeded(result: FitResult, lane: int) -> bool:
 
 def peak_force(result: FitResult, lane: int) -> float:
     """Largest measured force of a lane, N."""
-    return max(float(np.max(np.abs(c.force))) for c in result.problem.curves[lane])
+    return max(float(np.max(np.abs(c.force))) for c in result.study.curves[lane])
 
 
 def flat_sentence(result: FitResult, lane: int) -> str:
     """The least determined combination of a lane in words."""
     if not succeeded(result, lane):
         return "no estimate"
-    if not result.problem.free:
+    if not result.study.free:
         return NOTHING_FITTED
-    names = [unknown_label(result, lane, i) for i in range(len(result.problem.unknowns[lane]))]
+    names = [unknown_label(result, lane, i) for i in range(len(result.study.unknowns[lane]))]
     u = result.uncertainty[lane]
     return describe_flat(
         names, u.flat, float(u.flat_se), u.blind, result.undetermined[lane],
@@ -74,12 +74,12 @@ def flat_sentence(result: FitResult, lane: int) -> str:
 
 def press_sizes(result: FitResult, lane: int) -> dict[int, tuple[float, str]]:
     """Size of the press in the unit of each onset and offset of a lane, by place of the unknown."""
-    unknowns = result.problem.unknowns[lane]
+    unknowns = result.study.unknowns[lane]
     places = [i for i, (p, _, _) in enumerate(unknowns) if p.name in OF_THE_PRESS]
     places = [i for i in places if unknowns[i][0].scale == "linear"]
     if not places:
         return {}
-    sizes = sizes_of_press(result.problem.take(np.array([lane])))[0]
+    sizes = sizes_of_press(result.study.take(np.array([lane])))[0]
     found = {i: (float(sizes[i]) * unknowns[i][0].step, unknowns[i][0].unit) for i in places}
     return {i: v for i, v in found.items() if np.isfinite(v[0])}
 
@@ -88,15 +88,15 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
     """Which unknowns of a lane have which verdict, and what is least determined."""
     if not succeeded(result, lane):
         return "no estimate"
-    if not result.problem.free:
+    if not result.study.free:
         return NOTHING_FITTED
     groups: dict[str, list[str]] = {}
-    for i in range(len(result.problem.unknowns[lane])):
+    for i in range(len(result.study.unknowns[lane])):
         word = verdict_of(result, lane, i, profiles)
         groups.setdefault(word, []).append(unknown_label(result, lane, i))
     said = [f"{word}: {', '.join(groups[word])}" for word in VERDICTS if word in groups]
     said.append(flat_sentence(result, lane))
-    if result.problem.joint and result.unexamined[lane].any():
+    if result.study.joint and result.unexamined[lane].any():
         said.append("not shown: only the local error was looked at; --profile looks further")
     if result.minima[lane] > 1:
         said.append("fits that end elsewhere are as good within the noise")
@@ -113,16 +113,16 @@ def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[d
     for lane, one in row_places(result):
         status = FitStatus(int(result.status[lane]))
         trials = trials_of(result, lane, one)
-        curves = [result.problem.curves[lane][t] for t in trials]
+        curves = [result.study.curves[lane][t] for t in trials]
         peak = max(float(np.max(np.abs(c.force))) for c in curves)
-        specimen, trial = result.problem.lane_name(lane)
+        specimen, trial = result.study.lane_name(lane)
         if one:
             specimen, trial = one, curves[0].trial if len(curves) == 1 else "(all)"
         row: dict[str, object] = {
             "specimen": specimen,
             "trial": trial,
             "status": status.name.lower(),
-            "message": status.message if result.problem.free else NOTHING_FITTED,
+            "message": status.message if result.study.free else NOTHING_FITTED,
             "iterations": int(result.iterations[lane]),
             "starts_agreeing": int(result.converged_starts[lane]),
             "starts": int(result.tried[lane]),
@@ -146,7 +146,7 @@ def _unknown_cells(
     result: FitResult, lane: int, specimen: str, profiles: Profiles | None
 ) -> dict[str, object]:
     """What a row of summary.csv says of the unknowns of its specimen."""
-    unknowns = result.problem.unknowns[lane]
+    unknowns = result.study.unknowns[lane]
     own = [i for i, u in enumerate(unknowns) if not specimen or u[1] in ("", specimen)]
     cells: dict[str, object] = {}
     more = []
@@ -179,7 +179,7 @@ def bad_row(bad: BadCurve) -> dict[str, object]:
 
 def is_own(result: FitResult, lane: int, i: int) -> bool:
     """Whether an unknown belongs to its lane alone, not to all lanes of a joint fit."""
-    return not (result.problem.joint and result.problem.unknowns[lane][i][0].scope == "shared")
+    return not (result.study.joint and result.study.unknowns[lane][i][0].scope == "shared")
 
 
 def said_before(result: FitResult, lanes: Sequence[int], lane: int, i: int) -> bool:
@@ -200,8 +200,8 @@ def parameter_rows(
     """
     every = range(result.lanes)
     for lane in range(result.lanes):
-        lane_specimen, _ = result.problem.lane_name(lane)
-        for i, (p, specimen, trial) in enumerate(result.problem.unknowns[lane]):
+        lane_specimen, _ = result.study.lane_name(lane)
+        for i, (p, specimen, trial) in enumerate(result.study.unknowns[lane]):
             if said_before(result, every, lane, i):
                 continue
             judged = judgement(result, lane, i, profiles)
@@ -250,8 +250,8 @@ def profile_rows(profiles: Profiles) -> Iterator[dict[str, object]]:
     """One row per point of each profile for profiles.csv."""
     result = profiles.result
     for k, (lane, i) in enumerate(profiles.pairs):
-        lane_specimen, _ = result.problem.lane_name(lane)
-        p, specimen, trial = result.problem.unknowns[lane][i]
+        lane_specimen, _ = result.study.lane_name(lane)
+        p, specimen, trial = result.study.unknowns[lane][i]
         for theta, statistic in zip(profiles.coordinate[k], profiles.statistic[k], strict=True):
             yield {
                 "specimen": specimen or lane_specimen,
@@ -310,7 +310,7 @@ def _write_profiles(group: h5py.Group, profiles: Profiles) -> None:
 
 def _write_lanes(group: h5py.Group, result: FitResult) -> None:
     text = h5py.string_dtype()
-    names = [result.problem.lane_name(lane) for lane in range(result.lanes)]
+    names = [result.study.lane_name(lane) for lane in range(result.lanes)]
     group.create_dataset("specimen", data=[n[0] for n in names], dtype=text)
     group.create_dataset("trial", data=[n[1] for n in names], dtype=text)
     codes = group.create_dataset("status", data=result.status.astype(np.int8))
@@ -325,17 +325,17 @@ def _write_lanes(group: h5py.Group, result: FitResult) -> None:
 
 
 def _write_unknowns(group: h5py.Group, result: FitResult, profiles: Profiles | None = None) -> None:
-    text, problem = h5py.string_dtype(), result.problem
+    text, study = h5py.string_dtype(), result.study
     for field, pick in (("parameter", 0), ("specimen", 1), ("trial", 2)):
-        cells = [[_cell(problem.unknowns[lane], i, pick) for i in range(problem.size)]
+        cells = [[_cell(study.unknowns[lane], i, pick) for i in range(study.size)]
                  for lane in range(result.lanes)]  # fmt: skip
         group.create_dataset(field, data=cells, dtype=text)
-    judged = [[judgement(result, k, i, profiles) for i in range(len(problem.unknowns[k]))]
+    judged = [[judgement(result, k, i, profiles) for i in range(len(study.unknowns[k]))]
               for k in range(result.lanes)]  # fmt: skip
-    words = [[j.verdict for j in row] + [""] * (problem.size - len(row)) for row in judged]
+    words = [[j.verdict for j in row] + [""] * (study.size - len(row)) for row in judged]
     for name in ("low", "high"):
-        absent = [np.nan] * problem.size
-        ends = [([getattr(j, name) for j in row] + absent)[: problem.size] for row in judged]
+        absent = [np.nan] * study.size
+        ends = [([getattr(j, name) for j in row] + absent)[: study.size] for row in judged]
         group.create_dataset(f"{name}95", data=ends, compression="gzip")
     group.create_dataset("verdict", data=words, dtype=text)
     arrays = {
@@ -348,8 +348,8 @@ def _write_unknowns(group: h5py.Group, result: FitResult, profiles: Profiles | N
     arrays["flat"] = np.stack([u.flat for u in result.uncertainty])
     for name, data in arrays.items():
         group.create_dataset(name, data=data, compression="gzip")
-    group.attrs["units"] = json.dumps({p.name: p.unit for p in problem.parameters})
-    fixed = {p.name: p.value for p in problem.parameters if p.fixed}
+    group.attrs["units"] = json.dumps({p.name: p.unit for p in study.parameters})
+    fixed = {p.name: p.value for p in study.parameters if p.fixed}
     group.attrs["fixed"] = json.dumps(fixed)
 
 

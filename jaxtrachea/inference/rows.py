@@ -14,7 +14,7 @@ def row_places(result: FitResult) -> list[tuple[int, str]]:
     The specimen is "" where the lane has but one.
     """
     places = []
-    for lane, curves in enumerate(result.problem.curves):
+    for lane, curves in enumerate(result.study.curves):
         names = list(dict.fromkeys(c.specimen for c in curves))
         places += [(lane, name) for name in (names if len(names) > 1 else [""])]
     return places
@@ -22,20 +22,20 @@ def row_places(result: FitResult) -> list[tuple[int, str]]:
 
 def trials_of(result: FitResult, lane: int, specimen: str) -> list[int]:
     """Which trials of a lane belong to a specimen; "": all."""
-    curves = result.problem.curves[lane]
+    curves = result.study.curves[lane]
     return [t for t, c in enumerate(curves) if specimen in ("", c.specimen)]
 
 
 def samples_of(result: FitResult, lane: int, trials: list[int]) -> int:
     """Observed forces and markers of some trials of a lane."""
-    lanes = result.problem.lanes
+    lanes = result.study.lanes
     kinds = (v for v in (lanes.precision, lanes.joint_precision) if v is not None)
     return sum(int(np.sum(v[lane, trials] > 0)) for v in kinds)
 
 
 def over_peak(result: FitResult) -> np.ndarray:
     """Root mean square force residual over the largest force of each lane; (lanes,)."""
-    curves = result.problem.curves
+    curves = result.study.curves
     peak = np.array([max(float(np.max(np.abs(c.force))) for c in of) for of in curves])
     return np.where(peak > 0, result.rms[:, 0], np.nan) / np.where(peak > 0, peak, 1)
 

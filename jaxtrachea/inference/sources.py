@@ -83,7 +83,7 @@ def source_of(
     if not status.succeeded:
         return _none(stored, specimen, trial, PredictionStatus.NO_ESTIMATE, status.message)
     index, own = _columns(stored, lane, used, trial)
-    lacking = [stored.problem.free[f].name for f in own]
+    lacking = [stored.study.free[f].name for f in own]
     lacking = [name for name in lacking if name not in OF_MEASUREMENT]
     if lacking and not measured:
         text = f"{', '.join(lacking)} belongs to single trials; name one of the fit with trial="
@@ -105,7 +105,7 @@ def _whose(stored: StoredFit, specimen: str, as_specimen: str | None) -> tuple[s
         return specimen, ""
     if as_specimen is not None:
         return as_specimen, f"predicted as specimen {as_specimen!r}"
-    own = [p.name for p in stored.problem.free if p.scope == "specimen"]
+    own = [p.name for p in stored.study.free if p.scope == "specimen"]
     if not own:
         return names[0], "a new specimen: predicted with what all specimens share"
     if len(names) == 1:
@@ -130,9 +130,9 @@ def _lane(stored: StoredFit, specimen: str, trial: str | None) -> int | None:
 
 def _columns(stored: StoredFit, lane: int, specimen: str, trial: str | None):
     """Unknown that every free column reads, -1 for those that the fit does not have; and these."""
-    place = {(p.name, s, t): i for i, (p, s, t) in enumerate(stored.problem.unknowns[lane])}
+    place = {(p.name, s, t): i for i, (p, s, t) in enumerate(stored.study.unknowns[lane])}
     index, own = [], []
-    for f, p in enumerate(stored.problem.free):
+    for f, p in enumerate(stored.study.free):
         key = (
             p.name,
             "" if p.scope == "shared" else specimen,
@@ -157,7 +157,7 @@ def _taken(stored: StoredFit, specimen, trial, lane: int, index, own, note: str)
     if known.any():
         covariance = np.where(both, stored.covariance[lane][np.ix_(pick, pick)], 0.0)
         blind = np.where(known, stored.blind[lane][:, pick], 0.0)
-        held = [p.name for p, k, i in zip(stored.problem.free, known, pick, strict=True)
+        held = [p.name for p, k, i in zip(stored.study.free, known, pick, strict=True)
                 if k and stored.at_bound[lane, i]]  # fmt: skip
         if held:
             status = PredictionStatus.AT_BOUND
@@ -167,7 +167,7 @@ def _taken(stored: StoredFit, specimen, trial, lane: int, index, own, note: str)
         trial=trial,
         lane=lane,
         free=free,
-        value=np.array([p.value for p in stored.problem.parameters]),
+        value=np.array([p.value for p in stored.study.parameters]),
         covariance=covariance,
         blind=blind,
         half_width=np.asarray(stored.half_width[lane]),
@@ -180,7 +180,7 @@ def _taken(stored: StoredFit, specimen, trial, lane: int, index, own, note: str)
 
 def _none(stored: StoredFit, specimen, trial, status: PredictionStatus, message: str) -> Source:
     """No parameters, and why; arrays of the usual shapes, so that one program serves all."""
-    F, J = len(stored.problem.free), len(stored.problem.parameters)
+    F, J = len(stored.study.free), len(stored.study.parameters)
     nan = np.full(F, np.nan)
     return Source(
         specimen=specimen,
@@ -200,7 +200,7 @@ def _none(stored: StoredFit, specimen, trial, status: PredictionStatus, message:
 
 def slack_of(stored: StoredFit, source: Source, s: float, displacement: np.ndarray) -> np.ndarray:
     """How far the fit sees slopes where it has pressed, see `prediction_core.predicted`; (N, F)."""
-    free = stored.problem.free
+    free = stored.study.free
     out = np.zeros((len(displacement), len(free)))
     curves = [c for c, k in zip(stored.curves, stored.curve_lane, strict=True) if k == source.lane]
     place = lambda c: np.nan if c.s_c is None else c.s_c  # noqa: E731

@@ -31,34 +31,34 @@ def write(
         files: SHA-256 by file name.
         reading: the [data] section.
     """
-    problem = result.problem
-    place = {p.name: j for j, p in enumerate(problem.parameters)}
-    unknowns = [[[place[p.name], *names] for p, *names in lane] for lane in problem.unknowns]
+    study = result.study
+    place = {p.name: j for j, p in enumerate(study.parameters)}
+    unknowns = [[[place[p.name], *names] for p, *names in lane] for lane in study.unknowns]
     group = file.create_group("model")
     _write_json(
         group,
         {
-            "options": dataclasses.asdict(problem.options),
-            "parameters": [dataclasses.asdict(p) for p in problem.parameters],
+            "options": dataclasses.asdict(study.model.options),
+            "parameters": [dataclasses.asdict(p) for p in study.parameters],
             "unknowns": unknowns,
-            "lanes": [problem.lane_name(lane) for lane in range(result.lanes)],
-            "loss": problem.loss,
-            "loss_scale": problem.loss_scale,
-            "noise_given": problem.noise_given,
-            "joint": problem.joint,
+            "lanes": [study.lane_name(lane) for lane in range(result.lanes)],
+            "loss": study.model.loss,
+            "loss_scale": study.model.loss_scale,
+            "noise_given": study.noise_given,
+            "joint": study.joint,
             "reading": dict(reading),
             "units": {"length": "mm", "force": "N", "angle": "rad"},
         },
     )
     for name in GEOMETRY:
-        group.create_dataset(name, data=np.asarray(getattr(problem.geometry, name), np.float64))
+        group.create_dataset(name, data=np.asarray(getattr(study.model.geometry, name), np.float64))
     _write_data(file.create_group("data"), result, files)
 
 
 def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) -> None:
     """Every curve as it was used, with the model's answer at the estimate; samples end to end."""
-    problem = result.problem
-    placed = [(k, t, c) for k, lane in enumerate(problem.curves) for t, c in enumerate(lane)]
+    study = result.study
+    placed = [(k, t, c) for k, lane in enumerate(study.curves) for t, c in enumerate(lane)]
     curves = [c for _, _, c in placed]
     names = sorted(files, key=len, reverse=True)
     _write_json(
@@ -74,9 +74,9 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
     group["samples"] = np.array([len(c.force) for c in curves], np.int64)
     group["s_c"] = np.array([np.nan if c.s_c is None else c.s_c for c in curves])
     group["phi_c"] = np.array([c.phi_c for c in curves])
-    blend = problem.lanes.blend
+    blend = study.lanes.blend
     group["blend"] = np.array([np.nan if blend is None else blend[k, t] for k, t, _ in placed])
-    seen = predictions(problem, result.theta)
+    seen = predictions(study, result.theta)
     residual = [seen.force[k, t, : len(c.force)] for k, t, c in placed]
     columns = {
         "displacement": [c.displacement for c in curves],
@@ -85,10 +85,10 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
         "residual": residual,
         "predicted": [c.force + r for c, r in zip(curves, residual, strict=True)],
     }
-    if seen.joints is not None and problem.lanes.joints is not None:
+    if seen.joints is not None and study.lanes.joints is not None:
         found = [seen.joints[k, t, : len(c.force)] for k, t, c in placed]
         columns["joint_residual"] = found
-        columns["joints"] = [_on_rings(c, problem.geometry.rings) for c in curves]
+        columns["joints"] = [_on_rings(c, study.model.geometry.rings) for c in curves]
     for name, parts in columns.items():
         group.create_dataset(name, data=np.concatenate(parts), compression="gzip")
 

@@ -10,12 +10,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from jaxtrachea.fit.lane import Lane
+from jaxtrachea.fit.model import FitModel, columns_of, numbers_of
 from jaxtrachea.fit.parameters import Parameter
-from jaxtrachea.fit.problem import Problem
+from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.store import GEOMETRY
 from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.read import Curve, DataError
@@ -46,7 +46,7 @@ class StoredFit:
 
     Attributes:
         path: the file.
-        problem: geometry, options, parameters and unknowns; no data.
+        study: geometry, options, parameters and unknowns; no data.
         reading: how the data were read, as in the [data] section.
         lane_names: specimen and trial of each lane, "(all)" where it spans several.
         theta: estimates; (L, P).
@@ -66,7 +66,7 @@ class StoredFit:
     """
 
     path: Path
-    problem: Problem
+    study: Study
     reading: Mapping[str, Any]
     lane_names: tuple[tuple[str, str], ...]
     theta: np.ndarray
@@ -103,7 +103,7 @@ class StoredFit:
 
     def __repr__(self) -> str:
         """One line: what was fitted to what."""
-        free = ", ".join(p.name for p in self.problem.free) or "nothing"
+        free = ", ".join(p.name for p in self.study.free) or "nothing"
         return (
             f"StoredFit({str(self.path)!r}: {free} fitted to {len(self.curves)} curves of "
             f"{len(self.specimens)} specimen(s))"
@@ -183,17 +183,19 @@ def _read(path: Path, file: Any) -> StoredFit:
         for lane in model["unknowns"]
     )
     empty: dict[str, Any] = dict.fromkeys(Lane._fields, np.zeros((0, 0)))
-    problem = Problem(
-        geometry=jax.tree.map(lambda v: np.asarray(v, np.float64), geometry),
-        options=Options(**model["options"]),
+    study = Study(
+        model=FitModel(
+            tube=numbers_of(geometry),
+            options=Options(**model["options"]),
+            columns=columns_of(parameters),
+            loss=model["loss"],
+            loss_scale=float(model["loss_scale"]),
+        ),
         parameters=parameters,
         lanes=Lane(**empty),
         curves=(),
         unknowns=unknowns,
-        loss=model["loss"],
-        loss_scale=model["loss_scale"],
         noise_given=(bool(model["noise_given"][0]), bool(model["noise_given"][1])),
-        common="nothing",
         joint=bool(model["joint"]),
     )
     theta = numeric(file["unknowns"], "theta")
@@ -201,7 +203,7 @@ def _read(path: Path, file: Any) -> StoredFit:
     curves, lane, files = _read_data(file["data"])
     stored = StoredFit(
         path=path,
-        problem=problem,
+        study=study,
         reading=model["reading"],
         lane_names=tuple((s, t) for s, t in model["lanes"]),
         theta=theta,
@@ -210,7 +212,7 @@ def _read(path: Path, file: Any) -> StoredFit:
         at_bound=numeric(file["unknowns"], "at_bound") > 0,
         status=numeric(file["lanes"], "status").astype(int),
         sigma=_sigma(file["lanes"]),
-        half_width=_known_half_width(problem, numeric(file["uncertainty"], "half_width")),
+        half_width=_known_half_width(study, numeric(file["uncertainty"], "half_width")),
         curves=curves,
         curve_lane=lane,
         blend=numeric(file["data"], "blend"),
@@ -220,12 +222,12 @@ def _read(path: Path, file: Any) -> StoredFit:
     return stored
 
 
-def _known_half_width(problem: Problem, half: np.ndarray) -> np.ndarray:
+def _known_half_width(study: Study, half: np.ndarray) -> np.ndarray:
     """Infinite where noise that should be estimated has no sample left to be estimated from.
 
     `uncertainty.analyse` puts the normal quantile there, which Student's t never reaches.
     """
-    return np.where((half == NORMAL) & ~np.array(problem.noise_given[0]), np.inf, half)
+    return np.where((half == NORMAL) & ~np.array(study.noise_given[0]), np.inf, half)
 
 
 def _sigma(lanes: Any) -> np.ndarray:
@@ -276,7 +278,7 @@ def _check_shapes(stored: StoredFit) -> None:
     Raises:
         ValueError: naming the array.
     """
-    L, P = len(stored.problem.unknowns), stored.theta.shape[-1]
+    L, P = len(stored.study.unknowns), stored.theta.shape[-1]
     shapes = {
         "theta": (L, P), "covariance": (L, P, P), "blind": (L, P, P), "at_bound": (L, P),
         "status": (L,), "sigma": (L, 2), "half_width": (L,), "curve_lane": (len(stored.curves),),
@@ -286,7 +288,7 @@ def _check_shapes(stored: StoredFit) -> None:
         if getattr(stored, name).shape != shape:
             raise ValueError(f"{name} has shape {getattr(stored, name).shape}, expected {shape}")
     known = {int(s) for s in FitStatus}
-    if max(map(len, stored.problem.unknowns), default=0) > P or set(stored.status) - known:
+    if max(map(len, stored.study.unknowns), default=0) > P or set(stored.status) - known:
         raise ValueError("unknowns or statuses that do not belong together")
     lanes = set(stored.curve_lane.tolist())
     if not stored.curves or not lanes <= set(range(L)):

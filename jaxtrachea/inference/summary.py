@@ -20,7 +20,7 @@ def with_residuals(
         if specimen:
             trials = trials_of(result, lane, specimen)
             own = float(rms(seen.force[lane, trials].ravel()))
-            curves = [result.problem.curves[lane][t] for t in trials]
+            curves = [result.study.curves[lane][t] for t in trials]
             peak = max(float(np.max(np.abs(c.force))) for c in curves)
             cells = {"rms_force_N": own, "rms_over_peak": own / peak if peak > 0 else np.nan}
             if seen.joints is not None:
@@ -45,7 +45,7 @@ def widened_rows(
             "high95_widened": float(wide.upper[lane, i]),
         }
         for lane in every
-        for i in range(len(result.problem.unknowns[lane]))
+        for i in range(len(result.study.unknowns[lane]))
         if not said_before(result, every, lane, i)
     ]
 
@@ -56,7 +56,7 @@ def left_out_cells(result: FitResult, left_out: LeftOut) -> list[dict[str, objec
     rows = []
     columns = (left_out.lane, left_out.trial, left_out.converged.tolist(), *errors)
     for k, t, converged, *values in zip(*columns, strict=True):
-        curve = result.problem.curves[k][t]
+        curve = result.study.curves[k][t]
         names = ("force_over_model", "rms_over_peak", "rms_joints_over_displacement")
         row: dict[str, object] = {"specimen": curve.specimen, "trial": curve.trial}
         out = zip(names, values, strict=True)

@@ -15,7 +15,7 @@ def doubts(result: FitResult, wide: Effective) -> list[str]:
     """What speaks against the standard errors of this fit."""
     said = []
     lanes = np.flatnonzero(wide.correlation > CORRELATED)
-    if len(lanes) and not result.problem.free:
+    if len(lanes) and not result.study.free:
         said.append(
             f"Neighbouring force residuals are correlated in {len(lanes)} of {result.lanes} lanes: "
             "the model misses the shape of these curves, or the noise is not independent from "

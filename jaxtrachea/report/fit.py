@@ -44,7 +44,7 @@ def estimate_rows(
     """Lane, parameter, value, standard error, 95 % interval, if given widened, verdict."""
     rows = []
     for lane in lanes:
-        for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+        for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
             if said_before(result, lanes, lane, i):
                 continue
             judged = judgement(result, lane, i, profiles)
@@ -81,7 +81,7 @@ def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[lis
     units: dict[str, str] = {}
     good = [k for k in range(result.lanes) if succeeded(result, k)]
     for lane in good:
-        for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+        for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
             if said_before(result, good, lane, i):
                 continue
             verdict = verdict_of(result, lane, i, profiles)
@@ -150,7 +150,7 @@ def left_out_rows(result: FitResult, left_out: LeftOut) -> list[list[str]]:
     rows = []
     errors = (left_out.ratio, left_out.force, left_out.joints)
     for k, t, *values in zip(left_out.lane, left_out.trial, *errors, strict=True):
-        curve = result.problem.curves[k][t]
+        curve = result.study.curves[k][t]
         rows.append([curve.specimen, curve.trial, *map(_percent, values)])
     mean = [float(rms(v)) for v in errors]
     return [*rows, ["(root mean square)", "", *map(_percent, mean)]]
@@ -172,7 +172,7 @@ def _percent(value: float) -> str:
 
 def own_touch_sentence(result: FitResult, which: str) -> list[str]:
     """That a curve left out has an onset or an offset fitted to itself; empty where it has none."""
-    own = [p.name for p in result.problem.free if p.scope == "trial" and p.name in OF_THE_PRESS]
+    own = [p.name for p in result.study.free if p.scope == "trial" and p.name in OF_THE_PRESS]
     if not own:
         return []
     return [
@@ -229,7 +229,7 @@ def report_text(
         parts += [f"{left_out.sentence}."] if left_out.sentence else []
     parts += more
     names = {"fit": "data and fit", "residuals": "residuals"}
-    names |= {"correlation": "correlation"} if result.problem.free else {}
+    names |= {"correlation": "correlation"} if result.study.free else {}
     parts += [f"![{text}]({name}.png)" for name, text in names.items()]
     if bad:
         rows = [[b.specimen, b.trial, b.kind, b.message, b.cure] for b in bad]
@@ -249,10 +249,10 @@ def _estimates(
     tables = [markdown_table(head, rows), *more_of(result, shown, "parameters.csv")]
     if result.lanes > len(shown):
         tables = [markdown_table(SPREAD_HEAD, spread_rows(result, profiles)), *tables]
-    if not result.problem.free:
+    if not result.study.free:
         tables = [f"None: {NOTHING_FITTED}."]
-    fixed = [f"{p.name} = {p.value:g} {p.unit}" for p in result.problem.parameters if p.fixed]
-    if not result.problem.free:
+    fixed = [f"{p.name} = {p.value:g} {p.unit}" for p in result.study.parameters if p.fixed]
+    if not result.study.free:
         return ["## Estimates", *tables, f"Fixed: {', '.join(fixed)}."]
     flat = [f"- {lane_label(result, k)}: {verdict_sentence(result, k, profiles)}." for k in shown]
     return [
@@ -334,7 +334,7 @@ def profile_table(profiles: Profiles, lanes: Sequence[int]) -> list[list[str]]:
     place = {lane: n for n, lane in enumerate(lanes)}
     pairs = [(k, lane, i) for k, (lane, i) in enumerate(profiles.pairs) if lane in place]
     for k, lane, i in sorted(pairs, key=lambda pair: place[pair[1]]):
-        p = result.problem.unknowns[lane][i][0]
+        p = result.study.unknowns[lane][i][0]
         low, high = (ProfileEnd(int(e)).name.lower() for e in profiles.end[k])
         local = (float(v[lane, i]) for v in (result.lower, result.upper))
         local = within_bounds(result, lane, i, *local)
@@ -382,7 +382,7 @@ def bootstrap_table(resampled: Bootstrap, lanes: Sequence[int]) -> list[list[str
     """Lane, parameter, value, standard error by bootstrap and local, percentile interval."""
     result, rows = resampled.result, []
     for lane in lanes:
-        for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+        for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
             low, high = float(resampled.lower[lane, i]), float(resampled.upper[lane, i])
             rows.append(
                 [

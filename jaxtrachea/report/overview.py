@@ -27,8 +27,8 @@ def overview(found: Any) -> Iterator[Table | str]:
     """
     result, lanes = found.result, listed(found.result)
     cut = result.lanes > len(lanes)
-    wide = effective(result, predictions(result.problem, result.theta), found.profiles)
-    if not result.problem.free:
+    wide = effective(result, predictions(result.study, result.theta), found.profiles)
+    if not result.study.free:
         yield f"{result.lanes} lanes: {verdict_sentence(result, 0)}"
     elif cut:
         spread = report.spread_rows(result, found.profiles)
@@ -38,7 +38,7 @@ def overview(found: Any) -> Iterator[Table | str]:
         head = report.ESTIMATE_HEAD if widened is None else report.WIDENED_HEAD
         yield "Estimates", head, report.estimate_rows(result, lanes, found.profiles, widened)
     doubted = int(np.sum(wide.correlation > CORRELATED))
-    if doubted and result.problem.free:
+    if doubted and result.study.free:
         yield (
             f"Neighbouring residuals are correlated in {doubted} of {result.lanes} lanes: standard "
             "errors are too small there; wider intervals: low95_widened, high95_widened in "
@@ -51,12 +51,12 @@ def overview(found: Any) -> Iterator[Table | str]:
     yield "Quality", report.QUALITY_HEAD, report.quality_rows(result, lanes)
     yield from _more(result.lanes, len(lanes), "summary.csv")
     yield from _further(found, lanes)
-    for lane in lanes if result.problem.free and not cut else ():
+    for lane in lanes if result.study.free and not cut else ():
         yield f"{lane_label(result, lane)}: {verdict_sentence(result, lane, found.profiles)}"
-    if cut and result.problem.free:
+    if cut and result.study.free:
         good = sum(succeeded(result, lane) for lane in range(result.lanes))
         yield f"{good} of {result.lanes} lanes succeeded"
-    for sentence in sentences([c for curves in result.problem.curves for c in curves]):
+    for sentence in sentences([c for curves in result.study.curves for c in curves]):
         yield f"{sentence} (curves.csv)"
 
 
@@ -79,7 +79,7 @@ def _further(found: Any, lanes: list[int]) -> Iterator[Table | str]:
     if found.left_out is not None:
         yield from _left_out(found.result, found.left_out)
     if found.influence is not None:
-        curves = sum(map(len, found.result.problem.curves))
+        curves = sum(map(len, found.result.study.curves))
         rows = sections.influence_rows(found.influence)
         yield "Influence of curves", sections.influence_head(found.influence), rows
         yield from _more(curves, len(rows), "influence_curves.csv")

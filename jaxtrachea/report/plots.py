@@ -44,7 +44,7 @@ def draw_all(
         "fit.png": partial(draw_fit, result, prediction),
         "residuals.png": partial(draw_residuals, result, prediction),
     }
-    if result.problem.free:
+    if result.study.free:
         drawings["correlation.png"] = partial(draw_correlation, result)
     if profiles is not None and len(profiles.lane):
         drawings["profiles.png"] = partial(draw_profiles, profiles)
@@ -80,7 +80,7 @@ def draw_fit(result: FitResult, prediction: Prediction):
     axes = iter(axes)
     for lane in shown:
         axis = next(axes)
-        curves = result.problem.curves[lane]
+        curves = result.study.curves[lane]
         colours = mpl.colormaps["viridis"](np.linspace(0.05, 0.9, len(curves)))
         for t, (curve, colour) in enumerate(zip(curves, colours, strict=True)):
             n = len(curve.force)
@@ -106,13 +106,13 @@ def draw_fit(result: FitResult, prediction: Prediction):
 
 def _draw_joints(axis, result, prediction, lane, colours) -> None:
     """Ligament deflection along the tube at the last sample, per unit of tool displacement."""
-    x = np.asarray(result.problem.geometry.ring_positions)
-    for t, (curve, colour) in enumerate(zip(result.problem.curves[lane], colours, strict=True)):
+    x = np.asarray(result.study.model.geometry.ring_positions)
+    for t, (curve, colour) in enumerate(zip(result.study.curves[lane], colours, strict=True)):
         if curve.joint_displacement is None:
             continue
         last = len(curve.force) - 1
         D = curve.displacement[last]
-        model = (result.problem.lanes.joints[lane, t, last] + prediction.joints[lane, t, last]) / D
+        model = (result.study.lanes.joints[lane, t, last] + prediction.joints[lane, t, last]) / D
         axis.plot(x[curve.joint_rings], curve.joint_displacement[last] / D, "o", color=colour, ms=3)
         axis.plot(x, model, "-", color=colour, lw=1)
     axis.set(
@@ -128,7 +128,7 @@ def draw_residuals(result: FitResult, prediction: Prediction):
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     pooled, lined = [], set(listed(result, LINES))
     for lane in range(result.lanes):
-        for t, curve in enumerate(result.problem.curves[lane]):
+        for t, curve in enumerate(result.study.curves[lane]):
             n = len(curve.force)
             peak = np.max(np.abs(curve.force))
             r = 100 * prediction.force[lane, t, :n] / (peak if peak > 0 else 1)
@@ -154,7 +154,7 @@ def _of(shown: int, total: int, what: str) -> str:
 
 def draw_correlation(result: FitResult):
     """Correlation of the estimates: of the lane, or the mean over lanes."""
-    count = len(result.problem.unknowns[0])
+    count = len(result.study.unknowns[0])
     names = [plain(unknown_label(result, 0, i), 24) for i in range(count)]
     shown = min(len(names), 30)
     with np.errstate(invalid="ignore"):
@@ -186,8 +186,8 @@ def draw_profiles(profiles: Profiles):
     Dotted: the parabola of the local standard error, of the first lane; dashed: threshold.
     """
     result = profiles.result
-    names = list(dict.fromkeys(p.name for p in result.problem.free))
-    of = lambda k: result.problem.unknowns[profiles.lane[k]][profiles.unknown[k]][0]  # noqa: E731
+    names = list(dict.fromkeys(p.name for p in result.study.free))
+    of = lambda k: result.study.unknowns[profiles.lane[k]][profiles.unknown[k]][0]  # noqa: E731
     groups = {n: [k for k in range(len(profiles.lane)) if of(k).name == n] for n in names}
     place = {lane: n for n, lane in enumerate(listed(result, LINES))}
     groups = {

@@ -104,7 +104,7 @@ def outcomes(predictions: Sequence[CurvePrediction]) -> list[str]:
 
 def _origin(stored: StoredFit, digest: str) -> str:
     names = ", ".join(list(stored.files)[:8]) + (", ..." if len(stored.files) > 8 else "")
-    free = ", ".join(p.name for p in stored.problem.free) or "nothing"
+    free = ", ".join(p.name for p in stored.study.free) or "nothing"
     return (
         f"From `{stored.path.name}` (SHA-256 {digest[:16]}...): {free} fitted to "
         f"{len(stored.curves)} curves of {len(stored.specimens)} specimen(s)"

@@ -43,7 +43,7 @@ def posterior_rows(drawn: Posterior, lanes: Sequence[int]) -> list[list[str]]:
     result, rows = drawn.result, []
     for lane in lanes:
         grade = drawn.verdict(lane).partition(":")[0]
-        for i, (p, _, _) in enumerate(result.problem.unknowns[lane]):
+        for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
             median, low, high = (
                 number(float(v[lane, i])) for v in (drawn.median, drawn.lower, drawn.upper)
             )
@@ -82,7 +82,7 @@ def posterior_section(drawn: Posterior) -> list[str]:
 
 def influence_head(found: Influence) -> list[str]:
     """Head of `influence_rows`."""
-    names = [p.name for p in found.result.problem.free]
+    names = [p.name for p in found.result.study.free]
     return ["specimen", "curve", *(f"{n}: share, left out" for n in names), "Cook"]
 
 
@@ -93,8 +93,8 @@ def influence_rows(found: Influence, most: int = ONE_BY_ONE) -> list[list[str]]:
 
 def influence_section(found: Influence) -> list[str]:
     """Which curves and samples the estimates hang on."""
-    names = [p.name for p in found.result.problem.free]
-    table, total = influence_rows(found), sum(map(len, found.result.problem.curves))
+    names = [p.name for p in found.result.study.free]
+    table, total = influence_rows(found), sum(map(len, found.result.study.curves))
     more = and_more(total, len(table), "influence_curves.csv")
     parts = [
         "## Influence",
@@ -125,7 +125,7 @@ REASONS = (
 
 def _top_curves(found: Influence, most: int) -> list[tuple[int, int]]:
     """All curves if few; of many those that nothing is known of, then by Cook's distance."""
-    curves = found.result.problem.curves
+    curves = found.result.study.curves
     places = [(k, t) for k, of in enumerate(curves) for t in range(len(of))]
     if len(places) <= most:
         return places
@@ -134,7 +134,7 @@ def _top_curves(found: Influence, most: int) -> list[tuple[int, int]]:
 
 
 def _curve_row(found: Influence, lane: int, t: int) -> list[str]:
-    curve, of = found.result.problem.curves[lane][t], found.of
+    curve, of = found.result.study.curves[lane][t], found.of
     cells = [influence_cell(found, lane, t, i) for i in range(of.curve_share.shape[2])]
     cook = float(of.curve_cook[lane, t])
     return [curve.specimen, curve.trial, *cells, number(cook, 2) if np.isfinite(cook) else "–"]
@@ -143,7 +143,7 @@ def _curve_row(found: Influence, lane: int, t: int) -> list[str]:
 def influence_cell(found: Influence, lane: int, t: int, i: int) -> str:
     """Share and change where the curve is left out, or in one word why there is none."""
     result, of = found.result, found.of
-    unknown = int(result.problem.lanes.index[lane, t, result.problem.free_columns[i]])
+    unknown = int(result.study.lanes.index[lane, t, result.study.free_columns[i]])
     if not succeeded(result, lane):
         return "no estimate"
     if result.at_bound[lane, unknown]:
@@ -153,12 +153,12 @@ def influence_cell(found: Influence, lane: int, t: int, i: int) -> str:
         return "undetermined"
     if np.isfinite(left):
         return f"{100 * share:.0f} %, {number(left, 2)}"
-    column = result.problem.lanes.index[lane][:, result.problem.free_columns[i]]
+    column = result.study.lanes.index[lane][:, result.study.free_columns[i]]
     return f"{100 * share:.0f} %, {'own' if np.sum(column == unknown) == 1 else 'needed'}"
 
 
 def _sample_row(found: Influence, names: Sequence[str], lane: int, t: int, e: int) -> list[str]:
-    curve, of = found.result.problem.curves[lane][t], found.of
+    curve, of = found.result.study.curves[lane][t], found.of
     moves = of.left_out[lane, t, :, e]
     most = "–"
     if np.isfinite(moves).any():
@@ -171,12 +171,12 @@ def _sample_row(found: Influence, names: Sequence[str], lane: int, t: int, e: in
 
 def drivers(found: Influence) -> list[str]:
     """In words: the curve whose loss moves each parameter most, where it moves it by much."""
-    names = [p.name for p in found.result.problem.free]
+    names = [p.name for p in found.result.study.free]
     said, moves = [], np.abs(np.nan_to_num(found.of.curve_left_out))
     for i, name in enumerate(names):
         lane, t = np.unravel_index(int(np.argmax(moves[:, :, i])), moves.shape[:2])
         if moves[lane, t, i] >= _MOVES:
-            curve, by = found.result.problem.curves[lane][t], found.of.curve_left_out[lane, t, i]
+            curve, by = found.result.study.curves[lane][t], found.of.curve_left_out[lane, t, i]
             said.append(f"- {name}: {curve.specimen} {curve.trial} ({by:+.2g} standard errors)")
     lead = "Estimates that hang on one curve, by more than a standard error:"
     return [lead, "\n".join(said)] if said else []

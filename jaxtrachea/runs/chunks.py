@@ -21,28 +21,28 @@ from jaxtrachea.fit import residual
 from jaxtrachea.fit.covariance import Uncertainty
 from jaxtrachea.fit.criteria import Criteria
 from jaxtrachea.fit.levenberg_marquardt import MOST_SEATS, PART_OF_MEMORY
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.study import Study
 from jaxtrachea.runs import journal as journals
 from jaxtrachea.runs.journal import Journal
 
 #: Lanes of a chunk at most, and its residual entries times starts at most: about ten seconds of
 #: one core.
 MOST_LANES, MOST_ENTRIES = 4096, 4_000_000
-_APART = ("problem", "criteria", "uncertainty")
+_APART = ("study", "criteria", "uncertainty")
 #: Fields of a result that are arrays with the leading axis of lanes.
 FIELDS = tuple(f.name for f in dataclasses.fields(FitResult) if f.name not in _APART)
 
 
-def lanes_per_chunk(problem: Problem, starts: int) -> int:
+def lanes_per_chunk(study: Study, starts: int) -> int:
     """Lanes saved together, by the size of the study alone: the same on every machine.
 
-    All of a joint problem.
+    All of a joint study.
     """
-    if problem.joint:
-        return len(problem.curves)
-    trials = problem.lanes.s_c.shape[1]
-    entries = trials * residual.size(problem.lanes) * starts
+    if study.joint:
+        return len(study.curves)
+    trials = study.lanes.s_c.shape[1]
+    entries = trials * residual.size(study.lanes) * starts
     return max(1, min(MOST_LANES, MOST_ENTRIES // entries))
 
 
@@ -51,25 +51,25 @@ def divide(lanes: int, most: int) -> list[np.ndarray]:
     return np.array_split(np.arange(lanes), -(-lanes // most))
 
 
-def bytes_per_seat(problem: Problem) -> int:
+def bytes_per_seat(study: Study) -> int:
     """Memory that one of the lanes computed together takes, from above.
 
     Five numbers per residual entry and free column, as XLA counts them for a Levenberg-Marquardt
     step in float64 (3.7 to 5 in ten studies), and the matrices of the unknowns.
     """
-    entries = problem.lanes.s_c.shape[1] * residual.size(problem.lanes)
-    return 8 * (5 * len(problem.free) * entries + 8 * problem.size**2 + 500)
+    entries = study.lanes.s_c.shape[1] * residual.size(study.lanes)
+    return 8 * (5 * len(study.free) * entries + 8 * study.size**2 + 500)
 
 
-def seats(problem: Problem, free: float, most: int = MOST_SEATS) -> int:
+def seats(study: Study, free: float, most: int = MOST_SEATS) -> int:
     """Lanes that can be computed together, a power of two.
 
     Args:
-        problem: the study.
+        study: the study.
         free: memory of the device that is free, bytes.
         most: upper bound.
     """
-    fitting = max(1, int(PART_OF_MEMORY * free) // bytes_per_seat(problem))
+    fitting = max(1, int(PART_OF_MEMORY * free) // bytes_per_seat(study))
     return min(most, 1 << (fitting.bit_length() - 1))
 
 
@@ -92,7 +92,7 @@ def free_memory() -> float:
 
 
 def arrays_of(result: FitResult) -> dict[str, np.ndarray]:
-    """Everything of a result but its problem, by name; of criteria and uncertainty `PART.NAME`."""
+    """Everything of a result but its study, by name; of criteria and uncertainty `PART.NAME`."""
     arrays = {name: np.asarray(getattr(result, name)) for name in FIELDS}
     arrays |= {f"criteria.{name}": v for name, v in result.criteria._asdict().items()}
     for name in Uncertainty._fields:
@@ -101,30 +101,30 @@ def arrays_of(result: FitResult) -> dict[str, np.ndarray]:
     return arrays
 
 
-def result_of(problem: Problem, arrays: dict[str, np.ndarray]) -> FitResult:
+def result_of(study: Study, arrays: dict[str, np.ndarray]) -> FitResult:
     """The result that `arrays_of` took apart.
 
     Raises:
         KeyError: an array is missing.
-        ValueError: an array does not fit the problem.
+        ValueError: an array does not fit the study.
     """
-    lanes = problem.lanes.lower.shape[0]
+    lanes = study.lanes.lower.shape[0]
     for name, array in arrays.items():
         if array.shape[:1] != (lanes,):
             raise ValueError(f"{name} has shape {array.shape}; expected {lanes} lanes")
-    if arrays["theta"].shape != (lanes, problem.size):
+    if arrays["theta"].shape != (lanes, study.size):
         raise ValueError(f"theta has shape {arrays['theta'].shape}")
     parts = (arrays[f"uncertainty.{name}"] for name in Uncertainty._fields)
     rows = tuple(Uncertainty(*row) for row in zip(*parts, strict=True))
     said = Criteria(*(arrays[f"criteria.{name}"] for name in Criteria._fields))
     fields = {name: arrays[name] for name in FIELDS}
-    return FitResult(problem=problem, criteria=said, uncertainty=rows, **fields)
+    return FitResult(study=study, criteria=said, uncertainty=rows, **fields)
 
 
-def join(problem: Problem, parts: list[FitResult]) -> FitResult:
-    """One result out of those of consecutive lanes; `problem` holds all of them."""
+def join(study: Study, parts: list[FitResult]) -> FitResult:
+    """One result out of those of consecutive lanes; `study` holds all of them."""
     each = [arrays_of(part) for part in parts]
-    return result_of(problem, {name: np.concatenate([a[name] for a in each]) for name in each[0]})
+    return result_of(study, {name: np.concatenate([a[name] for a in each]) for name in each[0]})
 
 
 def replaced(result: FitResult, lanes: np.ndarray, by: FitResult) -> FitResult:
@@ -134,7 +134,7 @@ def replaced(result: FitResult, lanes: np.ndarray, by: FitResult) -> FitResult:
     for name, array in arrays.items():
         arrays[name] = array.copy()
         arrays[name][lanes[better]] = new[name][better]
-    return result_of(result.problem, arrays)
+    return result_of(result.study, arrays)
 
 
 def save(path: Path, journal: Journal, lanes: np.ndarray, result: FitResult) -> None:
@@ -163,20 +163,20 @@ def read_journal(path: Path) -> Journal | None:
         return None
 
 
-def load(path: Path, run: str, lanes: np.ndarray, problem: Problem) -> FitResult | None:
+def load(path: Path, run: str, lanes: np.ndarray, study: Study) -> FitResult | None:
     """A saved chunk, or None where there is none, or a damaged one, or one of another run.
 
     Args:
         path: file.
         run: name of the run it must belong to.
         lanes: that it must hold.
-        problem: of these lanes.
+        study: of these lanes.
     """
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         arrays.pop("journal", None)
         mine = arrays.pop("run") == run and np.array_equal(arrays.pop("lanes"), lanes)
-        return result_of(problem, arrays) if mine else None
+        return result_of(study, arrays) if mine else None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None

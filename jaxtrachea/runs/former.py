@@ -8,9 +8,9 @@ import numpy as np
 
 from jaxtrachea.fit.covariance import Uncertainty
 from jaxtrachea.fit.criteria import Criteria
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.starts import of_unknowns
+from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.results import MORE, SCHEMA, SCHEMA_VERSION
 from jaxtrachea.runs import journal as journals
 from jaxtrachea.runs.chunks import FIELDS, result_of
@@ -21,15 +21,15 @@ from jaxtrachea.status import FitStatus
 VERSIONS = (1, SCHEMA_VERSION)
 
 
-def read_hdf5(path: Path, problem: Problem) -> FitResult:
+def read_hdf5(path: Path, study: Study) -> FitResult:
     """Read the fit back from results.h5, bit for bit.
 
     Args:
         path: written by `results.write_hdf5`.
-        problem: what was fitted.
+        study: what was fitted.
 
     Raises:
-        NoRun: the file is no such file, or of another problem.
+        NoRun: the file is no such file, or of another study.
     """
     try:
         with h5py.File(path) as file:
@@ -48,7 +48,7 @@ def read_hdf5(path: Path, problem: Problem) -> FitResult:
             place = f"uncertainty/{name}" if name in MORE else _place(found, name)
             arrays[f"uncertainty.{name}"] = found[place]
         arrays["status"] = arrays["status"].astype(int)
-        return _same_steps(result_of(problem, arrays))
+        return _same_steps(result_of(study, arrays))
     except (KeyError, ValueError) as error:
         raise NoRun(f"{path} is of another study or version ({error})") from None
 
@@ -59,10 +59,10 @@ def _same_steps(result: FitResult) -> FitResult:
     Raises:
         ValueError: they were written by a version that took other steps.
     """
-    log = of_unknowns(result.problem, lambda p: p.scale == "log", 0.0) > 0
-    step = of_unknowns(result.problem, lambda p: p.step, 1.0)
+    log = of_unknowns(result.study, lambda p: p.scale == "log", 0.0) > 0
+    step = of_unknowns(result.study, lambda p: p.step, 1.0)
     meant = np.where(log, np.exp(np.where(log, result.theta, 0.0)), result.theta * step)
-    known = np.isfinite(meant) & np.isfinite(result.value) & (result.problem.lanes.active > 0)
+    known = np.isfinite(meant) & np.isfinite(result.value) & (result.study.lanes.active > 0)
     known &= result.succeeded[:, None]
     if not np.allclose(meant[known], result.value[known], rtol=1e-9, atol=0):
         raise ValueError("its scaled coordinates have other steps; fit again")

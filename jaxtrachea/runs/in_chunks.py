@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.problem import Problem
 from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.effective import effective
 from jaxtrachea.inference.results import lane_rows, write_csv
 from jaxtrachea.inference.summary import with_residuals
@@ -23,9 +23,9 @@ from jaxtrachea.runs.former import read_hdf5
 MORE_STARTS = 4
 
 
-def fitted_lanes(run: RunFolder, problem: Problem) -> Problem:
-    """What a run fits: the problem, or its failed lanes."""
-    return problem if run.journal.rerun is None else problem.take(np.array(run.journal.rerun.lanes))
+def fitted_lanes(run: RunFolder, study: Study) -> Study:
+    """What a run fits: the study, or its failed lanes."""
+    return study if run.journal.rerun is None else study.take(np.array(run.journal.rerun.lanes))
 
 
 def settings_for(run: RunFolder, settings: Settings) -> Settings:
@@ -37,9 +37,9 @@ def settings_for(run: RunFolder, settings: Settings) -> Settings:
     return dataclasses.replace(settings, starts=starts, seed=seed)
 
 
-def missing(run: RunFolder, problem: Problem) -> tuple[list[int], list[int]]:
+def missing(run: RunFolder, study: Study) -> tuple[list[int], list[int]]:
     """Chunks that are still to be fitted, and those among them whose file cannot be used."""
-    part, todo, damaged = fitted_lanes(run, problem), [], []
+    part, todo, damaged = fitted_lanes(run, study), [], []
     for k, lanes in enumerate(_chunks(run, part)):
         if _read(run, k, part.take(lanes), lanes) is None:
             todo.append(k)
@@ -50,7 +50,7 @@ def missing(run: RunFolder, problem: Problem) -> tuple[list[int], list[int]]:
 
 def fit_chunks(
     run: RunFolder,
-    problem: Problem,
+    study: Study,
     settings: Settings,
     todo: list[int],
     progress: Callable[[int, int], None],
@@ -59,14 +59,14 @@ def fit_chunks(
 
     Args:
         run: where to.
-        problem: the whole study.
+        study: the whole study.
         settings: of the run, as `settings_for` gives them.
         todo: chunks, as `missing` gives them.
         progress: as for `fit.fit`; what it raises ends the work.
     """
     from jaxtrachea.fit.fit import fit
 
-    part = fitted_lanes(run, problem)
+    part = fitted_lanes(run, study)
     chunks = _chunks(run, part)
     jobs = settings.starts * sum(len(chunks[k]) for k in todo)
 
@@ -104,13 +104,13 @@ def _on_devices(work: Callable[[int], None], items: list[int], devices: list) ->
             done.result()
 
 
-def collect(run: RunFolder, problem: Problem) -> FitResult:
+def collect(run: RunFolder, study: Study) -> FitResult:
     """The result of the whole study, out of the chunks and, in a rerun, of the former result.
 
     Raises:
         NoRun: a chunk cannot be read back, or the former result is not what it was.
     """
-    part = fitted_lanes(run, problem)
+    part = fitted_lanes(run, study)
     found = [_read(run, k, part.take(lanes), lanes) for k, lanes in enumerate(_chunks(run, part))]
     if any(result is None for result in found):
         k = next(k for k, result in enumerate(found) if result is None)
@@ -118,20 +118,20 @@ def collect(run: RunFolder, problem: Problem) -> FitResult:
     result = join(part, [result for result in found if result is not None])
     again = run.journal.rerun
     if again is None:
-        return dataclasses.replace(result, problem=problem)
+        return dataclasses.replace(result, study=study)
     path = run.target / "results.h5"
     if digest(path) != again.former:
         raise NoRun(f"{path} has changed since its failed lanes were fitted again")
-    return replaced(read_hdf5(path, problem), np.array(again.lanes), result)
+    return replaced(read_hdf5(path, study), np.array(again.lanes), result)
 
 
-def write_so_far(path: Path, run: RunFolder, problem: Problem) -> None:
+def write_so_far(path: Path, run: RunFolder, study: Study) -> None:
     """Write the rows of summary.csv of the lanes that are fitted."""
     rows = []
-    for k, lanes in enumerate(_chunks(run, problem)):
-        part = _read(run, k, problem.take(lanes), lanes)
+    for k, lanes in enumerate(_chunks(run, study)):
+        part = _read(run, k, study.take(lanes), lanes)
         if part is not None:
-            seen = predictions(part.problem, part.theta)
+            seen = predictions(part.study, part.theta)
             rows += with_residuals(part, list(lane_rows(part)), seen, effective(part, seen))
     try:
         write_csv(path, rows)
@@ -140,14 +140,14 @@ def write_so_far(path: Path, run: RunFolder, problem: Problem) -> None:
         raise
 
 
-def count(run: RunFolder, problem: Problem) -> int:
+def count(run: RunFolder, study: Study) -> int:
     """Chunks of a run."""
-    return len(_chunks(run, fitted_lanes(run, problem)))
+    return len(_chunks(run, fitted_lanes(run, study)))
 
 
-def _chunks(run: RunFolder, part: Problem) -> list[np.ndarray]:
+def _chunks(run: RunFolder, part: Study) -> list[np.ndarray]:
     return divide(part.lanes.lower.shape[0], run.journal.save_every)
 
 
-def _read(run: RunFolder, k: int, part: Problem, lanes: np.ndarray) -> FitResult | None:
+def _read(run: RunFolder, k: int, part: Study, lanes: np.ndarray) -> FitResult | None:
     return load(run.chunk(k), run.journal.id, lanes, part)

@@ -26,11 +26,11 @@ SPECIMENS, SAMPLE, ROUNDS = 10_000, 20, 3
 SPOTS, DEPTHS = np.array([15.0, 30.0, 45.0, 65.0, 80.0]), np.linspace(0.03, 6.0, 200)
 
 
-def command(problem) -> dict:
+def command(study) -> dict:
     """Seconds by phase and peak memory (MB) of `jaxtrachea fit` on the same data."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        curves = tuple(curve for lane in problem.curves for curve in lane)
+        curves = tuple(curve for lane in study.curves for curve in lane)
         write_hdf5(folder / "cohort.h5", Measurements(curves, (), ()))
         (folder / "spec.toml").write_text('[data]\nfiles = ["cohort.h5"]\n')
         code = "from jaxtrachea.cli.main import main; main()"
@@ -48,10 +48,10 @@ def command(problem) -> dict:
 def main() -> None:
     """Time all in turn and write the results."""
     out = common.Writer("cohort", "scipy", "lmfit")
-    problem, model, forces = fitting.study(SPECIMENS, SPOTS, DEPTHS)
+    study, model, forces = fitting.make_study(SPECIMENS, SPOTS, DEPTHS)
     few = forces[:SAMPLE]
     cases = {
-        "jaxtrachea: fit with standard errors": lambda: fit.fit(problem, Settings(starts=1)),
+        "jaxtrachea: fit with standard errors": lambda: fit.fit(study, Settings(starts=1)),
         "scipy least_squares lm, numpy residual and Jacobian": fitting.one_by_one(
             model, few, lambda i: fitting.with_scipy(model.value, model.jacobian)
         ),
@@ -73,7 +73,7 @@ def main() -> None:
         out.add("cohort", name, values, lanes=lanes[name], **more)
     if "XLA_FLAGS" in os.environ:
         del os.environ["XLA_FLAGS"]
-    told = command(problem)
+    told = command(study)
     out.add("command", "jaxtrachea fit, four starts", [told.pop("wall")], lanes=SPECIMENS, **told)
     print(told)
     out.write()

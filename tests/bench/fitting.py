@@ -21,9 +21,9 @@ from jaxtrachea.fit import levenberg_marquardt as solve
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.noise import first_sigma
 from jaxtrachea.fit.parameters import in_model
-from jaxtrachea.fit.problem import build, default_parameters
 from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.starts import draw_starts
+from jaxtrachea.fit.study import build_study, default_parameters
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.geometry import table_1
@@ -106,8 +106,8 @@ class Numpy:
         return J.reshape(4, -1).T
 
 
-def study(specimens=SPECIMENS, spots=SPOTS, depths=DEPTHS):
-    """The problem of the library, and the forces (specimens, positions, points)."""
+def make_study(specimens=SPECIMENS, spots=SPOTS, depths=DEPTHS):
+    """The study of the library, and the forces (specimens, positions, points)."""
     rng = np.random.default_rng(11)
     geometry = table_1(np.float64)
     truths = np.array([100.0, 1.0, 1.0, 0.01]) * np.exp(0.2 * rng.standard_normal((specimens, 4)))
@@ -127,7 +127,7 @@ def study(specimens=SPECIMENS, spots=SPOTS, depths=DEPTHS):
             curves.append(Curve(f"s{i:05d}", f"{spot:g}", spot, 0.0, depths, force))
     options = Options()
     parameters = default_parameters(in_model(options, joints=False), {})
-    return build(curves, geometry, options, parameters), model, forces
+    return build_study(curves, geometry, options, parameters), model, forces
 
 
 def standard_errors(J, r):
@@ -161,21 +161,21 @@ def with_lmfit(model):
     return theta, 0.5 * found.chisqr, found.nfev, errors
 
 
-def lane_residual(problem, theta, lane: Lane):
+def lane_residual(study, theta, lane: Lane):
     """Our model's residual alone, for solvers that differentiate it themselves."""
-    geometry = jax.tree.map(jnp.asarray, problem.geometry)
+    geometry = jax.tree.map(jnp.asarray, study.model.geometry)
     EI_L, k_M, k_1 = jnp.exp(theta[:3])
     material = Material(EI_L=EI_L, k_M=k_M, k_1=k_1, k_3=STEP_K_3 * theta[3])
-    one = lambda s, d: press(geometry, material, s, d, problem.options).force  # noqa: E731
+    one = lambda s, d: press(geometry, material, s, d, study.model.options).force  # noqa: E731
     return (jax.vmap(one)(lane.s_c, lane.displacement) - lane.force).ravel()
 
 
-def optimistix_batch(problem, count: int):
+def optimistix_batch(study, count: int):
     """`count` specimens by optimistix, vmapped in chunks of 256; theta, cost, steps."""
     solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
 
     def one(lane):
-        residual = lambda theta, lane: lane_residual(problem, theta, lane)  # noqa: E731
+        residual = lambda theta, lane: lane_residual(study, theta, lane)  # noqa: E731
         found = optimistix.least_squares(
             residual, solver, jnp.asarray(start()), args=lane, throw=False, max_steps=100
         )
@@ -183,7 +183,7 @@ def optimistix_batch(problem, count: int):
         return found.value, 0.5 * jnp.sum(r * r), found.stats["num_steps"]
 
     run = jax.jit(jax.vmap(one))
-    part = lambda i: jax.tree.map(lambda v: v[i : i + 256], problem.lanes)  # noqa: E731
+    part = lambda i: jax.tree.map(lambda v: v[i : i + 256], study.lanes)  # noqa: E731
     chunks = [part(i) for i in range(0, count, 256)]
     chunks = jax.device_put(chunks)
 
@@ -194,12 +194,12 @@ def optimistix_batch(problem, count: int):
     return call
 
 
-def jitted_residual(problem):
+def jitted_residual(study):
     """Our residual and Jacobian of one specimen, jitted, behind two numpy functions."""
-    value = lambda theta, lane: lane_residual(problem, theta, lane)  # noqa: E731
+    value = lambda theta, lane: lane_residual(study, theta, lane)  # noqa: E731
     both = jax.jit(lambda theta, lane: (value(theta, lane), jax.jacfwd(value)(theta, lane)))
     lanes = [
-        jax.device_put(jax.tree.map(lambda v: v[i], problem.lanes))  # noqa: B023
+        jax.device_put(jax.tree.map(lambda v: v[i], study.lanes))  # noqa: B023
         for i in range(SAMPLE)
     ]
 
@@ -231,11 +231,11 @@ def one_by_one(model, forces, one):
     return call
 
 
-def check(problem, model, forces) -> None:
+def check(study, model, forces) -> None:
     """Our residual and the numpy one are the same function, Jacobian included."""
     theta = np.array([np.log(80.0), np.log(0.7), 0.1, 1.2])
-    lane = jax.tree.map(lambda v: jnp.asarray(v[0]), problem.lanes)
-    value = lambda theta: lane_residual(problem, theta, lane)  # noqa: E731
+    lane = jax.tree.map(lambda v: jnp.asarray(v[0]), study.lanes)
+    value = lambda theta: lane_residual(study, theta, lane)  # noqa: E731
     model.load(forces[0])
     common.close("residual", model.value(theta), value(theta))
     common.close("jacobian", model.jacobian(theta), jax.jacfwd(value)(jnp.asarray(theta)))
@@ -244,20 +244,20 @@ def check(problem, model, forces) -> None:
 def main() -> None:
     """Time all solvers in turn and write the results."""
     out = common.Writer("fitting", "scipy", "lmfit", "optimistix")
-    problem, model, forces = study()
-    check(problem, model, forces)
+    study, model, forces = make_study()
+    check(study, model, forces)
     settings = Settings(starts=1)
-    jobs, sigma = np.arange(SPECIMENS), first_sigma(problem)
-    starts = draw_starts(problem, settings)
+    jobs, sigma = np.arange(SPECIMENS), first_sigma(study)
+    starts = draw_starts(study, settings)
     first = {}
 
     def ours():
-        return fit.fit(problem, settings)
+        return fit.fit(study, settings)
 
     def solve_only():
-        return solve.levenberg_marquardt(problem, jobs, starts, sigma)
+        return solve.levenberg_marquardt(study, jobs, starts, sigma)
 
-    through_jax = jitted_residual(problem)
+    through_jax = jitted_residual(study)
     count = {
         "jaxtrachea: fit with standard errors": SPECIMENS,
         "jaxtrachea: Levenberg-Marquardt alone": SPECIMENS,
@@ -270,7 +270,7 @@ def main() -> None:
     calls = (
         ours,
         solve_only,
-        optimistix_batch(problem, 512),
+        optimistix_batch(study, 512),
         one_by_one(model, few, lambda i: with_scipy(model.value, model.jacobian)),
         one_by_one(model, few, lambda i: with_lmfit(model)),
         one_by_one(model, few, through_jax),

@@ -117,19 +117,19 @@ def check(cases) -> None:
 
 def fits(out: common.Writer) -> None:
     """Residual of a fit, with its Jacobian, and a whole step of Levenberg-Marquardt; 512 lanes."""
-    problem, *_ = fitting.study(FITS)
-    program, lanes = problem.program, jax.device_put(problem.lanes)
+    study, *_ = fitting.make_study(FITS)
+    model, lanes = study.model, jax.device_put(study.lanes)
     settings = Settings(starts=1)
-    theta = jnp.asarray(draw_starts(problem, settings))
-    sigma = jnp.asarray(first_sigma(problem))
-    of = lambda f: jax.vmap(functools.partial(f, program))  # noqa: E731
+    theta = jnp.asarray(draw_starts(study, settings))
+    sigma = jnp.asarray(first_sigma(study))
+    of = lambda f: jax.vmap(functools.partial(f, model))  # noqa: E731
     point = jax.jit(of(cost.evaluate))(theta, lanes, sigma)
     same = lambda v, dtype: jnp.full(FITS, v, dtype)  # noqa: E731
     state = solve.State(
         theta, point, same(solve.FIRST_RADIUS, float), same(1, jnp.int32),
         same(solve.RUNNING, jnp.int8),
     )  # fmt: skip
-    step = lambda *a: jax.vmap(functools.partial(solve.iterate, program, solve.Tolerances()))(*a)  # noqa: E731
+    step = lambda *a: jax.vmap(functools.partial(solve.iterate, model, solve.Tolerances()))(*a)  # noqa: E731
     cases = {
         "residual": wait(of(residual.residual_value), theta, lanes),
         "residual and Jacobian": wait(of(residual.residual), theta, lanes),

@@ -24,22 +24,22 @@ SIZES = {"joint": (10, 30, 100, 300, 1000, 3000, 10_000), "dense": (10, 20, 40, 
 SHARED = {name: {"scope": "shared"} for name in ("EI_L", "k_M")}
 
 
-def study(count, *, joint):
+def make_study(count, *, joint):
     """Specimens with one skeleton."""
     truth = synthetic.draw(7, count, 1.3, CLEAR)
     truth[:, :2] = CLEAR[:2]
     force, _ = synthetic.forces(truth)
     sigma = 0.01 * np.abs(force).max((1, 2), keepdims=True)
     force = force + sigma * np.random.default_rng(8).normal(size=force.shape)
-    return synthetic.problem(force, changes=SHARED, joint=joint)
+    return synthetic.study(force, changes=SHARED, joint=joint)
 
 
-def timed(problem, repeats):
+def timed(study, repeats):
     """Seconds of each fit, the least processor time, and the last result."""
-    result, samples, cpu = fit(problem, Settings(starts=2)), [], []
+    result, samples, cpu = fit(study, Settings(starts=2)), [], []
     for _ in range(repeats):
         begin, used = time.perf_counter(), time.process_time()
-        result = fit(problem, Settings(starts=2))
+        result = fit(study, Settings(starts=2))
         samples.append(time.perf_counter() - begin)
         cpu.append(time.process_time() - used)
     return samples, min(cpu), result
@@ -50,7 +50,7 @@ if __name__ == "__main__":
     for case, sizes in SIZES.items():
         for count in sizes:
             repeats = 2 if count > 3000 else 3
-            samples, cpu, result = timed(study(count, joint=case == "joint"), repeats)
+            samples, cpu, result = timed(make_study(count, joint=case == "joint"), repeats)
             pull = (result.value[0, :2] - CLEAR[:2]) / result.standard_error[0, :2]
             writer.add(
                 "specimens", f"{case}, {count} specimens", samples, lanes=count, how=case, cpu=cpu,

@@ -44,7 +44,7 @@ from jaxtrachea.fit.noise import first_sigma
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.starts import draw_starts
 fitting.SPECIMENS = 256
-p, *_ = fitting.study()
+p, *_ = fitting.make_study()
 s = Settings(starts=1)
 args = (p, np.arange(256), draw_starts(p, s), first_sigma(p))
 f = lambda *a: levenberg_marquardt(*a).theta

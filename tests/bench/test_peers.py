@@ -121,14 +121,14 @@ def whole_update() -> dict[str, Case]:
 
 def fits() -> dict[str, Case]:
     """A batch with standard errors against solvers that take one specimen at a time."""
-    problem, model, forces = fitting.study(SPECIMENS)
-    fitting.check(problem, model, forces)
+    study, model, forces = fitting.make_study(SPECIMENS)
+    fitting.check(study, model, forces)
     settings = Settings(starts=1)
     solvers = {
         "scipy least_squares lm": lambda i: fitting.with_scipy(model.value, model.jacobian),
         "lmfit leastsq": lambda i: fitting.with_lmfit(model),
     }
-    cases = {OURS: made(lambda: fit.fit(problem, settings), lanes=SPECIMENS)}
+    cases = {OURS: made(lambda: fit.fit(study, settings), lanes=SPECIMENS)}
     for name, one in solvers.items():
         call = fitting.one_by_one(model, forces[:SAMPLE], one)
         cases[name] = made(call, differs=in_standard_errors, lanes=SAMPLE)

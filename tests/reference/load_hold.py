@@ -169,8 +169,8 @@ def fitted(chosen):
     jax.config.update("jax_enable_x64", True)
     from jaxtrachea.fit.fit import fit
     from jaxtrachea.fit.parameters import in_model
-    from jaxtrachea.fit.problem import build, default_parameters
     from jaxtrachea.fit.result import Settings
+    from jaxtrachea.fit.study import build_study, default_parameters
     from jaxtrachea.measurements.read import Curve
     from jaxtrachea.mechanics.press import Options
     from jaxtrachea.trachea.geometry import table_1
@@ -186,11 +186,11 @@ def fitted(chosen):
         for i, (r, keep) in enumerate(chosen)
         if keep is not None
     ]
-    result = fit(build(curves, table_1(), options, table), Settings(starts=1, more_starts=0))
-    names = [p.name for p, _, _ in result.problem.unknowns[0]]
+    result = fit(build_study(curves, table_1(), options, table), Settings(starts=1, more_starts=0))
+    names = [p.name for p, _, _ in result.study.unknowns[0]]
     values = np.full(len(chosen), np.nan)
     for lane in range(result.lanes):
-        values[int(result.problem.lane_name(lane)[0])] = result.value[lane, names.index("k_1")]
+        values[int(result.study.lane_name(lane)[0])] = result.value[lane, names.index("k_1")]
     return values
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.fit.parameters import in_model
-from jaxtrachea.fit.problem import build, default_parameters
+from jaxtrachea.fit.study import build_study, default_parameters
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.geometry import table_1
@@ -57,9 +57,9 @@ def parameters(options=OPTIONS, joints=False, **changes):
     return default_parameters(in_model(options, joints=joints), merged)
 
 
-def problem(force, options=OPTIONS, changes=None, **settings):
+def study(force, options=OPTIONS, changes=None, **settings):
     """A study of `force` at the standard positions and depths."""
-    return build(
+    return build_study(
         curves(force), GEOMETRY, options, parameters(options, **(changes or {})), **settings
     )
 

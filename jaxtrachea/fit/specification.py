@@ -1,0 +1,224 @@
+"""From a fit specification to a study: opens the files, names what is wrong, builds the lanes."""
+
+import dataclasses
+from collections.abc import Collection
+
+from jaxtrachea.config import FitSpec, ParameterSection, SpecError
+from jaxtrachea.fit.levenberg_marquardt import MOST_SEATS, Tolerances
+from jaxtrachea.fit.parameters import DEFAULTS, Parameter, in_model
+from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.study import Noise, Study, build_study, check_curve, table_names
+from jaxtrachea.measurements.read import (
+    BadCurve,
+    Measurements,
+)
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.trachea.section import geometry_of
+from jaxtrachea.units import parse_quantity
+
+
+def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Parameter, ...]:
+    """The parameter table of the chosen model with the user's changes.
+
+    Raises:
+        SpecError: a parameter the model does not have, or values that contradict each other.
+    """
+    names = in_model(options, joints=joints)
+    for name in spec.parameters:
+        if name not in names:
+            known = "not a parameter" if name not in DEFAULTS else "not seen by this model"
+            raise SpecError(f"parameters.{name}: {known}; expected one of {', '.join(names)}")
+    names = table_names(options, spec.parameters, joints=joints)
+    return tuple(_parameter(DEFAULTS[n], spec.parameters.get(n)) for n in names)
+
+
+def _parameter(default: Parameter, section: ParameterSection | None) -> Parameter:
+    """One row of the table.
+
+    Raises:
+        SpecError: with the dotted key.
+    """
+    if section is None:
+        return default
+    try:
+        if section.fixed is not None:
+            return _fixed(default, section.fixed)
+        return _free(default, section)
+    except ValueError as error:
+        text = str(error).removeprefix(f"{default.name}: ")
+        raise SpecError(f"parameters.{default.name}: {text}") from None
+
+
+def _number(default: Parameter, key: str, value: str | float | int) -> float:
+    """A value in the parameter's unit; a bare number is in it already."""
+    if not isinstance(value, str):
+        return float(value)
+    try:
+        return parse_quantity(value, default.dimension)
+    except ValueError as error:
+        raise ValueError(f"{key}: {error}") from None
+
+
+def _fixed(default: Parameter, given: str | float | int) -> Parameter:
+    value = _number(default, "fixed", given)
+    if default.scale == "log" and value <= 0:
+        raise ValueError(f"fixed: {value:g} {default.unit} is no stiffness; expected more than 0")
+    return dataclasses.replace(default, value=value, fixed=True)
+
+
+def _free(default: Parameter, section: ParameterSection) -> Parameter:
+    lower, upper = default.lower, default.upper
+    scale = section.scale or default.scale
+    if section.bounds is not None:
+        lower, upper = (_number(default, "bounds", v) for v in section.bounds)
+    elif scale == "log":
+        lower = max(lower, 1e-9)
+    if section.initial is not None:
+        value = _number(default, "initial", section.initial)
+    else:
+        value = min(max(default.value, lower), upper)
+    scope = section.scope or default.scope
+    return dataclasses.replace(
+        default, value=value, lower=lower, upper=upper, scale=scale, scope=scope, fixed=False
+    )
+
+
+def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
+    """The measurements with curves that this tube and model cannot press moved to the bad ones.
+
+    Raises:
+        SpecError: not one curve is left; the message is that of the first.
+    """
+    geometry, options = geometry_of(spec.trachea), Options(**spec.model.model_dump())
+    good, bad = [], list(measurements.bad)
+    reasons = []
+    for curve in measurements.curves:
+        try:
+            check_curve(curve, geometry, options)
+        except ValueError as error:
+            text = str(error)
+            reasons.append(f"{curve.source}: {text}")
+            text = text.split(": ", 1)[-1]
+            cure = "correct the file, or the trachea and model sections"
+            bad.append(BadCurve(curve.specimen, curve.trial, curve.source, "position", text, cure))
+        else:
+            good.append(curve)
+    if reasons and not good:
+        raise SpecError(reasons[0])
+    return dataclasses.replace(measurements, curves=tuple(good), bad=tuple(bad))
+
+
+#: Unknowns up to which a study with shared parameters is refitted as one dense lane.
+MOST_DENSE = 500
+
+
+def study_of(spec: FitSpec, measurements: Measurements, *, refits: bool = False) -> Study:
+    """Everything together; parameters that are shared are fitted jointly, specimens as lanes.
+
+    What looks at whole lanes (profiles, bootstrap, posterior, influence, leaving out, design,
+    comparison) and methods other than
+    Levenberg-Marquardt get one dense lane in place of the joint study.
+
+    Args:
+        spec: the specification.
+        measurements: what to fit.
+        refits: something that refits lanes was asked for outside the specification.
+
+    Raises:
+        SpecError: with the key, or the specimen and trial, that cannot be used.
+    """
+    u = spec.uncertainty
+    asked = u.profile or u.bootstrap or u.posterior or u.influence
+    joint = not (refits or asked or spec.fit.method != "levenberg-marquardt")
+    study = _built(spec, measurements, joint)
+    shared = [p.name for p in study.free if p.scope == "shared"]
+    if shared and not joint and study.size > MOST_DENSE:
+        raise SpecError(
+            f"parameters.{shared[0]}: shared, so that {study.size} unknowns depend on each "
+            "other; profiles, bootstrap, posterior, influence, --leave-one-out, design, compare "
+            f"and methods other than levenberg-marquardt take at most {MOST_DENSE}; leave them out "
+            "(the joint fit has no limit), or give it the scope 'specimen'"
+        )
+    return study
+
+
+def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
+    options = Options(**spec.model.model_dump())
+    curves = measurements.curves
+    joints = any(c.joint_displacement is not None for c in curves)
+    given = (spec.noise.force, spec.noise.joints)
+    noise = Noise(*(None if sigma == "estimate" else sigma for sigma in given))
+    try:
+        return build_study(
+            curves,
+            geometry_of(spec.trachea),
+            options,
+            parameters_of(spec, options, joints=joints),
+            noise=noise,
+            balance=spec.fit.balance,
+            loss=spec.fit.loss,
+            loss_scale=spec.fit.loss_scale,
+            tool_radius=spec.data.tool_radius,
+            joint=joint,
+        )
+    except SpecError:
+        raise
+    except ValueError as error:
+        raise SpecError(str(error)) from None
+
+
+def profiled(spec: FitSpec, study: Study, *, asked: bool) -> tuple[str, ...]:
+    """Names of the parameters to profile: those of the specification, all if only asked for.
+
+    Raises:
+        SpecError: one is not fitted.
+    """
+    names, free = spec.uncertainty.profile, tuple(p.name for p in study.free)
+    for name in names:
+        if name not in (*free, "all"):
+            raise SpecError(
+                f"uncertainty.profile: {name!r} is not fitted; expected 'all' or names out of "
+                f"{', '.join(free)}"
+            )
+    return free if "all" in names or (asked and not names) else tuple(names)
+
+
+def refuse_without_unknowns(spec: FitSpec, study: Study, options: Collection[str]) -> None:
+    """Say what has no meaning where every parameter is fixed.
+
+    Args:
+        spec: the specification.
+        study: the study.
+        options: of the command line, without dashes.
+
+    Raises:
+        SpecError: something was asked for that needs a free parameter; it is named.
+    """
+    if study.free:
+        return
+    u = spec.uncertainty
+    asked = {"profile": u.profile, "bootstrap": u.bootstrap, "posterior": u.posterior,
+             "influence": u.influence}  # fmt: skip
+    names = [f"--{name}" for name in options]
+    names += [f"uncertainty.{name}" for name, wanted in asked.items() if wanted]
+    if names:
+        raise SpecError(
+            f"{', '.join(names)}: every parameter is fixed, so that there is no estimate to be "
+            "doubted; leave it out (the model is then evaluated), or free a parameter"
+        )
+
+
+def settings_of(spec: FitSpec) -> Settings:
+    """Solver settings of the [fit] section; `chunk` is its upper bound if left to the machine."""
+    f = spec.fit
+    limits = Tolerances(f.tolerance, f.tolerance, f.tolerance, f.max_iterations)
+    return Settings(
+        method=f.method,
+        starts=f.starts,
+        decades=f.start_decades,
+        seed=f.seed,
+        more_starts=f.more_starts,
+        chunk=MOST_SEATS if f.chunk == "auto" else f.chunk,
+        tolerances=limits,
+        float32=f.precision == "float32",
+    )
