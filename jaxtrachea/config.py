@@ -186,10 +186,17 @@ class FitSection(Section):
     more_starts: int = Field(8, ge=0, le=10_000)
     max_iterations: int = Field(200, ge=1, le=1_000_000)
     tolerance: float = Field(1e-10, gt=0, lt=0.1)
-    chunk: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = "auto"
+    batch: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = "auto"
     save_every: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = "auto"
     precision: Literal["float64", "float32"] = "float64"
     population: bool | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "chunk" in data:
+            raise ValueError("chunk: this key is called 'batch' now; rename it")
+        return data
 
 
 class UncertaintySection(Section):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import synthetic
 
+from jaxtrachea.fit.cost import LaneCost
 from jaxtrachea.fit.descent import descend
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances, levenberg_marquardt
@@ -40,7 +41,7 @@ def parted_from_bounds(study, theta):
 def check_lanes(count, dtype):
     study, start = bounded.random_study(11, count)
     sigma = first_sigma(study)
-    solved = levenberg_marquardt(study, np.arange(count), start, sigma, dtype=dtype)
+    solved = levenberg_marquardt(LaneCost(study.model, study.lanes, sigma), start, dtype=dtype)
     assert np.all(solved.status == FitStatus.CONVERGED), np.bincount(solved.status)
     assert np.max(bounded.kkt_residual(study, solved.theta, sigma)) <= promise_allowed(dtype)
     assert not np.any(parted_from_bounds(study, solved.theta))
@@ -85,15 +86,15 @@ def test_a_start_next_to_a_bound(gap):
     """The free optimum lies beyond: the others must not stay where it has them."""
     study, _ = bounded.random_study(11, 60)
     wide = study.lanes._replace(lower=np.full((60, 4), -12.0), upper=np.full((60, 4), 12.0))
-    sigma, jobs = first_sigma(study), np.arange(60)
+    sigma = first_sigma(study)
     guess = np.tile(np.log(bounded.CLEAR), (60, 1))
-    best = levenberg_marquardt(bounded.with_lanes(study, wide), jobs, guess, sigma)
+    best = levenberg_marquardt(LaneCost(study.model, wide, sigma), guess)
     upper = wide.upper.copy()
     upper[:, 2] = best.theta[:, 2] - 0.3
     tight = bounded.with_lanes(study, wide._replace(upper=upper))
     start = best.theta.copy()
     start[:, 2] = upper[:, 2] - gap
-    solved = levenberg_marquardt(tight, jobs, start, sigma)
+    solved = levenberg_marquardt(LaneCost(tight.model, tight.lanes, sigma), start)
     assert np.all(solved.status == FitStatus.CONVERGED)
     assert np.all(solved.theta[:, 2] == upper[:, 2])
     assert np.max(bounded.kkt_residual(tight, solved.theta, sigma)) <= promise_allowed(np.float64)
@@ -104,9 +105,9 @@ def test_a_start_next_to_a_bound(gap):
 )
 def test_first_order_methods_respect_bounds(method, blocks):
     study, start = bounded.random_study(11, 60)
-    sigma, jobs = first_sigma(study), np.arange(60)
+    sigma, rows = first_sigma(study), np.arange(60)
     solved = descend(
-        study, jobs, start, sigma, method=method, tolerances=Tolerances(iterations=blocks)
+        study, rows, start, sigma, method=method, tolerances=Tolerances(iterations=blocks)
     )
     assert np.all(solved.status == FitStatus.CONVERGED)
     # Their tolerance is on the cost over a block of steps, no better than its square root.

@@ -15,8 +15,8 @@ import synthetic
 from small_scenes import MATERIAL, MESH, TUBE, presses
 
 from jaxtrachea import Wishes, make_scene, simulate
-from jaxtrachea.fit import levenberg_marquardt as solve
-from jaxtrachea.fit.cost import evaluate
+from jaxtrachea.fit import levenberg_marquardt
+from jaxtrachea.fit.cost import LaneCost, evaluate
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS
@@ -151,8 +151,8 @@ def test_a_step_is_bent_by_the_second_derivative():
     lane = jax.tree.map(lambda v: v[0], study.lanes)
     sigma, theta = jnp.ones(2), jnp.log(jnp.array([1.0]))
     point = evaluate(study.model, theta, lane, sigma)
-    state = solve.State(theta, point, jnp.array(10.0), jnp.array(1), jnp.array(0))
-    step = solve._step(study.model, state, lane, sigma)
+    state = levenberg_marquardt.State(theta, point, jnp.array(10.0), jnp.array(1), jnp.array(0))
+    step = levenberg_marquardt._step(LaneCost(study.model, lane, sigma), state)
     v = 0.3  # (1.3 - 1) / 1, undamped within the trust region
     np.testing.assert_allclose(step.straight, v, rtol=1e-6)
     np.testing.assert_allclose(step.delta[0], v - v * v / 2, rtol=0.01)

@@ -8,6 +8,7 @@ import pytest
 import synthetic
 from scipy.optimize import least_squares
 
+from jaxtrachea.fit.cost import LaneCost
 from jaxtrachea.fit.descent import descend
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances, levenberg_marquardt
@@ -92,13 +93,14 @@ def test_intervals_cover_5000(given):
 
 @pytest.mark.parametrize("loss", ["linear", pytest.param("huber", marks=pytest.mark.slow)])
 def test_a_batch_is_its_lanes_one_by_one(noisy, loss):
-    """The same lane alone, in a batch, elsewhere in the chunk and among others: to 1e-8."""
+    """The same lane alone, in a batch, elsewhere in the batch and among others: to 1e-8."""
     _, force, _ = noisy
     study = synthetic.study(force, loss=loss)
     starts = np.tile([p.to_scaled(p.value) for p, _, _ in study.unknowns[0]], (20, 1))
     sigma = first_sigma(study)
-    solve = lambda jobs: levenberg_marquardt(  # noqa: E731
-        study, jobs, starts[jobs], sigma[jobs], tolerances=Tolerances(iterations=60)
+    objective = LaneCost(study.model, study.lanes, sigma)
+    solve = lambda rows: levenberg_marquardt(  # noqa: E731
+        objective, starts[rows], rows, tolerances=Tolerances(iterations=60)
     )
     batch = solve(np.arange(20))
     order = np.random.default_rng(0).permutation(20)
@@ -399,7 +401,8 @@ def test_descent_reaches_the_same_minimum(noisy, method, blocks):
     study = synthetic.study(force)
     sigma = first_sigma(study)[:2]
     truth = np.log(noisy[0][:2])
-    best = levenberg_marquardt(study, np.arange(2), truth, sigma)
+    two = study.take(np.arange(2))
+    best = levenberg_marquardt(LaneCost(study.model, two.lanes, sigma), truth)
     other = descend(
         study, np.arange(2), truth, sigma, method=method, tolerances=Tolerances(iterations=blocks)
     )

@@ -12,12 +12,11 @@ import synthetic
 from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
-from jaxtrachea.fit import schur as arrow
-from jaxtrachea.fit import shared as joint
-from jaxtrachea.fit import specification
+from jaxtrachea.fit import schur, specification
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.shared import held_count, unknown_count
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import population as populations
 from jaxtrachea.inference import results
@@ -36,7 +35,7 @@ from jaxtrachea.trachea.material import Material
 PAGE = (Path(__file__).parents[1] / "docs" / "results.md").read_text()
 TOTAL = Options(coupling="total", contact="bonded")
 LANES, DEPTH = 20, np.linspace(0.1, 2, 12)
-ONE_START = Settings(starts=1, chunk=16)
+ONE_START = Settings(starts=1, batch=16)
 
 
 def columns(trials):
@@ -118,11 +117,11 @@ def test_elimination_is_the_dense_solution():
     keep = np.delete(np.arange(23), place[2, own[2, 0]])
     inverse = np.zeros((23, 23))
     inverse[np.ix_(keep, keep)] = np.linalg.inv(A[np.ix_(keep, keep)])
-    reduced = arrow.eliminate(g, bread, shared, free)
+    reduced = schur.eliminate(g, bread, shared, free)
     step = -np.linalg.solve(reduced.hessian.sum(0), reduced.gradient.sum(0))
-    moved = reduced.step + reduced.follow @ step
+    moved = reduced.step + reduced.sensitivity @ step
     np.testing.assert_allclose(moved, -(inverse @ b)[place], atol=1e-12)
-    a, m = arrow.marginal(bread, meat, shared, free)
+    a, m = schur.eliminate_others(bread, meat, shared, free)
     for i, p in enumerate(place):
         f = np.flatnonzero(free[i])
         block = np.linalg.inv(a[i][np.ix_(f, f)])
@@ -134,8 +133,8 @@ def test_elimination_is_the_dense_solution():
 def test_the_step_of_the_trust_region():
     """Inside: Newton's. On the sphere: (H + damping) step = -g with damping >= 0."""
     H, g = np.diag([1.0, 4.0, 0.0]), np.array([3.0, 4.0, 0.0])
-    np.testing.assert_allclose(arrow.within(9.0, g, H), [-3, -1, 0], atol=1e-12)
-    step = arrow.within(0.5, g, H)
+    np.testing.assert_allclose(schur.trust_region_step(9.0, g, H), [-3, -1, 0], atol=1e-12)
+    step = schur.trust_region_step(0.5, g, H)
     assert np.isclose(np.linalg.norm(step), 0.5)
     damping = (-g - H @ step)[:2] / step[:2]
     np.testing.assert_allclose(damping, damping[0])
@@ -170,7 +169,7 @@ def test_a_lane_that_cannot_be_evaluated_costs_itself(linear):
 
 @pytest.mark.slow
 def test_result_does_not_depend_on_chunks_nor_much_on_precision(linear):
-    other = fit(linear_study(), dataclasses.replace(ONE_START, chunk=7, starts=2))
+    other = fit(linear_study(), dataclasses.replace(ONE_START, batch=7, starts=2))
     np.testing.assert_allclose(other.theta, linear.theta, rtol=1e-9, atol=1e-9)
     assert np.all(other.converged_starts == 2)
     single = fit(linear_study(), dataclasses.replace(ONE_START, float32=True))
@@ -330,7 +329,7 @@ def dense_reference(force):
 def test_twenty_specimens_are_the_dense_fit_of_scipy():
     """Estimates and standard errors within 1e-6 (relative)."""
     force, study = skeleton_study(20)
-    result = fit(study, dataclasses.replace(ONE_START, chunk=32))
+    result = fit(study, dataclasses.replace(ONE_START, batch=32))
     x, se = dense_reference(force)
     value = np.exp(np.concatenate([np.tile(x[:2], (20, 1)), x[2:].reshape(20, 2)], axis=1))
     error = np.concatenate([np.tile(se[:2], (20, 1)), se[2:].reshape(20, 2)], axis=1)
@@ -373,6 +372,6 @@ def test_held_unknowns_are_counted_once():
     held[np.arange(LANES), study.shared[:, 0]] = True
     held[4, 0] = True
     everyone = np.ones(LANES, bool)
-    assert joint.held_count(study, held, everyone) == 2
+    assert held_count(study, held, everyone) == 2
     # k_3, 20 k_1, and an offset of each of 30 curves.
-    assert joint.unknown_count(study, everyone) == 51
+    assert unknown_count(study, everyone) == 51

@@ -64,7 +64,7 @@ WITHIN = {
         {"model"},
         {"onset"},
         {"study"},
-        {"press_scale", "residual"},
+        {"map_lanes", "press_scale", "residual"},
         {"cost"},
         {"levenberg_marquardt"},
         {"descent", "starts"},

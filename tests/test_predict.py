@@ -114,7 +114,7 @@ def check_coverage(read, noise):
     rng, lanes = np.random.default_rng(8), len(read.specimens)
     sources = [source_of(read, name) for name in read.specimens]
     for s in UNSEEN:
-        found = predict_sources(read, sources, [s] * lanes, [DEPTHS] * lanes, chunk=8)
+        found = predict_sources(read, sources, [s] * lanes, [DEPTHS] * lanes, batch=8)
         truth = true_force(s)
         sample = truth + noise * rng.normal(size=(lanes, len(DEPTHS)))
         inside = np.array([(p.curve_low95 <= truth) & (truth <= p.curve_high95) for p in found])
@@ -272,7 +272,7 @@ def total_study(curves, more=None, **settings):
 
 
 #: Always two lanes at once, so that one program serves.
-TWO = Settings(starts=1, chunk=2, scrutiny=False)
+TWO = Settings(starts=1, batch=2, scrutiny=False)
 
 
 def stored_again(study, path):

@@ -8,7 +8,7 @@ import synthetic
 
 from jaxtrachea.fit.levenberg_marquardt import Solved
 from jaxtrachea.fit.result import Settings
-from jaxtrachea.fit.starts import REDRAWS, best, completed, draw_starts
+from jaxtrachea.fit.starts import REDRAWS, add_starts, best, draw_starts
 from jaxtrachea.status import FitStatus
 
 #: Lanes of the tests, and the cost of the deep and the shallow minimum.
@@ -48,7 +48,7 @@ def run(study, wells, settings):
     lanes = len(study.curves)
     jobs = np.repeat(np.arange(lanes), settings.starts)
     first = wells(jobs, draw_starts(study, settings))
-    jobs, solved = completed(study, settings, jobs, first, np.ones(lanes), wells)
+    jobs, solved = add_starts(study, settings, jobs, first, np.ones(lanes), wells)
     return (*best(jobs, solved, lanes), jobs, solved)
 
 

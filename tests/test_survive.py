@@ -25,8 +25,9 @@ from jaxtrachea.cli.terminal import set_up_jax
 from jaxtrachea.config import load_fit_spec
 from jaxtrachea.files import lock as run_lock
 from jaxtrachea.files import output
-from jaxtrachea.fit import fit
-from jaxtrachea.fit import levenberg_marquardt as solve
+from jaxtrachea.fit import fit, levenberg_marquardt
+from jaxtrachea.fit.cost import LaneCost
+from jaxtrachea.fit.map_lanes import program
 from jaxtrachea.fit.specification import study_of
 from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.runs import chunks, former, in_chunks, journal, processes
@@ -310,10 +311,13 @@ def test_memory_of_a_lane_is_what_xla_counts(peace):
     """The estimate bounds XLA's own figure, by at most a factor of 3."""
     study, count = load_peace(peace), 32
     lanes = jax.tree.map(lambda v: np.repeat(v[:1], count, axis=0), study.lanes)
-    state = solve._idle(study, study.lanes, count, np.float64)
-    step = solve._compiled(study.model, solve.Tolerances(), 4)
-    starts, sigma = np.zeros((count, study.size)), np.ones((count, 2))
-    lowered = step.lower(lanes, sigma, starts, np.ones(count, bool), state)
+    objective = LaneCost(study.model, lanes, np.ones((count, 2)))
+    state = levenberg_marquardt._idle(objective, count, np.float64)
+    step = program(
+        levenberg_marquardt._advance, levenberg_marquardt.Tolerances(), 4, axes=None, donate=(3,)
+    )
+    starts = np.zeros((count, study.size))
+    lowered = step.lower(objective, starts, np.ones(count, bool), state)
     used = lowered.compile().memory_analysis()
     total = used.temp_size_in_bytes + used.argument_size_in_bytes
     assert total / count <= chunks.bytes_per_seat(study) <= 3 * total / count

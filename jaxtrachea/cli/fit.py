@@ -138,11 +138,11 @@ def describe(how: How, spec: Path, root: Path, loaded, measurements, study, opti
     from jaxtrachea.runs import chunks, journal
 
     asked, settings = loaded.fit, settings_of(loaded)
-    chunk, every = asked.chunk, "auto" if study.joint else asked.save_every
+    batch, every = asked.batch, "auto" if study.joint else asked.save_every
     return journal.describe(
         spec, root, measurements.sha256(), asked.precision, jax.local_devices()[0].device_kind,
         lanes=study.lanes.lower.shape[0],
-        chunk=chunks.seats(study, chunks.free_memory()) if chunk == "auto" else chunk,
+        chunk=chunks.seats(study, chunks.free_memory()) if batch == "auto" else batch,
         save_every=chunks.lanes_per_chunk(study, settings.starts) if every == "auto" else every,
         options=options,
     )  # fmt: skip
@@ -253,7 +253,7 @@ def running(how: How, now, study, settings) -> Iterator[Run]:
                     watch.wait_for_others()
                     return in_chunks.collect(run, study)
 
-                settings = dataclasses.replace(settings, chunk=run.journal.chunk)
+                settings = dataclasses.replace(settings, batch=run.journal.chunk)
                 staged, options = run_folder.stage(run), run.journal.options
                 yield Run(staged, options, journal.as_dict(run.journal), settings, fit, check)
                 check()

@@ -50,7 +50,7 @@ def run(spec, study, settings, options, profile: tuple[str, ...], stop_if_asked,
                 progress=counted("resampling"),
             )  # fmt: skip
         wanted = u.influence or "influence" in options
-        found = diagnose(result, settings.chunk) if wanted else None
+        found = diagnose(result, settings.batch) if wanted else None
         drawn = None
         if u.posterior:
             drawn = draw(

@@ -1,14 +1,19 @@
 """What is minimised: robust loss, weights of curves and noise, and the normal equations."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxtrachea.fit import residual as _residual
+from jaxtrachea._numerics import epsilon
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.model import FitModel
+from jaxtrachea.fit.residual import of_trials, residual, residual_value, size
 from jaxtrachea.trachea.geometry import Geometry
+
+#: Part of a step after which the residual's curvature along it is probed.
+PROBE = 0.1
 
 
 class Point(NamedTuple):
@@ -48,7 +53,7 @@ def robust(name: str, z2: Float[Array, "*n"], scale: float) -> tuple[Array, Arra
 
 def entry_scale(lane: Lane, sigma: Float[Array, "2"]) -> Float[Array, " m"]:
     """1 / sigma of each residual entry: forces by sigma[0], markers by sigma[1]."""
-    forces = jnp.arange(_residual.size(lane)) < lane.force.shape[-1]
+    forces = jnp.arange(size(lane)) < lane.force.shape[-1]
     return jnp.where(forces, 1 / sigma[0], 1 / sigma[1])
 
 
@@ -71,7 +76,7 @@ def evaluate(
     geometry: Geometry | None = None,
 ) -> Point:
     """Residual, cost and normal equations of one lane; cost O(trials) in the Jacobian."""
-    r = _residual.residual(model, theta, lane, geometry)
+    r = residual(model, theta, lane, geometry)
     rho, root = weights(model, r.value, lane, sigma)
     J, z = r.jacobian * root[:, None], r.value * root
     hessian = jnp.einsum("tim,tjm->tij", J, J)
@@ -113,3 +118,68 @@ def assemble(model: FitModel, parts: Array, lane: Lane) -> Array:
         return jnp.zeros(size, parts.dtype).at[place].add(parts, mode="drop")
     zero = jnp.zeros((size, size), parts.dtype)
     return zero.at[place[:, :, None], place[:, None, :]].add(parts, mode="drop")
+
+
+def rounding_cost(lane: Lane, sigma: Float[Array, "2"]) -> Float[Array, ""]:
+    """Cost that rounding alone leaves: ten roundings of every force."""
+    scale = entry_scale(lane, sigma)[: lane.force.shape[-1]]
+    data = jnp.sum((lane.force * lane.precision * lane.balance[:, None] * scale[None]) ** 2)
+    return 0.5 * data * (10 * epsilon(lane.force.dtype)) ** 2
+
+
+class LaneCost(eqx.Module):
+    """The cost of a lane, or with a leading axis of many, as `levenberg_marquardt` minimises it.
+
+    Attributes:
+        model: what is fitted (static).
+        lane: arrays of the lane.
+        sigma: standard deviation of (force, markers) in units of the lane's precision (1 where
+            noise is given); (2,).
+        geometry: the tube, may be traced; None: of the model.
+    """
+
+    model: FitModel = eqx.field(static=True)
+    lane: Lane
+    sigma: Any
+    geometry: Geometry | None = None
+
+    @property
+    def lower(self):
+        """Bounds in scaled coordinates; (P,)."""
+        return self.lane.lower
+
+    @property
+    def upper(self):
+        """Bounds in scaled coordinates; (P,)."""
+        return self.lane.upper
+
+    @property
+    def active(self):
+        """Whether the unknown exists in the lane; (P,)."""
+        return self.lane.active
+
+    def evaluate(self, theta: Float[Array, " P"]) -> Point:
+        """Residual, cost and normal equations."""
+        return evaluate(self.model, theta, self.lane, self.sigma, self.geometry)
+
+    def ahead(self, point: Point, theta, step) -> Float[Array, " P"]:
+        """J^T times the residual's second derivative along the step, by a probe on the way."""
+        model, lane = self.model, self.lane
+        along = of_trials(model, step, lane)
+        probe = residual_value(model, theta + PROBE * step, lane, self.geometry)
+        _, root = weights(model, point.value, lane, self.sigma)
+        linear = jnp.einsum("tim,ti->tm", point.jacobian, along)
+        curvature = 2 / PROBE * ((probe - point.value) / PROBE * root - linear)
+        return assemble(model, jnp.einsum("tim,tm->ti", point.jacobian, curvature), lane)
+
+    def blank(self) -> Point:
+        """Zeros in the shapes of `evaluate`."""
+        lane = self.lane
+        P, Jf, T = lane.lower.shape[0], len(self.model.free), lane.s_c.shape[0]
+        m, dtype = size(lane), lane.lower.dtype
+        zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
+        return Point(zeros(T, m), zeros(T, Jf, m), zeros(), zeros(P), zeros(P, P))
+
+    def rounding(self) -> Float[Array, ""]:
+        """See `rounding_cost`."""
+        return rounding_cost(self.lane, self.sigma)

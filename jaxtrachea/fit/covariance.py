@@ -6,7 +6,6 @@ covariance is the sandwich kappa A^-1 B A^-1 (Huber 1981, ch. 7); otherwise it r
 s^2 (J^T J)^-1.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -17,7 +16,7 @@ from scipy.special import stdtrit
 
 from jaxtrachea.fit.cost import assemble, entry_scale, robust
 from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.levenberg_marquardt import chunk_size
+from jaxtrachea.fit.map_lanes import batch_size, map_lanes
 from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import observations, residual
 from jaxtrachea.fit.structure import leaving_alone
@@ -104,24 +103,11 @@ def information(
 
 
 def informations(
-    study: Study, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, chunk: int = 128
+    study: Study, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, batch: int = 128
 ) -> Information:
     """`information` of many lanes, on the host; leading axis = order of `lanes`."""
-    chunk = chunk_size(len(lanes), chunk)
-    run = _compiled(study.model)
-    parts = []
-    for first in range(0, len(lanes), chunk):
-        of = np.minimum(np.arange(first, first + chunk), len(lanes) - 1)
-        lane = jax.tree.map(lambda v, row=lanes[of]: v[row], study.lanes)
-        part = run(jnp.asarray(theta[of]), lane, jnp.asarray(sigma[of]))
-        left = len(lanes) - first
-        parts.append(jax.tree.map(lambda v, left=left: np.asarray(v)[:left], part))
-    return jax.tree.map(lambda *v: np.concatenate(v), *parts)
-
-
-@functools.lru_cache(maxsize=32)
-def _compiled(model: FitModel):
-    return jax.jit(jax.vmap(functools.partial(information, model)))
+    batch = batch_size(len(lanes), batch)
+    return map_lanes(information, study, theta, sigma, rows=lanes, batch=batch)
 
 
 class Uncertainty(NamedTuple):

@@ -1,10 +1,9 @@
 """The same cost by optax: L-BFGS or Adam, for users who put the model into a larger loss.
 
 `cost` is the scalar to embed; `descend` runs it by itself, with the box kept by projection. Slower
-than `solve.levenberg_marquardt` for a plain fit; use it where the loss is not a sum of squares.
+than `levenberg_marquardt` for a plain fit; use it where the loss is not a sum of squares.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Literal
 
@@ -15,9 +14,10 @@ import optax
 from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea.fit.cost import entry_scale, evaluate, robust
+from jaxtrachea.fit.cost import entry_scale, evaluate, robust, rounding_cost
 from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.levenberg_marquardt import Solved, Tolerances, held, promise, rounding_cost
+from jaxtrachea.fit.levenberg_marquardt import Solved, Tolerances, active_set, promise
+from jaxtrachea.fit.map_lanes import map_lanes
 from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import residual_value
 from jaxtrachea.fit.study import Study
@@ -45,51 +45,42 @@ def cost(
 
 def descend(
     study: Study,
-    jobs: np.ndarray,
+    rows: np.ndarray,
     starts: np.ndarray,
     sigma: np.ndarray,
     *,
     method: Literal["lbfgs", "adam"] = "lbfgs",
     tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
-    chunk: int = 256,
+    batch: int = 256,
     learning_rate: float = 0.03,
     progress: Callable[[int], None] | None = None,
     dtype=np.float64,
 ) -> Solved:
-    """Minimise every job by a first-order method; arguments and result as `levenberg_marquardt`.
+    """Minimise from every start by a first-order method; results as `levenberg_marquardt`.
 
-    `tolerances.iterations` counts tens of steps for L-BFGS and hundreds for Adam; a job is done
+    `rows`: lane of each start; `sigma`: of each lane. The other arguments are those of
+    `levenberg_marquardt`.
+
+    `tolerances.iterations` counts tens of steps for L-BFGS and hundreds for Adam; a start is done
     when the relative change of its cost over such a block is below `tolerances.cost` per step.
     Where an unknown alone could still lower the residual's norm by more than `NEARLY_FLAT`, it has
     stalled.
     """
     check_word("method", method, Literal["lbfgs", "adam"])
     block = {"lbfgs": 10, "adam": 100}[method]
-    run = _compiled(study.model, method, learning_rate, block, tolerances)
-    cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype)  # noqa: E731
-    parts = []
-    for first in range(0, len(jobs), chunk):
-        of = jobs[first : first + chunk]
-        lane = jax.tree.map(lambda v, of=of: cast(v[of]), study.lanes)
-        rows = slice(first, first + chunk)
-        # optax mixes integer widths in its counters
-        with jax.numpy_dtype_promotion("standard"):
-            done = run(cast(starts[rows]), lane, cast(sigma[rows]))
-        parts.append([np.asarray(v) for v in done])
-        if progress is not None:
-            progress(len(parts[-1][0]))
-    theta, value, status, iterations = (np.concatenate(v) for v in zip(*parts, strict=True))
-    return Solved(theta.astype(float), value.astype(float), status.astype(int), iterations)
-
-
-@functools.lru_cache(maxsize=8)
-def _compiled(model: FitModel, method, learning_rate, block, tolerances):
-    one = functools.partial(_descend, model, method, learning_rate, block, tolerances)
-    return jax.jit(jax.vmap(one))
+    static = (method, learning_rate, block, tolerances)
+    # optax mixes integer widths in its counters
+    with jax.numpy_dtype_promotion("standard"):
+        outcome = map_lanes(
+            _descend, study, starts, sigma[rows], rows=rows, batch=min(batch, len(rows)),
+            static=static, dtype=dtype, progress=progress,
+        )  # fmt: skip
+    theta, value, status, iterations = outcome
+    return Solved(theta, value, status.astype(int), iterations)
 
 
 def _descend(model, method, learning_rate, block, tolerances, start, lane, sigma):
-    """One job: blocks of steps until the cost settles."""
+    """One start: blocks of steps until the cost settles."""
     loss = lambda theta: cost(model, theta, lane, sigma)  # noqa: E731
     box = lambda theta: jnp.clip(theta, lane.lower, lane.upper)  # noqa: E731
     optimiser = optax.lbfgs() if method == "lbfgs" else optax.adam(learning_rate)
@@ -98,7 +89,7 @@ def _descend(model, method, learning_rate, block, tolerances, start, lane, sigma
         theta, state = carry
         value, gradient = jax.value_and_grad(loss)(theta)
         # What a bound holds does not move, and the others do not count on it.
-        gradient = jnp.where(held(theta, gradient, lane), 0, gradient)
+        gradient = jnp.where(active_set(theta, gradient, lane), 0, gradient)
         extra = {"value": value, "grad": gradient, "value_fn": loss} if method == "lbfgs" else {}
         updates, state = optimiser.update(gradient, state, theta, **extra)
         return box(optax.apply_updates(theta, updates)), state

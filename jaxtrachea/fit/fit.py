@@ -5,11 +5,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxtrachea.fit import shared as joint
 from jaxtrachea.fit.covariance import Uncertainty, analyse
 from jaxtrachea.fit.criteria import criteria
 from jaxtrachea.fit.evaluate import evaluated
-from jaxtrachea.fit.levenberg_marquardt import Solved, chunk_size
+from jaxtrachea.fit.levenberg_marquardt import Solved
+from jaxtrachea.fit.map_lanes import batch_size
 from jaxtrachea.fit.minima import (
     Minima,
     information_per_lane,
@@ -20,6 +20,7 @@ from jaxtrachea.fit.noise import next_sigma, precision_unit
 from jaxtrachea.fit.press_scale import relative_change
 from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.scrutiny import doubtful, left_in_doubt, scrutinise
+from jaxtrachea.fit.shared import held_count, marginal, summed_gradient
 from jaxtrachea.fit.starts import scales
 from jaxtrachea.fit.structure import Structure, null_spaces, reduced, structure_of, suspicious
 from jaxtrachea.fit.study import Study
@@ -47,7 +48,7 @@ def fit(
     Args:
         study: from `study.build_study`.
         settings: how to solve.
-        progress: called with (jobs finished since the last call, jobs in all).
+        progress: called with (starts finished since the last call, starts in all).
         starts: where to start, scaled coordinates, (lanes * settings.starts, P); None: drawn.
 
     Returns:
@@ -97,8 +98,8 @@ def _scrutinised(result, minima: Minima, known: Structure, settings, progress) -
         if not turns_left or not len(rows):
             return dataclasses.replace(result, **evidence._asdict())
         # As many as the fit computes together: the same program.
-        chunk = chunk_size(max(result.lanes * settings.starts, 16), settings.chunk)
-        full = rows[np.arange(max(len(rows), chunk)) % len(rows)]
+        batch = batch_size(max(result.lanes * settings.starts, 16), settings.batch)
+        full = rows[np.arange(max(len(rows), batch)) % len(rows)]
         part = reduced(result.study.take(full), known.pinned[full])
         solved, sigma = refit_with_noise(part, settings, None, minima.sigma[full], better[full])
         solved = Solved(*(v[: len(rows)] for v in solved))
@@ -124,7 +125,7 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
         info, pool, unknowns = information_per_lane(study, solved, sigma)
     lanes, theta = study.lanes, solved.theta
     alive = solved.status <= FitStatus.STALLED
-    gradient = joint.summed_gradient(study, info, alive) if study.joint else info.gradient
+    gradient = summed_gradient(study, info, alive) if study.joint else info.gradient
     log, step = scales(study)
     both = lanes.joints is None or study.noise_given[1]
     at_bound = (theta <= lanes.lower) & (gradient > 0)
@@ -134,8 +135,8 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
     held = at_bound | ~present
     relative = relative_change(study, theta)
     if study.joint:
-        pool = joint.marginal(study, pool, held, alive)
-        unknowns = (unknowns or 0) - joint.held_count(study, held, alive)
+        pool = marginal(study, pool, held, alive)
+        unknowns = (unknowns or 0) - held_count(study, held, alive)
     noise_given = study.noise_given[0] and both
     blind = _open_directions(study, theta, structure)
     u = analyse(pool, relative, held, noise_given=noise_given, unknowns=unknowns, structural=blind)

@@ -6,13 +6,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxtrachea.fit import descent
-from jaxtrachea.fit import shared as joint
+from jaxtrachea.fit.cost import LaneCost
 from jaxtrachea.fit.covariance import Information, informations
-from jaxtrachea.fit.levenberg_marquardt import Solved, chunk_size, levenberg_marquardt
+from jaxtrachea.fit.descent import descend
+from jaxtrachea.fit.levenberg_marquardt import Solved, levenberg_marquardt
+from jaxtrachea.fit.map_lanes import batch_size
 from jaxtrachea.fit.noise import first_sigma, next_sigma, noise_rounds
 from jaxtrachea.fit.result import Settings
-from jaxtrachea.fit.starts import best, completed, draw_starts
+from jaxtrachea.fit.shared import pooled, solve_jointly, unknown_count
+from jaxtrachea.fit.starts import add_starts, best, draw_starts
 from jaxtrachea.fit.structure import Structure, reduced
 from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus
@@ -29,16 +31,16 @@ class Minima(NamedTuple):
         agree: starts that ended in it; (lanes,).
         tried: starts in all; (lanes,).
         sigma: standard deviations that it was found with; (lanes, 2).
-        job: lane of every start; (jobs,).
-        end: where it ended; (jobs, P).
-        cost: that it ended at, with the noise that fits begin with; (jobs,).
+        lane: of every start; (starts,).
+        end: where it ended; (starts, P).
+        cost: that it ended at, with the noise that fits begin with; (starts,).
     """
 
     solved: Solved
     agree: np.ndarray
     tried: np.ndarray
     sigma: np.ndarray
-    job: np.ndarray
+    lane: np.ndarray
     end: np.ndarray
     cost: np.ndarray
 
@@ -47,7 +49,7 @@ class Minima(NamedTuple):
         rows = [np.array(v) for v in (*self.solved, self.agree, self.tried, self.sigma)]
         for old, new in zip(rows, (*by.solved, by.agree, by.tried, by.sigma), strict=True):
             old[lanes] = new
-        ends = (self.job, self.end, self.cost), (lanes[by.job], by.end, by.cost)
+        ends = (self.lane, self.end, self.cost), (lanes[by.lane], by.end, by.cost)
         joined = (np.concatenate(pair) for pair in zip(*ends, strict=True))
         return Minima(Solved(*rows[:4]), rows[4], rows[5], rows[6], *joined)
 
@@ -102,15 +104,15 @@ def _from_starts(study: Study, settings: Settings, starts, sigma, progress):
         solved, agree = _solve_jointly(study, settings, starts, sigma, progress)
         tried = np.full(lanes, len(starts) // lanes)
         return solved, np.full(lanes, agree), tried, np.arange(lanes), solved.theta, solved.cost
-    jobs = np.repeat(np.arange(lanes), settings.starts)
-    solved = _solve(study, settings, jobs, starts, sigma[jobs], progress)
+    rows = np.repeat(np.arange(lanes), settings.starts)
+    solved = _solve(study, settings, rows, starts, sigma, progress)
     if drawn:
         again = functools.partial(_solve_more, study, settings, sigma, progress)
-        jobs, solved = completed(study, settings, jobs, solved, data_weight(study, sigma), again)
-    found, agree = best(jobs, solved, lanes)
-    tried = np.bincount(jobs, minlength=lanes)
-    chosen = Solved(*(v[found] for v in solved))
-    return chosen, agree, tried, jobs, solved.theta, solved.cost
+        rows, solved = add_starts(study, settings, rows, solved, data_weight(study, sigma), again)
+    lowest, agree = best(rows, solved, lanes)
+    tried = np.bincount(rows, minlength=lanes)
+    chosen = Solved(*(v[lowest] for v in solved))
+    return chosen, agree, tried, rows, solved.theta, solved.cost
 
 
 def refit_with_sigma(study: Study, settings: Settings, theta, sigma) -> Solved:
@@ -120,13 +122,13 @@ def refit_with_sigma(study: Study, settings: Settings, theta, sigma) -> Solved:
     return _solve(study, settings, np.arange(len(theta)), theta, sigma, None)
 
 
-def _solve_more(study, settings, sigma, progress, jobs, starts) -> Solved:
-    """Further starts of a few lanes; their chunk does not depend on how many there are."""
-    settings = dataclasses.replace(settings, chunk=min(settings.chunk, FEW))
-    rows = np.arange(max(len(jobs), 2)) % len(jobs)  # one alone would be another program
+def _solve_more(study, settings, sigma, progress, rows, starts) -> Solved:
+    """Further starts of a few lanes; their batch does not depend on how many there are."""
+    settings = dataclasses.replace(settings, batch=min(settings.batch, FEW))
+    filled = np.arange(max(len(rows), 2)) % len(rows)  # one alone would be another program
     alive = None if progress is None else lambda done, of: progress(0, of)
-    solved = _solve(study, settings, jobs[rows], starts[rows], sigma[jobs[rows]], alive)
-    return Solved(*(v[: len(jobs)] for v in solved))
+    solved = _solve(study, settings, rows[filled], starts[filled], sigma, alive)
+    return Solved(*(v[: len(rows)] for v in solved))
 
 
 def data_weight(study: Study, sigma: np.ndarray) -> np.ndarray:
@@ -136,11 +138,14 @@ def data_weight(study: Study, sigma: np.ndarray) -> np.ndarray:
     return 0.5 * np.sum(z * z, axis=(1, 2))
 
 
-def _solve(study: Study, settings: Settings, jobs, starts, sigma, progress) -> Solved:
-    common = _common(settings, len(jobs), progress)
+def _solve(study: Study, settings: Settings, rows, starts, sigma, progress) -> Solved:
+    """Every start of lane `rows`; sigma of each lane."""
+    common = _common(settings, len(rows), progress)
     if settings.method == "levenberg-marquardt":
-        return levenberg_marquardt(study, jobs, starts, sigma, **common)
-    return descent.descend(study, jobs, starts, sigma, method=settings.method, **common)
+        return levenberg_marquardt(
+            LaneCost(study.model, study.lanes, sigma), starts, rows, **common
+        )
+    return descend(study, rows, starts, sigma, method=settings.method, **common)
 
 
 def _solve_jointly(
@@ -152,15 +157,15 @@ def _solve_jointly(
     lanes = study.lanes.lower.shape[0]
     common = _common(settings, len(starts), progress)
     # One size for all calls, so that it is compiled once.
-    common["chunk"] = chunk_size(lanes * settings.starts, settings.chunk)
+    common["batch"] = batch_size(lanes * settings.starts, settings.batch)
     of_starts = np.swapaxes(starts.reshape(lanes, len(starts) // lanes, -1), 0, 1)
-    return joint.solve_jointly(study, of_starts, sigma, alone=not near, **common)
+    return solve_jointly(study, of_starts, sigma, separately=not near, **common)
 
 
-def _common(settings: Settings, jobs: int, progress) -> dict[str, Any]:
+def _common(settings: Settings, starts: int, progress) -> dict[str, Any]:
     """What all solvers are told."""
-    report = None if progress is None else lambda done: progress(done, jobs)
-    common = {"tolerances": settings.tolerances, "chunk": settings.chunk, "progress": report}
+    report = None if progress is None else lambda done: progress(done, starts)
+    common = {"tolerances": settings.tolerances, "batch": settings.batch, "progress": report}
     return common | {"dtype": np.float32 if settings.float32 else np.float64}
 
 
@@ -176,5 +181,5 @@ def information_per_lane(
     if not study.joint:
         return info, info, None
     alive = solved.status <= FitStatus.STALLED
-    pool = joint.pooled(study, info, solved.theta, alive)
-    return info, pool, joint.unknown_count(study, alive)
+    pool = pooled(study, info, solved.theta, alive)
+    return info, pool, unknown_count(study, alive)

@@ -1,14 +1,10 @@
 """The fitted model at the measured points, for plots, residual tables and cross-validation."""
 
 import dataclasses
-import functools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.model import FitModel
+from jaxtrachea.fit.map_lanes import batch_size, map_lanes
 from jaxtrachea.fit.residual import residual_value
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.study import Study
@@ -55,16 +51,9 @@ def lag_correlation(prediction: Prediction) -> np.ndarray:
         return np.where(np.sum(pair, axis=(1, 2)) >= 10, both / ends, np.nan)
 
 
-def predictions(study: Study, theta: np.ndarray, chunk: int = 256) -> Prediction:
+def predictions(study: Study, theta: np.ndarray, batch: int = 256) -> Prediction:
     """Residuals of all lanes at `theta` (lanes, P), in N and mm."""
-    run = _compiled(study.model)
-    count = len(theta)
-    parts = []
-    for first in range(0, count, chunk):
-        of = np.arange(first, min(first + chunk, count))
-        lane = jax.tree.map(lambda v, of=of: v[of], study.lanes)
-        parts.append(np.asarray(run(jnp.asarray(theta[of]), lane)))
-    value = np.concatenate(parts)
+    value = map_lanes(residual_value, study, theta, batch=batch_size(len(theta), batch))
     lanes = study.lanes
     samples = lanes.force.shape[-1]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -74,14 +63,6 @@ def predictions(study: Study, theta: np.ndarray, chunk: int = 256) -> Prediction
             markers = value[..., samples:].reshape(lanes.joints.shape) / lanes.joint_precision
             joints = np.where(lanes.joint_precision > 0, markers, np.nan)
     return Prediction(force, joints)
-
-
-@functools.lru_cache(maxsize=8)
-def _compiled(model: FitModel):
-    def value(theta, lane: Lane):
-        return residual_value(model, theta, lane)
-
-    return jax.jit(jax.vmap(value))
 
 
 def rms(values: np.ndarray) -> np.ndarray | np.floating:

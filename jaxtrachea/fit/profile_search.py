@@ -4,7 +4,9 @@ import dataclasses
 
 import numpy as np
 
-from jaxtrachea.fit.levenberg_marquardt import Solved, chunk_size, levenberg_marquardt
+from jaxtrachea.fit.cost import LaneCost
+from jaxtrachea.fit.levenberg_marquardt import Solved, levenberg_marquardt
+from jaxtrachea.fit.map_lanes import batch_size
 from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.structure import leaving_alone, pins
 from jaxtrachea.status import FitStatus, ProfileEnd
@@ -53,7 +55,7 @@ class Sides:
         self.first = np.clip(self.target * pick([v.se for v in u]), 1e-9 * (1 + np.abs(here)), None)
         self.first = np.where(np.isfinite(self.first), self.first, 1.0)
         starts = result.lanes * settings.starts
-        self.chunk = chunk_size(max(starts, 16), settings.chunk)
+        self.batch = batch_size(max(starts, 16), settings.batch)
         self.sigma = result.whitened_sigma
         self.cost = self._costs_at_estimate()
 
@@ -92,18 +94,18 @@ class Sides:
     def _solve(self, lanes, start, pinned):
         """Fit `lanes` from `start` with the unknowns `pinned` (n, P) staying there."""
         study = self.result.study
-        # Never fewer jobs than places: every call then runs the one compiled program.
-        fill = max(self.chunk - len(lanes), 0)
+        # Never fewer starts than slots: every call then runs the one compiled program.
+        fill = max(self.batch - len(lanes), 0)
         pad = lambda v: np.concatenate([v, v[-1:].repeat(fill, axis=0)])  # noqa: E731
         chosen = study.take(pad(lanes))
         pinned = pad(np.broadcast_to(pinned, start.shape))
         start = np.clip(pad(start), chosen.lanes.lower, chosen.lanes.upper)
         active = np.where(pinned, 0, chosen.lanes.active)
         chosen = dataclasses.replace(chosen, lanes=chosen.lanes._replace(active=active))
+        objective = LaneCost(chosen.model, chosen.lanes, self.sigma[pad(lanes)])
         solved = levenberg_marquardt(
-            chosen, np.arange(len(start)), start, self.sigma[pad(lanes)],
-            tolerances=self.settings.tolerances, chunk=self.chunk,
-        )  # fmt: skip
+            objective, start, tolerances=self.settings.tolerances, batch=self.batch
+        )
         return Solved(*(v[: len(lanes)] for v in solved))
 
     def refit(self, side, distance, start):

@@ -82,8 +82,9 @@ def inputs(
         geometry: the tube, may be traced; None: of the model.
     """
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
-    skeleton = _skeleton(model, free, lane, tube)
-    contact = jax.vmap(lambda f, trial: _at_contact(model, f, trial, tube))(free, _trials(lane))
+    skeleton = _skeleton(model, free, _places(lane), tube)
+    at = lambda free, value, s_c: _at_contact(model, free, value, s_c, tube)  # noqa: E731
+    contact = jax.vmap(at)(free, lane.value, lane.s_c)
     law, felt = contact.law, _felt(model, skeleton)
     return Inputs(felt, skeleton.joints, law.k_1, law.k_3, contact.onset, contact.force_offset)
 
@@ -100,7 +101,7 @@ def residual(
         geometry: the tube, may be traced; None: of the model.
     """
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
-    skeleton, by_beam = _skeleton_and_derivative(model, free, lane, tube)
+    skeleton, by_beam = _skeleton_and_derivative(model, free, _places(lane), tube)
     one = lambda *trial: _of_trial_with_jacobian(model, tube, *trial)  # noqa: E731
     return Residual(*jax.vmap(one)(free, skeleton, by_beam, _trials(lane)))
 
@@ -110,10 +111,10 @@ def residual_value(
 ) -> Float[Array, "T m"]:
     """`residual` without its Jacobian."""
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
-    skeleton = _skeleton(model, free, lane, tube)
+    skeleton = _skeleton(model, free, _places(lane), tube)
 
     def one(free, skeleton, trial):
-        law, onset, offset = _at_contact(model, free, trial, tube)
+        law, onset, offset = _at_contact(model, free, trial.value, trial.s_c, tube)
         c = _felt(model, skeleton)
         force = respond(trial.displacement, onset, c, law, model.options, trial.blend).force
         joints = None if skeleton.joints is None else _times(force, skeleton.joints)
@@ -164,26 +165,41 @@ def _tube(model: FitModel, geometry: Geometry | None, dtype) -> Geometry:
     return jax.tree.map(lambda v: jnp.asarray(v, dtype), of)
 
 
-def _skeleton(model: FitModel, free, lane: Lane, tube: Geometry) -> Skeleton:
+class _Places(NamedTuple):
+    """Where T trials press, and whether the motion of the rings is asked for (static).
+
+    `value`: every model parameter, used where it is not free.
+    """
+
+    s_c: Float[Array, " T"]
+    value: Float[Array, "T J"]
+    marked: bool
+
+
+def _places(lane: Lane) -> _Places:
+    return _Places(lane.s_c, lane.value, lane.joints is not None)
+
+
+def _skeleton(model: FitModel, free, places: _Places, tube: Geometry) -> Skeleton:
     """What moves under a unit force in every trial."""
 
     def at(free, value, s_c):
         material, _ = material_and_values(model, free, value)
-        if lane.joints is None:
+        if not places.marked:
             return Skeleton(compliance(tube, material, s_c, model.options), None)
         beam = ligament_beam(tube, material, model.options)
         unit = unit_deflection(beam, s_c, model.options)
         return Skeleton(unit.w_C, unit.w)
 
-    if model.options.coupling == "total" and lane.joints is None:
-        return Skeleton(jnp.zeros_like(lane.s_c), None)
-    if model.common != "nothing" and lane.joints is None:
-        return at(free[0], lane.value[0], lane.s_c)
-    return jax.vmap(at)(free, lane.value, lane.s_c)
+    if model.options.coupling == "total" and not places.marked:
+        return Skeleton(jnp.zeros_like(places.s_c), None)
+    if model.common != "nothing" and not places.marked:
+        return at(free[0], places.value[0], places.s_c)
+    return jax.vmap(at)(free, places.value, places.s_c)
 
 
 def _skeleton_and_derivative(
-    model: FitModel, free, lane: Lane, tube: Geometry
+    model: FitModel, free, places: _Places, tube: Geometry
 ) -> tuple[Skeleton, Skeleton]:
     """`_skeleton` and its derivative by each of `_beam_columns`, an axis after that of the trials.
 
@@ -191,13 +207,13 @@ def _skeleton_and_derivative(
     """
     columns = _beam_columns(model)
     if not columns:
-        skeleton = _skeleton(model, free, lane, tube)
+        skeleton = _skeleton(model, free, places, tube)
         return skeleton, jax.tree.map(lambda v: jnp.zeros((v.shape[0], 0, *v.shape[1:])), skeleton)
     along = jnp.eye(free.shape[1], dtype=free.dtype)[jnp.array(columns)]
 
     def push(tangent):
         tangents = jnp.broadcast_to(tangent, free.shape)
-        return jax.jvp(lambda free: _skeleton(model, free, lane, tube), (free,), (tangents,))
+        return jax.jvp(lambda free: _skeleton(model, free, places, tube), (free,), (tangents,))
 
     return jax.vmap(push, out_axes=(None, 1))(along)
 
@@ -210,9 +226,9 @@ class _Contact(NamedTuple):
     force_offset: Float[Array, ""]
 
 
-def _at_contact(model: FitModel, free, trial: Lane, tube: Geometry) -> _Contact:
-    material, values = material_and_values(model, free, trial.value)
-    law = local_law(tube, material, trial.s_c, model.options)
+def _at_contact(model: FitModel, free, value, s_c, tube: Geometry) -> _Contact:
+    material, values = material_and_values(model, free, value)
+    law = local_law(tube, material, s_c, model.options)
     return _Contact(law, values["onset"], values["force_offset"])
 
 
@@ -242,10 +258,31 @@ def _masked(force, joints, trial: Lane) -> Float[Array, " m"]:
     return jnp.concatenate([r, markers.reshape(*r.shape[:-1], -1)], axis=-1)
 
 
-def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, trial: Lane):
-    """Whitened residual of one trial, (m,), and its Jacobian by the free columns, (Jf, m)."""
+class _Pressed(NamedTuple):
+    """One press of N samples and its derivatives by the Jf free columns, without data.
+
+    Attributes:
+        force: of the local law, without offset, N; (N,).
+        d_force: (Jf, N).
+        offset: N; scalar.
+        d_offset: (Jf,).
+        d_joints: of the motion of every ring under a unit force; (Jf, rings); None without rings.
+        corner: second derivative of the force by the onset's column, as far as it comes from the
+            rounded corner; None where no onset is fitted; (N,).
+    """
+
+    force: Float[Array, " N"]
+    d_force: Float[Array, "Jf N"]
+    offset: Float[Array, ""]
+    d_offset: Float[Array, " Jf"]
+    d_joints: Float[Array, "Jf rings"] | None
+    corner: Float[Array, " N"] | None
+
+
+def _press(model: FitModel, tube, free, skeleton, by_beam, value, s_c, D, blend) -> _Pressed:
+    """One press at s_c (mm) with tool displacements D (mm), given the skeleton there."""
     eye = jnp.eye(free.shape[0], dtype=free.dtype)
-    at_contact = lambda free: _at_contact(model, free, trial, tube)  # noqa: E731
+    at_contact = lambda free: _at_contact(model, free, value, s_c, tube)  # noqa: E731
     push = lambda t: jax.jvp(at_contact, (free,), (t,))  # noqa: E731
     contact, d_contact = jax.vmap(push, out_axes=(None, 0))(eye)
     of_beam = _beam_columns(model)
@@ -257,7 +294,6 @@ def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, tria
 
     d_skeleton = jax.tree.map(all_columns, by_beam)
     law, c = contact.law, _felt(model, skeleton)
-    D, blend = trial.displacement, trial.blend
     depth = respond(D, contact.onset, c, law, model.options, blend).depth
     by = sensitivity(depth, c, law)
     at = lambda onset: touch(D, onset, model.options, blend)  # noqa: E731
@@ -272,20 +308,62 @@ def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, tria
     d_force = jnp.zeros((len(eye), *depth.shape), depth.dtype)
     for d_input, by_input in (terms[name] for name in _felt_through(model)):
         d_force = d_force + d_input[:, None] * by_input[None]
-    force = duffing(depth, law)
+    corner = None
+    if blend is not None and any(p.name == "onset" for p in model.free):
+        curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
+        corner = by.displacement * curved * jnp.sum(d_contact.onset**2)
+    return _Pressed(
+        force=duffing(depth, law),
+        d_force=d_force,
+        offset=contact.force_offset,
+        d_offset=d_contact.force_offset,
+        d_joints=d_skeleton.joints,
+        corner=corner,
+    )
+
+
+def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, trial: Lane):
+    """Whitened residual of one trial, (m,), and its Jacobian by the free columns, (Jf, m)."""
+    place = trial.value, trial.s_c, trial.displacement, trial.blend
+    pressed = _press(model, tube, free, skeleton, by_beam, *place)
     joints, d_joints = None, None
-    if skeleton.joints is not None and d_skeleton.joints is not None:
-        joints = _times(force, skeleton.joints)
-        d_joints = jax.vmap(_times, (0, None))(d_force, skeleton.joints)
-        d_joints = d_joints + jax.vmap(_times, (None, 0))(force, d_skeleton.joints)
-    value = _whitened(force + contact.force_offset, joints, trial)
+    if skeleton.joints is not None and pressed.d_joints is not None:
+        joints = _times(pressed.force, skeleton.joints)
+        d_joints = jax.vmap(_times, (0, None))(pressed.d_force, skeleton.joints)
+        d_joints = d_joints + jax.vmap(_times, (None, 0))(pressed.force, pressed.d_joints)
+    value = _whitened(pressed.force + pressed.offset, joints, trial)
     row = lambda force, joints: _masked(force, joints, trial)  # noqa: E731
     bend = None
-    if blend is not None and joints is None and any(p.name == "onset" for p in model.free):
-        curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
-        squared = jnp.sum(d_contact.onset**2)
-        bend = _masked(by.displacement * curved * squared, None, trial)
-    return value, jax.vmap(row)(d_force + d_contact.force_offset[:, None], d_joints), bend
+    if pressed.corner is not None and joints is None:
+        bend = _masked(pressed.corner, None, trial)
+    jacobian = jax.vmap(row)(pressed.d_force + pressed.d_offset[:, None], d_joints)
+    return value, jacobian, bend
+
+
+def force_jacobian(
+    model: FitModel,
+    free: Float[Array, " Jf"],
+    value: Float[Array, " J"],
+    s_c: Float[Array, ""],
+    displacement: Float[Array, " N"],
+    blend: Float[Array, ""] | None = None,
+) -> Float[Array, "Jf N"]:
+    """Derivative of the force at the load cell by the free columns, of a press without data.
+
+    Args:
+        model: what is fitted (static).
+        free: free parameters, scaled coordinates.
+        value: all parameters in their units, used where they are not free.
+        s_c: mm.
+        displacement: of the tool, mm.
+        blend: rounded corner at the onset, mm, see `Lane`.
+    """
+    tube = _tube(model, None, free.dtype)
+    places = _Places(s_c[None], value[None], marked=False)
+    of_lane = _skeleton_and_derivative(model, free[None], places, tube)
+    skeleton, by_beam = jax.tree.map(lambda v: v[0], of_lane)
+    pressed = _press(model, tube, free, skeleton, by_beam, value, s_c, displacement, blend)
+    return pressed.d_force + pressed.d_offset[:, None]
 
 
 def _felt_through(model: FitModel) -> list[str]:

@@ -27,7 +27,7 @@ class Settings:
         seed: of the drawn starts.
         more_starts: added to lanes in doubt: no start converged, or one of several alone came
             lowest. With them infeasible starts are drawn anew. 0: neither.
-        chunk: lanes computed together.
+        batch: lanes computed together.
         tolerances: when a lane is done.
         float32: compute in single precision (results are float64 all the same).
         scrutiny: look for other minima and profile where an estimate gives cause; False: verdicts
@@ -40,7 +40,7 @@ class Settings:
     decades: float = 1.0
     seed: int = 0
     more_starts: int = 8
-    chunk: int = 128
+    batch: int = 128
     tolerances: Tolerances = Tolerances()
     float32: bool = False
     scrutiny: bool = True
@@ -51,7 +51,7 @@ class Settings:
         Raises:
             ValueError: naming the field, what was found and what is expected.
         """
-        check_record(self, starts=1.0, decades=0.0, seed=0.0, more_starts=0.0, chunk=1.0)
+        check_record(self, starts=1.0, decades=0.0, seed=0.0, more_starts=0.0, batch=1.0)
         check_record(self.tolerances, cost=0.0, step=0.0, gradient=0.0, iterations=1.0)
 
 

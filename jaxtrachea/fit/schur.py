@@ -22,15 +22,15 @@ class Reduced(NamedTuple):
 
     Attributes:
         step: Newton step of a lane's own unknowns where the shared ones stay; 0 for those; (L, P).
-        follow: how all unknowns of a lane move with each shared one; (L, P, k).
-        gain: fall of each lane's cost by `step`, to second order; (L,).
+        sensitivity: how all unknowns of a lane move with each shared one; (L, P, k).
+        predicted_decrease: fall of each lane's cost by `step`, to second order; (L,).
         gradient: of each lane's cost by the shared unknowns, its own following; (L, k).
         hessian: Schur complement; (L, k, k).
     """
 
     step: Float[np.ndarray, "L P"]
-    follow: Float[np.ndarray, "L P k"]
-    gain: Float[np.ndarray, " L"]
+    sensitivity: Float[np.ndarray, "L P k"]
+    predicted_decrease: Float[np.ndarray, " L"]
     gradient: Float[np.ndarray, "L k"]
     hessian: Float[np.ndarray, "L k k"]
 
@@ -49,24 +49,24 @@ def eliminate(
         shared: where the shared unknowns stand in each lane.
         free: unknowns that move; shared ones are not looked at.
     """
-    tip = tips(shared, hessian.shape[1])
-    own = free & (tip.sum(axis=2) == 0)
+    select = selector(shared, hessian.shape[1])
+    own = free & (select.sum(axis=2) == 0)
     inverse = pseudo_inverse(hessian, own)
     step = -np.einsum("lpq,lq->lp", inverse, gradient)
-    follow = tip - inverse @ hessian @ tip
-    gain = -0.5 * np.sum(step * gradient * own, axis=1)
-    reduced = np.einsum("lpk,lp->lk", follow, gradient)
-    return Reduced(step, follow, gain, reduced, congruent(hessian, follow))
+    sensitivity = select - inverse @ hessian @ select
+    predicted_decrease = -0.5 * np.sum(step * gradient * own, axis=1)
+    reduced = np.einsum("lpk,lp->lk", sensitivity, gradient)
+    return Reduced(step, sensitivity, predicted_decrease, reduced, congruent(hessian, sensitivity))
 
 
-def tips(shared: Int[np.ndarray, "L k"], size: int) -> Float[np.ndarray, "L size k"]:
+def selector(shared: Int[np.ndarray, "L k"], size: int) -> Float[np.ndarray, "L size k"]:
     """Columns that put shared unknowns into their places in every lane."""
     return np.swapaxes(np.eye(size)[shared], 1, 2)
 
 
-def congruent(matrix: Float[np.ndarray, "L P P"], follow: Float[np.ndarray, "L P k"]):
-    """follow^T matrix follow of every lane, symmetric to the last digit; (L, k, k)."""
-    product = np.swapaxes(follow, 1, 2) @ matrix @ follow
+def congruent(matrix: Float[np.ndarray, "L P P"], sensitivity: Float[np.ndarray, "L P k"]):
+    """sensitivity^T matrix sensitivity of every lane, symmetric to the last digit; (L, k, k)."""
+    product = np.swapaxes(sensitivity, 1, 2) @ matrix @ sensitivity
     return 0.5 * (product + np.swapaxes(product, 1, 2))
 
 
@@ -84,7 +84,7 @@ def pseudo_inverse(
     return inverse * scale[:, :, None] * scale[:, None]
 
 
-def within(
+def trust_region_step(
     radius: float, gradient: Float[np.ndarray, " k"], hessian: Float[np.ndarray, "k k"]
 ) -> Float[np.ndarray, " k"]:
     """Minimum of the quadratic model in the ball of this radius.
@@ -106,7 +106,7 @@ def within(
     return vectors @ step(np.exp(low))
 
 
-def marginal(
+def eliminate_others(
     bread: Float[np.ndarray, "L P P"],
     meat: Float[np.ndarray, "L P P"],
     shared: Int[np.ndarray, "L k"],
@@ -125,11 +125,11 @@ def marginal(
         free: unknowns that are not held on a bound.
     """
     reduced = eliminate(np.zeros(free.shape), bread, shared, free)
-    tip = tips(shared, free.shape[1])
+    select = selector(shared, free.shape[1])
 
     def with_others(matrix):
-        schur = congruent(matrix, reduced.follow)
+        schur = congruent(matrix, reduced.sensitivity)
         others = schur.sum(axis=0) - schur
-        return matrix + tip @ others @ np.swapaxes(tip, 1, 2)
+        return matrix + select @ others @ np.swapaxes(select, 1, 2)
 
     return with_others(bread), with_others(meat)

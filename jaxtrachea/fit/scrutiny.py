@@ -10,7 +10,6 @@ to the confidence region, whatever way it was found: the interval of an unknown 
 far (likelihood region; Raue et al. 2009, doi:10.1093/bioinformatics/btp358).
 """
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -18,6 +17,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxtrachea.fit.lane import Lane
+from jaxtrachea.fit.map_lanes import program
 from jaxtrachea.fit.minima import Minima, data_weight
 from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.natural_sizes import natural_sizes
@@ -127,7 +128,7 @@ def _elsewhere_as_low(result: FitResult, minima: Minima, se, natural) -> Bool[np
     By the covariance at the estimate: what it calls within the interval is no other minimum.
     """
     out = np.zeros(result.lanes, bool)
-    lane = minima.job
+    lane = minima.lane
     apart = np.abs(minima.end - result.theta[lane]) / natural[lane]
     own = (result.study.lanes.active[lane] > 0) & ~result.undetermined[lane]
     rows = np.flatnonzero(np.any(own & (apart > np.maximum(APART, 2 * se[lane])), axis=1))
@@ -209,8 +210,8 @@ def scrutinise(
     lanes = np.flatnonzero(doubts.any(axis=1))
     alive = None if progress is None else lambda *_: progress(0, 0)
     region = _Region(_sides(result, settings, doubts, alive), lanes)
-    of_lanes = np.isin(minima.job, lanes)
-    lane, end = minima.job[of_lanes], minima.end[of_lanes]
+    of_lanes = np.isin(minima.lane, lanes)
+    lane, end = minima.lane[of_lanes], minima.end[of_lanes]
     region.add(lane, end, region.sides.costs(lane, end))
     several = _other_minima(region, lanes, known)
     evidence = _unseen(result)
@@ -322,13 +323,12 @@ def _compliances(study: Study, lanes, theta) -> Float[np.ndarray, " n"]:
 def _compliance(study: Study, lane: int, theta) -> Float[np.ndarray, "n T"]:
     """Compliance at every trial of a lane, mm/N, at many points."""
     row = jax.tree.map(lambda v: v[lane], study.lanes)
-    return np.asarray(_compiled(study.model)(theta, row))
+    return np.asarray(program(_felt_compliance, study.model, axes=(0, None))(theta, row))
 
 
-@functools.lru_cache(maxsize=16)
-def _compiled(model: FitModel):
-    of_point = lambda theta, lane: inputs(model, theta, lane).compliance  # noqa: E731
-    return jax.jit(jax.vmap(of_point, (0, None)))
+def _felt_compliance(model: FitModel, theta, lane: Lane):
+    """Compliance at every trial of one lane, mm/N; (T,)."""
+    return inputs(model, theta, lane).compliance
 
 
 def barely_determined(study: Study) -> Bool[np.ndarray, " lanes"]:

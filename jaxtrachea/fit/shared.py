@@ -1,6 +1,6 @@
 """Joint fit: unknowns of every specimen and unknowns that all share, linear in the specimens.
 
-Each iteration is a Gauss-Newton step on the arrow matrix (`arrow`) with one trust region, on the
+Each iteration is a Gauss-Newton step on the arrow matrix (`schur`) with one trust region, on the
 shared unknowns: all others follow by substitution. A lane that this leaves well above its own
 minimum is fitted anew with the shared unknowns pinned, by the solver of single lanes; near the
 solution none is. Bounds by an active set. A lane that cannot be evaluated is left out and marked.
@@ -11,24 +11,23 @@ and outliers, where the mean of the estimates is not.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._numerics import epsilon
-from jaxtrachea.fit import schur as arrow
-from jaxtrachea.fit.cost import evaluate
+from jaxtrachea.fit.cost import LaneCost, evaluate
 from jaxtrachea.fit.covariance import Information
 from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.levenberg_marquardt import Solved, Tolerances, chunk_size, levenberg_marquardt
+from jaxtrachea.fit.levenberg_marquardt import Solved, Tolerances, levenberg_marquardt
+from jaxtrachea.fit.map_lanes import batch_size, map_lanes
 from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import observations, residual_value
+from jaxtrachea.fit.schur import eliminate, eliminate_others, trust_region_step
 from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus
 
@@ -36,13 +35,13 @@ from jaxtrachea.status import FitStatus
 _FIRST_RADIUS = 2.0
 #: A lane is fitted anew if it is above its own minimum by more than this share of its cost, or of
 #: what it has moved through (a Gauss-Newton step that works leaves far less).
-_POOR, _LEFT = 0.01, 0.1
+_NOT_MINIMISED, _LEFT = 0.01, 0.1
 #: Iterations granted after the shared unknowns have come to rest, or when the cost falls no more.
-_PATIENCE = 10
+_BUDGET = 10
 
 
-class Settled(NamedTuple):
-    """All lanes at one point of the shared unknowns.
+class Evaluated(NamedTuple):
+    """All lanes evaluated at one point of the shared unknowns.
 
     Attributes:
         theta: (L, P).
@@ -69,7 +68,7 @@ class _Task:
     study: Study
     sigma: np.ndarray
     tolerances: Tolerances
-    chunk: int
+    batch: int
     dtype: Any
     shared: Int[np.ndarray, "L k"]
 
@@ -84,9 +83,9 @@ def solve_jointly(
     starts: Float[np.ndarray, "starts L P"],
     sigma: Float[np.ndarray, "L 2"],
     *,
-    alone: bool,
+    separately: bool,
     tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
-    chunk: int = 128,
+    batch: int = 128,
     progress: Callable[[int], None] | None = None,
     dtype=np.float64,
 ) -> tuple[Solved, int]:
@@ -96,18 +95,18 @@ def solve_jointly(
         study: a joint one.
         starts: scaled coordinates.
         sigma: of each lane, as for `levenberg_marquardt`.
-        alone: fit every lane by itself first; else a start is a point near the solution.
+        separately: fit every lane by itself first; else a start is a point near the solution.
         tolerances: when all is done; the cost's is per lane.
-        chunk: lanes computed together, always as many.
+        batch: lanes computed together, always as many.
         progress: as for `levenberg_marquardt`; also called with 0 in every joint iteration.
         dtype: of the computation; sums over lanes are float64.
 
     Returns:
         The best outcome, one row per lane, and how many starts ended in it.
     """
-    task = _Task(study, sigma, tolerances, chunk, dtype, study.shared)
-    if alone:
-        starts = _fitted_alone(task, starts, progress)
+    task = _Task(study, sigma, tolerances, batch, dtype, study.shared)
+    if separately:
+        starts = _fit_separately(task, starts, progress)
     solved = [_descend(task, start, progress) for start in starts]
     there = [s.status <= FitStatus.STALLED for s in solved]
     # The cost of a start that lost a lane is not comparable: most lanes first.
@@ -120,11 +119,11 @@ def solve_jointly(
     return solved[best], int(np.sum(near & well))
 
 
-def _fitted_alone(task: _Task, starts, progress) -> np.ndarray:
+def _fit_separately(task: _Task, starts, progress) -> np.ndarray:
     """Lanes fitted by themselves from every start, then the shared unknowns at their median."""
     count, lanes, P = starts.shape
-    jobs = np.tile(np.arange(lanes), count)
-    found = _single(task, task.study, jobs, starts.reshape(-1, P), progress)
+    rows = np.tile(np.arange(lanes), count)
+    found = _single(task, task.study, rows, starts.reshape(-1, P), progress)
     usable = (found.status <= FitStatus.STALLED).reshape(count, lanes)
     theta = np.where(usable[..., None], found.theta.reshape(starts.shape), starts)
     row = np.arange(lanes)[:, None]
@@ -134,14 +133,14 @@ def _fitted_alone(task: _Task, starts, progress) -> np.ndarray:
     return theta
 
 
-def _single(task: _Task, study: Study, jobs, starts, progress=None) -> Solved:
-    """The solver of single lanes; always in chunks of one size, so that it is compiled once."""
-    total = len(jobs)
-    missing = max(0, task.chunk - total)
+def _single(task: _Task, study: Study, rows, starts, progress=None) -> Solved:
+    """The solver of single lanes; always in batches of one size, so that it is compiled once."""
+    total = len(rows)
+    missing = max(0, task.batch - total)
     pad = lambda v: np.concatenate([v, np.repeat(v[:1], missing, axis=0)])  # noqa: E731
     solved = levenberg_marquardt(
-        study, pad(jobs), pad(starts), pad(task.sigma[jobs]), tolerances=task.tolerances,
-        chunk=task.chunk, progress=progress, dtype=task.dtype,
+        LaneCost(study.model, study.lanes, task.sigma), pad(starts), pad(rows),
+        tolerances=task.tolerances, batch=task.batch, progress=progress, dtype=task.dtype,
     )  # fmt: skip
     return Solved(*(v[:total] for v in solved))
 
@@ -150,29 +149,31 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
     """One start: iterations until the shared unknowns and all lanes rest."""
     lanes = task.study.lanes
     clip = lambda theta: np.clip(theta, lanes.lower, lanes.upper)  # noqa: E731
-    here = _settle(task, clip(start), None, np.ones(len(start), bool))
+    here = _evaluate_or_refit(task, clip(start), None, np.ones(len(start), bool))
     alive = here.finite
-    radius, status, patience, n = _FIRST_RADIUS, FitStatus.MAX_ITERATIONS, _PATIENCE, 0
+    radius, status, budget, n = _FIRST_RADIUS, FitStatus.MAX_ITERATIONS, _BUDGET, 0
     fall = np.inf
-    restless = np.zeros(len(alive), bool)
+    unconverged = np.zeros(len(alive), bool)
     while alive.any() and n < task.tolerances.iterations:
         n += 1
         if progress is not None:
             progress(0)
         reduced, moving, gradient, hessian = _reduce(task, here, alive)
         step, shared = _shared_step(task, here, alive, radius, moving, gradient, hessian)
-        resting, restless = _at_rest(task, here, alive, reduced, gradient, hessian, moving)
-        patience -= resting or fall <= _floor(task, here, alive)
-        if (resting and not restless.any()) or patience == 0:
+        resting, unconverged = _at_rest(task, here, alive, reduced, gradient, hessian, moving)
+        budget -= resting or fall <= _floor(task, here, alive)
+        if (resting and not unconverged.any()) or budget == 0:
             status = FitStatus.CONVERGED
             break
-        trial = clip(here.theta + reduced.step + reduced.follow @ step)
+        trial = clip(here.theta + reduced.step + reduced.sensitivity @ step)
         trial[np.arange(len(trial))[:, None], task.shared] = shared
         trial = np.where(alive[:, None], trial, here.theta)
-        there = _settle(task, trial, here, alive)
+        there = _evaluate_or_refit(task, trial, here, alive)
         finite = np.all(there.finite[alive])
         fall = np.sum(here.cost[alive] - there.cost[alive]) if finite else -np.inf
-        promised = -(gradient @ step + 0.5 * step @ hessian @ step) + np.sum(reduced.gain[alive])
+        promised = -(gradient @ step + 0.5 * step @ hessian @ step) + np.sum(
+            reduced.predicted_decrease[alive]
+        )
         length = scipy.linalg.norm(step)
         if fall < 0.25 * promised:
             radius = 0.25 * (min(radius, length) if length > 0 else radius)
@@ -186,12 +187,12 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
         elif radius < task.tolerances.step:
             status = FitStatus.STALLED
             break
-    codes = np.where(restless & ~_nearly_flat(task, here), FitStatus.MAX_ITERATIONS, status)
+    codes = np.where(unconverged & ~_nearly_flat(task, here), FitStatus.MAX_ITERATIONS, status)
     codes = np.where(alive, codes, FitStatus.INFEASIBLE_START)
     return Solved(here.theta, here.cost, codes, np.full(len(alive), n))
 
 
-def _shared_step(task: _Task, here: Settled, alive, radius, moving, gradient, hessian):
+def _shared_step(task: _Task, here: Evaluated, alive, radius, moving, gradient, hessian):
     """Step of the shared unknowns within the radius, and where it leads; (k,) each.
 
     What the step would carry over a bound stops on it, and the others are minimal given that.
@@ -202,7 +203,7 @@ def _shared_step(task: _Task, here: Settled, alive, radius, moving, gradient, he
         free = moving & ~stops
         if free.any():
             pull = gradient[free] + hessian[np.ix_(free, stops)] @ step[stops]
-            step[free] = arrow.within(radius, pull, hessian[np.ix_(free, free)])
+            step[free] = trust_region_step(radius, pull, hessian[np.ix_(free, free)])
         ahead = theta + step
         crossing = free & ((ahead < box.lower) | (ahead > box.upper))
         if not crossing.any():
@@ -220,14 +221,14 @@ def _of_shared(task: _Task, theta, alive):
     return at(theta), Bounds(at(lanes.lower), at(lanes.upper))
 
 
-def _reduce(task: _Task, here: Settled, alive):
+def _reduce(task: _Task, here: Evaluated, alive):
     """Elimination at a point: lanes reduced, which shared unknowns move, and their equations."""
     g = np.where(alive[:, None], here.gradient, 0)
     H = np.where(alive[:, None, None], here.hessian, 0)
-    reduced = arrow.eliminate(g, H, task.shared, ~_held(here.theta, g, task.study.lanes))
+    reduced = eliminate(g, H, task.shared, ~_active_set(here.theta, g, task.study.lanes))
     gradient, hessian = reduced.gradient.sum(axis=0), reduced.hessian.sum(axis=0)
     theta, box = _of_shared(task, here.theta, alive)
-    return reduced, ~_held(theta, gradient, box), gradient, hessian
+    return reduced, ~_active_set(theta, gradient, box), gradient, hessian
 
 
 class Bounds(NamedTuple):
@@ -237,30 +238,30 @@ class Bounds(NamedTuple):
     upper: np.ndarray
 
 
-def _held(theta, gradient, box) -> np.ndarray:
+def _active_set(theta, gradient, box) -> np.ndarray:
     """Unknowns on a bound that the gradient pushes against."""
     return ((theta <= box.lower) & (gradient >= 0)) | ((theta >= box.upper) & (gradient <= 0))
 
 
-def _at_rest(task: _Task, here: Settled, alive, reduced, gradient, hessian, moving):
+def _at_rest(task: _Task, here: Evaluated, alive, reduced, gradient, hessian, moving):
     """Whether the shared unknowns have nothing left to gain, and which lanes have."""
     floor = _floor(task, here, alive)
     newton = np.linalg.lstsq(hessian[np.ix_(moving, moving)], gradient[moving], rcond=None)[0]
     resting = 0.5 * newton @ gradient[moving] <= floor
-    return bool(resting), alive & (reduced.gain > floor)
+    return bool(resting), alive & (reduced.predicted_decrease > floor)
 
 
-def _nearly_flat(task: _Task, here: Settled) -> np.ndarray:
+def _nearly_flat(task: _Task, here: Evaluated) -> np.ndarray:
     """Lanes whose residual is all but orthogonal to their Jacobian, as for single lanes; (L,)."""
     diagonal = np.diagonal(here.hessian, axis1=1, axis2=2)
-    own = ~_held(here.theta, here.gradient, task.study.lanes) & (diagonal > 0)
+    own = ~_active_set(here.theta, here.gradient, task.study.lanes) & (diagonal > 0)
     own[np.arange(len(own))[:, None], task.shared] = False
     cosine = np.abs(here.gradient) / np.sqrt(np.where(own, diagonal, 1)) * own
     tolerance = max(task.tolerances.gradient, 4 * epsilon(task.dtype))
     return np.max(cosine, axis=1) <= 1e3 * tolerance**0.5 * np.sqrt(2 * here.cost)
 
 
-def _floor(task: _Task, here: Settled, alive) -> float:
+def _floor(task: _Task, here: Evaluated, alive) -> float:
     """Fall of the cost that is not worth a step, for the shared unknowns and for each lane.
 
     A share of the cost of one lane, or what rounding leaves where the data are exact: a share of
@@ -275,13 +276,15 @@ def _floor(task: _Task, here: Settled, alive) -> float:
     return (total + 0.5 * data * (10 * epsilon(task.dtype)) ** 2) / np.sum(alive)
 
 
-def _rounding(task: _Task, here: Settled, alive) -> float:
+def _rounding(task: _Task, here: Evaluated, alive) -> float:
     """Promise too small to be seen in the cost."""
     total = np.sum(here.cost[alive])
     return task.tolerance * total / np.sum(alive) + 100 * epsilon(task.dtype) * total
 
 
-def _settle(task: _Task, theta: np.ndarray, before: Settled | None, alive) -> Settled:
+def _evaluate_or_refit(
+    task: _Task, theta: np.ndarray, before: Evaluated | None, alive
+) -> Evaluated:
     """Evaluate all lanes; those far above their own minimum are fitted with shared ones pinned.
 
     Args:
@@ -290,22 +293,22 @@ def _settle(task: _Task, theta: np.ndarray, before: Settled | None, alive) -> Se
         before: its own unknowns are a second start of such a fit.
         alive: lanes that count; (L,).
     """
-    here = _evaluated(task, theta)
+    here = _evaluate(task, theta)
     if task.study.size == task.shared.shape[1]:
         return here
     lanes = task.study.lanes
     finite = here.finite
     g = np.where(finite[:, None], here.gradient, 0)
     H = np.where(finite[:, None, None], here.hessian, 0)
-    gain = arrow.eliminate(g, H, task.shared, ~_held(theta, g, lanes)).gain
+    gain = eliminate(g, H, task.shared, ~_active_set(theta, g, lanes)).predicted_decrease
     floor = _floor(task, here, alive)
-    poor = ~finite | (gain > _POOR * here.cost)
+    not_minimised = ~finite | (gain > _NOT_MINIMISED * here.cost)
     if before is not None:
         moved = theta - before.theta
         through = 0.5 * np.einsum("lp,lpq,lq->l", moved, before.hessian, moved)
-        poor |= (gain > _LEFT * through) & (gain > floor)
-    poor = np.flatnonzero(alive & poor)
-    if not len(poor):
+        not_minimised |= (gain > _LEFT * through) & (gain > floor)
+    not_minimised = np.flatnonzero(alive & not_minimised)
+    if not len(not_minimised):
         return here
     row = np.arange(len(theta))[:, None]
     starts = [theta]
@@ -316,54 +319,38 @@ def _settle(task: _Task, theta: np.ndarray, before: Settled | None, alive) -> Se
     for side in (lower, upper):
         side[row, task.shared] = theta[row, task.shared]
     pinned = dataclasses.replace(task.study, lanes=lanes._replace(lower=lower, upper=upper))
-    jobs = np.tile(poor, len(starts))
-    found = _single(task, pinned, jobs, np.concatenate([s[poor] for s in starts]))
+    rows = np.tile(not_minimised, len(starts))
+    found = _single(task, pinned, rows, np.concatenate([s[not_minimised] for s in starts]))
     cost = np.where(np.isfinite(found.cost), found.cost, np.inf).reshape(len(starts), -1)
     best = np.argmin(cost, axis=0)
     again = theta.copy()
-    again[poor] = found.theta.reshape(len(starts), len(poor), -1)[best, np.arange(len(poor))]
-    return _evaluated(task, again)
+    count = len(not_minimised)
+    of_starts = found.theta.reshape(len(starts), count, -1)
+    again[not_minimised] = of_starts[best, np.arange(count)]
+    return _evaluate(task, again)
 
 
-def _evaluated(task: _Task, theta: Float[np.ndarray, "L P"]) -> Settled:
-    """Cost and normal equations of all lanes, a chunk at a time."""
-    run = _compiled(task.study.model)
-    settings = task.sigma, task.chunk, task.dtype
-    cost, gradient, hessian = in_chunks(run, task.study, theta, *settings)
+def _evaluate(task: _Task, theta: Float[np.ndarray, "L P"]) -> Evaluated:
+    """Cost and normal equations of all lanes, a batch at a time."""
+    batch = batch_size(len(theta), task.batch)
+    cost, gradient, hessian = map_lanes(
+        _normal_equations, task.study, theta, task.sigma, batch=batch, dtype=task.dtype
+    )
     finite = np.isfinite(cost) & np.isfinite(hessian).all(axis=(1, 2))
     finite &= np.isfinite(gradient).all(axis=1)
-    return Settled(theta, np.where(finite, cost, np.inf), gradient, hessian)
+    return Evaluated(theta, np.where(finite, cost, np.inf), gradient, hessian)
 
 
-def in_chunks(run, study: Study, theta, sigma, chunk: int, dtype) -> tuple[np.ndarray, ...]:
-    """A function of (theta, lane, sigma) over all lanes; float64 on the host."""
-    count, parts = len(theta), []
-    chunk = chunk_size(count, chunk)
-    cast = lambda v: v if np.issubdtype(v.dtype, np.integer) else v.astype(dtype)  # noqa: E731
-    for first in range(0, count, chunk):
-        of = np.minimum(np.arange(first, first + chunk), count - 1)
-        lane = jax.tree.map(lambda v, of=of: cast(v[of]), study.lanes)
-        part = run(cast(theta[of]), lane, cast(sigma[of]))
-        parts.append([np.asarray(v, np.float64)[: count - first] for v in part])
-    return tuple(np.concatenate(v) for v in zip(*parts, strict=True))
+def _normal_equations(model: FitModel, theta: Array, lane: Lane, sigma: Array):
+    """Cost, gradient and Gauss-Newton matrix of one lane."""
+    point = evaluate(model, theta, lane, sigma)
+    return point.cost, point.gradient, point.hessian
 
 
-@functools.lru_cache(maxsize=16)
-def _compiled(model: FitModel):
-    def normal(theta: Array, lane: Lane, sigma: Array):
-        point = evaluate(model, theta, lane, sigma)
-        return point.cost, point.gradient, point.hessian
-
-    return jax.jit(jax.vmap(normal))
-
-
-@functools.lru_cache(maxsize=16)
-def _compiled_residual(model: FitModel):
-    def absolute(theta: Array, lane: Lane, sigma: Array):
-        seen, _ = observations(lane)
-        return (jnp.where(seen > 0, jnp.abs(residual_value(model, theta, lane)), jnp.nan),)
-
-    return jax.jit(jax.vmap(absolute))
+def _absolute_residual(model: FitModel, theta: Array, lane: Lane):
+    """Sizes of the residuals of one lane, NaN where nothing was observed; (T, m)."""
+    seen, _ = observations(lane)
+    return jnp.where(seen > 0, jnp.abs(residual_value(model, theta, lane)), jnp.nan)
 
 
 def pooled(
@@ -382,8 +369,8 @@ def pooled(
     mean = lambda v: np.sum(v[alive] * of_lane) / max(np.sum(of_lane), 1)  # noqa: E731
     spread = np.zeros(2)
     if study.model.loss != "linear":
-        run, forces = _compiled_residual(study.model), study.lanes.force.shape[-1]
-        r = in_chunks(run, study, theta, np.ones_like(info.counts), 128, np.float64)[0][alive]
+        batch, forces = batch_size(len(theta), 128), study.lanes.force.shape[-1]
+        r = map_lanes(_absolute_residual, study, theta, batch=batch)[alive]
         kinds = (r[..., :forces], r[..., forces:])
         spread = np.array([np.nanmedian(v) if np.any(np.isfinite(v)) else 0.0 for v in kinds])
     every = lambda v: np.tile(v, (len(alive), *[1] * np.ndim(v)))  # noqa: E731
@@ -405,7 +392,7 @@ def marginal(study: Study, info: Information, held: Bool[np.ndarray, "L P"], ali
     """Information on each lane's unknowns, those of all other lanes eliminated."""
     bread = np.where(alive[:, None, None], info.bread, 0)
     meat = np.where(alive[:, None, None], info.meat, 0)
-    bread, meat = arrow.marginal(bread, meat, study.shared, ~held)
+    bread, meat = eliminate_others(bread, meat, study.shared, ~held)
     lost = ~alive[:, None, None]
     return info._replace(bread=np.where(lost, np.nan, bread), meat=np.where(lost, np.nan, meat))
 

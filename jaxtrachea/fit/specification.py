@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Collection
 
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
-from jaxtrachea.fit.levenberg_marquardt import MOST_SEATS, Tolerances
+from jaxtrachea.fit.levenberg_marquardt import MOST_SLOTS, Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS, Parameter, in_model
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import Noise, Study, build_study, check_curve, table_names
@@ -209,7 +209,7 @@ def refuse_without_unknowns(spec: FitSpec, study: Study, options: Collection[str
 
 
 def settings_of(spec: FitSpec) -> Settings:
-    """Solver settings of the [fit] section; `chunk` is its upper bound if left to the machine."""
+    """Solver settings of the [fit] section; `batch` is its upper bound if left to the machine."""
     f = spec.fit
     limits = Tolerances(f.tolerance, f.tolerance, f.tolerance, f.max_iterations)
     return Settings(
@@ -218,7 +218,7 @@ def settings_of(spec: FitSpec) -> Settings:
         decades=f.start_decades,
         seed=f.seed,
         more_starts=f.more_starts,
-        chunk=MOST_SEATS if f.chunk == "auto" else f.chunk,
+        batch=MOST_SLOTS if f.batch == "auto" else f.batch,
         tolerances=limits,
         float32=f.precision == "float32",
     )

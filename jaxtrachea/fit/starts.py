@@ -76,8 +76,8 @@ def draw_starts(study: Study, settings) -> np.ndarray:
 Solve = Callable[[np.ndarray, np.ndarray], Solved]
 
 
-def completed(
-    study: Study, settings, jobs: Int[np.ndarray, " jobs"], solved: Solved, weight, solve: Solve
+def add_starts(
+    study: Study, settings, rows: Int[np.ndarray, " starts"], solved: Solved, weight, solve: Solve
 ) -> tuple[Int[np.ndarray, " more"], Solved]:
     """First starts with infeasible ones drawn anew, and more starts for lanes in doubt.
 
@@ -86,7 +86,7 @@ def completed(
     Args:
         study: the study.
         settings: of the fit; `more_starts` 0: all stays as it is.
-        jobs: lane of each start.
+        rows: lane of each start.
         solved: what they came to.
         weight: half the weighted sum of squares of the data; (lanes,).
         solve: fits (lanes, starts).
@@ -95,71 +95,76 @@ def completed(
         Lane and outcome of every start, the first ones first.
     """
     if not settings.more_starts:
-        return jobs, solved
-    slots = np.arange(len(jobs)) % settings.starts
-    solved = _feasible(study, settings, jobs, slots, solved, solve)
-    doubt = np.flatnonzero(in_doubt(jobs, solved, weight))
+        return rows, solved
+    numbers = np.arange(len(rows)) % settings.starts
+    solved = _redrawn(study, settings, rows, numbers, solved, solve)
+    doubt = np.flatnonzero(needs_more_starts(rows, solved, weight))
     if not len(doubt):
-        return jobs, solved
+        return rows, solved
     more = np.repeat(doubt, settings.more_starts)
-    slots = settings.starts + np.tile(np.arange(settings.more_starts), len(doubt))
-    added = solve(more, _drawn(study, settings, more, slots, 0))
-    added = _feasible(study, settings, more, slots, added, solve)
+    numbers = settings.starts + np.tile(np.arange(settings.more_starts), len(doubt))
+    added = solve(more, _drawn(study, settings, more, numbers, 0))
+    added = _redrawn(study, settings, more, numbers, added, solve)
     both = (np.concatenate(pair) for pair in zip(solved, added, strict=True))
-    return np.concatenate([jobs, more]), Solved(*both)
+    return np.concatenate([rows, more]), Solved(*both)
 
 
-def best(jobs: np.ndarray, solved: Solved, lanes: int) -> tuple[np.ndarray, np.ndarray]:
+def best(rows: np.ndarray, solved: Solved, lanes: int) -> tuple[np.ndarray, np.ndarray]:
     """Start with the lowest cost of each lane (converged ones first), and how many agree.
 
     Args:
-        jobs: lane of each start; every lane has one.
+        rows: lane of each start; every lane has one.
         solved: what they came to.
         lanes: number of lanes.
     """
     cost = np.where(np.isfinite(solved.cost), solved.cost, np.inf)
     low = np.full(lanes, np.inf)
-    np.minimum.at(low, jobs, cost)
-    agree = (cost <= low[jobs] * (1 + 1e-6) + 1e-300) & (solved.status == FitStatus.CONVERGED)
-    order = np.lexsort((np.arange(len(jobs)), np.where(agree, -1.0, cost), jobs))
-    _, first = np.unique(jobs[order], return_index=True)
-    return order[first], np.bincount(jobs, agree, lanes).astype(int)
+    np.minimum.at(low, rows, cost)
+    agree = (cost <= low[rows] * (1 + 1e-6) + 1e-300) & (solved.status == FitStatus.CONVERGED)
+    order = np.lexsort((np.arange(len(rows)), np.where(agree, -1.0, cost), rows))
+    _, first = np.unique(rows[order], return_index=True)
+    return order[first], np.bincount(rows, agree, lanes).astype(int)
 
 
-def in_doubt(jobs: np.ndarray, solved: Solved, weight: np.ndarray) -> Bool[np.ndarray, " lanes"]:
+def needs_more_starts(
+    rows: np.ndarray, solved: Solved, weight: np.ndarray
+) -> Bool[np.ndarray, " lanes"]:
     """Lanes without a converged start, or with several starts of which one alone came lowest."""
     lanes = len(weight)
-    found, agree = best(jobs, solved, lanes)
+    found, agree = best(rows, solved, lanes)
     exact = solved.cost[found] <= EXACT * weight
-    alone = (agree == 1) & (np.bincount(jobs, minlength=lanes) > 1) & ~exact
+    alone = (agree == 1) & (np.bincount(rows, minlength=lanes) > 1) & ~exact
     return (agree == 0) | alone
 
 
-def _feasible(study, settings, jobs, slots, solved: Solved, solve: Solve) -> Solved:
+def _redrawn(study, settings, rows, numbers, solved: Solved, solve: Solve) -> Solved:
     """`solved` with infeasible starts drawn anew, all together, a few times."""
     solved = Solved(*map(np.array, solved))
     for turn in range(1, REDRAWS + 1):
-        rows = np.flatnonzero(solved.status == FitStatus.INFEASIBLE_START)
-        if not len(rows):
+        failed = np.flatnonzero(solved.status == FitStatus.INFEASIBLE_START)
+        if not len(failed):
             break
-        starts = _drawn(study, settings, jobs[rows], slots[rows], turn)
-        for old, new in zip(solved, solve(jobs[rows], starts), strict=True):
-            old[rows] = new
+        starts = _drawn(study, settings, rows[failed], numbers[failed], turn)
+        for old, new in zip(solved, solve(rows[failed], starts), strict=True):
+            old[failed] = new
     return solved
 
 
-def _drawn(study: Study, settings, jobs, slots, turn: int) -> Float[np.ndarray, "jobs P"]:
-    """A start for each job, uniform in a box 2^turn times as wide, from the lane's own numbers."""
+def _drawn(study: Study, settings, rows, numbers, turn: int) -> Float[np.ndarray, "starts P"]:
+    """A start of each lane of `rows`, from the lane's own numbers.
+
+    Uniform in a box 2^turn times as wide.
+    """
     _, low, high = box(study, settings.decades * 2**turn)
     unit = np.stack(
         [
             np.random.default_rng(
-                [settings.seed, _number(study.lane_name(lane)), slot, turn]
+                [settings.seed, _number(study.lane_name(lane)), number, turn]
             ).uniform(size=study.size)
-            for lane, slot in zip(jobs.tolist(), slots.tolist(), strict=True)
+            for lane, number in zip(rows.tolist(), numbers.tolist(), strict=True)
         ]
     )
-    return low[jobs] + unit * (high - low)[jobs]
+    return low[rows] + unit * (high - low)[rows]
 
 
 def _number(name: tuple[str, str]) -> int:

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea.fit.lane import Lane
+from jaxtrachea.fit.map_lanes import map_lanes
 from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.parameters import SKELETON
 from jaxtrachea.fit.residual import inputs
@@ -33,7 +34,7 @@ POINTS, DECADES = 8, 2.0
 #: Ratio of singular values, and part of an unknown in a direction, that are taken as zero.
 ZERO, NO_PART = 1e-7, 1e-3
 #: Lanes computed together.
-_LANES = 64
+_BATCH = 64
 #: Tool displacements of a generic curve, mm; with c, k_1 and k_3 near 1 it is as bent as can be.
 _GENERIC_DEPTHS = np.linspace(0.2, 3.0, 24)
 
@@ -221,12 +222,7 @@ def _joint_null_spaces(study: Study, J, active, nullity) -> list[np.ndarray]:
 
 def _seen(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     """V J of each lane: all combinations of inputs that its curves tell, by the unknowns."""
-    run, parts = _compiled(study.model), []
-    for first in range(0, len(lanes), _LANES):
-        rows = np.minimum(np.arange(first, first + _LANES), len(lanes) - 1)
-        lane = jax.tree.map(lambda v, of=lanes[rows]: v[of], _without_curves(study))
-        parts.append(np.asarray(run(jnp.asarray(theta[rows]), lane))[: len(lanes) - first])
-    J = np.concatenate(parts)
+    J = map_lanes(_inputs_by_unknowns, _without_curves(study), theta, rows=lanes, batch=_BATCH)
     log = _log(study)[lanes]
     J = J * np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))[:, None, None]
     V = _curve_sees(study)
@@ -241,9 +237,10 @@ def _seen(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     return np.nan_to_num(J).reshape(len(lanes), -1, J.shape[-1])
 
 
-@functools.lru_cache(maxsize=16)
-def _compiled(model: FitModel):
-    def relative_inputs(theta, lane):
+def _inputs_by_unknowns(model: FitModel, theta: Float[Array, " P"], lane: Lane):
+    """Derivative of all inputs, each in its natural measure, by the unknowns; (T, n, P)."""
+
+    def relative_inputs(theta):
         x = inputs(model, theta, lane)
         c = jnp.maximum(x.compliance, jnp.finfo(theta.dtype).tiny)
         felt = model.options.coupling == "series"
@@ -254,12 +251,9 @@ def _compiled(model: FitModel):
         size = jnp.max(jnp.abs(jax.lax.stop_gradient(x.joints)), axis=1, keepdims=True)
         return jnp.concatenate([rows, x.joints / size], axis=1)
 
-    def jacobian(theta: Array, lane: Lane):
-        k_3 = jax.lax.stop_gradient(inputs(model, theta, lane).k_3)
-        J = jax.jacfwd(relative_inputs)(theta, lane)
-        return J.at[:, 2].divide(jnp.where(k_3 != 0, k_3, 1)[:, None])
-
-    return jax.jit(jax.vmap(jacobian))
+    k_3 = inputs(model, theta, lane).k_3
+    J = jax.jacfwd(relative_inputs)(theta)
+    return J.at[:, 2].divide(jnp.where(k_3 != 0, k_3, 1)[:, None])
 
 
 @functools.lru_cache(maxsize=64)
@@ -318,10 +312,10 @@ def _log(study: Study) -> Bool[np.ndarray, "lanes P"]:
     )
 
 
-def _without_curves(study: Study) -> Lane:
-    """Lanes whose curves have one sample: what the inputs need and no more."""
+def _without_curves(study: Study) -> Study:
+    """The study with curves of one sample: what the inputs need and no more."""
     lanes = study.lanes
     one = {name: getattr(lanes, name)[:, :, :1] for name in ("displacement", "force", "precision")}
     if lanes.joints is not None:
         one |= {name: getattr(lanes, name)[:, :, :1] for name in ("joints", "joint_precision")}
-    return lanes._replace(**one)
+    return dataclasses.replace(study, lanes=lanes._replace(**one))

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from jaxtrachea._arguments import check_word
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.levenberg_marquardt import chunk_size
+from jaxtrachea.fit.map_lanes import batch_size
 from jaxtrachea.fit.predictions import Prediction, predictions
 from jaxtrachea.fit.result import FitResult, Settings
 
@@ -82,8 +82,8 @@ def bootstrap(
     _check(count, kind, block)
     result.study.refuse_joint("the bootstrap")
     seen = predictions(result.study, result.theta)
-    chunk = chunk_size(max(result.lanes * settings.starts, 16), settings.chunk)
-    one = dataclasses.replace(settings, starts=1, chunk=chunk, scrutiny=False)
+    batch = batch_size(max(result.lanes * settings.starts, 16), settings.batch)
+    one = dataclasses.replace(settings, starts=1, batch=batch, scrutiny=False)
     thetas, usable = [], []
     together = max(_AT_ONCE // count, 1)
     for first in range(0, result.lanes, together):

@@ -12,22 +12,19 @@ marginalised, so that information, scores and errors are those of the other unkn
 """
 
 import dataclasses
-import functools
 from typing import Literal, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.config import FitSpec, SpecError
-from jaxtrachea.fit.cost import assemble
 from jaxtrachea.fit.covariance import informations
-from jaxtrachea.fit.lane import Lane
+from jaxtrachea.fit.map_lanes import program
 from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.press_scale import relative_change
-from jaxtrachea.fit.residual import residual
+from jaxtrachea.fit.residual import force_jacobian
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.bootstrap import Bootstrap
@@ -183,13 +180,13 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
     In relative coordinates; what the press has of its own is eliminated.
     """
     study = known.study
-    run = _compiled(study.model, known.samples)
+    run = program(_information, study.model, known.samples, axes=(*[None] * 4, 0, 0))
     place = jnp.asarray(candidates.s), jnp.asarray(candidates.depth)
     parts = []
     for g, k in enumerate(known.lane):
         lanes = study.lanes
-        blend = None if known.blend is None else jnp.asarray(known.blend[g : g + 1])
-        rows = lanes.value[k, :1], lanes.index[k, :1], blend
+        blend = None if known.blend is None else jnp.asarray(known.blend[g])
+        rows = lanes.value[k, 0], lanes.index[k, 0], blend
         matrix = run(jnp.asarray(known.theta[g]), *rows, *place) / known.sigma[g] ** 2
         parts.append(np.asarray(matrix) * known.relative[g][:, None] * known.relative[g])
     added = np.stack(parts)
@@ -204,20 +201,19 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
     return marginal(of_press, shared)
 
 
-@functools.lru_cache(maxsize=16)
-def _compiled(model: FitModel, samples: int):
-    def one(theta, value, index, blend, s, depth):
-        displacement = depth * jnp.arange(1, samples + 1, dtype=theta.dtype)[None] / samples
-        ones, size = jnp.ones_like(displacement), theta.shape[0]
-        lane = Lane(
-            s_c=s[None], displacement=displacement, force=0 * ones, precision=ones, joints=None,
-            joint_precision=None, balance=ones[:, 0], blend=blend, value=value, index=index,
-            lower=jnp.zeros(size), upper=jnp.zeros(size), active=jnp.ones(size),
-        )  # fmt: skip
-        J = residual(model, theta, lane).jacobian
-        return assemble(model, jnp.einsum("tim,tjm->tij", J, J), lane)
+def _information(model: FitModel, samples: int, theta, value, index, blend, s, depth):
+    """Information of one press with noise of 1 N on the unknowns; (P, P).
 
-    return jax.jit(jax.vmap(one, (None, None, None, None, 0, 0)))
+    `value` and `index`: rows of the trial it is like, see `Lane`; `blend`: as `force_jacobian`.
+    """
+    displacement = depth * jnp.arange(1, samples + 1, dtype=theta.dtype) / samples
+    index = index[jnp.array(model.free_columns)]
+    free = jnp.where(index >= 0, theta[jnp.maximum(index, 0)], 0)
+    J = force_jacobian(model, free, value, s, displacement, blend)
+    place = jnp.where(index >= 0, index, len(theta))
+    zero = jnp.zeros((len(theta), len(theta)), theta.dtype)
+    gram = jnp.einsum("im,jm->ij", J, J)
+    return zero.at[place[:, None], place[None]].add(gram, mode="drop")
 
 
 def scores(information: Float[np.ndarray, "G C P P"], criterion: Criterion):

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
-from jaxtrachea.fit import shared as joint
 from jaxtrachea.fit.predictions import Prediction, lag_correlation
 from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.shared import held_count, unknown_count
 from jaxtrachea.fit.starts import of_unknowns
 from jaxtrachea.inference.judgement import interval95, within_bounds
 from jaxtrachea.inference.profile import Profiles
@@ -89,7 +89,7 @@ def effective(result: FitResult, seen: Prediction, profiles: Profiles | None = N
     unknowns = np.sum(~held, axis=1).astype(float)
     if study.joint:
         alive = result.succeeded
-        P = joint.unknown_count(study, alive) - joint.held_count(study, held, alive)
+        P = unknown_count(study, alive) - held_count(study, held, alive)
         unknowns = np.full(len(n), float(P))
         n, worth = (np.full(len(n), np.nansum(v[alive])) for v in (n, worth))
     given = study.noise_given[0] and (lanes.joints is None or study.noise_given[1])

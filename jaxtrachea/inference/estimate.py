@@ -12,11 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea.fit.cost import Point, evaluate
+from jaxtrachea.fit.cost import LaneCost, evaluate
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import FIRST_RADIUS, RUNNING, State, Tolerances, iterate
 from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.residual import size
 from jaxtrachea.fit.study import Study
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -85,17 +84,12 @@ def hessian(
 
 def _solve(model: FitModel, tolerances: Tolerances, start, data) -> State:
     """Levenberg-Marquardt of one lane, as a loop inside the program."""
-    lane, sigma, tube = data
-    P, Jf, T, m = start.shape[0], len(model.free), lane.s_c.shape[0], size(lane)
-    zeros = lambda *shape: jnp.zeros(shape, start.dtype)  # noqa: E731
-    point = Point(
-        zeros(T, m), zeros(T, Jf, m), jnp.full((), jnp.inf, start.dtype), zeros(P), zeros(P, P)
-    )
+    objective = LaneCost(model, *data)
     radius = jnp.full((), FIRST_RADIUS, start.dtype)
-    state = State(start, point, radius, jnp.int32(0), jnp.int8(RUNNING))
+    state = State(start, objective.blank(), radius, jnp.int32(0), jnp.int8(RUNNING))
     return jax.lax.while_loop(
         lambda state: state.status == RUNNING,
-        lambda state: iterate(model, tolerances, state, lane, sigma, tube),
+        lambda state: iterate(tolerances, objective, state),
         state,
     )
 

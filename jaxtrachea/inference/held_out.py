@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.fit.fit import fit
+from jaxtrachea.fit.map_lanes import program
 from jaxtrachea.fit.onset import onset_is_sought
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import Study, build_study, check_curve
 from jaxtrachea.inference.predict import CurvePrediction, predict_sources
-from jaxtrachea.inference.prediction_core import compiled_slopes
+from jaxtrachea.inference.prediction_core import force_and_slope
 from jaxtrachea.inference.sources import Source, source_of
 from jaxtrachea.inference.stored import StoredFit
 from jaxtrachea.measurements.read import BadCurve, Curve
@@ -232,7 +233,7 @@ def _slopes(stored: StoredFit, own, sources, theta, own_study: Study) -> list[np
     free = np.stack([source.free for source in sources])
     free[:, list(own)] = np.where(np.isfinite(theta), theta, 0.0)
     lanes = own_study.lanes
-    run = compiled_slopes(stored.study.model)
+    run = program(force_and_slope, stored.study.model)
     value = np.stack([source.value for source in sources])
     columns = [free, value, lanes.s_c[:, 0], lanes.displacement[:, 0]]
     columns += [] if lanes.blend is None else [lanes.blend[:, 0]]

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float
 from jaxtrachea.fit.cost import assemble, entry_scale, robust
 from jaxtrachea.fit.covariance import SINGULAR
 from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.levenberg_marquardt import chunk_size
+from jaxtrachea.fit.map_lanes import batch_size, map_lanes
 from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import observations, residual
 from jaxtrachea.fit.result import FitResult
@@ -207,30 +207,19 @@ def _without_curve(J, gram, stiffness, pull, near, K, own):
     return moved, jnp.sum(pushed * jnp.linalg.solve(inner, pushed[:, :, None])[:, :, 0], axis=1)
 
 
-def influence(result: FitResult, chunk: int = 128) -> Influence:
+def influence(result: FitResult, batch: int = 128) -> Influence:
     """Diagnostics of all lanes of a fit.
 
     Args:
         result: the fit.
-        chunk: lanes computed together.
+        batch: lanes computed together.
     """
-    study, lanes = result.study, result.lanes
-    chunk = chunk_size(lanes, chunk)
-    run = _compiled(study.model)
-    free = study.lanes.active * ~result.at_bound
-    sigma, relative, parts = result.whitened_sigma, result.relative, []
-    for first in range(0, lanes, chunk):
-        of = np.minimum(np.arange(first, first + chunk), lanes - 1)
-        lane = jax.tree.map(lambda v, of=of: v[of], study.lanes)
-        part = run(result.theta[of], lane, sigma[of], relative[of], free[of])
-        parts.append(jax.tree.map(lambda v: np.asarray(v)[: lanes - first], part))  # noqa: B023
-    found = jax.tree.map(lambda *v: np.concatenate(v), *parts)
-    return _conclude(result, found)
-
-
-@functools.lru_cache(maxsize=8)
-def _compiled(model: FitModel):
-    return jax.jit(jax.vmap(functools.partial(diagnose, model)))
+    free = result.study.lanes.active * ~result.at_bound
+    diagnostics = map_lanes(
+        diagnose, result.study, result.theta, result.whitened_sigma, result.relative, free,
+        batch=batch_size(result.lanes, batch),
+    )  # fmt: skip
+    return _conclude(result, diagnostics)
 
 
 def _conclude(result: FitResult, found: Diagnostics) -> Influence:

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea.fit.cost import weights
 from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.levenberg_marquardt import chunk_size
+from jaxtrachea.fit.map_lanes import batch_size, program
 from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import observations, residual_value
 from jaxtrachea.fit.result import FitResult
@@ -170,17 +170,16 @@ def _draw(model: FitModel, drawn, draws: int, lane: Lane, sigma, centre, root, w
     return x, lost, state.position
 
 
-@functools.lru_cache(maxsize=8)
-def _compiled(model: FitModel, drawn: tuple[bool, bool], draws: int):
-    """Warm-up and drawing of many lanes of many chains."""
+def _warm_up_chains(model: FitModel, drawn, acceptance, lane: Lane, sigma, centre, root, y, keys):
+    """`_warm_up` of all chains of one lane."""
+    one = functools.partial(_warm_up, model, drawn, acceptance, lane, sigma, centre, root)
+    return jax.vmap(one)(y, keys)
 
-    def many(chain):
-        return jax.vmap(jax.vmap(chain, (None, None, None, None, 0, 0)))
 
-    def warm_up(acceptance, *lanes):
-        return many(functools.partial(_warm_up, model, drawn, acceptance))(*lanes)
-
-    return jax.jit(warm_up), jax.jit(many(functools.partial(_draw, model, drawn, draws)))
+def _draw_chains(model: FitModel, drawn, draws, lane: Lane, sigma, centre, root, warm, keys):
+    """`_draw` of all chains of one lane."""
+    one = functools.partial(_draw, model, drawn, draws, lane, sigma, centre, root)
+    return jax.vmap(one)(warm, keys)
 
 
 def posterior(
@@ -189,7 +188,7 @@ def posterior(
     draws: int = 1000,
     chains: int = 4,
     seed: int = 0,
-    chunk: int = 16,
+    batch: int = 16,
     progress: Callable[[int, int], None] | None = None,
 ) -> Posterior:
     """Draw from the posterior of every lane that has an estimate.
@@ -201,7 +200,7 @@ def posterior(
         draws: of each chain, after 500 steps of warm-up; more where the chains are not good.
         chains: of each lane, 2 or more.
         seed: of the drawing.
-        chunk: lanes computed together.
+        batch: lanes computed together.
         progress: called with (lanes done since the last call, lanes in all).
 
     Raises:
@@ -216,14 +215,14 @@ def posterior(
     drawn = (not study.noise_given[0], markers and not study.noise_given[1])
     good = np.array([k for k in range(result.lanes) if succeeded(result, k)], int)
     found = _empty(result, chains, draws)
-    chunk = chunk_size(max(len(good), 1), chunk)
-    for first in range(0, len(good), chunk):
-        of = good[first : first + chunk]
+    batch = batch_size(max(len(good), 1), batch)
+    for first in range(0, len(good), batch):
+        of = good[first : first + batch]
         start = {int(k): around_the_fit(base, int(k), drawn, chains, seed) for k in of}
         for again, times in enumerate((1, *_AGAIN)):
             if not start:
                 break
-            x, lost = _run(base, drawn, draws, times, start, chunk, (seed, again))
+            x, lost = _run(base, drawn, draws, times, start, batch, (seed, again))
             start = _keep(found, base, drawn, start, x, lost)
         if progress is not None:
             progress(len(of), len(good))
@@ -241,18 +240,20 @@ def _empty(result: FitResult, chains: int, draws: int) -> Posterior:
     )  # fmt: skip
 
 
-def _run(base: FitResult, drawn, draws: int, times: int, start: dict[int, Start], chunk: int, salt):
+def _run(base: FitResult, drawn, draws: int, times: int, start: dict[int, Start], batch: int, salt):
     """Warm up and draw `times` times: (lanes, C, times D, Q) on the real line, and what diverged.
 
-    The lanes are filled up to `chunk`, so that one program serves all rounds.
+    The lanes are filled up to `batch`, so that one program serves all rounds.
     """
     lanes = list(start)
-    of = np.array(lanes + [lanes[-1]] * (chunk - len(lanes)))
+    of = np.array(lanes + [lanes[-1]] * (batch - len(lanes)))
     lane = jax.tree.map(lambda v: v[of], base.study.lanes)
     chains, (seed, again) = len(start[lanes[0]].y), salt
     places = map(np.stack, zip(*(start[int(k)] for k in of), strict=True))
     centre, root, y = places
-    warm_up, draw = _compiled(base.study.model, drawn, draws)
+    model = base.study.model
+    warm_up = program(_warm_up_chains, model, drawn, axes=(None, *[0] * 6))
+    draw = program(_draw_chains, model, drawn, draws)
 
     def keys(turn: int):
         key = jax.random.fold_in(jax.random.key(seed), again * 1000 + turn)

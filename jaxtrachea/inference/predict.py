@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxtrachea.inference.prediction_core import Predicted, Response, compiled
+from jaxtrachea.fit.map_lanes import program
+from jaxtrachea.inference.prediction_core import Predicted, Response, predicted
 from jaxtrachea.inference.sources import Source, slack_of, source_of
 from jaxtrachea.inference.stored import StoredFit
 from jaxtrachea.status import PredictionStatus, PressStatus
@@ -99,7 +100,7 @@ def predict_sources(
     s: list[float],
     displacements: list[np.ndarray],
     sigmas: Sequence[np.ndarray | None] | None = None,
-    chunk: int = 64,
+    batch: int = 64,
 ) -> list[CurvePrediction]:
     """Predictions for many curves in one program.
 
@@ -109,9 +110,9 @@ def predict_sources(
         s: contact position of each, mm; NaN without one.
         displacements: of each, mm.
         sigmas: noise of each sample, N, where it is not that of the fit.
-        chunk: curves computed together.
+        batch: curves computed together.
     """
-    run = compiled(stored.study.model)
+    run = program(predicted, stored.study.model)
     most = _rounded(max(map(len, displacements)), 32)
     padded = np.stack([np.pad(d, (0, most - len(d)), mode="edge") for d in displacements])
     places = np.where(np.isnan(s), float(stored.study.model.geometry.length) / 2, s)
@@ -125,7 +126,7 @@ def predict_sources(
     for members in (np.flatnonzero(np.isnan(blend)), np.flatnonzero(~np.isnan(blend))):
         # A rounded corner is another program; mostly all curves have one, or none.
         arrays = columns if np.isnan(blend[members]).all() else [*columns, blend]
-        size = min(chunk, _rounded(max(len(members), 1), 8))
+        size = min(batch, _rounded(max(len(members), 1), 8))
         for first in range(0, len(members), size):
             at = members[first : first + size]
             rows = np.pad(at, (0, size - len(at)), mode="edge")

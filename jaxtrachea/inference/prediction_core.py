@@ -4,7 +4,6 @@ Standard errors by the delta method: covariance of the estimates through the exa
 cannot do is said in `inference.predict`.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -172,18 +171,7 @@ def predicted(
     return Predicted(out, se, status, jnp.stack([bend(1.0), bend(-1.0)]), deepest)
 
 
-@functools.lru_cache(maxsize=16)
-def compiled(model: FitModel):
-    """`predicted` for many curves at once; `model` is a `FitModel`."""
-    return jax.jit(jax.vmap(functools.partial(predicted, model)))
-
-
-@functools.lru_cache(maxsize=16)
-def compiled_slopes(model: FitModel):
-    """Force and its derivative for many curves at once."""
-
-    def force(free, value, s_c, displacement, blend=None):
-        out, _, slopes = jacobian(model, free, value, s_c, displacement, blend)
-        return out.force, slopes.force
-
-    return jax.jit(jax.vmap(force))
+def force_and_slope(model: FitModel, free, value, s_c, displacement, blend=None):
+    """Force of one curve and its derivative by the free columns; (N,) and (F, N)."""
+    out, _, slopes = jacobian(model, free, value, s_c, displacement, blend)
+    return out.force, slopes.force

@@ -114,7 +114,7 @@ def profiles(
 
     Args:
         result: a fit with Levenberg-Marquardt or another method.
-        settings: tolerances and chunk of the refits.
+        settings: tolerances and batch of the refits.
         names: parameters; None: all.
         points: grid points on each side of the estimate.
         progress: called with (refits done since the last call, 0 for unknown in all).

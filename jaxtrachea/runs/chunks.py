@@ -20,7 +20,7 @@ from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.fit import residual
 from jaxtrachea.fit.covariance import Uncertainty
 from jaxtrachea.fit.criteria import Criteria
-from jaxtrachea.fit.levenberg_marquardt import MOST_SEATS, PART_OF_MEMORY
+from jaxtrachea.fit.levenberg_marquardt import MOST_SLOTS, PART_OF_MEMORY
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.study import Study
 from jaxtrachea.runs import journal as journals
@@ -61,7 +61,7 @@ def bytes_per_seat(study: Study) -> int:
     return 8 * (5 * len(study.free) * entries + 8 * study.size**2 + 500)
 
 
-def seats(study: Study, free: float, most: int = MOST_SEATS) -> int:
+def seats(study: Study, free: float, most: int = MOST_SLOTS) -> int:
     """Lanes that can be computed together, a power of two.
 
     Args:

@@ -30,7 +30,7 @@ def fitted_lanes(run: RunFolder, study: Study) -> Study:
 
 def settings_for(run: RunFolder, settings: Settings) -> Settings:
     """Settings of a run: a rerun has more and other starts."""
-    settings = dataclasses.replace(settings, chunk=run.journal.chunk)
+    settings = dataclasses.replace(settings, batch=run.journal.chunk)
     if run.journal.rerun is None:
         return settings
     starts, seed = MORE_STARTS * settings.starts, settings.seed + run.journal.rerun.count

@@ -17,8 +17,9 @@ import optimistix
 from scipy.optimize import least_squares
 
 from jaxtrachea.fit import fit
-from jaxtrachea.fit import levenberg_marquardt as solve
+from jaxtrachea.fit.cost import LaneCost
 from jaxtrachea.fit.lane import Lane
+from jaxtrachea.fit.levenberg_marquardt import Solved, levenberg_marquardt
 from jaxtrachea.fit.noise import first_sigma
 from jaxtrachea.fit.parameters import in_model
 from jaxtrachea.fit.result import FitResult, Settings
@@ -247,7 +248,7 @@ def main() -> None:
     study, model, forces = make_study()
     check(study, model, forces)
     settings = Settings(starts=1)
-    jobs, sigma = np.arange(SPECIMENS), first_sigma(study)
+    sigma = first_sigma(study)
     starts = draw_starts(study, settings)
     first = {}
 
@@ -255,7 +256,7 @@ def main() -> None:
         return fit.fit(study, settings)
 
     def solve_only():
-        return solve.levenberg_marquardt(study, jobs, starts, sigma)
+        return levenberg_marquardt(LaneCost(study.model, study.lanes, sigma), starts)
 
     through_jax = jitted_residual(study)
     count = {
@@ -304,7 +305,7 @@ def agreement(results, count) -> dict[str, dict]:
             # Cost is in units of the estimated sigma; recompute it from the residuals.
             total = found.rms[:, 0] ** 2 * found.samples / 2
             costs[name], evaluations[name] = total, found.iterations
-        elif isinstance(found, solve.Solved):
+        elif isinstance(found, Solved):
             costs[name] = None
             evaluations[name] = found.iterations
         elif isinstance(found[0], np.ndarray):

@@ -15,8 +15,7 @@ import numpy as np
 import update
 
 from jaxtrachea import Material, press, simulate, table_1
-from jaxtrachea.fit import cost, residual
-from jaxtrachea.fit import levenberg_marquardt as solve
+from jaxtrachea.fit import cost, levenberg_marquardt, residual
 from jaxtrachea.fit.noise import first_sigma
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.starts import draw_starts
@@ -125,16 +124,18 @@ def fits(out: common.Writer) -> None:
     of = lambda f: jax.vmap(functools.partial(f, model))  # noqa: E731
     point = jax.jit(of(cost.evaluate))(theta, lanes, sigma)
     same = lambda v, dtype: jnp.full(FITS, v, dtype)  # noqa: E731
-    state = solve.State(
-        theta, point, same(solve.FIRST_RADIUS, float), same(1, jnp.int32),
-        same(solve.RUNNING, jnp.int8),
+    state = levenberg_marquardt.State(
+        theta, point, same(levenberg_marquardt.FIRST_RADIUS, float), same(1, jnp.int32),
+        same(levenberg_marquardt.RUNNING, jnp.int8),
     )  # fmt: skip
-    step = lambda *a: jax.vmap(functools.partial(solve.iterate, model, solve.Tolerances()))(*a)  # noqa: E731
+    step = jax.vmap(
+        functools.partial(levenberg_marquardt.iterate, levenberg_marquardt.Tolerances())
+    )
     cases = {
         "residual": wait(of(residual.residual_value), theta, lanes),
         "residual and Jacobian": wait(of(residual.residual), theta, lanes),
         "residual, Jacobian, normal equations": wait(of(cost.evaluate), theta, lanes, sigma),
-        "one Levenberg-Marquardt step": wait(step, state, lanes, sigma),
+        "one Levenberg-Marquardt step": wait(step, cost.LaneCost(model, lanes, sigma), state),
     }
     common.close("residual", cases["residual and Jacobian"]().value, cases["residual"]())
     assert bool(jnp.all(cases["one Levenberg-Marquardt step"]().iteration == 2))

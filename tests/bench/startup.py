@@ -39,6 +39,7 @@ print(json.dumps(first - later))
 """
 FIT = """
 import fitting, jax, numpy as np
+from jaxtrachea.fit.cost import LaneCost
 from jaxtrachea.fit.levenberg_marquardt import levenberg_marquardt
 from jaxtrachea.fit.noise import first_sigma
 from jaxtrachea.fit.result import Settings
@@ -46,7 +47,7 @@ from jaxtrachea.fit.starts import draw_starts
 fitting.SPECIMENS = 256
 p, *_ = fitting.make_study()
 s = Settings(starts=1)
-args = (p, np.arange(256), draw_starts(p, s), first_sigma(p))
+args = (LaneCost(p.model, p.lanes, first_sigma(p)), draw_starts(p, s))
 f = lambda *a: levenberg_marquardt(*a).theta
 """
 CASES = {

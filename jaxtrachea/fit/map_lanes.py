@@ -1,0 +1,88 @@
+"""A function of one lane over many lanes: batches of one size, each function compiled once.
+
+`program` keeps what is compiled, by value of the model: the same functions of equal models share
+their programs. jax keeps apart what differs in shapes and dtypes.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from jaxtrachea.fit.study import Study
+
+
+@functools.lru_cache(maxsize=128)
+def program(function: Callable, *static, axes: Any = 0, donate: tuple[int, ...] = ()) -> Any:
+    """`function(*static, ...)`, compiled; the same object for equal arguments.
+
+    Args:
+        function: pure; a module's own, not one that is defined anew in every call.
+        static: its first arguments, compared and hashed by value (`FitModel`, numbers, words).
+        axes: of the other arguments, as `in_axes` of `jax.vmap`; None: no `vmap`.
+        donate: of the other arguments, as `donate_argnums` of `jax.jit`.
+    """
+    one = functools.partial(function, *static)
+    return jax.jit(one if axes is None else jax.vmap(one, axes), donate_argnums=donate)
+
+
+def batch_size(total: int, most: int) -> int:
+    """Lanes computed together: few different sizes, so that few programs are compiled."""
+    return 1 if total == 1 else min(most, max(16, 1 << (total - 1).bit_length()))
+
+
+def cast(tree: Any, dtype) -> Any:
+    """Floating-point numpy arrays of a tree in a dtype; others stay."""
+    moves = lambda v: np.issubdtype(v.dtype, np.floating)  # noqa: E731
+    return jax.tree.map(lambda v: v.astype(dtype, copy=False) if moves(v) else v, tree)
+
+
+def map_lanes(
+    function: Callable,
+    study: Study,
+    *arrays: np.ndarray,
+    batch: int,
+    rows: Int[np.ndarray, " n"] | None = None,
+    static: tuple = (),
+    dtype: Any = np.float64,
+    progress: Callable[[int], None] | None = None,
+) -> Any:
+    """`function(model, *static, array, lane, *arrays)` of many lanes.
+
+    Args:
+        function: pure, of one lane; a module's own, so that its program is kept (see `program`).
+        study: whose model and lanes.
+        arrays: of each row, leading axis n: what comes before the lane (mostly theta), and after.
+        batch: lanes computed together, always as many: the last ones are filled up with the last
+            lane, and one program serves all.
+        rows: lane of each row; None: all lanes in order.
+        static: arguments between model and arrays, by value.
+        dtype: of the computation.
+        progress: called with the number of rows done since the last call.
+
+    Returns:
+        What the function returns, on the host with leading axis n; floating-point arrays in
+        float64.
+    """
+    count = len(arrays[0])
+    rows = np.arange(count) if rows is None else rows
+    run, parts = program(function, study.model, *static), []
+    for first in range(0, count, batch):
+        here = np.minimum(np.arange(first, first + batch), count - 1)
+        lane = jax.tree.map(lambda v, at=rows[here]: v[at], study.lanes)
+        before, *after = cast([v[here] for v in arrays], dtype)
+        part = run(before, cast(lane, dtype), *after)
+        left = min(count - first, batch)
+        parts.append(jax.tree.map(lambda v, left=left: _on_host(v)[:left], part))
+        if progress is not None:
+            progress(left)
+    return jax.tree.map(lambda *v: np.concatenate(v), *parts)
+
+
+def _on_host(value) -> np.ndarray:
+    """A numpy array, in float64 if of floating point."""
+    array = np.asarray(value)
+    return array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else array

@@ -1,0 +1,104 @@
+"""The solver on a function of its own: Rosenbrock's valley inside boxes, minima in closed form."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrachea.fit.levenberg_marquardt import levenberg_marquardt
+from jaxtrachea.status import FitStatus
+
+
+class Point(NamedTuple):
+    """What the solver needs, and the residual's Jacobian."""
+
+    cost: Any
+    gradient: Any
+    hessian: Any
+    jacobian: Any
+
+
+def residual(theta):
+    """Rosenbrock (1960) as least squares: minimum 0 at (1, 1)."""
+    return jnp.stack([10 * (theta[1] - theta[0] ** 2), 1 - theta[0]])
+
+
+class Valley(eqx.Module):
+    """Its cost inside a box."""
+
+    lower: Any
+    upper: Any
+    active: Any
+
+    def evaluate(self, theta):
+        r, J = residual(theta), jax.jacfwd(residual)(theta)
+        return Point(0.5 * jnp.sum(r * r), J.T @ r, J.T @ J, J)
+
+    def ahead(self, point, theta, step):
+        along = lambda t: jax.jvp(residual, (t,), (step,))[1]  # noqa: E731
+        return point.jacobian.T @ jax.jvp(along, (theta,), (step,))[1]
+
+    def blank(self):
+        zero = jnp.zeros((2, 2), self.lower.dtype)
+        return Point(zero[0, 0], zero[0], zero, zero)
+
+    def rounding(self):
+        return jnp.zeros((), self.lower.dtype)
+
+
+def on_the_floor(y):
+    """Minimum over x at given y, beyond the maximum at x = 0: f' is a cubic."""
+    roots = np.roots([200, 0, 1 - 200 * y, -1])
+    return np.max(roots[np.abs(roots.imag) < 1e-12].real)
+
+
+#: Lower, upper, active, minimum: free; x held below it; y held above it; y at its start.
+BOXES = [
+    ((-5.0, -5.0), (5.0, 5.0), (1.0, 1.0), (1.0, 1.0)),
+    ((-5.0, -5.0), (0.5, 5.0), (1.0, 1.0), (0.5, 0.25)),
+    ((0.0, 2.0), (5.0, 5.0), (1.0, 1.0), (on_the_floor(2.0), 2.0)),
+    ((0.0, -5.0), (5.0, 5.0), (1.0, 0.0), (on_the_floor(3.0), 3.0)),
+]
+
+
+@pytest.mark.parametrize(("count", "batch"), [(1, 16), (40, 16)])
+def test_minima_of_a_valley_inside_boxes(count, batch):
+    """From `count` starts of each box, in batches with a rest: all end where the algebra says."""
+    valley = Valley(*(np.array(column) for column in list(zip(*BOXES, strict=True))[:3]))
+    rows = np.tile(np.arange(4), count)
+    unit = np.random.default_rng(1).uniform(size=(4 * count, 2))
+    starts = valley.lower[rows] + unit * (valley.upper - valley.lower)[rows]
+    starts[rows == 3, 1] = 3.0
+    solved = levenberg_marquardt(valley, starts, rows, batch=batch)
+    minimum = np.array([m for *_, m in BOXES])[rows]
+    assert np.all(solved.status == FitStatus.CONVERGED)
+    # A relative fall of the cost by 1e-10 is left; with a residual of 1 a distance of its root.
+    np.testing.assert_allclose(solved.theta, minimum, rtol=0, atol=1e-5)
+    assert np.all(solved.theta[rows == 1, 0] == 0.5)
+    assert np.all(solved.theta[rows == 2, 1] == 2.0)
+    assert np.all(solved.theta[rows == 3, 1] == 3.0)
+    x, y = minimum.T
+    truth = 50 * (y - x * x) ** 2 + 0.5 * (1 - x) ** 2
+    np.testing.assert_allclose(solved.cost, truth, rtol=1e-9, atol=1e-18)
+
+
+def test_a_start_that_cannot_be_evaluated_is_a_status():
+    """And touches no other row."""
+    valley = Valley(*(np.array(column)[None] for column in BOXES[0][:3]))
+    starts = np.array([[np.nan, 0.0], [-1.2, 1.0]])
+    solved = levenberg_marquardt(valley, starts, np.zeros(2, int))
+    assert solved.status.tolist() == [FitStatus.INFEASIBLE_START, FitStatus.CONVERGED]
+    np.testing.assert_allclose(solved.theta[1], 1.0, atol=1e-8)
+
+
+def test_float32_ends_on_the_bound_as_given():
+    """A bound that float32 cannot hold comes back to the last digit."""
+    third = 1 / 3
+    valley = Valley(np.full((1, 2), -5.0), np.array([[third, 5.0]]), np.ones((1, 2)))
+    solved = levenberg_marquardt(valley, np.zeros((1, 2)), dtype=np.float32)
+    assert solved.theta.dtype == np.float64
+    assert solved.theta[0, 0] == third
+    np.testing.assert_allclose(solved.theta[0, 1], third**2, rtol=1e-3)

@@ -1,0 +1,88 @@
+"""A function of one lane over many: any number of lanes compiles one program."""
+
+import jax
+import jax.monitoring
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import synthetic
+
+from jaxtrachea.fit.covariance import informations
+from jaxtrachea.fit.descent import descend
+from jaxtrachea.fit.levenberg_marquardt import Tolerances
+from jaxtrachea.fit.map_lanes import batch_size, map_lanes
+from jaxtrachea.fit.predictions import predictions
+
+EVENT = "/jax/core/compile/backend_compile_duration"
+
+
+@pytest.fixture(scope="module")
+def study():
+    """40 lanes: no multiple of 16."""
+    truth = synthetic.draw(3, 40, 1.5)
+    return synthetic.study(synthetic.forces(truth)[0])
+
+
+@pytest.fixture
+def compiled(monkeypatch):
+    """Programs compiled so far, by XLA's own events."""
+    seen, at_work = [], [True]
+
+    def listen(event, duration, **_):
+        if event == EVENT and at_work:
+            seen.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield seen
+    at_work.clear()
+
+
+def peak(model, factor, theta, lane, offset):
+    return {"peak": factor * jnp.max(lane.force) + offset, "scaled": theta * theta}
+
+
+def test_any_number_of_lanes_compiles_one_program(study, compiled):
+    """Against the same in numpy; equal models share the program, other dtypes do not."""
+    theta = np.arange(160.0).reshape(40, 4)
+    offset = np.arange(40.0)
+    rows = np.arange(40)[::-1]
+    done = []
+    found = map_lanes(peak, study, theta, offset, rows=rows, static=(3.0,), batch=16,
+                      progress=done.append)  # fmt: skip
+    assert len(compiled) == 1
+    assert done == [16, 16, 8]
+    np.testing.assert_allclose(found["scaled"], theta**2)
+    largest = study.lanes.force.max(axis=(1, 2))[rows]
+    np.testing.assert_allclose(found["peak"], 3 * largest + offset)
+    again = study.take(np.arange(23))
+    map_lanes(peak, again, theta[:23], offset[:23], static=(3.0,), batch=16)
+    assert len(compiled) == 1
+    single = map_lanes(peak, study, theta, offset, static=(3.0,), batch=16, dtype=np.float32)
+    assert len(compiled) == 2
+    assert single["peak"].dtype == np.float64
+    exact = 3 * study.lanes.force.max(axis=(1, 2)) + offset
+    np.testing.assert_allclose(single["peak"], exact, rtol=1e-6)
+
+
+def guess(study):
+    return np.tile([p.to_scaled(p.value) for p, _, _ in study.unknowns[0]], (40, 1))
+
+
+@pytest.mark.parametrize("loop", ["predictions", "descend", "informations"])
+def test_loops_over_lanes_compile_once(study, compiled, loop):
+    """40 lanes, 16 at a time: the last 8 are filled up."""
+    theta, sigma = guess(study), np.ones((40, 2))
+    if loop == "predictions":
+        assert predictions(study, theta, 16).force.shape == (40, 4, 50)
+    elif loop == "informations":
+        assert informations(study, np.arange(40), theta, sigma, 16).bread.shape == (40, 4, 4)
+    else:
+        few = Tolerances(iterations=1)
+        solved = descend(study, np.arange(40), theta, sigma, batch=16, tolerances=few)
+        assert solved.theta.shape == (40, 4)
+    assert len(compiled) == 1
+
+
+@pytest.mark.parametrize(("total", "size"), [(1, 1), (2, 16), (17, 32), (100, 128), (5000, 128)])
+def test_few_sizes(total, size):
+    assert batch_size(total, 128) == size
