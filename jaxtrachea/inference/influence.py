@@ -214,7 +214,7 @@ def influence(result: FitResult, batch: int = 128) -> Influence:
         result: the fit.
         batch: lanes computed together.
     """
-    free = result.study.lanes.active * ~result.at_bound
+    free = np.asarray(result.study.lanes.active) * ~result.at_bound
     diagnostics = map_lanes(
         diagnose, result.study, result.theta, result.whitened_sigma, result.relative, free,
         batch=batch_size(result.lanes, batch),
