@@ -99,13 +99,13 @@ def test_a_batch_is_its_lanes_one_by_one(noisy, loss):
     starts = np.tile([p.to_scaled(p.value) for p, _, _ in study.unknowns[0]], (20, 1))
     sigma = first_sigma(study)
     objective = LaneCost(study.model, study.lanes, sigma)
-    solve = lambda rows: levenberg_marquardt(  # noqa: E731
+    fitted = lambda rows: levenberg_marquardt(  # noqa: E731
         objective, starts[rows], rows, tolerances=Tolerances(iterations=60)
     )
-    batch = solve(np.arange(20))
+    batch = fitted(np.arange(20))
     order = np.random.default_rng(0).permutation(20)
-    np.testing.assert_array_equal(solve(order).theta, batch.theta[order])
-    one = solve(np.array([13]))
+    np.testing.assert_array_equal(fitted(order).theta, batch.theta[order])
+    one = fitted(np.array([13]))
     np.testing.assert_allclose(one.theta[0], batch.theta[13], rtol=0, atol=1e-8)
     assert one.status[0] == batch.status[13]
 

@@ -34,22 +34,22 @@ class Wells:
     wall: float = -np.inf
     calls: list = dataclasses.field(default_factory=list)
 
-    def __call__(self, jobs, starts):
+    def __call__(self, rows, starts):
         """Lane and start of each job to what it comes to."""
-        self.calls.append((np.array(jobs), np.array(starts)))
+        self.calls.append((np.array(rows), np.array(starts)))
         x = starts[:, 0]
-        inside = np.abs(x - self.deep[jobs]) < self.width[jobs]
+        inside = np.abs(x - self.deep[rows]) < self.width[rows]
         status = np.where(x < self.wall, FitStatus.INFEASIBLE_START, FitStatus.CONVERGED)
         cost = np.where(x < self.wall, np.inf, np.where(inside, DEEP, SHALLOW))
-        return Solved(np.array(starts), cost, status.astype(int), np.ones(len(jobs), int))
+        return Solved(np.array(starts), cost, status.astype(int), np.ones(len(rows), int))
 
 
 def run(study, wells, settings):
     lanes = len(study.curves)
-    jobs = np.repeat(np.arange(lanes), settings.starts)
-    first = wells(jobs, draw_starts(study, settings))
-    jobs, solved = add_starts(study, settings, jobs, first, np.ones(lanes), wells)
-    return (*best(jobs, solved, lanes), jobs, solved)
+    rows = np.repeat(np.arange(lanes), settings.starts)
+    first = wells(rows, draw_starts(study, settings))
+    rows, solved = add_starts(study, settings, rows, first, np.ones(lanes), wells)
+    return (*best(rows, solved, lanes), rows, solved)
 
 
 GUESS = np.log(synthetic.CHANGES["EI_L"]["value"])
@@ -62,9 +62,9 @@ def one_well(wall=-np.inf):
 
 def test_where_all_starts_agree_nothing_is_solved_again(study):
     wells = one_well()
-    _, agree, jobs, _ = run(study, wells, Settings(starts=4))
+    _, agree, rows, _ = run(study, wells, Settings(starts=4))
     assert len(wells.calls) == 1
-    assert len(jobs) == 4 * LANES
+    assert len(rows) == 4 * LANES
     np.testing.assert_array_equal(agree, 4)
 
 
@@ -73,21 +73,21 @@ def test_a_well_that_one_start_found_is_confirmed(study):
     settings = Settings(starts=4, more_starts=40)
     drawn = draw_starts(study, settings).reshape(LANES, 4, -1)[:, :, 0]
     wells = Wells(drawn[:, 2], np.where(np.arange(LANES) < 2, 0.2, 50.0))
-    found, agree, jobs, solved = run(study, wells, settings)
+    found, agree, rows, solved = run(study, wells, settings)
     assert set(wells.calls[1][0]) == {0, 1}
     np.testing.assert_array_equal(solved.cost[found], DEEP)
     assert np.all(agree[:2] >= 2)
-    np.testing.assert_array_equal(np.bincount(jobs), [44, 44, 4, 4, 4, 4])
+    np.testing.assert_array_equal(np.bincount(rows), [44, 44, 4, 4, 4, 4])
 
 
 def test_infeasible_starts_are_drawn_anew_together_and_not_for_ever(study):
     wells = one_well(GUESS + 0.5)
     settings = Settings(starts=1)
-    found, _, jobs, solved = run(study, wells, settings)
+    found, _, rows, solved = run(study, wells, settings)
     np.testing.assert_array_equal(solved.status[found], FitStatus.CONVERGED)
-    assert len(jobs) == LANES
+    assert len(rows) == LANES
     assert 2 <= len(wells.calls) <= 1 + REDRAWS
-    sizes = [len(jobs) for jobs, _ in wells.calls[1:]]
+    sizes = [len(rows) for rows, _ in wells.calls[1:]]
     assert sizes == sorted(sizes, reverse=True)
     nowhere = one_well(np.inf)
     found, agree, _, solved = run(study, nowhere, settings)
@@ -103,7 +103,7 @@ def test_draws_stay_in_the_bounds_and_belong_to_the_lane(study):
     def draws(study, settings, lane):
         wells = one_well(np.inf)
         run(study, wells, settings)
-        return np.concatenate([starts[jobs == lane] for jobs, starts in wells.calls[1:]])
+        return np.concatenate([starts[rows == lane] for rows, starts in wells.calls[1:]])
 
     mine = draws(study, settings, 3)
     assert len(np.unique(mine, axis=0)) == len(mine) == 2 * REDRAWS + 5 * (1 + REDRAWS)

@@ -217,13 +217,13 @@ class Repeats(NamedTuple):
     """What can be left out, one entry for each fit.
 
     Attributes:
-        lanes: whose; (jobs,).
-        held: which trials; (jobs, T).
-        kinds: `positions`, `trials` or `specimens`; (jobs,).
+        lanes: whose; (rows,).
+        held: which trials; (rows, T).
+        kinds: `positions`, `trials` or `specimens`; (rows,).
     """
 
-    lanes: Int[np.ndarray, " jobs"]
-    held: Bool[np.ndarray, "jobs T"]
+    lanes: Int[np.ndarray, " rows"]
+    held: Bool[np.ndarray, "rows T"]
     kinds: tuple[str, ...]
 
     @property
