@@ -96,7 +96,7 @@ def linear():
 
 
 def test_elimination_is_the_dense_solution():
-    """Random bordered matrix of 7 lanes, 3 own and 2 shared unknowns, some held: step and sandwich."""
+    """Random lanes, 3 own and 2 shared unknowns each, some held: step and sandwich in full."""
     rng = np.random.default_rng(1)
     L, P, k = 7, 5, 2
     J = rng.normal(size=(L, 9, P))

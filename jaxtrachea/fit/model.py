@@ -8,6 +8,7 @@ from typing import Literal
 import jax
 import numpy as np
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.fit.parameters import Parameter, Scale
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import Geometry
@@ -31,6 +32,14 @@ class Column:
     scale: Scale
     step: float
     fixed: bool
+
+    def __post_init__(self):
+        """Refuse words that mean nothing.
+
+        Raises:
+            ValueError: naming the column, what was found and what is expected.
+        """
+        check_word(f"{self.name}: scale", self.scale, Scale)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,6 +65,15 @@ class FitModel:
     loss: Loss = "linear"
     loss_scale: float = 1.345
     common: Common = "nothing"
+
+    def __post_init__(self):
+        """Refuse words that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_word("loss", self.loss, Loss)
+        check_word("common", self.common, Common)
 
     @property
     def geometry(self) -> Geometry:

@@ -306,7 +306,7 @@ def leave_repeats_out(
     observed = held[:, :, None] & (chosen.lanes.precision > 0)
     lost = np.any(observed & ~np.isfinite(seen), axis=(1, 2))
     converged = result.succeeded & touched.converged
-    of_lane = lambda jobs: np.bincount(lanes[jobs], minlength=count)  # noqa: E731
+    of_lane = lambda rows: np.bincount(lanes[rows], minlength=count)  # noqa: E731
     missed = Missed(
         error=np.full(count, np.nan),
         refits=of_lane(np.ones(len(lanes), bool)),
@@ -314,7 +314,7 @@ def leave_repeats_out(
         lost=of_lane(lost),
     )
     for lane in np.flatnonzero((missed.refits > 0) & (missed.lost == 0)):
-        jobs = lanes == lane
+        rows = lanes == lane
         peak = np.max(np.abs(study.lanes.force[lane]))
-        missed.error[lane] = float(rms(seen[jobs][observed[jobs]])) / peak
+        missed.error[lane] = float(rms(seen[rows][observed[rows]])) / peak
     return missed
