@@ -284,7 +284,7 @@ def test_a_level_box_touches_a_symmetric_tube_in_the_middle(name, kind):
 
 
 def test_of_two_patches_equally_near_one_is_always_taken():
-    """A box over the middle of a patch, its two neighbours level: alone as in a batch, per dtype."""
+    """A box over the middle of a patch, its neighbours level: alone, in a batch, each dtype."""
     tube, tool = tubes()["round"], box(np.array(BOXES["square"]), 0.5)
     one = lambda x, tool, tube: touch(tool, Pose(jnp.eye(3, dtype=x.dtype), x), tube)  # noqa: E731
     found = []
