@@ -288,7 +288,7 @@ def _minimum_jvp(primals, tangents_):
     return _minimum(pair, n), change
 
 
-def _contact(a: Shape, b: Shape, scaled: _Scaled, d, tied=False) -> Contact:
+def _contact(a: Shape, b: Shape, scaled: _Scaled, d, tied: Array | bool = False) -> Contact:
     """Everything that is read off at the direction where the search stopped."""
     pair, size = scaled.pair, scaled.size
     n = _normal(pair, jax.lax.stop_gradient(d))
