@@ -45,7 +45,7 @@ class ContactStatus(_Described):
     """What became of one distance between two convex shapes."""
 
     OK = 0, "solved"
-    FLAT = 1, "solved, but the normal is not determined: the distance is level in its direction"
+    FLAT = 1, "solved, but other normals are as right: equal minima, or a level distance"
     NOT_CONVERGED = 2, "the search stopped short of a minimum by more than its smoothing"
     NON_FINITE = 3, "an input or a result is not finite"
 

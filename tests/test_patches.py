@@ -356,7 +356,7 @@ def test_deep_is_told_and_a_broken_lane_keeps_to_itself():
     assert np.isfinite(c.gap[:2]).all()
     # Searched over all directions: out of the cylinder by 12 + 3 less 0.1 mm off the axis.
     every = solve(tool, TUBE, 0 * at, at, 16, True)
-    assert every.status[1] == ContactStatus.OK
+    assert every.status[1] == ContactStatus.FLAT  # as well to the front as to the left
     assert abs(every.gap[1] + 12 + 3.1 - 0.1) < every.bound[1]
 
 

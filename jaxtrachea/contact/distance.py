@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._numerics import solve_2x2
+from jaxtrachea._numerics import epsilon, solve_2x2
 from jaxtrachea.contact.pose import Pose, rotate
 from jaxtrachea.contact.search import (
     FLOOR,
@@ -38,6 +38,7 @@ from jaxtrachea.contact.search import (
     Model,
     Pair,
     Settings,
+    descend,
     eigenvalues,
     find_normal,
     floor_of,
@@ -52,6 +53,8 @@ from jaxtrachea.status import ContactStatus
 
 #: Share of 1/beta by which a stopped search may miss its minimum and still count as converged.
 TOLERANCE = 0.01
+#: Roundings of coordinates up to which their difference counts as none.
+ROUNDINGS = 4
 
 
 class Contact(eqx.Module):
@@ -66,7 +69,9 @@ class Contact(eqx.Module):
         upper: certified upper bound of it, mm; not differentiable.
         residual: gradient left over along the sphere, relative to the size of the pair.
         curvature: smaller eigenvalue of the Hessian on the sphere, relative to the same.
-        status: a `ContactStatus` as int8.
+        status: a `ContactStatus` as int8; FLAT where other normals are as right, as far as those
+            were found (`track` looks for none). Of flat faces against each other the normal is the
+            only one, the points are not.
     """
 
     distance: Float[Array, ""]
@@ -91,9 +96,10 @@ def signed_distance(
 ) -> Contact:
     """Signed distance of two convex shapes, searched over all directions.
 
-    Among several equal minima (a ball at the centre of a cube) one is taken. In overlap the lowest
-    minimum can be missed; the distance is then that of another face, too small, and `lower` is
-    still a bound (docs/contact.md has the rates).
+    Among several equal minima (a ball at the centre of a cube) the one furthest along
+    `search.PREFERRED` in the frame of A is taken, of those found, and the status is FLAT. In
+    overlap the lowest minimum can be missed; the distance is then that of another face, too small,
+    and `lower` is still a bound (docs/contact.md has the rates).
 
     Args:
         a: shape A.
@@ -121,8 +127,8 @@ def signed_distance(
         rows = sharp_table(pair.a, settings.directions)
     else:
         rows = jax.lax.stop_gradient(table) / size
-    d = find_normal(pair, rows, _towards(pair), settings)
-    return _contact(a, b, scaled, d)
+    d, tied = find_normal(pair, rows, _towards(pair), settings)
+    return _contact(a, b, scaled, d, tied)
 
 
 def track(
@@ -158,6 +164,36 @@ def track(
     return _contact(a, b, scaled, d)
 
 
+def approach(
+    a: Shape,
+    b: Shape,
+    pose: Pose,
+    direction: Float[Array, "3"],
+    settings: Settings = STANDARD,
+    *,
+    beta: Float[Array, ""] | None = None,
+) -> Contact:
+    """Signed distance of two shapes whose cores are apart, from a direction up to 0.3 rad off.
+
+    There is one minimum then. Two steps more than `track`, and no limit to the first one.
+
+    Args:
+        a: shape A.
+        b: shape B, of the same dtype.
+        pose: from B's frame to A's.
+        direction: unit vector, taken without derivative; shape (3,).
+        settings: `sharpness` and `warm_steps` are used.
+        beta: as in `signed_distance`.
+
+    Returns:
+        The `Contact`, as `signed_distance`.
+    """
+    scaled = _scaled(a, b, pose, settings, beta)
+    d, pair = jax.lax.stop_gradient((direction, scaled.pair))
+    d, _ = descend(pair, d, settings.warm_steps + 2)
+    return _contact(a, b, scaled, d)
+
+
 def direction_table(a: Shape, settings: Settings = STANDARD) -> Float[Array, " directions"]:
     """Support of A about its centre over the coarse directions, mm; the same for every pose."""
     centre = jnp.mean(a.vertices, axis=1)
@@ -175,11 +211,25 @@ class _Scaled(eqx.Module):
 def _scaled(a: Shape, b: Shape, pose: Pose, settings: Settings, beta) -> _Scaled:
     """Lengths over the size, about A's centre: translations cancel before they are rounded."""
     centre = jax.lax.stop_gradient(jnp.mean(a.vertices, axis=1))
+    turned = rotate(pose.rotation, b.vertices)
     v_a = a.vertices - centre[:, None]
-    v_b = rotate(pose.rotation, b.vertices) + (pose.translation - centre)[:, None]
+    v_b = turned + (pose.translation - centre)[:, None]
+    largest = lambda *v: jnp.max(jnp.abs(jnp.concatenate([x.ravel() for x in v])))  # noqa: E731
+    v_a = _without_rounding(v_a, largest(a.vertices))
+    v_b = _without_rounding(v_b, largest(turned, pose.translation, centre))
     size = jax.lax.stop_gradient(_size(v_a, v_b, a.radius + b.radius))
     sharpness = jnp.asarray(settings.sharpness, size.dtype) if beta is None else beta * size
     return _Scaled(Pair(v_a / size, v_b / size, sharpness), centre, size)
+
+
+def _without_rounding(v, largest):
+    """Differences that are only rounding of the coordinates they come from are none.
+
+    Coincident points would otherwise have a distance, and a direction that depends on the unit. The
+    derivative is kept.
+    """
+    none = jnp.abs(v) <= ROUNDINGS * epsilon(v.dtype) * largest
+    return v - jax.lax.stop_gradient(jnp.where(none, v, 0))
 
 
 def _size(v_a, v_b, radius):
@@ -238,7 +288,7 @@ def _minimum_jvp(primals, tangents_):
     return _minimum(pair, n), change
 
 
-def _contact(a: Shape, b: Shape, scaled: _Scaled, d) -> Contact:
+def _contact(a: Shape, b: Shape, scaled: _Scaled, d, tied: Array | bool = False) -> Contact:
     """Everything that is read off at the direction where the search stopped."""
     pair, size = scaled.pair, scaled.size
     n = _normal(pair, jax.lax.stop_gradient(d))
@@ -257,7 +307,7 @@ def _contact(a: Shape, b: Shape, scaled: _Scaled, d) -> Contact:
         size * upper,
         jnp.sqrt(m.gradient[0] ** 2 + m.gradient[1] ** 2),
         low,
-        _status(m, low, pair.beta, distance),
+        _status(m, low, pair.beta, distance, tied),
     )
 
 
@@ -269,11 +319,12 @@ def _bounds(a: Shape, b: Shape, at_a: Support, at_b: Support, n):
     return -(sharp_support(a, n) + sharp_support(b, -n)), upper
 
 
-def _status(m: Model, low, beta, distance):
+def _status(m: Model, low, beta, distance, tied):
     """Converged by the value that one more Newton step would gain, in units of 1/beta."""
     u1, u2 = newton_step(m)
     gain = -0.5 * (m.gradient[0] * u1 + m.gradient[1] * u2)
-    status = jnp.where(low <= floor_of(m.hessian), ContactStatus.FLAT, ContactStatus.OK)
+    level = (low <= floor_of(m.hessian)) | tied
+    status = jnp.where(level, ContactStatus.FLAT, ContactStatus.OK)
     status = jnp.where(gain * beta > TOLERANCE, ContactStatus.NOT_CONVERGED, status)
     finite = jnp.isfinite(distance)
     return jnp.where(finite, status, ContactStatus.NON_FINITE).astype(jnp.int8)

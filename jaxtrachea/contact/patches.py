@@ -24,10 +24,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea.contact.distance import signed_distance, track
+from jaxtrachea.contact.distance import approach, signed_distance
 from jaxtrachea.contact.line import Centreline, skeleton_coordinates
 from jaxtrachea.contact.pose import Pose, transform
-from jaxtrachea.contact.search import STANDARD, Settings
+from jaxtrachea.contact.search import LEAD, PREFERRED, STANDARD, Settings
 from jaxtrachea.contact.shapes import ArrayLike, Shape, heights, sharp_support
 from jaxtrachea.status import ContactStatus
 
@@ -170,13 +170,15 @@ def touch(
         raise ValueError(f"near: expected 1 to {count} (the number of patches), found {near}")
     beta = settings.sharpness / _size(tool, patches) if beta is None else beta
     bounds, directions = gap_bounds(tool, pose, patches)
-    _, chosen = jax.lax.top_k(-bounds, near)
+    # Where two patches are equally near, beside the middle one, roundings do not choose.
+    order = jnp.arange(count, dtype=bounds.dtype) / count
+    _, chosen = jax.lax.top_k(-bounds - LEAD * _size(tool, patches) * order, near)
     shapes = jax.tree.map(lambda v: v[chosen], patches.shapes)
 
     def contact(patch, direction):
         if search:
             return signed_distance(patch, tool, pose, settings, beta=beta)
-        return track(patch, tool, pose, direction, settings, beta=beta)
+        return approach(patch, tool, pose, direction, settings, beta=beta)
 
     each = jax.vmap(contact)(shapes, directions[chosen])
     low = jax.lax.stop_gradient(jnp.min(each.distance))
@@ -221,8 +223,10 @@ def gap_bounds(
     def bound(patch, centre):
         z = jnp.mean(moved.vertices, axis=1) - centre
         for _ in range(NEARING):  # Frank-Wolfe on the difference of the cores, exact steps
-            tip = moved.vertices[:, jnp.argmin(heights(moved.vertices, z))]
-            step = tip - patch.vertices[:, jnp.argmax(heights(patch.vertices, z))] - z
+            # Of vertices equally far (flat faces), a fixed one: roundings would choose others.
+            ahead = z + LEAD * jnp.max(jnp.abs(z)) * jnp.asarray(PREFERRED, z.dtype)
+            tip = moved.vertices[:, jnp.argmin(heights(moved.vertices, ahead))]
+            step = tip - patch.vertices[:, jnp.argmax(heights(patch.vertices, ahead))] - z
             square = jnp.sum(step * step)
             share = -jnp.sum(z * step) / jnp.where(square > 0, square, 1)
             z = z + jnp.clip(share, 0, 1) * step

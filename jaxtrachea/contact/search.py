@@ -5,6 +5,11 @@ one minimum when the shapes are apart and many when they overlap. A table of coa
 the starts; from each, saddle-free Newton steps in the tangent plane follow the minimum while beta
 rises; the survivors finish with safeguarded steps. Fixed cost: no step depends on the outcome.
 
+Where several minima are equally low, roundings must not choose: those within a tolerance well above
+rounding count as equal, and of them the one furthest along a fixed direction in the frame of A is
+taken. Steps against a gradient that is rounding alone are left out, so that a start on a level
+circle, or on a saddle by symmetry, stays where it is.
+
 Everything here works on numbers; derivatives are attached in `distance`.
 """
 
@@ -29,6 +34,21 @@ TRUST = 30.0
 LONGEST, WIDEST = 0.06, 0.5
 #: Smallest curvature taken at face value, relative to the size of the pair.
 FLOOR = 1e-6
+#: Which of equal normals is taken: the one furthest along this direction. At no small whole ratio
+#: of the axes, so that it tells the normals of symmetric shapes apart.
+PREFERRED = (0.7548776662, 0.5698402910, 0.3247179572)
+#: Values that count as equal when one is chosen, and gradients that are none, in roundings.
+EQUAL, NONE = 8, 8
+#: Values that count as equal for the status, relative to the extent of the pair.
+TIED = 1e-6
+#: Curvature from which on a rounding of the gradient moves the direction by little.
+CURVED = 1e-3
+#: Share of the extent by which starts and survivors further along `PREFERRED` come first.
+LEAD = 1e-5
+#: Cosine from which on two directions belong to one minimum: 0.03 rad.
+SAME = 1 - 5e-4
+#: First trust radius of `descend`, rad, and its growth.
+WIDE, GROWTH = 0.3, 3.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,8 +69,8 @@ class Settings:
 
     sharpness: float = 1000.0
     directions: int = 256
-    starts: int = 4
-    survivors: int = 2
+    starts: int = 8
+    survivors: int = 3
     coarse_steps: int = 4
     fine_steps: int = 6
     final_steps: int = 12
@@ -77,13 +97,17 @@ class Settings:
             )
 
 
-FAST = Settings(sharpness=300.0, directions=128, starts=3, fine_steps=4, final_steps=10)
+FAST = Settings(
+    sharpness=300.0, directions=128, starts=6, survivors=3, fine_steps=4, final_steps=10
+)
 STANDARD = Settings()
+#: For a point against a shape, many times over: there are fewer minima than of two bodies.
+FOR_POINTS = Settings(starts=4, survivors=2)
 FINE = Settings(
     sharpness=10_000.0,
     directions=512,
-    starts=6,
-    survivors=3,
+    starts=12,
+    survivors=5,
     fine_steps=10,
     final_steps=16,
     warm_steps=16,
@@ -157,19 +181,35 @@ def floor_of(hessian):
     return jnp.maximum(16 * epsilon(high.dtype) * high, FLOOR)
 
 
-def newton_step(m: Model):
-    """-|H|^-1 g, downhill also at a saddle; |eigenvalues| not below FLOOR."""
+def extent(pair: Pair) -> Float[Array, ""]:
+    """Largest coordinates of the pair: roundings of f and of its gradient are in units of it."""
+    return jnp.max(jnp.abs(pair.a)) + jnp.max(jnp.abs(pair.b))
+
+
+def newton_step(m: Model, noise: Float[Array, ""] | float = 0.0):
+    """-|H|^-1 g, downhill also at a saddle; |eigenvalues| not below FLOOR.
+
+    Along an eigenvector no step is taken where the gradient is not above `noise` and the curvature
+    so small that such a gradient would move the direction.
+    """
     (g1, g2), (a, b, c) = m.gradient, m.hessian
     low, high = eigenvalues(m.hessian)
-    inverse_low = 1 / jnp.maximum(jnp.abs(low), FLOOR)
-    inverse_high = 1 / jnp.maximum(jnp.abs(high), FLOOR)
-    mean = 0.5 * (inverse_low + inverse_high)
-    # f(H) = mean I + slope (H - middle I); the smallest normal number keeps 0/0 away.
-    slope = (inverse_high - inverse_low) / jnp.maximum(high - low, jnp.finfo(a.dtype).tiny)
+    # (H - middle I) g over the spread of the eigenvalues. Their difference would be rounded, and
+    # with it the share of the gradient; below rounding any share is right.
     half = 0.5 * (a - c)
-    u1 = mean * g1 + slope * (half * g1 + b * g2)
-    u2 = mean * g2 + slope * (b * g1 - half * g2)
-    return -u1, -u2
+    least = epsilon(a.dtype) * jnp.maximum(jnp.maximum(jnp.abs(low), jnp.abs(high)), FLOOR)
+    spread = jnp.maximum(2 * jnp.sqrt(half * half + b * b), least)
+    h1, h2 = (half * g1 + b * g2) / spread, (b * g1 - half * g2) / spread
+
+    def part(curvature, p1, p2):
+        """Of the step, along one eigenvalue."""
+        level = (p1 * p1 + p2 * p2 <= noise * noise) & (curvature < CURVED)
+        inverse = jnp.where(level, 0, 1 / jnp.maximum(jnp.abs(curvature), FLOOR))
+        return inverse * p1, inverse * p2
+
+    u1, u2 = part(low, 0.5 * g1 - h1, 0.5 * g2 - h2)
+    v1, v2 = part(high, 0.5 * g1 + h1, 0.5 * g2 + h2)
+    return -u1 - v1, -u2 - v2
 
 
 def _walk(d, step, trust):
@@ -184,11 +224,12 @@ def _walk(d, step, trust):
 def anneal(pair: Pair, d, first, steps: int):
     """`steps` Newton steps while the sharpness rises from `first` towards `pair.beta`."""
     rate = jnp.log(pair.beta / first) / max(steps, 1)
+    noise = _noise(pair)
 
     def body(d, i):
         beta = first * jnp.exp(rate * i)
         m = model(pair._replace(beta=beta), d)
-        return _walk(d, newton_step(m), jnp.minimum(TRUST / beta, LONGEST))[0], None
+        return _walk(d, newton_step(m, noise), jnp.minimum(TRUST / beta, LONGEST))[0], None
 
     return jax.lax.scan(body, d, jnp.arange(steps, dtype=d.dtype))[0]
 
@@ -200,10 +241,11 @@ def polish(pair: Pair, d, steps: int):
     but the gradient does.
     """
     slack = 8 * epsilon(d.dtype) * (1 + jnp.max(jnp.abs(pair.b)))
+    noise = _noise(pair)
 
     def body(carry, _):
         d, m, trust = carry
-        new, length = _walk(d, newton_step(m), trust)
+        new, length = _walk(d, newton_step(m, noise), trust)
         m_new = model(pair, new)
         better = m_new.value <= m.value + slack
         taken = (new, m_new, jnp.minimum(1.5 * trust, WIDEST))
@@ -213,6 +255,46 @@ def polish(pair: Pair, d, steps: int):
     start = (d, model(pair, d), jnp.minimum(TRUST / pair.beta, WIDEST))
     (d, m, _), _ = jax.lax.scan(body, start, None, length=steps)
     return d, m.value
+
+
+def descend(pair: Pair, d, steps: int):
+    """As `polish`, from a direction that may be 0.3 rad off, of a pair whose cores are apart.
+
+    f is then convex. Of two flat faces it is a valley with a sharp floor, 1 / beta wide, on whose
+    sides the Hessian says nothing: where the slope turns round along a step, the next one is as
+    long as to the point where the tangents of both ends meet.
+    """
+    slack = 8 * epsilon(d.dtype) * (1 + jnp.max(jnp.abs(pair.b)))
+    noise = _noise(pair)
+
+    def body(carry, _):
+        d, m, trust = carry
+        new, length = _walk(d, newton_step(m, noise), trust)
+        m_new = model(pair, new)
+        fall, rise = _slope(d, m, new - d), _slope(new, m_new, new - d)
+        turned = (fall < 0) & (rise > 0)
+        meet = (m_new.value - m.value - rise) / jnp.where(turned, fall - rise, 1)
+        meet = jnp.clip(meet, 0.1, 0.9)
+        better = m_new.value <= m.value + slack
+        ahead = jnp.where(turned, (1 - meet) * length, jnp.minimum(GROWTH * trust, WIDEST))
+        taken = (new, m_new, ahead)
+        kept = (d, m, jnp.where(turned, meet, 0.25) * length)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), taken, kept), None
+
+    start = (d, model(pair, d), jnp.asarray(WIDE, d.dtype))
+    (d, m, _), _ = jax.lax.scan(body, start, None, length=steps)
+    return d, m.value
+
+
+def _slope(d, m: Model, way):
+    """Change of f along a way from d, by its gradient there."""
+    e1, e2 = tangents(d)
+    return m.gradient[0] * jnp.sum(e1 * way) + m.gradient[1] * jnp.sum(e2 * way)
+
+
+def _noise(pair: Pair):
+    """A gradient up to this is rounding."""
+    return NONE * epsilon(pair.a.dtype) * extent(pair)
 
 
 @functools.lru_cache(None)
@@ -235,14 +317,15 @@ def starts(pair: Pair, table, centre, count: int):
     """The `count - 1` lowest local minima of the table, and the direction between the centres."""
     directions, neighbours = coarse_directions(table.shape[0])
     f = table + sharp_table(-pair.b, table.shape[0])
+    f = f - LEAD * extent(pair) * jnp.asarray(directions @ np.asarray(PREFERRED), f.dtype)
     lowest = jnp.all(f[:, None] <= f[neighbours], axis=1)
     ranked = jnp.where(lowest, f, f + (jnp.max(f) - jnp.min(f)))
     _, best = jax.lax.top_k(-ranked, count - 1)
     return jnp.concatenate([jnp.asarray(directions, f.dtype)[best], centre[None]])
 
 
-def find_normal(pair: Pair, table, centre, settings: Settings) -> Float[Array, "3"]:
-    """Direction of the lowest minimum found.
+def find_normal(pair: Pair, table, centre, settings: Settings):
+    """Direction of the lowest minimum found, and whether another one is as low.
 
     Args:
         pair: the two shapes.
@@ -257,12 +340,39 @@ def find_normal(pair: Pair, table, centre, settings: Settings) -> Float[Array, "
     d = starts(pair, table, centre, s.starts)
     rough = pair._replace(beta=middle)
     d = jax.vmap(lambda d: anneal(rough, d, first, s.coarse_steps))(d)
-    sharp = jax.vmap(lambda d: jnp.max(heights(pair.a, d)) + jnp.max(heights(-pair.b, d)))(d)
-    _, best = jax.lax.top_k(-sharp, s.survivors)
+    d = d[_survivors(pair, d, s.survivors)]
 
     def finish(d):
         d = anneal(pair, d, middle, s.fine_steps)
         return polish(pair, d, s.final_steps)
 
-    d, f = jax.vmap(finish)(d[best])
-    return d[jnp.argmin(f)]
+    return _choose(pair, *jax.vmap(finish)(d))
+
+
+def _survivors(pair: Pair, d, count: int):
+    """The lowest directions; of those that have come together only the lowest is kept first."""
+    sharp = jax.vmap(lambda d: jnp.max(heights(pair.a, d)) + jnp.max(heights(-pair.b, d)))(d)
+    rank = sharp - LEAD * extent(pair) * _along(d)
+    together = jnp.sum(d[:, None] * d[None], axis=2) > SAME
+    again = jnp.any(together & (rank[None] < rank[:, None]), axis=1)
+    last = jnp.max(rank) - jnp.min(rank)
+    return jax.lax.top_k(-(rank + jnp.where(again, last, 0)), count)[1]
+
+
+def _choose(pair: Pair, d, f):
+    """The lowest direction, of equal ones the preferred one; whether separate ones are equal.
+
+    Survivors in one minimum differ by how far they have come: the lowest of those is taken.
+    """
+    above = f - jnp.min(f)
+    rounding = EQUAL * epsilon(f.dtype) * extent(pair)
+    best = d[jnp.argmax(jnp.where(above <= rounding, _along(d), -2))]
+    apart = jnp.sum(d * best[None], axis=1) < SAME
+    equal = above <= jnp.maximum(2 * rounding, TIED * extent(pair))
+    return d[jnp.argmin(jnp.where(apart, jnp.inf, f))], jnp.any(apart & equal)
+
+
+def _along(d):
+    """Components along `PREFERRED`."""
+    x, y, z = PREFERRED
+    return x * d[:, 0] + y * d[:, 1] + z * d[:, 2]

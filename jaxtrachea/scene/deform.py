@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
+from jaxtrachea.contact.search import FOR_POINTS
 from jaxtrachea.contact.shapes import Shape, sphere
 from jaxtrachea.scene import trail
 from jaxtrachea.scene.approach import Approach, backed_out
@@ -116,6 +117,7 @@ def _sag(tool: Shape, pose: Poses, points):
     def one(x):
         back = inverse(Pose(pose.rotation, pose.translation))
         seen = transform(back, x[:, None])[:, 0]
-        return signed_distance(tool, point, Pose(jnp.eye(3, dtype=x.dtype), seen)).distance
+        there = Pose(jnp.eye(3, dtype=x.dtype), seen)
+        return signed_distance(tool, point, there, FOR_POINTS).distance
 
     return jnp.maximum(jax.vmap(one)(points), 0)

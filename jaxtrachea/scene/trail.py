@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
+from jaxtrachea.contact.search import FOR_POINTS
 from jaxtrachea.contact.shapes import Shape, sphere
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.stage import Poses
@@ -103,5 +104,5 @@ def _distance(tool: Shape, point):
         away = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
         return away - tool.radius, off / jnp.where(square > 0, away, 1)
     dot = sphere(jnp.zeros_like(tool.radius))
-    seen = signed_distance(tool, dot, Pose(jnp.eye(3, dtype=point.dtype), point))
+    seen = signed_distance(tool, dot, Pose(jnp.eye(3, dtype=point.dtype), point), FOR_POINTS)
     return seen.distance, seen.normal
