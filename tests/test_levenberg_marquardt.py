@@ -95,10 +95,11 @@ def test_a_start_that_cannot_be_evaluated_is_a_status():
 
 
 def test_float32_ends_on_the_bound_as_given():
-    """A bound that float32 cannot hold comes back to the last digit."""
-    third = 1 / 3
-    valley = Valley(np.full((1, 2), -5.0), np.array([[third, 5.0]]), np.ones((1, 2)))
+    """A bound that float32 has a little lower comes back to the last digit."""
+    bound = 0.7
+    assert np.float32(bound) < bound
+    valley = Valley(np.full((1, 2), -5.0), np.array([[bound, 5.0]]), np.ones((1, 2)))
     solved = levenberg_marquardt(valley, np.zeros((1, 2)), dtype=np.float32)
     assert solved.theta.dtype == np.float64
-    assert solved.theta[0, 0] == third
-    np.testing.assert_allclose(solved.theta[0, 1], third**2, rtol=1e-3)
+    assert solved.theta[0, 0] == bound
+    np.testing.assert_allclose(solved.theta[0, 1], bound**2, rtol=1e-3)
