@@ -97,7 +97,7 @@ def test_a_start_that_cannot_be_evaluated_is_a_status():
 def test_float32_ends_on_the_bound_as_given():
     """A bound that float32 has a little lower comes back to the last digit."""
     bound = 0.7
-    assert np.float32(bound) < bound
+    assert float(np.float32(bound)) < bound
     valley = Valley(np.full((1, 2), -5.0), np.array([[bound, 5.0]]), np.ones((1, 2)))
     solved = levenberg_marquardt(valley, np.zeros((1, 2)), dtype=np.float32)
     assert solved.theta.dtype == np.float64
