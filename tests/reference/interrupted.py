@@ -33,7 +33,7 @@ def write_study(
     (folder / "curves.csv").write_text("\n".join(rows) + "\n")
     text = '[data]\nfiles = "curves.csv"\n[model]\ncoupling = "total"\n'
     (folder / "spec.toml").write_text(
-        f"{text}[fit]\nstarts = {starts}\nchunk = 32\nsave_every = {every}\n{more}"
+        f"{text}[fit]\nstarts = {starts}\nbatch = 32\nsave_every = {every}\n{more}"
     )
 
 
