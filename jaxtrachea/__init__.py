@@ -32,18 +32,18 @@ if TYPE_CHECKING:
     from jaxtrachea.mechanics.press import press as press
     from jaxtrachea.mechanics.skeleton import Skeleton as Skeleton
     from jaxtrachea.mechanics.skeleton import skeleton_response as skeleton_response
+    from jaxtrachea.scene.assemble import make_scene as make_scene
+    from jaxtrachea.scene.assemble import with_geometry as with_geometry
+    from jaxtrachea.scene.declare import PlanError as PlanError
+    from jaxtrachea.scene.effects import EffectOptions as EffectOptions
     from jaxtrachea.scene.plan import Plan as Plan
-    from jaxtrachea.scene.plan import PlanError as PlanError
-    from jaxtrachea.scene.plan import Wishes as Wishes
     from jaxtrachea.scene.session import Session as Session
     from jaxtrachea.scene.simulation import Simulation as Simulation
     from jaxtrachea.scene.simulation import simulate as simulate
-    from jaxtrachea.scene.simulation import sweep as sweep
     from jaxtrachea.scene.stage import Poses as Poses
     from jaxtrachea.scene.stage import Presses as Presses
     from jaxtrachea.scene.stage import Scene as Scene
-    from jaxtrachea.scene.stage import make_scene as make_scene
-    from jaxtrachea.scene.stage import with_geometry as with_geometry
+    from jaxtrachea.scene.sweep import sweep as sweep
     from jaxtrachea.status import FitStatus as FitStatus
     from jaxtrachea.status import PredictionStatus as PredictionStatus
     from jaxtrachea.status import PressStatus as PressStatus
@@ -60,10 +60,14 @@ _HOME = {
     "mechanics.force_law": ("Law", "duffing"),
     "mechanics.press": ("Options", "Press", "press"),
     "mechanics.oblique": ("ObliquePath", "ObliquePress", "press_oblique", "press_path"),
-    "scene.plan": ("Plan", "PlanError", "Wishes"),
+    "scene.assemble": ("make_scene", "with_geometry"),
+    "scene.declare": ("PlanError",),
+    "scene.effects": ("EffectOptions",),
+    "scene.plan": ("Plan",),
     "scene.session": ("Session",),
-    "scene.simulation": ("Simulation", "simulate", "sweep"),
-    "scene.stage": ("Poses", "Presses", "Scene", "make_scene", "with_geometry"),
+    "scene.simulation": ("Simulation", "simulate"),
+    "scene.stage": ("Poses", "Presses", "Scene"),
+    "scene.sweep": ("sweep",),
     "mechanics.skeleton": ("Skeleton", "skeleton_response"),
     "status": ("FitStatus", "PredictionStatus", "PressStatus"),
     "trachea.geometry": ("Geometry", "table_1"),

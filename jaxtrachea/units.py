@@ -14,8 +14,10 @@ from typing import overload
 
 import numpy as np
 
+from jaxtrachea._errors import InputError
 
-class UnitError(ValueError):
+
+class UnitError(InputError):
     """A unit is missing, unknown, or of the wrong dimension."""
 
 

@@ -29,9 +29,11 @@ from jaxtrachea.mechanics import beam
 from jaxtrachea.mechanics.oblique import press_oblique, press_path
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.skeleton import skeleton_response
-from jaxtrachea.scene.plan import Wishes
-from jaxtrachea.scene.simulation import simulate, sweep
-from jaxtrachea.scene.stage import Poses, Presses, make_scene
+from jaxtrachea.scene.assemble import make_scene
+from jaxtrachea.scene.effects import EffectOptions
+from jaxtrachea.scene.simulation import simulate
+from jaxtrachea.scene.stage import Poses, Presses
+from jaxtrachea.scene.sweep import sweep
 from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.material import Material
@@ -52,7 +54,12 @@ def bare(kind, start=None, **changes):
     if not start and kind is Parameter:
         return bare(kind, DEFAULTS["k_1"], **changes)
     if hasattr(record, "effects"):  # a `Plan`
-        for field, word in (("seat", "first"), ("rings", "mat"), ("dent", 0), ("surface", None)):
+        for field, word in (
+            ("contact_point", "fixed"),
+            ("rings", "mat"),
+            ("dent", 0),
+            ("surface", None),
+        ):
             object.__setattr__(record, field, changes.get(field, word))
         for field in ("contact", "curved", "friction", "second_plane", "axial", "end_motion",
                       "joints", "ring_ends"):  # fmt: skip
@@ -92,9 +99,9 @@ def test_other_records():
         (Settings, {"tolerances": Tolerances(cost=-1.0)}),
         (Noise, {"force": 0.0}),
         (Noise, {"joints": math.inf}),
-        (Wishes, {"seat": "every"}),
-        (Wishes, {"onset_width": -1.0}),
-        (Wishes, {"want_joints": "no"}),
+        (EffectOptions, {"contact_point": "every"}),
+        (EffectOptions, {"onset_width": -1.0}),
+        (EffectOptions, {"want_joints": "no"}),
         (Parameter, {"scale": "ln"}),
         (Parameter, {"scope": "specimens"}),
         (Parameter, {"step": 0.0}),
@@ -186,7 +193,7 @@ def test_no_record_keeps_a_misspelt_word():
                     seen.add(node.name)
                     with pytest.raises(ValueError, match="'no such word'; expected"):
                         bare(kind, **{field: "no such word"})
-    assert seen >= {"Options", "Wishes", "Plan", "Settings", "Parameter", "Levels"}
+    assert seen >= {"Options", "EffectOptions", "Plan", "Settings", "Parameter", "Levels"}
 
 
 #: Made by the package out of words that were checked.
@@ -333,7 +340,7 @@ def test_wrong_lengths_elsewhere():
     bad = Material(**FULL | {"EA_L": np.ones(3)})
     D = np.zeros((2, 3))
     path = Presses([40.0, 50.0], [0.0, 0.0], [[0, -1, 0], [0, -2, 0]])
-    scene = make_scene(g, m, path, wishes=Wishes(want_surface=False))
+    scene = make_scene(g, m, path, effects=EffectOptions(want_surface=False))
     flat = jnp.zeros((2, 2))
     short = eqx.tree_at(lambda p: p.phi, path, jnp.zeros(3))
     narrow = eqx.tree_at(lambda p: p.displacement, path, flat)
@@ -349,7 +356,7 @@ def test_wrong_lengths_elsewhere():
         "Material.EA_L has 3 values; expected .*16": lambda: skeleton_response(g, bad, 40, 0),
         "s_c has 3 values": lambda: skeleton_response(g, m, [1, 2, 3], 0),
         "path.phi has 3 values; expected 2":
-            lambda: make_scene(g, m, short, wishes=Wishes(want_surface=False)),
+            lambda: make_scene(g, m, short, effects=EffectOptions(want_surface=False)),
         "path.rotation has": lambda: make_scene(g, m, one_turn),
         "path.displacement has": lambda: simulate(scene, m, narrow),
         "Material.EA_L has 3 ": lambda: simulate(scene, bad, path),
@@ -373,8 +380,11 @@ def test_scenes_and_sweeps():
     path = Presses([40.0, 400.0, -1.0], [0.0] * 3, [[0, -1, 0]] * 3)
     none = {"want_surface": False, "want_joints": False, "want_ring_ends": False}
     run = jax.jit(simulate)
-    for wishes in (Wishes(seat="each", **none), Wishes(seat="each", second_plane="on", **none)):
-        scene = make_scene(g, m, path, wishes=wishes)
+    for effects in (
+        EffectOptions(contact_point="per_step", **none),
+        EffectOptions(contact_point="per_step", second_plane="on", **none),
+    ):
+        scene = make_scene(g, m, path, effects=effects)
         out = run(scene, m, path)
         assert out.status.tolist() == [OK, OFF, OFF]
         np.testing.assert_array_equal(np.isnan(out.force[:, 1]), [False, True, True])

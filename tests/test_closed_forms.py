@@ -14,7 +14,7 @@ import scipy.stats
 import synthetic
 from small_scenes import MATERIAL, MESH, TUBE, presses
 
-from jaxtrachea import Wishes, make_scene, simulate
+from jaxtrachea import EffectOptions, make_scene, simulate
 from jaxtrachea.fit import levenberg_marquardt
 from jaxtrachea.fit.cost import LaneCost, evaluate
 from jaxtrachea.fit.fit import fit
@@ -186,8 +186,8 @@ def test_each_end_moves_on_its_own_spring():
     springs = {"k_A": jnp.array(0.2), "k_B": jnp.array(1.5)}
     material = dataclasses.replace(MATERIAL, **springs)
     path = presses([-2, -4, 0], s=45.0)
-    wishes = Wishes(rings="mat", contact="bonded", dent="off", want_joints=False)
-    scene = make_scene(TUBE, material, path, mesh=MESH, wishes=wishes)
+    effects = EffectOptions(rings="mat", contact="bonded", dent="off", want_joints=False)
+    scene = make_scene(TUBE, material, path, mesh=MESH, effects=effects)
     out = jax.jit(simulate)(scene, material, path)
     moved = np.asarray(out.vertices[-1] - out.vertices[0])[:, 0]
     at, length, EA = np.asarray(MESH.s), 160.0, 3.9

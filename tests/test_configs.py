@@ -19,7 +19,7 @@ NAMES = sorted(path.stem for path in CONFIGS.glob("*.toml"))
 SHOWS = {
     "bonded_pull": {"contact law": "bonded", "second_plane": "off"},
     "capsule": {"contact": "on", "end_motion": "on", "axial": "on"},
-    "friction": {"friction": "on", "axial": "on", "seat": "first"},
+    "friction": {"friction": "on", "axial": "on", "contact_point": "fixed"},
     "imported": {"curved": "off", "rings": "arch2"},
     "imported_tool": {"contact": "on", "curved": "on"},
     "left_down": {"axial": "on", "rings": "arch2"},
@@ -27,7 +27,7 @@ SHOWS = {
     "normal": {"axial": "off", "rings": "arch2"},
     "off_midline": {"contact": "on", "second_plane": "on", "rings": "arch2"},
     "right_down": {"axial": "on", "rings": "arch2"},
-    "scan": {"seat": "each", "surface": "off"},
+    "scan": {"contact_point": "per_step", "surface": "off"},
 }
 
 

@@ -12,6 +12,7 @@ import jaxtrachea
 PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 #: Rooms from the bottom up; `fit` and `scene` are neighbours, neither knows the other.
 ORDER = [
+    {"_errors"},
     {"units", "status", "_numerics", "_arguments"},
     {"files"},
     {"config"},
@@ -33,18 +34,17 @@ STRANGERS = [("scene", {"fit", "inference", "runs"}), ("inference", {"scene"}), 
 #: Modules within the larger rooms, from the bottom up.
 WITHIN = {
     "scene": [
-        {"operations", "spec", "curve", "sizes", "wall_check"},
-        {"plan"},
-        {"rules"},
-        {"stage"},
-        {"ranges"},
-        {"approach", "trail"},
-        {"deform"},
-        {"simulation"},
-        {"seat"},
+        {"operations", "curve", "sizes", "wall_check", "declare"},
+        {"wall", "effects"},
+        {"plan", "spec"},
+        {"rules", "stage"},
+        {"lumen", "ranges", "trail", "paths"},
+        {"approach"},
+        {"facts", "refusals", "deform", "programs"},
+        {"assemble", "simulation", "sweep", "seat"},
         {"session"},
         {"build", "results"},
-        {"plots"},
+        {"cost", "plots"},
     ],
     "measurements": [
         {"presses", "turning", "plausible", "first_touch"},

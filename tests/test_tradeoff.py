@@ -12,7 +12,7 @@ import pytest
 from run_cli import run
 
 from jaxtrachea.scene.build import stage
-from jaxtrachea.scene.plan import PlanError
+from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.tradeoff import choice as choosing
@@ -127,8 +127,8 @@ def test_the_finest_level_is_no_wish_of_the_user():
     assert said["rings"].forced
     wish = SCENE | {"effects": {"rings": "mat"}}
     full = full_scene(*staged(wish, **arch))
-    assert full.levels.rings == "mat"
-    assert not full.levels.second_plane
+    assert full.levels.plan.rings == "mat"
+    assert not full.levels.plan.second_plane
 
 
 def test_a_measured_rung_errs_as_by_hand(monkeypatch):
@@ -268,7 +268,7 @@ def test_a_wish_is_kept():
     choice = choose(full_scene(*staged(wish)), 0.1, precision="float64")
     assert {rung.ladder for rung in choice.dropped} == {"local"}
     assert choice.material.k_1.dtype == float
-    assert choice.levels.shear
+    assert choice.levels.plan.options.shear
 
 
 TOML = f"""

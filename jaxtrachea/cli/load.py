@@ -37,8 +37,7 @@ def load(path: Path, data: Path | None, *, refits: bool = False, quiet: bool = F
             raise Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
         return spec, measurements, study_of(spec, measurements, refits=refits)
     except SpecError as error:
-        text = str(error)
-        raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
+        raise Stop(str(SpecError.like(error, place=str(path)))) from None
     except DataError as error:
         raise Stop(str(error)) from None
 

@@ -28,7 +28,7 @@ MANY = 12
 
 def plan(scene: SceneArgument) -> None:
     """Say which effects a scene calls for, and why."""
-    from jaxtrachea.scene.build import shares
+    from jaxtrachea.scene.cost import shares
     from jaxtrachea.scene.results import plan_rows
 
     spec, staged = _staged(scene)
@@ -93,7 +93,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
     from jaxtrachea.files.pictures import save_each
     from jaxtrachea.scene.plots import draw_sweep
     from jaxtrachea.scene.results import write_sweep
-    from jaxtrachea.scene.simulation import sweep as run
+    from jaxtrachea.scene.sweep import sweep as run
     from jaxtrachea.status import PressStatus
 
     clock = [time.perf_counter()]
@@ -148,15 +148,14 @@ def _staged(path: Path):
         with interrupts() as stop_if_asked, progress_bar(transient=True) as bar:
             return spec, stage(spec, path.parent, Stages(bar, stop_if_asked).begin)
     except SpecError as error:
-        text = str(error)
-        raise Stop(text if text.startswith(str(path)) else f"{path}: {text}") from None
+        raise Stop(str(SpecError.like(error, place=str(path)))) from None
 
 
 def _chosen(path: Path, spec, staged):
     """The scene with the plan within its tolerance, and that choice; as it is without tolerance."""
     if spec.plan is None:
         return staged, None
-    from jaxtrachea.scene.plan import PlanError
+    from jaxtrachea.scene.declare import PlanError
     from jaxtrachea.tradeoff.choice import choose
     from jaxtrachea.tradeoff.levels import full_scene
 
@@ -175,7 +174,7 @@ def _chosen(path: Path, spec, staged):
         try:
             choice = choose(full, wish.tolerance, report, precision=wish.precision)
         except PlanError as error:
-            raise Stop(f"{path}: plan.tolerance: {error}") from None
+            raise Stop(f"{path}: {error}") from None
     chosen = {name: getattr(choice, name) for name in ("scene", "material", "path")}
     return staged._replace(**chosen), choice
 

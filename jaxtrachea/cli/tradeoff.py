@@ -75,7 +75,7 @@ def _full(scene: Path | None):
         jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
         jax.config.update("jax_cpu_enable_async_dispatch", False)  # no hand-over to a thread
         from jaxtrachea.scene.build import stage
-        from jaxtrachea.scene.plan import PlanError
+        from jaxtrachea.scene.declare import PlanError
         from jaxtrachea.tradeoff.levels import BUILT_IN, full_scene
 
         spec = spec or SceneSpec.model_validate(BUILT_IN)
@@ -83,10 +83,9 @@ def _full(scene: Path | None):
             staged = stage(spec, Path() if scene is None else scene.parent)
             return full_scene(spec, staged, coupling="series")
         except PlanError as error:
-            raise SpecError(f"effects.{error}") from None
+            raise SpecError.like(error, key=f"effects.{error.key}") from None
     except SpecError as error:
-        text = str(error)
-        raise Stop(text if text.startswith(str(scene)) else f"{scene}: {text}") from None
+        raise Stop(str(SpecError.like(error, place=str(scene)))) from None
 
 
 def measured_curves(data: Path | None):

@@ -7,6 +7,8 @@ from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from jaxtrachea._errors import InputError
+
 Spec = TypeVar("Spec", bound=BaseModel)
 #: Longest specification that is read.
 MAX_BYTES = 2**20
@@ -16,8 +18,11 @@ MAX_LINES = 10
 EVEN, LISTED = "evenly spaced", "listed"
 
 
-class SpecError(ValueError):
-    """A specification that cannot be used; the message has one line per problem."""
+class SpecError(InputError):
+    """A specification that cannot be used; the message has one line per problem.
+
+    The place is the file, which a command knows; where nothing else does, it is empty.
+    """
 
 
 def load_spec(path: Path, kind: type[Spec], called: str) -> Spec:
@@ -35,21 +40,24 @@ def load_spec(path: Path, kind: type[Spec], called: str) -> Spec:
     try:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise SpecError(f"{path}: not valid TOML: {_at_line(error, text)}") from None
+        raise SpecError(f"not valid TOML: {_at_line(error, text)}", place=str(path)) from None
     except RecursionError:
-        raise SpecError(f"{path}: not valid TOML: nested too deeply; expected tables") from None
+        raise SpecError(
+            "not valid TOML: nested too deeply", place=str(path), expected="tables"
+        ) from None
     except ValueError:  # the one other refusal of tomllib: an integer that Python does not convert
         raise SpecError(
-            f"{path}: not valid TOML: an integer of too many digits; expected 4300 digits at most"
+            "not valid TOML: an integer of too many digits",
+            place=str(path),
+            expected="4300 digits at most",
         ) from None
     try:
         return kind.model_validate(content)
     except ValidationError as error:
         lines = _lines(error, kind)
-        more = [f"... and {len(lines) - MAX_LINES} more"] if len(lines) > MAX_LINES else []
-        raise SpecError(
-            "\n".join([f"{path}: {line}" for line in lines[:MAX_LINES]] + more)
-        ) from None
+        more = f"\n... and {len(lines) - MAX_LINES} more" if len(lines) > MAX_LINES else ""
+        told = f"\n{path}: ".join(lines[:MAX_LINES])
+        raise SpecError(f"{told}{more}", place=str(path)) from None
 
 
 def _text(path: Path, called: str) -> str:
@@ -60,18 +68,22 @@ def _text(path: Path, called: str) -> str:
     """
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):
-            raise SpecError(f"{path}: is a device or a pipe; expected a TOML {called}")
+            raise SpecError("is a device or a pipe", place=str(path), expected=f"a TOML {called}")
         with path.open("rb") as stream:
             data = stream.read(MAX_BYTES + 1)
     except OSError as error:
         reason = error.strerror or "cannot be read"
-        raise SpecError(f"{path}: {reason}; expected a TOML {called}") from None
+        raise SpecError(reason, place=str(path), expected=f"a TOML {called}") from None
     if len(data) > MAX_BYTES:
-        raise SpecError(f"{path}: more than {MAX_BYTES} bytes; expected a TOML {called}, not data")
+        raise SpecError(
+            f"more than {MAX_BYTES} bytes", place=str(path), expected=f"a TOML {called}, not data"
+        )
     try:
         return data.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
-        raise SpecError(f"{path}: not UTF-8 (byte {error.start}); save it as UTF-8") from None
+        raise SpecError(
+            f"not UTF-8 (byte {error.start})", place=str(path), cure="save it as UTF-8"
+        ) from None
 
 
 def _at_line(error: tomllib.TOMLDecodeError, text: str) -> str:

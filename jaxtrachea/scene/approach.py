@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.curve import frame_at
-from jaxtrachea.scene.ranges import in_lumen
-from jaxtrachea.scene.stage import Poses, Presses, Scene, at_row, followed, touch_tube
+from jaxtrachea.scene.lumen import in_lumen
+from jaxtrachea.scene.stage import Poses, Presses, Scene, at_row, contact_point_path, touch_tube
 
 
 class Approach(NamedTuple):
@@ -39,23 +39,30 @@ def approach(scene: Scene, path: Poses) -> Approach:
     """Let the tool touch the tube at rest, and say what it does to the place it touches."""
     seen = touch_tube(scene, path)
     inside = in_lumen(scene, path, seen)
-    if scene.plan.seat == "each":
+    if scene.plan.contact_point == "per_step":
         inward, frame = _directions(scene, seen)
         presses = Presses(seen.s, seen.phi, -seen.gap[:, None] * inward)
         return Approach(seen, presses, inward, None, frame, seen, inside)
+    return on_one_point(scene, path, seen, first_touch(seen, inside)[1], inside)
+
+
+def first_touch(
+    seen: Touch, inside: Bool[Array, " rows"]
+) -> tuple[Bool[Array, " rows"], Int[Array, ""]]:
+    """Rows that touch the tube from outside, and the first of them; without any the nearest row."""
     touching = (seen.gap < 0) & ~inside
     nearest = jnp.argmin(jnp.where(inside | jnp.isnan(seen.gap), jnp.inf, seen.gap))
-    first = jnp.where(jnp.any(touching), jnp.argmax(touching), nearest)
-    return seated(scene, path, seen, first, inside)
+    return touching, jnp.where(jnp.any(touching), jnp.argmax(touching), nearest)
 
 
-def seated(
+def on_one_point(
     scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""], inside: Bool[Array, " rows"]
 ) -> Approach:
     """The path as presses on the place that row `first` touches."""
     inward, frame = _directions(scene, seen)
     rows = seen.gap.shape[0]
-    D = followed(path, seen, first, at_row(inward, first), None if frame is None else frame[first])
+    axes = None if frame is None else frame[first]
+    D = contact_point_path(path, seen, first, at_row(inward, first), axes)
     if scene.plan.options.contact == "bonded":
         D = jnp.where((jnp.arange(rows) >= first)[:, None], D, 0)
     spread = lambda v: jnp.broadcast_to(at_row(v, first), v.shape)  # noqa: E731

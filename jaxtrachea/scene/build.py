@@ -1,51 +1,41 @@
 """From a scene specification to a `Scene`: reads the files that it names."""
 
-import csv
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea._errors import InputError
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.contact import shapes
-from jaxtrachea.contact.pose import pose_from_vector
 from jaxtrachea.scene import wall_check
-from jaxtrachea.scene.operations import count_operations
-from jaxtrachea.scene.plan import PlanError, Wishes
+from jaxtrachea.scene.assemble import make_scene
+from jaxtrachea.scene.declare import PlanError
+from jaxtrachea.scene.effects import EffectOptions
+from jaxtrachea.scene.facts import facts_of
+from jaxtrachea.scene.paths import named_file, path_of, read_table
 from jaxtrachea.scene.rules import make_plan
-from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.sizes import SizeError
-from jaxtrachea.scene.spec import PathSection, SceneSpec, SceneTracheaSection, ToolSection
-from jaxtrachea.scene.stage import Poses, Presses, Scene, facts_of, make_scene
-from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.scene.spec import SceneSpec, SceneTracheaSection, ToolSection
+from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.imported import read_mesh
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import MeshError
 from jaxtrachea.trachea.section import geometry_of
 from jaxtrachea.trachea.tube import make_tube
-from jaxtrachea.units import UnitError, column_unit, convert
+from jaxtrachea.units import UnitError
 
-#: Steps of a press or a line that names none.
-STEPS = 10
-
-#: Longest table of points or poses that is read.
-MAX_BYTES = 64 * 2**20
-
-#: Meshes that scenes of `configs/` name, and where they come from.
-MESHES = {
-    "meshes/trachea.glb": "3D Reference Organ for Trachea, Male v1.0 (GLB, CC BY 4.0), "
-    "doi:10.48539/HBM969.WCCJ.636",
-}
-
-#: Arguments of `read_mesh` that a scene calls otherwise, or does not have.
+#: Arguments of Python functions that a scene calls otherwise, or does not have.
 KEYS = {
+    "rings": "cartilage",
     "rings=": "cartilage=",
     "ring_positions": "rings",
-    "give centreline=": "give centreline= to read_mesh (from Python)",
+    "ring_positions=": "rings=",
+    "centreline=": "centreline= to read_mesh (from Python)",
+    "geometry.length": "trachea.length",
+    "geometry.radius": "trachea.radius",
 }
 
 
@@ -79,7 +69,7 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     geometry, mesh, notes = _trachea(spec.trachea, folder, files, counted)
     material = Material(**spec.material.model_dump())
     tool = None if spec.tool is None else _tool(spec.tool, folder, files)
-    path = _path(spec, folder, files, geometry)
+    path = path_of(spec, folder, files, geometry)
     friction = None if spec.tool is None else spec.tool.friction
     radius = float(geometry.radius) + spec.trachea.wall / 2
     if spec.trachea.file is not None:
@@ -87,15 +77,15 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     try:
         scene = make_scene(
             geometry, material, path, tool=tool, friction=friction, mesh=mesh, radius=radius,
-            wishes=wishes_of(spec), progress=counted("cutting its wall into patches"),
+            effects=effects_of(spec), progress=counted("cutting its wall into patches"),
         )  # fmt: skip
     except PlanError as error:
-        raise SpecError(f"effects.{error}") from None
+        raise SpecError.like(error, key=f"effects.{error.key}") from None
     except MeshError as error:
-        name = Path(spec.trachea.file or "").name
-        raise SpecError(f"trachea.file: {name}: {_in_keys(str(error))}") from None
+        error.place = Path(spec.trachea.file or "").name
+        raise _of_file(error) from None
     except SizeError as error:
-        raise SpecError(str(error).replace("geometry.", "trachea.")) from None
+        raise SpecError.like(error.renamed(KEYS)) from None
     if scene.tube is not None and mesh is not None:
         lost, filled = float(scene.tube.lost.max()), float(scene.tube.filled.max())
         notes += (
@@ -133,45 +123,21 @@ def stage_sweep(spec: SceneSpec, staged: Staged, s: np.ndarray, phi: np.ndarray)
     inward = np.stack([0 * phi, -np.cos(phi), -np.sin(phi)], axis=1)
     bare = dataclasses.replace(staged.scene, mesh=None)
     facts = facts_of(bare, staged.material, Presses(s, phi, spec.sweep.depth * inward))
-    wishes = dataclasses.replace(
-        wishes_of(spec), seat="auto", friction="off", second_plane="auto", axial="off",
+    bare_effects = dataclasses.replace(
+        effects_of(spec), contact_point="auto", friction="off", second_plane="auto", axial="off",
         end_motion="off", surface="off", dent="off", want_surface=False, want_joints=False,
         want_ring_ends=False,
     )  # fmt: skip
-    return dataclasses.replace(staged.scene, plan=make_plan(facts, wishes))
+    return dataclasses.replace(staged.scene, plan=make_plan(facts, bare_effects))
 
 
-def wishes_of(spec: SceneSpec) -> Wishes:
+def effects_of(spec: SceneSpec) -> EffectOptions:
     """What the specification asks for."""
     output = spec.output
-    return Wishes(
+    return EffectOptions(
         **spec.effects.model_dump(), want_surface=output.surface, want_joints=output.joints,
         want_ring_ends=output.ring_ends, **spec.model.model_dump(),
     )  # fmt: skip
-
-
-def shares(staged: Staged) -> tuple[int, dict[str, float]]:
-    """Operations of the whole program, and the share of each effect that can be taken away."""
-    scene = staged.scene
-    count = lambda s: count_operations(simulate, s, staged.material, staged.path)  # noqa: E731
-    whole, found = count(scene), {}
-    for effect in scene.plan.effects:
-        less = scene.plan.without(effect.name)
-        if less is not None and effect.level not in ("off", "mat"):
-            found[effect.name] = 1 - count(dataclasses.replace(scene, plan=less)) / whole
-    if scene.plan.contact:
-        moved = jax.eval_shape(simulate, scene, staged.material, staged.path)
-        given = jax.tree.map(
-            lambda v: jnp.zeros(v.shape, v.dtype), (moved.s, moved.phi, moved.displacement)
-        )
-        # Compared without dent, which takes another form without a tool.
-        plan = dataclasses.replace(scene.plan, dent=0)
-        bare = dataclasses.replace(plan, contact=False)
-        rest = count_operations(
-            simulate, dataclasses.replace(scene, plan=bare), staged.material, Presses(*given)
-        )
-        found["contact"] = (count(dataclasses.replace(scene, plan=plan)) - rest) / whole
-    return whole, found
 
 
 def _trachea(section: SceneTracheaSection, folder: Path, files: list[Path], counted: Counted):
@@ -192,10 +158,10 @@ def _trachea(section: SceneTracheaSection, folder: Path, files: list[Path], coun
 
 
 def _imported(section: SceneTracheaSection, folder: Path, files: list[Path], progress):
-    path = _file(folder, section.file or "", "trachea.file", files)
+    path = named_file(folder, section.file or "", "trachea.file", files)
     cartilage = section.cartilage
     if cartilage is not None and (folder / cartilage).is_file():
-        cartilage = _file(folder, cartilage, "trachea.cartilage", files)
+        cartilage = named_file(folder, cartilage, "trachea.cartilage", files)
     rings = section.rings if isinstance(section.rings, list) else None
     try:
         read = read_mesh(
@@ -204,15 +170,15 @@ def _imported(section: SceneTracheaSection, folder: Path, files: list[Path], pro
             progress=progress,
         )  # fmt: skip
     except (MeshError, UnitError) as error:
-        raise SpecError(f"trachea.file: {_in_keys(str(error))}") from None
+        raise _of_file(error) from None
     return read.geometry, read.mesh, read.notes
 
 
-def _in_keys(message: str) -> str:
-    """The message with the keys of a scene for the arguments of `read_mesh`."""
-    for argument, key in KEYS.items():
-        message = message.replace(argument, key)
-    return message
+def _of_file(error: InputError) -> SpecError:
+    """What is wrong with the mesh, with the keys of a scene for the arguments of `read_mesh`."""
+    named = error.renamed(KEYS)
+    key = ": ".join(part for part in ("trachea.file", error.place, named.key) if part)
+    return SpecError.like(named, place="", key=key, joint=named.joint if named.key else ": ")
 
 
 def _tool(section: ToolSection, folder: Path, files: list[Path]) -> shapes.Shape:
@@ -227,128 +193,6 @@ def _tool(section: ToolSection, folder: Path, files: list[Path]) -> shapes.Shape
         )
     if section.shape == "box":
         return shapes.box(np.asarray(section.size) / 2, rounding)
-    path = _file(folder, section.file or "", "tool.file", files)
-    rows = _table(path, "tool.file", ("x", "y", "z"), ())
+    path = named_file(folder, section.file or "", "tool.file", files)
+    rows = read_table(path, "tool.file", ("x", "y", "z"), ())
     return shapes.hull(rows, rounding)
-
-
-def _path(spec: SceneSpec, folder: Path, files: list[Path], geometry: Geometry) -> Poses | Presses:
-    if spec.path[0].kind == "press":
-        return _presses(spec.path, geometry)
-    legs = [_leg(leg, i, folder, files) for i, leg in enumerate(spec.path)]
-    translation, vectors = (np.concatenate(v) for v in zip(*legs, strict=True))
-    turn = jax.vmap(lambda v: pose_from_vector(v, jnp.zeros_like(v)).rotation)
-    return Poses(turn(jnp.asarray(vectors)), jnp.asarray(translation))
-
-
-def _presses(legs: list[PathSection], geometry: Geometry) -> Presses:
-    s, phi, D = [], [], []
-    length, alpha = float(geometry.length), float(geometry.half_angle)
-    for i, leg in enumerate(legs):
-        at, angle, steps = leg.s or 0.0, leg.phi or 0.0, leg.steps or STEPS
-        if not 0 <= at <= length:
-            raise SpecError(
-                f"path.{i}.s: {at:g} mm; expected a place on the tube, 0 to {length:g} mm"
-            )
-        if abs(angle) > alpha:
-            raise SpecError(
-                f"path.{i}.phi: {np.degrees(angle):.4g} deg; expected within the rings, "
-                f"-{np.degrees(alpha):.4g} to {np.degrees(alpha):.4g} deg"
-            )
-        s += [at] * steps
-        phi += [angle] * steps
-        whole = np.asarray(leg.displacement)
-        D += [whole * (k + 1) / steps for k in range(steps)]
-    return Presses(np.array(s), np.array(phi), np.array(D))
-
-
-def _leg(leg: PathSection, i: int, folder: Path, files: list[Path]):
-    """Translations and rotation vectors of one leg."""
-    if leg.kind == "file":
-        path = _file(folder, leg.file or "", f"path.{i}.file", files)
-        rows = _table(path, f"path.{i}.file", ("x", "y", "z"), ("rx", "ry", "rz"))
-        return rows[:, :3], rows[:, 3:]
-    if leg.kind == "line":
-        steps = leg.steps or STEPS
-        if steps < 2:
-            raise SpecError(f"path.{i}.steps: {steps}; expected at least 2, the start and the end")
-        places = np.linspace(np.asarray(leg.start), np.asarray(leg.end), steps)
-    else:
-        places = np.asarray(leg.positions)
-    turn = np.asarray(leg.rotation or [0.0, 0.0, 0.0])
-    return places, np.broadcast_to(turn, places.shape)
-
-
-def _file(folder: Path, name: str, key: str, files: list[Path]) -> Path:
-    path = folder / name
-    try:
-        found = bool(name) and path.is_file()
-    except (OSError, ValueError):
-        found = False
-    if not found:
-        from_where = _source(name) if key == "trachea.file" else ""
-        raise SpecError(
-            f"{key}: there is no file {name!r} in the scene's folder; check the name{from_where}"
-        )
-    files.append(path)
-    return path
-
-
-def _source(name: str) -> str:
-    """Where a mesh of `configs/` comes from, which the repository does not hold."""
-    if name not in MESHES:
-        return ""
-    return f", or fetch it: {MESHES[name]}, and save it under this name (docs/surface.md)"
-
-
-def _table(path: Path, key: str, needed: tuple[str, ...], optional: tuple[str, ...]) -> np.ndarray:
-    """Columns of a CSV file with units in its header; optional columns that lack are 0."""
-    if path.stat().st_size > MAX_BYTES:
-        raise SpecError(f"{key}: {path.name} has more than {MAX_BYTES} bytes; thin it out")
-    try:
-        rows = [row for row in csv.reader(path.read_text("utf-8-sig").splitlines()) if row]
-    except (UnicodeDecodeError, csv.Error, OSError):
-        raise SpecError(f"{key}: {path.name} is not a CSV file in UTF-8; save it as one") from None
-    heads = [column_unit(cell) for cell in rows[0]] if rows else []
-    names = [name for name, _ in heads]
-    expected = ", ".join(f"{name} [mm]" for name in needed)
-    if missing := [name for name in needed if name not in names]:
-        raise SpecError(
-            f"{key}: {path.name} has no column {missing[0]!r}; expected a header {expected}"
-        )
-    if len(rows) < 2:
-        raise SpecError(f"{key}: {path.name} has no rows; expected at least one")
-    columns = []
-    for name in (*needed, *optional):
-        if name not in names:
-            columns.append(np.zeros(len(rows) - 1))
-            continue
-        at, dimension = names.index(name), "length" if name in needed else "angle"
-        unit = heads[at][1]
-        try:
-            if unit is None:
-                raise UnitError(f"no unit; write {name} [{'mm' if name in needed else 'deg'}]")
-            values = convert(np.array([_cell(row, at, i) for i, row in enumerate(rows[1:], 1)]),
-                             unit, dimension)  # fmt: skip
-        except ValueError as error:
-            raise SpecError(f"{key}: {path.name}, column {name!r}: {error}") from None
-        if not np.isfinite(values).all():
-            raise SpecError(f"{key}: {path.name}, column {name!r}: expected finite numbers")
-        columns.append(values)
-    return np.stack(columns, axis=1)
-
-
-def _cell(row: list[str], at: int, number: int) -> float:
-    """A number of the table.
-
-    Raises:
-        ValueError: it is none, or is missing.
-    """
-    if at >= len(row):
-        raise ValueError(f"row {number} below the header has {len(row)} cells; complete it")
-    try:
-        return float(row[at])
-    except ValueError:
-        raise ValueError(
-            f"{row[at]!r} in row {number} below the header; expected a number"
-        ) from None

@@ -42,7 +42,7 @@ def deform(
     if plan.dent > 8 and made is not None:
         radius, tool = _distances(scene, made), backed_out(path, made)
     where = presses.s, presses.phi, radius, tool
-    together = plan.seat == "first"
+    together = plan.contact_point == "fixed"
     if together:  # one contact point for all rows: what depends on it alone is computed once
         where = jax.tree.map(lambda v: v[0], where)
     weights = regions.weigh(binding, where[1]) if together else None

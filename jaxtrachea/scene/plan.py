@@ -1,114 +1,24 @@
-"""What a scene calls for: its facts, the wishes of the user, and the static `Plan` made of both.
+"""The static `Plan` of a scene: the program that is compiled (`simulate`).
 
-The plan selects the program that is compiled (`simulate`); an effect that is off adds no operation
-to it. `rules` makes it.
+An effect that is off adds no operation to it. `rules` makes it of the facts and of the options.
 """
 
 import dataclasses
-import math
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.skeleton import Rings
+from jaxtrachea.scene.effects import EFFECTS
 from jaxtrachea.surface.regions import Method
 
-Switch = Literal["auto", "on", "off"]
-
-
-class PlanError(ValueError):
-    """A wish that this scene cannot meet: the effect, what was found, the cure."""
+#: What a simulation can leave out of its result.
+OUTPUTS = ("joints", "ring_ends")
 
 
 @dataclasses.dataclass(frozen=True)
-class Facts:
-    """What the rules read of a scene; numbers in mm and rad.
-
-    Attributes:
-        poses: the path is given as motions of the tool, not as presses at contact points.
-        angle: largest |phi| of a contact.
-        seats: whether the contacts of the path lie in more than one place.
-        along: largest axial motion of the tool while it touches, against its whole motion.
-        across: the same round the tube.
-        slip: largest motion of the tool along the surface while it touches, mm.
-        spacing: smallest distance of two rings, mm.
-        friction: whether the tool has a coefficient of friction.
-        known: optional values of the material that are there.
-        mesh: whether there is a surface.
-        curved: whether its centreline is.
-        near: whether the contact comes near a vertex of it.
-    """
-
-    poses: bool = False
-    angle: float = 0.0
-    seats: bool = False
-    along: float = 0.0
-    across: float = 0.0
-    slip: float = 0.0
-    spacing: float = math.inf
-    friction: bool = False
-    known: frozenset[str] = frozenset()
-    mesh: bool = True
-    curved: bool = False
-    near: bool = True
-
-
-@dataclasses.dataclass(frozen=True)
-class Wishes:
-    """What the user asks for; `auto` leaves it to the rules.
-
-    Attributes:
-        seat: `first`: the tool stays on the place it touched first; `each`: every row is a press of
-            its own, frictionless along the surface.
-        friction: Coulomb friction along the path.
-        second_plane: bending along the circumference, vectors; off: a normal press on the midline.
-        rings: see `skeleton_response`.
-        axial: the ligament stretches.
-        shear: it shears.
-        two_material: the rings have a local law of their own.
-        end_motion: the clamps move on axial springs, and the surface with them.
-        surface: method of interpolation, or off.
-        dent: centres of the local correction, or off.
-        want_surface: deformed vertices are asked for.
-        want_joints: joints and their loads are asked for.
-        want_ring_ends: ends of the rings are asked for.
-        coupling: see `Options`; with `contact`, `onset_width` and `transition`.
-        contact: -
-        onset_width: -
-        transition: -
-    """
-
-    seat: Literal["auto", "first", "each"] = "auto"
-    friction: Switch = "auto"
-    second_plane: Switch = "auto"
-    rings: Literal["auto", "mat", "arch", "arch2"] = "auto"
-    axial: Switch = "auto"
-    shear: Switch = "auto"
-    two_material: Switch = "auto"
-    end_motion: Switch = "auto"
-    surface: Literal["auto", "off", "linear", "hermite", "phong"] = "auto"
-    dent: Literal["auto", "off", "8", "16", "32"] = "auto"
-    want_surface: bool = True
-    want_joints: bool = True
-    want_ring_ends: bool = True
-    coupling: Literal["series", "total"] = "series"
-    contact: Literal["unilateral", "bonded"] = "unilateral"
-    onset_width: float = 1e-3
-    transition: float | None = None
-
-    def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
-        check_record(self)
-        Options(self.coupling, contact=self.contact, onset_width=self.onset_width,
-                transition=self.transition)  # fmt: skip
-
-
-@dataclasses.dataclass(frozen=True)
-class Effect:
+class Decision:
     """One decision: its level (`on`, `off` or a word), the reason, and whether it was forced."""
 
     name: str
@@ -138,22 +48,32 @@ class Served:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """The program of a scene; hashable, equal where the programs are. Fields as in `Wishes`.
+    """The program of a scene; hashable, equal where the programs are. Effects as in `EFFECTS`.
 
     Attributes:
+        contact: the path moves a tool.
         curved: motions of the tool are turned into the frame of the centreline at the contact.
+        contact_point: see `EffectOptions`, like all down to `dent`.
+        friction: -
+        second_plane: -
+        rings: -
+        axial: -
+        end_motion: -
+        surface: method of interpolation, None: off.
         dent: number of centres, 0: off.
+        joints: they are in the result.
+        ring_ends: they are in the result.
         options: of the model.
-        ignored: effects that stay off (the seat: that stays) whatever a path needs, because the
-            user wished it or a tolerance allows it. A row that needs any other effect that is off
-            is refused by status (`ranges.unserved`).
+        ignored: effects that stay off (the contact point: that stays) whatever a path needs,
+            because the user wished it or a tolerance allows it. A row that needs any other effect
+            that is off is refused by status (`ranges.unserved`).
         served: presses that a tolerance was measured for; None: no tolerance.
         effects: all decisions in words; they do not count in comparisons.
     """
 
     contact: bool
     curved: bool
-    seat: Literal["first", "each"]
+    contact_point: Literal["fixed", "per_step"]
     friction: bool
     second_plane: bool
     rings: Rings
@@ -166,7 +86,7 @@ class Plan:
     options: Options
     ignored: frozenset[str] = frozenset()
     served: Served | None = None
-    effects: tuple[Effect, ...] = dataclasses.field(default=(), compare=False, repr=False)
+    effects: tuple[Decision, ...] = dataclasses.field(default=(), compare=False, repr=False)
 
     def __post_init__(self):
         """Refuse words and numbers that mean nothing.
@@ -176,26 +96,47 @@ class Plan:
         """
         check_record(self, dent=0.0)
 
+    def level(self, name: str) -> str:
+        """The level of an effect."""
+        value = self
+        for part in EFFECTS[name].field.split("."):
+            value = getattr(value, part)
+        return EFFECTS[name].level(value)
+
+    def has(self, name: str) -> bool:
+        """Whether an effect is in the program."""
+        return self.level(name) != EFFECTS[name].least
+
+    def at(self, **levels: str) -> "Plan":
+        """The plan with these levels of effects; what cannot be without an effect goes with it."""
+        own, model = stored(levels)
+        made = dataclasses.replace(self, options=dataclasses.replace(self.options, **model), **own)
+        lost = {
+            e.name: e.least for e in EFFECTS.values()
+            if made.has(e.name) and not all(map(made.has, (*e.requires, *e.brings)))
+        }  # fmt: skip
+        return made.at(**lost) if lost else made
+
     def without(self, name: str) -> "Plan | None":
         """The plan with one effect less on every path, or None where none goes alone."""
-        off: dict[str, dict] = {
-            "friction": {"friction": False},
-            "axial": {"axial": False, "end_motion": False},
-            "end_motion": {"end_motion": False},
-            "surface": {"surface": None, "dent": 0, "end_motion": False},
-            "dent": {"dent": 0},
-            "joints": {"joints": False},
-            "ring_ends": {"ring_ends": False},
-            "rings": {"rings": "mat"},
-            "shear": {"options": dataclasses.replace(self.options, shear=False)},
-            "two_material": {"options": dataclasses.replace(self.options, local="uniform")},
-        }
-        less = dataclasses.replace(self, **off[name]) if name in off else self
-        if name == "second_plane" and self.second_plane and not self.friction:
-            less = dataclasses.replace(self, second_plane=False, rings="mat", axial=False,
-                                       end_motion=False)  # fmt: skip
+        if name in OUTPUTS:
+            less = dataclasses.replace(self, **{name: False})
+            return None if less == self else less
+        if name not in EFFECTS or not EFFECTS[name].least:
+            return None
+        if any(name in e.holds and self.has(e.name) for e in EFFECTS.values()):
+            return None
+        less = self.at(**{name: EFFECTS[name].least})
         if less == self:
             return None
-        gone = {name} | ({"rings", "axial", "end_motion"} if name == "second_plane" else set())
-        gone |= {"end_motion"} if name in ("axial", "surface") else set()
+        gone = {e for e in EFFECTS if self.level(e) != less.level(e)}
         return dataclasses.replace(less, ignored=self.ignored | gone)
+
+
+def stored(levels: Mapping[str, str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Fields of a `Plan`, and of its options, that hold these levels of effects."""
+    own, model = {}, {}
+    for name, level in levels.items():
+        field = EFFECTS[name].field.split(".")
+        (own if len(field) == 1 else model)[field[-1]] = EFFECTS[name].value(level)
+    return own, model

@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from jaxtrachea.files.pictures import plain
-from jaxtrachea.scene.simulation import Simulation, Sweep
+from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Scene
+from jaxtrachea.scene.sweep import Sweep
 
 #: Unit vector towards the light, over the viewer's shoulder.
 LIGHT = np.array([0.25, -0.55, 0.8]) / np.sqrt(0.25**2 + 0.55**2 + 0.8**2)

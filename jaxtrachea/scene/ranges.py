@@ -4,18 +4,16 @@ What a row needs and the plan has not is a status, unless the user, or a toleran
 (`Plan.ignored`). Where nothing is asked, nothing is added to the program.
 """
 
-import enum
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool
 
-from jaxtrachea.contact.line import Centreline, point_at
 from jaxtrachea.contact.patches import Touch
+from jaxtrachea.scene.effects import EFFECTS, given_values
 from jaxtrachea.scene.plan import Served
-from jaxtrachea.scene.stage import COVERED, Poses, Presses, Scene
+from jaxtrachea.scene.stage import COVERED, Presses, Scene
 from jaxtrachea.surface import local
 from jaxtrachea.trachea.material import Material
 
@@ -25,31 +23,15 @@ from jaxtrachea.trachea.material import Material
 #: to the axis of the tube.
 DEEPEST = 1.0
 
-#: A contact on the face that closes a patch at an end of the tube: distance from the end over the
-#: radius, and least part of the normal along the tube (that of a wall with relief is below 0.4).
-RIM, ALONG = 0.08, 0.8
-
-#: Values of the material that each effect reads: where they are given, a path may need it.
-READ = {
-    "rings": ("EI_C", "k_t"),
-    "shear": ("GA_L",),
-    "two_material": ("k_1_ring",),
-    "axial": ("EA_L",),
-}
-
 
 def lacking(scene: Scene, material: Material) -> list[str]:
     """Effects that the material gives, but not the plan; the user did not leave them out."""
-    plan = scene.plan
-    there = {
-        "rings": plan.rings != "mat", "shear": plan.options.shear, "axial": plan.axial,
-        "two_material": plan.options.local == "two-material",
-    }  # fmt: skip
-    given = [e for e, names in READ.items() if all(getattr(material, n) is not None for n in names)]
-    if plan.axial and plan.surface is not None and not plan.end_motion:
-        there["end_motion"] = False
-        given += ["end_motion"] * any(getattr(material, n) is not None for n in ("k_A", "k_B"))
-    return [e for e in given if not there[e] and e not in plan.ignored]
+    plan, known = scene.plan, given_values(material)
+    return [
+        e.name for e in EFFECTS.values()
+        if e.given(known) and not plan.has(e.name) and all(map(plan.has, e.requires))
+        and e.name not in plan.ignored
+    ]  # fmt: skip
 
 
 def unserved(
@@ -58,9 +40,9 @@ def unserved(
     """Rows that press and need an effect that is off.
 
     Off the midline or oblique without vectors, along the tube without stretch, along the surface
-    without friction, elsewhere or too far for one seat, near a surface without a dent; or anywhere
-    with a material that bends, shears, lets the ends move or has rings of their own where the plan
-    did not.
+    without friction, elsewhere or too far for one contact point, near a surface without a dent; or
+    anywhere with a material that bends, shears, lets the ends move or has rings of their own where
+    the plan did not.
 
     Args:
         scene: -
@@ -78,10 +60,10 @@ def unserved(
     given = not plan.contact
     if not plan.second_plane:
         found.append(_off_plane(presses))
-    elif "axial" in less and (given or plan.seat == "first"):
+    elif "axial" in less and (given or plan.contact_point == "fixed"):
         found.append(jnp.abs(D[:, 0]) > COVERED * _length(D) + COVERED)
-    if plan.seat == "first":
-        found += _seats(scene, presses) if given else _wandering(scene, presses)
+    if plan.contact_point == "fixed":
+        found += _elsewhere(scene, presses) if given else _wandering(scene, presses)
         if _frictionless(scene):
             slides = pressing & (_along(presses) > COVERED * _length(D) + COVERED)
             found.append(jnp.cumsum(slides) > 0)  # what slid leaves its trace in later rows
@@ -114,7 +96,7 @@ def _off_plane(presses: Presses):
     return ~(jnp.abs(presses.phi) <= COVERED) | oblique
 
 
-def _seats(scene: Scene, presses: Presses):
+def _elsewhere(scene: Scene, presses: Presses):
     """Rows at another contact point than the first."""
     near = lambda v: jnp.abs(v - v[0]) <= COVERED  # noqa: E731
     return [~(near(presses.s) & near(presses.phi))]
@@ -131,8 +113,8 @@ def _near_surface(scene: Scene, presses: Presses):
 
 
 def _wandering(scene: Scene, presses: Presses):
-    """Rows of a tool that has left its seat: as `rules` has it, by half a ring spacing."""
-    if "seat" in scene.plan.ignored or scene.plan.options.contact == "bonded":
+    """Rows of a tool that has left its contact point: as `rules` has it, by half a ring spacing."""
+    if "contact_point" in scene.plan.ignored or scene.plan.options.contact == "bonded":
         return []
     return [_along(presses) > half_spacing(scene)]
 
@@ -184,110 +166,3 @@ def contact_share(scene: Scene, seen: Touch):
         raise ValueError("scene.tool is None; contact needs a tool")
     sure = scene.tool.radius + jnp.min(scene.tube.shapes.radius)
     return jax.lax.stop_gradient(jnp.maximum(-seen.gap, 0) / jnp.where(sure > 0, sure, jnp.nan))
-
-
-class Side(enum.IntEnum):
-    """Where a tool is, as far as its way tells."""
-
-    UNTOLD = 0
-    BEFORE_AN_END = 1
-    IN_LUMEN = 2
-    OUTSIDE = 3
-
-
-class Whereabouts(NamedTuple):
-    """What a pose tells of it; shape (rows,) each.
-
-    Attributes:
-        known: the pose and its contact are finite.
-        off: the contact lies beyond an end, or on a face that closes it.
-        clear: the tool does not touch.
-        within: all of it lies within the inner wall.
-        centred: its middle lies within the middle of the wall.
-    """
-
-    known: Bool[Array, " rows"]
-    off: Bool[Array, " rows"]
-    clear: Bool[Array, " rows"]
-    within: Bool[Array, " rows"]
-    centred: Bool[Array, " rows"]
-
-
-def whereabouts(scene: Scene, path: Poses, seen: Touch) -> Whereabouts:
-    """Look at the place of the tool.
-
-    Its corners' distance from the centreline, not the gap, says what is within: patches of a mesh
-    are closed, and deep in one of them the nearest way out may be the one along the tube. The wall
-    of an imported mesh has no thickness here.
-    """
-    if scene.tool is None or scene.tube is None:
-        raise ValueError("scene.tool is None; contact needs a tool")
-    gap = jax.lax.stop_gradient(seen.gap)
-    wall = 2 * jnp.maximum(scene.radius - scene.geometry.radius, 0)
-    room = scene.radius - wall - scene.tool.radius
-    corners = path.rotation @ scene.tool.vertices + path.translation[:, :, None]
-    line = scene.tube.line if scene.plan.curved else None
-    off_axis = jax.vmap(functools.partial(_off_axis, line))
-    square = jax.vmap(off_axis, 2, 1)(corners)
-    return Whereabouts(
-        known=jnp.isfinite(jnp.sum(corners, axis=(1, 2)) + gap),
-        off=off_the_end(scene, seen),
-        clear=gap >= 0,
-        within=(jnp.max(square, axis=1) < room * room) & (room > 0),
-        centred=off_axis(jnp.mean(corners, axis=2)) < (scene.radius - wall / 2) ** 2,
-    )
-
-
-def next_side(side: Int[Array, ""], at: Whereabouts) -> Int[Array, ""]:
-    """The side after one more pose (fields of `at` without rows).
-
-    A tool that does not touch the tube beside its ends is outside; one that touches stays on its
-    side. A way that begins wholly within the inner wall begins in the lumen; a tool that comes
-    over an end is in the lumen if its middle is.
-    """
-    begins = jnp.where(side == Side.UNTOLD, at.within, at.centred)
-    inside = jnp.where(side <= Side.BEFORE_AN_END, begins, side == Side.IN_LUMEN)
-    touching = jnp.where(inside, Side.IN_LUMEN, Side.OUTSIDE)
-    beside = ~at.off | (at.within & ~at.clear)
-    new = jnp.where(at.clear, Side.OUTSIDE, touching)
-    return jnp.where(at.known, jnp.where(beside, new, Side.BEFORE_AN_END), side)
-
-
-def _off_axis(line: Centreline | None, point):
-    """Square of the distance from the centreline (by its nearest sample), mm^2."""
-    if line is None:
-        return jnp.sum(point[1:] ** 2)
-    away = point[None] - line.points
-    square = jnp.sum(away * away, axis=1)
-    nearest = jnp.argmin(square)
-    return square[nearest] - jnp.sum(away[nearest] * line.tangents[nearest]) ** 2
-
-
-def off_the_end(scene: Scene, seen: Touch) -> Bool[Array, " rows"]:
-    """Rows whose contact lies beyond an end of the tube, or on the face that closes it.
-
-    Patches of a mesh are closed, the tube is not: at its ends there is no wall across.
-    """
-    s, length = seen.s, scene.geometry.length
-    beyond = (s < 0) | (s > length)
-    if scene.tube is None:
-        return beyond
-    if scene.plan.curved:
-        line = scene.tube.line
-        tangent = jax.vmap(lambda v: point_at(line, v)[1])(s)
-        along = jnp.sum(seen.normal * tangent, axis=1)
-    else:
-        along = seen.normal[:, 0]
-    rim = RIM * scene.radius
-    return beyond | ((s < rim) & (along < -ALONG)) | ((s > length - rim) & (along > ALONG))
-
-
-def in_lumen(scene: Scene, path: Poses, seen: Touch) -> Bool[Array, " rows"]:
-    """Rows of a tool in the lumen, by its way so far (`next_side`)."""
-    at = whereabouts(scene, path, seen)
-
-    def step(side, at):
-        side = next_side(side, at)
-        return side, (side == Side.IN_LUMEN) & at.known
-
-    return jax.lax.scan(step, jnp.asarray(Side.UNTOLD), at)[1]

@@ -8,8 +8,9 @@ import numpy as np
 
 from jaxtrachea.files.atomic import hdf5_file
 from jaxtrachea.scene.plan import Plan
-from jaxtrachea.scene.simulation import Simulation, Sweep
+from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Poses, Presses, Scene
+from jaxtrachea.scene.sweep import Sweep
 from jaxtrachea.status import PressStatus
 
 SCHEMA, SCHEMA_VERSION = "jaxtrachea-simulation", 1

@@ -17,8 +17,8 @@ then the work over closed loops of the tool is not negative.
 
 `HOLD` limits the way along the surface, not the force. It is no law of friction: the tangential
 force is what the skeleton answers to that way, in 5,000 poses 0.69 of the normal force in the
-median, 2.4 at most (`tests/bench/jumps.py`). With seat `each`, in `simulate` too, there is no way
-along the surface and no such force.
+median, 2.4 at most (`tests/bench/jumps.py`). With contact point
+`per_step`, in `simulate` too, there is no way along the surface and no such force.
 
 A tool that goes further along the tube in one step than its dent is wide has left its seat: it
 grasps anew where it is. A glued tool (`bonded`) holds its first place whatever it does.
@@ -39,8 +39,8 @@ from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.ranges import half_spacing
-from jaxtrachea.scene.simulation import on_the_tube
-from jaxtrachea.scene.stage import Poses, Presses, Scene, followed
+from jaxtrachea.scene.refusals import on_the_tube
+from jaxtrachea.scene.stage import Poses, Presses, Scene, contact_point_path
 from jaxtrachea.trachea.material import Material
 
 #: Way along the surface that a seat holds, over the depth.
@@ -111,7 +111,7 @@ def arrive(scene: Scene, before: Instant, here: Instant) -> Seat:
     path = jax.tree.map(join, before.path, here.path)
     seen = jax.tree.map(join, before.seen, here.seen)
     frame = local_frame(seat.phi)
-    way = followed(path, seen, jnp.asarray(1), frame[0], _axes(scene, seat.s))[1]
+    way = contact_point_path(path, seen, jnp.asarray(1), frame[0], _axes(scene, seat.s))[1]
     return anchored(scene, seat, _times(frame, way), here.path)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxtrachea.scene.approach import approach
-from jaxtrachea.scene.ranges import Side, next_side, whereabouts
+from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.seat import (
     Instant,
     Seat,
@@ -43,7 +43,7 @@ class State(NamedTuple):
     Attributes:
         started: there was a step.
         touching: the tool is on its seat.
-        side: a `ranges.Side`.
+        side: a `lumen.Side`.
         last: the step before.
         seat: the place that the tool holds.
     """
@@ -78,11 +78,12 @@ class Latency(NamedTuple):
 class Session:
     """A scene and its material, compiled for one pose at a time.
 
-    With `seat` first the tool stays on the place it touched first, as in `simulate`, until that
-    seat gives way (`scene.seat`): led along the surface by more than its depth the tool slides,
-    after a jump it grasps anew, and it lets go where it leaves the undeformed tube (`simulate`
-    keeps the first place of its whole path; a bonded tool never lets go). Force is continuous in
-    the pose. A pose that is not finite is a row of NaN with NON_FINITE and changes nothing else.
+    With `contact_point` fixed the tool stays on the place it touched first, as in `simulate`,
+    until that seat gives way (`scene.seat`): led along the surface by more than its depth the tool
+    slides, after a jump it grasps anew, and it lets go where it leaves the undeformed tube
+    (`simulate` keeps the first place of its whole path; a bonded tool never lets go). Force is
+    continuous in the pose. A pose that is not finite is a row of NaN with NON_FINITE and changes
+    nothing else.
 
     A step gives up the arrays of the step before: copy what must last longer
     (`jax.tree.map(np.array, result)`). On the CPU 7 to 9 us of a step go away with
@@ -107,7 +108,7 @@ class Session:
         if scene.plan.friction:
             raise ValueError(
                 "the plan has friction, which depends on the whole path; use simulate, or make the "
-                "scene with Wishes(friction='off')"
+                "scene with EffectOptions(friction='off')"
             )
         self.scene, self.dtype = scene, np.dtype(scene.footprint.dtype)
         pose = (np.eye(3, dtype=self.dtype), np.zeros(3, self.dtype))
@@ -202,7 +203,7 @@ def _start(scene: Scene, rotation, translation) -> State:
 def _step(scene: Scene, material: Material, state: State, rotation, translation):
     """The next state, and the result without its axis of rows."""
     path = Poses(rotation[None], translation[None])
-    each = approach(scene, path) if scene.plan.seat == "each" else None
+    each = approach(scene, path) if scene.plan.contact_point == "per_step" else None
     here = Instant(path, touch_tube(scene, path) if each is None else each.seen)
     at = jax.tree.map(lambda v: v[0], whereabouts(scene, *here))
     side = next_side(state.side, at)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from jaxtrachea._errors import InputError
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -13,7 +14,7 @@ RADII = (0.2, 100.0)
 LONGEST_TOOL = 1000.0
 
 
-class SizeError(ValueError):
+class SizeError(InputError):
     """A length that no trachea and no tool has: what, how long, what is expected, the cause."""
 
 
@@ -33,17 +34,22 @@ def check_sizes(geometry: Geometry, outer: float, tool: Shape | None) -> None:
     _within("geometry.radius", radius, RADII)
     if not radius / 2 <= outer <= 1.5 * radius:
         raise SizeError(
-            f"radius of the outside is {outer:.4g} mm, that of the rings' line {radius:.4g} mm; "
-            "expected it half to one and a half times as large (a wall not thicker than the "
-            "radius); check the units of wall and radius"
+            f"is {outer:.4g} mm, that of the rings' line {radius:.4g} mm",
+            key="radius of the outside",
+            expected="it half to one and a half times as large (a wall not thicker than the radius)",
+            cure="check the units of wall and radius",
+            joint=" ",
         )
     if tool is not None:
         corners = np.asarray(tool.vertices, float)
         across = float(np.ptp(corners, axis=1).max() + 2 * float(tool.radius))
         if not across <= LONGEST_TOOL:
             raise SizeError(
-                f"tool is {across:.4g} mm across; expected at most {LONGEST_TOOL:g} mm; lengths "
-                f"are in mm: {_cause(across)}"
+                f"is {across:.4g} mm across",
+                key="tool",
+                expected=f"at most {LONGEST_TOOL:g} mm",
+                cure=f"lengths are in mm: {_cause(across)}",
+                joint=" ",
             )
 
 
@@ -52,8 +58,11 @@ def _within(name: str, value: float, limits: tuple[float, float]) -> None:
     if not low <= value <= high:
         small = f"is the unit wrong (mm in place of m)? It would be {1000 * value:.4g} mm"
         raise SizeError(
-            f"{name} is {value:.4g} mm; expected {low:g} to {high:g} mm; lengths are in mm: "
-            f"{_cause(value) if value > high else small}"
+            f"is {value:.4g} mm",
+            key=name,
+            expected=f"{low:g} to {high:g} mm",
+            cure=f"lengths are in mm: {_cause(value) if value > high else small}",
+            joint=" ",
         )
 
 

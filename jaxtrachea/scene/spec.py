@@ -7,7 +7,7 @@ the specification is opened here.
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, create_model, model_validator
 
 from jaxtrachea.config import (
     Angle,
@@ -18,6 +18,8 @@ from jaxtrachea.config import (
     load_spec,
     quantity,
 )
+from jaxtrachea.scene.declare import Effect
+from jaxtrachea.scene.effects import EFFECTS
 
 Stiffness = Annotated[float, quantity("stiffness", positive=True)]
 Bending = Annotated[float, quantity("bending_stiffness", positive=True)]
@@ -27,7 +29,6 @@ Lengths3 = Annotated[list[Length], Field(min_length=3, max_length=3)]
 Sizes3 = Annotated[list[PositiveLength], Field(min_length=3, max_length=3)]
 Angles3 = Annotated[list[Angle], Field(min_length=3, max_length=3)]
 Direction = Annotated[list[float], Field(min_length=3, max_length=3)]
-Switch = Literal["auto", "on", "off"]
 
 
 class SceneTracheaSection(Section):
@@ -173,19 +174,36 @@ def _one_or_auto(value: Any) -> Any:
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-class EffectsSection(Section):
-    """[effects]: what is left "auto" follows the rules of docs/scenes.md."""
+#: Former names in [effects], and what is written now.
+FORMER = "is now contact_point; write contact_point = 'fixed' for 'first', 'per_step' for 'each'"
 
-    seat: Literal["auto", "first", "each"] = "auto"
-    friction: Switch = "auto"
-    second_plane: Switch = "auto"
-    rings: Literal["auto", "mat", "arch", "arch2"] = "auto"
-    axial: Switch = "auto"
-    shear: Switch = "auto"
-    two_material: Switch = "auto"
-    end_motion: Switch = "auto"
-    surface: Literal["auto", "off", "linear", "hermite", "phong"] = "auto"
-    dent: Annotated[Literal["auto", "off", "8", "16", "32"], BeforeValidator(_one_or_auto)] = "auto"
+
+class _Effects(Section):
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "seat" in data:
+            raise ValueError(f"seat {FORMER}")
+        if isinstance(data, dict) and data.get("contact_point") in ("first", "each"):
+            raise ValueError(
+                f"contact_point: expected 'auto', 'fixed' (formerly 'first') or 'per_step' "
+                f"(formerly 'each'), found {data['contact_point']!r}"
+            )
+        return data
+
+
+def _levels(effect: Effect) -> Any:
+    words = Literal[("auto", *effect.levels)]  # pyright: ignore
+    return Annotated[words, BeforeValidator(_one_or_auto)], "auto"
+
+
+_Declared: Any = create_model(
+    "_Declared", __base__=_Effects, **{e.name: _levels(e) for e in EFFECTS.values()}
+)
+
+
+class EffectsSection(_Declared):
+    """[effects], as `scene.effects` declares them; what is "auto" follows docs/scenes.md."""
 
 
 class OutputSection(Section):

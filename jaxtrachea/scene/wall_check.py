@@ -123,8 +123,9 @@ def check(mesh: Mesh, geometry: Geometry, patches: Patches) -> WallError:
         f"a tool would not touch it where it is: the contact gap is off by {seen.median:.2g} mm in "
         f"the median and by {seen.worst:.2g} mm at worst (at s = {at:.3g} mm), expected at most "
         f"{USUAL * seen.limit:.2g} and {seen.limit:.2g} mm for rings this far apart; is it the "
-        "outer wall, one tube without branches and sharp bends? Give that surface, or "
-        "ring_positions, where the rings are"
+        "outer wall, one tube without branches and sharp bends?",
+        cure="give that surface, or {}, where the rings are",
+        arguments=("ring_positions",),
     )
 
 

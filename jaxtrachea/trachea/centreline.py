@@ -88,7 +88,9 @@ class Shape(NamedTuple):
             raise MeshError(
                 f"the centreline found runs {most:.2g} mm beside the middle of its cross-sections, "
                 f"expected at most {BESIDE * usual:.2g}: it bends too sharply to be followed, or "
-                "is no tube; give centreline="
+                "is no tube",
+                cure="give {}",
+                arguments=("centreline=",),
             )
 
 
@@ -110,7 +112,11 @@ def find_centreline(vertices, faces, given=None) -> Line:
     centre = np.average(middle, axis=0, weights=weight)
     spread, axes = np.linalg.eigh(np.cov((middle - centre).T, aweights=weight))
     if spread[2] < 3 * spread[1]:
-        raise MeshError("it is not longer than wide: no axis to follow; give centreline=")
+        raise MeshError(
+            "it is not longer than wide: no axis to follow",
+            cure="give {}",
+            arguments=("centreline=",),
+        )
     axes = axes[:, ::-1]
     along = (vertices - centre) @ axes[:, 0]
     margin = 0.05 * np.ptp(along)
@@ -120,8 +126,9 @@ def find_centreline(vertices, faces, given=None) -> Line:
         seen, off = _centres(cells, centre, axes, stations, curve)
         if len(seen) < STATIONS / 2:
             raise MeshError(
-                f"only {len(seen)} of {STATIONS} cross-sections close round the axis; "
-                "expected a tube: repair it, or give centreline="
+                f"only {len(seen)} of {STATIONS} cross-sections close round the axis",
+                cure="expected a tube: repair it, or give {}",
+                arguments=("centreline=",),
             )
         curve = [np.polynomial.polynomial.polyfit(seen, v, 4) for v in off.T]
     t = np.linspace(seen.min(), seen.max(), 60)
@@ -192,7 +199,9 @@ def check_turn(line: Line) -> None:
     if turn > TURN:
         raise MeshError(
             f"its centreline turns by {turn:.0f} degrees, expected at most {TURN:.0f}: its skeleton"
-            " is taken as straight; is it one trachea? Give centreline= if it was found wrong"
+            " is taken as straight; is it one trachea?",
+            cure="give {} if it was found wrong",
+            arguments=("centreline=",),
         )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxtrachea._arguments import real
+from jaxtrachea._errors import InputError
 
 
 class Geometry(eqx.Module):
@@ -61,51 +62,52 @@ class Geometry(eqx.Module):
             dtype: of every array; the default float type of JAX if None.
 
         Raises:
-            ValueError: naming the argument, what was found and what is expected.
+            InputError: naming the argument, what was found and what is expected.
         """
         length, radius = _number("length", length), _number("radius", radius)
         half_angle = _number("half_angle", half_angle)
         ring_height = _number("ring_height", ring_height)
         x = np.atleast_1d(_numbers("ring_positions", ring_positions))
         if x.ndim != 1:
-            raise ValueError(f"ring_positions has shape {x.shape}; expected one axis of s")
+            raise _refused("ring_positions", f"has shape {x.shape}", "one axis of s")
         if not math.isfinite(length) or length <= 0:
-            raise ValueError(f"length is {length} mm; expected a positive number")
+            raise _refused("length", f"is {length} mm", "a positive number")
         if x.size == 0:
-            raise ValueError("ring_positions is empty; expected at least one ring")
+            raise _refused("ring_positions", "is empty", "at least one ring")
         if not np.all(np.isfinite(x)) or np.any(np.diff(x) <= 0):
             found = ", ".join(f"{v:g}" for v in x[:12]) + (", ..." if x.size > 12 else "")
-            raise ValueError(
-                f"ring_positions must be finite and strictly increasing; found {found}"
+            raise _refused(
+                "ring_positions", f"must be finite and strictly increasing; found {found}"
             )
         if x[0] <= 0 or x[-1] >= length:
-            raise ValueError(
-                f"ring_positions run from {x[0]:g} to {x[-1]:g} mm; "
-                f"expected all inside (0, {length:g}) mm"
-            )
+            found = f"run from {x[0]:g} to {x[-1]:g} mm"
+            raise _refused("ring_positions", found, f"all inside (0, {length:g}) mm")
         for name, value in (("radius", radius), ("ring_height", ring_height)):
             if not math.isfinite(value) or value <= 0:
-                raise ValueError(f"{name} is {value} mm; expected a positive number")
+                raise _refused(name, f"is {value} mm", "a positive number")
         if not math.pi / 2 < half_angle < math.pi:
-            raise ValueError(
-                f"half_angle is {half_angle:.6g} rad; expected between pi/2 and pi, 90 and 180 deg"
-            )
+            found = f"is {half_angle:.6g} rad"
+            raise _refused("half_angle", found, "between pi/2 and pi, 90 and 180 deg")
         dtype = jnp.zeros(0, dtype).dtype
         arrays = (np.asarray(v, dtype) for v in (length, x, radius, half_angle, ring_height))
         return cls(*arrays)
+
+
+def _refused(argument: str, found: str, expected: str = "") -> InputError:
+    return InputError(found, key=argument, expected=expected, joint=" ")
 
 
 def _numbers(name: str, value: object) -> np.ndarray:
     try:
         return np.asarray(value, np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} is {value!r}; expected numbers in mm or rad") from None
+        raise _refused(name, f"is {value!r}", "numbers in mm or rad") from None
 
 
 def _number(name: str, value: object) -> float:
     array = _numbers(name, value)
     if array.ndim:
-        raise ValueError(f"{name} has shape {array.shape}; expected a single number")
+        raise _refused(name, f"has shape {array.shape}", "a single number")
     return float(array)
 
 

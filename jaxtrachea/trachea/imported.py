@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtrachea._errors import InputError
 from jaxtrachea.trachea.centreline import (
     Line,
     Shape,
@@ -97,7 +98,7 @@ def read_mesh(
         return _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
                      half_angle, dtype, progress)  # fmt: skip
     except MeshError as error:
-        raise MeshError(f"{path.name}: {error}") from error.__cause__
+        raise MeshError.like(error, place=path.name) from error.__cause__
 
 
 def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions, half_angle, dtype,
@@ -145,8 +146,9 @@ def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
             shape.line.s[-1], found.positions, radius=found.radius, half_angle=found.half_angle,
             ring_height=found.height, dtype=dtype,
         )  # fmt: skip
-    except ValueError as error:
-        raise MeshError(f"{error}; give ring_positions or half_angle") from error
+    except InputError as error:
+        names = ("ring_positions", "half_angle")
+        raise MeshError.like(error, cure="give {} or {}", arguments=names) from error
     return Imported(mesh, geometry, cast(rotation), cast(origin / scale), scale, tuple(notes))
 
 
@@ -201,7 +203,7 @@ def _wall(parts: dict[str, Surface], part: str | None) -> str:
     if not areas[largest] > 0:
         raise MeshError("all vertices lie in one point or line; expected the surface of a trachea")
     if areas[largest] <= 0.5 * sum(areas.values()):
-        raise MeshError(f"which of the objects {names} is the wall? Give part=")
+        raise MeshError(f"which of the objects {names} is the wall?", cure="give part=")
     return largest
 
 
@@ -212,7 +214,7 @@ def _scale(surface: Surface, path: Path, unit: str | None, notes: list[str]) -> 
         try:
             scale = float(unit_factor(unit, "length"))
         except ValueError as error:
-            raise MeshError(str(error)) from error
+            raise MeshError.like(error, key="") from error
         if not POSSIBLE[0] <= size * scale <= POSSIBLE[1]:
             raise MeshError(f"unit={unit!r} makes it {size * scale:.4g} mm long; correct unit=")
         return scale
@@ -235,7 +237,8 @@ def _cartilage(parts, wall, rings, path, scale, notes) -> Surface | None:
             n for n in parts if n != wall and ("cartilage" in n.lower() or "ring" in n.lower())
         ]
         if len(named) > 1:
-            raise MeshError(f"which of the objects {', '.join(named)} are the rings? Give rings=")
+            found = f"which of the objects {', '.join(named)} are the rings?"
+            raise MeshError(found, cure="give {}", arguments=("rings=",))
         rings = named[0] if named else None
     if rings is None:
         return None
@@ -246,7 +249,8 @@ def _cartilage(parts, wall, rings, path, scale, notes) -> Surface | None:
         try:
             found = list(_parts(other).values())
         except MeshError as error:
-            raise MeshError(f"rings={str(rings)!r}: {error}") from error
+            found = f"{str(rings)!r}: {error}"
+            raise MeshError(found, key="rings", joint="=") from error
     notes.append(f"rings: {rings}")
     shift = np.cumsum([0, *(len(f.vertices) for f in found[:-1])])
     vertices = np.concatenate([f.vertices for f in found]) * scale

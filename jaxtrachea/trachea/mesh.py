@@ -11,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxtrachea._errors import InputError
 
-class MeshError(ValueError):
+
+class MeshError(InputError):
     """A mesh that cannot be used: which file, what was found, what is expected, the cure."""
 
 

@@ -117,9 +117,9 @@ def _check_row(found, source, radius, length, own) -> None:
         return
     at = ", ".join(f"{v:.1f}" for v in found[:8]) + (", ..." if len(found) > 8 else "")
     raise MeshError(
-        f"found {len(found)} rings in {source}{f' (s = {at} mm)' if at else ''}, expected {fault}; "
-        "a lumen shows none: give the outer wall, or rings=, the cartilage's own surface, or "
-        "ring_positions="
+        f"found {len(found)} rings in {source}{f' (s = {at} mm)' if at else ''}, expected {fault}",
+        cure="a lumen shows none: give the outer wall, or {}, the cartilage's own surface, or {}",
+        arguments=("rings=", "ring_positions="),
     )
 
 
@@ -176,7 +176,9 @@ def _opposite_flat(shape: Shape) -> float:
     others = np.roll(smooth, -low)[RAYS // 6 : -RAYS // 6]
     if not others.min() > 1.03 * smooth[low]:
         raise MeshError(
-            "no flat side, no relief of rings: which side is anterior? Give anterior= or rings="
+            "no flat side, no relief of rings: which side is anterior?",
+            cure="give anterior= or {}",
+            arguments=("rings=",),
         )
     return float(ANGLES[low] + math.pi)
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from jaxtrachea._errors import InputError
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.trachea.geometry import Geometry, table_1
 
@@ -27,5 +28,6 @@ def geometry_of(section: TracheaSection) -> Geometry:
             half_angle=section.half_angle,
             ring_height=section.ring_height,
         )
-    except ValueError as error:
-        raise SpecError(f"trachea.{str(error).replace('ring_positions', 'rings')}") from None
+    except InputError as error:
+        named = error.renamed({"ring_positions": "rings"})
+        raise SpecError.like(named, key=f"trachea.{named.key}") from None

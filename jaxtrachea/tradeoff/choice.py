@@ -17,8 +17,10 @@ import numpy as np
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.approach import approach
+from jaxtrachea.scene.declare import PlanError
+from jaxtrachea.scene.effects import EFFECTS
 from jaxtrachea.scene.operations import count_operations
-from jaxtrachea.scene.plan import Effect, Plan, PlanError, Served
+from jaxtrachea.scene.plan import Decision, Served
 from jaxtrachea.scene.simulation import Simulation, simulate
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
@@ -28,18 +30,6 @@ from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
 BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
-#: Effects of a plan, by the name of their ladder where that differs.
-EFFECT: dict[str, str] = {
-    "local": "two_material",
-    "interpolation": "surface",
-    "quality": "contact quality",
-    "dtype": "precision",
-}
-#: Levels that a plan calls otherwise.
-WORD = {"uniform": "off", "0": "off"}
-#: Ladders of which the choice takes rungs, if the user leaves their effect to it.
-CHOSEN = ("second_plane", "rings", "shear", "local", "axial", "end_motion", "friction",
-          "interpolation", "dent")  # fmt: skip
 #: What an operation costs.
 COST = {"float32": 0.5, "float64": 1.0}
 
@@ -50,9 +40,18 @@ _simulate = jax.jit(
 
 
 class Rung(NamedTuple):
-    """One effect at a lower level, alone: what that changes, and the share of operations saved."""
+    """One effect at a lower level, alone.
+
+    Attributes:
+        ladder: by name.
+        effect: that it is of.
+        level: on the ladder.
+        errors: what that changes.
+        saved: share of operations.
+    """
 
     ladder: str
+    effect: str
     level: str
     errors: Errors
     saved: float
@@ -139,9 +138,12 @@ def choose(
     scene = _explained(scene, picked, refused, returned)
     plan = dataclasses.replace(scene.plan, served=_served(trial.reference))
     scene = dataclasses.replace(scene, plan=plan)
-    found = tuple(picked), tuple(refused), tuple(returned)
     cost = trial.cost(full.levels), trial.cost(levels)
-    return Choice(scene, material, path, levels, tolerance, *found, errors, cost)
+    return Choice(
+        scene=scene, material=material, path=path, levels=levels, tolerance=tolerance,
+        dropped=tuple(picked), refused=tuple(refused), returned=tuple(returned), errors=errors,
+        cost=cost,
+    )  # fmt: skip
 
 
 class _Trial:
@@ -158,8 +160,10 @@ class _Trial:
         if not pressed.all():
             where = "the path" + (" a quarter of a ring spacing beside it" if pressed[0] else "")
             raise PlanError(
+                "plan.tolerance",
                 f"no row of {where} is solved with a force: nothing that a tolerance could be "
-                "measured by; press deeper, further from the ends, or take no tolerance"
+                "measured by",
+                cure="press deeper, further from the ends, or take no tolerance",
             )
 
     def errors(self, levels: Levels) -> Errors:
@@ -215,12 +219,11 @@ def changes(errors: Errors) -> str:
 
 def _ladders(full: Full, precision: str) -> list[Ladder]:
     """Those of the choice: what saves operations, and what the user has not decided."""
-    free = lambda name: getattr(full.given, _effect(name)) == "auto"  # noqa: E731
     every = ladders(full)[0]
-    found = [v for v in every if v.name in CHOSEN and free(v.name)]
+    found = [v for v in every if v.effect in EFFECTS and getattr(full.given, v.effect) == "auto"]
     if full.scene.plan.contact:
         rungs = {k: {"sharpness": sharp, "steps": n} for k, (sharp, n) in QUALITY.items()}
-        found.append(Ladder("quality", "truncation", {**rungs, "fine": {}}, {}))
+        found.append(Ladder("quality", "truncation", {**rungs, "fine": {}}, {}, "contact quality"))
     return found + [v for v in every if v.name == "dtype" and precision == "auto"]
 
 
@@ -240,7 +243,10 @@ def _within(
         for name in (name for name in names if saved[name] == worth):
             trial.report(f"{ladder.name} {name}")
             errors = trial.errors(ladder.levels(trial.full, name))
-            rungs.append(Rung(ladder.name, name, errors, worth))
+            rung = Rung(
+                ladder=ladder.name, effect=ladder.effect, level=name, errors=errors, saved=worth
+            )
+            rungs.append(rung)
         best = min(rungs, key=lambda rung: rung.errors.worst)
         if best.errors.worst <= tolerance:
             return best
@@ -253,7 +259,7 @@ def _combined(full: Full, named: dict[str, Ladder], picked: list[Rung]) -> Level
     changed = {}
     for rung in picked:
         changed |= named[rung.ladder].rungs[rung.level]
-    return dataclasses.replace(full.levels, **changed)
+    return full.levels.changed(**changed)
 
 
 def _served(reference: Simulation) -> Served:
@@ -264,7 +270,9 @@ def _served(reference: Simulation) -> Served:
     on = np.asarray(reference.force).any(axis=-1) & np.isfinite(inward)
     most = lambda v: float(np.abs(v[on]).max())  # noqa: E731
     s = float(reference.s[on].min()), float(reference.s[on].max())
-    return Served(s, most(phi), most(D[..., 0]), most(across), most(inward))
+    return Served(
+        s=s, angle=most(phi), along=most(D[..., 0]), across=most(across), inward=most(inward)
+    )
 
 
 def _explained(
@@ -278,33 +286,18 @@ def _explained(
         (returned, "{0} would change {1}, too much together with the others"),
     ):
         for rung in rungs:
-            said.setdefault(_effect(rung.ladder), []).append(
-                form.format(rung.level, changes(rung.errors))
-            )
+            said.setdefault(rung.effect, []).append(form.format(rung.level, changes(rung.errors)))
     plan = scene.plan
-    more = [Effect("contact quality", "fine", "the finest")] if plan.contact else []
-    more.append(Effect("precision", "float64", "the finest"))
-    picks = {_effect(rung.ladder): WORD.get(rung.level, rung.level) for rung in picked}
+    more = [Decision("contact quality", "fine", "the finest")] if plan.contact else []
+    more.append(Decision("precision", "float64", "the finest"))
+    picks = {rung.effect: rung.level for rung in picked}
 
-    def explained(effect: Effect) -> Effect:
-        level = picks[effect.name] if effect.name in picks else _level(plan, effect)
-        reason = effect.reason if level == effect.level else "goes with another effect"
-        reason = "; ".join(said.get(effect.name, [reason]))
-        return Effect(effect.name, level, reason, effect.forced)
+    def explained(decision: Decision) -> Decision:
+        name = decision.name
+        level = plan.level(name) if name in EFFECTS else picks.get(name, decision.level)
+        reason = decision.reason if level == decision.level else "goes with another effect"
+        reason = "; ".join(said.get(name, [reason]))
+        return Decision(name, level, reason, decision.forced)
 
     effects = tuple(map(explained, (*plan.effects, *more)))
     return dataclasses.replace(scene, plan=dataclasses.replace(plan, effects=effects))
-
-
-def _effect(ladder: str) -> str:
-    """The effect of a plan that a ladder is of."""
-    return EFFECT[ladder] if ladder in EFFECT else ladder
-
-
-def _level(plan: Plan, effect: Effect) -> str:
-    """The level of an effect that another one took with it."""
-    if effect.name == "rings":
-        return plan.rings
-    if effect.name in ("axial", "end_motion", "friction", "second_plane"):
-        return "on" if getattr(plan, effect.name) else "off"
-    return effect.level

@@ -4,10 +4,10 @@ Each has a kind: `truncation` (how far something is computed), `algebra` (anothe
 numbers) or `model` (something left out).
 """
 
-import dataclasses
 from typing import Any, Literal, NamedTuple
 
 from jaxtrachea.contact.search import FINE
+from jaxtrachea.scene.effects import EFFECTS, Effect
 from jaxtrachea.tradeoff.levels import Full, Levels, one_plane
 
 Kind = Literal["truncation", "algebra", "model"]
@@ -30,16 +30,18 @@ class Ladder(NamedTuple):
         kind: -
         rungs: what each changes in the finest levels, by name of the level; the finest last.
         base: what is changed for all of them, their reference included.
+        effect: that it is of; empty: of none.
     """
 
     name: str
     kind: Kind
     rungs: dict[str, dict[str, Any]]
     base: dict[str, Any]
+    effect: str = ""
 
     def levels(self, full: Full, rung: str) -> Levels:
         """The finest levels with this rung."""
-        return dataclasses.replace(full.levels, **self.base, **self.rungs[rung])
+        return full.levels.changed(**self.base, **self.rungs[rung])
 
 
 def ladders(full: Full) -> tuple[list[Ladder], dict[str, str]]:
@@ -47,45 +49,50 @@ def ladders(full: Full) -> tuple[list[Ladder], dict[str, str]]:
     found: list[Ladder] = []
     out: dict[str, str] = {}
 
-    def add(name, kind, rungs, why="", **base):
+    def add(name, kind, rungs, why="", effect="", **base):
         if why:
             out[name] = why
         else:
-            found.append(Ladder(name, kind, rungs, base))
+            found.append(Ladder(name, kind, rungs, base, effect))
 
-    reasons = {effect.name: effect.reason for effect in full.scene.plan.effects}
-    finest, flat = full.levels, one_plane(full)
-    plane = {"second_plane": False}
-    add("form", "algebra", _words("form", "reactions", "recursion"), flat, **plane)
-    add("split", "model", _words("split", "independent", "continuous"), flat, **plane)
-    both = flat or ("" if finest.second_plane else "the program is of one plane already")
-    add("second_plane", "model", {"off": plane, "on": {}}, both)
-    bends = "" if finest.rings == "arch2" else reasons["rings"]
-    add("rings", "model", _words("rings", "mat", "arch", "arch2"), bends)
-    sliding = "friction needs coupling 'series'" if finest.friction else ""
+    flat, plan = one_plane(full), full.scene.plan
+    add("form", "algebra", _words("form", "reactions", "recursion"), flat, second_plane="off")
+    add("split", "model", _words("split", "independent", "continuous"), flat, second_plane="off")
+    sliding = "friction needs coupling 'series'" if plan.friction else ""
     add("coupling", "model", _words("coupling", "total", "series"), sliding)
-    for name in ("shear", "axial", "end_motion", "friction"):
-        why = "" if getattr(finest, name) else reasons[name]
-        add(name, "model", {"off": {name: False}, "on": {name: True}}, why)
-    two = "" if finest.local == "two-material" else reasons["two_material"]
-    add("local", "model", _words("local", "uniform", "two-material"), two)
-    _surface(full, add, reasons)
+    reasons = {effect.name: effect.reason for effect in plan.effects}
+    if plan.second_plane:
+        reasons["second_plane"] = flat
+    else:
+        reasons["second_plane"] = flat or "the program is of one plane already"
+    for effect in EFFECTS.values():
+        if effect.rungs:
+            why = "" if _at_its_finest(effect, full) else reasons[effect.name]
+            add(effect.ladder, effect.ladder_kind, _rungs(effect, full), why, effect.name)
     _truncations(full, add)
     out["tolerance"] = "nothing stops at a tolerance: closed forms, and fixed numbers of steps"
     return found, out
 
 
+def _at_its_finest(effect: Effect, full: Full) -> bool:
+    """Whether the ladder of an effect is climbed: a truncation wherever it is on."""
+    plan = full.scene.plan
+    if effect.name == "second_plane" and one_plane(full):
+        return False
+    if effect.ladder_kind == "truncation":
+        return plan.has(effect.name)
+    return plan.level(effect.name) == effect.rungs[-1]
+
+
+def _rungs(effect: Effect, full: Full) -> dict[str, dict[str, Any]]:
+    """Levels up to that of the full program, by the name that they have on the ladder."""
+    level = full.scene.plan.level(effect.name)
+    top = effect.rungs.index(level) if level in effect.rungs else -1
+    return {effect.words.get(v, v): {effect.name: v} for v in effect.rungs[: top + 1]}
+
+
 def _words(name: str, *levels: str) -> dict[str, dict[str, Any]]:
     return {level: {name: level} for level in levels}
-
-
-def _surface(full: Full, add, reasons: dict[str, str]) -> None:
-    method, dent = full.levels.surface, full.levels.dent
-    why = "" if method == "hermite" else reasons["surface"]
-    add("interpolation", "model", _words("surface", "linear", "phong", "hermite"), why)
-    counts = [n for n in (0, 8, 16, 32) if n <= dent]
-    why = "" if dent else reasons["dent"]
-    add("dent", "truncation", {str(n): {"dent": n} for n in counts}, why)
 
 
 def _truncations(full: Full, add) -> None:
@@ -96,10 +103,10 @@ def _truncations(full: Full, add) -> None:
     steps = {str(n): {"steps": n} for n in (*STEPS, FINE.warm_steps)}
     add("iterations", "truncation", steps, contact)
     mesh = "" if full.made is not None else "the mesh is read from a file, or there is none"
-    if not mesh and full.levels.surface is None and contact:
+    if not mesh and full.scene.plan.surface is None and contact:
         mesh = "no surface and no contact"
     add("mesh", "truncation", {f"{v:g}": {"mesh": v} for v in MESH}, mesh)
     count = full.levels.kept
     kept = {str(n): {"kept": n} for n in (*(n for n in KEPT if n < count), count)}
     add("rings_kept", "truncation", kept, "" if count > 1 else "there is one ring")
-    add("dtype", "truncation", _words("dtype", "float32", "float64"))
+    add("dtype", "truncation", _words("dtype", "float32", "float64"), effect="precision")

@@ -1,11 +1,11 @@
 """The accuracy choices of a scene as one record, and the program that a record stands for.
 
-`Levels` holds one level of every choice. A rung of a ladder is a `Levels` with few fields replaced,
-so that rungs of several ladders combine.
+`Levels` holds one level of every choice: those of the effects in its plan, the others beside it. A
+rung of a ladder is a `Levels` with a few of them changed, so that rungs of several ladders combine.
 """
 
 import dataclasses
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,29 +13,24 @@ import numpy as np
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea.contact.search import FINE
-from jaxtrachea.mechanics.beam import Form, Split
-from jaxtrachea.mechanics.skeleton import Rings
-from jaxtrachea.scene.build import Staged, wishes_of
-from jaxtrachea.scene.plan import Effect, Facts, Plan, PlanError, Wishes
+from jaxtrachea.scene.assemble import with_geometry, with_mesh
+from jaxtrachea.scene.build import Staged, effects_of
+from jaxtrachea.scene.declare import PlanError, SceneFacts
+from jaxtrachea.scene.effects import EFFECTS, EffectOptions, given_values, goes_with
+from jaxtrachea.scene.facts import facts_of
+from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import SceneSpec
-from jaxtrachea.scene.stage import (
-    Poses,
-    Presses,
-    Scene,
-    facts_of,
-    touch_tube,
-    with_geometry,
-    with_mesh,
-)
-from jaxtrachea.surface.regions import Method
+from jaxtrachea.scene.stage import Poses, Presses, Scene, touch_tube
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.tube import make_tube
 
 #: What a program on a ladder leaves out knowingly: its errors are what is measured.
-EVERY = frozenset({"seat", "friction", "rings", "axial", "shear", "two_material", "end_motion"})
+EVERY = frozenset(EFFECTS)
+#: Choices of the model that a ladder climbs and no effect is.
+MODEL = ("form", "split", "coupling")
 #: A scene that climbs every ladder but friction's: a ball on the trachea of Table 1.
 BUILT_IN = {
     "material": {
@@ -55,19 +50,7 @@ class Levels:
     """One level of every choice; hashable.
 
     Attributes:
-        form: of the beam, see `Options`; read in one plane only, like `split`.
-        split: -
-        coupling: see `Options`, like `shear` and `local`.
-        shear: -
-        local: -
-        second_plane: see `Wishes`, like all down to `dent`; without it rings are `mat` and nothing
-            moves along the tube.
-        rings: -
-        axial: -
-        end_motion: -
-        friction: -
-        surface: -
-        dent: number of centres, 0: off.
+        plan: levels of the effects, and the model.
         sharpness: of the contact, see `contact.search.Settings`.
         steps: Newton steps of the contact (`warm_steps`).
         mesh: vertices round and along the tube, against those of the scene.
@@ -75,18 +58,7 @@ class Levels:
         dtype: -
     """
 
-    form: Form = "recursion"
-    split: Split = "continuous"
-    coupling: Literal["series", "total"] = "series"
-    shear: bool = False
-    local: Literal["uniform", "two-material"] = "uniform"
-    second_plane: bool = False
-    rings: Rings = "mat"
-    axial: bool = False
-    end_motion: bool = False
-    friction: bool = False
-    surface: Method | None = None
-    dent: int = 0
+    plan: Plan
     sharpness: float = FINE.sharpness
     steps: int = FINE.warm_steps
     mesh: float = 1.0
@@ -99,7 +71,16 @@ class Levels:
         Raises:
             ValueError: naming the field, what was found and what is expected.
         """
-        check_record(self, dent=0.0, sharpness=0.0, steps=1.0, mesh=0.0, kept=1.0)
+        check_record(self, sharpness=0.0, steps=1.0, mesh=0.0, kept=1.0)
+
+    def changed(self, **levels: Any) -> "Levels":
+        """With these levels: of effects, of the model (`MODEL`), or of the other fields."""
+        effects = {name: level for name, level in levels.items() if name in EFFECTS}
+        model = {name: level for name, level in levels.items() if name in MODEL}
+        others = {k: v for k, v in levels.items() if k not in effects | model}
+        options = dataclasses.replace(self.plan.options, **model)
+        plan = dataclasses.replace(self.plan, options=options).at(**effects)
+        return dataclasses.replace(self, plan=plan, **others)
 
 
 class Full(NamedTuple):
@@ -111,7 +92,7 @@ class Full(NamedTuple):
         path: -
         levels: what that plan and the finest of all else are.
         facts: of the scene.
-        wishes: of the user, what was `auto` at its finest.
+        options: of the user, what was `auto` at its finest.
         given: of the user.
         made: vertices round and along the mesh; None: not made, or none.
         load: s of the contacts, mm.
@@ -121,9 +102,9 @@ class Full(NamedTuple):
     material: Material
     path: Poses | Presses
     levels: Levels
-    facts: Facts
-    wishes: Wishes
-    given: Wishes
+    facts: SceneFacts
+    options: EffectOptions
+    given: EffectOptions
     made: tuple[int, int, float] | None
     load: np.ndarray
 
@@ -143,59 +124,39 @@ def full_scene(spec: SceneSpec, staged: Staged, *, coupling: str | None = None) 
         PlanError: a wish that cannot be met.
     """
     scene, material, path = staged.scene, staged.material, staged.path
-    facts, given = facts_of(scene, material, path), wishes_of(spec)
-    wishes = _finest(given, scene, material, path)
+    facts, given = facts_of(scene, material, path), effects_of(spec)
+    options, finest = _finest(given, scene, material, path)
     if coupling is not None:
-        wishes = dataclasses.replace(wishes, coupling=coupling)
-    plan = _in_words(make_plan(facts, wishes), given)
+        options = dataclasses.replace(options, coupling=coupling)
+    plan = make_plan(facts, options, finest=finest)
     scene = dataclasses.replace(scene, plan=plan, quality=FINE)
     made = None
     if spec.trachea.file is None and scene.mesh is not None:
         made = spec.trachea.around, spec.trachea.along, spec.trachea.wall
-    load = _load(scene, path)
     return Full(
-        scene, material, path, levels_of(scene.plan, scene), facts, wishes, given, made, load
-    )
-
-
-def _finest(wishes: Wishes, scene: Scene, material: Material, path) -> Wishes:
-    """The user's wishes, with the finest level instead of `auto` where the rules stop short."""
-    bends = material.EI_C is not None and material.k_t is not None
-    if wishes.rings == "auto" and bends and wishes.second_plane != "off":
-        wishes = dataclasses.replace(wishes, rings="arch2")
-    if wishes.dent == "auto" and scene.plan.dent and isinstance(path, Poses):
-        wishes = dataclasses.replace(wishes, dent="32")
-    return wishes
-
-
-def _in_words(plan: Plan, given: Wishes) -> Plan:
-    """The plan with reasons that do not call a wish what is one of `_finest` only."""
-
-    def said(effect: Effect) -> Effect:
-        mine = effect.name in ("rings", "dent") and getattr(given, effect.name) == "auto"
-        if mine and effect.forced:
-            return Effect(effect.name, effect.level, "the finest level")
-        if effect.reason == "rings 'arch2' were asked for" and given.rings == "auto":
-            return Effect(effect.name, effect.level, "arches need vectors")
-        return effect
-
-    return dataclasses.replace(plan, effects=tuple(map(said, plan.effects)))
-
-
-def levels_of(plan: Plan, scene: Scene) -> Levels:
-    """The levels that a plan stands for, with all rings, the scene's mesh and float64."""
-    o = plan.options
-    return Levels(
-        o.form, o.split, o.coupling, o.shear, o.local, plan.second_plane, plan.rings, plan.axial,
-        plan.end_motion, plan.friction, plan.surface, plan.dent, scene.quality.sharpness,
-        scene.quality.warm_steps, kept=scene.geometry.rings,
+        scene=scene, material=material, path=path,
+        levels=Levels(plan, kept=scene.geometry.rings), facts=facts, options=options, given=given,
+        made=made, load=_load(scene, path),
     )  # fmt: skip
+
+
+def _finest(
+    given: EffectOptions, scene: Scene, material: Material, path: Poses | Presses
+) -> tuple[EffectOptions, frozenset[str]]:
+    """The user's options, the finest level in place of `auto` where rules stop short; its names."""
+    finest = {}
+    bends = EFFECTS["rings"].given(given_values(material))
+    if given.rings == "auto" and bends and given.second_plane != "off":
+        finest["rings"] = EFFECTS["rings"].rungs[-1]
+    if given.dent == "auto" and scene.plan.dent and isinstance(path, Poses):
+        finest["dent"] = EFFECTS["dent"].rungs[-1]
+    return dataclasses.replace(given, **finest), frozenset(finest)
 
 
 def program(full: Full, levels: Levels) -> tuple[Scene, Material, Poses | Presses]:
     """Scene, material and path whose `simulate` is the program of these levels."""
     scene, rings = full.scene, full.levels.kept
-    plan = plan_of(full.scene.plan, levels)
+    plan = dataclasses.replace(levels.plan, ignored=EVERY)
     if plan.options.transition is None and levels.kept < rings:
         wide = dataclasses.replace(plan.options, transition=_half_gap(scene.geometry))
         plan = dataclasses.replace(plan, options=wide)
@@ -213,22 +174,6 @@ def program(full: Full, levels: Levels) -> tuple[Scene, Material, Poses | Presse
     return made if levels.dtype == "float64" else cast(made, levels.dtype)
 
 
-def plan_of(plan: Plan, levels: Levels) -> Plan:
-    """The plan with these levels; decisions in words stay those of `plan`."""
-    flat = not levels.second_plane
-    options = dataclasses.replace(
-        plan.options, form=levels.form, split=levels.split, coupling=levels.coupling,
-        shear=levels.shear, local=levels.local,
-    )  # fmt: skip
-    return dataclasses.replace(
-        plan, second_plane=levels.second_plane, rings="mat" if flat else levels.rings,
-        axial=levels.axial and not flat, friction=levels.friction and not flat,
-        end_motion=levels.end_motion and levels.axial and not flat and levels.surface is not None,
-        surface=levels.surface, dent=levels.dent if levels.surface else 0, options=options,
-        ignored=EVERY,
-    )  # fmt: skip
-
-
 def kept_rings(full: Full, count: int) -> np.ndarray:
     """The `count` rings nearest to the loads, in order."""
     x = np.asarray(full.scene.geometry.ring_positions)
@@ -238,11 +183,11 @@ def kept_rings(full: Full, count: int) -> np.ndarray:
 
 def one_plane(full: Full) -> str:
     """Why the path does not fit in one plane; empty if it does."""
-    flat = {"rings": "mat", "axial": "off", "end_motion": "off", "friction": "off"}
+    flat = {name: EFFECTS[name].least for name in ("second_plane", *goes_with("second_plane"))}
     try:
-        make_plan(full.facts, dataclasses.replace(full.wishes, second_plane="off", **flat))
+        make_plan(full.facts, dataclasses.replace(full.options, **flat))
     except PlanError as error:
-        return str(error).removeprefix("second_plane: 'off', but ").split(";")[0]
+        return error.why
     return ""
 
 

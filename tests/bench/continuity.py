@@ -20,20 +20,22 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 from small_scenes import MATERIAL, TUBE  # noqa: E402
 
-from jaxtrachea import Poses, Presses, Wishes, make_scene, simulate  # noqa: E402
+from jaxtrachea import EffectOptions, Poses, Presses, make_scene, simulate  # noqa: E402
 from jaxtrachea.contact.shapes import sphere  # noqa: E402
 from jaxtrachea.trachea.tube import make_tube  # noqa: E402
 
 #: No press is stiffer than its local law at this depth: k_1 + 3 k_3 d^2, N/mm.
 DEPTH = 2.0
 STIFFNESS = 0.3 + 3 * 0.02 * DEPTH**2
-BARE = Wishes(want_surface=False, want_joints=False, want_ring_ends=False, seat="each")
+BARE = EffectOptions(
+    want_surface=False, want_joints=False, want_ring_ends=False, contact_point="per_step"
+)
 run = jax.jit(simulate)
 
 
 def force(path, rings="auto", **how):
     """Contact force of every row, N; all rows are solved."""
-    scene = make_scene(TUBE, MATERIAL, path, wishes=dataclasses.replace(BARE, rings=rings), **how)
+    scene = make_scene(TUBE, MATERIAL, path, effects=dataclasses.replace(BARE, rings=rings), **how)
     out = run(scene, MATERIAL, path)
     assert (np.asarray(out.status) == 0).all()
     return np.asarray(out.force)

@@ -20,9 +20,9 @@ from jaxtrachea.contact.patches import straight_patches, touch
 from jaxtrachea.contact.pose import Pose
 from jaxtrachea.contact.shapes import sphere
 from jaxtrachea.mechanics.beam import contact_compliance
-from jaxtrachea.scene.plan import Wishes
-from jaxtrachea.scene.simulation import sweep
+from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.stage import Poses
+from jaxtrachea.scene.sweep import sweep
 from jaxtrachea.trachea.tube import make_tube
 
 jax.config.update("jax_cpu_enable_async_dispatch", False)
@@ -30,7 +30,7 @@ jax.config.update("jax_cpu_enable_async_dispatch", False)
 LANES, FEW = 256, 32
 #: Seconds of one call above which a case of many lanes is left out.
 LONGEST = 5.0
-BARE = Wishes(want_surface=False, want_joints=False, want_ring_ends=False)
+BARE = EffectOptions(want_surface=False, want_joints=False, want_ring_ends=False)
 MATERIAL = Material(**{k: jnp.asarray(v) for k, v in update.VALUES.items()})
 
 
@@ -87,7 +87,7 @@ def positions(out: common.Writer) -> None:
     """Contact positions of one sweep over the tube: the whole press, and its compliance alone."""
     geometry = table_1()
     start = Presses(jnp.array([75.0]), jnp.zeros(1), jnp.array([[0.0, -2.0, 0.0]]))
-    scene = make_scene(geometry, MATERIAL, start, wishes=BARE)
+    scene = make_scene(geometry, MATERIAL, start, effects=BARE)
     run = lambda s, depth: sweep(scene, MATERIAL, s, 0 * s, depth)  # noqa: E731
     for m in (1, 10, 100, 1000, 10_000, 100_000):
         s = jnp.linspace(5.0, 155.0, m)
@@ -111,7 +111,7 @@ def patches(out: common.Writer) -> None:
 def ball_scene():
     """The ball on a round tube, forces alone."""
     ball = sphere(jnp.asarray(update.RADIUS))
-    scene = make_scene(table_1(), MATERIAL, update.at(float), tool=ball, wishes=BARE)
+    scene = make_scene(table_1(), MATERIAL, update.at(float), tool=ball, effects=BARE)
     return dataclasses.replace(scene, tube=update.round_tube(float), near=2)
 
 
@@ -128,7 +128,7 @@ def path(out: common.Writer) -> None:
 
 def vertices(out: common.Writer) -> None:
     """Vertices of the surface under a given press: skeleton, global shape, dent of 16 centres."""
-    wishes = dataclasses.replace(BARE, want_surface=True, dent="8")
+    effects = dataclasses.replace(BARE, want_surface=True, dent="8")
     for count in (1_000, 10_000, 100_000, 1_000_000):
         around = round((count / 2.77) ** 0.5)
         for dtype in ("float32", "float64"):
@@ -137,7 +137,7 @@ def vertices(out: common.Writer) -> None:
             material = jax.tree.map(lambda v: v.astype(dtype), MATERIAL)  # noqa: B023
             number = lambda *v: jnp.asarray(v, dtype)  # noqa: B023, E731
             given = Presses(number(update.S), number(0.0), number(0.0, -2.0, 0.0)[None])
-            scene = make_scene(geometry, material, given, mesh=mesh, wishes=wishes)
+            scene = make_scene(geometry, material, given, mesh=mesh, effects=effects)
             # The plan refuses 16 centres without a tool to shape the dent; the work is the same.
             scene = dataclasses.replace(scene, plan=dataclasses.replace(scene.plan, dent=16))
             run = lambda scene, m, p: simulate(scene, m, p).vertices  # noqa: E731

@@ -29,7 +29,7 @@ from jaxtrachea.status import PressStatus
 
 POSES, LOOPS = 5000, 40
 WISHES = dataclasses.replace(
-    BARE, seat="first", rings="arch2", axial="on", second_plane="on", want_joints=False,
+    BARE, contact_point="fixed", rings="arch2", axial="on", second_plane="on", want_joints=False,
     want_ring_ends=False,
 )  # fmt: skip
 K_1, K_3 = float(MATERIAL.k_1), float(MATERIAL.k_3)
@@ -37,7 +37,7 @@ K_1, K_3 = float(MATERIAL.k_1), float(MATERIAL.k_3)
 
 def session() -> Session:
     start = ball([75, 1, 0], [76, -2, 1])
-    return Session(make_scene(TUBE, MATERIAL, start, tool=BALL, wishes=WISHES), MATERIAL)
+    return Session(make_scene(TUBE, MATERIAL, start, tool=BALL, effects=WISHES), MATERIAL)
 
 
 def follow(steps: Session, rotation, translation):
@@ -111,13 +111,13 @@ def run_loops(name: str) -> None:
 
 def run_scan(name: str) -> None:
     """A press of 2 mm straight in, its program made for it alone."""
-    wishes = dataclasses.replace(BARE, want_joints=False, want_ring_ends=False)
+    effects = dataclasses.replace(BARE, want_joints=False, want_ring_ends=False)
     run = jax.jit(simulate)
 
     def press(s, phi):
         D = [[0, -2 * np.cos(phi), -2 * np.sin(phi)]]
         path = Presses(jnp.asarray([s]), jnp.asarray([phi]), jnp.asarray(D))
-        scene = make_scene(TUBE, MATERIAL, path, wishes=wishes)
+        scene = make_scene(TUBE, MATERIAL, path, effects=effects)
         return np.array(run(scene, MATERIAL, path).force[0])
 
     degrees, s = np.arange(-200, 201) / 100, np.arange(60, 90.001, 0.05)

@@ -25,14 +25,14 @@ def work(kind: str) -> None:
     import numpy as np
     from small_scenes import BALL, BARE, MATERIAL, OUTER, TUBE, ball
 
-    from jaxtrachea import Session, Wishes, make_scene
+    from jaxtrachea import EffectOptions, Session, make_scene
     from jaxtrachea.trachea.tube import make_tube
 
-    how = {"seat": "first", "rings": "arch2", "axial": "on", "second_plane": "on"}
-    wishes = Wishes(**{**vars(BARE), **how, "want_surface": kind == "surface"})
+    how = {"contact_point": "fixed", "rings": "arch2", "axial": "on", "second_plane": "on"}
+    effects = EffectOptions(**{**vars(BARE), **how, "want_surface": kind == "surface"})
     mesh = make_tube(TUBE, around=36, along=160) if kind == "surface" else None
     start = ball([75, 1, 0], [76, -2, 1])
-    scene = make_scene(TUBE, MATERIAL, start, tool=BALL, mesh=mesh, wishes=wishes)
+    scene = make_scene(TUBE, MATERIAL, start, tool=BALL, mesh=mesh, effects=effects)
     session, empty, zero = Session(scene, MATERIAL), jax.jit(jnp.negative), jnp.zeros(())
     turn, angle = np.eye(3), np.linspace(0, 2 * np.pi, BLOCK)
     down = np.maximum(0, 1.5 - 2 * np.cos(angle))

@@ -24,7 +24,7 @@ from jaxtrachea import Material, make_scene, press, simulate, table_1
 from jaxtrachea.contact.patches import straight_patches, touch
 from jaxtrachea.contact.pose import Pose
 from jaxtrachea.contact.shapes import box, sphere
-from jaxtrachea.scene.plan import Wishes
+from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.stage import Poses
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.tube import make_tube
@@ -78,7 +78,7 @@ def scenes(dtype):
     geometry = table_1(dtype)
     mesh = make_tube(geometry)
     material = Material(**{k: jnp.asarray(v, dtype) for k, v in VALUES.items()})
-    bare = Wishes(want_surface=False, want_joints=False, want_ring_ends=False)
+    bare = EffectOptions(want_surface=False, want_joints=False, want_ring_ends=False)
     shown = dataclasses.replace(bare, want_surface=True)
     cases = {
         "contact, skeleton": bare,
@@ -87,9 +87,9 @@ def scenes(dtype):
         "whole, dent of 16": dataclasses.replace(shown, dent="16"),
     }
     made = {}
-    for name, wishes in cases.items():
+    for name, effects in cases.items():
         ball = sphere(jnp.asarray(RADIUS, dtype))
-        scene = make_scene(geometry, material, at(dtype), tool=ball, mesh=mesh, wishes=wishes)
+        scene = make_scene(geometry, material, at(dtype), tool=ball, mesh=mesh, effects=effects)
         made[f"{name}; patches of the mesh"] = scene
         made[f"{name}; round tube"] = dataclasses.replace(scene, tube=round_tube(dtype), near=2)
     return made, material

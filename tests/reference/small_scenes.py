@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrachea import Material, Poses, Presses, Wishes, table_1
+from jaxtrachea import EffectOptions, Material, Poses, Presses, table_1
 from jaxtrachea.contact.shapes import sphere
 from jaxtrachea.trachea.tube import make_tube
 
@@ -16,7 +16,7 @@ MATERIAL = Material(EI_L=1.86, EA_L=3.9, EI_C=13.0, k_M=0.1, k_t=0.4, k_1=0.3, k
 SPRINGS = dataclasses.replace(MATERIAL, EI_C=None, k_t=None)
 MESH = make_tube(TUBE, around=9, along=40)
 BALL = sphere(5.0)
-BARE = Wishes(want_surface=False)
+BARE = EffectOptions(want_surface=False)
 
 
 def presses(D, s=75.0, phi=0.0, rows=3):

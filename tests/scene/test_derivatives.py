@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_scenes import BALL, MATERIAL, TUBE, ball
 
-from jaxtrachea import Poses, Presses, Wishes, make_scene, simulate, with_geometry
+from jaxtrachea import EffectOptions, Poses, Presses, make_scene, simulate, with_geometry
 from jaxtrachea.trachea.tube import make_tube
 
 COARSE = make_tube(TUBE, around=5, along=11)  # no row on a ring, where the ends have a kink
@@ -64,7 +64,13 @@ def test_of_the_tools_pose_the_material_and_the_geometry():
     """Friction, axial motion, a dent shaped by the tool; in contact from the second row on."""
     path = ball([74, 0.4, 0.5], [76, -2.0, 1.0], 3)
     scene = make_scene(
-        TUBE, MATERIAL, path, tool=BALL, friction=0.66, mesh=COARSE, wishes=Wishes(rings="mat")
+        TUBE,
+        MATERIAL,
+        path,
+        tool=BALL,
+        friction=0.66,
+        mesh=COARSE,
+        effects=EffectOptions(rings="mat"),
     )
     plan = scene.plan
     assert (plan.friction, plan.axial, plan.dent) == (True, True, 16)
@@ -90,8 +96,8 @@ def test_at_first_touch_on_a_ring_at_rest_and_before():
     depth = np.array([3.0, 5e-4, 0.0, -0.5])
     inward = np.array([0.2, -np.cos(0.3), -np.sin(0.3)])
     path = Presses(np.full(4, 60.0), np.full(4, 0.3), depth[:, None] * inward)
-    wishes = Wishes(second_plane="on", axial="on", rings="arch2")
-    scene = make_scene(TUBE, MATERIAL, path, mesh=COARSE, wishes=wishes)
+    effects = EffectOptions(second_plane="on", axial="on", rings="arch2")
+    scene = make_scene(TUBE, MATERIAL, path, mesh=COARSE, effects=effects)
 
     def f(x):
         there, m = changed(scene, MATERIAL, x[:9])

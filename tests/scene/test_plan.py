@@ -5,15 +5,15 @@ import dataclasses
 import pytest
 from small_scenes import BALL, BARE, MATERIAL, MESH, TUBE, ball, presses
 
-from jaxtrachea import PlanError, Poses, Wishes, make_scene, simulate
-from jaxtrachea.scene.plan import Facts
+from jaxtrachea import EffectOptions, PlanError, Poses, make_scene, simulate
+from jaxtrachea.scene.declare import SceneFacts
 from jaxtrachea.scene.rules import make_plan
 
 ALL = frozenset({"EA_L", "EI_C", "k_t", "GA_L", "k_A", "k_B", "k_1_ring"})
 
 
 def levels(**facts):
-    return {e.name: e.level for e in make_plan(Facts(**facts)).effects}
+    return {e.name: e.level for e in make_plan(SceneFacts(**facts)).effects}
 
 
 @pytest.mark.parametrize(
@@ -21,8 +21,9 @@ def levels(**facts):
     [
         ({}, {"contact": "off", "second_plane": "off", "rings": "mat", "axial": "off",
               "friction": "off", "surface": "hermite", "dent": "8"}),
-        ({"poses": True}, {"contact": "on", "dent": "16", "seat": "first"}),
-        ({"poses": True, "slip": 30.0, "spacing": 10.0}, {"seat": "each", "friction": "off"}),
+        ({"poses": True}, {"contact": "on", "dent": "16", "contact_point": "fixed"}),
+        ({"poses": True, "slip": 30.0, "spacing": 10.0}, {"contact_point": "per_step",
+                                                          "friction": "off"}),
         ({"slip": 2.0, "along": 0.5}, {"second_plane": "on", "axial": "off", "friction": "off"}),
         ({"slip": 2.0, "along": 0.5, "known": ALL}, {"axial": "on", "end_motion": "on",
                                                      "rings": "arch2", "shear": "on",
@@ -32,7 +33,7 @@ def levels(**facts):
         ({"angle": 0.3, "known": ALL}, {"second_plane": "on", "rings": "arch2", "axial": "off"}),
         ({"angle": 0.3}, {"second_plane": "on", "rings": "mat"}),
         ({"near": False}, {"dent": "off"}),
-        ({"seats": True}, {"seat": "each"}),
+        ({"several_points": True}, {"contact_point": "per_step"}),
     ],
 )  # fmt: skip
 def test_rules(facts, expected):
@@ -41,7 +42,7 @@ def test_rules(facts, expected):
 
 
 def test_every_effect_has_a_reason_and_forcing_says_so():
-    plan = make_plan(Facts(known=ALL, slip=1.0, along=0.5), Wishes(axial="off"))
+    plan = make_plan(SceneFacts(known=ALL, slip=1.0, along=0.5), EffectOptions(axial="off"))
     assert all(e.reason for e in plan.effects)
     assert [e.name for e in plan.effects if e.forced] == ["axial"]
     assert not plan.axial
@@ -49,7 +50,7 @@ def test_every_effect_has_a_reason_and_forcing_says_so():
 
 
 @pytest.mark.parametrize(
-    ("facts", "wishes", "says"),
+    ("facts", "effects", "says"),
     [
         ({}, {"friction": "on"}, "friction: 'on', but the tool has no coefficient"),
         ({"friction": True}, {"friction": "on", "contact": "bonded"}, "unilateral"),
@@ -64,41 +65,41 @@ def test_every_effect_has_a_reason_and_forcing_says_so():
         ({}, {"want_surface": False, "surface": "linear"}, "output.surface is false"),
         ({}, {"want_surface": False, "dent": "8"}, "there is no surface"),
         ({}, {"dent": "16"}, "no tool to shape the dent"),
-        ({"seats": True}, {"seat": "first"}, "different contact points"),
+        ({"several_points": True}, {"contact_point": "fixed"}, "different contact points"),
     ],
 )
-def test_wishes_that_cannot_be_met_are_refused(facts, wishes, says):
+def test_wishes_that_cannot_be_met_are_refused(facts, effects, says):
     with pytest.raises(PlanError, match=says.replace("(", r"\(")):
-        make_plan(Facts(**facts), Wishes(**wishes))
+        make_plan(SceneFacts(**facts), EffectOptions(**effects))
 
 
 def test_a_moving_tool_needs_a_tool():
     with pytest.raises(PlanError, match="there is none"):
-        make_scene(TUBE, MATERIAL, ball([75, 1, 0], [75, -2, 0]), wishes=BARE)
+        make_scene(TUBE, MATERIAL, ball([75, 1, 0], [75, -2, 0]), effects=BARE)
 
 
 def test_the_wrong_kind_of_path_is_refused():
-    scene = make_scene(TUBE, MATERIAL, presses([0, -1, 0]), wishes=BARE)
+    scene = make_scene(TUBE, MATERIAL, presses([0, -1, 0]), effects=BARE)
     with pytest.raises(ValueError, match="expected Presses"):
         simulate(scene, MATERIAL, ball([75, 1, 0], [75, -2, 0]))
 
 
 def test_what_the_scene_holds_reaches_the_rules():
-    """Facts of a path of the tool: seats, direction, friction, what is known of the material."""
+    """Facts of a path of the tool: places, direction, friction, what the material gives."""
     path = ball([75, 1, 0.5], [77, -2, 1.0])
     scene = make_scene(TUBE, MATERIAL, path, tool=BALL, friction=0.66, mesh=MESH)
     level = {e.name: e.level for e in scene.plan.effects}
     assert level["friction"] == level["axial"] == level["second_plane"] == "on"
-    assert (level["rings"], level["dent"], level["seat"]) == ("arch2", "16", "first")
+    assert (level["rings"], level["dent"], level["contact_point"]) == ("arch2", "16", "fixed")
     assert level["shear"] == level["end_motion"] == "off"
-    far = make_scene(TUBE, MATERIAL, ball([40, -1, 0], [90, -1, 0]), tool=BALL, wishes=BARE)
-    assert far.plan.seat == "each"
+    far = make_scene(TUBE, MATERIAL, ball([40, -1, 0], [90, -1, 0]), tool=BALL, effects=BARE)
+    assert far.plan.contact_point == "per_step"
 
 
 def test_one_step_from_afar_to_a_slanting_press():
     """The way along the surface between two rows, from first touch on, counts for the plan too."""
     path = ball([70, 4, 0], [76, -2, 0], 2)
-    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, friction=0.66, wishes=BARE)
+    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, friction=0.66, effects=BARE)
     assert scene.plan.friction
     assert scene.plan.axial
     assert simulate(scene, MATERIAL, path).status.tolist() == [1, 0]
@@ -111,4 +112,4 @@ def test_misuse_is_named(rows, friction, says):
     path = ball([75, 1, 0], [75, -2, 0], 2)
     path = Poses(path.rotation[:rows], path.translation[:rows])
     with pytest.raises(ValueError, match=says):
-        make_scene(TUBE, MATERIAL, path, tool=BALL, friction=friction, wishes=BARE)
+        make_scene(TUBE, MATERIAL, path, tool=BALL, friction=friction, effects=BARE)

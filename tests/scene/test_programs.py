@@ -11,10 +11,10 @@ import pytest
 from small_scenes import BALL, DOWN, MATERIAL, MESH, OBLIQUE, OFF, TUBE, ball
 
 from jaxtrachea import (
+    EffectOptions,
     Options,
     Poses,
     Presses,
-    Wishes,
     make_scene,
     press_oblique,
     press_path,
@@ -25,9 +25,10 @@ from jaxtrachea.contact.pose import Pose
 from jaxtrachea.mechanics.press import ligament_beam, local_law, respond, unit_deflection
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import Approach
+from jaxtrachea.scene.lumen import in_lumen
 from jaxtrachea.scene.operations import count_operations
-from jaxtrachea.scene.ranges import contact_share, depth_share, in_lumen
-from jaxtrachea.scene.simulation import _refuse, _status, _without_negative
+from jaxtrachea.scene.ranges import contact_share, depth_share
+from jaxtrachea.scene.refusals import refuse, status_of, without_negative_values
 from jaxtrachea.scene.stage import touch_tube
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.mesh import place
@@ -51,12 +52,12 @@ def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **ho
 
 def admitted(scene, m, p, made=None):
     """Material and presses as computed, and how statuses are read: the same in all programs."""
-    m, bad = _without_negative(scene, m)
-    presses, used, inward, refused = _refuse(scene, m, p, made, bad)
+    m, bad = without_negative_values(scene, m)
+    presses, used, inward, refused = refuse(scene, m, p, made, bad)
 
     def status(out):
         share = depth_share(scene, out.depth, out.skeleton, inward)
-        return share, _status(out.status, share, made, refused)
+        return share, status_of(out.status, share, made, refused)
 
     return m, presses.displacement, used, status
 
@@ -140,7 +141,7 @@ SKIN = {"want_joints": False, "want_ring_ends": False}
 MANY = Presses([30.0, 75.0, 120.0], [0.1, 0.2, 0.3], np.full((3, 3), -1.0))
 LED = ball([20, -1, 1.0], [130, -1, 2.0])
 MAT = {"rings": "mat"}
-#: name -> (path, wishes, program by hand)
+#: name -> (path, effects, program by hand)
 PROGRAMS = {
     "normal": (DOWN, {**ONE, **MAT}, normal),
     "oblique": (OBLIQUE, {**BARE, **MAT}, by_hand(**MAT)),
@@ -159,11 +160,11 @@ PROGRAMS = {
 
 @functools.cache
 def program(name):
-    path, wishes, hand = PROGRAMS[name]
+    path, effects, hand = PROGRAMS[name]
     mu = 0.66 if name == "friction" else None
     scene = make_scene(
         TUBE, MATERIAL, path, tool=BALL if name == "tool" else None, friction=mu, mesh=MESH,
-        wishes=Wishes(**wishes),
+        effects=EffectOptions(**effects),
     )  # fmt: skip
     return scene, path, hand
 

@@ -27,13 +27,15 @@ from small_scenes import (
 from jaxtrachea import Poses, Presses, Session, make_scene, press_oblique, simulate, sweep
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.contact.shapes import sphere
+from jaxtrachea.scene.assemble import with_mesh
 from jaxtrachea.scene.build import dropped_effects
-from jaxtrachea.scene.plan import Facts, Served
-from jaxtrachea.scene.ranges import depth_share, lacking, off_the_end, unserved
+from jaxtrachea.scene.declare import SceneFacts
+from jaxtrachea.scene.lumen import off_the_end
+from jaxtrachea.scene.plan import Served
+from jaxtrachea.scene.ranges import depth_share, lacking, unserved
+from jaxtrachea.scene.refusals import status_of, without_negative_values
 from jaxtrachea.scene.rules import make_plan
-from jaxtrachea.scene.simulation import _status, _without_negative
 from jaxtrachea.scene.sizes import SizeError
-from jaxtrachea.scene.stage import with_mesh
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.tube import make_tube
 
@@ -57,13 +59,13 @@ LED = Presses([75.0] * 3, [0.5] * 3, [[0, -3, -1.0], [0.5, -3, -1], [4, -3, -1]]
 
 def test_a_plan_without_stretch_refuses_a_path_along_the_tube():
     """It gave 8 times the force with OK: the ligament cannot stretch in it."""
-    scene = make_scene(TUBE, SPRINGS, OFF, wishes=ONE)
+    scene = make_scene(TUBE, SPRINGS, OFF, effects=ONE)
     assert not scene.plan.axial
     out = run(scene, SPRINGS, LED)
     assert out.status.tolist() == [OK, OFF_PLAN, OFF_PLAN]
     assert np.isnan(out.force[1:]).all()
     # Left out because the user says so, or because the material has no EA_L: as it was.
-    wished = make_scene(TUBE, SPRINGS, OFF, wishes=dataclasses.replace(ONE, axial="off"))
+    wished = make_scene(TUBE, SPRINGS, OFF, effects=dataclasses.replace(ONE, axial="off"))
     stiff = dataclasses.replace(SPRINGS, EA_L=None)
     assert needing_more(scene, SPRINGS, LED) == [0, 1, 1]
     assert needing_more(wished, SPRINGS, LED) == needing_more(scene, stiff, LED) == [0, 0, 0]
@@ -71,10 +73,10 @@ def test_a_plan_without_stretch_refuses_a_path_along_the_tube():
 
 @pytest.mark.slow
 def test_what_the_user_left_out_is_solved_without_it():
-    wished = make_scene(TUBE, SPRINGS, OFF, wishes=dataclasses.replace(ONE, axial="off"))
+    wished = make_scene(TUBE, SPRINGS, OFF, effects=dataclasses.replace(ONE, axial="off"))
     assert run(wished, SPRINGS, LED).status[2] == OK
     stiff = dataclasses.replace(SPRINGS, EA_L=None)
-    made = make_scene(TUBE, SPRINGS, OFF, wishes=ONE)
+    made = make_scene(TUBE, SPRINGS, OFF, effects=ONE)
     assert run(made, stiff, LED).status.tolist() == [OK] * 3
 
 
@@ -84,7 +86,7 @@ ASIDE = Presses([75.0], [1.0], [[0, -2 * np.cos(1.0), -2 * np.sin(1.0)]])
 
 def test_what_a_material_gives_and_a_plan_lacks():
     """By name; and rows that need it, with one program of small ones."""
-    scene = make_scene(TUBE, SPRINGS, ASIDE, wishes=ONE)
+    scene = make_scene(TUBE, SPRINGS, ASIDE, effects=ONE)
     assert scene.plan.rings == "mat"
     more = dataclasses.replace(MATERIAL, GA_L=jnp.array(9.0), k_1_ring=jnp.array(0.6))
     assert lacking(scene, SPRINGS) == ["axial"]
@@ -112,11 +114,11 @@ def test_ends_that_move_and_a_dent_are_effects_too():
 
 
 def test_a_negative_friction_is_a_bad_material():
-    scene = make_scene(TUBE, SPRINGS, presses([-2, -4, 0]), friction=0.5, wishes=ONE)
+    scene = make_scene(TUBE, SPRINGS, presses([-2, -4, 0]), friction=0.5, effects=ONE)
     assert scene.plan.friction
     for mu, expected in ((0.5, False), (-0.1, True)):
         scene = dataclasses.replace(scene, friction=jnp.asarray(mu))
-        assert bool(_without_negative(scene, SPRINGS)[1]) == expected
+        assert bool(without_negative_values(scene, SPRINGS)[1]) == expected
 
 
 def test_another_mesh_says_whether_it_is_bent():
@@ -133,7 +135,7 @@ def test_another_mesh_says_whether_it_is_bent():
 @pytest.mark.parametrize(("material", "expected"), [(SPRINGS, OK), (MATERIAL, OFF_PLAN)])
 def test_a_plan_without_bending_rings_refuses_a_material_with_them(material, expected):
     """Rings as springs at 60 degrees were 83 % off, with OK, in sweeps too."""
-    scene = make_scene(TUBE, SPRINGS, ASIDE, wishes=ONE)
+    scene = make_scene(TUBE, SPRINGS, ASIDE, effects=ONE)
     assert run(scene, material, ASIDE).status.tolist() == [expected]
     out = sweep(scene, material, [75.0] * 3, [1.0] * 3, [2.0, 0.0, -1.0])
     assert out.status.tolist() == [expected, PressStatus.NO_CONTACT, PressStatus.NO_CONTACT]
@@ -145,7 +147,7 @@ def test_a_plan_without_bending_rings_refuses_a_material_with_them(material, exp
 def test_a_plan_of_the_midline_bends_its_rings_off_it():
     """Its rings were springs, and 83 % off at 60 degrees."""
     single = jax.jit(lambda D: press_oblique(TUBE, MATERIAL, 75.0, 1.0, D, axial=False).force)
-    made = make_scene(TUBE, MATERIAL, Presses([75.0], [0.0], [[0, -2.0, 0]]), wishes=ONE)
+    made = make_scene(TUBE, MATERIAL, Presses([75.0], [0.0], [[0, -2.0, 0]]), effects=ONE)
     right = single(ASIDE.displacement[0])
     np.testing.assert_allclose(run(made, MATERIAL, ASIDE).force[0], right, rtol=1e-12)
 
@@ -157,8 +159,8 @@ def test_a_plan_of_a_tolerance_serves_what_it_was_measured_for():
         [75.0, 75, 75, 75, 90], [0.0, 0.5, 0.0, 0.0, 0.0],
         [[0, -3.0, 0], [0, -2, -1], [1, -3, 0], [0, -4, 0], [0, -3, 0]],
     )  # fmt: skip
-    wishes = dataclasses.replace(ONE, rings="mat", axial="off")
-    scene = make_scene(TUBE, MATERIAL, path, wishes=wishes)
+    effects = dataclasses.replace(ONE, rings="mat", axial="off")
+    scene = make_scene(TUBE, MATERIAL, path, effects=effects)
     chosen = dataclasses.replace(scene, plan=dataclasses.replace(scene.plan, served=served))
     assert needing_more(scene, MATERIAL, path) == [0] * 5
     assert needing_more(chosen, MATERIAL, path) == [0, 1, 1, 1, 1]
@@ -180,7 +182,7 @@ def test_sizes_of_another_unit_are_refused_with_the_cause(change, says):
     tube, path = dataclasses.replace(TUBE, **own), ball([0.08, 1, 0], [0.08, -2, 0])
     tool = sphere(change.get("tool", 5.0))
     with pytest.raises(SizeError, match=says) as caught:
-        make_scene(tube, MATERIAL, path, tool=tool, wishes=BARE, radius=change.get("outer"))
+        make_scene(tube, MATERIAL, path, tool=tool, effects=BARE, radius=change.get("outer"))
     assert "unit" in str(caught.value)
 
 
@@ -191,7 +193,7 @@ def test_a_wall_thicker_than_the_radius_is_refused():
 
 def test_the_outside_is_that_of_the_mesh():
     """Of an imported mesh it was taken 1.3 mm too large."""
-    mesh, bare = make_tube(TUBE, around=36, along=160, wall=2.0), {"wishes": BARE}
+    mesh, bare = make_tube(TUBE, around=36, along=160, wall=2.0), {"effects": BARE}
     assert float(make_scene(TUBE, MATERIAL, OFF, mesh=mesh, **bare).radius) == pytest.approx(12.3)
     imported = dataclasses.replace(TUBE, radius=jnp.asarray(12.3))
     scene = make_scene(imported, MATERIAL, OFF, mesh=bend(mesh, 200.0), **bare)
@@ -222,7 +224,7 @@ def test_what_a_linear_ring_leaves_out():
 
 def test_presses_of_a_tool_that_need_friction_or_another_seat():
     """As the tool's way gives them: a tool with friction was stuck, and dragged its first place."""
-    plain = make_scene(TUBE, SPRINGS, DOWN, wishes=dataclasses.replace(VECTORS, axial="off"))
+    plain = make_scene(TUBE, SPRINGS, DOWN, effects=dataclasses.replace(VECTORS, axial="off"))
     plan = dataclasses.replace(plain.plan, contact=True)
     smooth = dataclasses.replace(plain, plan=plan)
     rough = dataclasses.replace(smooth, friction=jnp.asarray(0.66))
@@ -240,11 +242,11 @@ def test_friction_and_a_seat_that_the_plan_has_not_are_refused():
     down, led = ball([75, 1, 0], [75, -2, 0]), ball([75, 1, 0], [78, -2, 0])
     far = ball([75, -1, 0], [95, -1, 0])
     unstretched = dataclasses.replace(VECTORS, axial="off")
-    rough = make_scene(TUBE, SPRINGS, down, tool=BALL, friction=0.66, wishes=unstretched)
-    smooth = make_scene(TUBE, SPRINGS, led, tool=BALL, wishes=ONE)
+    rough = make_scene(TUBE, SPRINGS, down, tool=BALL, friction=0.66, effects=unstretched)
+    smooth = make_scene(TUBE, SPRINGS, led, tool=BALL, effects=ONE)
     assert run(rough, SPRINGS, down).status.tolist() == [1, OK, OK, OK]
     assert run(rough, SPRINGS, led).status.tolist() == [1, OFF_PLAN, OFF_PLAN, OFF_PLAN]
-    assert (smooth.plan.seat, smooth.plan.axial) == ("first", True)
+    assert (smooth.plan.contact_point, smooth.plan.axial) == ("fixed", True)
     assert run(smooth, SPRINGS, far).status.tolist() == [OK] + [OFF_PLAN] * 3
 
 
@@ -259,8 +261,8 @@ def test_rows_that_do_not_press_are_no_contact_wherever_they_are(material, press
     normal = np.array([[0, np.cos(v), np.sin(v)] for v in around])
     away = poses([75, 0, 0], [75, 0, 0], 3)
     start = poses([40, 12, 0], [100, 12, 0], 3)
-    scene = make_scene(TUBE, material, start, tool=sphere(1.0), wishes=ONE)
-    assert (scene.plan.seat, scene.plan.second_plane) == ("each", material is MATERIAL)
+    scene = make_scene(TUBE, material, start, tool=sphere(1.0), effects=ONE)
+    assert (scene.plan.contact_point, scene.plan.second_plane) == ("per_step", material is MATERIAL)
     for height, expected in ((14.0, [1, 1, 1]), (12.0, pressed)):
         path = dataclasses.replace(away, translation=jnp.asarray(height * normal + [75, 0, 0]))
         out = run(scene, material, path)
@@ -276,12 +278,12 @@ def test_force_is_continuous_across_the_midline():
     """
     steps = np.radians(np.linspace(-2, 2, 401))
     hair = [5e-5, 9.9e-5, 1.01e-4, 1e-3]
-    plans = [make_scene(TUBE, MATERIAL, normal([v]), wishes=ONE).plan for v in (0.0, *hair)]
+    plans = [make_scene(TUBE, MATERIAL, normal([v]), effects=ONE).plan for v in (0.0, *hair)]
     assert all(plan == plans[0] for plan in plans)
     assert plans[0].rings == "arch2"
-    wishes = dataclasses.replace(ONE, seat="each")
+    effects = dataclasses.replace(ONE, contact_point="per_step")
     path = normal([*steps, *hair])
-    scene = make_scene(TUBE, MATERIAL, path, wishes=wishes)
+    scene = make_scene(TUBE, MATERIAL, path, effects=effects)
     out = run(scene, MATERIAL, path)
     force, middle = np.asarray(out.force), 200
     assert (np.asarray(out.status) == OK).all()
@@ -307,12 +309,12 @@ ROWS = 18
 def through():
     """A ball driven 50 mm through the tube: scene, path, result."""
     path = ball([75, 1, 0], [75, -50, 0], ROWS)
-    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, wishes=ONE)
-    assert scene.plan.seat == "first"
+    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=ONE)
+    assert scene.plan.contact_point == "fixed"
     return scene, path, run(scene, SPRINGS, path)
 
 
-def too_deep(path, out, seat):
+def too_deep(path, out, contact_point):
     """What is asserted of the ball driven through."""
     depth = np.maximum(-(np.asarray(path.translation)[:, 1] - 5 - 12.6), 0)
     deep = depth > 13.0
@@ -324,7 +326,7 @@ def too_deep(path, out, seat):
     # Contact: sure down to the axes of ball and tube, without a mesh (log(8) / beta: 0.1 mm).
     sure = np.asarray(out.contact_share)[shallow]
     np.testing.assert_allclose(sure, depth[shallow] / 17.6, atol=0.1 / 17.6)
-    if seat == "first":
+    if contact_point == "fixed":
         assert out.status[-1] == PressStatus.TOO_DEEP
         np.testing.assert_allclose(share[-1], 50 / 12.6, atol=0.02)
 
@@ -341,7 +343,7 @@ def test_only_motion_inwards_counts_as_depth(through):
     skeleton = np.stack([-5 * inward, 0.5 * inward + [4, 0, 0], 3.5 * inward, 4 * inward])
     share = depth_share(through[0], depth, skeleton, np.tile(inward, (4, 1)))
     np.testing.assert_allclose(share, [0, 2 / 12.6, 12.5 / 12.6, 13 / 12.6], rtol=1e-12)
-    status = _status(jnp.zeros(4, jnp.int8), share, None, {})
+    status = status_of(jnp.zeros(4, jnp.int8), share, None, {})
     assert status.tolist() == [OK, OK, OK, PressStatus.TOO_DEEP]
 
 
@@ -361,8 +363,8 @@ def test_the_face_that_closes_a_tube_is_as_thick_as_the_tube_is_large(through):
 def test_a_tool_drawn_outwards_is_not_too_deep():
     """Glued and drawn 20 mm: solved; pressed as far: too deep."""
     out = presses([0, 20.0, 0])
-    wishes = dataclasses.replace(ONE, contact="bonded", second_plane="on")
-    scene = make_scene(TUBE, SPRINGS, out, wishes=wishes)
+    effects = dataclasses.replace(ONE, contact="bonded", second_plane="on")
+    scene = make_scene(TUBE, SPRINGS, out, effects=effects)
     for sign, expected in ((1, OK), (-1, PressStatus.TOO_DEEP)):
         path = dataclasses.replace(out, displacement=sign * jnp.asarray(out.displacement))
         found = run(scene, SPRINGS, path)
@@ -375,8 +377,8 @@ def test_a_tool_drawn_outwards_is_not_too_deep():
 @pytest.mark.slow
 def test_presses_of_their_own_through_the_tube_are_beyond_their_range(through):
     path = through[1]
-    wishes = dataclasses.replace(ONE, seat="each")
-    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, wishes=wishes)
+    effects = dataclasses.replace(ONE, contact_point="per_step")
+    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=effects)
     too_deep(path, run(scene, SPRINGS, path), "each")
 
 
@@ -425,10 +427,10 @@ def test_a_lost_pose_leaves_the_others_as_they_are(through):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seat", ["first", "each"])
-def test_steps_keep_their_side_of_the_wall(seat):
-    wishes = dataclasses.replace(ONE, seat=seat)
-    scene = make_scene(TUBE, SPRINGS, upright(19, 16), tool=BALL, wishes=wishes)
+@pytest.mark.parametrize("contact_point", ["fixed", "per_step"])
+def test_steps_keep_their_side_of_the_wall(contact_point):
+    effects = dataclasses.replace(ONE, contact_point=contact_point)
+    scene = make_scene(TUBE, SPRINGS, upright(19, 16), tool=BALL, effects=effects)
     session = Session(scene, SPRINGS)
     for heights, expected in WAYS.values():
         session.reset()
@@ -457,7 +459,7 @@ def test_a_tool_in_the_lumen_of_a_mesh_has_no_force(radius):
 
     to = lambda a, b: np.linspace(a, b, ROWS)  # noqa: E731
     down = led(to(75, 75), to(18.6, 15.0))
-    scene = make_scene(TUBE, SPRINGS, down, tool=BALL, mesh=mesh, wishes=ONE)
+    scene = make_scene(TUBE, SPRINGS, down, tool=BALL, mesh=mesh, effects=ONE)
     assert scene.plan.curved == (radius is not None)
     pressed = run(scene, SPRINGS, down).status.tolist()
     assert pressed == [PressStatus.NO_CONTACT] * pressed.count(1) + [OK] * pressed.count(OK)
@@ -486,7 +488,7 @@ def test_a_tool_behind_the_ends_of_the_rings_touches_or_does_not(through):
 @pytest.mark.slow
 def test_steps_of_a_session_are_refused_alike():
     """In the lumen, out of it, a press, and a jump along the tube: it keeps no old place."""
-    scene = make_scene(TUBE, SPRINGS, ball([75, 1, 0], [75, -2, 0]), tool=BALL, wishes=ONE)
+    scene = make_scene(TUBE, SPRINGS, ball([75, 1, 0], [75, -2, 0]), tool=BALL, effects=ONE)
     session, found = Session(scene, SPRINGS), []
     for place in ([75, 0, 0], [75, 19, 0], [75, 16, 0], [95, 16, 0], [75, 19, 0], [75, -40, 0]):
         found.append(int(session.step(np.eye(3), place).status))
@@ -495,10 +497,10 @@ def test_steps_of_a_session_are_refused_alike():
 
 
 def test_friction_that_a_plan_drops_is_said():
-    facts = Facts(poses=True, slip=40.0, spacing=10.0, friction=True, mesh=False)
+    facts = SceneFacts(poses=True, slip=40.0, spacing=10.0, friction=True, mesh=False)
     plan = make_plan(facts, BARE)
-    assert (plan.seat, plan.friction) == ("each", False)
-    scene = make_scene(TUBE, SPRINGS, DOWN, wishes=ONE)
+    assert (plan.contact_point, plan.friction) == ("per_step", False)
+    scene = make_scene(TUBE, SPRINGS, DOWN, effects=ONE)
     scene = dataclasses.replace(scene, plan=plan, friction=jnp.asarray(0.5))
     assert [note.split(";")[0] for note in dropped_effects(scene)] == [
         "friction: off, the contact does not keep its place"

@@ -23,7 +23,7 @@ from small_scenes import (
 )
 from tool_ways import closed_loop, placed, random_way, step_lengths
 
-from jaxtrachea import Poses, Session, Wishes, make_scene, press, press_oblique, simulate
+from jaxtrachea import EffectOptions, Poses, Session, make_scene, press, press_oblique, simulate
 from jaxtrachea.mechanics.oblique import place_at
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.seat import given_way
@@ -33,7 +33,12 @@ EYE = np.eye(3)
 OK, NO_CONTACT, NON_FINITE = PressStatus.OK, PressStatus.NO_CONTACT, PressStatus.NON_FINITE
 #: Every effect of a press that holds its place, forces only.
 HELD = dataclasses.replace(
-    BARE, seat="first", axial="on", second_plane="on", want_joints=False, want_ring_ends=False
+    BARE,
+    contact_point="fixed",
+    axial="on",
+    second_plane="on",
+    want_joints=False,
+    want_ring_ends=False,
 )
 # Comes down slanting, presses, and goes on along the tube, still in contact: s, height, z.
 WAY = np.array([[72, 3, 0], [73, 1, 0], [74, -1, 0], [74.5, -3, 0], [75, -4, 0.2], [74, -2, 0]])
@@ -59,8 +64,8 @@ def rows(session, path):
 @pytest.mark.parametrize("radius", [None, 200.0])
 def test_steps_are_the_rows_of_one_simulation(radius):
     mesh, path = None if radius is None else bend(MESH, radius), along(radius)
-    wishes = dataclasses.replace(BARE, want_surface=mesh is not None, seat="first")
-    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, mesh=mesh, wishes=wishes)
+    effects = dataclasses.replace(BARE, want_surface=mesh is not None, contact_point="fixed")
+    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, mesh=mesh, effects=effects)
     whole = jax.jit(simulate)(scene, MATERIAL, path)
     touched = int(np.argmax(np.asarray(whole.gap) < 0))
     session = Session(scene, MATERIAL)
@@ -82,8 +87,8 @@ def test_steps_are_the_rows_of_one_simulation(radius):
 def test_it_lets_go_and_touches_elsewhere():
     """Two presses with a way through the air between: each is a normal press where it stands."""
     path = ball([40, 1, 0], [40, -2, 0], rows=4), ball([90, 1, 0], [90, -3, 0], rows=5)
-    wishes = dataclasses.replace(BARE, seat="first")
-    session = Session(make_scene(TUBE, SPRINGS, path[0], tool=BALL, wishes=wishes), SPRINGS)
+    effects = dataclasses.replace(BARE, contact_point="fixed")
+    session = Session(make_scene(TUBE, SPRINGS, path[0], tool=BALL, effects=effects), SPRINGS)
     for one, s, depth in zip(path, (40.0, 90.0), (2.0, 3.0), strict=True):
         last = rows(session, one)[-1]
         known = press(TUBE, SPRINGS, jnp.asarray(s), jnp.asarray(depth))
@@ -118,7 +123,7 @@ def held(request):
     cast = lambda tree: jax.tree.map(lambda v: v.astype(request.param), tree)  # noqa: E731
     tube, material, tool = cast((TUBE, MATERIAL, BALL))
     start = cast(ball([75, 1, 0], [76, -2, 0]))
-    return Session(make_scene(tube, material, start, tool=tool, wishes=HELD), material)
+    return Session(make_scene(tube, material, start, tool=tool, effects=HELD), material)
 
 
 def led(session, places, rotation=None):
@@ -316,7 +321,7 @@ def test_a_bonded_tool_holds_its_first_place():
     path = ball([75, 1, 0], [78, -2, 0], 5)
     path = Poses(*(jnp.concatenate([v, v[::-1]]) for v in (path.rotation, path.translation)))
     scene = make_scene(
-        TUBE, MATERIAL, path, tool=BALL, wishes=dataclasses.replace(HELD, contact="bonded")
+        TUBE, MATERIAL, path, tool=BALL, effects=dataclasses.replace(HELD, contact="bonded")
     )
     whole = jax.jit(simulate)(scene, MATERIAL, path)
     force, _, status, _ = stepped(Session(scene, MATERIAL), path.rotation, path.translation)
@@ -329,11 +334,13 @@ def test_refusals():
     over = poses([70, OUTER + 4, 0], [76, OUTER + 3, 0])
     rubbing = make_scene(
         TUBE, MATERIAL, over, tool=BALL, friction=0.3,
-        wishes=dataclasses.replace(BARE, seat="first"),
+        effects=dataclasses.replace(BARE, contact_point="fixed"),
     )  # fmt: skip
     with pytest.raises(ValueError, match="friction"):
         Session(rubbing, MATERIAL)
     with pytest.raises(ValueError, match="no contact"):
-        Session(make_scene(TUBE, MATERIAL, DOWN, wishes=Wishes(want_surface=False)), MATERIAL)
+        Session(
+            make_scene(TUBE, MATERIAL, DOWN, effects=EffectOptions(want_surface=False)), MATERIAL
+        )
     with pytest.raises(ValueError, match="keep"):
         Session(rubbing, MATERIAL, keep=0)

@@ -25,9 +25,9 @@ from small_scenes import (
 )
 
 from jaxtrachea import (
+    EffectOptions,
     Poses,
     Presses,
-    Wishes,
     make_scene,
     press,
     press_oblique,
@@ -47,7 +47,7 @@ FINE = make_tube(table_1())
 
 def test_one_plane_agrees_with_vectors():
     scene = make_scene(TUBE, SPRINGS, DOWN, mesh=MESH)
-    full = make_scene(TUBE, SPRINGS, DOWN, mesh=MESH, wishes=Wishes(second_plane="on"))
+    full = make_scene(TUBE, SPRINGS, DOWN, mesh=MESH, effects=EffectOptions(second_plane="on"))
     assert not scene.plan.second_plane
     assert full.plan.second_plane
     a, b = (run(s, SPRINGS, DOWN) for s in (scene, full))
@@ -57,7 +57,7 @@ def test_one_plane_agrees_with_vectors():
 
 
 def test_rows_off_the_plan_are_refused_by_status():
-    scene = make_scene(TUBE, SPRINGS, DOWN, wishes=BARE)
+    scene = make_scene(TUBE, SPRINGS, DOWN, effects=BARE)
     other = Presses([75.0, 75.0, 75.0], [0.0, 0.3, 0.0], [[0, -2.0, 0], [0, -2.0, 0], [1, -2.0, 0]])
     out = run(scene, SPRINGS, other)
     assert out.status.tolist() == [0, PressStatus.OFF_PLAN, PressStatus.OFF_PLAN]
@@ -68,8 +68,8 @@ def test_rows_off_the_plan_are_refused_by_status():
 def test_a_press_elsewhere_is_refused_by_status():
     """A program for one contact point gave every row the answer of the first."""
     there = Presses([75.0, 40.0, 75.0], [0.0, 0.0, 0.3], [[0, -2.0, 0]] * 3)
-    for wishes in (BARE, dataclasses.replace(BARE, second_plane="on", axial="off")):
-        scene = make_scene(TUBE, MATERIAL, DOWN, wishes=wishes)
+    for effects in (BARE, dataclasses.replace(BARE, second_plane="on", axial="off")):
+        scene = make_scene(TUBE, MATERIAL, DOWN, effects=effects)
         out = run(scene, MATERIAL, there)
         assert out.status.tolist() == [0, PressStatus.OFF_PLAN, PressStatus.OFF_PLAN]
         assert np.isnan(out.force[1:, 1]).all()
@@ -88,7 +88,7 @@ def test_another_geometry_moves_the_surface_with_its_rings():
 def test_behind_the_rings_nothing_is_solved(rings):
     """Not only the arches: the surface is NaN there, and an OK would be misleading."""
     path = presses([0, 1, -1], phi=2.3)
-    scene = make_scene(TUBE, MATERIAL, path, mesh=MESH, wishes=Wishes(rings=rings))
+    scene = make_scene(TUBE, MATERIAL, path, mesh=MESH, effects=EffectOptions(rings=rings))
     out = run(scene, MATERIAL, path)
     behind = PressStatus.BEHIND_GAP
     assert out.status.tolist() == [PressStatus.NO_CONTACT, behind, behind]
@@ -98,7 +98,7 @@ def test_behind_the_rings_nothing_is_solved(rings):
 
 def test_a_ball_led_down_presses_as_deep_as_it_goes():
     path = ball([75, 1, 0], [75, -3, 0], 5)
-    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, wishes=BARE)
+    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=BARE)
     out = run(scene, SPRINGS, path)
     # The smoothed distance is at most log(8) / beta too small (docs/contact.md): 0.1 mm here.
     np.testing.assert_allclose(out.gap, [1, 0, -1, -2, -3], atol=0.1)
@@ -112,8 +112,8 @@ def test_a_ball_led_down_presses_as_deep_as_it_goes():
 
 def test_a_ball_beyond_the_end_is_refused_by_status():
     path = poses([75, OUTER + 3, 0], [170, OUTER - 3, 0], 2)
-    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, wishes=BARE)
-    assert scene.plan.seat == "each"
+    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, effects=BARE)
+    assert scene.plan.contact_point == "per_step"
     out = run(scene, MATERIAL, path)
     assert out.status.tolist() == [0, PressStatus.OFF_TUBE]
     assert np.isfinite(out.force[0]).all()
@@ -133,7 +133,7 @@ def test_the_dent_follows_the_tool():
 
 
 def test_sweep_agrees_with_single_presses_whatever_the_chunk():
-    scene = make_scene(TUBE, MATERIAL, OFF, wishes=BARE)
+    scene = make_scene(TUBE, MATERIAL, OFF, effects=BARE)
     grid = list(itertools.product((20.0, 75.0), (-0.4, 0.0, 0.4)))
     s, phi = (jnp.array(v) for v in zip(*grid, strict=True))
     depths = jnp.full(6, 2.0)
@@ -163,8 +163,8 @@ def test_a_ball_in_the_plane_of_symmetry_is_on_the_midline_everywhere():
     along = np.linspace(21.3, 138.7, 200)
     at = np.stack([along, np.full(200, OUTER + 5 - 1.5), np.zeros(200)], axis=1)
     path = Poses(np.tile(np.eye(3), (200, 1, 1)), at)
-    wishes = dataclasses.replace(BARE, seat="each")
-    scene = make_scene(table_1(), SPRINGS, path, tool=sphere(5.0), mesh=FINE, wishes=wishes)
+    effects = dataclasses.replace(BARE, contact_point="per_step")
+    scene = make_scene(table_1(), SPRINGS, path, tool=sphere(5.0), mesh=FINE, effects=effects)
     assert not scene.plan.second_plane
     assert run(scene, SPRINGS, path).status.tolist() == [PressStatus.OK] * 200
 
@@ -173,7 +173,7 @@ def test_a_ball_in_the_plane_of_symmetry_is_on_the_midline_everywhere():
 def test_a_box_touches_flat():
     flat = box([4.0, 3.0, 4.0], 0.5)
     path = poses([75, OUTER + 3.5 - 1, 0], [75, OUTER + 3.5 - 1, 0], 1)
-    scene = make_scene(TUBE, MATERIAL, path, tool=flat, wishes=BARE)
+    scene = make_scene(TUBE, MATERIAL, path, tool=flat, effects=BARE)
     seen = touch_tube(scene, path)
     np.testing.assert_allclose(seen.gap, -1, atol=0.15)
     np.testing.assert_allclose(seen.phi, 0, atol=1e-6)
@@ -191,7 +191,7 @@ def test_a_bent_tube_is_pressed_like_the_straight_one():
     led = np.array([[0, 1, 0.0], [0, -1, 0], [1.0, -3, 0.5]]) + [0, OUTER + 5, 0]
     eye = np.broadcast_to(np.eye(3), (3, 3, 3))
     paths = Poses(eye, led + [70, 0, 0]), Poses(eye @ turn, centre + led @ turn.T)
-    how = {"tool": BALL, "friction": 0.66, "wishes": Wishes(rings="mat")}
+    how = {"tool": BALL, "friction": 0.66, "effects": EffectOptions(rings="mat")}
     outs = []
     for where, path in zip((mesh, bent), paths, strict=True):
         scene = make_scene(TUBE, MATERIAL, path, mesh=where, **how)
@@ -211,7 +211,7 @@ def test_the_tool_touches_the_mesh_not_a_cylinder():
     """Between two rings the wall lies lower, by the relief."""
     path = poses([0, OUTER + 5 + 0.2, 0], [160, OUTER + 5 + 0.2, 0], 33)
     mesh = make_tube(TUBE, around=35, along=96)
-    scene = make_scene(TUBE, MATERIAL, path, tool=sphere(0.5), mesh=mesh, wishes=BARE)
+    scene = make_scene(TUBE, MATERIAL, path, tool=sphere(0.5), mesh=mesh, effects=BARE)
     lifted = Poses(path.rotation, path.translation - jnp.array([[0, 4.5, 0]]))
     seen = jax.jit(touch_tube)(scene, lifted)
     gap = np.asarray(seen.gap)[2:-2]

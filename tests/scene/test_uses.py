@@ -46,7 +46,7 @@ def test_material_from_a_deformed_surface():
 
 def test_a_network_learns_which_motion_reaches_a_force():
     """Depth of the tool from the force wanted: nothing is shown to it but the simulated force."""
-    scene = make_scene(TUBE, MATERIAL, DOWN, wishes=BARE)
+    scene = make_scene(TUBE, MATERIAL, DOWN, effects=BARE)
     wanted = jnp.linspace(0.05, 0.6, 12)
 
     def forces(depths):

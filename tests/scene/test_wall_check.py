@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from small_scenes import BALL, SPRINGS, bend, poses
 
-from jaxtrachea import Poses, Wishes, make_scene, simulate, table_1
+from jaxtrachea import EffectOptions, Poses, make_scene, simulate, table_1
 from jaxtrachea.config import SpecError
 from jaxtrachea.contact.shapes import Shape, sphere
 from jaxtrachea.scene import stage, wall_check
@@ -56,9 +56,11 @@ def filled_up(tube):
 def scene():
     """A ball pressed in, every row a press of its own; rings are springs."""
     path = poses([75, 18.5, 0], [75, 15.5, 0])
-    wishes = Wishes(want_surface=False, want_joints=False, want_ring_ends=False, seat="each",
-                    second_plane="on")  # fmt: skip
-    return make_scene(TUBE, SPRINGS, path, tool=sphere(6.0), radius=12.6, wishes=wishes)
+    effects = EffectOptions(
+        want_surface=False, want_joints=False, want_ring_ends=False, contact_point="per_step",
+        second_plane="on",
+    )  # fmt: skip
+    return make_scene(TUBE, SPRINGS, path, tool=sphere(6.0), radius=12.6, effects=effects)
 
 
 run = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})

@@ -1,0 +1,128 @@
+"""A scene put together: what is there, its program, and the same with another skeleton or mesh."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.mechanics.admission import check_shapes
+from jaxtrachea.scene.declare import PlanError, SceneFacts
+from jaxtrachea.scene.effects import EffectOptions
+from jaxtrachea.scene.facts import facts_of
+from jaxtrachea.scene.rules import make_plan
+from jaxtrachea.scene.sizes import check_sizes
+from jaxtrachea.scene.stage import Poses, Presses, Scene, check_path
+from jaxtrachea.scene.wall import checked_walls, near_patches, round_wall
+from jaxtrachea.surface import local, regions
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+from jaxtrachea.trachea.mesh import Mesh
+
+#: Distance between the circles of the dent's centres: share of the tool's size; mm at least.
+FOOTPRINT, LEAST = 0.6, 4.0
+#: Wall of Table 1, mm, where nothing else is known of it.
+WALL = 2.6
+
+
+def make_scene(
+    geometry: Geometry,
+    material: Material,
+    path: Poses | Presses,
+    *,
+    tool: Shape | None = None,
+    friction: float | None = None,
+    mesh: Mesh | None = None,
+    radius: float | None = None,
+    effects: EffectOptions = EffectOptions(),  # noqa: B008 (frozen)
+    progress: Callable[[int, int], None] | None = None,
+) -> Scene:
+    """Put a scene together and choose its program from the path (concrete numbers).
+
+    Args:
+        geometry: the tube at rest.
+        material: read only for which optional values are there.
+        path: what the plan is made for; other paths may follow if they need no more.
+        tool: needed for `Poses`.
+        friction: Coulomb's coefficient.
+        mesh: the surface; without one `effects.want_surface` must be false.
+        radius: of the tube's outside, mm; None: that of the mesh (of an imported one it is
+            `geometry.radius`); without a mesh `geometry.radius` + 1.3 (half of Table 1's wall).
+        effects: what is not left to the rules.
+        progress: called with (patches of the wall done since the last call, patches in all).
+
+    Raises:
+        PlanError: a wish that cannot be met.
+        MeshError: patches for the contact that are not where an imported mesh is.
+        SizeError: a length that no trachea and no tool has: the unit is wrong, most likely.
+        ValueError: a path without rows, arrays of a wrong length, or a negative friction.
+    """
+    check_path(path)
+    check_shapes(geometry, material)
+    if not len(path.s if isinstance(path, Presses) else path.translation):
+        raise ValueError("path has no rows; expected at least one")
+    if friction is not None and not 0 <= float(friction) < np.inf:
+        raise ValueError(f"friction is {friction}; expected a finite number, not negative")
+    dtype = geometry.length.dtype
+    outer = _outer(geometry, mesh) if radius is None else jnp.asarray(radius, dtype)
+    check_sizes(geometry, float(outer), tool)
+    if isinstance(path, Poses) and tool is None:
+        raise PlanError("contact", "the path moves a tool", "there is none", "give a tool")
+    size, tube, near = LEAST, None, 1
+    if tool is not None and isinstance(path, Poses):
+        if mesh is None:
+            tube = round_wall(geometry, float(outer))
+        else:
+            tube = checked_walls(geometry, mesh, progress)
+        near = near_patches(tool, geometry, tube.centres.shape[0])
+    if tool is not None:
+        extent = np.ptp(np.asarray(tool.vertices), axis=1).min() / 2 + float(tool.radius)
+        size = max(FOOTPRINT * extent, LEAST)
+    mu = None if friction is None else jnp.asarray(friction, dtype)
+    binding = None if mesh is None else regions.bind(mesh, geometry)
+    spacing = jnp.asarray(size, dtype)
+    scene = Scene(
+        geometry=geometry, radius=outer, tube=tube, tool=tool, friction=mu, mesh=mesh,
+        binding=binding, footprint=spacing, near=near,
+        plan=make_plan(SceneFacts(mesh=False), EffectOptions(want_surface=False)),  # not read
+    )  # fmt: skip
+    plan = make_plan(facts_of(scene, material, path), effects)
+    if plan.surface is None or mesh is None:
+        return dataclasses.replace(scene, mesh=None, binding=None, plan=plan)
+    return dataclasses.replace(scene, plan=plan, runs=local.runs(mesh.s, spacing))
+
+
+def _outer(geometry: Geometry, mesh: Mesh | None):
+    """Radius of the outside, mm: of an imported mesh read with it, of a made one its crests."""
+    if mesh is None:
+        return geometry.radius + WALL / 2
+    return geometry.radius if mesh.frames is not None else jnp.max(mesh.distance)
+
+
+def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
+    """The scene with another skeleton: the surface is bound to it anew, the wall stays as it is.
+
+    May be traced; derivatives of the surface by geometry go through this. (A new geometry put into
+    the scene by hand leaves the surface on the old rings.)
+    """
+    binding = None
+    if scene.mesh is not None:
+        binding = regions.bind(scene.mesh, geometry, scene.binding)
+    return dataclasses.replace(scene, geometry=geometry, binding=binding)
+
+
+def with_mesh(scene: Scene, mesh: Mesh) -> Scene:
+    """The scene with another surface: bound to the rings, and the wall that a tool touches.
+
+    The program stays, but for `curved`, which says what the mesh is.
+
+    Raises:
+        MeshError: patches for the contact that are not where an imported mesh is.
+    """
+    curved = scene.plan.contact and mesh.frames is not None
+    plan = dataclasses.replace(scene.plan, curved=curved)
+    tube = None if scene.tube is None else checked_walls(scene.geometry, mesh)
+    binding, runs = regions.bind(mesh, scene.geometry), local.runs(mesh.s, scene.footprint)
+    parts = {"mesh": mesh, "binding": binding, "tube": tube, "runs": runs, "plan": plan}
+    return dataclasses.replace(scene, **parts)

@@ -1,0 +1,273 @@
+"""The effects of a scene, each declared once: a field of `EffectOptions` with its `Effect`.
+
+A declaration says which levels an effect has, the rule that chooses one and why, what it needs of
+the material and of other effects, where a plan keeps it, and how it is climbed where accuracy is
+traded. The table [effects] of a scene (`spec`), the decisions (`rules`), what a plan without it is
+(`Plan.without`), its share of the operations (`cost`), what a row may lack (`ranges`) and the
+ladders (`tradeoff`) follow from it. A rule reads the effects above its own.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, Literal, get_args, get_type_hints
+
+from jaxtrachea._arguments import check_record
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.scene.declare import Case, Effect, PlanError, Verdict
+from jaxtrachea.trachea.material import Material
+
+Switch = Literal["auto", "on", "off"]
+
+#: Angle (rad) and share of the motion below which something counts as not there.
+SMALL = 1e-6
+
+
+def _contact_point(case: Case) -> Verdict:
+    facts = case.facts
+    if not facts.poses:
+        if not facts.several_points:
+            return Verdict("fixed", "one contact point")
+        why = "the presses have different contact points"
+        return Verdict("per_step", "several contact points", {"fixed": (why, "use 'auto'")})
+    if facts.slip < facts.spacing / 2:
+        way = f"the tool moves {facts.slip:.3g} mm along the surface"
+        return Verdict("fixed", f"{way}, less than half a ring spacing")
+    if case.options.contact == "bonded":
+        return Verdict("fixed", "glued where it touches first")
+    reason = "the tool wanders over the rings: every row is a frictionless press of its own"
+    return Verdict("per_step", reason)
+
+
+def _friction(case: Case) -> Verdict:
+    facts, options = case.facts, case.options
+    fixed = case.levels["contact_point"] == "fixed"
+    cannot = ""
+    if not facts.friction:
+        cannot = "the tool has no coefficient; give tool.friction"
+    elif not fixed:
+        cannot = (
+            "the contact does not keep its place; shorten the path or set contact_point 'fixed'"
+        )
+    elif options.contact != "unilateral" or options.coupling != "series":
+        cannot = "it needs contact 'unilateral' and coupling 'series'"
+    moves = facts.slip > SMALL
+    reason = "the tool moves along the surface"
+    if not moves:
+        reason = "no motion along the surface"
+    elif cannot:
+        reason = f"{cannot}; the tool {'holds the surface' if fixed else 'slides freely'}"
+    return _switch(moves and not cannot, reason, cannot)
+
+
+def _second_plane(case: Case) -> Verdict:
+    facts, options, must = case.facts, case.options, ""
+    if facts.angle > SMALL:
+        must = f"the contact lies up to {math.degrees(facts.angle):.3g} deg off the midline"
+    elif case.led and (facts.along > SMALL or facts.across > SMALL):
+        must = "the tool's motion is oblique"
+    elif case.levels["friction"] == "on":
+        must = "friction works in the tangent plane"
+    elif options.rings in ("arch", "arch2"):
+        must = f"rings {options.rings!r} were asked for"
+        must = "arches need vectors" if "rings" in case.finest else must
+    elif options.rings == "auto" and _bends(case):
+        must = "rings bend (EI_C and k_t are given)"
+    elif options.axial == "on":
+        must = "axial motion was asked for"
+    reason = must or "a normal press on the midline stays in one plane"
+    cure = "leave second_plane 'auto'"
+    return Verdict("on" if must else "off", reason, {"off": (must, cure)} if must else {})
+
+
+def _bends(case: Case) -> bool:
+    """Whether the material gives what rings that bend need."""
+    return EFFECTS["rings"].given(case.facts.known)
+
+
+def _rings(case: Case) -> Verdict:
+    """What a ring is, by what the material gives: the same wherever the tool touches."""
+    if _bends(case):
+        reason = "EI_C and k_t are given: a ring bends, on the midline and off it"
+        return Verdict("arch2", reason)
+    reason = "EI_C and k_t are not given: a ring is its spring k_M (paper 2.3)"
+    if case.facts.angle > SMALL:
+        reason = "off the midline a ring would bend, but EI_C and k_t are not given"
+    why = "EI_C or k_t is not given", "give both, or use 'mat'"
+    return Verdict("mat", reason, {"arch": why, "arch2": why})
+
+
+def _axial(case: Case) -> Verdict:
+    needed = case.led and case.facts.along > SMALL
+    cannot = "" if EFFECTS["axial"].given(case.facts.known) else "EA_L is not given"
+    reason = "the tool moves along the tube" if needed else "no motion along the tube"
+    if needed and cannot:
+        reason = f"{cannot}; the skeleton does not stretch"
+    return _switch(needed and not cannot, reason, cannot)
+
+
+def _surface(case: Case) -> Verdict:
+    if not case.options.want_surface:
+        why = "output.surface is false", ""
+        levels = EFFECTS["surface"].levels
+        refused = {level: why for level in levels if level != "off"}
+        return Verdict("off", "not asked for", refused, free=False)
+    if not case.facts.mesh:
+        cure = "give one, or do not ask (want_surface)"
+        raise PlanError("surface", "asked for", "the scene has no mesh", cure)
+    return Verdict("hermite", "asked for; exact for the beam without shear")
+
+
+def _end_motion(case: Case) -> Verdict:
+    springs = sorted(case.facts.known & set(EFFECTS["end_motion"].material))
+    on = all(case.levels[name] != "off" for name in EFFECTS["end_motion"].requires)
+    cannot = "" if springs and on else "it needs k_A or k_B, axial and a surface"
+    reason = f"{' and '.join(springs)} let the ends move"
+    return _switch(not cannot, reason if springs else "the ends are held (no k_A, k_B)", cannot)
+
+
+def _dent(case: Case) -> Verdict:
+    if case.levels["surface"] == "off":
+        why = "there is no surface", "leave it 'auto'"
+        levels = EFFECTS["dent"].levels
+        refused = {level: why for level in levels if level != "off"}
+        return Verdict("off", "no surface", refused, free=False)
+    refused = {}
+    if not case.facts.poses:
+        why = "a press at a point has no tool to shape the dent"
+        cure = "use 8 or 'off', or give the path as motions of the tool"
+        refused = {"16": (why, cure), "32": (why, cure)}
+    if not case.facts.near:
+        return Verdict("off", "no vertex comes near the contact", refused)
+    if case.facts.poses:
+        return Verdict("16", "vertices lie near the tool")
+    reason = "vertices lie near the contact; a peak, the tool's shape is not known"
+    return Verdict("8", reason, refused)
+
+
+def _given(name: str) -> Callable[[Case], Verdict]:
+    """The rule of an effect that is on wherever the material gives what it reads."""
+
+    def rule(case: Case) -> Verdict:
+        values, given = EFFECTS[name].material, EFFECTS[name].given(case.facts.known)
+        reason = f"{' and '.join(values)} is {'' if given else 'not '}given"
+        return _switch(given, reason, "" if given else reason)
+
+    return rule
+
+
+def _switch(on: bool, reason: str, cannot: str) -> Verdict:
+    refused = {"on": (cannot, "give it, or use 'auto'")} if cannot else {}
+    return Verdict("on" if on else "off", reason, refused)
+
+
+def _effect(rule: Callable[[Case], Verdict], **declaration: Any) -> Any:
+    return dataclasses.field(default="auto", metadata={"effect": Effect(rule=rule, **declaration)})
+
+
+ON_OFF = ("off", "on")
+
+
+@dataclasses.dataclass(frozen=True)
+class EffectOptions:
+    """What the user asks for; `auto` leaves it to the rules.
+
+    Attributes:
+        contact_point: `fixed`: the tool stays on the place it touched first; `per_step`: every row
+            is a press of its own, frictionless along the surface.
+        friction: Coulomb friction along the path.
+        second_plane: bending along the circumference, vectors; off: a normal press on the midline.
+        rings: see `skeleton_response`.
+        axial: the ligament stretches.
+        surface: method of interpolation, or off.
+        end_motion: the clamps move on axial springs, and the surface with them.
+        dent: centres of the local correction, or off.
+        shear: the ligament shears.
+        two_material: the rings have a local law of their own.
+        want_surface: deformed vertices are asked for.
+        want_joints: joints and their loads are asked for.
+        want_ring_ends: ends of the rings are asked for.
+        coupling: see `Options`; with `contact`, `onset_width` and `transition`.
+        contact: -
+        onset_width: -
+        transition: -
+    """
+
+    contact_point: Literal["auto", "fixed", "per_step"] = _effect(
+        _contact_point, least="", values={}
+    )
+    friction: Switch = _effect(
+        _friction, brings=("second_plane",), holds=("second_plane",), rungs=ON_OFF
+    )
+    second_plane: Switch = _effect(_second_plane, rungs=ON_OFF)
+    rings: Literal["auto", "mat", "arch", "arch2"] = _effect(
+        _rings, least="mat", values={}, material=("EI_C", "k_t"), brings=("second_plane",),
+        rungs=("mat", "arch", "arch2"),
+    )  # fmt: skip
+    axial: Switch = _effect(_axial, material=("EA_L",), brings=("second_plane",), rungs=ON_OFF)
+    surface: Literal["auto", "off", "linear", "hermite", "phong"] = _effect(
+        _surface, values={"off": None}, rungs=("linear", "phong", "hermite"),
+        ladder="interpolation",
+    )  # fmt: skip
+    end_motion: Switch = _effect(
+        _end_motion, material=("k_A", "k_B"), either=True, requires=("axial", "surface"),
+        rungs=ON_OFF,
+    )  # fmt: skip
+    dent: Literal["auto", "off", "8", "16", "32"] = _effect(
+        _dent, values={"off": 0, "8": 8, "16": 16, "32": 32}, requires=("surface",),
+        rungs=("off", "8", "16", "32"), ladder_kind="truncation", words={"off": "0"},
+    )  # fmt: skip
+    shear: Switch = _effect(
+        _given("shear"), field="options.shear", material=("GA_L",), rungs=ON_OFF
+    )
+    two_material: Switch = _effect(
+        _given("two_material"), field="options.local",
+        values={"off": "uniform", "on": "two-material"}, material=("k_1_ring",), rungs=ON_OFF,
+        ladder="local", words={"off": "uniform", "on": "two-material"},
+    )  # fmt: skip
+    want_surface: bool = True
+    want_joints: bool = True
+    want_ring_ends: bool = True
+    coupling: Literal["series", "total"] = "series"
+    contact: Literal["unilateral", "bonded"] = "unilateral"
+    onset_width: float = 1e-3
+    transition: float | None = None
+
+    def __post_init__(self):
+        """Refuse words and numbers that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_record(self)
+        Options(self.coupling, contact=self.contact, onset_width=self.onset_width,
+                transition=self.transition)  # fmt: skip
+
+
+def _declared() -> dict[str, Effect]:
+    kinds, found = get_type_hints(EffectOptions), {}
+    for field in dataclasses.fields(EffectOptions):
+        effect, name = field.metadata.get("effect"), field.name
+        if effect is not None:
+            levels = tuple(word for word in get_args(kinds[name]) if word != "auto")
+            field, ladder = effect.field or name, effect.ladder or name
+            found[name] = dataclasses.replace(
+                effect, name=name, levels=levels, field=field, ladder=ladder
+            )
+    return found
+
+
+#: Every effect by name.
+EFFECTS = _declared()
+
+
+def given_values(material: Material) -> frozenset[str]:
+    """Optional values that effects read and the material gives."""
+    names = {name for effect in EFFECTS.values() for name in effect.material}
+    return frozenset(name for name in names if getattr(material, name) is not None)
+
+
+def goes_with(name: str) -> set[str]:
+    """Effects that cannot be without this one, and those that cannot be without them."""
+    own = {e.name for e in EFFECTS.values() if name in (*e.requires, *e.brings)}
+    return own.union(*map(goes_with, own))

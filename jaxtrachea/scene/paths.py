@@ -1,0 +1,171 @@
+"""The path of a scene, from its tables and from CSV files."""
+
+import csv
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtrachea.config import SpecError
+from jaxtrachea.contact.pose import pose_from_vector
+from jaxtrachea.scene.spec import PathSection, SceneSpec
+from jaxtrachea.scene.stage import Poses, Presses
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.units import UnitError, column_unit, convert
+
+#: Steps of a press or a line that names none.
+STEPS = 10
+#: Longest table of points or poses that is read.
+MAX_BYTES = 64 * 2**20
+#: Meshes that scenes of `configs/` name, and where they come from.
+MESHES = {
+    "meshes/trachea.glb": "3D Reference Organ for Trachea, Male v1.0 (GLB, CC BY 4.0), "
+    "doi:10.48539/HBM969.WCCJ.636",
+}
+
+
+def path_of(
+    spec: SceneSpec, folder: Path, files: list[Path], geometry: Geometry
+) -> Poses | Presses:
+    """The path of a scene.
+
+    Args:
+        spec: the scene.
+        folder: that relative file names start from.
+        files: that were read; those of the path are added.
+        geometry: of the tube that it presses.
+
+    Raises:
+        SpecError: a file or a value that cannot be used, with its key.
+    """
+    if spec.path[0].kind == "press":
+        return _presses(spec.path, geometry)
+    legs = [_leg(leg, i, folder, files) for i, leg in enumerate(spec.path)]
+    translation, vectors = (np.concatenate(v) for v in zip(*legs, strict=True))
+    turn = jax.vmap(lambda v: pose_from_vector(v, jnp.zeros_like(v)).rotation)
+    return Poses(turn(jnp.asarray(vectors)), jnp.asarray(translation))
+
+
+def _presses(legs: list[PathSection], geometry: Geometry) -> Presses:
+    s, phi, D = [], [], []
+    length, alpha = float(geometry.length), float(geometry.half_angle)
+    for i, leg in enumerate(legs):
+        at, angle, steps = leg.s or 0.0, leg.phi or 0.0, leg.steps or STEPS
+        if not 0 <= at <= length:
+            raise SpecError(
+                f"path.{i}.s: {at:g} mm; expected a place on the tube, 0 to {length:g} mm"
+            )
+        if abs(angle) > alpha:
+            raise SpecError(
+                f"path.{i}.phi: {np.degrees(angle):.4g} deg; expected within the rings, "
+                f"-{np.degrees(alpha):.4g} to {np.degrees(alpha):.4g} deg"
+            )
+        s += [at] * steps
+        phi += [angle] * steps
+        whole = np.asarray(leg.displacement)
+        D += [whole * (k + 1) / steps for k in range(steps)]
+    return Presses(np.array(s), np.array(phi), np.array(D))
+
+
+def _leg(leg: PathSection, i: int, folder: Path, files: list[Path]):
+    """Translations and rotation vectors of one leg."""
+    if leg.kind == "file":
+        path = named_file(folder, leg.file or "", f"path.{i}.file", files)
+        rows = read_table(path, f"path.{i}.file", ("x", "y", "z"), ("rx", "ry", "rz"))
+        return rows[:, :3], rows[:, 3:]
+    if leg.kind == "line":
+        steps = leg.steps or STEPS
+        if steps < 2:
+            raise SpecError(f"path.{i}.steps: {steps}; expected at least 2, the start and the end")
+        places = np.linspace(np.asarray(leg.start), np.asarray(leg.end), steps)
+    else:
+        places = np.asarray(leg.positions)
+    turn = np.asarray(leg.rotation or [0.0, 0.0, 0.0])
+    return places, np.broadcast_to(turn, places.shape)
+
+
+def named_file(folder: Path, name: str, key: str, files: list[Path]) -> Path:
+    """The file that a key names, added to `files`.
+
+    Raises:
+        SpecError: there is none.
+    """
+    path = folder / name
+    try:
+        found = bool(name) and path.is_file()
+    except (OSError, ValueError):
+        found = False
+    if not found:
+        from_where = _source(name) if key == "trachea.file" else ""
+        raise SpecError(
+            f"{key}: there is no file {name!r} in the scene's folder; check the name{from_where}"
+        )
+    files.append(path)
+    return path
+
+
+def _source(name: str) -> str:
+    """Where a mesh of `configs/` comes from, which the repository does not hold."""
+    if name not in MESHES:
+        return ""
+    return f", or fetch it: {MESHES[name]}, and save it under this name (docs/surface.md)"
+
+
+def read_table(
+    path: Path, key: str, needed: tuple[str, ...], optional: tuple[str, ...]
+) -> np.ndarray:
+    """Columns of a CSV file with units in its header; optional columns that lack are 0.
+
+    Raises:
+        SpecError: with the key that names the file.
+    """
+    if path.stat().st_size > MAX_BYTES:
+        raise SpecError(f"{key}: {path.name} has more than {MAX_BYTES} bytes; thin it out")
+    try:
+        rows = [row for row in csv.reader(path.read_text("utf-8-sig").splitlines()) if row]
+    except (UnicodeDecodeError, csv.Error, OSError):
+        raise SpecError(f"{key}: {path.name} is not a CSV file in UTF-8; save it as one") from None
+    heads = [column_unit(cell) for cell in rows[0]] if rows else []
+    names = [name for name, _ in heads]
+    expected = ", ".join(f"{name} [mm]" for name in needed)
+    if missing := [name for name in needed if name not in names]:
+        raise SpecError(
+            f"{key}: {path.name} has no column {missing[0]!r}; expected a header {expected}"
+        )
+    if len(rows) < 2:
+        raise SpecError(f"{key}: {path.name} has no rows; expected at least one")
+    columns = []
+    for name in (*needed, *optional):
+        if name not in names:
+            columns.append(np.zeros(len(rows) - 1))
+            continue
+        at, dimension = names.index(name), "length" if name in needed else "angle"
+        unit = heads[at][1]
+        try:
+            if unit is None:
+                raise UnitError(f"no unit; write {name} [{'mm' if name in needed else 'deg'}]")
+            values = convert(np.array([_cell(row, at, i) for i, row in enumerate(rows[1:], 1)]),
+                             unit, dimension)  # fmt: skip
+        except ValueError as error:
+            raise SpecError(f"{key}: {path.name}, column {name!r}: {error}") from None
+        if not np.isfinite(values).all():
+            raise SpecError(f"{key}: {path.name}, column {name!r}: expected finite numbers")
+        columns.append(values)
+    return np.stack(columns, axis=1)
+
+
+def _cell(row: list[str], at: int, number: int) -> float:
+    """A number of the table.
+
+    Raises:
+        ValueError: it is none, or is missing.
+    """
+    if at >= len(row):
+        raise ValueError(f"row {number} below the header has {len(row)} cells; complete it")
+    try:
+        return float(row[at])
+    except ValueError:
+        raise ValueError(
+            f"{row[at]!r} in row {number} below the header; expected a number"
+        ) from None

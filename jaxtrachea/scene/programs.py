@@ -1,0 +1,88 @@
+"""Force and skeleton of presses: in one plane, or as vectors."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxtrachea.mechanics.oblique import ObliquePress, press_oblique, press_path
+from jaxtrachea.mechanics.press import ligament_beam, local_law, respond, unit_deflection
+from jaxtrachea.scene.stage import Presses, Scene
+from jaxtrachea.trachea.material import Material
+
+
+class Moved(NamedTuple):
+    """Force and skeleton, whichever program found them; fields as in `Simulation`.
+
+    Slopes are those of the ligament at the contact and at the rings.
+    """
+
+    force: Any
+    depth: Any
+    skeleton: Any
+    slope_C: Any
+    joints: Any
+    slopes: Any
+    loads: Any
+    end_U: Any
+    end_V: Any
+    status: Any
+    slip: Any = None
+    dissipated: Any = None
+
+
+def moved_by(press: ObliquePress) -> Moved:
+    """The same of a press as vectors."""
+    return Moved(**press._asdict())
+
+
+def one_plane(scene: Scene, material: Material, presses: Presses) -> Moved:
+    """Normal press on the midline: scalars, then spread to vectors."""
+    plan, geometry = scene.plan, scene.geometry
+    beam = ligament_beam(geometry, material, plan.options)
+
+    def at(s_c, inward):
+        unit = unit_deflection(beam, s_c, plan.options)
+        law = local_law(geometry, material, s_c, plan.options)
+        return unit, respond(inward, jnp.zeros_like(s_c), unit.w_C, law, plan.options)
+
+    inward = -presses.displacement[:, 1]
+    if plan.contact_point == "fixed":
+        unit, solved = at(presses.s[0], inward)
+        unit = jax.tree.map(lambda v: jnp.broadcast_to(v, (inward.shape[0], *v.shape)), unit)
+    else:
+        unit, solved = jax.vmap(at)(presses.s, inward)
+    F = -solved.force  # along y
+    per_ring = lambda v: _anterior(F[:, None] * v)  # noqa: E731
+    joints = per_ring(unit.w)
+    slope = lambda v: jnp.stack([v, jnp.zeros_like(v)], -1)  # noqa: E731
+    return Moved(
+        force=_anterior(F), depth=_anterior(-solved.depth), skeleton=_anterior(F * unit.w_C),
+        slope_C=slope(F * unit.theta_C), joints=joints, slopes=slope(F[:, None] * unit.theta),
+        loads=per_ring(unit.reaction), end_U=joints, end_V=joints, status=solved.status,
+    )  # fmt: skip
+
+
+def _anterior(v):
+    """Vectors with only a y component."""
+    return jnp.stack([jnp.zeros_like(v), v, jnp.zeros_like(v)], -1)
+
+
+def vectors(scene: Scene, material: Material, presses: Presses) -> Moved:
+    """Presses in any direction, anywhere on the rings."""
+    plan = scene.plan
+    how = {"rings": plan.rings, "axial": plan.axial}
+    fixed = scene.geometry, material
+    if plan.friction:
+        if scene.friction is None:
+            raise ValueError("scene.friction is None; the plan has friction")
+        path = press_path(
+            *fixed, presses.s[0], presses.phi[0], presses.displacement, scene.friction,
+            plan.options, **how,
+        )  # fmt: skip
+        return moved_by(path.press)._replace(slip=path.slip, dissipated=path.dissipated)
+    if plan.contact_point == "fixed":
+        at = presses.s[0], presses.phi[0], presses.displacement
+        return moved_by(press_oblique(*fixed, *at, plan.options, **how))
+    one = lambda s, phi, D: press_oblique(*fixed, s, phi, D, plan.options, **how)  # noqa: E731
+    return moved_by(jax.vmap(one)(presses.s, presses.phi, presses.displacement))

@@ -1,0 +1,94 @@
+"""Rows that are refused, and the status of every row."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxtrachea.mechanics.admission import without_negative
+from jaxtrachea.mechanics.press import read_values
+from jaxtrachea.mechanics.ring import on_ring
+from jaxtrachea.mechanics.skeleton import local_frame
+from jaxtrachea.mechanics.skeleton import read_values as skeleton_values
+from jaxtrachea.scene.approach import Approach
+from jaxtrachea.scene.lumen import off_the_end
+from jaxtrachea.scene.ranges import DEEPEST, unserved
+from jaxtrachea.scene.stage import Presses, Scene
+from jaxtrachea.status import ContactStatus, PressStatus
+from jaxtrachea.trachea.material import Material
+
+#: Statuses of rows that are refused; of several that a row could have, the last.
+REFUSALS = (PressStatus.OFF_TUBE, PressStatus.OFF_PLAN, PressStatus.BEHIND_GAP,
+            PressStatus.IN_LUMEN, PressStatus.NON_FINITE, PressStatus.BAD_MATERIAL)  # fmt: skip
+
+
+def without_negative_values(scene: Scene, material: Material):
+    """The material with 1 in place of negative values that the plan reads, and whether it had any.
+
+    A negative coefficient of friction counts as well (`press_path` puts 0 in its place).
+    """
+    plan = scene.plan
+    shear = plan.options.shear
+    skeleton = skeleton_values(plan.rings, axial=plan.axial, shear=shear)
+    used = (*read_values(plan.options), *(skeleton if plan.second_plane else ()))
+    material, bad = without_negative(material, dict.fromkeys(used))
+    if plan.friction and scene.friction is not None:
+        bad = bad | (scene.friction < 0)
+    return material, bad
+
+
+def refuse(scene: Scene, material: Material, path: Presses | None, made: Approach | None, bad):
+    """The presses, NaN where refused; the same as computed; inward normals; refusals by status.
+
+    A row that does not press needs nothing of the plan, the rings and the tube: off the plan or
+    behind the ends of the rings it is computed as no motion, on the midline; off the tube at its
+    end. (What presses there is NaN by then.)
+    """
+    presses = path if made is None else made.presses
+    assert presses is not None
+    D, phi, geometry = presses.displacement, presses.phi, scene.geometry
+    inward = jax.vmap(local_frame)(phi)[:, 0] if made is None else made.inward
+    pressing = ~(jnp.sum(D * inward, axis=1) <= 0)
+    acting = pressing
+    if scene.plan.options.contact == "bonded":
+        acting = ~jnp.all(D == 0, axis=1)
+    outside = ~((presses.s >= 0) & (presses.s <= geometry.length))
+    if made is not None:
+        outside = pressing & (outside | off_the_end(scene, made.own))
+    refused = {PressStatus.OFF_TUBE: outside}
+    unlike = unserved(scene, material, presses, acting)
+    if unlike is not None:
+        refused[PressStatus.OFF_PLAN] = unlike
+    s, mid, behind = on_the_tube(scene, presses.s, phi)
+    refused[PressStatus.BEHIND_GAP] = behind & acting
+    if made is not None:
+        refused[PressStatus.IN_LUMEN] = made.inside
+    refused[PressStatus.NON_FINITE] = jnp.isnan(jnp.sum(D, axis=1))
+    refused[PressStatus.BAD_MATERIAL] = jnp.broadcast_to(bad, presses.s.shape)
+    for rows in refused.values():
+        D = jnp.where(rows[:, None], jnp.nan, D)
+    idle = (behind if scene.plan.second_plane else True) & ~acting
+    used = Presses(s, mid, jnp.where(idle[:, None], jnp.zeros_like(D), D))
+    return Presses(presses.s, phi, D), used, inward, refused
+
+
+def on_the_tube(scene: Scene, s: Float[Array, "*n"], phi: Float[Array, "*n"]):
+    """Contact positions to compute with (an end, the midline in place of none); who is behind."""
+    geometry = scene.geometry
+    behind = ~on_ring(geometry.half_angle, phi)[0] & ~jnp.isnan(phi)
+    s = jnp.where(s < 0, 0, jnp.where(s > geometry.length, geometry.length, s))
+    return s, jnp.where(behind, 0, phi), behind
+
+
+def status_of(status, share, made: Approach | None, refused: dict[PressStatus, Bool[Array, "*n"]]):
+    """That of the press; of depth and contact where they are in doubt; of the rows refused."""
+    status = jnp.where((status == PressStatus.OK) & (share > DEEPEST), PressStatus.TOO_DEEP, status)
+    if made is not None:
+        seen = made.own.status
+        if made.first is not None:
+            seen = jnp.maximum(seen, made.seen.status[made.first])
+        unsure = (seen > ContactStatus.FLAT) & (status == PressStatus.OK)
+        status = jnp.where(unsure, PressStatus.UNSURE, status)
+    for code in REFUSALS:
+        if code in refused:
+            status = jnp.where(refused[code], code, status)
+    return status.astype(jnp.int8)

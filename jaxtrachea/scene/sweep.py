@@ -1,0 +1,95 @@
+"""Normal presses at many contact points."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxtrachea._arguments import ArrayLike, shaped
+from jaxtrachea.mechanics.oblique import press_oblique
+from jaxtrachea.mechanics.skeleton import local_frame
+from jaxtrachea.scene.ranges import depth_share, lacking
+from jaxtrachea.scene.refusals import REFUSALS, on_the_tube, status_of
+from jaxtrachea.scene.stage import Scene
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.material import Material
+
+
+class Sweep(NamedTuple):
+    """Normal presses at many contact points.
+
+    Attributes:
+        force: normal contact force, N; shape (points,).
+        indentation: local, along the normal, mm.
+        compliance: of the skeleton along the normal, mm/N; NaN where nothing moves.
+        depth_share: as in `Simulation`.
+        status: a `PressStatus` each.
+    """
+
+    force: Float[Array, " points"]
+    indentation: Float[Array, " points"]
+    compliance: Float[Array, " points"]
+    depth_share: Float[Array, " points"]
+    status: Int[Array, " points"]
+
+
+def sweep(
+    scene: Scene,
+    material: Material,
+    s: ArrayLike,
+    phi: ArrayLike,
+    depth: ArrayLike,
+    *,
+    chunk: int = 256,
+) -> Sweep:
+    """Press along the normal at many contact points, `chunk` of them at a time.
+
+    Args:
+        scene: its geometry and the level of rings, shear and laws of its plan are used; OFF_PLAN
+            where a point presses and the material gives more than the plan has (as in `simulate`).
+        material: -
+        s: mm.
+        phi: rad, within the half-angle of the rings; else BEHIND_GAP where it presses.
+        depth: of the tool along the inward normal, mm; 0 and less: NO_CONTACT (see `Options`).
+        chunk: points computed together.
+
+    Raises:
+        ValueError: arrays of different lengths, or no numbers.
+    """
+    dtype = scene.geometry.length.dtype
+    s = shaped("s", s, ("points",), dtype=dtype)
+    phi, depth = (
+        shaped(name, value, s.shape, dtype=dtype, why=" (as s has)")
+        for name, value in (("phi", phi), ("depth", depth))
+    )
+
+    unlike = set(lacking(scene, material)) - {"axial"}  # every press is along the normal
+
+    def one(at):
+        s_c, phi_c, d = at
+        acting = d != 0 if scene.plan.options.contact == "bonded" else ~(d <= 0)
+        behind = on_the_tube(scene, s_c, phi_c)[2] & ~acting
+        phi_c, d = (jnp.where(behind, 0, v) for v in (phi_c, d))  # needs nothing of the rings
+        inward = local_frame(phi_c)[0]
+        press = press_oblique(
+            scene.geometry, material, s_c, phi_c, d * inward, scene.plan.options,
+            rings=scene.plan.rings, axial=False,
+        )  # fmt: skip
+        force, way, depth = (v @ inward for v in (press.force, press.skeleton, press.depth))
+        free = ~(force != 0)
+        softness = jnp.where(free, jnp.nan, way / jnp.where(free, 1, force))
+        share = depth_share(scene, press.depth, press.skeleton, inward)
+        refused = {}
+        if unlike:
+            refused = {code: press.status == code for code in REFUSALS}
+            refused[PressStatus.OFF_PLAN] = acting
+            force, depth, softness = (
+                jnp.where(acting, jnp.nan, v) for v in (force, depth, softness)
+            )
+        status = status_of(press.status, share, None, refused)
+        return Sweep(
+            force=force, indentation=depth, compliance=softness, depth_share=share, status=status
+        )
+
+    return jax.lax.map(one, (s, phi, depth), batch_size=chunk)

@@ -1,0 +1,70 @@
+"""The outside of the tube as convex patches, for a tool to touch."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtrachea.contact.patches import Patches, straight_patches
+from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.contact.walls import patches_of
+from jaxtrachea.scene import wall_check
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.mesh import Mesh
+
+#: Patches of the tube searched for a contact with a tool shorter than one of them.
+NEAR = 2
+#: Patches of a mesh: their rounding, and corners of each (docs/scenes.md says what that loses).
+ROUNDED, CORNERS = 0.15, 128
+#: Longest patch over the usual distance of the rings (at most the radius): beyond the last ring a
+#: tube goes on, and one patch would bridge its bend.
+LONGEST = 1.5
+
+
+def round_wall(geometry: Geometry, radius: float) -> Patches:
+    """A straight cylinder, in patches about as long as it is wide: so their rounding is small."""
+    length = float(geometry.length)
+    borders = np.linspace(0, length, max(round(length / (2 * float(geometry.radius))), 1) + 1)
+    return straight_patches(borders, radius, dtype=geometry.length.dtype)
+
+
+def checked_walls(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
+    """The wall of a mesh; that of an imported one is checked against its triangles."""
+    tube = _walls(geometry, mesh, progress)
+    if mesh.frames is None:
+        return tube
+    wall_check.check(mesh, geometry, tube)
+    doubtful = wall_check.look_beyond(mesh, geometry, tube).doubtful
+    return dataclasses.replace(tube, doubtful=jnp.asarray(doubtful)) if doubtful.any() else tube
+
+
+def _walls(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
+    """The surface of a mesh, cut midway between the rings: each patch bulges with its ring.
+
+    Spans longer than `LONGEST` says are cut evenly.
+    """
+    numbers = (mesh.vertices, mesh.faces, mesh.s, mesh.phi, mesh.distance)
+    vertices, faces, s, phi, distance = (np.asarray(v) for v in numbers)
+    centres = frames = None
+    if mesh.frames is not None:
+        frames = np.asarray(mesh.frames)
+        across = np.stack([distance * np.cos(phi), distance * np.sin(phi)], axis=1)
+        centres = vertices - np.einsum("vij,vj->vi", frames[:, :, 1:], across)
+    ring = np.asarray(geometry.ring_positions, float)
+    ends = max(float(s.min()), 0.0), min(float(s.max()), float(geometry.length))
+    between = (ring[1:] + ring[:-1]) / 2
+    borders = np.array([ends[0], *between[(between > ends[0]) & (between < ends[1])], ends[1]])
+    usual = wall_check.spacing_of(geometry)
+    parts = np.ceil(np.diff(borders) / (LONGEST * usual) - 1e-4).astype(int)
+    spans = zip(borders[:-1], borders[1:], np.maximum(parts, 1), strict=True)
+    borders = np.concatenate([*(np.linspace(a, b, n + 1)[:-1] for a, b, n in spans), borders[-1:]])
+    return patches_of(
+        vertices, faces, s, borders, centres=centres, frames=frames, rounding=ROUNDED, most=CORNERS,
+        overlap=wall_check.overlap_of(geometry), dtype=geometry.length.dtype, progress=progress,
+    )  # fmt: skip
+
+
+def near_patches(tool: Shape, geometry: Geometry, count: int) -> int:
+    """As many patches as the tool can lie along, and one more."""
+    length = np.ptp(np.asarray(tool.vertices), axis=1).max() + 2 * float(tool.radius)
+    return min(NEAR + int(length * count / float(geometry.length)), count)
