@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Integer
 
+from jaxtrachea._errors import InputError
 from jaxtrachea.measurements.usage import Usage
 from jaxtrachea.units import UnitError, parse_quantity, unit_factor
 
 
-class DataError(ValueError):
+class DataError(InputError):
     """A whole file or study cannot be read; the message names file, place, expectation and cure."""
 
 
@@ -288,8 +289,9 @@ def identify_file(path: Path, options: ReadOptions) -> FileIdentity:
     match = pattern.search(path.name)
     if match is None:
         raise DataError(
-            f"{path}: the file name does not fit the specimen pattern {options.specimen!r};"
-            " correct the pattern or leave the file out"
+            f"the file name does not fit the specimen pattern {options.specimen!r}",
+            place=str(path),
+            cure="correct the pattern or leave the file out",
         )
     found = match.groupdict()
     position: dict[str, float | None] = {"s": None, "phi": None}
@@ -301,6 +303,8 @@ def identify_file(path: Path, options: ReadOptions) -> FileIdentity:
                 )
             except ValueError as error:
                 raise DataError(
-                    f"{path}: {role} in the file name: {error}; give its unit in units"
+                    f"{role} in the file name: {error}",
+                    place=str(path),
+                    cure="give its unit in units",
                 ) from None
     return FileIdentity(found["specimen"], found.get("trial"), position["s"], position["phi"])

@@ -122,17 +122,20 @@ def _read_one(path: Path, options: ReadOptions) -> Measurements:
     try:
         return read_measurements([path], options)
     except DataError as error:
-        text = str(error).removeprefix(f"{path}: ")
-        message, _, cure = text.rpartition("; ")
         bad = BadCurve(
             path.stem,
             "(all)",
             str(path),
             "unreadable",
-            message or text,
-            cure if message else "repair the file or leave it out",
+            _own(error, path),
+            error.remedy or "repair the file or leave it out",
         )
         return Measurements((), (bad,), (path,))
+
+
+def _own(error: DataError, path: Path) -> str:
+    """What is wrong, without the path; with the place in the file, if the error has one."""
+    return error.problem if error.place in ("", str(path)) else f"{error.place}: {error.problem}"
 
 
 def _refuse_twice(parts: list[Measurements]) -> None:
@@ -143,7 +146,8 @@ def _refuse_twice(parts: list[Measurements]) -> None:
             key = (curve.specimen, curve.trial)
             if key in seen:
                 raise DataError(
-                    f"{curve.source}: specimen {key[0]!r} trial {key[1]!r} was already in "
-                    f"{seen[key]}; rename one, or give a specimen pattern that tells files apart"
+                    f"specimen {key[0]!r} trial {key[1]!r} was already in {seen[key]}",
+                    place=curve.source,
+                    cure="rename one, or give a specimen pattern that tells files apart",
                 )
             seen[key] = curve.source

@@ -86,7 +86,10 @@ def read_measurements(
     """
     options = options or ReadOptions()
     if isinstance(paths, (str, bytes)) or not paths:
-        raise DataError(f"paths is {paths!r}; expected a list of at least one file")
+        raise DataError(
+            f"paths is {paths!r}",
+            cure="expected a list of at least one file",
+        )
     files = tuple(Path(path) for path in paths)
     curves: list[Curve] = []
     bad: list[BadCurve] = []
@@ -102,8 +105,9 @@ def read_measurements(
             key = (record.specimen, record.trial)
             if key in seen:
                 raise DataError(
-                    f"{record.source}: specimen {key[0]!r} trial {key[1]!r} was already in"
-                    f" {seen[key]}; rename one, or give a specimen pattern that tells files apart"
+                    f"specimen {key[0]!r} trial {key[1]!r} was already in {seen[key]}",
+                    place=record.source,
+                    cure="rename one, or give a specimen pattern that tells files apart",
                 )
             seen[key] = record.source
             done = record if isinstance(record, BadCurve) else finish(record, options)
@@ -140,10 +144,18 @@ def write_hdf5(
 
 def _check_file(path: Path) -> None:
     if not path.exists():
-        raise DataError(f"{path}: no such file; check the path")
+        raise DataError(
+            "no such file",
+            place=str(path),
+            cure="check the path",
+        )
     if not path.is_file():
         what = "a folder, so is no file" if path.is_dir() else "a device or a pipe, so is no file"
-        raise DataError(f"{path}: is {what}; list files with curves instead")
+        raise DataError(
+            f"is {what}",
+            place=str(path),
+            cure="list files with curves instead",
+        )
 
 
 def _read_file(path: Path, options: ReadOptions) -> tuple[list[RawCurve | BadCurve], list[str]]:
@@ -163,7 +175,11 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[list[RawCurve | BadCur
         return _read_workbook(path, asked, options)
     if found != "text":
         what = "HDF5" if found == "hdf5" else "a workbook (xlsx)"
-        raise DataError(f"{path}: is {what}, but data.format is {asked!r}; remove data.format")
+        raise DataError(
+            f"is {what}, but data.format is {asked!r}",
+            place=str(path),
+            cure="remove data.format",
+        )
     text = Text(path, read_lines(path))
     kind = asked or _sniff(text.lines)
     if kind == "afmformats":
@@ -186,7 +202,7 @@ def _read_workbook(
     try:
         records = _TEXT_READERS["tidy" if kind == "afmformats" else kind](text, options)
     except DataError as error:
-        raise DataError(f"{error}{hint}") from None
+        raise DataError.like(error, cure=error.cure + hint) from None
     records = [
         dataclasses.replace(r, cure=r.cure + hint)
         if isinstance(r, BadCurve) and r.kind in _OF_THE_SHEET
@@ -221,6 +237,7 @@ def _sniff_hdf5(path: Path) -> str:
         if any(name.isdecimal() for name in file):
             return "afmformats"
     raise DataError(
-        f"{path}: HDF5 of no known layout; expected root attribute schema ="
-        f' "{hdf5.SCHEMA}", or groups 0, 1, ... of afmformats'
+        "HDF5 of no known layout",
+        place=str(path),
+        cure=f'expected root attribute schema = "{hdf5.SCHEMA}", or groups 0, 1, ... of afmformats',
     )

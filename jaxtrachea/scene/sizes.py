@@ -36,7 +36,8 @@ def check_sizes(geometry: Geometry, outer: float, tool: Shape | None) -> None:
         raise SizeError(
             f"is {outer:.4g} mm, that of the rings' line {radius:.4g} mm",
             key="radius of the outside",
-            expected="it half to one and a half times as large (a wall not thicker than the radius)",
+            expected="it half to one and a half times as large (a wall not thicker than the "
+            "radius)",
             cure="check the units of wall and radius",
             joint=" ",
         )

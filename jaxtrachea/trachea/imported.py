@@ -26,7 +26,7 @@ from jaxtrachea.trachea.cleaning import Surface, clean
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh, MeshError, vertex_normals
 from jaxtrachea.trachea.rings import find_anterior, find_rings
-from jaxtrachea.units import unit_factor
+from jaxtrachea.units import UnitError, unit_factor
 
 #: Length of a trachea with its wall, infant to adult, mm: what a guess of the unit goes by.
 PLAUSIBLE = 40.0, 250.0
@@ -213,7 +213,7 @@ def _scale(surface: Surface, path: Path, unit: str | None, notes: list[str]) -> 
     if unit is not None:
         try:
             scale = float(unit_factor(unit, "length"))
-        except ValueError as error:
+        except UnitError as error:
             raise MeshError.like(error, key="") from error
         if not POSSIBLE[0] <= size * scale <= POSSIBLE[1]:
             raise MeshError(f"unit={unit!r} makes it {size * scale:.4g} mm long; correct unit=")

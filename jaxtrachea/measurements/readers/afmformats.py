@@ -103,7 +103,9 @@ def _read_hdf5(path: Path, who: FileIdentity, options: ReadOptions) -> list[RawC
                 found.append(bad(who.specimen, trial, source, fault))
     if not found:
         raise DataError(
-            f"{path}: no groups 0, 1, ... as afmformats writes them; export the file again"
+            "no groups 0, 1, ... as afmformats writes them",
+            place=str(path),
+            cure="export the file again",
         )
     return found
 
@@ -156,7 +158,11 @@ def _tab_head(path: Path, lines: list[Line]) -> tuple[list[str], Mapping[str, An
         if lines[i].text.startswith("#") and texts[i]:
             names, first = _split_glued(texts[i].split("\t"))
             return names, metadata, [Line(lines[i].number, row) for row in first] + lines[i + 1 :]
-    raise DataError(f"{path}: no line with column names after the metadata; export the file again")
+    raise DataError(
+        "no line with column names after the metadata",
+        place=str(path),
+        cure="export the file again",
+    )
 
 
 def _split_glued(cells: list[str]) -> tuple[list[str], list[str]]:

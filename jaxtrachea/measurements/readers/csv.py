@@ -57,12 +57,16 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
             if role in NUMERIC or role.startswith("joint_")
         }
     except Fault as fault:
-        raise DataError(f"{place}: {fault}") from None
+        raise DataError(fault.message, place=place, cure=fault.cure) from None
     except DataError as error:
-        raise DataError(str(error) if place in str(error) else f"{place}: {error}") from None
+        raise DataError.like(error, place=error.place or place) from None
     twice = [key for key in state if key in roles]
     if twice:
-        raise DataError(f"{place}: {twice[0]} stands in the first line and in a column; remove one")
+        raise DataError(
+            f"{twice[0]} stands in the first line and in a column",
+            place=place,
+            cure="remove one",
+        )
     groups = _group(table, roles, state, options)
     return [
         _curve(table, roles, units, state, key, picked, options) for key, picked in groups.items()
@@ -77,26 +81,33 @@ def _state(lines: list[Line], word: str) -> tuple[dict, list[Line]]:
         state = json.loads(lines[0].text)
     except (ValueError, RecursionError) as error:
         raise DataError(
-            f"{word} {lines[0].number}: not a JSON object ({error}); correct it"
+            f"{word} {lines[0].number}: not a JSON object ({error})",
+            cure="correct it",
         ) from None
     known: dict = {key: str(state[key]) for key in ("specimen", "trial") if key in state}
     for key in ("s", "phi"):
         if key in state:
             if not isinstance(state[key], str | int | float):
                 raise DataError(
-                    f"{word} {lines[0].number}: {key}: expected a quantity with its unit,"
-                    ' as "17 mm"'
+                    f"{word} {lines[0].number}: {key}: expected a quantity with its unit, as "
+                    '"17 mm"',
                 )
             try:
                 known[key] = parse_quantity(state[key], role_dimension(key))
             except (ValueError, TypeError) as error:
-                raise DataError(f"{word} {lines[0].number}: {key}: {error}") from None
+                raise DataError(
+                    f"{word} {lines[0].number}: {key}: {error}",
+                ) from None
     return known, lines[1:]
 
 
 def _table(text: Text, lines: list[Line]) -> Table:
     if not lines:
-        raise DataError(f"{text.place}: is empty; expected a header with displacement and force")
+        raise DataError(
+            "is empty",
+            place=text.place,
+            cure="expected a header with displacement and force",
+        )
     delimiter = guess_delimiter(lines[0].text)
     header = split_cells(lines[0].text, delimiter)
     while header and header[-1] == "":
@@ -105,14 +116,16 @@ def _table(text: Text, lines: list[Line]) -> Table:
     repeated = {name for name in names if name and names.count(name) > 1}
     if repeated:
         raise DataError(
-            f"{text.place}: {text.word} {lines[0].number}: column {min(repeated)!r} is there"
-            " twice; rename one"
+            f"{text.word} {lines[0].number}: column {min(repeated)!r} is there twice",
+            place=text.place,
+            cure="rename one",
         )
     numbers, rows = read_rows(lines[1:], len(header), delimiter, text.word)
     if not rows:
         raise DataError(
-            f"{text.place}: no rows below the header in {text.word} {lines[0].number};"
-            " export it again"
+            f"no rows below the header in {text.word} {lines[0].number}",
+            place=text.place,
+            cure="export it again",
         )
     return Table(
         text=text,
@@ -147,13 +160,17 @@ def _group(
             groups[key].append(i)
             continue
         if fault := _name_fault(table, "specimen", specimen) or _name_fault(table, "trial", trial):
-            raise DataError(f"{table.text.place}: {table.text.word} {table.lines[i]}: {fault}")
+            raise DataError(
+                f"{table.text.word} {table.lines[i]}: {fault}",
+                place=table.text.place,
+            )
         if key in groups:
             first = table.lines[groups[key][0]]
             raise DataError(
-                f"{table.text.place}: specimen {key[0]!r} trial {key[1]!r} starts in"
-                f" {table.text.word} {first} and again in {table.text.word} {table.lines[i]};"
-                " keep the rows of a curve together, or rename it"
+                f"specimen {key[0]!r} trial {key[1]!r} starts in {table.text.word} {first} "
+                f"and again in {table.text.word} {table.lines[i]}",
+                place=table.text.place,
+                cure="keep the rows of a curve together, or rename it",
             )
         groups[key], last = [i], key
     return groups

@@ -56,7 +56,11 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
                 except Fault as fault:
                     found.append(bad(*key, source, fault))
     if not found:
-        raise DataError(f"{path}: /specimens is empty; add one group per specimen and trial")
+        raise DataError(
+            "/specimens is empty",
+            place=str(path),
+            cure="add one group per specimen and trial",
+        )
     return found
 
 
@@ -65,19 +69,25 @@ def _check_schema(path: Path, file: Any) -> None:
         schema = text_attribute(file, "schema")
         version = attribute(file, "schema_version")
     except Fault as fault:
-        raise DataError(f"{path}: {fault}") from None
+        raise DataError(fault.message, place=str(path), cure=fault.cure) from None
     if schema != SCHEMA:
         raise DataError(
-            f"{path}: root attribute schema is {schema!r}, expected {SCHEMA!r};"
-            " see docs/measurements.md"
+            f"root attribute schema is {schema!r}, expected {SCHEMA!r}",
+            place=str(path),
+            cure="see docs/measurements.md",
         )
     if not isinstance(version, (int, np.integer)) or version != SCHEMA_VERSION:
         raise DataError(
-            f"{path}: schema_version is {version}, this program reads {SCHEMA_VERSION};"
-            " update the program or the file"
+            f"schema_version is {version}, this program reads {SCHEMA_VERSION}",
+            place=str(path),
+            cure="update the program or the file",
         )
     if not hasattr(file.get("specimens"), "items"):
-        raise DataError(f"{path}: no group /specimens; expected specimens/<name>/<trial>")
+        raise DataError(
+            "no group /specimens",
+            place=str(path),
+            cure="expected specimens/<name>/<trial>",
+        )
 
 
 def _trial(group: Any, key: tuple[str, str], source: str, options: ReadOptions) -> RawCurve:

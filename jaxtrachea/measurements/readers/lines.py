@@ -96,7 +96,9 @@ def read_lines(path: Path) -> list[Line]:
     text = text.lstrip("\ufeff")
     if "\0" in text:
         raise DataError(
-            f"{path}: holds zero bytes, so it is no text table; export it as CSV or HDF5"
+            "holds zero bytes, so it is no text table",
+            place=str(path),
+            cure="export it as CSV or HDF5",
         )
     lines = re.split(r"\r\n|\n|\r", text)
     return [Line(i, line) for i, line in enumerate(lines, 1) if line.strip()]
@@ -116,8 +118,9 @@ def _bytes(path: Path) -> bytes:
         raise _unreadable(path, error) from None
     if len(data) > MAX_TEXT_BYTES:
         raise DataError(
-            f"{path}: more than {MAX_TEXT_BYTES} bytes of text, at most so many are read;"
-            " split it or use HDF5"
+            f"more than {MAX_TEXT_BYTES} bytes of text, at most so many are read",
+            place=str(path),
+            cure="split it or use HDF5",
         )
     return data
 
@@ -131,8 +134,10 @@ def _unpacked(path: Path) -> bytes:
                 size += len(block)
                 if size > MAX_TEXT_BYTES:
                     raise DataError(
-                        f"{path}: unpacks to more than {MAX_TEXT_BYTES} bytes of text, at most so"
-                        " many are read; unpack it and split it, or use HDF5"
+                        f"unpacks to more than {MAX_TEXT_BYTES} bytes of text, at most so "
+                        "many are read",
+                        place=str(path),
+                        cure="unpack it and split it, or use HDF5",
                     )
         with gzip.open(path) as stream:
             return stream.read(size)
@@ -141,11 +146,17 @@ def _unpacked(path: Path) -> bytes:
 
 
 def _unreadable(path: Path, error: OSError) -> DataError:
-    return DataError(f"{path}: cannot be read ({error.strerror}); check the permissions")
+    return DataError(
+        f"cannot be read ({error.strerror})",
+        place=str(path),
+        cure="check the permissions",
+    )
 
 
 def _damaged_gzip(path: Path, error: Exception) -> DataError:
     # BadGzipFile is an OSError, but its reason is in its text.
     return DataError(
-        f"{path}: a gzip file, cut off or damaged ({str(error)[:80]}); copy or pack it again"
+        f"a gzip file, cut off or damaged ({str(error)[:80]})",
+        place=str(path),
+        cure="copy or pack it again",
     )

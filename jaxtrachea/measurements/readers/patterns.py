@@ -55,9 +55,9 @@ def ensure_quick(pattern: re.Pattern, names: Sequence[str]) -> None:
         name = names[int(answer[-1])] if answer else names[0]
         shown = name if len(name) <= 80 else f"{name[:76]} ..."
         raise DataError(
-            f"the pattern {pattern.pattern!r} was stopped: it did not finish within {SECONDS:g} s"
-            f" on the file name {shown!r}, as repeats of repeats like (a+)+ do; repeat each part"
-            ' once, or write a template "{specimen}_A{trial}"'
+            f"the pattern {pattern.pattern!r} was stopped: it did not finish within "
+            f"{SECONDS:g} s on the file name {shown!r}, as repeats of repeats like (a+)+ do",
+            cure='repeat each part once, or write a template "{specimen}_A{trial}"',
         )
     _quick.update((pattern, name) for name in names)
 
@@ -94,7 +94,8 @@ def _tried(pattern: re.Pattern, names: list[str]) -> list[str]:
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise DataError(
-            f"the pattern {pattern.pattern!r} may backtrack for long, and cannot be tried"
-            f' ({error}); write a template "{{specimen}}_A{{trial}}", or repeat two parts at most'
+            f"the pattern {pattern.pattern!r} may backtrack for long, and cannot be tried "
+            f"({error})",
+            cure='write a template "{specimen}_A{trial}", or repeat two parts at most',
         ) from None
     return done.stdout.split()

@@ -90,7 +90,11 @@ def kind_of(path: Path) -> str:
         found = _named(head) or _json(path, head)
     if found is None:
         return "text"
-    raise DataError(f"{path}: is {found[0]}; {EXPECTED}; {found[1]}")
+    raise DataError(
+        f"is {found[0]}; {EXPECTED}",
+        place=str(path),
+        cure=f"{found[1]}",
+    )
 
 
 def is_workbook(path: Path) -> bool:

@@ -67,8 +67,9 @@ def opened(path: Path, *, audit: bool = True, read: tuple[str, ...] | None = Non
 def _damaged(path: Path, error: Exception) -> DataError:
     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
     return DataError(
-        f"{path}: not a readable HDF5 file, truncated or damaged ({reason});"
-        " copy or export it again"
+        f"not a readable HDF5 file, truncated or damaged ({reason})",
+        place=str(path),
+        cure="copy or export it again",
     )
 
 
@@ -115,7 +116,7 @@ class _Audit:
         self.groups: set = set()
 
     def refuse(self, name: str, what: str, cure: str) -> DataError:
-        return DataError(f"{self.path}:{name or '/'}: {what}; {cure}")
+        return DataError(what, place=f"{self.path}:{name or '/'}", cure=cure)
 
     def group(self, group: Any, name: str, depth: int) -> None:
         info = self.h5.h5o.get_info(group.id)

@@ -204,7 +204,8 @@ def resolve_unit(role: str, found: str | None, options: ReadOptions, place: str)
         ) from None
     if given is not None and unit_factor(given, role_dimension(role)) != factor:
         raise DataError(
-            f"{place} is in {found} but units.{general} says {given}; remove the wrong one"
+            f"{place} is in {found} but units.{general} says {given}",
+            cure="remove the wrong one",
         )
     return unit
 

@@ -77,8 +77,9 @@ def _opened(path: Path, *, values: bool) -> Iterator[Any]:
         openpyxl = importlib.import_module("openpyxl")
     except ImportError:
         raise DataError(
-            f"{path}: is an Excel workbook (xlsx), and openpyxl, which reads it, is not installed;"
-            " run pip install 'jaxtrachea[xlsx]', or save the sheet as CSV"
+            "is an Excel workbook (xlsx), and openpyxl, which reads it, is not installed",
+            place=str(path),
+            cure="run pip install 'jaxtrachea[xlsx]', or save the sheet as CSV",
         ) from None
     try:
         with path.open("rb") as stream, warnings.catch_warnings():
@@ -93,8 +94,9 @@ def _opened(path: Path, *, values: bool) -> Iterator[Any]:
     except _ERRORS as error:
         reason = " ".join(str(error).split())[:80] or type(error).__name__
         raise DataError(
-            f"{path}: not a readable workbook, truncated or damaged ({reason!a});"
-            " save it again, or save the sheet as CSV"
+            f"not a readable workbook, truncated or damaged ({reason!a})",
+            place=str(path),
+            cure="save it again, or save the sheet as CSV",
         ) from None
 
 
@@ -115,8 +117,9 @@ def _audit(path: Path) -> bool:
     except _ERRORS as error:
         reason = "it has a password" if "password" in str(error) else str(error)[:80]
         raise DataError(
-            f"{path}: not a readable workbook, truncated or damaged ({reason!a});"
-            " save it again without a password, or save the sheet as CSV"
+            f"not a readable workbook, truncated or damaged ({reason!a})",
+            place=str(path),
+            cure="save it again without a password, or save the sheet as CSV",
         ) from None
     return formulas
 
@@ -124,7 +127,11 @@ def _audit(path: Path) -> bool:
 def _check_sizes(path: Path, members: Sequence[zipfile.ZipInfo]) -> None:
     """`zipfile` reads no more of a member than it declares, so the declared sizes are bounds."""
     if len(members) > MAX_MEMBERS:
-        raise DataError(f"{path}: more than {MAX_MEMBERS} parts; save the sheet as CSV")
+        raise DataError(
+            f"more than {MAX_MEMBERS} parts",
+            place=str(path),
+            cure="save the sheet as CSV",
+        )
     sheets = 0
     for member in members:
         limit = MAX_PART_BYTES
@@ -137,8 +144,10 @@ def _check_sizes(path: Path, members: Sequence[zipfile.ZipInfo]) -> None:
             continue  # pictures and macros, which nobody opens
         if member.file_size > limit or sheets > MAX_SHEET_BYTES:
             raise DataError(
-                f"{path}: {member.filename!a} unpacks to {member.file_size} bytes, at most"
-                f" {limit} are read; save the sheet alone as CSV"
+                f"{member.filename!a} unpacks to {member.file_size} bytes, at most {limit} "
+                "are read",
+                place=str(path),
+                cure="save the sheet alone as CSV",
             )
 
 
@@ -149,8 +158,9 @@ def _scan(path: Path, name: str, stream: Any) -> bool:
         data = tail + block
         if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
             raise DataError(
-                f"{path}: {name!a} defines entities or is not UTF-8, as no spreadsheet program"
-                " writes it; save the sheet as CSV"
+                f"{name!a} defines entities or is not UTF-8, as no spreadsheet program writes it",
+                place=str(path),
+                cure="save the sheet as CSV",
             )
         formulas = formulas or ("worksheets/" in name and bool(_FORMULA.search(data)))
         tail = data[-16:]
@@ -161,14 +171,19 @@ def _sheet(path: Path, book: Any, name: str | None) -> Any:
     """The sheet of that name, or the first that is not hidden."""
     pages = book.worksheets
     if not pages:
-        raise DataError(f"{path}: has no sheet with cells; save the table as CSV")
+        raise DataError(
+            "has no sheet with cells",
+            place=str(path),
+            cure="save the table as CSV",
+        )
     if name is None:
         return next((page for page in pages if page.sheet_state == "visible"), pages[0])
     found = [page for page in pages if page.title == name]
     if not found:
         raise DataError(
-            f"{path}: has no sheet {name!r}; its sheets are {listed([p.title for p in pages])};"
-            " correct data.sheet"
+            f"has no sheet {name!r}; its sheets are {listed([p.title for p in pages])}",
+            place=str(path),
+            cure="correct data.sheet",
         )
     return found[0]
 
@@ -187,16 +202,18 @@ def _rows(path: Path, page: Any) -> dict[int, tuple]:
     for number, row in enumerate(page.iter_rows(values_only=True), 1):
         if number > MAX_ROWS or len(row) > MAX_COLUMNS:
             raise DataError(
-                f"{path}: sheet {page.title!r} has cells beyond row {MAX_ROWS} or column"
-                f" {MAX_COLUMNS}; save it as CSV"
+                f"sheet {page.title!r} has cells beyond row {MAX_ROWS} or column {MAX_COLUMNS}",
+                place=str(path),
+                cure="save it as CSV",
             )
         if any(cell is not None for cell in row):
             rows[number] = row
             cells += len(row)
         if cells > MAX_CELLS:
             raise DataError(
-                f"{path}: sheet {page.title!r} has more than {MAX_CELLS} cells (row {number});"
-                " save it as CSV"
+                f"sheet {page.title!r} has more than {MAX_CELLS} cells (row {number})",
+                place=str(path),
+                cure="save it as CSV",
             )
     return rows
 
