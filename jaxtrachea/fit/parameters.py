@@ -5,6 +5,7 @@ import math
 from typing import Literal
 
 from jaxtrachea._arguments import check_word
+from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.press import Options
 
 Scope = Literal["shared", "specimen", "trial"]
@@ -46,30 +47,36 @@ class Parameter:
         """Check that value, bounds and scale agree.
 
         Raises:
-            ValueError: naming the parameter and the cure.
+            InputError: naming the parameter and the cure.
         """
         check_word(f"{self.name}: scale", self.scale, Scale)
         check_word(f"{self.name}: scope", self.scope, Scope)
         if not 0 < self.step < math.inf:
-            raise ValueError(f"{self.name}: step is {self.step}; expected more than 0")
+            raise InputError(f"step is {self.step}", key=self.name, expected="more than 0")
         if not all(map(math.isfinite, (self.value, self.lower, self.upper))):
-            raise ValueError(f"{self.name}: value and bounds must be finite numbers; give such")
+            raise InputError(
+                "value and bounds must be finite numbers", key=self.name, cure="give such"
+            )
         if self.fixed:
             return
         if self.lower >= self.upper:
-            raise ValueError(
-                f"{self.name}: lower bound {self.lower:g} is not below upper bound {self.upper:g}; "
-                "swap or correct them"
+            raise InputError(
+                f"lower bound {self.lower:g} is not below upper bound {self.upper:g}",
+                key=self.name,
+                cure="swap or correct them",
             )
         if self.scale == "log" and self.lower <= 0:
-            raise ValueError(
-                f"{self.name}: scale 'log' needs a positive lower bound, found {self.lower:g}; "
-                "raise the bound or use scale = 'linear'"
+            raise InputError(
+                f"scale 'log' needs a positive lower bound, found {self.lower:g}",
+                key=self.name,
+                cure="raise the bound or use scale = 'linear'",
             )
         if not self.lower <= self.value <= self.upper:
-            raise ValueError(
-                f"{self.name}: initial value {self.value:g} {self.unit} is outside its bounds "
-                f"[{self.lower:g}, {self.upper:g}]; move one or the other"
+            raise InputError(
+                f"initial value {self.value:g} {self.unit} is outside its bounds "
+                f"[{self.lower:g}, {self.upper:g}]",
+                key=self.name,
+                cure="move one or the other",
             )
 
     def to_scaled(self, value: float) -> float:

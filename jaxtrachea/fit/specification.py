@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Collection
 
+from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
 from jaxtrachea.fit.levenberg_marquardt import MOST_SLOTS, Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS, Parameter, in_model
@@ -14,7 +15,7 @@ from jaxtrachea.measurements.read import (
 )
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.section import geometry_of
-from jaxtrachea.units import parse_quantity
+from jaxtrachea.units import UnitError, parse_quantity
 
 
 def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Parameter, ...]:
@@ -44,9 +45,10 @@ def _parameter(default: Parameter, section: ParameterSection | None) -> Paramete
         if section.fixed is not None:
             return _fixed(default, section.fixed)
         return _free(default, section)
-    except ValueError as error:
-        text = str(error).removeprefix(f"{default.name}: ")
-        raise SpecError(f"parameters.{default.name}: {text}") from None
+    except InputError as error:
+        name = f"parameters.{default.name}"
+        key = name if error.key == default.name else f"{name}: {error.key}"
+        raise SpecError.like(error, key=key) from None
 
 
 def _number(default: Parameter, key: str, value: str | float | int) -> float:
@@ -55,14 +57,15 @@ def _number(default: Parameter, key: str, value: str | float | int) -> float:
         return float(value)
     try:
         return parse_quantity(value, default.dimension)
-    except ValueError as error:
-        raise ValueError(f"{key}: {error}") from None
+    except UnitError as error:
+        raise InputError.like(error, key=key) from None
 
 
 def _fixed(default: Parameter, given: str | float | int) -> Parameter:
     value = _number(default, "fixed", given)
     if default.scale == "log" and value <= 0:
-        raise ValueError(f"fixed: {value:g} {default.unit} is no stiffness; expected more than 0")
+        found = f"{value:g} {default.unit} is no stiffness"
+        raise InputError(found, key="fixed", expected="more than 0")
     return dataclasses.replace(default, value=value, fixed=True)
 
 
@@ -95,10 +98,9 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
     for curve in measurements.curves:
         try:
             check_curve(curve, geometry, options)
-        except ValueError as error:
-            text = str(error)
-            reasons.append(f"{curve.source}: {text}")
-            text = text.split(": ", 1)[-1]
+        except InputError as error:
+            reasons.append(f"{curve.source}: {error}")
+            text = str(InputError.like(error, place=""))
             cure = "correct the file, or the trachea and model sections"
             bad.append(BadCurve(curve.specimen, curve.trial, curve.source, "position", text, cure))
         else:

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxtrachea._arguments import check_record, check_word
+from jaxtrachea._errors import InputError
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.model import Common, FitModel, Loss, columns_of, numbers_of
 from jaxtrachea.fit.onset import blends, natural_steps, onset_is_sought, within_reach
@@ -275,28 +276,32 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
     """Refuse a curve that the model cannot press.
 
     Raises:
-        ValueError: no contact position, one outside the tube or off the midline, a marker on a ring
+        InputError: no contact position, one outside the tube or off the midline, a marker on a ring
             that does not exist; specimen and trial are named.
     """
     where = f"specimen {curve.specimen!r} trial {curve.trial!r}"
     length, rings = float(geometry.length), geometry.rings
     if curve.s_c is None:
         if options.coupling == "series":
-            raise ValueError(
-                f"{where}: no contact position; give a column s, or data.s for all curves "
-                "(coupling = 'total' needs none)"
+            raise InputError(
+                "no contact position",
+                place=where,
+                cure="give a column s, or data.s for all curves (coupling = 'total' needs none)",
             )
     elif not 0 <= curve.s_c <= length:
-        raise ValueError(
-            f"{where}: contact at s = {curve.s_c:g} mm, expected on the tube, 0 to {length:g} mm"
+        raise InputError(
+            f"contact at s = {curve.s_c:g} mm, expected on the tube, 0 to {length:g} mm",
+            place=where,
         )
     if options.coupling == "series" and abs(curve.phi_c) > 1e-6:
-        raise ValueError(
-            f"{where}: contact at phi = {np.degrees(curve.phi_c):.3g} deg; this model presses on "
-            "the anterior midline (phi = 0) only"
+        raise InputError(
+            f"contact at phi = {np.degrees(curve.phi_c):.3g} deg; this model presses on the "
+            "anterior midline (phi = 0) only",
+            place=where,
         )
     if curve.joint_rings is not None and np.any(curve.joint_rings >= rings):
-        raise ValueError(f"{where}: marker on ring {curve.joint_rings.max() + 1} of {rings}")
+        found = f"marker on ring {curve.joint_rings.max() + 1} of {rings}"
+        raise InputError(found, place=where)
 
 
 def _unknowns(lane: list[Curve], parameters) -> list[tuple[Parameter, str, str]]:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea._errors import InputError
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.map_lanes import program
 from jaxtrachea.fit.onset import onset_is_sought
@@ -63,8 +64,8 @@ def pressable(stored: StoredFit, curves: Sequence[Curve]) -> tuple[list[Curve], 
     for curve in curves:
         try:
             check_curve(curve, stored.study.model.geometry, stored.study.model.options)
-        except ValueError as error:
-            text = str(error).split(": ", 1)[-1]
+        except InputError as error:
+            text = str(InputError.like(error, place=""))
             cure = "correct the file; tube and model are those of the fit"
             bad.append(BadCurve(curve.specimen, curve.trial, curve.source, "position", text, cure))
         else:

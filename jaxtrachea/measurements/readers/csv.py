@@ -161,8 +161,9 @@ def _group(
             continue
         if fault := _name_fault(table, "specimen", specimen) or _name_fault(table, "trial", trial):
             raise DataError(
-                f"{table.text.word} {table.lines[i]}: {fault}",
+                f"{table.text.word} {table.lines[i]}: {fault[0]}",
                 place=table.text.place,
+                cure=fault[1],
             )
         if key in groups:
             first = table.lines[groups[key][0]]
@@ -176,22 +177,23 @@ def _group(
     return groups
 
 
-def _name_fault(table: Table, role: str, name: str) -> str:
-    """What is wrong with a name and its cure; empty if nothing is."""
+def _name_fault(table: Table, role: str, name: str) -> tuple[str, str] | None:
+    """What is wrong with a name and its cure; None if nothing is."""
     if not name:
         cure = "name it in every row"
         if table.text.sheet is not None:
             cure += " (merged cells hold their value in the first alone: unmerge and fill down)"
-        return f"{role} is empty; {cure}"
+        return f"{role} is empty", cure
     if name.startswith("=") and table.text.sheet is not None:
         return (
-            f"{role} {name!r} is a formula without a stored value; open the file in a spreadsheet"
-            " program and save it, or write the name itself"
+            f"{role} {name!r} is a formula without a stored value",
+            "open the file in a spreadsheet program and save it, or write the name itself",
         )
     hidden = [c for c in name if not c.isprintable()]
     if hidden:
-        return f"{role} {name!a} holds the unprintable character U+{ord(hidden[0]):04X}; rename it"
-    return ""
+        found = f"{role} {name!a} holds the unprintable character U+{ord(hidden[0]):04X}"
+        return found, "rename it"
+    return None
 
 
 def _curve(
