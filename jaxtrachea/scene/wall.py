@@ -30,7 +30,7 @@ def round_wall(geometry: Geometry, radius: float) -> Patches:
 
 def checked_walls(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
     """The wall of a mesh; that of an imported one is checked against its triangles."""
-    tube = _walls(geometry, mesh, progress)
+    tube = patches_of_wall(geometry, mesh, progress)
     if mesh.frames is None:
         return tube
     wall_check.check(mesh, geometry, tube)
@@ -38,7 +38,7 @@ def checked_walls(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
     return dataclasses.replace(tube, doubtful=jnp.asarray(doubtful)) if doubtful.any() else tube
 
 
-def _walls(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
+def patches_of_wall(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
     """The surface of a mesh, cut midway between the rings: each patch bulges with its ring.
 
     Spans longer than `LONGEST` says are cut evenly.

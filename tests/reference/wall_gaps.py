@@ -26,7 +26,8 @@ from jaxtrachea import table_1  # noqa: E402
 from jaxtrachea.contact.patches import touch  # noqa: E402
 from jaxtrachea.contact.pose import Pose  # noqa: E402
 from jaxtrachea.contact.shapes import sphere  # noqa: E402
-from jaxtrachea.scene import stage, wall_check  # noqa: E402
+from jaxtrachea.scene import wall as walls_of_scene  # noqa: E402
+from jaxtrachea.scene import wall_check  # noqa: E402
 from jaxtrachea.trachea.imported import read_mesh  # noqa: E402
 from jaxtrachea.trachea.mesh import MeshError  # noqa: E402
 from jaxtrachea.trachea.tube import make_tube  # noqa: E402
@@ -43,7 +44,7 @@ def gap_of(tube, centre, radius):
 
 def gaps(mesh, geometry):
     """Gaps of the balls: of the mesh, and of the patches less that; limit of a scene."""
-    tube = stage._walls(geometry, mesh)
+    tube = walls_of_scene.patches_of_wall(geometry, mesh)
     centres, _, radius = wall_check._balls(mesh, geometry, BALLS)
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     true = trimesh.proximity.closest_point(surface, centres)[1] - radius
@@ -140,7 +141,7 @@ def main(files):
             trimesh.Trimesh(vertices, np.asarray(faces), process=False).export(path)
             try:
                 read = read_mesh(path, **given)
-                tube = stage._checked_walls(read.geometry, read.mesh)
+                tube = walls_of_scene.checked_walls(read.geometry, read.mesh)
                 seen = wall_check.measure(read.mesh, read.geometry, tube)
                 answer = f"**read**: {read.notes[-1]}; {seen.sentence}"
             except (MeshError, ValueError) as error:

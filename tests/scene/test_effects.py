@@ -1,0 +1,160 @@
+"""An effect is declared once; options, table, plan, what a row lacks and ladders follow."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from run_cli import run as run_cli
+from small_scenes import BALL, BARE, MATERIAL, SPRINGS, TUBE, ball, poses
+
+from jaxtrachea import Poses, make_scene, simulate, sweep
+from jaxtrachea.config import SpecError
+from jaxtrachea.scene.build import effects_of
+from jaxtrachea.scene.declare import SceneFacts
+from jaxtrachea.scene.effects import EFFECTS, EffectOptions, goes_with
+from jaxtrachea.scene.facts import facts_of
+from jaxtrachea.scene.rules import make_plan
+from jaxtrachea.scene.spec import EffectsSection, load_scene_spec
+from jaxtrachea.status import PressStatus
+
+ALL = frozenset({"EA_L", "EI_C", "k_t", "GA_L", "k_A", "k_B", "k_1_ring"})
+#: A scene in which every effect is on.
+EVERYTHING = SceneFacts(
+    poses=True, angle=0.3, along=0.5, across=0.5, slip=1.0, spacing=10.0, friction=True, known=ALL
+)
+
+
+def test_the_table_has_the_words_of_the_declarations():
+    fields = EffectsSection.model_fields
+    assert list(fields) == list(EFFECTS)
+    for effect in EFFECTS.values():
+        for word in ("auto", *effect.levels):
+            assert getattr(EffectsSection(**{effect.name: word}), effect.name) == word
+            assert getattr(EffectOptions(**{effect.name: word}), effect.name) == word
+        with pytest.raises(ValueError, match=effect.name):
+            EffectsSection(**{effect.name: "no such level"})
+
+
+def test_a_plan_keeps_every_level_it_is_given():
+    plan = make_plan(EVERYTHING)
+    assert all(plan.has(name) for name in EFFECTS)
+    for effect in EFFECTS.values():
+        for level in effect.levels:
+            assert plan.at(**{effect.name: level}).level(effect.name) == level
+
+
+#: What goes with an effect, by mechanics: vectors need a second plane; clamps move on axial
+#: springs and are seen on the surface only, as the dent is.
+TAKES = {
+    "friction": {"friction"},
+    "rings": {"rings"},
+    "axial": {"axial", "end_motion"},
+    "surface": {"surface", "end_motion", "dent"},
+    "end_motion": {"end_motion"},
+    "dent": {"dent"},
+    "shear": {"shear"},
+    "two_material": {"two_material"},
+}
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_what_goes_with_an_effect(name):
+    plan = make_plan(EVERYTHING)
+    less = plan.without(name)
+    if name not in TAKES:  # a place is no effect to leave out; friction holds the second plane
+        assert less is None
+        return
+    gone = {e for e in EFFECTS if plan.has(e) and not less.has(e)}
+    assert gone == TAKES[name] == {name} | goes_with(name)
+    assert less.ignored == plan.ignored | gone
+    assert less.without(name) is None
+
+
+def test_the_second_plane_goes_without_friction():
+    less = make_plan(dataclasses.replace(EVERYTHING, friction=False)).without("second_plane")
+    assert (less.second_plane, less.rings, less.axial, less.end_motion) == (
+        False, "mat", False, False
+    )  # fmt: skip
+
+
+SCENE = """
+[material]
+EI_L = "1.862 N mm^2"
+k_M = "0.1 N/mm"
+k_1 = "0.3 N/mm"
+k_3 = "0.02 N/mm^3"
+[path]
+s = "75 mm"
+displacement = ["0 mm", "-4 mm", "0 mm"]
+[effects]
+"""
+
+
+@pytest.mark.parametrize(
+    "line", ["seat = 'first'", "seat = 'auto'", "contact_point = 'each'", "contact_point = 'first'"]
+)
+def test_former_words_are_refused_with_the_new_ones(line, tmp_path, monkeypatch, capsys):
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE + line)
+    with pytest.raises(SpecError):
+        load_scene_spec(path)
+    code, _, err = run_cli(monkeypatch, capsys, "plan", path)
+    assert (code, "Traceback" in err, err.count("\n")) == (2, False, 1)
+    for words in ("effects", "contact_point", "'fixed'", "'per_step'"):
+        assert words in err
+    path.write_text(SCENE + "contact_point = 'per_step'\ndent = 8")
+    assert effects_of(load_scene_spec(path)).contact_point == "per_step"
+
+
+def test_former_words_are_refused_from_python():
+    with pytest.raises(ValueError, match="'each'; expected 'auto' or 'fixed' or 'per_step'"):
+        EffectOptions(contact_point="each")
+
+
+#: Straight down beside the midline, a little along the tube.
+DOWN = [[75.0, 18.0, 0.0], [75.5, 16.0, 0.0], [76.0, 15.0, 0.0]]
+
+
+def test_rows_in_the_lumen_are_no_contacts_of_the_plan():
+    """The facts are those of the path without them; they made another contact point of each."""
+    small = dataclasses.replace(BARE)
+    inside = [[40.0, 0.0, 0.0], [40.0, 7.0, 0.0]]  # begins within the wall, and reaches into it
+    away = [[75.0, 40.0, 0.0]]
+    whole, outside = (
+        Poses(jnp.tile(jnp.eye(3), (len(rows), 1, 1)), jnp.asarray(rows))
+        for rows in (inside + away + DOWN, away + DOWN)
+    )
+    scene = make_scene(TUBE, SPRINGS, outside, tool=BALL, effects=small)
+    assert facts_of(scene, SPRINGS, whole) == facts_of(scene, SPRINGS, outside)
+    made = make_scene(TUBE, SPRINGS, whole, tool=BALL, effects=small)
+    assert made.plan == scene.plan
+    found = simulate(made, SPRINGS, whole)
+    alone = simulate(scene, SPRINGS, outside)
+    assert found.status[:2].tolist() == [PressStatus.IN_LUMEN] * 2
+    np.testing.assert_allclose(found.force[2:], alone.force, rtol=1e-12)
+
+
+def test_a_bad_material_is_one_in_simulate_and_in_sweep():
+    """Off the plan too: `sweep` said OFF_PLAN where `simulate` says BAD_MATERIAL."""
+    path = poses([75, 18, 0], [75, 15, 0], 2)
+    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=BARE)
+    bad = dataclasses.replace(MATERIAL, k_1=jnp.asarray(-0.3))
+    assert simulate(scene, bad, path).status.tolist() == [PressStatus.BAD_MATERIAL] * 2
+    places, depth = [75.0] * 3, [2.0, 0.0, 1.0]
+    assert sweep(scene, bad, places, [0.0] * 3, depth).status.tolist() == (
+        [PressStatus.BAD_MATERIAL] * 3
+    )
+    out = sweep(scene, MATERIAL, places, [0.0] * 3, depth)
+    off = PressStatus.OFF_PLAN
+    assert out.status.tolist() == [off, PressStatus.NO_CONTACT, off]
+
+
+def test_behind_the_rings_or_without_a_number_a_row_is_not_off_the_plan():
+    """Of two reasons the same one is named as in `simulate`."""
+    path = ball([75, 1, 0], [75, -2, 0], 2)
+    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=BARE)
+    out = sweep(scene, MATERIAL, [75.0, np.nan, 500.0], [3.0, 0.0, 0.0], [2.0] * 3)
+    assert out.status.tolist() == [
+        PressStatus.BEHIND_GAP, PressStatus.NON_FINITE, PressStatus.OFF_PLAN
+    ]  # fmt: skip
