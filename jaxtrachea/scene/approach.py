@@ -42,7 +42,10 @@ def approach(scene: Scene, path: Poses) -> Approach:
     if scene.plan.contact_point == "per_step":
         inward, frame = _directions(scene, seen)
         presses = Presses(seen.s, seen.phi, -seen.gap[:, None] * inward)
-        return Approach(seen, presses, inward, None, frame, seen, inside)
+        return Approach(
+            seen=seen, presses=presses, inward=inward, first=None, frame=frame, own=seen,
+            inside=inside,
+        )  # fmt: skip
     return on_one_point(scene, path, seen, first_touch(seen, inside)[1], inside)
 
 
@@ -68,7 +71,10 @@ def on_one_point(
     spread = lambda v: jnp.broadcast_to(at_row(v, first), v.shape)  # noqa: E731
     presses = Presses(spread(seen.s), spread(seen.phi), D)
     frames = None if frame is None else spread(frame)
-    return Approach(seen, presses, spread(inward), first, frames, seen, inside)
+    return Approach(
+        seen=seen, presses=presses, inward=spread(inward), first=first, frame=frames, own=seen,
+        inside=inside,
+    )  # fmt: skip
 
 
 def _directions(scene: Scene, seen: Touch):

@@ -95,7 +95,8 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
         )
         if doubt := wall_check.look_beyond(mesh, geometry, scene.tube).sentence:
             notes += (doubt,)
-    return Staged(scene, material, path, tuple(files), notes + dropped_effects(scene))
+    notes += dropped_effects(scene)
+    return Staged(scene=scene, material=material, path=path, files=tuple(files), notes=notes)
 
 
 def _uncounted(_: str) -> None:

@@ -167,7 +167,10 @@ class Session:
         taken = self._seconds[: self._steps]
         counts = np.histogram(np.clip(taken, edges[0], edges[-1]), edges)[0]
         median, p99 = np.quantile(taken, (0.5, 0.99))
-        return Latency(len(taken), float(median), float(p99), float(taken.max()), edges, counts)
+        return Latency(
+            steps=len(taken), median=float(median), p99=float(p99), worst=float(taken.max()),
+            edges=edges, counts=counts,
+        )  # fmt: skip
 
 
 def _pack(state: State) -> Float[Array, " numbers"]:
@@ -197,7 +200,7 @@ def _start(scene: Scene, rotation, translation) -> State:
     )
     no, nowhere = jnp.asarray(False), Instant(path, seen)
     side = jnp.asarray(Side.UNTOLD)
-    return State(no, no, side, nowhere, grasp(scene, nowhere))
+    return State(started=no, touching=no, side=side, last=nowhere, seat=grasp(scene, nowhere))
 
 
 def _step(scene: Scene, material: Material, state: State, rotation, translation):
@@ -242,7 +245,9 @@ def _held(scene: Scene, material: Material, state: State, here: Instant, inside)
         seat = anchored(scene, seat, way, here.path)
     rest, made = as_approach(scene, seat, way, here, inside)
     result = follow(scene, material, rest, made, place)
-    return State(jnp.asarray(True), touching, state.side, here, seat), result
+    started = jnp.asarray(True)
+    after = State(started=started, touching=touching, side=state.side, last=here, seat=seat)
+    return after, result
 
 
 def _pick(when, a, b):

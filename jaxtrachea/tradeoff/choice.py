@@ -223,7 +223,11 @@ def _ladders(full: Full, precision: str) -> list[Ladder]:
     found = [v for v in every if v.effect in EFFECTS and getattr(full.given, v.effect) == "auto"]
     if full.scene.plan.contact:
         rungs = {k: {"sharpness": sharp, "steps": n} for k, (sharp, n) in QUALITY.items()}
-        found.append(Ladder("quality", "truncation", {**rungs, "fine": {}}, {}, "contact quality"))
+        quality = Ladder(
+            name="quality", kind="truncation", rungs={**rungs, "fine": {}}, base={},
+            effect="contact quality",
+        )  # fmt: skip
+        found.append(quality)
     return found + [v for v in every if v.name == "dtype" and precision == "auto"]
 
 

@@ -71,8 +71,8 @@ def compare(
         millimetres = surface * largest(expected)
     gradient = None if gradients is None else relative(*(np.swapaxes(g, -1, -2) for g in gradients))
     return Errors(
-        relative(found.force, reference.force), joints, surface, millimetres,
-        _gaps(found, reference), gradient,
+        force=relative(found.force, reference.force), joints=joints, surface=surface,
+        surface_mm=millimetres, contact_mm=_gaps(found, reference), gradient=gradient,
     )  # fmt: skip
 
 

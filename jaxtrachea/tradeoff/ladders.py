@@ -53,7 +53,7 @@ def ladders(full: Full) -> tuple[list[Ladder], dict[str, str]]:
         if why:
             out[name] = why
         else:
-            found.append(Ladder(name, kind, rungs, base, effect))
+            found.append(Ladder(name=name, kind=kind, rungs=rungs, base=base, effect=effect))
 
     flat, plan = one_plane(full), full.scene.plan
     add("form", "algebra", _words("form", "reactions", "recursion"), flat, second_plane="off")

@@ -13,7 +13,7 @@ from small_scenes import BALL, SPRINGS, bend, poses
 from jaxtrachea import EffectOptions, Poses, make_scene, simulate, table_1
 from jaxtrachea.config import SpecError
 from jaxtrachea.contact.shapes import Shape, sphere
-from jaxtrachea.scene import wall as walls_of_scene
+from jaxtrachea.scene import wall as walls_
 from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.assemble import with_mesh
 from jaxtrachea.scene.build import stage as read_scene
@@ -40,9 +40,7 @@ ROWS = 41
 def filled_up(tube):
     """The same patches, and one far away for each that lacks, so that all share one program."""
     cores = np.asarray(tube.shapes.vertices)
-    inside = np.repeat(
-        cores.mean(axis=2, keepdims=True), walls_of_scene.CORNERS - cores.shape[2], 2
-    )
+    inside = np.repeat(cores.mean(axis=2, keepdims=True), walls_.CORNERS - cores.shape[2], 2)
     lacking = TUBE.rings - len(cores)
     longer = lambda v, away=0.0: np.concatenate([v, np.repeat(v[:1], lacking, 0) + away])  # noqa: E731
     cores = longer(np.concatenate([cores, inside], axis=2), 1e4)
@@ -85,7 +83,7 @@ def pressed(tube, centres, radius=6.0):
 def spacings():
     """Gap and force along the front and midway between vertices, light and 3 mm deep."""
     s, found = np.linspace(70, 80, ROWS), {}
-    walls = [walls_of_scene.patches_of_wall(TUBE, mesh) for mesh in MESHES.values()]
+    walls = [walls_.patches_of_wall(TUBE, mesh) for mesh in MESHES.values()]
     for name, phi in (("on vertices", 0.0), ("between", np.pi / 35)):
         for depth in (0.1, 3.0):
             height = 18.6 - depth
@@ -123,7 +121,7 @@ def test_crests_of_the_rings_are_as_high_in_every_mesh(along):
 
 def test_the_measure_is_the_gap_of_touch():
     """The same balls by `touch`, which smooths by at most its bound."""
-    wall = walls_of_scene.patches_of_wall(TUBE, MESHES[1])
+    wall = walls_.patches_of_wall(TUBE, MESHES[1])
     centres, _, radius = wall_check._balls(MESHES[1], TUBE, ROWS)
     seen = wall_check.measure(MESHES[1], TUBE, wall, ROWS)
     difference = pressed(wall, centres, radius)[0] - (seen.gap + seen.error)
@@ -185,8 +183,8 @@ def test_a_small_tube_is_as_near_as_a_large_one():
     small |= {"radius": TUBE.radius / 16, "ring_height": TUBE.ring_height / 16}
     small = dataclasses.replace(TUBE, **{k: jnp.asarray(v) for k, v in small.items()})
     mesh = imported(make_tube(small, wall=2.6 / 16, relief=0.6 / 16))
-    off = wall_check.check(mesh, small, walls_of_scene.patches_of_wall(small, mesh))
-    large = wall_check.check(MESHES[1], TUBE, walls_of_scene.patches_of_wall(TUBE, MESHES[1]))
+    off = wall_check.check(mesh, small, walls_.patches_of_wall(small, mesh))
+    large = wall_check.check(MESHES[1], TUBE, walls_.patches_of_wall(TUBE, MESHES[1]))
     longer = (1 + 2 * 0.15) / (1 + 2 * 0.05)  # patches, over the rings' distance; hollows: squared
     assert off.worst <= longer**2 * large.worst / 16
 
@@ -201,7 +199,7 @@ def waist(mesh, at, depth, width):
 def test_patches_beside_the_wall_are_refused():
     """A waist of 4 mm within one patch: a ball would touch where there is nothing."""
     thin = waist(MESHES[1], 70, 0.35, 4)
-    good = walls_of_scene.checked_walls(TUBE, bend(MESHES[1], 300.0))
+    good = walls_.checked_walls(TUBE, bend(MESHES[1], 300.0))
     assert good.doubtful is None
     says = r"gap is off by .* at worst \(at s = .* expected at most"
     with pytest.raises(MeshError, match=says):
@@ -214,7 +212,7 @@ def test_touches_beyond_the_rings_are_unsure_where_the_gap_is_off():
     """The same waist beyond the last ring: no reason to refuse the mesh, but none for OK."""
     rings = dataclasses.replace(TUBE, ring_positions=TUBE.ring_positions[:10])
     mesh = waist(MESHES[1], 130, 0.35, 4)
-    tube = walls_of_scene.checked_walls(rings, mesh)
+    tube = walls_.checked_walls(rings, mesh)
     beyond = wall_check.look_beyond(mesh, rings, tube)
     (first, _), (low, high) = beyond.s
     assert np.isnan(first)
