@@ -13,6 +13,8 @@ from run_cli import run
 
 from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.declare import PlanError
+from jaxtrachea.scene.effects import EFFECTS
+from jaxtrachea.scene.ranges import unserved
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.tradeoff import choice as choosing
@@ -20,7 +22,7 @@ from jaxtrachea.tradeoff import measure as measuring
 from jaxtrachea.tradeoff.choice import choose
 from jaxtrachea.tradeoff.errors import Errors, relative, remesh, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
-from jaxtrachea.tradeoff.levels import full_scene, kept_rings
+from jaxtrachea.tradeoff.levels import full_scene, kept_rings, program
 from jaxtrachea.tradeoff.page import choice_rows
 from jaxtrachea.tradeoff.plots import draw, pareto
 
@@ -351,3 +353,17 @@ def test_command_writes_every_file(tmp_path, monkeypatch, capsys):
     assert 1e-9 < error["dtype", "float32"]["force"] < 1e-5
     kept = [error["rings_kept", n]["joints"] for n in ("1", "3", "7")]
     assert kept[0] > kept[1] > kept[2] == 0
+
+
+def test_no_rung_of_an_effect_is_refused_as_off_its_plan():
+    """The rung `dent 0` was: its rows were NaN, and its error infinite."""
+    spec, made = staged(SCENE | {"output": {"ring_ends": False}}, EI_C="13 N mm^2", k_t="0.4 N/mm")
+    full = full_scene(spec, made)
+    climbed = {ladder.effect: ladder for ladder in ladders(full)[0] if ladder.effect in EFFECTS}
+    assert {"rings", "shear", "two_material", "surface", "dent"} <= set(climbed)
+    pressing = jax.numpy.ones(len(full.path.s), bool)
+    for ladder in climbed.values():
+        for rung in ladder.rungs:
+            scene, material, path = program(full, ladder.levels(full, rung))
+            asked = unserved(scene, material, path, pressing)
+            assert asked is None or not asked.any(), (ladder.name, rung)
