@@ -6,6 +6,7 @@ solved by a banded L D L^T factorisation in `DIGITS` decimal digits. Both elemen
 loads at nodes, so the only error is rounding, some 1e-50 of the largest value.
 """
 
+from bisect import bisect_right
 from typing import NamedTuple
 
 import mpmath as mp
@@ -78,19 +79,21 @@ def solve(x, length, EI, k, s_c, force, GA=None, ring_load=None, *, free_end=Fal
         n = len(nodes)
         K = [[mp.mpf(0)] * (_BAND + 1) for _ in range(2 * n)]
         elements = []
+        rings = sorted(x)
         for e, (low, high) in enumerate(zip(nodes, nodes[1:], strict=False)):
-            span = sum(1 for position in x if position <= low)
+            span = bisect_right(rings, low)
             element = _element(high - low, EI[span], GA[span])
             elements.append(element)
             for i in range(4):
                 for j in range(i, 4):
                     K[2 * e + i][j - i] += element[i][j]
         f = [mp.mpf(0)] * (2 * n)
-        at = [nodes.index(position) for position in x]
+        node_at = {position: node for node, position in enumerate(nodes)}
+        at = [node_at[position] for position in x]
         for node, stiffness, value in zip(at, k, load, strict=True):
             K[2 * node][0] += stiffness
             f[2 * node] += value
-        at_C = nodes.index(s_c)
+        at_C = node_at[s_c]
         f[2 * at_C] += force
         last = 2 * n if free_end else 2 * n - 2
         u = _solve_banded(K[2:last], f[2:last]) if last > 2 else []
