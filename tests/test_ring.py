@@ -42,7 +42,7 @@ def C_of(ring, phi, **more):
 
 
 def _bars(points, EI, EA):
-    """Stiffness of straight bars in the (y, z) plane, [bar, 6, 6]; dofs (y, z, turn) at the ends."""
+    """Stiffness of bars in the (y, z) plane [bar, 6, 6]; dofs (y, z, turn) of its ends."""
     along = np.diff(points, axis=0)
     h = np.hypot(*along.T)
     c, s = along.T / h
