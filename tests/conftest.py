@@ -46,3 +46,29 @@ def _forget_programs():
     """Compiled programs of a file are dropped with it; together they would take gigabytes."""
     yield
     jax.clear_caches()
+
+
+#: Files that take longest begin, so that none runs on alone at the end.
+LONGEST = (
+    "test_distance.py",
+    "test_fit.py",
+    "test_oblique.py",
+    "test_damaged.py",
+    "test_wall_check.py",
+    "test_plan.py",
+    "test_tradeoff.py",
+    "test_beam.py",
+    "test_reports.py",
+    "test_onset.py",
+    "test_predict.py",
+    "test_bounds.py",
+    "test_spatial_beam.py",
+    "test_gradients.py",
+)
+
+
+def pytest_collection_modifyitems(config, items):
+    """Order of the files in the default suite; --no-loadscope-reorder leaves it so."""
+    if config.getoption("markexpr") == "not slow":
+        rank = {name: place for place, name in enumerate(LONGEST)}
+        items.sort(key=lambda item: rank.get(item.path.name, len(LONGEST)))
