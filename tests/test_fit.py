@@ -32,14 +32,15 @@ def noisy():
     return truth, force + sigma * rng.normal(size=force.shape), sigma
 
 
-def test_noise_free_data_give_back_the_parameters():
-    """1,000 draws from two decades in each parameter, noise-free.
+@pytest.mark.parametrize("draws", [200, pytest.param(1000, marks=pytest.mark.slow)])
+def test_noise_free_data_give_back_the_parameters(draws):
+    """Draws from two decades in each parameter, noise-free.
 
     A lane counts as recoverable if it reports success, a condition number up to 1e6 (its error is
     then rounding, 1e-15 of the data, times the condition and a margin) and residuals that are
     rounding: some lanes have a second minimum, and its residual tells.
     """
-    truth = synthetic.draw(1, 1000, 10.0)
+    truth = synthetic.draw(1, draws, 10.0)
     force, _ = synthetic.forces(truth)
     result = fit(synthetic.study(force), Settings(starts=4))
     error = np.abs(result.value / truth - 1).max(1)
@@ -49,11 +50,11 @@ def test_noise_free_data_give_back_the_parameters():
     fitted = result.rms[:, 0] <= 1e-12 * peak
     should = succeeded & (condition <= 1e6) & fitted
     assert error[should].max() <= 1e-6
-    assert should.sum() >= 970
+    assert should.sum() >= 0.97 * draws
     second = succeeded & (condition <= 1e6) & ~fitted
-    assert second.sum() <= 5
+    assert second.sum() <= 0.005 * draws
     # Of the others nearly all have an estimate.
-    assert (~succeeded).sum() <= 10
+    assert (~succeeded).sum() <= 0.01 * draws
 
 
 def _coverage(count, given):

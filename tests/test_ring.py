@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.linalg import solve_banded
 
 from jaxtrachea.mechanics.ring import (
     Ring,
@@ -40,17 +41,22 @@ def C_of(ring, phi, **more):
     return np.asarray(C)
 
 
-def _bar(near, far, EI, EA):
-    """Stiffness of a straight bar in the (y, z) plane; dofs (y, z, turn) at both ends."""
-    h = math.dist(near, far)
-    c, s = (far - near) / h
-    k = np.zeros((6, 6))
-    k[np.ix_([0, 3], [0, 3])] = EA / h * np.array([[1, -1], [-1, 1]])
-    bend = [[12, 6 * h, -12, 6 * h], [6 * h, 4 * h * h, -6 * h, 2 * h * h]]
-    bend += [[-12, -6 * h, 12, -6 * h], [6 * h, 2 * h * h, -6 * h, 4 * h * h]]
-    k[np.ix_([1, 2, 4, 5], [1, 2, 4, 5])] = EI / h**3 * np.array(bend)
-    turn = np.kron(np.eye(2), np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
-    return turn.T @ k @ turn
+def _bars(points, EI, EA):
+    """Stiffness of bars in the (y, z) plane [bar, 6, 6]; dofs (y, z, turn) of its ends."""
+    along = np.diff(points, axis=0)
+    h = np.hypot(*along.T)
+    c, s = along.T / h
+    k = np.zeros((len(h), 6, 6))
+    for i, j, sign in ((0, 0, 1), (0, 3, -1), (3, 0, -1), (3, 3, 1)):
+        k[:, i, j] = sign * EA / h
+    one, zero = np.ones_like(h), np.zeros_like(h)
+    bend = [[12 * one, 6 * h, -12 * one, 6 * h], [6 * h, 4 * h * h, -6 * h, 2 * h * h]]
+    bend += [[-12 * one, -6 * h, 12 * one, -6 * h], [6 * h, 2 * h * h, -6 * h, 4 * h * h]]
+    k[np.ix_(range(len(h)), [1, 2, 4, 5], [1, 2, 4, 5])] = np.moveaxis(EI / h**3 * bend, 2, 0)
+    node = np.moveaxis(np.array([[c, s, zero], [-s, c, zero], [zero, zero, one]]), 2, 0)
+    turn = np.zeros((len(h), 6, 6))
+    turn[:, :3, :3] = turn[:, 3:, 3:] = node
+    return np.swapaxes(turn, 1, 2) @ k @ turn
 
 
 @functools.cache
@@ -62,16 +68,20 @@ def frame(segments, phi_c, load, *fields):
         [np.linspace(-alpha, phi_c, left + 1), np.linspace(phi_c, alpha, segments - left + 1)[1:]]
     )
     points = radius * np.stack([np.cos(phi), np.sin(phi)], 1)
-    K = np.zeros((3 * segments + 3,) * 2)
-    for e in range(segments):
-        at = slice(3 * e, 3 * e + 6)
-        K[at, at] += _bar(points[e], points[e + 1], EI, 1e4 * EI)  # next to inextensible
-    for i in (0, 1, -3, -2):
-        K[i, i] += k_M / 2
-    K[np.ix_([1, -2], [1, -2])] += k_t * np.array([[1, -1], [-1, 1]])
-    f = np.zeros(3 * segments + 3)
-    f[3 * left : 3 * left + 2] = load
-    return phi, np.linalg.solve(K, f).reshape(-1, 3)[:, :2], left
+    # Next to inextensible; row `width` of `K` is the diagonal, those below are under it.
+    bars, width, size = _bars(points, EI, 1e4 * EI), 5, 3 * segments + 3
+    K = np.zeros((2 * width + 1, size))
+    for i in range(6):
+        for j in range(6):
+            K[width + i - j, j : j + 3 * segments : 3] += bars[:, i, j]
+    K[width, [0, 1, -3, -2]] += k_M / 2
+    f = np.zeros((size, 2))
+    f[3 * left : 3 * left + 2, 0] = load
+    # The tie between the ends is not in the band: by Sherman and Morrison.
+    f[[1, -2], 1] = 1, -1
+    u, t = solve_banded((width, width), K, f).T
+    u = u - k_t * (u[1] - u[-2]) / (1 + k_t * (t[1] - t[-2])) * t
+    return phi, u.reshape(-1, 3)[:, :2], left
 
 
 def frame_of(segments, phi_c, load, **changes):

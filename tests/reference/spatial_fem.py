@@ -4,17 +4,19 @@ Shares nothing with `jaxtrachea.mechanics.spatial_beam`: Hermite (Timoshenko) el
 planes, ring springs as the inverse of their compliance, one dense solve in `DIGITS` decimal digits.
 """
 
+from bisect import bisect_right
+from decimal import Decimal
 from typing import NamedTuple
 
 import mpmath as mp
-from beam_fem import _element, _exact
+from beam_fem import _element, exactly
 
 DIGITS = 60
 _BAND = 7
 
 
 class Solution(NamedTuple):
-    """Nodal results as `mpmath` numbers, components (y, z) last."""
+    """Nodal results in high precision, components (y, z) last."""
 
     w_C: list
     theta_C: list
@@ -22,7 +24,7 @@ class Solution(NamedTuple):
     theta: list
     reaction: list
     end_shear: tuple  # force of each clamp against the load, per plane
-    energy: mp.mpf
+    energy: Decimal | mp.mpf
 
 
 def _solve_banded(K, f):
@@ -42,12 +44,12 @@ def _solve_banded(K, f):
     return f
 
 
-def _assemble(nodes, x, EI, GA):
+def _assemble(nodes, x, EI, GA, zero):
     """Banded stiffness; the dofs of a node are (w_y, w_z, theta_y, theta_z)."""
-    K = [[mp.mpf(0)] * (_BAND + 1) for _ in range(4 * len(nodes))]
-    elements = []
+    K = [[zero] * (_BAND + 1) for _ in range(4 * len(nodes))]
+    elements, rings = [], sorted(x)
     for e, (low, high) in enumerate(zip(nodes, nodes[1:], strict=False)):
-        span = sum(1 for position in x if position <= low)
+        span = bisect_right(rings, low)
         for p in range(2):
             element = _element(high - low, EI[span][p], None if GA is None else GA[span][p])
             elements.append(element)
@@ -63,16 +65,18 @@ def solve(x, length, EI, C, s_c, force, GA=None, ring_load=None, integrity=None)
 
     The numbers are taken as they are: floats exactly, `mpmath` numbers unchanged.
     """
-    with mp.workdps(DIGITS):
-        exact = lambda v: [exact(u) for u in v] if hasattr(v, "__len__") else _exact(v)  # noqa: E731
+    given = x, length, EI, C, s_c, force, GA, ring_load, integrity
+    with exactly(DIGITS, *given) as number:
+        exact = lambda v: [exact(u) for u in v] if hasattr(v, "__len__") else number(v)  # noqa: E731
+        zero = number(0)
         x, EI, C, force = exact(x), exact(EI), exact(C), exact(force)
         GA = None if GA is None else exact(GA)
         load = exact([[0, 0]] * len(x) if ring_load is None else ring_load)
         hold = exact([1] * len(x) if integrity is None else integrity)
         length, s_c = exact(length), exact(s_c)
-        nodes = sorted({mp.mpf(0), length, s_c, *x})
-        K, elements = _assemble(nodes, x, EI, GA)
-        f = [mp.mpf(0)] * len(K)
+        nodes = sorted({zero, length, s_c, *x})
+        K, elements = _assemble(nodes, x, EI, GA, zero)
+        f = [zero] * len(K)
         at, at_C = [4 * nodes.index(v) for v in x], 4 * nodes.index(s_c)
         springs = []
         for i, c, g, e in zip(at, C, load, hold, strict=True):
@@ -86,7 +90,7 @@ def solve(x, length, EI, C, s_c, force, GA=None, ring_load=None, integrity=None)
         applied = f[4:-4]
         u = _solve_banded(K[4:-4], applied[:])
         energy = sum(p * q for p, q in zip(applied, u, strict=True)) / 2
-        u = [mp.mpf(0)] * 4 + u + [mp.mpf(0)] * 4
+        u = [zero] * 4 + u + [zero] * 4
         ends = []
         for e, row in ((0, 0), (len(nodes) - 2, 2)):
             ends.append(
