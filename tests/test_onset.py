@@ -262,7 +262,7 @@ def test_influence_of_a_curve_with_its_own_onset(owned):
     held[:, 1] = True
     again = fit(without(study, held), ONE)
     moved = (again.theta - owned.theta)[:, common]
-    se = np.stack([u.se for u in owned.uncertainty])[:, common]
+    se = owned.uncertainty.se[:, common]
     np.testing.assert_allclose(found.curve_left_out[:, 1, common], moved / se, atol=0.1)
     assert np.all((found.curve_cook > 0) & (found.curve_cook < 5))
 

@@ -193,11 +193,11 @@ def test_chains_start_where_the_estimate_is():
         share = 1 / (1 + np.exp(-x[:, :2]))
         low, high = result.study.lanes.lower[lane], result.study.lanes.upper[lane]
         theta = low + (high - low) * share
-        se = result.uncertainty[lane].se
+        se = result.uncertainty.se[lane]
         np.testing.assert_allclose(theta.mean(axis=0), result.theta[lane], atol=0.3 * se.max())
         np.testing.assert_allclose(theta.std(axis=0), se, rtol=0.15)
         found = np.corrcoef(theta.T)[0, 1]
-        np.testing.assert_allclose(found, result.uncertainty[lane].correlation[0, 1], atol=0.02)
+        np.testing.assert_allclose(found, result.uncertainty.correlation[lane, 0, 1], atol=0.02)
 
 
 @pytest.mark.slow
@@ -243,7 +243,7 @@ def test_poor_chains_are_said_beside_the_estimates():
 def test_well_conditioned_lanes_are_those_of_quadrature(blackjax):
     """Conditions 5 to 14, bounds and numbers of draws as users have them; 200 asked, more drawn."""
     result = fit(default_study([(1.3, 0.4), (0.5, 1.0), (1.0, 0.6)]), ONE)
-    assert max(u.condition for u in result.uncertainty) < 20
+    assert max(result.uncertainty.condition) < 20
     drawn = posterior(result, draws=200)
     for lane in range(3):
         assert drawn.rhat[lane].max() < 1.01

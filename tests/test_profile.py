@@ -57,9 +57,8 @@ def test_linear_model_has_the_interval_of_the_covariance(noise):
     width = (result.upper - result.lower) / 2
     assert np.abs(found.lower.reshape(shape) - result.lower).max() <= 2e-6 * width.max()
     assert np.abs(found.upper.reshape(shape) - result.upper).max() <= 2e-6 * width.max()
-    at = (found.coordinate - result.theta.ravel()[:, None]) / np.concatenate(
-        [u.se for u in result.uncertainty]
-    )[:, None]
+    se = result.uncertainty.se.ravel()[:, None]
+    at = (found.coordinate - result.theta.ravel()[:, None]) / se
     np.testing.assert_allclose(found.statistic, at**2, rtol=1e-5, atol=1e-6)
     assert not found.improved.any()
 

@@ -108,8 +108,9 @@ def test_failed_lane_keeps_its_row_and_is_called_failed(result):
 
 
 def flat(result, direction, error):
-    u = result.uncertainty[0]._replace(flat=np.array(direction), flat_se=error)
-    return results.flat_sentence(dataclasses.replace(result, uncertainty=(u,)), 0)
+    change = {"flat": np.array([direction]), "flat_se": np.array([error])}
+    local = result.uncertainty._replace(**change)
+    return results.flat_sentence(dataclasses.replace(result, uncertainty=local), 0)
 
 
 def test_flat_combination_in_words(result):

@@ -170,7 +170,7 @@ def test_widened_intervals_hold_the_plain_ones(result):
             if judged.ends is not None and judged.ends[1] == ProfileEnd.OPEN:
                 assert judged.high == wide.upper[k, i] == most
     left = wide.samples[5] - 4
-    ratio = stdtrit(left, 0.975) * wide.factor[5] / given.uncertainty[5].half_width
+    ratio = stdtrit(left, 0.975) * wide.factor[5] / given.uncertainty.half_width[5]
     assert ratio > 1.5
     found = np.log([wide.lower[5, 2] / value, wide.upper[5, 2] / value])
     np.testing.assert_allclose(found, ratio * sides, rtol=1e-9)

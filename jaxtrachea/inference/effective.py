@@ -93,7 +93,7 @@ def effective(result: FitResult, seen: Prediction, profiles: Profiles | None = N
         unknowns = np.full(len(n), float(P))
         n, worth = (np.full(len(n), np.nansum(v[alive])) for v in (n, worth))
     given = study.noise_given[0] and (lanes.joints is None or study.noise_given[1])
-    plain = np.array([float(u.half_width) for u in result.uncertainty])
+    plain = result.uncertainty.half_width
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         left = worth - unknowns
         if given:

@@ -227,7 +227,7 @@ def _conclude(result: FitResult, found: Diagnostics) -> Influence:
     study, lanes = result.study, result.study.lanes
     columns = lanes.index[:, :, study.free_columns]
     rows = np.arange(result.lanes)[:, None, None]
-    se = np.stack([u.se for u in result.uncertainty])[rows, np.maximum(columns, 0)]
+    se = result.uncertainty.se[rows, np.maximum(columns, 0)]
     se = np.where((columns >= 0) & np.isfinite(se) & (se > 0), se, np.nan)
     good = np.array([succeeded(result, k) for k in range(result.lanes)])
     seen = _seen(study) & good[:, None, None]

@@ -264,7 +264,7 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
                 if p.name in names:
                     place[lane, names.index(p.name)] = i
     row = np.arange(result.lanes)[:, None]
-    se = np.stack([u.se for u in result.uncertainty])[row, place]
+    se = result.uncertainty.se[row, place]
     error = (relative_errors(result, profiles) * result.relative)[row, place]
     known = (place >= 0) & np.isfinite(se) & np.isfinite(error)
     se = np.where(known, np.maximum(se, error), se)
@@ -272,7 +272,7 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
     if not enough.any():
         raise ValueError(f"no parameter is determined in {FEWEST} specimens of their own")
     place, known, se = place[:, enough], known[:, enough], se[:, enough]
-    correlation = np.stack([u.correlation for u in result.uncertainty])
+    correlation = result.uncertainty.correlation
     correlation = correlation[row[:, :, None], place[:, :, None], place[:, None]]
     se = np.where(known, se, 0)
     covariance = np.nan_to_num(correlation) * se[:, :, None] * se[:, None]
@@ -289,9 +289,9 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
 def _common(result: FitResult, place, se: Float[np.ndarray, "lanes q"]) -> Common:
     """How the estimates of a joint fit follow what is shared; `place`: see `Population`."""
     row, shared = np.arange(result.lanes)[:, None], result.study.shared
-    own = np.stack([u.se for u in result.uncertainty])[row, shared]
+    own = result.uncertainty.se[row, shared]
     own = np.where(np.isfinite(own), own, 0)
-    full = np.nan_to_num(np.stack([u.correlation for u in result.uncertainty]))
+    full = np.nan_to_num(result.uncertainty.correlation)
     between = full[row[:, :, None], shared[:, :, None], shared[:, None]]
     across = full[row[:, :, None], place[:, :, None], shared[:, None]]
     first = int(np.argmax(result.succeeded))

@@ -65,9 +65,9 @@ def flat_sentence(result: FitResult, lane: int) -> str:
     if not result.study.free:
         return NOTHING_FITTED
     names = [unknown_label(result, lane, i) for i in range(len(result.study.unknowns[lane]))]
-    u = result.uncertainty[lane]
+    u = result.uncertainty
     return describe_flat(
-        names, u.flat, float(u.flat_se), u.blind, result.undetermined[lane],
+        names, u.flat[lane], float(u.flat_se[lane]), u.blind[lane], result.undetermined[lane],
         press_sizes(result, lane),
     )  # fmt: skip
 
@@ -133,7 +133,7 @@ def lane_rows(result: FitResult, profiles: Profiles | None = None) -> Iterator[d
             "rms_over_peak": float(result.rms[lane, 0]) / peak if peak > 0 else float("nan"),
             "sigma_force_N": float(result.sigma[lane, 0]),
             "rms_joints_mm": float(result.rms[lane, 1]),
-            "condition": float(result.uncertainty[lane].condition),
+            "condition": float(result.uncertainty.condition[lane]),
             "unknowns": int(result.criteria.unknowns[lane]),
             "AIC": float(result.criteria.AIC[lane]),
             "AICc": float(result.criteria.AICc[lane]),
@@ -290,8 +290,8 @@ def write_hdf5(
         store.write(file, result, provenance.get("inputs", {}), reading or {})
         group = file.create_group("uncertainty")
         for name in MORE:
-            rows = np.stack([getattr(u, name) for u in result.uncertainty])
-            group.create_dataset(name, data=rows, compression="gzip")
+            data = getattr(result.uncertainty, name)
+            group.create_dataset(name, data=data, compression="gzip")
         if profiles is not None:
             _write_profiles(file.create_group("profiles"), profiles)
         if resampled is not None:
@@ -321,7 +321,7 @@ def _write_lanes(group: h5py.Group, result: FitResult) -> None:
         group.create_dataset(name, data=getattr(result.criteria, name))
     for name in ("sigma", "rms"):
         group.create_dataset(name, data=getattr(result, name)).attrs["unit"] = "N, mm"
-    group.create_dataset("condition", data=[u.condition for u in result.uncertainty])
+    group.create_dataset("condition", data=result.uncertainty.condition)
 
 
 def _write_unknowns(group: h5py.Group, result: FitResult, profiles: Profiles | None = None) -> None:
@@ -344,8 +344,7 @@ def _write_unknowns(group: h5py.Group, result: FitResult, profiles: Profiles | N
                      "at_bound", "undetermined", "unexamined", "evidence_low", "evidence_high",
                      "evidence_end")
     }  # fmt: skip
-    arrays["correlation"] = np.stack([u.correlation for u in result.uncertainty])
-    arrays["flat"] = np.stack([u.flat for u in result.uncertainty])
+    arrays |= {name: getattr(result.uncertainty, name) for name in ("correlation", "flat")}
     for name, data in arrays.items():
         group.create_dataset(name, data=data, compression="gzip")
     group.attrs["units"] = json.dumps({p.name: p.unit for p in study.parameters})

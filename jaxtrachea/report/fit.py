@@ -124,7 +124,7 @@ def quality_rows(result: FitResult, lanes: Sequence[int]) -> list[list[str]]:
                 f"{number(result.rms[lane, 0], 3)} N",
                 f"{100 * result.rms[lane, 0] / peak:.2g} %" if peak > 0 else "–",
                 f"{number(result.rms[lane, 1], 3)} mm" if np.isfinite(result.rms[lane, 1]) else "–",
-                number(float(result.uncertainty[lane].condition), 2),
+                number(float(result.uncertainty.condition[lane]), 2),
                 number(float(result.criteria.AICc[lane]), 5),
             ]
         )

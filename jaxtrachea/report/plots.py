@@ -158,7 +158,7 @@ def draw_correlation(result: FitResult):
     names = [plain(unknown_label(result, 0, i), 24) for i in range(count)]
     shown = min(len(names), 30)
     with np.errstate(invalid="ignore"):
-        stack = np.stack([u.correlation[:shown, :shown] for u in result.uncertainty])
+        stack = result.uncertainty.correlation[:, :shown, :shown]
         known = np.isfinite(stack)
         mean = np.where(known, stack, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     mean = np.where(known.any(axis=0), mean, np.nan)
@@ -203,7 +203,7 @@ def draw_profiles(profiles: Profiles):
             at = np.array([p.from_scaled(v) for v in profiles.coordinate[k]])
             axis.plot(at, profiles.statistic[k], ".-", color=colour, lw=0.9, ms=3)
         lane, unknown = profiles.lane[first], profiles.unknown[first]
-        se = result.uncertainty[lane].se[unknown]
+        se = result.uncertainty.se[lane, unknown]
         if np.isfinite(se):
             ends = profiles.coordinate[first]
             theta = np.linspace(ends[0], ends[-1], 101)

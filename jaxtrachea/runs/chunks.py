@@ -95,10 +95,7 @@ def arrays_of(result: FitResult) -> dict[str, np.ndarray]:
     """Everything of a result but its study, by name; of criteria and uncertainty `PART.NAME`."""
     arrays = {name: np.asarray(getattr(result, name)) for name in FIELDS}
     arrays |= {f"criteria.{name}": v for name, v in result.criteria._asdict().items()}
-    for name in Uncertainty._fields:
-        rows = [getattr(u, name) for u in result.uncertainty]
-        arrays[f"uncertainty.{name}"] = np.stack(rows)
-    return arrays
+    return arrays | {f"uncertainty.{name}": v for name, v in result.uncertainty._asdict().items()}
 
 
 def result_of(study: Study, arrays: dict[str, np.ndarray]) -> FitResult:
@@ -114,11 +111,10 @@ def result_of(study: Study, arrays: dict[str, np.ndarray]) -> FitResult:
             raise ValueError(f"{name} has shape {array.shape}; expected {lanes} lanes")
     if arrays["theta"].shape != (lanes, study.size):
         raise ValueError(f"theta has shape {arrays['theta'].shape}")
-    parts = (arrays[f"uncertainty.{name}"] for name in Uncertainty._fields)
-    rows = tuple(Uncertainty(*row) for row in zip(*parts, strict=True))
+    local = Uncertainty(*(arrays[f"uncertainty.{name}"] for name in Uncertainty._fields))
     said = Criteria(*(arrays[f"criteria.{name}"] for name in Criteria._fields))
     fields = {name: arrays[name] for name in FIELDS}
-    return FitResult(study=study, criteria=said, uncertainty=rows, **fields)
+    return FitResult(study=study, criteria=said, uncertainty=local, **fields)
 
 
 def join(study: Study, parts: list[FitResult]) -> FitResult:
