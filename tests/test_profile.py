@@ -12,16 +12,16 @@ import synthetic
 from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
+from jaxtrachea.files.tables import interval
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.profile_search import Sides
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import Noise, build_study
+from jaxtrachea.inference.analyses.profile import profile_rows
 from jaxtrachea.inference.profile import choose, profiles
-from jaxtrachea.inference.results import profile_rows
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.report.fit import interval
 from jaxtrachea.status import FitStatus, ProfileEnd
 from jaxtrachea.trachea.geometry import table_1
 

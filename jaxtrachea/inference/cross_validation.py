@@ -28,6 +28,7 @@ class LeftOut:
             without markers.
         ratio: measured over predicted force in the least-squares sense, minus 1 (for linear data:
             the relative error of the compliance).
+        study: the study.
         result: the fits, one lane per left-out curve.
         converged: whether that fit converged, and the onset and offset of the curve left out; else
             the errors are those of its best point, NaN where it predicts nothing.
@@ -38,6 +39,7 @@ class LeftOut:
     force: np.ndarray
     joints: np.ndarray
     ratio: np.ndarray
+    study: Study
     result: FitResult
     converged: np.ndarray
 
@@ -126,6 +128,7 @@ def leave_one_out(study: Study, settings: Settings, progress=None) -> LeftOut:
         force=np.where(lost, np.nan, peak),
         joints=np.where(lost, np.nan, joints),
         ratio=np.where(lost, np.nan, ratio),
+        study=study,
         result=result,
         converged=result.succeeded & touched.converged,
     )

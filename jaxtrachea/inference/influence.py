@@ -32,7 +32,7 @@ from jaxtrachea.fit.residual import observations, residual
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.estimate import hessian
-from jaxtrachea.inference.results import succeeded
+from jaxtrachea.inference.labels import succeeded
 
 #: det(1 - hat matrix of a curve) below which the curve alone determines some combination.
 _ALONE = 1e-9

@@ -4,11 +4,6 @@ import numpy as np
 
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.effective import CORRELATED, Effective
-from jaxtrachea.inference.posterior import Posterior
-from jaxtrachea.inference.results import lane_label
-
-#: Lanes that are named; of more, the number.
-_NAMED = 12
 
 
 def doubts(result: FitResult, wide: Effective) -> list[str]:
@@ -45,23 +40,3 @@ def doubts(result: FitResult, wide: Effective) -> list[str]:
             "the other unknowns there hold it fixed: they do not include its own uncertainty."
         )
     return said
-
-
-def not_good(drawn: Posterior) -> dict[int, str]:
-    """Lanes whose chains are not good, with the verdict on them; poor ones first."""
-    words = {lane: drawn.verdict(lane) for lane in range(drawn.result.lanes)}
-    bad = {k: text for k, text in words.items() if not text.startswith("good")}
-    return dict(sorted(bad.items(), key=lambda item: not item[1].startswith(("poor", "no draws"))))
-
-
-def distrust(drawn: Posterior) -> list[str]:
-    """A paragraph on the draws that deserve no trust; none if all do."""
-    bad = not_good(drawn)
-    if not bad:
-        return []
-    named = [f"{lane_label(drawn.result, k)} {bad[k]}" for k in list(bad)[:_NAMED]]
-    more = f"; and {len(bad) - _NAMED} more, see parameters.csv" if len(bad) > _NAMED else ""
-    return [
-        f"**The posterior of {len(bad)} of {drawn.result.lanes} lanes is not to be trusted as it "
-        f"stands**: {'; '.join(named)}{more}. Draw more, or look at the profiles."
-    ]
