@@ -92,7 +92,7 @@ WITHIN = {
     "results": [{"arrays", "store"}, {"rows", "stored"}, {"hdf5"}],
     "prediction": [{"core", "sources"}, {"predict"}, {"held_out"}, {"plots", "report", "tables"}],
     "runs": [{"processes", "journal"}, {"chunks"}, {"folder"}, {"former", "in_chunks"}],
-    "report": [{"doubts", "plots", "tables"}, {"fit"}, {"overview"}],
+    "report": [{"plots", "tables"}, {"fit"}, {"overview"}],
     "cli": [{"terminal_table"}, {"terminal"},
             {"fit", "load", "predict_data", "run", "scene", "selfcheck"},
             {"compare", "predict", "tradeoff"}, {"main"}],

@@ -26,6 +26,7 @@ from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference.analyses import INFLUENCE, LEFT_OUT
 from jaxtrachea.inference.analyses.cross_validation import left_out_table
+from jaxtrachea.inference.analyses.effective import widened
 from jaxtrachea.inference.analyses.influence import REASONS, influence_cell, influence_section
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import LeftOut
@@ -39,7 +40,7 @@ from jaxtrachea.mechanics.press import Options
 from jaxtrachea.report.fit import report_text
 from jaxtrachea.report.overview import overview
 from jaxtrachea.report.plots import STYLE, draw_all
-from jaxtrachea.results.rows import lane_rows, with_residuals
+from jaxtrachea.results.rows import lane_rows, summary_rows
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
 
@@ -233,7 +234,7 @@ def test_one_lane_of_several_specimens_has_a_row_for_each(dense):
     """All columns of a specimen's own unknowns; what it has several of is named, not dropped."""
     assert dense.lanes == 1
     seen = predictions(dense.study, dense.theta)
-    rows = with_residuals(dense, list(lane_rows(dense)), seen, effective(dense, seen))
+    rows = summary_rows(widened(dense))
     assert [(r["specimen"], r["trial"]) for r in rows] == [("A", "(all)"), ("B", "1"), ("C", "1")]
     labels = [unknown_label(dense, 0, i) for i in range(8)]
     for row in rows:
@@ -317,10 +318,10 @@ def test_fewer_independent_samples_than_unknowns_leave_no_limit():
     # No limit but the bounds.
     assert wide.lower[0].tolist() == [p.lower for p in result.study.free]
     assert wide.upper[0].tolist() == [p.upper for p in result.study.free]
-    text = report_text("T", Findings(result), [])
+    text = report_text("T", widened(result), [])
     assert "95 % widened" in text
     assert "no more independent samples than unknowns" in text
-    assert "correlated in 1 of 1 lanes" in " ".join(shown(overview(Findings(result))).split())
+    assert "correlated in 1 of 1 lanes" in " ".join(shown(overview(widened(result))).split())
 
 
 def test_the_command_with_names_of_mathematics(tmp_path, monkeypatch, capsys):

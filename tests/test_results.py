@@ -18,8 +18,10 @@ from jaxtrachea.fit.predictions import Prediction, lag_correlation, predictions,
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import build_study
 from jaxtrachea.inference.analyses.cross_validation import left_out_rows
+from jaxtrachea.inference.analyses.effective import EFFECTIVE
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
+from jaxtrachea.inference.effective import effective
 from jaxtrachea.inference.labels import flat_sentence, unknown_label
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.mechanics.press import Options
@@ -58,7 +60,7 @@ def result():
 
 def predicted(result, prediction):
     """Findings of a fit with these residuals."""
-    findings = Findings(result)
+    findings = Findings(result, ((EFFECTIVE, effective(result, prediction)),))
     vars(findings)["prediction"] = prediction
     return findings
 

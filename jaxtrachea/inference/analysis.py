@@ -14,7 +14,6 @@ from jaxtrachea.config import FitSpec
 from jaxtrachea.fit.predictions import Prediction, predictions
 from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.study import Study
-from jaxtrachea.inference.effective import Effective, effective
 from jaxtrachea.inference.profile import Profiles
 
 #: Cells of a row of a table, by column.
@@ -79,11 +78,6 @@ class Findings:
     def prediction(self) -> Prediction:
         """Residuals at the estimate."""
         return predictions(self.result.study, self.result.theta)
-
-    @functools.cached_property
-    def wide(self) -> Effective:
-        """Intervals for correlated residuals."""
-        return effective(self.result, self.prediction, self.profiles)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,6 +35,7 @@ class Effective(NamedTuple):
     """Of every lane; NaN where residuals are too few for a correlation.
 
     Attributes:
+        result: the fit they belong to.
         correlation: of neighbouring force residuals; (lanes,).
         samples: how many independent ones the samples are worth; (lanes,).
         factor: by which standard errors grow; inf where no more than the unknowns; (lanes,).
@@ -43,6 +44,7 @@ class Effective(NamedTuple):
         upper: (lanes, P).
     """
 
+    result: FitResult
     correlation: Float[np.ndarray, " lanes"]
     samples: Float[np.ndarray, " lanes"]
     factor: Float[np.ndarray, " lanes"]
@@ -104,7 +106,7 @@ def effective(result: FitResult, seen: Prediction, profiles: Profiles | None = N
         factor = np.where(np.isnan(worth), np.nan, factor)
         growth = np.maximum(half * factor / plain, 1)
     lower, upper = _drawn_out(result, growth, profiles)
-    return Effective(lag_correlation(seen), worth, factor, lower, upper)
+    return Effective(result, lag_correlation(seen), worth, factor, lower, upper)
 
 
 def _drawn_out(

@@ -12,7 +12,6 @@ from jaxtrachea.inference.effective import CORRELATED
 from jaxtrachea.inference.labels import lane_label, succeeded, verdict_sentence
 from jaxtrachea.inference.rows import ONE_BY_ONE, listed, more_of
 from jaxtrachea.measurements.read import BadCurve
-from jaxtrachea.report.doubts import doubts
 from jaxtrachea.report.tables import (
     ESTIMATE_HEAD,
     QUALITY_HEAD,
@@ -48,7 +47,7 @@ def report_text(
         *_quality(result, failed),
         f"Largest residual: {findings.prediction.worst(result)}.",
         *_sections(findings, "quality"),
-        *doubts(result, findings.wide),
+        *_bounds(result),
         *_sections(findings, "checks"),
         *data,
         *_sections(findings, "data"),
@@ -70,9 +69,9 @@ def _sections(findings: Findings, place: str) -> list[str]:
 
 def _estimates(findings: Findings) -> list[str]:
     """Values with their errors, and what the data leave open."""
-    result, profiles, wide = findings.result, findings.profiles, findings.wide
+    result, profiles, wide = findings.result, findings.profiles, findings.get("effective")
     shown = listed(result)
-    widened = wide if np.any(wide.correlation > CORRELATED) else None
+    widened = wide if wide and np.any(wide.correlation > CORRELATED) else None
     head = ESTIMATE_HEAD if widened is None else WIDENED_HEAD
     rows = estimate_rows(result, shown, profiles, widened)
     tables = [markdown_table(head, rows), *more_of(result, shown, "parameters.csv")]
@@ -107,3 +106,14 @@ def _quality(result: FitResult, failed: list[int]) -> list[str]:
     shown = listed(result, max(ONE_BY_ONE, min(len(failed), 50)))
     table = markdown_table(QUALITY_HEAD, quality_rows(result, shown))
     return [table, *more_of(result, shown, "summary.csv")]
+
+
+def _bounds(result: FitResult) -> list[str]:
+    """That errors leave out the unknowns that ended on a bound."""
+    bound = np.flatnonzero(result.at_bound.any(axis=1))
+    if not len(bound):
+        return []
+    return [
+        f"In {len(bound)} of {result.lanes} lanes an unknown ended on its bound. The errors of "
+        "the other unknowns there hold it fixed: they do not include its own uncertainty."
+    ]

@@ -20,22 +20,15 @@ def overview(findings: Findings) -> Iterator[Table | str]:
     """
     result, profiles = findings.result, findings.profiles
     lanes = listed(result)
-    cut, wide = result.lanes > len(lanes), findings.wide
+    cut, wide = result.lanes > len(lanes), findings.get("effective")
     if not result.study.free:
         yield f"{result.lanes} lanes: {verdict_sentence(result, 0)}"
     elif cut:
         yield "Estimates over lanes", tables.SPREAD_HEAD, tables.spread_rows(result, profiles)
     else:
-        widened = wide if np.any(wide.correlation > CORRELATED) else None
+        widened = wide if wide and np.any(wide.correlation > CORRELATED) else None
         head = tables.ESTIMATE_HEAD if widened is None else tables.WIDENED_HEAD
         yield "Estimates", head, tables.estimate_rows(result, lanes, profiles, widened)
-    doubted = int(np.sum(wide.correlation > CORRELATED))
-    if doubted and result.study.free:
-        yield (
-            f"Neighbouring residuals are correlated in {doubted} of {result.lanes} lanes: standard "
-            "errors are too small there; wider intervals: low95_widened, high95_widened in "
-            "parameters.csv"
-        )
     for analysis, found in findings.at("quality"):
         yield from analysis.shown(found, lanes)
     for analysis, found in findings.found:

@@ -8,7 +8,6 @@ from jaxtrachea.fit.evaluate import NOTHING_FITTED
 from jaxtrachea.fit.predictions import Prediction, rms
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.analysis import Findings
-from jaxtrachea.inference.effective import Effective
 from jaxtrachea.inference.judgement import judgement
 from jaxtrachea.inference.labels import is_own, said_before, unknown_label
 from jaxtrachea.inference.profile import Profiles
@@ -85,7 +84,7 @@ def _unknown_cells(
 def summary_rows(findings: Findings, bad: Sequence[BadCurve] = ()) -> list[dict[str, object]]:
     """All rows of summary.csv: those of the lanes, then curves that could not be used."""
     rows = list(lane_rows(findings.result, findings.profiles))
-    rows = with_residuals(findings.result, rows, findings.prediction, findings.wide)
+    rows = with_residuals(findings.result, rows, findings.prediction)
     for (lane, _), row in zip(row_places(findings.result), rows, strict=True):
         for analysis, found in findings.found:
             row.update(analysis.lane_cells(found, lane))
@@ -107,7 +106,7 @@ def parameter_rows(findings: Findings) -> Iterator[dict[str, object]]:
 
     What the lanes of a joint fit share has one row, that of the first lane which succeeded.
     """
-    result, profiles, wide = findings.result, findings.profiles, findings.wide
+    result, profiles = findings.result, findings.profiles
     every = range(result.lanes)
     for lane in range(result.lanes):
         lane_specimen, _ = result.study.lane_name(lane)
@@ -129,14 +128,11 @@ def parameter_rows(findings: Findings) -> Iterator[dict[str, object]]:
             }
             for analysis, found in findings.found:
                 row |= analysis.parameter_cells(found, lane, i)
-            yield row | {
-                "low95_widened": float(wide.lower[lane, i]),
-                "high95_widened": float(wide.upper[lane, i]),
-            }
+            yield row
 
 
 def with_residuals(
-    result: FitResult, rows: list[dict[str, object]], seen: Prediction, wide: Effective
+    result: FitResult, rows: list[dict[str, object]], seen: Prediction
 ) -> list[dict[str, object]]:
     """Rows of `lane_rows`; that of one specimen among several of a lane has its own residuals."""
     out = []
@@ -150,9 +146,5 @@ def with_residuals(
             cells = {"rms_force_N": own, "rms_over_peak": own / peak if peak > 0 else np.nan}
             if seen.joints is not None:
                 cells["rms_joints_mm"] = float(rms(seen.joints[lane, trials].ravel()))
-        cells |= {
-            "residual_correlation": float(wide.correlation[lane]),
-            "effective_samples": float(wide.samples[lane]),
-        }
         out.append(row | cells)
     return out

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtrachea.files.tables import write_csv
 from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.study import Study
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analyses.effective import widened
 from jaxtrachea.results.hdf5 import read_hdf5
 from jaxtrachea.results.rows import summary_rows
 from jaxtrachea.runs.chunks import divide, join, load, replaced, save
@@ -130,7 +130,7 @@ def write_so_far(path: Path, run: RunFolder, study: Study) -> None:
     for k, lanes in enumerate(_chunks(run, study)):
         part = _read(run, k, study.take(lanes), lanes)
         if part is not None:
-            rows += summary_rows(Findings(part))
+            rows += summary_rows(widened(part))
     try:
         write_csv(path, rows)
     except OSError:

@@ -7,6 +7,7 @@ from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.analyses.bootstrap import BOOTSTRAP
 from jaxtrachea.inference.analyses.cross_validation import LEFT_OUT
 from jaxtrachea.inference.analyses.design import DESIGN
+from jaxtrachea.inference.analyses.effective import EFFECTIVE
 from jaxtrachea.inference.analyses.influence import INFLUENCE
 from jaxtrachea.inference.analyses.population import POPULATION
 from jaxtrachea.inference.analyses.posterior import POSTERIOR
@@ -22,6 +23,7 @@ ANALYSES: tuple[Analysis, ...] = (
     POSTERIOR,
     LEFT_OUT,
     INFLUENCE,
+    EFFECTIVE,
     DESIGN,
 )
 
