@@ -14,7 +14,7 @@ from jaxtrachea.files.output import OutputExists, new_directory, new_output
 from jaxtrachea.files.tables import markdown_table, number, write_csv
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.predictions import Prediction, lag_correlation, predictions, rms
+from jaxtrachea.fit.predictions import Prediction, predictions
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import build_study
 from jaxtrachea.inference.analyses.cross_validation import left_out_rows
@@ -23,6 +23,7 @@ from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
 from jaxtrachea.inference.effective import effective
 from jaxtrachea.inference.labels import flat_sentence, unknown_label
+from jaxtrachea.inference.residuals import lag_correlation, rms, worst
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.report.fit import report_text
@@ -165,9 +166,9 @@ def test_predictions_are_model_minus_data(result):
             model = k_1 * curve.displacement + k_3 * curve.displacement**3 + offsets[t]
             # The smooth touch (1 micrometre) shifts the displacement by less than 1e-5 mm here.
             assert np.allclose(seen.force[lane, t], model - curve.force, atol=1e-4)
-    assert "N were measured" in seen.worst(result)
+    assert "N were measured" in worst(seen, result)
     nothing = dataclasses.replace(seen, force=np.full_like(seen.force, np.nan))
-    assert nothing.worst(result) == "none, no finite prediction"
+    assert worst(nothing, result) == "none, no finite prediction"
 
 
 def test_plots_of_many_lanes_and_of_nothing_finite(result, tmp_path):

@@ -14,9 +14,6 @@ from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus
 
-#: What reports say in the place of estimates.
-NOTHING_FITTED = "every parameter is fixed: nothing was fitted, the model was evaluated"
-
 
 def evaluated(study: Study) -> FitResult:
     """Cost, residuals, noise and criteria of a study without unknowns.

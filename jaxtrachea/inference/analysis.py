@@ -102,8 +102,7 @@ class Analysis:
         datasets: writes into its group of results.h5; None: it has none.
         place: of its section in report.md and of its tables on the terminal: `estimates`, before
             the quality of the fit; `quality`, with it; `checks`, after it; `data`, after what is
-            used of the data;
-            `design`: it belongs to that command.
+            used of the data; `design`: it belongs to that command.
         section: paragraphs of the report.
         warning: paragraphs below the table of estimates.
         shown: tables and sentences on the terminal, for (found, lanes that are listed).

@@ -9,10 +9,11 @@ from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import OF_THE_PRESS
-from jaxtrachea.fit.predictions import predictions, rms
+from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.starts import draw_starts
 from jaxtrachea.fit.study import Study
+from jaxtrachea.inference.residuals import rms
 from jaxtrachea.measurements.read import Curve
 
 

@@ -19,12 +19,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
-from jaxtrachea.fit.predictions import Prediction, lag_correlation
+from jaxtrachea.fit.predictions import Prediction
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.shared import held_count, unknown_count
 from jaxtrachea.fit.starts import of_unknowns
 from jaxtrachea.inference.judgement import interval95, within_bounds
 from jaxtrachea.inference.profile import Profiles
+from jaxtrachea.inference.residuals import lag_correlation
 from jaxtrachea.status import ProfileEnd
 
 #: Correlation of neighbouring residuals from which the report doubts plain standard errors.

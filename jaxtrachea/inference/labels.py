@@ -4,13 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxtrachea.fit.evaluate import NOTHING_FITTED
 from jaxtrachea.fit.parameters import OF_THE_PRESS
 from jaxtrachea.fit.press_scale import sizes_of_press
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.judgement import verdict_of
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.verdict import VERDICTS, describe_flat
+
+#: What reports say in the place of estimates.
+NOTHING_FITTED = "every parameter is fixed: nothing was fitted, the model was evaluated"
 
 
 def unknown_label(result: FitResult, lane: int, i: int) -> str:

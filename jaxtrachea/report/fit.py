@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea.files.tables import markdown_table
-from jaxtrachea.fit.evaluate import NOTHING_FITTED
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.effective import CORRELATED
-from jaxtrachea.inference.labels import lane_label, succeeded, verdict_sentence
+from jaxtrachea.inference.labels import NOTHING_FITTED, lane_label, succeeded, verdict_sentence
+from jaxtrachea.inference.residuals import worst
 from jaxtrachea.inference.rows import ONE_BY_ONE, listed, more_of
 from jaxtrachea.measurements.read import BadCurve
 from jaxtrachea.report.tables import (
@@ -45,7 +45,7 @@ def report_text(
         *_sections(findings, "estimates"),
         "## Quality",
         *_quality(result, failed),
-        f"Largest residual: {findings.prediction.worst(result)}.",
+        f"Largest residual: {worst(findings.prediction, result)}.",
         *_sections(findings, "quality"),
         *_bounds(result),
         *_sections(findings, "checks"),

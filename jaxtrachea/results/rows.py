@@ -4,13 +4,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from jaxtrachea.fit.evaluate import NOTHING_FITTED
-from jaxtrachea.fit.predictions import Prediction, rms
+from jaxtrachea.fit.predictions import Prediction
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.judgement import judgement
-from jaxtrachea.inference.labels import is_own, said_before, unknown_label
+from jaxtrachea.inference.labels import NOTHING_FITTED, is_own, said_before, unknown_label
 from jaxtrachea.inference.profile import Profiles
+from jaxtrachea.inference.residuals import rms
 from jaxtrachea.inference.rows import row_places, samples_of, trials_of
 from jaxtrachea.measurements.read import BadCurve
 from jaxtrachea.measurements.usage_tables import lane_cells

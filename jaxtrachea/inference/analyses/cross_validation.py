@@ -7,10 +7,10 @@ import numpy as np
 from jaxtrachea.config import SpecError
 from jaxtrachea.files.tables import markdown_table
 from jaxtrachea.fit.parameters import OF_THE_PRESS
-from jaxtrachea.fit.predictions import rms
 from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
 from jaxtrachea.inference.cross_validation import LeftOut, curves_to_leave_out, leave_one_out
+from jaxtrachea.inference.residuals import rms
 from jaxtrachea.inference.rows import ONE_BY_ONE, and_more
 
 LEFT_OUT_HEAD = ["specimen", "left out", "force / model", "rms force / peak", "rms joints / D"]
