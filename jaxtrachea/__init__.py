@@ -13,11 +13,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from jaxtrachea.inference.predict import CurvePrediction as CurvePrediction
-    from jaxtrachea.inference.predict import predict as predict
-    from jaxtrachea.inference.stored import NoResults as NoResults
-    from jaxtrachea.inference.stored import StoredFit as StoredFit
-    from jaxtrachea.inference.stored import read_results as read_results
     from jaxtrachea.mechanics.beam import Beam as Beam
     from jaxtrachea.mechanics.beam import contact_compliance as contact_compliance
     from jaxtrachea.mechanics.beam import deflect as deflect
@@ -32,6 +27,11 @@ if TYPE_CHECKING:
     from jaxtrachea.mechanics.press import press as press
     from jaxtrachea.mechanics.skeleton import Skeleton as Skeleton
     from jaxtrachea.mechanics.skeleton import skeleton_response as skeleton_response
+    from jaxtrachea.prediction.predict import CurvePrediction as CurvePrediction
+    from jaxtrachea.prediction.predict import predict as predict
+    from jaxtrachea.results.stored import NoResults as NoResults
+    from jaxtrachea.results.stored import StoredFit as StoredFit
+    from jaxtrachea.results.stored import read_results as read_results
     from jaxtrachea.scene.assemble import make_scene as make_scene
     from jaxtrachea.scene.assemble import with_geometry as with_geometry
     from jaxtrachea.scene.declare import PlanError as PlanError
@@ -54,8 +54,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "inference.predict": ("CurvePrediction", "predict"),
-    "inference.stored": ("NoResults", "StoredFit", "read_results"),
+    "prediction.predict": ("CurvePrediction", "predict"),
+    "results.stored": ("NoResults", "StoredFit", "read_results"),
     "mechanics.beam": ("Beam", "contact_compliance", "deflect"),
     "mechanics.force_law": ("Law", "duffing"),
     "mechanics.press": ("Options", "Press", "press"),

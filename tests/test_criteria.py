@@ -13,14 +13,14 @@ import synthetic
 from run_cli import run
 
 from jaxtrachea.cli.compare import _left_out_notes
-from jaxtrachea.fit.criteria import penalised, weights
+from jaxtrachea.fit.criteria import penalised
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.onset import where_sought
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import cross_validation
-from jaxtrachea.inference.comparison import Model, Row, compared, same_data, sentence
+from jaxtrachea.inference.comparison import Model, Row, compared, same_data, sentence, weights
 from jaxtrachea.inference.cross_validation import Missed, leave_repeats_out, repeats
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press

@@ -44,7 +44,7 @@ def test_noise_free_data_give_back_the_parameters(draws):
     force, _ = synthetic.forces(truth)
     result = fit(synthetic.study(force), Settings(starts=4))
     error = np.abs(result.value / truth - 1).max(1)
-    condition = np.array([u.condition for u in result.uncertainty])
+    condition = result.uncertainty.condition
     peak = np.abs(force).max((1, 2))
     succeeded = result.status <= FitStatus.UNIDENTIFIABLE
     fitted = result.rms[:, 0] <= 1e-12 * peak
@@ -232,14 +232,14 @@ def test_one_position_leaves_skeleton_undetermined():
     study = build_study(data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters())
     result = fit(study, Settings(starts=2))
     assert result.status[0] == FitStatus.UNIDENTIFIABLE
-    flat = result.uncertainty[0].flat
+    flat = result.uncertainty.flat[0]
     ratio = flat[0] / flat[1]
     # Beam on discrete rings, not on a continuum: the exponents are near 1 and 3.
     assert -4.5 < ratio < -2.0
     assert np.all(np.isinf(result.standard_error[0, :2]))
     assert np.all(np.isfinite(result.standard_error[0, 2:]))
-    u = result.uncertainty[0]
-    words = describe_flat([p.name for p, _, _ in study.unknowns[0]], u.flat, np.inf, u.blind)
+    names = [p.name for p, _, _ in study.unknowns[0]]
+    words = describe_flat(names, flat, np.inf, result.uncertainty.blind[0])
     shape = re.fullmatch(r"EI_L and k_M only through EI_L k_M\^([\d.]+)", words)
     assert shape is not None
     assert float(shape[1]) == pytest.approx(-ratio, rel=1e-2)

@@ -134,7 +134,7 @@ def test_four_unknowns_against_refits(noisy, name):
     shift = np.zeros((2 * len(places), T, N))
     for k, (t, e) in enumerate(places):
         shift[2 * k, t, e], shift[2 * k + 1, t, e] = step, -step
-    se = result.uncertainty[0].se
+    se = result.uncertainty.se[0]
     start = lambda n: np.repeat(result.theta, n, axis=0)  # noqa: E731
     data = study.lanes.force + shift
     again = fit(moved(study, data), SHARP, starts=start(len(data))).theta
@@ -155,7 +155,7 @@ def test_left_out_is_a_refit_to_first_order(quiet):
     held = study.lanes.force.repeat(len(places), axis=0)
     starts = np.repeat(result.theta, len(places), axis=0)
     gone = fit(moved(study, held, precision), SHARP, starts=starts).theta
-    exact = (gone - result.theta) / result.uncertainty[0].se
+    exact = (gone - result.theta) / result.uncertainty.se[0]
     first = np.array([found.of.left_out[0, t, :, e] for t, e in places])
     np.testing.assert_allclose(first, exact, atol=0.05 * np.abs(exact).max())
 
@@ -228,7 +228,7 @@ def test_estimate_follows_data_and_geometry(noisy):
     at = lane.force, lane.s_c, tube.ring_positions
     value, forward, reverse, difference = both(*at)
     # Roundings of the cost hide a rise of it: 8 of them are this many standard errors.
-    hidden = np.sqrt(16 * np.finfo(float).eps * result.samples[0]) * result.uncertainty[0].se
+    hidden = np.sqrt(16 * np.finfo(float).eps * result.samples[0]) * result.uncertainty.se[0]
     assert np.all(np.abs(value - result.theta[0]) <= hidden)
     np.testing.assert_allclose(forward, difference, rtol=1e-3)
     products = sum(float(jnp.sum(r * d)) for r, d in zip(reverse, along, strict=True))

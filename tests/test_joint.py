@@ -19,14 +19,16 @@ from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.shared import held_count, unknown_count
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import population as populations
-from jaxtrachea.inference import results
+from jaxtrachea.inference.analyses.population import POPULATION, population_rows
+from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.bootstrap import bootstrap
 from jaxtrachea.inference.cross_validation import curves_to_leave_out
 from jaxtrachea.inference.design import check
-from jaxtrachea.inference.population import population, population_rows, wanted
+from jaxtrachea.inference.population import population, wanted
 from jaxtrachea.inference.profile import profiles
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
+from jaxtrachea.results.rows import lane_rows, parameter_rows
 from jaxtrachea.runs import journal
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
@@ -199,14 +201,14 @@ def test_bounds_of_shared_and_of_own_unknowns():
 
 
 def test_rows_name_what_is_shared_once(linear):
-    rows = list(results.parameter_rows(linear, population=population(linear)))
+    rows = list(parameter_rows(Findings(linear, ((POPULATION, population(linear)),))))
     shared = [r for r in rows if r["parameter"] == "k_3"]
     assert [r["specimen"] for r in shared] == ["(all)"]
     own = [r for r in rows if r["parameter"] == "k_1"]
     assert [r["specimen"] for r in own] == [f"s{i:02d}" for i in range(LANES)]
     assert all(abs(r["shrunk"] - r["value"]) < 3 * r["se"] for r in own)
     assert "shrunk" not in shared[0]
-    summary = list(results.lane_rows(linear))
+    summary = list(lane_rows(linear))
     assert len({r["k_3 [N/mm^3]"] for r in summary}) == 1
     assert len({r["k_1 [N/mm]"] for r in summary}) == LANES
 
@@ -221,8 +223,8 @@ def test_population_and_its_page(linear):
     truth = np.log(1 + 0.1 * np.arange(LANES))
     np.testing.assert_allclose(np.log(rows[0]["mean"]), truth.mean(), atol=0.02)
     np.testing.assert_allclose(rows[0]["sd_scaled"], truth.std(ddof=1), atol=0.02)
-    assert not wanted(False, linear)
-    assert wanted(None, linear)
+    assert not wanted(False, linear.study)
+    assert wanted(None, linear.study)
 
 
 def test_population_knows_what_errors_have_in_common(linear, monkeypatch):

@@ -14,16 +14,18 @@ from jaxtrachea.fit.parameters import in_model
 from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import build_study, default_parameters
+from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import leave_one_out, leave_repeats_out, without
 from jaxtrachea.inference.design import Candidates, check, gains, situation
-from jaxtrachea.inference.held_out import compare
 from jaxtrachea.inference.influence import influence
-from jaxtrachea.inference.results import verdict_sentence, write_hdf5
-from jaxtrachea.inference.stored import read_results
+from jaxtrachea.inference.labels import verdict_sentence
 from jaxtrachea.inference.verdict import describe_flat
 from jaxtrachea.measurements.first_touch import first_touch
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, compliance
+from jaxtrachea.prediction.held_out import compare
+from jaxtrachea.results.hdf5 import write_hdf5
+from jaxtrachea.results.stored import read_results
 from jaxtrachea.trachea.material import Material
 
 ONE = Settings(starts=1)
@@ -262,7 +264,7 @@ def test_influence_of_a_curve_with_its_own_onset(owned):
     held[:, 1] = True
     again = fit(without(study, held), ONE)
     moved = (again.theta - owned.theta)[:, common]
-    se = np.stack([u.se for u in owned.uncertainty])[:, common]
+    se = owned.uncertainty.se[:, common]
     np.testing.assert_allclose(found.curve_left_out[:, 1, common], moved / se, atol=0.1)
     assert np.all((found.curve_cook > 0) & (found.curve_cook < 5))
 
@@ -329,7 +331,7 @@ def test_where_no_onset_is_fitted_nothing_changes():
 
 def test_a_stored_fit_predicts_with_its_corners_and_in_its_steps(owned, tmp_path):
     """Used curves come back to 1e-9 N; a press ten times as deep, in other steps: SciPy."""
-    write_hdf5(tmp_path / "results.h5", owned, {})
+    write_hdf5(tmp_path / "results.h5", Findings(owned), {})
     read = read_results(tmp_path)
     (k_1, k_3), D = owned.value[0, :2], np.linspace(0, 50, 80)
     force = k_1 * np.maximum(D - 4, 0) + k_3 * np.maximum(D - 4, 0) ** 3 + 0.2

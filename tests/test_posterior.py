@@ -13,21 +13,21 @@ import numpy as np
 import pytest
 from run_cli import GOOD, run
 
-from jaxtrachea.cli.run import Found, posterior_failed
+from jaxtrachea.cli.run import poor
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS, in_model
-from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import Noise, build_study, default_parameters
+from jaxtrachea.inference.analyses.posterior import POSTERIOR, posterior_rows
+from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.estimate import lane_of
 from jaxtrachea.inference.posterior import Posterior, log_density, posterior
 from jaxtrachea.inference.posterior_start import around_the_fit, mode
-from jaxtrachea.inference.posterior_tables import rows_with_draws
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.report.fit import report_text
 from jaxtrachea.report.overview import overview
-from jaxtrachea.report.sections import posterior_rows
+from jaxtrachea.results.rows import parameter_rows
 from jaxtrachea.trachea.geometry import table_1
 
 ONE = Settings(starts=1)
@@ -193,11 +193,11 @@ def test_chains_start_where_the_estimate_is():
         share = 1 / (1 + np.exp(-x[:, :2]))
         low, high = result.study.lanes.lower[lane], result.study.lanes.upper[lane]
         theta = low + (high - low) * share
-        se = result.uncertainty[lane].se
+        se = result.uncertainty.se[lane]
         np.testing.assert_allclose(theta.mean(axis=0), result.theta[lane], atol=0.3 * se.max())
         np.testing.assert_allclose(theta.std(axis=0), se, rtol=0.15)
         found = np.corrcoef(theta.T)[0, 1]
-        np.testing.assert_allclose(found, result.uncertainty[lane].correlation[0, 1], atol=0.02)
+        np.testing.assert_allclose(found, result.uncertainty.correlation[lane, 0, 1], atol=0.02)
 
 
 @pytest.mark.slow
@@ -222,28 +222,25 @@ def test_chains_start_at_the_mode_of_the_posterior():
 def test_poor_chains_are_said_beside_the_estimates():
     """No interval in report and table, a sentence under the estimates, empty cells, exit code 1."""
     drawn = made(1.55, 8.0, 0)
-    seen = predictions(drawn.result.study, drawn.result.theta)
-    text = report_text("T", drawn.result, [], seen, None, drawn=drawn)
+    found = Findings(drawn.result, ((POSTERIOR, drawn),))
+    text = report_text("T", found, [])
     estimates = text.partition("## Estimates")[2].partition("## What")[0]
     assert "The posterior of 1 of 1 lanes is not to be trusted" in estimates
     assert "poor: R-hat 1.550, 8 effective draws" in estimates
     assert [row[2:4] + row[-1:] for row in posterior_rows(drawn, [0])] == [["–", "–", "poor"]] * 2
-    rows = list(rows_with_draws(drawn.result, None, None, None, drawn))
+    rows = list(parameter_rows(found))
     assert rows[0]["posterior_low95"] == rows[0]["posterior_median"] == ""
-    nothing = dict.fromkeys(("left_out", "profiles", "resampled", "influence", "population"))
-    found = Found(result=drawn.result, posterior=drawn, **nothing)
     said = [item for item in overview(found) if isinstance(item, str)]
     assert any("not to be trusted" in text for text in said)
-    assert posterior_failed(found)
-    fine = dataclasses.replace(found, posterior=made(1.0, 900.0, 0))
-    assert not posterior_failed(fine)
+    assert poor(found)
+    assert not poor(Findings(drawn.result, ((POSTERIOR, made(1.0, 900.0, 0)),)))
 
 
 @pytest.mark.slow
 def test_well_conditioned_lanes_are_those_of_quadrature(blackjax):
     """Conditions 5 to 14, bounds and numbers of draws as users have them; 200 asked, more drawn."""
     result = fit(default_study([(1.3, 0.4), (0.5, 1.0), (1.0, 0.6)]), ONE)
-    assert max(u.condition for u in result.uncertainty) < 20
+    assert max(result.uncertainty.condition) < 20
     drawn = posterior(result, draws=200)
     for lane in range(3):
         assert drawn.rhat[lane].max() < 1.01

@@ -26,17 +26,20 @@ from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import Noise, build_study
-from jaxtrachea.inference import held_out, results, stored
+from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import leave_one_out, with_own_touch
-from jaxtrachea.inference.predict import predict_sources
-from jaxtrachea.inference.prediction_core import predicted
-from jaxtrachea.inference.sources import source_of
+from jaxtrachea.inference.labels import verdict_sentence
 from jaxtrachea.measurements.presses import parse_presses
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.report import prediction_plots
-from jaxtrachea.runs import former
-from jaxtrachea.runs.folder import NoRun
+from jaxtrachea.prediction import held_out
+from jaxtrachea.prediction import plots as prediction_plots
+from jaxtrachea.prediction.core import predicted
+from jaxtrachea.prediction.predict import predict_sources
+from jaxtrachea.prediction.sources import source_of
+from jaxtrachea.results import stored
+from jaxtrachea.results.hdf5 import read_hdf5, write_hdf5
+from jaxtrachea.results.rows import lane_rows
 from jaxtrachea.status import FitStatus, PredictionStatus
 from jaxtrachea.trachea.geometry import table_1
 
@@ -93,7 +96,7 @@ def noisy_study(folder, noise, lanes, seed):
     result = fit(
         build_study(curves, table_1(), synthetic.OPTIONS, table), Settings(starts=1, scrutiny=False)
     )
-    results.write_hdf5(folder / "results.h5", result, {"inputs": {"a.csv": "0" * 64}})
+    write_hdf5(folder / "results.h5", Findings(result), {"inputs": {"a.csv": "0" * 64}})
     return result
 
 
@@ -139,10 +142,10 @@ def test_everything_comes_back_from_the_file(study, read):
     assert np.array_equal(read.theta, result.theta)
     assert read.study.parameters == result.study.parameters
     assert read.study.model.options == result.study.model.options
-    u = result.uncertainty[3]
+    u = result.uncertainty
     se = np.sqrt(np.diag(read.covariance[3]))
-    assert np.allclose(se, u.se, rtol=1e-12)
-    assert np.allclose(read.covariance[3], u.correlation * np.outer(se, se), rtol=1e-9)
+    assert np.allclose(se, u.se[3], rtol=1e-12)
+    assert np.allclose(read.covariance[3], u.correlation[3] * np.outer(se, se), rtol=1e-9)
     for mine, its in zip(
         read.curves, (c for lane in result.study.curves for c in lane), strict=True
     ):
@@ -278,7 +281,7 @@ TWO = Settings(starts=1, batch=2, scrutiny=False)
 def stored_again(study, path):
     """A fit of a study, written and read."""
     result = fit(study, TWO)
-    results.write_hdf5(path, result, {})
+    write_hdf5(path, Findings(result), {})
     return jaxtrachea.read_results(path)
 
 
@@ -587,10 +590,10 @@ def test_fixed_specification_is_evaluated(tmp_path):
     assert np.isclose(result.sigma[0, 0], sigma, rtol=1e-12)
     assert np.isclose(result.cost[0], 0.5 * 60)
     assert result.criteria.unknowns[0] == 1
-    row = next(results.lane_rows(result))
+    row = next(lane_rows(result))
     assert "nothing was fitted" in str(row["message"])
-    assert "nothing was fitted" in results.verdict_sentence(result, 0)
-    results.write_hdf5(tmp_path / "r.h5", result, {})
+    assert "nothing was fitted" in verdict_sentence(result, 0)
+    write_hdf5(tmp_path / "r.h5", Findings(result), {})
     read = jaxtrachea.read_results(tmp_path / "r.h5")
     curve = jaxtrachea.predict(read, s=80.0, displacement=1.0, specimen="T1")
     assert curve.se == 0
@@ -825,23 +828,23 @@ def test_schema_1_serves_to_fit_failed_lanes_again(study, tmp_path):
     """What `--rerun-failed` needs is in it; the covariance follows from errors and correlation."""
     shutil.copytree(study[0], tmp_path / "r")
     old(tmp_path / "r")
-    again = former.read_hdf5(tmp_path / "r" / "results.h5", study[1].study)
+    again = read_hdf5(tmp_path / "r" / "results.h5", study[1].study)
     assert np.array_equal(again.theta, study[1].theta)
-    for mine, its in zip(again.uncertainty, study[1].uncertainty, strict=True):
-        assert np.allclose(mine.covariance, its.covariance, rtol=1e-9)
+    mine, its = again.uncertainty.covariance, study[1].uncertainty.covariance
+    assert np.allclose(mine, its, rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_a_former_fit_with_other_steps_is_refused(touched):
     """Its lanes would keep scaled coordinates that mean other numbers here."""
     study, read = touched
-    assert former.read_hdf5(read.path, study).succeeded.all()
+    assert read_hdf5(read.path, study).succeeded.all()
     other = [dataclasses.replace(p, step=7 * p.step) if p.name == "onset" else p
              for p in study.parameters]  # fmt: skip
     model = dataclasses.replace(study.model, columns=columns_of(other))
     study = dataclasses.replace(study, model=model, parameters=tuple(other))
-    with pytest.raises(NoRun, match="other steps; fit again"):
-        former.read_hdf5(read.path, study)
+    with pytest.raises(stored.NoResults, match="other steps; fit again"):
+        read_hdf5(read.path, study)
 
 
 @pytest.mark.parametrize(
@@ -929,7 +932,7 @@ def test_a_lane_with_one_place_predicts_that_place(study, tmp_path):
     force = truth + NOISE * rng.normal(size=(1, 1, len(DEPTHS)))
     curves = synthetic.curves(force, np.array([75.0]), DEPTHS)
     result = fit(build_study(curves, table_1(), synthetic.OPTIONS, synthetic.parameters()), TWO)
-    results.write_hdf5(tmp_path / "results.h5", result, {"inputs": {"a.csv": "0" * 64}})
+    write_hdf5(tmp_path / "results.h5", Findings(result), {"inputs": {"a.csv": "0" * 64}})
     read = jaxtrachea.read_results(tmp_path)
     source = source_of(read, read.specimens[0])
     # EI_L on its upper bound: k_M is a direction by itself, whose slope is 1e-8 of the others'.

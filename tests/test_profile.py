@@ -12,16 +12,16 @@ import synthetic
 from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
+from jaxtrachea.files.tables import interval
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.profile_search import Sides
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import Noise, build_study
+from jaxtrachea.inference.analyses.profile import profile_rows
 from jaxtrachea.inference.profile import choose, profiles
-from jaxtrachea.inference.results import profile_rows
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.report.fit import interval
 from jaxtrachea.status import FitStatus, ProfileEnd
 from jaxtrachea.trachea.geometry import table_1
 
@@ -57,9 +57,8 @@ def test_linear_model_has_the_interval_of_the_covariance(noise):
     width = (result.upper - result.lower) / 2
     assert np.abs(found.lower.reshape(shape) - result.lower).max() <= 2e-6 * width.max()
     assert np.abs(found.upper.reshape(shape) - result.upper).max() <= 2e-6 * width.max()
-    at = (found.coordinate - result.theta.ravel()[:, None]) / np.concatenate(
-        [u.se for u in result.uncertainty]
-    )[:, None]
+    se = result.uncertainty.se.ravel()[:, None]
+    at = (found.coordinate - result.theta.ravel()[:, None]) / se
     np.testing.assert_allclose(found.statistic, at**2, rtol=1e-5, atol=1e-6)
     assert not found.improved.any()
 

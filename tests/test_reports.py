@@ -5,7 +5,6 @@ import dataclasses
 import io
 import warnings
 from pathlib import Path
-from types import SimpleNamespace
 
 import matplotlib as mpl
 import numpy as np
@@ -25,18 +24,23 @@ from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import Noise, build_study
-from jaxtrachea.inference import results
+from jaxtrachea.inference.analyses import INFLUENCE, LEFT_OUT
+from jaxtrachea.inference.analyses.cross_validation import left_out_table
+from jaxtrachea.inference.analyses.effective import widened
+from jaxtrachea.inference.analyses.influence import REASONS, influence_cell, influence_section
+from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import LeftOut
 from jaxtrachea.inference.effective import effective, share_independent
 from jaxtrachea.inference.influence import influence
+from jaxtrachea.inference.judgement import verdict_of
+from jaxtrachea.inference.labels import peak_force, unknown_label
 from jaxtrachea.inference.rows import worst_first
-from jaxtrachea.inference.summary import with_residuals
 from jaxtrachea.measurements.read import Curve, read_measurements
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.report.fit import left_out_table, report_text
+from jaxtrachea.report.fit import report_text
 from jaxtrachea.report.overview import overview
 from jaxtrachea.report.plots import STYLE, draw_all
-from jaxtrachea.report.sections import REASONS, influence_cell, influence_section
+from jaxtrachea.results.rows import lane_rows, summary_rows
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
 
@@ -84,13 +88,6 @@ def shown(items, width=80):
     return console.file.getvalue()
 
 
-def found(result, **more):
-    """As `cli_run.Found`."""
-    nothing = dict.fromkeys(("left_out", "profiles", "resampled", "influence", "posterior",
-                             "population"))  # fmt: skip
-    return SimpleNamespace(result=result, **nothing | more)
-
-
 def test_formulas_are_quoted_and_read_back(tmp_path):
     """Every start that OWASP names; numbers and harmless text stay; names are read back."""
     texts = ["=1+1", "+1", "-1", "@SUM(A1)", "\tx", "\rx", "＝1", "'=1", "''-1", "'tis", "a=b", ""]
@@ -115,7 +112,7 @@ def test_formulas_are_quoted_and_read_back(tmp_path):
 
 
 def test_summary_quotes_what_specimens_are_called(many, tmp_path):
-    results.write_csv(tmp_path / "s.csv", list(results.lane_rows(many)))
+    write_csv(tmp_path / "s.csv", list(lane_rows(many)))
     with (tmp_path / "s.csv").open(newline="", encoding="utf-8") as stream:
         names = [row["specimen"] for row in csv.DictReader(stream)]
     assert names[3] == "'=1+1"
@@ -145,11 +142,10 @@ def test_names_are_plain_text_in_pictures(name):
 
 def test_a_run_of_such_names_writes_all_its_files(many, tmp_path):
     """Every picture and the page; markup and formulas as text; tables say what they leave out."""
-    seen = predictions(many.study, many.theta)
-    paths, lost = draw_all(tmp_path, many, seen)
+    paths, lost = draw_all(tmp_path, Findings(many))
     assert lost == {}
     assert all(p.read_bytes()[:4] == b"\x89PNG" for p in paths)
-    text = report_text("$x$ | <b>", many, [], seen, None)
+    text = report_text("$x$ | <b>", Findings(many), [])
     made = page(text, {p.name: p.read_bytes() for p in paths}, {})
     assert "<script>" not in made
     assert "&lt;script&gt;" in made
@@ -165,7 +161,7 @@ def test_a_run_of_such_names_writes_all_its_files(many, tmp_path):
 def test_the_worst_come_first(many):
     order = worst_first(many)
     assert order[0] == 2
-    share = [many.rms[k, 0] / results.peak_force(many, k) for k in order[1:]]
+    share = [many.rms[k, 0] / peak_force(many, k) for k in order[1:]]
     assert share == sorted(share, reverse=True)
 
 
@@ -176,11 +172,10 @@ def test_a_picture_that_fails_costs_itself(many, tmp_path, monkeypatch):
         raise ValueError("no such $ colour")
 
     monkeypatch.setattr("jaxtrachea.report.plots.draw_residuals", broken)
-    seen = predictions(many.study, many.theta)
-    paths, lost = draw_all(tmp_path, many, seen)
+    paths, lost = draw_all(tmp_path, Findings(many))
     assert [p.name for p in paths] == ["fit.png", "correlation.png"]
     assert lost == {"residuals.png": "ValueError: no such $ colour"}
-    text = without_lost(report_text("T", many, [], seen, None), lost)
+    text = without_lost(report_text("T", Findings(many), []), lost)
     assert "](residuals.png)" not in text
     assert "residuals.png could not be drawn (ValueError: no such $ colour)" in text
     made = page(text, {p.name: p.read_bytes() for p in paths}, {})
@@ -219,7 +214,7 @@ def test_no_column_is_cut_without_an_ellipsis(width):
 
 
 def test_terminal_takes_names_as_they_are(many):
-    text = shown(overview(found(many)), 120)
+    text = shown(overview(Findings(many)), 120)
     for name in ("[bold]", ":smile:", "<script>", "=1+1"):
         assert name in text.split()
     assert "Worst first; and 2 more, see summary.csv" in " ".join(text.split())
@@ -239,13 +234,13 @@ def test_one_lane_of_several_specimens_has_a_row_for_each(dense):
     """All columns of a specimen's own unknowns; what it has several of is named, not dropped."""
     assert dense.lanes == 1
     seen = predictions(dense.study, dense.theta)
-    rows = with_residuals(dense, list(results.lane_rows(dense)), seen, effective(dense, seen))
+    rows = summary_rows(widened(dense))
     assert [(r["specimen"], r["trial"]) for r in rows] == [("A", "(all)"), ("B", "1"), ("C", "1")]
-    labels = [results.unknown_label(dense, 0, i) for i in range(8)]
+    labels = [unknown_label(dense, 0, i) for i in range(8)]
     for row in rows:
         k = labels.index(f"k_3[{row['specimen']}]")
         assert row["k_3 [N/mm^3]"] == dense.value[0, k]
-        assert row["k_3 verdict"] == results.verdict_of(dense, 0, k)
+        assert row["k_3 verdict"] == verdict_of(dense, 0, k)
         assert row["k_1 [N/mm]"] == dense.value[0, 0]
         assert row["k_1 low95"] == dense.lower[0, 0]
     assert rows[0]["more"] == "force_offset[A/1], force_offset[A/2]: see parameters.csv"
@@ -270,7 +265,7 @@ def test_influence_says_why_there_is_no_number(dense):
     bound[0, 0] = True
     held = dataclasses.replace(diagnosed, result=dataclasses.replace(dense, at_bound=bound))
     assert influence_cell(held, 0, 0, 0) == "held"
-    shown_text = shown(overview(found(dense, influence=diagnosed)))
+    shown_text = shown(overview(Findings(dense, ((INFLUENCE, diagnosed),))))
     assert "Influence of curves" in shown_text
 
 
@@ -323,10 +318,10 @@ def test_fewer_independent_samples_than_unknowns_leave_no_limit():
     # No limit but the bounds.
     assert wide.lower[0].tolist() == [p.lower for p in result.study.free]
     assert wide.upper[0].tolist() == [p.upper for p in result.study.free]
-    text = report_text("T", result, [], predictions(result.study, result.theta), None)
+    text = report_text("T", widened(result), [])
     assert "95 % widened" in text
     assert "no more independent samples than unknowns" in text
-    assert "correlated in 1 of 1 lanes" in " ".join(shown(overview(found(result))).split())
+    assert "correlated in 1 of 1 lanes" in " ".join(shown(overview(widened(result))).split())
 
 
 def test_the_command_with_names_of_mathematics(tmp_path, monkeypatch, capsys):
@@ -361,26 +356,33 @@ def test_of_many_curves_left_out_report_and_terminal_show_the_worst_first(dense)
     lane, trial = np.zeros(14, int), np.arange(14) % 4
     force = 0.01 * np.array([3.0, 1, 14, 2, 4, np.nan, 5, 13, 6, 7, 8, 9, 10, 12])
     left_out = LeftOut(
-        lane, trial, force, np.full(14, np.nan), force, dense, converged=np.ones(14, bool)
+        lane,
+        trial,
+        force,
+        np.full(14, np.nan),
+        force,
+        dense.study,
+        dense,
+        converged=np.ones(14, bool),
     )
-    rows, further = left_out_table(dense, left_out)
+    rows, further = left_out_table(left_out)
     shares = ["–", *(f"{v}.00 %" for v in (14, 13, 12, 10, 9, 8, 7, 6, 5, 4, 3))]
     assert [row[3] for row in rows[:-1]] == shares
-    assert further == "Worst first; and 2 more, see left_out.csv"
-    seen = predictions(dense.study, dense.theta)
-    text = report_text("T", dense, [], seen, left_out)
+    assert further == ["Worst first; and 2 more, see left_out.csv"]
+    findings = Findings(dense, ((LEFT_OUT, left_out),))
+    text = report_text("T", findings, [])
     section = text.split("## Leaving one curve out")[1].split("##")[0]
     lines = [line for line in section.splitlines() if line.startswith("| ")][2:14]
     assert [line.split(" | ")[3] for line in lines] == shares
-    assert f"{further}." in section
-    items = list(overview(found(dense, left_out=left_out)))
+    assert f"{further[0]}." in section
+    items = list(overview(findings))
     assert rows in [item[2] for item in items if not isinstance(item, str)]
-    assert further in items
+    assert further[0] in items
     few = LeftOut(
-        lane[:4], trial[:4], force[:4], np.full(4, np.nan), force[:4], dense,
+        lane[:4], trial[:4], force[:4], np.full(4, np.nan), force[:4], dense.study, dense,
         converged=np.ones(4, bool),
     )  # fmt: skip
-    assert [row[1] for row in left_out_table(dense, few)[0][:-1]] == ["1", "2", "1", "1"]
+    assert [row[1] for row in left_out_table(few)[0][:-1]] == ["1", "2", "1", "1"]
 
 
 def test_counts_of_the_progress_bar_never_pass_the_total():

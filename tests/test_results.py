@@ -11,17 +11,25 @@ import numpy as np
 import pytest
 
 from jaxtrachea.files.output import OutputExists, new_directory, new_output
+from jaxtrachea.files.tables import markdown_table, number, write_csv
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.predictions import Prediction, lag_correlation, predictions, rms
+from jaxtrachea.fit.predictions import Prediction, predictions
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import build_study
-from jaxtrachea.inference import results
+from jaxtrachea.inference.analyses.cross_validation import left_out_rows
+from jaxtrachea.inference.analyses.effective import EFFECTIVE
+from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
+from jaxtrachea.inference.effective import effective
+from jaxtrachea.inference.labels import flat_sentence, unknown_label
+from jaxtrachea.inference.residuals import lag_correlation, rms, worst
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.report.fit import left_out_rows, markdown_table, number, report_text
+from jaxtrachea.report.fit import report_text
 from jaxtrachea.report.plots import draw_all
+from jaxtrachea.results.hdf5 import write_hdf5
+from jaxtrachea.results.rows import bad_row, lane_rows, parameter_rows
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
 
@@ -51,24 +59,31 @@ def result():
     return fit(make_study(force_offset=offset), Settings(starts=1))
 
 
+def predicted(result, prediction):
+    """Findings of a fit with these residuals."""
+    findings = Findings(result, ((EFFECTIVE, effective(result, prediction)),))
+    vars(findings)["prediction"] = prediction
+    return findings
+
+
 def columns(heading):
     body = re.split(r"^## ", PAGE.partition(heading)[2], maxsplit=1, flags=re.M)[0]
     return re.findall(r"^\| `([\w/]+)` \|", body, re.M)
 
 
 def test_page_names_every_column(result):
-    rows = list(results.lane_rows(result))
+    rows = list(lane_rows(result))
     names = list(rows[0])
     head = columns("## summary.csv")
     assert names[: len(head)] == head
     assert names[len(head) : len(head) + 5] == [
         *("k_1 [N/mm]", "k_1 se", "k_1 low95", "k_1 high95", "k_1 verdict")
     ]
-    assert list(next(results.parameter_rows(result))) == columns("## parameters.csv")
+    assert list(next(parameter_rows(Findings(result)))) == columns("## parameters.csv")
 
 
 def test_page_names_every_dataset(result, tmp_path):
-    results.write_hdf5(tmp_path / "r.h5", result, {"a": 1})
+    write_hdf5(tmp_path / "r.h5", Findings(result), {"a": 1})
     found = {}
     with h5py.File(tmp_path / "r.h5") as file:
         file.visititems(lambda name, item: found.__setitem__(name, getattr(item, "shape", None)))
@@ -79,37 +94,38 @@ def test_page_names_every_dataset(result, tmp_path):
     assert sorted(shapes) == sorted(columns("## results.h5"))
     assert shapes["unknowns/correlation"] == (2, 4, 4)
     with pytest.raises(FileExistsError):
-        results.write_hdf5(tmp_path / "r.h5", result, {})
+        write_hdf5(tmp_path / "r.h5", Findings(result), {})
 
 
 def test_trialwise_unknowns_are_named_by_trial(result):
-    labels = [results.unknown_label(result, 0, i) for i in range(4)]
+    labels = [unknown_label(result, 0, i) for i in range(4)]
     assert labels == ["k_1", "k_3", "force_offset[a]", "force_offset[b]"]
-    rows = list(results.parameter_rows(result))
+    rows = list(parameter_rows(Findings(result)))
     assert [(r["specimen"], r["trial"]) for r in rows[:4]] == [
         *(("T1", "(all)"), ("T1", "(all)"), ("T1", "a"), ("T1", "b"))
     ]
-    assert not any("force_offset" in name for name in next(results.lane_rows(result)))
+    assert not any("force_offset" in name for name in next(lane_rows(result)))
 
 
 def test_failed_lane_keeps_its_row_and_is_called_failed(result):
     status = result.status.copy()
     status[1] = FitStatus.MAX_ITERATIONS
     failed = dataclasses.replace(result, status=status)
-    good, bad = results.lane_rows(failed)
+    good, bad = lane_rows(failed)
     assert (good["status"], bad["status"]) == ("converged", "max_iterations")
     assert bad["message"] == FitStatus.MAX_ITERATIONS.message
     assert bad["k_1 verdict"] == "failed"
-    assert results.flat_sentence(failed, 1) == "no estimate"
-    text = report_text("T", failed, [BAD], predictions(result.study, result.theta), None)
+    assert flat_sentence(failed, 1) == "no estimate"
+    text = report_text("T", Findings(failed), [BAD])
     assert "2 lanes, 1 succeeded, 1 failed; 1 curves could not be used" in text
     assert "| T9 | 1 | non_finite | line 3: force is nan | leave it out |" in text
     assert "max iterations" in text
 
 
 def flat(result, direction, error):
-    u = result.uncertainty[0]._replace(flat=np.array(direction), flat_se=error)
-    return results.flat_sentence(dataclasses.replace(result, uncertainty=(u,)), 0)
+    change = {"flat": np.array([direction]), "flat_se": np.array([error])}
+    local = result.uncertainty._replace(**change)
+    return flat_sentence(dataclasses.replace(result, uncertainty=local), 0)
 
 
 def test_flat_combination_in_words(result):
@@ -121,8 +137,8 @@ def test_flat_combination_in_words(result):
 
 
 def test_rows_with_different_keys_make_one_table(tmp_path, result):
-    rows = [*results.lane_rows(result), results.bad_row(BAD)]
-    results.write_csv(tmp_path / "s.csv", rows)
+    rows = [*lane_rows(result), bad_row(BAD)]
+    write_csv(tmp_path / "s.csv", rows)
     with (tmp_path / "s.csv").open(newline="") as stream:
         *_, last = csv.DictReader(stream)
     assert last["status"] == "bad_data"
@@ -137,7 +153,7 @@ def test_leaving_out_predicts_from_the_other_trial():
     assert curves_to_leave_out(study) == [(0, 0), (0, 1), (1, 0), (1, 1)]
     assert np.allclose(left_out.ratio, [1 / 1.02 - 1, 0.02] * 2, atol=1e-6)
     assert np.all(np.isnan(left_out.joints))
-    rows = left_out_rows(left_out.result, left_out)
+    rows = left_out_rows(left_out)
     assert rows[-1][2] == "1.98 %"
     assert rows[-1][4] == "–"
 
@@ -150,9 +166,9 @@ def test_predictions_are_model_minus_data(result):
             model = k_1 * curve.displacement + k_3 * curve.displacement**3 + offsets[t]
             # The smooth touch (1 micrometre) shifts the displacement by less than 1e-5 mm here.
             assert np.allclose(seen.force[lane, t], model - curve.force, atol=1e-4)
-    assert "N were measured" in seen.worst(result)
+    assert "N were measured" in worst(seen, result)
     nothing = dataclasses.replace(seen, force=np.full_like(seen.force, np.nan))
-    assert nothing.worst(result) == "none, no finite prediction"
+    assert worst(nothing, result) == "none, no finite prediction"
 
 
 def test_plots_of_many_lanes_and_of_nothing_finite(result, tmp_path):
@@ -162,7 +178,7 @@ def test_plots_of_many_lanes_and_of_nothing_finite(result, tmp_path):
         ("none", dataclasses.replace(seen, force=np.full_like(seen.force, np.nan))),
     ):
         (tmp_path / name).mkdir()
-        paths, lost = draw_all(tmp_path / name, result, one)
+        paths, lost = draw_all(tmp_path / name, predicted(result, one))
         assert (len(paths), lost) == (3, {})
         assert all(p.read_bytes()[:4] == b"\x89PNG" for p in paths)
 
@@ -221,10 +237,10 @@ def test_report_doubts_what_it_should(result):
     shape = seen.force.shape
     bend = dataclasses.replace(seen, force=np.tile(np.linspace(1, 2, shape[-1]), (*shape[:2], 1)))
     noise = dataclasses.replace(seen, force=np.tile([1.0, -1.0], (*shape[:2], shape[-1] // 2)))
-    text = report_text("T", result, [], bend, None)
+    text = report_text("T", predicted(result, bend), [])
     assert "correlated in 2 of 2 lanes" in text
     assert "on its bound" not in text
     held = dataclasses.replace(result, at_bound=np.eye(2, result.at_bound.shape[1], dtype=bool))
-    text = report_text("T", held, [], noise, None)
+    text = report_text("T", predicted(held, noise), [])
     assert "correlated" not in text
     assert "In 2 of 2 lanes an unknown ended on its bound" in text

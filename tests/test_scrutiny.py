@@ -10,6 +10,7 @@ import specimens
 from scipy.special import stdtrit
 from specimens import NAMES, POSITIONS, STIFF_CONTACT
 
+from jaxtrachea.files.tables import write_csv
 from jaxtrachea.fit import scrutiny
 from jaxtrachea.fit import structure as structures
 from jaxtrachea.fit.fit import fit
@@ -17,13 +18,15 @@ from jaxtrachea.fit.parameters import in_model
 from jaxtrachea.fit.predictions import Prediction
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import build_study, default_parameters
-from jaxtrachea.inference import results
+from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.effective import effective
 from jaxtrachea.inference.judgement import judgement, verdict_of
 from jaxtrachea.inference.population import population
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.report.fit import estimate_rows, spread_rows
+from jaxtrachea.results.hdf5 import write_hdf5
+from jaxtrachea.results.rows import lane_rows, parameter_rows
 from jaxtrachea.status import FitStatus, ProfileEnd
 from jaxtrachea.trachea.geometry import table_1
 
@@ -132,14 +135,14 @@ def test_a_twin_skeleton_belongs_to_the_interval(result, pressed):
 def test_all_that_is_written_agrees(result, tmp_path):
     lanes = range(result.lanes)
     table = [row[-1] for row in estimate_rows(result, lanes)]
-    rows = list(results.parameter_rows(result))
+    rows = list(parameter_rows(Findings(result)))
     assert [row["verdict"] for row in rows] == table
-    summary = [row[f"{n} verdict"] for row in results.lane_rows(result) for n in NAMES]
+    summary = [row[f"{n} verdict"] for row in lane_rows(result) for n in NAMES]
     assert summary == table
-    results.write_hdf5(tmp_path / "r.h5", result, {})
+    write_hdf5(tmp_path / "r.h5", Findings(result), {})
     with h5py.File(tmp_path / "r.h5") as file:
         assert [v.decode() for v in file["unknowns/verdict"][()].ravel()] == table
-    results.write_csv(tmp_path / "p.csv", rows)
+    write_csv(tmp_path / "p.csv", rows)
     with (tmp_path / "p.csv").open(newline="") as stream:
         low = [float(row["low95"]) for row in csv.DictReader(stream)]
     assert low == [judgement(result, k, i).low for k in lanes for i in range(4)]
@@ -170,7 +173,7 @@ def test_widened_intervals_hold_the_plain_ones(result):
             if judged.ends is not None and judged.ends[1] == ProfileEnd.OPEN:
                 assert judged.high == wide.upper[k, i] == most
     left = wide.samples[5] - 4
-    ratio = stdtrit(left, 0.975) * wide.factor[5] / given.uncertainty[5].half_width
+    ratio = stdtrit(left, 0.975) * wide.factor[5] / given.uncertainty.half_width[5]
     assert ratio > 1.5
     found = np.log([wide.lower[5, 2] / value, wide.upper[5, 2] / value])
     np.testing.assert_allclose(found, ratio * sides, rtol=1e-9)

@@ -30,6 +30,8 @@ from jaxtrachea.fit.cost import LaneCost
 from jaxtrachea.fit.map_lanes import program
 from jaxtrachea.fit.specification import study_of
 from jaxtrachea.measurements.data_files import read_data
+from jaxtrachea.results.hdf5 import read_hdf5
+from jaxtrachea.results.stored import NoResults
 from jaxtrachea.runs import chunks, former, in_chunks, journal, processes
 from jaxtrachea.runs import folder as run_folder
 from jaxtrachea.runs.processes import Lost, Meeting, Watch
@@ -264,7 +266,7 @@ def load_peace(peace):
 def test_results_are_read_back_bit_for_bit(peace, tmp_path):
     """What write_hdf5 and save wrote comes back; damaged, foreign and truncated chunks do not."""
     study = load_peace(peace)
-    result = former.read_hdf5(peace / "out" / "results.h5", study)
+    result = read_hdf5(peace / "out" / "results.h5", study)
     lanes, path = np.arange(9), tmp_path / "0.npz"
     run_of_it = former.read_journal(peace / "out" / "results.h5")
     chunks.save(path, dataclasses.replace(run_of_it, id="me"), lanes, result)
@@ -287,8 +289,8 @@ def test_results_are_read_back_bit_for_bit(peace, tmp_path):
     middle = whole.index(result.theta.tobytes()) + result.theta.nbytes // 2
     path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
     assert chunks.load(path, "me", lanes, study) is None
-    with pytest.raises(run_folder.NoRun, match="another study"):
-        former.read_hdf5(peace / "out" / "results.h5", study.take(lanes[:8]))
+    with pytest.raises(NoResults, match="another study"):
+        read_hdf5(peace / "out" / "results.h5", study.take(lanes[:8]))
 
 
 def test_sizes_of_chunks(peace):
@@ -484,7 +486,7 @@ def test_a_file_system_without_locks(peace, study, monkeypatch, capsys):
 
 def from_peace(folder):
     """Stand in for `fit.fit`: the same numbers, read back."""
-    whole = former.read_hdf5(folder / "out" / "results.h5", load_peace(folder))
+    whole = read_hdf5(folder / "out" / "results.h5", load_peace(folder))
     names = [curves[0].specimen for curves in whole.study.curves]
     arrays = chunks.arrays_of(whole)
 

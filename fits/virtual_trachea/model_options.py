@@ -15,11 +15,11 @@ import numpy as np
 
 from jaxtrachea.config import FitSpec, load_fit_spec
 from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.predictions import rms
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.specification import settings_of, study_of
 from jaxtrachea.inference.cross_validation import leave_one_out
-from jaxtrachea.inference.results import peak_force
+from jaxtrachea.inference.labels import peak_force
+from jaxtrachea.inference.residuals import rms
 from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.status import FitStatus
 

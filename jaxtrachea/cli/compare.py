@@ -110,13 +110,12 @@ def _write(folder: Path, specs, loaded, models, clock):
     import jax
 
     from jaxtrachea.files.provenance import provenance
-    from jaxtrachea.files.tables import write_text
-    from jaxtrachea.inference import results
+    from jaxtrachea.files.tables import write_csv, write_text
     from jaxtrachea.inference.comparison import compared
 
     rows, failed = compared(models)
     said = _sentences(models, rows)
-    results.write_csv(folder / "compare.csv", [dataclasses.asdict(row) for row in rows])
+    write_csv(folder / "compare.csv", [dataclasses.asdict(row) for row in rows])
     write_text(folder / "report.md", _report(rows, said, failed, models))
     ends = [*clock, time.perf_counter()]
     timings = {n: ends[i + 1] - ends[i] for i, n in enumerate(("read", "fit", "write"))}
@@ -180,7 +179,7 @@ def _why_nothing(model) -> str:
 
 
 def _cells(rows) -> list[list[str]]:
-    from jaxtrachea.report.fit import number
+    from jaxtrachea.files.tables import number
 
     return [
         [row.specimen, row.model, str(row.unknowns), number(row.deviance, 6), number(row.delta, 3),
@@ -194,7 +193,7 @@ def _percent(share: float) -> str:
 
 
 def _report(rows, said: dict[str, str], failed: int, models) -> str:
-    from jaxtrachea.report.fit import markdown_table
+    from jaxtrachea.files.tables import markdown_table
 
     parts = [
         "# Which model",

@@ -198,6 +198,7 @@ def _opened(how: How, now, study):
 
 def _finished(how: How, target: Path, now, study):
     """A rerun of the failed lanes of a finished run, if that is asked for."""
+    from jaxtrachea.results.hdf5 import read_hdf5
     from jaxtrachea.runs import folder as run_folder
     from jaxtrachea.runs import former, journal
 
@@ -212,7 +213,7 @@ def _finished(how: How, target: Path, now, study):
         raise Stop(
             "--rerun-failed: specimens of a joint fit are fitted together; change [fit] starts"
         )
-    result = former.read_hdf5(target / "results.h5", study)
+    result = read_hdf5(target / "results.h5", study)
     failed = former.failed_lanes(result)
     if not failed:
         to_stderr(f"no lane of {escape(str(target))} failed; there is nothing to fit again")
@@ -276,11 +277,12 @@ def _watched(watch: processes.Watch, **content):
 def _said(how: How) -> Iterator[None]:
     """Failures to open or write a run become messages."""
     from jaxtrachea.files.lock import Busy, NoLocks
+    from jaxtrachea.results.stored import NoResults
     from jaxtrachea.runs.folder import NoRun
 
     try:
         yield
-    except (NoRun, Busy, NoLocks) as error:
+    except (NoRun, NoResults, Busy, NoLocks) as error:
         raise Stop(str(error)) from None
     except Lost as error:
         raise Kept(f"error: {error}", 3) from None

@@ -6,6 +6,7 @@ heavy is imported inside the commands.
 """
 
 import contextlib
+import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -23,7 +24,7 @@ from jaxtrachea.cli import scene as cli_scene
 from jaxtrachea.cli import selfcheck as cli_selfcheck
 from jaxtrachea.cli import tradeoff as cli_tradeoff
 from jaxtrachea.cli.load import load
-from jaxtrachea.cli.run import posterior_failed, run, show, write
+from jaxtrachea.cli.run import poor, refuse, run, show, write, write_tables
 from jaxtrachea.cli.terminal import Kept, Stop, complain, into, say_lost, table, to_stderr
 
 app = typer.Typer(
@@ -142,7 +143,8 @@ def fit(
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
     from jaxtrachea.fit.specification import settings_of
-    from jaxtrachea.inference.results import succeeded
+    from jaxtrachea.inference.analysis import Request
+    from jaxtrachea.report.overview import overview
 
     clock = [time.perf_counter()]
     meeting = cli_fit.meet(distributed, coordinator, processes, process, patience)
@@ -153,122 +155,46 @@ def fit(
     options = [name for name, wanted in asked.items() if wanted]
     options = sorted({*options, *cli_fit.remembered(how)})
     loaded, measurements, study = load(spec, data, refits=bool(options))
-    _has_unknowns(spec, loaded, study, options)
+    request = Request(loaded, study, settings_of(loaded), options)
+    refuse(spec, request)
     root = spec.parent if data is None else data
     now = cli_fit.describe(how, spec, root, loaded, measurements, study, options)
     if meeting.process > 0:
-        cli_fit.help_out(how, now, study, settings_of(loaded))
+        cli_fit.help_out(how, now, study, request.settings)
         raise typer.Exit(0)
-    if "leave-one-out" in options:
-        _can_leave_out(study)
-    names = _names_to_profile(spec, loaded, study, "profile" in options)
-    if loaded.uncertainty.posterior:
-        _can_draw(spec)
     clock.append(time.perf_counter())
-    with cli_fit.running(how, now, study, settings_of(loaded)) as under:
-        found = run(
-            loaded, study, under.settings, under.options, names, under.stop_if_asked, under.fit
-        )
+    with cli_fit.running(how, now, study, request.settings) as under:
+        changed = {"settings": under.settings, "options": under.options}
+        findings = run(dataclasses.replace(request, **changed), under.stop_if_asked, under.fit)
         clock.append(time.perf_counter())
-        write(under.folder, spec, loaded, measurements, found, clock, under.journal)
-    show(found, under.folder.parent)
-    failed = any(not succeeded(found.result, lane) for lane in range(found.result.lanes))
-    raise typer.Exit(1 if failed or measurements.bad or posterior_failed(found) else 0)
+        for name, reason in findings.unavailable.items():
+            to_stderr(f"[yellow]no {name}:[/] {escape(reason)}")
+        write(under.folder, spec, loaded, measurements, findings, clock, under.journal)
+    show(overview(findings), under.folder.parent)
+    failed = not findings.result.succeeded.all()
+    raise typer.Exit(1 if failed or measurements.bad or poor(findings) else 0)
 
 
 @app.command()
 def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = None) -> None:
     """Fit, then say where the next presses tell most."""
-    from jaxtrachea.config import SpecError
     from jaxtrachea.fit.specification import settings_of
-    from jaxtrachea.inference.design import candidates_of
+    from jaxtrachea.inference.analysis import Request
+    from jaxtrachea.report.plots import draw_analyses
 
     loaded, measurements, study = load(spec, data, refits=True)
-    if not study.free:
-        raise Stop(f"{spec}: design: every parameter is fixed; free what the presses shall tell")
-    try:
-        candidates = candidates_of(loaded, study)
-    except SpecError as error:
-        raise Stop(f"{spec}: {error}") from None
-    if loaded.uncertainty.posterior:
-        _can_draw(spec)
+    request = Request(loaded, study, settings_of(loaded), command="design")
+    refuse(spec, request)
     default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}-design"
     with into(out_dir, default) as (folder, stop_if_asked):
-        found = run(loaded, study, settings_of(loaded), (), (), stop_if_asked)
-        try:
-            rows = _design(folder, loaded, found, candidates)
-        except ValueError as error:
-            raise Stop(f"{spec}: {error}") from None
-    errors = [k.removesuffix(" relative se") for k in rows[0] if k.endswith(" relative se")]
-    head = ["press", "s [mm]", "depth [mm]", *errors]
-    cells = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
-    out = Console()
-    out.print(table("Next presses, relative errors expected after each", head, cells))
-    out.print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
+        findings = run(request, stop_if_asked)
+        for reason in findings.unavailable.values():
+            raise Stop(f"{spec}: {reason}")
+        write_tables(folder, findings)
+        say_lost(draw_analyses(folder, findings))
+    chosen = ((analysis.shown, found) for analysis, found in findings.at("design"))
+    show((item for shown, found in chosen for item in shown(found, [])), folder.parent)
     raise typer.Exit(1 if measurements.bad else 0)
-
-
-def _design(folder: Path, loaded, found, candidates) -> list[dict[str, object]]:
-    """Choose, write the files, return the rows of the choice."""
-    import numpy as np
-
-    from jaxtrachea.inference import design as designs
-    from jaxtrachea.inference import design_tables as tables
-    from jaxtrachea.inference.results import write_csv
-    from jaxtrachea.report.plots import draw_design
-
-    section = loaded.design
-    known = designs.situation(found.result, found.resampled)
-    unknowns = tables.names(known, found.result)
-    choice = designs.next_points(known, candidates, section.points, section.criterion)
-    s = np.linspace(candidates.s.min(), candidates.s.max(), 121)
-    chart = designs.identifiability(known, s, float(candidates.depth.max()))
-    rows = list(tables.choice_rows(choice, candidates, unknowns))
-    write_csv(folder / "next_points.csv", rows)
-    gains = designs.gains(known, candidates)
-    write_csv(folder / "candidates.csv", list(tables.candidate_rows(known, gains, candidates)))
-    write_csv(folder / "identifiability.csv", list(tables.map_rows(chart, unknowns)))
-    rings = np.asarray(found.result.study.model.geometry.ring_positions)
-    say_lost(draw_design(folder / "identifiability.png", chart, candidates, choice, rings))
-    return rows
-
-
-def _has_unknowns(path: Path, spec, study, options: list[str]) -> None:
-    from jaxtrachea.config import SpecError
-    from jaxtrachea.fit.specification import refuse_without_unknowns
-
-    try:
-        refuse_without_unknowns(spec, study, options)
-    except SpecError as error:
-        raise Stop(f"{path}: {error}") from None
-
-
-def _can_leave_out(study) -> None:
-    from jaxtrachea.inference.cross_validation import curves_to_leave_out
-
-    try:
-        curves_to_leave_out(study)
-    except ValueError as error:
-        raise Stop(f"--leave-one-out: {error}") from None
-
-
-def _can_draw(spec: Path) -> None:
-    from jaxtrachea.inference.posterior import MissingSampler, sampler
-
-    try:
-        sampler()
-    except MissingSampler as error:
-        raise Stop(f"{spec}: uncertainty.posterior: {error}") from None
-
-
-def _names_to_profile(path: Path, spec, study, asked: bool) -> tuple[str, ...]:
-    from jaxtrachea.config import SpecError
-    from jaxtrachea.fit.specification import profiled
-
-    try:
-        return profiled(spec, study, asked=asked)
-    except SpecError as error:
-        raise Stop(f"{path}: {error}") from None
 
 
 def _print_usage(out: Console, curves) -> None:

@@ -44,7 +44,7 @@ def predict(
     as_specimen: AsOption = None,
 ) -> None:
     """Predict curves from a finished fit, with 95 % bands."""
-    from jaxtrachea.inference.stored import NoResults, read_results
+    from jaxtrachea.results.stored import NoResults, read_results
 
     set_up_jax()
     given = [*(data or []), *(files or [])]
@@ -74,7 +74,7 @@ def predict(
 
 
 def _unknown(kind: str, name: str, known) -> str:
-    from jaxtrachea.inference.predict import unknown_name
+    from jaxtrachea.prediction.predict import unknown_name
 
     return unknown_name(kind, name, known)
 
@@ -84,12 +84,10 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
     import numpy as np
 
     from jaxtrachea.files.pictures import without_lost
-    from jaxtrachea.files.tables import write_text
-    from jaxtrachea.inference import prediction_tables as tables
-    from jaxtrachea.inference.predict import predict_sources
-    from jaxtrachea.inference.results import write_csv
-    from jaxtrachea.report import prediction as report
-    from jaxtrachea.report.prediction_plots import draw_predictions
+    from jaxtrachea.files.tables import write_csv, write_text
+    from jaxtrachea.prediction import report, tables
+    from jaxtrachea.prediction.plots import draw_predictions
+    from jaxtrachea.prediction.predict import predict_sources
 
     sources, s, depths = _asked(stored, texts)
     with into(out_dir, default) as (folder, stop_if_asked):
@@ -117,9 +115,9 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
 
 def _asked(stored, texts: Sequence[str]):
     """Sources, positions and displacements of every --at."""
-    from jaxtrachea.inference.predict import check_position
-    from jaxtrachea.inference.sources import source_of
     from jaxtrachea.measurements.presses import parse_presses
+    from jaxtrachea.prediction.predict import check_position
+    from jaxtrachea.prediction.sources import source_of
 
     needs = stored.study.model.options.coupling == "series"
     sources, places, depths = [], [], []
@@ -152,12 +150,10 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
     import numpy as np
 
     from jaxtrachea.files.pictures import without_lost
-    from jaxtrachea.files.tables import write_text
-    from jaxtrachea.inference import prediction_tables as tables
-    from jaxtrachea.inference.held_out import compare, pressable
-    from jaxtrachea.inference.results import write_csv
-    from jaxtrachea.report import prediction as report
-    from jaxtrachea.report.prediction_plots import draw_compared
+    from jaxtrachea.files.tables import write_csv, write_text
+    from jaxtrachea.prediction import report, tables
+    from jaxtrachea.prediction.held_out import compare, pressable
+    from jaxtrachea.prediction.plots import draw_compared
 
     measurements, notes = measured_curves(stored, given)
     curves, unusable = pressable(stored, measurements.curves)

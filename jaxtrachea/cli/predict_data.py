@@ -56,9 +56,9 @@ def _refuse_results(given: Sequence[str]) -> None:
     """Results of a fit are no measured curves."""
     import contextlib
 
-    from jaxtrachea.inference.stored import SCHEMA
     from jaxtrachea.measurements.read import DataError
     from jaxtrachea.measurements.readers.safe_hdf5 import attribute, opened
+    from jaxtrachea.results.stored import SCHEMA
 
     for name in given:
         path = Path(name)

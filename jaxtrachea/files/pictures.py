@@ -12,6 +12,18 @@ from typing import Any
 
 #: Characters of a name in a picture; beyond it, an ellipsis.
 LONGEST = 48
+#: What all figures share.
+STYLE: dict[Any, object] = {
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "font.size": 9,
+    "legend.frameon": False,
+    "legend.fontsize": 7,
+    "figure.dpi": 130,
+    "text.usetex": False,
+}
 
 
 def plain(name: str, longest: int = LONGEST) -> str:
@@ -73,3 +85,22 @@ def without_lost(text: str, lost: Mapping[str, str]) -> str:
             rf"^!\[[^\n]*\]\({re.escape(name)}\)$", lambda _, w=words: w, text, flags=re.M
         )
     return text
+
+
+def grid(count: int, height: float = 2.7):
+    """A figure of at least `count` axes in up to three columns, the others hidden; and its axes."""
+    from matplotlib.figure import Figure
+
+    columns = min(3, count)
+    rows = -(-count // columns)
+    size = (max(4.6, 3.6 * columns), height * rows + 0.6)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for axis in axes.flat[count:]:
+        axis.set_visible(False)
+    return figure, axes.flat
+
+
+def of_all(shown: int, total: int, what: str) -> str:
+    """In a title, how much of all is drawn; "" for all."""
+    return "" if shown >= total else f", {shown} {what} of {total}"

@@ -1,10 +1,12 @@
-"""Text that a spreadsheet would run as a formula, in CSV files that people open with one.
+"""Tables: CSV files, Markdown, and numbers for people.
 
-A cell that starts a formula is written behind an apostrophe, as OWASP recommends ("CSV injection",
-https://owasp.org/www-community/attacks/CSV_Injection); `unquoted` takes it away again.
+A cell of a CSV file that a spreadsheet would run as a formula is written behind an apostrophe, as
+OWASP recommends ("CSV injection", https://owasp.org/www-community/attacks/CSV_Injection);
+`unquoted` takes it away again.
 """
 
 import csv
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -48,3 +50,28 @@ def read_csv(path: Path) -> list[dict[str, Any]]:
 def write_text(path: Path, text: str) -> None:
     """Write a text file."""
     path.write_text(text, encoding="utf-8")
+
+
+def number(value: float, digits: int = 4) -> str:
+    """A number for people: `digits` significant ones, a dash for NaN."""
+    return "–" if math.isnan(value) else f"{value:.{digits}g}"
+
+
+def interval(low: float, high: float, *, log: bool) -> str:
+    """An interval for people; open sides are left out."""
+    open_low, open_high = low == (0 if log else -math.inf), high == math.inf
+    if open_low and open_high:
+        return "anything"
+    if open_low or open_high:
+        return f"up to {number(high)}" if open_low else f"from {number(low)}"
+    return "–" if math.isnan(low) and math.isnan(high) else f"{number(low)} … {number(high)}"
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+
+    def line(cells):
+        plain = (" ".join(str(cell).split()).replace("|", "\\|") for cell in cells)
+        return f"| {' | '.join(plain)} |"
+
+    return "\n".join([line(head), line(["---"] * len(head)), *map(line, rows)])

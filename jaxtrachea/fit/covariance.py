@@ -111,40 +111,41 @@ def informations(
 
 
 class Uncertainty(NamedTuple):
-    """Local uncertainty of a lane's unknowns, numpy; NaN where an unknown is held on a bound.
+    """Local uncertainty of the unknowns of all lanes; NaN where an unknown is held on a bound.
 
     Attributes:
-        se: standard error in scaled coordinates; inf where undetermined; (P,).
-        correlation: (P, P).
+        se: standard error in scaled coordinates; inf where undetermined; (lanes, P).
+        correlation: (lanes, P, P).
         condition: ratio of the largest to the smallest singular value of the Jacobian in relative
-            coordinates (a change of 1 = 100 %); inf if singular.
-        flat: unit vector, in relative coordinates, of the least determined combination; (P,).
-        flat_se: its standard error (relative).
+            coordinates (a change of 1 = 100 %); inf if singular; (lanes,).
+        flat: unit vector, in relative coordinates, of the least determined combination; (lanes, P).
+        flat_se: its standard error (relative); (lanes,).
         blind: directions that the structure leaves open (`structure`), relative coordinates,
-            orthonormal rows; the other rows are 0; (P, P).
-        half_width: of the 95 % interval, in standard errors (Student's t).
+            orthonormal rows; the other rows are 0; (lanes, P, P).
+        half_width: of the 95 % interval, in standard errors (Student's t); (lanes,).
         along: how all unknowns move where one is moved and the others follow in the least costly
-            way, to first order, scaled coordinates; row i: by a unit change of unknown i; (P, P).
+            way, to first order, scaled coordinates; row i: by a unit change of unknown i;
+            (lanes, P, P).
         dispersion: of twice the rise of the cost along each unknown: where the cost is a
             likelihood s^2, else such that its curvature gives `se` (Kent 1982,
-            doi:10.1093/biomet/69.1.19); (P,).
+            doi:10.1093/biomet/69.1.19); (lanes, P).
         covariance: of the estimates, scaled coordinates; 0 for held unknowns, and without the
-            `silent` directions, along which it is infinite; (P, P).
+            `silent` directions, along which it is infinite; (lanes, P, P).
         silent: all directions that change no residual at the estimate, whatever the cause, scaled
-            coordinates, rows; the other rows are 0; (P, P).
+            coordinates, rows; the other rows are 0; (lanes, P, P).
     """
 
-    se: np.ndarray
-    correlation: np.ndarray
-    condition: np.ndarray
-    flat: np.ndarray
-    flat_se: np.ndarray
-    blind: np.ndarray
-    half_width: np.ndarray
-    along: np.ndarray
-    dispersion: np.ndarray
-    covariance: np.ndarray
-    silent: np.ndarray
+    se: Float[np.ndarray, "lanes P"]
+    correlation: Float[np.ndarray, "lanes P P"]
+    condition: Float[np.ndarray, " lanes"]
+    flat: Float[np.ndarray, "lanes P"]
+    flat_se: Float[np.ndarray, " lanes"]
+    blind: Float[np.ndarray, "lanes P P"]
+    half_width: Float[np.ndarray, " lanes"]
+    along: Float[np.ndarray, "lanes P P"]
+    dispersion: Float[np.ndarray, "lanes P"]
+    covariance: Float[np.ndarray, "lanes P P"]
+    silent: Float[np.ndarray, "lanes P P"]
 
 
 def analyse(
@@ -166,9 +167,6 @@ def analyse(
         unknowns: estimated from the `counts`, if more than those of one lane.
         structural: directions that the structure leaves open, relative coordinates, orthonormal
             rows, the others 0; (lanes, P, P).
-
-    Returns:
-        One record whose arrays have the leading axis of lanes.
     """
     free = ~held
     total = np.sum(info.counts, axis=1)

@@ -88,12 +88,3 @@ def penalised(deviance: np.ndarray, k: np.ndarray, n: np.ndarray) -> Criteria:
         more = np.where(left > 0, 2 * k * (k + 1) / left, np.inf)
         return Criteria(k, deviance, deviance + 2 * k, deviance + 2 * k + more,
                         deviance + k * np.log(n))  # fmt: skip
-
-
-def weights(values: Float[np.ndarray, " models"]) -> Float[np.ndarray, " models"]:
-    """Akaike weights exp(-difference / 2) over their sum (Burnham and Anderson 2002, sec. 2.9)."""
-    values = np.where(np.isnan(values), np.inf, values)
-    if not np.isfinite(values).any():
-        return np.full(len(values), np.nan)
-    w = np.exp(-0.5 * (values - np.min(values)))
-    return w / np.sum(w)

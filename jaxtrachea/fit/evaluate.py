@@ -14,9 +14,6 @@ from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.study import Study
 from jaxtrachea.status import FitStatus
 
-#: What reports say in the place of estimates.
-NOTHING_FITTED = "every parameter is fixed: nothing was fitted, the model was evaluated"
-
 
 def evaluated(study: Study) -> FitResult:
     """Cost, residuals, noise and criteria of a study without unknowns.
@@ -46,7 +43,7 @@ def evaluated(study: Study) -> FitResult:
         status=np.where(finite, FitStatus.CONVERGED, FitStatus.NON_FINITE).astype(int),
         cost=_cost(study, seen, sigma), converged_starts=finite.astype(int),
         sigma=sigma * unit, rms=rms, samples=total, criteria=criteria(study, info, finite),
-        uncertainty=tuple(map(_no_uncertainty, half)), undetermined=none.astype(bool),
+        uncertainty=_no_uncertainty(half), undetermined=none.astype(bool),
         unexamined=none.astype(bool),
         evidence_low=none, evidence_high=none, evidence_end=np.zeros((lanes, 0, 2), int),
         minima=np.ones(lanes, int), **counts,
@@ -110,12 +107,12 @@ def _cost(study: Study, seen, sigma: np.ndarray) -> np.ndarray:
     return total
 
 
-def _no_uncertainty(half: float) -> Uncertainty:
-    """Of no unknowns; only the width of an interval for the noise."""
-    none, square = np.zeros(0), np.zeros((0, 0))
-    nan = np.asarray(np.nan)
+def _no_uncertainty(half: np.ndarray) -> Uncertainty:
+    """Of no unknowns; only the width of an interval for the noise, (lanes,)."""
+    none, square = np.zeros((len(half), 0)), np.zeros((len(half), 0, 0))
+    nan = np.full(len(half), np.nan)
     return Uncertainty(
         se=none, correlation=square, condition=nan, flat=none, flat_se=nan, blind=square,
-        half_width=np.asarray(half), along=square, dispersion=none, covariance=square,
+        half_width=half, along=square, dispersion=none, covariance=square,
         silent=square,
     )  # fmt: skip

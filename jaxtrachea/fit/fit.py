@@ -78,7 +78,7 @@ def fit(
 
 def _unproven(result: FitResult, known: Structure) -> np.ndarray:
     """Lanes not looked at whose Jacobian at the estimate does not prove that nothing is open."""
-    condition = np.array([u.condition for u in result.uncertainty])
+    condition = result.uncertainty.condition
     examined = suspicious(result.study)
     if result.study.joint and examined.any():
         examined[:] = True
@@ -157,8 +157,7 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
         at_bound=at_bound, status=status, iterations=solved.iterations, cost=solved.cost,
         converged_starts=agree, tried=tried, sigma=sigma * unit, rms=rms * unit, samples=samples,
         criteria=criteria(study, info, alive),
-        uncertainty=tuple(Uncertainty(*row) for row in zip(*u, strict=True)),
-        undetermined=structure.undetermined,
+        uncertainty=u, undetermined=structure.undetermined,
         unexamined=np.zeros(theta.shape, bool), evidence_low=np.full(theta.shape, np.nan),
         evidence_high=np.full(theta.shape, np.nan),
         evidence_end=np.full((*theta.shape, 2), -1), minima=np.ones(len(theta), int),

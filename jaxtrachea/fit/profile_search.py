@@ -40,19 +40,17 @@ class Sides:
         self.sign = np.tile([-1.0, 1.0], len(lane) // 2)
         self.best = result.theta[lane] if origin is None else origin
         u = result.uncertainty
-        pick = lambda rows: np.array([rows[k][i] for k, i in zip(lane, unknown, strict=True)])  # noqa: E731
-        self.dispersion = pick([v.dispersion for v in u])
-        size = result.theta.shape[1]
-        self.along = pick([v.along for v in u]).reshape(-1, size) * self.sign[:, None]
+        self.dispersion = u.dispersion[lane, unknown]
+        self.along = u.along[lane, unknown] * self.sign[:, None]
         if origin is not None:
             self.along = np.zeros_like(self.along)
         self.pinned = self._pinned()
-        self.target = np.array([float(u[k].half_width) for k in lane])
+        self.target = u.half_width[lane]
         lanes = result.study.lanes
         bound = np.where(self.sign < 0, lanes.lower[lane, unknown], lanes.upper[lane, unknown])
         here = self.best[np.arange(len(lane)), unknown]
         self.limit = np.maximum(self.sign * (bound - here), 0)
-        self.first = np.clip(self.target * pick([v.se for v in u]), 1e-9 * (1 + np.abs(here)), None)
+        self.first = np.clip(self.target * u.se[lane, unknown], 1e-9 * (1 + np.abs(here)), None)
         self.first = np.where(np.isfinite(self.first), self.first, 1.0)
         starts = result.lanes * settings.starts
         self.batch = batch_size(max(starts, 16), settings.batch)
@@ -67,7 +65,7 @@ class Sides:
         pinned = np.arange(self.best.shape[1])[None] == self.unknown[:, None]
         for s in np.flatnonzero(self.result.undetermined[self.lane].any(axis=1)):
             lane, i = int(self.lane[s]), int(self.unknown[s])
-            rows = self.result.uncertainty[lane].blind
+            rows = self.result.uncertainty.blind[lane]
             rest = leaving_alone(rows[rows.any(axis=1)], i)
             names = [p.name for p, _, _ in self.result.study.unknowns[lane]]
             pinned[s] |= pins(names, rest)

@@ -78,7 +78,7 @@ class FitResult:
         rms: root mean square residual of force (N) and markers (mm); (lanes, 2).
         samples: observed entries; (lanes,).
         criteria: AIC, AICc, BIC of all lanes.
-        uncertainty: `Uncertainty` of each lane.
+        uncertainty: local one of all lanes.
         undetermined: unknowns that the structure leaves open (`structure`); (lanes, P).
         unexamined: unknowns that gave cause to look further than the local error, and nobody did:
             in a joint fit, or without scrutiny; (lanes, P).
@@ -109,7 +109,7 @@ class FitResult:
     rms: np.ndarray
     samples: np.ndarray
     criteria: Criteria
-    uncertainty: tuple[Uncertainty, ...]
+    uncertainty: Uncertainty
     undetermined: np.ndarray
     unexamined: np.ndarray
     evidence_low: np.ndarray

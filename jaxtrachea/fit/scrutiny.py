@@ -75,10 +75,10 @@ def doubtful(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
     present = (result.study.lanes.active > 0) & ~result.undetermined & alive[:, None]
     doubt = np.zeros(present.shape, bool)
     natural = natural_sizes(result)
-    se = np.stack([u.se for u in result.uncertainty]) / natural
+    se = result.uncertainty.se / natural
     known = present & np.isfinite(se)
     se = np.where(known, se, 0)
-    correlation = np.stack([u.correlation for u in result.uncertainty])
+    correlation = result.uncertainty.correlation
     both = known[:, :, None] & known[:, None]
     covariance = np.where(both, correlation, 0) * se[:, :, None] * se[:, None]
     values, vectors = np.linalg.eigh(np.nan_to_num(covariance))
@@ -108,7 +108,7 @@ def left_in_doubt(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes 
         row, good = np.arange(len(doubt))[:, None], result.succeeded
         votes = doubt[row, shared][good]
         doubt[row, shared] = np.mean(votes, axis=0) >= 0.5 if len(votes) else True
-    error = np.stack([u.se for u in result.uncertainty]) / natural_sizes(result)
+    error = result.uncertainty.se / natural_sizes(result)
     for lane, unknowns in enumerate(study.unknowns):
         for i, (p, _, _) in enumerate(unknowns):
             if p.name in OF_THE_PRESS:
@@ -136,8 +136,8 @@ def _elsewhere_as_low(result: FitResult, minima: Minima, se, natural) -> Bool[np
         low = np.full(result.lanes, np.inf)
         np.minimum.at(low, lane, np.where(np.isfinite(minima.cost), minima.cost, np.inf))
         scale = (first_sigma(result.study) / result.whitened_sigma)[lane[rows], 0] ** 2
-        dispersion = np.array([np.nanmin(u.dispersion) for u in result.uncertainty])[lane[rows]]
-        half = np.array([u.half_width for u in result.uncertainty])[lane[rows]]
+        dispersion = np.nanmin(result.uncertainty.dispersion, axis=1)[lane[rows]]
+        half = result.uncertainty.half_width[lane[rows]]
         with np.errstate(invalid="ignore"):
             rise = 2 * (minima.cost[rows] - low[lane[rows]]) * scale
         out[lane[rows[rise <= 4 * dispersion * half**2]]] = True
@@ -153,8 +153,8 @@ class _Region:
         self.sides = sides
         self.cost = np.full(result.lanes, np.nan)
         self.cost[lanes] = sides.costs(lanes, result.theta[lanes])
-        self.dispersion = np.stack([u.dispersion for u in result.uncertainty])
-        self.threshold = np.array([float(u.half_width) for u in result.uncertainty]) ** 2
+        self.dispersion = result.uncertainty.dispersion
+        self.threshold = result.uncertainty.half_width**2
         self.floor = EXACT * data_weight(result.study, result.whitened_sigma)
         self.low, self.high = result.theta.copy(), result.theta.copy()
         self.at_low = np.repeat(result.theta[:, None], result.theta.shape[1], axis=1)
@@ -395,9 +395,9 @@ def _walks(region: _Region, lanes) -> list[Float[np.ndarray, "n P"]]:
     On the way every point within the threshold is added to the region.
     """
     result, sides = region.result, region.sides
-    u = [result.uncertainty[k] for k in lanes]
-    flat = np.stack([v.flat for v in u]) * result.relative[lanes]
-    half = np.array([v.half_width * v.flat_se for v in u])
+    u = result.uncertainty
+    flat = u.flat[lanes] * result.relative[lanes]
+    half = (u.half_width * u.flat_se)[lanes]
     half = np.where(np.isfinite(half), half, 1.0)
     steps = np.minimum(half[:, None] * WALK, FAR)
     data, out = result.study.lanes, []

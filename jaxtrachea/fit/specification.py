@@ -1,7 +1,6 @@
 """From a fit specification to a study: opens the files, names what is wrong, builds the lanes."""
 
 import dataclasses
-from collections.abc import Collection
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
@@ -167,47 +166,6 @@ def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
         raise
     except ValueError as error:
         raise SpecError(str(error)) from None
-
-
-def profiled(spec: FitSpec, study: Study, *, asked: bool) -> tuple[str, ...]:
-    """Names of the parameters to profile: those of the specification, all if only asked for.
-
-    Raises:
-        SpecError: one is not fitted.
-    """
-    names, free = spec.uncertainty.profile, tuple(p.name for p in study.free)
-    for name in names:
-        if name not in (*free, "all"):
-            raise SpecError(
-                f"uncertainty.profile: {name!r} is not fitted; expected 'all' or names out of "
-                f"{', '.join(free)}"
-            )
-    return free if "all" in names or (asked and not names) else tuple(names)
-
-
-def refuse_without_unknowns(spec: FitSpec, study: Study, options: Collection[str]) -> None:
-    """Say what has no meaning where every parameter is fixed.
-
-    Args:
-        spec: the specification.
-        study: the study.
-        options: of the command line, without dashes.
-
-    Raises:
-        SpecError: something was asked for that needs a free parameter; it is named.
-    """
-    if study.free:
-        return
-    u = spec.uncertainty
-    asked = {"profile": u.profile, "bootstrap": u.bootstrap, "posterior": u.posterior,
-             "influence": u.influence}  # fmt: skip
-    names = [f"--{name}" for name in options]
-    names += [f"uncertainty.{name}" for name, wanted in asked.items() if wanted]
-    if names:
-        raise SpecError(
-            f"{', '.join(names)}: every parameter is fixed, so that there is no estimate to be "
-            "doubted; leave it out (the model is then evaluated), or free a parameter"
-        )
 
 
 def settings_of(spec: FitSpec) -> Settings:

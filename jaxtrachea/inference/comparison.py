@@ -6,12 +6,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxtrachea.fit.criteria import Criteria, weights
-from jaxtrachea.fit.predictions import predictions, rms
+from jaxtrachea.fit.criteria import Criteria
+from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.cross_validation import Missed
 from jaxtrachea.inference.effective import CORRELATED, effective_samples
+from jaxtrachea.inference.residuals import rms
 
 #: Difference of AICc up to which models cannot be told apart, and from which on they clearly can
 #: (Burnham and Anderson 2002, sec. 2.6).
@@ -260,3 +261,12 @@ def sentence(rows: Sequence[Row], left: str = "positions") -> str:
     why = "; ".join(text for doubt, text in doubts if doubt)
     why += f"; {left} left out agree with it" if known and not against else ""
     return f"the data prefer {best.model} ({said}), but not decisively: {why}"
+
+
+def weights(values: Float[np.ndarray, " models"]) -> Float[np.ndarray, " models"]:
+    """Akaike weights exp(-difference / 2) over their sum (Burnham and Anderson 2002, sec. 2.9)."""
+    values = np.where(np.isnan(values), np.inf, values)
+    if not np.isfinite(values).any():
+        return np.full(len(values), np.nan)
+    w = np.exp(-0.5 * (values - np.min(values)))
+    return w / np.sum(w)

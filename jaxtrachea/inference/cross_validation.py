@@ -9,10 +9,11 @@ from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import OF_THE_PRESS
-from jaxtrachea.fit.predictions import predictions, rms
+from jaxtrachea.fit.predictions import predictions
 from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.starts import draw_starts
 from jaxtrachea.fit.study import Study
+from jaxtrachea.inference.residuals import rms
 from jaxtrachea.measurements.read import Curve
 
 
@@ -28,6 +29,7 @@ class LeftOut:
             without markers.
         ratio: measured over predicted force in the least-squares sense, minus 1 (for linear data:
             the relative error of the compliance).
+        study: the study.
         result: the fits, one lane per left-out curve.
         converged: whether that fit converged, and the onset and offset of the curve left out; else
             the errors are those of its best point, NaN where it predicts nothing.
@@ -38,6 +40,7 @@ class LeftOut:
     force: np.ndarray
     joints: np.ndarray
     ratio: np.ndarray
+    study: Study
     result: FitResult
     converged: np.ndarray
 
@@ -126,6 +129,7 @@ def leave_one_out(study: Study, settings: Settings, progress=None) -> LeftOut:
         force=np.where(lost, np.nan, peak),
         joints=np.where(lost, np.nan, joints),
         ratio=np.where(lost, np.nan, ratio),
+        study=study,
         result=result,
         converged=result.succeeded & touched.converged,
     )

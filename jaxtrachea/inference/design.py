@@ -29,7 +29,7 @@ from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.bootstrap import Bootstrap
 from jaxtrachea.inference.design_press import marginal, of_a_new_press
-from jaxtrachea.inference.results import succeeded
+from jaxtrachea.inference.labels import succeeded
 
 Criterion = Literal["D", "A", "E"]
 #: Estimates of a lane, out of its bootstrap replicates, that a design is averaged over.

@@ -19,12 +19,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
-from jaxtrachea.fit.predictions import Prediction, lag_correlation
+from jaxtrachea.fit.predictions import Prediction
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.shared import held_count, unknown_count
 from jaxtrachea.fit.starts import of_unknowns
 from jaxtrachea.inference.judgement import interval95, within_bounds
 from jaxtrachea.inference.profile import Profiles
+from jaxtrachea.inference.residuals import lag_correlation
 from jaxtrachea.status import ProfileEnd
 
 #: Correlation of neighbouring residuals from which the report doubts plain standard errors.
@@ -35,6 +36,7 @@ class Effective(NamedTuple):
     """Of every lane; NaN where residuals are too few for a correlation.
 
     Attributes:
+        result: the fit they belong to.
         correlation: of neighbouring force residuals; (lanes,).
         samples: how many independent ones the samples are worth; (lanes,).
         factor: by which standard errors grow; inf where no more than the unknowns; (lanes,).
@@ -43,6 +45,7 @@ class Effective(NamedTuple):
         upper: (lanes, P).
     """
 
+    result: FitResult
     correlation: Float[np.ndarray, " lanes"]
     samples: Float[np.ndarray, " lanes"]
     factor: Float[np.ndarray, " lanes"]
@@ -93,7 +96,7 @@ def effective(result: FitResult, seen: Prediction, profiles: Profiles | None = N
         unknowns = np.full(len(n), float(P))
         n, worth = (np.full(len(n), np.nansum(v[alive])) for v in (n, worth))
     given = study.noise_given[0] and (lanes.joints is None or study.noise_given[1])
-    plain = np.array([float(u.half_width) for u in result.uncertainty])
+    plain = result.uncertainty.half_width
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         left = worth - unknowns
         if given:
@@ -104,7 +107,7 @@ def effective(result: FitResult, seen: Prediction, profiles: Profiles | None = N
         factor = np.where(np.isnan(worth), np.nan, factor)
         growth = np.maximum(half * factor / plain, 1)
     lower, upper = _drawn_out(result, growth, profiles)
-    return Effective(lag_correlation(seen), worth, factor, lower, upper)
+    return Effective(result, lag_correlation(seen), worth, factor, lower, upper)
 
 
 def _drawn_out(

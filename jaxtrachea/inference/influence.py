@@ -32,7 +32,7 @@ from jaxtrachea.fit.residual import observations, residual
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.estimate import hessian
-from jaxtrachea.inference.results import succeeded
+from jaxtrachea.inference.labels import succeeded
 
 #: det(1 - hat matrix of a curve) below which the curve alone determines some combination.
 _ALONE = 1e-9
@@ -227,7 +227,7 @@ def _conclude(result: FitResult, found: Diagnostics) -> Influence:
     study, lanes = result.study, result.study.lanes
     columns = lanes.index[:, :, study.free_columns]
     rows = np.arange(result.lanes)[:, None, None]
-    se = np.stack([u.se for u in result.uncertainty])[rows, np.maximum(columns, 0)]
+    se = result.uncertainty.se[rows, np.maximum(columns, 0)]
     se = np.where((columns >= 0) & np.isfinite(se) & (se > 0), se, np.nan)
     good = np.array([succeeded(result, k) for k in range(result.lanes)])
     seen = _seen(study) & good[:, None, None]

@@ -58,7 +58,7 @@ def judgement(result: FitResult, lane: int, i: int, profiles: Profiles | None = 
             unseen=bool(result.unexamined[lane, i]),
         )  # fmt: skip
         return Judgement(word, *inside, None, float(result.relative_se[lane, i]))
-    value, unit = float(result.value[lane, i]), float(result.uncertainty[lane].half_width)
+    value, unit = float(result.value[lane, i]), float(result.uncertainty.half_width[lane])
     with np.errstate(divide="ignore", invalid="ignore"):
         if p.scale == "log":
             longer = max(np.log(high / value), np.log(value / low) if low > 0 else np.inf)

@@ -13,15 +13,15 @@ is added to the standard errors of the mean and of the estimates.
 """
 
 import dataclasses
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import chdtri, stdtrit
+from scipy.special import chdtri
 
 from jaxtrachea.fit.parameters import Parameter
 from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.judgement import relative_errors
 from jaxtrachea.inference.profile import Profiles
 
@@ -231,10 +231,10 @@ class Population:
         return {"shrunk": value, "shrunk_se": slope * float(self.effects.shrunk_sd[lane, j])}
 
 
-def wanted(asked: bool | None, result: FitResult) -> bool:
+def wanted(asked: bool | None, study: Study) -> bool:
     """Whether to take the specimens as a sample: as asked, else if there are enough of them."""
-    own = any(p.scope == "specimen" for p in result.study.free)
-    return asked or (asked is None and own and result.lanes >= ENOUGH)
+    own = any(p.scope == "specimen" for p in study.free)
+    return asked or (asked is None and own and len(study.curves) >= ENOUGH)
 
 
 def population(result: FitResult, profiles: Profiles | None = None) -> Population:
@@ -264,7 +264,7 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
                 if p.name in names:
                     place[lane, names.index(p.name)] = i
     row = np.arange(result.lanes)[:, None]
-    se = np.stack([u.se for u in result.uncertainty])[row, place]
+    se = result.uncertainty.se[row, place]
     error = (relative_errors(result, profiles) * result.relative)[row, place]
     known = (place >= 0) & np.isfinite(se) & np.isfinite(error)
     se = np.where(known, np.maximum(se, error), se)
@@ -272,7 +272,7 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
     if not enough.any():
         raise ValueError(f"no parameter is determined in {FEWEST} specimens of their own")
     place, known, se = place[:, enough], known[:, enough], se[:, enough]
-    correlation = np.stack([u.correlation for u in result.uncertainty])
+    correlation = result.uncertainty.correlation
     correlation = correlation[row[:, :, None], place[:, :, None], place[:, None]]
     se = np.where(known, se, 0)
     covariance = np.nan_to_num(correlation) * se[:, :, None] * se[:, None]
@@ -289,9 +289,9 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
 def _common(result: FitResult, place, se: Float[np.ndarray, "lanes q"]) -> Common:
     """How the estimates of a joint fit follow what is shared; `place`: see `Population`."""
     row, shared = np.arange(result.lanes)[:, None], result.study.shared
-    own = np.stack([u.se for u in result.uncertainty])[row, shared]
+    own = result.uncertainty.se[row, shared]
     own = np.where(np.isfinite(own), own, 0)
-    full = np.nan_to_num(np.stack([u.correlation for u in result.uncertainty]))
+    full = np.nan_to_num(result.uncertainty.correlation)
     between = full[row[:, :, None], shared[:, :, None], shared[:, None]]
     across = full[row[:, :, None], place[:, :, None], shared[:, None]]
     first = int(np.argmax(result.succeeded))
@@ -310,32 +310,3 @@ def _not_negative(rest: Float[np.ndarray, "m q q"], of: Float[np.ndarray, "m q q
     values, vectors = np.linalg.eigh(rest / both)
     vectors = vectors * np.sqrt(np.maximum(values, 0))[:, None]
     return both * (vectors @ np.swapaxes(vectors, 1, 2))
-
-
-def population_rows(of: Population) -> Iterator[dict[str, object]]:
-    """One row per parameter for population.csv; intervals with Student's t, m - 1."""
-    e = of.effects
-    for j, p in enumerate(of.parameters):
-        count = int(of.known[:, j].sum())
-        half = float(stdtrit(count - 1, 0.975) * e.mean_se[j])
-        log = p.scale == "log"
-        ends = np.array([e.sd[j], e.sd_low[j], e.sd_high[j]])
-        spread, low, high = map(float, np.exp(ends) if log else ends * p.step)
-        mean = float(e.mean[j])
-        slope = p.from_scaled(mean) if log else p.step
-        yield {
-            "parameter": p.name,
-            "unit": p.unit,
-            "specimens": count,
-            "left_out": int(of.left_out[j]),
-            "mean": p.from_scaled(mean),
-            "mean_se": slope * float(e.mean_se[j]),
-            "mean_low95": p.from_scaled(mean - half),
-            "mean_high95": p.from_scaled(mean + half),
-            "spread_is": "factor" if log else p.unit,
-            "spread": spread,
-            "spread_low95": low,
-            "spread_high95": high,
-            "sd_scaled": float(e.sd[j]),
-            "sd_scaled_se": float(e.sd_se[j]),
-        }

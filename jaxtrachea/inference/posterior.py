@@ -30,8 +30,8 @@ from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.residual import observations, residual_value
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.inference.chains import grade, lenient, mixing, quantiles
+from jaxtrachea.inference.labels import succeeded
 from jaxtrachea.inference.posterior_start import Start, around_the_draws, around_the_fit, mode
-from jaxtrachea.inference.results import succeeded
 
 #: Steps of each chain before its draws count.
 _WARM_UP = 500

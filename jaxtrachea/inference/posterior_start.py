@@ -8,6 +8,7 @@ the draws themselves where these were poor.
 import dataclasses
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -55,10 +56,7 @@ def mode(result: FitResult) -> FitResult:
         result,
         theta=keep(again.theta, result.theta),
         sigma=keep(again.sigma, result.sigma),
-        uncertainty=tuple(
-            old if bad else new
-            for bad, new, old in zip(worse, again.uncertainty, result.uncertainty, strict=True)
-        ),
+        uncertainty=jax.tree.map(keep, again.uncertainty, result.uncertainty),
     )
 
 
@@ -70,17 +68,18 @@ def around_the_fit(
     An estimate nearer to a bound than its standard error, or on it, is centred one standard error
     away, where half of the posterior's mass is about.
     """
-    lanes, u = result.study.lanes, result.uncertainty[lane]
+    lanes, u = result.study.lanes, result.uncertainty
     P, active = result.study.size, lanes.active[lane] > 0
     width = np.where(active, lanes.upper[lane] - lanes.lower[lane], 1)
     low = np.where(active, lanes.lower[lane], -0.5)
-    se = np.where(np.isfinite(u.se), u.se, _conditional(result, lane, width))
+    se = np.where(np.isfinite(u.se[lane]), u.se[lane], _conditional(result, lane, width))
     edge = np.clip(se / width, _EDGE, 0.25)
     share = np.clip((result.theta[lane] - low) / width, edge, 1 - edge)
     slope = width * share * (1 - share)
     deviation = np.where(active, np.clip(se / slope, 1e-8, 2), 1)
-    known = np.isfinite(u.correlation) & np.isfinite(u.se)[:, None] & np.isfinite(u.se)
-    correlation = np.where(known, (1 - _SHRINK) * np.clip(u.correlation, -1, 1), 0)
+    finite, correlation = np.isfinite(u.se[lane]), u.correlation[lane]
+    known = np.isfinite(correlation) & finite[:, None] & finite
+    correlation = np.where(known, (1 - _SHRINK) * np.clip(correlation, -1, 1), 0)
     np.fill_diagonal(correlation, 1)
     Q = P + sum(drawn)
     covariance = np.eye(Q) / max(2 * result.samples[lane], 1)

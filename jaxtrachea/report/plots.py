@@ -8,46 +8,41 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxtrachea.files.pictures import plain, save_each
+from jaxtrachea.files.pictures import STYLE, grid, of_all, plain, save_each
 from jaxtrachea.fit.predictions import Prediction
 from jaxtrachea.fit.result import FitResult
-from jaxtrachea.inference.design import Candidates, Choice, Map
-from jaxtrachea.inference.profile import Profiles
-from jaxtrachea.inference.results import lane_label, unknown_label
-from jaxtrachea.inference.rows import ONE_BY_ONE, listed, worst_first
-
-#: Lanes that have a line of their own in a picture of all; of more, the worst.
-LINES = 200
-#: What all figures share.
-STYLE: dict[Any, object] = {
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "font.size": 9,
-    "legend.frameon": False,
-    "legend.fontsize": 7,
-    "figure.dpi": 130,
-    "text.usetex": False,
-}
+from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.labels import lane_label, unknown_label
+from jaxtrachea.inference.rows import LINES, ONE_BY_ONE, listed, worst_first
 
 
-def draw_all(
-    folder: Path, result: FitResult, prediction: Prediction, profiles: Profiles | None = None
-) -> tuple[list[Path], dict[str, str]]:
-    """Write fit.png, residuals.png, if fitted correlation.png, if given profiles.png.
+def draw_all(folder: Path, findings: Findings) -> tuple[list[Path], dict[str, str]]:
+    """Write fit.png, residuals.png, if fitted correlation.png, and those of the analyses.
 
     Returns:
         The paths; and by file name, why a picture could not be drawn: it costs itself only.
     """
+    result, prediction = findings.result, findings.prediction
     drawings: dict[str, Any] = {
         "fit.png": partial(draw_fit, result, prediction),
         "residuals.png": partial(draw_residuals, result, prediction),
     }
     if result.study.free:
         drawings["correlation.png"] = partial(draw_correlation, result)
-    if profiles is not None and len(profiles.lane):
-        drawings["profiles.png"] = partial(draw_profiles, profiles)
+    return _save(folder, drawings | _drawings(findings))
+
+
+def draw_analyses(folder: Path, findings: Findings) -> dict[str, str]:
+    """Write the pictures of the analyses alone; why one could not be drawn, by file name."""
+    return _save(folder, _drawings(findings))[1]
+
+
+def _drawings(findings: Findings) -> dict[str, Any]:
+    figures = (analysis.figures(found) for analysis, found in findings.found)
+    return {name: draw for drawings in figures for name, draw in drawings.items()}
+
+
+def _save(folder: Path, drawings: dict[str, Any]) -> tuple[list[Path], dict[str, str]]:
     with mpl.rc_context(STYLE):
         return save_each(folder, drawings, bbox_inches="tight")
 
@@ -61,22 +56,11 @@ def _panels(result: FitResult) -> list[int]:
     return [order[i] for i in [*range(half), *rest]]
 
 
-def _grid(count: int, height: float = 2.7):
-    columns = min(3, count)
-    rows = -(-count // columns)
-    size = (max(4.6, 3.6 * columns), height * rows + 0.6)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False)
-    for axis in axes.flat[count:]:
-        axis.set_visible(False)
-    return figure, axes.flat
-
-
 def draw_fit(result: FitResult, prediction: Prediction):
     """Data (dots) and fitted force (line) against displacement; markers in a second row of axes."""
     shown = _panels(result)
     with_joints = prediction.joints is not None and result.lanes <= 3
-    figure, axes = _grid(len(shown) * (2 if with_joints else 1), 3.2 if with_joints else 2.7)
+    figure, axes = grid(len(shown) * (2 if with_joints else 1), 3.2 if with_joints else 2.7)
     axes = iter(axes)
     for lane in shown:
         axis = next(axes)
@@ -139,17 +123,12 @@ def draw_residuals(result: FitResult, prediction: Prediction):
     left.set(
         xlabel="displacement [mm]",
         ylabel="(model - data) / peak [%]",
-        title="force residuals" + _of(len(lined), result.lanes, "worst lanes"),
+        title="force residuals" + of_all(len(lined), result.lanes, "worst lanes"),
     )
     values = np.concatenate(pooled)
     right.hist(values[np.isfinite(values)], bins=60, color="0.4")
     right.set(xlabel="residual / peak [%]", ylabel="samples")
     return figure
-
-
-def _of(shown: int, total: int, what: str) -> str:
-    """In a title, how much of all is drawn; "" for all."""
-    return "" if shown >= total else f", {shown} {what} of {total}"
 
 
 def draw_correlation(result: FitResult):
@@ -158,7 +137,7 @@ def draw_correlation(result: FitResult):
     names = [plain(unknown_label(result, 0, i), 24) for i in range(count)]
     shown = min(len(names), 30)
     with np.errstate(invalid="ignore"):
-        stack = np.stack([u.correlation[:shown, :shown] for u in result.uncertainty])
+        stack = result.uncertainty.correlation[:, :shown, :shown]
         known = np.isfinite(stack)
         mean = np.where(known, stack, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     mean = np.where(known.any(axis=0), mean, np.nan)
@@ -175,78 +154,6 @@ def draw_correlation(result: FitResult):
                 dark = "w" if abs(mean[i, j]) > 0.6 else "k"
                 axis.text(j, i, f"{mean[i, j]:.2f}", ha="center", va="center", color=dark, size=7)
     title = "correlation" + (f", mean of {result.lanes} lanes" if result.lanes > 1 else "")
-    axis.set_title(title + _of(shown, len(names), "unknowns"))
+    axis.set_title(title + of_all(shown, len(names), "unknowns"))
     figure.colorbar(image, shrink=0.8)
-    return figure
-
-
-def draw_profiles(profiles: Profiles):
-    """Rise of the profile against the parameter, a panel for each parameter, a line for each lane.
-
-    Dotted: the parabola of the local standard error, of the first lane; dashed: threshold.
-    """
-    result = profiles.result
-    names = list(dict.fromkeys(p.name for p in result.study.free))
-    of = lambda k: result.study.unknowns[profiles.lane[k]][profiles.unknown[k]][0]  # noqa: E731
-    groups = {n: [k for k in range(len(profiles.lane)) if of(k).name == n] for n in names}
-    place = {lane: n for n, lane in enumerate(listed(result, LINES))}
-    groups = {
-        n: sorted(members, key=lambda k: place.get(profiles.lane[k], LINES))
-        for n, members in groups.items()
-        if members
-    }
-    figure, axes = _grid(len(groups))
-    for axis, members in zip(axes, groups.values(), strict=False):
-        p, first = of(members[0]), members[0]
-        colours = mpl.colormaps["viridis"](np.linspace(0.05, 0.9, len(members)))
-        for k, colour in zip(members[:LINES], colours, strict=False):
-            at = np.array([p.from_scaled(v) for v in profiles.coordinate[k]])
-            axis.plot(at, profiles.statistic[k], ".-", color=colour, lw=0.9, ms=3)
-        lane, unknown = profiles.lane[first], profiles.unknown[first]
-        se = result.uncertainty[lane].se[unknown]
-        if np.isfinite(se):
-            ends = profiles.coordinate[first]
-            theta = np.linspace(ends[0], ends[-1], 101)
-            local = ((theta - result.theta[lane, unknown]) / se) ** 2
-            axis.plot([p.from_scaled(v) for v in theta], local, ":", color="k", lw=1)
-        axis.axhline(profiles.threshold[first], ls="--", color="tab:red", lw=0.9)
-        wide = np.ptp(profiles.coordinate[members]) > np.log(20)
-        axis.set_xscale("log" if p.scale == "log" and wide else "linear")
-        axis.set_ylim(-0.2, 2.2 * profiles.threshold[first])
-        title = p.name + _of(min(len(members), LINES), len(members), "worst lanes")
-        axis.set(title=title, xlabel=f"{p.name} [{p.unit}]", ylabel="rise of the profile")
-    return figure
-
-
-def draw_design(
-    path: Path, found: Map, at: Candidates, choice: Choice, rings: np.ndarray
-) -> dict[str, str]:
-    """Write the identifiability map: over s with the data, of pairs without, and the gains.
-
-    Returns:
-        By file name, why it could not be drawn; empty if it could.
-    """
-    with mpl.rc_context(STYLE):
-        draw = partial(_design, found, at, choice, rings)
-        return save_each(path.parent, {path.name: draw}, bbox_inches="tight")[1]
-
-
-def _design(found: Map, at: Candidates, choice: Choice, rings: np.ndarray) -> Figure:
-    """The identifiability map."""
-    figure = Figure(figsize=(13, 3.8), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
-    left.plot(found.s, found.condition, color="0.2")
-    left.set(xlabel="s [mm]", ylabel="condition", title="data and a press at s")
-    left.plot(rings, np.full(len(rings), found.condition.min()), "|", color="tab:green", ms=9)
-    image = middle.pcolormesh(found.s, found.s, np.log10(found.pairs), cmap="viridis_r")
-    figure.colorbar(image, label="log10 condition")
-    middle.set(xlabel="s [mm]", ylabel="s [mm]", title="two presses, no other data")
-    for depth in np.unique(at.depth):
-        own = at.depth == depth
-        right.plot(at.s[own], choice.score[0, own], lw=1, label=f"{depth:.3g} mm")
-    for k in np.unique(choice.chosen):
-        order = ", ".join(str(step + 1) for step in np.flatnonzero(choice.chosen == k))
-        right.annotate(order, (at.s[k], choice.score[0, k]), color="tab:red")
-    right.legend(title="depth")
-    right.set(xlabel="s [mm]", ylabel="criterion", title="first press; chosen in order")
     return figure

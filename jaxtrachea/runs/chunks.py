@@ -6,7 +6,6 @@ depend on when a run was stopped, nor on which process or device fitted which ch
 """
 
 import contextlib
-import dataclasses
 import io
 import json
 import os
@@ -18,20 +17,16 @@ import numpy as np
 
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.fit import residual
-from jaxtrachea.fit.covariance import Uncertainty
-from jaxtrachea.fit.criteria import Criteria
 from jaxtrachea.fit.levenberg_marquardt import MOST_SLOTS, PART_OF_MEMORY
 from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.study import Study
+from jaxtrachea.results.arrays import arrays_of, result_of
 from jaxtrachea.runs import journal as journals
 from jaxtrachea.runs.journal import Journal
 
 #: Lanes of a chunk at most, and its residual entries times starts at most: about ten seconds of
 #: one core.
 MOST_LANES, MOST_ENTRIES = 4096, 4_000_000
-_APART = ("study", "criteria", "uncertainty")
-#: Fields of a result that are arrays with the leading axis of lanes.
-FIELDS = tuple(f.name for f in dataclasses.fields(FitResult) if f.name not in _APART)
 
 
 def lanes_per_chunk(study: Study, starts: int) -> int:
@@ -89,36 +84,6 @@ def free_memory() -> float:
         pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
         return pages / jax.local_device_count()
     return np.inf
-
-
-def arrays_of(result: FitResult) -> dict[str, np.ndarray]:
-    """Everything of a result but its study, by name; of criteria and uncertainty `PART.NAME`."""
-    arrays = {name: np.asarray(getattr(result, name)) for name in FIELDS}
-    arrays |= {f"criteria.{name}": v for name, v in result.criteria._asdict().items()}
-    for name in Uncertainty._fields:
-        rows = [getattr(u, name) for u in result.uncertainty]
-        arrays[f"uncertainty.{name}"] = np.stack(rows)
-    return arrays
-
-
-def result_of(study: Study, arrays: dict[str, np.ndarray]) -> FitResult:
-    """The result that `arrays_of` took apart.
-
-    Raises:
-        KeyError: an array is missing.
-        ValueError: an array does not fit the study.
-    """
-    lanes = study.lanes.lower.shape[0]
-    for name, array in arrays.items():
-        if array.shape[:1] != (lanes,):
-            raise ValueError(f"{name} has shape {array.shape}; expected {lanes} lanes")
-    if arrays["theta"].shape != (lanes, study.size):
-        raise ValueError(f"theta has shape {arrays['theta'].shape}")
-    parts = (arrays[f"uncertainty.{name}"] for name in Uncertainty._fields)
-    rows = tuple(Uncertainty(*row) for row in zip(*parts, strict=True))
-    said = Criteria(*(arrays[f"criteria.{name}"] for name in Criteria._fields))
-    fields = {name: arrays[name] for name in FIELDS}
-    return FitResult(study=study, criteria=said, uncertainty=rows, **fields)
 
 
 def join(study: Study, parts: list[FitResult]) -> FitResult:

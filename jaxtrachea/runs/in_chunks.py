@@ -9,15 +9,14 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxtrachea.fit.predictions import predictions
+from jaxtrachea.files.tables import write_csv
 from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.study import Study
-from jaxtrachea.inference.effective import effective
-from jaxtrachea.inference.results import lane_rows, write_csv
-from jaxtrachea.inference.summary import with_residuals
+from jaxtrachea.inference.analyses.effective import widened
+from jaxtrachea.results.hdf5 import read_hdf5
+from jaxtrachea.results.rows import summary_rows
 from jaxtrachea.runs.chunks import divide, join, load, replaced, save
 from jaxtrachea.runs.folder import NoRun, RunFolder, digest
-from jaxtrachea.runs.former import read_hdf5
 
 #: A rerun of failed lanes has so many times more starts.
 MORE_STARTS = 4
@@ -131,8 +130,7 @@ def write_so_far(path: Path, run: RunFolder, study: Study) -> None:
     for k, lanes in enumerate(_chunks(run, study)):
         part = _read(run, k, study.take(lanes), lanes)
         if part is not None:
-            seen = predictions(part.study, part.theta)
-            rows += with_residuals(part, list(lane_rows(part)), seen, effective(part, seen))
+            rows += summary_rows(widened(part))
     try:
         write_csv(path, rows)
     except OSError:

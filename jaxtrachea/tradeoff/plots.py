@@ -6,8 +6,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxtrachea.files.pictures import plain
-from jaxtrachea.report.plots import STYLE
+from jaxtrachea.files.pictures import STYLE, plain
 
 #: An error up to this is drawn as exact, left of all others.
 EXACT = 1e-17

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxtrachea.inference.held_out import Compared
-from jaxtrachea.inference.predict import CurvePrediction
-from jaxtrachea.inference.stored import StoredFit
+from jaxtrachea.files.tables import markdown_table, number
 from jaxtrachea.measurements.read import BadCurve
-from jaxtrachea.report.fit import markdown_table, number
+from jaxtrachea.prediction.held_out import Compared
+from jaxtrachea.prediction.predict import CurvePrediction
+from jaxtrachea.results.stored import StoredFit
 from jaxtrachea.status import PredictionStatus
 
 #: Rows of a table; the files hold all.

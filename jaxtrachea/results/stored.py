@@ -16,11 +16,11 @@ from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.model import FitModel, columns_of, numbers_of
 from jaxtrachea.fit.parameters import Parameter
 from jaxtrachea.fit.study import Study
-from jaxtrachea.inference.store import GEOMETRY
 from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.read import Curve, DataError
 from jaxtrachea.measurements.readers.safe_hdf5 import attribute, numeric, opened
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.results.store import GEOMETRY
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
 

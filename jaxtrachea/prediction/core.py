@@ -1,7 +1,7 @@
 """The model's answer and its standard errors, as pure functions for `jit` and `vmap`.
 
 Standard errors by the delta method: covariance of the estimates through the exact Jacobian. What it
-cannot do is said in `inference.predict`.
+cannot do is said in `prediction.predict`.
 """
 
 from typing import NamedTuple

@@ -8,10 +8,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxtrachea.files.pictures import plain, save_each
-from jaxtrachea.inference.held_out import Compared
-from jaxtrachea.inference.predict import CurvePrediction
-from jaxtrachea.report.plots import STYLE
+from jaxtrachea.files.pictures import STYLE, plain, save_each
+from jaxtrachea.prediction.held_out import Compared
+from jaxtrachea.prediction.predict import CurvePrediction
 
 #: Panels of a picture, curves of a panel, and curves of the picture of all samples.
 PANELS, LINES, MOST = 12, 10, 200

@@ -13,11 +13,11 @@ from jaxtrachea.fit.map_lanes import program
 from jaxtrachea.fit.onset import onset_is_sought
 from jaxtrachea.fit.result import Settings
 from jaxtrachea.fit.study import Study, build_study, check_curve
-from jaxtrachea.inference.predict import CurvePrediction, predict_sources
-from jaxtrachea.inference.prediction_core import force_and_slope
-from jaxtrachea.inference.sources import Source, source_of
-from jaxtrachea.inference.stored import StoredFit
 from jaxtrachea.measurements.read import BadCurve, Curve
+from jaxtrachea.prediction.core import force_and_slope
+from jaxtrachea.prediction.predict import CurvePrediction, predict_sources
+from jaxtrachea.prediction.sources import Source, source_of
+from jaxtrachea.results.stored import StoredFit
 from jaxtrachea.status import FitStatus, PredictionStatus
 
 

@@ -4,9 +4,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from jaxtrachea.inference.held_out import Compared
-from jaxtrachea.inference.predict import CurvePrediction
 from jaxtrachea.measurements.read import BadCurve
+from jaxtrachea.prediction.held_out import Compared
+from jaxtrachea.prediction.predict import CurvePrediction
 from jaxtrachea.status import PredictionStatus, PressStatus
 
 Row = dict[str, object]

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from jaxtrachea.fit.covariance import SINGULAR
-from jaxtrachea.inference.stored import StoredFit
+from jaxtrachea.results.stored import StoredFit
 from jaxtrachea.status import FitStatus, PredictionStatus
 
 #: Parameters of a measurement, not of the specimen: zero where no measurement is meant.

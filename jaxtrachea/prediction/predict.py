@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxtrachea.fit.map_lanes import program
-from jaxtrachea.inference.prediction_core import Predicted, Response, predicted
-from jaxtrachea.inference.sources import Source, slack_of, source_of
-from jaxtrachea.inference.stored import StoredFit
+from jaxtrachea.prediction.core import Predicted, Response, predicted
+from jaxtrachea.prediction.sources import Source, slack_of, source_of
+from jaxtrachea.results.stored import StoredFit
 from jaxtrachea.status import PredictionStatus, PressStatus
 
 #: Error of the linear band at its ends, in half-widths, from which it is called bent.

@@ -1,0 +1,164 @@
+"""Where to press next, in tables and picture (docs/design.md)."""
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+
+from jaxtrachea.config import SpecError
+from jaxtrachea.inference.analysis import (
+    Analysis,
+    Cells,
+    Findings,
+    Progress,
+    Request,
+    Table,
+    Unavailable,
+)
+from jaxtrachea.inference.design import (
+    Candidates,
+    Choice,
+    Criterion,
+    Map,
+    Situation,
+    candidates_of,
+    gains,
+    identifiability,
+    next_points,
+    scores,
+    situation,
+)
+from jaxtrachea.inference.labels import unknown_label
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Design:
+    """The next presses, and what they were chosen from.
+
+    Attributes:
+        known: what is known before.
+        at: candidates.
+        choice: those chosen.
+        chart: identifiability along the tube.
+        unknowns: names of what a new press shares.
+    """
+
+    known: Situation
+    at: Candidates
+    choice: Choice
+    chart: Map
+    unknowns: list[str]
+
+
+def _refuse(request: Request) -> None:
+    if not request.study.free:
+        raise SpecError("design: every parameter is fixed; free what the presses shall tell")
+    candidates_of(request.spec, request.study)
+
+
+def _compute(request: Request, findings: Findings, progress: Progress) -> Design:
+    section = request.spec.design
+    at = candidates_of(request.spec, request.study)
+    try:
+        known = situation(findings.result, findings.get("bootstrap"))
+    except ValueError as error:
+        raise Unavailable(str(error)) from None
+    choice = next_points(known, at, section.points, section.criterion)
+    s = np.linspace(at.s.min(), at.s.max(), 121)
+    chart = identifiability(known, s, float(at.depth.max()))
+    return Design(known, at, choice, chart, names(known, findings.result))
+
+
+def names(known: Situation, result) -> list[str]:
+    """Unknowns of the first guess's lane that a new press shares; all lanes have the same ones."""
+    lane = int(known.lane[0])
+    count = len(result.study.unknowns[lane])
+    return [unknown_label(result, lane, int(i)) for i in known.kept[0] if i < count]
+
+
+def choice_rows(choice: Choice, at: Candidates, unknowns: list[str]) -> Iterator[Cells]:
+    """One row before any press, then one per press chosen, with the errors expected after it."""
+    for step, error in enumerate(choice.error):
+        k = int(choice.chosen[step - 1])
+        place = {"s_mm": float(at.s[k]), "depth_mm": float(at.depth[k])} if step else {}
+        before: dict[str, object] = {"press": step, "s_mm": "", "depth_mm": ""}
+        pairs = zip(unknowns, error, strict=False)
+        yield before | place | {f"{name} relative se": float(e) for name, e in pairs}
+
+
+def candidate_rows(known: Situation, added: np.ndarray, at: Candidates) -> Iterator[Cells]:
+    """One row per candidate: what it would gain by every criterion, as a first further press."""
+    criteria: tuple[Criterion, ...] = ("D", "A", "E")
+    now = {c: float(scores(known.base[:, None], c)[0]) for c in criteria}
+    then = {c: scores(known.base[:, None] + added, c) for c in criteria}
+    for k in range(len(at.s)):
+        gain = {f"gain_{c}": float(then[c][k]) - now[c] for c in criteria}
+        yield {"s_mm": float(at.s[k]), "depth_mm": float(at.depth[k])} | gain
+
+
+def map_rows(found: Map, unknowns: list[str]) -> Iterator[Cells]:
+    """One row per position: condition, weakest combination, and its best partner from scratch."""
+    partner = np.argmin(found.pairs, axis=1)
+    for i, s in enumerate(found.s):
+        parts = zip(unknowns, found.weakest[i], strict=False)
+        yield {
+            "s_mm": float(s),
+            "condition": float(found.condition[i]),
+            "partner_s_mm": float(found.s[partner[i]]),
+            "pair_condition": float(found.pairs[i, partner[i]]),
+        } | {f"weakest {name}": float(v) for name, v in parts}
+
+
+def _tables(found: Design):
+    added = gains(found.known, found.at)
+    return {
+        "next_points.csv": choice_rows(found.choice, found.at, found.unknowns),
+        "candidates.csv": candidate_rows(found.known, added, found.at),
+        "identifiability.csv": map_rows(found.chart, found.unknowns),
+    }
+
+
+def _shown(found: Design, lanes: list[int]) -> Iterator[Table]:
+    rows = list(choice_rows(found.choice, found.at, found.unknowns))
+    errors = [k.removesuffix(" relative se") for k in rows[0] if k.endswith(" relative se")]
+    head = ["press", "s [mm]", "depth [mm]", *errors]
+    cells = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
+    yield "Next presses, relative errors expected after each", head, cells
+
+
+def draw_design(design: Design):
+    """The identifiability map: over s with the data, of pairs without, and the gains."""
+    from matplotlib.figure import Figure
+
+    found, at, choice = design.chart, design.at, design.choice
+    rings = np.asarray(design.known.study.model.geometry.ring_positions)
+    figure = Figure(figsize=(13, 3.8), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    left.plot(found.s, found.condition, color="0.2")
+    left.set(xlabel="s [mm]", ylabel="condition", title="data and a press at s")
+    left.plot(rings, np.full(len(rings), found.condition.min()), "|", color="tab:green", ms=9)
+    image = middle.pcolormesh(found.s, found.s, np.log10(found.pairs), cmap="viridis_r")
+    figure.colorbar(image, label="log10 condition")
+    middle.set(xlabel="s [mm]", ylabel="s [mm]", title="two presses, no other data")
+    for depth in np.unique(at.depth):
+        own = at.depth == depth
+        right.plot(at.s[own], choice.score[0, own], lw=1, label=f"{depth:.3g} mm")
+    for k in np.unique(choice.chosen):
+        order = ", ".join(str(step + 1) for step in np.flatnonzero(choice.chosen == k))
+        right.annotate(order, (at.s[k], choice.score[0, k]), color="tab:red")
+    right.legend(title="depth")
+    right.set(xlabel="s [mm]", ylabel="criterion", title="first press; chosen in order")
+    return figure
+
+
+DESIGN = Analysis(
+    name="design",
+    compute=_compute,
+    asked=lambda request: True,
+    commands=("design",),
+    refuse=_refuse,
+    tables=_tables,
+    place="design",
+    shown=_shown,
+    figures=lambda found: {"identifiability.png": lambda: draw_design(found)},
+)

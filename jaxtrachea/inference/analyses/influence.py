@@ -1,0 +1,216 @@
+"""Influence of samples and curves in tables and report."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from jaxtrachea.files.tables import markdown_table, number
+from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
+from jaxtrachea.inference.influence import Influence, influence
+from jaxtrachea.inference.labels import succeeded
+from jaxtrachea.inference.rows import ONE_BY_ONE, and_more
+
+#: Rows of the tables on influence; the files hold all.
+_TOP = 12
+#: Change of an estimate, in standard errors, from which a curve is named.
+_MOVES = 1.0
+#: What stands in a table of influence where a number cannot be given.
+REASONS = (
+    "`own`: nobody else tells of this unknown. `needed`: without this curve the others do not "
+    "determine all unknowns. `held`: the unknown is on its bound. `undetermined`: it has no "
+    "standard error. `no estimate`: the fit failed."
+)
+
+
+def _compute(request: Request, findings: Findings, progress: Progress) -> Influence:
+    return influence(findings.result, request.settings.batch)
+
+
+def _tables(found: Influence):
+    return {"influence.csv": sample_rows(found), "influence_curves.csv": curve_rows(found)}
+
+
+def sample_rows(found: Influence) -> Iterator[Cells]:
+    """One row per observed force and marker for influence.csv."""
+    study, of = found.result.study, found.of
+    names = [p.name for p in study.free]
+    for lane, curves in enumerate(study.curves):
+        for t, curve in enumerate(curves):
+            for e in np.flatnonzero(np.isfinite(of.leverage[lane, t])):
+                at = lane, t, e
+                sample, ring = _place(found, int(e))
+                yield {
+                    "specimen": curve.specimen,
+                    "trial": curve.trial,
+                    "sample": sample + 1,
+                    "ring": "" if ring is None else ring + 1,
+                    "displacement_mm": float(curve.displacement[sample]),
+                    "leverage": float(of.leverage[at]),
+                    "studentised": float(of.studentised[at]),
+                    "studentised_external": float(found.external[at]),
+                    "cook": float(of.cook[at]),
+                } | {
+                    f"{name} {what}": float(v[lane, t, i, e])
+                    for i, name in enumerate(names)
+                    for what, v in (("per sigma", of.per_sigma), ("left out", of.left_out))
+                }
+
+
+def curve_rows(found: Influence) -> Iterator[Cells]:
+    """One row per curve for influence_curves.csv."""
+    study, of = found.result.study, found.of
+    names = [p.name for p in study.free]
+    for lane, curves in enumerate(study.curves):
+        for t, curve in enumerate(curves):
+            r = of.studentised[lane, t]
+            worst = np.nanmax(np.abs(r)) if np.isfinite(r).any() else np.nan
+            yield {
+                "specimen": curve.specimen,
+                "trial": curve.trial,
+                "leverage": float(np.nansum(of.leverage[lane, t])),
+                "largest_studentised": float(worst),
+                "cook": float(of.curve_cook[lane, t]),
+            } | {
+                f"{name} {what}": float(v[lane, t, i])
+                for i, name in enumerate(names)
+                for what, v in (("share", of.curve_share), ("left out", of.curve_left_out))
+            }
+
+
+def top_samples(found: Influence, count: int) -> list[tuple[int, int, int]]:
+    """Lane, curve and entry of the samples with the largest Cook's distance, largest first."""
+    cook = np.where(np.isfinite(found.of.cook), found.of.cook, -1)
+    order = np.argsort(-cook, axis=None, kind="stable")[:count]
+    places = zip(*np.unravel_index(order, cook.shape), strict=True)
+    return [(int(k), int(t), int(e)) for k, t, e in places if cook[k, t, e] >= 0]
+
+
+def _place(found: Influence, entry: int) -> tuple[int, int | None]:
+    """Sample and ring (None: a force) of an entry of the residual."""
+    lanes = found.result.study.lanes
+    samples = lanes.force.shape[-1]
+    if entry < samples or lanes.joints is None:
+        return entry, None
+    sample, ring = divmod(entry - samples, lanes.joints.shape[-1])
+    return sample, ring
+
+
+def sample_label(found: Influence, lane: int, t: int, entry: int) -> str:
+    """Where a sample is, in words: 2.5 mm, or 2.5 mm, ring 3."""
+    sample, ring = _place(found, entry)
+    where = f"{found.result.study.curves[lane][t].displacement[sample]:.3g} mm"
+    return where if ring is None else f"{where}, ring {ring + 1}"
+
+
+def influence_head(found: Influence) -> list[str]:
+    """Head of `influence_rows`."""
+    names = [p.name for p in found.result.study.free]
+    return ["specimen", "curve", *(f"{n}: share, left out" for n in names), "Cook"]
+
+
+def influence_rows(found: Influence, most: int = ONE_BY_ONE) -> list[list[str]]:
+    """Curves: all of few; of many those with the largest Cook's distance."""
+    return [_curve_row(found, *place) for place in _top_curves(found, most)]
+
+
+def influence_section(found: Influence) -> list[str]:
+    """Which curves and samples the estimates hang on."""
+    names = [p.name for p in found.result.study.free]
+    table, total = influence_rows(found), sum(map(len, found.result.study.curves))
+    parts = [
+        "## Influence",
+        markdown_table(influence_head(found), table),
+        *(f"{text}." for text in and_more(total, len(table), "influence_curves.csv")),
+        "Share: part of the variance of an estimate that the noise of this curve makes. Left out: "
+        "change of the estimate, in standard errors, if the curve were not there (first order). "
+        f"{REASONS} All curves: `influence_curves.csv`.",
+        *drivers(found),
+    ]
+    rows = [_sample_row(found, names, *place) for place in top_samples(found, _TOP)]
+    head = ["specimen", "curve", "sample", "leverage", "studentised", "Cook", "moves most"]
+    return [
+        *parts,
+        markdown_table(head, rows),
+        "The samples whose loss would move the estimates most; studentised residuals beyond 3 to 4 "
+        "are outliers. All samples: `influence.csv` (docs/uncertainty.md).",
+    ]
+
+
+def _top_curves(found: Influence, most: int) -> list[tuple[int, int]]:
+    """All curves if few; of many those that nothing is known of, then by Cook's distance."""
+    curves = found.result.study.curves
+    places = [(k, t) for k, of in enumerate(curves) for t in range(len(of))]
+    if len(places) <= most:
+        return places
+    cook = np.nan_to_num(found.of.curve_cook, nan=-1)
+    return sorted(places, key=lambda place: -cook[place])[:most]
+
+
+def _curve_row(found: Influence, lane: int, t: int) -> list[str]:
+    curve, of = found.result.study.curves[lane][t], found.of
+    cells = [influence_cell(found, lane, t, i) for i in range(of.curve_share.shape[2])]
+    cook = float(of.curve_cook[lane, t])
+    return [curve.specimen, curve.trial, *cells, number(cook, 2) if np.isfinite(cook) else "–"]
+
+
+def influence_cell(found: Influence, lane: int, t: int, i: int) -> str:
+    """Share and change where the curve is left out, or in one word why there is none."""
+    result, of = found.result, found.of
+    unknown = int(result.study.lanes.index[lane, t, result.study.free_columns[i]])
+    if not succeeded(result, lane):
+        return "no estimate"
+    if result.at_bound[lane, unknown]:
+        return "held"
+    share, left = float(of.curve_share[lane, t, i]), float(of.curve_left_out[lane, t, i])
+    if np.isnan(share):
+        return "undetermined"
+    if np.isfinite(left):
+        return f"{100 * share:.0f} %, {number(left, 2)}"
+    column = result.study.lanes.index[lane][:, result.study.free_columns[i]]
+    return f"{100 * share:.0f} %, {'own' if np.sum(column == unknown) == 1 else 'needed'}"
+
+
+def _sample_row(found: Influence, names: Sequence[str], lane: int, t: int, e: int) -> list[str]:
+    curve, of = found.result.study.curves[lane][t], found.of
+    moves = of.left_out[lane, t, :, e]
+    most = "–"
+    if np.isfinite(moves).any():
+        i = int(np.nanargmax(np.abs(moves)))
+        most = f"{names[i]} by {moves[i]:+.2g} std. errors"
+    numbers = (of.leverage[lane, t, e], found.external[lane, t, e], of.cook[lane, t, e])
+    where = sample_label(found, lane, t, e)
+    return [curve.specimen, curve.trial, where, *(number(float(v), 2) for v in numbers), most]
+
+
+def drivers(found: Influence) -> list[str]:
+    """In words: the curve whose loss moves each parameter most, where it moves it by much."""
+    names = [p.name for p in found.result.study.free]
+    said, moves = [], np.abs(np.nan_to_num(found.of.curve_left_out))
+    for i, name in enumerate(names):
+        lane, t = np.unravel_index(int(np.argmax(moves[:, :, i])), moves.shape[:2])
+        if moves[lane, t, i] >= _MOVES:
+            curve, by = found.result.study.curves[lane][t], found.of.curve_left_out[lane, t, i]
+            said.append(f"- {name}: {curve.specimen} {curve.trial} ({by:+.2g} standard errors)")
+    lead = "Estimates that hang on one curve, by more than a standard error:"
+    return [lead, "\n".join(said)] if said else []
+
+
+def _shown(found: Influence, lanes: list[int]) -> Iterator[Table | str]:
+    curves = sum(map(len, found.result.study.curves))
+    rows = influence_rows(found)
+    yield "Influence of curves", influence_head(found), rows
+    yield from and_more(curves, len(rows), "influence_curves.csv")
+    said = drivers(found)
+    yield from (["\n".join(said)] if said else [])
+
+
+INFLUENCE = Analysis(
+    name="influence",
+    compute=_compute,
+    option="influence",
+    key="influence",
+    tables=_tables,
+    place="data",
+    section=influence_section,
+    shown=_shown,
+)

@@ -1,0 +1,109 @@
+"""The population in tables and report."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.special import stdtrit
+
+from jaxtrachea.files.tables import markdown_table, number
+from jaxtrachea.inference.analysis import (
+    Analysis,
+    Cells,
+    Findings,
+    Progress,
+    Request,
+    Table,
+    Unavailable,
+)
+from jaxtrachea.inference.population import Population, population, wanted
+
+POPULATION_HEAD = ["parameter", "n", "left out", "mean", "95 % interval", "spread", "95 % interval"]
+
+
+def _asked(request: Request) -> bool:
+    return wanted(request.spec.fit.population, request.study)
+
+
+def _compute(request: Request, findings: Findings, progress: Progress) -> Population:
+    try:
+        return population(findings.result, findings.profiles)
+    except ValueError as error:
+        raise Unavailable(str(error)) from None
+
+
+def population_rows(of: Population) -> Iterator[Cells]:
+    """One row per parameter for population.csv; intervals with Student's t, m - 1."""
+    e = of.effects
+    for j, p in enumerate(of.parameters):
+        count = int(of.known[:, j].sum())
+        half = float(stdtrit(count - 1, 0.975) * e.mean_se[j])
+        log = p.scale == "log"
+        ends = np.array([e.sd[j], e.sd_low[j], e.sd_high[j]])
+        spread, low, high = map(float, np.exp(ends) if log else ends * p.step)
+        mean = float(e.mean[j])
+        slope = p.from_scaled(mean) if log else p.step
+        yield {
+            "parameter": p.name,
+            "unit": p.unit,
+            "specimens": count,
+            "left_out": int(of.left_out[j]),
+            "mean": p.from_scaled(mean),
+            "mean_se": slope * float(e.mean_se[j]),
+            "mean_low95": p.from_scaled(mean - half),
+            "mean_high95": p.from_scaled(mean + half),
+            "spread_is": "factor" if log else p.unit,
+            "spread": spread,
+            "spread_low95": low,
+            "spread_high95": high,
+            "sd_scaled": float(e.sd[j]),
+            "sd_scaled_se": float(e.sd_se[j]),
+        }
+
+
+def population_table(found: Population) -> list[list[str]]:
+    """Parameter, specimens, mean and its interval, spread between specimens and its interval."""
+    rows = []
+    for row in population_rows(found):
+        sign = "× / " if row["spread_is"] == "factor" else "± "
+        cell = {k: number(v) for k, v in row.items() if isinstance(v, float)}
+        rows.append(
+            [
+                f"{row['parameter']} [{row['unit']}]",
+                str(row["specimens"]),
+                str(row["left_out"]),
+                cell["mean"],
+                f"{cell['mean_low95']} … {cell['mean_high95']}",
+                f"{sign}{cell['spread']}",
+                f"{cell['spread_low95']} … {cell['spread_high95']}",
+            ]
+        )
+    return rows
+
+
+def _section(found: Population) -> list[str]:
+    """The section on the population."""
+    return [
+        "## Population",
+        markdown_table(POPULATION_HEAD, population_table(found)),
+        "The specimens as a sample, those whose estimate is identifiable or weak: their errors are "
+        "taken out of the spread between them. Spread: one standard deviation, with scale `log` as "
+        "a factor, and the mean is then the geometric one. Estimates drawn towards the mean by "
+        "what they are uncertain: `shrunk` in `parameters.csv`; all numbers: `population.csv` "
+        "(docs/joint.md).",
+    ]
+
+
+def _shown(found: Population, lanes: list[int]) -> Iterator[Table]:
+    yield "Population", POPULATION_HEAD, population_table(found)
+
+
+POPULATION = Analysis(
+    name="population",
+    compute=_compute,
+    asked=_asked,
+    tables=lambda found: {"population.csv": population_rows(found)},
+    parameter_cells=Population.shrunk_cells,
+    place="estimates",
+    section=_section,
+    shown=_shown,
+)

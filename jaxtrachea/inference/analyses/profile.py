@@ -1,0 +1,196 @@
+"""Profile likelihood in tables, report, results.h5 and picture."""
+
+import json
+from collections.abc import Iterator, Sequence
+from functools import partial
+
+import numpy as np
+
+from jaxtrachea.config import SpecError
+from jaxtrachea.files.pictures import grid, of_all
+from jaxtrachea.files.tables import interval, markdown_table, number
+from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
+from jaxtrachea.inference.judgement import within_bounds
+from jaxtrachea.inference.labels import lane_label, unknown_label
+from jaxtrachea.inference.profile import Profiles, profiles
+from jaxtrachea.inference.rows import LINES, and_more, listed, more_of
+from jaxtrachea.status import ProfileEnd
+
+PROFILE_HEAD = ["specimen", "parameter", "value", "profile 95 %", "local 95 %", "ends"]
+
+
+def names_of(request: Request) -> tuple[str, ...]:
+    """Names of the parameters to profile: those of the specification, all if only asked for.
+
+    Raises:
+        SpecError: one is not fitted.
+    """
+    names, free = request.spec.uncertainty.profile, tuple(p.name for p in request.study.free)
+    for name in names:
+        if name not in (*free, "all"):
+            raise SpecError(
+                f"uncertainty.profile: {name!r} is not fitted; expected 'all' or names out of "
+                f"{', '.join(free)}"
+            )
+    return tuple(names) if names and "all" not in names else free
+
+
+def _compute(request: Request, findings: Findings, progress: Progress) -> Profiles:
+    points = request.spec.uncertainty.profile_points
+    names = names_of(request)
+    return profiles(findings.result, request.settings, names, points=points, progress=progress)
+
+
+def _refuse(request: Request) -> None:
+    names_of(request)
+
+
+def _cells(found: Profiles, lane: int, i: int) -> Cells:
+    """Interval by profile likelihood, and how it ends."""
+    k = found.find(lane, i)
+    if k is None:
+        return {}
+    low, high = (ProfileEnd(int(v)).name.lower() for v in found.end[k])
+    return {
+        "profile_low95": float(found.lower[k]),
+        "profile_high95": float(found.upper[k]),
+        "profile_low_end": low,
+        "profile_high_end": high,
+    }
+
+
+def profile_rows(found: Profiles) -> Iterator[Cells]:
+    """One row per point of each profile for profiles.csv."""
+    result = found.result
+    for k, (lane, i) in enumerate(found.pairs):
+        lane_specimen, _ = result.study.lane_name(lane)
+        p, specimen, trial = result.study.unknowns[lane][i]
+        for theta, statistic in zip(found.coordinate[k], found.statistic[k], strict=True):
+            yield {
+                "specimen": specimen or lane_specimen,
+                "trial": trial or "(all)",
+                "parameter": p.name,
+                "unit": p.unit,
+                "at": p.from_scaled(float(theta)),
+                "statistic": float(statistic),
+                "threshold": float(found.threshold[k]),
+            }
+
+
+def _datasets(group, found: Profiles) -> None:
+    for name in ("lane", "unknown", "lower", "upper", "threshold", "theta", "statistic"):
+        group.create_dataset(name, data=getattr(found, name))
+    codes = group.create_dataset("end", data=found.end.astype(np.int8))
+    codes.attrs["meaning"] = json.dumps({int(e): e.message for e in ProfileEnd})
+
+
+def profile_table(found: Profiles, lanes: Sequence[int]) -> list[list[str]]:
+    """Lane, parameter, value, interval by profile and by standard error, how the profile ends."""
+    result, rows = found.result, []
+    place = {lane: n for n, lane in enumerate(lanes)}
+    pairs = [(k, lane, i) for k, (lane, i) in enumerate(found.pairs) if lane in place]
+    for k, lane, i in sorted(pairs, key=lambda pair: place[pair[1]]):
+        p = result.study.unknowns[lane][i][0]
+        low, high = (ProfileEnd(int(e)).name.lower() for e in found.end[k])
+        local = (float(v[lane, i]) for v in (result.lower, result.upper))
+        local = within_bounds(result, lane, i, *local)
+        rows.append(
+            [
+                lane_label(result, lane),
+                f"{unknown_label(result, lane, i)} [{p.unit}]",
+                number(float(result.value[lane, i])),
+                interval(found.lower[k], found.upper[k], log=p.scale == "log"),
+                interval(*local, log=p.scale == "log"),
+                low if low == high else f"{low}, {high}",
+            ]
+        )
+    return rows
+
+
+def _section(found: Profiles) -> list[str]:
+    """The section on profile likelihood."""
+    result = found.result
+    shown = listed(result)
+    count = lambda end: int(np.sum((found.end == end).any(axis=1)))  # noqa: E731
+    parts = [
+        "## Profile likelihood",
+        markdown_table(PROFILE_HEAD, profile_table(found, shown)),
+        *more_of(result, shown, "parameters.csv"),
+        f"{len(found.lane)} profiles: {count(ProfileEnd.OPEN)} open on a side (the data do not "
+        f"limit the parameter there), {count(ProfileEnd.BOUND)} limited only because another "
+        f"unknown is on its bound, {count(ProfileEnd.FAILED)} failed. All other unknowns are "
+        "fitted anew at every point; points: `profiles.csv` (docs/uncertainty.md).",
+    ]
+    better = np.flatnonzero(found.improved)
+    if len(better):
+        names = sorted({lane_label(result, int(found.lane[k])) for k in better})
+        parts.append(
+            f"**A profile found a better fit than the fit itself** ({', '.join(names[:20])}): "
+            "these intervals are wrong. Fit again with more starts."
+        )
+    return [*parts, "![profiles](profiles.png)"] if len(found.lane) else parts
+
+
+def _shown(found: Profiles, lanes: list[int]) -> Iterator[Table | str]:
+    yield "Profile likelihood", PROFILE_HEAD, profile_table(found, lanes)
+    yield from and_more(found.result.lanes, len(lanes), "parameters.csv")
+
+
+def _figures(found: Profiles):
+    return {"profiles.png": partial(draw_profiles, found)} if len(found.lane) else {}
+
+
+def draw_profiles(found: Profiles):
+    """Rise of the profile against the parameter, a panel for each parameter, a line for each lane.
+
+    Dotted: the parabola of the local standard error, of the first lane; dashed: threshold.
+    """
+    import matplotlib as mpl
+
+    result = found.result
+    names = list(dict.fromkeys(p.name for p in result.study.free))
+    of = lambda k: result.study.unknowns[found.lane[k]][found.unknown[k]][0]  # noqa: E731
+    groups = {n: [k for k in range(len(found.lane)) if of(k).name == n] for n in names}
+    place = {lane: n for n, lane in enumerate(listed(result, LINES))}
+    groups = {
+        n: sorted(members, key=lambda k: place.get(found.lane[k], LINES))
+        for n, members in groups.items()
+        if members
+    }
+    figure, axes = grid(len(groups))
+    for axis, members in zip(axes, groups.values(), strict=False):
+        p, first = of(members[0]), members[0]
+        colours = mpl.colormaps["viridis"](np.linspace(0.05, 0.9, len(members)))
+        for k, colour in zip(members[:LINES], colours, strict=False):
+            at = np.array([p.from_scaled(v) for v in found.coordinate[k]])
+            axis.plot(at, found.statistic[k], ".-", color=colour, lw=0.9, ms=3)
+        lane, unknown = found.lane[first], found.unknown[first]
+        se = result.uncertainty.se[lane, unknown]
+        if np.isfinite(se):
+            ends = found.coordinate[first]
+            theta = np.linspace(ends[0], ends[-1], 101)
+            local = ((theta - result.theta[lane, unknown]) / se) ** 2
+            axis.plot([p.from_scaled(v) for v in theta], local, ":", color="k", lw=1)
+        axis.axhline(found.threshold[first], ls="--", color="tab:red", lw=0.9)
+        wide = np.ptp(found.coordinate[members]) > np.log(20)
+        axis.set_xscale("log" if p.scale == "log" and wide else "linear")
+        axis.set_ylim(-0.2, 2.2 * found.threshold[first])
+        title = p.name + of_all(min(len(members), LINES), len(members), "worst lanes")
+        axis.set(title=title, xlabel=f"{p.name} [{p.unit}]", ylabel="rise of the profile")
+    return figure
+
+
+PROFILES = Analysis(
+    name="profiles",
+    compute=_compute,
+    work="profiling",
+    option="profile",
+    key="profile",
+    refuse=_refuse,
+    tables=lambda found: {"profiles.csv": profile_rows(found)},
+    parameter_cells=_cells,
+    datasets=_datasets,
+    section=_section,
+    shown=_shown,
+    figures=_figures,
+)

@@ -1,0 +1,136 @@
+"""What an analysis of a fit is: one record of what it computes, and of all that is said of it.
+
+An analysis is a file in `analyses` and a line in its `ANALYSES`. The command line, report.md, the
+tables, results.h5 and the pictures go through that list. What an analysis is asked for by is
+declared where users give it: an option in `cli.main`, a key in `config.UncertaintySection`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from typing import Any, Literal
+
+from jaxtrachea.config import FitSpec
+from jaxtrachea.fit.predictions import Prediction, predictions
+from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.study import Study
+from jaxtrachea.inference.profile import Profiles
+
+#: Cells of a row of a table, by column.
+Cells = Mapping[str, object]
+#: Title, head and rows of a table on the terminal.
+Table = tuple[str, list[str], list[list[str]]]
+#: Called with (steps done since the last call, steps in all, 0 if unknown).
+Progress = Callable[[int, int], None]
+
+
+class Unavailable(ValueError):
+    """A fit does not allow an analysis; the message says why, and the rest of the run stands."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Request:
+    """What the user asks for.
+
+    Attributes:
+        spec: the specification.
+        study: the study.
+        settings: of the solver.
+        options: of the command line, without dashes.
+        command: whose analyses are done.
+    """
+
+    spec: FitSpec
+    study: Study
+    settings: Settings
+    options: Collection[str] = ()
+    command: Literal["fit", "design"] = "fit"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Findings:
+    """A fit, and what its analyses have found.
+
+    Attributes:
+        result: the fit.
+        found: each analysis that was done, with what it found, in the order of `ANALYSES`.
+        unavailable: name of an analysis that could not be done, and why.
+    """
+
+    result: FitResult
+    found: tuple[tuple["Analysis", Any], ...] = ()
+    unavailable: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    def get(self, name: str) -> Any:
+        """What the analysis of this name has found; None if it was not done."""
+        return next((found for analysis, found in self.found if analysis.name == name), None)
+
+    def at(self, place: str) -> Iterator[tuple["Analysis", Any]]:
+        """The analyses that the report has at this place."""
+        return ((analysis, found) for analysis, found in self.found if analysis.place == place)
+
+    @property
+    def profiles(self) -> Profiles | None:
+        """Profiles that were asked for: they add to the evidence for all verdicts."""
+        return self.get("profiles")
+
+    @functools.cached_property
+    def prediction(self) -> Prediction:
+        """Residuals at the estimate."""
+        return predictions(self.result.study, self.result.theta)
+
+
+@dataclasses.dataclass(frozen=True)
+class Analysis:
+    """An analysis of a fit; what it has nothing to say of is left at its default.
+
+    `found` is what `compute` returns. Pictures import matplotlib when they are drawn.
+
+    Attributes:
+        name: of its group in results.h5, and of itself.
+        compute: the analysis itself, out of the request, the findings so far and whom to tell of
+            progress; raises `Unavailable` where the fit does not allow it.
+        work: what is done meanwhile, for the progress bar; "" if it takes no time.
+        option: of the command line that asks for it, without dashes.
+        key: of the section [uncertainty] that asks for it.
+        asked: whether it is asked for otherwise.
+        commands: that it belongs to.
+        refuse: raises `SpecError`, before anything is fitted, where it cannot be done.
+        tables: rows by name of a CSV file.
+        lane_cells: cells of summary.csv, for (found, lane).
+        parameter_cells: cells of parameters.csv, for (found, lane, unknown).
+        datasets: writes into its group of results.h5; None: it has none.
+        place: of its section in report.md and of its tables on the terminal: `estimates`, before
+            the quality of the fit; `quality`, with it; `checks`, after it; `data`, after what is
+            used of the data; `design`: it belongs to that command.
+        section: paragraphs of the report.
+        warning: paragraphs below the table of estimates.
+        shown: tables and sentences on the terminal, for (found, lanes that are listed).
+        figures: what draws each picture, by name of the file.
+        poor: whether it came out so that the command ends with exit code 1.
+    """
+
+    name: str
+    compute: Callable[[Request, Findings, Progress], Any]
+    work: str = ""
+    option: str = ""
+    key: str = ""
+    asked: Callable[[Request], bool] = lambda request: False
+    commands: tuple[str, ...] = ("fit",)
+    refuse: Callable[[Request], None] = lambda request: None
+    tables: Callable[[Any], Mapping[str, Iterable[Cells]]] = lambda found: {}
+    lane_cells: Callable[[Any, int], Cells] = lambda found, lane: {}
+    parameter_cells: Callable[[Any, int, int], Cells] = lambda found, lane, i: {}
+    datasets: Callable[[Any, Any], None] | None = None
+    place: Literal["estimates", "quality", "checks", "data", "design"] = "checks"
+    section: Callable[[Any], list[str]] = lambda found: []
+    warning: Callable[[Any], list[str]] = lambda found: []
+    shown: Callable[[Any, list[int]], Iterable[Table | str]] = lambda found, lanes: ()
+    figures: Callable[[Any], Mapping[str, Callable[[], Any]]] = lambda found: {}
+    poor: Callable[[Any], bool] = lambda found: False
+
+    def wanted(self, request: Request) -> bool:
+        """Whether the request asks for it."""
+        by_key = bool(self.key) and bool(getattr(request.spec.uncertainty, self.key))
+        asked = self.option in request.options or by_key or self.asked(request)
+        return request.command in self.commands and asked

@@ -1,0 +1,1 @@
+"""What a finished fit, read back from its file, predicts: presses, and measured curves."""

@@ -1,0 +1,130 @@
+"""An analysis is one record: what it says stands in every file of a run, and nowhere else."""
+
+import csv
+from pathlib import Path
+
+import h5py
+import pytest
+from run_cli import GOOD, run
+
+from jaxtrachea.cli.main import app
+from jaxtrachea.config import SpecError, UncertaintySection
+from jaxtrachea.inference import analyses
+from jaxtrachea.inference.analysis import Analysis, Unavailable
+
+SPEC = '[data]\nfiles = "good.csv"\n[model]\ncoupling = "total"\n'
+
+
+def draw():
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    figure.subplots()
+    return figure
+
+
+def datasets(group, found):
+    group["twice"] = 2 * found
+
+
+def refuse(request):
+    raise SpecError("--toy: not today")
+
+
+#: Finds the number of lanes, and says it in every way there is.
+TOY = Analysis(
+    name="toy",
+    compute=lambda request, findings, progress: findings.result.lanes,
+    work="playing",
+    asked=lambda request: True,
+    tables=lambda found: {"toy.csv": [{"lanes": found}]},
+    lane_cells=lambda found, lane: {"played": lane + 100},
+    parameter_cells=lambda found, lane, i: {"toy": 10 * lane + i},
+    datasets=datasets,
+    section=lambda found: ["## Toys", f"{found} lanes were played with."],
+    warning=lambda found: ["Toys are **no** tools."],
+    shown=lambda found, lanes: [f"{found} toys"],
+    figures=lambda found: {"toy.png": draw},
+    poor=lambda found: True,
+)
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capsys):
+    """The command `fit` on a small study, with these analyses alone."""
+    monkeypatch.chdir(tmp_path)
+    Path("good.csv").write_text(GOOD)
+    Path("spec.toml").write_text(SPEC)
+
+    def fit(*wanted):
+        monkeypatch.setattr(analyses, "ANALYSES", wanted)
+        return run(monkeypatch, capsys, "fit", "spec.toml", "--out", "out")
+
+    return fit
+
+
+def test_one_record_is_all_that_a_new_analysis_takes(command):
+    """Columns, files, sections, datasets, picture, terminal, progress and exit code."""
+    code, out, err = command(TOY)
+    assert code == 1
+    assert "toys" in out
+    assert "Toys are no tools." in out
+    assert "playing" in err
+    text = Path("out/report.md").read_text()
+    assert "lanes were played with." in text
+    assert text.index("Toys are **no** tools.") < text.index("## Quality") < text.index("## Toys")
+    assert Path("out/toy.png").read_bytes()[:4] == b"\x89PNG"
+    with h5py.File("out/results.h5") as file:
+        lanes = len(file["lanes/status"])
+        assert file["toy/twice"][()] == 2 * lanes
+    with Path("out/parameters.csv").open(newline="") as stream:
+        cells = [row["toy"] for row in csv.DictReader(stream)]
+    assert cells == [str(10 * lane + i) for lane in range(lanes) for i in range(2)]
+    with Path("out/summary.csv").open(newline="") as stream:
+        cells = [row["played"] for row in csv.DictReader(stream)]
+    assert cells == [str(lane + 100) for lane in range(lanes)]
+    assert Path("out/toy.csv").read_text().split() == ["lanes", str(lanes)]
+
+
+def test_what_cannot_be_done_stops_before_the_fit_or_is_said_after_it(command):
+    """Refused: nothing is written. Unavailable: everything else stands."""
+
+    def unavailable(request, findings, progress):
+        raise Unavailable("the fit is too [small]")
+
+    wishes = {"compute": unavailable, "asked": lambda request: True}
+    code, _, err = command(Analysis(name="toy", refuse=refuse, **wishes))
+    assert code == 2
+    assert "--toy: not today" in err
+    assert not Path("out").exists()
+    code, _, err = command(Analysis(name="toy", **wishes))
+    assert code == 0
+    assert "no toy: the fit is too [small]" in err
+    assert Path("out/report.md").exists()
+
+
+def test_an_analysis_is_done_only_if_asked_for_and_sees_those_before_it(command):
+    seen = []
+
+    def look(request, findings, progress):
+        seen.append(findings.get("toy"))
+
+    after = Analysis(name="after", compute=look, asked=lambda request: True)
+    never = Analysis(name="never", compute=lambda *_: seen.append("never"))
+    elsewhere = Analysis(
+        name="elsewhere", compute=lambda *_: seen.append("elsewhere"),
+        asked=lambda request: True, commands=("design",),
+    )  # fmt: skip
+    command(never, TOY, after, elsewhere)
+    assert len(seen) == 1
+    assert isinstance(seen[0], int)
+
+
+def test_names_options_and_keys_exist_once():
+    names = [a.name for a in analyses.ANALYSES]
+    assert len(set(names)) == len(names)
+    keys = [a.key for a in analyses.ANALYSES if a.key]
+    assert set(keys) <= set(UncertaintySection.model_fields)
+    fit = next(c for c in app.registered_commands if c.callback and c.callback.__name__ == "fit")
+    options = [a.option.replace("-", "_") for a in analyses.ANALYSES if a.option]
+    assert set(options) <= set(fit.callback.__annotations__)
