@@ -25,7 +25,7 @@ from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import check_sizes
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.material import Material
+from jaxtrachea.trachea.material import OPTIONAL, Material
 from jaxtrachea.trachea.mesh import Mesh
 
 #: What counts as a normal press on the midline and as one contact point: rad, mm, and share of the
@@ -327,7 +327,6 @@ def _near_patches(tool: Shape, geometry: Geometry, count: int) -> int:
 def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> Facts:
     """What the rules need to know of a scene and its path."""
     curved = scene.mesh is not None and scene.mesh.frames is not None
-    optional = ("GA_L", "k_1_ring", "EA_L", "k_A", "k_B", "EI_C", "k_t")
     if isinstance(path, Poses):
         seen = jax.jit(touch_tube)(scene, path)
         gap, s, phi = (np.asarray(v, float) for v in (seen.gap, seen.s, seen.phi))
@@ -360,7 +359,7 @@ def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> Facts:
         slip=float(slip) if slip > COVERED * whole else 0.0,
         spacing=float(np.diff(x).min()) if len(x) > 1 else float(scene.geometry.length),
         friction=scene.friction is not None,
-        known=frozenset(name for name in optional if getattr(material, name) is not None),
+        known=frozenset(name for name in OPTIONAL if getattr(material, name) is not None),
         mesh=scene.mesh is not None,
         curved=curved,
         near=_near(scene, s, phi),
