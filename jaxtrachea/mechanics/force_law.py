@@ -51,10 +51,12 @@ class Law(NamedTuple):
     Attributes:
         k_1: N/mm; positive.
         k_3: N/mm^3; negative for a law that softens.
+        k_5: N/mm^5; likewise. Not in the paper: silicone beyond 40 % strain needs it.
     """
 
     k_1: Float[Array, "..."]
     k_3: Float[Array, "..."]
+    k_5: Float[Array, "..."] | None = None
 
     def coefficients(self) -> dict[str, Float[Array, "..."]]:
         """Those that are there, by name, in rising powers 1, 3, 5, ... of the indentation."""

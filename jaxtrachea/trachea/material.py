@@ -152,6 +152,13 @@ class Material(eqx.Module):
             fit=Fitted(0.01, 0.0, 1e6, "linear", 0.01),
         )
     )  # fmt: skip
+    k_5: Float[Array, ""] | None = _field(
+        Declaration(
+            "k_5", "N/mm^5", "quintic_stiffness", "quintic contact stiffness",
+            part="contact", absent="a cubic law", signed=True,
+            fit=Fitted(1e-4, 0.0, 1e6, "linear", 1e-4, if_named=True),
+        )
+    )  # fmt: skip
     k_1_ring: Float[Array, ""] | None = _field(
         Declaration(
             "k_1_ring", "N/mm", "stiffness", "linear contact stiffness on a ring",
@@ -164,6 +171,13 @@ class Material(eqx.Module):
             "k_3_ring", "N/mm^3", "cubic_stiffness", "cubic contact stiffness on a ring",
             part="contact", needs="two-material", absent="k_3", signed=True,
             fit=Fitted(0.01, 0.0, 1e6, "linear", 0.01, if_named=True),
+        )
+    )  # fmt: skip
+    k_5_ring: Float[Array, ""] | None = _field(
+        Declaration(
+            "k_5_ring", "N/mm^5", "quintic_stiffness", "quintic contact stiffness on a ring",
+            part="contact", needs="two-material", absent="k_5", signed=True,
+            fit=Fitted(1e-4, 0.0, 1e6, "linear", 1e-4, if_named=True),
         )
     )  # fmt: skip
     EA_L: Float[Array, "..."] | None = _field(
