@@ -31,6 +31,7 @@ CASES = {
     "dense": (Options(form="reactions"), False, {}),
     "independent": (Options(split="independent"), True, {}),
     "markers": (Options(shear=True, local="two-material"), True, {}),
+    "quintic law": (Options(local="two-material"), False, {"k_5": {}, "k_5_ring": {}}),
     "total": (Options(coupling="total"), False, {}),
     "total, markers": (Options(coupling="total"), True, {}),
     "onset and offset": (Options(onset_width=0.5), False, BOTH),
