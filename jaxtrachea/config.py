@@ -148,8 +148,8 @@ class ModelSection(Section):
 class ParameterSection(Section):
     """[parameters.NAME]: `fixed`, or free with any of `initial`, `bounds`, `scale`, `scope`.
 
-    Numbers are in the parameter's own unit (EI_L N mm^2, GA_L N, k_M, k_1, k_1_ring N/mm, k_3,
-    k_3_ring N/mm^3, onset mm, force_offset N), or quantities with a unit.
+    Names and units are those that `jaxtrachea.trachea.material` declares (docs/parameters.md).
+    Numbers are in the parameter's own unit, or quantities with a unit.
     """
 
     fixed: Number | None = None

@@ -6,7 +6,15 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from jaxtrachea._numerics import cubic_ratio, epsilon, positive_part, solve_spd
+from jaxtrachea._numerics import (
+    cubic_ratio,
+    epsilon,
+    first_positive_root,
+    positive_part,
+    quintic_past_fold,
+    quintic_ratio,
+    solve_spd,
+)
 
 DTYPES = ["float32", "float64"]
 ratio = jax.jit(cubic_ratio)
@@ -127,3 +135,126 @@ def test_solve_spd(n, dtype):
         got[0], expected, rtol=0, atol=3000 * np.finfo(dtype).eps * abs(expected).max()
     )
     assert np.all(np.isnan(got[1]))
+
+
+def first_root(u, v):
+    """Root of g + u g^3 + v g^5 = 1 on the branch from 0, and the fold: all roots in 60 digits."""
+    with mp.workdps(60):
+        u, v = mp.mpf(float(u)), mp.mpf(float(v))
+        real = lambda p: [  # noqa: E731
+            mp.re(r) for r in mp.polyroots(p[::-1], maxsteps=500, extraprec=800, asc=True)
+            if abs(mp.im(r)) < mp.mpf(10) ** -25 * abs(r) and mp.re(r) > 0
+        ]  # fmt: skip
+        trimmed = lambda p: p[next(i for i, c in enumerate(p) if c != 0) :]  # noqa: E731
+        slope = trimmed([5 * v, 3 * u, 1])
+        squares = real(slope) if len(slope) > 1 else []
+        fold = mp.sqrt(min(squares)) if squares else mp.inf
+        roots = [r for r in real(trimmed([v, 0, u, 0, 1, -1])) if r <= fold]
+        return (float(min(roots)) if roots else np.nan), float(fold)
+
+
+PARTS = [0.0, 1e-9, 0.03, 1.0, 40.0, 1e6, 1e15]
+PAIRS = [(u, v) for u in PARTS for v in PARTS]
+#: Softening and then hardening, with and without a fold, softening twice, hardening and softening.
+PAIRS += [(-0.1, 1e-4), (-0.1, 0.01), (-0.12, 0.006), (-3.0, 20.0), (-40.0, 1e4), (-1e6, 1e13)]
+PAIRS += [(-0.1, -1e-3), (-1e-12, -1e-12), (0.5, -0.05), (0.0, -0.05), (1e3, -1e4), (30.0, -60.0)]
+PAST = [(-1.0, 0.3), (-1.0, 0.01), (-1.0, 0.0), (-0.2, -0.2), (0.0, -1.0), (3.0, -1e4)]
+PAST += [(1e3, -4e4), (-1e9, 1e9)]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_quintic_ratio_is_the_first_root(dtype):
+    u, v = np.array(PAIRS + PAST).T.astype(dtype)
+    got = np.asarray(jax.jit(quintic_ratio)(jnp.asarray(u), jnp.asarray(v)))
+    expected, fold = np.array([first_root(a, b) for a, b in zip(u, v, strict=True)]).T
+    assert got.dtype == dtype
+    assert np.all(np.isnan(expected[len(PAIRS) :]))
+    np.testing.assert_array_equal(np.isnan(got), np.isnan(expected))
+    # Condition of the root: parts of the sum that cancel, over the slope.
+    q, good = expected**2, slice(len(PAIRS))
+    parts = 1 + np.abs(u) * q * expected + np.abs(v) * q * q * expected
+    room = 8 * np.finfo(dtype).eps * parts / (expected * (1 + 3 * u * q + 5 * v * q * q))
+    assert np.all((np.abs(got / expected - 1) < room)[good])
+    past = np.asarray(jax.jit(quintic_past_fold)(jnp.asarray(u), jnp.asarray(v)))
+    np.testing.assert_array_equal(past, np.isnan(expected))
+    assert np.all(expected[good] <= fold[good])
+
+
+def test_quintic_ratio_knows_the_cubic():
+    """Without the fifth power it is the other closed form, up to its fold."""
+    u = np.concatenate([MAGNITUDES[:46], SOFTENING])
+    got = jax.jit(quintic_ratio)(jnp.asarray(u * 4 / 27), jnp.zeros(len(u)))
+    room = 16 * np.finfo(float).eps / np.sqrt(np.clip(1 + u, 1e-12, 1))
+    assert np.all(np.abs(np.asarray(got) / np.array([closed_form(v) for v in u]) - 1) < room)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("away", [1e-1, 1e-3, 1e-5, 0.0, -1e-5])
+def test_quintic_ratio_next_to_the_fold(away, dtype):
+    """With the fold at g = f: u from v, and the right side as much below as `away` says."""
+    f, v = 0.8, -0.05
+    u = (-1 - 5 * v * f**4) / (3 * f * f)
+    size = (f + u * f**3 + v * f**5) * (1 - away)  # g + ... = size, rescaled to 1
+    u, v = np.asarray(u * size**2, dtype), np.asarray(v * size**4, dtype)
+    expected, _ = first_root(u, v)
+    got = float(jax.jit(quintic_ratio)(jnp.asarray(u), jnp.asarray(v)))
+    if abs(away) > 1e-6:
+        assert np.isnan(got) == np.isnan(expected) or abs(away) < 1e2 * np.finfo(dtype).eps
+    if np.isfinite(expected) and np.isfinite(got):
+        # Rounding e of the arguments moves the root by sqrt(e) at the fold itself.
+        eps = float(np.finfo(dtype).eps)
+        assert abs(got / expected - 1) < 30 * eps / max(np.sqrt(max(away, 0)), np.sqrt(eps))
+
+
+def test_quintic_ratio_rows_stay_alone():
+    """NaN, infinite and folded rows change no bit of the others; they are NaN themselves."""
+    u, v = jnp.array([0.3, -0.2, 5.0, 0.1]), jnp.array([0.2, 0.05, 1.0, 2.0])
+    run = jax.jit(quintic_ratio)
+    good, bad = run(u, v), run(u.at[0].set(jnp.nan).at[2].set(jnp.inf), v.at[3].set(-9.0))
+    assert good[1] == bad[1]
+    assert np.all(np.isnan(np.asarray(bad)[[0, 2, 3]]))
+    one = jax.vmap(run)(u, v)
+    np.testing.assert_array_equal(one, good)
+
+
+@pytest.mark.parametrize(("u", "v"), [(0.0, 0.0), (0.4, 0.7), (-0.3, 0.2), (1e6, 1e9), (-0.1, 0.0)])
+def test_quintic_ratio_derivatives(u, v):
+    """First derivatives, forward = reverse, by differences in 60 digits; second ones likewise."""
+    at = jnp.array([u, v])
+    f = lambda x: quintic_ratio(x[0], x[1])  # noqa: E731
+    with mp.workdps(60):
+
+        def root(a, b):
+            start, _ = first_root(u, v)
+            return mp.findroot(lambda g: g + a * g**3 + b * g**5 - 1, start)
+
+        m = mp.mpf
+        step = [m(max(abs(x), 1e-3)) * m(10) ** -15 for x in (u, v)]
+        up = lambda i, j: root(m(u) + i * step[0], m(v) + j * step[1])  # noqa: E731
+        first = [float((up(1, 0) - up(-1, 0)) / (2 * step[0])),
+                 float((up(0, 1) - up(0, -1)) / (2 * step[1]))]  # fmt: skip
+        mixed = float((up(1, 1) - up(1, -1) - up(-1, 1) + up(-1, -1)) / (4 * step[0] * step[1]))
+    np.testing.assert_allclose(jax.jacfwd(f)(at), first, rtol=1e-12)
+    np.testing.assert_allclose(jax.grad(f)(at), first, rtol=1e-12)
+    np.testing.assert_allclose(jax.jacfwd(jax.grad(f))(at)[0, 1], mixed, rtol=1e-11)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_first_positive_root(dtype):
+    """Of a + b q + e q^2, by all roots in 60 digits; inf where there is none."""
+    rows = [(1, -3, 1), (1, -1, 0), (1, 2, -3), (1, -2.5, 1.5), (1, 1, 1), (1, 0, 0), (1, -1, 9)]
+    rows += [(0, -1, 0), (1, -1e18, 1e17), (1, 1e18, -1), (1e-9, -1, -1), (2, 0, -8)]
+    a, b, e = np.array(rows).T.astype(dtype)
+    got = np.asarray(jax.jit(first_positive_root)(*map(jnp.asarray, (a, b, e))))
+    expected = []
+    for row in zip(a, b, e, strict=True):
+        with mp.workdps(60):
+            row = [mp.mpf(float(x)) for x in row]
+            if row[0] == 0:
+                expected.append(0.0)
+                continue
+            inverse = [r for r in mp.polyroots(row[::-1], 500, extraprec=500, asc=True)]
+            # Of 1 / q.
+            there = [1 / mp.re(r) for r in inverse if abs(mp.im(r)) < 1e-30 and mp.re(r) > 0]
+            expected.append(float(min(there)) if there else np.inf)
+    np.testing.assert_allclose(got, expected, rtol=8 * np.finfo(dtype).eps)

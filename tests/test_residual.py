@@ -31,6 +31,7 @@ CASES = {
     "dense": (Options(form="reactions"), False, {}),
     "independent": (Options(split="independent"), True, {}),
     "markers": (Options(shear=True, local="two-material"), True, {}),
+    "quintic law": (Options(local="two-material"), False, {"k_5": {}, "k_5_ring": {}}),
     "total": (Options(coupling="total"), False, {}),
     "total, markers": (Options(coupling="total"), True, {}),
     "onset and offset": (Options(onset_width=0.5), False, BOTH),
@@ -59,7 +60,8 @@ def make_study(name):
         sigma = rng.uniform(0.5, 2.0, n) if i % 2 else None
         D, F = np.linspace(-0.2, 5.0, n), rng.normal(size=n)
         found.append(Curve(f"s{i // 3}", f"t{i}", s, 0.0, D, F, sigma=sigma, **seen))
-    parameters = default_parameters(in_model(options, joints=markers), changes)
+    named = ("k_3_ring", *changes)
+    parameters = default_parameters(in_model(options, joints=markers, named=named), changes)
     noise = Noise(force=0.3, joints=0.7)
     return build_study(found, synthetic.GEOMETRY, options, parameters, noise=noise)
 

@@ -2,14 +2,12 @@
 
 import dataclasses
 import math
-from typing import Literal
+from collections.abc import Collection
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.press import Options
-
-Scope = Literal["shared", "specimen", "trial"]
-Scale = Literal["log", "linear"]
+from jaxtrachea.trachea.material import PARAMETERS, Declaration, Fitted, Scale, Scope
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,92 +86,43 @@ class Parameter:
         return math.exp(theta) if self.scale == "log" else theta * self.step
 
 
-def _stiffness(name, text, value, lower=1e-6, upper=1e6):
-    return Parameter(name, "N/mm", "stiffness", text, value, lower, upper)
+def _of(declared: Declaration, fit: Fitted) -> Parameter:
+    return Parameter(
+        declared.name, declared.unit, declared.dimension, declared.description, fit.value,
+        fit.lower, fit.upper, fit.scale, fit.step, fit.scope, fit.fixed,
+    )  # fmt: skip
 
 
-#: Every parameter with its defaults. The initial guesses are round numbers of the right order for a
-#: human-sized trachea, not values of the paper (which gives none).
-DEFAULTS = {
-    p.name: p
-    for p in (
-        Parameter(
-            "EI_L", "N mm^2", "bending_stiffness", "ligament bending stiffness", 10.0, 1e-4, 1e7
-        ),
-        Parameter("GA_L", "N", "force", "ligament shear stiffness", 10.0, 1e-4, 1e6),
-        _stiffness("k_M", "muscle stiffness under a ring", 0.1),
-        _stiffness("k_1", "linear contact stiffness", 1.0),
-        Parameter(
-            "k_3",
-            "N/mm^3",
-            "cubic_stiffness",
-            "cubic contact stiffness",
-            0.01,
-            0.0,
-            1e6,
-            scale="linear",
-            step=0.01,
-        ),
-        _stiffness("k_1_ring", "linear contact stiffness on a ring", 10.0),
-        Parameter(
-            "k_3_ring",
-            "N/mm^3",
-            "cubic_stiffness",
-            "cubic contact stiffness on a ring",
-            0.01,
-            0.0,
-            1e6,
-            scale="linear",
-            step=0.01,
-        ),
-        Parameter(
-            "onset",
-            "mm",
-            "length",
-            "displacement at first touch",
-            0.0,
-            -100.0,
-            100.0,
-            scale="linear",
-            scope="trial",
-            fixed=True,
-        ),
-        Parameter(
-            "force_offset",
-            "N",
-            "force",
-            "zero offset of the load cell",
-            0.0,
-            -1e4,
-            1e4,
-            scale="linear",
-            step=0.1,
-            scope="trial",
-            fixed=True,
-        ),
-    )
-}
-
+#: Every parameter that can be identified, with its defaults, as `trachea.material` declares it.
+DEFAULTS = {name: _of(p, p.fit) for name, p in PARAMETERS.items() if p.fit is not None}
 #: Parameters of the beam; all others act at the contact.
-SKELETON = ("EI_L", "GA_L", "k_M")
+SKELETON = tuple(name for name in DEFAULTS if PARAMETERS[name].part == "skeleton")
 #: Parameters of single presses that are no property of the specimen: errors are measured against
 #: the range of displacement and the largest force.
-OF_THE_PRESS = ("onset", "force_offset")
+OF_THE_PRESS = tuple(name for name in DEFAULTS if PARAMETERS[name].part == "press")
 
 
-def in_model(options: Options, *, joints: bool) -> list[str]:
+def visible(options: Options, *, joints: bool) -> list[str]:
     """Names of the parameters that the chosen model can see, in table order.
 
     With coupling `total` and no joint markers the skeleton does not enter: force-displacement
-    curves then see k_1 and k_3 alone.
+    curves then see the local law alone.
     """
-    names = []
-    for name in DEFAULTS:
-        if name in SKELETON and options.coupling == "total" and not joints:
-            continue
-        if name == "GA_L" and not options.shear:
-            continue
-        if name.endswith("_ring") and options.local != "two-material":
-            continue
-        names.append(name)
-    return names
+    has = {"": True, "shear": options.shear, "two-material": options.local == "two-material"}
+    blind = options.coupling == "total" and not joints
+    return [
+        name for name in DEFAULTS
+        if has[PARAMETERS[name].needs] and not (blind and name in SKELETON)
+    ]  # fmt: skip
+
+
+def in_model(options: Options, *, joints: bool, named: Collection[str] = ()) -> list[str]:
+    """`visible`, but for those that a model has only where they are named.
+
+    Args:
+        options: of the model.
+        joints: whether there are markers.
+        named: parameters that the specification names.
+    """
+    tacit = {name for name, p in PARAMETERS.items() if p.fit is not None and p.fit.if_named}
+    return [n for n in visible(options, joints=joints) if n not in tacit or n in named]

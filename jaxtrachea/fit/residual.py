@@ -15,7 +15,7 @@ from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.model import FitModel
 from jaxtrachea.fit.parameters import SKELETON
 from jaxtrachea.mechanics.equilibrium import sensitivity
-from jaxtrachea.mechanics.force_law import Law, duffing
+from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.press import (
     compliance,
     ligament_beam,
@@ -25,7 +25,7 @@ from jaxtrachea.mechanics.press import (
     unit_deflection,
 )
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.material import Material
+from jaxtrachea.trachea.material import Material, material_of
 
 
 class Residual(NamedTuple):
@@ -56,16 +56,14 @@ class Inputs(NamedTuple):
     Attributes:
         compliance: of the skeleton as the force feels it, mm/N; (T,).
         joints: motion of every ring under a unit force, mm/N; (T, rings); None without markers.
-        k_1: of the local law at the contact, N/mm; (T,).
-        k_3: N/mm^3; (T,).
+        law: at the contact; (T,).
         onset: mm; (T,).
         force_offset: N; (T,).
     """
 
     compliance: Float[Array, " T"]
     joints: Float[Array, "T rings"] | None
-    k_1: Float[Array, " T"]
-    k_3: Float[Array, " T"]
+    law: Law
     onset: Float[Array, " T"]
     force_offset: Float[Array, " T"]
 
@@ -85,8 +83,8 @@ def inputs(
     skeleton = _skeleton(model, free, _places(lane), tube)
     at = lambda free, value, s_c: _at_contact(model, free, value, s_c, tube)  # noqa: E731
     contact = jax.vmap(at)(free, lane.value, lane.s_c)
-    law, felt = contact.law, _felt(model, skeleton)
-    return Inputs(felt, skeleton.joints, law.k_1, law.k_3, contact.onset, contact.force_offset)
+    felt = _felt(model, skeleton)
+    return Inputs(felt, skeleton.joints, contact.law, contact.onset, contact.force_offset)
 
 
 def residual(
@@ -147,16 +145,7 @@ def material_and_values(model: FitModel, free, value) -> tuple[Material, dict[st
     for p, scaled in zip(model.free, free, strict=True):
         values[p.name] = jnp.exp(scaled) if p.scale == "log" else scaled * p.step
     one = jnp.ones((), free.dtype)  # where the skeleton is not part of the model
-    material = Material(
-        EI_L=values.get("EI_L", one),
-        k_M=values.get("k_M", one),
-        k_1=values["k_1"],
-        k_3=values["k_3"],
-        GA_L=values.get("GA_L"),
-        k_1_ring=values.get("k_1_ring"),
-        k_3_ring=values.get("k_3_ring"),
-    )
-    return material, values
+    return material_of({"EI_L": one, "k_M": one} | values), values
 
 
 def _tube(model: FitModel, geometry: Geometry | None, dtype) -> Geometry:
@@ -301,19 +290,19 @@ def _press(model: FitModel, tube, free, skeleton, by_beam, value, s_c, D, blend)
     moved = slope(contact.onset)
     terms = {
         "compliance": (_felt(model, d_skeleton), by.compliance),
-        "k_1": (d_contact.law.k_1, by.k_1),
-        "k_3": (d_contact.law.k_3, by.k_3),
+        **{k: (getattr(d_contact.law, k), by_k) for k, by_k in by.law.coefficients().items()},
         "onset": (d_contact.onset, by.displacement * moved),
     }
     d_force = jnp.zeros((len(eye), *depth.shape), depth.dtype)
-    for d_input, by_input in (terms[name] for name in _felt_through(model)):
+    through = _felt_through(model)
+    for d_input, by_input in (v for name, v in terms.items() if name in through):
         d_force = d_force + d_input[:, None] * by_input[None]
     corner = None
     if blend is not None and any(p.name == "onset" for p in model.free):
         curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
         corner = by.displacement * curved * jnp.sum(d_contact.onset**2)
     return _Pressed(
-        force=duffing(depth, law),
+        force=law.force(depth),
         d_force=d_force,
         offset=contact.force_offset,
         d_offset=d_contact.force_offset,
@@ -366,12 +355,10 @@ def force_jacobian(
     return pressed.d_force + pressed.d_offset[:, None]
 
 
-def _felt_through(model: FitModel) -> list[str]:
+def _felt_through(model: FitModel) -> set[str]:
     """Through what the free parameters act on the contact force: only these terms are computed."""
-    through = {
-        "compliance" if p.name in SKELETON else p.name.removesuffix("_ring") for p in model.free
-    }
-    return [name for name in ("compliance", "k_1", "k_3", "onset") if name in through]
+    names = (p.name for p in model.free)
+    return {"compliance" if name in SKELETON else coefficient(name) or name for name in names}
 
 
 def observations(lane: Lane) -> tuple[Float[Array, "T m"], int]:

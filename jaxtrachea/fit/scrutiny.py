@@ -30,6 +30,7 @@ from jaxtrachea.fit.result import FitResult, Settings
 from jaxtrachea.fit.starts import EXACT, box, scales
 from jaxtrachea.fit.structure import Structure, positions
 from jaxtrachea.fit.study import Study
+from jaxtrachea.mechanics.force_law import coefficient, power
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 #: Relative standard error along a direction, and condition number, from which there is doubt about
@@ -305,10 +306,11 @@ def _soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
             for i, (p, _, _) in enumerate(study.unknowns[lane]):
                 if p.name in SKELETON:
                     start[n, i] = guess[n, i] - np.log(softer[n])
-                elif p.name.startswith("k_1"):
+                elif coefficient(p.name) == "k_1":
                     start[n, i] = p.to_scaled(max(k_1[n], 1e-300))
-                elif p.name.startswith("k_3"):
-                    start[n, i] = p.to_scaled(0.1 * k_1[n] / (depth[n] * (1 - of_skeleton)) ** 2)
+                elif coefficient(p.name):
+                    local = (depth[n] * (1 - of_skeleton)) ** (power(p.name) - 1)
+                    start[n, i] = p.to_scaled(0.1 * k_1[n] / local)
         out.append(np.clip(np.nan_to_num(start), low[lanes], high[lanes]))
     return out
 

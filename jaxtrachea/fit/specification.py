@@ -5,9 +5,9 @@ import dataclasses
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
 from jaxtrachea.fit.levenberg_marquardt import MOST_SLOTS, Tolerances
-from jaxtrachea.fit.parameters import DEFAULTS, Parameter, in_model
+from jaxtrachea.fit.parameters import DEFAULTS, Parameter, in_model, visible
 from jaxtrachea.fit.result import Settings
-from jaxtrachea.fit.study import Noise, Study, build_study, check_curve, table_names
+from jaxtrachea.fit.study import Noise, Study, build_study, check_curve
 from jaxtrachea.measurements.read import (
     BadCurve,
     Measurements,
@@ -23,12 +23,12 @@ def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Par
     Raises:
         SpecError: a parameter the model does not have, or values that contradict each other.
     """
-    names = in_model(options, joints=joints)
+    known = visible(options, joints=joints)
     for name in spec.parameters:
-        if name not in names:
-            known = "not a parameter" if name not in DEFAULTS else "not seen by this model"
-            raise SpecError(f"parameters.{name}: {known}; expected one of {', '.join(names)}")
-    names = table_names(options, spec.parameters, joints=joints)
+        if name not in known:
+            reason = "not a parameter" if name not in DEFAULTS else "not seen by this model"
+            raise SpecError(f"parameters.{name}: {reason}; expected one of {', '.join(known)}")
+    names = in_model(options, joints=joints, named=spec.parameters)
     return tuple(_parameter(DEFAULTS[n], spec.parameters.get(n)) for n in names)
 
 

@@ -26,7 +26,7 @@ from jaxtrachea.fit.parameters import SKELETON
 from jaxtrachea.fit.residual import inputs
 from jaxtrachea.fit.starts import box
 from jaxtrachea.fit.study import Study
-from jaxtrachea.mechanics.force_law import Law
+from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.press import respond
 
 #: Points of the parameter box, and half its width in decades.
@@ -35,7 +35,8 @@ POINTS, DECADES = 8, 2.0
 ZERO, NO_PART = 1e-7, 1e-3
 #: Lanes computed together.
 _BATCH = 64
-#: Tool displacements of a generic curve, mm; with c, k_1 and k_3 near 1 it is as bent as can be.
+#: Tool displacements of a generic curve, mm; with c and the law's k_n near 1 it is as bent as can
+#: be.
 _GENERIC_DEPTHS = np.linspace(0.2, 3.0, 24)
 
 
@@ -90,7 +91,7 @@ def suspicious(study: Study) -> Bool[np.ndarray, " lanes"]:
     names = {p.name for p in study.free}
     needed = beam
     if not _hardens(study):  # a slope of each curve, in place of its shape
-        needed += len(names & {"k_1", "k_1_ring"})
+        needed += sum(coefficient(name) == "k_1" for name in names)
         if {"onset", "force_offset"} <= names:
             return np.ones(len(places), bool)
     return places < needed
@@ -244,41 +245,58 @@ def _inputs_by_unknowns(model: FitModel, theta: Float[Array, " P"], lane: Lane):
         x = inputs(model, theta, lane)
         c = jnp.maximum(x.compliance, jnp.finfo(theta.dtype).tiny)
         felt = model.options.coupling == "series"
-        rows = [jnp.log(c) if felt else jnp.zeros_like(c), jnp.log(x.k_1), x.k_3]
+        k_1, *more = x.law.coefficients().values()
+        rows = [jnp.log(c) if felt else jnp.zeros_like(c), jnp.log(k_1), *more]
         rows = jnp.stack([*rows, x.onset, x.force_offset], axis=1)
         if x.joints is None:
             return rows
         size = jnp.max(jnp.abs(jax.lax.stop_gradient(x.joints)), axis=1, keepdims=True)
         return jnp.concatenate([rows, x.joints / size], axis=1)
 
-    k_3 = inputs(model, theta, lane).k_3
+    _, *higher = inputs(model, theta, lane).law.coefficients().values()
     J = jax.jacfwd(relative_inputs)(theta)
-    return J.at[:, 2].divide(jnp.where(k_3 != 0, k_3, 1)[:, None])
+    for i, k in enumerate(higher):
+        J = J.at[:, 2 + i].divide(jnp.where(k != 0, k, 1)[:, None])
+    return J
 
 
 @functools.lru_cache(maxsize=64)
-def _generic(options, hardens: bool) -> Float[np.ndarray, "r n"]:
-    def curve(v):
-        k_3 = (1 + v[2]) if hardens else v[2]
-        law = Law(jnp.exp(v[1]), k_3)
-        depths = jnp.asarray(_GENERIC_DEPTHS)
-        return respond(depths, v[3], jnp.exp(v[0]), law, options).force + v[4]
+def _generic(options, higher: tuple[tuple[str, bool], ...]) -> Float[np.ndarray, "r n"]:
+    """See `_curve_sees`; of a law with these coefficients above k_1, or zero in their place."""
 
-    J = np.asarray(jax.jit(jax.jacfwd(curve))(jnp.zeros(5)))
-    _, values, vectors = np.linalg.svd(J if hardens else J[:, [0, 1, 3, 4]], full_matrices=False)
-    seen = vectors[values > 1e-6 * values[0]]
-    return seen if hardens else np.insert(seen, 2, 0, axis=1)
+    def curve(v):
+        parts = {name: 1.0 * there + v[2 + i] for i, (name, there) in enumerate(higher)}
+        law = Law(**{"k_1": jnp.exp(v[1]), **parts})
+        depths = jnp.asarray(_GENERIC_DEPTHS)
+        return respond(depths, v[-2], jnp.exp(v[0]), law, options).force + v[-1]
+
+    J = np.asarray(jax.jit(jax.jacfwd(curve))(jnp.zeros(4 + len(higher))))
+    there = np.array([True, True, *(part for _, part in higher), True, True])
+    _, values, vectors = np.linalg.svd(J[:, there], full_matrices=False)
+    rows = values > 1e-6 * values[0]
+    seen = np.zeros((rows.sum(), len(there)))
+    seen[:, there] = vectors[rows]
+    return seen
 
 
 def _curve_sees(study: Study) -> Float[np.ndarray, "r n"]:
-    """Combinations of (log c, log k_1, k_3, onset, offset) that one curve tells; rows."""
-    return _generic(study.model.options, _hardens(study))
+    """Combinations of (log c, log k_1, k_3, ..., onset, offset) that one curve tells; rows."""
+    return _generic(study.model.options, tuple(_higher(study).items()))
+
+
+def _higher(study: Study) -> dict[str, bool]:
+    """Coefficients of the local law above k_1, and whether they are more than a fixed zero."""
+    out: dict[str, bool] = {}
+    for p in study.parameters:
+        name = coefficient(p.name)
+        if name is not None and name != "k_1":
+            out[name] = out.get(name, False) or not p.fixed or p.value != 0
+    return {name: out[name] for name in Law._fields if name in out}
 
 
 def _hardens(study: Study) -> bool:
-    """Whether the local law has a cubic part."""
-    cubic = [p for p in study.parameters if p.name.startswith("k_3")]
-    return any(not p.fixed or p.value != 0 for p in cubic)
+    """Whether the local law is more than a straight line."""
+    return any(_higher(study).values())
 
 
 def _kinds(study: Study) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " lanes"]]:

@@ -9,7 +9,7 @@ are compared with is in `residual`.
 """
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import jax
@@ -251,16 +251,7 @@ def _table(parameters: Table | None, options: Options, curves) -> Sequence[Param
         return parameters
     changes = parameters or {}
     joints = any(c.joint_displacement is not None for c in curves)
-    return default_parameters(table_names(options, changes, joints=joints), changes)
-
-
-def table_names(options: Options, changed: Collection[str], *, joints: bool) -> list[str]:
-    """Names of `parameters.in_model` that make a table where `changed` are asked for.
-
-    Unless asked for, a ring hardens like the ligament: k_3_ring is then k_3, not a parameter.
-    """
-    names = in_model(options, joints=joints)
-    return [name for name in names if name != "k_3_ring" or name in changed]
+    return default_parameters(in_model(options, joints=joints, named=changes), changes)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,10 +16,7 @@ from jaxtyping import Array, Float, Int
 from jaxtrachea._arguments import ArrayLike, shaped
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.material import Material
-
-#: Values of a material that may be given span by span, and ring by ring; the others are scalars.
-BY_SPAN, BY_RING = ("EI_L", "GA_L", "EA_L", "EI_side", "GA_side"), ("k_M",)
+from jaxtrachea.trachea.material import VALUES, Material
 
 
 class Admitted(NamedTuple):
@@ -74,10 +71,10 @@ def check_shapes(geometry: Geometry, material: Material) -> None:
         value, name = getattr(material, field.name), f"Material.{field.name}"
         if value is None:
             continue
-        if field.name in BY_SPAN:
+        if VALUES[field.name].each == "span":
             why = f" ({rings} rings make {rings + 1} spans)"
             shaped(name, value, (), (rings + 1,), why=why)
-        elif field.name in BY_RING:
+        elif VALUES[field.name].each == "ring":
             shaped(name, value, (), (rings,), why=" (one for each ring)")
         else:
             shaped(name, value, ())

@@ -2,19 +2,189 @@
 
 |F| = m_0 |omega_0^2 d + 3/4 beta_0^2 eps d^3| = k_1 d + k_3 d^3. Only k_1 and k_3 can be
 identified; m_0 merely scales. The paper gives no values for them.
+
+Everything else asks a law for its `force`, its `tangent` and its `series` (the equilibrium with a
+compliance behind it), or for the same of a vector (`secant`, `root`); no other module knows its
+coefficients. A new one is a field of `Law` and two declarations in `trachea.material`: of the same
+name, and of its value on a ring.
 """
 
+import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
+
+from jaxtrachea._numerics import (
+    cubic_ratio,
+    first_positive_root,
+    quintic_past_fold,
+    quintic_ratio,
+)
+from jaxtrachea.trachea.material import Material
+
+#: What the name of a coefficient ends in where it is meant for a ring.
+ON_RING = "_ring"
+
+
+class Series(NamedTuple):
+    """A local law in series with a compliance, one entry per displacement.
+
+    Attributes:
+        depth: local indentation, mm; NaN past the fold.
+        force: N; NaN past the fold.
+        folded: whether the displacement lies past the fold.
+    """
+
+    depth: Float[Array, "*n"]
+    force: Float[Array, "*n"]
+    folded: Bool[Array, "*n"]
 
 
 class Law(NamedTuple):
-    """Coefficients of the local law at one contact point: k_1 in N/mm, k_3 in N/mm^3."""
+    """An odd polynomial in the local indentation d: the sum of k_n d^n over the fields.
 
-    k_1: Float[Array, ""]
-    k_3: Float[Array, ""]
+    What is None is no part of the law, nor of the program. With k_1 and k_3 alone the equilibrium
+    of `series` is a closed form, with one coefficient more it is found by Newton steps.
+
+    Attributes:
+        k_1: N/mm; positive.
+        k_3: N/mm^3; negative for a law that softens.
+        k_5: N/mm^5; likewise. Not in the paper: silicone beyond 40 % strain needs it.
+    """
+
+    k_1: Float[Array, "..."]
+    k_3: Float[Array, "..."]
+    k_5: Float[Array, "..."] | None = None
+
+    def coefficients(self) -> dict[str, Float[Array, "..."]]:
+        """Those that are there, by name, in rising powers 1, 3, 5, ... of the indentation."""
+        return {name: k for name, k in zip(self._fields, self, strict=True) if k is not None}
+
+    def force(self, depth: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Contact force, N, at a local indentation, mm; odd in it."""
+        value, *lower = reversed(self.coefficients().values())
+        for k in lower:
+            value = k + value * depth * depth
+        return depth * value
+
+    def tangent(self, depth: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Derivative of `force` by the local indentation, N/mm."""
+        first, *rest = self.coefficients().items()
+        return _horner([first[1], *(power(name) * k for name, k in rest)], depth * depth)
+
+    def secant(self, squared: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Force over indentation, N/mm, by the square of the indentation, mm^2."""
+        return _horner(list(self.coefficients().values()), squared)
+
+    def stiffest(self, squared: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """As `secant`, of the parts that harden: no smaller indentation has a larger one."""
+        first, *rest = self.coefficients().values()
+        return _horner([first, *(jnp.maximum(k, 0) for k in rest)], squared)
+
+    def softens(self) -> Bool[Array, "..."]:
+        """Whether a part of the law softens, so that there may be a fold."""
+        _, *rest = self.coefficients().values()
+        return functools.reduce(jnp.logical_or, [k < 0 for k in rest])
+
+    def in_unit(self, size: Float[Array, ""]) -> "Law":
+        """The law for indentations in units of `size`, mm: k_n size^(n - 1), N/mm."""
+        out = self.coefficients()
+        for name in out:
+            for _ in range(power(name) - 1):
+                out[name] = out[name] * size
+        return self._replace(**out)
+
+    def series(self, displacement: Float[Array, "..."], compliance: Float[Array, "..."]) -> Series:
+        """Solve d + c F(d) = D on the branch through d = 0, up to its fold (1 + c F' = 0).
+
+        Unique for a law that nowhere softens. Derivatives, forward and reverse and to any order,
+        are those of the equilibrium.
+
+        Args:
+            displacement: D, mm; any shape.
+            compliance: c, mm/N, not negative; broadcasts against D.
+        """
+        depth, force = _series(displacement, compliance, self)
+        return Series(depth, force, self._folded(displacement, compliance))
+
+    def root(
+        self,
+        displacement: Float[Array, "..."],
+        compliance: Float[Array, "..."],
+        share: Float[Array, "..."] | float = 1,
+    ) -> Float[Array, "..."]:
+        """Indentation d, mm, with share d + c F(d) = D, see `series`; NaN past the fold.
+
+        Raises:
+            ValueError: a law of more than three coefficients.
+        """
+        delta, terms = _scaled(self, displacement, compliance, share)
+        return delta * (cubic_ratio(*terms) if len(terms) == 1 else quintic_ratio(*terms))
+
+    def _folded(self, displacement, compliance) -> Bool[Array, "..."]:
+        terms = _scaled(self, displacement, compliance, 1)[1]
+        if len(terms) == 1:
+            return terms[0] <= -1  # the fold of `cubic_ratio`
+        return quintic_past_fold(*terms)
+
+
+def power(name: str) -> int:
+    """Of the indentation, that a coefficient belongs to: 3 of `k_3` and of `k_3_ring`."""
+    return int(name.removesuffix(ON_RING).removeprefix("k_"))
+
+
+def coefficient(name: str) -> str | None:
+    """Field of `Law` that a parameter of a material feeds, on ligament or ring; None: not one."""
+    name = name.removesuffix(ON_RING)
+    return name if name in Law._fields else None
+
+
+def _horner(coefficients, x):
+    """Polynomial in x with these coefficients in rising powers."""
+    value, *lower = reversed(coefficients)
+    for k in lower:
+        value = k + value * x
+    return value
+
+
+def _scaled(law: Law, displacement, compliance, share):
+    """The equilibrium in d = delta g: delta, and the arguments of `_numerics.*_ratio` for g."""
+    first, *rest = law.coefficients().items()
+    stiffening = share + compliance * first[1]
+    delta = displacement / stiffening
+    if len(rest) > 2:
+        raise ValueError(f"a contact law of {len(rest) + 1} coefficients; expected three at most")
+    factor = 6.75 if len(rest) == 1 else 1  # that of `cubic_ratio`
+    terms = [factor * (compliance * k / stiffening) for _, k in rest]
+    for i, (name, _) in enumerate(rest):
+        for _ in range(power(name) - 1):
+            terms[i] = terms[i] * delta
+    return delta, terms
+
+
+@jax.custom_jvp
+def _series(displacement, compliance, law: Law):
+    """Indentation and force of `Law.series`, with the derivatives of the equilibrium d + c F = D.
+
+    Both are differentiated here: the derivative of F(d) by the law would be the difference of its
+    growth at fixed d and of the growth of c F, which cancel on a soft skeleton.
+    """
+    depth = law.root(displacement, compliance)
+    return depth, law.force(depth)
+
+
+@_series.defjvp
+def _series_jvp(primals, tangents):
+    _, compliance, law = primals
+    d_displacement, d_compliance, d_law = tangents
+    depth, force = _series(*primals)
+    slope = law.tangent(depth)
+    share = 1 / (1 + compliance * slope)
+    pushed = share * (d_displacement - force * d_compliance)
+    grown = depth * d_law.secant(depth * depth)
+    return (depth, force), (pushed - (compliance * share) * grown, slope * pushed + share * grown)
 
 
 def from_duffing(m_0, omega_0_squared, beta_0_squared_epsilon) -> Law:
@@ -29,12 +199,23 @@ def from_duffing(m_0, omega_0_squared, beta_0_squared_epsilon) -> Law:
 
 
 def duffing(depth: Float[Array, "*n"], law: Law) -> Float[Array, "*n"]:
-    """Contact force k_1 d + k_3 d^3, N, for a local indentation d, mm (odd in d)."""
-    return depth * (law.k_1 + law.k_3 * depth * depth)
+    """Contact force, N, for a local indentation d, mm (odd in d): `Law.force`, as a function."""
+    return law.force(depth)
 
 
-def fold_depth(law: Law) -> Float[Array, ""]:
-    """Depth at which a softening law peaks: sqrt(k_1 / (-3 k_3)), mm; inf for k_3 >= 0."""
+def fold_depth(law: Law) -> Float[Array, "..."]:
+    """Depth at which a softening law peaks, mm; inf where it nowhere does.
+
+    sqrt(k_1 / (-3 k_3)) of a cubic law; with k_5 the first zero of k_1 + 3 k_3 d^2 + 5 k_5 d^4.
+    """
+    if len(law.coefficients()) > 2:
+        k_1, *rest = law.coefficients().items()
+        squared = first_positive_root(
+            jnp.maximum(k_1[1], 0), *(power(name) * k for name, k in rest)
+        )
+        return jnp.where(
+            jnp.isfinite(squared), jnp.sqrt(jnp.where(squared > 0, squared, 0)), jnp.inf
+        )
     softening = law.k_3 < 0
     cubic = jnp.where(softening, -3 * law.k_3, 1)
     return jnp.where(softening, jnp.sqrt(jnp.maximum(law.k_1, 0) / cubic), jnp.inf)
@@ -57,7 +238,30 @@ def ring_weight(
     return 1 - jnp.prod(1 - (1 - t * t) ** 3)
 
 
+def of_ligament(material: Material) -> Law:
+    """The law of the ligament."""
+    return Law(**{name: getattr(material, name) for name in Law._fields})
+
+
+def of_ring(material: Material) -> Law:
+    """The law on a ring; a coefficient that is not given there is that of the ligament."""
+    of_all = of_ligament(material)
+    own = {name: getattr(material, name + ON_RING) for name in Law._fields}
+    return of_all._replace(**{name: k for name, k in own.items() if k is not None})
+
+
 def blend(ligament: Law, ring: Law, weight: Float[Array, ""]) -> Law:
-    """Two-material law: coefficients of ring and ligament mixed by `ring_weight`."""
-    mix = lambda on_ligament, on_ring: on_ligament + weight * (on_ring - on_ligament)  # noqa: E731
-    return Law(mix(ligament.k_1, ring.k_1), mix(ligament.k_3, ring.k_3))
+    """Two-material law: coefficients of ring and ligament mixed by `ring_weight`.
+
+    One that only one of them has counts as 0 in the other.
+    """
+
+    def mix(on_ligament, on_ring):
+        if on_ligament is None and on_ring is None:
+            return None
+        low = jnp.zeros_like(on_ring) if on_ligament is None else on_ligament
+        high = jnp.zeros_like(low) if on_ring is None else on_ring
+        return low + weight * (high - low)
+
+    mixed = map(mix, ligament, ring)
+    return Law(**dict(zip(Law._fields, mixed, strict=True)))  # pyright: ignore

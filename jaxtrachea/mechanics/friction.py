@@ -140,10 +140,10 @@ def _length(v):
 
 def _on_cone(D, compliance, law: Law, mu):
     """Force with |F_t| = mu F_n along the slip, and the indentation under it."""
-    z = _cone_root(D, compliance, law.k_1, law.k_3, mu)
+    z = _cone_root(D, compliance, law, mu)
     N, h, d = _given_mobility(z, D, compliance, law, mu)
     force = jnp.concatenate([N[None], mu / z * h])
-    return force, force / (law.k_1 + law.k_3 * d * d)
+    return force, force / law.secant(d * d)
 
 
 def _given_mobility(z, D, C, law: Law, mu):
@@ -163,20 +163,20 @@ def _given_mobility(z, D, C, law: Law, mu):
     return N, h - N * coupled, normal.depth
 
 
-def _excess(z, D, C, k_1, k_3, mu):
+def _excess(z, D, C, law: Law, mu):
     """What mu N / |F_t| exceeds 1 by; a straight line in z for equal, uncoupled compliances."""
-    N, h, _ = _given_mobility(z, D, C, Law(k_1, k_3), mu)
+    N, h, _ = _given_mobility(z, D, C, law, mu)
     return N * z / jnp.linalg.norm(h) - 1
 
 
 @jax.custom_jvp
-def _cone_root(D, C, k_1, k_3, mu):
+def _cone_root(D, C, law: Law, mu):
     """Root z of `_excess`: Newton from the frictionless tangent, kept in a shrinking bracket."""
-    low = mu / (k_1 + jnp.maximum(k_3, 0) * jnp.sum(D * D))  # no softer than sticking
-    N, w, _ = _given_mobility(jnp.full_like(mu, jnp.inf), D, C, Law(k_1, k_3), mu)
+    low = mu / law.stiffest(jnp.sum(D * D))  # no softer than sticking
+    N, w, _ = _given_mobility(jnp.full_like(mu, jnp.inf), D, C, law, mu)
     length = jnp.linalg.norm(w)
     first = length / N - mu * jnp.sum(w * apply(C[1:, 1:], w)) / length**2
-    excess = lambda z: _excess(z, D, C, k_1, k_3, mu)  # noqa: E731
+    excess = lambda z: _excess(z, D, C, law, mu)  # noqa: E731
 
     def newton(_, state):
         z, low, high = state

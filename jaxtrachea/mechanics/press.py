@@ -100,12 +100,11 @@ def local_law(
     Raises:
         ValueError: `two-material` without `material.k_1_ring`.
     """
-    ligament = force_law.Law(material.k_1, material.k_3)
+    ligament = force_law.of_ligament(material)
     if options.local == "uniform":
         return ligament
     if material.k_1_ring is None:
         raise ValueError("options.local='two-material' needs Material.k_1_ring (N/mm); it is None")
-    on_ring = material.k_3 if material.k_3_ring is None else material.k_3_ring
     x = geometry.ring_positions
     if options.transition is not None:
         transition = jnp.asarray(options.transition, x.dtype)
@@ -113,7 +112,7 @@ def local_law(
         ends = jnp.concatenate([-x[:1], x, 2 * geometry.length - x[-1:]])
         transition = jnp.min(jnp.diff(ends)) / 2
     weight = force_law.ring_weight(s_c, x, transition)
-    return force_law.blend(ligament, force_law.Law(material.k_1_ring, on_ring), weight)
+    return force_law.blend(ligament, force_law.of_ring(material), weight)
 
 
 def touch(

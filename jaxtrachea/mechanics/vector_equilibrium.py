@@ -1,8 +1,8 @@
 """Local indentation and skeleton displacement together, as vectors (oblique press).
 
 The vector companion of `equilibrium`, in any frame of reference. The local force is parallel to the
-local indentation, F = kappa d with the secant stiffness kappa = k_1 + k_3 |d|^2 (paper eq. 1), so
-that (1 + kappa C) d = D is linear once the number kappa is known.
+local indentation, F = kappa d with the law's secant stiffness kappa, k_1 + k_3 |d|^2 (paper eq. 1),
+so that (1 + kappa C) d = D is linear once the number kappa is known.
 """
 
 from typing import NamedTuple
@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._numerics import cubic_ratio, epsilon, solve_spd
+from jaxtrachea._numerics import epsilon, solve_spd
 from jaxtrachea.mechanics.equilibrium import status_of
 from jaxtrachea.mechanics.force_law import Law, fold_depth
 from jaxtrachea.status import PressStatus
 
-#: Tangent steps of `press_vector`; 6 leave rounding whatever C and k_3 (test_any_compliance).
+#: Tangent steps of `press_vector`; 6 leave rounding whatever C and the law (test_any_compliance).
 STEPS = 8
 
 
@@ -37,24 +37,25 @@ class VectorEquilibrium(NamedTuple):
 def press_vector(
     displacement: Float[Array, "3"], compliance: Float[Array, "3 3"], law: Law
 ) -> VectorEquilibrium:
-    """Series coupling: d + C F = D with F = (k_1 + k_3 |d|^2) d; odd in D (press or draw).
+    """Series coupling: d + C F = D with F = kappa(|d|^2) d; odd in D (press or draw).
 
     1 / |(1 + kappa C)^-1 D| is a concave function of kappa (a power mean of the 1 + kappa c_i).
-    Each step replaces it by its tangent and solves the cubic that is left in closed form. The
-    tangent lies above, so |d| rises from below and needs no safeguard; for D along an axis of C the
-    first step is exact and the answer that of `press_series`.
+    Each step replaces it by its tangent a + b kappa and solves |d| (a + b kappa) = 1, the law in
+    series with one number (`Law.root`). The tangent lies above, so |d| rises from below and needs
+    no safeguard; for D along an axis of C the first step is exact and the answer that of
+    `press_series`.
 
-    Unique for k_3 >= 0. For k_3 < 0 the branch from D = 0 is followed up to its fold, beyond which
-    depth and force are NaN. Derivatives are those of the equilibrium.
+    Unique for a law that nowhere softens. Else the branch from D = 0 is followed up to its fold,
+    beyond which depth and force are NaN. Derivatives are those of the equilibrium.
 
     Args:
         displacement: D after first touch, mm.
         compliance: C, skeleton at the contact, mm/N, symmetric and positive semi-definite.
         law: local law; k_1 > 0.
     """
-    depth, force = _series(displacement, compliance, law.k_1, law.k_3)
-    given = jnp.sum(displacement) + jnp.sum(compliance) + law.k_1 + law.k_3
-    folded = (law.k_3 < 0) & jnp.isfinite(given) & ~jnp.isfinite(jnp.sum(depth))
+    depth, force = _series(displacement, compliance, law)
+    given = jnp.sum(displacement) + jnp.sum(compliance) + sum(law.coefficients().values())
+    folded = law.softens() & jnp.isfinite(given) & ~jnp.isfinite(jnp.sum(depth))
     status = status_of(jnp.max(jnp.abs(displacement)), jnp.sum(depth + force), folded)
     return VectorEquilibrium(depth, force, status)
 
@@ -70,7 +71,7 @@ def press_vector_total(
     Args: as `press_vector`.
     """
     squared = jnp.sum(displacement * displacement)
-    folded = (law.k_3 < 0) & (squared >= fold_depth(law) ** 2)
+    folded = law.softens() & (squared >= fold_depth(law) ** 2)
     force = _force(displacement, law)
     depth = displacement - compliance @ force
     status = status_of(jnp.max(jnp.abs(displacement)), jnp.sum(depth + force), folded)
@@ -81,7 +82,7 @@ def press_vector_total(
 
 
 def _force(depth, law: Law):
-    return (law.k_1 + law.k_3 * jnp.sum(depth * depth)) * depth
+    return law.secant(jnp.sum(depth * depth)) * depth
 
 
 def _secant_motion(direction, compliance, kappa):
@@ -92,45 +93,45 @@ def _secant_motion(direction, compliance, kappa):
 
 
 @jax.custom_jvp
-def _series(displacement, compliance, k_1, k_3):
+def _series(displacement, compliance, law: Law):
     """Local indentation and force of `press_vector`; NaN past the fold."""
     size = jnp.max(jnp.abs(displacement))
     still = size == 0
     direction = jnp.where(still, 1, displacement / jnp.where(still, 1, size))
-    cubic = k_3 * size * size
+    scaled = law.in_unit(size)
 
     def tangent_step(_, t):
-        d, e = _secant_motion(direction, compliance, k_1 + cubic * t * t)
+        d, e = _secant_motion(direction, compliance, scaled.secant(t * t))
         length = jnp.linalg.norm(d)
-        # 1/|d| = a + b kappa, neither formed by a subtraction; t (a + b kappa(t)) = 1.
+        # 1/|d| = a + b kappa, neither formed by a subtraction; a t + b t kappa(t) = 1.
         a, b = jnp.sum(d * e) / length**3, jnp.sum(d * (compliance @ e)) / length**3
-        delta = 1 / (a + b * k_1)
-        return delta * cubic_ratio(6.75 * (b * cubic * delta) * delta * delta)
+        return scaled.root(jnp.ones_like(a), b, a)
 
     t = jax.lax.fori_loop(0, STEPS, tangent_step, jnp.zeros_like(size))
-    d, _ = _secant_motion(direction, compliance, k_1 + cubic * t * t)
+    d, _ = _secant_motion(direction, compliance, scaled.secant(t * t))
     missed = jnp.abs(jnp.linalg.norm(d) - t) > 100 * epsilon(t.dtype) * t
-    depth = jnp.where((k_3 < 0) & missed, jnp.nan, size * d)
-    return depth, _force(depth, Law(k_1, k_3))
+    depth = jnp.where(law.softens() & missed, jnp.nan, size * d)
+    return depth, _force(depth, law)
 
 
 @_series.defjvp
 def _series_jvp(primals, tangents):
-    """(1 + C (kappa + 2 k_3 d d^T)) d' = D' - C' F - C f, by the secant system and rank one.
+    """(1 + C (kappa + 2 kappa' d d^T)) d' = D' - C' F - C f, by the secant system and rank one.
 
-    f is the growth of F at fixed d, along d. F' is not formed from d', where f and C f would cancel
-    on a soft skeleton.
+    kappa' is the derivative of kappa by |d|^2, and f the growth of F at fixed d, along d. F' is not
+    formed from d', where f and C f would cancel on a soft skeleton.
     """
-    _, compliance, k_1, k_3 = primals
-    d_displacement, d_compliance, d_k_1, d_k_3 = tangents
+    _, compliance, law = primals
+    d_displacement, d_compliance, d_law = tangents
     depth, force = _series(*primals)
     squared = jnp.sum(depth * depth)
-    kappa, grown = k_1 + k_3 * squared, d_k_1 + d_k_3 * squared
+    kappa, stiffening = jax.jvp(law.secant, (squared,), (jnp.ones_like(squared),))
+    grown = d_law.secant(squared)
     M = jnp.eye(3, dtype=depth.dtype) + kappa * compliance
     y, z = solve_spd(M, d_displacement - d_compliance @ force), solve_spd(M, depth)
     v = compliance @ z
-    share = 1 / (1 + 2 * k_3 * jnp.sum(depth * v))
-    along = 2 * k_3 * share * jnp.sum(depth * y)
+    share = 1 / (1 + 2 * stiffening * jnp.sum(depth * v))
+    along = 2 * stiffening * share * jnp.sum(depth * y)
     d_depth = y - along * v
     d_force = kappa * d_depth + along * depth + (grown * share) * z
     return (depth, force), (d_depth - (grown * share) * v, d_force)

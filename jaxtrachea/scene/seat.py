@@ -193,7 +193,7 @@ def _stiffness(scene: Scene, depth, place: Place | None) -> Float[Array, "3"] | 
         return None
     frame = local_frame(place.phi_c)
     stretched = STRETCHED * depth
-    local = place.law.k_1 + jnp.maximum(place.law.k_3, 0) * stretched * stretched
+    local = place.law.stiffest(stretched * stretched)
     C = frame @ place.unit.compliance @ frame.T
     one = jnp.eye(3, dtype=C.dtype)
     known = jnp.isfinite(jnp.sum(C) + local) & (local > 0)

@@ -20,11 +20,8 @@ from jaxtrachea.config import (
 )
 from jaxtrachea.scene.declare import Effect
 from jaxtrachea.scene.effects import EFFECTS
+from jaxtrachea.trachea.material import VALUES
 
-Stiffness = Annotated[float, quantity("stiffness", positive=True)]
-Bending = Annotated[float, quantity("bending_stiffness", positive=True)]
-PositiveForce = Annotated[float, quantity("force", positive=True)]
-Cubic = Annotated[float, quantity("cubic_stiffness")]
 Lengths3 = Annotated[list[Length], Field(min_length=3, max_length=3)]
 Sizes3 = Annotated[list[PositiveLength], Field(min_length=3, max_length=3)]
 Angles3 = Annotated[list[Angle], Field(min_length=3, max_length=3)]
@@ -68,23 +65,17 @@ class SceneTracheaSection(Section):
         return self
 
 
-class MaterialSection(Section):
-    """[material]: see `jaxtrachea.trachea.material.Material`; one value for all rings and spans."""
+def _material_keys() -> type[Section]:
+    """A key for each value that `trachea.material` declares."""
+    keys: dict[str, Any] = {}
+    for name, p in VALUES.items():
+        number = Annotated[float | None, quantity(p.dimension, positive=not p.signed)]
+        keys[name] = (number, None if p.absent else ...)
+    return create_model("MaterialKeys", __base__=Section, **keys)
 
-    EI_L: Bending
-    k_M: Stiffness
-    k_1: Stiffness
-    k_3: Cubic
-    GA_L: PositiveForce | None = None
-    EA_L: PositiveForce | None = None
-    k_A: Stiffness | None = None
-    k_B: Stiffness | None = None
-    EI_C: Bending | None = None
-    k_t: Stiffness | None = None
-    k_1_ring: Stiffness | None = None
-    k_3_ring: Cubic | None = None
-    EI_side: Bending | None = None
-    GA_side: PositiveForce | None = None
+
+class MaterialSection(_material_keys()):
+    """[material]: see `jaxtrachea.trachea.material`; one value for all rings and spans."""
 
 
 #: Keys that each shape of tool needs, and those it may have.

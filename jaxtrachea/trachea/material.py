@@ -1,57 +1,250 @@
-"""The mechanical parameters of a trachea as one pytree."""
+"""The mechanical parameters of a trachea: each declared once, and as one pytree.
 
-import functools
+What a parameter is called, what it means and in which unit, where it may be given and how a fit
+treats it stands here and nowhere else. The tables of a fit, the keys of a scene's `[material]` and
+the page docs/parameters.md follow from it.
+"""
+
+import dataclasses
+from typing import Any, Literal
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxtrachea._arguments import real
+from jaxtrachea._arguments import check_word, real
+
+Scope = Literal["shared", "specimen", "trial"]
+Scale = Literal["log", "linear"]
+Part = Literal["skeleton", "contact", "press"]
+Needs = Literal["", "shear", "two-material", "axial", "arch", "second plane"]
+Each = Literal["", "span", "ring"]
 
 
-def _array(name: str):
-    """A field whose Python numbers become arrays (one door, so that jit does not retrace)."""
-    return eqx.field(converter=functools.partial(real, name))
+@dataclasses.dataclass(frozen=True)
+class Fitted:
+    """How a fit treats a parameter unless the specification says otherwise.
+
+    Attributes:
+        value: initial guess, or the value if `fixed`; in the parameter's unit, like all here.
+        lower: bound.
+        upper: bound.
+        scale: coordinate of steps and of relative errors.
+        step: natural size of a change with scale `linear`.
+        scope: one value for the whole study, per specimen, or per trial (curve).
+        fixed: not fitted unless named.
+        if_named: not even part of the model unless named.
+    """
+
+    value: float
+    lower: float
+    upper: float
+    scale: Scale = "log"
+    step: float = 1.0
+    scope: Scope = "specimen"
+    fixed: bool = False
+    if_named: bool = False
+
+    def __post_init__(self):
+        """Refuse words that no fit knows.
+
+        Raises:
+            ValueError: naming the field.
+        """
+        check_word("scale", self.scale, Scale)
+        check_word("scope", self.scope, Scope)
 
 
-def _optional(name: str):
-    """As `_array`, or None."""
-    return eqx.field(default=None, converter=lambda v: None if v is None else real(name, v))
+@dataclasses.dataclass(frozen=True)
+class Declaration:
+    """A parameter, declared.
+
+    Attributes:
+        name: as in `Material`, TOML files and tables.
+        unit: of every bare number.
+        dimension: for `units.parse_quantity`.
+        description: what the user reads in tables.
+        part: `skeleton` (it changes the compliance under the contact), `contact` (the local law) or
+            `press` (of a single press: no property of the specimen, not in `Material`).
+        symbol: in the paper.
+        needs: option or effect that reads it; "" where every press does. A fit has it in its model
+            where `mechanics.press.Options` has that option.
+        absent: what a value that is not given stands for; "" where it must be given.
+        each: where an array may give each its own value.
+        signed: whether it may be zero or negative.
+        fit: None where a fit cannot identify it.
+    """
+
+    name: str
+    unit: str
+    dimension: str
+    description: str
+    part: Part = "skeleton"
+    symbol: str = ""
+    needs: Needs = ""
+    absent: str = ""
+    each: Each = ""
+    signed: bool = False
+    fit: Fitted | None = None
+
+    def __post_init__(self):
+        """Refuse words that have no meaning.
+
+        Raises:
+            ValueError: naming the field.
+        """
+        check_word(f"{self.name}: part", self.part, Part)
+        check_word(f"{self.name}: needs", self.needs, Needs)
+        check_word(f"{self.name}: each", self.each, Each)
+
+
+def _field(declaration: Declaration) -> Any:
+    """A field of `Material`; by keyword, and None unless given, where it has an `absent`.
+
+    Python numbers become arrays (one door, so that jit does not retrace).
+    """
+    convert = lambda v: None if v is None else real(declaration.name, v)  # noqa: E731
+    metadata = {"declaration": declaration}
+    if declaration.absent:
+        return eqx.field(default=None, kw_only=True, converter=convert, metadata=metadata)
+    return eqx.field(converter=lambda v: real(declaration.name, v), metadata=metadata)
 
 
 class Material(eqx.Module):
     """Stiffness of ligament, rings and local contact: everything that is identified.
 
-    A scalar holds for all spans or rings; an array gives each its own. None: not part of the model
-    (no shear flexibility; the ring's local law is that of the ligament).
+    A scalar holds for all spans or rings; an array, shape (rings + 1,) or (rings,), gives each its
+    own where the declaration says so. None: not given. EI_L, k_M, k_1 and k_3, in this order, are
+    needed; the others are given by keyword. Units and meanings: docs/parameters.md.
 
-    Attributes:
-        EI_L: bending stiffness E_L I_L of the ligament, N mm^2; scalar or (rings + 1,).
-        k_M: stiffness of the muscular mat under each ring, N/mm; scalar or (rings,).
-        k_1: linear local contact stiffness m_0 omega_0^2, N/mm.
-        k_3: cubic local contact stiffness 3/4 m_0 beta_0^2 eps, N/mm^3.
-        GA_L: shear stiffness kappa G A of the ligament, N; scalar or (rings + 1,), or None.
-        k_1_ring: `k_1` where the tool rests on a ring, N/mm, or None.
-        k_3_ring: `k_3` where the tool rests on a ring, N/mm^3, or None.
-        EA_L: axial stiffness E_L A_L, N; scalar or (rings + 1,), or None.
-        k_A: axial spring of the carina end, N/mm; None: rigid.
-        k_B: axial spring of the larynx end, N/mm; None: rigid.
-        EI_C: bending stiffness E_C I_C of the cartilage in the plane of a ring, N mm^2, or None.
-        k_t: stiffness of the muscular bar between the ends of a ring, N/mm, or None.
-        EI_side: `EI_L` for bending along the circumference, off the midline sideways; None: EI_L.
-        GA_side: `GA_L` likewise; None: GA_L.
+    The initial guesses of a fit are round numbers of the right order for a human-sized trachea, not
+    values of the paper (which gives none).
     """
 
-    EI_L: Float[Array, "..."] = _array("EI_L")
-    k_M: Float[Array, "..."] = _array("k_M")
-    k_1: Float[Array, ""] = _array("k_1")
-    k_3: Float[Array, ""] = _array("k_3")
-    GA_L: Float[Array, "..."] | None = _optional("GA_L")
-    k_1_ring: Float[Array, ""] | None = _optional("k_1_ring")
-    k_3_ring: Float[Array, ""] | None = _optional("k_3_ring")
-    EA_L: Float[Array, "..."] | None = _optional("EA_L")
-    k_A: Float[Array, ""] | None = _optional("k_A")
-    k_B: Float[Array, ""] | None = _optional("k_B")
-    EI_C: Float[Array, ""] | None = _optional("EI_C")
-    k_t: Float[Array, ""] | None = _optional("k_t")
-    EI_side: Float[Array, "..."] | None = _optional("EI_side")
-    GA_side: Float[Array, "..."] | None = _optional("GA_side")
+    EI_L: Float[Array, "..."] = _field(
+        Declaration(
+            "EI_L", "N mm^2", "bending_stiffness", "ligament bending stiffness",
+            symbol="E_L I_L", part="skeleton", each="span", fit=Fitted(10.0, 1e-4, 1e7),
+        )
+    )  # fmt: skip
+    GA_L: Float[Array, "..."] | None = _field(
+        Declaration(
+            "GA_L", "N", "force", "ligament shear stiffness",
+            symbol="kappa G A", part="skeleton", needs="shear", absent="no shear", each="span",
+            fit=Fitted(10.0, 1e-4, 1e6),
+        )
+    )  # fmt: skip
+    k_M: Float[Array, "..."] = _field(
+        Declaration(
+            "k_M", "N/mm", "stiffness", "muscle stiffness under a ring",
+            part="skeleton", each="ring", fit=Fitted(0.1, 1e-6, 1e6),
+        )
+    )  # fmt: skip
+    k_1: Float[Array, ""] = _field(
+        Declaration(
+            "k_1", "N/mm", "stiffness", "linear contact stiffness",
+            symbol="m_0 omega_0^2", part="contact", fit=Fitted(1.0, 1e-6, 1e6),
+        )
+    )  # fmt: skip
+    k_3: Float[Array, ""] = _field(
+        Declaration(
+            "k_3", "N/mm^3", "cubic_stiffness", "cubic contact stiffness",
+            symbol="3/4 m_0 beta_0^2 eps", part="contact", signed=True,
+            fit=Fitted(0.01, 0.0, 1e6, "linear", 0.01),
+        )
+    )  # fmt: skip
+    k_5: Float[Array, ""] | None = _field(
+        Declaration(
+            "k_5", "N/mm^5", "quintic_stiffness", "quintic contact stiffness",
+            part="contact", absent="a cubic law", signed=True,
+            fit=Fitted(1e-4, 0.0, 1e6, "linear", 1e-4, if_named=True),
+        )
+    )  # fmt: skip
+    k_1_ring: Float[Array, ""] | None = _field(
+        Declaration(
+            "k_1_ring", "N/mm", "stiffness", "linear contact stiffness on a ring",
+            part="contact", needs="two-material", absent="one law everywhere",
+            fit=Fitted(10.0, 1e-6, 1e6),
+        )
+    )  # fmt: skip
+    k_3_ring: Float[Array, ""] | None = _field(
+        Declaration(
+            "k_3_ring", "N/mm^3", "cubic_stiffness", "cubic contact stiffness on a ring",
+            part="contact", needs="two-material", absent="k_3", signed=True,
+            fit=Fitted(0.01, 0.0, 1e6, "linear", 0.01, if_named=True),
+        )
+    )  # fmt: skip
+    k_5_ring: Float[Array, ""] | None = _field(
+        Declaration(
+            "k_5_ring", "N/mm^5", "quintic_stiffness", "quintic contact stiffness on a ring",
+            part="contact", needs="two-material", absent="k_5", signed=True,
+            fit=Fitted(1e-4, 0.0, 1e6, "linear", 1e-4, if_named=True),
+        )
+    )  # fmt: skip
+    EA_L: Float[Array, "..."] | None = _field(
+        Declaration(
+            "EA_L", "N", "force", "ligament axial stiffness",
+            symbol="E_L A_L", part="skeleton", needs="axial", absent="no stretch", each="span",
+        )
+    )  # fmt: skip
+    k_A: Float[Array, ""] | None = _field(
+        Declaration(
+            "k_A", "N/mm", "stiffness", "axial spring of the carina end",
+            part="skeleton", needs="axial", absent="held",
+        )
+    )  # fmt: skip
+    k_B: Float[Array, ""] | None = _field(
+        Declaration(
+            "k_B", "N/mm", "stiffness", "axial spring of the larynx end",
+            part="skeleton", needs="axial", absent="held",
+        )
+    )  # fmt: skip
+    EI_C: Float[Array, ""] | None = _field(
+        Declaration(
+            "EI_C", "N mm^2", "bending_stiffness", "cartilage bending stiffness in a ring's plane",
+            symbol="E_C I_C", part="skeleton", needs="arch", absent="rings do not bend",
+        )
+    )  # fmt: skip
+    k_t: Float[Array, ""] | None = _field(
+        Declaration(
+            "k_t", "N/mm", "stiffness", "muscular bar between the ends of a ring",
+            part="skeleton", needs="arch", absent="rings do not bend",
+        )
+    )  # fmt: skip
+    EI_side: Float[Array, "..."] | None = _field(
+        Declaration(
+            "EI_side", "N mm^2", "bending_stiffness", "EI_L for bending along the circumference",
+            part="skeleton", needs="second plane", absent="EI_L", each="span",
+        )
+    )  # fmt: skip
+    GA_side: Float[Array, "..."] | None = _field(
+        Declaration(
+            "GA_side", "N", "force", "GA_L for shear along the circumference",
+            part="skeleton", needs="second plane", absent="GA_L", each="span",
+        )
+    )  # fmt: skip
+
+
+#: Parameters of single presses, which are no property of the specimen.
+_OF_THE_PRESS = (
+    Declaration(
+        "onset", "mm", "length", "displacement at first touch", part="press", signed=True,
+        fit=Fitted(0.0, -100.0, 100.0, "linear", scope="trial", fixed=True),
+    ),
+    Declaration(
+        "force_offset", "N", "force", "zero offset of the load cell", part="press", signed=True,
+        fit=Fitted(0.0, -1e4, 1e4, "linear", 0.1, "trial", fixed=True),
+    ),
+)  # fmt: skip
+#: Values of a material by name, in the order of every table.
+VALUES: dict[str, Declaration] = {
+    field.name: field.metadata["declaration"] for field in dataclasses.fields(Material)
+}
+#: Every parameter, likewise; those of single presses last.
+PARAMETERS: dict[str, Declaration] = VALUES | {p.name: p for p in _OF_THE_PRESS}
+#: Values that may be left out of a material.
+OPTIONAL = tuple(name for name, p in VALUES.items() if p.absent)
+
+
+def material_of(values: dict[str, Array]) -> Material:
+    """The material of values by name; names of no value of it are passed over."""
+    return Material(**{name: v for name, v in values.items() if name in VALUES})
