@@ -23,7 +23,7 @@ import jaxtrachea
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS, Parameter
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Noise
 from jaxtrachea.mechanics import beam
 from jaxtrachea.mechanics.oblique import press_oblique, press_path

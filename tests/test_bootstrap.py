@@ -13,7 +13,7 @@ from run_cli import GOOD, run
 
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import build_study
 from jaxtrachea.inference.bootstrap import bootstrap
 from jaxtrachea.measurements.read import Curve

@@ -12,7 +12,7 @@ from jaxtrachea.fit.descent import descend
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances, levenberg_marquardt
 from jaxtrachea.fit.noise import first_sigma
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import bootstrap as bootstraps
 from jaxtrachea.inference.profile import profiles

@@ -21,7 +21,7 @@ from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.starts import draw_starts
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import bootstrap

@@ -10,7 +10,7 @@ import pytest
 import synthetic
 
 from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.inference.profile import profiles
 
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])

@@ -17,7 +17,7 @@ from jaxtrachea.fit.criteria import penalised
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.onset import where_sought
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import cross_validation
 from jaxtrachea.inference.comparison import Model, Row, compared, same_data, sentence, weights

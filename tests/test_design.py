@@ -10,7 +10,7 @@ import synthetic
 from run_cli import run, tree
 
 from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference.design import (
     Candidates,

@@ -13,9 +13,9 @@ from jaxtrachea.fit.descent import descend
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances, levenberg_marquardt
 from jaxtrachea.fit.noise import first_sigma
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Noise, build_study
-from jaxtrachea.inference.verdict import describe_flat
+from jaxtrachea.fit.verdict import describe_flat
 from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.status import FitStatus
 

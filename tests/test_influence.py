@@ -12,7 +12,7 @@ import synthetic
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.levenberg_marquardt import Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference.estimate import estimate, lane_of
 from jaxtrachea.inference.influence import influence

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from jaxtrachea.fit import schur, specification
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.shared import held_count, unknown_count
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference import population as populations

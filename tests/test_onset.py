@@ -12,14 +12,14 @@ from jaxtrachea._numerics import centred_hinge
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import in_model
 from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import build_study, default_parameters
+from jaxtrachea.fit.verdict import describe_flat
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import leave_one_out, leave_repeats_out, without
 from jaxtrachea.inference.design import Candidates, check, gains, situation
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.inference.labels import verdict_sentence
-from jaxtrachea.inference.verdict import describe_flat
 from jaxtrachea.measurements.first_touch import first_touch
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, compliance

@@ -16,7 +16,7 @@ from run_cli import GOOD, run
 from jaxtrachea.cli.run import poor
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS, in_model
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Noise, build_study, default_parameters
 from jaxtrachea.inference.analyses.posterior import POSTERIOR, posterior_rows
 from jaxtrachea.inference.analysis import Findings

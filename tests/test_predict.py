@@ -24,7 +24,7 @@ from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.model import columns_of
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import leave_one_out, with_own_touch
@@ -893,8 +893,8 @@ def test_bad_input_ends_with_a_cure(arguments, says, study, tmp_path, monkeypatc
 @pytest.mark.slow
 def test_virtual_trachea_ten_positions_by_the_command(tmp_path, monkeypatch, capsys):
     """The command on fits of nine positions predicts the tenth as `--leave-one-out` does."""
+    from jaxtrachea.cli.specification import settings_of, study_of
     from jaxtrachea.config import load_fit_spec
-    from jaxtrachea.fit.specification import settings_of, study_of
     from jaxtrachea.measurements.data_files import read_data
     from jaxtrachea.measurements.read import Measurements, write_hdf5
 

@@ -16,7 +16,7 @@ from jaxtrachea.files.tables import interval
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.profile_search import Sides
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference.analyses.profile import profile_rows
 from jaxtrachea.inference.profile import choose, profiles

@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 
 from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.structure import structure
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.measurements.read import Curve

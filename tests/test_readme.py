@@ -6,14 +6,21 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from jaxtrachea.measurements.read import read_measurements
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 
 
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", README, re.S)
+
+
 def block(language):
-    return re.search(rf"```{language}\n(.*?)```", README, re.S)[1]
+    return blocks(language)[-1]
 
 
 def shell_lines():
@@ -36,6 +43,19 @@ def test_python_example_runs_and_says_plausible_things():
     # In series the skeleton alone, and the local law alone, would both be pressed harder.
     assert 0 < force < 6.0 / compliance
     assert force < 20.0 * 6 + 0.5 * 6**3
+
+
+def test_fit_from_python_runs_and_finds_what_the_source_states(tmp_path):
+    """Ten lines at most; the force at 75 mm is near the finite-element specimen's there."""
+    code = blocks("python")[0]
+    assert len([line for line in code.splitlines() if line.strip()]) <= 10
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert run.returncode == 0, run.stderr
+    assert re.search(r"k_M +N/mm +0\.\d+ .* identifiable", run.stdout)
+    force = float(re.search(r"\[\S+ +(\S+)\] N", run.stdout)[1])
+    read = read_measurements(ROOT / "fits" / "virtual_trachea" / "small_strain.h5")
+    measured = [np.interp(0.1, c.displacement, c.force) for c in read.curves if c.s_c == 75.0]
+    assert force == pytest.approx(np.mean(measured), rel=0.1)
 
 
 def test_specification_in_the_readme_is_valid():

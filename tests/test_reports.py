@@ -22,7 +22,8 @@ from jaxtrachea.files.tables import quoted, read_csv, unquoted, write_csv
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.result import unknown_label, verdict_of
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Noise, build_study
 from jaxtrachea.inference.analyses import INFLUENCE, LEFT_OUT
 from jaxtrachea.inference.analyses.cross_validation import left_out_table
@@ -32,8 +33,7 @@ from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import LeftOut
 from jaxtrachea.inference.effective import effective, share_independent
 from jaxtrachea.inference.influence import influence
-from jaxtrachea.inference.judgement import verdict_of
-from jaxtrachea.inference.labels import peak_force, unknown_label
+from jaxtrachea.inference.labels import peak_force
 from jaxtrachea.inference.rows import worst_first
 from jaxtrachea.measurements.read import Curve, read_measurements
 from jaxtrachea.mechanics.press import Options

@@ -15,14 +15,15 @@ from jaxtrachea.files.tables import markdown_table, number, write_csv
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import DEFAULTS
 from jaxtrachea.fit.predictions import Prediction, predictions
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.result import unknown_label
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import build_study
 from jaxtrachea.inference.analyses.cross_validation import left_out_rows
 from jaxtrachea.inference.analyses.effective import EFFECTIVE
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
 from jaxtrachea.inference.effective import effective
-from jaxtrachea.inference.labels import flat_sentence, unknown_label
+from jaxtrachea.inference.labels import flat_sentence
 from jaxtrachea.inference.residuals import lag_correlation, rms, worst
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.mechanics.press import Options

@@ -16,11 +16,11 @@ from jaxtrachea.fit import structure as structures
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import in_model
 from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.result import judgement, verdict_of
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import build_study, default_parameters
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.effective import effective
-from jaxtrachea.inference.judgement import judgement, verdict_of
 from jaxtrachea.inference.population import population
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options

@@ -7,7 +7,7 @@ import pytest
 import synthetic
 
 from jaxtrachea.fit.levenberg_marquardt import Solved
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.starts import REDRAWS, add_starts, best, draw_starts
 from jaxtrachea.status import FitStatus
 

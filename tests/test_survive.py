@@ -21,6 +21,7 @@ from run_cli import run, tree
 
 import jaxtrachea
 from jaxtrachea.cli import main as cli
+from jaxtrachea.cli.specification import study_of
 from jaxtrachea.cli.terminal import set_up_jax
 from jaxtrachea.config import load_fit_spec
 from jaxtrachea.files import lock as run_lock
@@ -28,7 +29,6 @@ from jaxtrachea.files import output
 from jaxtrachea.fit import fit, levenberg_marquardt
 from jaxtrachea.fit.cost import LaneCost
 from jaxtrachea.fit.map_lanes import program
-from jaxtrachea.fit.specification import study_of
 from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.results.hdf5 import read_hdf5
 from jaxtrachea.results.stored import NoResults

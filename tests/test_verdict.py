@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxtrachea.inference.verdict import VERDICTS, combinations, describe_flat, verdict
+from jaxtrachea.fit.verdict import VERDICTS, combinations, describe_flat, verdict
 from jaxtrachea.status import ProfileEnd
 
 NAMES = ["EI_L", "GA_L", "k_M", "k_1"]

@@ -13,10 +13,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from jaxtrachea.cli.specification import settings_of, study_of
 from jaxtrachea.config import FitSpec, load_fit_spec
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.specification import settings_of, study_of
 from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.inference.labels import peak_force
 from jaxtrachea.inference.residuals import rms

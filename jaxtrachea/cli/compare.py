@@ -82,8 +82,8 @@ def _same_data(specs, loaded, names) -> None:
 
 
 def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
+    from jaxtrachea.cli.specification import settings_of
     from jaxtrachea.fit.fit import fit
-    from jaxtrachea.fit.specification import settings_of
     from jaxtrachea.inference.comparison import Model
     from jaxtrachea.inference.cross_validation import leave_repeats_out
 

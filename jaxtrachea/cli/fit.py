@@ -134,7 +134,7 @@ def describe(how: How, spec: Path, root: Path, loaded, measurements, study, opti
     """The journal of what would be run now."""
     import jax
 
-    from jaxtrachea.fit.specification import settings_of
+    from jaxtrachea.cli.specification import settings_of
     from jaxtrachea.runs import chunks, journal
 
     asked, settings = loaded.fit, settings_of(loaded)

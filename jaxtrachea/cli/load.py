@@ -19,8 +19,8 @@ def load(path: Path, data: Path | None, *, refits: bool = False, quiet: bool = F
     Raises:
         Stop: nothing can be fitted.
     """
+    from jaxtrachea.cli.specification import study_of, usable
     from jaxtrachea.config import SpecError, load_fit_spec
-    from jaxtrachea.fit.specification import study_of, usable
     from jaxtrachea.measurements.data_files import read_data
     from jaxtrachea.measurements.read import DataError
 

@@ -142,7 +142,7 @@ def fit(
     patience: cli_fit.PatienceOption = 100.0,
 ) -> None:
     """Fit, write results.h5, tables, report, plots."""
-    from jaxtrachea.fit.specification import settings_of
+    from jaxtrachea.cli.specification import settings_of
     from jaxtrachea.inference.analysis import Request
     from jaxtrachea.report.overview import overview
 
@@ -178,7 +178,7 @@ def fit(
 @app.command()
 def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = None) -> None:
     """Fit, then say where the next presses tell most."""
-    from jaxtrachea.fit.specification import settings_of
+    from jaxtrachea.cli.specification import settings_of
     from jaxtrachea.inference.analysis import Request
     from jaxtrachea.report.plots import draw_analyses
 

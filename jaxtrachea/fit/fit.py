@@ -18,8 +18,9 @@ from jaxtrachea.fit.minima import (
 )
 from jaxtrachea.fit.noise import next_sigma, precision_unit
 from jaxtrachea.fit.press_scale import relative_change
-from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.scrutiny import doubtful, left_in_doubt, scrutinise
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.shared import held_count, marginal, summed_gradient
 from jaxtrachea.fit.starts import scales
 from jaxtrachea.fit.structure import Structure, null_spaces, reduced, structure_of, suspicious

@@ -12,7 +12,7 @@ from jaxtrachea.fit.descent import descend
 from jaxtrachea.fit.levenberg_marquardt import Solved, levenberg_marquardt
 from jaxtrachea.fit.map_lanes import batch_size
 from jaxtrachea.fit.noise import first_sigma, next_sigma, noise_rounds
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.shared import pooled, solve_jointly, unknown_count
 from jaxtrachea.fit.starts import add_starts, best, draw_starts
 from jaxtrachea.fit.structure import Structure, reduced

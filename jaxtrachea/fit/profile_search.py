@@ -7,7 +7,8 @@ import numpy as np
 from jaxtrachea.fit.cost import LaneCost
 from jaxtrachea.fit.levenberg_marquardt import Solved, levenberg_marquardt
 from jaxtrachea.fit.map_lanes import batch_size
-from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.structure import leaving_alone, pins
 from jaxtrachea.status import FitStatus, ProfileEnd
 

@@ -1,58 +1,51 @@
-"""How a fit is solved and what it gives: estimates, errors and verdict of every lane."""
+"""What a fit gives: estimates, errors, and of every unknown its verdict and its interval.
+
+Verdict and interval are decided here and nowhere else (`judgement`): terminal, report, tables,
+results.h5 and the population all ask.
+"""
 
 import dataclasses
-from typing import Literal
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 
-from jaxtrachea._arguments import check_record
+from jaxtrachea.files.table import Table
 from jaxtrachea.fit.covariance import Uncertainty
 from jaxtrachea.fit.criteria import Criteria
-from jaxtrachea.fit.levenberg_marquardt import Tolerances
 from jaxtrachea.fit.noise import precision_unit
 from jaxtrachea.fit.press_scale import relative_change
 from jaxtrachea.fit.study import Study
-from jaxtrachea.status import FitStatus
+from jaxtrachea.fit.verdict import verdict
+from jaxtrachea.status import FitStatus, ProfileEnd
+
+if TYPE_CHECKING:
+    import xarray
 
 
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """How to solve.
+@runtime_checkable
+class Intervals(Protocol):
+    """Intervals of some unknowns on top of what a fit says by itself (`inference.profile`)."""
 
-    Attributes:
-        method: `levenberg-marquardt`, or optax's `lbfgs` / `adam` on the same cost.
-        starts: starts per lane; the first is the initial guess, the others are drawn around it.
-        decades: starts are drawn up to this many decades from the guess (log scale; with linear
-            scale up to this many times 10 steps), inside the bounds.
-        seed: of the drawn starts.
-        more_starts: added to lanes in doubt: no start converged, or one of several alone came
-            lowest. With them infeasible starts are drawn anew. 0: neither.
-        batch: lanes computed together.
-        tolerances: when a lane is done.
-        float32: compute in single precision (results are float64 all the same).
-        scrutiny: look for other minima and profile where an estimate gives cause; False: verdicts
-            rest on structure and local standard errors alone (for refits of which no one reads
-            the verdicts).
-    """
+    @property
+    def lower(self) -> np.ndarray:
+        """Lower ends in the parameters' units."""
+        ...
 
-    method: Literal["levenberg-marquardt", "lbfgs", "adam"] = "levenberg-marquardt"
-    starts: int = 4
-    decades: float = 1.0
-    seed: int = 0
-    more_starts: int = 8
-    batch: int = 128
-    tolerances: Tolerances = Tolerances()
-    float32: bool = False
-    scrutiny: bool = True
+    @property
+    def upper(self) -> np.ndarray:
+        """Upper ends."""
+        ...
 
-    def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
+    @property
+    def end(self) -> np.ndarray:
+        """`ProfileEnd` of both sides."""
+        ...
 
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
-        check_record(self, starts=1.0, decades=0.0, seed=0.0, more_starts=0.0, batch=1.0)
-        check_record(self.tolerances, cost=0.0, step=0.0, gradient=0.0, iterations=1.0)
+    def find(self, lane: int, unknown: int) -> int | None:
+        """Row of an unknown; None if it has none."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -136,3 +129,260 @@ class FitResult:
     def relative(self) -> np.ndarray:
         """Change of each scaled coordinate that makes a relative change of 1; (lanes, P)."""
         return relative_change(self.study, self.theta)
+
+    def table(self, profiles: Intervals | None = None) -> Table:
+        """One row per unknown: estimate, standard error, 95 % interval and verdict, with units.
+
+        Args:
+            profiles: further intervals (`jaxtrachea.profiles`), which come on top.
+
+        Returns:
+            A `Table`: prints as text, shows as HTML in a notebook, `rows` are dictionaries. What
+            the lanes of a joint fit share has one row.
+        """
+        return Table(list(estimate_rows(self, profiles)))
+
+    def to_dataset(self) -> "xarray.Dataset":
+        """All arrays of the fit with dimensions `lane` and `unknown`, as an xarray Dataset.
+
+        `parameter` and `unit` say what each unknown is; statuses and verdicts are words. Lanes with
+        fewer unknowns than others are filled up with NaN and "".
+
+        Raises:
+            ImportError: xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise ImportError(
+                "xarray is not installed; install it with pip install 'jaxtrachea[dataset]'"
+            ) from None
+        study, names = self.study, [self.study.lane_name(k) for k in range(self.lanes)]
+        size = self.theta.shape[1]
+        labels = [[unknown_label(self, k, i) if i < len(study.unknowns[k]) else ""
+                   for i in range(size)] for k in range(self.lanes)]  # fmt: skip
+        judged = [[judgement(self, k, i) if i < len(study.unknowns[k]) else None
+                   for i in range(size)] for k in range(self.lanes)]  # fmt: skip
+        both, per_lane = ("lane", "unknown"), ("lane",)
+        word = lambda j: "" if j is None else j.verdict  # noqa: E731
+        end = lambda j, side: np.nan if j is None else getattr(j, side)  # noqa: E731
+        units = [
+            [p.unit for p, _, _ in lane] + [""] * (size - len(lane)) for lane in study.unknowns
+        ]
+        data = {
+            "parameter": (both, labels),
+            "unit": (both, units),
+            "value": (both, self.value),
+            "standard_error": (both, self.standard_error),
+            "low95": (both, [[end(j, "low") for j in row] for row in judged]),
+            "high95": (both, [[end(j, "high") for j in row] for row in judged]),
+            "verdict": (both, [[word(j) for j in row] for row in judged]),
+            "status": (per_lane, [FitStatus(int(v)).name.lower() for v in self.status]),
+            "iterations": (per_lane, self.iterations),
+            "cost": (per_lane, self.cost),
+            "samples": (per_lane, self.samples),
+            "rms": (("lane", "kind"), self.rms, {"unit": "N, mm"}),
+            "sigma": (("lane", "kind"), self.sigma, {"unit": "N, mm"}),
+        }
+        same = all(row == labels[0] for row in labels)
+        coords = {
+            "specimen": (per_lane, [name for name, _ in names]),
+            "trial": (per_lane, [trial for _, trial in names]),
+            "kind": ["force", "joints"],
+            "unknown": labels[0] if same and labels else np.arange(size),
+        }
+        return xarray.Dataset(data, coords)
+
+
+#: Verdicts on estimates that enter medians and populations.
+DETERMINED = ("identifiable", "weak")
+
+
+class Judgement(NamedTuple):
+    """What is known of one unknown of one lane.
+
+    Attributes:
+        verdict: one of `VERDICTS`; "failed" without an estimate.
+        low: 95 % interval in the parameter's unit, within its bounds: by profile and other minima
+            where there is such evidence, else local; the bound where open.
+        high: likewise.
+        ends: `ProfileEnd` of the two; None where the interval is local.
+        error: relative error that the verdict rests on: the longer side of the interval over that
+            of one standard error, or the local one.
+    """
+
+    verdict: str
+    low: float
+    high: float
+    ends: tuple[int, int] | None
+    error: float
+
+
+def judgement(result: FitResult, lane: int, i: int, profiles: Intervals | None = None) -> Judgement:
+    """Verdict and interval of an unknown: the one place where both are decided.
+
+    Args:
+        result: the fit, with the evidence that it has gathered by itself.
+        lane: of the result.
+        i: unknown of the lane.
+        profiles: further profiles, which come on top.
+    """
+    low, high, ends = _unbounded(result, lane, i, profiles)
+    inside = within_bounds(result, lane, i, low, high)
+    if not result.succeeded[lane]:
+        return Judgement("failed", *inside, None, np.nan)
+    p = result.study.unknowns[lane][i][0]
+    structural, held = bool(result.undetermined[lane, i]), bool(result.at_bound[lane, i])
+    if ends is None:
+        word = verdict(
+            float(result.relative_se[lane, i]), structural=structural, held=held,
+            unseen=bool(result.unexamined[lane, i]),
+        )  # fmt: skip
+        return Judgement(word, *inside, None, float(result.relative_se[lane, i]))
+    value, unit = float(result.value[lane, i]), float(result.uncertainty.half_width[lane])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if p.scale == "log":
+            longer = max(np.log(high / value), np.log(value / low) if low > 0 else np.inf)
+        else:
+            longer = max(high - value, value - low) / (p.step * result.relative[lane, i])
+    error = float(longer) / unit
+    word = verdict(error, structural=structural, held=held, ends=ends)
+    return Judgement(word, *inside, ends, error)
+
+
+def interval95(
+    result: FitResult, lane: int, i: int, profiles: Intervals | None = None
+) -> tuple[float, float, tuple[int, int] | None]:
+    """`low`, `high`, `ends` of `judgement` without its verdict, which asks for the whole fit."""
+    low, high, ends = _unbounded(result, lane, i, profiles)
+    return *within_bounds(result, lane, i, low, high), ends
+
+
+def within_bounds(
+    result: FitResult, lane: int, i: int, low: float, high: float
+) -> tuple[float, float]:
+    """An interval, in the parameter's unit, cut at the bounds of the fit; NaN stays.
+
+    The bounds are those of the lane: an onset is looked for near its own curve.
+    """
+    p, lanes = result.study.unknowns[lane][i][0], result.study.lanes
+    value = float(result.value[lane, i])
+    ends = []
+    for bound, theta in ((p.lower, lanes.lower[lane, i]), (p.upper, lanes.upper[lane, i])):
+        ends.append(bound if p.to_scaled(bound) == theta else p.from_scaled(float(theta)))
+    # An estimate on a bound may be off it by a rounding. NaN comes first, so that it stays.
+    return max(low, min(ends[0], value)), min(high, max(ends[1], value))
+
+
+def _unbounded(
+    result: FitResult, lane: int, i: int, profiles: Intervals | None
+) -> tuple[float, float, tuple[int, int] | None]:
+    """Interval and `ProfileEnd` of its sides, None if local; -inf (scale `log`: 0), inf if open."""
+    local = float(result.lower[lane, i]), float(result.upper[lane, i]), None
+    if not result.succeeded[lane]:
+        return local
+    found = _evidence(result, lane, i, profiles)
+    if not found and result.undetermined[lane, i]:
+        log = result.study.unknowns[lane][i][0].scale == "log"
+        return 0.0 if log else -np.inf, np.inf, (ProfileEnd.OPEN, ProfileEnd.OPEN)
+    if not found:
+        return local
+    low_end, high_end = (_end([v[2][side] for v in found]) for side in (0, 1))
+    return min(v[0] for v in found), max(v[1] for v in found), (low_end, high_end)
+
+
+def _end(ends: list[int]) -> int:
+    """How a side ends by all that is known: an end that was found comes before a lost one."""
+    return max([end for end in ends if end != ProfileEnd.FAILED] or ends)
+
+
+def _evidence(result: FitResult, lane: int, i: int, profiles: Intervals | None) -> list:
+    """Intervals (low, high, ends) that rest on more than the local error."""
+    found = []
+    if result.evidence_end[lane, i, 0] >= 0:
+        low, high = float(result.evidence_low[lane, i]), float(result.evidence_high[lane, i])
+        found.append((low, high, tuple(map(int, result.evidence_end[lane, i]))))
+    k = None if profiles is None else profiles.find(lane, i)
+    if profiles is not None and k is not None:
+        value = float(result.value[lane, i])
+        low, high = (float(v) if np.isfinite(v) or np.isinf(v) else value
+                     for v in (profiles.lower[k], profiles.upper[k]))  # fmt: skip
+        found.append((low, high, tuple(map(int, profiles.end[k]))))
+    return found
+
+
+def verdict_of(result: FitResult, lane: int, i: int, profiles: Intervals | None = None) -> str:
+    """The verdict of `judgement`."""
+    return judgement(result, lane, i, profiles).verdict
+
+
+def relative_errors(
+    result: FitResult, profiles: Intervals | None = None
+) -> Float[np.ndarray, "L P"]:
+    """Relative error of what is determined: of identifiable and weak unknowns; NaN elsewhere."""
+    out = np.full(result.theta.shape, np.nan)
+    for lane, unknowns in enumerate(result.study.unknowns):
+        for i in range(len(unknowns)):
+            judged = judgement(result, lane, i, profiles)
+            if judged.verdict in DETERMINED:
+                out[lane, i] = judged.error
+    return out
+
+
+def unknown_label(result: FitResult, lane: int, i: int) -> str:
+    """Name of an unknown: k_M, or onset[t03], or k_M[T01] where a lane holds several of them."""
+    unknowns = result.study.unknowns[lane]
+    p, specimen, trial = unknowns[i]
+    same = [u for u in unknowns if u[0].name == p.name]
+    if len(same) == 1:
+        return p.name
+    several = len({u[1] for u in same}) > 1
+    where = "/".join(filter(None, (specimen if several else "", trial)))
+    return f"{p.name}[{where}]"
+
+
+def is_own(result: FitResult, lane: int, i: int) -> bool:
+    """Whether an unknown belongs to its lane alone, not to all lanes of a joint fit."""
+    return not (result.study.joint and result.study.unknowns[lane][i][0].scope == "shared")
+
+
+def said_before(result: FitResult, lanes: Sequence[int], lane: int, i: int) -> bool:
+    """Whether an unknown that all lanes share is listed with another of `lanes`, the first good."""
+    first = next((k for k in lanes if result.succeeded[k]), lanes[0])
+    return not is_own(result, lane, i) and lane != first
+
+
+def estimated(result: FitResult) -> list[tuple[int, int]]:
+    """Lane and unknown of every estimate that is listed.
+
+    What the lanes of a joint fit share is listed once, with the first lane which succeeded.
+    """
+    every = range(result.lanes)
+    return [
+        (lane, i)
+        for lane in every
+        for i in range(len(result.study.unknowns[lane]))
+        if not said_before(result, every, lane, i)
+    ]
+
+
+def estimate_rows(
+    result: FitResult, profiles: Intervals | None = None
+) -> Iterator[dict[str, object]]:
+    """Estimate, standard error, interval and verdict of every unknown of `estimated`."""
+    for lane, i in estimated(result):
+        lane_specimen, _ = result.study.lane_name(lane)
+        p, specimen, trial = result.study.unknowns[lane][i]
+        judged = judgement(result, lane, i, profiles)
+        yield {
+            "specimen": (specimen or lane_specimen) if is_own(result, lane, i) else "(all)",
+            "trial": trial or "(all)",
+            "parameter": p.name,
+            "unit": p.unit,
+            "value": float(result.value[lane, i]),
+            "se": float(result.standard_error[lane, i]),
+            "low95": judged.low,
+            "high95": judged.high,
+            "relative_se": float(result.relative_se[lane, i]),
+            "verdict": judged.verdict,
+        }

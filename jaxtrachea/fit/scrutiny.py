@@ -26,7 +26,8 @@ from jaxtrachea.fit.noise import first_sigma
 from jaxtrachea.fit.parameters import OF_THE_PRESS, SKELETON
 from jaxtrachea.fit.profile_search import Sides, find_ends
 from jaxtrachea.fit.residual import inputs
-from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.starts import EXACT, box, scales
 from jaxtrachea.fit.structure import Structure, positions
 from jaxtrachea.fit.study import Study

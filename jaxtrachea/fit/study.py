@@ -9,6 +9,7 @@ are compared with is in `residual`.
 """
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -22,7 +23,7 @@ from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.model import Common, FitModel, Loss, columns_of, numbers_of
 from jaxtrachea.fit.onset import blends, natural_steps, onset_is_sought, within_reach
 from jaxtrachea.fit.parameters import DEFAULTS, SKELETON, Parameter, in_model
-from jaxtrachea.measurements.read import Curve
+from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -159,7 +160,7 @@ def group(
 
 
 def build_study(
-    curves: Sequence[Curve],
+    curves: Measurements | Sequence[Curve],
     geometry: Geometry,
     options: Options = Options(),  # noqa: B008 (frozen)
     parameters: Table | None = None,
@@ -174,7 +175,8 @@ def build_study(
     """Put curves, model and parameters together.
 
     Args:
-        curves: at least one; `s_c` set wherever the skeleton enters.
+        curves: at least one; `s_c` set wherever the skeleton enters. Of `Measurements` the usable
+            ones; a warning names what could not be used.
         geometry: the tube at rest (`Geometry.create` takes plain numbers; kept as float64).
         options: what the model includes.
         parameters: the table, in the order of `parameters.in_model`; or changes to the defaults of
@@ -199,6 +201,9 @@ def build_study(
         raise ValueError(f"loss_scale is {loss_scale}; expected a finite number, more than 0")
     if tool_radius is not None and not 0 <= tool_radius < np.inf:
         raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
+    if isinstance(curves, Measurements):
+        _warn_of(curves.bad)
+        curves = curves.curves
     if not curves:
         raise ValueError("no usable curve; nothing to fit")
     for curve in curves:
@@ -243,6 +248,14 @@ def build_study(
         noise_given=(known, noise.joints is not None),
         joint=joint,
     )
+
+
+def _warn_of(bad: Sequence[BadCurve]) -> None:
+    """Say what could not be used; it is not forgotten in silence."""
+    if bad:
+        first = f"{bad[0].specimen} {bad[0].trial}: {bad[0].reason}"
+        more = f", and {len(bad) - 1} more" if len(bad) > 1 else ""
+        warnings.warn(f"curves left out: {first}{more}", stacklevel=3)
 
 
 def _table(parameters: Table | None, options: Options, curves) -> Sequence[Parameter]:

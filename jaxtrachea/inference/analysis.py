@@ -12,7 +12,8 @@ from typing import Any, Literal
 
 from jaxtrachea.config import FitSpec
 from jaxtrachea.fit.predictions import Prediction, predictions
-from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.profile import Profiles
 

@@ -19,7 +19,8 @@ from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.map_lanes import batch_size
 from jaxtrachea.fit.predictions import Prediction, predictions
-from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.settings import Settings
 
 Kind = Literal["parametric", "residual"]
 #: Refits handed to the solver at a time; bounds the memory.

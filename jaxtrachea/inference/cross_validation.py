@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.parameters import OF_THE_PRESS
 from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.starts import draw_starts
 from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.residuals import rms

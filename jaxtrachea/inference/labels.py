@@ -1,30 +1,15 @@
 """What lanes and unknowns are called, and what is said of them in a sentence."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from jaxtrachea.fit.parameters import OF_THE_PRESS
 from jaxtrachea.fit.press_scale import sizes_of_press
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.inference.judgement import verdict_of
+from jaxtrachea.fit.result import FitResult, unknown_label, verdict_of
+from jaxtrachea.fit.verdict import VERDICTS, describe_flat
 from jaxtrachea.inference.profile import Profiles
-from jaxtrachea.inference.verdict import VERDICTS, describe_flat
 
 #: What reports say in the place of estimates.
 NOTHING_FITTED = "every parameter is fixed: nothing was fitted, the model was evaluated"
-
-
-def unknown_label(result: FitResult, lane: int, i: int) -> str:
-    """Name of an unknown: k_M, or onset[t03], or k_M[T01] where a lane holds several of them."""
-    unknowns = result.study.unknowns[lane]
-    p, specimen, trial = unknowns[i]
-    same = [u for u in unknowns if u[0].name == p.name]
-    if len(same) == 1:
-        return p.name
-    several = len({u[1] for u in same}) > 1
-    where = "/".join(filter(None, (specimen if several else "", trial)))
-    return f"{p.name}[{where}]"
 
 
 def lane_label(result: FitResult, lane: int) -> str:
@@ -41,17 +26,6 @@ def succeeded(result: FitResult, lane: int) -> bool:
 def peak_force(result: FitResult, lane: int) -> float:
     """Largest measured force of a lane, N."""
     return max(float(np.max(np.abs(c.force))) for c in result.study.curves[lane])
-
-
-def is_own(result: FitResult, lane: int, i: int) -> bool:
-    """Whether an unknown belongs to its lane alone, not to all lanes of a joint fit."""
-    return not (result.study.joint and result.study.unknowns[lane][i][0].scope == "shared")
-
-
-def said_before(result: FitResult, lanes: Sequence[int], lane: int, i: int) -> bool:
-    """Whether an unknown that all lanes share is listed with another of `lanes`, the first good."""
-    first = next((k for k in lanes if succeeded(result, k)), lanes[0])
-    return not is_own(result, lane, i) and lane != first
 
 
 def flat_sentence(result: FitResult, lane: int) -> str:

@@ -20,9 +20,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import chdtri
 
 from jaxtrachea.fit.parameters import Parameter
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.result import FitResult, relative_errors
 from jaxtrachea.fit.study import Study
-from jaxtrachea.inference.judgement import relative_errors
 from jaxtrachea.inference.profile import Profiles
 
 #: Specimens below which no spread is estimated, and from which one is unasked.

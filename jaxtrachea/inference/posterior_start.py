@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.settings import Settings
 
 #: Nearest that the centre comes to a bound, as a share of the width: what float64 can tell.
 _EDGE = 1e-12

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fit.profile_search import Sides, find_ends, on_grid
-from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 

@@ -68,12 +68,12 @@ class Measurements:
 
 
 def read_measurements(
-    paths: Sequence[Path | str], options: ReadOptions | None = None
+    paths: Path | str | Sequence[Path | str], options: ReadOptions | None = None
 ) -> Measurements:
     """Read measured curves from files of one study.
 
     Args:
-        paths: the files, at least one.
+        paths: the files, at least one; or one file.
         options: how to read them; by default by content.
 
     Returns:
@@ -85,10 +85,11 @@ def read_measurements(
             seconds on the name of a file.
     """
     options = options or ReadOptions()
+    paths = [paths] if paths and isinstance(paths, (str, Path)) else paths
     if isinstance(paths, (str, bytes)) or not paths:
         raise DataError(
             f"paths is {paths!r}",
-            cure="expected a list of at least one file",
+            cure="expected a file, or a list of at least one",
         )
     files = tuple(Path(path) for path in paths)
     curves: list[Curve] = []

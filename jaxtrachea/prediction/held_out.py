@@ -11,7 +11,7 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.fit.fit import fit
 from jaxtrachea.fit.map_lanes import program
 from jaxtrachea.fit.onset import onset_is_sought
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Study, build_study, check_curve
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.prediction.core import force_and_slope

@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxtrachea.fit.map_lanes import program
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.prediction.core import Predicted, Response, predicted
 from jaxtrachea.prediction.sources import Source, slack_of, source_of
-from jaxtrachea.results.stored import StoredFit
+from jaxtrachea.results.stored import StoredFit, from_result
 from jaxtrachea.status import PredictionStatus, PressStatus
 
 #: Error of the linear band at its ends, in half-widths, from which it is called bent.
@@ -228,7 +229,7 @@ def _verdict(source: Source, value: Response, se: Response, presses, bend: float
 
 
 def predict(
-    results: StoredFit,
+    results: StoredFit | FitResult,
     *,
     s: float,
     displacement: ArrayLike | Sequence[float],
@@ -244,7 +245,7 @@ def predict(
     Computed in float64 where JAX is set to it (`jax_enable_x64`), else in float32.
 
     Args:
-        results: from `read_results`.
+        results: from `read_results` or `fit`.
         s: contact position, mm, on the tube.
         displacement: of the tool from first touch, mm; one number or a vector.
         specimen: whose parameters; may be left out where the fit has one specimen only, or shares
@@ -257,6 +258,7 @@ def predict(
         ValueError: a position outside the tube, a displacement that is no finite number, a specimen
             or trial that the fit does not have, one without an estimate; with the cure.
     """
+    results = from_result(results) if isinstance(results, FitResult) else results
     D = np.atleast_1d(np.asarray(displacement, np.float64))
     if D.ndim != 1 or not D.size or not np.isfinite(D).all():
         raise ValueError("displacement: expected a finite number or a vector of them, mm")

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from jaxtrachea.files.pictures import STYLE, grid, of_all, plain, save_each
 from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.result import FitResult, unknown_label
 from jaxtrachea.inference.analysis import Findings
-from jaxtrachea.inference.labels import lane_label, unknown_label
+from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.rows import LINES, ONE_BY_ONE, listed, worst_first
 
 

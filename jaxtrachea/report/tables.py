@@ -6,17 +6,17 @@ import numpy as np
 
 from jaxtrachea.files.tables import interval, number
 from jaxtrachea.fit.parameters import OF_THE_PRESS
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.inference.effective import Effective
-from jaxtrachea.inference.judgement import DETERMINED, judgement, verdict_of
-from jaxtrachea.inference.labels import (
+from jaxtrachea.fit.result import (
+    DETERMINED,
+    FitResult,
     is_own,
-    lane_label,
-    peak_force,
+    judgement,
     said_before,
-    succeeded,
     unknown_label,
+    verdict_of,
 )
+from jaxtrachea.inference.effective import Effective
+from jaxtrachea.inference.labels import lane_label, peak_force, succeeded
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.status import FitStatus
 

@@ -10,11 +10,10 @@ import numpy as np
 from jaxtrachea.files.atomic import hdf5_file
 from jaxtrachea.fit.covariance import Uncertainty
 from jaxtrachea.fit.criteria import Criteria
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.result import FitResult, judgement
 from jaxtrachea.fit.starts import of_unknowns
 from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.analysis import Findings
-from jaxtrachea.inference.judgement import judgement
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.results import store
 from jaxtrachea.results.arrays import FIELDS, result_of

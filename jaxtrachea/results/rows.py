@@ -5,10 +5,15 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.result import (
+    FitResult,
+    estimate_rows,
+    estimated,
+    judgement,
+    unknown_label,
+)
 from jaxtrachea.inference.analysis import Findings
-from jaxtrachea.inference.judgement import judgement
-from jaxtrachea.inference.labels import NOTHING_FITTED, is_own, said_before, unknown_label
+from jaxtrachea.inference.labels import NOTHING_FITTED
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.residuals import rms
 from jaxtrachea.inference.rows import row_places, samples_of, trials_of
@@ -107,28 +112,11 @@ def parameter_rows(findings: Findings) -> Iterator[dict[str, object]]:
     What the lanes of a joint fit share has one row, that of the first lane which succeeded.
     """
     result, profiles = findings.result, findings.profiles
-    every = range(result.lanes)
-    for lane in range(result.lanes):
-        lane_specimen, _ = result.study.lane_name(lane)
-        for i, (p, specimen, trial) in enumerate(result.study.unknowns[lane]):
-            if said_before(result, every, lane, i):
-                continue
-            judged = judgement(result, lane, i, profiles)
-            row: dict[str, object] = {
-                "specimen": (specimen or lane_specimen) if is_own(result, lane, i) else "(all)",
-                "trial": trial or "(all)",
-                "parameter": p.name,
-                "unit": p.unit,
-                "value": float(result.value[lane, i]),
-                "se": float(result.standard_error[lane, i]),
-                "low95": judged.low,
-                "high95": judged.high,
-                "relative_se": float(result.relative_se[lane, i]),
-                "verdict": judged.verdict,
-            }
-            for analysis, found in findings.found:
-                row |= analysis.parameter_cells(found, lane, i)
-            yield row
+    places = estimated(result)
+    for (lane, i), row in zip(places, estimate_rows(result, profiles), strict=True):
+        for analysis, found in findings.found:
+            row |= analysis.parameter_cells(found, lane, i)
+        yield row
 
 
 def with_residuals(

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.model import FitModel, columns_of, numbers_of
 from jaxtrachea.fit.parameters import Parameter
+from jaxtrachea.fit.result import FitResult
 from jaxtrachea.fit.study import Study
 from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.read import Curve, DataError
@@ -108,6 +109,30 @@ class StoredFit:
             f"StoredFit({str(self.path)!r}: {free} fitted to {len(self.curves)} curves of "
             f"{len(self.specimens)} specimen(s))"
         )
+
+
+def from_result(result: FitResult) -> StoredFit:
+    """A fit of this process as one that was read back: what predictions need."""
+    study, u = result.study, result.uncertainty
+    placed = [(k, t, c) for k, lane in enumerate(study.curves) for t, c in enumerate(lane)]
+    blend = study.lanes.blend
+    return StoredFit(
+        path=Path(),
+        study=study,
+        reading={},
+        lane_names=tuple(study.lane_name(lane) for lane in range(result.lanes)),
+        theta=result.theta,
+        covariance=u.covariance,
+        blind=u.silent,
+        at_bound=result.at_bound,
+        status=result.status,
+        sigma=np.where(np.isnan(result.rms), np.nan, result.sigma),
+        half_width=_known_half_width(study, u.half_width),
+        curves=tuple(c for _, _, c in placed),
+        curve_lane=np.array([k for k, _, _ in placed]),
+        blend=np.array([np.nan if blend is None else blend[k, t] for k, t, _ in placed]),
+        files={},
+    )
 
 
 def read_results(path: Path | str) -> StoredFit:

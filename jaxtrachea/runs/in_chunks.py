@@ -10,7 +10,8 @@ import jax
 import numpy as np
 
 from jaxtrachea.files.tables import write_csv
-from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Study
 from jaxtrachea.inference.analyses.effective import widened
 from jaxtrachea.results.hdf5 import read_hdf5

@@ -19,7 +19,7 @@ import fitting
 import numpy as np
 
 from jaxtrachea.fit import fit
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.measurements.read import Measurements, write_hdf5
 
 SPECIMENS, SAMPLE, ROUNDS = 10_000, 20, 3

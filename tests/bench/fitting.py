@@ -22,7 +22,8 @@ from jaxtrachea.fit.lane import Lane
 from jaxtrachea.fit.levenberg_marquardt import Solved, levenberg_marquardt
 from jaxtrachea.fit.noise import first_sigma
 from jaxtrachea.fit.parameters import in_model
-from jaxtrachea.fit.result import FitResult, Settings
+from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.starts import draw_starts
 from jaxtrachea.fit.study import build_study, default_parameters
 from jaxtrachea.measurements.read import Curve

@@ -17,7 +17,7 @@ import update
 from jaxtrachea import Material, press, simulate, table_1
 from jaxtrachea.fit import cost, levenberg_marquardt, residual
 from jaxtrachea.fit.noise import first_sigma
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.starts import draw_starts
 from jaxtrachea.scene.stage import Poses
 

@@ -17,7 +17,7 @@ sys.path.insert(0, str(common.FOLDER.parent / "reference"))
 import synthetic  # noqa: E402
 
 from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
 SIZES = {"joint": (10, 30, 100, 300, 1000, 3000, 10_000), "dense": (10, 20, 40, 80)}

@@ -21,7 +21,7 @@ import skeleton
 import update
 
 from jaxtrachea.fit import fit
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 
 TURNS = 7
 SPECIMENS, SAMPLE = 500, 10

@@ -169,7 +169,7 @@ def fitted(chosen):
     jax.config.update("jax_enable_x64", True)
     from jaxtrachea.fit.fit import fit
     from jaxtrachea.fit.parameters import in_model
-    from jaxtrachea.fit.result import Settings
+    from jaxtrachea.fit.settings import Settings
     from jaxtrachea.fit.study import build_study, default_parameters
     from jaxtrachea.measurements.read import Curve
     from jaxtrachea.mechanics.press import Options

@@ -5,9 +5,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from jaxtrachea.files.tables import markdown_table, number
+from jaxtrachea.fit.result import unknown_label
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
 from jaxtrachea.inference.bootstrap import FEWEST, Bootstrap, bootstrap
-from jaxtrachea.inference.labels import lane_label, unknown_label
+from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.rows import and_more, listed, more_of
 
 BOOTSTRAP_HEAD = ["specimen", "parameter", "value", "std. error", "local", "95 % of replicates"]

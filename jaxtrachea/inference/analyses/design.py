@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxtrachea.config import SpecError
+from jaxtrachea.fit.result import unknown_label
 from jaxtrachea.inference.analysis import (
     Analysis,
     Cells,
@@ -28,7 +29,6 @@ from jaxtrachea.inference.design import (
     scores,
     situation,
 )
-from jaxtrachea.inference.labels import unknown_label
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

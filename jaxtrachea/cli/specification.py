@@ -6,7 +6,7 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
 from jaxtrachea.fit.levenberg_marquardt import MOST_SLOTS, Tolerances
 from jaxtrachea.fit.parameters import DEFAULTS, Parameter, in_model, visible
-from jaxtrachea.fit.result import Settings
+from jaxtrachea.fit.settings import Settings
 from jaxtrachea.fit.study import Noise, Study, build_study, check_curve
 from jaxtrachea.measurements.read import (
     BadCurve,

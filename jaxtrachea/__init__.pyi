@@ -1,0 +1,53 @@
+"""The public names of jaxtrachea, each once; `jaxtrachea/__init__.py` loads them on first use."""
+
+from .fit.fit import fit as fit
+from .fit.result import FitResult as FitResult
+from .fit.settings import Settings as Settings
+from .fit.study import Noise as Noise
+from .fit.study import Study as Study
+from .fit.study import build_study as build_study
+from .inference.bootstrap import bootstrap as bootstrap
+from .inference.profile import profiles as profiles
+from .measurements.curve import Curve as Curve
+from .measurements.curve import ReadOptions as ReadOptions
+from .measurements.read import Measurements as Measurements
+from .measurements.read import read_measurements as read_measurements
+from .mechanics.beam import Beam as Beam
+from .mechanics.beam import contact_compliance as contact_compliance
+from .mechanics.beam import deflect as deflect
+from .mechanics.force_law import Law as Law
+from .mechanics.force_law import duffing as duffing
+from .mechanics.oblique import ObliquePath as ObliquePath
+from .mechanics.oblique import ObliquePress as ObliquePress
+from .mechanics.oblique import press_oblique as press_oblique
+from .mechanics.oblique import press_path as press_path
+from .mechanics.press import Options as Options
+from .mechanics.press import Press as Press
+from .mechanics.press import press as press
+from .mechanics.skeleton import Skeleton as Skeleton
+from .mechanics.skeleton import skeleton_response as skeleton_response
+from .prediction.predict import CurvePrediction as CurvePrediction
+from .prediction.predict import predict as predict
+from .results.stored import NoResults as NoResults
+from .results.stored import StoredFit as StoredFit
+from .results.stored import read_results as read_results
+from .scene.assemble import make_scene as make_scene
+from .scene.assemble import with_geometry as with_geometry
+from .scene.declare import PlanError as PlanError
+from .scene.effects import EffectOptions as EffectOptions
+from .scene.plan import Plan as Plan
+from .scene.session import Session as Session
+from .scene.simulation import Simulation as Simulation
+from .scene.simulation import simulate as simulate
+from .scene.stage import Poses as Poses
+from .scene.stage import Presses as Presses
+from .scene.stage import Scene as Scene
+from .scene.sweep import sweep as sweep
+from .status import FitStatus as FitStatus
+from .status import PredictionStatus as PredictionStatus
+from .status import PressStatus as PressStatus
+from .trachea.geometry import Geometry as Geometry
+from .trachea.geometry import table_1 as table_1
+from .trachea.material import Material as Material
+
+__version__: str

@@ -1,0 +1,47 @@
+"""How a fit is solved."""
+
+import dataclasses
+from typing import Literal
+
+from jaxtrachea._arguments import check_record
+from jaxtrachea.fit.levenberg_marquardt import Tolerances
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How to solve.
+
+    Attributes:
+        method: `levenberg-marquardt`, or optax's `lbfgs` / `adam` on the same cost.
+        starts: starts per lane; the first is the initial guess, the others are drawn around it.
+        decades: starts are drawn up to this many decades from the guess (log scale; with linear
+            scale up to this many times 10 steps), inside the bounds.
+        seed: of the drawn starts.
+        more_starts: added to lanes in doubt: no start converged, or one of several alone came
+            lowest. With them infeasible starts are drawn anew. 0: neither.
+        batch: lanes computed together.
+        tolerances: when a lane is done.
+        float32: compute in single precision (results are float64 all the same).
+        scrutiny: look for other minima and profile where an estimate gives cause; False: verdicts
+            rest on structure and local standard errors alone (for refits of which no one reads
+            the verdicts).
+    """
+
+    method: Literal["levenberg-marquardt", "lbfgs", "adam"] = "levenberg-marquardt"
+    starts: int = 4
+    decades: float = 1.0
+    seed: int = 0
+    more_starts: int = 8
+    batch: int = 128
+    tolerances: Tolerances = Tolerances()
+    float32: bool = False
+    scrutiny: bool = True
+
+    def __post_init__(self):
+        """Refuse words and numbers that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_record(self, starts=1.0, decades=0.0, seed=0.0, more_starts=0.0, batch=1.0)
+        check_record(self.tolerances, cost=0.0, step=0.0, gradient=0.0, iterations=1.0)
