@@ -1,11 +1,11 @@
 """The public names of jaxtrachea, each once; `jaxtrachea/__init__.py` loads them on first use."""
 
-from .fit.fit import fit as fit
-from .fit.result import FitResult as FitResult
-from .fit.settings import Settings as Settings
-from .fit.study import Noise as Noise
-from .fit.study import Study as Study
-from .fit.study import build_study as build_study
+from .fitting.fit import fit as fit
+from .fitting.result import FitResult as FitResult
+from .fitting.settings import Settings as Settings
+from .fitting.study import Noise as Noise
+from .fitting.study import Study as Study
+from .fitting.study import build_study as build_study
 from .inference.bootstrap import bootstrap as bootstrap
 from .inference.profile import profiles as profiles
 from .measurements.curve import Curve as Curve

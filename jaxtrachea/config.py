@@ -50,7 +50,7 @@ def quantity(dimension: str, *, positive: bool = False, word: str | None = None)
 
 
 def _number_or_quantity(value: Any) -> Any:
-    """Checked against the parameter's unit later, in `fit.study`."""
+    """Checked against the parameter's unit later, in `fitting.study`."""
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         raise ValueError("expected a number, or a quantity with its unit")
     if isinstance(value, int) and abs(value) > 1e300:
@@ -174,7 +174,7 @@ class NoiseSection(Section):
 
 
 class FitSection(Section):
-    """[fit]: how to weigh and solve; see `jaxtrachea.fit.fit.Settings`."""
+    """[fit]: how to weigh and solve; see `jaxtrachea.fitting.fit.Settings`."""
 
     method: Literal["levenberg-marquardt", "lbfgs", "adam"] = "levenberg-marquardt"
     balance: Literal["curve", "sample"] = "curve"

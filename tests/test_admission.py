@@ -20,11 +20,11 @@ import numpy as np
 import pytest
 
 import jaxtrachea
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.levenberg_marquardt import Tolerances
-from jaxtrachea.fit.parameters import DEFAULTS, Parameter
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import Noise
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.levenberg_marquardt import Tolerances
+from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Noise
 from jaxtrachea.mechanics import beam
 from jaxtrachea.mechanics.oblique import press_oblique, press_path
 from jaxtrachea.mechanics.press import Options, press

@@ -11,10 +11,10 @@ import pytest
 import synthetic
 from run_cli import GOOD, run
 
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import build_study
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.parameters import DEFAULTS
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.bootstrap import bootstrap
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.fit.cost import LaneCost
-from jaxtrachea.fit.descent import descend
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.levenberg_marquardt import Tolerances, levenberg_marquardt
-from jaxtrachea.fit.noise import first_sigma
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import Noise, build_study
+from jaxtrachea.fitting.cost import LaneCost
+from jaxtrachea.fitting.descent import descend
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.levenberg_marquardt import Tolerances, levenberg_marquardt
+from jaxtrachea.fitting.noise import first_sigma
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Noise, build_study
 from jaxtrachea.inference import bootstrap as bootstraps
 from jaxtrachea.inference.profile import profiles
 from jaxtrachea.status import FitStatus, ProfileEnd

@@ -12,7 +12,7 @@ import pytest
 from run_cli import GOOD, run, tree
 
 import jaxtrachea
-from jaxtrachea.fit import fit as fit_module
+from jaxtrachea.fitting import fit as fit_module
 
 ROOT = Path(__file__).parents[1]
 HEAD = "specimen,trial,s [mm],displacement [mm],force [N]\n"
@@ -273,7 +273,7 @@ def test_stopped_run_leaves_nothing(error, code, out, study, monkeypatch, capsys
 
     (study / "there").mkdir()
     monkeypatch.chdir(study)
-    monkeypatch.setattr("jaxtrachea.fit.fit.fit", stop)
+    monkeypatch.setattr("jaxtrachea.fitting.fit.fit", stop)
     before = tree(study)
     arguments = ("fit", "spec.toml", "--out", out)
     if code is None:
@@ -332,7 +332,7 @@ def test_interrupt_that_was_swallowed(study, monkeypatch, capsys):
         pytest.fail("went on after an interrupt")
 
     monkeypatch.chdir(study)
-    monkeypatch.setattr("jaxtrachea.fit.fit.fit", fit)
+    monkeypatch.setattr("jaxtrachea.fitting.fit.fit", fit)
     previous = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         code, _, err = run(monkeypatch, capsys, "fit", "spec.toml")

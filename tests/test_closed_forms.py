@@ -15,15 +15,15 @@ import synthetic
 from small_scenes import MATERIAL, MESH, TUBE, presses
 
 from jaxtrachea import EffectOptions, make_scene, simulate
-from jaxtrachea.fit import levenberg_marquardt
-from jaxtrachea.fit.cost import LaneCost, evaluate
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.levenberg_marquardt import Tolerances
-from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.starts import draw_starts
-from jaxtrachea.fit.study import Noise, build_study
+from jaxtrachea.fitting import levenberg_marquardt
+from jaxtrachea.fitting.cost import LaneCost, evaluate
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.levenberg_marquardt import Tolerances
+from jaxtrachea.fitting.parameters import DEFAULTS
+from jaxtrachea.fitting.predictions import Prediction
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.starts import draw_starts
+from jaxtrachea.fitting.study import Noise, build_study
 from jaxtrachea.inference import bootstrap
 from jaxtrachea.inference.design import situation
 from jaxtrachea.inference.influence import influence

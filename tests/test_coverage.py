@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.settings import Settings
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.inference.profile import profiles
 
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])

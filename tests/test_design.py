@@ -9,9 +9,9 @@ import pytest
 import synthetic
 from run_cli import run, tree
 
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import Noise, build_study
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Noise, build_study
 from jaxtrachea.inference.design import (
     Candidates,
     gains,

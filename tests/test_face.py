@@ -122,15 +122,20 @@ def test_one_file_and_its_curves_are_a_study():
     study = jt.build_study(read, jt.table_1(), jt.Options(contact="bonded"), tool_radius=3.0)
     assert [p.name for p in study.free] == ["EI_L", "k_M", "k_1", "k_3"]
     bad = BadCurve("T01", "9", "a.csv", "unreadable", "no force column", "add one")
-    with pytest.warns(UserWarning, match="T01 9: no force column"):
+    with pytest.warns(UserWarning, match="T01 9: .*no force column"):
         jt.build_study(Measurements(read.curves, (bad,), ()), jt.table_1(), jt.Options())
 
 
-def test_profiles_and_bootstrap_go_by_the_same_names(result):
-    """Of noiseless data both give intervals that are points at the truth."""
+def test_profiles_and_bootstrap_go_by_the_same_names():
+    """With little noise the model is linear: both agree with the local standard errors."""
+    force, _ = forces(TRUTH)
+    noisy = force + 1e-4 * force.max() * np.random.default_rng(1).normal(size=force.shape)
+    result = jt.fit(jt.build_study(curves(noisy), GEOMETRY, OPTIONS, parameters()), SETTINGS)
     k_m = jt.profiles(result, SETTINGS, ["k_M"], points=2)
-    np.testing.assert_allclose((k_m.lower + k_m.upper) / 2, TRUTH[:, 1], rtol=1e-4)
-    again = jt.bootstrap(result, SETTINGS, count=40)
-    np.testing.assert_allclose((again.lower + again.upper) / 2, TRUTH, rtol=1e-4)
+    np.testing.assert_allclose(k_m.lower, result.lower[:, 1], rtol=0.01)
+    np.testing.assert_allclose(k_m.upper, result.upper[:, 1], rtol=0.01)
     rows = result.table(k_m)
     assert [r["low95"] for r in rows if r["parameter"] == "k_M"] == k_m.lower.tolist()
+    again = jt.bootstrap(result, SETTINGS, count=100)
+    # The standard deviation of 100 draws is known to 7 %; three times that.
+    np.testing.assert_allclose(again.standard_error, result.standard_error, rtol=0.22)

@@ -8,14 +8,14 @@ import pytest
 import synthetic
 from scipy.optimize import least_squares
 
-from jaxtrachea.fit.cost import LaneCost
-from jaxtrachea.fit.descent import descend
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.levenberg_marquardt import Tolerances, levenberg_marquardt
-from jaxtrachea.fit.noise import first_sigma
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import Noise, build_study
-from jaxtrachea.fit.verdict import describe_flat
+from jaxtrachea.fitting.cost import LaneCost
+from jaxtrachea.fitting.descent import descend
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.levenberg_marquardt import Tolerances, levenberg_marquardt
+from jaxtrachea.fitting.noise import first_sigma
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.inference.flat_directions import describe_flat
 from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.status import FitStatus
 

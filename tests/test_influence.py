@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.levenberg_marquardt import Tolerances
-from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import Noise, build_study
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.levenberg_marquardt import Tolerances
+from jaxtrachea.fitting.parameters import DEFAULTS
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Noise, build_study
 from jaxtrachea.inference.estimate import estimate, lane_of
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.measurements.read import Curve

@@ -12,12 +12,12 @@ import synthetic
 from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
-from jaxtrachea.fit import schur, specification
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.shared import held_count, unknown_count
-from jaxtrachea.fit.study import Noise, build_study
+from jaxtrachea.fitting import schur, specification
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.parameters import DEFAULTS
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.shared import held_count, unknown_count
+from jaxtrachea.fitting.study import Noise, build_study
 from jaxtrachea.inference import population as populations
 from jaxtrachea.inference.analyses.population import POPULATION, population_rows
 from jaxtrachea.inference.analysis import Findings

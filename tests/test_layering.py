@@ -20,7 +20,7 @@ ORDER = [
     {"contact"},
     {"mechanics"},
     {"surface", "measurements"},
-    {"fit", "scene", "selfcheck"},
+    {"fitting", "scene", "selfcheck"},
     {"inference"},
     {"results"},
     {"prediction", "runs"},
@@ -30,7 +30,7 @@ ORDER = [
     {"__main__"},
 ]
 #: Neighbours that stand on different levels.
-STRANGERS = [("scene", {"fit", "inference", "results", "prediction", "runs"}),
+STRANGERS = [("scene", {"fitting", "inference", "results", "prediction", "runs"}),
              ("inference", {"scene"}), ("results", {"scene"}), ("prediction", {"scene", "runs"}),
              ("runs", {"scene"}), ("measurements", {"contact", "mechanics", "trachea"}),
              ("inference/analyses", {"results", "report", "scene"})]  # fmt: skip
@@ -62,7 +62,7 @@ WITHIN = {
         {"read"},
         {"data_files", "usage_tables"},
     ],
-    "fit": [
+    "fitting": [
         {"parameters", "lane", "schur"},
         {"model"},
         {"onset"},
@@ -74,16 +74,15 @@ WITHIN = {
         {"structure"},
         {"covariance"},
         {"noise", "shared"},
-        {"criteria"},
+        {"criteria", "settings", "verdict"},
         {"result"},
-        {"minima", "natural_sizes", "predictions", "profile_search", "specification"},
+        {"minima", "natural_sizes", "predictions", "profile_search"},
         {"evaluate", "scrutiny"},
         {"fit"},
     ],
     "inference": [
-        {"verdict", "rows", "residuals", "chains", "estimate", "design_press"},
+        {"rows", "residuals", "chains", "flat_directions", "estimate", "design_press"},
         {"cross_validation", "bootstrap", "profile", "posterior_start"},
-        {"judgement"},
         {"effective", "labels", "population"},
         {"analysis", "comparison"},
         {"design", "influence", "posterior"},
@@ -93,7 +92,7 @@ WITHIN = {
     "prediction": [{"core", "sources"}, {"predict"}, {"held_out"}, {"plots", "report", "tables"}],
     "runs": [{"processes", "journal"}, {"chunks"}, {"folder"}, {"former", "in_chunks"}],
     "report": [{"plots", "tables"}, {"fit"}, {"overview"}],
-    "cli": [{"terminal_table"}, {"terminal"},
+    "cli": [{"terminal_table", "specification"}, {"terminal"},
             {"fit", "load", "predict_data", "run", "scene", "selfcheck"},
             {"compare", "predict", "tradeoff"}, {"main"}],
 }  # fmt: skip
@@ -169,9 +168,9 @@ def test_no_room_holds_too_much_of_the_package():
     [
         ("mechanics", "from jaxtrachea.surface import phong"),
         ("trachea", "def f():\n    import jaxtrachea.mechanics.beam as b"),
-        ("trachea", "from jaxtrachea import fit"),
-        ("surface", "from jaxtrachea.fit.fit import fit"),
-        ("fit", "from jaxtrachea.scene.stage import Scene"),
+        ("trachea", "from jaxtrachea import fitting"),
+        ("surface", "from jaxtrachea.fitting.fit import fit"),
+        ("fitting", "from jaxtrachea.scene.stage import Scene"),
         ("trachea", "from jaxtrachea.surface.regions import bind"),
         ("mechanics", "from jaxtrachea.surface import local"),
         ("_numerics", "from .trachea import geometry"),

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.fit.covariance import informations
-from jaxtrachea.fit.descent import descend
-from jaxtrachea.fit.levenberg_marquardt import Tolerances
-from jaxtrachea.fit.map_lanes import batch_size, map_lanes
-from jaxtrachea.fit.predictions import predictions
+from jaxtrachea.fitting.covariance import informations
+from jaxtrachea.fitting.descent import descend
+from jaxtrachea.fitting.levenberg_marquardt import Tolerances
+from jaxtrachea.fitting.map_lanes import batch_size, map_lanes
+from jaxtrachea.fitting.predictions import predictions
 
 EVENT = "/jax/core/compile/backend_compile_duration"
 

@@ -9,15 +9,15 @@ from scipy.integrate import quad
 from scipy.optimize import least_squares
 
 from jaxtrachea._numerics import centred_hinge
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.parameters import in_model
-from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import build_study, default_parameters
-from jaxtrachea.fit.verdict import describe_flat
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.parameters import in_model
+from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import leave_one_out, leave_repeats_out, without
 from jaxtrachea.inference.design import Candidates, check, gains, situation
+from jaxtrachea.inference.flat_directions import describe_flat
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.inference.labels import verdict_sentence
 from jaxtrachea.measurements.first_touch import first_touch

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxtrachea.config import SpecError
-from jaxtrachea.fit.parameters import DEFAULTS, OF_THE_PRESS, SKELETON, in_model, visible
+from jaxtrachea.fitting.parameters import DEFAULTS, OF_THE_PRESS, SKELETON, in_model, visible
 from jaxtrachea.mechanics.force_law import ON_RING, Law, coefficient, power
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.scene.spec import MaterialSection, load_scene_spec

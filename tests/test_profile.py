@@ -13,11 +13,11 @@ from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
 from jaxtrachea.files.tables import interval
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.profile_search import Sides
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import Noise, build_study
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.parameters import DEFAULTS
+from jaxtrachea.fitting.profile_search import Sides
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Noise, build_study
 from jaxtrachea.inference.analyses.profile import profile_rows
 from jaxtrachea.inference.profile import choose, profiles
 from jaxtrachea.measurements.read import Curve

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.structure import structure
-from jaxtrachea.fit.study import Noise, build_study
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.structure import structure
+from jaxtrachea.fitting.study import Noise, build_study
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.equilibrium import press_series, press_total
 from jaxtrachea.mechanics.force_law import Law, blend, coefficient, fold_depth

@@ -19,12 +19,12 @@ from jaxtrachea.cli.terminal_table import wide_table
 from jaxtrachea.files.html import page
 from jaxtrachea.files.pictures import plain, save_each, without_lost
 from jaxtrachea.files.tables import quoted, read_csv, unquoted, write_csv
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.result import unknown_label, verdict_of
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import Noise, build_study
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.parameters import DEFAULTS
+from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.result import unknown_label, verdict_of
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Noise, build_study
 from jaxtrachea.inference.analyses import INFLUENCE, LEFT_OUT
 from jaxtrachea.inference.analyses.cross_validation import left_out_table
 from jaxtrachea.inference.analyses.effective import widened

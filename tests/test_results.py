@@ -12,12 +12,12 @@ import pytest
 
 from jaxtrachea.files.output import OutputExists, new_directory, new_output
 from jaxtrachea.files.tables import markdown_table, number, write_csv
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.parameters import DEFAULTS
-from jaxtrachea.fit.predictions import Prediction, predictions
-from jaxtrachea.fit.result import unknown_label
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import build_study
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.parameters import DEFAULTS
+from jaxtrachea.fitting.predictions import Prediction, predictions
+from jaxtrachea.fitting.result import unknown_label
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.cross_validation import left_out_rows
 from jaxtrachea.inference.analyses.effective import EFFECTIVE
 from jaxtrachea.inference.analysis import Findings

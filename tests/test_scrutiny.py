@@ -11,14 +11,14 @@ from scipy.special import stdtrit
 from specimens import NAMES, POSITIONS, STIFF_CONTACT
 
 from jaxtrachea.files.tables import write_csv
-from jaxtrachea.fit import scrutiny
-from jaxtrachea.fit import structure as structures
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.parameters import in_model
-from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.result import judgement, verdict_of
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import build_study, default_parameters
+from jaxtrachea.fitting import scrutiny
+from jaxtrachea.fitting import structure as structures
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.parameters import in_model
+from jaxtrachea.fitting.predictions import Prediction
+from jaxtrachea.fitting.result import judgement, verdict_of
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.effective import effective
 from jaxtrachea.inference.population import population

@@ -10,7 +10,7 @@ from run_cli import run
 
 from jaxtrachea.cli.specification import parameters_of, usable
 from jaxtrachea.config import FitSpec, SpecError, TracheaSection, load_fit_spec
-from jaxtrachea.fit.parameters import DEFAULTS
+from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.measurements.data_files import find_files, read_data
 from jaxtrachea.measurements.read import Curve, DataError, Measurements, write_hdf5
 from jaxtrachea.mechanics.press import Options

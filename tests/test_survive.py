@@ -26,9 +26,9 @@ from jaxtrachea.cli.terminal import set_up_jax
 from jaxtrachea.config import load_fit_spec
 from jaxtrachea.files import lock as run_lock
 from jaxtrachea.files import output
-from jaxtrachea.fit import fit, levenberg_marquardt
-from jaxtrachea.fit.cost import LaneCost
-from jaxtrachea.fit.map_lanes import program
+from jaxtrachea.fitting import fit, levenberg_marquardt
+from jaxtrachea.fitting.cost import LaneCost
+from jaxtrachea.fitting.map_lanes import program
 from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.results.hdf5 import read_hdf5
 from jaxtrachea.results.stored import NoResults
@@ -79,7 +79,7 @@ def stop_at(patch, k, error=KeyboardInterrupt):
             raise error
         return real(study, settings, progress)
 
-    patch.setattr("jaxtrachea.fit.fit.fit", stopping)
+    patch.setattr("jaxtrachea.fitting.fit.fit", stopping)
     return asked
 
 
@@ -115,7 +115,7 @@ def test_an_error_while_files_are_written_keeps_the_chunks(peace, study, monkeyp
         )
         code, _, err = run(patch, capsys, *FIT)
     assert (code, "3 of 3 chunks are kept" in err) == (2, True)
-    monkeypatch.setattr("jaxtrachea.fit.fit.fit", None)
+    monkeypatch.setattr("jaxtrachea.fitting.fit.fit", None)
     assert run(monkeypatch, capsys, *FIT, "--resume")[0] == 0
     assert numbers(study / "out") == numbers(peace / "out")
 
@@ -125,7 +125,7 @@ def test_stopped_while_files_move(peace, study, monkeypatch, capsys):
     shutil.copytree(peace / "out", study / "out" / ".written")
     (study / "out" / ".run").mkdir()
     (study / "out" / ".written" / "summary.csv").replace(study / "out" / "summary.csv")
-    monkeypatch.setattr("jaxtrachea.fit.fit.fit", None)
+    monkeypatch.setattr("jaxtrachea.fitting.fit.fit", None)
     code, _, err = run(monkeypatch, capsys, *FIT, "--resume")
     assert (code, "out is finished" in err) == (0, True)
     assert tree(study / "out") == tree(peace / "out")
@@ -179,7 +179,7 @@ def test_refusals(peace, study, monkeypatch, capsys):
         stop_at(patch, 2)
         assert run(patch, capsys, *FIT)[0] == 130
     shutil.copytree(peace / "out", study / "finished")
-    monkeypatch.setattr("jaxtrachea.fit.fit.fit", None)
+    monkeypatch.setattr("jaxtrachea.fitting.fit.fit", None)
     refused(*FIT, "--rerun-failed", says=["not finished; use --resume first"])
     for change, says in CHANGES.values():
         kept = {p.name: p.read_text() for p in (study / "spec.toml", study / "curves.csv")}
@@ -234,7 +234,7 @@ def test_failed_lanes_are_fitted_again(peace, study, monkeypatch, capsys):
         seen.append((part.lanes.lower.shape[0], settings.starts, settings.seed))
         return real(part, settings, progress)
 
-    monkeypatch.setattr("jaxtrachea.fit.fit.fit", fit_and_tell)
+    monkeypatch.setattr("jaxtrachea.fitting.fit.fit", fit_and_tell)
     code, _, err = run(monkeypatch, capsys, *FIT, "--rerun-failed")
     assert code == 0, err
     assert seen == [(2, 8, 1)]
@@ -431,7 +431,7 @@ def test_the_lock_lasts_as_long_as_the_run(study, monkeypatch, capsys):
         at_work()
         return real(*arguments)
 
-    monkeypatch.setattr("jaxtrachea.fit.fit.fit", fit_and_look)
+    monkeypatch.setattr("jaxtrachea.fitting.fit.fit", fit_and_look)
     monkeypatch.setattr("jaxtrachea.report.plots.draw_all", lambda *_: at_work() or ([], {}))
     assert run(monkeypatch, capsys, *FIT)[0] == 0
     assert len(seen) == 4
@@ -503,7 +503,7 @@ def test_a_disk_that_fills_up(peace, study, monkeypatch, capsys, code):
 
     With room again the run goes on to the same numbers.
     """
-    monkeypatch.setattr("jaxtrachea.fit.fit.fit", from_peace(peace))
+    monkeypatch.setattr("jaxtrachea.fitting.fit.fit", from_peace(peace))
     monkeypatch.setattr("jaxtrachea.cli.run.show", lambda *_: None)
     out, expected = study / "out", numbers(peace / "out")
     with Disk(out).watched() as disk:
@@ -600,7 +600,7 @@ def test_a_damaged_journal_costs_no_chunk(peace, study, monkeypatch, capsys):
             shutil.copy(peace / "curves.csv", study)
             asked = []
             patch.setattr(
-                "jaxtrachea.fit.fit.fit", lambda p, *a, n=asked: n.append(p) or fitted(p, *a)
+                "jaxtrachea.fitting.fit.fit", lambda p, *a, n=asked: n.append(p) or fitted(p, *a)
             )
             code, _, err = run(patch, capsys, *FIT, "--resume")
         assert code == 0, err
@@ -634,7 +634,7 @@ def test_options_and_force_outlive_the_journal(peace, study, monkeypatch, capsys
         path.unlink()
     assert run_folder.known_journal(study / "out")[0] == journal.from_dict(json.loads(text))
     (folder / "previous-run.json").unlink()
-    monkeypatch.setattr("jaxtrachea.fit.fit.fit", from_peace(peace))
+    monkeypatch.setattr("jaxtrachea.fitting.fit.fit", from_peace(peace))
     shutil.copy(peace / "curves.csv", study)
     code, _, err = run(monkeypatch, capsys, *FIT, "--resume")
     assert (code, "nothing was saved yet" in err) == (0, True), err

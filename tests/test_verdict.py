@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxtrachea.fit.verdict import VERDICTS, combinations, describe_flat, verdict
+from jaxtrachea.fitting.verdict import VERDICTS, verdict
+from jaxtrachea.inference.flat_directions import combinations, describe_flat
 from jaxtrachea.status import ProfileEnd
 
 NAMES = ["EI_L", "GA_L", "k_M", "k_1"]

@@ -15,8 +15,8 @@ import numpy as np
 
 from jaxtrachea.cli.specification import settings_of, study_of
 from jaxtrachea.config import FitSpec, load_fit_spec
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.inference.labels import peak_force
 from jaxtrachea.inference.residuals import rms

@@ -83,7 +83,7 @@ def _same_data(specs, loaded, names) -> None:
 
 def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
     from jaxtrachea.cli.specification import settings_of
-    from jaxtrachea.fit.fit import fit
+    from jaxtrachea.fitting.fit import fit
     from jaxtrachea.inference.comparison import Model
     from jaxtrachea.inference.cross_validation import leave_repeats_out
 
@@ -169,7 +169,7 @@ def _left_out_notes(models) -> list[str]:
 
 def _why_nothing(model) -> str:
     """Why there was nothing to leave out of a model."""
-    from jaxtrachea.fit.parameters import OF_THE_PRESS
+    from jaxtrachea.fitting.parameters import OF_THE_PRESS
 
     free = model.result.study.free
     own = [p.name for p in free if p.scope == "trial" and p.name not in OF_THE_PRESS]

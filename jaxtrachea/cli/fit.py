@@ -70,7 +70,7 @@ class Run:
         options: to be done after the fit.
         journal: as JSON.
         settings: of the solver.
-        fit: as `fit.fit.fit`, in chunks.
+        fit: as `fitting.fit.fit`, in chunks.
         stop_if_asked: raises KeyboardInterrupt if Ctrl-C came, `Lost` if a process is gone.
     """
 

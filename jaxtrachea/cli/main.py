@@ -225,7 +225,7 @@ def _curve_table(curves):
 
 
 def _parameter_table(parameters, options):
-    from jaxtrachea.fit.onset import where_sought
+    from jaxtrachea.fitting.onset import where_sought
 
     head = ["free parameter", "what", "initial", "bounds", "scale", "scope"]
     rows = [

@@ -22,7 +22,7 @@ def refuse(path: Path, request) -> None:
 
 def run(request, stop_if_asked, fit=None):
     """Fit, by `fit` if given, then what needs a fit; the `Findings`."""
-    from jaxtrachea.fit.fit import fit as in_one_go
+    from jaxtrachea.fitting.fit import fit as in_one_go
     from jaxtrachea.inference.analyses import analyse
 
     with progress_bar() as bar:

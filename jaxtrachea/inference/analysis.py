@@ -11,10 +11,10 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, Literal
 
 from jaxtrachea.config import FitSpec
-from jaxtrachea.fit.predictions import Prediction, predictions
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.predictions import Prediction, predictions
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.profile import Profiles
 
 #: Cells of a row of a table, by column.

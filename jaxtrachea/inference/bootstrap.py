@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.map_lanes import batch_size
-from jaxtrachea.fit.predictions import Prediction, predictions
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.settings import Settings
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.map_lanes import batch_size
+from jaxtrachea.fitting.predictions import Prediction, predictions
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.settings import Settings
 
 Kind = Literal["parametric", "residual"]
 #: Refits handed to the solver at a time; bounds the memory.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fitting.result import FitResult
 
 #: What good chains reach, and what makes draws useless: R-hat, effective draws, share divergent.
 GOOD, POOR = (1.01, 400, 0.0), (1.05, 100, 0.02)

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxtrachea.fit.criteria import Criteria
-from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.criteria import Criteria
+from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.cross_validation import Missed
 from jaxtrachea.inference.effective import CORRELATED, effective_samples
 from jaxtrachea.inference.residuals import rms

@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.parameters import OF_THE_PRESS
-from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.starts import draw_starts
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.parameters import OF_THE_PRESS
+from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.starts import draw_starts
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.residuals import rms
 from jaxtrachea.measurements.read import Curve
 

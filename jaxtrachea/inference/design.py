@@ -20,13 +20,13 @@ from jaxtyping import Float, Int
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.config import FitSpec, SpecError
-from jaxtrachea.fit.covariance import informations
-from jaxtrachea.fit.map_lanes import program
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.press_scale import relative_change
-from jaxtrachea.fit.residual import force_jacobian
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.covariance import informations
+from jaxtrachea.fitting.map_lanes import program
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.press_scale import relative_change
+from jaxtrachea.fitting.residual import force_jacobian
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.bootstrap import Bootstrap
 from jaxtrachea.inference.design_press import marginal, of_a_new_press
 from jaxtrachea.inference.labels import succeeded

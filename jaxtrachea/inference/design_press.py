@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.study import Study
 
 
 def of_a_new_press(

@@ -19,10 +19,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
-from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.result import FitResult, interval95, within_bounds
-from jaxtrachea.fit.shared import held_count, unknown_count
-from jaxtrachea.fit.starts import of_unknowns
+from jaxtrachea.fitting.predictions import Prediction
+from jaxtrachea.fitting.result import FitResult, interval95, within_bounds
+from jaxtrachea.fitting.shared import held_count, unknown_count
+from jaxtrachea.fitting.starts import of_unknowns
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.residuals import lag_correlation
 from jaxtrachea.status import ProfileEnd

@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea.fit.cost import LaneCost, evaluate
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.levenberg_marquardt import FIRST_RADIUS, RUNNING, State, Tolerances, iterate
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.cost import LaneCost, evaluate
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.levenberg_marquardt import FIRST_RADIUS, RUNNING, State, Tolerances, iterate
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.trachea.geometry import Geometry
 
 

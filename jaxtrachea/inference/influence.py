@@ -23,14 +23,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxtrachea.fit.cost import assemble, entry_scale, robust
-from jaxtrachea.fit.covariance import SINGULAR
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.map_lanes import batch_size, map_lanes
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.residual import observations, residual
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.cost import assemble, entry_scale, robust
+from jaxtrachea.fitting.covariance import SINGULAR
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.map_lanes import batch_size, map_lanes
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.residual import observations, residual
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.estimate import hessian
 from jaxtrachea.inference.labels import succeeded
 

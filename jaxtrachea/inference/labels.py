@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from jaxtrachea.fit.parameters import OF_THE_PRESS
-from jaxtrachea.fit.press_scale import sizes_of_press
-from jaxtrachea.fit.result import FitResult, unknown_label, verdict_of
-from jaxtrachea.fit.verdict import VERDICTS, describe_flat
+from jaxtrachea.fitting.parameters import OF_THE_PRESS
+from jaxtrachea.fitting.press_scale import sizes_of_press
+from jaxtrachea.fitting.result import FitResult, unknown_label, verdict_of
+from jaxtrachea.fitting.verdict import VERDICTS
+from jaxtrachea.inference.flat_directions import describe_flat
 from jaxtrachea.inference.profile import Profiles
 
 #: What reports say in the place of estimates.

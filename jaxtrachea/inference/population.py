@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import chdtri
 
-from jaxtrachea.fit.parameters import Parameter
-from jaxtrachea.fit.result import FitResult, relative_errors
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.parameters import Parameter
+from jaxtrachea.fitting.result import DETERMINED, FitResult, Intervals, judgement
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.profile import Profiles
 
 #: Specimens below which no spread is estimated, and from which one is unasked.
@@ -309,3 +309,16 @@ def _not_negative(rest: Float[np.ndarray, "m q q"], of: Float[np.ndarray, "m q q
     values, vectors = np.linalg.eigh(rest / both)
     vectors = vectors * np.sqrt(np.maximum(values, 0))[:, None]
     return both * (vectors @ np.swapaxes(vectors, 1, 2))
+
+
+def relative_errors(
+    result: FitResult, profiles: Intervals | None = None
+) -> Float[np.ndarray, "L P"]:
+    """Relative error of what is determined: of identifiable and weak unknowns; NaN elsewhere."""
+    out = np.full(result.theta.shape, np.nan)
+    for lane, unknowns in enumerate(result.study.unknowns):
+        for i in range(len(unknowns)):
+            judged = judgement(result, lane, i, profiles)
+            if judged.verdict in DETERMINED:
+                out[lane, i] = judged.error
+    return out

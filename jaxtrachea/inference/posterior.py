@@ -23,12 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea.fit.cost import weights
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.map_lanes import batch_size, program
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.residual import observations, residual_value
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fitting.cost import weights
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.map_lanes import batch_size, program
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.residual import observations, residual_value
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.chains import grade, lenient, mixing, quantiles
 from jaxtrachea.inference.labels import succeeded
 from jaxtrachea.inference.posterior_start import Start, around_the_draws, around_the_fit, mode

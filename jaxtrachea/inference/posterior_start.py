@@ -12,9 +12,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.settings import Settings
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.settings import Settings
 
 #: Nearest that the centre comes to a bound, as a share of the width: what float64 can tell.
 _EDGE = 1e-12

@@ -15,9 +15,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fit.profile_search import Sides, find_ends, on_grid
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.settings import Settings
+from jaxtrachea.fitting.profile_search import Sides, find_ends, on_grid
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fitting.predictions import Prediction
+from jaxtrachea.fitting.result import FitResult
 
 
 def rms(values: np.ndarray) -> np.ndarray | np.floating:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fitting.result import FitResult
 
 #: Lanes that are listed and drawn one by one; of more, the worst.
 ONE_BY_ONE = 12

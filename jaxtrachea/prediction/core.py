@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.residual import material_and_values
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.residual import material_and_values
 from jaxtrachea.mechanics.press import press
 
 #: Slope along a blind direction, over what its terms add up to, from which it counts.

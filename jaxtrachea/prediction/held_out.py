@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.map_lanes import program
-from jaxtrachea.fit.onset import onset_is_sought
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import Study, build_study, check_curve
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.map_lanes import program
+from jaxtrachea.fitting.onset import onset_is_sought
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Study, build_study, check_curve
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.prediction.core import force_and_slope
 from jaxtrachea.prediction.predict import CurvePrediction, predict_sources

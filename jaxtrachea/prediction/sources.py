@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from jaxtrachea.fit.covariance import SINGULAR
+from jaxtrachea.fitting.covariance import SINGULAR
 from jaxtrachea.results.stored import StoredFit
 from jaxtrachea.status import FitStatus, PredictionStatus
 

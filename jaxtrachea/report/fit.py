@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea.files.tables import markdown_table
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.effective import CORRELATED
 from jaxtrachea.inference.labels import NOTHING_FITTED, lane_label, succeeded, verdict_sentence

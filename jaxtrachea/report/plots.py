@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxtrachea.files.pictures import STYLE, grid, of_all, plain, save_each
-from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.result import FitResult, unknown_label
+from jaxtrachea.fitting.predictions import Prediction
+from jaxtrachea.fitting.result import FitResult, unknown_label
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.rows import LINES, ONE_BY_ONE, listed, worst_first

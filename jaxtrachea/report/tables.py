@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea.files.tables import interval, number
-from jaxtrachea.fit.parameters import OF_THE_PRESS
-from jaxtrachea.fit.result import (
+from jaxtrachea.fitting.parameters import OF_THE_PRESS
+from jaxtrachea.fitting.result import (
     DETERMINED,
     FitResult,
     is_own,

@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 
-from jaxtrachea.fit.covariance import Uncertainty
-from jaxtrachea.fit.criteria import Criteria
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.covariance import Uncertainty
+from jaxtrachea.fitting.criteria import Criteria
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.study import Study
 
 _APART = ("study", "criteria", "uncertainty")
 #: Fields of a result that are arrays with the leading axis of lanes.

@@ -8,11 +8,11 @@ import h5py
 import numpy as np
 
 from jaxtrachea.files.atomic import hdf5_file
-from jaxtrachea.fit.covariance import Uncertainty
-from jaxtrachea.fit.criteria import Criteria
-from jaxtrachea.fit.result import FitResult, judgement
-from jaxtrachea.fit.starts import of_unknowns
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.covariance import Uncertainty
+from jaxtrachea.fitting.criteria import Criteria
+from jaxtrachea.fitting.result import FitResult, judgement
+from jaxtrachea.fitting.starts import of_unknowns
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.results import store

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from jaxtrachea.fit.predictions import Prediction
-from jaxtrachea.fit.result import (
+from jaxtrachea.fitting.predictions import Prediction
+from jaxtrachea.fitting.result import (
     FitResult,
     estimate_rows,
     estimated,

@@ -11,8 +11,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.trachea.geometry import Geometry
 

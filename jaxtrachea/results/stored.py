@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.model import FitModel, columns_of, numbers_of
-from jaxtrachea.fit.parameters import Parameter
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.model import FitModel, columns_of, numbers_of
+from jaxtrachea.fitting.parameters import Parameter
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.read import Curve, DataError
 from jaxtrachea.measurements.readers.safe_hdf5 import attribute, numeric, opened

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from jaxtrachea.files.atomic import write_whole
-from jaxtrachea.fit import residual
-from jaxtrachea.fit.levenberg_marquardt import MOST_SLOTS, PART_OF_MEMORY
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting import residual
+from jaxtrachea.fitting.levenberg_marquardt import MOST_SLOTS, PART_OF_MEMORY
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.results.arrays import arrays_of, result_of
 from jaxtrachea.runs import journal as journals
 from jaxtrachea.runs.journal import Journal

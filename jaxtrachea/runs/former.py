@@ -5,7 +5,7 @@ from pathlib import Path
 
 import h5py
 
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.runs import journal as journals
 from jaxtrachea.runs.folder import NoRun
 from jaxtrachea.status import FitStatus

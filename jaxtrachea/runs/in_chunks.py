@@ -10,9 +10,9 @@ import jax
 import numpy as np
 
 from jaxtrachea.files.tables import write_csv
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analyses.effective import widened
 from jaxtrachea.results.hdf5 import read_hdf5
 from jaxtrachea.results.rows import summary_rows
@@ -64,7 +64,7 @@ def fit_chunks(
         todo: chunks, as `missing` gives them.
         progress: as for `fit.fit`; what it raises ends the work.
     """
-    from jaxtrachea.fit.fit import fit
+    from jaxtrachea.fitting.fit import fit
 
     part = fitted_lanes(run, study)
     chunks = _chunks(run, part)

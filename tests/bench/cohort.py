@@ -18,8 +18,8 @@ import common
 import fitting
 import numpy as np
 
-from jaxtrachea.fit import fit
-from jaxtrachea.fit.settings import Settings
+from jaxtrachea.fitting import fit
+from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.measurements.read import Measurements, write_hdf5
 
 SPECIMENS, SAMPLE, ROUNDS = 10_000, 20, 3

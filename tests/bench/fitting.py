@@ -16,16 +16,16 @@ import numpy as np
 import optimistix
 from scipy.optimize import least_squares
 
-from jaxtrachea.fit import fit
-from jaxtrachea.fit.cost import LaneCost
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.levenberg_marquardt import Solved, levenberg_marquardt
-from jaxtrachea.fit.noise import first_sigma
-from jaxtrachea.fit.parameters import in_model
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.starts import draw_starts
-from jaxtrachea.fit.study import build_study, default_parameters
+from jaxtrachea.fitting import fit
+from jaxtrachea.fitting.cost import LaneCost
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.levenberg_marquardt import Solved, levenberg_marquardt
+from jaxtrachea.fitting.noise import first_sigma
+from jaxtrachea.fitting.parameters import in_model
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.starts import draw_starts
+from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.geometry import table_1

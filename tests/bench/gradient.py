@@ -15,10 +15,10 @@ import numpy as np
 import update
 
 from jaxtrachea import Material, press, simulate, table_1
-from jaxtrachea.fit import cost, levenberg_marquardt, residual
-from jaxtrachea.fit.noise import first_sigma
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.starts import draw_starts
+from jaxtrachea.fitting import cost, levenberg_marquardt, residual
+from jaxtrachea.fitting.noise import first_sigma
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.starts import draw_starts
 from jaxtrachea.scene.stage import Poses
 
 jax.config.update("jax_cpu_enable_async_dispatch", False)

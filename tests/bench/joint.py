@@ -16,8 +16,8 @@ import numpy as np
 sys.path.insert(0, str(common.FOLDER.parent / "reference"))
 import synthetic  # noqa: E402
 
-from jaxtrachea.fit.fit import fit
-from jaxtrachea.fit.settings import Settings
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.settings import Settings
 
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
 SIZES = {"joint": (10, 30, 100, 300, 1000, 3000, 10_000), "dense": (10, 20, 40, 80)}

@@ -39,11 +39,11 @@ print(json.dumps(first - later))
 """
 FIT = """
 import fitting, jax, numpy as np
-from jaxtrachea.fit.cost import LaneCost
-from jaxtrachea.fit.levenberg_marquardt import levenberg_marquardt
-from jaxtrachea.fit.noise import first_sigma
-from jaxtrachea.fit.result import Settings
-from jaxtrachea.fit.starts import draw_starts
+from jaxtrachea.fitting.cost import LaneCost
+from jaxtrachea.fitting.levenberg_marquardt import levenberg_marquardt
+from jaxtrachea.fitting.noise import first_sigma
+from jaxtrachea.fitting.result import Settings
+from jaxtrachea.fitting.starts import draw_starts
 fitting.SPECIMENS = 256
 p, *_ = fitting.make_study()
 s = Settings(starts=1)
@@ -54,7 +54,7 @@ CASES = {
     "import jax (alone)": START + "import json, jax\n" + STOP,
     "import jaxtrachea": START + "import json, jaxtrachea\n" + STOP,
     "import jaxtrachea.mechanics.press": START + "import json, jaxtrachea.mechanics.press\n" + STOP,
-    "import jaxtrachea.fit.fit": START + "import json, jaxtrachea.fit.fit\n" + STOP,
+    "import jaxtrachea.fitting.fit": START + "import json, jaxtrachea.fitting.fit\n" + STOP,
     "compile press, 50 displacements": "import json" + MODEL + "f = jax.jit(value)" + TIMED,
     "compile gradient of press, 5 arguments": "import json"
     + MODEL

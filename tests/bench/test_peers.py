@@ -20,8 +20,8 @@ import pytest
 import skeleton
 import update
 
-from jaxtrachea.fit import fit
-from jaxtrachea.fit.settings import Settings
+from jaxtrachea.fitting import fit
+from jaxtrachea.fitting.settings import Settings
 
 TURNS = 7
 SPECIMENS, SAMPLE = 500, 10

@@ -8,10 +8,10 @@ import numpy as np
 import synthetic
 from scipy.optimize import least_squares
 
-from jaxtrachea.fit.cost import evaluate
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.residual import residual_value
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.cost import evaluate
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.residual import residual_value
+from jaxtrachea.fitting.study import Study
 
 #: Truths that four curves with 1 % noise identify: a soft contact that hardens early.
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])

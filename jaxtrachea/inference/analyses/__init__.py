@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from jaxtrachea.config import SpecError
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analyses.bootstrap import BOOTSTRAP
 from jaxtrachea.inference.analyses.cross_validation import LEFT_OUT
 from jaxtrachea.inference.analyses.design import DESIGN

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from jaxtrachea.files.tables import markdown_table, number
-from jaxtrachea.fit.result import unknown_label
+from jaxtrachea.fitting.result import unknown_label
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
 from jaxtrachea.inference.bootstrap import FEWEST, Bootstrap, bootstrap
 from jaxtrachea.inference.labels import lane_label

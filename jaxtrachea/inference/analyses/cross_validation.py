@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxtrachea.config import SpecError
 from jaxtrachea.files.tables import markdown_table
-from jaxtrachea.fit.parameters import OF_THE_PRESS
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.parameters import OF_THE_PRESS
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
 from jaxtrachea.inference.cross_validation import LeftOut, curves_to_leave_out, leave_one_out
 from jaxtrachea.inference.residuals import rms

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxtrachea.config import SpecError
-from jaxtrachea.fit.result import unknown_label
+from jaxtrachea.fitting.result import unknown_label
 from jaxtrachea.inference.analysis import (
     Analysis,
     Cells,

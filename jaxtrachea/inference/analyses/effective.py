@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
 from jaxtrachea.inference.effective import CORRELATED, Effective, effective
 

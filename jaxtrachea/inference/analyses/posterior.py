@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from jaxtrachea.config import SpecError
 from jaxtrachea.files.tables import markdown_table, number
-from jaxtrachea.fit.result import unknown_label
+from jaxtrachea.fitting.result import unknown_label
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.posterior import MissingSampler, Posterior, posterior, sampler

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtrachea.config import SpecError
 from jaxtrachea.files.pictures import grid, of_all
 from jaxtrachea.files.tables import interval, markdown_table, number
-from jaxtrachea.fit.result import unknown_label, within_bounds
+from jaxtrachea.fitting.result import unknown_label, within_bounds
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.profile import Profiles, profiles

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import epsilon, solve_spd
-from jaxtrachea.fit.map_lanes import batch_size, cast, program
+from jaxtrachea.fitting.map_lanes import batch_size, cast, program
 from jaxtrachea.status import FitStatus
 
 RUNNING = -1

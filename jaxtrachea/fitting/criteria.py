@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fit.covariance import Information
-from jaxtrachea.fit.shared import unknown_count
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.covariance import Information
+from jaxtrachea.fitting.shared import unknown_count
+from jaxtrachea.fitting.study import Study
 
 #: Share of the largest datum that its own rounding may be: no residual counts for less.
 ROUNDING = 1e-15

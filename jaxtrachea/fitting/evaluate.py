@@ -5,13 +5,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrachea.fit.cost import robust
-from jaxtrachea.fit.covariance import Information, Uncertainty, half_widths
-from jaxtrachea.fit.criteria import criteria
-from jaxtrachea.fit.noise import first_sigma, next_sigma, precision_unit
-from jaxtrachea.fit.predictions import predictions
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.cost import robust
+from jaxtrachea.fitting.covariance import Information, Uncertainty, half_widths
+from jaxtrachea.fitting.criteria import criteria
+from jaxtrachea.fitting.noise import first_sigma, next_sigma, precision_unit
+from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.status import FitStatus
 
 

@@ -9,15 +9,14 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxtrachea.files.table import Table
-from jaxtrachea.fit.covariance import Uncertainty
-from jaxtrachea.fit.criteria import Criteria
-from jaxtrachea.fit.noise import precision_unit
-from jaxtrachea.fit.press_scale import relative_change
-from jaxtrachea.fit.study import Study
-from jaxtrachea.fit.verdict import verdict
+from jaxtrachea.fitting.covariance import Uncertainty
+from jaxtrachea.fitting.criteria import Criteria
+from jaxtrachea.fitting.noise import precision_unit
+from jaxtrachea.fitting.press_scale import relative_change
+from jaxtrachea.fitting.study import Study
+from jaxtrachea.fitting.verdict import verdict
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 if TYPE_CHECKING:
@@ -314,19 +313,6 @@ def _evidence(result: FitResult, lane: int, i: int, profiles: Intervals | None) 
 def verdict_of(result: FitResult, lane: int, i: int, profiles: Intervals | None = None) -> str:
     """The verdict of `judgement`."""
     return judgement(result, lane, i, profiles).verdict
-
-
-def relative_errors(
-    result: FitResult, profiles: Intervals | None = None
-) -> Float[np.ndarray, "L P"]:
-    """Relative error of what is determined: of identifiable and weak unknowns; NaN elsewhere."""
-    out = np.full(result.theta.shape, np.nan)
-    for lane, unknowns in enumerate(result.study.unknowns):
-        for i in range(len(unknowns)):
-            judged = judgement(result, lane, i, profiles)
-            if judged.verdict in DETERMINED:
-                out[lane, i] = judged.error
-    return out
 
 
 def unknown_label(result: FitResult, lane: int, i: int) -> str:

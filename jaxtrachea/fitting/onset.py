@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.parameters import DEFAULTS, OF_THE_PRESS, Parameter
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.parameters import DEFAULTS, OF_THE_PRESS, Parameter
 from jaxtrachea.measurements.first_touch import FirstTouch, blend_widths, first_touch
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options

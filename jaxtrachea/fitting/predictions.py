@@ -4,9 +4,9 @@ import dataclasses
 
 import numpy as np
 
-from jaxtrachea.fit.map_lanes import batch_size, map_lanes
-from jaxtrachea.fit.residual import residual_value
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.map_lanes import batch_size, map_lanes
+from jaxtrachea.fitting.residual import residual_value
+from jaxtrachea.fitting.study import Study
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

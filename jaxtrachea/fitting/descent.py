@@ -14,13 +14,13 @@ import optax
 from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea.fit.cost import entry_scale, evaluate, robust, rounding_cost
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.levenberg_marquardt import Solved, Tolerances, active_set, promise
-from jaxtrachea.fit.map_lanes import map_lanes
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.residual import residual_value
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.cost import entry_scale, evaluate, robust, rounding_cost
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.levenberg_marquardt import Solved, Tolerances, active_set, promise
+from jaxtrachea.fitting.map_lanes import map_lanes
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.residual import residual_value
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.status import FitStatus
 
 #: Cosine between residual and Jacobian up to which a point counts as a minimum.

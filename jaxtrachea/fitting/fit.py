@@ -5,26 +5,26 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxtrachea.fit.covariance import Uncertainty, analyse
-from jaxtrachea.fit.criteria import criteria
-from jaxtrachea.fit.evaluate import evaluated
-from jaxtrachea.fit.levenberg_marquardt import Solved
-from jaxtrachea.fit.map_lanes import batch_size
-from jaxtrachea.fit.minima import (
+from jaxtrachea.fitting.covariance import Uncertainty, analyse
+from jaxtrachea.fitting.criteria import criteria
+from jaxtrachea.fitting.evaluate import evaluated
+from jaxtrachea.fitting.levenberg_marquardt import Solved
+from jaxtrachea.fitting.map_lanes import batch_size
+from jaxtrachea.fitting.minima import (
     Minima,
     information_per_lane,
     lowest_minima,
     refit_with_noise,
 )
-from jaxtrachea.fit.noise import next_sigma, precision_unit
-from jaxtrachea.fit.press_scale import relative_change
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.scrutiny import doubtful, left_in_doubt, scrutinise
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.shared import held_count, marginal, summed_gradient
-from jaxtrachea.fit.starts import scales
-from jaxtrachea.fit.structure import Structure, null_spaces, reduced, structure_of, suspicious
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.noise import next_sigma, precision_unit
+from jaxtrachea.fitting.press_scale import relative_change
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.scrutiny import doubtful, left_in_doubt, scrutinise
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.shared import held_count, marginal, summed_gradient
+from jaxtrachea.fitting.starts import scales
+from jaxtrachea.fitting.structure import Structure, null_spaces, reduced, structure_of, suspicious
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.status import FitStatus
 
 #: Condition number of the Jacobian up to which it proves that the structure leaves nothing open.

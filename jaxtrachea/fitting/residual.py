@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.parameters import SKELETON
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.parameters import SKELETON
 from jaxtrachea.mechanics.equilibrium import sensitivity
 from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.press import (

@@ -20,15 +20,15 @@ import scipy.linalg
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._numerics import epsilon
-from jaxtrachea.fit.cost import LaneCost, evaluate
-from jaxtrachea.fit.covariance import Information
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.levenberg_marquardt import Solved, Tolerances, levenberg_marquardt
-from jaxtrachea.fit.map_lanes import batch_size, map_lanes
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.residual import observations, residual_value
-from jaxtrachea.fit.schur import eliminate, eliminate_others, trust_region_step
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.cost import LaneCost, evaluate
+from jaxtrachea.fitting.covariance import Information
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.levenberg_marquardt import Solved, Tolerances, levenberg_marquardt
+from jaxtrachea.fitting.map_lanes import batch_size, map_lanes
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.residual import observations, residual_value
+from jaxtrachea.fitting.schur import eliminate, eliminate_others, trust_region_step
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.status import FitStatus
 
 #: First radius of the trust region of the shared unknowns, scaled coordinates.

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxtrachea.fit.result import FitResult
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.mechanics.force_law import coefficient, power
 
 

@@ -19,10 +19,10 @@ from jaxtyping import Int
 
 from jaxtrachea._arguments import check_record, check_word
 from jaxtrachea._errors import InputError
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.model import Common, FitModel, Loss, columns_of, numbers_of
-from jaxtrachea.fit.onset import blends, natural_steps, onset_is_sought, within_reach
-from jaxtrachea.fit.parameters import DEFAULTS, SKELETON, Parameter, in_model
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.model import Common, FitModel, Loss, columns_of, numbers_of
+from jaxtrachea.fitting.onset import blends, natural_steps, onset_is_sought, within_reach
+from jaxtrachea.fitting.parameters import DEFAULTS, SKELETON, Parameter, in_model
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import Geometry

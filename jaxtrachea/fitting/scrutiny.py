@@ -17,20 +17,20 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.map_lanes import program
-from jaxtrachea.fit.minima import Minima, data_weight
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.natural_sizes import natural_sizes
-from jaxtrachea.fit.noise import first_sigma
-from jaxtrachea.fit.parameters import OF_THE_PRESS, SKELETON
-from jaxtrachea.fit.profile_search import Sides, find_ends
-from jaxtrachea.fit.residual import inputs
-from jaxtrachea.fit.result import FitResult
-from jaxtrachea.fit.settings import Settings
-from jaxtrachea.fit.starts import EXACT, box, scales
-from jaxtrachea.fit.structure import Structure, positions
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.map_lanes import program
+from jaxtrachea.fitting.minima import Minima, data_weight
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.natural_sizes import natural_sizes
+from jaxtrachea.fitting.noise import first_sigma
+from jaxtrachea.fitting.parameters import OF_THE_PRESS, SKELETON
+from jaxtrachea.fitting.profile_search import Sides, find_ends
+from jaxtrachea.fitting.residual import inputs
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.starts import EXACT, box, scales
+from jaxtrachea.fitting.structure import Structure, positions
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import coefficient, power
 from jaxtrachea.status import FitStatus, ProfileEnd
 

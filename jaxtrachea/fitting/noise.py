@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jaxtrachea.fit.covariance import Information
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.covariance import Information
+from jaxtrachea.fitting.study import Study
 
 
 def noise_rounds(study: Study) -> int:

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.study import Study
 
 
 @functools.lru_cache(maxsize=128)

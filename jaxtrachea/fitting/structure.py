@@ -19,13 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.map_lanes import map_lanes
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.parameters import SKELETON
-from jaxtrachea.fit.residual import inputs
-from jaxtrachea.fit.starts import box
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.map_lanes import map_lanes
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.parameters import SKELETON
+from jaxtrachea.fitting.residual import inputs
+from jaxtrachea.fitting.starts import box
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.press import respond
 

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea.fit.parameters import Parameter, Scale
+from jaxtrachea.fitting.parameters import Parameter, Scale
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import Geometry
 

@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import stdtrit
 
-from jaxtrachea.fit.cost import assemble, entry_scale, robust
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.map_lanes import batch_size, map_lanes
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.residual import observations, residual
-from jaxtrachea.fit.structure import leaving_alone
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.cost import assemble, entry_scale, robust
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.map_lanes import batch_size, map_lanes
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.residual import observations, residual
+from jaxtrachea.fitting.structure import leaving_alone
+from jaxtrachea.fitting.study import Study
 
 #: Smallest ratio of singular values of the scaled Jacobian that float64 can tell from zero.
 SINGULAR = 1e-7

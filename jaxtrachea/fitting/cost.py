@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrachea._numerics import epsilon
-from jaxtrachea.fit.lane import Lane
-from jaxtrachea.fit.model import FitModel
-from jaxtrachea.fit.residual import of_trials, residual, residual_value, size
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.residual import of_trials, residual, residual_value, size
 from jaxtrachea.trachea.geometry import Geometry
 
 #: Part of a step after which the residual's curvature along it is probed.

@@ -8,9 +8,9 @@ sizes are the steps in which the solver moves them, so that an offset of 20 N is
 import numpy as np
 from jaxtyping import Float
 
-from jaxtrachea.fit.onset import touches
-from jaxtrachea.fit.parameters import DEFAULTS, OF_THE_PRESS
-from jaxtrachea.fit.study import Study
+from jaxtrachea.fitting.onset import touches
+from jaxtrachea.fitting.parameters import DEFAULTS, OF_THE_PRESS
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.first_touch import FirstTouch
 
 #: Half the width in which starts are drawn around a change point, of the press.
