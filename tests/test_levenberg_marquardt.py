@@ -86,12 +86,17 @@ def test_minima_of_a_valley_inside_boxes(count, batch):
 
 
 def test_a_start_that_cannot_be_evaluated_is_a_status():
-    """And touches no other row."""
+    """It touches no other row, and its cost is no minimum: infinite, in a used slot as well."""
     valley = Valley(*(np.array(column)[None] for column in BOXES[0][:3]))
     starts = np.array([[np.nan, 0.0], [-1.2, 1.0]])
     solved = levenberg_marquardt(valley, starts, np.zeros(2, int))
     assert solved.status.tolist() == [FitStatus.INFEASIBLE_START, FitStatus.CONVERGED]
     np.testing.assert_allclose(solved.theta[1], 1.0, atol=1e-8)
+    assert solved.cost[0] == np.inf
+    good = np.tile([[-1.2, 1.0]], (40, 1))
+    late = levenberg_marquardt(valley, np.concatenate([good, starts]), np.zeros(42, int), batch=16)
+    assert late.status[40] == FitStatus.INFEASIBLE_START
+    assert np.flatnonzero(np.isinf(late.cost)).tolist() == [40]
 
 
 def test_float32_ends_on_the_bound_as_given():

@@ -17,6 +17,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -302,10 +303,12 @@ def _status(tolerances, old_cost, new, objective, fresh, finite, step, actual):
 def _advance(tolerances, rounds, objective, start, refill, state):
     """Put fresh starts where asked, then up to `rounds` iterations of the whole batch."""
     put = lambda new, old: jnp.where(refill.reshape(-1, *[1] * (old.ndim - 1)), new, old)  # noqa: E731
-    # Iteration 0 marks a fresh start: its point is evaluated before it is used.
+    # Iteration 0 marks a fresh start: its point is evaluated before it is used. Where that fails
+    # the cost stays infinite, so that no minimum of another start is taken for its own.
+    cost = put(jnp.inf, state.point.cost)
     state = State(
         theta=put(start, state.theta),
-        point=state.point,
+        point=eqx.tree_at(lambda point: point.cost, state.point, cost),
         radius=put(FIRST_RADIUS, state.radius),
         iteration=put(0, state.iteration),
         status=put(jnp.int8(RUNNING), state.status),

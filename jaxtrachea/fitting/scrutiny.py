@@ -138,7 +138,7 @@ def _elsewhere_as_low(result: FitResult, minima: Minima, se, natural) -> Bool[np
         low = np.full(result.lanes, np.inf)
         np.minimum.at(low, lane, np.where(np.isfinite(minima.cost), minima.cost, np.inf))
         scale = (first_sigma(result.study) / result.whitened_sigma)[lane[rows], 0] ** 2
-        dispersion = np.nanmin(result.uncertainty.dispersion, axis=1)[lane[rows]]
+        dispersion = np.fmin.reduce(result.uncertainty.dispersion, axis=1)[lane[rows]]
         half = result.uncertainty.half_width[lane[rows]]
         with np.errstate(invalid="ignore"):
             rise = 2 * (minima.cost[rows] - low[lane[rows]]) * scale

@@ -10,6 +10,7 @@ import functools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, Literal
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.config import FitSpec
 from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
@@ -21,6 +22,8 @@ from jaxtrachea.inference.profile import Profiles
 Cells = Mapping[str, object]
 #: Title, head and rows of a table on the terminal.
 Table = tuple[str, list[str], list[list[str]]]
+#: Where an analysis speaks, see `Analysis`.
+Place = Literal["estimates", "quality", "checks", "data", "design"]
 #: Called with (steps done since the last call, steps in all, 0 if unknown).
 Progress = Callable[[int, int], None]
 
@@ -123,12 +126,20 @@ class Analysis:
     lane_cells: Callable[[Any, int], Cells] = lambda found, lane: {}
     parameter_cells: Callable[[Any, int, int], Cells] = lambda found, lane, i: {}
     datasets: Callable[[Any, Any], None] | None = None
-    place: Literal["estimates", "quality", "checks", "data", "design"] = "checks"
+    place: Place = "checks"
     section: Callable[[Any], list[str]] = lambda found: []
     warning: Callable[[Any], list[str]] = lambda found: []
     shown: Callable[[Any, list[int]], Iterable[Table | str]] = lambda found, lanes: ()
     figures: Callable[[Any], Mapping[str, Callable[[], Any]]] = lambda found: {}
     poor: Callable[[Any], bool] = lambda found: False
+
+    def __post_init__(self):
+        """Refuse a place that no report has: what stands there would never be seen.
+
+        Raises:
+            ValueError: with the places there are.
+        """
+        check_word("place", self.place, Place)
 
     def wanted(self, request: Request) -> bool:
         """Whether the request asks for it."""
