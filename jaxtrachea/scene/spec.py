@@ -69,7 +69,7 @@ def _material_keys() -> type[Section]:
     """A key for each value that `trachea.material` declares."""
     keys: dict[str, Any] = {}
     for name, p in VALUES.items():
-        number = Annotated[float, quantity(p.dimension, positive=not p.signed)]
+        number: Any = Annotated[float, quantity(p.dimension, positive=not p.signed)]
         keys[name] = (number | None, None) if p.absent else (number, ...)
     return create_model("MaterialKeys", __base__=Section, **keys)
 
