@@ -198,7 +198,10 @@ def _quintic_root(u, v):
     start = _quintic_start(u, v, folds, top)
     first = jnp.where(past, 0, jnp.full_like(u, jnp.inf))
     begin = start, jnp.zeros_like(u), top, first, jnp.zeros((), jnp.int32)
-    unsettled = lambda state: jnp.any(moving(state[0], state[3])) & (state[4] < 64)  # noqa: E731
+
+    def unsettled(state):
+        return jnp.any(moving(state[0], state[3])) & (state[4] < 64)
+
     g = jax.lax.while_loop(unsettled, newton, begin)[0]
     return jnp.where(past | ~known, jnp.nan, g)
 

@@ -50,7 +50,9 @@ def test_against_bar_fem(s_c, springs):
 
 
 def uniform(s_c, dtype="float64"):
-    cast = lambda v: jnp.asarray(v, dtype)  # noqa: E731
+    def cast(v):
+        return jnp.asarray(v, dtype)
+
     return jitted(cast(X), cast(LENGTH), cast(np.full(5, 3.9)), cast(s_c), cast(0.5))
 
 

@@ -24,7 +24,9 @@ EI = 1.862
 
 
 def beam_of(x, length, EI, k, GA=None, dtype="float64"):
-    cast = lambda v: None if v is None else jnp.asarray(np.asarray(v), dtype)  # noqa: E731
+    def cast(v):
+        return None if v is None else jnp.asarray(np.asarray(v), dtype)
+
     return Beam(cast(x), cast(length), cast(EI), cast(k), cast(GA))
 
 
@@ -85,7 +87,10 @@ def test_recursion_beats_reactions(tube, dtype):
 def _random_beam(rng, n, with_shear, with_load):
     """Numbers rounded to float32, over 4 decades per span and per ring."""
     x = np.sort(rng.uniform(2, 158, n))
-    draw = lambda m: np.float32(10 ** rng.uniform(-2, 2, m))  # noqa: E731
+
+    def draw(m):
+        return np.float32(10 ** rng.uniform(-2, 2, m))
+
     GA = draw(n + 1) if with_shear else None
     load = np.float32(0.3 * rng.normal(size=n)) if with_load else None
     return np.float32(x), np.float32(160), draw(n + 1), 0.1 * draw(n), GA, load, rng.uniform(1, 159)

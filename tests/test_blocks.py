@@ -71,7 +71,10 @@ def test_derivatives_of_the_way_back(dtype):
     x, dx = (jnp.asarray(draw(size=(2, shape[0], 3, shape[1])), dtype) for _ in range(2))
     weight = jnp.asarray(draw(size=(2, 300, 3)), dtype)
     of = jax.vmap(lambda v: to_vertices(v, blocks))
-    rows = lambda v: np.asarray(v).swapaxes(2, 3).reshape(2, -1, 3)  # noqa: E731
+
+    def rows(v):
+        return np.asarray(v).swapaxes(2, 3).reshape(2, -1, 3)
+
     out, ahead = jax.jit(lambda x, dx: jax.jvp(of, (x,), (dx,)))(x, dx)
     assert out.dtype == jnp.dtype(dtype)
     np.testing.assert_array_equal(out, rows(x)[:, place])
@@ -83,7 +86,10 @@ def test_derivatives_of_the_way_back(dtype):
 
 
 GEOMETRY, TUBE = table_1(), make_tube(table_1())
-draw = lambda *n: jnp.asarray(np.random.default_rng(len(n)).normal(size=n))  # noqa: E731
+
+
+def draw(*n):
+    return jnp.asarray(np.random.default_rng(len(n)).normal(size=n))
 
 
 def keys_at(s_c):
@@ -94,7 +100,10 @@ def keys_at(s_c):
 def alone(mesh, geometry):
     """The binding without blocks."""
     grouped = regions.bind(mesh, geometry)
-    of = lambda v: to_vertices(v[:, None], grouped.blocks)  # noqa: E731
+
+    def of(v):
+        return to_vertices(v[:, None], grouped.blocks)
+
     s, phi, fraction = (of(v) for v in (grouped.s, grouped.phi, grouped.fraction))
     patch = jnp.searchsorted(geometry.ring_positions, mesh.s, side="right")
     return regions.Binding(s, phi, fraction, patch, grouped.nodes, grouped.half_angle)
@@ -108,9 +117,9 @@ def test_a_surface_in_blocks_is_that_of_its_vertices(method):
     weight = draw(len(order), 3)
 
     def answer(binding, weight, phi_c, keys):
-        moved = lambda *x: regions.interpolate(  # noqa: E731
-            binding, regions.weigh(binding, x[0]), x[1], method=method
-        )
+        def moved(*x):
+            return regions.interpolate(binding, regions.weigh(binding, x[0]), x[1], method=method)
+
         out, back = jax.vjp(moved, phi_c, keys)
         return out, back(weight)
 
@@ -155,7 +164,9 @@ def test_second_derivatives():
         u = regions.interpolate(binding, regions.weigh(binding, 0.4 + x[0]), moved)
         return jnp.sum(weight * u * u)
 
-    compiled = lambda f: jax.jit(f, compiler_options=QUICK)  # noqa: E731
+    def compiled(f):
+        return jax.jit(f, compiler_options=QUICK)
+
     zero, slope = jnp.zeros(2), compiled(jax.grad(total))
     one = compiled(jax.jacfwd(jax.grad(total)))(zero)
     other = compiled(jax.jacrev(jax.jacfwd(total)))(zero)

@@ -71,9 +71,12 @@ def test_blocks_see_correlated_noise():
     lag = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     pinv = np.linalg.inv(J.T @ J) @ J.T
     true = np.sqrt(np.diag(pinv @ (0.05**2 * r**lag) @ pinv.T) / 2)
-    share = lambda block: np.median(  # noqa: E731
-        bootstrap(result, ONE, count=200, kind="residual", block=block).standard_error / true, 0
-    )
+
+    def share(block):
+        return np.median(
+            bootstrap(result, ONE, count=200, kind="residual", block=block).standard_error / true, 0
+        )
+
     # Independent draws miss the factor sqrt((1 + r) / (1 - r)) = 2.4; blocks of 20 get most of it.
     assert np.all(share(1) < 0.5)
     assert np.all((share(20) > 0.8) & (share(20) < 1.1))

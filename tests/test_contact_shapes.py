@@ -207,7 +207,9 @@ def test_rotation_vector_is_the_quaternion(w):
 
 @quick
 def turning(w, t):
-    turn = lambda t: pose_from_vector(w * t, jnp.zeros(3)).rotation  # noqa: E731
+    def turn(t):
+        return pose_from_vector(w * t, jnp.zeros(3)).rotation
+
     second = jax.jacfwd(jax.jacrev(turn))
     return turn(t), jax.jacfwd(turn)(t), second(t), jax.jacfwd(jax.jacfwd(second))(t)
 

@@ -32,7 +32,10 @@ def covered(level, count):
     found = profiles(result, one, points=2)
     lanes = found.lane[::4]
     assert len(lanes) >= 0.99 * count
-    inside = lambda low, high, at: np.mean((low <= at) & (at <= high), axis=0)  # noqa: E731
+
+    def inside(low, high, at):
+        return np.mean((low <= at) & (at <= high), axis=0)
+
     low, high = found.lower.reshape(-1, 4), found.upper.reshape(-1, 4)
     return inside(result.lower, result.upper, truth), inside(low, high, truth[lanes])
 

@@ -50,15 +50,24 @@ def stack(shapes, count, scale, dtype):
 
 
 def poses(vectors, translations, scale, dtype):
-    cast = lambda v: jnp.asarray(np.asarray(v, float), dtype)  # noqa: E731
+    def cast(v):
+        return jnp.asarray(np.asarray(v, float), dtype)
+
     return jax.vmap(pose_from_vector)(cast(vectors), cast(np.asarray(translations) * scale))
 
 
 def sizes(shapes_a, shapes_b):
     """The size of each pair, as the settings define it."""
-    v = lambda s: np.asarray(s.vertices, float)  # noqa: E731
-    about = lambda v: v - v.mean(axis=1, keepdims=True)  # noqa: E731
-    reach = lambda s: np.linalg.norm(about(v(s)), axis=0).max()  # noqa: E731
+
+    def v(s):
+        return np.asarray(s.vertices, float)
+
+    def about(v):
+        return v - v.mean(axis=1, keepdims=True)
+
+    def reach(s):
+        return np.linalg.norm(about(v(s)), axis=0).max()
+
     return np.array(
         [
             reach(a) + reach(b) + float(a.radius) + float(b.radius)
@@ -165,9 +174,14 @@ def with_derivatives(dtype):
             turned = compose(pose_from_vector(v[:3], 0 * t), Pose(q, 0 * t))
             return Pose(turned.rotation, v[3:] + t)
 
-        solve = lambda v: signed_distance(a, b, moved(v))  # noqa: E731
+        def solve(v):
+            return signed_distance(a, b, moved(v))
+
         gradient = jax.grad(lambda v: solve(v).distance)(v)
-        read = lambda v: (lambda c: (c.distance, c.normal, c.point_a, c.point_b))(solve(v))  # noqa: E731
+
+        def read(v):
+            return (lambda c: (c.distance, c.normal, c.point_a, c.point_b))(solve(v))
+
         return solve(v), gradient, jax.jacfwd(read)(v)
 
     return quick(jax.vmap(one))
@@ -247,7 +261,10 @@ def segment_distance(half, p):
 def lanes(settings_, dtype):
     """One program per accuracy and dtype: a batch of pairs of 12 vertices."""
     del dtype
-    one = lambda a, b, pose: signed_distance(a, b, pose, settings_)  # noqa: E731
+
+    def one(a, b, pose):
+        return signed_distance(a, b, pose, settings_)
+
     return quick(jax.vmap(one))
 
 
@@ -286,7 +303,10 @@ def pairs(index, dtype, scale):
         radius = data["radius"][index, side] / 1024.0
         true_mean = np.stack([x[:n].mean(axis=0) for x, n in zip(v, count[:, side], strict=True)])
         size += np.linalg.norm(v - true_mean[:, None], axis=2).max(axis=1) + radius
-        cast = lambda x: jnp.asarray(x * scale, dtype)  # noqa: E731
+
+        def cast(x):
+            return jnp.asarray(x * scale, dtype)
+
         made.append(Shape(cast(v.transpose(0, 2, 1)), cast(radius)))
     at = jax.vmap(pose_from_quaternion)(
         jnp.asarray(data["quaternion"][index], dtype),
@@ -454,10 +474,18 @@ def derivatives():
         return at(v, jnp.array([1.0, 0.7, 0.4]), near).normal
 
     gradient = jax.grad(distance, (0, 1))
-    both = lambda *w: (gradient(*w), jax.jacfwd(distance, (0, 1))(*w))  # noqa: E731
+
+    def both(*w):
+        return (gradient(*w), jax.jacfwd(distance, (0, 1))(*w))
+
     by_pose = jax.grad(distance)
-    second = lambda *w: (jax.jacfwd(by_pose)(*w), jax.jacrev(by_pose)(*w))  # noqa: E731
-    turning = lambda *w: (jax.jacfwd(normal)(*w), jax.jacrev(normal)(*w), normal(*w))  # noqa: E731
+
+    def second(*w):
+        return (jax.jacfwd(by_pose)(*w), jax.jacrev(by_pose)(*w))
+
+    def turning(*w):
+        return (jax.jacfwd(normal)(*w), jax.jacrev(normal)(*w), normal(*w))
+
     return quick(distance), quick(both), quick(second), quick(turning)
 
 
@@ -506,7 +534,10 @@ def test_gradients_of_random_pairs(scale):
 
         zero, step = jnp.zeros(6), 1e-6 * jnp.eye(6)
         found = signed_distance(a, b, moved(zero))
-        near = lambda v: track(a, b, moved(v), found.normal).distance  # noqa: E731
+
+        def near(v):
+            return track(a, b, moved(v), found.normal).distance
+
         gradient = jax.grad(lambda v: signed_distance(a, b, moved(v)).distance)(zero)
         return gradient, jax.lax.map(lambda h: (near(h) - near(-h)) / 2e-6, step)
 

@@ -100,9 +100,12 @@ def test_a_batch_is_its_lanes_one_by_one(noisy, loss):
     starts = np.tile([p.to_scaled(p.value) for p, _, _ in study.unknowns[0]], (20, 1))
     sigma = first_sigma(study)
     objective = LaneCost(study.model, study.lanes, sigma)
-    fitted = lambda rows: levenberg_marquardt(  # noqa: E731
-        objective, starts[rows], rows, tolerances=Tolerances(iterations=60)
-    )
+
+    def fitted(rows):
+        return levenberg_marquardt(
+            objective, starts[rows], rows, tolerances=Tolerances(iterations=60)
+        )
+
     batch = fitted(np.arange(20))
     order = np.random.default_rng(0).permutation(20)
     np.testing.assert_array_equal(fitted(order).theta, batch.theta[order])
@@ -150,9 +153,10 @@ def test_bad_specimens_cost_only_themselves(tmp_path):
     read = read_measurements([tmp_path / n for n in ("all.csv", "s006.csv", "s007.csv")])
     assert {b.specimen for b in read.bad} == {f"s{i:03d}" for i in range(1, 8)}
     assert {b.kind for b in read.bad} >= {"non_finite", "too_few_points", "non_monotone", "empty"}
-    study = lambda curves: build_study(  # noqa: E731
-        curves, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters()
-    )
+
+    def study(curves):
+        return build_study(curves, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters())
+
     with_bad = fit(study(read.curves), Settings(starts=1))
     without = fit(study(read_measurements([tmp_path / "good.csv"]).curves), Settings(starts=1))
     assert with_bad.lanes == without.lanes == 93
@@ -172,7 +176,10 @@ def test_an_infeasible_start_is_a_status_and_disturbs_nobody(noisy):
         dataclasses.replace(c, specimen="x" + c.specimen)
         for c in synthetic.curves(near, displacement=shallow)
     ]
-    make = lambda data: build_study(data, synthetic.GEOMETRY, synthetic.OPTIONS, table)  # noqa: E731
+
+    def make(data):
+        return build_study(data, synthetic.GEOMETRY, synthetic.OPTIONS, table)
+
     together = fit(make([*rest[:4], *deep, *rest[4:]]), Settings(starts=1, more_starts=0))
     alone = fit(make(rest), Settings(starts=1))
     assert together.status[1] == FitStatus.INFEASIBLE_START
@@ -317,9 +324,12 @@ def test_unequal_lengths_do_not_change_results():
         )
         for c in synthetic.curves(force[1:])
     ]
-    make = lambda data: build_study(  # noqa: E731
-        data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(), balance="sample"
-    )
+
+    def make(data):
+        return build_study(
+            data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(), balance="sample"
+        )
+
     both = fit(make([*long, *short]), Settings(starts=1))
     alone = fit(make(short), Settings(starts=1))
     np.testing.assert_allclose(both.theta[1], alone.theta[0], rtol=0, atol=1e-8)
@@ -392,7 +402,10 @@ def test_robust_losses_as_scipy(noisy, loss):
     np.testing.assert_allclose(result.theta[0], other.x, rtol=0, atol=1e-3)
     plain = fit(synthetic.study(force, noise=Noise(force=level)), Settings(starts=1))
     truth = noisy[0][0]
-    stray = lambda r: np.abs(np.log(r.value[0] / truth)).max()  # noqa: E731
+
+    def stray(r):
+        return np.abs(np.log(r.value[0] / truth)).max()
+
     assert stray(result) < stray(plain)
 
 

@@ -46,7 +46,9 @@ def table(path):
 def folder(tmp_path_factory):
     class Silent:
         out = err = ""
-        readouterr = lambda self: self  # noqa: E731
+
+        def readouterr(self):
+            return self
 
     out = tmp_path_factory.mktemp("virtual") / "out"
     with pytest.MonkeyPatch.context() as patch:
@@ -113,7 +115,10 @@ def test_files_agree_with_each_other(folder):
 
 def test_provenance_holds_the_digests(folder):
     made = json.loads((folder / "provenance.json").read_text())
-    sha256 = lambda name: hashlib.sha256((VIRTUAL / name).read_bytes()).hexdigest()  # noqa: E731
+
+    def sha256(name):
+        return hashlib.sha256((VIRTUAL / name).read_bytes()).hexdigest()
+
     assert made["inputs"] == {"small_strain.h5": sha256("small_strain.h5")}
     assert made["specification"] == {"file": "fit.toml", "sha256": sha256("fit.toml")}
     assert made["dtype"] == "float64"

@@ -77,7 +77,10 @@ def test_ring_weight_limits(dtype):
 def test_ring_weight_is_c2():
     """Left and right limits of value, slope and curvature, at centres and at the rim."""
     x, width = jnp.asarray(RINGS), jnp.asarray(5.0)
-    f = lambda s: ring_weight(s, x, width)  # noqa: E731
+
+    def f(s):
+        return ring_weight(s, x, width)
+
     for tolerance in (1e-8, 1e-8, 1e-7):
         for s in (5.0, 10.0, 15.0, 25.0, 27.0, 37.0):
             left, at, right = (f(jnp.asarray(s + e)) for e in (-1e-9, 0.0, 1e-9))

@@ -22,7 +22,9 @@ QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compil
 
 @functools.cache
 def compiled(rounding):
-    run = lambda D, C, a, b, mu: slide_path(D, C, Law(a, b), mu, rounding=rounding)  # noqa: E731
+    def run(D, C, a, b, mu):
+        return slide_path(D, C, Law(a, b), mu, rounding=rounding)
+
     return jax.jit(run, compiler_options=QUICK)
 
 
@@ -78,7 +80,9 @@ def _root(f, start, *args):
 def reference(D, C, k_1, k_3, mu):
     """Stick or slide step by step with SciPy: unknowns F, and the slip where it slides."""
     slip, forces, slips = np.zeros(2), [], []
-    depth_of = lambda F: F / (k_1 + k_3 * local(np.linalg.norm(F)) ** 2)  # noqa: E731
+
+    def depth_of(F):
+        return F / (k_1 + k_3 * local(np.linalg.norm(F)) ** 2)
 
     def local(size):
         return max(
@@ -87,7 +91,10 @@ def reference(D, C, k_1, k_3, mu):
 
     F = np.array([1e-3, 0, 0])
     for target in D:
-        gap = lambda F, slip: depth_of(F) + C @ F + [0, *slip] - target  # noqa: B023, E731
+
+        def gap(F, slip):
+            return depth_of(F) + C @ F + [0, *slip] - target  # noqa: B023
+
         F = _root(gap, F, slip)
         if np.linalg.norm(F[1:]) > mu * F[0]:
             old = slip
@@ -129,7 +136,10 @@ def test_any_coupling():
     D = rng.normal(size=(n, 3))
     D[:, 0] = np.abs(D[:, 0])
     k_1, k_3, mu = 10 ** rng.uniform(-1, 1, n), 10 ** rng.uniform(-3, 2, n), rng.uniform(0, 0.9, n)
-    one = lambda D, C, a, b, m: slide(D, C, Law(a, b), m, jnp.zeros(2))  # noqa: E731
+
+    def one(D, C, a, b, m):
+        return slide(D, C, Law(a, b), m, jnp.zeros(2))
+
     step = jax.jit(jax.vmap(one))
     got = step(D, (C + C.mT) / 2, k_1, k_3, mu)
     F, d = np.asarray(got.force), np.asarray(got.depth)
@@ -263,6 +273,9 @@ def test_gradient_at_rest_is_finite(rounding):
     """No tangential motion, no pressure: nothing divides by the length of zero."""
     C, local, mu = jnp.asarray(COUPLED), Law(jnp.asarray(0.5), jnp.asarray(0.1)), jnp.asarray(MU)
     D = jnp.asarray([[0.0, 0, 0], [1.0, 0, 0], [-1.0, 2, 0], [0.0, 1, 0]])
-    f = lambda D, mu: slide(D, C, local, mu, jnp.zeros(2), rounding=rounding).force  # noqa: E731
+
+    def f(D, mu):
+        return slide(D, C, local, mu, jnp.zeros(2), rounding=rounding).force
+
     slopes = jax.jit(jax.vmap(jax.jacrev(f, (0, 1)), (0, None)), compiler_options=QUICK)(D, mu)
     assert all(np.all(np.isfinite(slope)) for slope in slopes)

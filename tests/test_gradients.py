@@ -28,9 +28,14 @@ def tree(values):
 @functools.cache
 def _compiled(f, key):
     unravel = key.unravel
-    flat = lambda v: ravel_pytree(f(unravel(v)))[0]  # noqa: E731
+
+    def flat(v):
+        return ravel_pytree(f(unravel(v)))[0]
+
     # One scan over evaluations, one over columns: compiled once for all points.
-    differences = lambda points: jax.lax.map(flat, points)  # noqa: E731
+    def differences(points):
+        return jax.lax.map(flat, points)
+
     quick = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
     programs = (jax.jacfwd(flat), jax.jacrev(flat), differences)
     return tuple(jax.jit(p, compiler_options=quick) for p in programs)
@@ -219,7 +224,10 @@ def test_near_the_fold(near):
 def test_second_derivative_of_press():
     """Hessian of the depth by D: forward over reverse = reverse over reverse = closed form."""
     v = tree({"D": 2.0, "c": 0.9, "k_1": 0.4, "k_3": 0.05})
-    depth = lambda D: series(v | {"D": D})[0]  # noqa: E731
+
+    def depth(D):
+        return series(v | {"D": D})[0]
+
     d, p, q = depth(v["D"]), 1 + 0.9 * 0.4, 0.9 * 0.05
     expected = -6 * q * d / (p + 3 * q * d * d) ** 3
     for hessian in (jax.jacfwd(jax.grad(depth)), jax.grad(jax.grad(depth))):

@@ -90,9 +90,10 @@ def test_float32_agrees_with_float64(name):
 def test_bad_rows_do_not_touch_their_neighbours(dtype):
     """NaN and folded specimens in a batch are flagged; the good ones keep every bit."""
     rows = [CASES[n][0] for n in ("plain", "NaN ligament", "on a ring", "past the fold")]
-    stack = lambda rows: {  # noqa: E731
-        n: jnp.asarray([(BASE | r)[n] for r in rows], dtype) for n in BASE
-    }
+
+    def stack(rows):
+        return {n: jnp.asarray([(BASE | r)[n] for r in rows], dtype) for n in BASE}
+
     run = jax.jit(jax.vmap(lambda v: _value_and_gradient(v, 9)))
     (_, mixed), gradients = run(stack(rows))
     (_, clean), others = run(stack([rows[0], {}, rows[2], {}]))

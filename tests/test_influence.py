@@ -47,8 +47,13 @@ def test_one_unknown_is_the_textbook(noise):
     e, h = k * D - F, D * D / (D @ D)
     s = noise.get("force", np.sqrt(e @ e / 11))
     t = e / (s * np.sqrt(1 - h))
-    one = lambda v: np.asarray(v)[0, 0]  # noqa: E731
-    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-8)  # noqa: E731
+
+    def one(v):
+        return np.asarray(v)[0, 0]
+
+    def close(a, b):
+        return np.testing.assert_allclose(a, b, rtol=1e-8)
+
     close(one(found.of.leverage), h)
     close(one(found.of.studentised), t)
     close(one(found.of.cook), t * t * h / (1 - h))
@@ -72,7 +77,10 @@ def test_curves_of_unequal_weight():
     hat = np.outer(D, w * D) / A
     variance = np.sum((np.eye(40) - hat) ** 2, axis=1)
     s = found.result.sigma[0, 0]
-    pick = lambda v: np.concatenate([v[0, 0, :30], v[0, 1, :10]])  # noqa: E731
+
+    def pick(v):
+        return np.concatenate([v[0, 0, :30], v[0, 1, :10]])
+
     np.testing.assert_allclose(pick(found.of.leverage), np.diag(hat), rtol=1e-8)
     t = (found.result.value[0, 0] * D - F) / s / np.sqrt(variance)
     np.testing.assert_allclose(pick(found.of.studentised), t, rtol=1e-7)
@@ -135,7 +143,10 @@ def test_four_unknowns_against_refits(noisy, name):
     for k, (t, e) in enumerate(places):
         shift[2 * k, t, e], shift[2 * k + 1, t, e] = step, -step
     se = result.uncertainty.se[0]
-    start = lambda n: np.repeat(result.theta, n, axis=0)  # noqa: E731
+
+    def start(n):
+        return np.repeat(result.theta, n, axis=0)
+
     data = study.lanes.force + shift
     again = fit(moved(study, data), SHARP, starts=start(len(data))).theta
     slope = (again[::2] - again[1::2]) / (2 * step) * sigma / se

@@ -230,7 +230,10 @@ def test_population_and_its_page(linear):
 def test_population_knows_what_errors_have_in_common(linear, monkeypatch):
     """Errors of k_1 at given k_3 and how k_1 follows it, by least squares of each specimen."""
     seen, real = [], populations.random_effects
-    keep = lambda *given: (seen.append(given), real(*given))[1]  # noqa: E731
+
+    def keep(*given):
+        return (seen.append(given), real(*given))[1]
+
     monkeypatch.setattr(populations, "random_effects", keep)
     population(linear)
     (_, covariance, _, common), scale = seen[0], linear.standard_error[:, 0] / linear.value[:, 0]
@@ -303,7 +306,10 @@ def dense_reference(force):
     def model(t):
         at = Material(*jnp.exp(t))
         depth, options = jnp.asarray(synthetic.DEPTHS), synthetic.OPTIONS
-        go = lambda s: press(synthetic.GEOMETRY, at, s, depth, options).force  # noqa: E731
+
+        def go(s):
+            return press(synthetic.GEOMETRY, at, s, depth, options).force
+
         return jax.vmap(go)(jnp.asarray(synthetic.S_C)).ravel()
 
     both = jax.jit(jax.vmap(lambda t: (model(t), jax.jacfwd(model)(t))))
@@ -319,7 +325,9 @@ def dense_reference(force):
             dense[i, :, 2 + 2 * i : 4 + 2 * i] = J[i, :, 2:]
         return dense.reshape(n * m, -1)
 
-    residual = lambda x: (np.asarray(both(spread(x))[0]) - force.reshape(n, m)).ravel()  # noqa: E731
+    def residual(x):
+        return (np.asarray(both(spread(x))[0]) - force.reshape(n, m)).ravel()
+
     start = np.log(np.concatenate([[200.0, 1.2], np.tile([0.6, 0.15], n)]))
     ends = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
     found = least_squares(residual, start, jac=jacobian, method="lm", **ends)

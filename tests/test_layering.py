@@ -149,7 +149,9 @@ def test_neighbours_do_not_know_each_other(room, others):
 
 
 def test_no_room_in_the_lists_that_does_not_exist():
-    there = lambda folder: {p.stem for p in folder.iterdir() if p.suffix == ".py" or p.is_dir()}  # noqa: E731
+    def there(folder):
+        return {p.stem for p in folder.iterdir() if p.suffix == ".py" or p.is_dir()}
+
     assert set().union(*ORDER) <= there(PACKAGE)
     for room, order in WITHIN.items():
         assert set().union(*order) <= there(PACKAGE / room), room

@@ -38,7 +38,9 @@ class Valley(eqx.Module):
         return Point(0.5 * jnp.sum(r * r), J.T @ r, J.T @ J, J)
 
     def ahead(self, point, theta, step):
-        along = lambda t: jax.jvp(residual, (t,), (step,))[1]  # noqa: E731
+        def along(t):
+            return jax.jvp(residual, (t,), (step,))[1]
+
         return point.jacobian.T @ jax.jvp(along, (theta,), (step,))[1]
 
     def blank(self):

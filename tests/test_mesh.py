@@ -91,9 +91,10 @@ def test_normals_point_outwards():
 def test_rings_stand_out_and_the_back_is_flatter():
     geometry = Geometry.create(50.0, [20.0], radius=10.0)
     mesh = make_tube(geometry, around=36, along=50, wall=2.0, relief=0.5, flatten=0.2)
-    at = lambda s, phi: float(  # noqa: E731
-        mesh.distance[np.argmin(np.abs(mesh.s - s) + np.abs(mesh.phi - phi))]
-    )
+
+    def at(s, phi):
+        return float(mesh.distance[np.argmin(np.abs(mesh.s - s) + np.abs(mesh.phi - phi))])
+
     np.testing.assert_allclose([at(20, 0), at(10, 0)], [11.0, 10.5])
     np.testing.assert_allclose([at(20, math.pi), at(10, math.pi)], 0.8 * 10.5)
 

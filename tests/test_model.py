@@ -146,7 +146,10 @@ def test_units(unit):
     import equinox as eqx
 
     g = table_1()
-    lengths = lambda v: (v.length, v.ring_positions, v.radius, v.ring_height)  # noqa: E731
+
+    def lengths(v):
+        return (v.length, v.ring_positions, v.radius, v.ring_height)
+
     h = eqx.tree_at(lengths, g, tuple(v * unit for v in lengths(g)))
     m = material()
     n = Material(m.EI_L * unit**2, m.k_M / unit, m.k_1 / unit, m.k_3 / unit**3)

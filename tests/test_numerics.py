@@ -61,9 +61,10 @@ def test_cubic_ratio_ends_at_the_fold(dtype):
 def test_cubic_ratio_derivatives(u):
     """First and second derivative: forward = reverse = implicit in 60 digits."""
     with mp.workdps(60):
-        root = lambda v: mp.findroot(  # noqa: E731
-            lambda g: g + mp.mpf(4) / 27 * v * g**3 - 1, closed_form(float(v))
-        )
+
+        def root(v):
+            return mp.findroot(lambda g: g + mp.mpf(4) / 27 * v * g**3 - 1, closed_form(float(v)))
+
         step = mp.mpf(max(abs(u), 1e-3)) * mp.mpf(10) ** -12
         low, mid, high = (root(mp.mpf(u) + i * step) for i in (-1, 0, 1))
         first, second = float((high - low) / (2 * step)), float((high - 2 * mid + low) / step**2)
@@ -102,7 +103,10 @@ def test_positive_part(width, dtype):
 def test_positive_part_is_c2():
     """Value, slope and curvature agree from both sides at both ends of the blend."""
     w = jnp.asarray(0.5)
-    f = lambda x: positive_part(x, w)  # noqa: E731
+
+    def f(x):
+        return positive_part(x, w)
+
     for order in range(3):
         for end in (0.0, 0.5):
             left, right = (f(jnp.asarray(end + e)) for e in (-1e-9, 1e-9))
@@ -141,11 +145,16 @@ def first_root(u, v):
     """Root of g + u g^3 + v g^5 = 1 on the branch from 0, and the fold: all roots in 60 digits."""
     with mp.workdps(60):
         u, v = mp.mpf(float(u)), mp.mpf(float(v))
-        real = lambda p: [  # noqa: E731
+
+        def real(p):
+            return [
             mp.re(r) for r in mp.polyroots(p[::-1], maxsteps=500, extraprec=800, asc=True)
             if abs(mp.im(r)) < mp.mpf(10) ** -25 * abs(r) and mp.re(r) > 0
         ]  # fmt: skip
-        trimmed = lambda p: p[next(i for i, c in enumerate(p) if c != 0) :]  # noqa: E731
+
+        def trimmed(p):
+            return p[next(i for i, c in enumerate(p) if c != 0) :]
+
         slope = trimmed([5 * v, 3 * u, 1])
         squares = real(slope) if len(slope) > 1 else []
         fold = mp.sqrt(min(squares)) if squares else mp.inf
@@ -221,7 +230,10 @@ def test_quintic_ratio_rows_stay_alone():
 def test_quintic_ratio_derivatives(u, v):
     """First derivatives, forward = reverse, by differences in 60 digits; second ones likewise."""
     at = jnp.array([u, v])
-    f = lambda x: quintic_ratio(x[0], x[1])  # noqa: E731
+
+    def f(x):
+        return quintic_ratio(x[0], x[1])
+
     with mp.workdps(60):
 
         def root(a, b):
@@ -230,7 +242,10 @@ def test_quintic_ratio_derivatives(u, v):
 
         m = mp.mpf
         step = [m(max(abs(x), 1e-3)) * m(10) ** -15 for x in (u, v)]
-        up = lambda i, j: root(m(u) + i * step[0], m(v) + j * step[1])  # noqa: E731
+
+        def up(i, j):
+            return root(m(u) + i * step[0], m(v) + j * step[1])
+
         first = [float((up(1, 0) - up(-1, 0)) / (2 * step[0])),
                  float((up(0, 1) - up(0, -1)) / (2 * step[1]))]  # fmt: skip
         mixed = float((up(1, 1) - up(1, -1) - up(-1, 1) + up(-1, -1)) / (4 * step[0] * step[1]))

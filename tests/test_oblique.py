@@ -142,9 +142,10 @@ def test_normal_on_the_midline_is_press(options, dtype):
     s, d = jnp.asarray(44.0, dtype), jnp.asarray(depth, dtype)
     one = run(table_1(dtype=dtype), material(dtype, **changes), s, d)
     rtol = 100 * np.finfo(dtype).eps
-    close = lambda a, b: np.testing.assert_allclose(  # noqa: E731
-        a, b, atol=rtol * np.max(np.abs(b)), rtol=0
-    )
+
+    def close(a, b):
+        return np.testing.assert_allclose(a, b, atol=rtol * np.max(np.abs(b)), rtol=0)
+
     close(-got.force[:, 1], one.force)
     close(-got.depth[:, 1], one.depth)
     close(-got.joints[..., 1], one.joints)
@@ -199,9 +200,12 @@ def test_status_of_lanes():
     phi = jnp.asarray([0.4, 2.2, 0.4, 0.4, ALPHA])
     D = jnp.asarray(np.tile([0.1, -1.0, 0.2], (5, 1)))
     k_3 = jnp.full(5, 0.02)
-    one = lambda phi, D, k_3: press_oblique(  # noqa: E731
-        table_1(), Material(**(VALUES | {"k_3": k_3})), jnp.asarray(63.0), phi, D, BONDED
-    )
+
+    def one(phi, D, k_3):
+        return press_oblique(
+            table_1(), Material(**(VALUES | {"k_3": k_3})), jnp.asarray(63.0), phi, D, BONDED
+        )
+
     run = jax.jit(jax.vmap(one), compiler_options=QUICK)
     good = run(jnp.where(phi > 2.1, 0.4, phi), D, k_3)
     bad = run(phi, D.at[2, 0].set(jnp.nan), k_3.at[3].set(-1e3))

@@ -51,7 +51,10 @@ def test_fit_is_the_recorded_one():
 def test_what_the_page_claims():
     """The sentences with numbers in docs/off_midline.md."""
     mat, arch, arch2 = (of(rings, "midline") for rings in ("mat", "arch", "arch2"))
-    at = lambda r, phi: [e for e in r["off"] if e["phi_c"] == phi]  # noqa: E731
+
+    def at(r, phi):
+        return [e for e in r["off"] if e["phi_c"] == phi]
+
     assert max(abs(e["compliance"]) for e in at(mat, 30)) < 0.025
     assert all(-0.15 < e["compliance"] < -0.13 for e in at(mat, 90))
     assert all(0.08 < e["compliance"] < 0.1 for e in at(arch2, 30))

@@ -34,7 +34,10 @@ OWN = {"onset": {"fixed": False}, "force_offset": {"fixed": False}}
 
 def test_rounded_corner_is_the_average_of_the_sharp_one():
     """`max(x, 0)` averaged with the kernel of the docstring, by quadrature; nothing outside."""
-    kernel = lambda u: 15 / 32 * (1 - u * u) * (3 - 7 * u * u)  # noqa: E731
+
+    def kernel(u):
+        return 15 / 32 * (1 - u * u) * (3 - 7 * u * u)
+
     width = 0.3
     for x in (-0.29, -0.1, 0.0, 0.12, 0.25):
         corner = [v for v in (x / width,) if abs(v) < 1]

@@ -54,7 +54,10 @@ def solver(near, search):
 def solve(tool, patches, turn, at, near=2, search=False, dtype="float64"):
     """Many poses, as numpy arrays of float64."""
     lanes = SEARCHED if search else LANES
-    pad = lambda v: np.concatenate([v, np.repeat(v[-1:], -len(v) % lanes, 0)])  # noqa: E731
+
+    def pad(v):
+        return np.concatenate([v, np.repeat(v[-1:], -len(v) % lanes, 0)])
+
     chunks = []
     for t, a in zip(*(pad(v).reshape(-1, lanes, 3) for v in (turn, at)), strict=True):
         c = solver(near, search)(*cast((tool, patches, t, a), dtype))
@@ -202,9 +205,9 @@ POSES = {
 def test_derivatives():
     """Reverse = forward = differences, of gap, s, phi, normal, witness by all six of the pose."""
     count, h = len(POSES), 1e-5
-    read = lambda c: jnp.concatenate(  # noqa: E731
-        [jnp.stack([c.gap, c.s, c.phi], -1), c.normal, c.tool_point], -1
-    )
+
+    def read(c):
+        return jnp.concatenate([jnp.stack([c.gap, c.s, c.phi], -1), c.normal, c.tool_point], -1)
 
     def f(v, shift, tool):
         return read(touch(tool, pose_from_vector(v[:3], shift + v[3:]), TUBE))

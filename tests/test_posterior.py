@@ -58,7 +58,10 @@ def test_density_is_that_of_the_normal_noise():
     study = make_study(force, depth, scale="log")
     lane, sigma = lane_of(study, 0), jnp.array([0.2, 1.0])
     points = jnp.asarray(rng.normal(size=(20, 3)))
-    density = lambda x: log_density(study.model, (True, False), lane, sigma, x)  # noqa: E731
+
+    def density(x):
+        return log_density(study.model, (True, False), lane, sigma, x)
+
     found = np.asarray(jax.jit(jax.vmap(density))(points))
     share = 1 / (1 + np.exp(-np.asarray(points[:, :2])))
     k = np.exp(np.log(0.1) + np.log(300.0) * share)
@@ -74,7 +77,10 @@ def made(rhat, ess, lost):
     result = fit(make_study(np.linspace(1, 3, 5), np.linspace(1, 3, 5)), ONE)
     theta, divergent = np.zeros((1, 2, 100, 2)), np.zeros((1, 2, 100), bool)
     divergent[0, 0, :lost] = True
-    pair = lambda v: np.array([[v, v]])  # noqa: E731
+
+    def pair(v):
+        return np.array([[v, v]])
+
     zero = pair(0.0)
     return Posterior(
         result=result, theta=theta, sigma=np.ones((1, 2, 100, 2)), divergent=divergent,

@@ -60,7 +60,10 @@ def true_force(s, depths=DEPTHS):
     EI, k_M, k_1, k_3 = TRUTH
     x = np.asarray(table_1().ring_positions)
     c = float(beam_fem.solve(x, 160.0, [EI] * 16, [k_M] * 15, s, 1.0).w_C)
-    law = lambda d: k_1 * d + k_3 * d**3  # noqa: E731
+
+    def law(d):
+        return k_1 * d + k_3 * d**3
+
     low, high = np.zeros_like(depths), depths.copy()
     for _ in range(80):
         middle = 0.5 * (low + high)
@@ -531,7 +534,10 @@ def test_unknown_specimens(read):
     (found,) = held_out.compare(read, [new], as_specimen="s0002")
     assert "predicted as specimen 's0002'" in found.prediction.message
     assert np.array_equal(found.prediction.force, known.prediction.force)
-    share = lambda p: dataclasses.replace(p, scope="specimen" if p.fixed else "shared")  # noqa: E731
+
+    def share(p):
+        return dataclasses.replace(p, scope="specimen" if p.fixed else "shared")
+
     study = dataclasses.replace(
         read.study,
         parameters=tuple(map(share, read.study.parameters)),

@@ -83,7 +83,10 @@ def test_without_its_last_coefficient_it_is_the_cubic_law(dtype):
 
 def test_the_cubic_program_has_nothing_of_it():
     """No loop of Newton steps where k_5 is None, one where it is there."""
-    text = lambda k: str(jax.make_jaxpr(press_series)(number(1.0), number(1.0), law(k)))  # noqa: E731
+
+    def text(k):
+        return str(jax.make_jaxpr(press_series)(number(1.0), number(1.0), law(k)))
+
     assert "while" not in text((0.4, 0.1))
     assert "while" in text((0.4, 0.1, 0.1))
 
@@ -106,7 +109,10 @@ def test_fold(c, k):
 def test_total_has_the_fold_of_the_law():
     """k_1 + 3 k_3 d^2 + 5 k_5 d^4 = 0 by SciPy; a law that dips but still rises has none."""
     k = (0.5, -0.2, 0.01)
-    slope = lambda d: k[0] + 3 * k[1] * d**2 + 5 * k[2] * d**4  # noqa: E731
+
+    def slope(d):
+        return k[0] + 3 * k[1] * d**2 + 5 * k[2] * d**4
+
     at = scipy.optimize.brentq(slope, 0.5, 1.5, xtol=1e-15)
     np.testing.assert_allclose(fold_depth(law(k)), at, rtol=1e-12)
     got = total(at * jnp.asarray([0.999, 1.001, 9.0]), number(0.1), law(k))
@@ -156,7 +162,10 @@ def test_derivatives(k, press):
 @pytest.mark.parametrize("k", LAWS)
 def test_vectors_against_scipy(k):
     D = np.array([0.6, -1.2, 0.4])
-    force = lambda d: (k[0] + k[1] * (d @ d) + k[2] * (d @ d) ** 2) * d  # noqa: E731
+
+    def force(d):
+        return (k[0] + k[1] * (d @ d) + k[2] * (d @ d) ** 2) * d
+
     known = scipy.optimize.root(lambda d: d + C_FULL @ force(d) - D, D / 3, tol=1e-13)
     got = jax.jit(press_vector)(jnp.asarray(D), jnp.asarray(C_FULL), law(k))
     np.testing.assert_allclose(got.depth, known.x, rtol=1e-9)
@@ -187,7 +196,10 @@ def test_friction_balances():
     D[:, 0] = np.abs(D[:, 0])
     k = 10 ** rng.uniform(-1, 1, n), 10 ** rng.uniform(-3, 1, n), 10 ** rng.uniform(-3, 2, n)
     mu = rng.uniform(0, 0.9, n)
-    one = lambda D, C, a, b, e, m: slide(D, C, Law(a, b, e), m, jnp.zeros(2))  # noqa: E731
+
+    def one(D, C, a, b, e, m):
+        return slide(D, C, Law(a, b, e), m, jnp.zeros(2))
+
     got = jax.jit(jax.vmap(one))(D, (C + C.mT) / 2, *k, mu)
     F, d = np.asarray(got.force), np.asarray(got.depth)
     assert np.all(got.status == PressStatus.OK)

@@ -292,7 +292,10 @@ def test_widened_intervals_cover(given):
     result = fit(build_study(curves, table_1(), BONDED, table(), noise=level), ONE)
     wide = effective(result, predictions(result.study, result.theta))
     truth = np.array([1.3, 0.4])
-    inside = lambda low, high: np.mean((low <= truth) & (truth <= high), axis=0)  # noqa: E731
+
+    def inside(low, high):
+        return np.mean((low <= truth) & (truth <= high), axis=0)
+
     plain_share = inside(result.lower, result.upper)
     share = inside(wide.lower, wide.upper)
     assert np.all(plain_share < 0.75), plain_share

@@ -68,7 +68,10 @@ def make_study(name):
 
 def lane_and_point(study, k, dtype=np.float64):
     """Arrays of lane k and unknowns near the guess."""
-    cast = lambda v: v if v.dtype == np.int32 else v.astype(dtype)  # noqa: E731
+
+    def cast(v):
+        return v if v.dtype == np.int32 else v.astype(dtype)
+
     lane = jax.tree.map(lambda v: jnp.asarray(cast(v[k])), study.lanes)
     rng = np.random.default_rng(k)
     guess = [p.to_scaled(p.value) for p, _, _ in study.unknowns[k]]
@@ -93,7 +96,10 @@ def evaluated(name):
 
 def rounded(x, width):
     """`max(x, 0)` averaged with a kernel of the fourth order, by quadrature."""
-    kernel = lambda u: 15 / 32 * (1 - u * u) * (3 - 7 * u * u)  # noqa: E731
+
+    def kernel(u):
+        return 15 / 32 * (1 - u * u) * (3 - 7 * u * u)
+
     corner = [x / width] if abs(x) < width else None
     return quad(lambda u: kernel(u) * max(x - width * u, 0), -1, 1, points=corner, epsabs=1e-13)[0]
 

@@ -130,8 +130,13 @@ def test_equilibrium_of_the_ends(phi_c):
     got = response(ring, jnp.asarray(phi_c), jnp.asarray(load))
     U, V = (TABLE_1["k_M"] / 2 * np.asarray(end) for end in (got.end_U, got.end_V))
     np.testing.assert_allclose(U + V, load, atol=1e-14)
-    at = lambda phi: 11.3 * np.array([math.cos(phi), math.sin(phi)])  # noqa: E731
-    cross = lambda r, f: r[0] * f[1] - r[1] * f[0]  # noqa: E731
+
+    def at(phi):
+        return 11.3 * np.array([math.cos(phi), math.sin(phi)])
+
+    def cross(r, f):
+        return r[0] * f[1] - r[1] * f[0]
+
     moments = cross(at(-ALPHA), U) + cross(at(ALPHA), V)
     np.testing.assert_allclose(moments, cross(at(phi_c), load), atol=1e-12)
     np.testing.assert_allclose(got.tie, 0.4 * got.opening, rtol=1e-14)
@@ -253,7 +258,10 @@ def test_float32():
 def test_all_rings_of_a_tube():
     """One call for rings that differ in k_M: the single answers."""
     k_M, base = jnp.asarray([0.05, 0.1, 0.3]), ring_of()
-    one_ring = lambda k: Ring(base.radius, base.half_angle, base.EI, k, base.k_t)  # noqa: E731
+
+    def one_ring(k):
+        return Ring(base.radius, base.half_angle, base.EI, k, base.k_t)
+
     C, _ = jax.vmap(lambda k: ring_compliance(one_ring(k), jnp.asarray(0.4)))(k_M)
     for k, one in zip(k_M, C, strict=True):
         np.testing.assert_allclose(one, C_of(ring_of(k_M=k), 0.4), rtol=1e-13)

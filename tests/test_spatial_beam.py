@@ -41,7 +41,10 @@ def tube(rng, k, *, spread=0.0, n=N, shear=False):
     """(x, length, EI, C, GA): even (spread 0) or random spans over 2 * `spread` decades."""
     even = 10.0 * np.arange(1, n + 1)
     x = np.float32(np.sort(rng.uniform(2, 158, n)) if spread else even)
-    draw = lambda: np.float32(EI * 10 ** rng.uniform(-spread, spread, (n + 1, 2)))  # noqa: E731
+
+    def draw():
+        return np.float32(EI * 10 ** rng.uniform(-spread, spread, (n + 1, 2)))
+
     C = turned(rng, n, k, 1.0 if spread else 0.5)
     return x, np.float32(160), draw(), C, draw() if shear else None
 
@@ -52,7 +55,10 @@ def beam_of(t, dtype="float64", integrity=None):
 
 def errors_of(got, exact):
     """Largest error of each quantity over its largest value (rotations share one scale)."""
-    number = lambda v: np.array(v, dtype=object).astype(float)  # noqa: E731
+
+    def number(v):
+        return np.array(v, dtype=object).astype(float)
+
     names = ("w_C", "theta_C", "w", "theta", "reaction")
     truth = {q: number(getattr(exact, q)) for q in names}
     peak = {q: np.max(np.abs(v)) for q, v in truth.items()}
@@ -108,7 +114,10 @@ def test_equal_rings_are_two_plane_beams(k):
     x, length, stiffness = 10.0 * np.arange(1, N + 1), 160.0, np.linspace(1, 3, N + 1)
     shear, load = np.linspace(2, 5, N + 1), 0.1 * np.sin(np.arange(N))
     flat = one_plane.Beam(*cast("float64", x, length, stiffness, np.full(N, k), shear))
-    pair = lambda v: np.stack([v, v], 1)  # noqa: E731
+
+    def pair(v):
+        return np.stack([v, v], 1)
+
     both = beam_of((x, length, pair(stiffness), np.eye(2) / k * np.ones((N, 1, 1)), pair(shear)))
     single = jax.jit(
         lambda b, s, f, g: one_plane.deflect(b, s, f, ring_load=g), compiler_options=QUICK
@@ -269,7 +278,10 @@ def test_gradients(k, s):
         direction = rng.normal(size=v.shape) * np.abs(v)
         if name == "C":  # stay symmetric
             direction = (direction + np.swapaxes(direction, 1, 2)) / 2
-        along = lambda J: np.tensordot(J, direction, v.ndim)  # noqa: B023, E731
+
+        def along(J):
+            return np.tensordot(J, direction, v.ndim)  # noqa: B023
+
         up, down = (value(point | {name: v + e * direction}) for e in (1e-5, -1e-5))
         size = np.abs(along(ahead[name])) + base
         np.testing.assert_array_less(np.abs(along(ahead[name]) - along(back[name])), 1e-9 * size)

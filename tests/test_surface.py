@@ -33,9 +33,9 @@ def points(s, phi, radius=12.0, dtype="float64"):
 
 
 def random_keys(seed=0, s_c=73.0, dtype="float64", size=1.0, rings=15):
-    draw = lambda *shape: jnp.asarray(  # noqa: E731
-        size * np.random.default_rng((seed, *shape)).normal(size=shape), dtype
-    )
+    def draw(*shape):
+        return jnp.asarray(size * np.random.default_rng((seed, *shape)).normal(size=shape), dtype)
+
     return regions.clamped(
         jnp.asarray(s_c, dtype), draw(3), draw(rings, 3), 2 * draw(rings, 3), -3 * draw(rings, 3),
         draw(rings, 2) / 10, draw(2) / 10, end_A=draw(1, 3)[0], end_B=-draw(1, 3)[0],
@@ -65,7 +65,9 @@ def motion(method, s, phi, phi_c, keys, geometry=GEOMETRY):
 @pytest.mark.parametrize("phi_c", [-ALPHA, -1.3, 0.0, 0.4, ALPHA - 0.01, ALPHA])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_weights_are_a_partition_of_unity(phi_c, dtype):
-    cast = lambda v: v.astype(dtype) if v.dtype == jnp.float64 else v  # noqa: E731
+    def cast(v):
+        return v.astype(dtype) if v.dtype == jnp.float64 else v
+
     w = regions.weigh(jax.tree.map(cast, BINDING), jnp.asarray(phi_c, dtype))
     eps = np.finfo(dtype).eps
     np.testing.assert_allclose(w.U + w.J + w.V, 1, rtol=4 * eps)
@@ -103,7 +105,10 @@ def test_translation_is_exact(method, dtype):
 def test_linear_field_along_the_tube(method, s_c):
     """Every component linear in s, the same round the tube: reproduced at every vertex."""
     slope, at_A = np.array([0.01, -0.03, 0.02]), np.array([0.1, 0.2, -0.5])
-    field = lambda s: jnp.asarray(at_A + slope * np.asarray(s)[..., None])  # noqa: E731
+
+    def field(s):
+        return jnp.asarray(at_A + slope * np.asarray(s)[..., None])
+
     nodes = np.asarray(BINDING.nodes)
     slopes = jnp.asarray(np.tile(slope[1:], (17, 1)))
     keys = regions.Keys(jnp.asarray(s_c), field(s_c), *[field(nodes)] * 3, slopes, slopes[0])
@@ -224,7 +229,10 @@ def test_phong_interpolates_magnitude_and_angle(sign, at_C):
 
     Press (angles from the inward normal) and draw.
     """
-    normal = lambda phi: np.array([0, math.cos(phi), math.sin(phi)])  # noqa: E731
+
+    def normal(phi):
+        return np.array([0, math.cos(phi), math.sin(phi)])
+
     x = np.array([1.0, 0, 0])
 
     def keyed(size, angle, phi):
@@ -256,7 +264,10 @@ def test_phong_on_the_back_of_a_flattened_tube():
     U at -b; between them the tube's normal turns and the angle goes linearly through 0.
     """
     b, size = 0.5, 1.4
-    outward = lambda angle: np.array([0, math.cos(angle), math.sin(angle)])  # noqa: E731
+
+    def outward(angle):
+        return np.array([0, math.cos(angle), math.sin(angle)])
+
     U, V = size * outward(-ALPHA - b), size * outward(ALPHA + b)
     rows = [jnp.tile(jnp.asarray(v), (17, 1)) for v in ([0.0, -2.0, 0.0], U, V)]
     keys = regions.Keys(jnp.asarray(73.0), jnp.array([0.0, -2.0, 0.0]), *rows)
@@ -313,7 +324,10 @@ def check_gradient(slopes, x, tangent, shape, step=1e-6, rtol=1e-6, sides=(1, -1
     _, ahead, back = slopes(x, tangent, weight)
     assert np.all(np.isfinite(ahead))
     np.testing.assert_allclose(back, jnp.sum(ahead * weight), rtol=1e-10, atol=1e-12)
-    at = lambda h: slopes(jax.tree.map(lambda a, b: a + h * b, x, tangent), tangent, weight)[0]  # noqa: E731
+
+    def at(h):
+        return slopes(jax.tree.map(lambda a, b: a + h * b, x, tangent), tangent, weight)[0]
+
     numeric = (at(sides[0] * step) - at(sides[1] * step)) / ((sides[0] - sides[1]) * step)
     np.testing.assert_allclose(ahead, numeric, atol=rtol * max(1, float(jnp.max(jnp.abs(ahead)))))
 
@@ -455,7 +469,10 @@ def test_dent_of_the_vertices_near_it_is_that_of_all(order, dtype):
 
         depth = jnp.asarray([0.2, -1.0, 0.3], dtype)
         slopes = jax.jacrev(lambda *x: both(*x)[1], argnums=(0, 1))
-        program = lambda s, d, f=both, df=slopes: (f(s, d)[0], df(s, d))  # noqa: E731
+
+        def program(s, d, f=both, df=slopes):
+            return (f(s, d)[0], df(s, d))
+
         batch = jax.jit(jax.vmap(program, (0, None)), compiler_options=QUICK)
         moved, derivatives = batch(s, depth)
         assert moved.dtype == jnp.dtype(dtype)

@@ -703,7 +703,10 @@ def test_a_lost_process_ends_the_other(lost, tmp_path):
     """Exit code 3 and a clear line within the patience; one process goes on alone."""
     write_study(tmp_path, 60, 3)
     pair = two(tmp_path, *FIT, "--patience", 5)
-    there = lambda: any((tmp_path / "out" / ".run").glob("*.npz"))  # noqa: E731
+
+    def there():
+        return any((tmp_path / "out" / ".run").glob("*.npz"))
+
     wait_for(there, pair[lost])
     pair[lost].send_signal(signal.SIGKILL)
     since = time.monotonic()

@@ -117,7 +117,10 @@ def batch(cases, scale, dtype):
 
 def sizes(cases, scale=1.0):
     """Of each pair, as the settings define it, over the scale; 1 mm for what has none."""
-    reach = lambda s: np.linalg.norm(s.vertices - s.vertices.mean(1)[:, None], axis=0).max()  # noqa: E731
+
+    def reach(s):
+        return np.linalg.norm(s.vertices - s.vertices.mean(1)[:, None], axis=0).max()
+
     size = [reach(c[0]) + reach(c[1]) + c[0].radius + c[1].radius for c in cases.values()]
     return np.where(np.array(size) > 1e-9, size, 1 / scale if scale else np.inf)
 
@@ -286,7 +289,10 @@ def test_a_level_box_touches_a_symmetric_tube_in_the_middle(name, kind):
 def test_of_two_patches_equally_near_one_is_always_taken():
     """A box over the middle of a patch, its neighbours level: alone, in a batch, each dtype."""
     tube, tool = tubes()["round"], box(np.array(BOXES["square"]), 0.5)
-    one = lambda x, tool, tube: touch(tool, Pose(jnp.eye(3, dtype=x.dtype), x), tube)  # noqa: E731
+
+    def one(x, tool, tube):
+        return touch(tool, Pose(jnp.eye(3, dtype=x.dtype), x), tube)
+
     found = []
     for dtype in ("float32", "float64"):
         cast = jax.tree.map(lambda v: jnp.asarray(v, dtype), (tool, tube))  # noqa: B023

@@ -64,12 +64,20 @@ def test_a_coarse_mesh_is_interpolated_where_the_fine_one_has_vertices():
     from jaxtrachea.trachea.tube import make_tube
 
     coarse, fine = (make_tube(table_1(), around=n, along=2 * n) for n in (8, 16))
-    field = lambda mesh: np.stack([mesh.s, 2 * mesh.s + 1, 0 * mesh.s], 1)[None]  # noqa: E731
+
+    def field(mesh):
+        return np.stack([mesh.s, 2 * mesh.s + 1, 0 * mesh.s], 1)[None]
+
     found = remesh(np.asarray(field(coarse)), coarse, fine)
     np.testing.assert_allclose(found, field(fine), atol=1e-12)
+
     # Linear in the turn from 0 to 315 deg, and from there back to its value at 360 = 0 deg.
-    turn = lambda mesh: np.asarray(mesh.phi) % (2 * np.pi)  # noqa: E731
-    around = lambda mesh: np.stack([turn(mesh)] * 3, 1)[None]  # noqa: E731
+    def turn(mesh):
+        return np.asarray(mesh.phi) % (2 * np.pi)
+
+    def around(mesh):
+        return np.stack([turn(mesh)] * 3, 1)[None]
+
     found = remesh(around(coarse), coarse, fine)[0, :, 0]
     last = 7 / 8 * 2 * np.pi
     expected = np.where(turn(fine) <= last + 1e-9, turn(fine), last / 2)
@@ -177,7 +185,10 @@ def off(found, reference):
     worst = 0.0
     for a, b in ((found.force, reference.force), (found.joints, reference.joints)):
         a, b = np.asarray(a, float), np.asarray(b)
-        length = lambda v: np.sqrt((v**2).sum(-1)).max()  # noqa: E731
+
+        def length(v):
+            return np.sqrt((v**2).sum(-1)).max()
+
         worst = max(worst, length(a - b) / length(b))
     return worst
 
@@ -211,10 +222,13 @@ def test_two_effects_within_tolerance_can_break_it_together():
     full = full_scene(spec, made)
     solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
     options = made.scene.plan.options
-    plan = lambda **less: dataclasses.replace(  # noqa: E731
+
+    def plan(**less):
+        return (dataclasses.replace(
         made.scene, plan=dataclasses.replace(
             made.scene.plan, options=dataclasses.replace(options, **less),
-            ignored=frozenset({"shear", "two_material"})))  # fmt: skip
+            ignored=frozenset({"shear", "two_material"}))))  # fmt: skip
+
     kept = {"precision": "float64"}
     loose = choose(full, 0.1, **kept)
     alone = {rung.ladder: rung.errors.worst for rung in loose.dropped}

@@ -45,7 +45,10 @@ def exact(D, C, k_1, k_3):
     with mp.workdps(60):
         D, C = mp.matrix(D.astype(float)), mp.matrix(C.astype(float).tolist())
         k_1, k_3 = mp.mpf(float(k_1)), mp.mpf(float(k_3))
-        depth = lambda kappa: mp.lu_solve(mp.eye(3) + kappa * C, D)  # noqa: E731
+
+        def depth(kappa):
+            return mp.lu_solve(mp.eye(3) + kappa * C, D)
+
         low, high = k_1, k_1 + k_3 * mp.norm(D) ** 2
         for _ in range(120):
             middle = mp.sqrt(low * high)
@@ -78,7 +81,10 @@ def test_any_compliance(dtype):
 @pytest.mark.parametrize("k_3", [0.0, 0.05, 3.0, -0.01])
 def test_against_scipy(k_3):
     D, k_1 = np.array([0.6, -1.7, 0.4]), 0.3
-    force = lambda d: (k_1 + k_3 * d @ d) * d  # noqa: E731
+
+    def force(d):
+        return (k_1 + k_3 * d @ d) * d
+
     found = scipy.optimize.root(lambda d: d + C_FULL @ force(d) - D, D / 3, tol=1e-13)
     got = solve(*cast("float64", D, C_FULL), law(k_1, k_3))
     np.testing.assert_allclose(got.depth, found.x, rtol=1e-10)

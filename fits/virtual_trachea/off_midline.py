@@ -75,7 +75,10 @@ def predict(values, s_c, phi_c, level, names):
 def measured(data: dict) -> tuple:
     """The data in the components of `predict`."""
     frames = np.stack([np.asarray(local_frame(jnp.asarray(p)))[::2] for p in data["phi_c"]])
-    local = lambda v: np.einsum("npq,n...q->n...p", frames, v)  # noqa: E731
+
+    def local(v):
+        return np.einsum("npq,n...q->n...p", frames, v)
+
     return (
         local(data["force"]),
         local(data["joints"]),
@@ -116,7 +119,10 @@ def errors(level: str, parameters: dict, data: dict) -> list[dict]:
     values = jnp.asarray(list(parameters.values()))
     got = [np.asarray(v) for v in predict(values, data["s_c"], data["phi_c"], level, names)]
     truth = measured(data)
-    rms = lambda v: float(np.sqrt(np.nanmean(v * v)))  # noqa: E731
+
+    def rms(v):
+        return float(np.sqrt(np.nanmean(v * v)))
+
     return [
         {
             "s_c": float(data["s_c"][i]),
@@ -144,8 +150,13 @@ def summary(name: str, on: str, parameters: dict, data: dict) -> dict:
 
 def document(record: list[dict]) -> str:
     """docs/off_midline.md."""
-    percent = lambda v: f"{100 * v:.1f}"  # noqa: E731
-    signed = lambda v: f"{100 * v:+.1f}"  # noqa: E731
+
+    def percent(v):
+        return f"{100 * v:.1f}"
+
+    def signed(v):
+        return f"{100 * v:+.1f}"
+
     rows = [["rings", "fitted to", "press", "F", "side force (FE)", "J normal", "J side", "ends"]]
     rows.append(["---"] * 8)
     for one in record:
@@ -165,7 +176,10 @@ def document(record: list[dict]) -> str:
         values.append(
             [one["rings"], one["fitted"], *("" if v is None else f"{v:.3g}" for v in cells)]
         )
-    table = lambda t: "\n".join(f"| {' | '.join(r)} |" for r in t)  # noqa: E731
+
+    def table(t):
+        return "\n".join(f"| {' | '.join(r)} |" for r in t)
+
     text = (HERE / "off_midline.md.in").read_text(encoding="utf-8")
     return text.replace("@ERRORS@", table(rows)).replace("@VALUES@", table(values))
 

@@ -258,8 +258,13 @@ def _print_rows(out) -> None:
 
     count = len(out.s)
     pick = np.unique(np.linspace(0, count - 1, min(count, MANY)).round().astype(int))
-    vector = lambda v: " ".join(f"{x:.3g}" for x in np.asarray(v).round(9) + 0.0)  # noqa: E731
-    share = lambda v: "–" if np.isnan(v) else f"{100 * v:.0f} %"  # noqa: E731
+
+    def vector(v):
+        return " ".join(f"{x:.3g}" for x in np.asarray(v).round(9) + 0.0)
+
+    def share(v):
+        return "–" if np.isnan(v) else f"{100 * v:.0f} %"
+
     rows = [
         [str(i + 1), f"{out.s[i]:.4g}", f"{np.degrees(out.phi[i]):.3g}",
          "–" if out.gap is None else f"{out.gap[i]:.3g}", vector(out.force[i]),

@@ -214,7 +214,10 @@ def _scaled(a: Shape, b: Shape, pose: Pose, settings: Settings, beta) -> _Scaled
     turned = rotate(pose.rotation, b.vertices)
     v_a = a.vertices - centre[:, None]
     v_b = turned + (pose.translation - centre)[:, None]
-    largest = lambda *v: jnp.max(jnp.abs(jnp.concatenate([x.ravel() for x in v])))  # noqa: E731
+
+    def largest(*v):
+        return jnp.max(jnp.abs(jnp.concatenate([x.ravel() for x in v])))
+
     v_a = _without_rounding(v_a, largest(a.vertices))
     v_b = _without_rounding(v_b, largest(turned, pose.translation, centre))
     size = jax.lax.stop_gradient(_size(v_a, v_b, a.radius + b.radius))

@@ -185,7 +185,10 @@ def touch(
     e = jnp.exp(-beta * (each.distance - low))
     weight = e / jnp.sum(e)
     gap = low - jnp.log(jnp.sum(e)) / beta
-    mean = lambda v: jnp.sum(weight[:, None] * v, axis=0)  # noqa: E731
+
+    def mean(v):
+        return jnp.sum(weight[:, None] * v, axis=0)
+
     point = mean(each.point_a)
     s, phi = skeleton_coordinates(patches.line, point)
     terms = patches.shapes.vertices.shape[2] * tool.vertices.shape[1] * near
@@ -246,9 +249,10 @@ def _unit(v):
 def _size(tool: Shape, patches: Patches):
     """Half-extents of tool and largest patch together, mm; not differentiable."""
     tool, shapes = jax.lax.stop_gradient((tool, patches.shapes))
-    reach = lambda v: jnp.sqrt(  # noqa: E731
-        jnp.max(jnp.sum((v - jnp.mean(v, axis=1, keepdims=True)) ** 2, axis=0))
-    )
+
+    def reach(v):
+        return jnp.sqrt(jnp.max(jnp.sum((v - jnp.mean(v, axis=1, keepdims=True)) ** 2, axis=0)))
+
     return (
         reach(tool.vertices)
         + tool.radius

@@ -108,7 +108,10 @@ def patches_of(
             progress(1, len(at) - 1)
     count = max(p[0].shape[1] for p in made)
     cores = np.stack([_filled_up(p[0], count) for p in made])
-    cast = lambda x: jnp.asarray(np.asarray(x), jnp.zeros(0, dtype).dtype)  # noqa: E731
+
+    def cast(x):
+        return jnp.asarray(np.asarray(x), jnp.zeros(0, dtype).dtype)
+
     shapes = Shape(cast(cores), cast([p[1] for p in made]))
     middles, lost, filled = (cast([p[i] for p in made]) for i in (2, 3, 4))
     return Patches(shapes, middles, Centreline(*map(cast, line)), lost, filled)
@@ -122,7 +125,10 @@ def _line(s, centres, frames, at):
         return x, x[:, None] * axes[0], axes[0], axes[1]
     known, first = np.unique(s, return_index=True)
     x = np.linspace(known[0], known[-1], int(np.ptp(known) / SPACING) + 2)
-    spread = lambda rows: np.stack([np.interp(x, known, r) for r in rows[first].T], axis=1)  # noqa: E731
+
+    def spread(rows):
+        return np.stack([np.interp(x, known, r) for r in rows[first].T], axis=1)
+
     points, tangents, anterior = map(spread, (centres, frames[:, :, 0], frames[:, :, 1]))
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     anterior -= np.sum(anterior * tangents, axis=1, keepdims=True) * tangents
@@ -132,7 +138,10 @@ def _line(s, centres, frames, at):
 def _station(line, at):
     """Point in the middle of a span, and the tangents at its middle and both of its ends."""
     x, points, tangents, _ = line
-    pick = lambda rows, y: np.array([np.interp(y, x, r) for r in rows.T])  # noqa: E731
+
+    def pick(rows, y):
+        return np.array([np.interp(y, x, r) for r in rows.T])
+
     middle = (at[0] + at[1]) / 2
     beyond = middle - np.clip(middle, x[0], x[-1])
     return pick(points, middle) + beyond * tangents[0], [pick(tangents, y) for y in (middle, *at)]
@@ -176,7 +185,10 @@ def _patch(inside, ends, own, station, rounding, most):
 
 def _deepest(points, planes):
     """Largest depth of the points below all planes; most are shallow, as a few planes tell."""
-    depth = lambda points, planes: (-(points @ planes[:, :3].T) - planes[:, 3]).min(axis=1)  # noqa: E731
+
+    def depth(points, planes):
+        return (-(points @ planes[:, :3].T) - planes[:, 3]).min(axis=1)
+
     bound = depth(points, planes[:: max(1, len(planes) // FEW)])
     order, deepest = np.argsort(-bound), -np.inf
     for start in range(0, len(order), PROBES):

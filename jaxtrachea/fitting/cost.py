@@ -177,7 +177,10 @@ class LaneCost(eqx.Module):
         lane = self.lane
         P, Jf, T = lane.lower.shape[0], len(self.model.free), lane.s_c.shape[0]
         m, dtype = size(lane), lane.lower.dtype
-        zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
+
+        def zeros(*shape):
+            return jnp.zeros(shape, dtype)
+
         return Point(zeros(T, m), zeros(T, Jf, m), zeros(), zeros(P), zeros(P, P))
 
     def rounding(self) -> Float[Array, ""]:

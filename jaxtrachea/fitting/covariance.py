@@ -74,13 +74,18 @@ def information(
     J = r.jacobian * (scale[None] * seen)[:, None]
     b2 = (lane.balance * lane.balance)[:, None, None]
     _, slope = robust(model.loss, z * z, model.loss_scale)
-    psi = lambda z: z * robust(model.loss, z * z, model.loss_scale)[1]  # noqa: E731
+
+    def psi(z):
+        return z * robust(model.loss, z * z, model.loss_scale)[1]
+
     _, dpsi = jax.jvp(psi, (z,), (jnp.ones_like(z),))
     gram = jnp.einsum("tim,tjm->tij", J, J)
     gradient = jnp.einsum("tim,tm->ti", J * b2, z * slope)
     total = jnp.sum(seen)
     kinds = jnp.arange(seen.shape[1]) < forces
-    by_kind = lambda v: jnp.stack([jnp.sum(v[:, :forces]), jnp.sum(v[:, forces:])])  # noqa: E731
+
+    def by_kind(v):
+        return jnp.stack([jnp.sum(v[:, :forces]), jnp.sum(v[:, forces:])])
 
     def spread(force):
         # A sort, and the dearest part of all this: only where the noise is taken from it.
@@ -232,7 +237,10 @@ def _ratio(along, meat, bread, meat_trace, bread_trace) -> np.ndarray:
 
     The traces are of the whole matrices: those of all unknowns, held ones too.
     """
-    form = lambda m: np.einsum("lip,lpq,liq->li", along, m, along)  # noqa: E731
+
+    def form(m):
+        return np.einsum("lip,lpq,liq->li", along, m, along)
+
     with np.errstate(invalid="ignore", divide="ignore"):
         return (form(meat) + 1e-12 * meat_trace[:, None]) / (
             form(bread) + 1e-12 * bread_trace[:, None]

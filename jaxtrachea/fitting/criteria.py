@@ -61,7 +61,10 @@ def criteria(study: Study, info: Information, alive: Bool[np.ndarray, " lanes"])
         n, S = counts[:, kind], squares[:, kind]
         if precision is None or data is None:
             continue
-        flat = lambda v: v.reshape(len(v), -1)  # noqa: E731
+
+        def flat(v):
+            return v.reshape(len(v), -1)
+
         if estimated[kind]:
             peak = np.max(np.abs(flat(data * precision)), axis=1, initial=0)
             peak = whole(peak, functools.partial(np.max, initial=0))

@@ -81,8 +81,13 @@ def descend(
 
 def _descend(model, method, learning_rate, block, tolerances, start, lane, sigma):
     """One start: blocks of steps until the cost settles."""
-    loss = lambda theta: cost(model, theta, lane, sigma)  # noqa: E731
-    box = lambda theta: jnp.clip(theta, lane.lower, lane.upper)  # noqa: E731
+
+    def loss(theta):
+        return cost(model, theta, lane, sigma)
+
+    def box(theta):
+        return jnp.clip(theta, lane.lower, lane.upper)
+
     optimiser = optax.lbfgs() if method == "lbfgs" else optax.adam(learning_rate)
 
     def step(_, carry):

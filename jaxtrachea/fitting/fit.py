@@ -142,7 +142,10 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
     blind = _open_directions(study, theta, structure)
     u = analyse(pool, relative, held, noise_given=noise_given, unknowns=unknowns, structural=blind)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        unscale = lambda v: np.where(present, np.where(log, np.exp(v), v * step), np.nan)  # noqa: E731
+
+        def unscale(v):
+            return np.where(present, np.where(log, np.exp(v), v * step), np.nan)
+
         value = unscale(theta)
         half = u.half_width[:, None] * u.se
         rms = np.sqrt(info.squares / info.counts)

@@ -229,7 +229,10 @@ def _step(objective: Objective, state: State) -> _Step:
     free = ~active_set(theta, g, objective)
     straight, damped = trust_region_step(state.radius, H, g, free)
     straight, stops = _onto_bounds(theta, straight, damped, point, free, state.radius, objective)
-    clip = lambda theta: jnp.clip(theta, objective.lower, objective.upper)  # noqa: E731
+
+    def clip(theta):
+        return jnp.clip(theta, objective.lower, objective.upper)
+
     straight = clip(theta + straight) - theta
     predicted = -jnp.sum(straight * (g + 0.5 * jnp.sum(H * straight[None], axis=1)))
     pull = objective.ahead(point, theta, straight)
@@ -260,7 +263,10 @@ def iterate(tolerances: Tolerances, objective: Objective, state: State) -> State
     shorter = jnp.where(finite, 0.25, 0.1) * jnp.minimum(state.radius, step.straight)
     longer = jnp.maximum(state.radius, 2 * step.straight)
     radius = jnp.where(ratio < 0.25, shorter, jnp.where(ratio > 0.75, longer, state.radius))
-    pick = lambda a, b: jnp.where(accept, a, b)  # noqa: E731
+
+    def pick(a, b):
+        return jnp.where(accept, a, b)
+
     point = jax.tree.map(pick, new, old)
     theta = pick(trial, state.theta)
     radius = jnp.where(fresh, state.radius, radius)
@@ -274,7 +280,10 @@ def iterate(tolerances: Tolerances, objective: Objective, state: State) -> State
 def _status(tolerances, old_cost, new, objective, fresh, finite, step, actual):
     """RUNNING, or why this lane is done."""
     dtype = new.theta.dtype
-    small = lambda tolerance: max(tolerance, 4 * epsilon(dtype))  # noqa: E731
+
+    def small(tolerance):
+        return max(tolerance, 4 * epsilon(dtype))
+
     cost, g = new.point.cost, new.point.gradient
     free = ~active_set(new.theta, g, objective)
     steepest = jnp.max(promise(new.theta, new.point, objective))
@@ -302,7 +311,10 @@ def _status(tolerances, old_cost, new, objective, fresh, finite, step, actual):
 
 def _advance(tolerances, rounds, objective, start, refill, state):
     """Put fresh starts where asked, then up to `rounds` iterations of the whole batch."""
-    put = lambda new, old: jnp.where(refill.reshape(-1, *[1] * (old.ndim - 1)), new, old)  # noqa: E731
+
+    def put(new, old):
+        return jnp.where(refill.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
     # Iteration 0 marks a fresh start: its point is evaluated before it is used. Where that fails
     # the cost stays infinite, so that no minimum of another start is taken for its own.
     cost = put(jnp.inf, state.point.cost)
@@ -404,7 +416,10 @@ def _on_bounds(theta, box: Box, rows) -> np.ndarray:
 def _idle(objective: Objective, batch: int, dtype) -> State:
     """A batch of slots nobody works at."""
     one: Any = jax.tree.map(lambda v: v[0], objective)
-    zeros = lambda *shape: jnp.zeros((batch, *shape), dtype)  # noqa: E731
+
+    def zeros(*shape):
+        return jnp.zeros((batch, *shape), dtype)
+
     point = jax.tree.map(lambda v: zeros(*v.shape), one.blank())
     done = jnp.full(batch, FitStatus.CONVERGED, jnp.int8)
     return State(zeros(*one.lower.shape), point, zeros(), jnp.zeros(batch, jnp.int32), done)

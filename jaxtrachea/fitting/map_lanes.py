@@ -36,7 +36,10 @@ def batch_size(total: int, most: int) -> int:
 
 def cast(tree: Any, dtype) -> Any:
     """Floating-point numpy arrays of a tree in a dtype; others stay."""
-    moves = lambda v: np.issubdtype(v.dtype, np.floating)  # noqa: E731
+
+    def moves(v):
+        return np.issubdtype(v.dtype, np.floating)
+
     return jax.tree.map(lambda v: v.astype(dtype, copy=False) if moves(v) else v, tree)
 
 

@@ -28,7 +28,10 @@ def sizes_of_press(study: Study) -> Float[np.ndarray, "lanes P"]:
         return out
     lanes = study.lanes
     seen = lanes.precision > 0
-    pick = lambda v, fill: np.where(seen, v, fill)  # noqa: E731
+
+    def pick(v, fill):
+        return np.where(seen, v, fill)
+
     span = np.max(pick(lanes.displacement, -np.inf), axis=2)
     span = span - np.min(pick(lanes.displacement, np.inf), axis=2)
     peak = np.max(pick(np.abs(lanes.force), -np.inf), axis=2)
@@ -81,7 +84,10 @@ def around_touch(study: Study, guess, low, high, decades: float):
         low = np.where(known, np.minimum(at - reach, start), low)
         high = np.where(known, np.maximum(at + reach, start), high)
         guess = np.where(known, start, guess)
-    inside = lambda v: np.clip(v, study.lanes.lower, study.lanes.upper)  # noqa: E731
+
+    def inside(v):
+        return np.clip(v, study.lanes.lower, study.lanes.upper)
+
     return inside(guess), inside(low), inside(high)
 
 

@@ -95,7 +95,10 @@ class Sides:
         study = self.result.study
         # Never fewer starts than slots: every call then runs the one compiled program.
         fill = max(self.batch - len(lanes), 0)
-        pad = lambda v: np.concatenate([v, v[-1:].repeat(fill, axis=0)])  # noqa: E731
+
+        def pad(v):
+            return np.concatenate([v, v[-1:].repeat(fill, axis=0)])
+
         chosen = study.take(pad(lanes))
         pinned = pad(np.broadcast_to(pinned, start.shape))
         start = np.clip(pad(start), chosen.lanes.lower, chosen.lanes.upper)

@@ -81,7 +81,10 @@ def inputs(
     """
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
     skeleton = _skeleton(model, free, _places(lane), tube)
-    at = lambda free, value, s_c: _at_contact(model, free, value, s_c, tube)  # noqa: E731
+
+    def at(free, value, s_c):
+        return _at_contact(model, free, value, s_c, tube)
+
     contact = jax.vmap(at)(free, lane.value, lane.s_c)
     felt = _felt(model, skeleton)
     return Inputs(felt, skeleton.joints, contact.law, contact.onset, contact.force_offset)
@@ -100,7 +103,10 @@ def residual(
     """
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
     skeleton, by_beam = _skeleton_and_derivative(model, free, _places(lane), tube)
-    one = lambda *trial: _of_trial_with_jacobian(model, tube, *trial)  # noqa: E731
+
+    def one(*trial):
+        return _of_trial_with_jacobian(model, tube, *trial)
+
     return Residual(*jax.vmap(one)(free, skeleton, by_beam, _trials(lane)))
 
 
@@ -239,7 +245,10 @@ def _whitened(force, joints, trial: Lane) -> Float[Array, " m"]:
 
 def _masked(force, joints, trial: Lane) -> Float[Array, " m"]:
     """Observed entries over their standard deviation, exact zeros elsewhere; in one row."""
-    seen = lambda v, precision: jnp.where(precision > 0, v, 0) * precision  # noqa: E731
+
+    def seen(v, precision):
+        return jnp.where(precision > 0, v, 0) * precision
+
     r = seen(force, trial.precision)
     if joints is None:
         return r
@@ -271,8 +280,13 @@ class _Pressed(NamedTuple):
 def _press(model: FitModel, tube, free, skeleton, by_beam, value, s_c, D, blend) -> _Pressed:
     """One press at s_c (mm) with tool displacements D (mm), given the skeleton there."""
     eye = jnp.eye(free.shape[0], dtype=free.dtype)
-    at_contact = lambda free: _at_contact(model, free, value, s_c, tube)  # noqa: E731
-    push = lambda t: jax.jvp(at_contact, (free,), (t,))  # noqa: E731
+
+    def at_contact(free):
+        return _at_contact(model, free, value, s_c, tube)
+
+    def push(t):
+        return jax.jvp(at_contact, (free,), (t,))
+
     contact, d_contact = jax.vmap(push, out_axes=(None, 0))(eye)
     of_beam = _beam_columns(model)
 
@@ -285,8 +299,13 @@ def _press(model: FitModel, tube, free, skeleton, by_beam, value, s_c, D, blend)
     law, c = contact.law, _felt(model, skeleton)
     depth = respond(D, contact.onset, c, law, model.options, blend).depth
     by = sensitivity(depth, c, law)
-    at = lambda onset: touch(D, onset, model.options, blend)  # noqa: E731
-    slope = lambda onset: jax.jvp(at, (onset,), (jnp.ones_like(onset),))[1]  # noqa: E731
+
+    def at(onset):
+        return touch(D, onset, model.options, blend)
+
+    def slope(onset):
+        return jax.jvp(at, (onset,), (jnp.ones_like(onset),))[1]
+
     moved = slope(contact.onset)
     terms = {
         "compliance": (_felt(model, d_skeleton), by.compliance),
@@ -321,7 +340,10 @@ def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, tria
         d_joints = jax.vmap(_times, (0, None))(pressed.d_force, skeleton.joints)
         d_joints = d_joints + jax.vmap(_times, (None, 0))(pressed.force, pressed.d_joints)
     value = _whitened(pressed.force + pressed.offset, joints, trial)
-    row = lambda force, joints: _masked(force, joints, trial)  # noqa: E731
+
+    def row(force, joints):
+        return _masked(force, joints, trial)
+
     bend = None
     if pressed.corner is not None and joints is None:
         bend = _masked(pressed.corner, None, trial)

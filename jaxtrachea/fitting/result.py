@@ -163,8 +163,13 @@ class FitResult:
         judged = [[judgement(self, k, i) if i < len(study.unknowns[k]) else None
                    for i in range(size)] for k in range(self.lanes)]  # fmt: skip
         both, per_lane = ("lane", "unknown"), ("lane",)
-        word = lambda j: "" if j is None else j.verdict  # noqa: E731
-        end = lambda j, side: np.nan if j is None else getattr(j, side)  # noqa: E731
+
+        def word(j):
+            return "" if j is None else j.verdict
+
+        def end(j, side):
+            return np.nan if j is None else getattr(j, side)
+
         units = [
             [p.unit for p, _, _ in lane] + [""] * (size - len(lane)) for lane in study.unknowns
         ]

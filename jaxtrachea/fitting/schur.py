@@ -95,7 +95,10 @@ def trust_region_step(
     top = max(values[-1], 1e-300)
     values = np.maximum(values, 0)
     along = vectors.T @ gradient
-    step = lambda damping: -along / (values + damping)  # noqa: E731
+
+    def step(damping):
+        return -along / (values + damping)
+
     low, high = np.log(_SINGULAR * top), np.log(top + scipy.linalg.norm(along) / radius)
     if scipy.linalg.norm(step(np.exp(low))) > radius:
         for _ in range(60):

@@ -434,7 +434,10 @@ def _profiled(region: _Region, evidence: Evidence) -> None:
     low, high = np.where(open_[:, 0], -np.inf, low), np.where(open_[:, 1], np.inf, high)
     log, step = scales(result.study)
     with np.errstate(over="ignore"):
-        unscale = lambda v: np.where(log[lane, unknown], np.exp(v), v * step[lane, unknown])  # noqa: E731
+
+        def unscale(v):
+            return np.where(log[lane, unknown], np.exp(v), v * step[lane, unknown])
+
         evidence.evidence_low[lane, unknown] = unscale(low)
         evidence.evidence_high[lane, unknown] = unscale(high)
     evidence.evidence_end[lane, unknown] = end

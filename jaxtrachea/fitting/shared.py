@@ -137,7 +137,10 @@ def _single(task: _Task, study: Study, rows, starts, progress=None) -> Solved:
     """The solver of single lanes; always in batches of one size, so that it is compiled once."""
     total = len(rows)
     missing = max(0, task.batch - total)
-    pad = lambda v: np.concatenate([v, np.repeat(v[:1], missing, axis=0)])  # noqa: E731
+
+    def pad(v):
+        return np.concatenate([v, np.repeat(v[:1], missing, axis=0)])
+
     solved = levenberg_marquardt(
         LaneCost(study.model, study.lanes, task.sigma), pad(starts), pad(rows),
         tolerances=task.tolerances, batch=task.batch, progress=progress, dtype=task.dtype,
@@ -148,7 +151,10 @@ def _single(task: _Task, study: Study, rows, starts, progress=None) -> Solved:
 def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
     """One start: iterations until the shared unknowns and all lanes rest."""
     lanes = task.study.lanes
-    clip = lambda theta: np.clip(theta, lanes.lower, lanes.upper)  # noqa: E731
+
+    def clip(theta):
+        return np.clip(theta, lanes.lower, lanes.upper)
+
     here = _evaluate_or_refit(task, clip(start), None, np.ones(len(start), bool))
     alive = here.finite
     radius, status, budget, n = _FIRST_RADIUS, FitStatus.MAX_ITERATIONS, _BUDGET, 0
@@ -217,7 +223,10 @@ def _shared_step(task: _Task, here: Evaluated, alive, radius, moving, gradient, 
 def _of_shared(task: _Task, theta, alive):
     """The shared unknowns and their bounds."""
     row, lanes = int(np.argmax(alive)), task.study.lanes
-    at = lambda v: v[row, task.shared[row]]  # noqa: E731
+
+    def at(v) -> Any:
+        return v[row, task.shared[row]]
+
     return at(theta), Bounds(at(lanes.lower), at(lanes.upper))
 
 
@@ -366,14 +375,20 @@ def pooled(
     """
     squares, counts = info.squares[alive].sum(axis=0), info.counts[alive].sum(axis=0)
     of_lane = info.counts[alive].sum(axis=1)
-    mean = lambda v: np.sum(v[alive] * of_lane) / max(np.sum(of_lane), 1)  # noqa: E731
+
+    def mean(v):
+        return np.sum(v[alive] * of_lane) / max(np.sum(of_lane), 1)
+
     spread = np.zeros(2)
     if study.model.loss != "linear":
         batch, forces = batch_size(len(theta), 128), study.lanes.force.shape[-1]
         r = map_lanes(_absolute_residual, study, theta, batch=batch)[alive]
         kinds = (r[..., :forces], r[..., forces:])
         spread = np.array([np.nanmedian(v) if np.any(np.isfinite(v)) else 0.0 for v in kinds])
-    every = lambda v: np.tile(v, (len(alive), *[1] * np.ndim(v)))  # noqa: E731
+
+    def every(v):
+        return np.tile(v, (len(alive), *[1] * np.ndim(v)))
+
     return info._replace(
         squares=every(squares), counts=every(counts), spread=every(spread),
         psi2=every(mean(info.psi2)), dpsi=every(mean(info.dpsi)),

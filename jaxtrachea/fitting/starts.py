@@ -40,7 +40,10 @@ def box(study: Study, decades: float) -> Box:
             a tenth of the press, around the change point of the curve).
     """
     guess = of_unknowns(study, lambda p: p.to_scaled(p.value), 0.0)
-    decade = lambda p: np.log(10) if p.scale == "log" else 10.0  # noqa: E731
+
+    def decade(p):
+        return np.log(10) if p.scale == "log" else 10.0
+
     reach = decades * of_unknowns(study, decade, 0.0)
     low = np.maximum(study.lanes.lower, guess - reach)
     high = np.minimum(study.lanes.upper, guess + reach)

@@ -110,7 +110,10 @@ class Study:
 
     def lane_name(self, lane: int) -> tuple[str, str]:
         """Specimen and trial of a lane; "(all)" where it spans several."""
-        one = lambda names: names.pop() if len(names) == 1 else "(all)"  # noqa: E731
+
+        def one(names):
+            return names.pop() if len(names) == 1 else "(all)"
+
         curves = self.curves[lane]
         return one({c.specimen for c in curves}), one({c.trial for c in curves})
 

@@ -17,7 +17,10 @@ GOOD, POOR = (1.01, 400, 0.0), (1.05, 100, 0.02)
 def grade(rhat: float, ess: float, share: float) -> str:
     """`good`, `doubtful` or `poor`, by the largest R-hat, fewest draws, share divergent."""
     found = np.array([rhat, -ess, share])
-    within = lambda bar: np.all(found <= (bar[0], -bar[1], bar[2]))  # noqa: E731
+
+    def within(bar):
+        return np.all(found <= (bar[0], -bar[1], bar[2]))
+
     if within(GOOD):
         return "good"
     return "doubtful" if within(POOR) else "poor"

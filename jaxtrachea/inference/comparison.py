@@ -96,7 +96,10 @@ def same_data(studies: Sequence[Study], names: Sequence[str]) -> None:
 
 def _curves(study: Study) -> set[tuple]:
     """Every curve as something that can be compared."""
-    said = lambda v: None if v is None else v.tobytes()  # noqa: E731
+
+    def said(v):
+        return None if v is None else v.tobytes()
+
     return {
         (c.specimen, c.trial, c.s_c, *map(said, (c.displacement, c.force, c.joint_displacement)))
         for lane in study.curves
@@ -170,7 +173,10 @@ def _rows(
 ) -> list[Row]:
     """One row per model of the sum over its lanes; samples are worth what the best model says."""
     of = [m.result.criteria for m in models]
-    total = lambda v, at: float(np.sum(v[at]))  # noqa: E731
+
+    def total(v, at):
+        return float(np.sum(v[at]))
+
     AICc = np.array([total(c.AICc, at) for c, at in zip(of, lanes, strict=True)])
     with np.errstate(invalid="ignore"):
         delta = AICc - np.min(AICc)

@@ -138,7 +138,10 @@ def leave_one_out(study: Study, settings: Settings, progress=None) -> LeftOut:
 
 def without(study: Study, held: Bool[np.ndarray, "lanes T"]) -> Study:
     """The same lanes, blind to the trials held back; what these alone read is no unknown."""
-    blind = lambda v: None if v is None else np.where(held[:, :, *[None] * (v.ndim - 2)], 0, v)  # noqa: E731
+
+    def blind(v):
+        return None if v is None else np.where(held[:, :, *[None] * (v.ndim - 2)], 0, v)
+
     lanes = study.lanes
     seen = lanes._replace(
         precision=blind(lanes.precision), joint_precision=blind(lanes.joint_precision)
@@ -311,7 +314,10 @@ def leave_repeats_out(
     observed = held[:, :, None] & (chosen.lanes.precision > 0)
     lost = np.any(observed & ~np.isfinite(seen), axis=(1, 2))
     converged = result.succeeded & touched.converged
-    of_lane = lambda rows: np.bincount(lanes[rows], minlength=count)  # noqa: E731
+
+    def of_lane(rows):
+        return np.bincount(lanes[rows], minlength=count)
+
     missed = Missed(
         error=np.full(count, np.nan),
         refits=of_lane(np.ones(len(lanes), bool)),

@@ -127,19 +127,32 @@ def diagnose(
     r, (seen, _) = residual(model, theta, lane), observations(lane)
     scale = entry_scale(lane, sigma)[None]
     z, J = r.value * scale, r.jacobian * (scale * seen)[:, None]
-    psi = lambda z: z * robust(model.loss, z * z, model.loss_scale)[1]  # noqa: E731
+
+    def psi(z):
+        return z * robust(model.loss, z * z, model.loss_scale)[1]
+
     slope = robust(model.loss, z * z, model.loss_scale)[1]
     pull, stiffness = jax.jvp(psi, (z,), (jnp.ones_like(z),))
     b2 = (lane.balance * lane.balance)[:, None]
     weight, pull, stiffness = b2 * slope, b2 * pull, b2 * stiffness
-    gram = lambda w: jnp.einsum("tim,tm,tjm->tij", J, w, J)  # noqa: E731
-    whole = lambda w: assemble(model, gram(w), lane)  # noqa: E731
+
+    def gram(w):
+        return jnp.einsum("tim,tm,tjm->tij", J, w, J)
+
+    def whole(w):
+        return assemble(model, gram(w), lane)
+
     A = whole(weight)
     inverse = _invert(A, hessian(model, theta, lane, sigma), relative, free)
     blocks = functools.partial(_blocks, model, lane)
     near, K = blocks(inverse.gauss_newton), blocks(inverse.full)
-    form = lambda block: jnp.einsum("tim,tij,tjm->tm", J, block, J)  # noqa: E731
-    sandwich = lambda outer, m: outer @ m @ outer  # noqa: E731
+
+    def form(block):
+        return jnp.einsum("tim,tij,tjm->tm", J, block, J)
+
+    def sandwich(outer, m):
+        return outer @ m @ outer
+
     leverage = weight * form(near)
     left = 1 - 2 * leverage + form(blocks(sandwich(inverse.gauss_newton, whole(weight**2))))
     rise = blocks(sandwich(inverse.full, A)) / jnp.maximum(jnp.sum(free), 1)
@@ -232,8 +245,13 @@ def _conclude(result: FitResult, found: Diagnostics) -> Influence:
     good = np.array([succeeded(result, k) for k in range(result.lanes)])
     seen = _seen(study) & good[:, None, None]
     curve = good[:, None] & np.array([np.arange(columns.shape[1]) < len(c) for c in study.curves])
-    at = lambda v, there: np.where(there, v, np.nan)  # noqa: E731
-    moved = lambda v: at(v / se[..., None], seen[:, :, None])  # noqa: E731
+
+    def at(v, there):
+        return np.where(there, v, np.nan)
+
+    def moved(v):
+        return at(v / se[..., None], seen[:, :, None])
+
     found = found._replace(
         leverage=at(found.leverage, seen),
         studentised=at(found.studentised, seen),

@@ -139,7 +139,10 @@ def _spread(drawn: tuple[bool, bool], values: Array) -> Float[Array, "2"]:
 
 def _density(model: FitModel, drawn, lane: Lane, sigma, centre, root):
     """Log posterior where the sampler moves, and the way from there to the real line."""
-    to_x = lambda y: centre + jnp.sum(root * y[None], axis=1)  # noqa: E731
+
+    def to_x(y):
+        return centre + jnp.sum(root * y[None], axis=1)
+
     return lambda y: log_density(model, drawn, lane, sigma, to_x(y)), to_x
 
 

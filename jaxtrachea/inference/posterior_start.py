@@ -52,7 +52,10 @@ def mode(result: FitResult) -> FitResult:
     settings = Settings(starts=1, more_starts=0)
     again = fit(dataclasses.replace(study, lanes=flat), settings, starts=result.theta)
     worse = ~again.succeeded
-    keep = lambda new, old: np.where(worse.reshape(-1, *[1] * (new.ndim - 1)), old, new)  # noqa: E731
+
+    def keep(new, old):
+        return np.where(worse.reshape(-1, *[1] * (new.ndim - 1)), old, new)
+
     return dataclasses.replace(
         result,
         theta=keep(again.theta, result.theta),

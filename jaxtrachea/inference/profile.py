@@ -135,7 +135,10 @@ def profiles(
     log = np.array([p.scale == "log" for p in parameters], bool)
     step = np.array([p.step for p in parameters])
     with np.errstate(over="ignore"):
-        unscale = lambda v: np.where(log, np.exp(v), v * step)  # noqa: E731
+
+        def unscale(v):
+            return np.where(log, np.exp(v), v * step)
+
         lower, upper = unscale(best - reach[:, 0]), unscale(best + reach[:, 1])
     threshold = sides.target[::2] ** 2
     ends = end.reshape(-1, 2)

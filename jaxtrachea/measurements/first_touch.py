@@ -78,7 +78,10 @@ def first_touch(
     around = np.linspace(-step, step, _FINE + 1)
     best = curves.best(curves.best(scan).onset[:, None] + around[None])
     peak = np.max(np.where(seen, np.abs(force - best.offset[:, None]), 0), axis=1)
-    hide = lambda v: np.where(usable, v, np.nan)  # noqa: E731
+
+    def hide(v):
+        return np.where(usable, v, np.nan)
+
     return FirstTouch(
         onset=hide(zero + best.onset * unit),
         force_offset=hide(best.offset),

@@ -105,7 +105,10 @@ def hide(refused: Int[Array, ""], *arrays: Any) -> Any:
         The same, one for each argument (of one argument: itself).
     """
     off = refused != PressStatus.OK
-    floating = lambda v: jnp.issubdtype(v.dtype, jnp.floating)  # noqa: E731
+
+    def floating(v):
+        return jnp.issubdtype(v.dtype, jnp.floating)
+
     hidden = jax.tree.map(lambda v: jnp.where(off, jnp.nan, v) if floating(v) else v, arrays)
     return hidden[0] if len(hidden) == 1 else hidden
 

@@ -92,7 +92,10 @@ def _sweep(side: _Side) -> tuple[_Node, _Node, Float[Array, " n"]]:
 
 def _both_sides(beam: Beam, ring_load=None) -> _Side:
     """The beam read from A and from B, stacked on a leading axis."""
-    both = lambda v: jnp.stack([v, v[::-1]])  # noqa: E731
+
+    def both(v):
+        return jnp.stack([v, v[::-1]])
+
     # Span lengths before mirroring: length - x would cost short spans their digits.
     h = both(jnp.diff(_ends(beam)))
     GA = None if beam.GA is None else both(beam.GA)
@@ -167,12 +170,18 @@ def contact_compliance(
         tips = jax.vmap(lambda side: _tip(side, _sweep(side)[0]))(cut)
         return _compliance_at(tips.g, s, split)
     _, nodes, _ = jax.vmap(_sweep)(both)
-    with_clamp = lambda v: jnp.concatenate([jnp.zeros_like(v[:, :1]), v], axis=1)  # noqa: E731
+
+    def with_clamp(v):
+        return jnp.concatenate([jnp.zeros_like(v[:, :1]), v], axis=1)
+
     nodes = jax.tree.map(with_clamp, nodes)
 
     def one(s_c):
         count, last, s = _reach(beam, s_c)
-        at = lambda v: v[jnp.arange(2), count]  # noqa: E731
+
+        def at(v):
+            return v[jnp.arange(2), count]
+
         GA = None if both.GA is None else at(both.GA)
         tips = add_span(jax.tree.map(at, nodes.g), last, at(both.EI), GA)
         return _compliance_at(tips, s, split)
@@ -228,7 +237,10 @@ def deflect(
     w_C, theta_C, V, M = divide_load(tips.g, s, force, split, tips.free)
     w, theta, R = jax.vmap(_back_substitute)(cut, nodes, passed, V, M)
     in_A = beam.x <= s_c
-    both = lambda v, sign: jnp.where(in_A, v[0], sign * v[1][::-1])  # noqa: E731
+
+    def both(v, sign):
+        return jnp.where(in_A, v[0], sign * v[1][::-1])
+
     return Deflection(w_C, theta_C, both(w, 1), both(theta, -1), both(R, 1), V[0], M[0])
 
 

@@ -91,7 +91,10 @@ def press_total(
     negative = depth * displacement < 0
     status = status_of(displacement, depth + force, folded)
     status = jnp.where((status == PressStatus.OK) & negative, PressStatus.NEGATIVE_LOCAL, status)
-    hide = lambda v: jnp.where(folded, jnp.nan, v)  # noqa: E731
+
+    def hide(v):
+        return jnp.where(folded, jnp.nan, v)
+
     return Equilibrium(hide(depth), hide(force), status.astype(jnp.int8))
 
 

@@ -176,7 +176,9 @@ def _cone_root(D, C, law: Law, mu):
     N, w, _ = _given_mobility(jnp.full_like(mu, jnp.inf), D, C, law, mu)
     length = jnp.linalg.norm(w)
     first = length / N - mu * jnp.sum(w * apply(C[1:, 1:], w)) / length**2
-    excess = lambda z: _excess(z, D, C, law, mu)  # noqa: E731
+
+    def excess(z):
+        return _excess(z, D, C, law, mu)
 
     def newton(_, state):
         z, low, high = state

@@ -240,7 +240,10 @@ def _only_default(options: Options):
 
 def _assemble(unit: Skeleton, force, depth, status) -> ObliquePress:
     """The skeleton's response times the forces; the ring's status where it has one."""
-    per_ring = lambda v: jnp.einsum("...q,ipq->...ip", force, v)  # noqa: E731
+
+    def per_ring(v):
+        return jnp.einsum("...q,ipq->...ip", force, v)
+
     behind = unit.status == RingStatus.BEHIND_GAP
     status = jnp.where(behind, PressStatus.BEHIND_GAP, status).astype(jnp.int8)
     return ObliquePress(

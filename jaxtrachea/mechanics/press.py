@@ -235,7 +235,10 @@ def _press(
     law = local_law(geometry, material, s_c, options)
     solved = respond(displacement, onset, unit.w_C, law, options, blend)
     unit, solved = hide(refused, unit, solved)
-    per_ring = lambda v: solved.force[..., None] * v  # noqa: E731
+
+    def per_ring(v):
+        return solved.force[..., None] * v
+
     shape = (*displacement.shape, *unit.w.shape)
     return Press(
         force=solved.force,

@@ -238,7 +238,10 @@ def respond(
     breaks = jnp.stack([-ring.half_angle, phi, ring.half_angle])
     C, h = _influence(ring, phi, phi, breaks, order)
     share, tie = _shares(ring, phi), _tie(ring)
-    settle = lambda end: 2 * jnp.sum(end * load) / ring.k_M  # noqa: E731
+
+    def settle(end):
+        return 2 * jnp.sum(end * load) / ring.k_M
+
     thrust, shift = tie.hold * jnp.sum(h * load), load[1] / ring.k_M
     opening = tie.give * jnp.sum(h * load)
     stiff = ring.k_t > 1  # N/mm; either form serves, the second loses digits of a weak tie
@@ -246,7 +249,10 @@ def respond(
     pulled = jnp.where(stiff, thrust - ring.k_M / 4 * opening, pulled)
     end_U = jnp.stack([settle(share.U), shift - opening / 2])
     end_V = jnp.stack([settle(share.V), shift + opening / 2])
-    hide = lambda v: jnp.where(on, v, jnp.nan)  # noqa: E731
+
+    def hide(v):
+        return jnp.where(on, v, jnp.nan)
+
     status = _status(phi_c, on, jnp.all(jnp.isfinite(C)))
     ends = hide(end_U), hide(end_V)
     return RingResponse(

@@ -120,8 +120,11 @@ def respond(
     GA = _planes(_needed(material, "GA_L", "shear"), material.GA_side, n + 1) if shear else None
     beam = spatial_beam.SpatialBeam(x, geometry.length, EI, frame @ C @ frame.T, GA)
     unit = jax.vmap(spatial_beam.deflect, (None, None, 0), -1)(beam, s_c, jnp.eye(2, dtype=x.dtype))
+
     # To y and z: components on the left, the force's on the right.
-    turn = lambda v: frame.T @ v @ frame  # noqa: E731
+    def turn(v):
+        return frame.T @ v @ frame
+
     w_C, w, P = turn(unit.w_C), turn(unit.w), turn(unit.reaction)
     along = None
     if axial:
@@ -175,7 +178,10 @@ def _rings(geometry: Geometry, material: Material, phi_c, level: Rings):
         return C, tuple(_ring.ring_influence(ring, end, phi_c) for end in ends), status
 
     if material.k_M.ndim == 0:
-        alike = lambda v: jnp.broadcast_to(v, (*k_M.shape, *v.shape))  # noqa: E731
+
+        def alike(v):
+            return jnp.broadcast_to(v, (*k_M.shape, *v.shape))
+
         C, ends, status = jax.tree.map(alike, one(material.k_M))
     else:
         # Not vmap: XLA's CPU compiler (jaxlib 0.10.2) then gets wrong forward derivatives of many

@@ -174,7 +174,10 @@ def _ends(beam: SpatialBeam):
 
 def _sweep_both(beam: SpatialBeam, ring_load=None) -> _Side:
     """Sweeps from A and from B, stacked on a leading axis; independent of the contact position."""
-    both = lambda v: None if v is None else jnp.stack([v, v[::-1]])  # noqa: E731
+
+    def both(v):
+        return None if v is None else jnp.stack([v, v[::-1]])
+
     integrity = jnp.ones_like(beam.x) if beam.integrity is None else beam.integrity
     h = both(jnp.diff(_ends(beam)))
     spans = (h, both(beam.EI), both(beam.GA))
@@ -197,7 +200,9 @@ def _reach(sides: _Side, beam: SpatialBeam, s_c) -> _Reach:
     last = jnp.stack([s_c - ends[count_A], ends[count_A + 1] - s_c])
 
     def one(side, h, count):
-        at = lambda v: jax.lax.dynamic_index_in_dim(v, count, keepdims=False)  # noqa: E731
+        def at(v):
+            return jax.lax.dynamic_index_in_dim(v, count, keepdims=False)
+
         tip, EI, GA = jax.tree.map(at, (side.after, side.EI, side.GA))
         return _add_span(tip, h, EI, GA)
 
@@ -292,7 +297,10 @@ def deflect(
     w_C, theta_C, V, M = _join(_side(reach.tips, 0), _side(reach.tips, 1), force)
     w, theta, R = jax.vmap(_back_substitute)(sides, reach.last, reach.count, V, M)
     in_A = (beam.x <= s_c)[:, None]
-    join = lambda v, sign: jnp.where(in_A, v[0], sign * v[1][::-1])  # noqa: E731
+
+    def join(v, sign):
+        return jnp.where(in_A, v[0], sign * v[1][::-1])
+
     return SpatialDeflection(w_C, theta_C, join(w, 1), join(theta, -1), join(R, 1), V[0], M[0])
 
 

@@ -77,7 +77,10 @@ def press_vector_total(
     status = status_of(jnp.max(jnp.abs(displacement)), jnp.sum(depth + force), folded)
     negative = (status == PressStatus.OK) & (jnp.sum(depth * force) < 0)
     status = jnp.where(negative, PressStatus.NEGATIVE_LOCAL, status).astype(jnp.int8)
-    hide = lambda v: jnp.where(folded, jnp.nan, v)  # noqa: E731
+
+    def hide(v):
+        return jnp.where(folded, jnp.nan, v)
+
     return VectorEquilibrium(hide(depth), hide(force), status)
 
 

@@ -84,7 +84,9 @@ def jacobian(model: FitModel, free, value, s_c, displacement, blend=None):
     """`respond`, its statuses, and its derivative by every free column, a leading axis (F, ...)."""
 
     def push(tangent):
-        at = lambda free: respond(model, free, value, s_c, displacement, blend)  # noqa: E731
+        def at(free):
+            return respond(model, free, value, s_c, displacement, blend)
+
         out, moved, status = jax.jvp(at, (free,), (tangent,), has_aux=True)
         return out, status, moved
 

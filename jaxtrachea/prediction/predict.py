@@ -117,7 +117,10 @@ def predict_sources(
     most = _rounded(max(map(len, displacements)), 32)
     padded = np.stack([np.pad(d, (0, most - len(d)), mode="edge") for d in displacements])
     places = np.where(np.isnan(s), float(stored.study.model.geometry.length) / 2, s)
-    stack = lambda name: np.stack([getattr(source, name) for source in sources])  # noqa: E731
+
+    def stack(name):
+        return np.stack([getattr(source, name) for source in sources])
+
     columns = [stack(n) for n in ("free", "value", "covariance", "blind", "half_width")]
     columns += [places, padded]
     presses = zip(sources, s, padded, strict=True)
@@ -150,12 +153,21 @@ def _rounded(count: int, least: int) -> int:
 def _on_host(stored: StoredFit, source: Source, s, displacement, part: Predicted, sigma):
     """One curve, cut to its length, with its status."""
     n = len(displacement)
-    cut = lambda v: np.asarray(v[:n], np.float64)  # noqa: E731
+
+    def cut(v):
+        return np.asarray(v[:n], np.float64)
+
     value, se = jax.tree.map(cut, part.value), jax.tree.map(cut, part.se)
     usable = source.status.predicts
-    hide = lambda v: v if usable else np.full_like(v, np.nan)  # noqa: E731
+
+    def hide(v):
+        return v if usable else np.full_like(v, np.nan)
+
     skeleton = any(p.name == "k_M" for p in stored.study.parameters)
-    show = lambda v: hide(v) if skeleton else np.full_like(v, np.nan)  # noqa: E731
+
+    def show(v):
+        return hide(v) if skeleton else np.full_like(v, np.nan)
+
     presses = np.asarray(part.status[:n])
     bend = _bend(source, cut(part.bend.T).T, value, se, int(part.deepest))
     status, message = _verdict(source, value, se, presses, bend)

@@ -61,7 +61,10 @@ def at_table(curves: Sequence[CurvePrediction]) -> list[list[str]]:
     rows = []
     for p in curves:
         i = int(np.argmax(np.abs(p.displacement)))
-        pair = lambda low, high, i=i: f"{number(float(low[i]))} … {number(float(high[i]))}"  # noqa: E731
+
+        def pair(low, high, i=i):
+            return f"{number(float(low[i]))} … {number(float(high[i]))}"
+
         rows.append(
             [
                 p.specimen,

@@ -203,7 +203,10 @@ def slack_of(stored: StoredFit, source: Source, s: float, displacement: np.ndarr
     free = stored.study.free
     out = np.zeros((len(displacement), len(free)))
     curves = [c for c, k in zip(stored.curves, stored.curve_lane, strict=True) if k == source.lane]
-    place = lambda c: np.nan if c.s_c is None else c.s_c  # noqa: E731
+
+    def place(c):
+        return np.nan if c.s_c is None else c.s_c
+
     here = [c for c in curves if np.isclose(place(c), s, rtol=0, atol=1e-9, equal_nan=True)]
     if not here or not source.blind.any():
         return out

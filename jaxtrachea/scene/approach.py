@@ -68,7 +68,10 @@ def on_one_point(
     D = contact_point_path(path, seen, first, at_row(inward, first), axes)
     if scene.plan.options.contact == "bonded":
         D = jnp.where((jnp.arange(rows) >= first)[:, None], D, 0)
-    spread = lambda v: jnp.broadcast_to(at_row(v, first), v.shape)  # noqa: E731
+
+    def spread(v):
+        return jnp.broadcast_to(at_row(v, first), v.shape)
+
     presses = Presses(spread(seen.s), spread(seen.phi), D)
     frames = None if frame is None else spread(frame)
     return Approach(
@@ -93,6 +96,9 @@ def backed_out(path: Poses, made: Approach) -> Poses:
         inward = jnp.einsum("rij,rj->ri", made.frame, inward)
     gap, rotation, translation = made.seen.gap, path.rotation, path.translation
     if made.first is not None:
-        first = lambda v: jnp.broadcast_to(at_row(v, made.first), v.shape)  # noqa: E731
+
+        def first(v):
+            return jnp.broadcast_to(at_row(v, made.first), v.shape)
+
         gap, rotation, translation = first(gap), first(rotation), first(translation)
     return Poses(rotation, translation + gap[:, None] * inward)

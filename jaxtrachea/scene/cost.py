@@ -14,7 +14,10 @@ from jaxtrachea.scene.stage import Presses
 def shares(staged: Staged) -> tuple[int, dict[str, float]]:
     """Operations of the whole program, and the share of each effect that can be taken away."""
     scene = staged.scene
-    count = lambda s: count_operations(simulate, s, staged.material, staged.path)  # noqa: E731
+
+    def count(s):
+        return count_operations(simulate, s, staged.material, staged.path)
+
     whole, found = count(scene), {}
     for effect in scene.plan.effects:
         less = scene.plan.without(effect.name)

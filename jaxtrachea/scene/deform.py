@@ -89,9 +89,10 @@ def _ends(scene: Scene, material: Material, s_c, moved):
     """Motion of both clamps on their axial springs."""
     passed, F = moved.loads[:, 0], moved.force[0]
     A = jnp.where(scene.geometry.ring_positions[0] <= s_c, passed[0], F - passed[-1])
-    along = lambda f, k: (  # noqa: E731
-        None if k is None else jnp.zeros_like(moved.force).at[0].set(f / k)
-    )
+
+    def along(f, k):
+        return None if k is None else jnp.zeros_like(moved.force).at[0].set(f / k)
+
     return along(A, material.k_A), along(F - A, material.k_B)
 
 

@@ -53,8 +53,13 @@ def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> SceneFa
     across = np.abs(moved[:, 2] * np.cos(here) - moved[:, 1] * np.sin(here))
     along, way = np.abs(moved[:, 0]), np.sqrt((moved**2).sum(axis=1))
     whole = max(way[touching].max(initial=0), 1e-9)  # not what the tool goes before it touches
-    share = lambda v: float(v.max(initial=0) / whole)  # noqa: E731
-    keep = lambda v: v if v > COVERED else 0.0  # noqa: E731
+
+    def share(v):
+        return float(v.max(initial=0) / whole)
+
+    def keep(v):
+        return v if v > COVERED else 0.0
+
     angles = np.abs(phi[touching])
     slip = np.hypot(along, across)[touching].max(initial=0)
     x = np.asarray(scene.geometry.ring_positions, float)

@@ -97,7 +97,10 @@ def draw_map(s, phi, values: np.ndarray, label: str) -> Figure:
 
 def draw_sweep(s, phi, out: Sweep) -> dict[str, Callable[[], Figure]]:
     """What draws maps of force and compliance, by file name."""
-    grid = lambda v: np.asarray(v).reshape(len(s), len(phi))  # noqa: E731
+
+    def grid(v):
+        return np.asarray(v).reshape(len(s), len(phi))
+
     return {
         "force.png": partial(draw_map, s, phi, grid(out.force), "force [N]"),
         "compliance.png": partial(draw_map, s, phi, grid(out.compliance), "compliance [mm/N]"),

@@ -53,9 +53,15 @@ def one_plane(scene: Scene, material: Material, presses: Presses) -> Moved:
     else:
         unit, solved = jax.vmap(at)(presses.s, inward)
     F = -solved.force  # along y
-    per_ring = lambda v: _anterior(F[:, None] * v)  # noqa: E731
+
+    def per_ring(v):
+        return _anterior(F[:, None] * v)
+
     joints = per_ring(unit.w)
-    slope = lambda v: jnp.stack([v, jnp.zeros_like(v)], -1)  # noqa: E731
+
+    def slope(v):
+        return jnp.stack([v, jnp.zeros_like(v)], -1)
+
     return Moved(
         force=_anterior(F), depth=_anterior(-solved.depth), skeleton=_anterior(F * unit.w_C),
         slope_C=slope(F * unit.theta_C), joints=joints, slopes=slope(F[:, None] * unit.theta),
@@ -84,5 +90,8 @@ def vectors(scene: Scene, material: Material, presses: Presses) -> Moved:
     if plan.contact_point == "fixed":
         at = presses.s[0], presses.phi[0], presses.displacement
         return moved_by(press_oblique(*fixed, *at, plan.options, **how))
-    one = lambda s, phi, D: press_oblique(*fixed, s, phi, D, plan.options, **how)  # noqa: E731
+
+    def one(s, phi, D):
+        return press_oblique(*fixed, s, phi, D, plan.options, **how)
+
     return moved_by(jax.vmap(one)(presses.s, presses.phi, presses.displacement))

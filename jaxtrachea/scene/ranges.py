@@ -98,7 +98,10 @@ def _off_plane(presses: Presses):
 
 def _elsewhere(scene: Scene, presses: Presses):
     """Rows at another contact point than the first."""
-    near = lambda v: jnp.abs(v - v[0]) <= COVERED  # noqa: E731
+
+    def near(v):
+        return jnp.abs(v - v[0]) <= COVERED
+
     return [~(near(presses.s) & near(presses.phi))]
 
 

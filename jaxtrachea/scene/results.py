@@ -22,7 +22,10 @@ UNITS = {"phi": "rad", "force": "N", "loads": "N", "dissipated": "N mm", "status
 
 def plan_rows(plan: Plan, shares: dict[str, float]) -> list[list[str]]:
     """Effect, level, whether forced, share of the operations, reason."""
-    share = lambda name: f"{100 * shares[name]:.1f} %" if name in shares else ""  # noqa: E731
+
+    def share(name):
+        return f"{100 * shares[name]:.1f} %" if name in shares else ""
+
     return [
         [e.name, e.level, "forced" if e.forced else "auto", share(e.name), e.reason]
         for e in plan.effects

@@ -107,7 +107,10 @@ def grasp(scene: Scene, here: Instant) -> Seat:
 def arrive(scene: Scene, before: Instant, here: Instant) -> Seat:
     """The seat of a first touch: the way along the surface since then counts."""
     seat = grasp(scene, here)
-    join = lambda v, w: jnp.concatenate([v, w])  # noqa: E731
+
+    def join(v, w):
+        return jnp.concatenate([v, w])
+
     path = jax.tree.map(join, before.path, here.path)
     seen = jax.tree.map(join, before.seen, here.seen)
     frame = local_frame(seat.phi)
@@ -128,7 +131,10 @@ def drawn(scene: Scene, seat: Seat, here: Instant) -> Seat:
     turned = jnp.arctan2(jnp.sin(turned), jnp.cos(turned))
     lag = jnp.stack([now.s - seat.s, scene.radius * turned])
     share = 1 - _limit(_hold(scene, -here.seen.gap[0]), _length(lag))
-    mix = lambda old, new: old + share * (new - old)  # noqa: E731
+
+    def mix(old, new):
+        return old + share * (new - old)
+
     body = mix(seat.body, now.body)
     path = _one(here.path)
     phi = seat.phi + share * turned

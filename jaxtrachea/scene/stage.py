@@ -108,7 +108,10 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
     if scene.tool is None or scene.tube is None:
         raise ValueError("scene.tool is None; contact needs a tool")
     tool, tube = scene.tool, scene.tube
-    one = lambda R, T: touch(tool, Pose(R, T), tube, scene.quality, near=scene.near)  # noqa: E731
+
+    def one(R, T):
+        return touch(tool, Pose(R, T), tube, scene.quality, near=scene.near)
+
     return jax.vmap(one)(path.rotation, path.translation)
 
 

@@ -172,7 +172,10 @@ def look_beyond(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = C
     if not rows.any():
         return Beyond(doubtful, 0.0, (none, none))
     middle = float(np.mean(np.asarray(geometry.ring_positions)))
-    span = lambda v: (float(v.min()), float(v.max())) if len(v) else none  # noqa: E731
+
+    def span(v):
+        return (float(v.min()), float(v.max())) if len(v) else none
+
     ends = span(s[rows & (s < middle)]), span(s[rows & (s > middle)])
     return Beyond(doubtful, float(error[rows].max()), ends)
 

@@ -177,7 +177,10 @@ def global_shape(v: Values) -> Answer:
     fraction = jnp.clip((v["s"] - nodes[patch]) / span, 0, 1)
     s, phi, fraction = (w[:, None] for w in (v["s"], v["phi"], fraction))
     binding = Binding(s, phi, fraction, patch, nodes, v["alpha"])
-    row = lambda y: jnp.broadcast_to(y[..., None], (*y.shape, 3))  # noqa: E731
+
+    def row(y):
+        return jnp.broadcast_to(y[..., None], (*y.shape, 3))
+
     keys: Keys = clamped(v["s_c"], row(v["w_C"]), row(v["J"]), row(v["U"]), row(v["V"]))
     moved = interpolate(binding, weigh(binding, v["phi_c"]), keys, method="linear")
     return _done(u=moved[:, 0])

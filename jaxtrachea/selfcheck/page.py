@@ -66,7 +66,10 @@ def as_dict(outcome: Outcome) -> dict:
         "faults": list(outcome.faults),
         "why": most.why,
     }
-    hide = lambda v: None if isinstance(v, float) and not math.isfinite(v) else v  # noqa: E731
+
+    def hide(v):
+        return None if isinstance(v, float) and not math.isfinite(v) else v
+
     return {n: hide(v) for n, v in plain.items()}
 
 

@@ -142,7 +142,10 @@ def _case(function: str, group: dict, row: dict) -> Case:
     said = row.pop("exception", group.get("exception"))
     tolerance = {d: _tolerance(said, d) for d in DTYPES}
     rounded = "float64" if more.get("only") == "float64" else "float32"
-    round_ = lambda v: np.asarray(v, rounded).astype(float).tolist()  # noqa: E731
+
+    def round_(v):
+        return np.asarray(v, rounded).astype(float).tolist()
+
     inputs = {n: round_(v) for n, v in _changed(base, row).items()}
     healthy = {n: round_(v) for n, v in base.items()}
     return Case(
@@ -166,15 +169,23 @@ def _tolerance(said: dict | None, dtype: str) -> Tolerance:
     """An exception: `value = 8` for both dtypes, or `value_float32 = 40` for one."""
     if said is None:
         return Tolerance()
-    usual = lambda name: said.get(name, ROUNDINGS[name])  # noqa: E731
-    pick = lambda name: float(said.get(f"{name}_{dtype}", usual(name)))  # noqa: E731
+
+    def usual(name):
+        return said.get(name, ROUNDINGS[name])
+
+    def pick(name):
+        return float(said.get(f"{name}_{dtype}", usual(name)))
+
     return Tolerance(pick("value"), pick("gradient"), said["why"])
 
 
 def read_truth(text: str | None = None) -> dict[str, Truth]:
     """The truth of every case that has an answer, by its name."""
     given = json.loads(TRUTH.read_text("utf-8") if text is None else text)
-    array = lambda v: np.asarray(v, dtype=float)  # noqa: E731
+
+    def array(v):
+        return np.asarray(v, dtype=float)
+
     return {
         name: Truth(
             row["inputs"],

@@ -60,7 +60,11 @@ def in_blocks(
     # Concrete numbers by numpy: nothing is compiled for them.
     given = jax.tree.leaves((s, patch, known))
     xp = jnp if any(isinstance(v, Tracer) for v in given) else np
-    at, to = xp.asarray(patch, np.int32), lambda n: xp.arange(n, dtype=np.int32)  # noqa: E731
+    at = xp.asarray(patch, np.int32)
+
+    def to(n):
+        return xp.arange(n, dtype=np.int32)
+
     if known is None:
         order = jnp.argsort(s) if xp is jnp else np.argsort(np.asarray(s), kind="stable")
         order, rank = (xp.asarray(v, np.int32) for v in (order, xp.argsort(order)))

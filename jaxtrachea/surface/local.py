@@ -198,9 +198,15 @@ def add_correction(
     circles = len(CIRCLES[dent.centres.shape[0]])
     length = min(runs.longest[circles], points.shape[0])
     half = _half_width(circles, dent.reach / REACH)
-    reached = lambda v: jnp.sum(jnp.abs(v[:, 0] - s_c) <= half * (1 - 5e-4))  # noqa: E731
+
+    def reached(v):
+        return jnp.sum(jnp.abs(v[:, 0] - s_c) <= half * (1 - 5e-4))
+
     start = jnp.minimum(jnp.sum(points[:, 0] < s_c - half), points.shape[0] - length)
-    cut = lambda v: jax.lax.dynamic_slice_in_dim(v, start, length)  # noqa: E731
+
+    def cut(v):
+        return jax.lax.dynamic_slice_in_dim(v, start, length)
+
     run = cut(points) if runs.order is None else points[cut(runs.order)]
     here = jnp.where(reached(points) == reached(run), correction(dent, run), jnp.nan)
     # A slice of what is padded by zeros: cheaper than writing the run into zeros.

@@ -121,7 +121,10 @@ def clamped(
     """
     held = jnp.zeros_like(contact)
     first, last = (held if end is None else end for end in (end_A, end_B))
-    ends = lambda rows, a, b: jnp.concatenate([a[None], rows, b[None]])  # noqa: E731
+
+    def ends(rows, a, b):
+        return jnp.concatenate([a[None], rows, b[None]])
+
     joints, U, V = (ends(rows, first, last) for rows in (joints, U, V))
     if slopes is not None:
         slopes = ends(slopes, held[:2], held[:2])
@@ -173,7 +176,10 @@ def weigh(binding: Binding, phi_c: Float[Array, ""]) -> Weights:
     behind = jnp.clip(behind, 0, 1)
     U = (1 - from_U) * (1 - behind) + (1 - from_V) * behind
     V = (1 - from_V) * (1 - behind) + (1 - from_U) * behind
-    hide = lambda weight: jnp.where(on, weight, jnp.nan)  # noqa: E731
+
+    def hide(weight):
+        return jnp.where(on, weight, jnp.nan)
+
     return Weights(hide(U), hide(from_U * from_V), hide(V), phi_c)
 
 
@@ -256,8 +262,11 @@ def _carry(binding: Binding, weights: Weights, s_c, line, U, V):
     """
     patch, beyond = binding.patch, binding.s >= s_c
     begin, density, cubic = line
+
     # Of the patch that C splits, a vertex belongs to the lower or to the upper part.
-    side = lambda v: jnp.where(beyond, v[patch + 1][:, None], v[patch][:, None])  # noqa: E731
+    def side(v):
+        return jnp.where(beyond, v[patch + 1][:, None], v[patch][:, None])
+
     t = (binding.s - side(begin)) * side(density)
     ends = jnp.stack([U[:-1], U[1:] - U[:-1], V[:-1], V[1:] - V[:-1]], axis=1)
     table = jnp.concatenate([cubic[patch], cubic[patch + 1], ends[patch]], axis=1)
@@ -294,8 +303,12 @@ def _combine(where, beyond, fraction, table):
 @functools.partial(_combine.defjvp, symbolic_zeros=True)
 def _combine_jvp(primals, tangents):
     (where, beyond, fraction, table), (d_where, _, d_fraction, d_table) = primals, tangents
-    still = lambda v: isinstance(v, SymbolicZero)  # noqa: E731
-    real = lambda v: jnp.zeros(v.shape, v.dtype) if still(v) else v  # noqa: E731
+
+    def still(v):
+        return isinstance(v, SymbolicZero)
+
+    def real(v):
+        return jnp.zeros(v.shape, v.dtype) if still(v) else v
 
     def basis(where, fraction):
         U, J, V, t = where
@@ -327,7 +340,10 @@ def _phong(binding: Binding, weights: Weights, keys: Keys):
     # opposite pole only, far from where the displacements are.
     phi_c = weights.phi_c
     pole = jnp.where(phong.radial(phi_c, keys.contact) > 0, 1, -1).astype(phi_c.dtype)
-    encode = lambda v: phong.encode(v, phi_c, pole)  # noqa: E731
+
+    def encode(v):
+        return phong.encode(v, phi_c, pole)
+
     joints, contact = encode(keys.joints.T).T, encode(keys.contact)
     line = _joint_line(binding.nodes, keys.s_c, joints, contact)
     channels = _carry(binding, weights, keys.s_c, line, encode(keys.U.T).T, encode(keys.V.T).T)

@@ -103,7 +103,9 @@ def read_mesh(
 
 def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions, half_angle, dtype,
           progress):  # fmt: skip
-    step = lambda: None if progress is None else progress(1, STEPS)  # noqa: E731
+    def step():
+        return None if progress is None else progress(1, STEPS)
+
     parts = _parts(path)
     step()
     name = _wall(parts, part)
@@ -117,7 +119,10 @@ def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
     line = find_centreline(wall.vertices, wall.faces, given)
     check_turn(line)
     step()
-    scan = lambda line: Shape.scan(line, wall.vertices, wall.faces, cartilage)  # noqa: E731
+
+    def scan(line):
+        return Shape.scan(line, wall.vertices, wall.faces, cartilage)
+
     if larynx is not None:
         shape = scan(turned(line) if _points_back(line, larynx) else line)
     else:
@@ -138,7 +143,10 @@ def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
     notes += cleaned + [f"{len(found.positions)} rings from {found.source}"]
     dtype = jnp.zeros(0, dtype).dtype
     fields = (normals, where.s, where.phi, where.distance, frames)
-    cast = lambda v: jnp.asarray(v, dtype)  # noqa: E731
+
+    def cast(v):
+        return jnp.asarray(v, dtype)
+
     mesh = Mesh(cast(vertices), jnp.asarray(wall.faces, jnp.int32), *(cast(v) for v in fields))
     step()
     try:

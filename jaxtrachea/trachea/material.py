@@ -102,7 +102,10 @@ def _field(declaration: Declaration) -> Any:
 
     Python numbers become arrays (one door, so that jit does not retrace).
     """
-    convert = lambda v: None if v is None else real(declaration.name, v)  # noqa: E731
+
+    def convert(v):
+        return None if v is None else real(declaration.name, v)
+
     metadata = {"declaration": declaration}
     if declaration.absent:
         return eqx.field(default=None, kw_only=True, converter=convert, metadata=metadata)

@@ -49,9 +49,12 @@ def find_anterior(shape: Shape, given=None) -> Shape:
     c, s = math.cos(angle), math.sin(angle)
     turn = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
     line = shape.line._replace(frames=shape.line.frames @ turn)
-    moved = lambda v: np.stack(  # noqa: E731
-        [np.interp(ANGLES + angle, ANGLES, row, period=2 * math.pi) for row in v.astype(float)]
-    )
+
+    def moved(v):
+        return np.stack(
+            [np.interp(ANGLES + angle, ANGLES, row, period=2 * math.pi) for row in v.astype(float)]
+        )
+
     cartilage = None if shape.cartilage is None else moved(shape.cartilage) > 0.5
     return Shape(line, shape.s, moved(shape.radius), cartilage)
 
@@ -141,7 +144,10 @@ def _relief(shape: Shape, to_ends: bool = False) -> np.ndarray:
     if not to_ends:
         return out
     i = np.arange(half)[:, None]
-    slope = lambda first, last: (last - first) / (span - 1)  # noqa: E731
+
+    def slope(first, last):
+        return (last - first) / (span - 1)
+
     out[:half] = shape.radius[:half] - level[0] + slope(level[0], level[span - 1]) * (half - i)
     out[-half:] = shape.radius[-half:] - level[-1] - slope(level[-span], level[-1]) * (i + 1)
     steep = np.abs(np.diff(shape.radius, axis=0)).mean(axis=1) > step  # a lid: more than 45 deg

@@ -68,7 +68,10 @@ def contour(corners, centre, frame) -> np.ndarray:
         ends.append(tip[:, 1:] + way[:, None] * (foot - tip)[:, 1:])
     first, side = ends[0], ends[1] - ends[0]
     ray = np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
-    cross = lambda a, b: a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]  # noqa: E731
+
+    def cross(a, b):
+        return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
     slope = cross(ray[:, None], side[None])
     slope = np.where(slope == 0, np.inf, slope)
     far = cross(first, side)[None] / slope

@@ -272,7 +272,10 @@ def _served(reference: Simulation) -> Served:
     inward = -np.cos(phi) * D[..., 1] - np.sin(phi) * D[..., 2]
     across = np.cos(phi) * D[..., 2] - np.sin(phi) * D[..., 1]
     on = np.asarray(reference.force).any(axis=-1) & np.isfinite(inward)
-    most = lambda v: float(np.abs(v[on]).max())  # noqa: E731
+
+    def most(v):
+        return float(np.abs(v[on]).max())
+
     s = float(reference.s[on].min()), float(reference.s[on].max())
     return Served(
         s=s, angle=most(phi), along=most(D[..., 0]), across=most(across), inward=most(inward)

@@ -99,7 +99,10 @@ def spread(joints: np.ndarray, x: np.ndarray, at: np.ndarray, length: float) -> 
         return joints
     ends = np.r_[0.0, x, length]
     padded = np.pad(joints, ((0, 0), (1, 1), (0, 0)))
-    line = lambda v: np.interp(at, ends, v)  # noqa: E731
+
+    def line(v):
+        return np.interp(at, ends, v)
+
     return np.apply_along_axis(line, 1, padded)
 
 

@@ -193,7 +193,10 @@ def one_plane(full: Full) -> str:
 
 def cast(tree, dtype: str):
     """All floating arrays of a tree in this dtype."""
-    change = lambda v: v.astype(dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v  # noqa: E731
+
+    def change(v):
+        return v.astype(dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v
+
     return jax.tree.map(change, tree)
 
 

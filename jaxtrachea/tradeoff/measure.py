@@ -1,6 +1,7 @@
 """Measure what every rung of a scene errs and costs."""
 
 import datetime
+import functools
 import os
 import platform
 import time
@@ -139,7 +140,10 @@ def against(full: Full, solved: Solved, curves: Sequence[Any], radius: float) ->
         moved = spread(np.asarray(moved), kept, x, float(full.scene.geometry.length))
     force, joints = ([], []), ([], [])
     for i, (curve, depth) in enumerate(check_curves(full.path, curves)):
-        at = lambda v: [np.interp(depth, curve.displacement, v)]  # noqa: B023, E731
+
+        def at(v):
+            return [np.interp(depth, curve.displacement, v)]  # noqa: B023
+
         force[0].append([-float(solved.out.force[i, 1])])
         force[1].append(at(curve.force))
         if curve.joint_rings is None or moved is None:
@@ -167,11 +171,15 @@ def compiled(full: Full, levels: Levels, lanes: int, *, slopes: bool = True) -> 
     many = gradient = None
     if slopes:
         both = jax.jit(derivatives).lower(material, row).compile()
-        gradient = lambda: both(material, row)  # noqa: E731
+        gradient = functools.partial(both, material, row)
+
     if lanes:
         wide = jax.tree.map(lambda v: jnp.stack([v] * lanes), (material, row))
         batch = jax.jit(jax.vmap(lambda m, p: simulate(scene, m, p))).lower(*wide).compile()
-        many = lambda: batch(*wide)  # noqa: E731
+
+        def many():
+            return batch(*wide)
+
     return Compiled(lambda: call(material, row), gradient, many, seconds)
 
 
@@ -188,7 +196,10 @@ def timed(programs: dict[Levels, Compiled], settings: Settings) -> dict[Levels, 
             if made.lanes is not None:
                 batches = sampled(made.lanes, max(block // settings.lanes, 2))
                 seen["lane"] += [v / settings.lanes for v in batches]
-    short = lambda v: float(f"{v:.4g}")  # noqa: E731
+
+    def short(v):
+        return float(f"{v:.4g}")
+
     found = {}
     for levels, seen in samples.items():
         found[levels] = {
@@ -202,10 +213,15 @@ def choice_row(
     name: str, full: Full, choice: Choice, times: dict[Levels, dict], settings: Settings
 ) -> dict[str, Any]:
     """A choice as a line of JSON, with the times of its program and of the full one."""
-    said = lambda rungs: [  # noqa: E731
-        {"ladder": r.ladder, "level": r.level, "error": _number(r.errors.worst)} for r in rungs
-    ]
-    call = lambda levels: times[levels]["call"]["median"]  # noqa: E731
+
+    def said(rungs):
+        return [
+            {"ladder": r.ladder, "level": r.level, "error": _number(r.errors.worst)} for r in rungs
+        ]
+
+    def call(levels):
+        return times[levels]["call"]["median"]
+
     return {
         "scene": name, "tolerance": choice.tolerance, "dropped": said(choice.dropped),
         "refused": said(choice.refused), "returned": said(choice.returned),

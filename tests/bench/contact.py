@@ -47,7 +47,9 @@ def load(dtype):
 
 
 def size_of(a, b):
-    reach = lambda v: np.linalg.norm(v - v.mean(axis=2, keepdims=True), axis=1).max(axis=1)  # noqa: E731
+    def reach(v):
+        return np.linalg.norm(v - v.mean(axis=2, keepdims=True), axis=1).max(axis=1)
+
     v_a, v_b = np.asarray(a.vertices, float), np.asarray(b.vertices, float)
     return reach(v_a) + reach(v_b) + np.asarray(a.radius + b.radius, float)
 
@@ -103,16 +105,28 @@ def times(settings, quick):
     """Two rounded boxes, float64: cold, warm, warm with gradient; the first two per vmap lane."""
     a, b = box([1.0, 0.7, 0.4], 0.1), box([0.5, 0.5, 0.2], 0.1)
     v = jnp.array([0.3, 0.2, 0.1, 1.5, 0.9, 0.4])
-    place = lambda v: pose_from_vector(v[:3], v[3:])  # noqa: E731
-    read = lambda c: (c.distance, c.normal, c.point_a, c.status)  # noqa: E731
-    cold = lambda v: read(signed_distance(a, b, place(v), settings))  # noqa: E731
-    warm = lambda v, n: read(track(a, b, place(v), n, settings))  # noqa: E731
+
+    def place(v):
+        return pose_from_vector(v[:3], v[3:])
+
+    def read(c):
+        return (c.distance, c.normal, c.point_a, c.status)
+
+    def cold(v):
+        return read(signed_distance(a, b, place(v), settings))
+
+    def warm(v, n):
+        return read(track(a, b, place(v), n, settings))
+
     slope = jax.value_and_grad(lambda v, n: track(a, b, place(v), n, settings).distance)
     n = jax.jit(cold)(v)[1]
     single = [best(jax.jit(cold), v), best(jax.jit(warm), v, n), best(jax.jit(slope), v, n)]
     lanes, chunk = (1024 if quick else 8192), 256
     many = v[None] + 0.01 * jnp.asarray(np.random.default_rng(0).normal(size=(lanes, 6)))
-    batched = lambda f: jax.jit(lambda *x: jax.lax.map(lambda row: f(*row), x, batch_size=chunk))  # noqa: E731
+
+    def batched(f):
+        return jax.jit(lambda *x: jax.lax.map(lambda row: f(*row), x, batch_size=chunk))
+
     start = jnp.tile(n, (lanes, 1))
     runs = {"runs": 3, "calls": 2}
     return [

@@ -154,7 +154,10 @@ def with_lmfit(model):
     parameters = lmfit.Parameters()
     for name, value in zip(NAMES, start(), strict=True):
         parameters.add(name, value=value)
-    unpack = lambda p: np.array([p[name].value for name in NAMES])  # noqa: E731
+
+    def unpack(p):
+        return np.array([p[name].value for name in NAMES])
+
     found = lmfit.Minimizer(lambda p: model.value(unpack(p)), parameters).leastsq(
         Dfun=lambda p: model.jacobian(unpack(p)), col_deriv=False
     )
@@ -168,7 +171,10 @@ def lane_residual(study, theta, lane: Lane):
     geometry = jax.tree.map(jnp.asarray, study.model.geometry)
     EI_L, k_M, k_1 = jnp.exp(theta[:3])
     material = Material(EI_L=EI_L, k_M=k_M, k_1=k_1, k_3=STEP_K_3 * theta[3])
-    one = lambda s, d: press(geometry, material, s, d, study.model.options).force  # noqa: E731
+
+    def one(s, d):
+        return press(geometry, material, s, d, study.model.options).force
+
     return (jax.vmap(one)(lane.s_c, lane.displacement) - lane.force).ravel()
 
 
@@ -177,7 +183,9 @@ def optimistix_batch(study, count: int):
     solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
 
     def one(lane):
-        residual = lambda theta, lane: lane_residual(study, theta, lane)  # noqa: E731
+        def residual(theta, lane):
+            return lane_residual(study, theta, lane)
+
         found = optimistix.least_squares(
             residual, solver, jnp.asarray(start()), args=lane, throw=False, max_steps=100
         )
@@ -185,7 +193,10 @@ def optimistix_batch(study, count: int):
         return found.value, 0.5 * jnp.sum(r * r), found.stats["num_steps"]
 
     run = jax.jit(jax.vmap(one))
-    part = lambda i: jax.tree.map(lambda v: v[i : i + 256], study.lanes)  # noqa: E731
+
+    def part(i):
+        return jax.tree.map(lambda v: v[i : i + 256], study.lanes)
+
     chunks = [part(i) for i in range(0, count, 256)]
     chunks = jax.device_put(chunks)
 
@@ -198,7 +209,10 @@ def optimistix_batch(study, count: int):
 
 def jitted_residual(study):
     """Our residual and Jacobian of one specimen, jitted, behind two numpy functions."""
-    value = lambda theta, lane: lane_residual(study, theta, lane)  # noqa: E731
+
+    def value(theta, lane):
+        return lane_residual(study, theta, lane)
+
     both = jax.jit(lambda theta, lane: (value(theta, lane), jax.jacfwd(value)(theta, lane)))
     lanes = [
         jax.device_put(jax.tree.map(lambda v: v[i], study.lanes))  # noqa: B023
@@ -237,7 +251,10 @@ def check(study, model, forces) -> None:
     """Our residual and the numpy one are the same function, Jacobian included."""
     theta = np.array([np.log(80.0), np.log(0.7), 0.1, 1.2])
     lane = jax.tree.map(lambda v: jnp.asarray(v[0]), study.lanes)
-    value = lambda theta: lane_residual(study, theta, lane)  # noqa: E731
+
+    def value(theta):
+        return lane_residual(study, theta, lane)
+
     model.load(forces[0])
     common.close("residual", model.value(theta), value(theta))
     common.close("jacobian", model.jacobian(theta), jax.jacfwd(value)(jnp.asarray(theta)))

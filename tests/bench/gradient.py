@@ -53,8 +53,13 @@ def forward(value, directions: int):
     def program(material, place):
         flat, tree = jax.tree.flatten(material)
         along = jnp.eye(len(flat), dtype=place.dtype)[:directions]
-        of = lambda m: value(jax.tree.unflatten(tree, m), place)  # noqa: E731
-        push = lambda t: jax.jvp(of, (flat,), (list(t),))  # noqa: E731
+
+        def of(m):
+            return value(jax.tree.unflatten(tree, m), place)
+
+        def push(t):
+            return jax.jvp(of, (flat,), (list(t),))
+
         if directions == 1:
             return push(along[0])
         return jax.vmap(push, out_axes=(None, 0))(along)
@@ -67,7 +72,10 @@ def arguments(dtype, material, lanes: int):
     if lanes == 1:
         return material, update.at(dtype).translation[0]
     rng = np.random.default_rng(0)
-    spread = lambda v: v * jnp.asarray(rng.uniform(0.8, 1.25, lanes), v.dtype)  # noqa: E731
+
+    def spread(v):
+        return v * jnp.asarray(rng.uniform(0.8, 1.25, lanes), v.dtype)
+
     s = rng.uniform(update.S - 2, update.S + 2, lanes)
     away = update.OUTER + update.RADIUS - rng.uniform(0.5, 3, lanes)
     places = np.stack([s, away, 0 * s], axis=1)
@@ -121,9 +129,15 @@ def fits(out: common.Writer) -> None:
     settings = Settings(starts=1)
     theta = jnp.asarray(draw_starts(study, settings))
     sigma = jnp.asarray(first_sigma(study))
-    of = lambda f: jax.vmap(functools.partial(f, model))  # noqa: E731
+
+    def of(f):
+        return jax.vmap(functools.partial(f, model))
+
     point = jax.jit(of(cost.evaluate))(theta, lanes, sigma)
-    same = lambda v, dtype: jnp.full(FITS, v, dtype)  # noqa: E731
+
+    def same(v, dtype):
+        return jnp.full(FITS, v, dtype)
+
     state = levenberg_marquardt.State(
         theta, point, same(levenberg_marquardt.FIRST_RADIUS, float), same(1, jnp.int32),
         same(levenberg_marquardt.RUNNING, jnp.int8),

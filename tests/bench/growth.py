@@ -88,7 +88,10 @@ def positions(out: common.Writer) -> None:
     geometry = table_1()
     start = Presses(jnp.array([75.0]), jnp.zeros(1), jnp.array([[0.0, -2.0, 0.0]]))
     scene = make_scene(geometry, MATERIAL, start, effects=BARE)
-    run = lambda s, depth: sweep(scene, MATERIAL, s, 0 * s, depth)  # noqa: E731
+
+    def run(s, depth):
+        return sweep(scene, MATERIAL, s, 0 * s, depth)
+
     for m in (1, 10, 100, 1000, 10_000, 100_000):
         s = jnp.linspace(5.0, 155.0, m)
         cases = {
@@ -104,7 +107,10 @@ def patches(out: common.Writer) -> None:
     place = update.at(float).translation[0]
     for n in (4, 8, 16, 32, 64, 128, 256):
         tube = straight_patches(np.linspace(0.0, 160.0, n + 1), update.OUTER)
-        search = lambda R, T, tube: touch(tool, Pose(R, T), tube, near=2)  # noqa: E731
+
+        def search(R, T, tube):
+            return touch(tool, Pose(R, T), tube, near=2)
+
         record(out, "patches", n, {"contact of a ball": (search, (eye, place, tube))})
 
 
@@ -118,7 +124,10 @@ def ball_scene():
 def path(out: common.Writer) -> None:
     """Poses of one path of the tool: it approaches the midline, touches and presses."""
     scene = ball_scene()
-    run = lambda path: simulate(scene, MATERIAL, path).force  # noqa: E731
+
+    def run(path):
+        return simulate(scene, MATERIAL, path).force
+
     for n in (1, 4, 16, 64, 256, 1024):
         way = np.linspace(1.0, -update.DEPTH, n) if n > 1 else np.array([-update.DEPTH])
         places = np.stack([0 * way + update.S, update.OUTER + update.RADIUS + way, 0 * way], 1)
@@ -135,12 +144,18 @@ def vertices(out: common.Writer) -> None:
             geometry = table_1(dtype)
             mesh = make_tube(geometry, around=around, along=round(count / around) - 1)
             material = jax.tree.map(lambda v: v.astype(dtype), MATERIAL)  # noqa: B023
-            number = lambda *v: jnp.asarray(v, dtype)  # noqa: B023, E731
+
+            def number(*v):
+                return jnp.asarray(v, dtype)  # noqa: B023
+
             given = Presses(number(update.S), number(0.0), number(0.0, -2.0, 0.0)[None])
             scene = make_scene(geometry, material, given, mesh=mesh, effects=effects)
             # The plan refuses 16 centres without a tool to shape the dent; the work is the same.
             scene = dataclasses.replace(scene, plan=dataclasses.replace(scene.plan, dent=16))
-            run = lambda scene, m, p: simulate(scene, m, p).vertices  # noqa: E731
+
+            def run(scene, m, p):
+                return simulate(scene, m, p).vertices
+
             size = mesh.vertices.shape[0]
             # What must be read (s, phi, fraction, rest shape; place) and written (shape), at least.
             bytes_ = size * (9 * mesh.vertices.dtype.itemsize + 4)
@@ -167,7 +182,10 @@ def lanes(out: common.Writer) -> None:
 
     for n in (1, 10, 100, 1000, 10_000, 100_000, 1_000_000):
         rng = np.random.default_rng(0)
-        spread = lambda low, high: jnp.asarray(rng.uniform(low, high, n))  # noqa: B023, E731
+
+        def spread(low, high):
+            return jnp.asarray(rng.uniform(low, high, n))  # noqa: B023
+
         s = spread(10, 150)
         args = spread(1.5, 2.2), spread(0.08, 0.12), s, spread(0.5, 3)
         cases = {"`press`: compliance, force": (jax.vmap(pressed), args)}

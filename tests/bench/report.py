@@ -13,7 +13,10 @@ DOCUMENT = FOLDER.parents[1] / "docs" / "benchmarks.md"
 
 def plain(rows: list[dict], *columns: str) -> list[list[str]]:
     """Lines of case, further columns, median and min."""
-    show = lambda v: "-" if v is None else v if isinstance(v, str) else f"{v:.1e}"  # noqa: E731
+
+    def show(v):
+        return "-" if v is None else v if isinstance(v, str) else f"{v:.1e}"
+
     return [
         [r["case"], *(show(r.get(c)) for c in columns), *map(number, microseconds(r))] for r in rows
     ]
@@ -35,7 +38,10 @@ def environment(environments: list[dict]) -> str:
 
 def skeleton_section(rows: list[dict], goals: list[list[str]]) -> str:
     """Tables of skeleton.jsonl; what it decides goes to `goals`."""
-    of = lambda name: [r for r in rows if r["table"] == name]  # noqa: E731
+
+    def of(name):
+        return [r for r in rows if r["table"] == name]
+
     single = [r for r in of("single") if r["kind"] == "row"]
     notes = [r["text"] for r in of("single") if r["kind"] == "note"]
     text = ["## One call\n", SINGLE]
@@ -58,7 +64,10 @@ def skeleton_section(rows: list[dict], goals: list[list[str]]) -> str:
     text += [f"## {count} lanes\n", LANES]
     head = ["case", "differs by", "median µs per lane", "min"]
     text.append(table(head, plain(list(lanes.values()), "error")))
-    ours = lambda what: lanes[f"jaxtrachea: {what}"]  # noqa: E731
+
+    def ours(what):
+        return lanes[f"jaxtrachea: {what}"]
+
     checks = [
         ("`contact_compliance` against the dense form", "at least 50 times as fast",
          lanes["dense: w_C"], ours("w_C"), lambda r: r >= 50),

@@ -22,7 +22,10 @@ def by_size(rows: list[dict], head: str, unit: str = "µs") -> str:
     cases = list(dict.fromkeys(r["case"] for r in rows))
     scale = {"µs": 1, "ns": 1e3}[unit]
     at = {(r["case"], r["size"]): scale * microseconds(r)[1] for r in rows}
-    shown = lambda case, size: number(at[case, size]) if (case, size) in at else "-"  # noqa: E731
+
+    def shown(case, size):
+        return number(at[case, size]) if (case, size) in at else "-"
+
     lines = [[f"{n:,}", *(shown(c, n) for c in cases)] for n in sorted({r["size"] for r in rows})]
     found = []
     for case in cases:
@@ -37,7 +40,10 @@ def by_size(rows: list[dict], head: str, unit: str = "µs") -> str:
 
 def growth_section(rows: list[dict], goals: list[list[str]]) -> str:
     """Tables of growth.jsonl; the goal of the rings goes to `goals`."""
-    of = lambda name: [r for r in rows if r["table"] == name]  # noqa: E731
+
+    def of(name):
+        return [r for r in rows if r["table"] == name]
+
     rings = [r for r in of("rings") if r["kind"] == "row"]
     best = {(r["case"], r["size"]): microseconds(r)[1] for r in rings}
     cases = list(dict.fromkeys(r["case"] for r in rings))
@@ -72,7 +78,10 @@ def vertices(rows: list[dict]) -> str:
                 pairs.setdefault(r["size"], []).append(r)
         for n, (surface, copy) in pairs.items():
             us, rest = microseconds(surface)[1], microseconds(copy)[1]
-            rate = lambda t, b=surface["bytes"]: number(1e-3 * b / t)  # noqa: E731
+
+            def rate(t, b=surface["bytes"]):
+                return number(1e-3 * b / t)
+
             line = [dtype, f"{n:,}", number(us), number(1e3 * us / n)]
             lines.append([*line, number(surface["bytes"] / n), rate(us), rate(rest)])
         sizes = list(pairs)

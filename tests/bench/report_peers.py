@@ -31,7 +31,10 @@ def peers_section(environment: dict, rows: list[dict]) -> str:
     cases: dict[tuple[str, str], list[dict]] = {}
     for r in timed:
         cases.setdefault((r["group"], r["case"]), []).append(r)
-    typical = lambda rs: number(1e6 * statistics.median(r["median"] / r["lanes"] for r in rs))  # noqa: E731
+
+    def typical(rs):
+        return number(1e6 * statistics.median(r["median"] / r["lanes"] for r in rs))
+
     lines = []
     for (group, case), peer in cases.items():
         if case == OURS:

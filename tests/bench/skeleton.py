@@ -159,7 +159,10 @@ def c_calls(n: int, lanes: int):
     """C value and gradient on the inputs of `lane_inputs`; each returns its output arrays."""
     library = c_library()
     x, L, EIs, ks, s, F = lane_inputs(n, lanes)
-    new = lambda *shape: np.zeros((lanes, *shape))  # noqa: E731
+
+    def new(*shape):
+        return np.zeros((lanes, *shape))
+
     tip, w, theta, R = new(4), new(n), new(n), new(n)
     w_C, dk, dEI, ds = new(), new(n), new(n + 1), new()
     head = [ctypes.c_int(lanes), ctypes.c_int(n), address(x), ctypes.c_double(L)]

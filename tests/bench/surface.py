@@ -32,7 +32,10 @@ def rows(dtype):
     geometry = table_1(dtype)
     mesh = make_tube(geometry)
     binding, points = regions.bind(mesh, geometry), mesh.straight
-    draw = lambda *shape: jnp.asarray(np.random.default_rng(0).normal(size=shape), dtype)  # noqa: E731
+
+    def draw(*shape):
+        return jnp.asarray(np.random.default_rng(0).normal(size=shape), dtype)
+
     keys = regions.clamped(
         jnp.asarray(73, dtype), draw(3), draw(15, 3), draw(15, 3), draw(15, 3),
         draw(15, 2), draw(2),
@@ -41,7 +44,9 @@ def rows(dtype):
     weights = regions.weigh(binding, phi_c)
 
     def dent(count, phi_c, depth):
-        number = lambda v: jnp.asarray(v, dtype)  # noqa: E731
+        def number(v):
+            return jnp.asarray(v, dtype)
+
         at = local.centres(number(73), phi_c, number(12.6), number(1.5), count)
         wanted = local.targets(depth, jnp.zeros(count, dtype))
         return local.correction(local.fit(at, wanted, number(5)), points)
@@ -53,7 +58,10 @@ def rows(dtype):
     yield "empty", times(lambda v: v + 1, phi_c)
     yield "weigh", times(lambda p: regions.weigh(binding, p), phi_c)
     for method in ("linear", "hermite", "phong"):
-        f = lambda w, k, m=method: regions.interpolate(binding, w, k, method=m)  # noqa: E731
+
+        def f(w, k, m=method):
+            return regions.interpolate(binding, w, k, method=m)
+
         yield method, times(f, weights, keys)
     for count in local.CIRCLES:
         yield f"dent {count}", times(lambda p, d, n=count: dent(n, p, d), phi_c, depth)

@@ -98,8 +98,11 @@ def lanes(what: str) -> dict[str, Case]:
 def contact(tool: str) -> dict[str, Case]:
     """A tool at 16 patches, two of them searched, against coal at 16 capsules."""
     own, other = update.tools()[tool]
+
     # Ours is smoothed and up to 0.06 mm too small; coal is exact.
-    differs = lambda gap, touch: common.close(tool, [gap], [touch.gap], 0.05)  # noqa: E731
+    def differs(gap, touch):
+        return common.close(tool, [gap], [touch.gap], 0.05)
+
     return {
         OURS: made(skeleton.wait(update.touch_call(own, 2))),
         "coal: 16 capsules, called from Python": made(update.coal_call(other), differs=differs),
@@ -112,7 +115,10 @@ def whole_update() -> dict[str, Case]:
     scene, place = scenes["whole, dent of 16; round tube"], update.at("float64").translation[0]
     run = jax.jit(update.of_one_pose(scene, material)).lower(place).compile()
     call, ball = update.c_update(scene, scene.plan.dent), np.asarray(place)
-    differs = lambda found, ours: max(update.differs("C loop", found, ours))  # noqa: E731
+
+    def differs(found, ours):
+        return max(update.differs("C loop", found, ours))
+
     return {
         OURS: made(skeleton.wait(lambda: run(place))),
         "scalar C loop": made(lambda: call(ball), differs=differs),

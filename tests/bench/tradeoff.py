@@ -55,7 +55,10 @@ def scene(name: str, settings) -> None:
     from jaxtrachea.tradeoff.plots import draw
 
     curves, radius, _ = measured_curves(ROOT / DATA[name] if name in DATA else None)
-    say = lambda text: print(name, text, flush=True)  # noqa: E731
+
+    def say(text):
+        return print(name, text, flush=True)
+
     rows = measure(name, full_of(name, "series"), settings, say, curves, radius)
     (FOLDER / f"{name}.jsonl").write_text(lines(rows), "utf-8")
     draw([row for row in rows if "left_out" not in row], name).savefig(FOLDER / f"{name}.png")

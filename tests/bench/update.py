@@ -135,7 +135,10 @@ def c_update(scene, dent: int):
     run = ctypes.CDLL(str(target)).update
     run.restype = ctypes.c_double
     b, weights = scene.binding, regions.weigh(scene.binding, jnp.asarray(0.0))
-    each = lambda v: np.broadcast_to(v, b.s.shape).ravel()[b.blocks.place]  # noqa: E731
+
+    def each(v):
+        return np.broadcast_to(v, b.s.shape).ravel()[b.blocks.place]
+
     offsets, collar = local.pattern(dent) if dent else (np.zeros((0, 2)), np.zeros(0))
     arrays = {
         "x": scene.geometry.ring_positions, "node": b.nodes, "EI": np.full(16, VALUES["EI_L"]),

@@ -85,7 +85,10 @@ def solve(x, length, EI, k, s_c, force, GA=None, ring_load=None, *, free_end=Fal
     """
     given = x, length, EI, k, s_c, force, GA, ring_load
     with exactly(DIGITS, *given) as number:
-        exact = lambda values: [number(v) for v in values]  # noqa: E731
+
+        def exact(values):
+            return [number(v) for v in values]
+
         zero = number(0)
         x, EI, k = exact(x), exact(EI), exact(k)
         GA = [None] * len(EI) if GA is None else exact(GA)

@@ -108,7 +108,10 @@ def with_lanes(study: Study, lanes) -> Study:
 def costs(study: Study, theta: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Cost of every lane at `theta` in float64, half the sum of squares written out; (lanes,)."""
     run, _ = _residual_and_jacobian(study.model)
-    lane = lambda k: jax.tree.map(lambda v: v[k], study.lanes)  # noqa: E731
+
+    def lane(k):
+        return jax.tree.map(lambda v: v[k], study.lanes)
+
     z = np.stack([np.asarray(run(theta[k], lane(k))) for k in range(len(theta))]) / sigma[:, :1]
     return 0.5 * np.sum(z * z, axis=1)
 

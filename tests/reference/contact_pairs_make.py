@@ -105,7 +105,10 @@ def make(rng, index):
     a, b = to_coal(kind[0], v_a, r_a), to_coal(kind[1], v_b, r_b)
     u = rng.normal(size=3)
     u /= np.linalg.norm(u)
-    reach = lambda v: np.linalg.norm(v, axis=1).max() / GRID  # noqa: E731
+
+    def reach(v):
+        return np.linalg.norm(v, axis=1).max() / GRID
+
     size = reach(v_a) + reach(v_b) + (r_a + r_b) / GRID
     low, high = 0.0, 2 * size
     for _ in range(40):
@@ -131,7 +134,10 @@ def main():
     for i, row in enumerate(made):
         for side in range(2):
             vertices[i, side, : len(row[1][side])] = row[1][side]
-    column = lambda f, dtype: np.array([f(row) for row in made], dtype)  # noqa: E731
+
+    def column(f, dtype):
+        return np.array([f(row) for row in made], dtype)
+
     differs = column(lambda r: r[8], bool)
     np.savez_compressed(
         pathlib.Path(__file__).with_name("contact_pairs.npz"),

@@ -36,7 +36,10 @@ def spread(model, case, inputs, base):
     Sizes are numbers, of the entry that moves most, or lists over all entries, flat, where the case
     is seen entry by entry.
     """
-    at = lambda given: {o: np.array(flat(v)) for o, v in model(given).items()}  # noqa: E731
+
+    def at(given):
+        return {o: np.array(flat(v)) for o, v in model(given).items()}
+
     here = {o: np.array(flat(v)) for o, v in base.items()}
     ways = list(_directions(case, inputs))
     ahead = [at(way(inputs)) for way in ways]

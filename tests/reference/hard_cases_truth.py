@@ -127,7 +127,9 @@ def axial(v):
         spans = zip(ends, ends[1:], v["EA"], strict=False)
         return sum(max(min(q, b) - max(p, a), mp.mpf(0)) / e for p, q, e in spans)
 
-    flexible = lambda k, c: 1 / c if k == mp.inf else k / (1 + k * c)  # noqa: E731
+    def flexible(k, c):
+        return 1 / c if k == mp.inf else k / (1 + k * c)
+
     c_A, c_B = bar(mp.mpf(0), s), bar(s, ends[-1])
     held_A, held_B = (k == mp.inf and c == 0 for k, c in ((v["k_A"], c_A), (v["k_B"], c_B)))
     K_A = mp.mpf(0) if held_A else flexible(v["k_A"], c_A)
@@ -141,14 +143,17 @@ def axial(v):
 
 def _integral(p, q, a, b):
     """Of (p_0 + p_1 cos + p_2 sin)(q_0 + q_1 cos + q_2 sin) from a to b."""
-    primitive = lambda t: (  # noqa: E731
-        p[0] * q[0] * t
-        + (p[0] * q[1] + p[1] * q[0]) * mp.sin(t)
-        - (p[0] * q[2] + p[2] * q[0]) * mp.cos(t)
-        + p[1] * q[1] * (t / 2 + mp.sin(2 * t) / 4)
-        + p[2] * q[2] * (t / 2 - mp.sin(2 * t) / 4)
-        + (p[1] * q[2] + p[2] * q[1]) * mp.sin(t) ** 2 / 2
-    )
+
+    def primitive(t):
+        return (
+            p[0] * q[0] * t
+            + (p[0] * q[1] + p[1] * q[0]) * mp.sin(t)
+            - (p[0] * q[2] + p[2] * q[0]) * mp.cos(t)
+            + p[1] * q[1] * (t / 2 + mp.sin(2 * t) / 4)
+            + p[2] * q[2] * (t / 2 - mp.sin(2 * t) / 4)
+            + (p[1] * q[2] + p[2] * q[1]) * mp.sin(t) ** 2 / 2
+        )
+
     return primitive(b) - primitive(a)
 
 
@@ -164,7 +169,10 @@ def arch(R, alpha, EI, k_M, k_t, phi):
         beyond = (b * S_V - y_h * P_z / mp.mpf(2), R * P_z / mp.mpf(2), -R * S_V)
         before = (beyond[0] - z_c * P_y + y_c * P_z, beyond[1] - R * P_z, beyond[2] + R * P_y)
         pieces.append((before, beyond))
-    over = lambda p, q: _integral(p[0], q[0], -alpha, phi) + _integral(p[1], q[1], phi, alpha)  # noqa: E731
+
+    def over(p, q):
+        return _integral(p[0], q[0], -alpha, phi) + _integral(p[1], q[1], phi, alpha)
+
     H_H, k_e = over((rise, rise), (rise, rise)), k_t + k_M / 4
     give = H_H + EI / (R * k_e)
     with_H = [over(m, (rise, rise)) for m in pieces]
@@ -182,7 +190,10 @@ def ring(v):
     names = ("R", "alpha", "EI", "k_M", "k_t", "phi")
     C, shares, thrust, k_e = arch(*(v[n] for n in names))
     P, k_M = v["P"], v["k_M"]
-    load = lambda w: sum(p * q for p, q in zip(P, w, strict=True))  # noqa: E731
+
+    def load(w):
+        return sum(p * q for p, q in zip(P, w, strict=True))
+
     opening, shift = load(thrust) / k_e, P[1] / k_M
     U, V = (2 * load([s[e] for s in shares]) / k_M for e in (0, 1))
     ends = {"end_U": [U, shift - opening / 2], "end_V": [V, shift + opening / 2]}
@@ -229,7 +240,10 @@ def boxes(v):
 
     def value(n):
         m = R.T * n
-        log = lambda y: abs(y) + mp.log1p(mp.exp(-2 * abs(y)))  # noqa: E731
+
+        def log(y):
+            return abs(y) + mp.log1p(mp.exp(-2 * abs(y)))
+
         both = sum(log(beta * a * n[i]) + log(beta * B[i] * m[i]) for i, a in enumerate(A))
         return both / beta - (n.T * t)[0]
 
@@ -282,7 +296,10 @@ def _newton(function):
 
 def _descend(value, t, R):
     """A float estimate of the lowest minimum: many starts, then a pattern search."""
-    cast = lambda n: mp.matrix([mp.mpf(float(c)) for c in n])  # noqa: E731
+
+    def cast(n):
+        return mp.matrix([mp.mpf(float(c)) for c in n])
+
     with mp.workdps(30):
         turned = [np.array([float(R[i, j]) for i in range(3)]) for j in range(3)]
         axes = [*np.eye(3), *turned, np.array([float(c) for c in t])]
@@ -319,7 +336,10 @@ def dent(v):
     centres = list(at)
     rhs = mp.matrix([sum(t) / len(t) for t in at.values()])
     n = len(centres)
-    psi = lambda p, c: _wendland(p[0] - c[0], p[1] - c[1], v["reach"])  # noqa: E731
+
+    def psi(p, c):
+        return _wendland(p[0] - c[0], p[1] - c[1], v["reach"])
+
     K = mp.matrix(n, n)
     for i in range(n):
         for j in range(n):
@@ -409,11 +429,17 @@ def derivative(case: Case, inputs, name, index, base):
     if np.isinf(x):
         return {o: [mp.mpf(0)] * len(flat(v)) for o, v in base.items()}
     h = STEP * (abs(mp.mpf(float(x))) if x != 0 else ONE)
-    at = lambda step: {o: flat(v) for o, v in model(moved(inputs, name, index, step)).items()}  # noqa: E731
+
+    def at(step):
+        return {o: flat(v) for o, v in model(moved(inputs, name, index, step)).items()}
+
     if name in case.one_sided:
         h *= case.one_sided[name]
         near, far = at(h), at(2 * h)
-        slope = lambda p, q, r: (-3 * p + 4 * q - r) / (2 * h)  # noqa: E731
+
+        def slope(p, q, r):
+            return (-3 * p + 4 * q - r) / (2 * h)
+
         sides = {o: zip(flat(v), near[o], far[o], strict=True) for o, v in base.items()}
         out = {o: [slope(*three) for three in side] for o, side in sides.items()}
         return {o: [v if abs(v) > mp.mpf(10) ** -45 else 0 for v in row] for o, row in out.items()}
@@ -438,7 +464,10 @@ def truth(case: Case):
     """Values and derivatives as strings, in the shapes (*output) and (*output, *input)."""
     inputs = {n: lifted(v) for n, v in case.inputs.items()}
     base = MODELS[case.function](inputs)
-    text = lambda v: mp.nstr(v, KEPT) if v != 0 else "0.0"  # noqa: E731
+
+    def text(v):
+        return mp.nstr(v, KEPT) if v != 0 else "0.0"
+
     gradient = {o: {} for o in base}
     for name, value in case.inputs.items():
         if name in case.constant or name in case.free:
@@ -450,7 +479,10 @@ def truth(case: Case):
                 continue
             rows = np.array([[text(c) for c in column[o]] for column in columns], object).T
             gradient[o][name] = rows.reshape((*np.shape(v), *shape)).tolist()
-    as_text = lambda v: [as_text(q) for q in v] if isinstance(v, list) else text(v)  # noqa: E731
+
+    def as_text(v):
+        return [as_text(q) for q in v] if isinstance(v, list) else text(v)
+
     return {"inputs": {n: repr(v) for n, v in case.inputs.items()},
             "value": {o: as_text(v) for o, v in base.items()}, "gradient": gradient,
             "spread": spread(MODELS[case.function], case, inputs, base)}  # fmt: skip

@@ -67,7 +67,10 @@ def solve(x, length, EI, C, s_c, force, GA=None, ring_load=None, integrity=None)
     """
     given = x, length, EI, C, s_c, force, GA, ring_load, integrity
     with exactly(DIGITS, *given) as number:
-        exact = lambda v: [exact(u) for u in v] if hasattr(v, "__len__") else number(v)  # noqa: E731
+
+        def exact(v):
+            return [exact(u) for u in v] if hasattr(v, "__len__") else number(v)
+
         zero = number(0)
         x, EI, C, force = exact(x), exact(EI), exact(C), exact(force)
         GA = None if GA is None else exact(GA)

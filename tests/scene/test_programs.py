@@ -114,7 +114,10 @@ def each(scene, m, p):
 
 def presses_of(scene, m, used, status):
     at = used.s, used.phi, used.displacement
-    one = lambda *at: press_oblique(scene.geometry, m, *at, rings="mat", axial=False)  # noqa: E731
+
+    def one(*at):
+        return press_oblique(scene.geometry, m, *at, rings="mat", axial=False)
+
     out = jax.vmap(one)(*at)
     return out.force, out.depth, out.skeleton, out.joints, out.loads, out.end_U, out.end_V, (
         status(out)
@@ -124,7 +127,10 @@ def presses_of(scene, m, used, status):
 def tool(scene, m, p):
     """A tool led over the tube: every row presses along the normal where it touches."""
     near = scene.near
-    contact = lambda R, T: touch(scene.tool, Pose(R, T), scene.tube, near=near)  # noqa: E731
+
+    def contact(R, T):
+        return touch(scene.tool, Pose(R, T), scene.tube, near=near)
+
     seen = jax.vmap(contact)(p.rotation, p.translation)
     inward = jax.vmap(lambda phi: local_frame(phi)[0])(seen.phi)
     presses = Presses(seen.s, seen.phi, -seen.gap[:, None] * inward)
@@ -243,7 +249,10 @@ def test_refusals_cost_no_more_than_counted_on_paper():
 def test_an_unused_effect_adds_none_to_the_compiled_program(name):
     """After XLA's optimisation, by its own count; which folds the two in orders of their own."""
     scene, path, hand = program(name)
-    count = lambda f: jax.jit(f).lower(scene, MATERIAL, path).compile().cost_analysis()  # noqa: E731
+
+    def count(f):
+        return jax.jit(f).lower(scene, MATERIAL, path).compile().cost_analysis()
+
     mine, minimal = count(simulate), count(hand)
     assert mine["flops"] <= minimal["flops"]
     assert mine["transcendentals"] == minimal["transcendentals"]
@@ -255,7 +264,10 @@ def test_each_effect_that_is_on_costs_operations():
     optional = {"GA_L": 9.0, "k_A": 0.2, "k_1_ring": 0.6}
     material = dataclasses.replace(MATERIAL, **{k: jnp.array(v) for k, v in optional.items()})
     scene = make_scene(TUBE, material, path, tool=BALL, friction=0.66, mesh=MESH)
-    without = lambda plan: dataclasses.replace(scene, plan=plan)  # noqa: E731
+
+    def without(plan):
+        return dataclasses.replace(scene, plan=plan)
+
     whole, taken = count_operations(simulate, scene, material, path), []
     for effect in scene.plan.effects:
         less = scene.plan.without(effect.name)
@@ -273,6 +285,9 @@ def test_counting_operations():
     assert count_operations(lambda x: (x + x).reshape(-1), x) == 20
     assert count_operations(lambda x: x @ x.T, x) == 2 * 5 * 16
     assert count_operations(lambda x: [jnp.sin(x), x][1], x) == 0
-    loop = lambda x: jax.lax.fori_loop(0, 7, lambda i, y: jnp.sin(y), x)  # noqa: E731
+
+    def loop(x):
+        return jax.lax.fori_loop(0, 7, lambda i, y: jnp.sin(y), x)
+
     assert 140 <= count_operations(loop, x) <= 140 + 14
     assert count_operations(jax.jit(lambda x: (jnp.sin(x), jnp.cos(x))), x) == 40

@@ -354,7 +354,10 @@ def test_the_face_that_closes_a_tube_is_as_thick_as_the_tube_is_large(through):
     s, along = jnp.array([0.01, 0.01, 0.5, 1.5, 1.99, -0.1]), jnp.array([-1.0, 0, -1, 1, 1, 0])
     normal = jnp.stack([along, 1 - jnp.abs(along), 0 * s], 1)
     no, point, none = jnp.asarray(0.0), jnp.zeros(3), jnp.asarray(0)
-    at = lambda s, n: Touch(no, point, point, n, s, no, none, no, no, none)  # noqa: E731
+
+    def at(s, n):
+        return Touch(no, point, point, n, s, no, none, no, no, none)
+
     seen = jax.vmap(at)(s, normal)
     assert off_the_end(scene, seen).tolist() == [True, False, False, False, True, True]
 
@@ -457,7 +460,9 @@ def test_a_tool_in_the_lumen_of_a_mesh_has_no_force(radius):
             places = centre + height[:, None] * frame[:, :, 1]
         return Poses(np.broadcast_to(np.eye(3), (ROWS, 3, 3)), places)
 
-    to = lambda a, b: np.linspace(a, b, ROWS)  # noqa: E731
+    def to(a, b):
+        return np.linspace(a, b, ROWS)
+
     down = led(to(75, 75), to(18.6, 15.0))
     scene = make_scene(TUBE, SPRINGS, down, tool=BALL, mesh=mesh, effects=ONE)
     assert scene.plan.curved == (radius is not None)

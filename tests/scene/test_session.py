@@ -120,7 +120,10 @@ def test_nothing_is_compiled_or_allocated_by_a_step():
 @pytest.fixture(scope="module", params=["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def held(request):
     """A session of a ball that holds its place; as float32 it is compiled for all tests here."""
-    cast = lambda tree: jax.tree.map(lambda v: v.astype(request.param), tree)  # noqa: E731
+
+    def cast(tree):
+        return jax.tree.map(lambda v: v.astype(request.param), tree)
+
     tube, material, tool = cast((TUBE, MATERIAL, BALL))
     start = cast(ball([75, 1, 0], [76, -2, 0]))
     return Session(make_scene(tube, material, start, tool=tool, effects=HELD), material)
@@ -260,14 +263,20 @@ def test_what_gives_way_only_loses_energy(held):
     def give(ways):
         options = scene.plan.options
         place = place_at(TUBE, stiff, 72.0, 1.0, options, rings="arch2", axial=True)
-        one = lambda way: given_way(scene, way, jnp.asarray(2.0), place)  # noqa: E731
+
+        def one(way):
+            return given_way(scene, way, jnp.asarray(2.0), place)
+
         once = jax.vmap(one)(ways)
         return once, jax.vmap(one)(once), place.unit.compliance
 
     once, twice, C = give(way)
     frame = np.array(local_frame(jnp.asarray(1.0)))
     stiffness = np.linalg.inv(frame @ C @ frame.T + np.eye(3) / 30)
-    energy = lambda e: np.einsum("ai,ij,aj->a", e, stiffness, e) / 2  # noqa: E731
+
+    def energy(e):
+        return np.einsum("ai,ij,aj->a", e, stiffness, e) / 2
+
     moved = np.abs(once - way).max(axis=1) > 1e-9
     assert 0.5 < moved.mean() < 1
     np.testing.assert_allclose(twice, once, atol=1e-9)

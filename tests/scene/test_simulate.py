@@ -126,7 +126,10 @@ def test_the_dent_follows_the_tool():
     scene = make_scene(TUBE, MATERIAL, path, tool=BALL, mesh=mesh)
     out = run(scene, MATERIAL, path)
     centre = path.translation[-1]
-    inside = lambda v: 5 - np.linalg.norm(np.asarray(v) - np.asarray(centre)[None], axis=1).min()  # noqa: E731
+
+    def inside(v):
+        return 5 - np.linalg.norm(np.asarray(v) - np.asarray(centre)[None], axis=1).min()
+
     before, after = inside(mesh.vertices), inside(out.vertices[-1])
     assert before > 2.4
     assert after < 0.35  # mm; what 16 centres of 4 mm spacing leave

@@ -24,9 +24,11 @@ def test_a_dent_laid_elsewhere_is_the_dent_made_there():
 
     @jax.jit
     def both(s, phi):
-        at = lambda s, phi: local.fit(  # noqa: E731
-            local.centres(s, phi, radius, spacing, 16), local.targets(depth, sag), 3 * spacing
-        )
+        def at(s, phi):
+            return local.fit(
+                local.centres(s, phi, radius, spacing, 16), local.targets(depth, sag), 3 * spacing
+            )
+
         s_0, phi_0 = jnp.asarray(80.0), jnp.asarray(0.3)
         return trail.lay_at(at(s_0, phi_0), s - s_0, phi - phi_0), at(s, phi)
 

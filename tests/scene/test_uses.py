@@ -68,7 +68,10 @@ def test_a_network_learns_which_motion_reaches_a_force():
 
     net, fixed = eqx.partition(net, eqx.is_inexact_array)
     whole = loss
-    loss = lambda net: whole(eqx.combine(net, fixed))  # noqa: E731
+
+    def loss(net):
+        return whole(eqx.combine(net, fixed))
+
     train = jax.jit(lambda c: jax.lax.scan(step, c, length=600))
     with jax.numpy_dtype_promotion("standard"):  # optax counts in int32
         (net, _), losses = train((net, optimiser.init(net)))

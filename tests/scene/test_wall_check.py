@@ -42,7 +42,10 @@ def filled_up(tube):
     cores = np.asarray(tube.shapes.vertices)
     inside = np.repeat(cores.mean(axis=2, keepdims=True), walls_.CORNERS - cores.shape[2], 2)
     lacking = TUBE.rings - len(cores)
-    longer = lambda v, away=0.0: np.concatenate([v, np.repeat(v[:1], lacking, 0) + away])  # noqa: E731
+
+    def longer(v, away=0.0):
+        return np.concatenate([v, np.repeat(v[:1], lacking, 0) + away])
+
     cores = longer(np.concatenate([cores, inside], axis=2), 1e4)
     doubtful = np.zeros(TUBE.rings, bool)
     if tube.doubtful is not None:

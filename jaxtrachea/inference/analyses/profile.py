@@ -111,7 +111,10 @@ def _section(found: Profiles) -> list[str]:
     """The section on profile likelihood."""
     result = found.result
     shown = listed(result)
-    count = lambda end: int(np.sum((found.end == end).any(axis=1)))  # noqa: E731
+
+    def count(end):
+        return int(np.sum((found.end == end).any(axis=1)))
+
     parts = [
         "## Profile likelihood",
         markdown_table(PROFILE_HEAD, profile_table(found, shown)),
@@ -149,7 +152,10 @@ def draw_profiles(found: Profiles):
 
     result = found.result
     names = list(dict.fromkeys(p.name for p in result.study.free))
-    of = lambda k: result.study.unknowns[found.lane[k]][found.unknown[k]][0]  # noqa: E731
+
+    def of(k):
+        return result.study.unknowns[found.lane[k]][found.unknown[k]][0]
+
     groups = {n: [k for k in range(len(found.lane)) if of(k).name == n] for n in names}
     place = {lane: n for n, lane in enumerate(listed(result, LINES))}
     groups = {
