@@ -176,9 +176,7 @@ def compiled(full: Full, levels: Levels, lanes: int, *, slopes: bool = True) -> 
     if lanes:
         wide = jax.tree.map(lambda v: jnp.stack([v] * lanes), (material, row))
         batch = jax.jit(jax.vmap(lambda m, p: simulate(scene, m, p))).lower(*wide).compile()
-
-        def many():
-            return batch(*wide)
+        many = functools.partial(batch, *wide)
 
     return Compiled(lambda: call(material, row), gradient, many, seconds)
 
