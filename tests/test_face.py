@@ -12,6 +12,7 @@ import pytest
 from synthetic import DEPTHS, GEOMETRY, OPTIONS, curves, draw, forces, parameters
 
 import jaxtrachea as jt
+from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
 from jaxtrachea.measurements.curve import BadCurve
 from jaxtrachea.measurements.read import Measurements
 
@@ -97,6 +98,24 @@ def test_dataset_has_the_same_numbers(result):
     table = result.table()
     for name, column in (("low95", "low95"), ("high95", "high95"), ("verdict", "verdict")):
         assert data[name].values.ravel().tolist() == table.column(column)
+
+
+def test_noise_of_markers_that_are_not_there_is_no_number(result):
+    assert np.isnan(result.to_dataset().sigma.sel(kind="joints")).all()
+
+
+def test_a_number_is_not_taken_for_a_switch():
+    """`fixed = 2.0` of a specification means its value; here it would have kept the default."""
+    # Past the checker of annotations, which users do not have.
+    given = dataclasses.asdict(DEFAULTS["k_1"]) | {"fixed": 2.0}
+    record = object.__new__(Parameter)
+    for name, value in given.items():
+        object.__setattr__(record, name, value)
+    with pytest.raises(ValueError, match="k_1.*fixed is 2.0.*give the number as value"):
+        record.__post_init__()
+    held = {"k_1": {"fixed": True, "value": 2.0}}
+    study = jt.build_study(curves(forces(TRUTH)[0]), GEOMETRY, OPTIONS, held)
+    assert [p.value for p in study.parameters if p.name == "k_1"] == [2.0]
 
 
 def test_dataset_says_what_is_missing(result, monkeypatch):

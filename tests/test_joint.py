@@ -12,7 +12,8 @@ import synthetic
 from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
-from jaxtrachea.fitting import schur, specification
+from jaxtrachea.cli import specification
+from jaxtrachea.fitting import schur
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings

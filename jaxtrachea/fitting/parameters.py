@@ -49,6 +49,11 @@ class Parameter:
         """
         check_word(f"{self.name}: scale", self.scale, Scale)
         check_word(f"{self.name}: scope", self.scope, Scope)
+        if not isinstance(self.fixed, bool):
+            raise InputError(
+                f"fixed is {self.fixed!r}", key=self.name, expected="True or False",
+                cure="give the number as value",
+            )  # fmt: skip
         if not 0 < self.step < math.inf:
             raise InputError(f"step is {self.step}", key=self.name, expected="more than 0")
         if not all(map(math.isfinite, (self.value, self.lower, self.upper))):

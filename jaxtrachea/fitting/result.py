@@ -142,7 +142,7 @@ class FitResult:
         return Table(list(estimate_rows(self, profiles)))
 
     def to_dataset(self) -> "xarray.Dataset":
-        """All arrays of the fit with dimensions `lane` and `unknown`, as an xarray Dataset.
+        """The estimates with dimensions `lane` and `unknown`, as an xarray Dataset.
 
         `parameter` and `unit` say what each unknown is; statuses and verdicts are words. Lanes with
         fewer unknowns than others are filled up with NaN and "".
@@ -186,7 +186,11 @@ class FitResult:
             "cost": (per_lane, self.cost),
             "samples": (per_lane, self.samples),
             "rms": (("lane", "kind"), self.rms, {"unit": "N, mm"}),
-            "sigma": (("lane", "kind"), self.sigma, {"unit": "N, mm"}),
+            "sigma": (
+                ("lane", "kind"),
+                np.where(np.isnan(self.rms), np.nan, self.sigma),
+                {"unit": "N, mm"},
+            ),
         }
         same = all(row == labels[0] for row in labels)
         coords = {

@@ -89,7 +89,7 @@ def read_measurements(
     if isinstance(paths, (str, bytes)) or not paths:
         raise DataError(
             f"paths is {paths!r}",
-            cure="expected a file, or a list of at least one",
+            cure="expected at least one file, by itself or in a list",
         )
     files = tuple(Path(path) for path in paths)
     curves: list[Curve] = []
