@@ -77,7 +77,7 @@ class DataSection(Section):
     """[data]: which files, and how to read them (docs/measurements.md)."""
 
     files: list[str] = Field(min_length=1)
-    format: Literal["auto", "tidy", "machine", "hdf5", "afmformats"] = "auto"
+    format: str = "auto"
     columns: dict[str, str] = {}
     units: dict[str, str] = {}
     specimen: str | None = None

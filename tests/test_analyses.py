@@ -120,6 +120,28 @@ def test_an_analysis_is_done_only_if_asked_for_and_sees_those_before_it(command)
     assert isinstance(seen[0], int)
 
 
+def test_each_analysis_follows_the_one_that_it_names():
+    """A chain and a fork, given in another order; what follows nothing is refused."""
+
+    def named(name, after=""):
+        return Analysis(name=name, compute=lambda *_: None, after=after)
+
+    first, second, fork, end = named("m"), named("z", "m"), named("b", "m"), named("a", "z")
+    assert analyses.in_order([end, second, first, fork, first]) == (first, fork, second, end)
+    with pytest.raises(ValueError, match="analysis b: after is 'm'; expected"):
+        analyses.in_order([fork])
+    with pytest.raises(ValueError, match="twice"):
+        analyses.in_order([first, named("m", "z"), second])
+
+
+def test_an_analysis_is_found_by_its_file():
+    """A file beside the others is all that it takes."""
+    files = {p.stem for p in Path(analyses.__file__).parent.glob("*.py")} - {"__init__"}
+    assert len(files) == len(analyses.ANALYSES)
+    modules = {a.compute.__module__.rpartition(".")[2] for a in analyses.ANALYSES}
+    assert modules == files
+
+
 def test_names_options_and_keys_exist_once():
     names = [a.name for a in analyses.ANALYSES]
     assert len(set(names)) == len(names)

@@ -8,6 +8,7 @@ import pytest
 
 from jaxtrachea import config
 from jaxtrachea.config import FitSpec, SpecError, load_fit_spec
+from jaxtrachea.measurements.readers import READERS
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "fit_spec.md").read_text()
@@ -52,6 +53,11 @@ def test_page_lists_every_key_with_its_default(heading):
             assert default.split()[0].strip("`") == (
                 "1e-10" if name == "tolerance" else str(field.default).lower()
             )
+
+
+def test_page_lists_every_format():
+    meaning = next(m for name, _, _, m in rows("## [data]") if name == "format")
+    assert set(re.findall(r"`(\w+)`", meaning)) == {reader.name for reader in READERS}
 
 
 def test_quantities_come_in_internal_units(tmp_path):

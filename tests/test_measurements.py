@@ -385,12 +385,13 @@ def test_missing_file_folder_and_nothing(tmp_path):
         read(tmp_path)
     with pytest.raises(DataError, match="at least one file"):
         read_measurements([])
+    with pytest.raises(ValueError, match="format: expected 'auto', .*'tidy'.* .found 'xls'"):
+        read(tmp_path / "gone.csv", format="xls")
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"format": "xls"}, "format must be one of auto, tidy"),
         ({"loading": "both"}, "loading must be one of"),
         ({"force_sign": 0}, "force_sign must be one of 1, -1"),
         ({"columns": {"weight": "w"}}, "role 'weight' in columns; expected one of"),

@@ -25,10 +25,14 @@ from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import unknown_label, verdict_of
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Noise, build_study
-from jaxtrachea.inference.analyses import INFLUENCE, LEFT_OUT
-from jaxtrachea.inference.analyses.cross_validation import left_out_table
+from jaxtrachea.inference.analyses.cross_validation import LEFT_OUT, left_out_table
 from jaxtrachea.inference.analyses.effective import widened
-from jaxtrachea.inference.analyses.influence import REASONS, influence_cell, influence_section
+from jaxtrachea.inference.analyses.influence import (
+    INFLUENCE,
+    REASONS,
+    influence_cell,
+    influence_section,
+)
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import LeftOut
 from jaxtrachea.inference.effective import effective, share_independent

@@ -1,8 +1,8 @@
 """What an analysis of a fit is: one record of what it computes, and of all that is said of it.
 
-An analysis is a file in `analyses` and a line in its `ANALYSES`. The command line, report.md, the
-tables, results.h5 and the pictures go through that list. What an analysis is asked for by is
-declared where users give it: an option in `cli.main`, a key in `config.UncertaintySection`.
+An analysis is a file in `analyses`, found by itself. The command line, report.md, the tables,
+results.h5 and the pictures go through all of them. One that is asked for has that declared where
+users give it: a key in `config.UncertaintySection`, an option in `cli.main`.
 """
 
 import dataclasses
@@ -92,6 +92,8 @@ class Analysis:
 
     Attributes:
         name: of its group in results.h5, and of itself.
+        after: the analysis that it follows: it may use what those before it have found, and its
+            columns in parameters.csv and its section at a place of the report come after theirs.
         compute: the analysis itself, out of the request, the findings so far and whom to tell of
             progress; raises `Unavailable` where the fit does not allow it.
         work: what is done meanwhile, for the progress bar; "" if it takes no time.
@@ -116,6 +118,7 @@ class Analysis:
 
     name: str
     compute: Callable[[Request, Findings, Progress], Any]
+    after: str = ""
     work: str = ""
     option: str = ""
     key: str = ""

@@ -117,7 +117,6 @@ class RawCurve:
     time: np.ndarray | None = None
 
 
-FORMATS = ("auto", "tidy", "machine", "hdf5", "afmformats")
 #: "loading" is the former name of "first".
 LOADINGS = ("last", "first", "loading", "all", "require-monotone")
 ROLE_DIMENSIONS = {
@@ -145,7 +144,7 @@ class ReadOptions:
     r"""How to read the files of one study.
 
     Attributes:
-        format: "auto" (by content), "tidy", "machine", "hdf5" or "afmformats".
+        format: "auto" (by content), or the name of one of `readers.READERS`.
         columns: role -> column name. Roles: specimen, trial, s, phi, displacement, force, sigma,
             time, and ``joint_7`` for the marker of ring number 7 (counted from 1).
         units: role -> unit, for a file that names none; against what the file says, it is an error.
@@ -191,7 +190,6 @@ class ReadOptions:
 
     def __post_init__(self) -> None:
         """Refuse what can never work before any file is opened."""
-        _one_of("format", self.format, FORMATS)
         _one_of("loading", self.loading, LOADINGS)
         _one_of("force_sign", self.force_sign, (1, -1))
         _one_of("displacement_sign", self.displacement_sign, (1, -1))

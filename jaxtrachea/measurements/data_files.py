@@ -5,6 +5,7 @@ import dataclasses
 import re
 from pathlib import Path
 
+from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.measurements.names import appearance
 from jaxtrachea.measurements.read import (
@@ -14,6 +15,7 @@ from jaxtrachea.measurements.read import (
     ReadOptions,
     read_measurements,
 )
+from jaxtrachea.measurements.readers import reader_of
 from jaxtrachea.measurements.readers.patterns import ensure_quick
 from jaxtrachea.measurements.readers.recognise import is_workbook
 
@@ -99,6 +101,10 @@ def read_data(spec: FitSpec, root: Path) -> Measurements:
         options = ReadOptions(**{k: v for k, v in spec.data.model_dump().items() if k in names})
     except ValueError as error:
         raise SpecError(f"data: {error}") from None
+    try:
+        reader_of(options.format)
+    except InputError as error:
+        raise SpecError.like(error, key=f"data.{error.key}") from None
     files = find_files(spec, root)
     if options.name_pattern is not None:
         try:

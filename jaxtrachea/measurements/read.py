@@ -12,15 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jaxtrachea.measurements.checks import finish
-from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, Fault, RawCurve, ReadOptions
-from jaxtrachea.measurements.readers import afmformats, csv, hdf5, machine_csv
-from jaxtrachea.measurements.readers.lines import Line, Text, is_comment, read_lines
+from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, RawCurve, ReadOptions
+from jaxtrachea.measurements.readers import READERS, hdf5, reader_of
+from jaxtrachea.measurements.readers.lines import Line, Text, read_lines
 from jaxtrachea.measurements.readers.patterns import ensure_quick
+from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.recognise import kind_of
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
-from jaxtrachea.measurements.readers.text import ALIASES, guess_delimiter, split_cells
 from jaxtrachea.measurements.readers.workbook import listed, read_sheet
-from jaxtrachea.units import column_unit
 
 __all__ = [
     "BadCurve",
@@ -32,8 +31,6 @@ __all__ = [
     "write_hdf5",
 ]
 
-_TEXT_READERS = {"tidy": csv.read, "machine": machine_csv.read}
-_FILE_READERS = {"hdf5": hdf5.read, "afmformats": afmformats.read}
 #: What another sheet of the same workbook may mend.
 _OF_THE_SHEET = ("empty", "column_missing")
 
@@ -83,8 +80,10 @@ def read_measurements(
         DataError: a file is missing, unreadable, hostile or of no known format, its table is
             malformed, a (specimen, trial) comes twice, or the specimen pattern backtracks for
             seconds on the name of a file.
+        InputError: `options.format` names no format.
     """
     options = options or ReadOptions()
+    reader_of(options.format)
     paths = [paths] if paths and isinstance(paths, (str, Path)) else paths
     if isinstance(paths, (str, bytes)) or not paths:
         raise DataError(
@@ -165,31 +164,32 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[list[RawCurve | BadCur
     Raises:
         DataError: as `read_measurements`.
     """
-    asked = None if options.format == "auto" else options.format
+    asked = reader_of(options.format)
     named_hdf5 = path.suffix.lower() in (".h5", ".hdf5")
     found = "hdf5" if named_hdf5 and asked is None else kind_of(path)
     if found == "hdf5" and asked is None:
-        asked = _sniff_hdf5(path)
-    if asked in _FILE_READERS and found != "xlsx":
-        return _FILE_READERS[asked](path, options), []
-    if found == "xlsx" and asked not in _FILE_READERS:
+        asked = _recognise_hdf5(path)
+    if found != "xlsx" and asked is not None and asked.read is not None:
+        return asked.read(path, options), []
+    if found == "xlsx" and (asked is None or asked.read_text is not None):
         return _read_workbook(path, asked, options)
     if found != "text":
         what = "HDF5" if found == "hdf5" else "a workbook (xlsx)"
         raise DataError(
-            f"is {what}, but data.format is {asked!r}",
+            f"is {what}, but data.format is {options.format!r}",
             place=str(path),
             cure="remove data.format",
         )
     text = Text(path, read_lines(path))
-    kind = asked or _sniff(text.lines)
-    if kind == "afmformats":
-        return afmformats.read(path, options), []
-    return _TEXT_READERS[kind](text, options), []
+    reader = asked or _recognise(text.lines, READERS)
+    if reader.read_text is not None:
+        return reader.read_text(text, options), []
+    assert reader.read is not None
+    return reader.read(path, options), []
 
 
 def _read_workbook(
-    path: Path, asked: str | None, options: ReadOptions
+    path: Path, asked: Reader | None, options: ReadOptions
 ) -> tuple[list[RawCurve | BadCurve], list[str]]:
     """The curves of a sheet, and which sheet it is if there are several.
 
@@ -199,9 +199,10 @@ def _read_workbook(
     text, sheets = read_sheet(path, options.sheet)
     others = listed([name for name in sheets if name != text.sheet])
     hint = f", or choose another sheet with data.sheet ({others})" if others else ""
-    kind = asked or _sniff(text.lines)
+    reader = asked or _recognise(text.lines, [r for r in READERS if r.read_text is not None])
+    assert reader.read_text is not None
     try:
-        records = _TEXT_READERS["tidy" if kind == "afmformats" else kind](text, options)
+        records = reader.read_text(text, options)
     except DataError as error:
         raise DataError.like(error, cure=error.cure + hint) from None
     records = [
@@ -214,31 +215,19 @@ def _read_workbook(
     return records, [note] if others else []
 
 
-def _sniff(lines: list[Line]) -> str:
-    """Format of a text by its lines."""
-    if any("BEGIN METADATA" in line.text for line in lines[:10]):
-        return "afmformats"
-    content = [line.text for line in lines if not is_comment(line)]
-    if not content:
-        return "machine"
-    if content[0].lstrip().startswith("{"):
-        return "tidy"
-    try:
-        cells = split_cells(content[0], guess_delimiter(content[0]))
-    except Fault:
-        return "machine"
-    names = {column_unit(cell)[0].lower() for cell in cells}
-    return "tidy" if names & set(ALIASES["specimen"]) else "machine"
+def _recognise(lines: list[Line], readers: Sequence[Reader]) -> Reader:
+    """Format of a text by its lines; the last reader takes any."""
+    return next(reader for reader in readers if reader.is_text(lines))
 
 
-def _sniff_hdf5(path: Path) -> str:
+def _recognise_hdf5(path: Path) -> Reader:
     with opened(path, audit=False) as file:
-        if "schema" in file.attrs:
-            return "hdf5"
-        if any(name.isdecimal() for name in file):
-            return "afmformats"
+        for reader in READERS:
+            if reader.is_hdf5(file):
+                return reader
+    layouts = sorted((r.layout for r in READERS if r.layout), reverse=True)
     raise DataError(
         "HDF5 of no known layout",
         place=str(path),
-        cure=f'expected root attribute schema = "{hdf5.SCHEMA}", or groups 0, 1, ... of afmformats',
+        cure=f"expected {', or '.join(layouts)}",
     )

@@ -1,31 +1,49 @@
 """All analyses of a fit, one file each: what they compute, and what is said of it where."""
 
-from collections.abc import Callable
+import importlib
+import pkgutil
+from collections.abc import Callable, Iterable
 
 from jaxtrachea.config import SpecError
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.inference.analyses.bootstrap import BOOTSTRAP
-from jaxtrachea.inference.analyses.cross_validation import LEFT_OUT
-from jaxtrachea.inference.analyses.design import DESIGN
-from jaxtrachea.inference.analyses.effective import EFFECTIVE
-from jaxtrachea.inference.analyses.influence import INFLUENCE
-from jaxtrachea.inference.analyses.population import POPULATION
-from jaxtrachea.inference.analyses.posterior import POSTERIOR
-from jaxtrachea.inference.analyses.profile import PROFILES
 from jaxtrachea.inference.analysis import Analysis, Findings, Progress, Request, Unavailable
+
+
+def in_order(analyses: Iterable[Analysis]) -> tuple[Analysis, ...]:
+    """Each after the one that it follows; of several that follow the same, by name.
+
+    Raises:
+        ValueError: a name comes twice, or an analysis follows none that there is.
+    """
+    left = sorted(dict.fromkeys(analyses), key=lambda analysis: analysis.name)
+    ordered: list[Analysis] = []
+
+    def append(before: str) -> None:
+        for analysis in left:
+            if analysis.after == before:
+                ordered.append(analysis)
+                append(analysis.name)
+
+    if len({analysis.name for analysis in left}) < len(left):
+        raise ValueError(f"analyses: a name comes twice: {[a.name for a in left]}")
+    append("")
+    for analysis in left:
+        if analysis not in ordered:
+            found = f"analysis {analysis.name}: after is {analysis.after!r}"
+            raise ValueError(f"{found}; expected an analysis that comes before it")
+    return tuple(ordered)
+
+
+def _declared() -> Iterable[Analysis]:
+    """The analyses in the files beside this one."""
+    for module in pkgutil.iter_modules(__path__):
+        content = vars(importlib.import_module(f"{__name__}.{module.name}"))
+        yield from (value for value in content.values() if isinstance(value, Analysis))
+
 
 #: In the order in which they are done, in which their columns stand in parameters.csv, and, at each
 #: place, their sections in the report. One may use what those before it have found.
-ANALYSES: tuple[Analysis, ...] = (
-    PROFILES,
-    BOOTSTRAP,
-    POPULATION,
-    POSTERIOR,
-    LEFT_OUT,
-    INFLUENCE,
-    EFFECTIVE,
-    DESIGN,
-)
+ANALYSES = in_order(_declared())
 
 
 def refuse(request: Request) -> None:

@@ -79,6 +79,7 @@ def _shown(found: Bootstrap, lanes: list[int]) -> Iterator[Table | str]:
 
 BOOTSTRAP = Analysis(
     name="bootstrap",
+    after="profiles",
     compute=_compute,
     work="resampling",
     key="bootstrap",

@@ -97,6 +97,7 @@ def _shown(found: LeftOut, lanes: list[int]) -> Iterator[Table | str]:
 
 LEFT_OUT = Analysis(
     name="left_out",
+    after="posterior",
     compute=_compute,
     work="leaving curves out",
     option="leave-one-out",

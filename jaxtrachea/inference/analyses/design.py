@@ -153,6 +153,7 @@ def draw_design(design: Design):
 
 DESIGN = Analysis(
     name="design",
+    after="effective",
     compute=_compute,
     asked=lambda request: True,
     commands=("design",),

@@ -69,6 +69,7 @@ def _shown(wide: Effective, lanes: list[int]) -> Iterator[str]:
 
 EFFECTIVE = Analysis(
     name="effective",
+    after="influence",
     compute=_compute,
     asked=lambda request: True,
     lane_cells=_lane_cells,

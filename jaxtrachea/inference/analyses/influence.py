@@ -206,6 +206,7 @@ def _shown(found: Influence, lanes: list[int]) -> Iterator[Table | str]:
 
 INFLUENCE = Analysis(
     name="influence",
+    after="left_out",
     compute=_compute,
     option="influence",
     key="influence",

@@ -99,6 +99,7 @@ def _shown(found: Population, lanes: list[int]) -> Iterator[Table]:
 
 POPULATION = Analysis(
     name="population",
+    after="bootstrap",
     compute=_compute,
     asked=_asked,
     tables=lambda found: {"population.csv": population_rows(found)},

@@ -127,6 +127,7 @@ def _poor(drawn: Posterior) -> bool:
 
 POSTERIOR = Analysis(
     name="posterior",
+    after="population",
     compute=_compute,
     work="drawing",
     key="posterior",

@@ -30,6 +30,7 @@ from jaxtrachea.measurements.curve import (
     identify_file,
 )
 from jaxtrachea.measurements.readers.lines import Line, read_lines
+from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.safe_hdf5 import attribute, numeric, opened, unit_of
 from jaxtrachea.measurements.readers.text import numbers, read_rows, resolve_unit
 from jaxtrachea.units import convert
@@ -246,3 +247,12 @@ def _column(
         )
     unit = resolve_unit(role, units[name], options, f"{source}/{name}")
     return np.atleast_1d(convert(columns[name], unit, "force" if role == "force" else "length"))
+
+
+AFMFORMATS = Reader(
+    "afmformats",
+    read=read,
+    is_text=lambda lines: any("BEGIN METADATA" in line.text for line in lines[:10]),
+    is_hdf5=lambda file: "schema" not in file.attrs and any(name.isdecimal() for name in file),
+    layout="groups 0, 1, ... of afmformats",
+)

@@ -16,7 +16,9 @@ from jaxtrachea.measurements.curve import (
     role_dimension,
 )
 from jaxtrachea.measurements.readers.lines import Line, Text, is_comment
+from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.text import (
+    ALIASES,
     Table,
     find_roles,
     guess_delimiter,
@@ -256,3 +258,21 @@ def _constant(
             "give each position its own trial",
         )
     return float(column[0] if np.ptp(column) == 0 else column.mean())
+
+
+def _is_tidy(lines: list[Line]) -> bool:
+    """Whether the first line is a JSON object, or names a column of specimens."""
+    content = [line.text for line in lines if not is_comment(line)]
+    if not content:
+        return False
+    if content[0].lstrip().startswith("{"):
+        return True
+    try:
+        cells = split_cells(content[0], guess_delimiter(content[0]))
+    except Fault:
+        return False
+    names = {column_unit(cell)[0].lower() for cell in cells}
+    return bool(names & set(ALIASES["specimen"]))
+
+
+TIDY = Reader("tidy", read_text=read, is_text=_is_tidy)

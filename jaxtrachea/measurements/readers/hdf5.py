@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.safe_hdf5 import (
     attribute,
     numeric,
@@ -219,3 +220,11 @@ def _write_dataset(group: Any, name: str, values: np.ndarray, unit: str | None) 
     )
     if unit:
         dataset.attrs["unit"] = unit
+
+
+HDF5 = Reader(
+    "hdf5",
+    read=read,
+    is_hdf5=lambda file: "schema" in file.attrs,
+    layout=f'root attribute schema = "{SCHEMA}"',
+)

@@ -5,6 +5,7 @@ import numpy as np
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.curve import BadCurve, Fault, RawCurve, ReadOptions, identify_file
 from jaxtrachea.measurements.readers.lines import Line, Text, is_comment
+from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.text import (
     Table,
     find_roles,
@@ -148,3 +149,6 @@ def _units_row(
     if not bracketed and not all(not b or (is_unit(b) and not b[0].isdigit()) for b in bare):
         return at, units
     return at + 1, [b or None for b in bare]
+
+
+MACHINE = Reader("machine", read_text=read, is_text=lambda lines: True)
