@@ -269,4 +269,5 @@ def load_fit_spec(path: Path) -> FitSpec:
         SpecError: missing file, broken TOML (line and column), unknown key, wrong value; one line
             per problem with its dotted key.
     """
-    return load_spec(path, FitSpec, "fit specification")
+    others = dict.fromkeys(("path", "material"), "a scene (commands plan, simulate, sweep)")
+    return load_spec(path, FitSpec, "fit specification", others)

@@ -364,6 +364,31 @@ def test_version_and_help(monkeypatch, capsys):
         assert "..." not in out.partition("Commands")[2]
 
 
+def test_help_lists_the_commands_in_the_order_of_use(monkeypatch, capsys):
+    code, out, _ = run(monkeypatch, capsys, "--help")
+    assert code == 0
+    lines = out.partition("Commands:\n")[2].rstrip().splitlines()
+    assert [line.split()[0] for line in lines] == [
+        "check", "fit", "predict", "design", "compare", "plan", "simulate", "sweep", "tradeoff",
+        "selfcheck",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("command", "path", "says"),
+    [
+        ("check", "configs/normal.toml", "it is a scene (commands plan, simulate, sweep)"),
+        ("plan", "fits/ecoflex/fit.toml", "it is a fit specification (commands check, fit,"),
+    ],
+)
+def test_a_scene_is_not_taken_for_a_specification(command, path, says, monkeypatch, capsys):
+    root = Path(__file__).parents[1]
+    code, _, err = run(monkeypatch, capsys, command, str(root / path))
+    assert code == 2
+    assert says in err
+    assert len(err.splitlines()) == 1
+
+
 def test_help_is_quick_and_loads_nothing_heavy():
     """Bar: 1 s of processor time, measured 0.5 s; jax, h5py and matplotlib would take 2 s more."""
     code = (

@@ -13,14 +13,15 @@ from jaxtrachea.cli.load import load
 from jaxtrachea.cli.terminal import Stages, Stop, into, progress_bar, table
 
 SpecsArgument = Annotated[
-    list[Path], typer.Argument(help="Fit specifications, two or more, of the same data.")
+    list[Path], typer.Argument(help="Two or more fit specifications of the same curves.")
 ]
 DataOption = Annotated[
-    Path | None, typer.Option("--data", help="Folder the data paths start from (default: SPEC's).")
+    Path | None,
+    typer.Option("--data", help="Folder of the data files (default: SPEC's)."),
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 CrossOption = Annotated[
-    bool, typer.Option(help="Also predict every position, or trial, from the others.")
+    bool, typer.Option(help="Also predict each contact position from fits without it.")
 ]
 #: Specimens of a terminal table; the files hold all.
 MANY = 8
@@ -33,7 +34,7 @@ def compare(
     out_dir: OutOption = None,
     cross_validation: CrossOption = True,
 ) -> None:
-    """Fit the same data by several models: which one they prefer."""
+    """Fit the same curves by several models and rank these."""
     clock = [time.perf_counter()]
     if len(specs) < 2:
         raise Stop("compare: one model has nothing to be compared with; give two or more SPEC")

@@ -32,24 +32,30 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help="Trachea mechanics: identify them from force-displacement curves, simulate scenes.",
+    help=(
+        "Mechanics of the trachea: identify stiffnesses from force-displacement curves "
+        "(check, fit, predict, design, compare); simulate a tool on a trachea (plan, simulate, "
+        "sweep)."
+    ),
 )
 #: Rows of a terminal table; the files hold all.
 MANY = 40
 
-SpecArgument = Annotated[Path, typer.Argument(help="TOML specification of the fit.")]
+SpecArgument = Annotated[Path, typer.Argument(help="Fit specification (TOML).")]
 DataOption = Annotated[
-    Path | None, typer.Option("--data", help="Folder the data paths start from (default: SPEC's).")
+    Path | None,
+    typer.Option("--data", help="Folder of the data files (default: SPEC's)."),
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 LeaveOption = Annotated[
-    bool, typer.Option("--leave-one-out", help="Also predict every curve from the others.")
+    bool, typer.Option("--leave-one-out", help="Also predict each curve from a fit of the others.")
 ]
 ProfileOption = Annotated[
-    bool, typer.Option("--profile", help="Also profile the likelihood of the parameters.")
+    bool, typer.Option("--profile", help="Also compute 95 % intervals by profile likelihood.")
 ]
 InfluenceOption = Annotated[
-    bool, typer.Option("--influence", help="Also say which samples and curves the estimates need.")
+    bool,
+    typer.Option("--influence", help="Also show which curves each estimate depends on."),
 ]
 
 
@@ -87,13 +93,6 @@ def _not_shown(error: OSError) -> str:
     return f"{error.filename or 'the output'}: {reason}; files said to be kept or written are there"
 
 
-for _command in (
-    cli_compare.compare, cli_predict.predict, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
-    cli_selfcheck.selfcheck, cli_tradeoff.tradeoff,
-):  # fmt: skip
-    app.command()(_command)
-
-
 @app.callback(invoke_without_command=True)
 def _options(
     version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
@@ -105,7 +104,7 @@ def _options(
 
 @app.command()
 def check(spec: SpecArgument, data: DataOption = None) -> None:
-    """Read everything, fit nothing, say what was found."""
+    """Read the curves and show what a fit would use; fit nothing."""
     _, measurements, study = load(spec, data)
     out = Console()
     curves = measurements.curves
@@ -141,7 +140,7 @@ def fit(
     process: cli_fit.ProcessOption = None,
     patience: cli_fit.PatienceOption = 100.0,
 ) -> None:
-    """Fit, write results.h5, tables, report, plots."""
+    """Identify stiffnesses from curves; write report, tables, plots."""
     from jaxtrachea.cli.specification import settings_of
     from jaxtrachea.inference.analysis import Request
     from jaxtrachea.report.overview import overview
@@ -175,9 +174,12 @@ def fit(
     raise typer.Exit(1 if failed or measurements.bad or poor(findings) else 0)
 
 
+app.command()(cli_predict.predict)
+
+
 @app.command()
 def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = None) -> None:
-    """Fit, then say where the next presses tell most."""
+    """Fit, then show where further presses would tell most."""
     from jaxtrachea.cli.specification import settings_of
     from jaxtrachea.inference.analysis import Request
     from jaxtrachea.report.plots import draw_analyses
@@ -195,6 +197,13 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
     chosen = ((analysis.shown, found) for analysis, found in findings.at("design"))
     show((item for shown, found in chosen for item in shown(found, [])), folder.parent)
     raise typer.Exit(1 if measurements.bad else 0)
+
+
+for _command in (
+    cli_compare.compare, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
+    cli_tradeoff.tradeoff, cli_selfcheck.selfcheck,
+):  # fmt: skip
+    app.command()(_command)
 
 
 def _print_usage(out: Console, curves) -> None:

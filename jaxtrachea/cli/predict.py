@@ -22,7 +22,11 @@ FilesArgument = Annotated[
 ]
 AtOption = Annotated[
     list[str] | None,
-    typer.Option("--at", metavar="s=75,D=0:6:0.5", help="Where and how deep; may be repeated."),
+    typer.Option(
+        "--at",
+        metavar="s=75,D=0:6:0.5",
+        help="Contact position and displacement, mm; repeatable.",
+    ),
 ]
 DataOption = Annotated[
     list[str] | None,
@@ -31,7 +35,7 @@ DataOption = Annotated[
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the predictions.")]
 AsOption = Annotated[
     str | None,
-    typer.Option("--as", metavar="SPECIMEN", help="Predict unknown specimens as this one."),
+    typer.Option("--as", metavar="SPECIMEN", help="Take unknown specimens for this one."),
 ]
 
 
@@ -43,7 +47,7 @@ def predict(
     out_dir: OutOption = None,
     as_specimen: AsOption = None,
 ) -> None:
-    """Predict curves from a finished fit, with 95 % bands."""
+    """Predict force curves from a finished fit, with 95 % bands."""
     from jaxtrachea.results.stored import NoResults, read_results
 
     set_up_jax()

@@ -20,14 +20,14 @@ from jaxtrachea.cli.terminal import (
     table,
 )
 
-SceneArgument = Annotated[Path, typer.Argument(help="TOML scene (docs/scenes.md).")]
+SceneArgument = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 #: Rows of a terminal table; the files hold all.
 MANY = 12
 
 
 def plan(scene: SceneArgument) -> None:
-    """Say which effects a scene calls for, and why."""
+    """Show which effects a scene needs, why, and their cost."""
     from jaxtrachea.scene.cost import shares
     from jaxtrachea.scene.results import plan_rows
 
@@ -48,7 +48,7 @@ def plan(scene: SceneArgument) -> None:
 
 
 def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
-    """Follow the path: forces, deformed mesh, pictures."""
+    """Move the tool along its path: forces, deformed mesh, pictures."""
     import jax
     import numpy as np
 
@@ -86,7 +86,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
 
 
 def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
-    """Press everywhere: maps of force and compliance."""
+    """Press along the whole tube: maps of force and compliance."""
     import jax
     import numpy as np
 

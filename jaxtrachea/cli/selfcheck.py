@@ -11,16 +11,14 @@ from rich.console import Console
 
 from jaxtrachea.cli.terminal import Stop, set_up_jax, table
 
-DtypeOption = Annotated[str, typer.Option("--dtype", help="float32, float64 or both.")]
+DtypeOption = Annotated[str, typer.Option("--dtype", help="Precision: float32, float64 or both.")]
 OnlyOption = Annotated[
     list[str] | None, typer.Option("--only", help="Only this case or function; may be repeated.")
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for selfcheck.json.")]
 QuickOption = Annotated[
     bool,
-    typer.Option(
-        "--quick", help="Compile without optimisation: not your usual programs, but soon."
-    ),
+    typer.Option("--quick", help="Faster start: programs compiled without optimisation."),
 ]
 HEAD = ["case", "dtype", "value", "gradient", "not finite", "verdict"]
 
@@ -37,7 +35,7 @@ def selfcheck(
     out_dir: OutOption = None,
     quick: QuickOption = False,
 ) -> None:
-    """Run the hard cases here: errors against 25-digit truth."""
+    """Test the numerics here against known 25-digit results."""
     from jaxtrachea.selfcheck.table import read_cases, read_truth
 
     start = time.perf_counter()

@@ -12,16 +12,19 @@ from rich.markup import escape
 from jaxtrachea.cli.terminal import Stop, into, progress_bar, say_lost, table
 
 SceneArgument = Annotated[
-    Path | None, typer.Argument(help="TOML scene (default: a ball on the trachea of Table 1).")
+    Path | None, typer.Argument(help="Scene file (default: a ball on the tube of Table 1).")
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
-CallsOption = Annotated[int, typer.Option("--calls", min=10, help="Timed calls of each rung.")]
-LanesOption = Annotated[int, typer.Option("--lanes", min=0, help="Poses of one batch; 0: none.")]
+CallsOption = Annotated[int, typer.Option("--calls", min=10, help="Timed calls of each setting.")]
+LanesOption = Annotated[
+    int, typer.Option("--lanes", min=0, help="Poses in one batch; 0: no batch.")
+]
 QuickOption = Annotated[
-    bool, typer.Option("--quick", help="Three rungs a ladder, 100 calls, no batches.")
+    bool, typer.Option("--quick", help="Three settings of each kind, 100 calls, no batch.")
 ]
 DataOption = Annotated[
-    Path | None, typer.Option("--data", help="Fit specification: its curves are the truth too.")
+    Path | None,
+    typer.Option("--data", help="Fit specification: its measured curves are a truth, too."),
 ]
 
 
@@ -33,7 +36,7 @@ def tradeoff(
     quick: QuickOption = False,
     data: DataOption = None,
 ) -> None:
-    """Error against time of every accuracy choice of a scene."""
+    """Measure error and time of every accuracy setting of a scene."""
     clock = [time.perf_counter()]
     name = "table-1" if scene is None else scene.stem
     full = _full(scene)

@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -25,13 +26,16 @@ class SpecError(InputError):
     """
 
 
-def load_spec(path: Path, kind: type[Spec], called: str) -> Spec:
+def load_spec(
+    path: Path, kind: type[Spec], called: str, others: Mapping[str, str] | None = None
+) -> Spec:
     """Read and validate a specification of any kind.
 
     Args:
         path: the TOML file.
         kind: the record it must fit.
         called: what a user calls it.
+        others: a table that only another kind of file has, and what that file is.
 
     Raises:
         SpecError: as `load_fit_spec`.
@@ -54,6 +58,10 @@ def load_spec(path: Path, kind: type[Spec], called: str) -> Spec:
     try:
         return kind.model_validate(content)
     except ValidationError as error:
+        for table, other in (others or {}).items():
+            if table in content:
+                found = f"has a table [{table}], so it is {other}"
+                raise SpecError(found, place=str(path), expected=f"a {called}") from None
         lines = _lines(error, kind)
         more = f"\n... and {len(lines) - MAX_LINES} more" if len(lines) > MAX_LINES else ""
         told = f"\n{path}: ".join(lines[:MAX_LINES])
@@ -132,7 +140,10 @@ def _missing(parts: list, root: type[BaseModel]) -> str:
     field = section.model_fields.get(parts[-1])
     inner = _sections(field.annotation) if field else []
     if inner:
-        return f"missing; add a table [{parts[-1]}] with {', '.join(inner[-1].model_fields)}"
+        fields = inner[-1].model_fields
+        needed = [name for name, value in fields.items() if value.is_required()]
+        keys = ", ".join(needed) if needed else f"some of {', '.join(fields)}"
+        return f"missing; add a table [{parts[-1]}] with {keys}"
     return f"missing; add it to [{'.'.join(map(str, parts[:-1]))}]"
 
 

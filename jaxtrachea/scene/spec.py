@@ -262,4 +262,5 @@ def load_scene_spec(path: Path) -> SceneSpec:
     Raises:
         SpecError: as `jaxtrachea.config.load_fit_spec`.
     """
-    return load_spec(path, SceneSpec, "scene")
+    others = {"data": "a fit specification (commands check, fit, design, compare)"}
+    return load_spec(path, SceneSpec, "scene", others)

@@ -194,7 +194,7 @@ def resolve_unit(role: str, found: str | None, options: ReadOptions, place: str)
         raise Fault(
             "unit_missing",
             f"{place} has no unit",
-            f"write it in the file, or give units.{general} if it has none",
+            f"write it in the header, as in 'force [N]', or give data.units.{general}",
         )
     try:
         factor = unit_factor(unit, role_dimension(role))
