@@ -8,6 +8,8 @@ from jaxtrachea.selfcheck.table import ROUNDINGS, Case
 
 _HEAD = """# Hard cases
 
+*For developers, and for whoever ran `jaxtrachea selfcheck` and got an error.*
+
 Written by `tests/reference/hard_cases_page.py` from `jaxtrachea/selfcheck/cases.toml`. Run them on
 your own machine: `jaxtrachea selfcheck` (`--only NAME`, `--dtype float32`, `--out FOLDER`).
 Nearly all of the time is compilation of the programs, which are kept for the next start. `--quick`

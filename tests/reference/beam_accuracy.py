@@ -149,6 +149,8 @@ def _errors(spans, k, a, b, count, last, tip):
 
 HEAD = """# Accuracy of the ligament beam
 
+*For developers: rounding errors of the two forms of the force method.*
+
 Written by `tests/reference/beam_accuracy.py`. Largest error over the largest value of the quantity
 (w: joint deflections, R: reactions, c: deflection of C, theta: all rotations), against a Hermite
 finite-element solution in 80 digits, over nine contact positions: mid-span, on three rings, 3 mm

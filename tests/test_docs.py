@@ -1,0 +1,333 @@
+"""What the pages show is run, and what they name exists. The README's own: `test_readme.py`."""
+
+import enum
+import importlib
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import typer
+from run_cli import run
+
+import jaxtrachea
+from jaxtrachea import status
+from jaxtrachea.cli.main import app
+from jaxtrachea.config import FitSpec
+from jaxtrachea.fitting import verdict
+from jaxtrachea.scene.spec import SceneSpec
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.section import geometry_of
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+#: What a user reads, in this order.
+PATH = ["install", "fit", "report", "simulate", "layer"]
+#: Commands that are shown without a placeholder, and the test that runs each.
+RUN_BY = {
+    "--version": "test_cli.py",
+    "check fits/virtual_trachea/fit.toml": "test_docs.py",
+    "fit fits/virtual_trachea/fit.toml": "test_fits.py",
+    "fit fits/virtual_trachea/fit.toml --out out/virtual": "test_docs.py",
+    "predict out/virtual --at s=75,D=0:0.1:0.02 --at 's=3.1 cm,D=100 um'": "test_docs.py",
+    "predict out/virtual --data fits/virtual_trachea/fit.toml": "test_docs.py",
+    "compare euler.toml shear.toml two_material.toml": "test_criteria.py",
+    "plan configs/friction.toml": "test_configs.py",
+    "simulate configs/friction.toml": "test_configs.py",
+    "sweep configs/scan.toml": "test_configs.py",
+}
+#: What a block of Python finds there, by page and number of the block.
+BEFORE = {
+    ("measurements", 0): """
+import pathlib
+pathlib.Path("study.csv").write_text(
+    "specimen,trial,s [mm],displacement [mm],force [N]\\nT01,1,35,0,0\\nT01,1,35,0.5,0.3\\n"
+    "T01,1,35,1,0.8\\n"
+)
+""",
+    ("contact", 0): """
+import jax.numpy as jnp
+from jaxtrachea.contact.pose import pose_from_vector
+rotation, translation = jnp.zeros(3), jnp.array([0.0, 0.0, 3.0])
+next_pose = pose_from_vector(rotation, translation + 0.01)
+""",
+    ("contact", 1): """
+import jax.numpy as jnp, numpy as np
+from jaxtrachea import table_1
+from jaxtrachea.contact.pose import pose_from_vector
+from jaxtrachea.contact.shapes import sphere
+from jaxtrachea.trachea.tube import make_tube
+mesh = make_tube(table_1(), around=12, along=40)
+vertices, faces, s = mesh.vertices, mesh.faces, mesh.s
+borders = np.linspace(0.0, 160.0, 17)
+centres = np.stack([s, 0 * s, 0 * s], axis=1)
+frames = np.tile(np.eye(3), (len(s), 1, 1))
+tool, pose = sphere(2.0), pose_from_vector(jnp.zeros(3), jnp.array([75.0, 15.0, 0.0]))
+""",
+}
+#: Blocks that take longer than the default suite allows, and those that other tests run.
+SLOW = {("layer", i) for i in (1, 2, 3, 4)} | {("contact", 0), ("contact", 1)}
+ELSEWHERE = {("README", 0): "test_readme.py", ("predict", 0): "test_docs.py"}
+
+
+def blocks(page, language):
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.S)
+
+
+def code_spans():
+    """Every `word` of every page."""
+    for page in PAGES:
+        text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+        for span in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", text):
+            yield page.name, span
+
+
+def python_blocks():
+    for page in PAGES:
+        for i in range(len(blocks(page, "python"))):
+            key = (page.stem, i)
+            if key not in ELSEWHERE:
+                marks = [pytest.mark.slow] if key in SLOW else []
+                yield pytest.param(page, i, marks=marks, id=f"{page.stem}-{i}")
+
+
+def test_each_page_is_listed_once_and_says_who_needs_it():
+    listed = re.findall(r"\]\(docs/(\w+)\.md\)", (ROOT / "README.md").read_text().split("\n## ")[2])
+    assert listed[: len(PATH)] == PATH
+    assert sorted(listed) == [page.stem for page in PAGES[1:]]
+    for page in PAGES[1:]:
+        lines = page.read_text().splitlines()
+        assert lines[0].startswith("# "), page
+        assert re.match(r"\*For .*", lines[2]), page
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if target.startswith("https://"):
+            continue
+        path, _, anchor = target.partition("#")
+        file = page.parent / path if path else page
+        assert file.exists(), target
+        if anchor:
+            heads = re.findall(r"^#+ (.*)$", file.read_text(), re.M)
+            slugs = [re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads]
+            assert anchor in slugs, target
+
+
+@pytest.mark.parametrize(("page", "i"), list(python_blocks()))
+def test_python_runs(page, i, tmp_path):
+    code = BEFORE.get((page.stem, i), "") + blocks(page, "python")[i]
+    (tmp_path / "fits").symlink_to(ROOT / "fits")
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    if (page.stem, i) in FINDS:
+        FINDS[page.stem, i](done.stdout)
+
+
+def _press(out):
+    """In series the skeleton alone, and the local law alone, would both be pressed harder."""
+    force, compliance = map(float, re.match(r"(\S+) N, (\S+) mm/N", out).groups())
+    assert 0 < force < 6.0 / compliance
+    assert force < 20.0 * 6 + 0.5 * 6**3
+
+
+def _trained(out):
+    """The weights that made the observed forces."""
+    k_m, slope = map(float, re.match(r"(\S+) N/mm at 50 years, slope (\S+)", out).groups())
+    assert k_m == pytest.approx(0.2, rel=1e-3)
+    assert slope == pytest.approx(-0.4, rel=1e-3)
+
+
+def _read(out):
+    assert out.splitlines() == ["T01 1 35.0 3"]
+
+
+def _stiffer(out):
+    assert float(out) > 0  # a stiffer muscle: the wall stays higher
+
+
+def _sensitivity(out):
+    assert out.strip() == "(5, 10, 3)"  # unknowns, presses, samples of small_strain.h5
+
+
+#: What a block must have printed.
+FINDS = {
+    ("layer", 0): _press,
+    ("layer", 1): _trained,
+    ("layer", 2): _stiffer,
+    ("layer", 4): _sensitivity,
+    ("measurements", 0): _read,
+}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
+def test_tables_of_toml_are_valid(page):
+    for text in blocks(page, "toml"):
+        content = tomllib.loads(text)
+        if "data" in content:
+            spec = FitSpec.model_validate(content)
+            assert geometry_of(spec.trachea).rings == 16
+            assert spec.parameters["EI_L"].scope == "shared"
+        else:
+            SceneSpec.model_validate(content)
+
+
+def commands():
+    """Every command of the pages, split into words: lines of their own, and in sentences."""
+    for page in PAGES:
+        text = page.read_text()
+        lines = re.findall(r"^    (?:.*&& )?(?:\.venv/bin/)?jaxtrachea (\S.*)$", text, re.M)
+        lines += [span[11:] for name, span in code_spans() if name == page.name
+                  and span.startswith("jaxtrachea ")]  # fmt: skip
+        for line in lines:
+            yield page.name, shlex.split(line, comments=True)
+
+
+def known_options():
+    group = typer.main.get_command(app)
+    names = {"": {"--version", "--help"}}
+    for name, command in group.commands.items():
+        names[name] = {"--help"}.union(
+            *((*option.opts, *option.secondary_opts) for option in command.params)
+        )
+    return names
+
+
+def test_commands_and_options_exist():
+    known = known_options()
+    for page, words in commands():
+        name = words[0] if words[0] in known else ""
+        assert name or words[0].startswith("--"), (page, words)
+        for word in words:
+            if word.startswith("--"):
+                assert word in known[name], (page, words)
+            elif "/" in word and not word.startswith("out/") and not word.isupper():
+                assert (ROOT / word).exists(), (page, words)
+    every = set().union(*known.values())
+    for page, span in code_spans():
+        if re.fullmatch(r"--[a-z][a-z-]*( .*)?", span) and page not in NOT_OURS:
+            assert span.split()[0] in every, (page, span)
+
+
+#: Pages that name what other programs know.
+NOT_OURS = {"benchmarks.md"}
+
+
+def test_commands_without_placeholder_are_run_by_a_test():
+    for page, words in commands():
+        if any(re.fullmatch(r"[A-Z:]+|\.\.\.", word) for word in words) or len(words) < 2:
+            continue
+        if words[0] in ("selfcheck",):
+            continue  # test_selfcheck.py
+        assert shlex.join(words) in RUN_BY, (page, shlex.join(words))
+    assert {(Path(__file__).parent / name).exists() for name in RUN_BY.values()} == {True}
+
+
+def test_check_of_the_page_runs(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    code, out, _ = run(monkeypatch, capsys, "check", "fits/virtual_trachea/fit.toml")
+    assert code == 0
+    assert "10 usable curves" in out
+
+
+@pytest.mark.slow
+def test_page_on_predictions_runs(tmp_path):
+    """Its three commands, then its Python: a folder of results and what it predicts."""
+    (tmp_path / "fits").symlink_to(ROOT / "fits")
+    lines = re.findall(r"^    jaxtrachea (.*)$", (DOCS / "predict.md").read_text(), re.M)
+    code = "import jaxtrachea\n" + blocks(DOCS / "predict.md", "python")[0]
+    calls = [["-m", "jaxtrachea", *shlex.split(line)] for line in lines]
+    for call in [*calls, ["-c", code]]:
+        done = subprocess.run([sys.executable, *call], capture_output=True, text=True, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert len(calls) == 3
+
+
+def test_paths_exist():
+    for page, span in code_spans():
+        if re.match(r"(?:tests|configs|fits|docs|jaxtrachea|\.ci)/[\w.*/-]+$", span):
+            assert list(ROOT.glob(span)), (page, span)
+
+
+def test_keys_of_specifications_exist():
+    for page, span in code_spans():
+        found = re.match(r"\[(\w+)\] (\w+)", span)
+        if found is None:
+            continue
+        kinds = [kind.model_fields for kind in (FitSpec, SceneSpec)]
+        owners = [fields[found[1]] for fields in kinds if found[1] in fields]
+        assert owners, (page, span)
+        assert any(re.search(rf"\b{found[2]}\b", keys(field)) for field in owners), (page, span)
+
+
+def keys(field):
+    """The keys of all models in the annotation of a field."""
+    kinds = [field.annotation, *getattr(field.annotation, "__args__", ())]
+    return " ".join(" ".join(getattr(kind, "model_fields", ())) for kind in kinds)
+
+
+FILES = r"\.(md|py|toml|csv|h5|png|html|jsonl?|in)$"
+
+
+def test_names_of_the_package_exist():
+    rooms = {path.stem for path in Path(jaxtrachea.__file__).parent.glob("*") if path.is_dir()}
+    for page, span in code_spans():
+        found = re.match(r"(?:jaxtrachea\.)?((\w+)(?:\.\w+)+)(?:\(.*\))?$", span)
+        if found and found[2] in rooms and not re.search(FILES, span):
+            assert resolve(f"jaxtrachea.{found[1]}"), (page, span)
+
+
+def resolve(name):
+    """Whether a dotted name is a module, or stands in one, or in a class of one."""
+    parts = name.split(".")
+    for i in range(len(parts), 0, -1):
+        try:
+            value = importlib.import_module(".".join(parts[:i]))
+        except ImportError:
+            continue
+        for part in parts[i:]:
+            if not hasattr(value, part):
+                return False
+            value = getattr(value, part)
+        return True
+    return False
+
+
+def test_statuses_exist():
+    members = {
+        name
+        for kind in vars(status).values()
+        if isinstance(kind, type) and issubclass(kind, enum.Enum)
+        for name in kind.__members__
+    }
+    for page, span in code_spans():
+        if re.fullmatch(r"[A-Z]{2,}_[A-Z_]{3,}", span) and page not in NOT_OURS:
+            assert span in members, (page, span)
+    scenes = (DOCS / "scenes.md").read_text()
+    assert [name for name in PressStatus.__members__ if f"`{name}`" not in scenes] == []
+
+
+def test_verdicts_of_the_page_are_those_of_a_fit():
+    listed = re.findall(r"^\| `([a-z -]+)` \|", (DOCS / "report.md").read_text(), re.M)
+    assert listed == [*verdict.VERDICTS, "failed"]  # the last: there is no estimate
+
+
+def test_keys_of_scenes_are_listed():
+    page = (DOCS / "scenes.md").read_text()
+    for name in ("model", "effects", "plan", "output", "sweep"):
+        row = re.search(rf"^\| `\[{name}\]` \| (.*) \|$", page, re.M)[1]
+        missing = [k for k in keys(SceneSpec.model_fields[name]).split() if f"`{k}`" not in row]
+        assert missing == [], name
+
+
+def test_extras_are_listed():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    listed = re.findall(r"^\| `(\w+)` \|", (DOCS / "install.md").read_text(), re.M)
+    assert sorted(listed) == sorted(project["optional-dependencies"])
