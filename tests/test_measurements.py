@@ -11,6 +11,9 @@ import h5py
 import numpy as np
 import pytest
 
+from jaxtrachea.measurements import read as door
+from jaxtrachea.measurements import readers
+from jaxtrachea.measurements.curve import RawCurve
 from jaxtrachea.measurements.read import (
     Curve,
     DataError,
@@ -20,6 +23,7 @@ from jaxtrachea.measurements.read import (
     write_hdf5,
 )
 from jaxtrachea.measurements.readers import safe_hdf5
+from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.units import UnitError
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -376,6 +380,27 @@ def test_same_curve_twice(tmp_path):
     paths = [put(tmp_path, TIDY), put(tmp_path / "x", TIDY)]
     with pytest.raises(DataError, match="specimen 'T01' trial '1' was already in"):
         read_measurements(paths)
+
+
+@pytest.mark.parametrize("format", ["auto", "toy"])
+def test_a_format_of_its_own_is_known_by_its_first_bytes(format, tmp_path, monkeypatch):
+    """A toy: four bytes, then displacement and force in turns, as float64."""
+
+    def read_toy(path, options):
+        values = np.frombuffer(path.read_bytes()[4:]).reshape(-1, 2)
+        rows = np.arange(len(values))
+        return [RawCurve("T", "1", str(path), values[:, 0], values[:, 1], rows, "sample", s=35.0)]
+
+    toy = Reader("toy", read=read_toy, is_file=lambda head: head.startswith(b"TOY\0"))
+    for module in (readers, door):
+        monkeypatch.setattr(module, "READERS", (toy, *readers.READERS))
+    wanted = np.array([[0.0, 0.0], [1.0, 0.3], [2.0, 0.8]])
+    path = tmp_path / "a.toy"
+    path.write_bytes(b"TOY\0" + wanted.tobytes())
+    curve = read(path, format=format).curves[0]
+    np.testing.assert_array_equal(curve.force, wanted[:, 1])
+    with pytest.raises(DataError):
+        read(path, format="tidy")
 
 
 def test_missing_file_folder_and_nothing(tmp_path):

@@ -14,10 +14,10 @@ from pathlib import Path
 from jaxtrachea.measurements.checks import finish
 from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, RawCurve, ReadOptions
 from jaxtrachea.measurements.readers import READERS, hdf5, reader_of
-from jaxtrachea.measurements.readers.lines import Line, Text, read_lines
+from jaxtrachea.measurements.readers.lines import Line, Text, first_bytes, read_lines
 from jaxtrachea.measurements.readers.patterns import ensure_quick
 from jaxtrachea.measurements.readers.reader import Reader
-from jaxtrachea.measurements.readers.recognise import kind_of
+from jaxtrachea.measurements.readers.recognise import HEAD, kind_of
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.measurements.readers.workbook import listed, read_sheet
 
@@ -165,6 +165,10 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[list[RawCurve | BadCur
         DataError: as `read_measurements`.
     """
     asked = reader_of(options.format)
+    head = first_bytes(path, HEAD)
+    for reader in READERS if asked is None else (asked,):
+        if reader.read is not None and reader.is_file(head):
+            return reader.read(path, options), []
     named_hdf5 = path.suffix.lower() in (".h5", ".hdf5")
     found = "hdf5" if named_hdf5 and asked is None else kind_of(path)
     if found == "hdf5" and asked is None:

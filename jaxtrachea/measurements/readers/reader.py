@@ -17,6 +17,8 @@ class Reader(NamedTuple):
         name: by which `data.format` asks for it.
         read: reads a file by its path; None: text and sheets only.
         read_text: reads the lines of a text or of a sheet of a workbook; None: files only.
+        is_file: whether a file that begins with these bytes is of this format; `read` then gets
+            it. Text, HDF5 and workbooks need no such sign.
         is_text: whether lines are of this format.
         is_hdf5: whether an open HDF5 file is of this format.
         layout: by what an HDF5 file of this format is known, for messages; empty: there are none.
@@ -25,6 +27,7 @@ class Reader(NamedTuple):
     name: str
     read: Callable[[Path, ReadOptions], Records] | None = None
     read_text: Callable[[Text, ReadOptions], Records] | None = None
+    is_file: Callable[[bytes], bool] = lambda head: False
     is_text: Callable[[list[Line]], bool] = lambda lines: False
     is_hdf5: Callable[[Any], bool] = lambda file: False
     layout: str = ""
