@@ -269,5 +269,6 @@ def load_fit_spec(path: Path) -> FitSpec:
         SpecError: missing file, broken TOML (line and column), unknown key, wrong value; one line
             per problem with its dotted key.
     """
-    others = dict.fromkeys(("path", "material"), "a scene (commands plan, simulate, sweep)")
+    scene = "a scene (commands plan, simulate, sweep)"
+    others = {"path": scene, "material": scene}
     return load_spec(path, FitSpec, "fit specification", others)

@@ -247,7 +247,7 @@ def test_one_position_leaves_skeleton_undetermined():
     assert np.all(np.isfinite(result.standard_error[0, 2:]))
     names = [p.name for p, _, _ in study.unknowns[0]]
     words = describe_flat(names, flat, np.inf, result.uncertainty.blind[0])
-    shape = re.fullmatch(r"EI_L and k_M only through EI_L k_M\^([\d.]+)", words)
+    shape = re.fullmatch(r"of EI_L and k_M only EI_L k_M\^([\d.]+) is known", words)
     assert shape is not None
     assert float(shape[1]) == pytest.approx(-ratio, rel=1e-2)
 

@@ -61,8 +61,8 @@ def test_two_separate_pairs_stay_apart():
 @pytest.mark.parametrize(
     ("flat", "error", "text"),
     [
-        ((3, 0, -1, 0), np.inf, "EI_L and k_M only through EI_L k_M^3"),
-        ((3, 0, -1, 0), 0.8, "EI_L and k_M little more than through EI_L k_M^3"),
+        ((3, 0, -1, 0), np.inf, "of EI_L and k_M only EI_L k_M^3 is known"),
+        ((3, 0, -1, 0), 0.8, "of EI_L and k_M little more is known than EI_L k_M^3"),
         ((3, 0, -1, 0), 0.2, "least determined: EI_L +10 %, k_M -3.33 % together, known to 20 %"),
         ((0, 0, 0, 1), np.inf, "k_1 changes no curve at all"),
         ((0, 0, 0, 1), 0.8, "k_1 alone is known to 80 % only"),

@@ -1,1 +1,1 @@
-"""What can be said of a fit: profiles, bootstrap, posterior, influence, predictions, design."""
+"""Inference from a fit: profiles, bootstrap, posterior, influence, cross-validation, design."""

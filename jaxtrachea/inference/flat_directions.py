@@ -104,10 +104,10 @@ def describe_flat(
             return (
                 f"{_list(involved)} change{'s' if alone else ''} the curves too little to be told"
             )
-        return f"{_list(involved)} little more than through {_list(products)}"
+        return f"of {_list(involved)} little more is known than {_list(products)}"
     if not products:
         return f"{_list(involved)} change{'s' if alone else ''} no curve at all"
-    return f"{_list(involved)} only through {_list(products)}"
+    return f"of {_list(involved)} only {_list(products)} is known"
 
 
 def _with_units(names, flat, flat_se, blind, press) -> str:

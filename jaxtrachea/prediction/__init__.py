@@ -1,1 +1,1 @@
-"""What a finished fit, read back from its file, predicts: presses, and measured curves."""
+"""Predictions of a finished fit: presses at new positions, and comparison with measured curves."""

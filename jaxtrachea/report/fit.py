@@ -39,8 +39,9 @@ def report_text(
     parts = [
         f"# {title or 'Fit'}",
         f"{result.lanes} lanes, {result.lanes - len(failed)} succeeded, {len(failed)} failed; "
-        f"{len(bad)} curves could not be used. All numbers: `results.h5`; one row per lane: "
-        "`summary.csv`; one row per estimate: `parameters.csv` (docs/results.md).",
+        f"{len(bad)} curves could not be used. A lane is what was fitted by itself: a specimen "
+        "or a curve. How to read this report: docs/report.md. All numbers: `results.h5`; one row "
+        "per lane: `summary.csv`; one row per estimate: `parameters.csv` (docs/results.md).",
         *_estimates(findings),
         *_sections(findings, "estimates"),
         "## Quality",
@@ -105,7 +106,12 @@ def _quality(result: FitResult, failed: list[int]) -> list[str]:
     """Lanes one by one: of many those that failed (50 at most), then the worst."""
     shown = listed(result, max(ONE_BY_ONE, min(len(failed), 50)))
     table = markdown_table(QUALITY_HEAD, quality_rows(result, shown))
-    return [table, *more_of(result, shown, "summary.csv")]
+    legend = (
+        "iter: iterations; n: samples; rms F: root mean square residual of the force; of peak: the "
+        "same over the largest force; rms joints: of the markers; cond: condition number of the "
+        "Jacobian; AICc: to compare models of the same data."
+    )
+    return [table, *more_of(result, shown, "summary.csv"), legend]
 
 
 def _bounds(result: FitResult) -> list[str]:

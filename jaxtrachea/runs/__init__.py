@@ -1,1 +1,1 @@
-"""How a long run survives: shards, manifest, lock, several processes."""
+"""Long runs: checkpoint of finished shards, manifest, lock, heartbeat of several processes."""

@@ -1,1 +1,1 @@
-"""A whole scene: what is there, which effects it calls for, and the program made of them."""
+"""Scenes: specification, the effects that a scene needs, the plan, and the program of the plan."""

@@ -1,1 +1,1 @@
-"""What is there at rest: geometry, material."""
+"""The trachea at rest: geometry, material, mesh and centreline."""

@@ -1,1 +1,1 @@
-"""Accuracy against time: the choices as ladders, what each rung errs and costs, the cheapest."""
+"""Accuracy against time: error and cost of every setting, and the cheapest within a tolerance."""
