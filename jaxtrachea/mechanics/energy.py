@@ -12,10 +12,10 @@ envelope theorem (the first variation with F does not count), C and F along the 
     dE/ds      = -F . (dC/ds) F / 2 + dW/ds     = -F . w' + dW/ds,
     dE/dphi    = -F . (dC/dphi) F / 2           = -sum_i P_i . (dC_i/dphi) P_i / 2,
 
-dW/ds at a fixed indentation d; w' the slope of the deflected ligament under C (Maxwell: d/ds G(s, s)
-is twice the derivative by one of them): a normal force on an inclined wall. P_i is the load on ring
-i and C_i its compliance: the bending stiffness of the ligament turns with the frame (least
-complementary energy). In `total` coupling the skeleton takes no part: E = W(p(delta); s).
+dW/ds at a fixed indentation d; w' the slope of the deflected ligament under C (Maxwell:
+d/ds G(s, s) is twice the derivative by one of them): a normal force on an inclined wall. P_i is the
+load on ring i and C_i its compliance: the bending stiffness of the ligament turns with the frame
+(least complementary energy). In `total` coupling the skeleton takes no part: E = W(p(delta); s).
 
 With shear C(s) has a kink where a ring stands (dE/ds jumps there); with the `split` "independent" a
 jump, which no derivative has.
@@ -109,12 +109,12 @@ def gradient(
         return press.local_law(geometry, material, s, options).energy(squared)
 
     by_s, by_phi = zero, zero
-    if options.local == "two-material":
-        by_s = jax.grad(local)(solved.s)
     if not total:
-        by_s = by_s + _by_position(
+        by_s = _by_position(
             geometry, material, solved, options, rings=rings, axial=axial, one_plane=one_plane
         )
+    if options.local == "two-material":
+        by_s = by_s + jax.grad(local)(solved.s)
     if not (total or one_plane or rings == "mat"):
         by_phi = _by_angle(geometry, material, solved, rings)
     return Gradient(inward=normal * rising, s=by_s, phi=by_phi)
