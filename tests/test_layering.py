@@ -44,6 +44,7 @@ WITHIN = {
         {"lumen", "ranges", "trail", "paths"},
         {"approach"},
         {"facts", "refusals", "deform", "programs"},
+        {"configurational"},
         {"assemble", "simulation", "sweep", "seat"},
         {"session"},
         {"build", "results"},

@@ -78,6 +78,11 @@ class Law(NamedTuple):
         """Force over indentation, N/mm, by the square of the indentation, mm^2."""
         return _horner(list(self.coefficients().values()), squared)
 
+    def energy(self, squared: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Stored energy, N mm, by the square of the indentation, mm^2: the integral of `force`."""
+        parts = [k / (power(name) + 1) for name, k in self.coefficients().items()]
+        return squared * _horner(parts, squared)
+
     def stiffest(self, squared: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """As `secant`, of the parts that harden: no smaller indentation has a larger one."""
         first, *rest = self.coefficients().values()

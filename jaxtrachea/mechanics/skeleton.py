@@ -161,6 +161,14 @@ def _planes(normal, side, spans):
     return jnp.stack([jnp.broadcast_to(v, (spans,)) for v in pair], 1)
 
 
+def turned_rings(
+    geometry: Geometry, material: Material, phi_c: Float[Array, ""], rings: Rings
+) -> Float[Array, "rings 2 2"]:
+    """Compliance of each ring at phi_c along (inward normal, circumferential), mm/N."""
+    frame = local_frame(phi_c)[::2, 1:]
+    return frame @ _rings(geometry, material, phi_c, rings)[0] @ frame.T
+
+
 def _rings(geometry: Geometry, material: Material, phi_c, level: Rings):
     """Compliance at phi_c (n, 2, 2), motion of the ends U and V per load (or None), and status."""
     k_M = jnp.broadcast_to(material.k_M, geometry.ring_positions.shape)

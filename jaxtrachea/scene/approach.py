@@ -1,5 +1,6 @@
 """From the tool's positions to presses at contact points: where it touches, and how far it goes."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -24,6 +25,8 @@ class Approach(NamedTuple):
         frame: those directions as columns in the frame of the mesh; None: straight tube, identity.
         own: contact of every row of `presses`: `seen`, but in a step of a session.
         inside: whether the tool is in the lumen; shape (rows,).
+        pull: from derivatives by the presses to those by the poses of the path; None: the contact
+            point is fixed.
     """
 
     seen: Touch
@@ -33,20 +36,31 @@ class Approach(NamedTuple):
     frame: Float[Array, "rows 3 3"] | None
     own: Touch
     inside: Bool[Array, " rows"]
+    pull: Callable[[Presses], tuple[Poses]] | None = None
 
 
 def approach(scene: Scene, path: Poses) -> Approach:
     """Let the tool touch the tube at rest, and say what it does to the place it touches."""
+    if scene.plan.contact_point == "per_step":
+        return _on_its_own(scene, path)
     seen = touch_tube(scene, path)
     inside = in_lumen(scene, path, seen)
-    if scene.plan.contact_point == "per_step":
-        inward, frame = _directions(scene, seen)
-        presses = Presses(seen.s, seen.phi, -seen.gap[:, None] * inward)
-        return Approach(
-            seen=seen, presses=presses, inward=inward, first=None, frame=frame, own=seen,
-            inside=inside,
-        )  # fmt: skip
     return on_one_point(scene, path, seen, first_touch(seen, inside)[1], inside)
+
+
+def _on_its_own(scene: Scene, path: Poses) -> Approach:
+    """Every row as a press along the normal where it touches."""
+
+    def pressed(path):
+        seen = touch_tube(scene, path)
+        inward, frame = _directions(scene, seen)
+        return Presses(seen.s, seen.phi, -seen.gap[:, None] * inward), (seen, inward, frame)
+
+    presses, pull, (seen, inward, frame) = jax.vjp(pressed, path, has_aux=True)
+    return Approach(
+        seen=seen, presses=presses, inward=inward, first=None, frame=frame, own=seen,
+        inside=in_lumen(scene, path, seen), pull=pull,
+    )  # fmt: skip
 
 
 def first_touch(

@@ -16,8 +16,8 @@ from jaxtrachea.status import PressStatus
 SCHEMA, SCHEMA_VERSION = "jaxtrachea-simulation", 1
 
 #: Unit of every series; what is not named is in mm.
-UNITS = {"phi": "rad", "force": "N", "loads": "N", "dissipated": "N mm", "status": "1",
-         "depth_share": "1", "contact_share": "1"}  # fmt: skip
+UNITS = {"phi": "rad", "force": "N", "loads": "N", "moment": "N mm", "dissipated": "N mm",
+         "status": "1", "depth_share": "1", "contact_share": "1"}  # fmt: skip
 
 
 def plan_rows(plan: Plan, shares: dict[str, float]) -> list[list[str]]:

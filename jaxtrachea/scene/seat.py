@@ -18,7 +18,7 @@ then the work over closed loops of the tool is not negative.
 `HOLD` limits the way along the surface, not the force. It is no law of friction: the tangential
 force is what the skeleton answers to that way, in 5,000 poses 0.69 of the normal force in the
 median, 2.4 at most (`tests/bench/jumps.py`). With contact point
-`per_step`, in `simulate` too, there is no way along the surface and no such force.
+`per_step` there is no way along the surface; `scene.configurational` has its force.
 
 A tool that goes further along the tube in one step than its dent is wide has left its seat: it
 grasps anew where it is. A glued tool (`bonded`) holds its first place whatever it does.

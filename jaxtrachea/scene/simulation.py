@@ -5,16 +5,19 @@ The program is put together from the scene's static `Plan`; what is off is not i
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea.mechanics.admission import check_shapes
 from jaxtrachea.mechanics.oblique import Place, press_at
 from jaxtrachea.scene.approach import Approach, approach
+from jaxtrachea.scene.configurational import force_by_pose
 from jaxtrachea.scene.deform import deform
 from jaxtrachea.scene.programs import moved_by, one_plane, vectors
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import refuse, status_of, without_negative_values
 from jaxtrachea.scene.stage import Poses, Presses, Scene, check_path
+from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
 
 
@@ -30,7 +33,12 @@ class Simulation(NamedTuple):
         phi: contact angle, rad.
         gap: signed distance of tool and undeformed tube.
         displacement: of the tool from first touch; shape (rows, 3).
-        force: contact force on the tube.
+        force: contact force on the tube. Of a tool with `contact_point` per_step it is the
+            derivative of the stored energy by the tool's position: with a part along the surface
+            where the wall is softer beside the contact (`scene.configurational`). Else it is what
+            depth and skeleton answer to.
+        moment: its moment about the tool's origin, N mm: the derivative of the energy by a turn;
+            None: without contact or with a fixed contact point.
         depth: local indentation.
         skeleton: displacement of C with the skeleton.
         joints: displacement of each joint; shape (rows, rings, 3).
@@ -54,6 +62,7 @@ class Simulation(NamedTuple):
     gap: Float[Array, " rows"] | None
     displacement: Float[Array, "rows 3"]
     force: Float[Array, "rows 3"]
+    moment: Float[Array, "rows 3"] | None
     depth: Float[Array, "rows 3"]
     skeleton: Float[Array, "rows 3"]
     joints: Float[Array, "rows rings 3"] | None
@@ -120,13 +129,19 @@ def follow(
     if plan.surface is not None:
         vertices = deform(scene, material, used, moved, path, made)
     share = depth_share(scene, moved.depth, moved.skeleton, inward)
+    force, moment, solved = moved.force, None, moved.status
+    if made is not None and made.pull is not None and isinstance(path, Poses):
+        force, moment = force_by_pose(scene, material, path, used, moved, made)
+        lost = (solved == PressStatus.OK) & ~jnp.isfinite(jnp.sum(force + moment, axis=1))
+        solved = jnp.where(lost, PressStatus.NON_FINITE, solved)
     asked, ends = plan.joints, plan.ring_ends
     return Simulation(
         s=presses.s,
         phi=presses.phi,
         gap=None if made is None else made.own.gap,
         displacement=presses.displacement,
-        force=moved.force,
+        force=force,
+        moment=moment,
         depth=moved.depth,
         skeleton=moved.skeleton,
         joints=moved.joints if asked else None,
@@ -139,5 +154,5 @@ def follow(
         vertices=vertices,
         depth_share=share,
         contact_share=None if made is None else contact_share(scene, made.own),
-        status=status_of(moved.status, share, made, refused),
+        status=status_of(solved, share, made, refused),
     )

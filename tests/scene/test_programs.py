@@ -23,6 +23,7 @@ from jaxtrachea import (
 from jaxtrachea.contact.patches import touch
 from jaxtrachea.contact.pose import Pose
 from jaxtrachea.mechanics.press import ligament_beam, local_law, respond, unit_deflection
+from jaxtrachea.mechanics.press import touch as first_touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.lumen import in_lumen
@@ -30,6 +31,7 @@ from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import refuse, status_of, without_negative_values
 from jaxtrachea.scene.stage import touch_tube
+from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.mesh import place
 
@@ -113,15 +115,19 @@ def each(scene, m, p):
 
 
 def presses_of(scene, m, used, status):
+    out = oblique_presses(scene, m, used)
+    return out.force, out.depth, out.skeleton, out.joints, out.loads, out.end_U, out.end_V, (
+        status(out)
+    )  # fmt: skip
+
+
+def oblique_presses(scene, m, used):
     at = used.s, used.phi, used.displacement
 
     def one(*at):
         return press_oblique(scene.geometry, m, *at, rings="mat", axial=False)
 
-    out = jax.vmap(one)(*at)
-    return out.force, out.depth, out.skeleton, out.joints, out.loads, out.end_U, out.end_V, (
-        status(out)
-    )  # fmt: skip
+    return jax.vmap(one)(*at)
 
 
 def tool(scene, m, p):
@@ -131,14 +137,38 @@ def tool(scene, m, p):
     def contact(R, T):
         return touch(scene.tool, Pose(R, T), scene.tube, near=near)
 
-    seen = jax.vmap(contact)(p.rotation, p.translation)
-    inward = jax.vmap(lambda phi: local_frame(phi)[0])(seen.phi)
-    presses = Presses(seen.s, seen.phi, -seen.gap[:, None] * inward)
+    def pressed(p):
+        seen = jax.vmap(contact)(p.rotation, p.translation)
+        inward = jax.vmap(lambda phi: local_frame(phi)[0])(seen.phi)
+        return Presses(seen.s, seen.phi, -seen.gap[:, None] * inward), (seen, inward)
+
+    presses, pull, (seen, inward) = jax.vjp(pressed, p, has_aux=True)
     inside = in_lumen(scene, p, seen)
     made = Approach(seen, presses, inward, None, None, seen, inside)
     m, led, used, status = admitted(scene, m, None, made)
-    out = presses_of(scene, m, used, status)
-    return seen.gap, seen.s, seen.phi, led, out, contact_share(scene, seen)
+    out = oblique_presses(scene, m, used)
+    wrench = force_and_moment(p, pull, inward, used, out)
+    # A row is OK only with a force and a moment that are finite.
+    finite = jnp.isfinite(jnp.sum(wrench[0] + wrench[1], axis=1))
+    solved = jnp.where((out.status == 0) & ~finite, PressStatus.NON_FINITE, out.status)
+    rest = out.depth, out.skeleton, out.joints, out.loads, out.end_U, out.end_V
+    said = status(out._replace(status=solved))
+    return seen.gap, seen.s, seen.phi, led, wrench, rest, said, contact_share(scene, seen)
+
+
+def force_and_moment(p, pull, inward, used, out):
+    """Normal force where it is touched, and the force that the slope of the ligament makes."""
+
+    def one(phi, D, n, F, slope):
+        x = jnp.sum(D * n)
+        rising = jax.jvp(
+            lambda x: first_touch(x, jnp.zeros_like(x), Options()), (x,), (jnp.ones_like(x),)
+        )
+        return jnp.sum(local_frame(phi)[0] * F) * rising[1], -jnp.sum(F[1:] * slope)
+
+    N, by_s = jax.vmap(one)(used.phi, used.displacement, inward, out.force, out.slope_C)
+    (by,) = pull(Presses(by_s, jnp.zeros_like(by_s), N[:, None] * inward))
+    return by.translation, jnp.sum(jnp.cross(p.rotation, by.rotation, axis=1), axis=2)
 
 
 BARE = {"want_surface": False}
