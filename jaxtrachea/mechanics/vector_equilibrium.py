@@ -122,11 +122,13 @@ def _series_jvp(primals, tangents):
     """(1 + C (kappa + 2 kappa' d d^T)) d' = D' - C' F - C f, by the secant system and rank one.
 
     kappa' is the derivative of kappa by |d|^2, and f the growth of F at fixed d, along d. F' is not
-    formed from d', where f and C f would cancel on a soft skeleton.
+    formed from d', where f and C f would cancel on a soft skeleton. Where there is no solution
+    it is that at rest: whoever takes another value there (sliding, for sticking) gets no NaN.
     """
     _, compliance, law = primals
     d_displacement, d_compliance, d_law = tangents
-    depth, force = _series(*primals)
+    solution = _series(*primals)
+    depth, force = (jnp.where(jnp.isfinite(jnp.sum(solution[0])), v, 0) for v in solution)
     squared = jnp.sum(depth * depth)
     kappa, stiffening = jax.jvp(law.secant, (squared,), (jnp.ones_like(squared),))
     grown = d_law.secant(squared)
@@ -137,4 +139,4 @@ def _series_jvp(primals, tangents):
     along = 2 * stiffening * share * jnp.sum(depth * y)
     d_depth = y - along * v
     d_force = kappa * d_depth + along * depth + (grown * share) * z
-    return (depth, force), (d_depth - (grown * share) * v, d_force)
+    return solution, (d_depth - (grown * share) * v, d_force)
