@@ -65,6 +65,26 @@ def test_rows_off_the_plan_are_refused_by_status():
     assert np.isnan(out.force[1:]).any(axis=1).all()
 
 
+@pytest.mark.parametrize("more", [{}, {"second_plane": "on"}, {"friction": "on"}])
+def test_past_the_zero_of_the_law_every_program_says_pulls(more):
+    """F(2 mm) = 0 with k_3 = -k_1 / 4 mm^2, whatever the stiff skeleton; the rows stay apart."""
+    material = dataclasses.replace(
+        SPRINGS, EI_L=jnp.asarray(1e3), k_M=jnp.asarray(10.0), k_3=-SPRINGS.k_1 / 4
+    )
+    path = Presses(np.full(4, 75.0), np.zeros(4), np.outer([0, 1.9, 2.1, 1.0], [0, -1.0, 0]))
+    rest = {"friction": 0.66} if more.get("friction") else {}
+    scene = make_scene(
+        TUBE, material, path, effects=EffectOptions(want_surface=False, **more), **rest
+    )
+    out = run(scene, material, path)
+    none, pulls = PressStatus.NO_CONTACT, PressStatus.PULLS
+    assert out.status.tolist() == [none, PressStatus.OK, pulls, PressStatus.OK]
+    depth = -np.asarray(out.depth)[[1, 3], 1]
+    force = float(SPRINGS.k_1) * depth * (1 - depth**2 / 4)
+    np.testing.assert_allclose(-np.asarray(out.force)[[1, 3], 1], force, rtol=1e-12)
+    assert np.isnan(out.force[2, 1])
+
+
 def test_a_press_elsewhere_is_refused_by_status():
     """A program for one contact point gave every row the answer of the first."""
     there = Presses([75.0, 40.0, 75.0], [0.0, 0.0, 0.3], [[0, -2.0, 0]] * 3)
