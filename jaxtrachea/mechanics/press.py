@@ -27,7 +27,7 @@ class Options:
         form: `recursion`, or `reactions` for the paper's dense force method.
         shear: the ligament also deforms in shear (needs `Material.GA_L`).
         local: one law everywhere (`uniform`), or `two-material`: a law of its own on the rings
-            (needs `Material.k_1_ring`; `k_3_ring` if it also hardens there).
+            (needs `Material.k_1_ring`; `k_3_ring` and `k_5_ring` where they differ there too).
         contact: `unilateral` (no force before first touch, and no pull: PULLS) or `bonded` (press
             or draw, odd law).
         onset_width: width of the smooth first touch, mm; no force before touch, none changed after.
