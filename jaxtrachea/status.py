@@ -46,7 +46,7 @@ class ContactStatus(_Described):
 
     OK = 0, "solved"
     FLAT = 1, "solved, but other normals are as right: equal minima, or a level distance"
-    NOT_CONVERGED = 2, "the search stopped short of a minimum by more than its smoothing"
+    NOT_CONVERGED = 2, "the search stopped short of a minimum, or on a saddle of the distance"
     NON_FINITE = 3, "an input or a result is not finite"
 
 

@@ -428,7 +428,8 @@ MODELS = {
     f.__name__: f
     for f in (
         series, quintic, total, first_touch, vector, press_9, press_1, compliance_200, beam,
-        beam_alone, axial, ring, oblique, spheres, boxes, dent, global_shape, on_ring_weight, friction,
+        beam_alone, axial, ring, oblique, spheres, boxes, dent, global_shape, on_ring_weight,
+        friction,
     )
 } | {"beam_shear": beam}  # fmt: skip
 

@@ -65,6 +65,24 @@ def test_rows_off_the_plan_are_refused_by_status():
     assert np.isnan(out.force[1:]).any(axis=1).all()
 
 
+@pytest.mark.parametrize("more", [False, True])
+@pytest.mark.parametrize("at", ["s", "phi", "depth"])
+def test_a_row_that_is_no_number_says_so(at, more):
+    """Whatever else it is: off the plan too where the material gives more than the plan has."""
+    material = MATERIAL if more else SPRINGS
+    rows = {"s": np.full(3, 75.0), "phi": np.zeros(3), "depth": np.ones(3)}
+    rows[at][1] = np.nan
+    s, phi, depth = rows.values()
+    D = depth[:, None] * np.stack([0 * phi, -np.cos(phi), -np.sin(phi)], 1)
+    scene = make_scene(TUBE, SPRINGS, DOWN, effects=BARE)
+    other = PressStatus.OFF_PLAN if more else PressStatus.OK
+    wanted = [other, PressStatus.NON_FINITE, other]
+    swept, out = sweep(scene, material, s, phi, depth), run(scene, material, Presses(s, phi, D))
+    for got in (swept, out):
+        assert got.status.tolist() == wanted
+        assert np.any(np.isnan(got.force[1]))
+
+
 @pytest.mark.parametrize("more", [{}, {"second_plane": "on"}, {"friction": "on"}])
 def test_past_the_zero_of_the_law_every_program_says_pulls(more):
     """F(2 mm) = 0 with k_3 = -k_1 / 4 mm^2, whatever the stiff skeleton; the rows stay apart."""
