@@ -35,6 +35,7 @@ class InputError(ValueError):
         super().__init__()
         self.place, self.key, self.found, self.expected = place, key, found, expected
         self.cure, self.arguments, self.joint = cure, arguments, joint
+        self.args = (str(self),)  # what `repr` and loggers show
 
     def __str__(self) -> str:
         """All of it in a sentence."""
@@ -46,7 +47,7 @@ class InputError(ValueError):
 
     def __reduce__(self) -> Any:
         """To other processes with all fields."""
-        return copyreg.__newobj__, (type(self),), vars(self)  # pyright: ignore
+        return copyreg.__newobj__, (type(self), str(self)), vars(self)  # pyright: ignore
 
     @property
     def problem(self) -> str:
@@ -69,6 +70,7 @@ class InputError(ValueError):
         """
         made = cls.__new__(cls)
         made.__dict__.update(vars(error) | fields)
+        made.args = (str(made),)
         return made
 
     def renamed(self: Own, names: Mapping[str, str]) -> Own:

@@ -397,3 +397,26 @@ def test_scenes_and_sweeps():
     assert np.isnan(swept.compliance).tolist() == [False, True, False]
     swept = sweep(scene, Material(**FULL | {"k_1": -0.1}), *points)
     assert swept.status.tolist() == [BAD] * 3
+
+
+@pytest.mark.parametrize(
+    ("name", "other"), [("k_3_ring", "k_1_ring"), ("k_5_ring", "k_1_ring"), ("GA_side", "GA_L")]
+)
+def test_a_value_that_would_be_ignored_is_refused(name, other):
+    """Whatever presses: with the value that it needs it is taken, without it is an error."""
+    given = {"EI_L": 1.9, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02, name: 0.5}
+    g, D = table_1(), [0.0, -1.0, 0.0]
+    path = Presses(jnp.full(1, 40.0), jnp.zeros(1), jnp.asarray([D]))
+    plain = Material(**{k: v for k, v in given.items() if k != name})
+    scene = make_scene(g, plain, path, effects=EffectOptions(want_surface=False))
+    alone = Material(**given)
+    for run in (
+        lambda m: press(g, m, 40.0, 1.0),
+        lambda m: press_oblique(g, m, 40.0, 0.0, D, rings="mat", axial=False),
+        lambda m: make_scene(g, m, path, effects=EffectOptions(want_surface=False)),
+        lambda m: simulate(scene, m, path),
+        lambda m: sweep(scene, m, [40.0], [0.0], [1.0]),
+    ):
+        with pytest.raises(ValueError, match=f"Material.{name}: given without Material.{other}"):
+            run(alone)
+    assert press(g, Material(**given, **{other: 0.9}), 40.0, 1.0).status == PressStatus.OK

@@ -565,6 +565,19 @@ def test_outcomes():
     assert all(member.message for member in ContactStatus)
 
 
+@pytest.mark.parametrize("start", [(1.0, 1, 0), (1.0, 1, 1), (0.0, -1, 1)])
+def test_a_saddle_by_symmetry_is_not_converged(start):
+    """A cube of 2 mm in itself is 2 mm deep, to a face; towards an edge or a corner 2.8 and 3.5."""
+    cube, here = box(jnp.ones(3)), Pose(jnp.eye(3), jnp.zeros(3))
+    got = quick(lambda d: track(cube, cube, here, d))(jnp.asarray(start))
+    assert got.distance < -2.7
+    assert got.curvature < -0.5
+    assert got.status == ContactStatus.NOT_CONVERGED
+    face = quick(lambda d: track(cube, cube, here, d))(jnp.asarray([1.0, 0.01, 0.02]))
+    np.testing.assert_allclose(face.distance, -2, atol=0.011)  # log(64) / sharpness of the size
+    assert face.status == ContactStatus.OK
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [

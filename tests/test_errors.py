@@ -78,3 +78,13 @@ def test_what_was_refused_is_in_the_fields():
 def test_a_semicolon_in_a_message_does_not_move_its_cure():
     error = DataError("row 'a; b' is no number", place="x.csv", cure="correct it")
     assert (error.problem, error.remedy) == ("row 'a; b' is no number", "correct it")
+
+
+def test_an_error_shows_its_text_wherever_it_goes():
+    """`args` and `repr` as of any exception, also after pickling and renaming."""
+    error = InputError("is 3", place="a.toml", key="fit.k", expected="2", cure="write 2")
+    text = "a.toml: fit.k: is 3; expected 2; write 2"
+    for shown in (error, pickle.loads(pickle.dumps(error)), error.like(error)):
+        assert shown.args == (text,)
+        assert repr(shown) == f"InputError({text!r})"
+    assert "fit.m" in error.renamed({"fit.k": "fit.m"}).args[0]

@@ -279,3 +279,85 @@ def test_gradient_at_rest_is_finite(rounding):
 
     slopes = jax.jit(jax.vmap(jax.jacrev(f, (0, 1)), (0, None)), compiler_options=QUICK)(D, mu)
     assert all(np.all(np.isfinite(slope)) for slope in slopes)
+
+
+def softening(n, quintic, dtype):
+    """Random steps on random skeletons, with laws of which at least one part softens."""
+    rng = np.random.default_rng(7)
+    axes = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    C = np.einsum("nij,nj,nkj->nik", axes, 10 ** rng.uniform(-2, 1, (n, 3)), axes)
+    D = rng.normal(size=(n, 3))
+    D[:, 0] = np.abs(D[:, 0])
+    k_1, mu = 10 ** rng.uniform(-1, 1, n), rng.uniform(0, 0.9, n)
+    soft, hard = -k_1 * 10 ** rng.uniform(-3, 0.5, n), k_1 * 10 ** rng.uniform(-3, 1, n)
+    if not quintic:
+        return [v.astype(dtype) for v in (D, (C + C.mT) / 2, k_1, soft, 0 * soft, mu)]
+    which = rng.integers(3, size=n)
+    k_3, k_5 = np.where(which == 0, hard, soft), np.where(which == 1, hard, soft)
+    return [v.astype(dtype) for v in (D, (C + C.mT) / 2, k_1, k_3, k_5, mu)]
+
+
+def summed(quintic):
+    """Force, slip and friction's work of a step, and the step; NaN counts as nothing."""
+
+    def one(D, C, a, b, e, mu):
+        got = slide(D, C, Law(a, b, e if quintic else None), mu, jnp.zeros(2, D.dtype))
+        known = jnp.where(got.status == PressStatus.OK, got.force, 0)
+        return jnp.sum(known) + jnp.sum(got.slip) + got.dissipated, got
+
+    return one
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("quintic", [False, True])
+def test_softening_steps_are_right_or_refused(quintic, dtype):
+    """Each solved step fulfils the equations, in double precision; its gradient is finite."""
+    given = softening(3000, quintic, dtype)
+    step = jax.value_and_grad(summed(quintic), (0, 1, 2, 3, 5), has_aux=True)
+    (_, got), slopes = jax.jit(jax.vmap(step), compiler_options=QUICK)(*given)
+    assert all(np.all(np.isfinite(slope)) for slope in slopes)
+    ok, slid = np.asarray(got.status) == PressStatus.OK, np.asarray(got.sliding)
+    assert got.force.dtype == dtype
+    assert set(np.unique(got.status)) == {0, PressStatus.PAST_FOLD, PressStatus.PULLS}
+    assert 2400 < np.sum(ok & slid) < 2800
+    for field in (got.force, got.depth):
+        assert np.all(np.isnan(np.asarray(field)[~ok]))
+    np.testing.assert_array_equal(np.asarray(got.slip)[~ok], 0)
+    D, C, k_1, k_3, k_5, mu = (v[ok].astype(float) for v in given)
+    F, d, slip = (np.asarray(v)[ok].astype(float) for v in (got.force, got.depth, got.slip))
+    size, q = np.linalg.norm(F, axis=1), np.sum(d * d, 1)
+    tolerance = 10 * np.finfo(dtype).eps ** 0.5  # what the search may leave, times its condition
+    assert np.all(F[:, 0] > 0)
+    by_law = (k_1 + k_3 * q + k_5 * q * q)[:, None] * d - F
+    assert np.all(np.linalg.norm(by_law, axis=1) <= tolerance * k_1 * np.sqrt(q))
+    above = np.linalg.norm(F[:, 1:], axis=1) - mu * F[:, 0]
+    assert np.all(np.where(slid[ok], np.abs(above), above) <= tolerance * size)
+    moved = d + np.einsum("nij,nj->ni", C, F)
+    moved[:, 1:] += slip
+    np.testing.assert_allclose(moved, D, atol=tolerance)
+    assert np.all(np.sum(slip * F[:, 1:], 1) >= -tolerance * size)
+
+
+@pytest.mark.parametrize("mu", [0.0, MU])
+def test_past_the_zero_of_a_softening_law_it_pulls(mu):
+    """On a stiff skeleton F = D (1 - 0.1 D^2) is 0 at sqrt(10) and would pull beyond it."""
+    got = path(sideways(np.zeros(3), np.array([1.0, 3.1, 3.2])), k_1=1.0, k_3=-0.1, mu=mu)
+    ok, pulls = PressStatus.OK, PressStatus.PULLS
+    np.testing.assert_array_equal(got.status, [ok, ok, pulls])
+    np.testing.assert_allclose(got.force[:2, 0], [0.9, 3.1 * (1 - 0.1 * 3.1**2)], rtol=1e-12)
+    assert np.all(np.isnan(got.force[2]) & np.isnan(got.depth[2]))
+    np.testing.assert_array_equal(got.slip, 0)
+
+
+def test_a_failed_step_leaves_the_derivatives_of_the_others():
+    """The same path without the step that folds: same slips after it, same gradients."""
+    D = sideways(np.array([0.2, 2.0, 2.1, 2.2]))
+    D[2, 0] = 50.0
+
+    def after(k_3, D):
+        return jnp.sum(slide_path(D, jnp.asarray(COUPLED), Law(jnp.asarray(0.5), k_3),
+                                  jnp.asarray(MU)).force[-1])  # fmt: skip
+
+    slope = jax.jit(jax.grad(after), compiler_options=QUICK)
+    k_3 = jnp.asarray(-0.01)
+    np.testing.assert_allclose(slope(k_3, D), slope(k_3, D[[0, 1, 3]]), rtol=1e-12)

@@ -174,3 +174,34 @@ def test_bad_specimen_in_a_batch(coupling):
     assert np.all(bad.status[0, 2:] == PressStatus.NON_FINITE)
     assert np.all(bad.status[2, 2:] == PressStatus.PAST_FOLD)
     assert np.all(np.isnan(bad.force[2, 2:]))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_unilateral_contact_does_not_pull(dtype):
+    """F = 0 at d = D = sqrt(-k_1 / k_3) whatever the compliance c < 1 / (2 k_1); then a pull."""
+    stiff = {"EI_L": 1e3, "k_M": 10.0, "k_3": -0.3 / 4, "s": 44.0}  # F = 0 at 2 mm
+    D = np.array([-1.0, 0.0, 1.9, 2.1, 2.2])
+    got = pressed(Options(), dtype, displacement=D, **stiff)
+    held = pressed(Options(contact="bonded"), dtype, displacement=D, **stiff)
+    ok, no, pulls = PressStatus.OK, PressStatus.NO_CONTACT, PressStatus.PULLS
+    assert 0.01 < got.compliance < 1 / 0.6
+    np.testing.assert_array_equal(got.status, [no, no, ok, pulls, pulls])
+    np.testing.assert_array_equal(held.status, [ok, no, ok, ok, ok])
+    assert held.force[2] > 0 > held.force[3] > held.force[4]
+    assert got.force[2] == held.force[2]
+    for value in (got.force, got.depth, got.skeleton, got.joints, got.reactions):
+        assert np.all(np.isnan(value[3:]) & ~np.any(np.isnan(value[:3])))
+
+
+def test_a_pull_leaves_the_derivatives_of_the_others():
+    """Derivative of the force at 1.9 mm by k_3, beside a row that pulls; by central differences."""
+    at, o = jnp.asarray([1.9, 2.2]), Options()
+    stiff = {"EI_L": 1e3, "k_M": 10.0}
+
+    def first(k_3):
+        return pressed(o, displacement=at, k_3=k_3, **stiff).force[0]
+
+    slope = jax.grad(first)(jnp.asarray(-0.075))
+    step = 1e-6
+    difference = (first(-0.075 + step) - first(-0.075 - step)) / (2 * step)
+    np.testing.assert_allclose(slope, difference, rtol=1e-7)

@@ -109,7 +109,8 @@ displacement = ["0 mm", "-1 mm", "0 mm"]
 def test_scene_keys_follow(tmp_path):
     """Units and signs by the declaration: a coefficient may soften, a stiffness is positive."""
     path = tmp_path / "scene.toml"
-    path.write_text(SCENE.format("-2 mN/mm^3", 'GA_L = "2 kN"\nk_3_ring = "0 N/mm^3"'))
+    rings = 'k_1_ring = "3 N/mm"\nk_3_ring = "0 N/mm^3"'
+    path.write_text(SCENE.format("-2 mN/mm^3", f'GA_L = "2 kN"\n{rings}'))
     material = load_scene_spec(path).material.model_dump()
     assert (material["k_3"], material["GA_L"], material["k_3_ring"]) == (-0.002, 2000.0, 0.0)
     assert material["EA_L"] is None
@@ -117,6 +118,9 @@ def test_scene_keys_follow(tmp_path):
         ("1 N/mm", "", ["material.k_3", "cubic_stiffness"]),
         ("0 N/mm^3", 'k_A = "0 N/mm"', ["material.k_A", "expected a positive stiffness"]),
         ("0 N/mm^3", 'k_9 = "1 N"', ["material.k_9"]),
+        ("0 N/mm^3", 'k_3_ring = "1 N/mm^3"', ["material: k_3_ring needs k_1_ring; give"]),
+        ("0 N/mm^3", 'k_5_ring = "1 N/mm^5"', ["material: k_5_ring needs k_1_ring; give"]),
+        ("0 N/mm^3", 'GA_side = "1 N"', ["material: GA_side needs GA_L; give GA_L too, or remove"]),
     ):
         path.write_text(SCENE.format(k_3, more))
         with pytest.raises(SpecError) as error:

@@ -18,7 +18,7 @@ from jaxtrachea.selfcheck.run import run_table
 CASES, TRUTHS = table.read_cases(), table.read_truth()
 DOCUMENT = Path(__file__).parents[1] / "docs" / "hard_cases.md"
 #: Functions whose programs compile at once; the others are slow tests.
-QUICK = ("series", "first_touch", "axial")
+QUICK = ("series", "quintic", "first_touch", "axial")
 
 
 def wrong(outcomes):

@@ -323,11 +323,17 @@ def _bounds(a: Shape, b: Shape, at_a: Support, at_b: Support, n):
 
 
 def _status(m: Model, low, beta, distance, tied):
-    """Converged by the value that one more Newton step would gain, in units of 1/beta."""
+    """Converged by the value that one more Newton step would gain, in units of 1/beta.
+
+    Where the distance bends downwards (a saddle by symmetry, where no gradient leads away) it is no
+    minimum, however small the gradient.
+    """
     u1, u2 = newton_step(m)
     gain = -0.5 * (m.gradient[0] * u1 + m.gradient[1] * u2)
-    level = (low <= floor_of(m.hessian)) | tied
+    floor = floor_of(m.hessian)
+    level = (low <= floor) | tied
     status = jnp.where(level, ContactStatus.FLAT, ContactStatus.OK)
-    status = jnp.where(gain * beta > TOLERANCE, ContactStatus.NOT_CONVERGED, status)
+    short = (gain * beta > TOLERANCE) | (low < -floor)
+    status = jnp.where(short, ContactStatus.NOT_CONVERGED, status)
     finite = jnp.isfinite(distance)
     return jnp.where(finite, status, ContactStatus.NON_FINITE).astype(jnp.int8)

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, shaped
+from jaxtrachea._errors import InputError
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.material import VALUES, Material
+from jaxtrachea.trachea.material import VALUES, Material, meaningless
 
 
 class Admitted(NamedTuple):
@@ -58,10 +59,10 @@ def admit(geometry: Geometry, material: Material, s_c: ArrayLike, used: Iterable
 
 
 def check_shapes(geometry: Geometry, material: Material) -> None:
-    """Refuse arrays of a wrong length.
+    """Refuse arrays of a wrong length, and values that mean nothing without one that is missing.
 
     Raises:
-        ValueError: the argument, its length and the expected one.
+        ValueError: the argument, its length and the expected one; or what it is missing.
     """
     for name in ("length", "radius", "half_angle", "ring_height"):
         shaped(f"Geometry.{name}", getattr(geometry, name), (), why="; use jax.vmap for many")
@@ -78,6 +79,12 @@ def check_shapes(geometry: Geometry, material: Material) -> None:
             shaped(name, value, (), (rings,), why=" (one for each ring)")
         else:
             shaped(name, value, ())
+    given = (name for name in VALUES if getattr(material, name) is not None)
+    for name, other in meaningless(given).items():
+        raise InputError(
+            f"given without Material.{other}, and would be ignored", key=f"Material.{name}",
+            cure=f"give Material.{other} too, or leave it out",
+        )  # fmt: skip
 
 
 def without_negative(material: Material, used: Iterable[str]) -> tuple[Material, Array]:

@@ -1,7 +1,8 @@
 """The local contact law (paper eq. 1, quasi-static Duffing oscillator) and where it applies.
 
-|F| = m_0 |omega_0^2 d + 3/4 beta_0^2 eps d^3| = k_1 d + k_3 d^3. Only k_1 and k_3 can be
-identified; m_0 merely scales. The paper gives no values for them.
+|F| = m_0 |omega_0^2 d + 3/4 beta_0^2 eps d^3| = k_1 d + k_3 d^3, and with a term that is not in the
+paper + k_5 d^5. Only k_1, k_3 and k_5 can be identified; m_0 merely scales. The paper gives no
+values for them. A law with k_3 < 0 or k_5 < 0 softens, and may have a fold (PAST_FOLD).
 
 Everything else asks a law for its `force`, its `tangent` and its `series` (the equilibrium with a
 compliance behind it), or for the same of a vector (`secant`, `root`); no other module knows its

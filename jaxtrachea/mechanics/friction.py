@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea._numerics import epsilon
 from jaxtrachea.mechanics._matrix2 import apply, solve
 from jaxtrachea.mechanics.equilibrium import press_series
 from jaxtrachea.mechanics.force_law import Law
@@ -102,6 +103,11 @@ def slide(
         rounding: width w that rounds the kink. The step creeps once |F_t| > (1 - w) mu F_n on
             trial; above (1 + w) it is exact. 0: Coulomb's law, with one-sided derivatives where a
             step passes from sticking to sliding.
+
+    Returns:
+        The `Slide`. Where neither sticking nor sliding is an equilibrium that presses (a law that
+        softens), force and depth are NaN and the slip stays: PULLS where sticking would need a
+        pull, else PAST_FOLD.
     """
     touching = ~(displacement[0] <= 0)  # NaN stays in
     trial = jnp.where(touching, displacement - jnp.concatenate([jnp.zeros(1, slip.dtype), slip]), 0)
@@ -112,19 +118,21 @@ def slide(
     if rounding > 0:
         # min(ratio, 1) with its corner replaced by a parabola below it.
         inside = sliding & (tangential < (1 + rounding) * limit)
-        room = 1 + rounding - tangential / jnp.where(inside, limit, 1)
+        room = 1 + rounding - jnp.where(inside, tangential, 1) / jnp.where(inside, limit, 1)
         mobilised = friction * (1 - jnp.where(inside, room * room / (4 * rounding), 0))
-    force, depth = _on_cone(jnp.where(sliding, trial, 1), compliance, law, mobilised)
-    force = jnp.where(sliding, force, stuck.force)
-    depth = jnp.where(sliding, depth, stuck.depth)
-    solved = jnp.isfinite(jnp.sum(force))
+    on_cone = _on_cone(sliding, trial, compliance, law, mobilised)
+    pulls = stuck.force[0] < 0
+    solved = jnp.where(sliding, on_cone.solved, jnp.isfinite(jnp.sum(stuck.force)) & ~pulls)
+    force = jnp.where(sliding, on_cone.force, jnp.where(solved, stuck.force, 0))
+    depth = jnp.where(sliding, on_cone.depth, jnp.where(solved, stuck.depth, 0))
     moved = jnp.where(sliding & solved, (trial - depth - compliance @ force)[1:], 0)
     away = jnp.where(jnp.isfinite(jnp.sum(displacement)), displacement[1:], slip)
-    failed = jnp.where(stuck.status == PressStatus.OK, PressStatus.PAST_FOLD, stuck.status)
+    failed = jnp.where(pulls, PressStatus.PULLS, PressStatus.PAST_FOLD)
+    failed = jnp.where(stuck.status == PressStatus.OK, failed, stuck.status)
     status = jnp.where(solved, PressStatus.OK, failed)
     return Slide(
-        depth=depth,
-        force=force,
+        depth=jnp.where(solved, depth, jnp.nan),
+        force=jnp.where(solved, force, jnp.nan),
         slip=jnp.where(touching, slip + moved, away),
         dissipated=jnp.sum(jnp.where(solved, force[1:], 0) * moved),
         sliding=sliding,
@@ -138,12 +146,47 @@ def _length(v):
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
 
 
-def _on_cone(D, compliance, law: Law, mu):
-    """Force with |F_t| = mu F_n along the slip, and the indentation under it."""
-    z = _cone_root(D, compliance, law, mu)
+class _OnCone(NamedTuple):
+    """A sliding step: force and indentation (any numbers where it is not solved)."""
+
+    force: Float[Array, "3"]
+    depth: Float[Array, "3"]
+    solved: Bool[Array, ""]
+
+
+def _on_cone(sliding, D, compliance, law: Law, mu) -> _OnCone:
+    """Force with |F_t| = mu F_n along the slip, and the indentation under it.
+
+    A law that softens may have no such force, or only one that pulls or gains energy: whatever the
+    search ends with is held against the conditions. A step that does not slide, or has no solution,
+    is computed as another one that has, so that no derivative is NaN because of it.
+    """
+    still = jax.lax.stop_gradient((D, compliance, law, mu))
+    z = _cone_root(*still)
+    force, depth, pressed = _at_root(z, *still)
+    normal, tangential = force[0], jnp.linalg.norm(force[1:])
+    tolerance = epsilon(D.dtype) ** 0.5
+    size = tolerance * jnp.linalg.norm(force)
+    work = jnp.sum(force[1:] * (still[0] - depth - still[1] @ force)[1:])
+    solved = sliding & jnp.isfinite(jnp.sum(force + depth)) & (normal >= 0) & (pressed >= 0)
+    solved &= jnp.abs(tangential - still[3] * normal) <= size
+    solved &= work >= -size * jnp.linalg.norm(still[0])
+
+    def safe(value, other):
+        return jnp.where(solved, value, jnp.asarray(other, D.dtype))
+
+    linear = Law(**{name: float(name == "k_1") for name in law.coefficients()})
+    used = safe(D, 1), safe(compliance, 0), jax.tree.map(safe, law, linear), mu
+    z = _follow(safe(z, 2**0.5), *used)  # of unit motions on a law of 1 N/mm alone
+    force, depth, _ = _at_root(z, *used)
+    return _OnCone(force, depth, solved)
+
+
+def _at_root(z, D, compliance, law: Law, mu):
+    """Force, indentation and the length of it (negative: of a pull), for a mobility of the cone."""
     N, h, d = _given_mobility(z, D, compliance, law, mu)
     force = jnp.concatenate([N[None], mu / z * h])
-    return force, force / law.secant(d * d)
+    return force, force / law.secant(d * d), d
 
 
 def _given_mobility(z, D, C, law: Law, mu):
@@ -169,7 +212,6 @@ def _excess(z, D, C, law: Law, mu):
     return N * z / jnp.linalg.norm(h) - 1
 
 
-@jax.custom_jvp
 def _cone_root(D, C, law: Law, mu):
     """Root z of `_excess`: Newton from the frictionless tangent, kept in a shrinking bracket."""
     low = mu / law.stiffest(jnp.sum(D * D))  # no softer than sticking
@@ -192,9 +234,15 @@ def _cone_root(D, C, law: Law, mu):
     return jax.lax.fori_loop(0, _ITERATIONS, newton, start)[0]
 
 
-@_cone_root.defjvp
-def _cone_root_jvp(primals, tangents):
-    z = _cone_root(*primals)
-    _, by_inputs = jax.jvp(lambda *p: _excess(z, *p), primals, tangents)
-    slope = jax.grad(_excess)(z, *primals)
+@jax.custom_jvp
+def _follow(z, D, C, law: Law, mu):
+    """The root `z` of `_excess`, with the derivatives that it has as one."""
+    return z
+
+
+@_follow.defjvp
+def _follow_jvp(primals, tangents):
+    z = _follow(*primals)
+    _, by_inputs = jax.jvp(lambda *p: _excess(z, *p), primals[1:], tangents[1:])
+    slope = jax.grad(_excess)(z, *primals[1:])
     return z, -by_inputs / slope

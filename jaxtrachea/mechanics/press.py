@@ -11,6 +11,7 @@ from jaxtrachea._numerics import centred_hinge, positive_part
 from jaxtrachea.mechanics import beam as _beam
 from jaxtrachea.mechanics import equilibrium, force_law
 from jaxtrachea.mechanics.admission import Admitted, admit, hide, status_of
+from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 
@@ -26,8 +27,9 @@ class Options:
         form: `recursion`, or `reactions` for the paper's dense force method.
         shear: the ligament also deforms in shear (needs `Material.GA_L`).
         local: one law everywhere (`uniform`), or `two-material`: a law of its own on the rings
-            (needs `Material.k_1_ring`; `k_3_ring` if it also hardens there).
-        contact: `unilateral` (no force before first touch) or `bonded` (press or draw, odd law).
+            (needs `Material.k_1_ring`; `k_3_ring` and `k_5_ring` where they differ there too).
+        contact: `unilateral` (no force before first touch, and no pull: PULLS) or `bonded` (press
+            or draw, odd law).
         onset_width: width of the smooth first touch, mm; no force before touch, none changed after.
         transition: distance from a ring's centre at which the ligament's own local law is reached,
             mm; None: half the smallest distance between two rings.
@@ -164,9 +166,23 @@ def respond(
     options: Options,
     blend: Float[Array, ""] | None = None,
 ) -> equilibrium.Equilibrium:
-    """Force and local indentation for a skeleton of known compliance; `blend`: see `touch`."""
-    solve = {"series": equilibrium.press_series, "total": equilibrium.press_total}[options.coupling]
-    return solve(touch(displacement, onset, options, blend), compliance, law)
+    """Force and local indentation for a skeleton of known compliance; `blend`: see `touch`.
+
+    NaN and PULLS where unilateral contact would pull: past the zero of a law that softens, which a
+    stiff skeleton reaches before the fold. (A total coupling ends at the law's own fold before it.)
+    """
+    moved = touch(displacement, onset, options, blend)
+    if options.coupling == "total":
+        return equilibrium.press_total(moved, compliance, law)
+    solved = equilibrium.press_series(moved, compliance, law)
+    if options.contact == "bonded":
+        return solved
+    pulls = (moved > 0) & (solved.force < 0)  # a rounded corner is below 0 by itself
+    return equilibrium.Equilibrium(
+        depth=jnp.where(pulls, jnp.nan, solved.depth),
+        force=jnp.where(pulls, jnp.nan, solved.force),
+        status=jnp.where(pulls, PressStatus.PULLS, solved.status).astype(jnp.int8),
+    )
 
 
 def press(

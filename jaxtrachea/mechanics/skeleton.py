@@ -175,7 +175,8 @@ def _rings(geometry: Geometry, material: Material, phi_c, level: Rings):
     eye = jnp.eye(2, dtype=k_M.dtype)[None]
     if level == "mat":
         on, _ = _ring.on_ring(geometry.half_angle, phi_c)
-        status = jnp.where(on, RingStatus.OK, RingStatus.BEHIND_GAP).astype(jnp.int8)
+        off = jnp.where(jnp.isnan(phi_c), RingStatus.NON_FINITE, RingStatus.BEHIND_GAP)
+        status = jnp.where(on, RingStatus.OK, off).astype(jnp.int8)
         return eye / jnp.where(on, k_M, jnp.nan)[:, None, None], None, status
     EI, k_t = (_needed(material, name, f"rings={level!r}") for name in ("EI_C", "k_t"))
 

@@ -215,7 +215,8 @@ def _beyond(stored: StoredFit, lane: int, s: float, displacement: np.ndarray) ->
     words = []
     if displacement.max() > high + 1e-9 or displacement.min() < min(low, 0.0) - 1e-9:
         words.append(f"D = {low:.3g} to {high:.3g} mm")
-    if s < first - 1e-9 or s > last + 1e-9:
+    known = first <= last  # else no curve of the lane says where it was pressed
+    if known and (s < first - 1e-9 or s > last + 1e-9):
         words.append(f"s = {first:.4g} to {last:.4g} mm")
     return f"extrapolated from data at {' and '.join(words)}" if words else ""
 

@@ -62,7 +62,7 @@ def refuse(scene: Scene, material: Material, path: Presses | None, made: Approac
     refused[PressStatus.BEHIND_GAP] = behind & acting
     if made is not None:
         refused[PressStatus.IN_LUMEN] = made.inside
-    refused[PressStatus.NON_FINITE] = jnp.isnan(jnp.sum(D, axis=1))
+    refused[PressStatus.NON_FINITE] = jnp.isnan(jnp.sum(D, axis=1) + presses.s + phi)
     refused[PressStatus.BAD_MATERIAL] = jnp.broadcast_to(bad, presses.s.shape)
     for rows in refused.values():
         D = jnp.where(rows[:, None], jnp.nan, D)

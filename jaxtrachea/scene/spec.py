@@ -20,7 +20,7 @@ from jaxtrachea.config import (
 )
 from jaxtrachea.scene.declare import Effect
 from jaxtrachea.scene.effects import EFFECTS
-from jaxtrachea.trachea.material import VALUES
+from jaxtrachea.trachea.material import VALUES, meaningless
 
 Lengths3 = Annotated[list[Length], Field(min_length=3, max_length=3)]
 Sizes3 = Annotated[list[PositiveLength], Field(min_length=3, max_length=3)]
@@ -76,6 +76,13 @@ def _material_keys() -> type[Section]:
 
 class MaterialSection(_material_keys()):
     """[material]: see `jaxtrachea.trachea.material`; one value for all rings and spans."""
+
+    @model_validator(mode="after")
+    def _meaningful(self) -> "MaterialSection":
+        given = (name for name in VALUES if getattr(self, name) is not None)
+        for name, other in meaningless(given).items():
+            raise ValueError(f"{name} needs {other}; give {other} too, or remove {name}")
+        return self
 
 
 #: Keys that each shape of tool needs, and those it may have.

@@ -67,10 +67,10 @@ def sweep(
     unlike = set(lacking(scene, material)) - {"axial"}  # every press is along the normal
 
     def one(at):
-        s_c, phi_c, d = at
+        s_c, phi_at, d = at
         acting = d != 0 if scene.plan.options.contact == "bonded" else ~(d <= 0)
-        behind = on_the_tube(scene, s_c, phi_c)[2] & ~acting
-        phi_c, d = (jnp.where(behind, 0, v) for v in (phi_c, d))  # needs nothing of the rings
+        behind = on_the_tube(scene, s_c, phi_at)[2] & ~acting
+        phi_c, d = (jnp.where(behind, 0, v) for v in (phi_at, d))  # needs nothing of the rings
         inward = local_frame(phi_c)[0]
         press = press_oblique(
             scene.geometry, material, s_c, phi_c, d * inward, scene.plan.options,
@@ -80,9 +80,9 @@ def sweep(
         free = ~(force != 0)
         softness = jnp.where(free, jnp.nan, way / jnp.where(free, 1, force))
         share = depth_share(scene, press.depth, press.skeleton, inward)
-        refused = {}
+        refused = {PressStatus.NON_FINITE: jnp.isnan(s_c + phi_at + d)}
         if unlike:
-            refused = {code: press.status == code for code in REFUSALS}
+            refused = {code: refused.get(code, False) | (press.status == code) for code in REFUSALS}
             refused[PressStatus.OFF_PLAN] = acting
             force, depth, softness = (
                 jnp.where(acting, jnp.nan, v) for v in (force, depth, softness)

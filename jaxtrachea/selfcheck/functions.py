@@ -44,6 +44,12 @@ def series(v: Values) -> Answer:
     return {"force": got.force, "depth": got.depth}, got.status
 
 
+def quintic(v: Values) -> Answer:
+    """`press_series` with a fifth power in the law: found by Newton steps."""
+    got = press_series(v["D"], v["c"], Law(v["k_1"], v["k_3"], v["k_5"]))
+    return {"force": got.force, "depth": got.depth}, got.status
+
+
 def total(v: Values) -> Answer:
     """`press_total`: the paper's printed coupling."""
     got = press_total(v["D"], v["c"], Law(v["k_1"], v["k_3"]))
@@ -201,8 +207,8 @@ def friction(v: Values) -> Answer:
 FUNCTIONS: dict[str, Callable[[Values], Answer]] = {
     f.__name__: f
     for f in (
-        series, total, first_touch, vector, press_9, press_1, compliance_200, beam, beam_shear,
-        beam_alone, axial, ring, oblique, spheres, boxes, dent, global_shape, on_ring_weight,
-        friction,
+        series, quintic, total, first_touch, vector, press_9, press_1, compliance_200, beam,
+        beam_shear, beam_alone, axial, ring, oblique, spheres, boxes, dent, global_shape,
+        on_ring_weight, friction,
     )
 }  # fmt: skip

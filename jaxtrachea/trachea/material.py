@@ -6,6 +6,7 @@ the page docs/parameters.md follow from it.
 """
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any, Literal
 
 import equinox as eqx
@@ -69,6 +70,7 @@ class Declaration:
         needs: option or effect that reads it; "" where every press does. A fit has it in its model
             where `mechanics.press.Options` has that option.
         absent: what a value that is not given stands for; "" where it must be given.
+        beside: value without which it means nothing.
         each: where an array may give each its own value.
         signed: whether it may be zero or negative.
         fit: None where a fit cannot identify it.
@@ -82,6 +84,7 @@ class Declaration:
     symbol: str = ""
     needs: Needs = ""
     absent: str = ""
+    beside: str = ""
     each: Each = ""
     signed: bool = False
     fit: Fitted | None = None
@@ -172,14 +175,14 @@ class Material(eqx.Module):
     k_3_ring: Float[Array, ""] | None = _field(
         Declaration(
             "k_3_ring", "N/mm^3", "cubic_stiffness", "cubic contact stiffness on a ring",
-            part="contact", needs="two-material", absent="k_3", signed=True,
+            part="contact", needs="two-material", absent="k_3", beside="k_1_ring", signed=True,
             fit=Fitted(0.01, 0.0, 1e6, "linear", 0.01, if_named=True),
         )
     )  # fmt: skip
     k_5_ring: Float[Array, ""] | None = _field(
         Declaration(
             "k_5_ring", "N/mm^5", "quintic_stiffness", "quintic contact stiffness on a ring",
-            part="contact", needs="two-material", absent="k_5", signed=True,
+            part="contact", needs="two-material", absent="k_5", beside="k_1_ring", signed=True,
             fit=Fitted(1e-4, 0.0, 1e6, "linear", 1e-4, if_named=True),
         )
     )  # fmt: skip
@@ -222,7 +225,7 @@ class Material(eqx.Module):
     GA_side: Float[Array, "..."] | None = _field(
         Declaration(
             "GA_side", "N", "force", "GA_L for shear along the circumference",
-            part="skeleton", needs="second plane", absent="GA_L", each="span",
+            part="skeleton", needs="second plane", absent="GA_L", beside="GA_L", each="span",
         )
     )  # fmt: skip
 
@@ -246,6 +249,13 @@ VALUES: dict[str, Declaration] = {
 PARAMETERS: dict[str, Declaration] = VALUES | {p.name: p for p in _OF_THE_PRESS}
 #: Values that may be left out of a material.
 OPTIONAL = tuple(name for name, p in VALUES.items() if p.absent)
+
+
+def meaningless(given: Iterable[str]) -> dict[str, str]:
+    """Values among these that mean nothing without another that is not, and that other."""
+    given = set(given)
+    wanting = {name: VALUES[name].beside for name in VALUES if name in given}
+    return {name: other for name, other in wanting.items() if other and other not in given}
 
 
 def material_of(values: dict[str, Array]) -> Material:

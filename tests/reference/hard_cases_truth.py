@@ -40,6 +40,21 @@ def series(v):
     return {"force": v["k_1"] * d + v["k_3"] * d**3, "depth": d}
 
 
+def quintic(v):
+    """Smallest root of d + c F(d) = |D| among all five, by their polynomial; sign of D."""
+    first, size = 1 + v["c"] * v["k_1"], abs(v["D"])
+    delta = size / first
+    p = [v["c"] * k / first * delta**n for k, n in ((v["k_5"], 4), (v["k_3"], 2))]
+    falling = [p[0], 0, p[1], 0, 1, -1]  # of d / delta
+    while falling[0] == 0:
+        falling.pop(0)
+    roots = mp.polyroots(falling, maxsteps=2000, extraprec=2000)
+    near = mp.mpf(10) ** -80
+    real = [mp.re(r) for r in roots if abs(mp.im(r)) < near * abs(r) and mp.re(r) > 0]
+    d = mp.sign(v["D"]) * delta * min(real)
+    return {"force": v["k_1"] * d + v["k_3"] * d**3 + v["k_5"] * d**5, "depth": d}
+
+
 def total(v):
     force = v["k_1"] * v["D"] + v["k_3"] * v["D"] ** 3
     return {"force": force, "depth": v["D"] - v["c"] * force}
@@ -412,8 +427,9 @@ def friction(v):
 MODELS = {
     f.__name__: f
     for f in (
-        series, total, first_touch, vector, press_9, press_1, compliance_200, beam, beam_alone,
-        axial, ring, oblique, spheres, boxes, dent, global_shape, on_ring_weight, friction,
+        series, quintic, total, first_touch, vector, press_9, press_1, compliance_200, beam,
+        beam_alone, axial, ring, oblique, spheres, boxes, dent, global_shape, on_ring_weight,
+        friction,
     )
 } | {"beam_shear": beam}  # fmt: skip
 

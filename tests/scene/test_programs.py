@@ -222,7 +222,7 @@ QUESTIONS = {
     "is it where the first is? two differences with size and limit, three logical": 9,
     "does it press off the plan?": 1,
     "is it behind the ends of the rings? size, limit, two for NaN, four logical": 8,
-    "is it a number? a sum, a comparison": 2,
+    "is it a number? a sum, two added for s and phi, a comparison": 4,
     "three displacements are NaN for each of five refusals": 15,
     "computed instead: two comparisons of s, two logical, three choices, one of three": 10,
     "how deep? two vectors added, part inwards (five), not below 0, against the radius": 10,

@@ -65,6 +65,44 @@ def test_rows_off_the_plan_are_refused_by_status():
     assert np.isnan(out.force[1:]).any(axis=1).all()
 
 
+@pytest.mark.parametrize("more", [False, True])
+@pytest.mark.parametrize("at", ["s", "phi", "depth"])
+def test_a_row_that_is_no_number_says_so(at, more):
+    """Whatever else it is: off the plan too where the material gives more than the plan has."""
+    material = MATERIAL if more else SPRINGS
+    rows = {"s": np.full(3, 75.0), "phi": np.zeros(3), "depth": np.ones(3)}
+    rows[at][1] = np.nan
+    s, phi, depth = rows.values()
+    D = depth[:, None] * np.stack([0 * phi, -np.cos(phi), -np.sin(phi)], 1)
+    scene = make_scene(TUBE, SPRINGS, DOWN, effects=BARE)
+    other = PressStatus.OFF_PLAN if more else PressStatus.OK
+    wanted = [other, PressStatus.NON_FINITE, other]
+    swept, out = sweep(scene, material, s, phi, depth), run(scene, material, Presses(s, phi, D))
+    for got in (swept, out):
+        assert got.status.tolist() == wanted
+        assert np.any(np.isnan(got.force[1]))
+
+
+@pytest.mark.parametrize("more", [{}, {"second_plane": "on"}, {"friction": "on"}])
+def test_past_the_zero_of_the_law_every_program_says_pulls(more):
+    """F(2 mm) = 0 with k_3 = -k_1 / 4 mm^2, whatever the stiff skeleton; the rows stay apart."""
+    material = dataclasses.replace(
+        SPRINGS, EI_L=jnp.asarray(1e3), k_M=jnp.asarray(10.0), k_3=-SPRINGS.k_1 / 4
+    )
+    path = Presses(np.full(4, 75.0), np.zeros(4), np.outer([0, 1.9, 2.1, 1.0], [0, -1.0, 0]))
+    rest = {"friction": 0.66} if more.get("friction") else {}
+    scene = make_scene(
+        TUBE, material, path, effects=EffectOptions(want_surface=False, **more), **rest
+    )
+    out = run(scene, material, path)
+    none, pulls = PressStatus.NO_CONTACT, PressStatus.PULLS
+    assert out.status.tolist() == [none, PressStatus.OK, pulls, PressStatus.OK]
+    depth = -np.asarray(out.depth)[[1, 3], 1]
+    force = float(SPRINGS.k_1) * depth * (1 - depth**2 / 4)
+    np.testing.assert_allclose(-np.asarray(out.force)[[1, 3], 1], force, rtol=1e-12)
+    assert np.isnan(out.force[2, 1])
+
+
 def test_a_press_elsewhere_is_refused_by_status():
     """A program for one contact point gave every row the answer of the first."""
     there = Presses([75.0, 40.0, 75.0], [0.0, 0.0, 0.3], [[0, -2.0, 0]] * 3)
