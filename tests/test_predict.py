@@ -967,12 +967,10 @@ def test_a_lane_with_one_place_predicts_that_place(study, tmp_path):
 
 def test_a_fit_that_knows_no_position_has_no_range_of_them():
     """Spans of curves without a position begin at inf and end at -inf."""
-    from types import SimpleNamespace
-
     from jaxtrachea.prediction.predict import _beyond
 
-    stored = SimpleNamespace(spans=[(0.0, 2.0, np.inf, -np.inf), (0.0, 2.0, 10.0, 20.0)])
+    nowhere, here = np.array([0.0, 2.0, np.inf, -np.inf]), np.array([0.0, 2.0, 10.0, 20.0])
     deep = np.array([0.0, 3.0])
-    assert _beyond(stored, 0, 15.0, deep[:1]) == ""  # pyright: ignore
-    assert _beyond(stored, 0, 15.0, deep) == "extrapolated from data at D = 0 to 2 mm"  # pyright: ignore
-    assert _beyond(stored, 1, 30.0, deep[:1]).endswith("s = 10 to 20 mm")  # pyright: ignore
+    assert _beyond(nowhere, 15.0, deep[:1]) == ""
+    assert _beyond(nowhere, 15.0, deep) == "extrapolated from data at D = 0 to 2 mm"
+    assert _beyond(here, 30.0, deep[:1]).endswith("s = 10 to 20 mm")

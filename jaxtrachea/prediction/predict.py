@@ -171,7 +171,7 @@ def _on_host(stored: StoredFit, source: Source, s, displacement, part: Predicted
     presses = np.asarray(part.status[:n])
     bend = _bend(source, cut(part.bend.T).T, value, se, int(part.deepest))
     status, message = _verdict(source, value, se, presses, bend)
-    if usable and (beyond := _beyond(stored, source.lane, float(s), displacement)):
+    if usable and (beyond := _beyond(stored.spans[source.lane], float(s), displacement)):
         message = f"{message}; {beyond}"
     return CurvePrediction(
         specimen=source.specimen,
@@ -209,9 +209,9 @@ def _bend(source: Source, off: np.ndarray, value: Response, se: Response, deepes
     return float(worst) if np.isfinite(worst) else np.inf
 
 
-def _beyond(stored: StoredFit, lane: int, s: float, displacement: np.ndarray) -> str:
+def _beyond(spans: np.ndarray, s: float, displacement: np.ndarray) -> str:
     """What of a curve lies outside the data of its lane, in words; "" if nothing does."""
-    low, high, first, last = stored.spans[lane]
+    low, high, first, last = spans
     words = []
     if displacement.max() > high + 1e-9 or displacement.min() < min(low, 0.0) - 1e-9:
         words.append(f"D = {low:.3g} to {high:.3g} mm")
