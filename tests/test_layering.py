@@ -91,9 +91,9 @@ WITHIN = {
     ],
     "results": [{"arrays", "store"}, {"rows", "stored"}, {"hdf5"}],
     "prediction": [{"core", "sources"}, {"predict"}, {"held_out"}, {"plots", "report", "tables"}],
-    "runs": [{"processes", "journal"}, {"chunks"}, {"folder"}, {"former", "in_chunks"}],
+    "runs": [{"meet", "manifest"}, {"processes", "shards"}, {"folder"}, {"rerun", "checkpoint"}],
     "report": [{"plots", "tables"}, {"fit"}, {"overview"}],
-    "cli": [{"terminal_table", "specification"}, {"terminal"},
+    "cli": [{"terminal_table", "specification", "options"}, {"terminal"},
             {"fit", "load", "predict_data", "run", "scene", "selfcheck"},
             {"compare", "predict", "tradeoff"}, {"main"}],
 }  # fmt: skip

@@ -10,16 +10,12 @@ from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea.cli.load import load
+from jaxtrachea.cli.options import DataOption, OutOption
 from jaxtrachea.cli.terminal import Stages, Stop, into, progress_bar, table
 
 SpecsArgument = Annotated[
     list[Path], typer.Argument(help="Two or more fit specifications of the same curves.")
 ]
-DataOption = Annotated[
-    Path | None,
-    typer.Option("--data", help="Folder of the data files (default: SPEC's)."),
-]
-OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 CrossOption = Annotated[
     bool, typer.Option(help="Also predict each contact position from fits without it.")
 ]

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from jaxtrachea.cli.options import OutOption
 from jaxtrachea.cli.terminal import (
     Stages,
     Stop,
@@ -21,7 +22,6 @@ from jaxtrachea.cli.terminal import (
 )
 
 SceneArgument = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
-OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 #: Rows of a terminal table; the files hold all.
 MANY = 12
 
