@@ -13,7 +13,6 @@ from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
 from jaxtrachea.cli import specification
-from jaxtrachea.fitting import schur
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
@@ -29,6 +28,7 @@ from jaxtrachea.inference.population import population, wanted
 from jaxtrachea.inference.profile import profiles
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
+from jaxtrachea.optimisation import schur
 from jaxtrachea.results.rows import lane_rows, parameter_rows
 from jaxtrachea.runs import manifest
 from jaxtrachea.status import FitStatus

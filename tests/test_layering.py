@@ -14,7 +14,7 @@ PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 ORDER = [
     {"_errors"},
     {"units", "status", "_numerics", "_arguments"},
-    {"files"},
+    {"files", "optimisation"},
     {"config"},
     {"trachea"},
     {"contact"},
@@ -64,13 +64,12 @@ WITHIN = {
         {"data_files", "usage_tables"},
     ],
     "fitting": [
-        {"parameters", "lane", "schur"},
+        {"parameters", "lane"},
         {"model"},
         {"onset"},
         {"study"},
         {"map_lanes", "press_scale", "residual"},
         {"cost"},
-        {"levenberg_marquardt"},
         {"descent", "starts"},
         {"structure"},
         {"covariance"},
@@ -81,6 +80,7 @@ WITHIN = {
         {"evaluate", "scrutiny"},
         {"fit"},
     ],
+    "optimisation": [{"programs", "schur", "trust_region"}, {"levenberg_marquardt"}],
     "inference": [
         {"rows", "residuals", "chains", "flat_directions", "estimate", "design_press"},
         {"cross_validation", "bootstrap", "profile", "posterior_start"},
@@ -163,7 +163,7 @@ def test_no_room_holds_too_much_of_the_package():
     rooms = {p.relative_to(PACKAGE).parts[0] for p in lines}
     share = {r: sum(n for p, n in lines.items() if p.relative_to(PACKAGE).parts[0] == r)
              for r in rooms}  # fmt: skip
-    assert max(share.values()) <= 0.155 * sum(lines.values())
+    assert max(share.values()) <= 0.15 * sum(lines.values())
 
 
 @pytest.mark.parametrize(

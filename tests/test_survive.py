@@ -26,10 +26,11 @@ from jaxtrachea.cli.terminal import set_up_jax
 from jaxtrachea.config import load_fit_spec
 from jaxtrachea.files import lock as run_lock
 from jaxtrachea.files import output
-from jaxtrachea.fitting import fit, levenberg_marquardt
+from jaxtrachea.fitting import fit
 from jaxtrachea.fitting.cost import LaneCost
-from jaxtrachea.fitting.map_lanes import program
 from jaxtrachea.measurements.data_files import read_data
+from jaxtrachea.optimisation import levenberg_marquardt
+from jaxtrachea.optimisation.programs import program
 from jaxtrachea.results.hdf5 import read_hdf5
 from jaxtrachea.results.stored import NoResults
 from jaxtrachea.runs import checkpoint, manifest, processes, rerun, shards

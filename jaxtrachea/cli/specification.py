@@ -4,7 +4,6 @@ import dataclasses
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
-from jaxtrachea.fitting.levenberg_marquardt import MOST_SLOTS, Tolerances
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, in_model, visible
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Noise, Study, build_study, check_curve
@@ -13,6 +12,8 @@ from jaxtrachea.measurements.read import (
     Measurements,
 )
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.optimisation.levenberg_marquardt import MOST_SLOTS
+from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.trachea.section import geometry_of
 from jaxtrachea.units import UnitError, parse_quantity
 

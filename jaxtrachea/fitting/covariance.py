@@ -16,11 +16,12 @@ from scipy.special import stdtrit
 
 from jaxtrachea.fitting.cost import assemble, entry_scale, robust
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.map_lanes import batch_size, map_lanes
+from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import observations, residual
 from jaxtrachea.fitting.structure import leaving_alone
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.programs import batch_size
 
 #: Smallest ratio of singular values of the scaled Jacobian that float64 can tell from zero.
 SINGULAR = 1e-7

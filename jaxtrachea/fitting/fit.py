@@ -8,8 +8,6 @@ import numpy as np
 from jaxtrachea.fitting.covariance import Uncertainty, analyse
 from jaxtrachea.fitting.criteria import criteria
 from jaxtrachea.fitting.evaluate import evaluated
-from jaxtrachea.fitting.levenberg_marquardt import Solved
-from jaxtrachea.fitting.map_lanes import batch_size
 from jaxtrachea.fitting.minima import (
     Minima,
     information_per_lane,
@@ -25,6 +23,8 @@ from jaxtrachea.fitting.shared import held_count, marginal, summed_gradient
 from jaxtrachea.fitting.starts import scales
 from jaxtrachea.fitting.structure import Structure, null_spaces, reduced, structure_of, suspicious
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.levenberg_marquardt import Solved
+from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.status import FitStatus
 
 #: Condition number of the Jacobian up to which it proves that the structure leaves nothing open.

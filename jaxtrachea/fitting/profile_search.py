@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 
 from jaxtrachea.fitting.cost import LaneCost
-from jaxtrachea.fitting.levenberg_marquardt import Solved, levenberg_marquardt
-from jaxtrachea.fitting.map_lanes import batch_size
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.structure import leaving_alone, pins
+from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
+from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 #: Rounds of the search for the ends; each is one batched solve.

@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.map_lanes import program
 from jaxtrachea.fitting.minima import Minima, data_weight
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.natural_sizes import natural_sizes
@@ -32,6 +31,7 @@ from jaxtrachea.fitting.starts import EXACT, box, scales
 from jaxtrachea.fitting.structure import Structure, positions
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import coefficient, power
+from jaxtrachea.optimisation.programs import program
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 #: Relative standard error along a direction, and condition number, from which there is doubt about

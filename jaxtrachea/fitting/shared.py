@@ -23,12 +23,14 @@ from jaxtrachea._numerics import epsilon
 from jaxtrachea.fitting.cost import LaneCost, evaluate
 from jaxtrachea.fitting.covariance import Information
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.levenberg_marquardt import Solved, Tolerances, levenberg_marquardt
-from jaxtrachea.fitting.map_lanes import batch_size, map_lanes
+from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import observations, residual_value
-from jaxtrachea.fitting.schur import eliminate, eliminate_others, trust_region_step
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
+from jaxtrachea.optimisation.programs import batch_size
+from jaxtrachea.optimisation.schur import eliminate, eliminate_others, trust_region_step
+from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.status import FitStatus
 
 #: First radius of the trust region of the shared unknowns, scaled coordinates.

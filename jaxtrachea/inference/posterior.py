@@ -25,13 +25,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea.fitting.cost import weights
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.map_lanes import batch_size, program
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import observations, residual_value
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.chains import grade, lenient, mixing, quantiles
 from jaxtrachea.inference.labels import succeeded
 from jaxtrachea.inference.posterior_start import Start, around_the_draws, around_the_fit, mode
+from jaxtrachea.optimisation.programs import batch_size, program
 
 #: Steps of each chain before its draws count.
 _WARM_UP = 500

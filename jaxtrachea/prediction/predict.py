@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxtrachea.fitting.map_lanes import program
 from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Predicted, Response, predicted
 from jaxtrachea.prediction.sources import Source, slack_of, source_of
 from jaxtrachea.results.stored import StoredFit, from_result

@@ -17,9 +17,9 @@ import numpy as np
 
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.fitting import residual
-from jaxtrachea.fitting.levenberg_marquardt import MOST_SLOTS, PART_OF_MEMORY
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.levenberg_marquardt import MOST_SLOTS, PART_OF_MEMORY
 from jaxtrachea.results.arrays import arrays_of, result_of
 from jaxtrachea.runs import manifest as manifests
 from jaxtrachea.runs.manifest import Manifest
