@@ -21,9 +21,9 @@ import pytest
 
 import jaxtrachea
 from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise
 from jaxtrachea.mechanics import beam
 from jaxtrachea.mechanics.oblique import press_oblique, press_path
 from jaxtrachea.mechanics.press import Options, press

@@ -11,9 +11,10 @@ from scipy.optimize import least_squares
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import descend
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.flat_directions import describe_flat
 from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt

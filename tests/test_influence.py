@@ -10,9 +10,10 @@ import pytest
 import synthetic
 
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.estimate import estimate, lane_of
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.measurements.read import Curve

@@ -14,10 +14,11 @@ from scipy.optimize import least_squares
 
 from jaxtrachea.cli import specification
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.joint_information import held_count, unknown_count
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.shared import held_count, unknown_count
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference import population as populations
 from jaxtrachea.inference.analyses.population import POPULATION, population_rows
 from jaxtrachea.inference.analysis import Findings

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.fitting.covariance import informations
 from jaxtrachea.fitting.descent import descend
+from jaxtrachea.fitting.information import informations
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.optimisation.programs import batch_size

@@ -20,11 +20,12 @@ from jaxtrachea.files.html import page
 from jaxtrachea.files.pictures import plain, save_each, without_lost
 from jaxtrachea.files.tables import quoted, read_csv, unquoted, write_csv
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import unknown_label, verdict_of
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.cross_validation import LEFT_OUT, left_out_table
 from jaxtrachea.inference.analyses.effective import widened
 from jaxtrachea.inference.analyses.influence import (

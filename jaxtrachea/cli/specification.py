@@ -4,9 +4,10 @@ import dataclasses
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, in_model, visible
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, Study, build_study, check_curve
+from jaxtrachea.fitting.study import Study, build_study, check_curve
 from jaxtrachea.measurements.read import (
     BadCurve,
     Measurements,

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.fitting.cost import robust
-from jaxtrachea.fitting.covariance import Information, Uncertainty, half_widths
+from jaxtrachea.fitting.covariance import Uncertainty, half_widths
 from jaxtrachea.fitting.criteria import criteria
+from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, precision_unit
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult

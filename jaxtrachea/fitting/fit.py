@@ -7,7 +7,9 @@ import numpy as np
 
 from jaxtrachea.fitting.covariance import Uncertainty, analyse
 from jaxtrachea.fitting.criteria import criteria
+from jaxtrachea.fitting.doubt import doubtful, left_in_doubt
 from jaxtrachea.fitting.evaluate import evaluated
+from jaxtrachea.fitting.joint_information import held_count, marginal, summed_gradient
 from jaxtrachea.fitting.minima import (
     Minima,
     information_per_lane,
@@ -17,9 +19,8 @@ from jaxtrachea.fitting.minima import (
 from jaxtrachea.fitting.noise import next_sigma, precision_unit
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.fitting.scrutiny import doubtful, left_in_doubt, scrutinise
+from jaxtrachea.fitting.scrutiny import scrutinise
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.shared import held_count, marginal, summed_gradient
 from jaxtrachea.fitting.starts import scales
 from jaxtrachea.fitting.structure import Structure, null_spaces, reduced, structure_of, suspicious
 from jaxtrachea.fitting.study import Study

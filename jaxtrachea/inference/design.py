@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.config import FitSpec, SpecError
-from jaxtrachea.fitting.covariance import informations
+from jaxtrachea.fitting.information import informations
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.residual import force_jacobian
