@@ -82,7 +82,7 @@ WITHIN = {
     ],
     "optimisation": [{"programs", "schur", "trust_region"}, {"levenberg_marquardt"}],
     "inference": [
-        {"rows", "residuals", "chains", "flat_directions", "estimate", "design_press"},
+        {"rows", "residuals", "chains", "weakest_direction", "estimate", "design_press"},
         {"cross_validation", "bootstrap", "profile", "posterior_start"},
         {"effective", "labels", "population"},
         {"analysis", "comparison"},

@@ -113,7 +113,8 @@ def _no_uncertainty(half: np.ndarray) -> Uncertainty:
     none, square = np.zeros((len(half), 0)), np.zeros((len(half), 0, 0))
     nan = np.full(len(half), np.nan)
     return Uncertainty(
-        se=none, correlation=square, condition=nan, flat=none, flat_se=nan, blind=square,
-        half_width=half, along=square, dispersion=none, covariance=square,
-        silent=square,
+        se=none, correlation=square, condition=nan, weakest_direction=none,
+        weakest_se=nan, structural_null_space=square,
+        half_width=half, conditional_direction=square, dispersion=none, covariance=square,
+        null_space=square,
     )  # fmt: skip

@@ -140,8 +140,8 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
         pool = marginal(study, pool, held, alive)
         unknowns = (unknowns or 0) - held_count(study, held, alive)
     noise_given = study.noise_given[0] and both
-    blind = _open_directions(study, theta, structure)
-    u = analyse(pool, relative, held, noise_given=noise_given, unknowns=unknowns, structural=blind)
+    open_ = _open_directions(study, theta, structure)
+    u = analyse(pool, relative, held, noise_given=noise_given, unknowns=unknowns, structural=open_)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
 
         def unscale(v):

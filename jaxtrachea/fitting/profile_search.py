@@ -42,9 +42,9 @@ class Sides:
         self.best = result.theta[lane] if origin is None else origin
         u = result.uncertainty
         self.dispersion = u.dispersion[lane, unknown]
-        self.along = u.along[lane, unknown] * self.sign[:, None]
+        self.direction = u.conditional_direction[lane, unknown] * self.sign[:, None]
         if origin is not None:
-            self.along = np.zeros_like(self.along)
+            self.direction = np.zeros_like(self.direction)
         self.pinned = self._pinned()
         self.target = u.half_width[lane]
         lanes = result.study.lanes
@@ -66,7 +66,7 @@ class Sides:
         pinned = np.arange(self.best.shape[1])[None] == self.unknown[:, None]
         for s in np.flatnonzero(self.result.undetermined[self.lane].any(axis=1)):
             lane, i = int(self.lane[s]), int(self.unknown[s])
-            rows = self.result.uncertainty.blind[lane]
+            rows = self.result.uncertainty.structural_null_space[lane]
             rest = leaving_alone(rows[rows.any(axis=1)], i)
             names = [p.name for p, _, _ in self.result.study.unknowns[lane]]
             pinned[s] |= pins(names, rest)
@@ -178,7 +178,7 @@ class Path:
         gap = distances[right] - distances[left]
         alone = gap <= 0
         slope = (thetas[right] - thetas[left]) / np.where(alone, 1, gap)[:, None]
-        slope = np.where(alone[:, None], self.sides.along[side], slope)
+        slope = np.where(alone[:, None], self.sides.direction[side], slope)
         beyond = distance > distances[right]
         base = np.where(beyond, right, left)
         move = slope * (distance - distances[base])[:, None]

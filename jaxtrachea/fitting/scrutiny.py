@@ -297,13 +297,13 @@ def _walks(region: _Region, lanes) -> list[Float[np.ndarray, "n P"]]:
     """
     result, sides = region.result, region.sides
     u = result.uncertainty
-    flat = u.flat[lanes] * result.relative[lanes]
-    half = (u.half_width * u.flat_se)[lanes]
+    weakest = u.weakest_direction[lanes] * result.relative[lanes]
+    half = (u.half_width * u.weakest_se)[lanes]
     half = np.where(np.isfinite(half), half, 1.0)
     steps = np.minimum(half[:, None] * WALK, FAR)
     data, out = result.study.lanes, []
     for sign in (-1.0, 1.0):
-        theta = result.theta[lanes][:, None] + sign * steps[..., None] * flat[:, None]
+        theta = result.theta[lanes][:, None] + sign * steps[..., None] * weakest[:, None]
         theta = np.clip(theta, data.lower[lanes][:, None], data.upper[lanes][:, None])
         lane = np.repeat(lanes, len(WALK))
         cost = sides.costs(lane, theta.reshape(len(lane), -1))

@@ -277,7 +277,7 @@ def _merged(stored: StoredFit, source: Source, own: _Own) -> Source:
         source,
         free=free,
         covariance=covariance,
-        blind=source.blind @ follow.T,
+        null_space=source.null_space @ follow.T,
         status=max(source.status, _own_status(own)),
         message=said,
         absorbed=(own.slopes[moving].T, inverse @ (A / own.sigma[:, None]).T),
