@@ -22,7 +22,7 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference import cross_validation
 from jaxtrachea.inference.comparison import Model, Row, compared, same_data, sentence, weights
-from jaxtrachea.inference.cross_validation import Missed, leave_repeats_out, repeats
+from jaxtrachea.inference.repeats import Missed, leave_repeats_out, repeats
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.status import FitStatus

@@ -84,7 +84,7 @@ WITHIN = {
     "inference": [
         {"rows", "residuals", "chains", "weakest_direction", "estimate", "design_press"},
         {"cross_validation", "bootstrap", "profile", "posterior_start"},
-        {"effective", "labels", "population"},
+        {"effective", "labels", "population", "repeats"},
         {"analysis", "comparison"},
         {"design", "influence", "posterior"},
         {"analyses"},

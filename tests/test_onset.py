@@ -15,10 +15,11 @@ from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.analysis import Findings
-from jaxtrachea.inference.cross_validation import leave_one_out, leave_repeats_out, without
+from jaxtrachea.inference.cross_validation import leave_one_out, without
 from jaxtrachea.inference.design import Candidates, check, gains, situation
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.inference.labels import verdict_sentence
+from jaxtrachea.inference.repeats import leave_repeats_out
 from jaxtrachea.inference.weakest_direction import describe_weakest
 from jaxtrachea.measurements.first_touch import first_touch
 from jaxtrachea.measurements.read import Curve

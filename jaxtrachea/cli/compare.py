@@ -82,7 +82,7 @@ def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
     from jaxtrachea.cli.specification import settings_of
     from jaxtrachea.fitting.fit import fit
     from jaxtrachea.inference.comparison import Model
-    from jaxtrachea.inference.cross_validation import leave_repeats_out
+    from jaxtrachea.inference.repeats import leave_repeats_out
 
     models = []
     with progress_bar() as bar:
@@ -142,7 +142,7 @@ def _sentences(models, rows) -> dict[str, str]:
 
 def _left_out_words(models) -> str:
     """What was left out, in words; "curves" if nothing was."""
-    from jaxtrachea.inference.cross_validation import repeats
+    from jaxtrachea.inference.repeats import repeats
 
     return repeats(models[0].result.study).words or "curves"
 

@@ -114,7 +114,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
                 rows = [v[np.minimum(np.arange(start, start + size), total - 1)] for v in points]
                 depth = np.full(size, want.depth)
                 part = compute(swept, staged.material, *rows, depth, chunk=size)
-                parts.append(jax.tree.map(lambda v: np.asarray(v)[: total - start], part))  # noqa: B023
+                parts.append(jax.tree.map(lambda v, left=total - start: np.asarray(v)[:left], part))
                 bar.update(task, completed=min(start + size, total))
         out = jax.tree.map(lambda *v: np.concatenate(v), *parts)
         clock.append(time.perf_counter())

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 #: What spreadsheets take for the start of a formula, full-width forms included.
-FORMULA = "=+-@\t\r\n＝＋－＠"  # noqa: RUF001
+FORMULA = "=+-@\t\r\n＝＋－＠"
 _STARTS = re.compile(f"'*[{re.escape(FORMULA)}]")
 _QUOTED = re.compile(f"'+[{re.escape(FORMULA)}]")
 

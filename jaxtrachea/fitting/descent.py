@@ -51,7 +51,7 @@ def descend(
     sigma: np.ndarray,
     *,
     method: Literal["lbfgs", "adam"] = "lbfgs",
-    tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
+    tolerances: Tolerances = Tolerances(),
     batch: int = 256,
     learning_rate: float = 0.03,
     progress: Callable[[int], None] | None = None,

@@ -36,7 +36,7 @@ REPLACED = 3
 
 def fit(
     study: Study,
-    settings: Settings = Settings(),  # noqa: B008 (frozen)
+    settings: Settings = Settings(),
     progress: Callable[[int, int], None] | None = None,
     starts: np.ndarray | None = None,
 ) -> FitResult:

@@ -83,7 +83,7 @@ def solve_jointly(
     sigma: Float[np.ndarray, "L 2"],
     *,
     separately: bool,
-    tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
+    tolerances: Tolerances = Tolerances(),
     batch: int = 128,
     progress: Callable[[int], None] | None = None,
     dtype=np.float64,

@@ -119,10 +119,10 @@ class Study:
 def build_study(
     curves: Measurements | Sequence[Curve],
     geometry: Geometry,
-    options: Options = Options(),  # noqa: B008 (frozen)
+    options: Options = Options(),
     parameters: Table | None = None,
     *,
-    noise: Noise = Noise(),  # noqa: B008 (frozen)
+    noise: Noise = Noise(),
     balance: Balance = "curve",
     loss: Loss = "linear",
     loss_scale: float = 1.345,

@@ -58,7 +58,7 @@ class Bootstrap:
 
 def bootstrap(
     result: FitResult,
-    settings: Settings = Settings(),  # noqa: B008 (frozen)
+    settings: Settings = Settings(),
     *,
     count: int = 200,
     kind: Kind = "parametric",

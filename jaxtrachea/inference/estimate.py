@@ -43,7 +43,7 @@ def estimate(
     lane: Lane,
     sigma: Float[Array, "2"],
     geometry: Geometry | None = None,
-    tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
+    tolerances: Tolerances = Tolerances(),
 ) -> Estimate:
     """Fit one lane from one start; differentiable by everything but start, model, tolerances.
 

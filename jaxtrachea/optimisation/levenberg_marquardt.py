@@ -81,7 +81,7 @@ def levenberg_marquardt(
     starts: np.ndarray,
     rows: np.ndarray | None = None,
     *,
-    tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
+    tolerances: Tolerances = Tolerances(),
     batch: int = 128,
     rounds: int = 4,
     progress: Callable[[int], None] | None = None,
