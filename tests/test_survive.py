@@ -207,6 +207,20 @@ def strip_manifests(folder):
     (folder / "previous-run.json").unlink(missing_ok=True)
 
 
+def test_a_manifest_of_an_earlier_version_is_read():
+    """Written out by hand, with the keys that the fields of today have on file; and back."""
+    run = {
+        "schema": "jaxtrachea-run", "schema_version": 1, "id": "a", "specification": "b",
+        "inputs": {"c.csv": "d"}, "versions": {"jax": "1"}, "dtype": "float64", "device": "cpu",
+        "lanes": 9, "chunk": 64, "save_every": 3, "options": ["profile"],
+        "rerun": {"former": "e", "lanes": [1, 5], "count": 2}, "forced": [],
+    }  # fmt: skip
+    read = manifest.from_dict(run)
+    assert (read.batch, read.save_every, read.lanes) == (64, 3, 9)
+    assert read.rerun == manifest.Rerun(results="e", lanes=[1, 5], count=2)
+    assert manifest.as_dict(read) == run
+
+
 def test_force_goes_on_and_says_so(study, monkeypatch, capsys):
     with monkeypatch.context() as patch:
         stop_at(patch, 2)

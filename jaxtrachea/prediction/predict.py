@@ -121,7 +121,7 @@ def predict_sources(
     def stack(name):
         return np.stack([getattr(source, name) for source in sources])
 
-    columns = [Estimate(*map(stack, Estimate._fields)), places, padded]
+    columns = [Estimate._make(map(stack, Estimate._fields)), places, padded]
     presses = zip(sources, s, padded, strict=True)
     slack = np.stack([slack_of(stored, source, float(at), D) for source, at, D in presses])
     blend = stack("blend")

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import uuid
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import get_args, get_origin, get_type_hints
 
@@ -182,7 +182,9 @@ def _renamed(content: dict, names: dict[str, str]) -> dict:
     return {names.get(key, key): value for key, value in content.items()}
 
 
-def _check_types(kind: type, found: dict, keys: dict[str, str], apart=frozenset()) -> None:
+def _check_types(
+    kind: type, found: dict, keys: dict[str, str], apart: Collection[str] = ()
+) -> None:
     """Refuse values that are not of the field's type.
 
     Raises:
