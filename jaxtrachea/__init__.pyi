@@ -1,9 +1,9 @@
 """The public names of jaxtrachea, each once; `jaxtrachea/__init__.py` loads them on first use."""
 
 from .fitting.fit import fit as fit
+from .fitting.lanes import Noise as Noise
 from .fitting.result import FitResult as FitResult
 from .fitting.settings import Settings as Settings
-from .fitting.study import Noise as Noise
 from .fitting.study import Study as Study
 from .fitting.study import build_study as build_study
 from .inference.bootstrap import bootstrap as bootstrap

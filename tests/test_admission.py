@@ -21,14 +21,14 @@ import pytest
 
 import jaxtrachea
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.levenberg_marquardt import Tolerances
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise
 from jaxtrachea.mechanics import beam
 from jaxtrachea.mechanics.oblique import press_oblique, press_path
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.skeleton import skeleton_response
+from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.scene.assemble import make_scene
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.simulation import simulate

@@ -10,12 +10,14 @@ import synthetic
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import descend
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.levenberg_marquardt import Tolerances, levenberg_marquardt
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference import bootstrap as bootstraps
 from jaxtrachea.inference.profile import profiles
+from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
+from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 EPSILON = np.finfo(np.float64).eps

@@ -15,20 +15,21 @@ import synthetic
 from small_scenes import MATERIAL, MESH, TUBE, presses
 
 from jaxtrachea import EffectOptions, make_scene, simulate
-from jaxtrachea.fitting import levenberg_marquardt
 from jaxtrachea.fitting.cost import LaneCost, evaluate
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.levenberg_marquardt import Tolerances
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.starts import draw_starts
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference import bootstrap
 from jaxtrachea.inference.design import situation
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.optimisation import trust_region
+from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.trachea.geometry import table_1
 
 ONE = Settings(
@@ -151,8 +152,8 @@ def test_a_step_is_bent_by_the_second_derivative():
     lane = jax.tree.map(lambda v: v[0], study.lanes)
     sigma, theta = jnp.ones(2), jnp.log(jnp.array([1.0]))
     point = evaluate(study.model, theta, lane, sigma)
-    state = levenberg_marquardt.State(theta, point, jnp.array(10.0), jnp.array(1), jnp.array(0))
-    step = levenberg_marquardt._step(LaneCost(study.model, lane, sigma), state)
+    state = trust_region.State(theta, point, jnp.array(10.0), jnp.array(1), jnp.array(0))
+    step = trust_region._step(LaneCost(study.model, lane, sigma), state)
     v = 0.3  # (1.3 - 1) / 1, undamped within the trust region
     np.testing.assert_allclose(step.straight, v, rtol=1e-6)
     np.testing.assert_allclose(step.delta[0], v - v * v / 2, rtol=0.01)

@@ -15,13 +15,14 @@ from run_cli import run
 from jaxtrachea.cli.compare import _left_out_notes
 from jaxtrachea.fitting.criteria import penalised
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.onset import where_sought
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference import cross_validation
 from jaxtrachea.inference.comparison import Model, Row, compared, same_data, sentence, weights
-from jaxtrachea.inference.cross_validation import Missed, leave_repeats_out, repeats
+from jaxtrachea.inference.repeats import Missed, leave_repeats_out, repeats
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.status import FitStatus

@@ -10,8 +10,9 @@ import synthetic
 from run_cli import run, tree
 
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.design import (
     Candidates,
     gains,

@@ -11,12 +11,14 @@ from scipy.optimize import least_squares
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import descend
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.levenberg_marquardt import Tolerances, levenberg_marquardt
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, build_study
-from jaxtrachea.inference.flat_directions import describe_flat
+from jaxtrachea.fitting.study import build_study
+from jaxtrachea.inference.weakest_direction import describe_weakest
 from jaxtrachea.measurements.read import read_measurements
+from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
+from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.status import FitStatus
 
 #: Truths that four curves with 1 % noise identify: a soft contact that hardens early.
@@ -239,14 +241,14 @@ def test_one_position_leaves_skeleton_undetermined():
     study = build_study(data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters())
     result = fit(study, Settings(starts=2))
     assert result.status[0] == FitStatus.UNIDENTIFIABLE
-    flat = result.uncertainty.flat[0]
+    flat = result.uncertainty.weakest_direction[0]
     ratio = flat[0] / flat[1]
     # Beam on discrete rings, not on a continuum: the exponents are near 1 and 3.
     assert -4.5 < ratio < -2.0
     assert np.all(np.isinf(result.standard_error[0, :2]))
     assert np.all(np.isfinite(result.standard_error[0, 2:]))
     names = [p.name for p, _, _ in study.unknowns[0]]
-    words = describe_flat(names, flat, np.inf, result.uncertainty.blind[0])
+    words = describe_weakest(names, flat, np.inf, result.uncertainty.structural_null_space[0])
     shape = re.fullmatch(r"of EI_L and k_M only EI_L k_M\^([\d.]+) is known", words)
     assert shape is not None
     assert float(shape[1]) == pytest.approx(-ratio, rel=1e-2)

@@ -10,14 +10,15 @@ import pytest
 import synthetic
 
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.levenberg_marquardt import Tolerances
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.estimate import estimate, lane_of
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.trachea.geometry import table_1
 
 SHARP = Settings(starts=1, tolerances=Tolerances(1e-15, 1e-15, 1e-15, 100))

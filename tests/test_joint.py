@@ -13,12 +13,12 @@ from run_cli import GOOD, run
 from scipy.optimize import least_squares
 
 from jaxtrachea.cli import specification
-from jaxtrachea.fitting import schur
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.joint_information import held_count, unknown_count
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.shared import held_count, unknown_count
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference import population as populations
 from jaxtrachea.inference.analyses.population import POPULATION, population_rows
 from jaxtrachea.inference.analysis import Findings
@@ -29,8 +29,9 @@ from jaxtrachea.inference.population import population, wanted
 from jaxtrachea.inference.profile import profiles
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
+from jaxtrachea.optimisation import schur
 from jaxtrachea.results.rows import lane_rows, parameter_rows
-from jaxtrachea.runs import journal
+from jaxtrachea.runs import manifest
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
@@ -263,16 +264,16 @@ def test_command_line_fits_jointly_what_is_shared(tmp_path, monkeypatch, capsys)
     code, _, err = run(monkeypatch, capsys, "fit", "spec.toml", "--profile")
     assert code == 2
     assert "parameters.k_M: shared, so that 7 unknowns" in err
-    was = journal.describe(
+    was = manifest.describe(
         tmp_path / "spec.toml", tmp_path, {}, "float64", "cpu",
-        lanes=1, chunk=1, save_every=1, options=["influence"],
+        lanes=1, batch=1, save_every=1, options=["influence"],
     )  # fmt: skip
     (tmp_path / "out" / ".run").mkdir(parents=True)
-    journal.write(tmp_path / "out" / ".run" / "run.json", was)
+    manifest.write(tmp_path / "out" / ".run" / "run.json", was)
     code, _, err = run(monkeypatch, capsys, "fit", "spec.toml", "--out", "out", "--resume")
     assert (code, "so that 7 unknowns" in err) == (2, True), err  # it was one lane, and is again
     now = dataclasses.replace(was, lanes=2, options=[])
-    assert list(journal.differences(now, was)) == [
+    assert list(manifest.differences(now, was)) == [
         "lanes was 2 and is 1 (--influence of a joint fit needs one lane)"
     ]
 

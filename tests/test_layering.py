@@ -14,7 +14,7 @@ PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 ORDER = [
     {"_errors"},
     {"units", "status", "_numerics", "_arguments"},
-    {"files"},
+    {"files", "optimisation"},
     {"config"},
     {"trachea"},
     {"contact"},
@@ -64,36 +64,36 @@ WITHIN = {
         {"data_files", "usage_tables"},
     ],
     "fitting": [
-        {"parameters", "lane", "schur"},
+        {"parameters", "lane"},
         {"model"},
-        {"onset"},
+        {"lanes", "onset"},
         {"study"},
         {"map_lanes", "press_scale", "residual"},
         {"cost"},
-        {"levenberg_marquardt"},
         {"descent", "starts"},
-        {"structure"},
-        {"covariance"},
-        {"noise", "shared"},
+        {"information", "shared", "structure"},
+        {"covariance", "joint_information", "noise"},
         {"criteria", "settings", "verdict"},
         {"result"},
         {"minima", "natural_sizes", "predictions", "profile_search"},
-        {"evaluate", "scrutiny"},
+        {"doubt", "evaluate"},
+        {"scrutiny"},
         {"fit"},
     ],
+    "optimisation": [{"programs", "schur", "trust_region"}, {"levenberg_marquardt"}],
     "inference": [
-        {"rows", "residuals", "chains", "flat_directions", "estimate", "design_press"},
+        {"rows", "residuals", "chains", "weakest_direction", "estimate", "design_press"},
         {"cross_validation", "bootstrap", "profile", "posterior_start"},
-        {"effective", "labels", "population"},
+        {"effective", "labels", "population", "repeats"},
         {"analysis", "comparison"},
         {"design", "influence", "posterior"},
         {"analyses"},
     ],
     "results": [{"arrays", "store"}, {"rows", "stored"}, {"hdf5"}],
     "prediction": [{"core", "sources"}, {"predict"}, {"held_out"}, {"plots", "report", "tables"}],
-    "runs": [{"processes", "journal"}, {"chunks"}, {"folder"}, {"former", "in_chunks"}],
+    "runs": [{"meet", "manifest"}, {"processes", "shards"}, {"folder"}, {"rerun", "checkpoint"}],
     "report": [{"plots", "tables"}, {"fit"}, {"overview"}],
-    "cli": [{"terminal_table", "specification"}, {"terminal"},
+    "cli": [{"terminal_table", "specification", "options"}, {"terminal"},
             {"fit", "load", "predict_data", "run", "scene", "selfcheck"},
             {"compare", "predict", "tradeoff"}, {"main"}],
 }  # fmt: skip
@@ -163,7 +163,7 @@ def test_no_room_holds_too_much_of_the_package():
     rooms = {p.relative_to(PACKAGE).parts[0] for p in lines}
     share = {r: sum(n for p, n in lines.items() if p.relative_to(PACKAGE).parts[0] == r)
              for r in rooms}  # fmt: skip
-    assert max(share.values()) <= 0.155 * sum(lines.values())
+    assert max(share.values()) <= 0.15 * sum(lines.values())
 
 
 @pytest.mark.parametrize(

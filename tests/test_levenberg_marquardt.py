@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtrachea.fitting.levenberg_marquardt import levenberg_marquardt
+from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
 from jaxtrachea.status import FitStatus
 
 

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.fitting.covariance import informations
 from jaxtrachea.fitting.descent import descend
-from jaxtrachea.fitting.levenberg_marquardt import Tolerances
-from jaxtrachea.fitting.map_lanes import batch_size, map_lanes
+from jaxtrachea.fitting.information import informations
+from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.optimisation.programs import batch_size
+from jaxtrachea.optimisation.trust_region import Tolerances
 
 EVENT = "/jax/core/compile/backend_compile_duration"
 

@@ -15,11 +15,12 @@ from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.analysis import Findings
-from jaxtrachea.inference.cross_validation import leave_one_out, leave_repeats_out, without
+from jaxtrachea.inference.cross_validation import leave_one_out, without
 from jaxtrachea.inference.design import Candidates, check, gains, situation
-from jaxtrachea.inference.flat_directions import describe_flat
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.inference.labels import verdict_sentence
+from jaxtrachea.inference.repeats import leave_repeats_out
+from jaxtrachea.inference.weakest_direction import describe_weakest
 from jaxtrachea.measurements.first_touch import first_touch
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, compliance
@@ -322,7 +323,7 @@ def test_errors_of_an_onset_are_of_the_press(owned):
 )
 def test_onset_in_words(flat, error, text):
     names = ["k_1", "k_3", "onset"]
-    assert describe_flat(names, np.array(flat, float), error, press={2: (5.0, "mm")}) == text
+    assert describe_weakest(names, np.array(flat, float), error, press={2: (5.0, "mm")}) == text
 
 
 def test_where_no_onset_is_fitted_nothing_changes():

@@ -21,11 +21,12 @@ from scipy.stats import t as student
 
 import jaxtrachea
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.model import columns_of
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import leave_one_out, with_own_touch
 from jaxtrachea.inference.labels import verdict_sentence
@@ -34,7 +35,7 @@ from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.prediction import held_out
 from jaxtrachea.prediction import plots as prediction_plots
-from jaxtrachea.prediction.core import predicted
+from jaxtrachea.prediction.core import Estimate, predicted
 from jaxtrachea.prediction.predict import predict_sources
 from jaxtrachea.prediction.sources import source_of
 from jaxtrachea.results import stored
@@ -219,9 +220,9 @@ def test_an_undetermined_direction_makes_bands_infinite_where_it_acts(read):
     """EI_L against k_M as one position leaves them: the same press stays known, others do not."""
     source = source_of(read, "s0003")
     J = slope_at(read, source, 75.0)
-    blind = np.zeros_like(source.blind)
-    blind[0, :2] = np.array([-J[1], J[0]]) / np.hypot(J[0], J[1])
-    lost = dataclasses.replace(source, blind=blind)
+    null_space = np.zeros_like(source.null_space)
+    null_space[0, :2] = np.array([-J[1], J[0]]) / np.hypot(J[0], J[1])
+    lost = dataclasses.replace(source, null_space=null_space)
     places = [75.0, 31.0]
     same, other = predict_sources(read, [lost, lost], places, [np.array([3.0])] * 2)
     assert np.isfinite(same.high95).all()
@@ -514,7 +515,7 @@ def test_own_onset_is_fitted_and_its_band_is_that_of_least_squares(tmp_path):
 
 def only(read, lanes):
     """The same fit of the first lanes alone."""
-    fields = ("theta", "covariance", "blind", "at_bound", "status", "sigma", "half_width",
+    fields = ("theta", "covariance", "null_space", "at_bound", "status", "sigma", "half_width",
               "lane_names")  # fmt: skip
     count = int(np.sum(read.curve_lane < lanes))
     cut = {name: getattr(read, name)[:lanes] for name in fields}
@@ -569,11 +570,11 @@ def test_joint_fit_predicts_as_one_dense_lane(tmp_path):
 def test_core_in_float32(read):
     """Jitted and batched as the command uses it in float64, which other tests check."""
     sources = [source_of(read, f"s{i:04d}") for i in range(3)]
-    names = ("free", "value", "covariance", "blind", "half_width")
-    args = [np.stack([getattr(s, n) for s in sources]).astype(np.float32) for n in names]
+    rows = [np.stack([getattr(s, n) for s in sources]) for n in Estimate._fields]
+    estimate = Estimate(*(jnp.asarray(v, np.float32) for v in rows))
     place, depth = np.full(3, 61.0, np.float32), np.tile(np.float32([1.0, 4.0]), (3, 1))
     program = functools.partial(predicted, read.study.model)
-    batch = jax.jit(jax.vmap(program))(*map(jnp.asarray, (*args, place, depth)))
+    batch = jax.jit(jax.vmap(program))(estimate, jnp.asarray(place), jnp.asarray(depth))
     assert batch.value.force.dtype == batch.se.joints.dtype == np.float32
     exact = predict_sources(read, sources, [61.0] * 3, [np.array([1.0, 4.0])] * 3)
     for k, curve in enumerate(exact):
@@ -942,11 +943,11 @@ def test_a_lane_with_one_place_predicts_that_place(study, tmp_path):
     read = jaxtrachea.read_results(tmp_path)
     source = source_of(read, read.specimens[0])
     # EI_L on its upper bound: k_M is a direction by itself, whose slope is 1e-8 of the others'.
-    free, blind = source.free.copy(), np.zeros_like(source.blind)
-    free[:2], blind[0, 1] = [np.log(1e7), np.log(1e-4)], 1.0
+    free, null_space = source.free.copy(), np.zeros_like(source.null_space)
+    free[:2], null_space[0, 1] = [np.log(1e7), np.log(1e-4)], 1.0
     covariance = np.zeros((4, 4))
     covariance[2, 2] = 1e-4
-    lost = dataclasses.replace(source, free=free, blind=blind, covariance=covariance)
+    lost = dataclasses.replace(source, free=free, null_space=null_space, covariance=covariance)
     near, far, deep = predict_sources(
         read, [lost] * 3, [75.0, 61.0, 75.0], [DEPTHS, DEPTHS, 2 * DEPTHS]
     )
@@ -959,7 +960,7 @@ def test_a_lane_with_one_place_predicts_that_place(study, tmp_path):
     assert np.isfinite(own.high95).all()
     inside = (own.low95 <= force[0, 0]) & (force[0, 0] <= own.high95)
     assert np.mean(inside) >= 0.85
-    bent = dataclasses.replace(source, blind=0 * blind, covariance=1e12 * np.eye(4))
+    bent = dataclasses.replace(source, null_space=0 * null_space, covariance=1e12 * np.eye(4))
     (worst,) = predict_sources(read, [bent], [75.0], [DEPTHS])
     assert worst.status == PredictionStatus.BENT
     assert " inf " not in worst.message

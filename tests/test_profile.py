@@ -14,10 +14,11 @@ from scipy.optimize import least_squares
 
 from jaxtrachea.files.tables import interval
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.profile_search import Sides
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.profile import profile_rows
 from jaxtrachea.inference.profile import choose, profiles
 from jaxtrachea.measurements.read import Curve

@@ -18,13 +18,14 @@ from jaxtrachea.cli.terminal import Stages, progress_bar
 from jaxtrachea.cli.terminal_table import wide_table
 from jaxtrachea.files.html import page
 from jaxtrachea.files.pictures import plain, save_each, without_lost
-from jaxtrachea.files.tables import quoted, read_csv, unquoted, write_csv
+from jaxtrachea.files.tables import quoted, unquoted, write_csv
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import unknown_label, verdict_of
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, build_study
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.cross_validation import LEFT_OUT, left_out_table
 from jaxtrachea.inference.analyses.effective import widened
 from jaxtrachea.inference.analyses.influence import (
@@ -53,6 +54,13 @@ NAMES = ["$a$", "a_b$", r"$\frac{$", "=1+1", "<script>", "a|b", "two\nlines", "x
 DEPTH = np.linspace(0.1, 2, 12)
 BONDED = Options(coupling="total", contact="bonded", onset_width=0.0)
 ONE = Settings(starts=1, more_starts=0)
+
+
+def read_csv(path):
+    """Rows of a file that `write_csv` wrote, all cells as text."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        rows = csv.DictReader(stream)
+        return [{unquoted(k): unquoted(v) for k, v in row.items()} for row in rows]
 
 
 def table(**changes):

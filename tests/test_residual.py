@@ -10,9 +10,10 @@ import pytest
 import synthetic
 from scipy.integrate import quad
 
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import in_model
 from jaxtrachea.fitting.residual import residual, residual_value
-from jaxtrachea.fitting.study import Noise, build_study, default_parameters
+from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.material import Material

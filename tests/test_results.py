@@ -23,7 +23,7 @@ from jaxtrachea.inference.analyses.effective import EFFECTIVE
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
 from jaxtrachea.inference.effective import effective
-from jaxtrachea.inference.labels import flat_sentence
+from jaxtrachea.inference.labels import weakest_sentence
 from jaxtrachea.inference.residuals import lag_correlation, rms, worst
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.mechanics.press import Options
@@ -116,7 +116,7 @@ def test_failed_lane_keeps_its_row_and_is_called_failed(result):
     assert (good["status"], bad["status"]) == ("converged", "max_iterations")
     assert bad["message"] == FitStatus.MAX_ITERATIONS.message
     assert bad["k_1 verdict"] == "failed"
-    assert flat_sentence(failed, 1) == "no estimate"
+    assert weakest_sentence(failed, 1) == "no estimate"
     text = report_text("T", Findings(failed), [BAD])
     assert "2 lanes, 1 succeeded, 1 failed; 1 curves could not be used" in text
     assert "| T9 | 1 | non_finite | line 3: force is nan | leave it out |" in text
@@ -124,9 +124,9 @@ def test_failed_lane_keeps_its_row_and_is_called_failed(result):
 
 
 def flat(result, direction, error):
-    change = {"flat": np.array([direction]), "flat_se": np.array([error])}
+    change = {"weakest_direction": np.array([direction]), "weakest_se": np.array([error])}
     local = result.uncertainty._replace(**change)
-    return flat_sentence(dataclasses.replace(result, uncertainty=local), 0)
+    return weakest_sentence(dataclasses.replace(result, uncertainty=local), 0)
 
 
 def test_flat_combination_in_words(result):

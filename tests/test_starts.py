@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.fitting.levenberg_marquardt import Solved
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.starts import REDRAWS, add_starts, best, draw_starts
+from jaxtrachea.optimisation.levenberg_marquardt import Solved
 from jaxtrachea.status import FitStatus
 
 #: Lanes of the tests, and the cost of the deep and the shallow minimum.

@@ -26,13 +26,14 @@ from jaxtrachea.cli.terminal import set_up_jax
 from jaxtrachea.config import load_fit_spec
 from jaxtrachea.files import lock as run_lock
 from jaxtrachea.files import output
-from jaxtrachea.fitting import fit, levenberg_marquardt
+from jaxtrachea.fitting import fit
 from jaxtrachea.fitting.cost import LaneCost
-from jaxtrachea.fitting.map_lanes import program
 from jaxtrachea.measurements.data_files import read_data
+from jaxtrachea.optimisation import levenberg_marquardt
+from jaxtrachea.optimisation.programs import program
 from jaxtrachea.results.hdf5 import read_hdf5
 from jaxtrachea.results.stored import NoResults
-from jaxtrachea.runs import chunks, former, in_chunks, journal, processes
+from jaxtrachea.runs import checkpoint, manifest, processes, rerun, shards
 from jaxtrachea.runs import folder as run_folder
 from jaxtrachea.runs.processes import Lost, Meeting, Watch
 
@@ -41,7 +42,7 @@ FIT = ("fit", "spec.toml", "--out", "out")
 
 @pytest.fixture(scope="module")
 def peace(tmp_path_factory):
-    """A study of 9 lanes in 3 chunks, fitted without interruption; all its files, as text."""
+    """A study of 9 lanes in 3 shards, fitted without interruption; all its files, as text."""
     folder = tmp_path_factory.mktemp("peace")
     write_study(folder, 9, 3)
     with pytest.MonkeyPatch.context() as patch:
@@ -84,12 +85,12 @@ def stop_at(patch, k, error=KeyboardInterrupt):
 
 
 def test_stopped_and_resumed(peace, study, monkeypatch, capsys):
-    """Ctrl-C in the third chunk, a damaged chunk, and on: two chunks anew, numbers as in peace."""
+    """Ctrl-C in the third shard, a damaged shard, and on: two shards anew, numbers as in peace."""
     with monkeypatch.context() as patch:
         stop_at(patch, 3)
         code, _, err = run(patch, capsys, *FIT)
     assert code == 130
-    assert "2 of 3 chunks are kept in out" in err
+    assert "2 of 3 shards are kept in out" in err
     assert "--out out --resume" in err
     assert "nothing was written" not in err
     so_far = (study / "out" / run_folder.SO_FAR).read_text().splitlines()
@@ -102,19 +103,19 @@ def test_stopped_and_resumed(peace, study, monkeypatch, capsys):
     code, _, err = run(monkeypatch, capsys, *FIT, "--resume")
     assert code == 0, err
     assert "damaged, fitted again: 00001.npz" in err
-    assert "1 of 3 chunks are there" in err
+    assert "1 of 3 shards are there" in err
     assert again == [3, 3]
     assert numbers(study / "out") == numbers(peace / "out")
     assert sorted(tree(study / "out")) == sorted(tree(peace / "out"))
 
 
-def test_an_error_while_files_are_written_keeps_the_chunks(peace, study, monkeypatch, capsys):
+def test_an_error_while_files_are_written_keeps_the_shards(peace, study, monkeypatch, capsys):
     with monkeypatch.context() as patch:
         patch.setattr(
             "jaxtrachea.report.plots.draw_all", lambda *_: (_ for _ in ()).throw(OSError(28, ""))
         )
         code, _, err = run(patch, capsys, *FIT)
-    assert (code, "3 of 3 chunks are kept" in err) == (2, True)
+    assert (code, "3 of 3 shards are kept" in err) == (2, True)
     monkeypatch.setattr("jaxtrachea.fitting.fit.fit", None)
     assert run(monkeypatch, capsys, *FIT, "--resume")[0] == 0
     assert numbers(study / "out") == numbers(peace / "out")
@@ -192,18 +193,32 @@ def test_refusals(peace, study, monkeypatch, capsys):
     with monkeypatch.context() as patch:
         patch.setattr(jaxtrachea, "__version__", "99")
         refused(*FIT, "--resume", says=["jaxtrachea was 0", "and is 99"])
-    strip_journals(study / "out" / ".run")
+    strip_manifests(study / "out" / ".run")
     (study / "out" / ".run" / "run.json").write_text("{")
-    refused(*FIT, "--resume", says=["its run.json cannot be read", "none of its 1 chunks says"])
+    refused(*FIT, "--resume", says=["its run.json cannot be read", "none of its 1 shards says"])
 
 
-def strip_journals(folder):
-    """Chunks as they were before each held the journal of its run; the former journal is gone."""
+def strip_manifests(folder):
+    """Shards as they were before each held the manifest of its run; its copy is gone."""
     for path in folder.glob("*.npz"):
         with np.load(path) as file:
             arrays = {name: file[name] for name in file.files if name != "journal"}
         np.savez(path, **arrays)
     (folder / "previous-run.json").unlink(missing_ok=True)
+
+
+def test_a_manifest_of_an_earlier_version_is_read():
+    """Written out by hand, with the keys that the fields of today have on file; and back."""
+    run = {
+        "schema": "jaxtrachea-run", "schema_version": 1, "id": "a", "specification": "b",
+        "inputs": {"c.csv": "d"}, "versions": {"jax": "1"}, "dtype": "float64", "device": "cpu",
+        "lanes": 9, "chunk": 64, "save_every": 3, "options": ["profile"],
+        "rerun": {"former": "e", "lanes": [1, 5], "count": 2}, "forced": [],
+    }  # fmt: skip
+    read = manifest.from_dict(run)
+    assert (read.batch, read.save_every, read.lanes) == (64, 3, 9)
+    assert read.rerun == manifest.Rerun(results="e", lanes=[1, 5], count=2)
+    assert manifest.as_dict(read) == run
 
 
 def test_force_goes_on_and_says_so(study, monkeypatch, capsys):
@@ -264,48 +279,48 @@ def load_peace(peace):
 
 
 def test_results_are_read_back_bit_for_bit(peace, tmp_path):
-    """What write_hdf5 and save wrote comes back; damaged, foreign and truncated chunks do not."""
+    """What write_hdf5 and save wrote comes back; damaged, foreign and truncated shards do not."""
     study = load_peace(peace)
     result = read_hdf5(peace / "out" / "results.h5", study)
     lanes, path = np.arange(9), tmp_path / "0.npz"
-    run_of_it = former.read_journal(peace / "out" / "results.h5")
-    chunks.save(path, dataclasses.replace(run_of_it, id="me"), lanes, result)
-    assert chunks.read_journal(path) == dataclasses.replace(run_of_it, id="me")
-    found = chunks.load(path, "me", lanes, study)
+    run_of_it = rerun.read_manifest(peace / "out" / "results.h5")
+    shards.save(path, dataclasses.replace(run_of_it, id="me"), lanes, result)
+    assert shards.read_manifest(path) == dataclasses.replace(run_of_it, id="me")
+    found = shards.load(path, "me", lanes, study)
     assert found is not None
-    expected = chunks.arrays_of(result)
-    for name, array in chunks.arrays_of(found).items():
+    expected = shards.arrays_of(result)
+    for name, array in shards.arrays_of(found).items():
         assert array.dtype == expected[name].dtype
         assert array.tobytes() == expected[name].tobytes(), name
-    parts = [chunks.load(path, "me", lanes, study) for _ in range(2)]
-    assert chunks.join(study.take(np.tile(lanes, 2)), parts).lanes == 18
-    assert chunks.load(path, "another", lanes, study) is None
-    assert chunks.load(path, "me", lanes[::-1], study) is None
+    parts = [shards.load(path, "me", lanes, study) for _ in range(2)]
+    assert shards.join(study.take(np.tile(lanes, 2)), parts).lanes == 18
+    assert shards.load(path, "another", lanes, study) is None
+    assert shards.load(path, "me", lanes[::-1], study) is None
     whole = path.read_bytes()
     for length in np.linspace(0, len(whole) - 1, 40).astype(int):
         path.write_bytes(whole[:length])
-        assert chunks.load(path, "me", lanes, study) is None
+        assert shards.load(path, "me", lanes, study) is None
     # Within an array: a byte between them may be one that nobody reads.
     middle = whole.index(result.theta.tobytes()) + result.theta.nbytes // 2
     path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
-    assert chunks.load(path, "me", lanes, study) is None
+    assert shards.load(path, "me", lanes, study) is None
     with pytest.raises(NoResults, match="another study"):
         read_hdf5(peace / "out" / "results.h5", study.take(lanes[:8]))
 
 
-def test_sizes_of_chunks(peace):
-    """Equal chunks; fewer lanes together where lanes are long or memory is short."""
-    assert [len(c) for c in chunks.divide(10, 4)] == [4, 3, 3]
-    assert np.array_equal(np.concatenate(chunks.divide(1000, 7)), np.arange(1000))
+def test_sizes_of_shards(peace):
+    """Equal shards; fewer lanes together where lanes are long or memory is short."""
+    assert [len(c) for c in shards.divide(10, 4)] == [4, 3, 3]
+    assert np.array_equal(np.concatenate(shards.divide(1000, 7)), np.arange(1000))
     study = load_peace(peace)
-    assert chunks.lanes_per_chunk(study, 2) == 4096
+    assert shards.lanes_per_shard(study, 2) == 4096
     long = dataclasses.replace(study, lanes=study.lanes._replace(force=np.zeros((1, 2, 100_000))))
-    assert chunks.lanes_per_chunk(long, 4) == 5
-    each = chunks.bytes_per_seat(study)
-    assert [chunks.seats(study, m) for m in (0.0, 2.1 * each, 65.0 * each, 1e12)] == [
+    assert shards.lanes_per_shard(long, 4) == 5
+    each = shards.bytes_per_slot(study)
+    assert [shards.slots(study, m) for m in (0.0, 2.1 * each, 65.0 * each, 1e12)] == [
         *(1, 1, 32, 128)
     ]
-    assert chunks.free_memory() > 1e6
+    assert shards.free_memory() > 1e6
 
 
 @pytest.mark.slow
@@ -322,13 +337,13 @@ def test_memory_of_a_lane_is_what_xla_counts(peace):
     lowered = step.lower(objective, starts, np.ones(count, bool), state)
     used = lowered.compile().memory_analysis()
     total = used.temp_size_in_bytes + used.argument_size_in_bytes
-    assert total / count <= chunks.bytes_per_seat(study) <= 3 * total / count
+    assert total / count <= shards.bytes_per_slot(study) <= 3 * total / count
 
 
 def test_devices_share_the_work_and_its_end():
     """Each item once; an error on one device ends the others after the item they are at."""
     device, done = jax.local_devices()[0], []
-    in_chunks._on_devices(done.append, list(range(20)), [device] * 3)
+    checkpoint._on_devices(done.append, list(range(20)), [device] * 3)
     assert sorted(done) == list(range(20))
 
     def fail(k):
@@ -339,7 +354,7 @@ def test_devices_share_the_work_and_its_end():
 
     done.clear()
     with pytest.raises(OSError, match="full"):
-        in_chunks._on_devices(fail, list(range(100)), [device] * 3)
+        checkpoint._on_devices(fail, list(range(100)), [device] * 3)
     assert len(done) < 20
 
 
@@ -371,7 +386,7 @@ def test_no_cluster_is_said(study):
 
 
 def begun(peace, study, monkeypatch, capsys):
-    """Stop the study in its third chunk; two are saved."""
+    """Stop the study in its third shard; two are saved."""
     with monkeypatch.context() as patch:
         stop_at(patch, 3)
         assert run(patch, capsys, *FIT)[0] == 130
@@ -411,13 +426,13 @@ def test_two_runs_of_one_folder(peace, study, monkeypatch, capsys):
         other.kill()
     assert (study / "out" / run_lock.LOCK).exists()
     code, _, err = run(monkeypatch, capsys, *FIT, "--resume")
-    assert (code, "2 of 3 chunks are there" in err) == (0, True), err
+    assert (code, "2 of 3 shards are there" in err) == (0, True), err
     assert numbers(study / "out") == numbers(peace / "out")
     assert sorted(tree(study / "out")) == sorted(tree(peace / "out"))
 
 
 def test_the_lock_lasts_as_long_as_the_run(study, monkeypatch, capsys):
-    """From the first chunk to the last file; new runs, too; and it is gone with the run."""
+    """From the first shard to the last file; new runs, too; and it is gone with the run."""
     seen, real = [], fit.fit
 
     def at_work(*_):
@@ -443,7 +458,7 @@ def test_the_lock_lasts_as_long_as_the_run(study, monkeypatch, capsys):
 
 def test_a_folder_that_another_run_takes_first(peace, tmp_path, monkeypatch):
     """Between a look at an empty folder and its lock: a run that is there, or has come and gone."""
-    real, now = run_folder.take, former.read_journal(peace / "out" / "results.h5")
+    real, now = run_folder.take, rerun.read_manifest(peace / "out" / "results.h5")
 
     def late(folder):
         lock = real(folder)
@@ -488,11 +503,11 @@ def from_peace(folder):
     """Stand in for `fit.fit`: the same numbers, read back."""
     whole = read_hdf5(folder / "out" / "results.h5", load_peace(folder))
     names = [curves[0].specimen for curves in whole.study.curves]
-    arrays = chunks.arrays_of(whole)
+    arrays = shards.arrays_of(whole)
 
     def fitted(study, settings, progress):
         rows = np.array([names.index(curves[0].specimen) for curves in study.curves])
-        return chunks.result_of(study, {name: v[rows] for name, v in arrays.items()})
+        return shards.result_of(study, {name: v[rows] for name, v in arrays.items()})
 
     return fitted
 
@@ -523,7 +538,7 @@ def test_a_disk_that_fills_up(peace, study, monkeypatch, capsys, code):
         kept = len(list(out.glob(".run/*.npz")))
         assert kept or not out.exists() or not any(out.iterdir())
         if kept:
-            assert f"{kept} of 3 chunks are kept in out" in err
+            assert f"{kept} of 3 shards are kept in out" in err
             assert ("make room on the disk, then go on with --out out --resume" in err) == (
                 code == errno.ENOSPC
             )
@@ -531,7 +546,7 @@ def test_a_disk_that_fills_up(peace, study, monkeypatch, capsys, code):
         more = ("--resume",) if kept else ()
         again, _, err = run(monkeypatch, capsys, *FIT, *more)
         assert again == 0, (first, err)
-        assert not kept or f"{kept} of 3 chunks are there" in err or "are now in out" in err
+        assert not kept or f"{kept} of 3 shards are there" in err or "are now in out" in err
         assert numbers(out) == expected
         assert sorted(tree(out)) == sorted(tree(peace / "out"))
 
@@ -547,7 +562,7 @@ def test_a_folder_that_became_read_only(peace, study, monkeypatch, capsys):
             code, _, err = run(monkeypatch, capsys, *FIT[:3], folder, option)
         assert (code, len(err.splitlines())) == (2, 1), err
         assert f"{folder}: cannot be written (Read-only file system)" in err
-        assert ("2 finished chunks are kept there" in err) == (folder == "out")
+        assert ("2 finished shards are kept there" in err) == (folder == "out")
         assert "copy it and go on in the copy" in err
         assert tree(study) == before
     with Disk(study / "finished", 1, errno.EROFS).watched():
@@ -585,8 +600,8 @@ def garbled(path):
     yield
 
 
-def test_a_damaged_journal_costs_no_chunk(peace, study, monkeypatch, capsys):
-    """Every chunk holds the journal of its run: rebuilt, still checked, and said."""
+def test_a_damaged_manifest_costs_no_shard(peace, study, monkeypatch, capsys):
+    """Every shard holds the manifest of its run: rebuilt, still checked, and said."""
     begun(peace, study, monkeypatch, capsys)
     shutil.copytree(study / "out", study / "kept")
     path = study / "out" / ".run" / "run.json"
@@ -605,17 +620,17 @@ def test_a_damaged_journal_costs_no_chunk(peace, study, monkeypatch, capsys):
             code, _, err = run(patch, capsys, *FIT, "--resume")
         assert code == 0, err
         assert "its run.json cannot be read" in err
-        assert "it was rebuilt from its 2 chunks" in err
+        assert "it was rebuilt from its 2 shards" in err
         assert len(asked) == 1
         assert numbers(study / "out") == numbers(peace / "out")
         shutil.rmtree(study / "out")
         shutil.copytree(study / "kept", study / "out")
 
 
-def test_options_and_force_outlive_the_journal(peace, study, monkeypatch, capsys):
-    """What a resume added is in the former copy, or in the chunks saved since.
+def test_options_and_force_outlive_the_manifest(peace, study, monkeypatch, capsys):
+    """What a resume added is in the copy of the manifest, or in the shards saved since.
 
-    Without both and without chunks nothing is lost, and the run starts anew.
+    Without both and without shards nothing is lost, and the run starts anew.
     """
     begun(peace, study, monkeypatch, capsys)
     folder = study / "out" / ".run"
@@ -626,13 +641,13 @@ def test_options_and_force_outlive_the_journal(peace, study, monkeypatch, capsys
     text = (folder / "run.json").read_text()
     (folder / "previous-run.json").write_text(text)
     (folder / "run.json").write_text(text[:-30])
-    found, note = run_folder.known_journal(study / "out")
+    found, note = run_folder.known_manifest(study / "out")
     assert found is not None
     assert (found.options, found.forced) == (["influence"], ["curves.csv has changed"])
-    assert "rebuilt from its 2 chunks" in note
+    assert "rebuilt from its 2 shards" in note
     for path in folder.glob("*.npz"):
         path.unlink()
-    assert run_folder.known_journal(study / "out")[0] == journal.from_dict(json.loads(text))
+    assert run_folder.known_manifest(study / "out")[0] == manifest.from_dict(json.loads(text))
     (folder / "previous-run.json").unlink()
     monkeypatch.setattr("jaxtrachea.fitting.fit.fit", from_peace(peace))
     shutil.copy(peace / "curves.csv", study)
@@ -691,7 +706,9 @@ def test_two_processes_and_two_devices(peace, study):
     found = [finish(p) for p in two(study, *FIT)]
     assert [code for code, _, _ in found] == [0, 0], found
     assert numbers(study / "out") == numbers(peace / "out")
-    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    # Added to those of `peace`: other code for the same sums rounds otherwise.
+    devices = "--xla_force_host_platform_device_count=2"
+    flags = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {devices}"}
     code, _, err = finish(start(study, *FIT[:3], "devices", **flags))
     assert code == 0, err
     assert numbers(study / "devices") == numbers(peace / "out")
@@ -700,9 +717,9 @@ def test_two_processes_and_two_devices(peace, study):
 @pytest.mark.slow
 @pytest.mark.parametrize("lost", [0, 1])
 def test_a_lost_process_ends_the_other(lost, tmp_path):
-    """Exit code 3 and a clear line within the patience; one process goes on alone."""
+    """Exit code 3 and a clear line within the timeout; one process goes on alone."""
     write_study(tmp_path, 60, 3)
-    pair = two(tmp_path, *FIT, "--patience", 5)
+    pair = two(tmp_path, *FIT, "--heartbeat-timeout", 5)
 
     def there():
         return any((tmp_path / "out" / ".run").glob("*.npz"))
@@ -719,4 +736,4 @@ def test_a_lost_process_ends_the_other(lost, tmp_path):
     assert "Traceback" not in err
     code, _, err = finish(start(tmp_path, *FIT, "--resume"))
     assert code == 0, err
-    assert "of 20 chunks are there" in err
+    assert "of 20 shards are there" in err

@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 
 from jaxtrachea.fitting.verdict import VERDICTS, verdict
-from jaxtrachea.inference.flat_directions import combinations, describe_flat
+from jaxtrachea.inference.weakest_direction import combinations, describe_weakest
 from jaxtrachea.status import ProfileEnd
 
 NAMES = ["EI_L", "GA_L", "k_M", "k_1"]
@@ -72,4 +72,4 @@ def test_two_separate_pairs_stay_apart():
 )
 def test_flat_direction_in_words(flat, error, text):
     v = np.array(flat, float)
-    assert describe_flat(NAMES, v / max(np.linalg.norm(v), 1), error) == text
+    assert describe_weakest(NAMES, v / max(np.linalg.norm(v), 1), error) == text

@@ -10,16 +10,12 @@ from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea.cli.load import load
+from jaxtrachea.cli.options import DataOption, OutOption
 from jaxtrachea.cli.terminal import Stages, Stop, into, progress_bar, table
 
 SpecsArgument = Annotated[
     list[Path], typer.Argument(help="Two or more fit specifications of the same curves.")
 ]
-DataOption = Annotated[
-    Path | None,
-    typer.Option("--data", help="Folder of the data files (default: SPEC's)."),
-]
-OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 CrossOption = Annotated[
     bool, typer.Option(help="Also predict each contact position from fits without it.")
 ]
@@ -86,7 +82,7 @@ def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
     from jaxtrachea.cli.specification import settings_of
     from jaxtrachea.fitting.fit import fit
     from jaxtrachea.inference.comparison import Model
-    from jaxtrachea.inference.cross_validation import leave_repeats_out
+    from jaxtrachea.inference.repeats import leave_repeats_out
 
     models = []
     with progress_bar() as bar:
@@ -146,7 +142,7 @@ def _sentences(models, rows) -> dict[str, str]:
 
 def _left_out_words(models) -> str:
     """What was left out, in words; "curves" if nothing was."""
-    from jaxtrachea.inference.cross_validation import repeats
+    from jaxtrachea.inference.repeats import repeats
 
     return repeats(models[0].result.study).words or "curves"
 

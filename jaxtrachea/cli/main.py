@@ -24,6 +24,7 @@ from jaxtrachea.cli import scene as cli_scene
 from jaxtrachea.cli import selfcheck as cli_selfcheck
 from jaxtrachea.cli import tradeoff as cli_tradeoff
 from jaxtrachea.cli.load import load
+from jaxtrachea.cli.options import DataOption, FitOptions, OutOption, SpecArgument, with_fields
 from jaxtrachea.cli.run import poor, refuse, run, show, write, write_tables
 from jaxtrachea.cli.terminal import Kept, Stop, complain, into, say_lost, table, to_stderr
 
@@ -40,23 +41,6 @@ app = typer.Typer(
 )
 #: Rows of a terminal table; the files hold all.
 MANY = 40
-
-SpecArgument = Annotated[Path, typer.Argument(help="Fit specification (TOML).")]
-DataOption = Annotated[
-    Path | None,
-    typer.Option("--data", help="Folder of the data files (default: SPEC's)."),
-]
-OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
-LeaveOption = Annotated[
-    bool, typer.Option("--leave-one-out", help="Also predict each curve from a fit of the others.")
-]
-ProfileOption = Annotated[
-    bool, typer.Option("--profile", help="Also compute 95 % intervals by profile likelihood.")
-]
-InfluenceOption = Annotated[
-    bool,
-    typer.Option("--influence", help="Also show which curves each estimate depends on."),
-]
 
 
 def main() -> None:
@@ -123,52 +107,32 @@ def check(spec: SpecArgument, data: DataOption = None) -> None:
 
 
 @app.command()
-def fit(
-    spec: SpecArgument,
-    data: DataOption = None,
-    out_dir: OutOption = None,
-    leave_one_out: LeaveOption = False,
-    profile: ProfileOption = False,
-    influence: InfluenceOption = False,
-    resume: cli_fit.ResumeOption = False,
-    rerun_failed: cli_fit.RerunOption = False,
-    force: cli_fit.ForceOption = False,
-    no_lock: cli_fit.NoLockOption = False,
-    distributed: cli_fit.DistributedOption = False,
-    coordinator: cli_fit.CoordinatorOption = None,
-    processes: cli_fit.ProcessesOption = None,
-    process: cli_fit.ProcessOption = None,
-    patience: cli_fit.PatienceOption = 100.0,
-) -> None:
+@with_fields(FitOptions)
+def fit(options: FitOptions) -> None:
     """Identify stiffnesses from curves; write report, tables, plots."""
     from jaxtrachea.cli.specification import settings_of
     from jaxtrachea.inference.analysis import Request
     from jaxtrachea.report.overview import overview
 
     clock = [time.perf_counter()]
-    meeting = cli_fit.meet(distributed, coordinator, processes, process, patience)
-    default = Path("out") / f"{spec.absolute().parent.name}-{spec.stem}"
-    how = cli_fit.How(out_dir, default, resume, rerun_failed, force, meeting, not no_lock)
-    cli_fit.check_options(how)
-    asked = {"leave-one-out": leave_one_out, "profile": profile, "influence": influence}
-    options = [name for name, wanted in asked.items() if wanted]
-    options = sorted({*options, *cli_fit.remembered(how)})
-    loaded, measurements, study = load(spec, data, refits=bool(options))
-    request = Request(loaded, study, settings_of(loaded), options)
+    spec, meeting = options.spec, cli_fit.meet(options)
+    cli_fit.check_options(options, meeting)
+    analyses = sorted({*options.analyses, *cli_fit.remembered(options)})
+    loaded, measurements, study = load(spec, options.data, refits=bool(analyses))
+    request = Request(loaded, study, settings_of(loaded), analyses)
     refuse(spec, request)
-    root = spec.parent if data is None else data
-    now = cli_fit.describe(how, spec, root, loaded, measurements, study, options)
+    now = cli_fit.describe(options, loaded, measurements, study, analyses)
     if meeting.process > 0:
-        cli_fit.help_out(how, now, study, request.settings)
+        cli_fit.help_out(options, meeting, now, study, request.settings)
         raise typer.Exit(0)
     clock.append(time.perf_counter())
-    with cli_fit.running(how, now, study, request.settings) as under:
+    with cli_fit.running(options, meeting, now, study, request.settings) as under:
         changed = {"settings": under.settings, "options": under.options}
         findings = run(dataclasses.replace(request, **changed), under.stop_if_asked, under.fit)
         clock.append(time.perf_counter())
         for name, reason in findings.unavailable.items():
             to_stderr(f"[yellow]no {name}:[/] {escape(reason)}")
-        write(under.folder, spec, loaded, measurements, findings, clock, under.journal)
+        write(under.folder, spec, loaded, measurements, findings, clock, under.manifest)
     show(overview(findings), under.folder.parent)
     failed = not findings.result.succeeded.all()
     raise typer.Exit(1 if failed or measurements.bad or poor(findings) else 0)

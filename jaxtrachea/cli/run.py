@@ -34,7 +34,7 @@ def run(request, stop_if_asked, fit=None):
         return findings
 
 
-def write(folder: Path, spec: Path, loaded, measurements, findings, clock, journal) -> None:
+def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manifest) -> None:
     """All files of one run; `clock`: when reading began, ended, and the fit ended."""
     import json
 
@@ -64,7 +64,7 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, journ
     timings = {name: ends[i + 1] - ends[i] for i, name in enumerate(phases)}
     made = provenance(
         spec, measurements.sha256(), str(jax.devices()[0]), loaded.fit.precision, timings
-    ) | {"run": journal}
+    ) | {"run": manifest}
     write_hdf5(folder / "results.h5", findings, made, loaded.data.model_dump(mode="json"))
     write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
     pictures = {path.name: path.read_bytes() for path in drawn}

@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from jaxtrachea.cli.options import OutOption
 from jaxtrachea.cli.terminal import (
     Stages,
     Stop,
@@ -21,7 +22,6 @@ from jaxtrachea.cli.terminal import (
 )
 
 SceneArgument = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
-OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 #: Rows of a terminal table; the files hold all.
 MANY = 12
 
@@ -114,7 +114,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
                 rows = [v[np.minimum(np.arange(start, start + size), total - 1)] for v in points]
                 depth = np.full(size, want.depth)
                 part = compute(swept, staged.material, *rows, depth, chunk=size)
-                parts.append(jax.tree.map(lambda v: np.asarray(v)[: total - start], part))  # noqa: B023
+                parts.append(jax.tree.map(lambda v, left=total - start: np.asarray(v)[:left], part))
                 bar.update(task, completed=min(start + size, total))
         out = jax.tree.map(lambda *v: np.concatenate(v), *parts)
         clock.append(time.perf_counter())

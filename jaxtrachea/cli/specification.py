@@ -4,15 +4,17 @@ import dataclasses
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
-from jaxtrachea.fitting.levenberg_marquardt import MOST_SLOTS, Tolerances
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, in_model, visible
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Noise, Study, build_study, check_curve
+from jaxtrachea.fitting.study import Study, build_study, check_curve
 from jaxtrachea.measurements.read import (
     BadCurve,
     Measurements,
 )
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.optimisation.levenberg_marquardt import MOST_SLOTS
+from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.trachea.section import geometry_of
 from jaxtrachea.units import UnitError, parse_quantity
 

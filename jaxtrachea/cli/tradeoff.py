@@ -9,12 +9,12 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from jaxtrachea.cli.options import OutOption
 from jaxtrachea.cli.terminal import Stop, into, progress_bar, say_lost, table
 
 SceneArgument = Annotated[
     Path | None, typer.Argument(help="Scene file (default: a ball on the tube of Table 1).")
 ]
-OutOption = Annotated[Path | None, typer.Option("--out", help="New folder for the results.")]
 CallsOption = Annotated[int, typer.Option("--calls", min=10, help="Timed calls of each setting.")]
 LanesOption = Annotated[
     int, typer.Option("--lanes", min=0, help="Poses in one batch; 0: no batch.")

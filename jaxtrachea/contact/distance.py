@@ -177,16 +177,7 @@ def approach(
 
     There is one minimum then. Two steps more than `track`, and no limit to the first one.
 
-    Args:
-        a: shape A.
-        b: shape B, of the same dtype.
-        pose: from B's frame to A's.
-        direction: unit vector, taken without derivative; shape (3,).
-        settings: `sharpness` and `warm_steps` are used.
-        beta: as in `signed_distance`.
-
-    Returns:
-        The `Contact`, as `signed_distance`.
+    The arguments are those of `track`; the direction is a unit vector.
     """
     scaled = _scaled(a, b, pose, settings, beta)
     d, pair = jax.lax.stop_gradient((direction, scaled.pair))

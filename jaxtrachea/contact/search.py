@@ -240,21 +240,11 @@ def polish(pair: Pair, d, steps: int):
     A rise within rounding is let pass: close to the minimum f no longer tells two directions apart,
     but the gradient does.
     """
-    slack = 8 * epsilon(d.dtype) * (1 + jnp.max(jnp.abs(pair.b)))
-    noise = _noise(pair)
 
-    def body(carry, _):
-        d, m, trust = carry
-        new, length = _walk(d, newton_step(m, noise), trust)
-        m_new = model(pair, new)
-        better = m_new.value <= m.value + slack
-        taken = (new, m_new, jnp.minimum(1.5 * trust, WIDEST))
-        kept = (d, m, 0.25 * length)
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), taken, kept), None
+    def radii(trust, length, *_):
+        return jnp.minimum(1.5 * trust, WIDEST), 0.25 * length
 
-    start = (d, model(pair, d), jnp.minimum(TRUST / pair.beta, WIDEST))
-    (d, m, _), _ = jax.lax.scan(body, start, None, length=steps)
-    return d, m.value
+    return _newton(pair, d, steps, jnp.minimum(TRUST / pair.beta, WIDEST), radii)
 
 
 def descend(pair: Pair, d, steps: int):
@@ -264,6 +254,29 @@ def descend(pair: Pair, d, steps: int):
     sides the Hessian says nothing: where the slope turns round along a step, the next one is as
     long as to the point where the tangents of both ends meet.
     """
+
+    def radii(trust, length, d, m, new, m_new):
+        fall, rise = _slope(d, m, new - d), _slope(new, m_new, new - d)
+        turned = (fall < 0) & (rise > 0)
+        meet = (m_new.value - m.value - rise) / jnp.where(turned, fall - rise, 1)
+        meet = jnp.clip(meet, 0.1, 0.9)
+        ahead = jnp.where(turned, (1 - meet) * length, jnp.minimum(GROWTH * trust, WIDEST))
+        return ahead, jnp.where(turned, meet, 0.25) * length
+
+    return _newton(pair, d, steps, jnp.asarray(WIDE, d.dtype), radii)
+
+
+def _newton(pair: Pair, d, steps: int, trust, radii):
+    """Newton steps that do not raise f, each within a radius; the direction and its f.
+
+    Args:
+        pair: the two shapes.
+        d: start.
+        steps: how many.
+        trust: first radius.
+        radii: from a radius, a step's length and both its ends with their models: the next radius
+            where the step is taken, and where it is not.
+    """
     slack = 8 * epsilon(d.dtype) * (1 + jnp.max(jnp.abs(pair.b)))
     noise = _noise(pair)
 
@@ -271,18 +284,12 @@ def descend(pair: Pair, d, steps: int):
         d, m, trust = carry
         new, length = _walk(d, newton_step(m, noise), trust)
         m_new = model(pair, new)
-        fall, rise = _slope(d, m, new - d), _slope(new, m_new, new - d)
-        turned = (fall < 0) & (rise > 0)
-        meet = (m_new.value - m.value - rise) / jnp.where(turned, fall - rise, 1)
-        meet = jnp.clip(meet, 0.1, 0.9)
+        onward, back = radii(trust, length, d, m, new, m_new)
         better = m_new.value <= m.value + slack
-        ahead = jnp.where(turned, (1 - meet) * length, jnp.minimum(GROWTH * trust, WIDEST))
-        taken = (new, m_new, ahead)
-        kept = (d, m, jnp.where(turned, meet, 0.25) * length)
+        taken, kept = (new, m_new, onward), (d, m, back)
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), taken, kept), None
 
-    start = (d, model(pair, d), jnp.asarray(WIDE, d.dtype))
-    (d, m, _), _ = jax.lax.scan(body, start, None, length=steps)
+    (d, m, _), _ = jax.lax.scan(body, (d, model(pair, d), trust), None, length=steps)
     return d, m.value
 
 

@@ -10,6 +10,7 @@ On numbers, once; nothing here is traced.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -70,51 +71,75 @@ def patches_of(
     """
     at = check_borders(borders)
     v, s, faces = np.asarray(vertices, float), np.asarray(s, float), np.asarray(faces)
+    _check(v, s, (centres, frames), (rounding, overlap, most))
+    if centres is not None and frames is not None:
+        centres, frames = np.asarray(centres, float), np.asarray(frames, float)
+    line = _line(s, centres, frames, at)
+    tube = _Tube(v, s, _edges(faces, s), line)
+    hulls = []
+    for span in zip(at[:-1], at[1:], strict=True):
+        hulls.append(_between(tube, span, overlap, rounding, most))
+        if progress is not None:
+            progress(1, len(at) - 1)
+    count = max(p[0].shape[1] for p in hulls)
+    cores = np.stack([_filled_up(p[0], count) for p in hulls])
+
+    def cast(x):
+        return jnp.asarray(np.asarray(x), jnp.zeros(0, dtype).dtype)
+
+    shapes = Shape(cast(cores), cast([p[1] for p in hulls]))
+    middles, lost, filled = (cast([p[i] for p in hulls]) for i in (2, 3, 4))
+    return Patches(shapes, middles, Centreline(*map(cast, line)), lost, filled)
+
+
+class _Tube(NamedTuple):
+    """Vertices, their s, edges of the surface and the centreline, as `_line` gives it."""
+
+    vertices: np.ndarray
+    s: np.ndarray
+    edges: np.ndarray
+    line: tuple
+
+
+def _check(v: np.ndarray, s: np.ndarray, curved: tuple, numbers: tuple[float, float, int]) -> None:
+    """Refuse arguments of `patches_of` that mean no tube.
+
+    Raises:
+        ValueError: naming the argument.
+    """
     if v.ndim != 2 or v.shape[1] != 3 or s.shape != v.shape[:1] or not np.isfinite(v).all():
         raise ValueError(
             f"vertices, s: expected finite (n, 3) and (n,), found {v.shape} and {s.shape}"
         )
-    if (centres is None) != (frames is None):
+    if (curved[0] is None) != (curved[1] is None):
         raise ValueError("centres, frames: expected both (a curved tube) or neither (a straight)")
+    rounding, overlap, most = numbers
     if not 0 < rounding < 1 or not overlap >= 0 or most < 4:
         raise ValueError(
             "rounding, overlap, most: expected in (0, 1), not below 0 and at least 4, found "
             f"{rounding:g}, {overlap:g}, {most}"
         )
-    if centres is not None and frames is not None:
-        centres, frames = np.asarray(centres, float), np.asarray(frames, float)
-    line = _line(s, centres, frames, at)
-    edges = _edges(faces, s)
-    made = []
-    for low, high in zip(at[:-1], at[1:], strict=True):
-        try:
-            a, b = np.clip((low - overlap, high + overlap), s.min(), s.max())
-            ends = [_section(v, s, edges, x) for x in (a, b)]
-            inside = v[(s >= a) & (s <= b)]
-            own = np.concatenate(
-                [
-                    _section(v, s, edges, low),
-                    _section(v, s, edges, high),
-                    v[(s >= low) & (s <= high)],
-                ]
-            )
-            made.append(_patch(inside, ends, own, _station(line, (a, b)), rounding, most))
-        except (QhullError, ValueError) as error:
-            raise ValueError(
-                f"the surface between s = {low:g} and {high:g} mm encloses nothing: "
-                f"{len(inside)} vertices; expected a tube round its centreline there"
-            ) from error
-        if progress is not None:
-            progress(1, len(at) - 1)
-    count = max(p[0].shape[1] for p in made)
-    cores = np.stack([_filled_up(p[0], count) for p in made])
 
-    def cast(x):
-        return jnp.asarray(np.asarray(x), jnp.zeros(0, dtype).dtype)
 
-    shapes = Shape(cast(cores), cast([p[1] for p in made]))
-    middles, lost, filled = (cast([p[i] for p in made]) for i in (2, 3, 4))
-    return Patches(shapes, middles, Centreline(*map(cast, line)), lost, filled)
+def _between(tube: _Tube, span: tuple[float, float], overlap: float, rounding: float, most: int):
+    """The patch between two borders, as `_patch`.
+
+    Raises:
+        ValueError: naming the span.
+    """
+    (low, high), (v, s, edges, line) = span, tube
+    a, b = np.clip((low - overlap, high + overlap), s.min(), s.max())
+    inside = v[(s >= a) & (s <= b)]
+    try:
+        ends = [_section(v, s, edges, x) for x in (a, b)]
+        own = [_section(v, s, edges, x) for x in span]
+        own = np.concatenate([*own, v[(s >= low) & (s <= high)]])
+        return _patch(inside, ends, own, _station(line, (a, b)), rounding, most)
+    except (QhullError, ValueError) as error:
+        raise ValueError(
+            f"the surface between s = {low:g} and {high:g} mm encloses nothing: "
+            f"{len(inside)} vertices; expected a tube round its centreline there"
+        ) from error
 
 
 def _line(s, centres, frames, at):

@@ -9,7 +9,6 @@ import errno
 import json
 import os
 import socket
-from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import IO
@@ -88,20 +87,6 @@ def take(folder: Path) -> Lock:
         "not notice each other; choose an --out on another file system, or say --no-lock and see "
         "to it yourself"
     )
-
-
-@contextlib.contextmanager
-def holding(folder: Path) -> Iterator[Lock]:
-    """Hold the lock of a folder until the block ends.
-
-    Raises:
-        Busy, NoLocks, OSError: as `take`.
-    """
-    lock = take(folder)
-    try:
-        yield lock
-    finally:
-        lock.release()
 
 
 def refuse_busy(folder: Path) -> None:

@@ -64,7 +64,7 @@ def save_each(
                 # A letter that the font has not got is drawn as a box.
                 warnings.filterwarnings("ignore", message=r"(?s).*Glyph .* missing")
                 draw().savefig(memory, format=Path(name).suffix[1:], **options)
-        except Exception as error:  # noqa: BLE001 (a picture is worth less than the numbers)
+        except Exception as error:  # a picture is worth less than the numbers
             lost[name] = " ".join(f"{type(error).__name__}: {error}".split())[:300]
             continue
         paths.append(folder / name)

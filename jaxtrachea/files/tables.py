@@ -10,10 +10,9 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 #: What spreadsheets take for the start of a formula, full-width forms included.
-FORMULA = "=+-@\t\r\n＝＋－＠"  # noqa: RUF001
+FORMULA = "=+-@\t\r\n＝＋－＠"
 _STARTS = re.compile(f"'*[{re.escape(FORMULA)}]")
 _QUOTED = re.compile(f"'+[{re.escape(FORMULA)}]")
 
@@ -38,13 +37,6 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
         writer = csv.writer(stream)
         writer.writerow([quoted(name) for name in columns])
         writer.writerows([[quoted(row.get(name, "")) for name in columns] for row in rows])
-
-
-def read_csv(path: Path) -> list[dict[str, Any]]:
-    """Rows of a file that `write_csv` wrote, all cells as text."""
-    with path.open(encoding="utf-8", newline="") as stream:
-        rows = csv.DictReader(stream)
-        return [{unquoted(k): unquoted(v) for k, v in row.items()} for row in rows]
 
 
 def write_text(path: Path, text: str) -> None:

@@ -1,4 +1,4 @@
-"""What the data say about each unknown: standard errors, correlation, flat combinations.
+"""What the data say about each unknown: standard errors, correlation, weakest direction.
 
 Everything is local, from the Jacobian at the estimate (Gauss-Newton information matrix); profile
 likelihood and bootstrap, which are not, are separate. With curve weights or a robust loss the
@@ -8,111 +8,15 @@ s^2 (J^T J)^-1.
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.special import stdtrit
 
-from jaxtrachea.fitting.cost import assemble, entry_scale, robust
-from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.map_lanes import batch_size, map_lanes
-from jaxtrachea.fitting.model import FitModel
-from jaxtrachea.fitting.residual import observations, residual
+from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.structure import leaving_alone
-from jaxtrachea.fitting.study import Study
 
 #: Smallest ratio of singular values of the scaled Jacobian that float64 can tell from zero.
 SINGULAR = 1e-7
-
-
-class Information(NamedTuple):
-    """One lane at its estimate; m entries of the residual, P unknowns.
-
-    Attributes:
-        bread: sum of b^2 J^T J (b: curve weight), whitened; (P, P).
-        meat: sum of b^4 J^T J; (P, P).
-        gradient: of the cost; (P,).
-        squares: sum of squared residuals of force (N^2) and markers (mm^2) in units of the given
-            precision; (2,).
-        weighted: the same with the squares of the curve weights; (2,).
-        counts: observed entries of each; (2,).
-        spread: median absolute residual of each, same units, 0 with a linear loss; (2,).
-        psi2: mean of psi(z)^2 over observed entries.
-        dpsi: mean of psi'(z).
-    """
-
-    bread: Float[Array, "P P"]
-    meat: Float[Array, "P P"]
-    gradient: Float[Array, " P"]
-    squares: Float[Array, "2"]
-    weighted: Float[Array, "2"]
-    counts: Float[Array, "2"]
-    spread: Float[Array, "2"]
-    psi2: Float[Array, ""]
-    dpsi: Float[Array, ""]
-
-    def rescaled(self, ratio: np.ndarray) -> "Information":
-        """The same lanes with sigma smaller by `ratio`, (lanes,): linear loss, no markers."""
-        square = ratio * ratio
-        return self._replace(
-            bread=self.bread * square[:, None, None],
-            meat=self.meat * square[:, None, None],
-            gradient=self.gradient * square[:, None],
-            psi2=self.psi2 * square,
-        )
-
-
-def information(
-    model: FitModel, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
-) -> Information:
-    """Information matrices and residual statistics of one lane."""
-    r = residual(model, theta, lane)
-    seen, forces = observations(lane)
-    scale = entry_scale(lane, sigma)
-    z = r.value * scale[None]
-    J = r.jacobian * (scale[None] * seen)[:, None]
-    b2 = (lane.balance * lane.balance)[:, None, None]
-    _, slope = robust(model.loss, z * z, model.loss_scale)
-
-    def psi(z):
-        return z * robust(model.loss, z * z, model.loss_scale)[1]
-
-    _, dpsi = jax.jvp(psi, (z,), (jnp.ones_like(z),))
-    gram = jnp.einsum("tim,tjm->tij", J, J)
-    gradient = jnp.einsum("tim,tm->ti", J * b2, z * slope)
-    total = jnp.sum(seen)
-    kinds = jnp.arange(seen.shape[1]) < forces
-
-    def by_kind(v):
-        return jnp.stack([jnp.sum(v[:, :forces]), jnp.sum(v[:, forces:])])
-
-    def spread(force):
-        # A sort, and the dearest part of all this: only where the noise is taken from it.
-        if model.loss == "linear":
-            return jnp.zeros((), theta.dtype)
-        mine = (seen > 0) & (kinds == force)[None]
-        return jnp.nanmedian(jnp.where(mine, jnp.abs(r.value), jnp.nan))
-
-    return Information(
-        bread=assemble(model, b2 * gram, lane),
-        meat=assemble(model, b2 * b2 * gram, lane),
-        gradient=assemble(model, gradient, lane),
-        squares=by_kind(r.value**2 * seen),
-        weighted=by_kind(r.value**2 * seen * b2[:, 0]),
-        counts=by_kind(seen),
-        spread=jnp.stack([spread(True), spread(False)]),
-        psi2=jnp.sum(psi(z) ** 2 * seen) / total,
-        dpsi=jnp.sum(dpsi * seen) / total,
-    )
-
-
-def informations(
-    study: Study, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, batch: int = 128
-) -> Information:
-    """`information` of many lanes, on the host; leading axis = order of `lanes`."""
-    batch = batch_size(len(lanes), batch)
-    return map_lanes(information, study, theta, sigma, rows=lanes, batch=batch)
 
 
 class Uncertainty(NamedTuple):
@@ -123,34 +27,35 @@ class Uncertainty(NamedTuple):
         correlation: (lanes, P, P).
         condition: ratio of the largest to the smallest singular value of the Jacobian in relative
             coordinates (a change of 1 = 100 %); inf if singular; (lanes,).
-        flat: unit vector, in relative coordinates, of the least determined combination; (lanes, P).
-        flat_se: its standard error (relative); (lanes,).
-        blind: directions that the structure leaves open (`structure`), relative coordinates,
-            orthonormal rows; the other rows are 0; (lanes, P, P).
+        weakest_direction: unit vector, in relative coordinates, of the least determined
+            combination; (lanes, P).
+        weakest_se: its standard error (relative); (lanes,).
+        structural_null_space: directions that the structure leaves open (`structure`), relative
+            coordinates, orthonormal rows; the other rows are 0; (lanes, P, P).
         half_width: of the 95 % interval, in standard errors (Student's t); (lanes,).
-        along: how all unknowns move where one is moved and the others follow in the least costly
-            way, to first order, scaled coordinates; row i: by a unit change of unknown i;
-            (lanes, P, P).
+        conditional_direction: how all unknowns move where one is moved and the others follow in
+            the least costly way, to first order, scaled coordinates; row i: by a unit change of
+            unknown i; (lanes, P, P).
         dispersion: of twice the rise of the cost along each unknown: where the cost is a
             likelihood s^2, else such that its curvature gives `se` (Kent 1982,
             doi:10.1093/biomet/69.1.19); (lanes, P).
         covariance: of the estimates, scaled coordinates; 0 for held unknowns, and without the
-            `silent` directions, along which it is infinite; (lanes, P, P).
-        silent: all directions that change no residual at the estimate, whatever the cause, scaled
-            coordinates, rows; the other rows are 0; (lanes, P, P).
+            `null_space`, along which it is infinite; (lanes, P, P).
+        null_space: all directions that change no residual at the estimate, whatever the cause,
+            scaled coordinates, rows; the other rows are 0; (lanes, P, P).
     """
 
     se: Float[np.ndarray, "lanes P"]
     correlation: Float[np.ndarray, "lanes P P"]
     condition: Float[np.ndarray, " lanes"]
-    flat: Float[np.ndarray, "lanes P"]
-    flat_se: Float[np.ndarray, " lanes"]
-    blind: Float[np.ndarray, "lanes P P"]
+    weakest_direction: Float[np.ndarray, "lanes P"]
+    weakest_se: Float[np.ndarray, " lanes"]
+    structural_null_space: Float[np.ndarray, "lanes P P"]
     half_width: Float[np.ndarray, " lanes"]
-    along: Float[np.ndarray, "lanes P P"]
+    conditional_direction: Float[np.ndarray, "lanes P P"]
     dispersion: Float[np.ndarray, "lanes P"]
     covariance: Float[np.ndarray, "lanes P P"]
-    silent: Float[np.ndarray, "lanes P P"]
+    null_space: Float[np.ndarray, "lanes P P"]
 
 
 def analyse(
@@ -190,25 +95,26 @@ def analyse(
     meat = _scaled(np.asarray(info.meat), unit) * kappa[:, None, None]
     covariance = inverse @ meat @ inverse
     variance = np.diagonal(covariance, axis1=1, axis2=2)
-    blind = np.any((np.abs(vectors) > 1e-3) & np.isinf(values)[:, None], axis=2)
+    unseen = np.any((np.abs(vectors) > 1e-3) & np.isinf(values)[:, None], axis=2)
     with np.errstate(invalid="ignore", divide="ignore"):
         root = np.sqrt(variance)
         correlation = covariance / root[:, :, None] / root[:, None]
-    se = np.where(free, np.where(blind, np.inf, np.sqrt(variance)) * relative, np.nan)
+    se = np.where(free, np.where(unseen, np.inf, np.sqrt(variance)) * relative, np.nan)
     both = free[:, :, None] & free[:, None]
-    condition, flat, flat_se = _flattest(values, vectors, free, covariance, usable)
+    condition, weakest, weakest_se = _weakest(values, vectors, free, covariance, usable)
     correlation = np.where(both, correlation, np.nan)
-    along = _along(values, vectors, free)
+    conditional = _conditional_directions(values, vectors, free)
     whole = [np.trace(_scaled(np.asarray(m), relative), axis1=1, axis2=2) for m in info[:2]]
-    dispersion = dpsi[:, None] * _ratio(along, meat, bread, whole[1] * kappa, whole[0])
-    along = along * relative[:, None] / relative[:, :, None]
+    dispersion = dpsi[:, None] * _ratio(conditional, meat, bread, whole[1] * kappa, whole[0])
+    conditional = conditional * relative[:, None] / relative[:, :, None]
     covariance = covariance * relative[:, :, None] * relative[:, None]
     lost = np.isinf(values) & (np.sum(vectors**2 * free[:, :, None], axis=1) > 0.5)
-    silent = np.swapaxes(vectors, 1, 2) * lost[:, :, None] * (free * relative)[:, None]
+    null_space = np.swapaxes(vectors, 1, 2) * lost[:, :, None] * (free * relative)[:, None]
     return Uncertainty(
-        se=se, correlation=correlation, condition=condition, flat=flat, flat_se=flat_se,
-        blind=structural, half_width=half, along=along, dispersion=dispersion,
-        covariance=covariance, silent=silent,
+        se=se, correlation=correlation, condition=condition, weakest_direction=weakest,
+        weakest_se=weakest_se, structural_null_space=structural, half_width=half,
+        conditional_direction=conditional, dispersion=dispersion, covariance=covariance,
+        null_space=null_space,
     )  # fmt: skip
 
 
@@ -220,7 +126,7 @@ def half_widths(dof: np.ndarray, *, noise_given: bool) -> np.ndarray:
     return np.where(dof > 0, stdtrit(np.maximum(dof, 1), 0.975), half)
 
 
-def _along(values, vectors, free) -> np.ndarray:
+def _conditional_directions(values, vectors, free) -> np.ndarray:
     """Columns of the inverse over their diagonal, in relative coordinates; singular ones too."""
     largest = np.max(np.where(np.isfinite(values), values, 0), axis=1, keepdims=True)
     floor = SINGULAR**2 * np.where(largest > 0, largest, 1)
@@ -232,14 +138,14 @@ def _along(values, vectors, free) -> np.ndarray:
     return np.where(both, inverse / diagonal[:, :, None], np.eye(values.shape[1]))
 
 
-def _ratio(along, meat, bread, meat_trace, bread_trace) -> np.ndarray:
+def _ratio(directions, meat, bread, meat_trace, bread_trace) -> np.ndarray:
     """What the meat is of the bread along each row, or in the mean where both vanish.
 
     The traces are of the whole matrices: those of all unknowns, held ones too.
     """
 
     def form(m):
-        return np.einsum("lip,lpq,liq->li", along, m, along)
+        return np.einsum("lip,lpq,liq->li", directions, m, directions)
 
     with np.errstate(invalid="ignore", divide="ignore"):
         return (form(meat) + 1e-12 * meat_trace[:, None]) / (
@@ -281,7 +187,7 @@ def _spectrum(matrix: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.where(keep, values, np.inf), vectors
 
 
-def _flattest(values, vectors, free, covariance, usable):
+def _weakest(values, vectors, free, covariance, usable):
     """Condition number, least determined direction and its standard error, of all lanes.
 
     Where every unknown is held nothing is left undetermined: 1, no direction, no error.
@@ -291,14 +197,14 @@ def _flattest(values, vectors, free, covariance, usable):
     singular = np.any(np.isinf(values) & own, axis=1) | ~usable
     nothing = usable & ~free.any(axis=1)
     order = np.where(own, np.where(np.isinf(values), -1, values), np.inf)
-    flattest = np.argmin(order, axis=1)
-    v = vectors[lanes, :, flattest] * free
+    weakest = np.argmin(order, axis=1)
+    v = vectors[lanes, :, weakest] * free
     sign = np.sign(v[lanes, np.argmax(np.abs(v), axis=1)])
-    flat = v * sign[:, None]
-    variance = np.einsum("lp,lpq,lq->l", flat, covariance, flat)
+    direction = v * sign[:, None]
+    variance = np.einsum("lp,lpq,lq->l", direction, covariance, direction)
     largest = np.max(np.where(own & np.isfinite(values), values, 0), axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        condition = np.sqrt(largest / values[lanes, flattest])
-    flat_se = np.where(singular, np.inf, np.sqrt(np.maximum(variance, 0)))
+        condition = np.sqrt(largest / values[lanes, weakest])
+    weakest_se = np.where(singular, np.inf, np.sqrt(np.maximum(variance, 0)))
     condition = np.where(nothing, 1, np.where(singular, np.inf, condition))
-    return condition, np.where(nothing[:, None], 0, flat), np.where(nothing, 0, flat_se)
+    return condition, np.where(nothing[:, None], 0, direction), np.where(nothing, 0, weakest_se)

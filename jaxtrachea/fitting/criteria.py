@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fitting.covariance import Information
-from jaxtrachea.fitting.shared import unknown_count
+from jaxtrachea.fitting.information import Information
+from jaxtrachea.fitting.joint_information import unknown_count
 from jaxtrachea.fitting.study import Study
 
 #: Share of the largest datum that its own rounding may be: no residual counts for less.

@@ -16,11 +16,12 @@ from jaxtyping import Array, Float
 from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.cost import entry_scale, evaluate, robust, rounding_cost
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.levenberg_marquardt import Solved, Tolerances, active_set, promise
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import residual_value
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.levenberg_marquardt import Solved
+from jaxtrachea.optimisation.trust_region import Tolerances, active_set, promise
 from jaxtrachea.status import FitStatus
 
 #: Cosine between residual and Jacobian up to which a point counts as a minimum.
@@ -50,7 +51,7 @@ def descend(
     sigma: np.ndarray,
     *,
     method: Literal["lbfgs", "adam"] = "lbfgs",
-    tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
+    tolerances: Tolerances = Tolerances(),
     batch: int = 256,
     learning_rate: float = 0.03,
     progress: Callable[[int], None] | None = None,

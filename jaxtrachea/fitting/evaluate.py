@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.fitting.cost import robust
-from jaxtrachea.fitting.covariance import Information, Uncertainty, half_widths
+from jaxtrachea.fitting.covariance import Uncertainty, half_widths
 from jaxtrachea.fitting.criteria import criteria
+from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, precision_unit
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult
@@ -112,7 +113,8 @@ def _no_uncertainty(half: np.ndarray) -> Uncertainty:
     none, square = np.zeros((len(half), 0)), np.zeros((len(half), 0, 0))
     nan = np.full(len(half), np.nan)
     return Uncertainty(
-        se=none, correlation=square, condition=nan, flat=none, flat_se=nan, blind=square,
-        half_width=half, along=square, dispersion=none, covariance=square,
-        silent=square,
+        se=none, correlation=square, condition=nan, weakest_direction=none,
+        weakest_se=nan, structural_null_space=square,
+        half_width=half, conditional_direction=square, dispersion=none, covariance=square,
+        null_space=square,
     )  # fmt: skip

@@ -7,9 +7,9 @@ import numpy as np
 
 from jaxtrachea.fitting.covariance import Uncertainty, analyse
 from jaxtrachea.fitting.criteria import criteria
+from jaxtrachea.fitting.doubt import doubtful, left_in_doubt
 from jaxtrachea.fitting.evaluate import evaluated
-from jaxtrachea.fitting.levenberg_marquardt import Solved
-from jaxtrachea.fitting.map_lanes import batch_size
+from jaxtrachea.fitting.joint_information import held_count, marginal, summed_gradient
 from jaxtrachea.fitting.minima import (
     Minima,
     information_per_lane,
@@ -19,12 +19,13 @@ from jaxtrachea.fitting.minima import (
 from jaxtrachea.fitting.noise import next_sigma, precision_unit
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.fitting.scrutiny import doubtful, left_in_doubt, scrutinise
+from jaxtrachea.fitting.scrutiny import scrutinise
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.shared import held_count, marginal, summed_gradient
 from jaxtrachea.fitting.starts import scales
 from jaxtrachea.fitting.structure import Structure, null_spaces, reduced, structure_of, suspicious
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.levenberg_marquardt import Solved
+from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.status import FitStatus
 
 #: Condition number of the Jacobian up to which it proves that the structure leaves nothing open.
@@ -35,7 +36,7 @@ REPLACED = 3
 
 def fit(
     study: Study,
-    settings: Settings = Settings(),  # noqa: B008 (frozen)
+    settings: Settings = Settings(),
     progress: Callable[[int, int], None] | None = None,
     starts: np.ndarray | None = None,
 ) -> FitResult:
@@ -139,8 +140,8 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
         pool = marginal(study, pool, held, alive)
         unknowns = (unknowns or 0) - held_count(study, held, alive)
     noise_given = study.noise_given[0] and both
-    blind = _open_directions(study, theta, structure)
-    u = analyse(pool, relative, held, noise_given=noise_given, unknowns=unknowns, structural=blind)
+    open_ = _open_directions(study, theta, structure)
+    u = analyse(pool, relative, held, noise_given=noise_given, unknowns=unknowns, structural=open_)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
 
         def unscale(v):

@@ -7,16 +7,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxtrachea.fitting.cost import LaneCost
-from jaxtrachea.fitting.covariance import Information, informations
 from jaxtrachea.fitting.descent import descend
-from jaxtrachea.fitting.levenberg_marquardt import Solved, levenberg_marquardt
-from jaxtrachea.fitting.map_lanes import batch_size
+from jaxtrachea.fitting.information import Information, informations
+from jaxtrachea.fitting.joint_information import pooled, unknown_count
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, noise_rounds
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.shared import pooled, solve_jointly, unknown_count
+from jaxtrachea.fitting.shared import solve_jointly
 from jaxtrachea.fitting.starts import add_starts, best, draw_starts
 from jaxtrachea.fitting.structure import Structure, reduced
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
+from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.status import FitStatus
 
 #: Lanes computed together where only a few are left.

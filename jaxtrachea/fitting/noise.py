@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxtrachea.fitting.covariance import Information
+from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.study import Study
 
 

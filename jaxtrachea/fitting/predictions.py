@@ -4,9 +4,10 @@ import dataclasses
 
 import numpy as np
 
-from jaxtrachea.fitting.map_lanes import batch_size, map_lanes
+from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.residual import residual_value
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.programs import batch_size
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 
 from jaxtrachea.fitting.cost import LaneCost
-from jaxtrachea.fitting.levenberg_marquardt import Solved, levenberg_marquardt
-from jaxtrachea.fitting.map_lanes import batch_size
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.structure import leaving_alone, pins
+from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
+from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 #: Rounds of the search for the ends; each is one batched solve.
@@ -42,9 +42,9 @@ class Sides:
         self.best = result.theta[lane] if origin is None else origin
         u = result.uncertainty
         self.dispersion = u.dispersion[lane, unknown]
-        self.along = u.along[lane, unknown] * self.sign[:, None]
+        self.direction = u.conditional_direction[lane, unknown] * self.sign[:, None]
         if origin is not None:
-            self.along = np.zeros_like(self.along)
+            self.direction = np.zeros_like(self.direction)
         self.pinned = self._pinned()
         self.target = u.half_width[lane]
         lanes = result.study.lanes
@@ -66,7 +66,7 @@ class Sides:
         pinned = np.arange(self.best.shape[1])[None] == self.unknown[:, None]
         for s in np.flatnonzero(self.result.undetermined[self.lane].any(axis=1)):
             lane, i = int(self.lane[s]), int(self.unknown[s])
-            rows = self.result.uncertainty.blind[lane]
+            rows = self.result.uncertainty.structural_null_space[lane]
             rest = leaving_alone(rows[rows.any(axis=1)], i)
             names = [p.name for p, _, _ in self.result.study.unknowns[lane]]
             pinned[s] |= pins(names, rest)
@@ -178,7 +178,7 @@ class Path:
         gap = distances[right] - distances[left]
         alone = gap <= 0
         slope = (thetas[right] - thetas[left]) / np.where(alone, 1, gap)[:, None]
-        slope = np.where(alone[:, None], self.sides.along[side], slope)
+        slope = np.where(alone[:, None], self.sides.direction[side], slope)
         beyond = distance > distances[right]
         base = np.where(beyond, right, left)
         move = slope * (distance - distances[base])[:, None]

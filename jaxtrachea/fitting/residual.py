@@ -277,12 +277,22 @@ class _Pressed(NamedTuple):
     corner: Float[Array, " N"] | None
 
 
-def _press(model: FitModel, tube, free, skeleton, by_beam, value, s_c, D, blend) -> _Pressed:
-    """One press at s_c (mm) with tool displacements D (mm), given the skeleton there."""
+class _Tool(NamedTuple):
+    """A press without data; the fields are those of a `Lane`'s trial."""
+
+    value: Float[Array, " J"]
+    s_c: Float[Array, ""]
+    displacement: Float[Array, " N"]
+    blend: Float[Array, ""] | None
+
+
+def _press(model: FitModel, tube, free, skeleton, by_beam, trial: Lane | _Tool) -> _Pressed:
+    """One press, given the skeleton at its place."""
+    D, blend = trial.displacement, trial.blend
     eye = jnp.eye(free.shape[0], dtype=free.dtype)
 
     def at_contact(free):
-        return _at_contact(model, free, value, s_c, tube)
+        return _at_contact(model, free, trial.value, trial.s_c, tube)
 
     def push(t):
         return jax.jvp(at_contact, (free,), (t,))
@@ -332,8 +342,7 @@ def _press(model: FitModel, tube, free, skeleton, by_beam, value, s_c, D, blend)
 
 def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, trial: Lane):
     """Whitened residual of one trial, (m,), and its Jacobian by the free columns, (Jf, m)."""
-    place = trial.value, trial.s_c, trial.displacement, trial.blend
-    pressed = _press(model, tube, free, skeleton, by_beam, *place)
+    pressed = _press(model, tube, free, skeleton, by_beam, trial)
     joints, d_joints = None, None
     if skeleton.joints is not None and pressed.d_joints is not None:
         joints = _times(pressed.force, skeleton.joints)
@@ -373,7 +382,8 @@ def force_jacobian(
     places = _Places(s_c[None], value[None], marked=False)
     of_lane = _skeleton_and_derivative(model, free[None], places, tube)
     skeleton, by_beam = jax.tree.map(lambda v: v[0], of_lane)
-    pressed = _press(model, tube, free, skeleton, by_beam, value, s_c, displacement, blend)
+    tool = _Tool(value, s_c, displacement, blend)
+    pressed = _press(model, tube, free, skeleton, by_beam, tool)
     return pressed.d_force + pressed.d_offset[:, None]
 
 

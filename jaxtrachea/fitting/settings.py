@@ -4,7 +4,7 @@ import dataclasses
 from typing import Literal
 
 from jaxtrachea._arguments import check_record
-from jaxtrachea.fitting.levenberg_marquardt import Tolerances
+from jaxtrachea.optimisation.trust_region import Tolerances
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fitting.levenberg_marquardt import Solved
 from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.fitting.press_scale import around_touch
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.levenberg_marquardt import Solved
 from jaxtrachea.status import FitStatus
 
 #: Times that an infeasible start is drawn again, each time from twice the box.

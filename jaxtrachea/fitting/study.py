@@ -3,23 +3,22 @@
 A *lane* is the smallest set of curves that share unknowns: the whole study if any parameter is
 shared, one specimen otherwise, one trial if all free parameters belong to trials. In a *joint*
 study lanes are specimens although they share unknowns: every lane holds a copy of the shared
-ones, and the solver keeps the copies equal. Lanes have equal shapes (curves of unequal length are
-padded with weight zero), so that one compiled program fits any number of them at once. What they
-are compared with is in `residual`.
+ones, and the solver keeps the copies equal. How curves become arrays is in `lanes`, what these are
+compared with in `residual`.
 """
 
 import dataclasses
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
 
 import jax
 import numpy as np
 from jaxtyping import Int
 
-from jaxtrachea._arguments import check_record, check_word
+from jaxtrachea._arguments import check_word
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lanes import Balance, Noise, Unknown, group, lanes_of, unknowns_of
 from jaxtrachea.fitting.model import Common, FitModel, Loss, columns_of, numbers_of
 from jaxtrachea.fitting.onset import blends, natural_steps, onset_is_sought, within_reach
 from jaxtrachea.fitting.parameters import DEFAULTS, SKELETON, Parameter, in_model
@@ -27,7 +26,6 @@ from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import Geometry
 
-Balance = Literal["curve", "sample"]
 #: The table of parameters, or what differs from the defaults of the model, by name.
 Table = Sequence[Parameter] | Mapping[str, Mapping[str, object]]
 
@@ -50,7 +48,7 @@ class Study:
     parameters: tuple[Parameter, ...]
     lanes: Lane
     curves: tuple[tuple[Curve, ...], ...]
-    unknowns: tuple[tuple[tuple[Parameter, str, str], ...], ...]
+    unknowns: tuple[tuple[Unknown, ...], ...]
     noise_given: tuple[bool, bool]
     joint: bool = False
 
@@ -118,57 +116,13 @@ class Study:
         return one({c.specimen for c in curves}), one({c.trial for c in curves})
 
 
-@dataclasses.dataclass(frozen=True)
-class Noise:
-    """Standard deviations; None: estimated from the residuals.
-
-    Attributes:
-        force: N; a curve's own per-sample sigma comes before it.
-        joints: mm.
-    """
-
-    force: float | None = None
-    joints: float | None = None
-
-    def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
-
-        Raises:
-            ValueError: naming the field, what was found and what is expected.
-        """
-        check_record(self)
-        for name in ("force", "joints"):
-            if (value := getattr(self, name)) is not None and value <= 0:
-                raise ValueError(
-                    f"{name} is {value:g}; expected a standard deviation of more than 0, or None"
-                )
-
-
-def group(
-    curves: Sequence[Curve], parameters: Sequence[Parameter], *, joint: bool = False
-) -> list[list[Curve]]:
-    """Divide curves into lanes by the widest scope among the free parameters.
-
-    By specimens if joint, or if none is free.
-    """
-    scopes = {"specimen"} if joint else {p.scope for p in parameters if not p.fixed}
-    scopes = scopes or {"specimen"}
-    if "shared" in scopes:
-        return [list(curves)]
-    lanes: dict[tuple[str, str], list[Curve]] = {}
-    for curve in curves:
-        key = (curve.specimen, "" if "specimen" in scopes else curve.trial)
-        lanes.setdefault(key, []).append(curve)
-    return list(lanes.values())
-
-
 def build_study(
     curves: Measurements | Sequence[Curve],
     geometry: Geometry,
-    options: Options = Options(),  # noqa: B008 (frozen)
+    options: Options = Options(),
     parameters: Table | None = None,
     *,
-    noise: Noise = Noise(),  # noqa: B008 (frozen)
+    noise: Noise = Noise(),
     balance: Balance = "curve",
     loss: Loss = "linear",
     loss_scale: float = 1.345,
@@ -198,12 +152,7 @@ def build_study(
             exist, a curve without a contact position where one is needed, with specimen and trial
             named; a parameter that the model does not have.
     """
-    check_word("balance", balance, Balance)
-    check_word("loss", loss, Loss)
-    if not 0 < loss_scale < np.inf:
-        raise ValueError(f"loss_scale is {loss_scale}; expected a finite number, more than 0")
-    if tool_radius is not None and not 0 <= tool_radius < np.inf:
-        raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
+    _check_choices(balance, loss, loss_scale, tool_radius)
     if isinstance(curves, Measurements):
         _warn_of(curves.bad)
         curves = curves.curves
@@ -215,42 +164,44 @@ def build_study(
     joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1
     groups = group(curves, parameters, joint=joint)
-    unknowns = [_unknowns(lane, parameters) for lane in groups]
-    sizes = _Sizes(
-        trials=max(map(len, groups)),
-        samples=max(len(c.force) for c in curves),
-        rings=geometry.rings,
-        unknowns=max(map(len, unknowns)),
-        joints=any(c.joint_displacement is not None for c in curves),
-    )
-    mean_length = float(np.mean([len(c.force) for c in curves]))
-    reach = -1.0 if tool_radius is None else tool_radius
-    lanes = [
-        _lane(lane, names, parameters, geometry, noise, balance, mean_length, reach, sizes)
-        for lane, names in zip(groups, unknowns, strict=True)
-    ]
-    stacked = jax.tree.map(lambda *arrays: np.stack(arrays), *lanes)
+    unknowns = [unknowns_of(lane, parameters) for lane in groups]
+    lanes = lanes_of(
+        groups, unknowns, parameters, geometry,
+        noise=noise, balance=balance, tool_radius=tool_radius,
+    )  # fmt: skip
     if onset_is_sought(parameters, options):
-        stacked = stacked._replace(blend=blends(stacked, groups, noise.force, parameters, options))
-        stacked = within_reach(stacked, parameters)
+        lanes = lanes._replace(blend=blends(lanes, groups, noise.force, parameters, options))
+        lanes = within_reach(lanes, parameters)
     known = noise.force is not None or all(c.sigma is not None for c in curves)
     model = FitModel(
-        tube=numbers_of(geometry),
-        options=options,
-        columns=columns_of(parameters),
-        loss=loss,
-        loss_scale=float(loss_scale),
-        common=_common(unknowns, parameters),
-    )
+        tube=numbers_of(geometry), options=options, columns=columns_of(parameters),
+        loss=loss, loss_scale=float(loss_scale), common=_common(unknowns, parameters),
+    )  # fmt: skip
     return Study(
         model=model,
         parameters=tuple(parameters),
-        lanes=stacked,
+        lanes=lanes,
         curves=tuple(map(tuple, groups)),
         unknowns=tuple(map(tuple, unknowns)),
         noise_given=(known, noise.joints is not None),
         joint=joint,
     )
+
+
+def _check_choices(
+    balance: Balance, loss: Loss, loss_scale: float, tool_radius: float | None
+) -> None:
+    """Refuse words and numbers that mean nothing.
+
+    Raises:
+        ValueError: naming the argument.
+    """
+    check_word("balance", balance, Balance)
+    check_word("loss", loss, Loss)
+    if not 0 < loss_scale < np.inf:
+        raise ValueError(f"loss_scale is {loss_scale}; expected a finite number, more than 0")
+    if tool_radius is not None and not 0 <= tool_radius < np.inf:
+        raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
 
 
 def _warn_of(bad: Sequence[BadCurve]) -> None:
@@ -268,15 +219,6 @@ def _table(parameters: Table | None, options: Options, curves) -> Sequence[Param
     changes = parameters or {}
     joints = any(c.joint_displacement is not None for c in curves)
     return default_parameters(in_model(options, joints=joints, named=changes), changes)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Sizes:
-    trials: int
-    samples: int
-    rings: int
-    unknowns: int
-    joints: bool
 
 
 def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
@@ -311,16 +253,6 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
         raise InputError(found, place=where)
 
 
-def _unknowns(lane: list[Curve], parameters) -> list[tuple[Parameter, str, str]]:
-    """Distinct unknowns of a lane, in parameter order."""
-    names: dict[tuple[Parameter, str, str], None] = {}
-    for p in parameters:
-        if not p.fixed:
-            for curve in lane:
-                names.setdefault(_key(p, curve))
-    return list(names)
-
-
 def _common(unknowns, parameters) -> Common:
     """See `FitModel.common`."""
     free = [p.name for p in parameters if not p.fixed]
@@ -329,62 +261,6 @@ def _common(unknowns, parameters) -> Common:
         return "all"
     beams = ([name for name in lane if name in SKELETON] for lane in names)
     return "beam" if all(len(b) == len(set(b)) for b in beams) else "nothing"
-
-
-def _key(p: Parameter, curve: Curve) -> tuple[Parameter, str, str]:
-    specimen = "" if p.scope == "shared" else curve.specimen
-    return p, specimen, curve.trial if p.scope == "trial" else ""
-
-
-def _lane(
-    curves, unknowns, parameters, geometry, noise, balance, mean_length, reach, sizes
-) -> Lane:
-    """One lane as padded float64 arrays."""
-    T, N, J, P = sizes.trials, sizes.samples, len(parameters), sizes.unknowns
-    joints = np.zeros((T, N, sizes.rings)) if sizes.joints else None
-    lane: dict[str, Any] = {
-        "s_c": np.full(T, float(geometry.length) / 2),
-        "displacement": np.zeros((T, N)),
-        "force": np.zeros((T, N)),
-        "precision": np.zeros((T, N)),
-        "joints": joints,
-        "joint_precision": None if joints is None else joints.copy(),
-        "balance": np.ones(T),
-        "blend": None,
-        "value": np.tile([p.value for p in parameters], (T, 1)).astype(np.float64),
-        "index": np.full((T, J), -1, np.int32),
-        "lower": np.zeros(P),
-        "upper": np.zeros(P),
-        "active": np.zeros(P),
-    }
-    place = {key: i for i, key in enumerate(unknowns)}
-    for i, (p, _, _) in enumerate(unknowns):
-        lane["lower"][i], lane["upper"][i] = p.to_scaled(p.lower), p.to_scaled(p.upper)
-        lane["active"][i] = 1
-    for t, curve in enumerate(curves):
-        n = len(curve.force)
-        if curve.s_c is not None:
-            lane["s_c"][t] = curve.s_c
-        lane["displacement"][t, :n], lane["force"][t, :n] = curve.displacement, curve.force
-        sigma = curve.sigma if curve.sigma is not None else noise.force
-        lane["precision"][t, :n] = 1.0 if sigma is None else 1 / np.asarray(sigma)
-        lane["balance"][t] = np.sqrt(mean_length / n) if balance == "curve" else 1.0
-        for j, p in enumerate(parameters):
-            if not p.fixed:
-                lane["index"][t, j] = place[_key(p, curve)]
-        if curve.joint_displacement is not None and curve.joint_rings is not None:
-            weight = 1.0 if noise.joints is None else 1 / noise.joints
-            seen, at = _seen_joints(curve, geometry, reach), curve.joint_rings
-            lane["joints"][t, :n, at] = np.where(seen, curve.joint_displacement, 0).T
-            lane["joint_precision"][t, :n, at] = np.where(seen, weight, 0).T
-    return Lane(**lane)
-
-
-def _seen_joints(curve: Curve, geometry: Geometry, reach: float) -> np.ndarray:
-    """Which markers of a curve count: observed, and not under the tool; (N, M)."""
-    seen = np.isfinite(np.asarray(curve.joint_displacement))
-    x = np.asarray(geometry.ring_positions)[curve.joint_rings]
-    return seen if curve.s_c is None else seen & (np.abs(x - curve.s_c) > reach)
 
 
 def default_parameters(

@@ -17,10 +17,10 @@ from jaxtyping import Bool, Float
 from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.map_lanes import batch_size
 from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.optimisation.programs import batch_size
 
 Kind = Literal["parametric", "residual"]
 #: Refits handed to the solver at a time; bounds the memory.
@@ -58,7 +58,7 @@ class Bootstrap:
 
 def bootstrap(
     result: FitResult,
-    settings: Settings = Settings(),  # noqa: B008 (frozen)
+    settings: Settings = Settings(),
     *,
     count: int = 200,
     kind: Kind = "parametric",

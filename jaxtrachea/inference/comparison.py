@@ -10,8 +10,8 @@ from jaxtrachea.fitting.criteria import Criteria
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.inference.cross_validation import Missed
 from jaxtrachea.inference.effective import CORRELATED, effective_samples
+from jaxtrachea.inference.repeats import Missed
 from jaxtrachea.inference.residuals import rms
 
 #: Difference of AICc up to which models cannot be told apart, and from which on they clearly can

@@ -1,21 +1,19 @@
 """Cross-validation: curves, contact positions or trials predicted by a fit without them."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
-from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.starts import draw_starts
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.residuals import rms
-from jaxtrachea.measurements.read import Curve
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -107,10 +105,7 @@ def leave_one_out(study: Study, settings: Settings, progress=None) -> LeftOut:
     rows = np.arange(len(lane))
     held = np.zeros(lanes.s_c.shape, bool)
     held[rows, trial] = True
-    plain = dataclasses.replace(settings, scrutiny=False)
-    result = fit(without(chosen, held), plain, progress)
-    touched = with_own_touch(chosen, held, result.theta, plain)
-    seen = predictions(chosen, touched.theta)
+    result, touched, seen = refitted(chosen, held, settings, progress)
     force, data = seen.force[rows, trial], lanes.force[rows, trial]
     observed = lanes.precision[rows, trial] > 0
     lost = np.any(observed & ~np.isfinite(force), axis=1)
@@ -203,129 +198,21 @@ def with_own_touch(
     return OwnTouch(found.theta, found.succeeded | ~own.any(axis=1))
 
 
-class Missed(NamedTuple):
-    """Errors of what was left out of each lane, and what became of the refits behind them.
-
-    Attributes:
-        error: root mean square force residual of the curves left out, over the lane's largest
-            force; NaN where nothing can be left out or a refit predicts nothing; (lanes,).
-        refits: fits without a part of the lane; (lanes,).
-        unconverged: of them, those that did not converge (`FitStatus`) or left the onset or offset
-            of a curve left out so, yet predict: their best point counts; (lanes,).
-        lost: of them, those without a finite prediction of all that they left out; (lanes,).
-    """
-
-    error: Float[np.ndarray, " lanes"]
-    refits: Int[np.ndarray, " lanes"]
-    unconverged: Int[np.ndarray, " lanes"]
-    lost: Int[np.ndarray, " lanes"]
-
-
-class Repeats(NamedTuple):
-    """What can be left out, one entry for each fit.
-
-    Attributes:
-        lanes: whose; (rows,).
-        held: which trials; (rows, T).
-        kinds: `positions`, `trials` or `specimens`; (rows,).
-    """
-
-    lanes: Int[np.ndarray, " rows"]
-    held: Bool[np.ndarray, "rows T"]
-    kinds: tuple[str, ...]
-
-    @property
-    def words(self) -> str:
-        """What is left out, in words."""
-        order = ("positions", "trials", "specimens")
-        return " and ".join(kind for kind in order if kind in self.kinds)
-
-
-def repeats(study: Study) -> Repeats:
-    """What each specimen repeats, within every lane.
-
-    Contact positions where a specimen has several (repeats of a position go together), else its
-    trials; where all unknowns are shared, a specimen of one curve as a whole. None where a
-    stiffness belongs to a single curve: no other tells of it. (Its onset and offset are fitted.)
-    """
-    free = [p for p in study.parameters if not p.fixed]
-    width = study.lanes.s_c.shape[1]
-    lanes, held, kinds = [], [], []
-    own = any(p.scope == "trial" and p.name not in OF_THE_PRESS for p in free)
-    shared = all(p.scope == "shared" or p.name in OF_THE_PRESS for p in free)
-    for lane, curves in enumerate(() if own else study.curves):
-        for kind, groups in _groups(curves, shared=shared):
-            for group in groups:
-                row = np.zeros(width, bool)
-                row[group] = True
-                lanes.append(lane)
-                held.append(row)
-                kinds.append(kind)
-    return Repeats(
-        np.array(lanes, int), np.array(held, bool).reshape(len(held), width), tuple(kinds)
-    )
-
-
-def _groups(curves: tuple[Curve, ...], *, shared: bool) -> list[tuple[str, list[list[int]]]]:
-    """For each specimen of a lane, what is left out and the trials of each."""
-    specimens: dict[str, list[int]] = {}
-    for t, curve in enumerate(curves):
-        specimens.setdefault(curve.specimen, []).append(t)
-    out = []
-    for trials in specimens.values():
-        places: dict[float | None, list[int]] = {}
-        for t in trials:
-            places.setdefault(curves[t].s_c, []).append(t)
-        if len(places) > 1:
-            out.append(("positions", list(places.values())))
-        elif len(trials) > 1:
-            out.append(("trials", [[t] for t in trials]))
-        elif shared and len(specimens) > 1:
-            out.append(("specimens", [trials]))
-    return out
-
-
-def leave_repeats_out(
-    study: Study, settings: Settings, progress: Callable[[int, int], None] | None = None
-) -> Missed:
-    """Fit every lane without each of its `repeats` and predict the curves left out.
-
-    The onset and the force offset of a curve left out are fitted to it, all else kept. A refit that
-    does not converge predicts from its best point, and is counted: to leave it out would spare a
-    model the curves that it does worst on. One that predicts nothing makes its lane NaN.
+def refitted(
+    study: Study, held: Bool[np.ndarray, "lanes T"], settings: Settings, progress
+) -> tuple[FitResult, OwnTouch, Prediction]:
+    """Every lane fitted without the trials `held`, and what it then says of all its trials.
 
     Args:
-        study: the study.
-        settings: as for `fit`.
+        study: the study, with all its data.
+        held: trials left out.
+        settings: as for `fit`; no doubt is followed up.
         progress: as for `fit`.
 
     Returns:
-        The `Missed` of all lanes.
+        The fit, onsets and offsets of the trials left out, and residuals of all trials.
     """
-    count = len(study.curves)
-    lanes, held, _ = repeats(study)
-    if not len(lanes):
-        return Missed(np.full(count, np.nan), *np.zeros((3, count), int))
-    chosen = study.take(lanes)
     plain = dataclasses.replace(settings, scrutiny=False)
-    result = fit(without(chosen, held), plain, progress)
-    touched = with_own_touch(chosen, held, result.theta, plain)
-    seen = predictions(chosen, touched.theta).force
-    observed = held[:, :, None] & (chosen.lanes.precision > 0)
-    lost = np.any(observed & ~np.isfinite(seen), axis=(1, 2))
-    converged = result.succeeded & touched.converged
-
-    def of_lane(rows):
-        return np.bincount(lanes[rows], minlength=count)
-
-    missed = Missed(
-        error=np.full(count, np.nan),
-        refits=of_lane(np.ones(len(lanes), bool)),
-        unconverged=of_lane(~converged & ~lost),
-        lost=of_lane(lost),
-    )
-    for lane in np.flatnonzero((missed.refits > 0) & (missed.lost == 0)):
-        rows = lanes == lane
-        peak = np.max(np.abs(study.lanes.force[lane]))
-        missed.error[lane] = float(rms(seen[rows][observed[rows]])) / peak
-    return missed
+    result = fit(without(study, held), plain, progress)
+    touched = with_own_touch(study, held, result.theta, plain)
+    return result, touched, predictions(study, touched.theta)

@@ -20,8 +20,7 @@ from jaxtyping import Float, Int
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.config import FitSpec, SpecError
-from jaxtrachea.fitting.covariance import informations
-from jaxtrachea.fitting.map_lanes import program
+from jaxtrachea.fitting.information import informations
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.residual import force_jacobian
@@ -30,6 +29,7 @@ from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.bootstrap import Bootstrap
 from jaxtrachea.inference.design_press import marginal, of_a_new_press
 from jaxtrachea.inference.labels import succeeded
+from jaxtrachea.optimisation.programs import program
 
 Criterion = Literal["D", "A", "E"]
 #: Estimates of a lane, out of its bootstrap replicates, that a design is averaged over.

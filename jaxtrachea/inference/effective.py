@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
+from jaxtrachea.fitting.joint_information import held_count, unknown_count
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.result import FitResult, interval95, within_bounds
-from jaxtrachea.fitting.shared import held_count, unknown_count
 from jaxtrachea.fitting.starts import of_unknowns
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.residuals import lag_correlation

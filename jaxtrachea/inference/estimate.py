@@ -14,9 +14,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxtrachea.fitting.cost import LaneCost, evaluate
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.levenberg_marquardt import FIRST_RADIUS, RUNNING, State, Tolerances, iterate
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.trust_region import FIRST_RADIUS, RUNNING, State, Tolerances, iterate
 from jaxtrachea.trachea.geometry import Geometry
 
 
@@ -43,7 +43,7 @@ def estimate(
     lane: Lane,
     sigma: Float[Array, "2"],
     geometry: Geometry | None = None,
-    tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
+    tolerances: Tolerances = Tolerances(),
 ) -> Estimate:
     """Fit one lane from one start; differentiable by everything but start, model, tolerances.
 

@@ -26,13 +26,14 @@ from jaxtyping import Array, Bool, Float
 from jaxtrachea.fitting.cost import assemble, entry_scale, robust
 from jaxtrachea.fitting.covariance import SINGULAR
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.map_lanes import batch_size, map_lanes
+from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import observations, residual
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.estimate import hessian
 from jaxtrachea.inference.labels import succeeded
+from jaxtrachea.optimisation.programs import batch_size
 
 #: det(1 - hat matrix of a curve) below which the curve alone determines some combination.
 _ALONE = 1e-9

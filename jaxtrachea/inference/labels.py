@@ -6,8 +6,8 @@ from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.press_scale import sizes_of_press
 from jaxtrachea.fitting.result import FitResult, unknown_label, verdict_of
 from jaxtrachea.fitting.verdict import VERDICTS
-from jaxtrachea.inference.flat_directions import describe_flat
 from jaxtrachea.inference.profile import Profiles
+from jaxtrachea.inference.weakest_direction import describe_weakest
 
 #: What reports say in the place of estimates.
 NOTHING_FITTED = "every parameter is fixed: nothing was fitted, the model was evaluated"
@@ -29,7 +29,7 @@ def peak_force(result: FitResult, lane: int) -> float:
     return max(float(np.max(np.abs(c.force))) for c in result.study.curves[lane])
 
 
-def flat_sentence(result: FitResult, lane: int) -> str:
+def weakest_sentence(result: FitResult, lane: int) -> str:
     """The least determined combination of a lane in words."""
     if not succeeded(result, lane):
         return "no estimate"
@@ -37,8 +37,9 @@ def flat_sentence(result: FitResult, lane: int) -> str:
         return NOTHING_FITTED
     names = [unknown_label(result, lane, i) for i in range(len(result.study.unknowns[lane]))]
     u = result.uncertainty
-    return describe_flat(
-        names, u.flat[lane], float(u.flat_se[lane]), u.blind[lane], result.undetermined[lane],
+    return describe_weakest(
+        names, u.weakest_direction[lane], float(u.weakest_se[lane]),
+        u.structural_null_space[lane], result.undetermined[lane],
         press_sizes(result, lane),
     )  # fmt: skip
 
@@ -66,7 +67,7 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
         word = verdict_of(result, lane, i, profiles)
         groups.setdefault(word, []).append(unknown_label(result, lane, i))
     said = [f"{word}: {', '.join(groups[word])}" for word in VERDICTS if word in groups]
-    said.append(flat_sentence(result, lane))
+    said.append(weakest_sentence(result, lane))
     if result.study.joint and result.unexamined[lane].any():
         said.append("not shown: only the local error was looked at; --profile looks further")
     if result.minima[lane] > 1:

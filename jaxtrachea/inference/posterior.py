@@ -16,7 +16,7 @@ import dataclasses
 import functools
 import importlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,13 +25,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea.fitting.cost import weights
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.map_lanes import batch_size, program
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import observations, residual_value
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.chains import grade, lenient, mixing, quantiles
 from jaxtrachea.inference.labels import succeeded
 from jaxtrachea.inference.posterior_start import Start, around_the_draws, around_the_fit, mode
+from jaxtrachea.optimisation.programs import batch_size, program
 
 #: Steps of each chain before its draws count.
 _WARM_UP = 500
@@ -137,19 +137,28 @@ def _spread(drawn: tuple[bool, bool], values: Array) -> Float[Array, "2"]:
     return out.at[jnp.flatnonzero(jnp.array(drawn), size=sum(drawn))].set(values)
 
 
-def _density(model: FitModel, drawn, lane: Lane, sigma, centre, root):
+class _Target(NamedTuple):
+    """A lane with its noise, and the affine map from where the sampler moves to the real line."""
+
+    lane: Lane
+    sigma: Any
+    centre: Any
+    root: Any
+
+
+def _density(model: FitModel, drawn, target: _Target):
     """Log posterior where the sampler moves, and the way from there to the real line."""
 
     def to_x(y):
-        return centre + jnp.sum(root * y[None], axis=1)
+        return target.centre + jnp.sum(target.root * y[None], axis=1)
 
-    return lambda y: log_density(model, drawn, lane, sigma, to_x(y)), to_x
+    return lambda y: log_density(model, drawn, target.lane, target.sigma, to_x(y)), to_x
 
 
-def _warm_up(model: FitModel, drawn, acceptance, lane: Lane, sigma, centre, root, y, key):
+def _warm_up(model: FitModel, drawn, acceptance, target: _Target, y, key):
     """Place, step and inverse mass matrix of one chain after its warm-up."""
     blackjax = sampler()
-    density, _ = _density(model, drawn, lane, sigma, centre, root)
+    density, _ = _density(model, drawn, target)
     adaptation = blackjax.window_adaptation(
         blackjax.nuts, density, is_mass_matrix_diagonal=False, max_num_doublings=_DOUBLINGS,
         target_acceptance_rate=acceptance, adaptation_info_fn=lambda *_: None,
@@ -158,10 +167,10 @@ def _warm_up(model: FitModel, drawn, acceptance, lane: Lane, sigma, centre, root
     return state.position, tuned["step_size"], tuned["inverse_mass_matrix"]
 
 
-def _draw(model: FitModel, drawn, draws: int, lane: Lane, sigma, centre, root, warm, key):
+def _draw(model: FitModel, drawn, draws: int, target: _Target, warm, key):
     """Draws of one chain on the real line, (D, Q), whether each diverged, and its last place."""
     blackjax = sampler()
-    density, to_x = _density(model, drawn, lane, sigma, centre, root)
+    density, to_x = _density(model, drawn, target)
     y, step_size, inverse_mass = warm
     kernel = blackjax.nuts(density, step_size, inverse_mass, max_num_doublings=_DOUBLINGS)
 
@@ -173,15 +182,15 @@ def _draw(model: FitModel, drawn, draws: int, lane: Lane, sigma, centre, root, w
     return x, lost, state.position
 
 
-def _warm_up_chains(model: FitModel, drawn, acceptance, lane: Lane, sigma, centre, root, y, keys):
+def _warm_up_chains(model: FitModel, drawn, acceptance, target: _Target, y, keys):
     """`_warm_up` of all chains of one lane."""
-    one = functools.partial(_warm_up, model, drawn, acceptance, lane, sigma, centre, root)
+    one = functools.partial(_warm_up, model, drawn, acceptance, target)
     return jax.vmap(one)(y, keys)
 
 
-def _draw_chains(model: FitModel, drawn, draws, lane: Lane, sigma, centre, root, warm, keys):
+def _draw_chains(model: FitModel, drawn, draws, target: _Target, warm, keys):
     """`_draw` of all chains of one lane."""
-    one = functools.partial(_draw, model, drawn, draws, lane, sigma, centre, root)
+    one = functools.partial(_draw, model, drawn, draws, target)
     return jax.vmap(one)(warm, keys)
 
 
@@ -255,18 +264,18 @@ def _run(base: FitResult, drawn, draws: int, times: int, start: dict[int, Start]
     places = map(np.stack, zip(*(start[int(k)] for k in of), strict=True))
     centre, root, y = places
     model = base.study.model
-    warm_up = program(_warm_up_chains, model, drawn, axes=(None, *[0] * 6))
+    warm_up = program(_warm_up_chains, model, drawn, axes=(None, 0, 0, 0))
     draw = program(_draw_chains, model, drawn, draws)
 
     def keys(turn: int):
         key = jax.random.fold_in(jax.random.key(seed), again * 1000 + turn)
         return jnp.stack([jax.random.split(jax.random.fold_in(key, k), chains) for k in of])
 
-    sigma, parts = base.whitened_sigma[of], []
+    target, parts = _Target(lane, base.whitened_sigma[of], centre, root), []
     with lenient():
-        warm = warm_up(_ACCEPTANCE[again], lane, sigma, centre, root, y, keys(0))
+        warm = warm_up(_ACCEPTANCE[again], target, y, keys(0))
         for turn in range(times):
-            x, lost, last = draw(lane, sigma, centre, root, warm, keys(1 + turn))
+            x, lost, last = draw(target, warm, keys(1 + turn))
             warm = (last, *warm[1:])
             parts.append((np.asarray(x), np.asarray(lost)))
     whole = (np.concatenate(v, axis=2)[: len(lanes)] for v in zip(*parts, strict=True))

@@ -105,7 +105,7 @@ def choose(result: FitResult, names: Sequence[str] | None) -> tuple[np.ndarray, 
 
 def profiles(
     result: FitResult,
-    settings: Settings = Settings(),  # noqa: B008 (frozen)
+    settings: Settings = Settings(),
     names: Sequence[str] | None = None,
     *,
     points: int = 10,

@@ -94,6 +94,15 @@ class BadCurve:
         place = "" if self.message.startswith(self.source) else f"{self.source}: "
         return f"{self.kind}: {place}{self.message}; {self.cure}"
 
+    @property
+    def cells(self) -> list[str]:
+        """A row of the table of what could not be used, under `BAD_HEAD`."""
+        return [self.specimen, self.trial, self.kind, self.message, self.cure]
+
+
+#: Heads of a table of `BadCurve.cells`.
+BAD_HEAD = ["specimen", "trial", "kind", "what", "cure"]
+
 
 @dataclass(frozen=True, eq=False)
 class RawCurve:
@@ -116,8 +125,32 @@ class RawCurve:
     joint_displacement: np.ndarray | None = None
     time: np.ndarray | None = None
 
+    @classmethod
+    def of_columns(
+        cls, key: tuple[str, str], source: str, values: Mapping[str, np.ndarray], **fields
+    ) -> "RawCurve":
+        """The curve of a table's columns.
 
-#: "loading" is the former name of "first".
+        Args:
+            key: specimen and trial.
+            source: file and place.
+            values: columns by role, in mm and N.
+            fields: the other fields.
+        """
+        joints = [role for role in values if role.startswith("joint_")]
+        return cls(
+            *key,
+            source,
+            values["displacement"],
+            values["force"],
+            sigma=values.get("sigma"),
+            joint_rings=np.array([int(r[6:]) - 1 for r in joints]) if joints else None,
+            joint_displacement=np.stack([values[r] for r in joints], axis=1) if joints else None,
+            **fields,
+        )
+
+
+#: "loading" means "first".
 LOADINGS = ("last", "first", "loading", "all", "require-monotone")
 ROLE_DIMENSIONS = {
     "s": "length",

@@ -82,7 +82,7 @@ def press_oblique(
     s_c: ArrayLike,
     phi_c: ArrayLike,
     displacement: ArrayLike,
-    options: Options = Options(),  # noqa: B008 (frozen)
+    options: Options = Options(),
     *,
     rings: Rings = "arch2",
     axial: bool = True,
@@ -151,7 +151,7 @@ def press_path(
     phi_c: ArrayLike,
     displacement: ArrayLike,
     friction: ArrayLike,
-    options: Options = Options(),  # noqa: B008 (frozen)
+    options: Options = Options(),
     *,
     rings: Rings = "arch2",
     axial: bool = True,

@@ -190,7 +190,7 @@ def press(
     material: Material,
     s_c: ArrayLike,
     displacement: ArrayLike,
-    options: Options = Options(),  # noqa: B008 (frozen)
+    options: Options = Options(),
     *,
     onset: ArrayLike | None = None,
     blend: ArrayLike | None = None,

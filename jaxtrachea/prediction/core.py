@@ -14,7 +14,7 @@ from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import material_and_values
 from jaxtrachea.mechanics.press import press
 
-#: Slope along a blind direction, over what its terms add up to, from which it counts.
+#: Slope along a direction of the null space, over what its terms add up to, from which it counts.
 _ACTS = 1e-6
 
 
@@ -49,6 +49,24 @@ class Predicted(NamedTuple):
     status: Int[Array, "*n"]
     bend: Float[Array, "2 ..."]
     deepest: Int[Array, ""]
+
+
+class Estimate(NamedTuple):
+    """What a fit knows of the free parameters of one curve, scaled coordinates.
+
+    Attributes:
+        free: estimates; (F,).
+        value: all parameters in their units, used where they are not free; (J,).
+        covariance: of `free`; 0 for what is held; (F, F).
+        null_space: rows: directions of `free` that the fit leaves undetermined; (B, F).
+        half_width: of a 95 % interval in standard errors.
+    """
+
+    free: Float[Array, " F"]
+    value: Float[Array, " J"]
+    covariance: Float[Array, "F F"]
+    null_space: Float[Array, "B F"]
+    half_width: Float[Array, ""]
 
 
 def respond(
@@ -100,16 +118,16 @@ def jacobian(model: FitModel, free, value, s_c, displacement, blend=None):
 def standard_errors(
     slope: Float[Array, "F ..."],
     covariance: Float[Array, "F F"],
-    blind: Float[Array, "B F"],
+    null_space: Float[Array, "B F"],
     unseen: Float[Array, "..."] | None = None,
 ) -> Float[Array, "..."]:
-    """Delta method: sqrt(J C J^T), inf where a blind direction changes the quantity.
+    """Delta method: sqrt(J C J^T), inf where a direction of the null space changes the quantity.
 
     By more than `unseen`, the slope that the fit could not tell from zero there; None: 0.
     """
     variance = jnp.einsum("f...,fg,g...->...", slope, covariance, slope)
-    along = jnp.abs(jnp.einsum("bf,f...->b...", blind, slope))
-    terms = jnp.einsum("bf,f...->b...", jnp.abs(blind), jnp.abs(slope))
+    along = jnp.abs(jnp.einsum("bf,f...->b...", null_space, slope))
+    terms = jnp.einsum("bf,f...->b...", jnp.abs(null_space), jnp.abs(slope))
     least = max(_ACTS, 100 * float(jnp.finfo(slope.dtype).eps))
     least = least * terms if unseen is None else jnp.maximum(least * terms, unseen[None])
     undetermined = jnp.any(along > least, axis=0)
@@ -117,11 +135,12 @@ def standard_errors(
 
 
 def _unseen(slope: Float[Array, "F N"], slack: Float[Array, "N F"]) -> Float[Array, " N"]:
-    """Slope along a blind direction that the fit could not tell from zero, see `predicted`.
+    """Slope along the null space that the fit could not tell from zero, see `predicted`.
 
-    A direction is blind where the sum of squares of its slopes over the samples of the fit is a
-    tiny share of that of all slopes. Where the same place is pressed no deeper, its slope is at
-    most that share, however it compares with its own terms: a direction of one unknown has but one.
+    A direction belongs to the null space where the sum of squares of its slopes over the samples of
+    the fit is a tiny share of that of all slopes. Where the same place is pressed no deeper, its
+    slope is at most that share, however it compares with its own terms: a direction of one unknown
+    has but one.
     """
     size = jnp.linalg.norm(slope.T * slack, axis=1)
     return jnp.where(jnp.any(slack > 0, axis=1), jnp.max(size), 0)
@@ -129,11 +148,7 @@ def _unseen(slope: Float[Array, "F N"], slack: Float[Array, "N F"]) -> Float[Arr
 
 def predicted(
     model: FitModel,
-    free: Float[Array, " F"],
-    value: Float[Array, " J"],
-    covariance: Float[Array, "F F"],
-    blind: Float[Array, "B F"],
-    half_width: Float[Array, ""],
+    estimate: Estimate,
     s_c: Float[Array, ""],
     displacement: Float[Array, " N"],
     blend: Float[Array, ""] | None = None,
@@ -143,22 +158,19 @@ def predicted(
 
     Args:
         model: of the fit (static).
-        free: estimates, scaled coordinates.
-        value: all parameters in their units, used where they are not free.
-        covariance: of `free`; 0 for what is held.
-        blind: rows: directions of `free` that the fit leaves undetermined.
-        half_width: of a 95 % interval in standard errors.
+        estimate: with its uncertainty.
         s_c: mm.
         displacement: mm; at least one.
         blend: see `respond`.
         slack: where the fit has pressed, how far it sees slopes: its least ratio of singular values
             times the root of its samples, times the size of each unknown; elsewhere 0; None: 0.
     """
+    free, value, covariance, null_space, half_width = estimate
     out, status, slopes = jacobian(model, free, value, s_c, displacement, blend)
-    se = jax.tree.map(lambda slope: standard_errors(slope, covariance, blind), slopes)
+    se = jax.tree.map(lambda slope: standard_errors(slope, covariance, null_space), slopes)
     if slack is not None:
         unseen = _unseen(slopes.force, slack)
-        se = se._replace(force=standard_errors(slopes.force, covariance, blind, unseen))
+        se = se._replace(force=standard_errors(slopes.force, covariance, null_space, unseen))
     deepest = jnp.argmax(jnp.abs(displacement))
     pull = covariance @ slopes.force[:, deepest]
     along = jnp.sqrt(jnp.maximum(slopes.force[:, deepest] @ pull, 0))

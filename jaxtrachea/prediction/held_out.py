@@ -9,11 +9,11 @@ import numpy as np
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.map_lanes import program
 from jaxtrachea.fitting.onset import onset_is_sought
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study, check_curve
 from jaxtrachea.measurements.read import BadCurve, Curve
+from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import force_and_slope
 from jaxtrachea.prediction.predict import CurvePrediction, predict_sources
 from jaxtrachea.prediction.sources import Source, source_of
@@ -277,7 +277,7 @@ def _merged(stored: StoredFit, source: Source, own: _Own) -> Source:
         source,
         free=free,
         covariance=covariance,
-        blind=source.blind @ follow.T,
+        null_space=source.null_space @ follow.T,
         status=max(source.status, _own_status(own)),
         message=said,
         absorbed=(own.slopes[moving].T, inverse @ (A / own.sigma[:, None]).T),

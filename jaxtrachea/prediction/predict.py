@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxtrachea.fitting.map_lanes import program
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.prediction.core import Predicted, Response, predicted
+from jaxtrachea.optimisation.programs import program
+from jaxtrachea.prediction.core import Estimate, Predicted, Response, predicted
 from jaxtrachea.prediction.sources import Source, slack_of, source_of
 from jaxtrachea.results.stored import StoredFit, from_result
 from jaxtrachea.status import PredictionStatus, PressStatus
@@ -121,8 +121,7 @@ def predict_sources(
     def stack(name):
         return np.stack([getattr(source, name) for source in sources])
 
-    columns = [stack(n) for n in ("free", "value", "covariance", "blind", "half_width")]
-    columns += [places, padded]
+    columns = [Estimate._make(map(stack, Estimate._fields)), places, padded]
     presses = zip(sources, s, padded, strict=True)
     slack = np.stack([slack_of(stored, source, float(at), D) for source, at, D in presses])
     blend = stack("blend")
@@ -134,10 +133,8 @@ def predict_sources(
         for first in range(0, len(members), size):
             at = members[first : first + size]
             rows = np.pad(at, (0, size - len(at)), mode="edge")
-            part = jax.tree.map(
-                np.asarray,
-                run(*(jnp.asarray(v[rows]) for v in arrays), slack=jnp.asarray(slack[rows])),
-            )
+            of_rows = jax.tree.map(lambda v, rows=rows: jnp.asarray(v[rows]), [*arrays, slack])
+            part = jax.tree.map(np.asarray, run(*of_rows[:-1], slack=of_rows[-1]))
             for row, k in enumerate(at):
                 own = jax.tree.map(lambda v, row=row: v[row], part)
                 sigma = None if sigmas is None else sigmas[k]

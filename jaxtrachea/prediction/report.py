@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea.files.tables import markdown_table, number
-from jaxtrachea.measurements.read import BadCurve
+from jaxtrachea.measurements.curve import BAD_HEAD, BadCurve
 from jaxtrachea.prediction.held_out import Compared
 from jaxtrachea.prediction.predict import CurvePrediction
 from jaxtrachea.results.stored import StoredFit
@@ -157,7 +157,6 @@ def report_data(
     ]
     parts += ["![curves](curves.png)", "![measured against predicted](measured_predicted.png)"]
     if bad:
-        cells = [[b.specimen, b.trial, b.kind, b.message, b.cure] for b in bad]
-        head = ["specimen", "trial", "kind", "what", "cure"]
-        parts += ["## Curves that could not be used", _table(head, cells, "errors.csv")]
+        cells = [b.cells for b in bad]
+        parts += ["## Curves that could not be used", _table(BAD_HEAD, cells, "errors.csv")]
     return "\n\n".join(parts) + "\n"

@@ -23,7 +23,7 @@ class Source:
         free: estimates of the free columns, scaled coordinates; 0 where the fit has none; (F,).
         value: all parameters in their units; (J,).
         covariance: of `free`; (F, F).
-        blind: directions that the fit leaves undetermined, rows; (P, F).
+        null_space: directions that the fit leaves undetermined, rows; (P, F).
         half_width: of a 95 % interval in standard errors.
         sigma: of force, N, and markers, mm; (2,).
         own: free columns that are the curve's own and not in the fit.
@@ -41,7 +41,7 @@ class Source:
     free: np.ndarray
     value: np.ndarray
     covariance: np.ndarray
-    blind: np.ndarray
+    null_space: np.ndarray
     half_width: np.ndarray
     sigma: np.ndarray
     own: tuple[int, ...]
@@ -151,12 +151,12 @@ def _taken(stored: StoredFit, specimen, trial, lane: int, index, own, note: str)
     both = known[:, None] & known[None]
     free = np.where(known, stored.theta[lane][pick] if known.any() else 0.0, 0.0)
     covariance = np.zeros(both.shape)
-    blind = np.zeros((max(stored.theta.shape[1], 1), len(index)))
+    null_space = np.zeros((max(stored.theta.shape[1], 1), len(index)))
     said = [note] if note else []
     status = PredictionStatus.OK
     if known.any():
         covariance = np.where(both, stored.covariance[lane][np.ix_(pick, pick)], 0.0)
-        blind = np.where(known, stored.blind[lane][:, pick], 0.0)
+        null_space = np.where(known, stored.null_space[lane][:, pick], 0.0)
         held = [p.name for p, k, i in zip(stored.study.free, known, pick, strict=True)
                 if k and stored.at_bound[lane, i]]  # fmt: skip
         if held:
@@ -169,7 +169,7 @@ def _taken(stored: StoredFit, specimen, trial, lane: int, index, own, note: str)
         free=free,
         value=np.array([p.value for p in stored.study.parameters]),
         covariance=covariance,
-        blind=blind,
+        null_space=null_space,
         half_width=np.asarray(stored.half_width[lane]),
         sigma=stored.sigma[lane],
         own=own,
@@ -189,7 +189,7 @@ def _none(stored: StoredFit, specimen, trial, status: PredictionStatus, message:
         free=nan,
         value=np.full(J, np.nan),
         covariance=np.full((F, F), np.nan),
-        blind=np.zeros((max(stored.theta.shape[1], 1), F)),
+        null_space=np.zeros((max(stored.theta.shape[1], 1), F)),
         half_width=np.asarray(np.nan),
         sigma=np.full(2, np.nan),
         own=(),
@@ -208,7 +208,7 @@ def slack_of(stored: StoredFit, source: Source, s: float, displacement: np.ndarr
         return np.nan if c.s_c is None else c.s_c
 
     here = [c for c in curves if np.isclose(place(c), s, rtol=0, atol=1e-9, equal_nan=True)]
-    if not here or not source.blind.any():
+    if not here or not source.null_space.any():
         return out
     # Of a scaled coordinate; an onset's steps are as large as the presses.
     size = [1.0 if p.scale == "log" or p.name in OF_MEASUREMENT else max(abs(v), 1e-3)

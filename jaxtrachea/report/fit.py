@@ -11,7 +11,7 @@ from jaxtrachea.inference.effective import CORRELATED
 from jaxtrachea.inference.labels import NOTHING_FITTED, lane_label, succeeded, verdict_sentence
 from jaxtrachea.inference.residuals import worst
 from jaxtrachea.inference.rows import ONE_BY_ONE, listed, more_of
-from jaxtrachea.measurements.read import BadCurve
+from jaxtrachea.measurements.curve import BAD_HEAD, BadCurve
 from jaxtrachea.report.tables import (
     ESTIMATE_HEAD,
     QUALITY_HEAD,
@@ -57,9 +57,8 @@ def report_text(
     names |= {"correlation": "correlation"} if result.study.free else {}
     parts += [f"![{text}]({name}.png)" for name, text in names.items()]
     if bad:
-        rows = [[b.specimen, b.trial, b.kind, b.message, b.cure] for b in bad]
-        head = ["specimen", "trial", "kind", "what", "cure"]
-        parts += ["## Curves that could not be used", markdown_table(head, rows)]
+        rows = [b.cells for b in bad]
+        parts += ["## Curves that could not be used", markdown_table(BAD_HEAD, rows)]
     return "\n\n".join(parts) + "\n"
 
 

@@ -16,14 +16,17 @@ from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.results import store
-from jaxtrachea.results.arrays import FIELDS, result_of
+from jaxtrachea.results.arrays import FIELDS, STORED_AS, result_of
 from jaxtrachea.results.stored import SCHEMA, VERSION, NoResults
 from jaxtrachea.status import FitStatus
 
 #: Schema versions that are read; 1 has no covariance, which then follows from the standard errors.
 VERSIONS = (1, VERSION)
 #: Fields of `Uncertainty` in the group of that name; the others stand with lanes and unknowns.
-MORE = ("se", "flat_se", "blind", "half_width", "along", "dispersion", "covariance", "silent")
+MORE = (
+    "se", "weakest_se", "structural_null_space", "half_width", "conditional_direction",
+    "dispersion", "covariance", "null_space",
+)  # fmt: skip
 
 
 def write_hdf5(
@@ -50,7 +53,7 @@ def write_hdf5(
         group = file.create_group("uncertainty")
         for name in MORE:
             data = getattr(result.uncertainty, name)
-            group.create_dataset(name, data=data, compression="gzip")
+            group.create_dataset(STORED_AS.get(name, name), data=data, compression="gzip")
         for analysis, found in findings.found:
             if analysis.datasets is not None:
                 analysis.datasets(file.create_group(analysis.name), found)
@@ -92,9 +95,11 @@ def _write_unknowns(group: h5py.Group, result: FitResult, profiles: Profiles | N
                      "at_bound", "undetermined", "unexamined", "evidence_low", "evidence_high",
                      "evidence_end")
     }  # fmt: skip
-    arrays |= {name: getattr(result.uncertainty, name) for name in ("correlation", "flat")}
+    arrays |= {
+        name: getattr(result.uncertainty, name) for name in ("correlation", "weakest_direction")
+    }
     for name, data in arrays.items():
-        group.create_dataset(name, data=data, compression="gzip")
+        group.create_dataset(STORED_AS.get(name, name), data=data, compression="gzip")
     group.attrs["units"] = json.dumps({p.name: p.unit for p in study.parameters})
     fixed = {p.name: p.value for p in study.parameters if p.fixed}
     group.attrs["fixed"] = json.dumps(fixed)
@@ -130,8 +135,9 @@ def read_hdf5(path: Path, study: Study) -> FitResult:
         arrays = {name: found[_place(found, name)] for name in FIELDS}
         arrays |= {f"criteria.{name}": found[f"lanes/{name}"] for name in Criteria._fields}
         for name in Uncertainty._fields:
-            place = f"uncertainty/{name}" if name in MORE else _place(found, name)
-            arrays[f"uncertainty.{name}"] = found[place]
+            key = STORED_AS.get(name, name)
+            place = f"uncertainty/{key}" if name in MORE else _place(found, key)
+            arrays[f"uncertainty.{key}"] = found[place]
         arrays["status"] = arrays["status"].astype(int)
         return _same_steps(result_of(study, arrays))
     except (KeyError, ValueError) as error:
@@ -160,7 +166,7 @@ def _keep(found: dict[str, np.ndarray], name: str, item: object) -> None:
 
 
 def _covariance(found: dict[str, np.ndarray]) -> np.ndarray:
-    """Of the estimates from standard errors and correlation; NaN along blind directions."""
+    """Of the estimates from standard errors and correlation; NaN along the null space."""
     se = found["uncertainty/se"]
     with np.errstate(invalid="ignore"):
         product = found["unknowns/correlation"] * se[:, :, None] * se[:, None]

@@ -21,6 +21,7 @@ from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.read import Curve, DataError
 from jaxtrachea.measurements.readers.safe_hdf5 import attribute, numeric, opened
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.results.arrays import STORED_AS
 from jaxtrachea.results.store import GEOMETRY
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -33,7 +34,7 @@ READ = (
     "/unknowns/at_bound",
     "/uncertainty/covariance", "/uncertainty/silent", "/uncertainty/half_width",
 )  # fmt: skip
-#: 97.5 % quantile of the normal distribution, as `uncertainty.analyse` uses it.
+#: 97.5 % quantile of the normal distribution, as `covariance.analyse` uses it.
 NORMAL = 1.959963984540054
 
 
@@ -51,8 +52,8 @@ class StoredFit:
         reading: how the data were read, as in the [data] section.
         lane_names: specimen and trial of each lane, "(all)" where it spans several.
         theta: estimates; (L, P).
-        covariance: of the estimates; 0 for what is held, without the blind directions; (L, P, P).
-        blind: rows: directions that change no residual, scaled coordinates; (L, P, P).
+        covariance: of the estimates; 0 for what is held, without the null space; (L, P, P).
+        null_space: rows: directions that change no residual, scaled coordinates; (L, P, P).
         at_bound: (L, P).
         status: `FitStatus`; (L,).
         sigma: standard deviation of force, N, and markers, mm, given or estimated; NaN without
@@ -72,7 +73,7 @@ class StoredFit:
     lane_names: tuple[tuple[str, str], ...]
     theta: np.ndarray
     covariance: np.ndarray
-    blind: np.ndarray
+    null_space: np.ndarray
     at_bound: np.ndarray
     status: np.ndarray
     sigma: np.ndarray
@@ -123,7 +124,7 @@ def from_result(result: FitResult) -> StoredFit:
         lane_names=tuple(study.lane_name(lane) for lane in range(result.lanes)),
         theta=result.theta,
         covariance=u.covariance,
-        blind=u.silent,
+        null_space=u.null_space,
         at_bound=result.at_bound,
         status=result.status,
         sigma=np.where(np.isnan(result.rms), np.nan, result.sigma),
@@ -224,7 +225,6 @@ def _read(path: Path, file: Any) -> StoredFit:
         joint=bool(model["joint"]),
     )
     theta = numeric(file["unknowns"], "theta")
-    silent = numeric(file["uncertainty"], "silent")
     curves, lane, files = _read_data(file["data"])
     stored = StoredFit(
         path=path,
@@ -233,7 +233,7 @@ def _read(path: Path, file: Any) -> StoredFit:
         lane_names=tuple((s, t) for s, t in model["lanes"]),
         theta=theta,
         covariance=numeric(file["uncertainty"], "covariance"),
-        blind=silent,
+        null_space=numeric(file["uncertainty"], STORED_AS["null_space"]),
         at_bound=numeric(file["unknowns"], "at_bound") > 0,
         status=numeric(file["lanes"], "status").astype(int),
         sigma=_sigma(file["lanes"]),
@@ -250,7 +250,7 @@ def _read(path: Path, file: Any) -> StoredFit:
 def _known_half_width(study: Study, half: np.ndarray) -> np.ndarray:
     """Infinite where noise that should be estimated has no sample left to be estimated from.
 
-    `uncertainty.analyse` puts the normal quantile there, which Student's t never reaches.
+    `covariance.analyse` puts the normal quantile there, which Student's t never reaches.
     """
     return np.where((half == NORMAL) & ~np.array(study.noise_given[0]), np.inf, half)
 
@@ -305,7 +305,7 @@ def _check_shapes(stored: StoredFit) -> None:
     """
     L, P = len(stored.study.unknowns), stored.theta.shape[-1]
     shapes = {
-        "theta": (L, P), "covariance": (L, P, P), "blind": (L, P, P), "at_bound": (L, P),
+        "theta": (L, P), "covariance": (L, P, P), "null_space": (L, P, P), "at_bound": (L, P),
         "status": (L,), "sigma": (L, 2), "half_width": (L,), "curve_lane": (len(stored.curves),),
         "blend": (len(stored.curves),),
     }  # fmt: skip

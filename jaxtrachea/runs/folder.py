@@ -1,12 +1,12 @@
-"""The folder of a fit: chunks while it runs, files when it is done; at no moment neither.
+"""The output folder of a fit, safe against crashes: its files appear after one atomic rename.
 
     OUT/.jaxtrachea-lock                held while a run is at work (`run_lock`)
-    OUT/.run/run.json, 00000.npz, ...   journal and finished chunks
+    OUT/.run/run.json, 00000.npz, ...   manifest and finished shards
     OUT/.unfinished/                    files being written
     OUT/.written/                       the same, complete, on their way into OUT
 
 The one step that counts is the renaming of `.unfinished` to `.written`: whoever comes before it
-finds the chunks, whoever comes after it only moves files.
+finds the shards, whoever comes after it only moves files.
 """
 
 import collections
@@ -20,9 +20,9 @@ from pathlib import Path
 
 from jaxtrachea.files.lock import Lock, take
 from jaxtrachea.files.output import new_directory, refuse_full
-from jaxtrachea.runs import journal as journals
-from jaxtrachea.runs.chunks import read_journal
-from jaxtrachea.runs.journal import Journal
+from jaxtrachea.runs import manifest as manifests
+from jaxtrachea.runs.manifest import Manifest
+from jaxtrachea.runs.shards import read_manifest
 
 #: Lanes fitted so far, written when the user stops a run; gone when it is finished.
 SO_FAR = "summary_so_far.csv"
@@ -38,22 +38,22 @@ class RunFolder:
 
     Attributes:
         target: what the user calls the output folder.
-        journal: of the run.
-        made: folders that did not exist before, innermost first; removed with a run of which
+        manifest: of the run.
+        created: folders that did not exist before, innermost first; removed with a run of which
             nothing is kept.
         lock: of the folder; None: another process holds it, or the user wants none.
         note: what the user should know of how it was opened, or nothing.
     """
 
     target: Path
-    journal: Journal
-    made: tuple[Path, ...] = ()
+    manifest: Manifest
+    created: tuple[Path, ...] = ()
     lock: Lock | None = None
     note: str = ""
 
     @property
-    def chunks(self) -> Path:
-        """Folder of the journal and the chunks."""
+    def checkpoint(self) -> Path:
+        """Folder of the manifest and the shards."""
         return self.target / ".run"
 
     @property
@@ -61,13 +61,9 @@ class RunFolder:
         """Folder of the files being written."""
         return self.target / ".unfinished"
 
-    def chunk(self, k: int) -> Path:
-        """File of chunk k."""
-        return self.chunks / f"{k:05d}.npz"
-
-    def finished(self) -> int:
-        """Number of chunks that are saved."""
-        return saved_chunks(self.target)
+    def shard(self, k: int) -> Path:
+        """File of shard k."""
+        return self.checkpoint / f"{k:05d}.npz"
 
     def release(self) -> None:
         """Let other runs into the folder."""
@@ -75,50 +71,49 @@ class RunFolder:
             self.lock.release()
 
 
-def saved_chunks(target: Path) -> int:
-    """Number of chunks of an unfinished run that are saved."""
+def saved_shards(target: Path) -> int:
+    """Number of shards of an unfinished run that are saved."""
     return len(list((target / ".run").glob("*.npz")))
 
 
-def claim(wanted: Path | None, default: Path, now: Journal, *, locked: bool = True) -> RunFolder:
+def claim(wanted: Path | None, default: Path, now: Manifest, *, locked: bool = True) -> RunFolder:
     """A new run in a new or empty folder.
 
     Args:
         wanted: as for `output.new_directory`.
         default: as for `output.new_directory`.
-        now: journal of the run.
+        now: manifest of the run.
         locked: keep other runs out until `RunFolder.release`.
 
     Raises:
         OutputExists: as `output.new_directory`.
         Busy, NoLocks: as `run_lock.take`.
     """
-    made = [folder for folder in (wanted or default).parents if not folder.exists()]
+    created = [folder for folder in (wanted or default).parents if not folder.exists()]
     existed = wanted is not None and wanted.exists()
     target = new_directory(wanted, default)
-    made = made if existed else [target, *made]
+    created = created if existed else [target, *created]
     lock = None
     try:
         lock = take(target) if locked else None
-        refuse_full(
-            target, held=locked
-        )  # another run may have come, and gone, since it was seen to be empty
+        # Another run may have come, and gone, since the folder was seen to be empty.
+        refuse_full(target, held=locked)
     except BaseException:
         if lock is not None:
             lock.release()
-        _remove_empty(made)
+        _remove_empty(created)
         raise
-    run = RunFolder(target, now, tuple(made), lock)
+    run = RunFolder(target, now, tuple(created), lock)
     try:
-        run.chunks.mkdir()
-        journals.write(run.chunks / "run.json", now)
+        run.checkpoint.mkdir()
+        manifests.write(run.checkpoint / "run.json", now)
     except BaseException:
         abandon(run)
         raise
     return run
 
 
-def go_on(target: Path, now: Journal, *, force: bool = False) -> RunFolder:
+def go_on(target: Path, now: Manifest, *, force: bool = False) -> RunFolder:
     """The unfinished run in `target`.
 
     Args:
@@ -131,9 +126,9 @@ def go_on(target: Path, now: Journal, *, force: bool = False) -> RunFolder:
     """
     if not (target / ".run").is_dir():
         raise NoRun(f"{target} holds no unfinished run; leave --resume out to start one")
-    was, note = known_journal(target)
+    was, note = known_manifest(target)
     if was is None:
-        if saved_chunks(target):
+        if saved_shards(target):
             raise NoRun(f"{target}: {note}; choose another --out")
         was = now
     was = dataclasses.replace(
@@ -144,71 +139,71 @@ def go_on(target: Path, now: Journal, *, force: bool = False) -> RunFolder:
     for pattern in ("*.npz.*", "*run.json.*"):  # of processes that died while they wrote
         for path in (target / ".run").glob(pattern):
             path.unlink()
-    journals.write(target / ".run" / "run.json", was)
+    manifests.write(target / ".run" / "run.json", was)
     return RunFolder(target, was, note=note)
 
 
-def known_journal(target: Path) -> tuple[Journal | None, str]:
-    """The journal of the unfinished run in `target`: run.json, or what its chunks say.
+def known_manifest(target: Path) -> tuple[Manifest | None, str]:
+    """The manifest of the unfinished run in `target`: run.json, or what its shards say.
 
-    Every chunk holds the journal of its run, so that a damaged run.json costs none of them.
+    Every shard holds the manifest of its run, so that a damaged run.json costs none of them.
 
     Returns:
-        The journal, None where there is none to be read; and what the user should know of that.
+        The manifest, None where there is none to be read; and what the user should know of that.
     """
     folder = target / ".run"
     try:
-        return journals.read(folder / "run.json"), ""
+        return manifests.read(folder / "run.json"), ""
     except (OSError, ValueError) as error:
         lost = f"its run.json cannot be read ({_reason(error)})"
-    told = [j for path in sorted(folder.glob("*.npz")) if (j := read_journal(path)) is not None]
-    chunks = len(told)
+    told = [j for path in sorted(folder.glob("*.npz")) if (j := read_manifest(path)) is not None]
+    shards = len(told)
     with contextlib.suppress(OSError, ValueError):
-        told.append(journals.read(journals.previous(folder / "run.json")))
+        told.append(manifests.read(manifests.previous(folder / "run.json")))
     if not told:
-        if not (count := saved_chunks(target)):
+        if not (count := saved_shards(target)):
             return None, f"{lost}; nothing was saved yet"
         return None, (
-            f"{lost}, and none of its {count} chunks says which specification, inputs and settings "
+            f"{lost}, and none of its {count} shards says which specification, inputs and settings "
             "it belongs to, so that they cannot be verified"
         )
     name = collections.Counter(j.id for j in told).most_common(1)[0][0]
     told = [j for j in told if j.id == name]
-    journal = dataclasses.replace(
+    manifest = dataclasses.replace(
         max(told, key=lambda j: len(j.forced)),
         options=sorted({option for j in told for option in j.options}),
     )
-    source = f"its {chunks} chunks" if chunks else journals.previous(folder / "run.json").name
-    return journal, f"{lost}; it was rebuilt from {source}"
+    source = f"its {shards} shards" if shards else manifests.previous(folder / "run.json").name
+    return manifest, f"{lost}; it was rebuilt from {source}"
 
 
 def _reason(error: Exception) -> str:
     return (isinstance(error, OSError) and error.strerror) or str(error)
 
 
-def join(target: Path, now: Journal) -> RunFolder:
+def join(target: Path, now: Manifest) -> RunFolder:
     """The run that another process has opened in `target`.
 
     Raises:
         NoRun: this process would run something else.
     """
     try:
-        was = journals.read(target / ".run" / "run.json")
+        was = manifests.read(target / ".run" / "run.json")
     except ValueError as error:
         raise NoRun(f"{target}: its run.json cannot be read ({error})") from None
-    changed = [line for line in journals.differences(was, now) if line not in was.forced]
+    changed = [line for line in manifests.differences(was, now) if line not in was.forced]
     if changed:
         raise NoRun(f"{target}: seen from this process, {'; '.join(changed)}")
     return RunFolder(target, was)
 
 
-def _passed(target: Path, was: Journal, now: Journal, force: bool) -> list[str]:
+def _passed(target: Path, was: Manifest, now: Manifest, force: bool) -> list[str]:
     """What differs, where the user forces it or has before.
 
     Raises:
         NoRun: something differs, and must not.
     """
-    changed = [line for line in journals.differences(was, now) if line not in was.forced]
+    changed = [line for line in manifests.differences(was, now) if line not in was.forced]
     if was.lanes != now.lanes:
         raise NoRun(
             f"{target}: {'; '.join(changed)}; the run there is of another study, "
@@ -220,31 +215,6 @@ def _passed(target: Path, was: Journal, now: Journal, force: bool) -> list[str]:
             "or mix old and new with --force"
         )
     return changed
-
-
-def again(target: Path, former: Journal, now: Journal, lanes: list[int]) -> RunFolder:
-    """A new run over the failed lanes of a finished one.
-
-    Args:
-        target: folder of the finished run.
-        former: its journal.
-        now: what would be run now; its sizes are used.
-        lanes: to fit again.
-    """
-    count = 1 if former.rerun is None else former.rerun.count + 1
-    rerun = journals.Rerun(digest(target / "results.h5"), lanes, count)
-    options = sorted({*former.options, *now.options})
-    journal = dataclasses.replace(now, rerun=rerun, options=options, forced=former.forced)
-    run = RunFolder(target, journal)
-    shutil.rmtree(run.staging, ignore_errors=True)
-    run.staging.mkdir()  # at no moment a .run without its journal beside finished files
-    try:
-        journals.write(run.staging / "run.json", journal)
-        run.staging.rename(run.chunks)
-    except BaseException:
-        shutil.rmtree(run.staging, ignore_errors=True)
-        raise
-    return run
 
 
 def digest(path: Path) -> str:
@@ -261,7 +231,7 @@ def stage(run: RunFolder) -> Path:
 
 
 def commit(run: RunFolder) -> None:
-    """Replace the chunks, and the files of a former run, by what was staged."""
+    """Replace the shards, and the files of an earlier run, by what was staged."""
     for path in run.staging.iterdir():
         with path.open("rb+") as stream:
             os.fsync(stream.fileno())
@@ -295,11 +265,11 @@ def abandon(run: RunFolder, *, shared: bool = False) -> bool:
         shared: other processes may be at work in it.
     """
     shutil.rmtree(run.staging, ignore_errors=True)
-    if shared or run.finished():
+    if shared or saved_shards(run.target):
         return True
-    shutil.rmtree(run.chunks, ignore_errors=True)
+    shutil.rmtree(run.checkpoint, ignore_errors=True)
     run.release()
-    _remove_empty(run.made)
+    _remove_empty(run.created)
     return False
 
 

@@ -9,12 +9,13 @@ import contextlib
 import json
 import threading
 import time
-import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-#: What a process says of itself: at work, through with its chunks, stopped early.
+from jaxtrachea.runs.meet import place
+
+#: What a process says of itself: at work, through with its shards, stopped early.
 WORKING, DONE, FAILED = "working", "done", "failed"
 #: Seconds to meet, and between two looks at the others.
 MEETING, LOOK = 300, 0.2
@@ -32,50 +33,35 @@ class Meeting:
         process: number of this process; 0 opens the folder and writes the results.
         processes: how many there are.
         session: name of this meeting.
-        patience: seconds of silence after which a process counts as lost.
+        heartbeat_timeout: seconds of silence after which a process counts as lost.
+        devices: JAX's settings that leave this process the devices meant for it.
     """
 
     process: int = 0
     processes: int = 1
     session: str = ""
-    patience: float = 100.0
+    heartbeat_timeout: float = 100.0
+    devices: dict[str, str] = field(default_factory=dict)
 
 
 def meet(
-    coordinator: str | None, processes: int | None, process: int | None, patience: float
+    coordinator: str | None, processes: int | None, process: int | None, heartbeat_timeout: float
 ) -> Meeting:
-    """Wait for the other processes; must come before anything else is asked of JAX.
+    """Wait for the other processes.
 
     Args:
         coordinator: HOST:PORT of process 0; None: as the cluster says, like the next two.
         processes: how many.
         process: number of this one.
-        patience: see `Meeting`.
+        heartbeat_timeout: see `Meeting`.
 
     Raises:
         Lost: no cluster was found, or the others did not come.
     """
-    import jax
-    from jax._src.distributed import global_state
-
-    try:
-        jax.distributed.initialize(coordinator, processes, process, initialization_timeout=MEETING)
-        client, key = global_state.client, "jaxtrachea/session"
-        if client is None:
-            raise Lost("jax.distributed has no client")
-        if global_state.process_id == 0:
-            client.key_value_set(key, uuid.uuid4().hex)
-        session = client.blocking_key_value_get(key, 1000 * MEETING)
-        found = Meeting(global_state.process_id, global_state.num_processes, session, patience)
-        client.wait_at_barrier("jaxtrachea/met", 1000 * MEETING)
-        jax.distributed.shutdown()
-    except (ValueError, TypeError) as error:
-        raise Lost(f"no cluster found ({error})") from None
-    except RuntimeError as error:
-        raise Lost(f"the processes did not meet: {str(error).splitlines()[0]}") from None
-    # From here on each computes for itself, with its own devices.
-    global_state.process_id, global_state.num_processes = 0, 1
-    return found
+    found = place(coordinator, processes, process, MEETING)
+    if "error" in found:
+        raise Lost(found["error"])
+    return Meeting(heartbeat_timeout=heartbeat_timeout, **found)
 
 
 @dataclass
@@ -107,7 +93,7 @@ class Watch:
         """
         self._content = content
         self._say(WORKING)
-        thread = threading.Thread(target=self._look_after, daemon=True)
+        thread = threading.Thread(target=self._heartbeat, daemon=True)
         thread.start()
         try:
             yield self
@@ -131,7 +117,7 @@ class Watch:
             raise Lost(self._lost[0])
 
     def done(self) -> None:
-        """Say that this process is through with its chunks."""
+        """Say that this process is through with its shards."""
         self._say(DONE)
 
     def wait_for_others(self) -> None:
@@ -164,9 +150,9 @@ class Watch:
             beside.write_text(json.dumps(content), encoding="utf-8")
             beside.replace(path)
 
-    def _look_after(self) -> None:
-        """Beat, and look at the others, several times within everybody's patience."""
-        while not self._end.wait(min(2.0, self.meeting.patience / 10)):
+    def _heartbeat(self) -> None:
+        """Show that this process is alive and look at the others, ten times in the timeout."""
+        while not self._end.wait(min(2.0, self.meeting.heartbeat_timeout / 10)):
             if self._said == WORKING:
                 with contextlib.suppress(OSError):
                     self._say(WORKING)
@@ -176,7 +162,7 @@ class Watch:
 
     def _look_at(self, k: int) -> None:
         """What process k says; silence counts from the last change of its file."""
-        now, patience = time.monotonic(), self.meeting.patience
+        now, timeout = time.monotonic(), self.meeting.heartbeat_timeout
         try:
             text = _file(self.folder, self.meeting, k).read_text(encoding="utf-8")
         except OSError:
@@ -190,8 +176,8 @@ class Watch:
             self._others[k] = json.loads(text)["says"]
         if self._others.get(k) == FAILED:
             self._lost.append(f"process {k} stopped early; see its own message")
-        elif self._others.get(k) != DONE and text == before and now - since > patience:
-            self._lost.append(f"process {k} has been silent for {patience:g} s; it is lost")
+        elif self._others.get(k) != DONE and text == before and now - since > timeout:
+            self._lost.append(f"process {k} has been silent for {timeout:g} s; it is lost")
 
 
 def _file(folder: Path, meeting: Meeting, process: int) -> Path:

@@ -35,7 +35,7 @@ def make_scene(
     friction: float | None = None,
     mesh: Mesh | None = None,
     radius: float | None = None,
-    effects: EffectOptions = EffectOptions(),  # noqa: B008 (frozen)
+    effects: EffectOptions = EffectOptions(),
     progress: Callable[[int, int], None] | None = None,
 ) -> Scene:
     """Put a scene together and choose its program from the path (concrete numbers).

@@ -14,7 +14,7 @@ from jaxtrachea.scene.plan import OUTPUTS, Decision, Plan, stored
 
 def make_plan(
     facts: SceneFacts,
-    options: EffectOptions = EffectOptions(),  # noqa: B008 (frozen)
+    options: EffectOptions = EffectOptions(),
     *,
     finest: frozenset[str] = frozenset(),
 ) -> Plan:

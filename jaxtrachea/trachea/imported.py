@@ -7,6 +7,7 @@ is refused.
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -95,27 +96,43 @@ def read_mesh(
     """
     path = Path(path)
     try:
-        return _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
-                     half_angle, dtype, progress)  # fmt: skip
+        known = _Known(unit, part, rings, larynx, anterior, centreline, ring_positions, half_angle)
+        return _read(path, known, dtype, progress)
     except MeshError as error:
         raise MeshError.like(error, place=path.name) from error.__cause__
 
 
-def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions, half_angle, dtype,
-          progress):  # fmt: skip
+class _Known(NamedTuple):
+    """What the user says of the file, see `read_mesh`; None: found in the shape."""
+
+    unit: str | None
+    part: str | None
+    rings: str | Path | None
+    larynx: Sequence[float] | np.ndarray | None
+    anterior: Sequence[float] | np.ndarray | None
+    centreline: np.ndarray | None
+    ring_positions: Sequence[float] | np.ndarray | None
+    half_angle: float | None
+
+
+def _read(path: Path, known: _Known, dtype, progress) -> Imported:
+    """As `read_mesh`; its errors do not name the file."""
+
     def step():
         return None if progress is None else progress(1, STEPS)
 
     parts = _parts(path)
     step()
-    name = _wall(parts, part)
+    name = _wall(parts, known.part)
     notes = [f"wall: {name}"] if len(parts) > 1 else []
     surface, cleaned = clean(parts[name])
     step()
-    scale = _scale(surface, path, unit, notes)
+    scale = _scale(surface, path, known.unit, notes)
     wall = Surface(surface.vertices * scale, surface.faces)
-    cartilage = _cartilage(parts, name, rings, path, scale, notes)
-    given = None if centreline is None else np.asarray(centreline, float) * scale
+    cartilage = _cartilage(parts, name, known.rings, path, scale, notes)
+    given = None
+    if known.centreline is not None:
+        given = np.asarray(known.centreline, float) * scale
     line = find_centreline(wall.vertices, wall.faces, given)
     check_turn(line)
     step()
@@ -123,16 +140,16 @@ def _read(path, unit, part, rings, larynx, anterior, centreline, ring_positions,
     def scan(line):
         return Shape.scan(line, wall.vertices, wall.faces, cartilage)
 
-    if larynx is not None:
-        shape = scan(turned(line) if _points_back(line, larynx) else line)
+    if known.larynx is not None:
+        shape = scan(turned(line) if _points_back(line, known.larynx) else line)
     else:
         shape = scan(line)
         shape = scan(turned(line)) if _carina_is_last(shape) else shape
     if given is None:
         shape.check_middle()
     step()
-    shape = find_anterior(shape, anterior)
-    found = find_rings(shape, ring_positions, half_angle)
+    shape = find_anterior(shape, known.anterior)
+    found = find_rings(shape, known.ring_positions, known.half_angle)
     where = locate(shape.line, wall.vertices)
     chord = shape.line.points[-1] - shape.line.points[0]
     rotation = _axes(chord, shape.line.frames[:, :, 1].mean(axis=0))

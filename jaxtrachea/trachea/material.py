@@ -247,8 +247,6 @@ VALUES: dict[str, Declaration] = {
 }
 #: Every parameter, likewise; those of single presses last.
 PARAMETERS: dict[str, Declaration] = VALUES | {p.name: p for p in _OF_THE_PRESS}
-#: Values that may be left out of a material.
-OPTIONAL = tuple(name for name, p in VALUES.items() if p.absent)
 
 
 def meaningless(given: Iterable[str]) -> dict[str, str]:

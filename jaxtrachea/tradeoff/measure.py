@@ -59,7 +59,7 @@ class Settings(NamedTuple):
 
 
 def measure(
-    name: str, full: Full, settings: Settings = Settings(), report: Report = lambda text: None,  # noqa: B008
+    name: str, full: Full, settings: Settings = Settings(), report: Report = lambda text: None,
     curves: Sequence[Any] = (), radius: float = -1.0,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Errors and times of every rung, one dict each; then one for each ladder left out.
@@ -141,8 +141,8 @@ def against(full: Full, solved: Solved, curves: Sequence[Any], radius: float) ->
     force, joints = ([], []), ([], [])
     for i, (curve, depth) in enumerate(check_curves(full.path, curves)):
 
-        def at(v):
-            return [np.interp(depth, curve.displacement, v)]  # noqa: B023
+        def at(v, depth=depth, curve=curve):
+            return [np.interp(depth, curve.displacement, v)]
 
         force[0].append([-float(solved.out.force[i, 1])])
         force[1].append(at(curve.force))

@@ -19,7 +19,6 @@ from scipy.optimize import least_squares
 from jaxtrachea.fitting import fit
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.levenberg_marquardt import Solved, levenberg_marquardt
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.parameters import in_model
 from jaxtrachea.fitting.result import FitResult
@@ -28,6 +27,7 @@ from jaxtrachea.fitting.starts import draw_starts
 from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
+from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 

@@ -15,10 +15,11 @@ import numpy as np
 import update
 
 from jaxtrachea import Material, press, simulate, table_1
-from jaxtrachea.fitting import cost, levenberg_marquardt, residual
+from jaxtrachea.fitting import cost, residual
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.starts import draw_starts
+from jaxtrachea.optimisation import trust_region
 from jaxtrachea.scene.stage import Poses
 
 jax.config.update("jax_cpu_enable_async_dispatch", False)
@@ -138,13 +139,11 @@ def fits(out: common.Writer) -> None:
     def same(v, dtype):
         return jnp.full(FITS, v, dtype)
 
-    state = levenberg_marquardt.State(
-        theta, point, same(levenberg_marquardt.FIRST_RADIUS, float), same(1, jnp.int32),
-        same(levenberg_marquardt.RUNNING, jnp.int8),
+    state = trust_region.State(
+        theta, point, same(trust_region.FIRST_RADIUS, float), same(1, jnp.int32),
+        same(trust_region.RUNNING, jnp.int8),
     )  # fmt: skip
-    step = jax.vmap(
-        functools.partial(levenberg_marquardt.iterate, levenberg_marquardt.Tolerances())
-    )
+    step = jax.vmap(functools.partial(trust_region.iterate, trust_region.Tolerances()))
     cases = {
         "residual": wait(of(residual.residual_value), theta, lanes),
         "residual and Jacobian": wait(of(residual.residual), theta, lanes),

@@ -40,7 +40,7 @@ print(json.dumps(first - later))
 FIT = """
 import fitting, jax, numpy as np
 from jaxtrachea.fitting.cost import LaneCost
-from jaxtrachea.fitting.levenberg_marquardt import levenberg_marquardt
+from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.result import Settings
 from jaxtrachea.fitting.starts import draw_starts

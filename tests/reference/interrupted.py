@@ -20,7 +20,7 @@ TABLES = ("summary.csv", "parameters.csv", "report.md")
 def write_study(
     folder: Path, lanes: int, every: int, *, samples: int = 12, starts: int = 2, more: str = ""
 ):
-    """A study of `lanes` specimens, two presses each, in chunks of `every`; coupling `total`."""
+    """A study of `lanes` specimens, two presses each, in shards of `every`; coupling `total`."""
     rng = np.random.default_rng(0)
     rows = ["specimen,trial,s [mm],displacement [mm],force [N]"]
     depth = np.linspace(0.1, 3, samples)
@@ -91,25 +91,25 @@ def wait_for(
 
 
 def saved(folder: Path) -> dict[str, tuple[int, int]]:
-    """Inode and time of every saved chunk: another where a chunk was written again."""
+    """Inode and time of every saved shard: another where a shard was written again."""
     found = {}
-    with contextlib.suppress(FileNotFoundError):  # a chunk or the folder may go meanwhile
+    with contextlib.suppress(FileNotFoundError):  # a shard or the folder may go meanwhile
         for path in sorted((folder / ".run").glob("*.npz")):
             found[path.name] = (path.stat().st_ino, path.stat().st_mtime_ns)
     return found
 
 
-def kill_and_resume(folder: Path, name: str, chunks: int, after: float) -> tuple[int, int, str]:
-    """Kill a run `after` seconds from its `chunks`-th chunk, then let it go on to its end.
+def kill_and_resume(folder: Path, name: str, shards: int, after: float) -> tuple[int, int, str]:
+    """Kill a run `after` seconds from its `shards`-th shard, then let it go on to its end.
 
     Returns:
-        Chunks that were there after the kill (-1: it had ended), starts that the resumed run
-        fitted, and what it said. No chunk that was there is written again.
+        Shards that were there after the kill (-1: it had ended), starts that the resumed run
+        fitted, and what it said. No shard that was there is written again.
     """
     out = folder / name
     process = start(folder, "fit", "spec.toml", "--out", name)
     wait_for((out / ".run").exists, process)
-    wait_for(lambda: len(saved(out)) >= chunks, process, pause=0.001)
+    wait_for(lambda: len(saved(out)) >= shards, process, pause=0.001)
     time.sleep(after)
     process.send_signal(signal.SIGKILL)
     finish(process)
@@ -119,7 +119,7 @@ def kill_and_resume(folder: Path, name: str, chunks: int, after: float) -> tuple
     process = start(folder, "fit", "spec.toml", "--out", name, "--resume")
     while process.poll() is None:
         now = saved(out)
-        assert all(now[chunk] == there[chunk] for chunk in now.keys() & there.keys())
+        assert all(now[shard] == there[shard] for shard in now.keys() & there.keys())
         time.sleep(0.01)
     code, _, err = finish(process)
     assert code == 0, err
@@ -131,11 +131,11 @@ def kill_and_resume(folder: Path, name: str, chunks: int, after: float) -> tuple
 def kill_often(folder: Path, times: int, seed: int = 0, *, lanes: int = 240) -> list[int]:
     """Kill and resume `times` runs; their numbers are those of one in peace.
 
-    Four of five between two chunks, at a random moment after a random one of them; the others
+    Four of five between two shards, at a random moment after a random one of them; the others
     anywhere, also while files are written.
 
     Returns:
-        Chunks there after each kill, out of 20 (-1: the run had ended).
+        Shards there after each kill, out of 20 (-1: the run had ended).
     """
     starts, every = 24, lanes // 20
     write_study(folder, lanes, every, samples=60, starts=starts)
@@ -150,13 +150,13 @@ def kill_often(folder: Path, times: int, seed: int = 0, *, lanes: int = 240) -> 
     expected, rng, there = numbers(folder / "peace"), random.Random(seed), []
     for k in range(times):
         anywhere = k % 5 == 4
-        chunks = 0 if anywhere else rng.randrange(20)
+        shards = 0 if anywhere else rng.randrange(20)
         after = rng.uniform(0, lasted if anywhere else fitting / 20)
-        done, fitted, said = kill_and_resume(folder, f"run{k}", chunks, after)
+        done, fitted, said = kill_and_resume(folder, f"run{k}", shards, after)
         assert numbers(folder / f"run{k}") == expected
         assert not any((folder / f"run{k}").glob(".*"))
         if done >= 0:
-            assert (f"{done} of 20 chunks are there" in said) == (done > 0)
+            assert (f"{done} of 20 shards are there" in said) == (done > 0)
             assert fitted == starts * every * (20 - done)
         there.append(done)
     return there

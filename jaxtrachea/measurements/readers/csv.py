@@ -214,19 +214,14 @@ def _curve(
             role: role_values(table, role, roles[role], picked, unit)
             for role, unit in units.items()
         }
-        joints = [role for role in values if role.startswith("joint_")]
-        return RawCurve(
-            *key,
+        return RawCurve.of_columns(
+            key,
             source,
-            values["displacement"],
-            values["force"],
-            rows,
-            table.text.word,
+            values,
+            rows=rows,
+            row_word=table.text.word,
             s=_constant("s", values, state, table, picked),
             phi=_constant("phi", values, state, table, picked),
-            sigma=values.get("sigma"),
-            joint_rings=np.array([int(r[6:]) - 1 for r in joints]) if joints else None,
-            joint_displacement=np.stack([values[r] for r in joints], axis=1) if joints else None,
             time=time_values(table, roles, picked, options),
         )
     except Fault as fault:

@@ -50,24 +50,8 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
         time = time_values(table, roles, range(len(table.rows)), options)
     except Fault as fault:
         return [bad(who.specimen, trial, source, fault)]
-    joints = [role for role in values if role.startswith("joint_")]
-    return [
-        RawCurve(
-            who.specimen,
-            trial,
-            source,
-            values["displacement"],
-            values["force"],
-            rows,
-            text.word,
-            s=who.s,
-            phi=who.phi,
-            sigma=values.get("sigma"),
-            joint_rings=np.array([int(r[6:]) - 1 for r in joints]) if joints else None,
-            joint_displacement=np.stack([values[r] for r in joints], axis=1) if joints else None,
-            time=time,
-        )
-    ]
+    place = {"rows": rows, "row_word": text.word, "s": who.s, "phi": who.phi}
+    return [RawCurve.of_columns((who.specimen, trial), source, values, time=time, **place)]
 
 
 def _values(table: Table, roles: dict[str, int], options: ReadOptions) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""A fit whose finished chunks lie in a folder: what is missing is fitted, what is there is read."""
+"""A fit saved as it goes on: finished shards are read from the folder, missing ones are fitted."""
 
 import dataclasses
 import threading
@@ -16,8 +16,8 @@ from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analyses.effective import widened
 from jaxtrachea.results.hdf5 import read_hdf5
 from jaxtrachea.results.rows import summary_rows
-from jaxtrachea.runs.chunks import divide, join, load, replaced, save
 from jaxtrachea.runs.folder import NoRun, RunFolder, digest
+from jaxtrachea.runs.shards import divide, join, load, replaced, save
 
 #: A rerun of failed lanes has so many times more starts.
 MORE_STARTS = 4
@@ -25,55 +25,55 @@ MORE_STARTS = 4
 
 def fitted_lanes(run: RunFolder, study: Study) -> Study:
     """What a run fits: the study, or its failed lanes."""
-    return study if run.journal.rerun is None else study.take(np.array(run.journal.rerun.lanes))
+    return study if run.manifest.rerun is None else study.take(np.array(run.manifest.rerun.lanes))
 
 
 def settings_for(run: RunFolder, settings: Settings) -> Settings:
     """Settings of a run: a rerun has more and other starts."""
-    settings = dataclasses.replace(settings, batch=run.journal.chunk)
-    if run.journal.rerun is None:
+    settings = dataclasses.replace(settings, batch=run.manifest.batch)
+    if run.manifest.rerun is None:
         return settings
-    starts, seed = MORE_STARTS * settings.starts, settings.seed + run.journal.rerun.count
+    starts, seed = MORE_STARTS * settings.starts, settings.seed + run.manifest.rerun.count
     return dataclasses.replace(settings, starts=starts, seed=seed)
 
 
 def missing(run: RunFolder, study: Study) -> tuple[list[int], list[int]]:
-    """Chunks that are still to be fitted, and those among them whose file cannot be used."""
+    """Shards that are still to be fitted, and those among them whose file cannot be used."""
     part, todo, damaged = fitted_lanes(run, study), [], []
-    for k, lanes in enumerate(_chunks(run, part)):
+    for k, lanes in enumerate(_shards(run, part)):
         if _read(run, k, part.take(lanes), lanes) is None:
             todo.append(k)
-            if run.chunk(k).exists():
+            if run.shard(k).exists():
                 damaged.append(k)
     return todo, damaged
 
 
-def fit_chunks(
+def fit_shards(
     run: RunFolder,
     study: Study,
     settings: Settings,
     todo: list[int],
     progress: Callable[[int, int], None],
 ) -> None:
-    """Fit chunks and save each as soon as it is done, on all devices of this process.
+    """Fit shards and save each as soon as it is done, on all devices of this process.
 
     Args:
         run: where to.
         study: the whole study.
         settings: of the run, as `settings_for` gives them.
-        todo: chunks, as `missing` gives them.
+        todo: shards, as `missing` gives them.
         progress: as for `fit.fit`; what it raises ends the work.
     """
     from jaxtrachea.fitting.fit import fit
 
     part = fitted_lanes(run, study)
-    chunks = _chunks(run, part)
-    jobs = settings.starts * sum(len(chunks[k]) for k in todo)
+    shards = _shards(run, part)
+    jobs = settings.starts * sum(len(shards[k]) for k in todo)
 
     def one(k: int) -> None:
-        lanes = chunks[k]
+        lanes = shards[k]
         result = fit(part.take(lanes), settings, lambda done, of: progress(done, jobs))
-        save(run.chunk(k), run.journal, lanes, result)
+        save(run.shard(k), run.manifest, lanes, result)
 
     _on_devices(one, todo, jax.local_devices())
 
@@ -105,22 +105,22 @@ def _on_devices(work: Callable[[int], None], items: list[int], devices: list) ->
 
 
 def collect(run: RunFolder, study: Study) -> FitResult:
-    """The result of the whole study, out of the chunks and, in a rerun, of the former result.
+    """The result of the whole study, out of the shards and, in a rerun, of the result before it.
 
     Raises:
-        NoRun: a chunk cannot be read back, or the former result is not what it was.
+        NoRun: a shard cannot be read back, or the result before the rerun has changed.
     """
     part = fitted_lanes(run, study)
-    found = [_read(run, k, part.take(lanes), lanes) for k, lanes in enumerate(_chunks(run, part))]
+    found = [_read(run, k, part.take(lanes), lanes) for k, lanes in enumerate(_shards(run, part))]
     if any(result is None for result in found):
         k = next(k for k, result in enumerate(found) if result is None)
-        raise NoRun(f"{run.chunk(k)} cannot be read; do all processes share this folder?")
+        raise NoRun(f"{run.shard(k)} cannot be read; do all processes share this folder?")
     result = join(part, [result for result in found if result is not None])
-    again = run.journal.rerun
+    again = run.manifest.rerun
     if again is None:
         return dataclasses.replace(result, study=study)
     path = run.target / "results.h5"
-    if digest(path) != again.former:
+    if digest(path) != again.results:
         raise NoRun(f"{path} has changed since its failed lanes were fitted again")
     return replaced(read_hdf5(path, study), np.array(again.lanes), result)
 
@@ -128,7 +128,7 @@ def collect(run: RunFolder, study: Study) -> FitResult:
 def write_so_far(path: Path, run: RunFolder, study: Study) -> None:
     """Write the rows of summary.csv of the lanes that are fitted."""
     rows = []
-    for k, lanes in enumerate(_chunks(run, study)):
+    for k, lanes in enumerate(_shards(run, study)):
         part = _read(run, k, study.take(lanes), lanes)
         if part is not None:
             rows += summary_rows(widened(part))
@@ -140,13 +140,13 @@ def write_so_far(path: Path, run: RunFolder, study: Study) -> None:
 
 
 def count(run: RunFolder, study: Study) -> int:
-    """Chunks of a run."""
-    return len(_chunks(run, fitted_lanes(run, study)))
+    """Shards of a run."""
+    return len(_shards(run, fitted_lanes(run, study)))
 
 
-def _chunks(run: RunFolder, part: Study) -> list[np.ndarray]:
-    return divide(part.lanes.lower.shape[0], run.journal.save_every)
+def _shards(run: RunFolder, part: Study) -> list[np.ndarray]:
+    return divide(part.lanes.lower.shape[0], run.manifest.save_every)
 
 
 def _read(run: RunFolder, k: int, part: Study, lanes: np.ndarray) -> FitResult | None:
-    return load(run.chunk(k), run.journal.id, lanes, part)
+    return load(run.shard(k), run.manifest.id, lanes, part)

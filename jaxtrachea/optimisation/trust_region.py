@@ -1,4 +1,4 @@
-"""Batched Levenberg-Marquardt: many starts in one compiled program, refilled as they finish.
+"""One iteration of Levenberg-Marquardt inside a box, of one start; pure functions.
 
 MINPACK's tests of convergence and trust region (More 1978, doi:10.1007/BFb0067700): a step is as
 long as the radius allows, in coordinates that are scaled already. Each step bends along the curve
@@ -8,23 +8,16 @@ contact nearly trade off, and straight steps crawl in them. Bounds by an active 
 its bound whose gradient points outwards is held; one that a step would carry over its bound stops
 on it exactly, and the others go to where that leaves their minimum.
 
-A batch of starts takes a few iterations at a time; those that are done leave their slots and
-waiting ones take them, so that a slow start holds up nobody and one program serves any number. Each
-start is computed from its own data alone. What is minimised is an `Objective`.
+What is minimised is an `Objective`.
 """
 
-import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import epsilon, solve_spd
-from jaxtrachea.fitting.map_lanes import batch_size, cast, program
 from jaxtrachea.status import FitStatus
 
 RUNNING = -1
@@ -131,31 +124,15 @@ class _Step(NamedTuple):
     predicted: Float[Array, ""]
 
 
-class Solved(NamedTuple):
-    """Outcome of many starts, numpy, leading axis = starts in the order given.
-
-    Attributes:
-        theta: unknowns in scaled coordinates; (starts, P).
-        cost: half the weighted sum of rho(residual^2); (starts,).
-        status: `FitStatus`; (starts,).
-        iterations: (starts,).
-    """
-
-    theta: np.ndarray
-    cost: np.ndarray
-    status: np.ndarray
-    iterations: np.ndarray
-
-
-def _rounding(bound, dtype=None):
+def bound_rounding(bound, dtype=None):
     """Distance to a bound that is rounding, at most."""
     return 8 * epsilon(bound.dtype if dtype is None else dtype) * (1 + abs(bound))
 
 
 def active_set(theta, gradient, box: Box):
     """Unknowns that do not move: absent, or on a bound that the gradient pushes against."""
-    low = (theta - box.lower <= _rounding(box.lower)) & (gradient > 0)
-    high = (box.upper - theta <= _rounding(box.upper)) & (gradient < 0)
+    low = (theta - box.lower <= bound_rounding(box.lower)) & (gradient > 0)
+    high = (box.upper - theta <= bound_rounding(box.upper)) & (gradient < 0)
     return low | high | (box.active == 0)
 
 
@@ -307,123 +284,3 @@ def _status(tolerances, old_cost, new, objective, fresh, finite, step, actual):
     out = (status == RUNNING) & (new.iteration >= tolerances.iterations)
     status = jnp.where(out, FitStatus.MAX_ITERATIONS, status)
     return jnp.where(fresh & ~finite, FitStatus.INFEASIBLE_START, status).astype(jnp.int8)
-
-
-def _advance(tolerances, rounds, objective, start, refill, state):
-    """Put fresh starts where asked, then up to `rounds` iterations of the whole batch."""
-
-    def put(new, old):
-        return jnp.where(refill.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-    # Iteration 0 marks a fresh start: its point is evaluated before it is used. Where that fails
-    # the cost stays infinite, so that no minimum of another start is taken for its own.
-    cost = put(jnp.inf, state.point.cost)
-    state = State(
-        theta=put(start, state.theta),
-        point=eqx.tree_at(lambda point: point.cost, state.point, cost),
-        radius=put(FIRST_RADIUS, state.radius),
-        iteration=put(0, state.iteration),
-        status=put(jnp.int8(RUNNING), state.status),
-    )
-    one = jax.vmap(functools.partial(iterate, tolerances))
-
-    def body(carry):
-        i, state = carry
-        return i + 1, one(objective, state)
-
-    def go(carry):
-        i, state = carry
-        return (i < rounds) & jnp.any(state.status == RUNNING)
-
-    return jax.lax.while_loop(go, body, (0, state))[1]
-
-
-def levenberg_marquardt(
-    objective: Objective,
-    starts: np.ndarray,
-    rows: np.ndarray | None = None,
-    *,
-    tolerances: Tolerances = Tolerances(),  # noqa: B008 (immutable)
-    batch: int = 128,
-    rounds: int = 4,
-    progress: Callable[[int], None] | None = None,
-    dtype=np.float64,
-) -> Solved:
-    """Minimise from every start.
-
-    Args:
-        objective: of all lanes: numpy arrays with a leading axis.
-        starts: scaled coordinates; (starts, P).
-        rows: lane of each start, int; (starts,); None: one start of each lane.
-        tolerances: when a start is done.
-        batch: starts computed together.
-        rounds: iterations between two looks at which are done.
-        progress: called with the number of starts that finished since the last call.
-        dtype: of the computation.
-
-    Returns:
-        The `Solved` starts, in order. Failed ones are rows with a status; they touch no other row.
-    """
-    total, unknowns = starts.shape
-    rows = np.arange(total) if rows is None else rows
-    batch = batch_size(total, batch)
-    exact, objective, given = objective, cast(objective, dtype), cast(starts, dtype)
-    advance = program(_advance, tolerances, rounds, axes=None, donate=(3,))
-    state = _idle(objective, batch, dtype)
-    # What the slots of the batch compute with; rewritten only where a start takes its place.
-    slots = jax.tree.map(lambda v: np.repeat(v[:1], batch, axis=0), (objective, given))
-    out = Solved(
-        np.zeros((total, unknowns)), np.full(total, np.inf), np.zeros(total, int),
-        np.zeros(total, int),
-    )  # fmt: skip
-    owner = np.full(batch, -1)
-    waiting = 0
-    while True:
-        refill = owner < 0
-        empty = np.flatnonzero(refill)[: total - waiting]
-        owner[empty] = np.arange(waiting, waiting + len(empty))
-        waiting += len(empty)
-        refill &= owner >= 0
-        if np.all(owner < 0):
-            return out
-        new = owner[empty]
-        arrivals = jax.tree.map(lambda v, of=rows[new]: v[of], objective), given[new]
-        for slot, arrival in zip(jax.tree.leaves(slots), jax.tree.leaves(arrivals), strict=True):
-            slot[empty] = arrival
-        state = advance(*slots, refill, state)
-        status = np.asarray(state.status)
-        done = (owner >= 0) & (status != RUNNING)
-        finished = owner[done]
-        if len(finished):
-            theta = np.asarray(state.theta)[done]
-            out.theta[finished] = _on_bounds(theta, exact, rows[finished])
-            out.cost[finished] = np.asarray(state.point.cost)[done]
-            out.status[finished] = status[done]
-            out.iterations[finished] = np.asarray(state.iteration)[done]
-            owner[done] = -1
-        if progress is not None:
-            progress(len(finished))
-
-
-def _on_bounds(theta, box: Box, rows) -> np.ndarray:
-    """Unknowns of the lanes `rows` in the box, on its bounds where rounding alone parts them."""
-    lower, upper = box.lower[rows], box.upper[rows]
-    inside = np.clip(np.asarray(theta, np.float64), lower, upper)
-    inside = np.where(inside - lower <= _rounding(lower, theta.dtype), lower, inside)
-    return np.where(upper - inside <= _rounding(upper, theta.dtype), upper, inside)
-
-
-def _idle(objective: Objective, batch: int, dtype) -> State:
-    """A batch of slots nobody works at."""
-    one: Any = jax.tree.map(lambda v: v[0], objective)
-
-    def zeros(*shape):
-        return jnp.zeros((batch, *shape), dtype)
-
-    point = jax.tree.map(lambda v: zeros(*v.shape), one.blank())
-    done = jnp.full(batch, FitStatus.CONVERGED, jnp.int8)
-    return State(zeros(*one.lower.shape), point, zeros(), jnp.zeros(batch, jnp.int32), done)
-
-
-#: Starts computed together at most, and the part of the free memory that they may take.
-MOST_SLOTS, PART_OF_MEMORY = 128, 0.5

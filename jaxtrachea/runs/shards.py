@@ -1,8 +1,8 @@
-"""A long fit in chunks of lanes: fitted by themselves, saved by themselves, joined at the end.
+"""A long fit in shards of lanes, each fitted and saved by itself, all joined at the end.
 
-What a chunk gives depends on its own lanes and on the settings alone, and all chunks are as large
+What a shard gives depends on its own lanes and on the settings alone, and all shards are as large
 as each other (within one lane), so that one compiled program serves them. Hence the result does not
-depend on when a run was stopped, nor on which process or device fitted which chunk.
+depend on when a run was stopped, nor on which process or device fitted which shard.
 """
 
 import contextlib
@@ -17,19 +17,21 @@ import numpy as np
 
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.fitting import residual
-from jaxtrachea.fitting.levenberg_marquardt import MOST_SLOTS, PART_OF_MEMORY
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.levenberg_marquardt import MOST_SLOTS, PART_OF_MEMORY
 from jaxtrachea.results.arrays import arrays_of, result_of
-from jaxtrachea.runs import journal as journals
-from jaxtrachea.runs.journal import Journal
+from jaxtrachea.runs import manifest as manifests
+from jaxtrachea.runs.manifest import Manifest
 
-#: Lanes of a chunk at most, and its residual entries times starts at most: about ten seconds of
+#: Lanes of a shard at most, and its residual entries times starts at most: about ten seconds of
 #: one core.
 MOST_LANES, MOST_ENTRIES = 4096, 4_000_000
+#: Key of the manifest in the file of a shard.
+_MANIFEST = "journal"
 
 
-def lanes_per_chunk(study: Study, starts: int) -> int:
+def lanes_per_shard(study: Study, starts: int) -> int:
     """Lanes saved together, by the size of the study alone: the same on every machine.
 
     All of a joint study.
@@ -42,11 +44,11 @@ def lanes_per_chunk(study: Study, starts: int) -> int:
 
 
 def divide(lanes: int, most: int) -> list[np.ndarray]:
-    """Lanes of every chunk: at most `most`, in order, as equal as can be."""
+    """Lanes of every shard: at most `most`, in order, as equal as can be."""
     return np.array_split(np.arange(lanes), -(-lanes // most))
 
 
-def bytes_per_seat(study: Study) -> int:
+def bytes_per_slot(study: Study) -> int:
     """Memory that one of the lanes computed together takes, from above.
 
     Five numbers per residual entry and free column, as XLA counts them for a Levenberg-Marquardt
@@ -56,7 +58,7 @@ def bytes_per_seat(study: Study) -> int:
     return 8 * (5 * len(study.free) * entries + 8 * study.size**2 + 500)
 
 
-def seats(study: Study, free: float, most: int = MOST_SLOTS) -> int:
+def slots(study: Study, free: float, most: int = MOST_SLOTS) -> int:
     """Lanes that can be computed together, a power of two.
 
     Args:
@@ -64,7 +66,7 @@ def seats(study: Study, free: float, most: int = MOST_SLOTS) -> int:
         free: memory of the device that is free, bytes.
         most: upper bound.
     """
-    fitting = max(1, int(PART_OF_MEMORY * free) // bytes_per_seat(study))
+    fitting = max(1, int(PART_OF_MEMORY * free) // bytes_per_slot(study))
     return min(most, 1 << (fitting.bit_length() - 1))
 
 
@@ -102,34 +104,34 @@ def replaced(result: FitResult, lanes: np.ndarray, by: FitResult) -> FitResult:
     return result_of(result.study, arrays)
 
 
-def save(path: Path, journal: Journal, lanes: np.ndarray, result: FitResult) -> None:
-    """Write a chunk at once or not at all, and onto the disk.
+def save(path: Path, manifest: Manifest, lanes: np.ndarray, result: FitResult) -> None:
+    """Write a shard at once or not at all, and onto the disk.
 
     Args:
         path: file, replaced if it exists.
-        journal: of the run it belongs to; stored whole, for the case that the run's own is lost.
+        manifest: of the run it belongs to; stored whole, for the case that the run's own is lost.
         lanes: that were fitted.
         result: of these lanes.
     """
     image = io.BytesIO()
-    text = json.dumps(journals.as_dict(journal))
-    arrays: dict[str, Any] = {"run": np.array(journal.id), "journal": np.array(text)}
+    text = json.dumps(manifests.as_dict(manifest))
+    arrays: dict[str, Any] = {"run": np.array(manifest.id), _MANIFEST: np.array(text)}
     arrays |= {"lanes": lanes} | arrays_of(result)
     np.savez(image, **arrays)
     write_whole(path, image.getvalue())
 
 
-def read_journal(path: Path) -> Journal | None:
-    """The journal in a saved chunk, or None where there is none to be read."""
+def read_manifest(path: Path) -> Manifest | None:
+    """The manifest in a saved shard, or None where there is none to be read."""
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return journals.from_dict(json.loads(str(file["journal"])))
+            return manifests.from_dict(json.loads(str(file[_MANIFEST])))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
 
 
 def load(path: Path, run: str, lanes: np.ndarray, study: Study) -> FitResult | None:
-    """A saved chunk, or None where there is none, or a damaged one, or one of another run.
+    """A saved shard, or None where there is none, or a damaged one, or one of another run.
 
     Args:
         path: file.
@@ -140,7 +142,7 @@ def load(path: Path, run: str, lanes: np.ndarray, study: Study) -> FitResult | N
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        arrays.pop("journal", None)
+        arrays.pop(_MANIFEST, None)
         mine = arrays.pop("run") == run and np.array_equal(arrays.pop("lanes"), lanes)
         return result_of(study, arrays) if mine else None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):

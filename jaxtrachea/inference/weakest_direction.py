@@ -13,7 +13,9 @@ from jaxtrachea.fitting.verdict import WEAK
 _PART, _EXPONENT = 0.1, 0.02
 
 
-def combinations(names: list[str], blind: Float[np.ndarray, "m P"]) -> tuple[list[str], list[str]]:
+def combinations(
+    names: list[str], null_space: Float[np.ndarray, "m P"]
+) -> tuple[list[str], list[str]]:
     """Who is involved in undetermined directions, and the products that are determined instead.
 
     In relative coordinates a direction v changes ln p by v; the products of powers that it leaves
@@ -22,13 +24,13 @@ def combinations(names: list[str], blind: Float[np.ndarray, "m P"]) -> tuple[lis
 
     Args:
         names: of the unknowns.
-        blind: undetermined directions, orthonormal.
+        null_space: undetermined directions, orthonormal.
 
     Returns:
         Names involved; products such as "EI_L k_M^3.02" (none if nothing is determined).
     """
-    parts = np.flatnonzero(np.any(np.abs(blind[:, : len(names)]) >= _PART, axis=0))
-    known = scipy.linalg.null_space(blind[:, parts]).T
+    parts = np.flatnonzero(np.any(np.abs(null_space[:, : len(names)]) >= _PART, axis=0))
+    known = scipy.linalg.null_space(null_space[:, parts]).T
     rows = _echelon(known)
     involved = [names[i] for i in parts]
     products = []
@@ -59,38 +61,37 @@ def _echelon(rows: np.ndarray) -> np.ndarray:
     return rows
 
 
-def describe_flat(
+def describe_weakest(
     names: list[str],
-    flat: Float[np.ndarray, " P"],
-    flat_se: float,
-    blind: Float[np.ndarray, "P P"] | None = None,
+    weakest: Float[np.ndarray, " P"],
+    weakest_se: float,
+    null_space: Float[np.ndarray, "P P"] | None = None,
     undetermined: Bool[np.ndarray, " P"] | None = None,
     press: Mapping[int, tuple[float, str]] = MappingProxyType({}),
 ) -> str:
     """What the data leave open, in words.
 
     Args:
-        names: unknowns, in the order of `flat`.
-        flat: least determined direction in relative coordinates, see `Uncertainty.flat`.
-        flat_se: relative standard error along it.
-        blind: directions that the structure leaves open, see `Uncertainty.blind`; None: `flat` if
-            its error is infinite.
+        names: unknowns, in the order of `weakest`.
+        weakest: `Uncertainty.weakest_direction`, in relative coordinates.
+        weakest_se: relative standard error along it.
+        null_space: `Uncertainty.structural_null_space`; None: `weakest` if its error is infinite.
         undetermined: unknowns that it leaves open at generic points.
         press: of unknowns that are measured against the press (by position), its size and unit.
     """
-    if not np.any(flat):
+    if not np.any(weakest):
         return "no free parameter"
-    if press and np.any(np.abs(flat[list(press)]) >= _PART * np.max(np.abs(flat))):
-        return _with_units(names, flat, flat_se, blind, press)
-    if np.isfinite(flat_se) and flat_se <= WEAK:
-        order = np.argsort(-np.abs(flat))
-        main = [i for i in order if abs(flat[i]) >= 0.1 * abs(flat[order[0]])]
+    if press and np.any(np.abs(weakest[list(press)]) >= _PART * np.max(np.abs(weakest))):
+        return _with_units(names, weakest, weakest_se, null_space, press)
+    if np.isfinite(weakest_se) and weakest_se <= WEAK:
+        order = np.argsort(-np.abs(weakest))
+        main = [i for i in order if abs(weakest[i]) >= 0.1 * abs(weakest[order[0]])]
         one = f"{names[main[0]]} alone" if len(main) == 1 else None
-        what = one or f"{_moves(names, flat, main)} together"
-        return f"least determined: {what}, known to {_percent(flat_se)}"
-    structural = bool(np.any(blind)) if blind is not None else not np.isfinite(flat_se)
-    open_ways = flat[None] if blind is None else blind[np.any(blind, axis=1)]
-    ways = open_ways if structural else flat[None]
+        what = one or f"{_moves(names, weakest, main)} together"
+        return f"least determined: {what}, known to {_percent(weakest_se)}"
+    structural = bool(np.any(null_space)) if null_space is not None else not np.isfinite(weakest_se)
+    open_ways = weakest[None] if null_space is None else null_space[np.any(null_space, axis=1)]
+    ways = open_ways if structural else weakest[None]
     involved, products = combinations(names, ways)
     alone = involved[0] if len(involved) == 1 else None
     open_ = [] if undetermined is None else np.flatnonzero(undetermined[: len(names)])
@@ -98,8 +99,8 @@ def describe_flat(
         # At this estimate one of them has no effect left at all.
         return f"{_list([names[i] for i in open_])} only in combination"
     if not structural:
-        if alone and np.isfinite(flat_se):
-            return f"{alone} alone is known to {_percent(flat_se)} only"
+        if alone and np.isfinite(weakest_se):
+            return f"{alone} alone is known to {_percent(weakest_se)} only"
         if alone or not products:
             return (
                 f"{_list(involved)} change{'s' if alone else ''} the curves too little to be told"
@@ -110,31 +111,31 @@ def describe_flat(
     return f"of {_list(involved)} only {_list(products)} is known"
 
 
-def _with_units(names, flat, flat_se, blind, press) -> str:
-    """As `describe_flat`, where an onset or an offset takes part: in its unit, no power of it."""
-    if np.isinf(flat_se):
-        ways = flat[None] if blind is None or not np.any(blind) else blind
+def _with_units(names, weakest, weakest_se, null_space, press) -> str:
+    """As `describe_weakest`, where an onset or an offset takes part: in its unit, no power."""
+    if np.isinf(weakest_se):
+        ways = weakest[None] if null_space is None or not np.any(null_space) else null_space
         parts = [n for i, n in enumerate(names) if np.any(np.abs(ways[:, i]) >= _PART)]
         alone = len(parts) == 1
         return f"{_list(parts)} change{'s' if alone else ' together'} without a change of any curve"
-    order = np.argsort(-np.abs(flat))
-    main = [i for i in order if abs(flat[i]) >= 0.1 * abs(flat[order[0]])]
+    order = np.argsort(-np.abs(weakest))
+    main = [i for i in order if abs(weakest[i]) >= 0.1 * abs(weakest[order[0]])]
     if len(main) == 1:
         size, unit = press[int(main[0])]
-        return f"least determined: {names[main[0]]} alone, known to {flat_se * size:.2g} {unit}"
-    step = 0.1 / np.max(np.abs(flat))
+        return f"least determined: {names[main[0]]} alone, known to {weakest_se * size:.2g} {unit}"
+    step = 0.1 / np.max(np.abs(weakest))
     moves = []
     for i in main:
         size, unit = press.get(int(i), (100.0, "%"))
-        moves.append(f"{names[i]} {step * flat[i] * size:+.3g} {unit}")
-    times = f"known to {flat_se / step:.2g} times that"
+        moves.append(f"{names[i]} {step * weakest[i] * size:+.3g} {unit}")
+    times = f"known to {weakest_se / step:.2g} times that"
     return f"least determined: {', '.join(moves)} together, {times}"
 
 
-def _moves(names, flat, main) -> str:
+def _moves(names, weakest, main) -> str:
     """Changes that belong together; the largest is 10 %."""
-    step = 0.1 / np.max(np.abs(flat))
-    return ", ".join(f"{names[i]} {100 * step * flat[i]:+.3g} %" for i in main)
+    step = 0.1 / np.max(np.abs(weakest))
+    return ", ".join(f"{names[i]} {100 * step * weakest[i]:+.3g} %" for i in main)
 
 
 def _percent(share: float) -> str:

@@ -1,4 +1,4 @@
-"""What decides the numbers of a run, kept beside its chunks, so that no other run goes on there."""
+"""What decides the numbers of a run, kept beside its shards, so that no other run goes on there."""
 
 import contextlib
 import dataclasses
@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import uuid
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import get_args, get_origin, get_type_hints
 
@@ -17,6 +17,8 @@ from jaxtrachea.files.provenance import installed
 SCHEMA = "jaxtrachea-run"
 SCHEMA_VERSION = 1
 _PACKAGES = ("jax", "jaxlib", "numpy", "scipy")
+#: Keys on file of the fields that are called otherwise there.
+_RUN_KEYS, _RERUN_KEYS = {"batch": "chunk"}, {"results": "former"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,29 +26,29 @@ class Rerun:
     """Fitting the failed lanes of a finished run again.
 
     Attributes:
-        former: SHA-256 of the results.h5 that holds the others.
+        results: SHA-256 of the results.h5 that holds the others.
         lanes: that are fitted again.
         count: how often this was done, this time included.
     """
 
-    former: str
+    results: str
     lanes: list[int]
     count: int
 
 
 @dataclasses.dataclass(frozen=True)
-class Journal:
+class Manifest:
     """A run.
 
     Attributes:
-        id: name of this run, in all its chunks.
+        id: name of this run, in all its shards.
         specification: SHA-256.
         inputs: SHA-256 by file, seen from the folder of the data.
         versions: of what computes.
         dtype: of the computation.
         device: kind of device.
         lanes: of the whole study.
-        chunk: lanes computed together.
+        batch: lanes computed together.
         save_every: lanes saved together, at most.
         options: of the command that need nothing but the fit: they are done at its end.
         rerun: None when all lanes are fitted.
@@ -60,7 +62,7 @@ class Journal:
     dtype: str
     device: str
     lanes: int
-    chunk: int
+    batch: int
     save_every: int
     options: list[str]
     rerun: Rerun | None = None
@@ -69,8 +71,8 @@ class Journal:
 
 def describe(
     spec: Path, root: Path, inputs: dict[str, str], dtype: str, device: str, **sizes
-) -> Journal:
-    """The journal of a run that starts now.
+) -> Manifest:
+    """The manifest of a run that starts now.
 
     Args:
         spec: the specification file.
@@ -78,9 +80,9 @@ def describe(
         inputs: SHA-256 by measurement file.
         dtype: of the computation.
         device: kind of device.
-        sizes: the other attributes of `Journal`.
+        sizes: the other attributes of `Manifest`.
     """
-    return Journal(
+    return Manifest(
         id=uuid.uuid4().hex,
         specification=hashlib.sha256(spec.read_bytes()).hexdigest(),
         inputs={os.path.relpath(name, root): digest for name, digest in inputs.items()},
@@ -91,7 +93,7 @@ def describe(
     )
 
 
-def differences(was: Journal, now: Journal) -> Iterator[str]:
+def differences(was: Manifest, now: Manifest) -> Iterator[str]:
     """What differs between two runs that should give the same numbers, in words."""
     if was.specification != now.specification:
         yield "the specification has changed"
@@ -112,31 +114,34 @@ def differences(was: Journal, now: Journal) -> Iterator[str]:
             yield f"{name} was {old} and is {new}{why}"
 
 
-def as_dict(journal: Journal) -> dict[str, object]:
-    """What is stored of a journal."""
-    return {"schema": SCHEMA, "schema_version": SCHEMA_VERSION} | dataclasses.asdict(journal)
+def as_dict(manifest: Manifest) -> dict[str, object]:
+    """What is stored of a manifest."""
+    stored = _renamed(dataclasses.asdict(manifest), _RUN_KEYS)
+    if manifest.rerun is not None:
+        stored["rerun"] = _renamed(dataclasses.asdict(manifest.rerun), _RERUN_KEYS)
+    return {"schema": SCHEMA, "schema_version": SCHEMA_VERSION} | stored
 
 
-def write(path: Path, journal: Journal) -> None:
-    """Write a journal at once or not at all; the former one stays beside it (`previous`).
+def write(path: Path, manifest: Manifest) -> None:
+    """Write a manifest at once or not at all; the one before stays beside it (`previous`).
 
     Raises:
         OSError: it could not be written; the one that was there still is.
     """
     with contextlib.suppress(OSError, ValueError):
-        if read(path) == journal:
+        if read(path) == manifest:
             return
         write_whole(previous(path), path.read_bytes())
-    write_whole(path, json.dumps(as_dict(journal), indent=2).encode())
+    write_whole(path, json.dumps(as_dict(manifest), indent=2).encode())
 
 
 def previous(path: Path) -> Path:
-    """Where the former journal lies."""
+    """Where the manifest before the last change lies."""
     return path.with_name(f"previous-{path.name}")
 
 
-def read(path: Path) -> Journal:
-    """Read a journal.
+def read(path: Path) -> Manifest:
+    """Read a manifest.
 
     Raises:
         OSError: there is none, or it cannot be read.
@@ -145,40 +150,51 @@ def read(path: Path) -> Journal:
     try:
         return from_dict(json.loads(path.read_text(encoding="utf-8")))
     except RecursionError:
-        raise ValueError("nested too deeply for the journal of a run") from None
+        raise ValueError("nested too deeply for the manifest of a run") from None
 
 
-def from_dict(content: object) -> Journal:
-    """A journal from what `as_dict` gives.
+def from_dict(content: object) -> Manifest:
+    """A manifest from what `as_dict` gives.
 
     Raises:
         ValueError: it is none, or of another version.
     """
     if not isinstance(content, dict):
-        raise ValueError(f"not the journal of a run, but {type(content).__name__}")
+        raise ValueError(f"not the manifest of a run, but {type(content).__name__}")
     found = dict(content)
     if (found.pop("schema", None), found.pop("schema_version", None)) != (SCHEMA, SCHEMA_VERSION):
-        raise ValueError("not the journal of a run, or one of another version")
+        raise ValueError("not the manifest of a run, or one of another version")
     try:
         rerun = found.pop("rerun")
-        _check_types(Journal, found, {"rerun"})
-        if rerun is not None:
-            _check_types(Rerun, rerun, set())
-        return Journal(**found, rerun=None if rerun is None else Rerun(**rerun))
+        _check_types(Manifest, found, _RUN_KEYS, {"rerun"})
+        run = Manifest(**_renamed(found, {key: name for name, key in _RUN_KEYS.items()}))
+        if rerun is None:
+            return run
+        _check_types(Rerun, rerun, _RERUN_KEYS)
+        rerun = Rerun(**_renamed(rerun, {key: name for name, key in _RERUN_KEYS.items()}))
+        return dataclasses.replace(run, rerun=rerun)
     except (TypeError, KeyError) as error:
-        raise ValueError(f"not the journal of a run: {error}") from None
+        raise ValueError(f"not the manifest of a run: {error}") from None
 
 
-def _check_types(kind: type, found: dict, apart: set[str]) -> None:
+def _renamed(content: dict, names: dict[str, str]) -> dict:
+    """The same content, keys replaced by `names`."""
+    return {names.get(key, key): value for key, value in content.items()}
+
+
+def _check_types(
+    kind: type, found: dict, keys: dict[str, str], apart: Collection[str] = ()
+) -> None:
     """Refuse values that are not of the field's type.
 
     Raises:
-        TypeError: naming the field.
+        TypeError: naming the key on file.
+        KeyError: a key is missing.
     """
-    for name, hint in get_type_hints(kind).items():
-        if name in apart:
+    for field, hint in get_type_hints(kind).items():
+        if field in apart:
             continue
-        wanted = get_origin(hint) or hint
+        name, wanted = keys.get(field, field), get_origin(hint) or hint
         if not isinstance(found[name], wanted) or isinstance(found[name], bool):
             raise TypeError(f"{name} is {found[name]!r}; expected {wanted.__name__}")
         inner = get_args(hint)[-1:]

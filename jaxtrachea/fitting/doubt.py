@@ -1,0 +1,117 @@
+"""Which estimates give cause for doubt: what a local standard error cannot tell.
+
+A lane gives cause where a direction is long (relative standard error above `LONG`) or the Jacobian
+ill-conditioned, where an unknown is on its bound, or where another start has ended as low
+elsewhere.
+"""
+
+import numpy as np
+from jaxtyping import Bool
+
+from jaxtrachea.fitting.minima import Minima
+from jaxtrachea.fitting.natural_sizes import natural_sizes
+from jaxtrachea.fitting.noise import first_sigma
+from jaxtrachea.fitting.parameters import OF_THE_PRESS, SKELETON
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.structure import positions
+from jaxtrachea.fitting.study import Study
+from jaxtrachea.status import FitStatus
+
+#: Relative standard error along a direction, and condition number, from which there is doubt about
+#: the unknowns with a part in it; and from which there is about all unknowns.
+LONG, ILL_CONDITIONED, VERY_LONG = 0.1, 1e4, 0.3
+#: Part of an unknown's relative error by a doubtful direction, below which it is left in peace.
+PART = 0.02
+#: Relative distance from which two points are two.
+APART = 0.05
+#: Lanes that have come to lie somewhere, if only in a valley.
+_SITUATED = [
+    *(s for s in FitStatus if s.succeeded), FitStatus.MAX_ITERATIONS, FitStatus.STALLED,
+]  # fmt: skip
+
+
+def doubtful(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
+    """Unknowns of succeeded lanes that give cause, other than those that the structure leaves open.
+
+    Args:
+        result: of lanes fitted by themselves.
+        minima: where all starts ended.
+    """
+    alive = np.isin(result.status, _SITUATED)
+    present = (result.study.lanes.active > 0) & ~result.undetermined & alive[:, None]
+    doubt = np.zeros(present.shape, bool)
+    natural = natural_sizes(result)
+    se = result.uncertainty.se / natural
+    known = present & np.isfinite(se)
+    se = np.where(known, se, 0)
+    correlation = result.uncertainty.correlation
+    both = known[:, :, None] & known[:, None]
+    covariance = np.where(both, correlation, 0) * se[:, :, None] * se[:, None]
+    values, vectors = np.linalg.eigh(np.nan_to_num(covariance))
+    root = np.sqrt(np.maximum(values, 0))
+    least = np.min(np.where(np.sum(vectors**2 * known[:, :, None], axis=1) > 0.5, root, np.inf), 1)
+    long = (root > LONG) | (root > ILL_CONDITIONED * least[:, None])
+    doubt |= np.any(long[:, None] & (np.abs(vectors) * root[:, None] > PART), axis=2)
+    failed = result.status > FitStatus.UNIDENTIFIABLE
+    lost = present & ~np.isfinite(se + np.where(known, 0, np.inf)) & ~result.at_bound
+    everything = result.at_bound.any(axis=1) | lost.any(axis=1) | failed
+    everything |= root.max(axis=1) > VERY_LONG
+    everything |= _elsewhere_as_low(result, minima, se, natural) | barely_determined(result.study)
+    return present & (doubt | everything[:, None])
+
+
+def left_in_doubt(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes P"]:
+    """`doubtful` unknowns of a fit that nothing further will look at.
+
+    An unknown that all lanes of a joint fit share is in doubt where half of them say so. What is
+    measured against the press (onset, offset) is seen by its own curve, whatever the others do: it
+    stands by its own error.
+    """
+    doubt = doubtful(result, minima)
+    study = result.study
+    shared = study.shared
+    if shared.size:
+        row, good = np.arange(len(doubt))[:, None], result.succeeded
+        votes = doubt[row, shared][good]
+        doubt[row, shared] = np.mean(votes, axis=0) >= 0.5 if len(votes) else True
+    error = result.uncertainty.se / natural_sizes(result)
+    for lane, unknowns in enumerate(study.unknowns):
+        for i, (p, _, _) in enumerate(unknowns):
+            if p.name in OF_THE_PRESS:
+                doubt[lane, i] &= not error[lane, i] <= LONG
+    return doubt
+
+
+def _elsewhere_as_low(result: FitResult, minima: Minima, se, natural) -> Bool[np.ndarray, " lanes"]:
+    """Lanes of which a start has ended apart from the estimate, at a cost that is no worse.
+
+    By the covariance at the estimate: what it calls within the interval is no other minimum.
+    """
+    out = np.zeros(result.lanes, bool)
+    lane = minima.lane
+    apart = np.abs(minima.end - result.theta[lane]) / natural[lane]
+    own = (result.study.lanes.active[lane] > 0) & ~result.undetermined[lane]
+    rows = np.flatnonzero(np.any(own & (apart > np.maximum(APART, 2 * se[lane])), axis=1))
+    if len(rows):
+        low = np.full(result.lanes, np.inf)
+        np.minimum.at(low, lane, np.where(np.isfinite(minima.cost), minima.cost, np.inf))
+        scale = (first_sigma(result.study) / result.whitened_sigma)[lane[rows], 0] ** 2
+        dispersion = np.fmin.reduce(result.uncertainty.dispersion, axis=1)[lane[rows]]
+        half = result.uncertainty.half_width[lane[rows]]
+        with np.errstate(invalid="ignore"):
+            rise = 2 * (minima.cost[rows] - low[lane[rows]]) * scale
+        out[lane[rows[rise <= 4 * dispersion * half**2]]] = True
+    return out
+
+
+def barely_determined(study: Study) -> Bool[np.ndarray, " lanes"]:
+    """Lanes without markers with at most one position more than unknowns of the skeleton.
+
+    With as many equations as unknowns other skeletons may have the same compliances exactly, with
+    one more nearly the same, each a sharp minimum of its own.
+    """
+    beam = [[p.name in SKELETON for p, _, _ in u] for u in study.unknowns]
+    count = np.array([sum(row) for row in beam])
+    marked = study.lanes.joint_precision
+    seen = np.zeros(len(count), bool) if marked is None else (marked > 0).any(axis=(1, 2, 3))
+    return (positions(study) <= count + 1) & (count > 1) & ~seen

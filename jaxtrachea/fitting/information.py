@@ -1,0 +1,105 @@
+"""Information matrices and residual statistics of lanes at their estimates (Gauss-Newton)."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxtrachea.fitting.cost import assemble, entry_scale, robust
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.map_lanes import map_lanes
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.residual import observations, residual
+from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.programs import batch_size
+
+
+class Information(NamedTuple):
+    """One lane at its estimate; m entries of the residual, P unknowns.
+
+    Attributes:
+        bread: sum of b^2 J^T J (b: curve weight), whitened; (P, P).
+        meat: sum of b^4 J^T J; (P, P).
+        gradient: of the cost; (P,).
+        squares: sum of squared residuals of force (N^2) and markers (mm^2) in units of the given
+            precision; (2,).
+        weighted: the same with the squares of the curve weights; (2,).
+        counts: observed entries of each; (2,).
+        spread: median absolute residual of each, same units, 0 with a linear loss; (2,).
+        psi2: mean of psi(z)^2 over observed entries.
+        dpsi: mean of psi'(z).
+    """
+
+    bread: Float[Array, "P P"]
+    meat: Float[Array, "P P"]
+    gradient: Float[Array, " P"]
+    squares: Float[Array, "2"]
+    weighted: Float[Array, "2"]
+    counts: Float[Array, "2"]
+    spread: Float[Array, "2"]
+    psi2: Float[Array, ""]
+    dpsi: Float[Array, ""]
+
+    def rescaled(self, ratio: np.ndarray) -> "Information":
+        """The same lanes with sigma smaller by `ratio`, (lanes,): linear loss, no markers."""
+        square = ratio * ratio
+        return self._replace(
+            bread=self.bread * square[:, None, None],
+            meat=self.meat * square[:, None, None],
+            gradient=self.gradient * square[:, None],
+            psi2=self.psi2 * square,
+        )
+
+
+def information(
+    model: FitModel, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
+) -> Information:
+    """Information matrices and residual statistics of one lane."""
+    r = residual(model, theta, lane)
+    seen, forces = observations(lane)
+    scale = entry_scale(lane, sigma)
+    z = r.value * scale[None]
+    J = r.jacobian * (scale[None] * seen)[:, None]
+    b2 = (lane.balance * lane.balance)[:, None, None]
+    _, slope = robust(model.loss, z * z, model.loss_scale)
+
+    def psi(z):
+        return z * robust(model.loss, z * z, model.loss_scale)[1]
+
+    _, dpsi = jax.jvp(psi, (z,), (jnp.ones_like(z),))
+    gram = jnp.einsum("tim,tjm->tij", J, J)
+    gradient = jnp.einsum("tim,tm->ti", J * b2, z * slope)
+    total = jnp.sum(seen)
+    kinds = jnp.arange(seen.shape[1]) < forces
+
+    def by_kind(v):
+        return jnp.stack([jnp.sum(v[:, :forces]), jnp.sum(v[:, forces:])])
+
+    def spread(force):
+        # A sort, and the dearest part of all this: only where the noise is taken from it.
+        if model.loss == "linear":
+            return jnp.zeros((), theta.dtype)
+        mine = (seen > 0) & (kinds == force)[None]
+        return jnp.nanmedian(jnp.where(mine, jnp.abs(r.value), jnp.nan))
+
+    return Information(
+        bread=assemble(model, b2 * gram, lane),
+        meat=assemble(model, b2 * b2 * gram, lane),
+        gradient=assemble(model, gradient, lane),
+        squares=by_kind(r.value**2 * seen),
+        weighted=by_kind(r.value**2 * seen * b2[:, 0]),
+        counts=by_kind(seen),
+        spread=jnp.stack([spread(True), spread(False)]),
+        psi2=jnp.sum(psi(z) ** 2 * seen) / total,
+        dpsi=jnp.sum(dpsi * seen) / total,
+    )
+
+
+def informations(
+    study: Study, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, batch: int = 128
+) -> Information:
+    """`information` of many lanes, on the host; leading axis = order of `lanes`."""
+    batch = batch_size(len(lanes), batch)
+    return map_lanes(information, study, theta, sigma, rows=lanes, batch=batch)

@@ -1,0 +1,199 @@
+"""Curves divided into lanes, each a set of padded arrays.
+
+Lanes have equal shapes (curves of unequal length are padded with weight zero), so that one compiled
+program fits any number of them at once.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+from jaxtrachea._arguments import check_record
+from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.parameters import Parameter
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.trachea.geometry import Geometry
+
+Balance = Literal["curve", "sample"]
+#: An unknown: its parameter, and the specimen and the trial that it belongs to, "" for all.
+Unknown = tuple[Parameter, str, str]
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise:
+    """Standard deviations; None: estimated from the residuals.
+
+    Attributes:
+        force: N; a curve's own per-sample sigma comes before it.
+        joints: mm.
+    """
+
+    force: float | None = None
+    joints: float | None = None
+
+    def __post_init__(self):
+        """Refuse words and numbers that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_record(self)
+        for name in ("force", "joints"):
+            if (value := getattr(self, name)) is not None and value <= 0:
+                raise ValueError(
+                    f"{name} is {value:g}; expected a standard deviation of more than 0, or None"
+                )
+
+
+def group(
+    curves: Sequence[Curve], parameters: Sequence[Parameter], *, joint: bool = False
+) -> list[list[Curve]]:
+    """Divide curves into lanes by the widest scope among the free parameters.
+
+    By specimens if joint, or if none is free.
+    """
+    scopes = {"specimen"} if joint else {p.scope for p in parameters if not p.fixed}
+    scopes = scopes or {"specimen"}
+    if "shared" in scopes:
+        return [list(curves)]
+    lanes: dict[tuple[str, str], list[Curve]] = {}
+    for curve in curves:
+        key = (curve.specimen, "" if "specimen" in scopes else curve.trial)
+        lanes.setdefault(key, []).append(curve)
+    return list(lanes.values())
+
+
+def unknowns_of(lane: Sequence[Curve], parameters: Sequence[Parameter]) -> list[Unknown]:
+    """Distinct unknowns of a lane, in parameter order."""
+    names: dict[Unknown, None] = {}
+    for p in parameters:
+        if not p.fixed:
+            for curve in lane:
+                names.setdefault(_key(p, curve))
+    return list(names)
+
+
+def _key(p: Parameter, curve: Curve) -> Unknown:
+    specimen = "" if p.scope == "shared" else curve.specimen
+    return p, specimen, curve.trial if p.scope == "trial" else ""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Layout:
+    """What all lanes of a study have in common: their sizes, and how curves become arrays.
+
+    Attributes:
+        parameters: the table.
+        geometry: the tube.
+        noise: known standard deviations.
+        mean_length: samples of a curve in the mean; None: every sample weighs the same.
+        reach: markers closer to the contact do not count, mm; below 0: all count.
+        trials: of a lane, at most.
+        samples: of a curve, at most.
+        unknowns: of a lane, at most.
+        joints: whether any curve has markers.
+    """
+
+    parameters: Sequence[Parameter]
+    geometry: Geometry
+    noise: Noise
+    mean_length: float | None
+    reach: float
+    trials: int
+    samples: int
+    unknowns: int
+    joints: bool
+
+    def curve_weight(self, samples: int) -> float:
+        """Weight of the residuals of a curve of so many samples."""
+        return 1.0 if self.mean_length is None else np.sqrt(self.mean_length / samples)
+
+
+def lanes_of(
+    groups: Sequence[Sequence[Curve]],
+    unknowns: Sequence[Sequence[Unknown]],
+    parameters: Sequence[Parameter],
+    geometry: Geometry,
+    *,
+    noise: Noise,
+    balance: Balance,
+    tool_radius: float | None,
+) -> Lane:
+    """The lanes of a study, stacked along a leading axis.
+
+    Args:
+        groups: curves of each lane.
+        unknowns: of each lane.
+        parameters: the table.
+        geometry: the tube.
+        noise: known standard deviations.
+        balance: see `study.build_study`.
+        tool_radius: see `study.build_study`.
+    """
+    lengths = [len(c.force) for curves in groups for c in curves]
+    layout = _Layout(
+        parameters=parameters,
+        geometry=geometry,
+        noise=noise,
+        mean_length=float(np.mean(lengths)) if balance == "curve" else None,
+        reach=-1.0 if tool_radius is None else tool_radius,
+        trials=max(map(len, groups)),
+        samples=max(lengths),
+        unknowns=max(map(len, unknowns)),
+        joints=any(c.joint_displacement is not None for curves in groups for c in curves),
+    )
+    lanes = [_lane(layout, *lane) for lane in zip(groups, unknowns, strict=True)]
+    return jax.tree.map(lambda *arrays: np.stack(arrays), *lanes)
+
+
+def _lane(layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown]) -> Lane:
+    """One lane as padded float64 arrays."""
+    parameters, geometry, noise = layout.parameters, layout.geometry, layout.noise
+    T, N, J, P = layout.trials, layout.samples, len(parameters), layout.unknowns
+    joints = np.zeros((T, N, geometry.rings)) if layout.joints else None
+    lane: dict[str, Any] = {
+        "s_c": np.full(T, float(geometry.length) / 2),
+        "displacement": np.zeros((T, N)),
+        "force": np.zeros((T, N)),
+        "precision": np.zeros((T, N)),
+        "joints": joints,
+        "joint_precision": None if joints is None else joints.copy(),
+        "balance": np.ones(T),
+        "blend": None,
+        "value": np.tile([p.value for p in parameters], (T, 1)).astype(np.float64),
+        "index": np.full((T, J), -1, np.int32),
+        "lower": np.zeros(P),
+        "upper": np.zeros(P),
+        "active": np.zeros(P),
+    }
+    place = {key: i for i, key in enumerate(unknowns)}
+    for i, (p, _, _) in enumerate(unknowns):
+        lane["lower"][i], lane["upper"][i] = p.to_scaled(p.lower), p.to_scaled(p.upper)
+        lane["active"][i] = 1
+    for t, curve in enumerate(curves):
+        n = len(curve.force)
+        if curve.s_c is not None:
+            lane["s_c"][t] = curve.s_c
+        lane["displacement"][t, :n], lane["force"][t, :n] = curve.displacement, curve.force
+        sigma = curve.sigma if curve.sigma is not None else noise.force
+        lane["precision"][t, :n] = 1.0 if sigma is None else 1 / np.asarray(sigma)
+        lane["balance"][t] = layout.curve_weight(n)
+        for j, p in enumerate(parameters):
+            if not p.fixed:
+                lane["index"][t, j] = place[_key(p, curve)]
+        if curve.joint_displacement is not None and curve.joint_rings is not None:
+            weight = 1.0 if noise.joints is None else 1 / noise.joints
+            seen, at = _seen_joints(curve, geometry, layout.reach), curve.joint_rings
+            lane["joints"][t, :n, at] = np.where(seen, curve.joint_displacement, 0).T
+            lane["joint_precision"][t, :n, at] = np.where(seen, weight, 0).T
+    return Lane(**lane)
+
+
+def _seen_joints(curve: Curve, geometry: Geometry, reach: float) -> np.ndarray:
+    """Which markers of a curve count: observed, and not under the tool; (N, M)."""
+    seen = np.isfinite(np.asarray(curve.joint_displacement))
+    x = np.asarray(geometry.ring_positions)[curve.joint_rings]
+    return seen if curve.s_c is None else seen & (np.abs(x - curve.s_c) > reach)

@@ -1,0 +1,40 @@
+"""Programs for batches of problems: compiled once for equal functions, in few sizes and one dtype.
+
+What is compiled is kept by value of the static arguments: the same functions of equal models share
+their programs. JAX keeps apart what differs in shapes and dtypes.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+
+@functools.lru_cache(maxsize=128)
+def program(function: Callable, *static, axes: Any = 0, donate: tuple[int, ...] = ()) -> Any:
+    """`function(*static, ...)`, compiled; the same object for equal arguments.
+
+    Args:
+        function: pure; a module's own, not one that is defined anew in every call.
+        static: its first arguments, compared and hashed by value (`FitModel`, numbers, words).
+        axes: of the other arguments, as `in_axes` of `jax.vmap`; None: no `vmap`.
+        donate: of the other arguments, as `donate_argnums` of `jax.jit`.
+    """
+    one = functools.partial(function, *static)
+    return jax.jit(one if axes is None else jax.vmap(one, axes), donate_argnums=donate)
+
+
+def batch_size(total: int, most: int) -> int:
+    """Lanes computed together: few different sizes, so that few programs are compiled."""
+    return 1 if total == 1 else min(most, max(16, 1 << (total - 1).bit_length()))
+
+
+def cast(tree: Any, dtype) -> Any:
+    """Floating-point numpy arrays of a tree in a dtype; others stay."""
+
+    def moves(v):
+        return np.issubdtype(v.dtype, np.floating)
+
+    return jax.tree.map(lambda v: v.astype(dtype, copy=False) if moves(v) else v, tree)
