@@ -41,11 +41,29 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 install_import_hook("jaxtrachea", "beartype.beartype")
 
 
+#: Programs compiled since they were last dropped.
+_compiled = 0
+
+
+def _count(event, duration, **_):
+    global _compiled
+    _compiled += event == "/jax/core/compile/backend_compile_duration"
+
+
+jax.monitoring.register_event_duration_secs_listener(_count)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _forget_programs():
-    """Compiled programs of a file are dropped with it; together they would take gigabytes."""
+    """Compiled programs are dropped after some files; all together would take gigabytes.
+
+    Not after every file: a fifth and more of the small ones serve the next file too.
+    """
+    global _compiled
     yield
-    jax.clear_caches()
+    if _compiled > 1500:
+        jax.clear_caches()
+        _compiled = 0
 
 
 #: Files that take longest begin, so that none runs on alone at the end.

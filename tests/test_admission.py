@@ -299,7 +299,7 @@ def test_python_numbers():
         got = jax.jit(lambda g=g: press(g, Material(**VALUES), 40, [1, 2]))()
         for a, b in zip(got, exact, strict=True):
             np.testing.assert_allclose(a, b, rtol=50 * jnp.finfo(dtype).eps)
-    one = press(table_1(), Material(2, 1, 1, 0), 40, 2)
+    one = jax.jit(lambda: press(table_1(), Material(2, 1, 1, 0), 40, 2))()
     assert (one.force.shape, one.force.dtype) == ((), jnp.float64)
     for k in range(3):  # one program for every new number
         run(table_1(), Material(2.0 + k, 1.0, 1.0, 0.0), 40.0 + k, 2.0)
@@ -379,7 +379,7 @@ def test_scenes_and_sweeps():
     g, m = table_1(), Material(**FULL)
     path = Presses([40.0, 400.0, -1.0], [0.0] * 3, [[0, -1, 0]] * 3)
     none = {"want_surface": False, "want_joints": False, "want_ring_ends": False}
-    run = jax.jit(simulate)
+    run, swept_by = jax.jit(simulate), jax.jit(sweep)
     for effects in (
         EffectOptions(contact_point="per_step", **none),
         EffectOptions(contact_point="per_step", second_plane="on", **none),
@@ -391,11 +391,11 @@ def test_scenes_and_sweeps():
         out = run(scene, Material(**FULL | {"k_M": -0.1}), path)
         assert out.status.tolist() == [BAD] * 3
         assert np.isnan(out.force[:, 1]).all()
-    points = [40, 200, 50], [0, 0, 0], [1, 1, 1]
-    swept = sweep(scene, m, *points)
+    points = np.array([[40.0, 200, 50], [0, 0, 0], [1, 1, 1]])
+    swept = swept_by(scene, m, *points)
     assert swept.status.tolist() == [OK, OFF, OK]
     assert np.isnan(swept.compliance).tolist() == [False, True, False]
-    swept = sweep(scene, Material(**FULL | {"k_1": -0.1}), *points)
+    swept = swept_by(scene, Material(**FULL | {"k_1": -0.1}), *points)
     assert swept.status.tolist() == [BAD] * 3
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.spec import EffectsSection, load_scene_spec
 from jaxtrachea.status import PressStatus
 
+run, swept = jax.jit(simulate), jax.jit(sweep)
 ALL = frozenset({"EA_L", "EI_C", "k_t", "GA_L", "k_A", "k_B", "k_1_ring"})
 #: A scene in which every effect is on.
 EVERYTHING = SceneFacts(
@@ -132,8 +134,8 @@ def test_rows_in_the_lumen_are_no_contacts_of_the_plan():
     assert facts_of(scene, SPRINGS, whole) == facts_of(scene, SPRINGS, outside)
     made = make_scene(TUBE, SPRINGS, whole, tool=BALL, effects=small)
     assert made.plan == scene.plan
-    found = simulate(made, SPRINGS, whole)
-    alone = simulate(scene, SPRINGS, outside)
+    found = run(made, SPRINGS, whole)
+    alone = run(scene, SPRINGS, outside)
     assert found.status[:2].tolist() == [PressStatus.IN_LUMEN] * 2
     np.testing.assert_allclose(found.force[2:], alone.force, rtol=1e-12)
 
@@ -143,12 +145,12 @@ def test_a_bad_material_is_one_in_simulate_and_in_sweep():
     path = poses([75, 18, 0], [75, 15, 0], 2)
     scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=BARE)
     bad = dataclasses.replace(MATERIAL, k_1=jnp.asarray(-0.3))
-    assert simulate(scene, bad, path).status.tolist() == [PressStatus.BAD_MATERIAL] * 2
-    places, depth = [75.0] * 3, [2.0, 0.0, 1.0]
-    assert sweep(scene, bad, places, [0.0] * 3, depth).status.tolist() == (
+    assert run(scene, bad, path).status.tolist() == [PressStatus.BAD_MATERIAL] * 2
+    places, depth = np.full(3, 75.0), np.array([2.0, 0.0, 1.0])
+    assert swept(scene, bad, places, np.zeros(3), depth).status.tolist() == (
         [PressStatus.BAD_MATERIAL] * 3
     )
-    out = sweep(scene, MATERIAL, places, [0.0] * 3, depth)
+    out = swept(scene, MATERIAL, places, np.zeros(3), depth)
     off = PressStatus.OFF_PLAN
     assert out.status.tolist() == [off, PressStatus.NO_CONTACT, off]
 
@@ -157,7 +159,8 @@ def test_behind_the_rings_or_without_a_number_a_row_is_not_off_the_plan():
     """Of two reasons the same one is named as in `simulate`."""
     path = ball([75, 1, 0], [75, -2, 0], 2)
     scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=BARE)
-    out = sweep(scene, MATERIAL, [75.0, np.nan, 500.0], [3.0, 0.0, 0.0], [2.0] * 3)
+    at = np.array([[75.0, np.nan, 500.0], [3.0, 0.0, 0.0], [2.0] * 3])
+    out = swept(scene, MATERIAL, *at)
     assert out.status.tolist() == [
         PressStatus.BEHIND_GAP, PressStatus.NON_FINITE, PressStatus.OFF_PLAN
     ]  # fmt: skip

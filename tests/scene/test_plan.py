@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import pytest
 from small_scenes import BALL, BARE, MATERIAL, MESH, TUBE, ball, presses
 
@@ -102,7 +103,7 @@ def test_one_step_from_afar_to_a_slanting_press():
     scene = make_scene(TUBE, MATERIAL, path, tool=BALL, friction=0.66, effects=BARE)
     assert scene.plan.friction
     assert scene.plan.axial
-    assert simulate(scene, MATERIAL, path).status.tolist() == [1, 0]
+    assert jax.jit(simulate)(scene, MATERIAL, path).status.tolist() == [1, 0]
 
 
 @pytest.mark.parametrize(
