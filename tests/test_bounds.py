@@ -103,11 +103,16 @@ def test_a_start_next_to_a_bound(gap):
 
 
 @pytest.mark.parametrize(
-    ("method", "blocks"), [("lbfgs", 60), pytest.param("adam", 300, marks=pytest.mark.slow)]
+    ("method", "blocks", "count"),
+    [
+        ("lbfgs", 60, 8),
+        pytest.param("lbfgs", 60, 60, marks=pytest.mark.slow),
+        pytest.param("adam", 300, 60, marks=pytest.mark.slow),
+    ],
 )
-def test_first_order_methods_respect_bounds(method, blocks):
-    study, start = bounded.random_study(11, 60)
-    sigma, rows = first_sigma(study), np.arange(60)
+def test_first_order_methods_respect_bounds(method, blocks, count):
+    study, start = bounded.random_study(11, count)
+    sigma, rows = first_sigma(study), np.arange(count)
     solved = descend(
         study, rows, start, sigma, method=method, tolerances=Tolerances(iterations=blocks)
     )
@@ -149,14 +154,14 @@ def joint_study(seed, specimens=3):
 
 
 @pytest.mark.parametrize(
-    "seeds", [range(100, 102), pytest.param(range(102, 130), marks=pytest.mark.slow)]
+    "seeds", [range(100, 101), pytest.param(range(101, 130), marks=pytest.mark.slow)]
 )
 def test_joint_fits_with_bounds(seeds):
     """The dense study's KKT conditions hold at the joint estimate; SciPy finds nothing lower."""
     for seed in seeds:
         study = joint_study(seed)
         joint, dense = study(joint=True), study()
-        result = fit(joint, Settings(starts=1, more_starts=0))
+        result = fit(joint, Settings(starts=1, more_starts=0, scrutiny=False))
         assert np.all(result.status <= FitStatus.AT_BOUND)
         theta = bounded.dense_theta(joint, dense, result.theta)
         known = np.ones((1, 2))
@@ -169,7 +174,7 @@ def test_joint_fits_with_bounds(seeds):
 @pytest.fixture(scope="module")
 def fitted():
     study, start = bounded.random_study(5, 40)
-    result = fit(study, Settings(starts=1, more_starts=0), starts=start)
+    result = fit(study, Settings(starts=1, more_starts=0, scrutiny=False), starts=start)
     assert np.all(result.succeeded)
     return result
 
@@ -179,7 +184,7 @@ def test_profiles_with_bounds(fitted):
     cornered = fitted.at_bound.all(axis=1)
     assert cornered.any()
     assert np.all(fitted.status[cornered] == FitStatus.AT_BOUND)
-    curves = profiles(fitted, Settings(starts=1), points=2)
+    curves = profiles(fitted, Settings(starts=1, scrutiny=False), points=2)
     good = np.isfinite(curves.statistic)
     assert np.mean(good) > 0.99
     assert np.mean(curves.end == ProfileEnd.FAILED) < 0.01
@@ -203,7 +208,7 @@ def test_bootstrap_with_bounds(fitted, monkeypatch):
         return result
 
     monkeypatch.setattr(bootstraps, "fit", recorded)
-    bootstraps.bootstrap(fitted, Settings(starts=1), count=bootstraps.FEWEST)
+    bootstraps.bootstrap(fitted, Settings(starts=1, scrutiny=False), count=bootstraps.FEWEST)
     study, result = seen[0]
     assert np.mean(result.succeeded) > 0.99
     rows = np.flatnonzero(result.succeeded)

@@ -27,7 +27,7 @@ def covered(level, count):
     noise = np.random.default_rng(4).normal(size=force.shape)
     force = force + level * np.abs(force).max((1, 2), keepdims=True) * noise
     changes = {n: {"value": float(v)} for n, v in zip(synthetic.NAMES, CLEAR, strict=True)}
-    one = Settings(starts=1)
+    one = Settings(starts=1, scrutiny=False)  # no one reads verdicts
     result = fit(synthetic.study(force, changes=changes), one)
     found = profiles(result, one, points=2)
     lanes = found.lane[::4]
@@ -40,10 +40,11 @@ def covered(level, count):
     return inside(result.lower, result.upper, truth), inside(low, high, truth[lanes])
 
 
-def test_profiles_cover_where_local_errors_do_not():
-    """3 % noise, relative errors of 10 to 22 %; four binomial standard deviations of 600 fits."""
-    local, profile = covered(0.03, 600)
-    assert np.all(np.abs(profile - 0.95) <= 4 * np.sqrt(0.95 * 0.05 / 600)), profile
+@pytest.mark.parametrize("count", [200, pytest.param(600, marks=pytest.mark.slow)])
+def test_profiles_cover_where_local_errors_do_not(count):
+    """3 % noise, relative errors of 10 to 22 %; four binomial standard deviations of the fits."""
+    local, profile = covered(0.03, count)
+    assert np.all(np.abs(profile - 0.95) <= 4 * np.sqrt(0.95 * 0.05 / count)), profile
     # EI_L: the valley is curved; measured 90 % with 5,000 fits.
     assert local[0] < 0.93
 

@@ -21,6 +21,8 @@ from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.status import FitStatus
 
+#: No one reads verdicts here.
+ONE = Settings(starts=1, scrutiny=False)
 #: Truths that four curves with 1 % noise identify: a soft contact that hardens early.
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
 
@@ -44,7 +46,7 @@ def test_noise_free_data_give_back_the_parameters(draws):
     """
     truth = synthetic.draw(1, draws, 10.0)
     force, _ = synthetic.forces(truth)
-    result = fit(synthetic.study(force), Settings(starts=4))
+    result = fit(synthetic.study(force), dataclasses.replace(ONE, starts=4))
     error = np.abs(result.value / truth - 1).max(1)
     condition = result.uncertainty.condition
     peak = np.abs(force).max((1, 2))
@@ -75,7 +77,7 @@ def _coverage(count, given):
         )
     else:
         study = synthetic.study(force, changes=changes)
-    result = fit(study, Settings(starts=1))
+    result = fit(study, ONE)
     assert np.all(result.status == FitStatus.CONVERGED)
     return np.mean((result.lower <= truth) & (truth <= result.upper), axis=0)
 
@@ -182,19 +184,19 @@ def test_an_infeasible_start_is_a_status_and_disturbs_nobody(noisy):
     def make(data):
         return build_study(data, synthetic.GEOMETRY, synthetic.OPTIONS, table)
 
-    together = fit(make([*rest[:4], *deep, *rest[4:]]), Settings(starts=1, more_starts=0))
-    alone = fit(make(rest), Settings(starts=1))
+    together = fit(make([*rest[:4], *deep, *rest[4:]]), dataclasses.replace(ONE, more_starts=0))
+    alone = fit(make(rest), ONE)
     assert together.status[1] == FitStatus.INFEASIBLE_START
     assert np.all(alone.status <= FitStatus.UNIDENTIFIABLE)
     np.testing.assert_allclose(together.theta[[0, 2, 3]], alone.theta, rtol=0, atol=1e-8)
     # Drawn anew it starts where the model exists, and ends at the truth within its errors; the
     # others keep every bit, and it has the same bits alone.
-    again = fit(make([*rest[:4], *deep, *rest[4:]]), Settings(starts=1))
+    again = fit(make([*rest[:4], *deep, *rest[4:]]), ONE)
     assert again.status[1] == FitStatus.CONVERGED
     assert np.all(np.abs(again.value[1] - truth[0]) < 4 * again.standard_error[1])
     np.testing.assert_array_equal(again.tried, [1, 1, 1, 1])
     np.testing.assert_array_equal(again.theta[[0, 2, 3]], together.theta[[0, 2, 3]])
-    rescued = fit(again.study.take(np.array([2, 1])), Settings(starts=1))
+    rescued = fit(again.study.take(np.array([2, 1])), ONE)
     np.testing.assert_allclose(rescued.theta[1], again.theta[1], rtol=0, atol=1e-8)
 
 
@@ -202,7 +204,7 @@ def test_same_optimum_and_errors_as_scipy(noisy):
     """20 lanes against MINPACK's lmder with the same residual."""
     _, force, _ = noisy
     study = synthetic.study(force)
-    result = fit(study, Settings(starts=1))
+    result = fit(study, ONE)
 
     def scipy(i):
         def residual(theta):
@@ -239,7 +241,7 @@ def test_one_position_leaves_skeleton_undetermined():
     force, _ = synthetic.forces(np.array([[100.0, 1.0, 2.0, 0.2]]), s_c=np.array([75.0]))
     data = synthetic.curves(force, s_c=np.array([75.0]))
     study = build_study(data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters())
-    result = fit(study, Settings(starts=2))
+    result = fit(study, dataclasses.replace(ONE, starts=2))
     assert result.status[0] == FitStatus.UNIDENTIFIABLE
     flat = result.uncertainty.weakest_direction[0]
     ratio = flat[0] / flat[1]
@@ -259,7 +261,7 @@ def test_a_bound_is_hit_and_said(noisy):
     truth, force, _ = noisy
     upper = 0.8 * truth[:, 2].min()
     study = synthetic.study(force, changes={"k_1": {"value": 0.2, "lower": 0.1, "upper": upper}})
-    result = fit(study, Settings(starts=1))
+    result = fit(study, ONE)
     assert np.all(result.status == FitStatus.AT_BOUND)
     np.testing.assert_allclose(result.value[:, 2], upper, rtol=1e-12)
     assert result.at_bound[:, 2].all()
@@ -272,7 +274,7 @@ def test_scopes_count_their_unknowns(scope, lanes, unknowns):
     truth = np.tile(CLEAR, (3, 1))
     force, _ = synthetic.forces(truth)
     changes = {name: {"scope": scope} for name in synthetic.NAMES}
-    result = fit(synthetic.study(force, changes=changes), Settings(starts=1))
+    result = fit(synthetic.study(force, changes=changes), ONE)
     assert result.value.shape == (lanes, unknowns)
     np.testing.assert_allclose(result.value, np.tile(CLEAR, (lanes, 1)), rtol=1e-6)
 
@@ -283,7 +285,7 @@ def test_shared_and_specimen_mix():
     truth[:, 2] *= [0.8, 1.0, 1.2]
     force, _ = synthetic.forces(truth)
     changes = {name: {"scope": "shared"} for name in ("EI_L", "k_M")}
-    result = fit(synthetic.study(force, changes=changes), Settings(starts=1))
+    result = fit(synthetic.study(force, changes=changes), ONE)
     assert result.value.shape == (1, 8)
     names = [(p.name, specimen) for p, specimen, _ in result.study.unknowns[0]]
     value = dict(zip(names, result.value[0], strict=True))
@@ -305,7 +307,7 @@ def test_onset_and_offset_of_each_trial_are_recovered():
         "onset": {"fixed": False, "value": 0.3, "lower": 0.0, "upper": 3.0},
         "force_offset": {"fixed": False},
     }
-    result = fit(synthetic.study(force, changes=changes), Settings(starts=1))
+    result = fit(synthetic.study(force, changes=changes), ONE)
     assert result.value.shape == (1, 12)
     value = {(p.name, t): v for (p, _, t), v in zip(result.study.unknowns[0], result.value[0])}  # noqa: B905
     np.testing.assert_allclose([value["onset", f"t{j}"] for j in range(4)], onset, atol=1e-5)
@@ -332,8 +334,8 @@ def test_unequal_lengths_do_not_change_results():
             data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(), balance="sample"
         )
 
-    both = fit(make([*long, *short]), Settings(starts=1))
-    alone = fit(make(short), Settings(starts=1))
+    both = fit(make([*long, *short]), ONE)
+    alone = fit(make(short), ONE)
     np.testing.assert_allclose(both.theta[1], alone.theta[0], rtol=0, atol=1e-8)
     np.testing.assert_allclose(both.standard_error[1], alone.standard_error[0], rtol=1e-8)
     assert both.samples.tolist() == [200, 140]
@@ -341,8 +343,8 @@ def test_unequal_lengths_do_not_change_results():
 
 def test_float32_agrees(noisy):
     _, force, _ = noisy
-    double = fit(synthetic.study(force), Settings(starts=1))
-    single = fit(synthetic.study(force), Settings(starts=1, float32=True))
+    double = fit(synthetic.study(force), ONE)
+    single = fit(synthetic.study(force), dataclasses.replace(ONE, float32=True))
     assert single.value.dtype == np.float64
     # A thousandth, or a thirtieth of the standard error where the data say less than that.
     allowed = np.maximum(1e-3, double.relative_se / 30)
@@ -351,8 +353,8 @@ def test_float32_agrees(noisy):
 
 def test_more_starts_never_cost_more(noisy):
     _, force, _ = noisy
-    one = fit(synthetic.study(force), Settings(starts=1))
-    four = fit(synthetic.study(force), Settings(starts=4))
+    one = fit(synthetic.study(force), ONE)
+    four = fit(synthetic.study(force), dataclasses.replace(ONE, starts=4))
     assert np.all(four.cost <= one.cost * (1 + 1e-6))
     assert np.all((four.converged_starts >= 1) & (four.converged_starts <= 4))
     np.testing.assert_allclose(four.value, one.value, rtol=1e-4)
@@ -373,11 +375,11 @@ def test_markers_with_both_noise_levels_estimated():
     study = build_study(
         data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(joints=True)
     )
-    result = fit(study, Settings(starts=1))
+    result = fit(study, ONE)
     # 200 and 600 samples: sd of an estimated level 5 % and 3 %; four of them.
     np.testing.assert_allclose(result.sigma[:, 0], level, rtol=0.2)
     np.testing.assert_allclose(result.sigma[:, 1], 0.02, rtol=0.12)
-    force_only = fit(synthetic.study(force), Settings(starts=1))
+    force_only = fit(synthetic.study(force), ONE)
     assert np.all(result.standard_error[:, 1] < force_only.standard_error[:, 1])
 
 
@@ -390,7 +392,7 @@ def test_robust_losses_as_scipy(noisy, loss):
     force, level = force[:1].copy(), float(sigma[0, 0, 0])
     force[0, :, ::9] += 20 * level
     study = synthetic.study(force, loss=loss, noise=Noise(force=level))
-    result = fit(study, Settings(starts=1))
+    result = fit(study, ONE)
     assert result.status[0] == FitStatus.CONVERGED
 
     def residual(theta):
@@ -402,7 +404,7 @@ def test_robust_losses_as_scipy(noisy, loss):
     )  # fmt: skip
     assert result.cost[0] <= other.cost * (1 + 1e-8)
     np.testing.assert_allclose(result.theta[0], other.x, rtol=0, atol=1e-3)
-    plain = fit(synthetic.study(force, noise=Noise(force=level)), Settings(starts=1))
+    plain = fit(synthetic.study(force, noise=Noise(force=level)), ONE)
     truth = noisy[0][0]
 
     def stray(r):

@@ -29,7 +29,7 @@ from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.results.stored import read_results
 from jaxtrachea.trachea.material import Material
 
-ONE = Settings(starts=1)
+ONE = Settings(starts=1, scrutiny=False)
 OWN = {"onset": {"fixed": False}, "force_offset": {"fixed": False}}
 
 

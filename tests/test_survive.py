@@ -512,11 +512,19 @@ def from_peace(folder):
     return fitted
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS], ids=["full", "read-only"])
-def test_a_disk_that_fills_up(peace, study, monkeypatch, capsys, code):
+@pytest.mark.parametrize(
+    ("code", "every"),
+    [
+        pytest.param(errno.ENOSPC, 1, marks=pytest.mark.slow, id="full"),
+        pytest.param(errno.ENOSPC, 7, id="full, every 7th"),
+        pytest.param(errno.EROFS, 6, marks=pytest.mark.slow, id="read-only"),
+        pytest.param(errno.EROFS, 20, id="read-only, every 20th"),
+    ],
+)
+def test_a_disk_that_fills_up(peace, study, monkeypatch, capsys, code, every):
     """Each write of a run in turn is the first that fails: one line, exit code 2, what was saved.
 
-    With room again the run goes on to the same numbers.
+    With room again the run goes on to the same numbers. By default some of the writes.
     """
     monkeypatch.setattr("jaxtrachea.fitting.fit.fit", from_peace(peace))
     monkeypatch.setattr("jaxtrachea.cli.run.show", lambda *_: None)
@@ -525,7 +533,7 @@ def test_a_disk_that_fills_up(peace, study, monkeypatch, capsys, code):
         assert run(monkeypatch, capsys, *FIT)[0] == 0
     writes = disk.count
     assert writes > 20
-    for first in range(1, writes + 1, 1 if code == errno.ENOSPC else 6):
+    for first in range(1, writes + 1, every):
         shutil.rmtree(out)
         with Disk(out, first, code).watched() as disk:
             said, _, err = run(monkeypatch, capsys, *FIT)
