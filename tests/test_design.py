@@ -58,6 +58,7 @@ def known(result):
     return situation(result)
 
 
+@pytest.mark.slow
 def test_predicted_errors_come_true(known):
     """1,000 repetitions with the chosen point: standard deviation within 20 % of the prediction."""
     depth = float(synthetic.DEPTHS[-1])

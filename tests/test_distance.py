@@ -229,6 +229,7 @@ def test_hard_cases(dtype, scale):
 # ---------------------------------------------------------------- closed forms
 
 
+@pytest.mark.slow
 def test_spheres_have_no_bias_and_derivatives_of_every_order():
     """Phi = |t| - r_A - r_B along a line, and its first three derivatives."""
     start, step = jnp.array([1.0, 2.0, -0.5]), jnp.array([0.3, -1.0, 0.7])

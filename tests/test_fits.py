@@ -167,6 +167,7 @@ def compare(found, known):
 
 
 @needs_ecoflex
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fit", "fit_67"])
 def test_ecoflex(name, tmp_path, monkeypatch, capsys):
     """70 published curves; the law against plain linear least squares where no bound binds."""

@@ -128,7 +128,7 @@ def test_mirror(rings):
     np.testing.assert_allclose(two.end_U, np.asarray(one.end_V) * flip, atol=1e-12)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
 @pytest.mark.parametrize(
     "options", [Options(), Options(coupling="total", shear=True, local="two-material")], ids=repr
 )

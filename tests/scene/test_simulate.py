@@ -142,12 +142,13 @@ def test_a_ball_led_down_presses_as_deep_as_it_goes():
     np.testing.assert_allclose(out.gap, [1, 0, -1, -2, -3], atol=0.1)
     np.testing.assert_allclose(out.displacement[1:, 1], out.gap[1:], atol=1e-4)
     np.testing.assert_allclose(out.s, 75, atol=0.02)
-    direct = press(TUBE, MATERIAL, jnp.asarray(75.0), -out.displacement[:, 1])
+    direct = jax.jit(press)(TUBE, MATERIAL, jnp.asarray(75.0), -out.displacement[:, 1])
     np.testing.assert_allclose(-out.force[:, 1], direct.force, rtol=1e-3, atol=1e-9)
     assert out.status.tolist()[0] == PressStatus.NO_CONTACT
     np.testing.assert_allclose(out.force[0], 0)
 
 
+@pytest.mark.slow
 def test_a_ball_beyond_the_end_is_refused_by_status():
     path = poses([75, OUTER + 3, 0], [170, OUTER - 3, 0], 2)
     scene = make_scene(TUBE, MATERIAL, path, tool=BALL, effects=BARE)
@@ -157,6 +158,7 @@ def test_a_ball_beyond_the_end_is_refused_by_status():
     assert np.isfinite(out.force[0]).all()
 
 
+@pytest.mark.slow
 def test_the_dent_follows_the_tool():
     """Under the footprint no vertex stays inside the ball by more than the smoothing."""
     mesh = make_tube(TUBE, around=60, along=160, relief=0.0, flatten=0.0)
@@ -199,6 +201,7 @@ def test_sweep_agrees_with_single_presses_whatever_the_chunk():
     np.testing.assert_allclose(out.force[3], out.force[5], rtol=1e-9)  # mirror image
 
 
+@pytest.mark.slow
 def test_a_ball_in_the_plane_of_symmetry_is_on_the_midline_everywhere():
     """A mesh with a mirror plane: the contact is in it, wherever between and on the rings."""
     along = np.linspace(21.3, 138.7, 200)
@@ -248,6 +251,7 @@ def test_a_bent_tube_is_pressed_like_the_straight_one():
     assert abs(moved).max() > 2.5
 
 
+@pytest.mark.slow
 def test_the_tool_touches_the_mesh_not_a_cylinder():
     """Between two rings the wall lies lower, by the relief."""
     path = poses([0, OUTER + 5 + 0.2, 0], [160, OUTER + 5 + 0.2, 0], 33)
