@@ -63,7 +63,16 @@ def test_each_shows_something():
 
 
 #: Half a minute of compilation each.
-LATER = {"off_midline", "scan", "imported_tool", "capsule", "friction", "left_down", "right_down"}
+LATER = {
+    "off_midline",
+    "scan",
+    "imported",
+    "imported_tool",
+    "capsule",
+    "friction",
+    "left_down",
+    "right_down",
+}
 EACH = [pytest.param(n, marks=pytest.mark.slow if n in LATER else ()) for n in NAMES]
 
 

@@ -31,7 +31,7 @@ from jaxtrachea.report.overview import overview
 from jaxtrachea.results.rows import parameter_rows
 from jaxtrachea.trachea.geometry import table_1
 
-ONE = Settings(starts=1)
+ONE = Settings(starts=1, scrutiny=False)
 SPEC = '[data]\nfiles = "good.csv"\n[model]\ncoupling = "total"\n[uncertainty]\nposterior = 100\n'
 
 

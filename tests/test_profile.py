@@ -26,7 +26,7 @@ from jaxtrachea.mechanics.press import Options
 from jaxtrachea.status import FitStatus, ProfileEnd
 from jaxtrachea.trachea.geometry import table_1
 
-ONE = Settings(starts=1)
+ONE = Settings(starts=1, scrutiny=False)
 PAGES = Path(__file__).parents[1] / "docs"
 CLEAR = np.array([300.0, 1.0, 0.5, 0.2])
 

@@ -43,6 +43,7 @@ CASES = {
 }  # fmt: skip
 #: Each takes some seconds of compilation; the others are variations.
 LATER = {"fixed law", "dense", "independent", "total", "several beams", "shear", "two materials"}
+LATER |= {"markers", "onset and offset"}  # parts of "all"
 EACH = [pytest.param(n, marks=pytest.mark.slow if n in LATER else ()) for n in CASES]
 QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
 
