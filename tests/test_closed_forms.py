@@ -151,12 +151,18 @@ def test_a_step_is_bent_by_the_second_derivative():
     study = line(1.3 * D, changes=changes)
     lane = jax.tree.map(lambda v: v[0], study.lanes)
     sigma, theta = jnp.ones(2), jnp.log(jnp.array([1.0]))
-    point = evaluate(study.model, theta, lane, sigma)
-    state = trust_region.State(theta, point, jnp.array(10.0), jnp.array(1), jnp.array(0))
-    step = trust_region._step(LaneCost(study.model, lane, sigma), state)
+
+    @jax.jit
+    def one_step(theta, lane, sigma):
+        point = evaluate(study.model, theta, lane, sigma)
+        state = trust_region.State(theta, point, jnp.array(10.0), jnp.array(1), jnp.array(0))
+        step = trust_region._step(LaneCost(study.model, lane, sigma), state)
+        return step.straight, step.delta
+
+    straight, delta = one_step(theta, lane, sigma)
     v = 0.3  # (1.3 - 1) / 1, undamped within the trust region
-    np.testing.assert_allclose(step.straight, v, rtol=1e-6)
-    np.testing.assert_allclose(step.delta[0], v - v * v / 2, rtol=0.01)
+    np.testing.assert_allclose(straight, v, rtol=1e-6)
+    np.testing.assert_allclose(delta[0], v - v * v / 2, rtol=0.01)
 
 
 def test_bounds_alone_are_known_as_uniform_distributions():
