@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea.mechanics.force_law import Law, fold_depth
+from jaxtrachea.mechanics.softening import Softening, soft_series
 from jaxtrachea.status import PressStatus
 
 
@@ -20,11 +21,14 @@ class Equilibrium(NamedTuple):
         depth: local indentation d, mm.
         force: contact force, N. NaN where `status` says there is no stable solution.
         status: a `PressStatus` as int8.
+        load: force under which a linear skeleton would deflect as much, N: what the joints follow.
+            None where the skeleton is linear: the force.
     """
 
     depth: Float[Array, "*n"]
     force: Float[Array, "*n"]
     status: Int[Array, "*n"]
+    load: Float[Array, "*n"] | None = None
 
 
 class Sensitivity(NamedTuple):
@@ -58,6 +62,26 @@ def press_series(
     """
     depth, force, folded = law.series(displacement, compliance)
     return Equilibrium(depth, force, status_of(displacement, depth + force, folded))
+
+
+def press_softening(
+    displacement: Float[Array, "*n"],
+    compliance: Float[Array, ""],
+    law: Law,
+    softening: Softening,
+) -> Equilibrium:
+    """Series coupling with a skeleton that softens, see `mechanics.softening`.
+
+    Args:
+        displacement: D after first touch, mm; any shape.
+        compliance: c of the skeleton at small strain, mm/N, not negative.
+        law: local law; k_1 > 0.
+        softening: of the skeleton.
+    """
+    solved = soft_series(displacement, compliance, law, softening)
+    status = status_of(displacement, solved.depth + solved.force, solved.folded)
+    load = solved.force / softening.ratio(solved.deflection)
+    return Equilibrium(solved.depth, solved.force, status, load)
 
 
 def sensitivity(depth: Float[Array, "*n"], compliance: Float[Array, ""], law: Law) -> Sensitivity:

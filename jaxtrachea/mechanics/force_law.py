@@ -257,17 +257,25 @@ def of_ring(material: Material) -> Law:
 
 
 def blend(ligament: Law, ring: Law, weight: Float[Array, ""]) -> Law:
-    """Two-material law: coefficients of ring and ligament mixed by `ring_weight`.
+    """Two-material law: compliances of ring and ligament mixed by `ring_weight`.
 
-    One that only one of them has counts as 0 in the other.
+    1 / k_1 is the mean of both by weight, as of two springs in series that share the displacement;
+    k_3 and k_5 are those of the same springs to leading order, k_1^(n + 1) times the mean of
+    k_n / k_1^(n + 1). (A mean of stiffnesses lets a rigid ring rule all but a notch midway between
+    two of them.) A coefficient that only one of them has counts as 0 in the other.
     """
 
-    def mix(on_ligament, on_ring):
-        if on_ligament is None and on_ring is None:
-            return None
-        low = jnp.zeros_like(on_ring) if on_ligament is None else on_ligament
-        high = jnp.zeros_like(low) if on_ring is None else on_ring
-        return low + weight * (high - low)
+    softer = (1 - weight) * ring.k_1 + weight * ligament.k_1
+    softer = jnp.where(softer > 0, softer, 1)
+    share = ring.k_1 / softer, ligament.k_1 / softer  # k_1 over that of ligament and ring
+    part = 1 - weight, weight
 
-    mixed = map(mix, ligament, ring)
-    return Law(**dict(zip(Law._fields, mixed, strict=True)))  # pyright: ignore
+    def mix(name, *both):
+        terms = [
+            p * k * s ** (power(name) + 1)
+            for k, s, p in zip(both, share, part, strict=True) if k is not None
+        ]  # fmt: skip
+        return sum(terms[1:], terms[0]) if terms else None
+
+    others = {n: mix(n, getattr(ligament, n), getattr(ring, n)) for n in Law._fields[1:]}
+    return Law(ligament.k_1 * share[0], **others)  # pyright: ignore

@@ -9,8 +9,9 @@ from jaxtyping import Array, Float, Int
 from jaxtrachea._arguments import ArrayLike, check_record, real, shaped
 from jaxtrachea._numerics import centred_hinge, positive_part
 from jaxtrachea.mechanics import beam as _beam
-from jaxtrachea.mechanics import equilibrium, force_law
+from jaxtrachea.mechanics import equilibrium, force_law, punch
 from jaxtrachea.mechanics.admission import Admitted, admit, hide, status_of
+from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -33,6 +34,11 @@ class Options:
         onset_width: width of the smooth first touch, mm; no force before touch, none changed after.
         transition: distance from a ring's centre at which the ligament's own local law is reached,
             mm; None: half the smallest distance between two rings.
+        half_width: of a flat punch along s, mm, which holds the ligament level over twice that and
+            whose local law is the mean over it (pi/4 of the radius of a cylinder's end; needs
+            `recursion` and `continuous`). 0: the tool touches at a point.
+        skeleton: `linear`, or `softening` for deep presses: it yields more the further it moves
+            (needs `Material.e_1` and `e_2`, and `series`).
     """
 
     coupling: Literal["series", "total"] = "series"
@@ -43,16 +49,28 @@ class Options:
     contact: Literal["unilateral", "bonded"] = "unilateral"
     onset_width: float = 1e-3
     transition: float | None = None
+    half_width: float = 0.0
+    skeleton: Literal["linear", "softening"] = "linear"
 
     def __post_init__(self):
-        """Refuse words and numbers that no model has.
+        """Refuse words and numbers that no model has, and options that exclude each other.
 
         Raises:
             ValueError: naming the option, what was found and what is expected.
         """
-        check_record(self, onset_width=0.0)
+        check_record(self, onset_width=0.0, half_width=0.0)
         if self.transition is not None and self.transition <= 0:
             raise ValueError(f"transition is {self.transition:g} mm; expected more than 0, or None")
+        if self.half_width > 0 and (self.form, self.split) != ("recursion", "continuous"):
+            raise ValueError(
+                f"half_width is {self.half_width:g} mm; a tool with a width needs "
+                "form='recursion' and split='continuous'"
+            )
+        if self.skeleton == "softening" and self.coupling != "series":
+            raise ValueError(
+                "skeleton='softening' needs coupling='series': with 'total' the force does not "
+                "depend on the skeleton"
+            )
 
 
 class Press(NamedTuple):
@@ -64,7 +82,7 @@ class Press(NamedTuple):
         skeleton: deflection of C by the skeleton, mm; same shape.
         joints: deflection of the ligament at each ring, mm; shape (*n, rings).
         reactions: force of each ring against the load, N; shape (*n, rings).
-        compliance: deflection of C per unit force, mm/N; scalar.
+        compliance: deflection of C per unit force, mm/N, at small strain; scalar.
         status: a `PressStatus` per displacement.
     """
 
@@ -113,8 +131,25 @@ def local_law(
     else:
         ends = jnp.concatenate([-x[:1], x, 2 * geometry.length - x[-1:]])
         transition = jnp.min(jnp.diff(ends)) / 2
-    weight = force_law.ring_weight(s_c, x, transition)
+    if options.half_width > 0:
+        weight = punch.mean_ring_weight(s_c, x, transition, options.half_width)
+    else:
+        weight = force_law.ring_weight(s_c, x, transition)
     return force_law.blend(ligament, force_law.of_ring(material), weight)
+
+
+def softening_of(material: Material, options: Options) -> Softening | None:
+    """How the skeleton softens; None where it is linear.
+
+    Raises:
+        ValueError: `softening` without `material.e_1` or `e_2`.
+    """
+    if options.skeleton == "linear":
+        return None
+    for name in Softening._fields:
+        if getattr(material, name) is None:
+            raise ValueError(f"options.skeleton='softening' needs Material.{name}; it is None")
+    return Softening(*(getattr(material, name) for name in Softening._fields))
 
 
 def touch(
@@ -148,14 +183,17 @@ def compliance(
     over the rings.
     """
     beam = ligament_beam(geometry, material, options)
-    if options.form == "recursion":
+    if options.form == "recursion" and options.half_width == 0:
         return _beam.contact_compliance(beam, s_c, split=options.split)
     return jnp.vectorize(lambda s: unit_deflection(beam, s, options).w_C)(s_c)
 
 
-def unit_deflection(beam: _beam.Beam, s_c: Float[Array, ""], options: Options) -> _beam.Deflection:
+def unit_deflection(beam: _beam.Beam, s_c: Float[Array, ""], options: Options) -> punch.Held:
     """Everything that moves under a unit force at C."""
-    return _beam.deflect(beam, s_c, jnp.ones_like(s_c), split=options.split, form=options.form)
+    if options.half_width > 0:
+        return punch.held_level(beam, s_c, options.half_width)
+    unit = _beam.deflect(beam, s_c, jnp.ones_like(s_c), split=options.split, form=options.form)
+    return punch.Held(unit.w_C, unit.theta_C, unit.w, unit.theta, unit.reaction)
 
 
 def respond(
@@ -165,6 +203,7 @@ def respond(
     law: force_law.Law,
     options: Options,
     blend: Float[Array, ""] | None = None,
+    softening: Softening | None = None,
 ) -> equilibrium.Equilibrium:
     """Force and local indentation for a skeleton of known compliance; `blend`: see `touch`.
 
@@ -174,6 +213,8 @@ def respond(
     moved = touch(displacement, onset, options, blend)
     if options.coupling == "total":
         return equilibrium.press_total(moved, compliance, law)
+    if softening is not None:  # which ends at the law's own fold, too
+        return equilibrium.press_softening(moved, compliance, law, softening)
     solved = equilibrium.press_series(moved, compliance, law)
     if options.contact == "bonded":
         return solved
@@ -197,9 +238,9 @@ def press(
 ) -> Press:
     """Press the tool along the inward normal at (s_c, phi = 0) and solve for force and skeleton.
 
-    Small deflections; rings are springs k_M (paper: the cartilage is taken as rigid against the
-    muscle); the skeleton is linear, so at finite strain the arch's flattening is not seen
-    (docs/model.md). Off the midline or oblique: not in this function.
+    Rings are springs k_M (paper: the cartilage is taken as rigid against the muscle). The skeleton
+    is linear, for small deflections, unless `options.skeleton` lets it soften: the arch of the wall
+    flattens in a deep press (docs/model.md). Off the midline or oblique: not in this function.
 
     Args:
         geometry: the tube at rest.
@@ -249,19 +290,20 @@ def _press(
     material, s_c, refused = asked
     unit = unit_deflection(ligament_beam(geometry, material, options), s_c, options)
     law = local_law(geometry, material, s_c, options)
-    solved = respond(displacement, onset, unit.w_C, law, options, blend)
+    softening = softening_of(material, options)
+    solved = respond(displacement, onset, unit.w_C, law, options, blend, softening)
     unit, solved = hide(refused, unit, solved)
 
-    def per_ring(v):
-        return solved.force[..., None] * v
+    def per_ring(factor, v):
+        return factor[..., None] * jnp.broadcast_to(v, (*displacement.shape, *v.shape))
 
-    shape = (*displacement.shape, *unit.w.shape)
+    load = solved.force if solved.load is None else solved.load
     return Press(
         force=solved.force,
         depth=solved.depth,
-        skeleton=unit.w_C * solved.force,
-        joints=per_ring(jnp.broadcast_to(unit.w, shape)),
-        reactions=per_ring(jnp.broadcast_to(unit.reaction, shape)),
+        skeleton=unit.w_C * load,
+        joints=per_ring(load, unit.w),
+        reactions=per_ring(solved.force, unit.reaction),
         compliance=unit.w_C,
         status=status_of(refused, solved.status),
     )

@@ -16,8 +16,8 @@ from jaxtrachea._arguments import check_word, real
 
 Scope = Literal["shared", "specimen", "trial"]
 Scale = Literal["log", "linear"]
-Part = Literal["skeleton", "contact", "press"]
-Needs = Literal["", "shear", "two-material", "axial", "arch", "second plane"]
+Part = Literal["skeleton", "contact", "finite strain", "press"]
+Needs = Literal["", "shear", "two-material", "softening", "axial", "arch", "second plane"]
 Each = Literal["", "span", "ring"]
 
 
@@ -64,8 +64,9 @@ class Declaration:
         unit: of every bare number.
         dimension: for `units.parse_quantity`.
         description: what the user reads in tables.
-        part: `skeleton` (it changes the compliance under the contact), `contact` (the local law) or
-            `press` (of a single press: no property of the specimen, not in `Material`).
+        part: `skeleton` (it changes the compliance under the contact), `contact` (the local law),
+            `finite strain` (how the skeleton leaves that compliance in deep presses) or `press` (of
+            a single press: no property of the specimen, not in `Material`).
         symbol: in the paper.
         needs: option or effect that reads it; "" where every press does. A fit has it in its model
             where `mechanics.press.Options` has that option.
@@ -184,6 +185,20 @@ class Material(eqx.Module):
             "k_5_ring", "N/mm^5", "quintic_stiffness", "quintic contact stiffness on a ring",
             part="contact", needs="two-material", absent="k_5", beside="k_1_ring", signed=True,
             fit=Fitted(1e-4, 0.0, 1e6, "linear", 1e-4, if_named=True),
+        )
+    )  # fmt: skip
+    e_1: Float[Array, ""] | None = _field(
+        Declaration(
+            "e_1", "1/mm", "inverse_length", "softening of the skeleton, linear in its deflection",
+            part="finite strain", needs="softening", absent="a linear skeleton", signed=True,
+            fit=Fitted(0.05, 0.0, 10.0, "linear", 0.01),
+        )
+    )  # fmt: skip
+    e_2: Float[Array, ""] | None = _field(
+        Declaration(
+            "e_2", "1/mm^2", "inverse_area", "softening of the skeleton, quadratic part",
+            part="finite strain", needs="softening", absent="a linear skeleton", signed=True,
+            fit=Fitted(0.002, 0.0, 10.0, "linear", 0.001),
         )
     )  # fmt: skip
     EA_L: Float[Array, "..."] | None = _field(

@@ -1,0 +1,96 @@
+"""A rigid flat punch on the ligament: it is held level between two points, half a width on each side.
+
+Two forces, half a width before and behind C, hold the ligament at one and the same deflection (a
+flat punch that does not tilt). The tool then feels less of what lies between two rings than a point
+does, and a ring that comes under it does so gradually.
+
+For the flat end of a cylinder of radius r the mean half chord, pi/4 r, is its half width along s.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxtrachea.mechanics.beam import deflect
+from jaxtrachea.mechanics.compliance import Beam
+from jaxtrachea.mechanics.force_law import ring_weight
+
+#: Points of Gauss and Legendre in [-1, 1] and their weights, for means over the width.
+_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+
+
+class Held(NamedTuple):
+    """What moves under a unit force at C; for a punch, the sum of its forces.
+
+    Attributes:
+        w_C: deflection of C, mm.
+        theta_C: rotation at C, rad; of a punch 0, it does not tilt.
+        w: deflection of the beam at each support, mm; shape (n,).
+        theta: rotation of the section at each support, rad; shape (n,).
+        reaction: force of each support against the load, N; shape (n,).
+    """
+
+    w_C: Float[Array, ""]
+    theta_C: Float[Array, ""]
+    w: Float[Array, " n"]
+    theta: Float[Array, " n"]
+    reaction: Float[Array, " n"]
+
+
+def held_level(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Held:
+    """Deflections under a punch at s_c whose forces sum to 1 N.
+
+    Where it reaches beyond an end of the beam it stands on the clamp there, and nothing moves. Loses
+    digits where it is narrower than some thousandth of a span: two points then are one.
+
+    Args:
+        beam: the beam and its supports.
+        s_c: middle of the punch, mm.
+        half_width: mm, more than 0.
+    """
+    ends = jnp.clip(jnp.stack([s_c - half_width, s_c + half_width]), 0, beam.length)
+    marked, ring = _with_marks(beam, ends)
+    unit = jax.vmap(lambda s: deflect(marked, s, jnp.ones_like(s)))(ends)
+    mark = jnp.sum(beam.x <= ends[1]) + 1
+    c_11, c_22 = unit.w_C
+    c_12 = unit.w[0, mark]
+    first, second = c_22 - c_12, c_11 - c_12
+    total = first + second
+    share = jnp.stack([first, second]) / jnp.where(total > 0, total, 1)
+
+    def per_ring(v):
+        return share @ v[:, ring]
+
+    w_C = c_12 + share[0] * second
+    return Held(w_C, jnp.zeros_like(w_C), *map(per_ring, (unit.w, unit.theta, unit.reaction)))
+
+
+def _with_marks(beam: Beam, ends) -> tuple[Beam, Array]:
+    """The beam with two more supports, of no stiffness, and where the others then stand.
+
+    A mark at a support stands behind it.
+    """
+    n = beam.x.shape[0]
+    before = jnp.arange(n)
+    ring = before + jnp.sum(ends[None] < beam.x[:, None], axis=1)
+    mark = jnp.sum(beam.x[None] <= ends[:, None], axis=1) + jnp.arange(2)
+    x = jnp.zeros(n + 2, beam.x.dtype).at[ring].set(beam.x).at[mark].set(ends)
+    k = jnp.zeros(n + 2, beam.k.dtype).at[ring].set(beam.k)
+    span = jnp.arange(n + 3) - jnp.sum(mark[None] < jnp.arange(n + 3)[:, None], axis=1)
+    GA = None if beam.GA is None else beam.GA[span]
+    return Beam(x, beam.length, beam.EI[span], k, GA), ring
+
+
+def mean_ring_weight(
+    s_c: Float[Array, ""],
+    ring_positions: Float[Array, " n"],
+    transition: Float[Array, ""],
+    half_width: float,
+) -> Float[Array, ""]:
+    """`ring_weight`, its mean over the width of the punch."""
+    points = s_c + half_width * jnp.asarray(_POINTS, s_c.dtype)
+    of_points = jax.vmap(ring_weight, (0, None, None))(points, ring_positions, transition)
+    return of_points @ jnp.asarray(_WEIGHTS / 2, s_c.dtype)
