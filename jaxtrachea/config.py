@@ -143,6 +143,8 @@ class ModelSection(Section):
     contact: Literal["unilateral", "bonded"] = "unilateral"
     onset_width: PositiveLength = 1e-3
     transition: PositiveLength | None = None
+    half_width: Length = 0.0
+    skeleton: Literal["linear", "softening"] = "linear"
 
 
 class ParameterSection(Section):

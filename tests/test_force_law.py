@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from jaxtrachea.mechanics.force_law import (
     Law,
@@ -89,8 +90,28 @@ def test_ring_weight_is_c2():
 
 
 def test_blend():
+    """Compliances are mixed: 1 / k_1 by weight, k_3 as of the two springs in series."""
     soft, stiff = law(0.2, 0.01), law(3.0, -0.5)
-    for weight, expected in ((0.0, soft), (1.0, stiff), (0.25, law(0.9, -0.1175))):
+    k_1 = 1 / (0.75 / 0.2 + 0.25 / 3.0)
+    k_3 = (0.75 * 0.01 / 0.2**4 + 0.25 * -0.5 / 3.0**4) * k_1**4
+    for weight, expected in ((0.0, soft), (1.0, stiff), (0.25, law(k_1, k_3))):
         got = blend(soft, stiff, jnp.asarray(weight))
         np.testing.assert_allclose(got[:2], expected[:2], rtol=1e-14)
         assert got.k_5 is None
+
+
+@pytest.mark.parametrize("weight", [0.1, 0.5, 0.9])
+def test_blend_is_springs_in_series(weight):
+    """Force at small depth to fifth order, of the laws in series by their shares of the depth."""
+    soft, stiff = law(0.2, 0.01), law(3.0, 0.5)
+
+    def depth(F):
+        def of(part, k):
+            return part * brentq(lambda d: k.k_1 * d + k.k_3 * d**3 - F, 0, 1e3, xtol=1e-15)
+
+        return of(1 - weight, soft) + of(weight, stiff)
+
+    got = blend(soft, stiff, jnp.asarray(weight))
+    errors = [float(got.force(jnp.asarray(depth(F)))) / F - 1 for F in (0.02, 0.01)]
+    assert abs(errors[0]) < 1e-5
+    np.testing.assert_allclose(errors[0] / errors[1], 16, rtol=0.1)

@@ -82,7 +82,9 @@ def test_models_see_what_their_options_read():
     assert rich == ["EI_L", "GA_L", "k_M", *local, "k_1_ring", *press]
     assert "k_3_ring" in in_model(both, joints=False, named=["k_3_ring"])
     assert "k_3_ring" not in visible(Options(), joints=True)
-    assert set(visible(both, joints=True)) == set(DEFAULTS)
+    deep = Options(shear=True, local="two-material", skeleton="softening")
+    assert set(visible(deep, joints=True)) == set(DEFAULTS)
+    assert {"e_1", "e_2"}.isdisjoint(visible(both, joints=True))
 
 
 @pytest.mark.parametrize("name", Law._fields)

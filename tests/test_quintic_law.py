@@ -222,7 +222,7 @@ def test_bad_rows_stay_alone():
     run = jax.jit(jax.vmap(lambda D, c, a, b, e: press_series(D, c, Law(a, b, e))))
     good = run(D, c, k_1, k_3, k_5)
     bad = run(D.at[0].set(jnp.nan), c, k_1, k_3, k_5.at[2].set(-5.0))
-    for one, two in zip(good, bad, strict=True):
+    for one, two in zip(good[:3], bad[:3], strict=True):
         np.testing.assert_array_equal(one[jnp.asarray([1, 3])], two[jnp.asarray([1, 3])])
     ok = PressStatus.OK
     expected = [PressStatus.NON_FINITE, ok, PressStatus.PAST_FOLD, ok]
@@ -232,7 +232,10 @@ def test_bad_rows_stay_alone():
 def test_rings_have_their_own_or_the_ligaments():
     soft, ring = law((0.2, 0.01, 0.004)), law((3.0, 0.5))
     got = blend(soft, ring, number(0.25))
-    np.testing.assert_allclose(got, (0.9, 0.1325, 0.003), rtol=1e-14)
+    k_1 = 1 / (0.75 / 0.2 + 0.25 / 3)  # compliances are mixed
+    k_3 = (0.75 * 0.01 / 0.2**4 + 0.25 * 0.5 / 3**4) * k_1**4
+    k_5 = 0.75 * 0.004 / 0.2**6 * k_1**6
+    np.testing.assert_allclose(got, (k_1, k_3, k_5), rtol=1e-14)
     assert blend(law((0.2, 0.01)), ring, number(0.25)).k_5 is None
     assert coefficient("k_5_ring") == "k_5"
     g, options = table_1(), Options(local="two-material", coupling="total")

@@ -33,6 +33,8 @@ CASES = {
     "independent": (Options(split="independent"), True, {}),
     "markers": (Options(shear=True, local="two-material"), True, {}),
     "quintic law": (Options(local="two-material"), False, {"k_5": {}, "k_5_ring": {}}),
+    "softening": (Options(shear=True, skeleton="softening"), True, BOTH),
+    "punch": (Options(shear=True, local="two-material", half_width=2.4), True, {}),
     "total": (Options(coupling="total"), False, {}),
     "total, markers": (Options(coupling="total"), True, {}),
     "onset and offset": (Options(onset_width=0.5), False, BOTH),

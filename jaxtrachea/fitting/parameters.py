@@ -113,7 +113,8 @@ def visible(options: Options, *, joints: bool) -> list[str]:
     With coupling `total` and no joint markers the skeleton does not enter: force-displacement
     curves then see the local law alone.
     """
-    has = {"": True, "shear": options.shear, "two-material": options.local == "two-material"}
+    has = {"": True, "shear": options.shear, "two-material": options.local == "two-material",
+           "softening": options.skeleton == "softening"}  # fmt: skip
     blind = options.coupling == "total" and not joints
     return [
         name for name in DEFAULTS

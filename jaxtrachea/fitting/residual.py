@@ -21,9 +21,11 @@ from jaxtrachea.mechanics.press import (
     ligament_beam,
     local_law,
     respond,
+    softening_of,
     touch,
     unit_deflection,
 )
+from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material, material_of
 
@@ -59,6 +61,7 @@ class Inputs(NamedTuple):
         law: at the contact; (T,).
         onset: mm; (T,).
         force_offset: N; (T,).
+        softening: of the skeleton; (T,). None where it is linear.
     """
 
     compliance: Float[Array, " T"]
@@ -66,6 +69,7 @@ class Inputs(NamedTuple):
     law: Law
     onset: Float[Array, " T"]
     force_offset: Float[Array, " T"]
+    softening: Softening | None
 
 
 def inputs(
@@ -87,7 +91,7 @@ def inputs(
 
     contact = jax.vmap(at)(free, lane.value, lane.s_c)
     felt = _felt(model, skeleton)
-    return Inputs(felt, skeleton.joints, contact.law, contact.onset, contact.force_offset)
+    return Inputs(compliance=felt, joints=skeleton.joints, **contact._asdict())
 
 
 def residual(
@@ -118,11 +122,14 @@ def residual_value(
     skeleton = _skeleton(model, free, _places(lane), tube)
 
     def one(free, skeleton, trial):
-        law, onset, offset = _at_contact(model, free, trial.value, trial.s_c, tube)
-        c = _felt(model, skeleton)
-        force = respond(trial.displacement, onset, c, law, model.options, trial.blend).force
-        joints = None if skeleton.joints is None else _times(force, skeleton.joints)
-        return _whitened(force + offset, joints, trial)
+        at = _at_contact(model, free, trial.value, trial.s_c, tube)
+        solved = respond(
+            trial.displacement, at.onset, _felt(model, skeleton), at.law, model.options,
+            trial.blend, at.softening,
+        )  # fmt: skip
+        load = solved.force if solved.load is None else solved.load
+        joints = None if skeleton.joints is None else _times(load, skeleton.joints)
+        return _whitened(solved.force + at.force_offset, joints, trial)
 
     return jax.vmap(one)(free, skeleton, _trials(lane))
 
@@ -219,12 +226,14 @@ class _Contact(NamedTuple):
     law: Law
     onset: Float[Array, ""]
     force_offset: Float[Array, ""]
+    softening: Softening | None
 
 
 def _at_contact(model: FitModel, free, value, s_c, tube: Geometry) -> _Contact:
     material, values = material_and_values(model, free, value)
     law = local_law(tube, material, s_c, model.options)
-    return _Contact(law, values["onset"], values["force_offset"])
+    softening = softening_of(material, model.options)
+    return _Contact(law, values["onset"], values["force_offset"], softening)
 
 
 def _felt(model: FitModel, skeleton: Skeleton):
@@ -233,9 +242,9 @@ def _felt(model: FitModel, skeleton: Skeleton):
     return c if model.options.coupling == "series" else jnp.zeros_like(c)
 
 
-def _times(force: Float[Array, " N"], joints: Float[Array, " rings"]) -> Float[Array, "N rings"]:
+def _times(load: Float[Array, " N"], joints: Float[Array, " rings"]) -> Float[Array, "N rings"]:
     """Motion of every ring at every sample."""
-    return force[:, None] * joints[None]
+    return load[:, None] * joints[None]
 
 
 def _whitened(force, joints, trial: Lane) -> Float[Array, " m"]:
@@ -262,6 +271,8 @@ class _Pressed(NamedTuple):
     Attributes:
         force: of the local law, without offset, N; (N,).
         d_force: (Jf, N).
+        load: what the joints follow, N; the force unless the skeleton softens; (N,).
+        d_load: (Jf, N).
         offset: N; scalar.
         d_offset: (Jf,).
         d_joints: of the motion of every ring under a unit force; (Jf, rings); None without rings.
@@ -271,6 +282,8 @@ class _Pressed(NamedTuple):
 
     force: Float[Array, " N"]
     d_force: Float[Array, "Jf N"]
+    load: Float[Array, " N"]
+    d_load: Float[Array, "Jf N"]
     offset: Float[Array, ""]
     d_offset: Float[Array, " Jf"]
     d_joints: Float[Array, "Jf rings"] | None
@@ -307,8 +320,8 @@ def _press(model: FitModel, tube, free, skeleton, by_beam, trial: Lane | _Tool) 
 
     d_skeleton = jax.tree.map(all_columns, by_beam)
     law, c = contact.law, _felt(model, skeleton)
-    depth = respond(D, contact.onset, c, law, model.options, blend).depth
-    by = sensitivity(depth, c, law)
+    solved = respond(D, contact.onset, c, law, model.options, blend, contact.softening)
+    of_force, of_load = sensitivity(solved, c, law, contact.softening)
 
     def at(onset):
         return touch(D, onset, model.options, blend)
@@ -317,22 +330,28 @@ def _press(model: FitModel, tube, free, skeleton, by_beam, trial: Lane | _Tool) 
         return jax.jvp(at, (onset,), (jnp.ones_like(onset),))[1]
 
     moved = slope(contact.onset)
-    terms = {
-        "compliance": (_felt(model, d_skeleton), by.compliance),
-        **{k: (getattr(d_contact.law, k), by_k) for k, by_k in by.law.coefficients().items()},
-        "onset": (d_contact.onset, by.displacement * moved),
-    }
-    d_force = jnp.zeros((len(eye), *depth.shape), depth.dtype)
-    through = _felt_through(model)
-    for d_input, by_input in (v for name, v in terms.items() if name in through):
-        d_force = d_force + d_input[:, None] * by_input[None]
+    d_inputs = {"compliance": _felt(model, d_skeleton), "onset": d_contact.onset}
+    for record in (d_contact.law.coefficients(), _fields(d_contact.softening)):
+        d_inputs.update(record)
+
+    def pushed(by):
+        by = by | {"onset": by["displacement"] * moved}
+        out = jnp.zeros((len(eye), *D.shape), D.dtype)
+        for name in (name for name in d_inputs if name in _felt_through(model)):
+            out = out + d_inputs[name][:, None] * by[name][None]
+        return out
+
+    d_force = pushed(of_force)
+    linear = solved.load is None
     corner = None
     if blend is not None and any(p.name == "onset" for p in model.free):
         curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
-        corner = by.displacement * curved * jnp.sum(d_contact.onset**2)
+        corner = of_force["displacement"] * curved * jnp.sum(d_contact.onset**2)
     return _Pressed(
-        force=law.force(depth),
+        force=solved.force,
         d_force=d_force,
+        load=solved.force if linear else solved.load,
+        d_load=d_force if linear else pushed(of_load),
         offset=contact.force_offset,
         d_offset=d_contact.force_offset,
         d_joints=d_skeleton.joints,
@@ -345,9 +364,9 @@ def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, tria
     pressed = _press(model, tube, free, skeleton, by_beam, trial)
     joints, d_joints = None, None
     if skeleton.joints is not None and pressed.d_joints is not None:
-        joints = _times(pressed.force, skeleton.joints)
-        d_joints = jax.vmap(_times, (0, None))(pressed.d_force, skeleton.joints)
-        d_joints = d_joints + jax.vmap(_times, (None, 0))(pressed.force, pressed.d_joints)
+        joints = _times(pressed.load, skeleton.joints)
+        d_joints = jax.vmap(_times, (0, None))(pressed.d_load, skeleton.joints)
+        d_joints = d_joints + jax.vmap(_times, (None, 0))(pressed.load, pressed.d_joints)
     value = _whitened(pressed.force + pressed.offset, joints, trial)
 
     def row(force, joints):
@@ -385,6 +404,10 @@ def force_jacobian(
     tool = _Tool(value, s_c, displacement, blend)
     pressed = _press(model, tube, free, skeleton, by_beam, tool)
     return pressed.d_force + pressed.d_offset[:, None]
+
+
+def _fields(softening: Softening | None) -> dict[str, Array]:
+    return {} if softening is None else softening._asdict()
 
 
 def _felt_through(model: FitModel) -> set[str]:

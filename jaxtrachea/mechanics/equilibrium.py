@@ -31,20 +31,6 @@ class Equilibrium(NamedTuple):
     load: Float[Array, "*n"] | None = None
 
 
-class Sensitivity(NamedTuple):
-    """Derivatives of the contact force, one entry per tool displacement.
-
-    Attributes:
-        displacement: N/mm.
-        compliance: N^2/mm.
-        law: by each of its coefficients; by k_n: mm^n.
-    """
-
-    displacement: Float[Array, "*n"]
-    compliance: Float[Array, "*n"]
-    law: Law
-
-
 def press_series(
     displacement: Float[Array, "*n"], compliance: Float[Array, ""], law: Law
 ) -> Equilibrium:
@@ -84,19 +70,42 @@ def press_softening(
     return Equilibrium(solved.depth, solved.force, status, load)
 
 
-def sensitivity(depth: Float[Array, "*n"], compliance: Float[Array, ""], law: Law) -> Sensitivity:
-    """Derivatives of the contact force at a solved press (series coupling; total: compliance 0).
+def sensitivity(
+    solved: Equilibrium,
+    compliance: Float[Array, ""],
+    law: Law,
+    softening: Softening | None = None,
+) -> tuple[dict[str, Float[Array, "*n"]], dict[str, Float[Array, "*n"]]]:
+    """Derivatives of force and load at a solved press (series coupling; total: compliance 0).
 
-    What `jax.jvp` of `press_series` gives, for callers that want every derivative from one depth.
+    What `jax.jvp` of `press_series` or `press_softening` gives, for callers that want every
+    derivative from one solution.
+
+    Returns:
+        Of the contact force and of the load (`Equilibrium.load`), N, each by the name of what it is
+        taken by: `displacement`, `compliance`, the coefficients of the law and of the softening.
     """
-    d2, slope = depth * depth, law.tangent(depth)
-    share = 1 / (1 + compliance * slope)
-    by_law, passed = {}, depth * share
-    by_compliance = -slope * law.secant(d2) * passed
-    for name in law.coefficients():
-        by_law[name] = passed
-        passed = d2 * passed
-    return Sensitivity(slope * share, by_compliance, law._replace(**by_law))
+    depth = solved.depth
+    slope, powered = law.tangent(depth), law.powers(depth)
+    if softening is None or solved.load is None:
+        share = 1 / (1 + compliance * slope)
+        force = law.secant(depth * depth) * depth
+        by = {"displacement": slope * share, "compliance": -slope * force * share}
+        by |= {name: share * v for name, v in powered.items()}
+        return by, by
+    load = solved.load
+    u = compliance * load
+    rise = softening.tangent(u)
+    share = 1 / (rise + compliance * slope)
+    yielding = {"e_1": share * u * load, "e_2": -share * u * u * load}
+    # The deflection is compliance times load: what is in `shed` is the bend of the skeleton alone.
+    shed = load * (softening.e_1 - 2 * softening.e_2 * u)
+    of_load = {"displacement": share * slope, "compliance": share * load * (shed - slope)}
+    of_load |= {name: share * v for name, v in powered.items()} | yielding
+    of_force = {name: rise * of_load[name] for name in ("displacement", *powered)}
+    of_force["compliance"] = -slope * share * solved.force
+    of_force |= {name: -compliance * slope * v for name, v in yielding.items()}
+    return of_force, of_load
 
 
 def press_total(

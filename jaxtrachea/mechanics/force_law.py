@@ -75,6 +75,14 @@ class Law(NamedTuple):
         first, *rest = self.coefficients().items()
         return _horner([first[1], *(power(name) * k for name, k in rest)], depth * depth)
 
+    def powers(self, depth: Float[Array, "*n"]) -> dict[str, Float[Array, "*n"]]:
+        """Derivative of `force` by each coefficient: d^n by k_n, mm^n."""
+        out, powered = {}, depth
+        for name in self.coefficients():
+            out[name] = powered
+            powered = depth * depth * powered
+        return out
+
     def secant(self, squared: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Force over indentation, N/mm, by the square of the indentation, mm^2."""
         return _horner(list(self.coefficients().values()), squared)

@@ -1,8 +1,9 @@
 """A rigid flat punch on the ligament: it is held level between two points, half a width on each side.
 
 Two forces, half a width before and behind C, hold the ligament at one and the same deflection (a
-flat punch that does not tilt). The tool then feels less of what lies between two rings than a point
-does, and a ring that comes under it does so gradually.
+flat punch that does not tilt, not even where it is so narrow that it is a point). The tool then
+feels less of what lies between two rings than a point does. With shear the compliance has a corner,
+no jump, where a ring comes under an edge, as that of a point has on a ring.
 
 For the flat end of a cylinder of radius r the mean half chord, pi/4 r, is its half width along s.
 """

@@ -34,7 +34,7 @@ class Softening(NamedTuple):
     e_1: Float[Array, "..."]
     e_2: Float[Array, "..."]
 
-    def load(self, deflection: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    def linear(self, deflection: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """c F, mm: what a linear skeleton would deflect under the force of this deflection, mm."""
         return deflection * self.ratio(deflection)
 
@@ -43,7 +43,7 @@ class Softening(NamedTuple):
         return 1 + deflection * (self.e_2 * deflection - self.e_1)
 
     def tangent(self, deflection: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Derivative of `load`."""
+        """Derivative of `linear`."""
         return 1 + deflection * (3 * self.e_2 * deflection - 2 * self.e_1)
 
 
@@ -83,33 +83,6 @@ def soft_series(
     return SoftSeries(*_solved(displacement, compliance, law, softening))
 
 
-def sensitivity(
-    solved: SoftSeries, compliance: Float[Array, "..."], law: Law, softening: Softening
-) -> tuple[dict[str, Float[Array, "*n"]], dict[str, Float[Array, "*n"]]]:
-    """Derivatives of force and of deflection at a solved press, by name of the input.
-
-    What `jax.jvp` of `soft_series` gives, for callers that want every derivative at once.
-
-    Returns:
-        Of the force, N, and of the deflection, mm, each by `displacement`, `compliance`, the
-        coefficients of the law and those of the softening.
-    """
-    d, u, c = solved.depth, solved.deflection, compliance
-    slope, rise = law.tangent(d), softening.tangent(u)
-    share = 1 / (rise + c * slope)
-    # du = share (c F' dD + F dc + c dF(d) - dg(u)); dF = F' (dD - du) + dF(d)
-    by_u = {"displacement": share * c * slope, "compliance": share * solved.force}
-    by_F = {"displacement": share * slope * rise, "compliance": -slope * by_u["compliance"]}
-    powered = d
-    for name in law.coefficients():
-        by_u[name], by_F[name] = share * c * powered, share * rise * powered
-        powered = d * d * powered
-    for name, grown in (("e_1", -u * u), ("e_2", u * u * u)):
-        by_u[name] = -share * grown
-        by_F[name] = share * slope * grown
-    return by_F, by_u
-
-
 @jax.custom_jvp
 def _solved(displacement, compliance, law: Law, softening: Softening):
     return _newton(*jnp.broadcast_arrays(displacement, compliance), law, softening)
@@ -120,14 +93,17 @@ def _solved_jvp(primals, tangents):
     _, compliance, law, softening = primals
     dD, dc, d_law, d_softening = tangents
     depth, u, force, folded = _solved(*primals)
-    slope, rise = law.tangent(depth), softening.tangent(u)
-    share = 1 / (rise + compliance * slope)
-    grown = depth * d_law.secant(depth * depth)
-    bent = u * u * (u * d_softening.e_2 - d_softening.e_1)
-    du = share * (compliance * (slope * dD + grown) + force * dc - bent)
-    d_force = share * (rise * (slope * dD + grown) + slope * (bent - force * dc))
+    # A row without a solution has derivative 0, so that what all rows share keeps its own.
+    solved = jnp.isfinite(force)
+    d, v, F = (jnp.where(solved, value, 0) for value in (depth, u, force))
+    slope, rise = law.tangent(d), softening.tangent(v)
+    share = jnp.where(solved, 1 / (rise + compliance * slope), 0)
+    grown = d * d_law.secant(d * d)
+    bent = v * v * (v * d_softening.e_2 - d_softening.e_1)
+    du = share * (compliance * (slope * dD + grown) + F * dc - bent)
+    d_force = share * (rise * (slope * dD + grown) + slope * (bent - F * dc))
     # Not dD - du, which cancels where the skeleton is soft.
-    d_depth = share * (rise * dD + bent - force * dc - compliance * grown)
+    d_depth = share * (rise * dD + bent - F * dc - compliance * grown)
     none = jnp.zeros(folded.shape, jax.dtypes.float0)
     return (depth, u, force, folded), (d_depth, du, d_force, none)
 
@@ -145,7 +121,7 @@ def _newton(displacement, compliance, law: Law, softening: Softening):
     high = jnp.minimum(D, limit)
 
     def excess(u):
-        return soft.load(u) - c * law.force(D - u)
+        return soft.linear(u) - c * law.force(D - u)
 
     solvable = (low <= high) & (excess(low) <= 0) & (excess(high) >= 0)
     near = epsilon(D.dtype) ** 0.6  # the error that a Newton step leaves is its square
@@ -187,10 +163,10 @@ def _polished(D, c, law: Law, soft: Softening, u):
     depth = D - u
     by_skeleton = u > depth
     c_safe = jnp.where(by_skeleton, c, 1)
-    force = jnp.where(by_skeleton, soft.load(u) / c_safe, law.force(depth))
+    force = jnp.where(by_skeleton, soft.linear(u) / c_safe, law.force(depth))
     slope = law.tangent(jnp.where(by_skeleton, depth, 0))
     better_depth = depth - (law.force(depth) - force) / slope
-    better_u = u - (soft.load(u) - c * force) / soft.tangent(u)
+    better_u = u - (soft.linear(u) - c * force) / soft.tangent(u)
     return (
         jnp.where(by_skeleton, better_depth, depth),
         jnp.where(by_skeleton, u, better_u),

@@ -1,0 +1,189 @@
+"""A skeleton that softens in series with the local law: roots in 40 digits, derivatives, folds."""
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jaxtrachea.mechanics.equilibrium import press_series, press_softening, sensitivity
+from jaxtrachea.mechanics.force_law import Law
+from jaxtrachea.mechanics.press import Options, press
+from jaxtrachea.mechanics.softening import Softening, soft_series
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.geometry import table_1
+from jaxtrachea.trachea.material import Material
+
+DTYPES = ["float32", "float64"]
+NAMES = ("displacement", "compliance", "k_1", "k_3", "e_1", "e_2")
+
+
+@jax.jit
+@jax.vmap
+def solve(D, c, k_1, k_3, e_1, e_2):
+    return soft_series(D, c, Law(k_1, k_3), Softening(e_1, e_2))
+
+
+def random_cases(n, dtype, seed=0):
+    """D, c, k_1, k_3, e_1, e_2 over many decades; draws and presses, with and without a fold."""
+    rng = np.random.default_rng(seed)
+    k_3 = 10 ** rng.uniform(-4, 2, n) * (rng.random(n) < 0.7)
+    rows = (
+        rng.uniform(-3, 8, n), 10 ** rng.uniform(-4, 4, n), 10 ** rng.uniform(-3, 3, n), k_3,
+        rng.uniform(-0.2, 0.3, n), rng.uniform(0, 0.05, n),
+    )  # fmt: skip
+    return [v.astype(dtype) for v in rows]
+
+
+def exact(D, c, k_1, k_3, e_1, e_2):
+    """Depth, deflection and force by bisection in 40 digits, and the condition of the problem.
+
+    None where the skeleton carries less than its part at the peak of its law, or at D.
+    """
+    with mp.workdps(40):
+        D, c, k_1, k_3, e_1, e_2 = (mp.mpf(float(v)) for v in (D, c, k_1, k_3, e_1, e_2))
+        sign = -1 if D < 0 else 1
+        D, e_1 = abs(D), sign * e_1
+        slopes = mp.polyroots([1, -2 * e_1, 3 * e_2], asc=True) if e_2 else [1 / (2 * e_1)]
+        peaks = [mp.re(r) for r in slopes if abs(mp.im(r)) < 1e-25 and mp.re(r) > 0]
+
+        def excess(u):
+            d = D - u
+            return u * (1 - e_1 * u + e_2 * u**2) - c * (k_1 * d + k_3 * d**3)
+
+        low, high = mp.mpf(0), min([D, *peaks])
+        if excess(high) < 0:
+            return None
+        for _ in range(140):
+            middle = (low + high) / 2
+            low, high = (middle, high) if excess(middle) < 0 else (low, middle)
+        d, u = D - low, low
+        slope, rise = c * (k_1 + 3 * k_3 * d**2), 1 - 2 * e_1 * u + 3 * e_2 * u**2
+        return sign * d, sign * u, sign * (k_1 * d + k_3 * d**3), (1 + slope) / (rise + slope)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_roots(dtype):
+    """All three to a few roundings relative to themselves, however unequal; folds are told."""
+    cases = random_cases(400, dtype)
+    got = solve(*cases)
+    eps, folded = np.finfo(dtype).eps, 0
+    for i, row in enumerate(zip(*cases, strict=True)):
+        truth = exact(*row)
+        if truth is None:
+            folded += 1
+            assert got.folded[i] and all(np.isnan(v[i]) for v in got[:3])
+            continue
+        assert not got.folded[i]
+        for value, true in zip(got[:3], truth[:3], strict=True):
+            error = abs(mp.mpf(float(value[i])) - true) / abs(true)
+            assert error < 8 * eps * max(1, truth[3]), (i, row)
+    assert 5 < folded < 50
+
+
+def test_a_row_knows_nothing_of_its_neighbours():
+    cases = random_cases(40, "float64", seed=1)
+    together = np.array(solve(*cases)[:3])
+    for i in (0, 17, 33):
+        alone = np.array(solve(*(v[i : i + 1] for v in cases))[:3])
+        np.testing.assert_array_equal(alone[:, 0], together[:, i])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_linear_limit(dtype):
+    """e_1 = e_2 = 0 is the linear skeleton, to rounding."""
+    D, c, k_1, k_3, _, _ = random_cases(300, dtype)
+    zero = np.zeros_like(D)
+    got = solve(D, c, k_1, k_3, zero, zero)
+    linear = jax.jit(jax.vmap(lambda D, c, k_1, k_3: press_series(D, c, Law(k_1, k_3))))
+    want = linear(D, c, k_1, k_3)
+    rtol = 20 * np.finfo(dtype).eps
+    np.testing.assert_allclose(got.depth, want.depth, rtol=rtol)
+    np.testing.assert_allclose(got.force, want.force, rtol=rtol)
+
+
+@pytest.mark.parametrize("D", [3.0, -3.0, 0.0])
+def test_derivatives(D):
+    """Forward, reverse and second order against differences; `sensitivity` is the forward one."""
+    args = [jnp.asarray(v) for v in (D, 0.8, 1.2, 0.1, 0.1127, 0.0061)]
+
+    def pressed(D, c, k_1, k_3, e_1, e_2):
+        return press_softening(D, c, Law(k_1, k_3), Softening(e_1, e_2))
+
+    def values(*args):
+        solved = pressed(*map(jnp.asarray, args))
+        return solved.depth, solved.force, solved.load
+
+    check_grads(values, args, 2, rtol=1e-4)
+    columns = tuple(range(len(args)))
+    _, force, load = jax.jacfwd(values, columns)(*args)
+    law, softening = Law(*args[2:4]), Softening(*args[4:])
+    by_force, by_load = sensitivity(pressed(*args), args[1], law, softening)
+    for i, name in enumerate(NAMES):
+        np.testing.assert_allclose(by_force[name], force[i], rtol=1e-12, atol=1e-15, err_msg=name)
+        np.testing.assert_allclose(by_load[name], load[i], rtol=1e-12, atol=1e-15, err_msg=name)
+
+
+def test_past_the_fold():
+    """Softening to a peak of the skeleton at u = 1/(2 e_1): no row beyond it, gradients finite."""
+    law, softening = Law(jnp.asarray(1e6), jnp.asarray(0.0)), Softening(0.25, 0.0)
+    D = jnp.array([1.9, 1.99, 2.01, 5.0, -5.0])
+    got = press_softening(D, jnp.asarray(1.0), law, softening)
+    folded = [PressStatus.OK] * 2 + [PressStatus.PAST_FOLD] * 2 + [PressStatus.OK]
+    assert got.status.tolist() == folded
+    assert np.isnan(got.force[2:4]).all()
+    # A rigid contact: the skeleton's own law.
+    truth = np.asarray(D) * (1 - 0.25 * np.asarray(D))
+    np.testing.assert_allclose(got.force[jnp.array([0, 1, 4])], truth[[0, 1, 4]], rtol=1e-5)
+
+    def total(e_1):
+        solved = press_softening(D, jnp.asarray(1.0), law, Softening(e_1, 0.0))
+        return jnp.sum(jnp.where(solved.status == PressStatus.OK, solved.force, 0))
+
+    slope = jax.grad(total)(0.25)
+    np.testing.assert_allclose(slope, -np.sum(np.array([1.9, 1.99, -5.0]) ** 2), rtol=1e-4)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_not_finite(bad):
+    got = press_softening(
+        jnp.array([1.0, bad]), jnp.asarray(1.0), Law(jnp.asarray(1.0), jnp.asarray(0.1)),
+        Softening(0.1, 0.01),
+    )  # fmt: skip
+    assert got.status.tolist() == [PressStatus.OK, PressStatus.NON_FINITE]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_press(dtype):
+    """In `press` the joints follow the deflection of C; work along a path is the stored energy."""
+    material = Material(
+        *(jnp.asarray(v, dtype) for v in (40.0, 0.1, 0.6, 0.02)),
+        e_1=jnp.asarray(0.11, dtype), e_2=jnp.asarray(0.006, dtype),
+    )  # fmt: skip
+    geometry = table_1(dtype=dtype)
+    options = Options(skeleton="softening", contact="bonded")
+    D = jnp.linspace(0, 6, 2001).astype(dtype)
+    got = jax.jit(lambda D: press(geometry, material, 75.0, D, options))(D)
+    linear = jax.jit(lambda: press(geometry, material, 75.0, 1.0, Options(contact="bonded")))()
+    rtol = 60 * np.finfo(dtype).eps
+    np.testing.assert_allclose(got.depth + got.skeleton, D, rtol=rtol, atol=rtol)
+    shape = linear.joints / linear.skeleton
+    joints = np.outer(got.skeleton, shape)
+    np.testing.assert_allclose(got.joints, joints, rtol=rtol, atol=1e-9)
+    reactions = np.outer(got.force, linear.reactions / linear.force)
+    np.testing.assert_allclose(got.reactions, reactions, rtol=rtol, atol=1e-9)
+    F, d, u = (np.asarray(v, np.float64) for v in (got.force, got.depth, got.skeleton))
+    work = np.sum((F[1:] + F[:-1]) / 2 * np.diff(np.asarray(D, np.float64)))
+    skeleton = u**2 / 2 - 0.11 * u**3 / 3 + 0.006 * u**4 / 4
+    stored = 0.6 * d**2 / 2 + 0.02 * d**4 / 4 + skeleton / float(got.compliance)
+    np.testing.assert_allclose(work, stored[-1], rtol=2e-6)
+    one = jax.vmap(lambda D: press(geometry, material, 75.0, D, options).force)(D[::500])
+    np.testing.assert_allclose(one, got.force[::500], rtol=rtol)
+
+
+def test_options():
+    with pytest.raises(ValueError, match="coupling='series'"):
+        Options(skeleton="softening", coupling="total")
+    with pytest.raises(ValueError, match="Material.e_1"):
+        press(table_1(), Material(40.0, 0.1, 0.6, 0.02), 75.0, 1.0, Options(skeleton="softening"))
