@@ -117,7 +117,8 @@ def test_no_notch():
     F = jax.jit(jax.vmap(lambda s: press(geometry, material, s, 0.1, options).force))(s)
     F = np.asarray(F)
     np.testing.assert_allclose(F, F[::-1], rtol=2e-3)
-    assert np.all(np.diff(F[:51]) < 0) and np.all(np.diff(F[50:]) > 0)
+    assert np.all(np.diff(F[:51]) < 0)
+    assert np.all(np.diff(F[50:]) > 0)
     assert np.max(np.abs(np.diff(F))) < 4e-3 * F.max()
     assert F[48] - F[50] < 1e-3 * F.max()
 

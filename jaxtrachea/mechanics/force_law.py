@@ -272,7 +272,6 @@ def blend(ligament: Law, ring: Law, weight: Float[Array, ""]) -> Law:
     k_n / k_1^(n + 1). (A mean of stiffnesses lets a rigid ring rule all but a notch midway between
     two of them.) A coefficient that only one of them has counts as 0 in the other.
     """
-
     softer = (1 - weight) * ring.k_1 + weight * ligament.k_1
     softer = jnp.where(softer > 0, softer, 1)
     share = ring.k_1 / softer, ligament.k_1 / softer  # k_1 over that of ligament and ring

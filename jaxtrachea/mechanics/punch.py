@@ -1,4 +1,4 @@
-"""A rigid flat punch on the ligament: it is held level between two points, half a width on each side.
+"""A rigid flat punch on the ligament: held level between two points, half a width to each side.
 
 Two forces, half a width before and behind C, hold the ligament at one and the same deflection (a
 flat punch that does not tilt, not even where it is so narrow that it is a point). The tool then
@@ -44,8 +44,8 @@ class Held(NamedTuple):
 def held_level(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Held:
     """Deflections under a punch at s_c whose forces sum to 1 N.
 
-    Where it reaches beyond an end of the beam it stands on the clamp there, and nothing moves. Loses
-    digits where it is narrower than some thousandth of a span: two points then are one.
+    Where it reaches beyond an end of the beam it stands on the clamp there, and nothing moves.
+    Loses digits where it is narrower than some thousandth of a span: two points then are one.
 
     Args:
         beam: the beam and its supports.

@@ -35,7 +35,7 @@ class Softening(NamedTuple):
     e_2: Float[Array, "..."]
 
     def linear(self, deflection: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """c F, mm: what a linear skeleton would deflect under the force of this deflection, mm."""
+        """Compliance times force, mm: what a linear skeleton would deflect under the same force."""
         return deflection * self.ratio(deflection)
 
     def ratio(self, deflection: Float[Array, "*n"]) -> Float[Array, "*n"]:
