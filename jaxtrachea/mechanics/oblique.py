@@ -236,8 +236,8 @@ def place_at(
 def _only_default(options: Options):
     if options.half_width != 0 or options.skeleton != "linear":
         raise ValueError(
-            "oblique presses need options.half_width=0 and options.skeleton='linear': a tool with a "
-            "width and a skeleton that softens are known for normal presses on the midline (`press`)"
+            "oblique presses need options.half_width=0 and options.skeleton='linear': a tool with "
+            "a width and a skeleton that softens are for normal presses on the midline (`press`)"
         )
     if options.split != "continuous" or options.form != "recursion":
         raise ValueError("oblique presses need options.split='continuous' and form='recursion'")

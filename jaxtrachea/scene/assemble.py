@@ -7,13 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.contact.shapes import Shape
-from jaxtrachea.mechanics.admission import check_shapes
 from jaxtrachea.scene.declare import PlanError, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import check_sizes
-from jaxtrachea.scene.stage import Poses, Presses, Scene, check_path
+from jaxtrachea.scene.stage import Poses, Presses, Scene, check_material, check_path
 from jaxtrachea.scene.wall import checked_walls, near_patches, round_wall
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
@@ -59,7 +58,7 @@ def make_scene(
         ValueError: a path without rows, arrays of a wrong length, or a negative friction.
     """
     check_path(path)
-    check_shapes(geometry, material)
+    check_material(geometry, material)
     if not len(path.s if isinstance(path, Presses) else path.translation):
         raise ValueError("path has no rows; expected at least one")
     if friction is not None and not 0 <= float(friction) < np.inf:

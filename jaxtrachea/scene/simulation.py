@@ -8,7 +8,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea.mechanics.admission import check_shapes
 from jaxtrachea.mechanics.oblique import Place, press_at
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.configurational import force_by_pose
@@ -16,7 +15,7 @@ from jaxtrachea.scene.deform import deform
 from jaxtrachea.scene.programs import moved_by, one_plane, vectors
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import refuse, status_of, without_negative_values
-from jaxtrachea.scene.stage import Poses, Presses, Scene, check_path
+from jaxtrachea.scene.stage import Poses, Presses, Scene, check_material, check_path
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
 
@@ -99,7 +98,7 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
     """
     plan = scene.plan
     check_path(path)
-    check_shapes(scene.geometry, material)
+    check_material(scene.geometry, material)
     if plan.contact != isinstance(path, Poses):
         kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
         raise ValueError(f"path is {type(path).__name__}; expected {kinds[not plan.contact]}")

@@ -20,7 +20,7 @@ from jaxtrachea.config import (
 )
 from jaxtrachea.scene.declare import Effect
 from jaxtrachea.scene.effects import EFFECTS
-from jaxtrachea.trachea.material import VALUES, meaningless
+from jaxtrachea.trachea.material import DEEP, VALUES, meaningless
 
 Lengths3 = Annotated[list[Length], Field(min_length=3, max_length=3)]
 Sizes3 = Annotated[list[PositiveLength], Field(min_length=3, max_length=3)]
@@ -82,6 +82,8 @@ class MaterialSection(_material_keys()):
         given = (name for name in VALUES if getattr(self, name) is not None)
         for name, other in meaningless(given).items():
             raise ValueError(f"{name} needs {other}; give {other} too, or remove {name}")
+        for name in (name for name in DEEP if getattr(self, name) is not None):
+            raise ValueError(f"{name}: the skeleton of a scene is linear; remove {name}")
         return self
 
 

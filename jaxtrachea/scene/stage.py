@@ -8,13 +8,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import real, shaped
+from jaxtrachea._errors import InputError
 from jaxtrachea.contact.patches import Patches, Touch, touch
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import STANDARD, Settings
 from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.mechanics.admission import check_shapes
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import DEEP, Material
 from jaxtrachea.trachea.mesh import Mesh
 
 #: What counts as a normal press on the midline and as one contact point: rad, mm, and share of the
@@ -47,6 +50,21 @@ class Poses(eqx.Module):
 
     rotation: Float[Array, "rows 3 3"] = eqx.field(converter=partial(real, "rotation"))
     translation: Float[Array, "rows 3"] = eqx.field(converter=partial(real, "translation"))
+
+
+def check_material(geometry: Geometry, material: Material) -> None:
+    """Refuse arrays of a wrong length, and values that no scene reads.
+
+    Raises:
+        ValueError: naming the value, what was expected and the cure.
+    """
+    check_shapes(geometry, material)
+    for name in DEEP:
+        if getattr(material, name) is not None:
+            raise InputError(
+                "the skeleton of a scene is linear, and would ignore it", key=f"Material.{name}",
+                cure="leave it out, or press by `press` with Options(skeleton='softening')",
+            )  # fmt: skip
 
 
 def check_path(path: Presses | Poses) -> None:

@@ -262,6 +262,8 @@ VALUES: dict[str, Declaration] = {
 }
 #: Every parameter, likewise; those of single presses last.
 PARAMETERS: dict[str, Declaration] = VALUES | {p.name: p for p in _OF_THE_PRESS}
+#: Values of a skeleton that softens in deep presses.
+DEEP = tuple(name for name, p in VALUES.items() if p.needs == "softening")
 
 
 def meaningless(given: Iterable[str]) -> dict[str, str]:
