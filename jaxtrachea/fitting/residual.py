@@ -342,7 +342,9 @@ def _press(model: FitModel, tube, free, skeleton, by_beam, trial: Lane | _Tool) 
         return out
 
     d_force = pushed(of_force)
-    linear = solved.load is None
+    load, d_load = solved.force, d_force
+    if solved.load is not None:
+        load, d_load = solved.load, pushed(of_load)
     corner = None
     if blend is not None and any(p.name == "onset" for p in model.free):
         curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
@@ -350,8 +352,8 @@ def _press(model: FitModel, tube, free, skeleton, by_beam, trial: Lane | _Tool) 
     return _Pressed(
         force=solved.force,
         d_force=d_force,
-        load=solved.force if linear else solved.load,
-        d_load=d_force if linear else pushed(of_load),
+        load=load,
+        d_load=d_load,
         offset=contact.force_offset,
         d_offset=d_contact.force_offset,
         d_joints=d_skeleton.joints,

@@ -80,12 +80,14 @@ def soft_series(
         law: local law; k_1 > 0.
         softening: of the skeleton.
     """
-    return SoftSeries(*_solved(displacement, compliance, law, softening))
+    depth, deflection, force, folded = _solved(displacement, compliance, law, softening)
+    return SoftSeries(depth=depth, deflection=deflection, force=force, folded=folded)
 
 
 @jax.custom_jvp
 def _solved(displacement, compliance, law: Law, softening: Softening):
-    return _newton(*jnp.broadcast_arrays(displacement, compliance), law, softening)
+    displacement, compliance = jnp.broadcast_arrays(displacement, compliance)
+    return _newton(displacement, compliance, law, softening)
 
 
 @_solved.defjvp
