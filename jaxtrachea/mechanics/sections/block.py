@@ -37,7 +37,7 @@ def invert(matrix: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Int[Array,
         row = jnp.where(here, 1, row) / pivot
         column = jnp.sum(jnp.where(here[None], A, 0), 1)
         A = jnp.where(here[None], 0, A) - column[:, None] * row[None]
-        return jnp.where(here[:, None], row[None], A), negative + (pivot < 0)
+        return jnp.where(here[:, None], row[None], A), negative + (pivot < 0).astype(jnp.int32)
 
     start = matrix, jnp.zeros((), jnp.int32)
     return jax.lax.fori_loop(0, matrix.shape[0], eliminate, start)

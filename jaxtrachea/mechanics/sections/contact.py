@@ -42,8 +42,8 @@ def effective_place(s_c: Float[Array, ""], left, right, footprint):
     """
     half = (right - left) / 2
     near_left = s_c - left <= half
-    ratio = jnp.clip(jnp.where(near_left, s_c - left, right - s_c) / half, 0, 1)
-    on_end = ratio == 0
+    ratio = jnp.where(near_left, s_c - left, right - s_c) / half
+    on_end = ratio <= 0
     moved = jnp.where(on_end, 0, jnp.where(on_end, 1, ratio) ** footprint)
     # On an end the power keeps its slope by s_c, 1 for a point and else 0.
     moved = jnp.where(on_end & (footprint == 1), ratio, moved)

@@ -1,0 +1,229 @@
+r"""What a skeleton of deforming cross-sections is made of, and where its numbers come from.
+
+Four stiffnesses and the bed are what force-displacement curves and markers determine: EI_C, Et_L,
+D_L, c_W, k_n and k_t. `from_wall` derives all from moduli and thicknesses; what the wall's own
+numbers leave open are `Factors`, each with its name.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxtrachea._arguments import real, shaped
+from jaxtrachea._errors import InputError
+from jaxtrachea.trachea.geometry import Geometry
+
+
+def _value(name: str, **default: Any) -> Any:
+    return eqx.field(converter=functools.partial(real, name), **default)
+
+
+class SectionMaterial(eqx.Module):
+    """Stiffnesses of rings, wall, bed and contact.
+
+    A scalar holds for all; an array gives each ring, shape (rings,), or span, shape (rings + 1,),
+    its own. The mid-line of the sections has the radius of the `Geometry`.
+
+    Attributes:
+        offset: from the mid-line of the wall to its outer surface, mm; a scalar.
+        EI_C: bending stiffness in front, N mm^2 for each ring with its pitch of wall; a ring.
+        EI_M: likewise of the muscle behind; a ring.
+        Et_M: modulus times thickness of the muscle around the tube, N/mm; a ring.
+        k_n: bed behind the muscle, along the normal, N/mm^3; a ring.
+        k_t: likewise along the circumference; a ring.
+        Gt_L: shear modulus times thickness of the wall between rings, N/mm; a span. Large values
+            stand for a wall without membrane shear.
+        Et_L: modulus along the tube times thickness of that wall, N/mm; a span.
+        D_L: bending stiffness of that wall, N mm; a span.
+        c_W: softening of a span with its energy, 1/(N mm); 0: linear; a span.
+        c_K: softening of bending in a ring, mm^2; 0: linear; a ring.
+        rho: share of the muscle in shear and stretch of the wall; a span.
+        k_end: how the clamped ends hold the warping, 1/mm, in [0, inf]; a scalar.
+        footprint: exponent by which a tool near a ring rests on it, 1 (a point) or more; a scalar.
+        c_n: local compliance along the normal, mm/N, positive; a scalar.
+        c_t: likewise along the circumference, mid-span.
+        c_t_ring: that on a ring.
+    """
+
+    offset: Float[Array, ""] = _value("offset")
+    EI_C: Float[Array, "..."] = _value("EI_C")
+    EI_M: Float[Array, "..."] = _value("EI_M")
+    Et_M: Float[Array, "..."] = _value("Et_M")
+    k_n: Float[Array, "..."] = _value("k_n")
+    k_t: Float[Array, "..."] = _value("k_t")
+    Gt_L: Float[Array, "..."] = _value("Gt_L")
+    Et_L: Float[Array, "..."] = _value("Et_L")
+    D_L: Float[Array, "..."] = _value("D_L")
+    c_W: Float[Array, "..."] = _value("c_W")
+    c_K: Float[Array, "..."] = _value("c_K", default=0.0)
+    rho: Float[Array, "..."] = _value("rho", default=1e-3)
+    k_end: Float[Array, ""] = _value("k_end", default=float("inf"))
+    footprint: Float[Array, ""] = _value("footprint", default=1.0)
+    c_n: Float[Array, ""] = _value("c_n", default=3e-3)
+    c_t: Float[Array, ""] = _value("c_t", default=0.1)
+    c_t_ring: Float[Array, ""] = _value("c_t_ring", default=0.01)
+
+
+#: Fields that may differ from ring to ring and from span to span; the others are scalars.
+EACH_RING = ("EI_C", "EI_M", "Et_M", "k_n", "k_t", "c_K")
+EACH_SPAN = ("Gt_L", "Et_L", "D_L", "c_W", "rho")
+#: Values that must be more than zero; the others must not be negative.
+POSITIVE = ("EI_C", "EI_M", "Et_M", "Gt_L", "Et_L", "c_n", "c_t", "c_t_ring")
+
+
+def check_sections(geometry: Geometry, material: SectionMaterial) -> None:
+    """Refuse arrays of a wrong length.
+
+    Raises:
+        ValueError: the field, its length and the expected one.
+    """
+    rings = geometry.rings
+    for field in dataclasses.fields(material):
+        name, value = f"SectionMaterial.{field.name}", getattr(material, field.name)
+        if field.name in EACH_RING:
+            shaped(name, value, (), (rings,), why=" (one for each ring)")
+        elif field.name in EACH_SPAN:
+            shaped(name, value, (), (rings + 1,), why=f" ({rings} rings make {rings + 1} spans)")
+        else:
+            shaped(name, value, ())
+
+
+@dataclasses.dataclass(frozen=True)
+class Wall:
+    """Moduli and thicknesses of a tracheal wall; MPa, mm.
+
+    A ring is a layer of cartilage on the outside of the wall, ligament below it and between rings;
+    muscle closes it behind. Table 1 of the paper gives E_C, E_L, h and h_M; the others are those of
+    the virtual specimen of docs/virtual_trachea.md.
+
+    Attributes:
+        E_C: cartilage.
+        E_L: ligament.
+        E_M: muscle.
+        nu: Poisson's ratio of the wall.
+        h: thickness of the wall in front.
+        h_C: thickness of the cartilage, at most h.
+        h_M: thickness of the muscle.
+        bed_n: bed behind along the normal, N/mm^3.
+        bed_t: likewise along the circumference.
+    """
+
+    E_C: float = 5.8
+    E_L: float = 0.65
+    E_M: float = 0.30
+    nu: float = 0.45
+    h: float = 2.6
+    h_C: float = 1.56
+    h_M: float = 2.0
+    bed_n: float = 0.02
+    bed_t: float = 0.002
+
+    def __post_init__(self):
+        """Refuse a wall that cannot be.
+
+        Raises:
+            InputError: naming the value.
+        """
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name != "nu" and not (np.isfinite(value) and value > 0):
+                raise InputError(f"is {value}", key=field.name, expected="more than 0", joint=" ")
+        if not 0 <= self.nu < 0.5:
+            raise InputError(f"is {self.nu}", key="nu", expected="in [0, 0.5)", joint=" ")
+        if self.h_C > self.h:
+            expected = f"at most the thickness of the wall, {self.h} mm"
+            raise InputError(f"is {self.h_C} mm", key="h_C", expected=expected, joint=" ")
+
+
+@dataclasses.dataclass(frozen=True)
+class Factors:
+    """What the moduli leave open, as factors on what they give; fitted to one virtual specimen.
+
+    Fit of 10 parameters to its presses on the midline and at 30 and 90 degrees, D to 6 mm
+    (docs/virtual_trachea.md): EI_C 23.6 N mm^2, Et_L 1.18 N/mm, D_L 4.19 N mm, Gt_L 20.7 N/mm,
+    Et_M 0.65 N/mm, c_W 0.915 /(N mm), k_end 0.159 /mm, footprint 2.85; bed as given to 10 %.
+
+    Attributes:
+        EI_C: on the composite section in plane strain.
+        Et_L: on E_L h.
+        D_L: on E_L h^3 / 12 / (1 - nu^2); more than 1 since stiff rings hold the wall's ends.
+        Gt_L: on E_L h / 2 / (1 + nu); not physical, it stands for a wall without membrane shear.
+        Et_M: on E_M h_M.
+        c_W: on 1 / (E_L h R p), p the mean span: softening at a given strain, an assumption for
+            other sizes than that of the specimen.
+        k_end: times R is this: warping held within about a diameter.
+        footprint: of a punch of 3 mm radius on rings 10 mm apart.
+    """
+
+    EI_C: float = 1.08
+    Et_L: float = 0.70
+    D_L: float = 3.5
+    Gt_L: float = 35.0
+    Et_M: float = 1.08
+    c_W: float = 181.0
+    k_end: float = 1.86
+    footprint: float = 2.85
+
+
+def from_wall(
+    geometry: Geometry, wall: Wall = Wall(), factors: Factors = Factors()  # noqa: B008 (frozen)
+) -> SectionMaterial:
+    """Stiffnesses of the sections of a tube, from moduli and thicknesses.
+
+    EI_C is that of a ring of the composite section (width `ring_height`) and of ligament for the
+    rest of its pitch, in plane strain.
+
+    Args:
+        geometry: the tube; its radius is that of the mid-line, `neutral_radius`.
+        wall: moduli and thicknesses.
+        factors: what they leave open.
+    """
+    pitches = ring_pitches(geometry)
+    plane = 1 - wall.nu**2
+    ring, ligament = _composite(wall)[0], wall.E_L * wall.h**3 / 12
+    height = jnp.minimum(geometry.ring_height, pitches)
+    EI_C = (ring * height + ligament * (pitches - height)) / plane
+    R, mean_span = geometry.radius, geometry.length / (geometry.rings + 1)
+    return SectionMaterial(
+        offset=wall.h - _composite(wall)[1] + 0 * R,
+        EI_C=factors.EI_C * EI_C,
+        EI_M=wall.E_M * wall.h_M**3 / 12 * pitches,
+        Et_M=factors.Et_M * wall.E_M * wall.h_M,
+        k_n=wall.bed_n,
+        k_t=wall.bed_t,
+        Gt_L=factors.Gt_L * wall.E_L * wall.h / 2 / (1 + wall.nu),
+        Et_L=factors.Et_L * wall.E_L * wall.h,
+        D_L=factors.D_L * ligament / plane,
+        c_W=factors.c_W / (wall.E_L * wall.h * R * mean_span),
+        k_end=factors.k_end / R,
+        footprint=factors.footprint,
+    )
+
+
+def neutral_radius(inner_radius: float, wall: Wall = Wall()) -> float:  # noqa: B008 (frozen)
+    """Radius of the mid-line of a ring, mm: where bending of the composite section strains nothing.
+
+    11.73 mm for the virtual specimen; the fits above take 11.7.
+    """
+    return inner_radius + _composite(wall)[1]
+
+
+def ring_pitches(geometry: Geometry) -> Float[Array, " rings"]:
+    """Length of tube that belongs to each ring, mm: half of both its spans."""
+    x = geometry.ring_positions
+    ends = jnp.concatenate([jnp.zeros_like(x[:1]), x, geometry.length[None]])
+    return (ends[2:] - ends[:-2]) / 2
+
+
+def _composite(wall: Wall) -> tuple[float, float]:
+    """Bending stiffness per width, N mm, of cartilage on ligament, and its height above inside."""
+    inner = wall.h - wall.h_C
+    layers = ((wall.E_L, inner, inner / 2), (wall.E_C, wall.h_C, inner + wall.h_C / 2))
+    total = sum(E * t for E, t, _ in layers)
+    height = sum(E * t * y for E, t, y in layers) / total
+    return sum(E * t * (t * t / 12 + (y - height) ** 2) for E, t, y in layers), height
