@@ -109,12 +109,11 @@ def press_sections(
     known = jnp.isfinite(displacement)
     path = jnp.where(known, displacement, 0)
     solved = solve_path(parts, path)
-    status, imbalance = _judge(solved, path, parts)
-    status = jnp.where(known, status, PressStatus.NON_FINITE)
+    status = jnp.where(known, _status(solved, path), PressStatus.NON_FINITE)
     status = jnp.where(asked.refused != PressStatus.OK, asked.refused, status).astype(jnp.int8)
     observe = jax.vmap(_observe, (0, 0, None))
     found = observe(solved.state, path, parts)
-    found = found._replace(imbalance=imbalance, steps=solved.steps, status=status)
+    found = found._replace(steps=solved.steps, status=status)
     valid = (status == PressStatus.OK) | (status == PressStatus.NO_CONTACT)
     hidden = jax.vmap(hide)(jnp.where(valid, PressStatus.OK, status), found)
     return hidden._replace(steps=solved.steps)
@@ -203,21 +202,19 @@ def _hold_ends(spans: span.Span, k_end):
     return scale, stiff[:, None, None, None] * spans.axial[jnp.array([0, -1])]
 
 
-def _judge(solved: Solved, path, parts: System):
-    """Status of each row, and its imbalance; without derivatives."""
-    solved, path, parts = jax.lax.stop_gradient((solved, path, parts))
-
-    def one(state, D):
-        r, tangent = system.linearise(state, D, parts)
-        pushed = jnp.max(jnp.abs(state.force))
-        off = jnp.max(jnp.abs(r.y)) / jnp.where(pushed > 0, pushed, 1)
-        return off, system.excess_negative(tangent)
-
-    imbalance, excess = jax.vmap(one)(solved.state, path)
-    unstable = jnp.cumsum((excess != 0) & (solved.solved > 0)) > 0
-    held = (solved.solved > 0) & ~unstable
+def _status(solved: Solved, path):
+    """Of each row."""
     status = jnp.where(path == 0, PressStatus.NO_CONTACT, PressStatus.OK)
-    return jnp.where(held, status, PressStatus.PAST_FOLD), imbalance
+    good = (solved.solved > 0) & (solved.stable > 0)
+    return jnp.where(good, status, PressStatus.PAST_FOLD)
+
+
+def _imbalance(state: State, displacement, parts: System):
+    """Largest residual of the nodes over the force."""
+    state, displacement, parts = jax.lax.stop_gradient((state, displacement, parts))
+    r = system.residual(state, displacement, parts)
+    pushed = jnp.max(jnp.abs(state.force))
+    return jnp.max(jnp.abs(r.y)) / jnp.where(pushed > 0, pushed, 1)
 
 
 def _observe(state: State, displacement, parts: System) -> SectionPress:
@@ -239,7 +236,6 @@ def _observe(state: State, displacement, parts: System) -> SectionPress:
         along = -parts.shape.radius * jnp.einsum("npw,pw->n", warp, X)
         return across.at[:, 0].set(along)
 
-    none = jnp.zeros((), v.dtype)
     return SectionPress(
         force=vector(state.force),
         depth=vector(displacement * parts.direction - v),
@@ -249,7 +245,7 @@ def _observe(state: State, displacement, parts: System) -> SectionPress:
         end_U=surface_at(-alpha),
         end_V=surface_at(alpha),
         energy=system.stored_energy(state, parts),
-        imbalance=none,
-        steps=none,
+        imbalance=_imbalance(state, displacement, parts),
+        steps=jnp.zeros_like(displacement),
         status=jnp.zeros((), jnp.int8),
     )

@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 from jaxtrachea._numerics import epsilon
 
 #: Gauss points on the half of the cartilage and on that of the muscle, and on the way to a point.
-FRONT, BACK, WAY = 10, 6, 10
+FRONT, BACK, WAY = 12, 8, 10
 #: Places in the symmetric modes q[:4] and, in the same order of halves, the antisymmetric q[4:].
 A1, STRETCH, B1 = 0, 3, 5
 
@@ -160,10 +160,15 @@ def make_grid(shape: Shape, *, midline: bool) -> Grid:
         behind = jnp.concatenate([behind, behind])
         none = jnp.zeros_like(up)
         to_z = jnp.block([[up, none], [none, -up]])
-    mean = (weights * phi / (2 * jnp.pi))[None]  # less the mean round the ring, by parts
+    mean = -mean_weights(phi, weights)[None]
     to_z, to_y = (to_z, to_z + mean) if midline else (to_z + mean, to_z + mean)
     turn, curve = turn_shapes(phi, shape.radius, midline)
     return Grid(phi, weights, behind, turn, curve, to_y, to_z)
+
+
+def mean_weights(phi: Float[Array, " m"], weights: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Mean round the ring of what is 0 at phi = 0, from its derivative at the points (by parts)."""
+    return weights * (jnp.sign(phi) / 2 - phi / (2 * jnp.pi))
 
 
 def small_solve(M: Float[Array, "c c"], r: Float[Array, "c *k"]) -> Float[Array, "c *k"]:
@@ -323,7 +328,7 @@ def surface_motion(
     turned = way + line.w @ turn_shapes(way, shape.radius, grid.midline)[0]
     c, s = jnp.cos(turned), jnp.sin(turned)
     c_0, s_0 = jnp.cos(way), jnp.sin(way)
-    mean = grid.weights * grid.phi / (2 * jnp.pi)
+    mean = -mean_weights(grid.phi, grid.weights)
     y = line.w[A1] + mean @ line.slope_y
     y = y + shape.radius * phi * (weights @ (s_0 - s)[:-1]) + shape.offset * (c - c_0)[-1]
     z = shape.radius * phi * (weights @ (c - c_0)[:-1]) + shape.offset * (s - s_0)[-1]

@@ -25,11 +25,13 @@ class Solved(NamedTuple):
     Attributes:
         state: one for each displacement; at rest where there is none.
         solved: 1 where Newton's method converged, else 0.
+        stable: 1 where this state and all before it are minima of the energy, else 0.
         steps: Newton steps made for it.
     """
 
     state: State
     solved: Float[Array, " m"]
+    stable: Float[Array, " m"]
     steps: Float[Array, " m"]
 
 
@@ -38,7 +40,7 @@ class _Way(NamedTuple):
 
     `there`, `before`: the last two states and their displacements; `state`: under correction for
     the displacement `tried`; `count`: Newton steps of this substep, `total` of all; `reach`:
-    substep allowed; `lost`: given up.
+    substep allowed; `lost`: given up; `stable`: no state so far that is no minimum of the energy.
     """
 
     there: State
@@ -51,6 +53,7 @@ class _Way(NamedTuple):
     count: Int[Array, ""]
     total: Int[Array, ""]
     lost: Bool[Array, ""]
+    stable: Bool[Array, ""]
 
 
 def _choose(condition, a, b):
@@ -80,15 +83,25 @@ def _advance(way: _Way, target, system: System) -> _Way:
     state = jax.tree.map(lambda x, y: x - y, way.state, step)
     size = _size(step)
     finite = jnp.isfinite(size + jnp.sum(state.force) + jnp.sum(state.y))
-    settled = finite & (size <= epsilon(size.dtype) ** 0.5 * jnp.abs(way.tried))
+    scale = jnp.maximum(jnp.abs(way.tried), jnp.abs(way.tried - way.at))
+    settled = finite & (size <= epsilon(size.dtype) ** 0.5 * scale)
     count, total = way.count + 1, way.total + 1
     failed = ~finite | (size > 3 * system.shape.radius) | ((count >= STEPS) & ~settled)
     on = way._replace(state=state, count=count, total=total)
+    # The tangent is that before the last step, which was small.
+    stable = way.stable & (_system.excess_negative(tangent) == 0)
     quick = jnp.where(count <= 5, 2 * way.reach, way.reach)
     accepted = _predict(
-        on._replace(there=state, before=way.there, at=way.tried, at_before=way.at,
-                    reach=jnp.minimum(quick, longest)), target
-    )  # fmt: skip
+        on._replace(
+            there=state,
+            before=way.there,
+            at=way.tried,
+            at_before=way.at,
+            reach=jnp.minimum(quick, longest),
+            stable=stable,
+        ),
+        target,
+    )
     shorter = jnp.minimum(way.reach, jnp.abs(way.tried - way.at)) / 2
     back = _predict(way._replace(reach=shorter, total=total), target)
     given_up = (shorter < longest / 2**HALVINGS) | (total >= IN_ALL)
@@ -102,18 +115,21 @@ def _follow(system: System, displacement) -> Solved:
     zero = jnp.zeros_like(system.phi_c)
     count = jnp.zeros((), jnp.int32)
     reach = REACH * system.shape.radius
-    begin = _Way(rest, rest, zero, zero, rest, zero, reach, count, count, jnp.zeros((), bool))
+    no = jnp.zeros((), bool)
+    begin = _Way(rest, rest, zero, zero, rest, zero, reach, count, count, no, ~no)
 
     def press_on(way, target):
-        way = _predict(way._replace(total=count, lost=jnp.zeros((), bool), reach=reach), target)
+        # No displacement is the state of rest, and that exactly.
+        way = _choose(target == 0, begin._replace(stable=way.stable), way)
+        way = _predict(way._replace(total=count, lost=no, reach=reach), target)
 
         def goes(way):
             return (way.at != target) & ~way.lost
 
         way = jax.lax.while_loop(goes, lambda w: _advance(w, target, system), way)
         state = _choose(way.lost, rest, way.there)
-        solved = Solved(state, 1 - way.lost.astype(target.dtype), way.total.astype(target.dtype))
-        return way, solved
+        told = (~way.lost, way.stable, way.total)
+        return way, Solved(state, *(v.astype(target.dtype) for v in told))
 
     return jax.lax.scan(press_on, begin, displacement)[1]
 
@@ -148,4 +164,4 @@ def _solve_path_jvp(primals, tangents):
 
     grown = jax.vmap(one)(found.state, displacement, tangents[1])
     none = jnp.zeros_like(found.solved)
-    return found, Solved(grown, none, none)
+    return found, Solved(grown, none, none, none)

@@ -1,0 +1,292 @@
+"""Presses on deforming cross-sections: linear limit, work, derivatives, hard cases, statuses."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from sections_linear import linear_force
+
+from jaxtrachea.mechanics import press as mat
+from jaxtrachea.mechanics.sections import system
+from jaxtrachea.mechanics.sections.contact import place_on
+from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
+from jaxtrachea.mechanics.sections.press import build, press_sections
+from jaxtrachea.mechanics.sections.span import Wall, make_forms, make_span
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+
+RINGS = 10.0 * np.arange(1, 7)
+LENGTH, RADIUS = 70.0, 11.7
+VALUES = {
+    "offset": 0.9, "EI_C": 24.2, "EI_M": 2.0, "Et_M": 0.68, "k_n": 0.0186, "k_t": 0.0018,
+    "Gt_L": 20.9, "Et_L": 1.19, "D_L": 3.5, "c_W": 0.68, "c_K": 22.3, "rho": 1e-3, "k_end": 0.146,
+    "footprint": 2.74, "c_n": 0.003, "c_t": 0.1, "c_t_ring": 0.01,
+}  # fmt: skip
+#: Gauss points of the work from 0 to 6 mm, and 6 mm.
+POINTS, WEIGHTS = np.polynomial.legendre.leggauss(8)
+PATH = np.append(3 * (POINTS + 1), 6.0)
+SMALL = np.linspace(0.2e-4, 1e-4, 9)
+LANES = 12  # of every call, so that all share one program
+
+
+@functools.cache
+def program(midline=False, dtype="float64"):
+    geometry = Geometry.create(LENGTH, RINGS, radius=RADIUS, dtype=dtype)
+
+    def one(values, s_c, phi_c, path):
+        return press_sections(geometry, SectionMaterial(**values), s_c, phi_c, path, midline=midline)
+
+    return jax.jit(jax.vmap(one))
+
+
+def press(cases, midline=False, dtype="float64"):
+    """Many presses (changed values, s_c, phi_c, path); as NumPy, one each."""
+    got = []
+    for i in range(0, len(cases), LANES):
+        rows = cases[i : i + LANES]
+        rows = rows + [({}, 30.0, 0.0, SMALL)] * (LANES - len(rows))
+        values = {k: np.array([(VALUES | c[0])[k] for c in rows]) for k in VALUES}
+        rest = (np.array([c[j] for c in rows]) for j in (1, 2, 3))
+        arrays = jax.tree.map(lambda v: jnp.asarray(v, dtype), (values, *rest))
+        out = jax.tree.map(np.asarray, program(midline, dtype)(*arrays))
+        got += [jax.tree.map(lambda v, j=j: v[j], out) for j in range(LANES)]
+    return got[: len(cases)]
+
+
+def inward(p, phi):
+    """Force along the inward normal and the circumference at phi."""
+    normal, around = np.array([0, -np.cos(phi), -np.sin(phi)]), np.array([0, -np.sin(phi), np.cos(phi)])
+    return np.stack([p.force @ normal, p.force @ around], -1)
+
+
+LINEAR = [
+    ({"footprint": 1.0, **change}, s, phi, SMALL)
+    for change, s, phi in [
+        ({}, 30.0, 0.0),
+        ({}, 35.0, 0.0),
+        ({"k_end": np.inf}, 12.5, 1.0),
+        ({"k_end": 0.0}, 8.0, -1.9),
+        ({"rho": 0.3}, 62.0, np.pi / 2),
+    ]
+]
+
+
+def test_linear_limit():
+    """Against the differential equations, linearised by hand; D = 1e-4 mm leaves 1e-6 of bending."""
+    for case, got in zip(LINEAR, press(LINEAR), strict=True):
+        change, s, phi, path = case
+        p = VALUES | change | {"R": RADIUS, "alpha": 2 * np.pi / 3}
+        wanted = linear_force(p, LENGTH, RINGS, s, phi)
+        force = inward(got, phi)[-1] / path[-1]
+        np.testing.assert_allclose(force, wanted, atol=2e-5 * wanted[0])
+        assert np.all(got.status == PressStatus.OK)
+
+
+WORK = [({}, 30.0, 0.0, PATH), ({}, 33.0, 1.0, PATH), ({}, 40.0, np.pi / 2, PATH),
+        ({"c_K": 0.0}, 25.0, -1.5, -0.7 * PATH)]  # fmt: skip
+
+
+def test_work_is_the_stored_energy():
+    """8 Gauss points of the force along the path; a draw as well."""
+    for case, got in zip(WORK, press(WORK), strict=True):
+        assert np.all(got.status == PressStatus.OK)
+        assert np.all(got.imbalance < 1e-10)
+        force = inward(got, case[2])[:, 0]
+        work = case[3][-1] / 2 * (WEIGHTS @ force[:-1])
+        assert work == pytest.approx(got.energy[-1], rel=1e-8)
+        # The tool's way is local indentation and motion of the surface.
+        way = got.depth + got.skeleton
+        normal = np.array([0, -np.cos(case[2]), -np.sin(case[2])])
+        np.testing.assert_allclose(way, case[3][:, None] * normal, atol=1e-12)
+
+
+def test_the_midline_program_is_the_other_one():
+    cases = [({}, 33.0, 0.0, PATH), ({"k_end": np.inf}, 0.0, 0.0, PATH), ({}, 70.0, 0.0, -PATH)]
+    for one, other in zip(press(cases, midline=True), press(cases), strict=True):
+        assert np.all(one.status == PressStatus.OK)
+        for name in ("force", "skeleton", "joints", "end_U", "end_V", "modes", "energy"):
+            a, b = getattr(one, name), getattr(other, name)
+            np.testing.assert_allclose(a, b, atol=1e-9 * max(1, np.abs(b).max()), err_msg=name)
+    off = press([({}, 33.0, 0.1, PATH)], midline=True)[0]
+    assert np.all(off.status == PressStatus.OFF_PLAN)
+    assert np.all(np.isnan(off.force))
+
+
+def test_mirror_images():
+    """What is at +phi is at -phi with z turned; so are the two ends of a symmetric tube."""
+    left, right, far = press([({}, 22.0, 0.8, PATH), ({}, 22.0, -0.8, PATH), ({}, 48.0, 0.8, PATH)])
+    mirror = np.array([1, 1, -1])
+    np.testing.assert_allclose(left.force, right.force * mirror, atol=1e-11)
+    np.testing.assert_allclose(left.end_U, right.end_V * mirror, atol=1e-10)
+    np.testing.assert_allclose(left.force, far.force, atol=1e-10)
+    np.testing.assert_allclose(left.joints, far.joints[:, ::-1] * [-1, 1, 1], atol=1e-10)
+
+
+def test_continuous_where_the_contact_crosses_a_ring_or_mid_span():
+    places = [29.999, 30.0, 30.001, 34.999, 35.0, 35.001]
+    got = press([({}, s, 0.9, PATH) for s in places] + [({"footprint": 1.0}, s, 0.9, PATH) for s in places])
+    force = np.stack([p.force[-1] for p in got]).reshape(4, 3, 3)
+    assert np.all(np.abs(np.diff(force, axis=1)) < 3e-3)
+    np.testing.assert_allclose(force[:, 0] + force[:, 2], 2 * force[:, 1], atol=2e-3)
+    with_footprint = np.abs(np.diff(force[:1], axis=1))
+    assert np.all(with_footprint < 1e-6)  # on the ring
+
+
+HARD = {
+    "10 mm": ({}, 30.0, 0.0, np.linspace(2, 10, 9)),
+    "10 mm at 90 deg": ({}, 30.0, np.pi / 2, np.linspace(2, 10, 9)),
+    "draw": ({}, 35.0, 0.7, -PATH),
+    "on a clamp": ({}, 0.0, 0.3, PATH),
+    "at the ring's end": ({}, 35.0, 2 * np.pi / 3, PATH),
+    "hard rings": ({"EI_C": 24e4, "EI_M": 2e4}, 35.0, 0.7, PATH / 2),
+    "soft wall": ({"Gt_L": 2e-3, "Et_L": 1e-4, "D_L": 4e-4}, 30.0, 0.7, PATH / 2),
+    "hard wall": ({"Gt_L": 2e5, "Et_L": 1e4, "D_L": 4e4}, 35.0, 0.7, PATH / 2),
+    "hard bed": ({"k_n": 189.0, "k_t": 18.0}, 35.0, 0.7, PATH / 2),
+    "soft bed": ({"k_n": 2e-6, "k_t": 2e-7}, 35.0, 0.7, PATH / 2),
+    "hard muscle": ({"Et_M": 6.8e3}, 35.0, 0.7, PATH / 2),
+    "one step, back and forth": ({}, 30.0, 0.7, np.array([6.0, -3, 0, 6, 6, 1, 2, -2, 4])),
+}
+
+
+def test_hard_cases():
+    """Every one is in balance, pushes back, and stores the energy that its force does."""
+    for (name, case), got in zip(HARD.items(), press(list(HARD.values())), strict=True):
+        rest = np.asarray(case[3]) == 0
+        wanted = np.where(rest, PressStatus.NO_CONTACT, PressStatus.OK)
+        np.testing.assert_array_equal(got.status, wanted, err_msg=name)
+        force = inward(got, case[2])[:, 0]
+        assert np.all(force * np.sign(case[3]) >= 0), name
+        assert np.all(force[rest] == 0), name
+        assert np.all(got.imbalance < 1e-6), (name, got.imbalance)
+    # The state belongs to the displacement, not to the way there.
+    repeated = press([HARD["one step, back and forth"]])[0].force
+    np.testing.assert_allclose(repeated[[3, 4]], repeated[[0, 0]], atol=1e-10)
+
+
+def test_past_a_fold():
+    """Soft rings snap through under a tool on a soft spring: no row from there on looks valid.
+
+    With a hard tool the force peaks at 0.0110 N, some 6 mm deep, and falls by more than 1e-3 N/mm:
+    against a spring of 2000 mm/N there is no equilibrium for D above about 6 + 2000 * 0.011.
+    """
+    soft = {"EI_C": 24e-4, "EI_M": 2e-4, "c_K": 0.0, "c_W": 0.0,
+            "Gt_L": 2e-3, "Et_L": 1e-4, "D_L": 4e-4}  # fmt: skip
+    spring = soft | {"c_n": 2000.0}
+    way = np.array([1.0, 3, 5, 6, 7, 8, 9, 10, 11])
+    fold = np.array([5.0, 10, 20, 25, 35, 40, 50, 20, 5])
+    cases = [(soft, 30.0, 0.0, way), (spring, 30.0, 0.0, fold), ({}, 30.0, 0.0, PATH)]
+    hard, folded, other = press(cases, midline=True)
+    force = inward(hard, 0.0)[:, 0]
+    assert np.all(hard.status == PressStatus.OK)  # held, it is stable all the way
+    assert 2 < np.argmax(force) < 7
+    top = np.max(way - 0.003 * force + 2000 * force)
+    assert 25 < top < 35
+    np.testing.assert_array_equal(folded.status[4:7], PressStatus.PAST_FOLD)
+    assert np.all(np.isnan(folded.force[4:7]))
+    np.testing.assert_array_equal(folded.status[:4], PressStatus.OK)
+    before = folded.skeleton[:4, 1]
+    np.testing.assert_allclose(inward(folded, 0.0)[:4, 0] * 2000 - before, fold[:4], rtol=1e-9)
+    assert np.all(other.status == PressStatus.OK)  # its neighbour
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("midline", [True, False])
+def test_float32(midline):
+    """Single precision: 1e-4 of the largest force, rows that it cannot solve are told."""
+    cases = [c for c in (*WORK, *HARD.values()) if c[2] == 0 or not midline]
+    for case, half, full in zip(
+        cases, press(cases, midline, "float32"), press(cases, midline), strict=True
+    ):
+        assert half.force.dtype == np.float32
+        np.testing.assert_array_equal(half.status, full.status, err_msg=str(case))
+        size = np.abs(full.force).max()
+        np.testing.assert_allclose(half.force, full.force, atol=2e-4 * size, err_msg=str(case))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [2, 200])
+def test_few_and_many_rings(count):
+    """2 and 200 rings: the linear limit, and balance and work at large displacement."""
+    length, rings = 10.0 * (count + 1), 10.0 * np.arange(1, count + 1)
+    geometry = Geometry.create(length, rings, radius=RADIUS)
+    s_c = length / 2 + 1.3
+    values = VALUES | {"footprint": 1.0}
+
+    @jax.jit
+    def at(path):
+        return press_sections(geometry, SectionMaterial(**values), s_c, 0.9, path)
+
+    p = values | {"R": RADIUS, "alpha": 2 * np.pi / 3}
+    small = inward(jax.tree.map(np.asarray, at(jnp.asarray(SMALL))), 0.9)[-1] / SMALL[-1]
+    wanted = linear_force(p, length, rings, s_c, 0.9)
+    np.testing.assert_allclose(small, wanted, atol=2e-5 * wanted[0])
+    got = jax.tree.map(np.asarray, at(jnp.asarray(PATH)))
+    assert np.all(got.status == PressStatus.OK)
+    work = 3 * (WEIGHTS @ inward(got, 0.9)[:-1, 0])
+    assert work == pytest.approx(got.energy[-1], rel=1e-8)
+
+
+def test_refusals():
+    nan = np.where(np.arange(9) == 4, np.nan, PATH)
+    cases = {
+        PressStatus.OFF_TUBE: ({}, 70.1, 0.0, PATH),
+        PressStatus.BEHIND_GAP: ({}, 30.0, 2.2, PATH),
+        PressStatus.BAD_MATERIAL: ({"k_n": -1.0}, 30.0, 0.0, PATH),
+        PressStatus.NON_FINITE: ({"EI_C": np.nan}, 30.0, 0.0, PATH),
+    }
+    zero = ({"Gt_L": 0.0}, 30.0, 0.0, PATH)
+    blunt = ({"footprint": 0.5}, 30.0, 0.0, PATH)
+    got = press([*cases.values(), zero, blunt, ({}, 30.0, 0.0, nan), ({}, np.nan, 0.0, PATH)])
+    for status, row in zip([*cases, *[PressStatus.BAD_MATERIAL] * 2], got, strict=False):
+        assert np.all(row.status == status)
+        for v in (row.force, row.joints, row.end_U, row.modes, row.energy):
+            assert np.all(np.isnan(v))
+    wanted = np.where(np.arange(9) == 4, PressStatus.NON_FINITE, PressStatus.OK)
+    np.testing.assert_array_equal(got[6].status, wanted)
+    assert np.all(got[7].status == PressStatus.NON_FINITE)
+    geometry = Geometry.create(LENGTH, RINGS)
+    material = SectionMaterial(**(VALUES | {"EI_C": np.ones(5)}))
+    with pytest.raises(ValueError, match=r"SectionMaterial.EI_C has 5 values; expected .* 6 values"):
+        press_sections(geometry, material, 30.0, 0.0, PATH)
+
+
+def test_a_beam_on_springs_is_the_limit():
+    """Rings that do not bend and uncoupled modes: the paper's ligament with shear on k_M."""
+    k_M, EI, GA, c_n = 0.216, 1402.0, 9.31, 0.003
+    geometry = Geometry.create(160.0, 10.0 * np.arange(1, 16), radius=RADIUS)
+    bed = k_M / (2 * np.pi / 3 * 10 * (RADIUS + 0.9))
+    rigid = {"EI_C": 1e9, "EI_M": 1e9, "Et_M": 1e9, "k_n": bed, "k_t": bed, "Gt_L": GA, "Et_L": EI}
+    material = SectionMaterial(**(VALUES | rigid | {"k_end": np.inf, "footprint": 1.0, "D_L": 0.0}))
+    beam = Material(EI_L=EI, GA_L=GA, k_M=k_M, k_1=1 / c_n, k_3=0.0)
+    options = mat.Options(shear=True)
+
+    @jax.jit
+    def force(s_c):
+        parts = build(geometry, material, s_c, 0 * s_c, jnp.asarray([1.0, 0.0]), midline=True)
+        forms = make_forms(parts.grid, parts.shape)
+        forms = jax.tree.map(jnp.zeros_like, forms)._replace(
+            shear_front=jnp.eye(4)[None] / RADIUS, stretch_front=jnp.eye(3)[None] / RADIUS**3
+        )
+        wall = Wall(*(jnp.asarray(v) for v in (GA, EI, 0.0, 0.0, 0.0)))
+        one = make_span(wall, jnp.asarray(10.0), forms, parts.shape)
+        spans = jax.tree.map(lambda v: jnp.broadcast_to(v, (16, *v.shape)), one)
+        nodes = jnp.concatenate([jnp.zeros(1), geometry.ring_positions, geometry.length[None]])
+        place = place_on(nodes, s_c, spans, jnp.asarray(1.0))
+        a_1 = jnp.asarray([[1.0, 0.0, 0.0, 0.0]])
+        place = place._replace(own=a_1 * place.own, shares=a_1[None, :, :, None] * place.shares)
+        parts = parts._replace(spans=spans, place=place)
+        r, tangent = system.linearise(system.at_rest(parts), jnp.asarray(1.0), parts)
+        return -system.solve_linear(tangent, r).force[0]
+
+    @jax.jit
+    def today(s_c):
+        return mat.press(geometry, beam, s_c, jnp.asarray([1.0]), options).force[0]
+
+    for s in (3.0, 22.0, 70.0, 75.0, 107.0):
+        s_c = jnp.asarray(s)
+        assert float(force(s_c)) == pytest.approx(float(today(s_c)), rel=1e-6)

@@ -1,0 +1,94 @@
+"""Derivatives of presses: forward = reverse = central differences, for every parameter."""
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.status import PressStatus
+from jaxtrachea.trachea.geometry import Geometry
+
+from .test_press import VALUES
+
+GEOMETRY = Geometry.create(41.0, [9.0, 19.0, 30.0], radius=11.7)
+EACH = {"EI_C": np.array([24.0, 22.0, 25.0]), "Gt_L": np.array([20.0, 21.0, 22.0, 20.5])}
+MATERIAL = SectionMaterial(**(VALUES | EACH))
+#: s_c, phi_c, direction, and a path to 5 mm.
+GIVEN = (jnp.asarray(17.0), jnp.asarray(np.pi / 2), jnp.asarray([1.0, 0.1]), jnp.asarray([2.0, 5.0]))
+FLAT, UNRAVEL = jax.flatten_util.ravel_pytree((GEOMETRY, MATERIAL, GIVEN))
+
+
+def force(flat):
+    """Force at 5 mm, and what it stores."""
+    geometry, material, (s_c, phi_c, direction, path) = UNRAVEL(flat)
+    got = press_sections(geometry, material, s_c, phi_c, path, direction)
+    return jnp.append(got.force[-1, 1:], got.energy[-1])
+
+
+def central_differences():
+    """Steps of 1e-4 of each value: an error of 1e-8 from the third derivative."""
+    h = 1e-4 * np.abs(FLAT)
+    moved = jnp.asarray(np.asarray(FLAT)[None] + np.concatenate([np.diag(h), -np.diag(h)]))
+    up, down = np.split(np.asarray(jax.jit(jax.vmap(force))(moved)), 2)
+    return ((up - down) / (2 * h[:, None])).T
+
+
+def test_along_one_direction():
+    """All of geometry, material, place, direction and path at once, 90 degrees and 5 mm."""
+    along = jnp.asarray(np.random.default_rng(0).normal(size=FLAT.size)) * FLAT
+    both = jax.jit(lambda x: jax.jvp(force, (x,), (along,)))
+    h = 1e-4
+    value, slope = both(FLAT)
+    difference = (both(FLAT + h * along)[0] - both(FLAT - h * along)[0]) / (2 * h)
+    assert np.all(np.abs(slope) > 0.1 * np.abs(value))
+    np.testing.assert_allclose(slope, difference, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_forward_is_central_differences():
+    """Each parameter by itself."""
+    value = np.asarray(jax.jit(force)(FLAT))
+    size = np.abs(value)[:, None] / np.abs(FLAT)[None]
+    forward = np.asarray(jax.jit(jax.jacfwd(force))(FLAT))
+    np.testing.assert_allclose(forward / size, central_differences() / size, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_reverse_is_forward():
+    forward, reverse = (np.asarray(jax.jit(of(force))(FLAT)) for of in (jax.jacfwd, jax.jacrev))
+    np.testing.assert_allclose(reverse, forward, atol=1e-9 * np.abs(forward).max())
+
+
+@pytest.mark.slow
+def test_second_derivatives():
+    """By the displacement and EI_C: the rule of the first derivatives is differentiated itself."""
+    i = int(np.flatnonzero(np.asarray(FLAT) == 25.0)[0])  # EI_C of the third ring
+    last = FLAT.size - 1
+
+    def energy(x):
+        return force(FLAT.at[jnp.array([i, last])].set(x))[2]
+
+    x, h = FLAT[jnp.array([i, last])], 1e-4
+    hessian = jax.jit(jax.hessian(energy))(x)
+    slope = jax.jit(jax.grad(energy))
+    by_hand = [(slope(x.at[k].add(h)) - slope(x.at[k].add(-h))) / (2 * h) for k in (0, 1)]
+    np.testing.assert_allclose(hessian, by_hand, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_bad_row_does_not_touch_the_derivatives_of_others():
+    def total(k_n):
+        def one(k_n, s_c):
+            material = SectionMaterial(**(VALUES | {"k_n": k_n}))
+            return press_sections(GEOMETRY, material, s_c, 0.4, jnp.asarray([1.0, 2.0]))
+
+        got = jax.vmap(one)(k_n, jnp.asarray([17.0, 99.0, 17.0]))
+        good = got.status == PressStatus.OK
+        return jnp.sum(jnp.where(good, got.force[..., 1], 0))
+
+    slope = jax.jit(jax.grad(total))(jnp.asarray([0.02, 0.02, -1.0]))
+    assert slope[0] != 0
+    np.testing.assert_array_equal(slope[1:], 0)
