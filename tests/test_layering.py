@@ -63,6 +63,14 @@ WITHIN = {
         {"read"},
         {"data_files", "usage_tables"},
     ],
+    "mechanics/sections": [
+        {"section", "block", "material"},
+        {"section_tangent", "span"},
+        {"contact"},
+        {"system"},
+        {"solve"},
+        {"press"},
+    ],
     "fitting": [
         {"parameters", "lane"},
         {"model"},
@@ -136,9 +144,11 @@ def test_imports_only_from_above(path):
     inside = path.relative_to(PACKAGE).with_suffix("").parts
     package, source = ("jaxtrachea", *inside[:-1]), path.read_text()
     assert not faults(inside[0], source, package)
-    if inside[0] in WITHIN and inside[1] != "__init__":
-        room = f"jaxtrachea.{inside[0]}"
-        assert not faults(inside[1], source, package, WITHIN[inside[0]], room)
+    for depth in range(1, len(inside)):
+        room = "/".join(inside[:depth])
+        if room in WITHIN and inside[depth] != "__init__":
+            within = ".".join(["jaxtrachea", *inside[:depth]])
+            assert not faults(inside[depth], source, package, WITHIN[room], within)
 
 
 @pytest.mark.parametrize(("room", "others"), STRANGERS)
@@ -181,6 +191,17 @@ def test_no_room_holds_too_much_of_the_package():
 )
 def test_the_walk_sees_a_fault(room, source):
     assert faults(room, source)
+
+
+def test_only_the_press_of_the_sections_is_known_outside():
+    """The other parts of the mechanics stand beside the sections; none is made of them."""
+    for path in set(PACKAGE.rglob("*.py")) - set((PACKAGE / "mechanics" / "sections").glob("*.py")):
+        names = imported(path.read_text(), ["jaxtrachea", *path.relative_to(PACKAGE).parts[:-1]])
+        own = [n for n in names if n.startswith("jaxtrachea.mechanics.sections")]
+        if path.parent == PACKAGE / "mechanics":
+            assert not own, path
+        allowed = ("jaxtrachea.mechanics.sections.press", "jaxtrachea.mechanics.sections.material")
+        assert all(n.startswith(allowed) for n in own), path
 
 
 def test_the_walk_sees_a_fault_within_the_scene():

@@ -1,6 +1,6 @@
 """Small presses on deforming cross-sections, from the differential equations (NumPy and SciPy).
 
-Independent of `jaxtrachea.mechanics.sections`: the modes are linearised by hand, spans are solved by
+Independent of `jaxtrachea.mechanics.sections`: the modes are linearised by hand, spans solved by
 the exponential of the coupled Timoshenko equations w' = E psi + A^-1 V, psi' = C^-1 M, V' = 0,
 M' = -E^T V (no shape functions, no effective shear stiffness), angles by 40 Gauss points a piece.
 Modes in the order a1, a2, a3, e, b0, b1, b2, b3; rotations of a1, a2, a3, b1, b2, b3.

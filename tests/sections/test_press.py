@@ -39,7 +39,9 @@ def program(midline=False, dtype="float64"):
     geometry = Geometry.create(LENGTH, RINGS, radius=RADIUS, dtype=dtype)
 
     def one(values, s_c, phi_c, path):
-        return press_sections(geometry, SectionMaterial(**values), s_c, phi_c, path, midline=midline)
+        return press_sections(
+            geometry, SectionMaterial(**values), s_c, phi_c, path, midline=midline
+        )
 
     return jax.jit(jax.vmap(one))
 
@@ -60,7 +62,10 @@ def press(cases, midline=False, dtype="float64"):
 
 def inward(p, phi):
     """Force along the inward normal and the circumference at phi."""
-    normal, around = np.array([0, -np.cos(phi), -np.sin(phi)]), np.array([0, -np.sin(phi), np.cos(phi)])
+    normal, around = (
+        np.array([0, -np.cos(phi), -np.sin(phi)]),
+        np.array([0, -np.sin(phi), np.cos(phi)]),
+    )
     return np.stack([p.force @ normal, p.force @ around], -1)
 
 
@@ -105,6 +110,7 @@ def test_work_is_the_stored_energy():
         np.testing.assert_allclose(way, case[3][:, None] * normal, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_midline_program_is_the_other_one():
     cases = [({}, 33.0, 0.0, PATH), ({"k_end": np.inf}, 0.0, 0.0, PATH), ({}, 70.0, 0.0, -PATH)]
     for one, other in zip(press(cases, midline=True), press(cases), strict=True):
@@ -129,7 +135,9 @@ def test_mirror_images():
 
 def test_continuous_where_the_contact_crosses_a_ring_or_mid_span():
     places = [29.999, 30.0, 30.001, 34.999, 35.0, 35.001]
-    got = press([({}, s, 0.9, PATH) for s in places] + [({"footprint": 1.0}, s, 0.9, PATH) for s in places])
+    got = press(
+        [({}, s, 0.9, PATH) for s in places] + [({"footprint": 1.0}, s, 0.9, PATH) for s in places]
+    )
     force = np.stack([p.force[-1] for p in got]).reshape(4, 3, 3)
     assert np.all(np.abs(np.diff(force, axis=1)) < 3e-3)
     np.testing.assert_allclose(force[:, 0] + force[:, 2], 2 * force[:, 1], atol=2e-3)
@@ -180,7 +188,7 @@ def test_past_a_fold():
     way = np.array([1.0, 3, 5, 6, 7, 8, 9, 10, 11])
     fold = np.array([5.0, 10, 20, 25, 35, 40, 50, 20, 5])
     cases = [(soft, 30.0, 0.0, way), (spring, 30.0, 0.0, fold), ({}, 30.0, 0.0, PATH)]
-    hard, folded, other = press(cases, midline=True)
+    hard, folded, other = press(cases)
     force = inward(hard, 0.0)[:, 0]
     assert np.all(hard.status == PressStatus.OK)  # held, it is stable all the way
     assert 2 < np.argmax(force) < 7
@@ -251,7 +259,9 @@ def test_refusals():
     assert np.all(got[7].status == PressStatus.NON_FINITE)
     geometry = Geometry.create(LENGTH, RINGS)
     material = SectionMaterial(**(VALUES | {"EI_C": np.ones(5)}))
-    with pytest.raises(ValueError, match=r"SectionMaterial.EI_C has 5 values; expected .* 6 values"):
+    with pytest.raises(
+        ValueError, match=r"SectionMaterial.EI_C has 5 values; expected .* 6 values"
+    ):
         press_sections(geometry, material, 30.0, 0.0, PATH)
 
 

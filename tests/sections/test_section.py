@@ -94,7 +94,7 @@ def brute_force(q, phi_c):
     return total, np.array([-y * c - z * s, z * c - y * s])
 
 
-@pytest.mark.parametrize("midline", [True, False])
+@pytest.mark.parametrize("midline", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_against_brute_force(midline):
     """Motions of 2 mm in every mode at once, far more than in a press: 1e-6 of the energy."""
     parts_ = parts(midline)
@@ -106,7 +106,7 @@ def test_against_brute_force(midline):
         np.testing.assert_allclose(moved, true_moved, atol=1e-6)
 
 
-@pytest.mark.parametrize("midline", [True, False])
+@pytest.mark.parametrize("midline", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_forces_and_stiffness_are_the_derivatives_of_the_energy(midline):
     parts_ = parts(midline)
 
@@ -122,7 +122,7 @@ def test_forces_and_stiffness_are_the_derivatives_of_the_energy(midline):
     np.testing.assert_allclose(stiff, by_ad[1], rtol=1e-11, atol=1e-11)
 
 
-@pytest.mark.parametrize("midline", [True, False])
+@pytest.mark.parametrize("midline", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_small_motions(midline):
     """Stiffness and shapes at rest are those of the modes linearised by hand."""
     ring, grid, shape = parts(midline)

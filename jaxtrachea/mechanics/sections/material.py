@@ -171,7 +171,9 @@ class Factors:
 
 
 def from_wall(
-    geometry: Geometry, wall: Wall = Wall(), factors: Factors = Factors()  # noqa: B008 (frozen)
+    geometry: Geometry,
+    wall: Wall = Wall(),
+    factors: Factors = Factors(),  # noqa: B008 (frozen)
 ) -> SectionMaterial:
     """Stiffnesses of the sections of a tube, from moduli and thicknesses.
 

@@ -40,8 +40,8 @@ class SectionPress(NamedTuple):
         depth: local indentation: way of the tool less `skeleton`, in the plane of the section.
         skeleton: displacement of the outer surface at the contact.
         modes: q of each ring: a1, a2, a3, e, b0, b1, b2, b3; shape (n, rings, 8).
-        joints: displacement of the outer surface of each ring at phi_c; x: warping of the
-            mid-line. Shape (n, rings, 3).
+        joints: displacement of the outer surface of each ring at phi_c; x is 0, since the warping
+            of the model is not what a finite element specimen shows. Shape (n, rings, 3).
         end_U: that at phi = -alpha.
         end_V: that at phi = +alpha.
         energy: stored, which is the work of the tool.
@@ -226,26 +226,28 @@ def _observe(state: State, displacement, parts: System) -> SectionPress:
 
     v = system.surface(state.q_C.ravel(), parts)
     modes = system.ring_modes(state, parts)
-    warp = system.physical(state, parts)[1:-1, :, 4:]
     alpha = parts.shape.half_angle
-
-    def surface_at(phi):
-        moved = jax.vmap(section.surface_motion, (0, None, None, None))
-        X = span.warping_shapes(phi[None], parts.grid.midline)[:, :, 0]
-        across = moved(modes, phi, parts.grid, parts.shape) @ local_frame(phi)[::2]
-        along = -parts.shape.radius * jnp.einsum("npw,pw->n", warp, X)
-        return across.at[:, 0].set(along)
-
+    joints, end_U, end_V = _ring_motion(modes, jnp.stack([parts.phi_c, -alpha, alpha]), parts)
     return SectionPress(
         force=vector(state.force),
         depth=vector(displacement * parts.direction - v),
         skeleton=vector(v),
         modes=jnp.pad(modes, ((0, 0), (0, 8 - modes.shape[1]))),
-        joints=surface_at(parts.phi_c),
-        end_U=surface_at(-alpha),
-        end_V=surface_at(alpha),
+        joints=joints,
+        end_U=end_U,
+        end_V=end_V,
         energy=system.stored_energy(state, parts),
         imbalance=_imbalance(state, displacement, parts),
         steps=jnp.zeros_like(displacement),
         status=jnp.zeros((), jnp.int8),
     )
+
+
+def _ring_motion(modes, angles, parts: System):
+    """Displacement of the outer surface of every ring at each angle; (angles, rings, 3)."""
+
+    def at(q, phi):
+        moved = section.surface_motion(q, phi, parts.grid, parts.shape)
+        return moved @ local_frame(phi)[::2]
+
+    return jax.vmap(lambda phi: jax.vmap(at, (0, None))(modes, phi))(angles)

@@ -1,10 +1,10 @@
-r"""One ring of the skeleton: an inextensible arch in seven modes, closed by a muscle that stretches.
+r"""One ring of the skeleton: an inextensible arch in seven modes, and a muscle that stretches.
 
 The mid-line of the wall is a circle of radius R, cartilage in |phi| <= alpha, muscle behind. Modes
 q, mm: symmetric a1, a2, a3, e and antisymmetric b0, b1, b2, b3. Radial and tangential shapes of a_m
 are (cos m phi, -sin m phi / m), of b_m (sin m phi, cos m phi / m); a1, b1 are translations, b0 is a
-roll, e stretches the muscle. At any size of q, with t(x) = (-sin x, cos x), n(x) = (cos x, sin x) as
-(y, z):
+roll, e stretches the muscle. At any size of q, with t(x) = (-sin x, cos x) and n(x) = (cos x,
+sin x) as (y, z):
 
 - rotation theta = [b0 + sum_{m=2,3} (m - 1/m)(a_m sin m phi - b_m cos m phi)] / R
   + l_a sin phi + l_b cos phi, strain eps = e / R behind, 0 in front;
@@ -171,7 +171,7 @@ def mean_weights(phi: Float[Array, " m"], weights: Float[Array, " m"]) -> Float[
     return weights * (jnp.sign(phi) / 2 - phi / (2 * jnp.pi))
 
 
-def small_solve(M: Float[Array, "c c"], r: Float[Array, "c *k"]) -> Float[Array, "c *k"]:
+def small_solve(M: Float[Array, "c c"], r: Float[Array, "c ..."]) -> Float[Array, "c ..."]:
     """M^-1 r for one or two unknowns."""
     if M.shape[0] == 1:
         return r / M[0, 0]
@@ -212,9 +212,7 @@ def close_ring(
 
     def step(state):
         lam, _, count = state
-        change = small_solve(
-            _gap_slope(lam, turn, stretch, grid), _gap(lam, turn, stretch, grid)
-        )
+        change = small_solve(_gap_slope(lam, turn, stretch, grid), _gap(lam, turn, stretch, grid))
         return lam - change, jnp.max(jnp.abs(change)), count + 1
 
     small = 16 * epsilon(turn.dtype)

@@ -85,7 +85,8 @@ def _slopes(line: Line, grid: Grid, shape: Shape):
 def _held(line: Line, loads: _Loads, ring: Ring, grid: Grid, shape: Shape):
     """Loads with the multipliers of the closure taken off, the gradient then, and dl/dq."""
     d_y, d_z = _slopes(line, grid, shape)
-    gaps = jnp.stack([d_z @ grid.weights] if grid.midline else [v @ grid.weights for v in (d_z, d_y)])
+    slopes = (d_z,) if grid.midline else (d_z, d_y)
+    gaps = jnp.stack([v @ grid.weights for v in slopes])
     by_lam = gaps[:, grid.modes :]
     free = _gradient(line, loads, ring, grid, shape)
     mu = small_solve(by_lam.T, free[grid.modes :])

@@ -1,4 +1,4 @@
-"""The equilibrium along a path of the tool: Newton's method with path following, implicit derivatives.
+"""Equilibria along a path of the tool: Newton's method, path following, implicit derivatives.
 
 One loop for each displacement of the path: every turn is one Newton step, after which the state is
 accepted (and the next substep predicted by the secant of the last two), corrected further, or given

@@ -4,7 +4,8 @@ The wall warps, u_x = -R sum_m psi_m X_m(phi) with X_m the radial shape of mode 
 rotations psi each for the symmetric and the antisymmetric modes (e and b0 do not warp). Membrane
 shear and axial strain, with the shapes r_k, t_k of the linear modes and f = 1 in front, rho behind:
 
-    A_kl = G_t R int f t_k t_l dphi,   C_kl = E_t R^3 int f X_k X_l dphi + D R int_front r_k r_l dphi.
+    A_kl = G_t R int f t_k t_l dphi,
+    C_kl = E_t R^3 int f X_k X_l dphi + D R int_front r_k r_l dphi.
 
 A span of length h: g = (q_R - q_L) / h - E (psi_L + psi_R) / 2, kap = (psi_R - psi_L) / h, energy
 W_0 = h/2 (g^T A* g + kap^T C kap) with A* = (A^-1 + h^2/12 E C^-1 E^T)^-1, which makes a linear
@@ -127,7 +128,13 @@ def make_forms(grid: Grid, shape: Shape) -> Forms:
         return jnp.einsum("pkm,plm,m->pkl", v, v, grid.weights * on)
 
     front, back = 1 - grid.behind, grid.behind
-    return Forms(form(t, front), form(t, back), form(X, front), form(X, back), form(orders * X, front))
+    return Forms(
+        shear_front=form(t, front),
+        shear_back=form(t, back),
+        stretch_front=form(X, front),
+        stretch_back=form(X, back),
+        bend_front=form(orders * X, front),
+    )
 
 
 def make_span(wall: Wall, h: Float[Array, ""], forms: Forms, shape: Shape) -> Span:

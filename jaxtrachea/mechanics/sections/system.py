@@ -1,7 +1,7 @@
 r"""Rings, spans, ends and contact together: residual, tangent and linear solution.
 
-Unknowns z = (y, q_C, F): y = (q, psi) of every node (both ends of the tube and the rings), the modes
-q_C of the section at the contact, and the contact's force. Residual:
+Unknowns z = (y, q_C, F): y = (q, psi) of every node (both ends of the tube and the rings), the
+modes q_C of the section at the contact, and the contact's force. Residual:
 
     r_y = dU/dy + dW/dy - N^T B^T F,   r_q = q_C - N y - S B^T F,   r_F = v(q_C) - D e + give F
 
@@ -213,7 +213,8 @@ def solve_linear(tangent: Tangent, r: State) -> State:
     nodes, m, modes = tangent.border.shape
     free = block.solve(tangent.factors, r.y.reshape(nodes, m, 1))[:, :, 0]
     C, B = tangent.compliance, tangent.B
-    J = jnp.block([[jnp.eye(modes, dtype=C.dtype) - C @ tangent.H, -C @ B.T], [B, jnp.diag(tangent.give)]])
+    upper = jnp.concatenate([jnp.eye(modes, dtype=C.dtype) - C @ tangent.H, -C @ B.T], 1)
+    J = jnp.concatenate([upper, jnp.concatenate([B, jnp.diag(tangent.give)], 1)])
     at_contact = r.q_C.ravel() + jnp.einsum("nim,ni->m", tangent.border, free)
     local = jnp.linalg.solve(J, jnp.concatenate([at_contact, r.force]))
     q, force = local[:modes], local[modes:]
