@@ -18,12 +18,7 @@ GEOMETRY = Geometry.create(41.0, [9.0, 19.0, 30.0], radius=11.7)
 EACH = {"EI_C": np.array([24.0, 22.0, 25.0]), "Gt_L": np.array([20.0, 21.0, 22.0, 20.5])}
 MATERIAL = SectionMaterial(**(VALUES | EACH))
 #: s_c, phi_c, direction, and a path to 5 mm.
-GIVEN = (
-    jnp.asarray(17.0),
-    jnp.asarray(np.pi / 2),
-    jnp.asarray([1.0, 0.1]),
-    jnp.asarray([2.0, 5.0]),
-)
+GIVEN = tuple(jnp.asarray(v) for v in (17.0, np.pi / 2, [1.0, 0.1], [2.0, 5.0]))
 FLAT, UNRAVEL = jax.flatten_util.ravel_pytree((GEOMETRY, MATERIAL, GIVEN))
 
 
@@ -43,14 +38,14 @@ def central_differences():
 
 
 def force_alone(flat):
-    """The same force by the parts that solve for it: quicker to compile."""
+    """The force on the midline by the parts that solve for it: quicker to compile."""
     geometry, material, (s_c, phi_c, direction, path) = UNRAVEL(flat)
-    parts = build(geometry, material, s_c, phi_c, direction, midline=False)
+    parts = build(geometry, material, s_c, 0 * phi_c, direction, midline=True)
     return solve_path(parts, path).state.force[-1]
 
 
 def test_along_one_direction():
-    """All of geometry, material, place, direction and path at once, 90 degrees and 5 mm."""
+    """All of geometry, material, place and path at once, midline and 5 mm."""
     along = jnp.asarray(np.random.default_rng(0).normal(size=FLAT.size)) * FLAT
     both = jax.jit(lambda x: jax.jvp(force_alone, (x,), (along,)))
     h = 1e-4

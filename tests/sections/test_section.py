@@ -106,7 +106,8 @@ def test_against_brute_force(midline):
         np.testing.assert_allclose(moved, true_moved, atol=1e-6)
 
 
-@pytest.mark.parametrize("midline", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("midline", [True, False])
 def test_forces_and_stiffness_are_the_derivatives_of_the_energy(midline):
     parts_ = parts(midline)
 

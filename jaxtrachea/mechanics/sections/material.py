@@ -191,20 +191,21 @@ def from_wall(
     height = jnp.minimum(geometry.ring_height, pitches)
     EI_C = (ring * height + ligament * (pitches - height)) / plane
     R, mean_span = geometry.radius, geometry.length / (geometry.rings + 1)
-    return SectionMaterial(
-        offset=wall.h - _composite(wall)[1] + 0 * R,
-        EI_C=factors.EI_C * EI_C,
-        EI_M=wall.E_M * wall.h_M**3 / 12 * pitches,
-        Et_M=factors.Et_M * wall.E_M * wall.h_M,
-        k_n=wall.bed_n,
-        k_t=wall.bed_t,
-        Gt_L=factors.Gt_L * wall.E_L * wall.h / 2 / (1 + wall.nu),
-        Et_L=factors.Et_L * wall.E_L * wall.h,
-        D_L=factors.D_L * ligament / plane,
-        c_W=factors.c_W / (wall.E_L * wall.h * R * mean_span),
-        k_end=factors.k_end / R,
-        footprint=factors.footprint,
-    )
+    values: dict[str, Any] = {
+        "offset": wall.h - _composite(wall)[1] + 0 * R,
+        "EI_C": factors.EI_C * EI_C,
+        "EI_M": wall.E_M * wall.h_M**3 / 12 * pitches,
+        "Et_M": factors.Et_M * wall.E_M * wall.h_M,
+        "k_n": wall.bed_n,
+        "k_t": wall.bed_t,
+        "Gt_L": factors.Gt_L * wall.E_L * wall.h / 2 / (1 + wall.nu),
+        "Et_L": factors.Et_L * wall.E_L * wall.h,
+        "D_L": factors.D_L * ligament / plane,
+        "c_W": factors.c_W / (wall.E_L * wall.h * R * mean_span),
+        "k_end": factors.k_end / R,
+        "footprint": factors.footprint,
+    }
+    return SectionMaterial(**values)
 
 
 def neutral_radius(inner_radius: float, wall: Wall = Wall()) -> float:  # noqa: B008 (frozen)

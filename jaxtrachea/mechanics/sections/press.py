@@ -5,7 +5,7 @@ positive phi.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, shaped
-from jaxtrachea.mechanics.admission import Admitted, hide
+from jaxtrachea.mechanics.admission import hide
 from jaxtrachea.mechanics.ring import on_ring
 from jaxtrachea.mechanics.sections import section, span, system
 from jaxtrachea.mechanics.sections.contact import place_on
@@ -104,8 +104,8 @@ def press_sections(
     direction = shaped("direction", direction, (2,), dtype=dtype)
     phi_c = shaped("phi_c", phi_c, (), dtype=dtype)
     s_c = shaped("s_c", s_c, (), dtype=dtype, why="; use jax.vmap for many positions")
-    asked, phi_c, direction = _admit(geometry, material, s_c, phi_c, direction, midline)
-    parts = build(geometry, asked.material, asked.s_c, phi_c, direction, midline=midline)
+    asked = _admit(geometry, material, s_c, phi_c, direction, midline)
+    parts = build(geometry, *asked[:4], midline=midline)
     known = jnp.isfinite(displacement)
     path = jnp.where(known, displacement, 0)
     solved = solve_path(parts, path)
@@ -119,31 +119,45 @@ def press_sections(
     return hidden._replace(steps=solved.steps)
 
 
-def _admit(geometry, material, s_c, phi_c, direction, midline):
-    """What is computed in place of what must be refused, and why it is."""
+class _Asked(NamedTuple):
+    """What is computed, in place of what must be refused, and why it is."""
+
+    material: SectionMaterial
+    s_c: Float[Array, ""]
+    phi_c: Float[Array, ""]
+    direction: Float[Array, "2"]
+    refused: Int[Array, ""]
+
+
+def _admit(geometry, material, s_c, phi_c, direction, midline) -> _Asked:
     off_tube = ~((s_c >= 0) & (s_c <= geometry.length))
     on, phi = on_ring(geometry.half_angle, phi_c)
-    ends, safe = {"BAD": jnp.zeros((), bool)}, {}
-    for field in dataclasses.fields(material):
-        value, name = getattr(material, field.name), field.name
-        low = value <= 0 if name in POSITIVE else value < 0
-        low = value < 1 if name == "footprint" else low
-        wrong = low | jnp.isnan(value) | (jnp.isinf(value) & (name != "k_end"))
-        safe[name] = jnp.where(wrong, 1, value)
-        ends["BAD"] = ends["BAD"] | jnp.any(low)
-        ends["NAN"] = ends.get("NAN", jnp.zeros((), bool)) | jnp.any(wrong & ~low)
-    where = jnp.isfinite(s_c) & jnp.isfinite(phi_c) & jnp.all(jnp.isfinite(direction))
-    refused = jnp.where(ends["BAD"], PressStatus.BAD_MATERIAL, PressStatus.OK)
+    material, bad, unknown = _safe_values(material)
+    place = jnp.isfinite(s_c) & jnp.isfinite(phi_c) & jnp.all(jnp.isfinite(direction))
+    refused = jnp.where(bad, PressStatus.BAD_MATERIAL, PressStatus.OK)
     refused = jnp.where(on, refused, PressStatus.BEHIND_GAP)
     if midline:
         plain = (phi_c == 0) & (direction[1] == 0)
         refused = jnp.where(plain, refused, PressStatus.OFF_PLAN)
         phi = jnp.zeros_like(phi)
     refused = jnp.where(off_tube, PressStatus.OFF_TUBE, refused)
-    refused = jnp.where(where & ~ends["NAN"], refused, PressStatus.NON_FINITE).astype(jnp.int8)
+    refused = jnp.where(place & ~unknown, refused, PressStatus.NON_FINITE).astype(jnp.int8)
     direction = jnp.where(jnp.isfinite(direction), direction, 0)
-    at = jnp.where(off_tube, geometry.length / 2, s_c)
-    return Admitted(SectionMaterial(**safe), at, refused), phi, direction
+    s_c = jnp.where(off_tube, geometry.length / 2, s_c)
+    return _Asked(SectionMaterial(**material), s_c, phi, direction, refused)
+
+
+def _safe_values(material: SectionMaterial) -> tuple[dict[str, Any], Array, Array]:
+    """Values with 1 for those that no press can have; whether any is too low, or not finite."""
+    safe, bad, unknown = {}, jnp.zeros((), bool), jnp.zeros((), bool)
+    for field in dataclasses.fields(material):
+        value, name = getattr(material, field.name), field.name
+        low = value <= 0 if name in POSITIVE else value < 0
+        low = value < 1 if name == "footprint" else low
+        odd = jnp.isnan(value) | (jnp.isinf(value) & (name != "k_end") & ~low)
+        safe[name] = jnp.where(low | odd, 1, value)
+        bad, unknown = bad | jnp.any(low), unknown | jnp.any(odd)
+    return safe, bad, unknown
 
 
 def build(
