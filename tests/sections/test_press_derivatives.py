@@ -61,7 +61,7 @@ def test_forward_is_central_differences():
     value = np.asarray(jax.jit(force)(FLAT))
     size = np.abs(value)[:, None] / np.abs(FLAT)[None]
     forward = np.asarray(jax.jit(jax.jacfwd(force))(FLAT))
-    np.testing.assert_allclose(forward / size, central_differences() / size, atol=1e-6)
+    np.testing.assert_allclose(forward / size, central_differences() / size, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Forces and stiffness of one ring by its modes, in closed form (a third of the work of AD twice).
+"""Forces and stiffness of one ring by its modes, in closed form: half the time of AD twice.
 
 With w = (q, l) the energy is explicit, and the closure holds by multipliers mu: the gradient is
 L_q and the Hessian Z^T L_ww Z for L = U - mu . closure, Z = (1; dl/dq).
@@ -115,7 +115,7 @@ def ring_tangent(
     EI = jnp.where(grid.behind > 0, ring.EI_M, ring.EI_C)
     kappa = line.w @ grid.curve / shape.radius
     stiff = grid.weights * EI * bend(kappa, ring.c_K)[2] / shape.radius
-    hessian = hessian + (grid.curve * stiff[None]) @ grid.curve.T
+    hessian = hessian + _weighted_squares(grid.curve, stiff)
     hessian = hessian.at[STRETCH, STRETCH].add(muscle(ring, shape))
     Z = jnp.concatenate([jnp.eye(grid.modes, dtype=q.dtype), follow])
     return gradient, Z.T @ hessian @ Z
@@ -141,5 +141,12 @@ def _curved_part(line: Line, loads: _Loads, grid: Grid, shape: Shape):
     c, s = line.c[grid.back], line.s[grid.back]
     squares = squares.at[grid.back].add(-shape.offset * (loads.bed_y * c + loads.bed_z * s))
     mixed = grid.turn @ (-grid.behind * (loads.y * line.c + loads.z * line.s))
-    part = (grid.turn * squares[None]) @ grid.turn.T
+    part = _weighted_squares(grid.turn, squares)
     return part.at[STRETCH].add(mixed).at[:, STRETCH].add(mixed)
+
+
+def _weighted_squares(shapes, weights):
+    """sum_p w_p v_p v_p^T: the table of products is the same for all rings, one product a batch."""
+    count, points = shapes.shape
+    table = (shapes[:, None] * shapes[None]).reshape(count * count, points)
+    return (table @ weights).reshape(count, count)
