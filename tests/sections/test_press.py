@@ -14,6 +14,7 @@ from jaxtrachea.mechanics.sections import system
 from jaxtrachea.mechanics.sections.contact import place_on
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.mechanics.sections.press import build, press_sections
+from jaxtrachea.mechanics.sections.solve import solve_path
 from jaxtrachea.mechanics.sections.span import Wall, make_forms, make_span
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -197,6 +198,36 @@ def test_past_a_fold():
     np.testing.assert_allclose(way[reached], fold[reached], rtol=1e-9)
     np.testing.assert_allclose(folded.force[[6, 7, 8]], folded.force[[3, 1, 0]], atol=1e-12)
     assert np.all(other.status == PressStatus.OK)  # its neighbour
+
+
+@pytest.mark.slow
+def test_an_equilibrium_that_is_no_minimum_is_seen():
+    """Where the force falls as the surface moves, a tool on a soft spring has one way down."""
+    soft = VALUES | {"EI_C": 24e-4, "EI_M": 2e-4, "c_K": 0.0, "c_W": 0.0,
+                     "Gt_L": 2e-3, "Et_L": 1e-4, "D_L": 4e-4}  # fmt: skip
+    geometry = Geometry.create(LENGTH, RINGS, radius=RADIUS)
+    parts = build(
+        geometry,
+        SectionMaterial(**soft),
+        jnp.asarray(30.0),
+        jnp.asarray(0.0),
+        jnp.asarray([1.0, 0.0]),
+        midline=True,
+    )
+    path = jnp.asarray([3.0, 10.9, 11.0])
+    states = jax.jit(solve_path)(parts, path).state
+    slope = float(states.force[2, 0] - states.force[1, 0]) / 0.1
+    assert slope < -1e-3
+    excess = jax.jit(lambda state, parts: system.excess_negative(
+        system.linearise(state, jnp.asarray(0.0), parts)[1]))  # fmt: skip
+    for row, give, wanted in (
+        (2, 0.003, 0),
+        (2, 0.9 / -slope, 0),
+        (2, 1.1 / -slope, 1),
+        (0, 1e4, 0),
+    ):
+        state = jax.tree.map(lambda v, row=row: v[row], states)
+        assert int(excess(state, parts._replace(give=jnp.asarray([give])))) == wanted
 
 
 @pytest.mark.slow
