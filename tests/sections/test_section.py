@@ -146,10 +146,15 @@ def test_small_motions(midline):
 
 
 def test_the_ring_closes_or_is_nan():
-    """A turn by half a circle of one side against the other: no closed ring, no number."""
+    """Shapes far beyond any press: some close after 16 steps, of the others there is no number."""
     _, grid, shape = parts(False)
-    close = jax.jit(lambda q: deform(q, grid, shape))
-    line = close(jnp.asarray(sample(False, 3.0, 1)[0]))
-    gaps = [np.sum(grid.weights * v) for v in (line.slope_y, line.slope_z)]
-    np.testing.assert_allclose(gaps, 0, atol=1e-11)
-    assert not np.isfinite(close(jnp.full(8, jnp.nan)).w[-1])
+    q = jnp.asarray(sample(False, 25.0, 200))
+    line = jax.jit(jax.vmap(lambda q: deform(q, grid, shape)))(q)
+    closed = np.isfinite(line.w[:, -1])
+    assert 0 < np.sum(~closed) < 150
+    for v in (line.slope_y, line.slope_z):
+        gap = np.asarray(v) @ np.asarray(grid.weights)
+        np.testing.assert_allclose(gap[closed], 0, atol=1e-9)
+        assert np.all(np.isnan(gap[~closed]))
+    small = jax.jit(lambda q: deform(q, grid, shape).w)(jnp.asarray(sample(False, 3.0, 1)[0]))
+    assert np.all(np.isfinite(small))
