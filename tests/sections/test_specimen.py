@@ -35,7 +35,7 @@ def test_the_composite_ring():
 
 @pytest.mark.slow
 def test_finite_strain_on_the_midline():
-    """D to 6 mm: force within 4 % of its peak, markers 2.5 % of D (rms, none under the tool)."""
+    """D to 6 mm: force within 4 % of its peak, markers 3 % of D (rms, none under the tool)."""
     with h5py.File(VIRTUAL / "finite_strain.h5") as file:
         curves = {
             float(name[1:]): [curve[k][1:] for k in ("displacement", "force", "joint_displacement")]
@@ -56,7 +56,7 @@ def test_finite_strain_on_the_midline():
     away = np.abs(RINGS - s_c[:, None]) > 3
     error = (-got.joints[..., 1] - markers) / D[..., None]
     for row, far in zip(error, away, strict=True):
-        assert np.sqrt(np.mean(row[:, far] ** 2)) < 0.025
+        assert np.sqrt(np.mean(row[:, far] ** 2)) < 0.03
 
 
 @pytest.mark.slow
