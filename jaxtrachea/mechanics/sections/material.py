@@ -145,7 +145,7 @@ class Factors:
     """What the moduli leave open, as factors on what they give; fitted to one virtual specimen.
 
     Fit of 10 parameters to its presses on the midline and at 30 and 90 degrees, D to 6 mm
-    (measured by tests/sections): EI_C 23.6 N mm^2, Et_L 1.18 N/mm, D_L 4.19 N mm, Gt_L 20.7 N/mm,
+    (errors: tests/sections): EI_C 23.6 N mm^2, Et_L 1.18 N/mm, D_L 4.19 N mm, Gt_L 20.7 N/mm,
     Et_M 0.65 N/mm, c_W 0.915 /(N mm), k_end 0.159 /mm, footprint 2.85; bed as given to 10 %.
 
     Attributes:
