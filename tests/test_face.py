@@ -5,13 +5,16 @@ import importlib
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from synthetic import DEPTHS, GEOMETRY, OPTIONS, curves, draw, forces, parameters
 
 import jaxtrachea as jt
+from jaxtrachea.fitting import settings as how
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
 from jaxtrachea.measurements.curve import BadCurve
 from jaxtrachea.measurements.read import Measurements
@@ -158,3 +161,30 @@ def test_profiles_and_bootstrap_go_by_the_same_names():
     again = jt.bootstrap(result, SETTINGS, count=100)
     # The standard deviation of 100 draws is known to 7 %; three times that.
     np.testing.assert_allclose(again.standard_error, result.standard_error, rtol=0.22)
+
+
+def test_a_fit_in_single_precision_is_said_once():
+    """With the cure, at the user's line; not where float32 was asked for, nor in float64."""
+    study = jt.build_study(curves(forces(TRUTH[:1])[0]), GEOMETRY, OPTIONS, parameters())
+    plain = jt.Settings(starts=1, more_starts=0, scrutiny=False)
+
+    def warned(call):
+        how._warn_of_single_precision.cache_clear()
+        with warnings.catch_warnings(record=True) as seen:
+            warnings.simplefilter("always")
+            found = [call(), call()][0]
+        cure = 'jax.config.update("jax_enable_x64", True)'
+        ours = [w for w in seen if cure in str(w.message)]
+        # Of a line outside: here the checker of annotations may stand before the user's.
+        assert not any(w.filename.startswith(str(Path(jt.__file__).parent)) for w in ours)
+        assert all(w.category is UserWarning for w in ours)
+        return found, len(ours)
+
+    with jax.enable_x64(False):
+        result, count = warned(lambda: jt.fit(study, plain))
+        assert count == 1
+        assert warned(lambda: jt.profiles(result, plain, ["k_M"], points=2))[1] == 1
+        assert warned(lambda: jt.bootstrap(result, plain, count=40))[1] == 1
+        deliberate = dataclasses.replace(plain, float32=True)
+        assert warned(lambda: jt.fit(study, deliberate))[1] == 0
+    assert warned(lambda: jt.fit(study, plain))[1] == 0
