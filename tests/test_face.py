@@ -103,6 +103,38 @@ def test_dataset_has_the_same_numbers(result):
         assert data[name].values.ravel().tolist() == table.column(column)
 
 
+def test_dataset_takes_profiles_as_the_table_does():
+    """With a bound at 0.8 of the true k_M the estimate lies on it: no error, and no local interval.
+
+    The profile gives the interval on the one side where it may move, in both.
+    """
+    force = forces(TRUTH[:1])[0]
+    noise = np.random.default_rng(1).normal(size=force.shape)
+    bound = float(0.8 * TRUTH[0, 1])
+    table = [
+        dataclasses.replace(p, upper=bound, value=bound / 2) if p.name == "k_M" else p
+        for p in parameters()
+    ]
+    noisy = curves(force + 1e-3 * force.max() * noise)
+    plain = dataclasses.replace(SETTINGS, scrutiny=False)
+    result = jt.fit(jt.build_study(noisy, GEOMETRY, OPTIONS, table), plain)
+    profiles = jt.profiles(result, SETTINGS, ["k_M"], points=2)
+    for given in (None, profiles):
+        data, rows = result.to_dataset(given), result.table(given)
+        assert data.status.values.tolist() == ["at_bound"]
+        assert data.at_bound.values.tolist() == [[False, True, False, False]]
+        for name, column in (("standard_error", "se"), ("low95", "low95"), ("high95", "high95")):
+            np.testing.assert_array_equal(data[name].values.ravel(), rows.column(column))
+        assert data.verdict.values.ravel().tolist() == rows.column("verdict")
+        k_m = data.sel(unknown="k_M")
+        assert k_m.verdict == "at bound"
+        assert np.isnan(k_m.standard_error)
+        assert k_m.value == bound
+        ends = [np.nan] * 2 if given is None else [profiles.lower[0], bound]
+        np.testing.assert_array_equal([k_m.low95[0], k_m.high95[0]], ends)
+    assert profiles.lower[0] < bound
+
+
 def test_noise_of_markers_that_are_not_there_is_no_number(result):
     assert np.isnan(result.to_dataset().sigma.sel(kind="joints")).all()
 
