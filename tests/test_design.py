@@ -9,10 +9,14 @@ import pytest
 import synthetic
 from run_cli import run, tree
 
+from jaxtrachea.cli.run import refuse
+from jaxtrachea.config import load_fit_spec
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
+from jaxtrachea.inference.analyses import left_out
+from jaxtrachea.inference.analysis import Request
 from jaxtrachea.inference.design import (
     Candidates,
     gains,
@@ -156,8 +160,9 @@ def test_command_writes_its_files_or_nothing(tmp_path, monkeypatch, capsys):
     Path("data.csv").write_text("\n".join(rows) + "\n")
     text = '[data]\nfiles = "data.csv"\n[design]\ncandidates = 200\n'
     Path("spec.toml").write_text(text + 's = ["20 mm", "140 mm"]\npoints = 2\n')
-    code, out, _ = run(monkeypatch, capsys, "design", "spec.toml", "--out", "out")
+    code, out, err = run(monkeypatch, capsys, "design", "spec.toml", "--out", "out")
     assert code == 0
+    assert "note:" not in err
     assert max(map(len, out.splitlines())) <= 80
     page = (Path(__file__).parents[1] / "docs" / "design.md").read_text()
     for name in ("next_points", "candidates", "identifiability"):
@@ -186,3 +191,20 @@ def test_command_writes_its_files_or_nothing(tmp_path, monkeypatch, capsys):
         assert code == 2
         assert says in err
     assert tree(tmp_path).keys() == before.keys()
+
+
+def test_analyses_of_a_fit_that_design_leaves_out_are_named(tmp_path, monkeypatch, capsys):
+    """They were passed over in silence; the bootstrap is used (docs/design.md), not named."""
+    monkeypatch.chdir(tmp_path)
+    asked = 'profile = "k_M"\nbootstrap = 40\ninfluence = true\nposterior = 100\n'
+    spec = Path("spec.toml")
+    spec.write_text('[data]\nfiles = "data.csv"\n[uncertainty]\n' + asked)
+    study = make_study(simulated(BEFORE, 1, 1), BEFORE)
+    request = Request(load_fit_spec(spec), study, ONE, command="design")
+    refuse(spec, request)
+    said = " ".join(capsys.readouterr().err.split())
+    names = said.removeprefix("note: spec.toml: ").partition(": left out by design")[0]
+    assert sorted(names.split(", ")) == [
+        "uncertainty.influence", "uncertainty.posterior", "uncertainty.profile"
+    ]  # fmt: skip
+    assert left_out(dataclasses.replace(request, command="fit")) == []

@@ -5,13 +5,16 @@ import importlib
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from synthetic import DEPTHS, GEOMETRY, OPTIONS, curves, draw, forces, parameters
 
 import jaxtrachea as jt
+from jaxtrachea.fitting import settings as how
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
 from jaxtrachea.measurements.curve import BadCurve
 from jaxtrachea.measurements.read import Measurements
@@ -100,6 +103,38 @@ def test_dataset_has_the_same_numbers(result):
         assert data[name].values.ravel().tolist() == table.column(column)
 
 
+def test_dataset_takes_profiles_as_the_table_does():
+    """With a bound at 0.8 of the true k_M the estimate lies on it: no error, and no local interval.
+
+    The profile gives the interval on the one side where it may move, in both.
+    """
+    force = forces(TRUTH[:1])[0]
+    noise = np.random.default_rng(1).normal(size=force.shape)
+    bound = float(0.8 * TRUTH[0, 1])
+    table = [
+        dataclasses.replace(p, upper=bound, value=bound / 2) if p.name == "k_M" else p
+        for p in parameters()
+    ]
+    noisy = curves(force + 1e-3 * force.max() * noise)
+    plain = dataclasses.replace(SETTINGS, scrutiny=False)
+    result = jt.fit(jt.build_study(noisy, GEOMETRY, OPTIONS, table), plain)
+    profiles = jt.profiles(result, SETTINGS, ["k_M"], points=2)
+    for given in (None, profiles):
+        data, rows = result.to_dataset(given), result.table(given)
+        assert data.status.values.tolist() == ["at_bound"]
+        assert data.at_bound.values.tolist() == [[False, True, False, False]]
+        for name, column in (("standard_error", "se"), ("low95", "low95"), ("high95", "high95")):
+            np.testing.assert_array_equal(data[name].values.ravel(), rows.column(column))
+        assert data.verdict.values.ravel().tolist() == rows.column("verdict")
+        k_m = data.sel(unknown="k_M")
+        assert k_m.verdict == "at bound"
+        assert np.isnan(k_m.standard_error)
+        assert k_m.value == bound
+        ends = [np.nan] * 2 if given is None else [profiles.lower[0], bound]
+        np.testing.assert_array_equal([k_m.low95[0], k_m.high95[0]], ends)
+    assert profiles.lower[0] < bound
+
+
 def test_noise_of_markers_that_are_not_there_is_no_number(result):
     assert np.isnan(result.to_dataset().sigma.sel(kind="joints")).all()
 
@@ -158,3 +193,30 @@ def test_profiles_and_bootstrap_go_by_the_same_names():
     again = jt.bootstrap(result, SETTINGS, count=100)
     # The standard deviation of 100 draws is known to 7 %; three times that.
     np.testing.assert_allclose(again.standard_error, result.standard_error, rtol=0.22)
+
+
+def test_a_fit_in_single_precision_is_said_once():
+    """With the cure, at the user's line; not where float32 was asked for, nor in float64."""
+    study = jt.build_study(curves(forces(TRUTH[:1])[0]), GEOMETRY, OPTIONS, parameters())
+    plain = jt.Settings(starts=1, more_starts=0, scrutiny=False)
+
+    def warned(call):
+        how._warn_of_single_precision.cache_clear()
+        with warnings.catch_warnings(record=True) as seen:
+            warnings.simplefilter("always")
+            found = [call(), call()][0]
+        cure = 'jax.config.update("jax_enable_x64", True)'
+        ours = [w for w in seen if cure in str(w.message)]
+        # Of a line outside: here the checker of annotations may stand before the user's.
+        assert not any(w.filename.startswith(str(Path(jt.__file__).parent)) for w in ours)
+        assert all(w.category is UserWarning for w in ours)
+        return found, len(ours)
+
+    with jax.enable_x64(False):
+        result, count = warned(lambda: jt.fit(study, plain))
+        assert count == 1
+        assert warned(lambda: jt.profiles(result, plain, ["k_M"], points=2))[1] == 1
+        assert warned(lambda: jt.bootstrap(result, plain, count=40))[1] == 1
+        deliberate = dataclasses.replace(plain, float32=True)
+        assert warned(lambda: jt.fit(study, deliberate))[1] == 0
+    assert warned(lambda: jt.fit(study, plain))[1] == 0

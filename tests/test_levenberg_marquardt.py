@@ -9,6 +9,13 @@ import numpy as np
 import pytest
 
 from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
+from jaxtrachea.optimisation.trust_region import (
+    FIRST_RADIUS,
+    RUNNING,
+    State,
+    Tolerances,
+    iterate,
+)
 from jaxtrachea.status import FitStatus
 
 
@@ -99,6 +106,24 @@ def test_a_start_that_cannot_be_evaluated_is_a_status():
     late = levenberg_marquardt(valley, np.concatenate([good, starts]), np.zeros(42, int), batch=16)
     assert late.status[40] == FitStatus.INFEASIBLE_START
     assert np.flatnonzero(np.isinf(late.cost)).tolist() == [40]
+
+
+def test_a_blank_start_that_cannot_be_evaluated_costs_infinitely():
+    """`iterate` by itself, from a blank point whose cost is 0; one that can has its own cost."""
+    valley = Valley(*map(jnp.array, BOXES[0][:3]))
+
+    def first(theta):
+        radius, count = jnp.asarray(FIRST_RADIUS), jnp.int32(0)
+        return iterate(Tolerances(), valley, State(theta, blank, radius, count, jnp.int8(RUNNING)))
+
+    blank = valley.blank()
+    assert blank.cost == 0
+    lost = first(jnp.array([jnp.nan, 0.0]))
+    assert (lost.status, lost.point.cost) == (FitStatus.INFEASIBLE_START, jnp.inf)
+    good = first(jnp.array([-1.2, 1.0]))
+    # 100 (1 - 1.44)^2 / 2 + (1 + 1.2)^2 / 2
+    assert good.status == RUNNING
+    np.testing.assert_allclose(good.point.cost, 9.68 + 2.42, rtol=1e-14)
 
 
 def test_float32_ends_on_the_bound_as_given():

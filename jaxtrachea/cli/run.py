@@ -6,11 +6,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from jaxtrachea.cli.terminal import Stages, Stop, progress_bar, say_lost, table
+from jaxtrachea.cli.terminal import Stages, Stop, progress_bar, say_lost, table, to_stderr
 
 
 def refuse(path: Path, request) -> None:
-    """End the command where something asked for cannot be done."""
+    """End the command where something asked for cannot be done; say what it leaves out."""
     from jaxtrachea.config import SpecError
     from jaxtrachea.inference import analyses
 
@@ -18,6 +18,9 @@ def refuse(path: Path, request) -> None:
         analyses.refuse(request)
     except SpecError as error:
         raise Stop(f"{path}: {error}") from None
+    if names := ", ".join(analyses.left_out(request)):
+        text = f"{path}: {names}: left out by {request.command}; fit does what they ask for"
+        to_stderr(f"[yellow]note:[/] {escape(text)}")
 
 
 def run(request, stop_if_asked, fit=None):

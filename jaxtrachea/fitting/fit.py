@@ -20,7 +20,7 @@ from jaxtrachea.fitting.noise import next_sigma, precision_unit
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.scrutiny import scrutinise
-from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.settings import Settings, check_precision
 from jaxtrachea.fitting.starts import scales
 from jaxtrachea.fitting.structure import Structure, null_spaces, reduced, structure_of, suspicious
 from jaxtrachea.fitting.study import Study
@@ -57,6 +57,7 @@ def fit(
         The `FitResult`. It never raises for a lane's sake. Without unknowns (every parameter is
         fixed) nothing is solved: the model is evaluated.
     """
+    check_precision(settings)
     if study.size == 0:
         return evaluated(study)
     known = structure_of(study, suspicious(study))

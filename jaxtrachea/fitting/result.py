@@ -141,11 +141,15 @@ class FitResult:
         """
         return Table(list(estimate_rows(self, profiles)))
 
-    def to_dataset(self) -> "xarray.Dataset":
+    def to_dataset(self, profiles: Intervals | None = None) -> "xarray.Dataset":
         """The estimates with dimensions `lane` and `unknown`, as an xarray Dataset.
 
         `parameter` and `unit` say what each unknown is; statuses and verdicts are words. Lanes with
-        fewer unknowns than others are filled up with NaN and "".
+        fewer unknowns than others are filled up with NaN and "". Where an unknown lies on its bound
+        (`at_bound`) its standard error is NaN, and so is its interval without a profile.
+
+        Args:
+            profiles: further intervals, as for `table`.
 
         Raises:
             ImportError: xarray is not installed.
@@ -160,7 +164,7 @@ class FitResult:
         size = self.theta.shape[1]
         labels = [[unknown_label(self, k, i) if i < len(study.unknowns[k]) else ""
                    for i in range(size)] for k in range(self.lanes)]  # fmt: skip
-        judged = [[judgement(self, k, i) if i < len(study.unknowns[k]) else None
+        judged = [[judgement(self, k, i, profiles) if i < len(study.unknowns[k]) else None
                    for i in range(size)] for k in range(self.lanes)]  # fmt: skip
         both, per_lane = ("lane", "unknown"), ("lane",)
 
@@ -181,6 +185,7 @@ class FitResult:
             "low95": (both, [[end(j, "low") for j in row] for row in judged]),
             "high95": (both, [[end(j, "high") for j in row] for row in judged]),
             "verdict": (both, [[word(j) for j in row] for row in judged]),
+            "at_bound": (both, self.at_bound),
             "status": (per_lane, [FitStatus(int(v)).name.lower() for v in self.status]),
             "iterations": (per_lane, self.iterations),
             "cost": (per_lane, self.cost),

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fitting.profile_search import Sides, find_ends, on_grid
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.settings import Settings, check_precision
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 
@@ -124,6 +124,7 @@ def profiles(
         ValueError: as `choose`, or a joint study.
     """
     result.study.refuse_joint("a profile")
+    check_precision(settings)
     lane, unknown = choose(result, names)
     sides = Sides(result, settings, lane.repeat(2), unknown.repeat(2), progress)
     distance, end, path = find_ends(sides)

@@ -9,7 +9,6 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,12 +52,10 @@ def _advance(tolerances, rounds, objective, start, refill, state):
     def put(new, old):
         return jnp.where(refill.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
-    # Iteration 0 marks a fresh start: its point is evaluated before it is used. Where that fails
-    # the cost stays infinite, so that no minimum of another start is taken for its own.
-    cost = put(jnp.inf, state.point.cost)
+    # Iteration 0 marks a fresh start: its point is evaluated before it is used.
     state = State(
         theta=put(start, state.theta),
-        point=eqx.tree_at(lambda point: point.cost, state.point, cost),
+        point=state.point,
         radius=put(FIRST_RADIUS, state.radius),
         iteration=put(0, state.iteration),
         status=put(jnp.int8(RUNNING), state.status),

@@ -13,6 +13,7 @@ What is minimised is an `Objective`.
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -226,9 +227,15 @@ def _step(objective: Objective, state: State) -> _Step:
 
 
 def iterate(tolerances: Tolerances, objective: Objective, state: State) -> State:
-    """One iteration of one start. The first one only evaluates it."""
-    old = state.point
+    """One iteration of one start. The first one only evaluates it.
+
+    Whatever point came with a fresh start has an infinite cost, which stays where the start cannot
+    be evaluated: neither the content of a blank point nor the minimum of another start is taken
+    for its own.
+    """
     fresh = state.iteration == 0
+    before = jnp.where(fresh, jnp.inf, state.point.cost)
+    old = eqx.tree_at(lambda point: point.cost, state.point, before)
     step = _step(objective, state)
     trial = jnp.where(fresh, state.theta, step.trial)
     new = objective.evaluate(trial)

@@ -99,10 +99,10 @@ def _off_plane(presses: Presses):
 def _elsewhere(scene: Scene, presses: Presses):
     """Rows at another contact point than the first."""
 
-    def near(v):
-        return jnp.abs(v - v[0]) <= COVERED
+    def far(v):
+        return jnp.abs(v - v[0]) > COVERED  # NaN is no place: not to be asked here
 
-    return [~(near(presses.s) & near(presses.phi))]
+    return [far(presses.s) | far(presses.phi)]
 
 
 def _near_surface(scene: Scene, presses: Presses):

@@ -62,7 +62,10 @@ def refuse(scene: Scene, material: Material, path: Presses | None, made: Approac
     refused[PressStatus.BEHIND_GAP] = behind & acting
     if made is not None:
         refused[PressStatus.IN_LUMEN] = made.inside
-    refused[PressStatus.NON_FINITE] = jnp.isnan(jnp.sum(D, axis=1) + presses.s + phi)
+    number = jnp.sum(D, axis=1) + presses.s + phi
+    if made is None and scene.plan.contact_point == "fixed":
+        number = number + (presses.s[0] + phi[0])  # the place that all rows press
+    refused[PressStatus.NON_FINITE] = jnp.isnan(number)
     refused[PressStatus.BAD_MATERIAL] = jnp.broadcast_to(bad, presses.s.shape)
     for rows in refused.values():
         D = jnp.where(rows[:, None], jnp.nan, D)

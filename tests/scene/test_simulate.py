@@ -83,6 +83,32 @@ def test_a_row_that_is_no_number_says_so(at, more):
         assert np.any(np.isnan(got.force[1]))
 
 
+@pytest.mark.parametrize("at", ["s", "phi"])
+@pytest.mark.parametrize("more", [{}, {"second_plane": "on"}, {"friction": "on"}])
+def test_without_a_contact_point_no_row_is_a_number(more, at):
+    """The place that all rows press is that of the first: where it is NaN, nothing is known.
+
+    Rows that press and one that does not (the first two and the last), with a surface.
+    """
+    path = Presses(np.full(3, 75.0), np.zeros(3), np.outer([2.0, 1.0, 0.0], [0, -1.0, 0]))
+    friction = 0.66 if more.get("friction") else None
+    scene = make_scene(
+        TUBE, SPRINGS, path, mesh=MESH, friction=friction, effects=EffectOptions(**more)
+    )
+    assert scene.plan.contact_point == "fixed"
+    whole = run(scene, SPRINGS, path)
+    assert whole.status.tolist() == [PressStatus.OK, PressStatus.OK, PressStatus.NO_CONTACT]
+    lost = dataclasses.replace(path, **{at: getattr(path, at).at[0].set(np.nan)})
+    out = run(scene, SPRINGS, lost)
+    assert out.status.tolist() == [PressStatus.NON_FINITE] * 3
+    assert np.isnan(out.force[:2]).any(axis=1).all()
+    # In a later row it is that row alone, and the others are what they were.
+    lost = dataclasses.replace(path, **{at: getattr(path, at).at[1].set(np.nan)})
+    out = run(scene, SPRINGS, lost)
+    assert out.status.tolist() == [0, PressStatus.NON_FINITE, PressStatus.NO_CONTACT]
+    np.testing.assert_array_equal(out.force[0], whole.force[0])
+
+
 @pytest.mark.parametrize("more", [{}, {"second_plane": "on"}, {"friction": "on"}])
 def test_past_the_zero_of_the_law_every_program_says_pulls(more):
     """F(2 mm) = 0 with k_3 = -k_1 / 4 mm^2, whatever the stiff skeleton; the rows stay apart."""

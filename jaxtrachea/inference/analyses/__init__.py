@@ -66,6 +66,17 @@ def refuse(request: Request) -> None:
         analysis.refuse(request)
 
 
+def left_out(request: Request) -> list[str]:
+    """Keys of the specification that ask for what the command of the request does not do."""
+    asked = request.spec.uncertainty
+    return [
+        f"uncertainty.{analysis.key}"
+        for analysis in ANALYSES
+        if analysis.key and getattr(asked, analysis.key)
+        if request.command not in analysis.commands
+    ]
+
+
 def analyse(
     request: Request, result: FitResult, begin: Callable[[str], Progress] | None = None
 ) -> Findings:
