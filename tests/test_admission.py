@@ -145,7 +145,8 @@ def any_words(function, argument):
     }
     known = {"geometry": table_1(), "material": Material(**FULL), "s_c": 40.0, "phi_c": 0.0,
              "displacement": np.zeros((1, 3)), "friction": 0.5, "force": 1.0, "count": 100,
-             "block": 1, "options": Options(), "beam": BEAM}  # fmt: skip
+             "block": 1, "options": Options(), "beam": BEAM, "loss_scale": 1.345, "loss": "linear",
+             "balance": "sample"}  # fmt: skip
     filled |= {n: v for n, v in known.items() if n in filled}
     return function(**filled | {argument: "no such word"})
 
@@ -153,7 +154,7 @@ def any_words(function, argument):
 #: Called by what checks the word, with its own word; never from outside.
 INNER = {
     "mechanics.compliance.divide_load", "mechanics.reactions.deflect_dense",
-    "mechanics.skeleton.respond", "mechanics.skeleton.read_values",
+    "mechanics.skeleton.respond", "mechanics.skeleton.read_values", "fitting.lanes.lanes_of",
 }  # fmt: skip
 
 

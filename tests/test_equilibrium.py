@@ -140,7 +140,7 @@ def test_bad_rows_stay_alone(press):
     run = jax.jit(jax.vmap(lambda D, c, a, b: press(D, c, Law(a, b))))
     good = run(D, c, k_1, k_3)
     bad = run(D.at[0].set(jnp.nan), c, k_1, k_3.at[2].set(-5.0))
-    for one, two in zip(good, bad, strict=True):
+    for one, two in zip(good[:3], bad[:3], strict=True):
         np.testing.assert_array_equal(one[jnp.asarray([1, 3])], two[jnp.asarray([1, 3])])
     ok = PressStatus.OK
     expected = [PressStatus.NON_FINITE, ok, PressStatus.PAST_FOLD, ok]

@@ -92,7 +92,7 @@ def test_derivatives():
 
     for s in (35.5, 31.0):
         args = (jnp.asarray(s), jnp.asarray(EI), jnp.asarray(K), jnp.asarray(GA))
-        check_grads(values, args, 1, rtol=1e-4)
+        check_grads(jax.jit(values), args, 1, rtol=1e-4)
 
 
 def test_continuous_over_a_ring():

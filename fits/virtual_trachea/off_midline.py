@@ -46,7 +46,7 @@ def read() -> dict:
     with h5py.File(HERE / "vectors.h5") as file:
         data = {name: file[name][()] for name in file}
     rings = 10.0 * np.arange(1, 16)
-    held = np.abs(rings - data["s_c"][:, None]) < TOOL_RADIUS
+    held = np.abs(rings - data["s_c"][:, None]) <= TOOL_RADIUS  # as `data.tool_radius` of a fit
     data["joints"][held] = np.nan
     return data
 

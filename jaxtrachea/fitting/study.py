@@ -189,7 +189,7 @@ def build_study(
 
 
 def _check_choices(
-    balance: Balance, loss: Loss, loss_scale: float, tool_radius: float | None
+    balance: str, loss: str, loss_scale: float, tool_radius: float | None
 ) -> None:
     """Refuse words and numbers that mean nothing.
 

@@ -48,7 +48,7 @@ def stored(scene, material, path):
     return jax.vmap(one)(seen.s, seen.phi, -seen.gap)
 
 
-@pytest.mark.parametrize("shape", ["ball", "capsule"])
+@pytest.mark.parametrize("shape", ["ball", pytest.param("capsule", marks=pytest.mark.slow)])
 def test_force_and_moment_are_what_changes_the_stored_energy(shape):
     """Six directions of each pose, by central differences of the energy.
 
@@ -89,7 +89,13 @@ def work(scene, material, seed, steps):
     return part.sum(), np.maximum(part, 0).sum()
 
 
-@pytest.mark.parametrize("material", [MATERIAL, SPRINGS], ids=["arches", "springs"])
+@pytest.mark.parametrize(
+    "material",
+    [
+        pytest.param(MATERIAL, marks=pytest.mark.slow, id="arches"),
+        pytest.param(SPRINGS, id="springs"),
+    ],
+)
 def test_loops_do_no_work(material):
     """It was -0.13 to 0.25 N mm, less than zero in 19 of 40 loops.
 
