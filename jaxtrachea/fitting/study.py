@@ -188,9 +188,7 @@ def build_study(
     )
 
 
-def _check_choices(
-    balance: str, loss: str, loss_scale: float, tool_radius: float | None
-) -> None:
+def _check_choices(balance: str, loss: str, loss_scale: float, tool_radius: float | None) -> None:
     """Refuse words and numbers that mean nothing.
 
     Raises:
