@@ -155,7 +155,7 @@ def any_words(function, argument):
 INNER = {
     "mechanics.compliance.divide_load", "mechanics.reactions.deflect_dense",
     "mechanics.skeleton.respond", "mechanics.skeleton.read_values", "fitting.lanes.lanes_of",
-    "mechanics.energy.gradient",
+    "mechanics.energy.gradient", "mechanics.skeleton.turned_rings",
 }  # fmt: skip
 
 
