@@ -70,6 +70,27 @@ def test_unknowns_left_open(positions, changes, left_open):
     np.testing.assert_array_equal(found.pinned.sum(axis=1), found.nullity)
 
 
+@pytest.mark.parametrize("changes", [{}, FIXED_K_3], ids=["law", "line"])
+def test_a_softening_skeleton_is_told_by_one_curve(changes):
+    """Its compliance, too, where the local law is a line: D = F / k_1 + g^-1(c F) has four terms.
+
+    F (1 / k_1 + c) + e_1 (c F)^2 + (2 e_1^2 - e_2) (c F)^3 + 5 e_1 (e_1^2 - e_2) (c F)^4: as many
+    as unknowns. What stays open are EI_L and k_M behind one compliance.
+    """
+    options = Options(skeleton="softening")
+    curves = [[Curve(f"s{i}", f"t{t}", s, 0.0, DEPTHS, DEPTHS) for t, s in enumerate(of_specimen)]
+              for i, of_specimen in enumerate([(75.0, 75.0), (75.0, 22.0)])]  # fmt: skip
+    parameters = default_parameters(in_model(options, joints=False), changes)
+    study = build_study(sum(curves, []), GEOMETRY, options, parameters)
+    found = structure(study)
+    names = [p.name for p, _, _ in study.unknowns[0]]
+    assert {"e_1", "e_2"} <= set(names)
+    told = [{n for n, open_ in zip(names, row, strict=False) if open_}
+            for row in found.undetermined]  # fmt: skip
+    assert told == [{"EI_L", "k_M"}, set()]
+    assert np.all(suspicious(study) | (found.nullity == 0))
+
+
 def test_markers_tell_the_skeleton_from_one_position():
     assert not structure(make_study([(75.0,)], markers=True)).nullity.any()
 

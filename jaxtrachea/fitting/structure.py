@@ -23,11 +23,12 @@ from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.parameters import SKELETON
-from jaxtrachea.fitting.residual import inputs
+from jaxtrachea.fitting.residual import Inputs, inputs
 from jaxtrachea.fitting.starts import box
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.press import respond
+from jaxtrachea.mechanics.softening import Softening
 
 #: Points of the parameter box, and half its width in decades.
 POINTS, DECADES = 8, 2.0
@@ -245,7 +246,7 @@ def _inputs_by_unknowns(model: FitModel, theta: Float[Array, " P"], lane: Lane):
         x = inputs(model, theta, lane)
         c = jnp.maximum(x.compliance, jnp.finfo(theta.dtype).tiny)
         felt = model.options.coupling == "series"
-        k_1, *more = x.law.coefficients().values()
+        k_1, *more = _nonlinear(x)
         rows = [jnp.log(c) if felt else jnp.zeros_like(c), jnp.log(k_1), *more]
         rows = jnp.stack([*rows, x.onset, x.force_offset], axis=1)
         if x.joints is None:
@@ -253,22 +254,30 @@ def _inputs_by_unknowns(model: FitModel, theta: Float[Array, " P"], lane: Lane):
         size = jnp.max(jnp.abs(jax.lax.stop_gradient(x.joints)), axis=1, keepdims=True)
         return jnp.concatenate([rows, x.joints / size], axis=1)
 
-    _, *higher = inputs(model, theta, lane).law.coefficients().values()
+    _, *higher = _nonlinear(inputs(model, theta, lane))
     J = jax.jacfwd(relative_inputs)(theta)
     for i, k in enumerate(higher):
         J = J.at[:, 2 + i].divide(jnp.where(k != 0, k, 1)[:, None])
     return J
 
 
+def _nonlinear(x: Inputs) -> list[Array]:
+    """Coefficients of the local law, and of a skeleton that softens; (T,) each."""
+    law = x.law.coefficients().values()
+    return [*law, *(x.softening or ())]
+
+
 @functools.lru_cache(maxsize=64)
 def _generic(options, higher: tuple[tuple[str, bool], ...]) -> Float[np.ndarray, "r n"]:
-    """See `_curve_sees`; of a law with these coefficients above k_1, or zero in their place."""
+    """See `_curve_sees`; of a model with these coefficients above k_1, or zero in their place."""
 
     def curve(v):
         parts = {name: 1.0 * there + v[2 + i] for i, (name, there) in enumerate(higher)}
+        bent = [0.1 * parts.pop(name) for name in Softening._fields if name in parts]
         law = Law(**{"k_1": jnp.exp(v[1]), **parts})
-        depths = jnp.asarray(_GENERIC_DEPTHS)
-        return respond(depths, v[-2], jnp.exp(v[0]), law, options).force + v[-1]
+        depths, c = jnp.asarray(_GENERIC_DEPTHS), jnp.exp(v[0])
+        softening = Softening(*bent) if bent else None
+        return respond(depths, v[-2], c, law, options, softening=softening).force + v[-1]
 
     J = np.asarray(jax.jit(jax.jacfwd(curve))(jnp.zeros(4 + len(higher))))
     there = np.array([True, True, *(part for _, part in higher), True, True])
@@ -280,18 +289,20 @@ def _generic(options, higher: tuple[tuple[str, bool], ...]) -> Float[np.ndarray,
 
 
 def _curve_sees(study: Study) -> Float[np.ndarray, "r n"]:
-    """Combinations of (log c, log k_1, k_3, ..., onset, offset) that one curve tells; rows."""
+    """Combinations of (log c, log k_1, k_3, ..., e_1, e_2, onset, offset) one curve tells; rows."""
     return _generic(study.model.options, tuple(_higher(study).items()))
 
 
 def _higher(study: Study) -> dict[str, bool]:
-    """Coefficients of the local law above k_1, and whether they are more than a fixed zero."""
+    """Coefficients above k_1, of the softening too, and whether they are more than a fixed zero."""
     out: dict[str, bool] = {}
     for p in study.parameters:
         name = coefficient(p.name)
         if name is not None and name != "k_1":
             out[name] = out.get(name, False) or not p.fixed or p.value != 0
-    return {name: out[name] for name in Law._fields if name in out}
+    law = {name: out[name] for name in Law._fields if name in out}
+    deep = [p for p in study.parameters if p.name in Softening._fields]
+    return law | {p.name: not p.fixed or p.value != 0 for p in deep}
 
 
 def _hardens(study: Study) -> bool:
