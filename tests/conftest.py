@@ -57,11 +57,12 @@ jax.monitoring.register_event_duration_secs_listener(_count)
 def _forget_programs():
     """Compiled programs are dropped after some files; all together would take gigabytes.
 
-    Not after every file: a fifth and more of the small ones serve the next file too.
+    Not after every file: a fifth and more of the small ones serve the next file too. Many more at a
+    time exceed what a process may map of memory (65,530 pieces), and XLA ends it.
     """
     global _compiled
     yield
-    if _compiled > 1500:
+    if _compiled > 400:
         jax.clear_caches()
         _compiled = 0
 
