@@ -112,7 +112,7 @@ def held_out(spec: FitSpec) -> dict:
         dataclasses.replace(c, specimen=f"{k:03d}")
         for k, three in enumerate(choices) for i, c in enumerate(curves) if i not in three
     ]  # fmt: skip
-    study = study_of(spec, dataclasses.replace(measured, curves=lanes))
+    study = study_of(spec, dataclasses.replace(measured, curves=tuple(lanes)))
     result = fit(study, settings_of(spec))
     rings = np.asarray(study.model.geometry.ring_positions)
     force, joints = [], []
