@@ -4,6 +4,8 @@ Everything here keeps the dtype of its input, is smooth where it says so, and is
 the singular operation, so that derivatives stay finite.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -128,6 +130,53 @@ def first_positive_root(
     return jnp.where(there, above / jnp.where(there, below, 1), jnp.inf)
 
 
+def newton_tolerance(dtype) -> float:
+    """Relative step that ends Newton's method: the error that a step leaves is its square."""
+    return epsilon(dtype) ** 0.6
+
+
+def rising_root(
+    value_and_slope: Callable[[Array], tuple[Array, Array]],
+    least_step: Callable[[Array], Array],
+    start: Float[Array, "*n"],
+    low: Float[Array, "*n"],
+    high: Float[Array, "*n"],
+    sought: Bool[Array, "*n"],
+) -> Float[Array, "*n"]:
+    """Roots of functions that rise from `low` to `high`, by Newton steps kept in the bracket.
+
+    A step that leaves the bracket goes to its middle instead. Up to 64 steps; callers give the
+    derivatives of the root, none is taken through the loop.
+
+    Args:
+        value_and_slope: of the functions at x, entry by entry: none knows of its neighbours.
+        least_step: at x, the size from which on a step is the last.
+        start: within the bracket.
+        low: where the functions are not positive.
+        high: where they are not negative.
+        sought: which roots; the others keep their start.
+    """
+
+    def moving(x, step):
+        return jnp.abs(step) > least_step(x)
+
+    def newton(state):
+        x, low, high, step, count = state
+        (value, slope), goes = value_and_slope(x), moving(x, step)
+        low, high = jnp.where(value < 0, x, low), jnp.where(value < 0, high, x)
+        new = x - value / slope
+        new = jnp.where((new >= low) & (new <= high), new, (low + high) / 2)
+        # What has settled stays, whatever the others do: no row knows of its neighbours.
+        return jnp.where(goes, new, x), low, high, jnp.where(goes, new - x, step), count + 1
+
+    def unsettled(state):
+        return jnp.any(moving(state[0], state[3])) & (state[4] < 64)
+
+    first = jnp.where(sought, jnp.full_like(start, jnp.inf), 0)
+    begin = start, low, high, first, jnp.zeros((), jnp.int32)
+    return jax.lax.while_loop(unsettled, newton, begin)[0]
+
+
 @jax.custom_jvp
 def quintic_ratio(u: Float[Array, "*n"], v: Float[Array, "*n"]) -> Float[Array, "*n"]:
     r"""Root g of g + u g^3 + v g^5 = 1 on the branch through g = 1 at u = v = 0.
@@ -180,29 +229,14 @@ def _quintic_root(u, v):
     u, v = jnp.where(known, u, 0), jnp.where(known, v, 0)
     folds, top = _quintic_fold(u, v)
     past = folds & (_quintic(u, v, top) < 0)
-    near = epsilon(u.dtype) ** 0.6  # the error that a Newton step leaves is its square
 
-    def moving(g, step):
-        return jnp.abs(step) > near * g
+    def value_and_slope(g):
+        return _quintic(u, v, g), 1 + g * g * (3 * u + 5 * v * (g * g))
 
-    def newton(state):
-        g, low, high, step, count = state
-        p, goes = _quintic(u, v, g), moving(g, step)
-        low, high = jnp.where(p < 0, g, low), jnp.where(p < 0, high, g)
-        new = g - p / (1 + g * g * (3 * u + 5 * v * (g * g)))
-        new = jnp.where((new >= low) & (new <= high), new, (low + high) / 2)
-        # What has settled stays, whatever the others do: no row knows of its neighbours.
-        new, step = jnp.where(goes, new, g), jnp.where(goes, new - g, step)
-        return new, low, high, step, count + 1
-
-    start = _quintic_start(u, v, folds, top)
-    first = jnp.where(past, 0, jnp.full_like(u, jnp.inf))
-    begin = start, jnp.zeros_like(u), top, first, jnp.zeros((), jnp.int32)
-
-    def unsettled(state):
-        return jnp.any(moving(state[0], state[3])) & (state[4] < 64)
-
-    g = jax.lax.while_loop(unsettled, newton, begin)[0]
+    g = rising_root(
+        value_and_slope, lambda g: newton_tolerance(g.dtype) * g, _quintic_start(u, v, folds, top),
+        jnp.zeros_like(u), top, ~past,
+    )  # fmt: skip
     return jnp.where(past | ~known, jnp.nan, g)
 
 

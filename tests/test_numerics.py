@@ -10,9 +10,11 @@ from jaxtrachea._numerics import (
     cubic_ratio,
     epsilon,
     first_positive_root,
+    newton_tolerance,
     positive_part,
     quintic_past_fold,
     quintic_ratio,
+    rising_root,
     solve_spd,
 )
 
@@ -288,3 +290,26 @@ def test_first_positive_root(dtype):
             there = [1 / mp.re(r) for r in inverse if abs(mp.im(r)) < 1e-30 and mp.re(r) > 0]
             expected.append(float(min(there)) if there else np.inf)
     np.testing.assert_allclose(got, expected, rtol=8 * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_rising_root(dtype):
+    """Tangents from values of arctan, from starts where plain Newton steps diverge (|x| > 1.4)."""
+    y = jnp.asarray([-1.4, -0.3, 0.0, 1.0, 1.5, 0.7], dtype)
+    start = jnp.asarray([20.0, -30.0, 40.0, -40.0, -9.0, 5.0], dtype)
+
+    def value_and_slope(x):
+        return jnp.arctan(x) - y, 1 / (1 + x * x)
+
+    def least_step(x):
+        return newton_tolerance(dtype) * jnp.abs(x)
+
+    low, sought = jnp.full_like(y, -50), jnp.asarray([True] * 5 + [False])
+    found = jax.jit(rising_root, static_argnums=(0, 1))(
+        value_and_slope, least_step, start, low, -low, sought
+    )
+    assert found.dtype == jnp.dtype(dtype)
+    # An error of one rounding in arctan moves x by 1 + x^2 of it, 35 at most.
+    want, rtol = np.tan(np.asarray(y, float)), 50 * np.finfo(dtype).eps
+    np.testing.assert_allclose(found[:5], want[:5], rtol=rtol, atol=rtol)
+    assert found[5] == start[5]

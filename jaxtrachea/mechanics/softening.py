@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxtrachea._numerics import epsilon, first_positive_root
+from jaxtrachea._numerics import epsilon, first_positive_root, newton_tolerance, rising_root
 from jaxtrachea.mechanics.force_law import Law, fold_depth
 
 
@@ -126,31 +126,19 @@ def _newton(displacement, compliance, law: Law, softening: Softening):
         return soft.linear(u) - c * law.force(D - u)
 
     solvable = (low <= high) & (excess(low) <= 0) & (excess(high) >= 0)
-    near = epsilon(D.dtype) ** 0.6  # the error that a Newton step leaves is its square
 
-    def moving(u, step):
+    def excess_and_slope(u):
+        return excess(u), soft.tangent(u) + c * law.tangent(D - u)
+
+    def least_step(u):
         # Not below the rounding of u itself; `_polished` does the rest.
-        least = jnp.maximum(near * jnp.minimum(u, D - u), 4 * epsilon(D.dtype) * D)
-        return jnp.abs(step) > least
-
-    def newton(state):
-        u, low, high, step, count = state
-        r, goes = excess(u), moving(u, step)
-        low, high = jnp.where(r < 0, u, low), jnp.where(r < 0, high, u)
-        new = u - r / (soft.tangent(u) + c * law.tangent(D - u))
-        new = jnp.where((new >= low) & (new <= high), new, (low + high) / 2)
-        # What has settled stays, whatever the others do: no row knows of its neighbours.
-        return jnp.where(goes, new, u), low, high, jnp.where(goes, new - u, step), count + 1
+        return jnp.maximum(
+            newton_tolerance(D.dtype) * jnp.minimum(u, D - u), 4 * epsilon(D.dtype) * D
+        )
 
     linear = c * law.k_1
     start = jnp.clip(D * (linear / (1 + linear)), low, jnp.maximum(low, high))
-    first = jnp.where(solvable & (D > 0), jnp.full_like(D, jnp.inf), 0)
-    begin = start, low, high, first, jnp.zeros((), jnp.int32)
-
-    def unsettled(state):
-        return jnp.any(moving(state[0], state[3])) & (state[4] < 64)
-
-    u = jax.lax.while_loop(unsettled, newton, begin)[0]
+    u = rising_root(excess_and_slope, least_step, start, low, high, solvable & (D > 0))
     depth, u, force = _polished(D, c, law, soft, u)
     sign = jnp.where(draw, -1, 1)
     out = (jnp.where(solvable & known, sign * v, jnp.nan) for v in (depth, u, force))
