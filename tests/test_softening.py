@@ -155,6 +155,32 @@ def test_not_finite(bad):
     assert got.status.tolist() == [PressStatus.OK, PressStatus.NON_FINITE]
 
 
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_not_finite_is_no_fold(name, bad, dtype):
+    """A row of which anything is not finite is NON_FINITE; its derivatives are 0, not NaN."""
+    row = jnp.asarray([1.0, 0.8, 1.2, 0.1, 0.1127, 0.0061], dtype)
+    rows = jnp.stack([row, row]).at[1, NAMES.index(name)].set(bad)
+
+    @jax.vmap
+    def pressed(row):
+        D, c, k_1, k_3, e_1, e_2 = row
+        return press_softening(D, c, Law(k_1, k_3), Softening(e_1, e_2))
+
+    def total(rows):
+        solved = pressed(rows)
+        return jnp.sum(jnp.where(solved.status == PressStatus.OK, solved.force, 0))
+
+    got = pressed(rows)
+    assert got.status.tolist() == [PressStatus.OK, PressStatus.NON_FINITE]
+    assert np.isfinite(got.force[0])
+    assert np.isnan(got.force[1])
+    slope = jax.grad(total)(rows)
+    np.testing.assert_array_equal(slope[1], 0)
+    np.testing.assert_allclose(slope[0], jax.grad(total)(rows[:1])[0], rtol=1e-5)
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_press(dtype):
     """In `press` the joints follow the deflection of C; work along a path is the stored energy."""

@@ -51,7 +51,8 @@ class SoftSeries(NamedTuple):
     """Local law and softening skeleton in series, one entry per displacement.
 
     Attributes:
-        depth: local indentation, mm; NaN past the fold, like all here.
+        depth: local indentation, mm; NaN past the fold and of a row that is not finite, like all
+            here.
         deflection: of the skeleton at C, mm.
         force: N.
         folded: whether the displacement lies past the fold.
@@ -97,7 +98,8 @@ def _solved_jvp(primals, tangents):
     depth, u, force, folded = _solved(*primals)
     # A row without a solution has derivative 0, so that what all rows share keeps its own.
     solved = jnp.isfinite(force)
-    d, v, F = (jnp.where(solved, value, 0) for value in (depth, u, force))
+    used = depth, u, force, compliance, law, softening
+    d, v, F, compliance, law, softening = jax.tree.map(lambda x: jnp.where(solved, x, 0), used)
     slope, rise = law.tangent(d), softening.tangent(v)
     share = jnp.where(solved, 1 / (rise + compliance * slope), 0)
     grown = d * d_law.secant(d * d)
@@ -114,6 +116,8 @@ def _newton(displacement, compliance, law: Law, softening: Softening):
     """Depth, deflection, force and fold by Newton steps for the deflection, in a bracket."""
     draw = displacement < 0
     known = jnp.isfinite(displacement) & jnp.isfinite(compliance)
+    for value in jax.tree.leaves((law, softening)):
+        known = known & jnp.isfinite(value)
     D = jnp.where(known, jnp.abs(displacement), 0)
     c = jnp.where(known, compliance, 0)
     e_1, e_2 = (jnp.asarray(e, D.dtype) for e in softening)
