@@ -10,7 +10,7 @@ from jaxtrachea.mechanics import beam as point
 from jaxtrachea.mechanics.compliance import Beam
 from jaxtrachea.mechanics.force_law import ring_weight
 from jaxtrachea.mechanics.press import Options, compliance, local_law, press
-from jaxtrachea.mechanics.punch import held_level, mean_ring_weight
+from jaxtrachea.mechanics.punch import mean_ring_weight, punch_deflection
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
@@ -58,7 +58,7 @@ PLACES = [2.5, 22.0, 30.0, 31.2, 27.6, 32.4, 35.0, 75.0, 157.0]
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("shear", [True, False])
 def test_against_finite_elements(dtype, shear):
-    held = jax.jit(jax.vmap(lambda s: held_level(beam(dtype, shear), s, HALF)))
+    held = jax.jit(jax.vmap(lambda s: punch_deflection(beam(dtype, shear), s, HALF)))
     got = held(jnp.asarray(PLACES, dtype))
     rtol = {"float32": 2e-3, "float64": 1e-9}[dtype]
     for i, s in enumerate(PLACES):
@@ -77,17 +77,17 @@ def test_narrow_punch_is_a_point_that_does_not_tilt():
     middle = Beam(jnp.asarray(X), jnp.asarray(LENGTH), jnp.full(16, 900.0), jnp.full(15, 0.2))
     s = jnp.asarray(80.0)
     truth = point.contact_compliance(middle, s)
-    errors = [held_level(middle, s, a).w_C / truth - 1 for a in (0.4, 0.2)]
+    errors = [punch_deflection(middle, s, a).w_C / truth - 1 for a in (0.4, 0.2)]
     assert abs(errors[0]) < 1e-3
     np.testing.assert_allclose(errors[0] / errors[1], 4, rtol=0.1)
     for end in (0.0, 1.0, 159.0, 160.0):
-        assert held_level(beam(), jnp.asarray(end), HALF).w_C == 0
+        assert punch_deflection(beam(), jnp.asarray(end), HALF).w_C == 0
 
 
 def test_derivatives():
     def values(s, EI, k, GA):
         s, EI, k, GA = map(jnp.asarray, (s, EI, k, GA))
-        out = held_level(Beam(jnp.asarray(X), jnp.asarray(LENGTH), EI, k, GA), s, HALF)
+        out = punch_deflection(Beam(jnp.asarray(X), jnp.asarray(LENGTH), EI, k, GA), s, HALF)
         return out.w_C, out.w
 
     for s in (35.5, 31.0):
@@ -98,7 +98,7 @@ def test_derivatives():
 def test_continuous_over_a_ring():
     """A ring that comes under the edge does so without a jump, in compliance and joints."""
     edge = X[3] - HALF
-    held = jax.jit(jax.vmap(lambda s: held_level(beam(), s, HALF)))
+    held = jax.jit(jax.vmap(lambda s: punch_deflection(beam(), s, HALF)))
     got = held(jnp.asarray([edge - 1e-9, edge, edge + 1e-9]))
     for v in got:
         np.testing.assert_allclose(v, np.broadcast_to(v[1], v.shape), rtol=1e-6, atol=1e-9)

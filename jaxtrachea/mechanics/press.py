@@ -188,12 +188,14 @@ def compliance(
     return jnp.vectorize(lambda s: unit_deflection(beam, s, options).w_C)(s_c)
 
 
-def unit_deflection(beam: _beam.Beam, s_c: Float[Array, ""], options: Options) -> punch.Held:
+def unit_deflection(
+    beam: _beam.Beam, s_c: Float[Array, ""], options: Options
+) -> punch.UnitDeflection:
     """Everything that moves under a unit force at C."""
     if options.half_width > 0:
-        return punch.held_level(beam, s_c, options.half_width)
+        return punch.punch_deflection(beam, s_c, options.half_width)
     unit = _beam.deflect(beam, s_c, jnp.ones_like(s_c), split=options.split, form=options.form)
-    return punch.Held(unit.w_C, unit.theta_C, unit.w, unit.theta, unit.reaction)
+    return punch.UnitDeflection(unit.w_C, unit.theta_C, unit.w, unit.theta, unit.reaction)
 
 
 def respond(

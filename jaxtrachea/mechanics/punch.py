@@ -23,7 +23,7 @@ from jaxtrachea.mechanics.force_law import ring_weight
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
-class Held(NamedTuple):
+class UnitDeflection(NamedTuple):
     """What moves under a unit force at C; for a punch, the sum of its forces.
 
     Attributes:
@@ -41,7 +41,7 @@ class Held(NamedTuple):
     reaction: Float[Array, " n"]
 
 
-def held_level(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Held:
+def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> UnitDeflection:
     """Deflections under a punch at s_c whose forces sum to 1 N.
 
     Where it reaches beyond an end of the beam it stands on the clamp there, and nothing moves.
@@ -66,7 +66,9 @@ def held_level(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Held:
         return share @ v[:, ring]
 
     w_C = c_12 + share[0] * second
-    return Held(w_C, jnp.zeros_like(w_C), *map(per_ring, (unit.w, unit.theta, unit.reaction)))
+    return UnitDeflection(
+        w_C, jnp.zeros_like(w_C), *map(per_ring, (unit.w, unit.theta, unit.reaction))
+    )
 
 
 def _with_marks(beam: Beam, ends) -> tuple[Beam, Array]:

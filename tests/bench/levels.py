@@ -55,4 +55,5 @@ def main() -> None:
         print(f"{name:28s} {1e6 * seconds:10.1f} us  {seconds / base:8.2f} x mat")
 
 
-main()
+if __name__ == "__main__":
+    main()
