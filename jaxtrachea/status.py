@@ -30,7 +30,7 @@ class PressStatus(_Described):
         7,
         "off the midline, oblique, elsewhere or else, in a program made for less than that",
     )
-    OFF_TUBE = 8, "the contact lies beyond an end of the tube"
+    OFF_TUBE = 8, "the contact, or a part of a tool's width, lies beyond an end of the tube"
     UNSURE = (
         9,
         "solved, but the contact may be another than found: the tool reaches so deep, or touches "

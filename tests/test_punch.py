@@ -11,6 +11,7 @@ from jaxtrachea.mechanics.compliance import Beam
 from jaxtrachea.mechanics.force_law import ring_weight
 from jaxtrachea.mechanics.press import Options, compliance, local_law, press
 from jaxtrachea.mechanics.punch import mean_ring_weight, punch_deflection
+from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
@@ -72,7 +73,7 @@ def test_against_finite_elements(dtype, shear):
 def test_narrow_punch_is_a_point_that_does_not_tilt():
     """As the square of the width, in the middle of a uniform beam, where a point does not either.
 
-    Beyond the end it stands on the clamp.
+    An edge beyond the end (refused by `press`) is taken to stand on the clamp.
     """
     middle = Beam(jnp.asarray(X), jnp.asarray(LENGTH), jnp.full(16, 900.0), jnp.full(15, 0.2))
     s = jnp.asarray(80.0)
@@ -147,6 +148,56 @@ def test_compliance_and_law_of_press():
         local = (1 - weight) / 8.18 + weight / 40.0  # compliances add
         np.testing.assert_allclose(1 / local_law(geometry, material, s[i], options).k_1, local)
         np.testing.assert_allclose(got.force, 0.1 / (c[i] + local), rtol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("skeleton", ["linear", "softening"])
+def test_beyond_an_end_is_refused(dtype, skeleton):
+    """No punch stands on a clamp: OFF_TUBE, NaN; its derivatives are 0, good rows keep theirs.
+
+    With its edge just on the end it stands there: rigid for forces, as a point at the end is.
+    """
+    options = Options(shear=True, local="two-material", half_width=2.5, skeleton=skeleton)
+    wide = Options(shear=True, half_width=80.5, skeleton=skeleton)
+    places = [75.0, 2.5, 157.5, 2.4, 157.6, 0.0, 160.0, -1.0, 162.0]
+    values = {"EI_L": 1930.0, "k_M": 0.2126, "k_1": 8.18, "k_3": 0.1, "GA_L": 6.97,
+              "k_1_ring": 40.0, "e_1": 0.1, "e_2": 0.005}  # fmt: skip
+    geometry = table_1(dtype=dtype)
+    if skeleton == "linear":
+        values = {k: v for k, v in values.items() if not k.startswith("e_")}
+
+    def press_row(options, s, values):
+        return press(geometry, Material(**values), s, 0.1, options)
+
+    def run(options, places, values):
+        columns = {k: jnp.full(len(places), v, dtype) for k, v in values.items()}
+
+        def total(s, values):
+            out = press_row(options, s, values)
+            solved = out.status == PressStatus.OK
+            return jnp.where(solved, out.force + jnp.sum(out.joints), 0), out
+
+        slope = jax.vmap(jax.value_and_grad(total, (0, 1), has_aux=True))
+        (_, out), by = jax.jit(slope)(jnp.asarray(places, dtype), columns)
+        return out, np.stack(jax.tree.leaves(by), axis=1)
+
+    out, by = run(options, places, values)
+    assert out.status.tolist() == [PressStatus.OK] * 3 + [PressStatus.OFF_TUBE] * 6
+    for v in out[:-1]:
+        assert np.isfinite(v[:3]).all()
+        assert np.isnan(v[3:]).all()
+    assert np.isfinite(by).all()
+    assert np.all(by[3:] == 0)
+    assert np.all(by[0, 1:] != 0)
+    material = Material(**{k: jnp.asarray(v, dtype) for k, v in values.items()})
+    c = compliance(geometry, material, jnp.asarray(places, dtype), options)
+    assert np.isfinite(c[:3]).all()
+    assert np.isnan(c[3:]).all()
+    values.pop("k_1_ring")
+    out, by = run(wide, [79.0, 80.0, 81.0], values)
+    assert out.status.tolist() == [PressStatus.OFF_TUBE] * 3
+    assert np.isnan(out.force).all()
+    assert np.all(by == 0)
 
 
 def test_options():

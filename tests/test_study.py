@@ -2,18 +2,25 @@
 
 import csv
 import json
+import re
 
 import h5py
 import numpy as np
 import pytest
 from run_cli import run
 
+from jaxtrachea._errors import InputError
 from jaxtrachea.cli.specification import parameters_of, usable
 from jaxtrachea.config import FitSpec, SpecError, TracheaSection, load_fit_spec
 from jaxtrachea.fitting.parameters import DEFAULTS
+from jaxtrachea.fitting.study import build_study
+from jaxtrachea.inference.design import candidates_of
 from jaxtrachea.measurements.data_files import find_files, read_data
 from jaxtrachea.measurements.read import Curve, DataError, Measurements, write_hdf5
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.prediction.predict import check_position
+from jaxtrachea.results.stored import StoredFit
+from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.section import geometry_of
 
 SPEC = """
@@ -245,3 +252,62 @@ def test_a_curve_outside_the_tube_costs_only_itself():
     assert "900" in bad.message
     with pytest.raises(SpecError, match="T2"):
         usable(spec, Measurements((curves[1],), (), ()))
+
+
+@pytest.mark.parametrize(
+    ("half_width", "s", "says"),
+    [
+        (3.0, 2.0, "expected s from 3 to 157 mm; leave the curve out"),
+        (3.0, 157.5, "expected s from 3 to 157 mm; leave the curve out"),
+        (90.0, 80.0, "expected a tool no wider than the tube is long, 160 mm"),
+    ],
+)
+def test_a_tool_beyond_an_end_of_the_tube(half_width, s, says):
+    """The curve is named, with the width and the places for it; others of the batch are fitted."""
+    D, F = curve(0)
+    options, tube = Options(half_width=half_width), table_1()
+    bad, good = Curve("T01", "a", s, 0.0, D, F, source="f.csv"), Curve("T01", "b", 75.0, 0.0, D, F)
+    start = (
+        f"specimen 'T01' trial 'a': contact at s = {s:g} mm, where a tool of half_width "
+        f"{half_width:g} mm reaches beyond an end of the tube; {says}"
+    )
+    with pytest.raises(InputError, match=re.escape(start)):
+        build_study([bad, good], tube, options)
+    assert build_study([good, bad], tube, Options()).curves
+    spec = FitSpec.model_validate(
+        {"data": {"files": ["f.csv"]}, "model": {"half_width": f"{half_width} mm"}}
+    )
+    with pytest.raises(SpecError, match=re.escape(says)):
+        usable(spec, Measurements((bad,), (), ()))
+    if half_width < 80:
+        left = usable(spec, Measurements((bad, good), (), ()))
+        assert left.curves == (good,)
+        assert "half_width" in left.bad[0].reason
+
+
+def test_places_of_a_tool_with_a_width():
+    """Predictions and designs leave half a width at both ends, as the fit does."""
+    D, F = curve(0)
+    study = build_study([Curve("T01", "a", 75.0, 0.0, D, F)], table_1(), Options(half_width=12.0))
+    stored = object.__new__(StoredFit)  # of which only the study is read
+    object.__setattr__(stored, "study", study)
+    for s in (12.0, 80.0, 148.0):
+        check_position(stored, s)
+    for s in (0.0, 11.9, 148.1, 160.0):
+        with pytest.raises(ValueError, match="half_width 12 mm.*; expected 12 to 148 mm"):
+            check_position(stored, s)
+    for s, says in (
+        (None, ""),
+        (["12 mm", "148 mm"], ""),
+        (["11 mm", "148 mm"], "half_width 12 mm"),
+        (["12 mm", "149 mm"], "fits from 12 to 148 mm"),
+    ):
+        spec = FitSpec.model_validate(
+            {"data": {"files": ["f.csv"]}, "design": {"s": s, "depth": ["1 mm", "2 mm"]}}
+        )
+        if says:
+            with pytest.raises(SpecError, match=says):
+                candidates_of(spec, study)
+        else:
+            at = candidates_of(spec, study).s
+            assert (at.min(), at.max()) == (12.0, 148.0)

@@ -223,8 +223,9 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
     """Refuse a curve that the model cannot press.
 
     Raises:
-        InputError: no contact position, one outside the tube or off the midline, a marker on a ring
-            that does not exist; specimen and trial are named.
+        InputError: no contact position, one outside the tube or off the midline, a tool whose width
+            reaches beyond an end of the tube, a marker on a ring that does not exist; specimen and
+            trial are named.
     """
     where = f"specimen {curve.specimen!r} trial {curve.trial!r}"
     length, rings = float(geometry.length), geometry.rings
@@ -240,6 +241,8 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
             f"contact at s = {curve.s_c:g} mm, expected on the tube, 0 to {length:g} mm",
             place=where,
         )
+    else:
+        _check_width(curve.s_c, length, options, where)
     if options.coupling == "series" and abs(curve.phi_c) > 1e-6:
         raise InputError(
             f"contact at phi = {np.degrees(curve.phi_c):.3g} deg; this model presses on the "
@@ -249,6 +252,27 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
     if curve.joint_rings is not None and np.any(curve.joint_rings >= rings):
         found = f"marker on ring {curve.joint_rings.max() + 1} of {rings}"
         raise InputError(found, place=where)
+
+
+def _check_width(s_c: float, length: float, options: Options, where: str) -> None:
+    """Refuse a tool of which a part lies off the tube.
+
+    Raises:
+        InputError: naming the curve, the width and the places for it.
+    """
+    low, high = options.places(length)
+    if low <= s_c <= high:
+        return
+    expected = f"s from {low:g} to {high:g} mm"
+    if low > high:
+        expected = f"a tool no wider than the tube is long, {length:g} mm"
+    raise InputError(
+        f"contact at s = {s_c:g} mm, where a tool of half_width {options.half_width:g} mm reaches "
+        "beyond an end of the tube",
+        place=where,
+        expected=expected,
+        cure="leave the curve out, or make half_width smaller (0: the tool touches at a point)",
+    )
 
 
 def _common(unknowns, parameters) -> Common:

@@ -292,8 +292,11 @@ def identifiability(known: Situation, s: Float[np.ndarray, " n"], depth: float) 
 def candidates_of(spec: FitSpec, study: Study) -> Candidates:
     """The presses of the [design] section; left out: first to last ring, half to full depth.
 
+    From ring to ring as far as all of the tool lies on the tube.
+
     Raises:
-        SpecError: positions outside the tube, or unknowns that a new curve would not share.
+        SpecError: positions outside the tube or where the tool reaches beyond its ends, or unknowns
+            that a new curve would not share.
     """
     try:
         check(study)
@@ -302,10 +305,13 @@ def candidates_of(spec: FitSpec, study: Study) -> Candidates:
     section, length = spec.design, float(study.model.geometry.length)
     deepest = float(np.max(study.lanes.displacement))
     rings = study.model.geometry.ring_positions
-    s = (float(rings[0]), float(rings[-1])) if section.s is None else section.s
-    if s[0] < 0 or s[1] > length:
+    low, high = study.model.options.places(length)
+    s = (max(float(rings[0]), low), min(float(rings[-1]), high)) if section.s is None else section.s
+    if s[0] < low or s[1] > high:
+        tool = f", the tool (half_width {low:g} mm) fits from {low:g} to {high:g} mm"
         raise SpecError(
-            f"design.s: {s[0]:g} to {s[1]:g} mm, tube spans 0 to {length:g} mm; give places on it"
+            f"design.s: {s[0]:g} to {s[1]:g} mm, tube spans 0 to {length:g} mm"
+            f"{tool if low > 0 else ''}; give places on it"
         )
     depth = (0.5 * deepest, deepest) if section.depth is None else section.depth
     return grid(s, depth, section.candidates)

@@ -25,7 +25,7 @@ class Admitted(NamedTuple):
 
     Attributes:
         material: with 1 in place of negative values.
-        s_c: contact position, mm; the middle of the tube in place of one off it.
+        s_c: contact position, mm; the middle of the tube in place of one where it is refused.
         refused: `PressStatus`: OK, OFF_TUBE or BAD_MATERIAL.
     """
 
@@ -34,7 +34,14 @@ class Admitted(NamedTuple):
     refused: Int[Array, ""]
 
 
-def admit(geometry: Geometry, material: Material, s_c: ArrayLike, used: Iterable[str]) -> Admitted:
+def admit(
+    geometry: Geometry,
+    material: Material,
+    s_c: ArrayLike,
+    used: Iterable[str],
+    *,
+    reach: float = 0.0,
+) -> Admitted:
     """Check what a press is asked.
 
     Args:
@@ -43,6 +50,7 @@ def admit(geometry: Geometry, material: Material, s_c: ArrayLike, used: Iterable
         s_c: contact position, mm.
         used: names of the values of the material that the model reads and that must not be
             negative; None values are passed over.
+        reach: how far the tool extends along s from s_c, mm: none of it may lie off the tube.
 
     Raises:
         ValueError: a value of the material that is neither a scalar nor one for each span or ring,
@@ -51,7 +59,7 @@ def admit(geometry: Geometry, material: Material, s_c: ArrayLike, used: Iterable
     check_shapes(geometry, material)
     length = geometry.length
     s_c = shaped("s_c", s_c, (), dtype=length.dtype, why="; use jax.vmap for many positions")
-    off = (s_c < 0) | (s_c > length)
+    off = (s_c < reach) | (s_c > length - reach)
     material, bad = without_negative(material, used)
     refused = jnp.where(off, PressStatus.OFF_TUBE, PressStatus.OK)
     refused = jnp.where(bad, PressStatus.BAD_MATERIAL, refused).astype(jnp.int8)

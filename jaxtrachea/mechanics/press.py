@@ -36,7 +36,8 @@ class Options:
             mm; None: half the smallest distance between two rings.
         half_width: of a flat punch along s, mm, which holds the ligament level over twice that and
             whose local law is the mean over it (pi/4 of the radius of a cylinder's end; needs
-            `recursion` and `continuous`). 0: the tool touches at a point.
+            `recursion` and `continuous`). All of it has to lie on the tube, else OFF_TUBE. 0: the
+            tool touches at a point.
         skeleton: `linear`, or `softening` for deep presses: it yields more the further it moves
             (needs `Material.e_1` and `e_2`, and `series`).
     """
@@ -71,6 +72,10 @@ class Options:
                 "skeleton='softening' needs coupling='series': with 'total' the force does not "
                 "depend on the skeleton"
             )
+
+    def places(self, length: float) -> tuple[float, float]:
+        """Lowest and highest contact position, mm, at which all of the tool lies on the tube."""
+        return self.half_width, length - self.half_width
 
 
 class Press(NamedTuple):
@@ -180,12 +185,15 @@ def compliance(
     """Deflection of C per unit force at C, mm/N, at one or many contact positions.
 
     Far cheaper than `press` where the joints are not asked for: many positions share one sweep
-    over the rings.
+    over the rings. NaN where a part of a tool with a width lies off the tube.
     """
     beam = ligament_beam(geometry, material, options)
     if options.form == "recursion" and options.half_width == 0:
         return _beam.contact_compliance(beam, s_c, split=options.split)
-    return jnp.vectorize(lambda s: unit_deflection(beam, s, options).w_C)(s_c)
+    w_C = jnp.vectorize(lambda s: unit_deflection(beam, s, options).w_C)(s_c)
+    if (half := options.half_width) == 0:
+        return w_C
+    return jnp.where((s_c < half) | (s_c > geometry.length - half), jnp.nan, w_C)
 
 
 def unit_deflection(
@@ -248,7 +256,7 @@ def press(
         geometry: the tube at rest.
         material: stiffness values; floating dtype of the result follows the arrays, that of Python
             numbers and lists the geometry.
-        s_c: contact position, mm, in [0, length]; a scalar.
+        s_c: contact position, mm, in [0, length], `options.half_width` off both ends; a scalar.
         displacement: tool displacement along the inward normal, mm; any shape.
         options: what is modelled (static).
         onset: tool displacement at first touch, mm; 0 if None.
@@ -269,7 +277,7 @@ def press(
     onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=displacement.dtype)
     if blend is not None:
         blend = shaped("blend", blend, (), dtype=displacement.dtype)
-    asked = admit(geometry, material, s_c, read_values(options))
+    asked = admit(geometry, material, s_c, read_values(options), reach=options.half_width)
     return _press(geometry, asked, displacement, options, onset, blend)
 
 

@@ -44,12 +44,13 @@ class UnitDeflection(NamedTuple):
 def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> UnitDeflection:
     """Deflections under a punch at s_c whose forces sum to 1 N.
 
-    Where it reaches beyond an end of the beam it stands on the clamp there, and nothing moves.
-    Loses digits where it is narrower than some thousandth of a span: two points then are one.
+    Not for a punch that reaches beyond an end of the beam (`press` refuses it): what reaches beyond
+    is taken to stand on the clamp there, and nothing moves. Loses digits where the punch is
+    narrower than some thousandth of a span: two points then are one.
 
     Args:
         beam: the beam and its supports.
-        s_c: middle of the punch, mm.
+        s_c: middle of the punch, mm; half a width off both ends.
         half_width: mm, more than 0.
     """
     ends = jnp.clip(jnp.stack([s_c - half_width, s_c + half_width]), 0, beam.length)

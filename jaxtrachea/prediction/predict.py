@@ -289,9 +289,11 @@ def check_position(results: StoredFit, s: float) -> None:
     Raises:
         ValueError: with what is expected.
     """
-    length = float(results.study.model.geometry.length)
-    if not 0 <= s <= length:
-        raise ValueError(f"s = {s:g} mm is not on the tube; expected 0 to {length:g} mm")
+    model = results.study.model
+    low, high = model.options.places(float(model.geometry.length))
+    if not low <= s <= high:
+        tool = f", with all of the tool (half_width {low:g} mm)" if low > 0 else ""
+        raise ValueError(f"s = {s:g} mm is not on the tube{tool}; expected {low:g} to {high:g} mm")
 
 
 def unknown_name(kind: str, name: str, known) -> str:
