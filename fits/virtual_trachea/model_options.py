@@ -7,27 +7,22 @@ nine; predicts three presses from seven, for every such choice; then the same wi
 Writes expected.json beside this file and docs/virtual_trachea.md. Takes a few minutes.
 """
 
-import dataclasses
-import functools
 import itertools
 import json
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.cli.specification import settings_of, study_of
 from jaxtrachea.config import FitSpec, load_fit_spec
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.inference.cross_validation import leave_one_out
+from jaxtrachea.inference.cross_validation import leave_one_out, refitted
 from jaxtrachea.inference.labels import peak_force
 from jaxtrachea.inference.residuals import rms
 from jaxtrachea.measurements.data_files import read_data
-from jaxtrachea.mechanics.press import press
 from jaxtrachea.status import FitStatus
-from jaxtrachea.trachea.material import material_of
 
 HERE = Path(__file__).parent
 DOC = HERE.parents[1] / "docs" / "virtual_trachea.md"
@@ -102,52 +97,30 @@ def held_out(spec: FitSpec) -> dict:
     Force: rms over the curve (of its last sample, where it is straight) over the curve's peak;
     markers at the largest displacement D, over D. Both rms and worst over all choices.
     """
-    measured = read_data(spec, HERE)
-    curves = measured.curves
+    study = study_of(spec, read_data(spec, HERE))
+    (curves,) = study.curves
     choices = [
         three for three in itertools.combinations(range(len(curves)), 3)
         if len({i for i in three if curves[i].s_c in TWINS}) != 1
     ]  # fmt: skip
-    lanes = [
-        dataclasses.replace(c, specimen=f"{k:03d}")
-        for k, three in enumerate(choices) for i, c in enumerate(curves) if i not in three
-    ]  # fmt: skip
-    study = study_of(spec, dataclasses.replace(measured, curves=tuple(lanes)))
-    result = fit(study, settings_of(spec))
-    rings = np.asarray(study.model.geometry.ring_positions)
+    held = np.zeros((len(choices), len(curves)), bool)
+    np.put_along_axis(held, np.array(choices), True, axis=1)
+    lanes = study.take(np.zeros(len(choices), int))
+    _, _, error = refitted(lanes, held, settings_of(spec), None)
     force, joints = [], []
-    for k, three in enumerate(choices):
-        for curve in (curves[i] for i in three):
-            F, w = _pressed(result, k, curve)
-            error = (F - curve.force)[1:] / np.max(np.abs(curve.force))
-            force.append(abs(error[-1]) if len(error) < 3 else np.sqrt(np.mean(error**2)))
-            seen = np.abs(rings[curve.joint_rings] - curve.s_c) > spec.data.tool_radius
-            off = (w[-1, curve.joint_rings] - curve.joint_displacement[-1])[seen]
-            joints.extend(off / curve.displacement[-1])
+    for lane, trial in np.argwhere(held):
+        curve = curves[trial]
+        last = len(curve.force) - 1
+        off = error.force[lane, trial, 1 : last + 1] / np.max(np.abs(curve.force))
+        force.append(abs(off[-1]) if last < 3 else np.sqrt(np.mean(off**2)))
+        off = error.joints[lane, trial, last] / curve.displacement[-1]
+        joints.extend(off[np.isfinite(off)])
     return {
         "choices": len(choices),
         "force": float(np.sqrt(np.mean(np.square(force)))),
         "force_worst": float(np.max(force)),
         "joints": float(np.sqrt(np.mean(np.square(joints)))),
     }
-
-
-def _pressed(result: FitResult, lane: int, curve) -> tuple[np.ndarray, np.ndarray]:
-    """Force and joints that a fit gives for the displacements of a curve."""
-    study = result.study
-    values = {p.name: p.value for p in study.parameters}
-    for i, (p, _, _) in enumerate(study.unknowns[lane]):
-        values[p.name] = result.value[lane, i]
-    values = {name: jnp.asarray(v, float) for name, v in values.items()}
-    D = jnp.asarray(curve.displacement)
-    out = _press(study.model, values, jnp.asarray(curve.s_c), D)
-    return np.asarray(out.force), np.asarray(out.joints)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _press(model, values, s_c, displacement):
-    tube = jax.tree.map(jnp.asarray, model.geometry)
-    return press(tube, material_of(values), s_c, displacement, model.options)
 
 
 def document(expected: dict) -> str:
