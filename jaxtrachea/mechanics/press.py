@@ -151,10 +151,11 @@ def softening_of(material: Material, options: Options) -> Softening | None:
     """
     if options.skeleton == "linear":
         return None
-    for name in Softening._fields:
-        if getattr(material, name) is None:
+    values = {name: getattr(material, name) for name in Softening._fields}
+    for name, value in values.items():
+        if value is None:
             raise ValueError(f"options.skeleton='softening' needs Material.{name}; it is None")
-    return Softening(*(getattr(material, name) for name in Softening._fields))
+    return Softening(**values)
 
 
 def touch(

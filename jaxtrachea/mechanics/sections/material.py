@@ -187,12 +187,12 @@ def from_wall(
     """
     pitches = ring_pitches(geometry)
     plane = 1 - wall.nu**2
-    ring, ligament = _composite(wall)[0], wall.E_L * wall.h**3 / 12
+    (ring, neutral), ligament = _composite(wall), wall.E_L * wall.h**3 / 12
     height = jnp.minimum(geometry.ring_height, pitches)
     EI_C = (ring * height + ligament * (pitches - height)) / plane
     R, mean_span = geometry.radius, geometry.length / (geometry.rings + 1)
     values: dict[str, Any] = {
-        "offset": wall.h - _composite(wall)[1] + 0 * R,
+        "offset": wall.h - neutral + 0 * R,
         "EI_C": factors.EI_C * EI_C,
         "EI_M": wall.E_M * wall.h_M**3 / 12 * pitches,
         "Et_M": factors.Et_M * wall.E_M * wall.h_M,
@@ -218,9 +218,14 @@ def neutral_radius(inner_radius: float, wall: Wall = Wall()) -> float:  # noqa: 
 
 def ring_pitches(geometry: Geometry) -> Float[Array, " rings"]:
     """Length of tube that belongs to each ring, mm: half of both its spans."""
+    nodes = ends_and_rings(geometry)
+    return (nodes[2:] - nodes[:-2]) / 2
+
+
+def ends_and_rings(geometry: Geometry) -> Float[Array, " nodes"]:
+    """Positions of one end of the tube, its rings and the other end, mm; shape (rings + 2,)."""
     x = geometry.ring_positions
-    ends = jnp.concatenate([jnp.zeros_like(x[:1]), x, geometry.length[None]])
-    return (ends[2:] - ends[:-2]) / 2
+    return jnp.concatenate([jnp.zeros_like(x[:1]), x, geometry.length[None]])
 
 
 def _composite(wall: Wall) -> tuple[float, float]:

@@ -23,6 +23,7 @@ from jaxtrachea.mechanics.sections.material import (
     POSITIVE,
     SectionMaterial,
     check_sections,
+    ends_and_rings,
     ring_pitches,
 )
 from jaxtrachea.mechanics.sections.solve import Solved, solve_path
@@ -170,15 +171,14 @@ def build(
     midline: bool,
 ) -> System:
     """The system of a press, of arguments that are checked."""
-    x, dtype = geometry.ring_positions, geometry.length.dtype
-    n = x.shape[0]
+    n, dtype = geometry.rings, geometry.length.dtype
     values = {f.name: getattr(material, f.name).astype(dtype) for f in dataclasses.fields(material)}
     shape = section.Shape(geometry.radius, values["offset"], geometry.half_angle)
     grid = section.make_grid(shape, midline=midline)
     per_ring = {k: jnp.broadcast_to(values[k], (n,)) for k in EACH_RING}
     per_span = {k: jnp.broadcast_to(values[k], (n + 1,)) for k in EACH_SPAN}
     rings = section.Ring(pitch=ring_pitches(geometry), **per_ring)
-    nodes = jnp.concatenate([jnp.zeros_like(x[:1]), x, geometry.length[None]])
+    nodes = ends_and_rings(geometry)
     forms = span.make_forms(grid, shape)
     make = jax.vmap(span.make_span, (0, 0, None, None))
     spans = make(span.Wall(**per_span), jnp.diff(nodes), forms, shape)
