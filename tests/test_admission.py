@@ -59,6 +59,7 @@ def bare(kind, start=None, **changes):
             ("rings", "mat"),
             ("dent", 0),
             ("surface", None),
+            ("options", Options()),
         ):
             object.__setattr__(record, field, changes.get(field, word))
         for field in ("contact", "curved", "friction", "second_plane", "axial", "end_motion",

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from jaxtrachea._arguments import check_record
+from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.skeleton import Rings
 from jaxtrachea.scene.effects import EFFECTS
@@ -89,12 +90,34 @@ class Plan:
     effects: tuple[Decision, ...] = dataclasses.field(default=(), compare=False, repr=False)
 
     def __post_init__(self):
-        """Refuse words and numbers that mean nothing.
+        """Refuse words and numbers that mean nothing, and options that no scene has.
 
         Raises:
             ValueError: naming the field, what was found and what is expected.
         """
         check_record(self, dent=0.0)
+        self._check_options()
+
+    def _check_options(self) -> None:
+        """Refuse options of `press` that a scene would ignore or get wrong.
+
+        Raises:
+            InputError: naming the option.
+        """
+        for name, level in (("half_width", 0.0), ("skeleton", "linear")):
+            if (found := getattr(self.options, name)) != level:
+                raise InputError(
+                    f"is {found!r}", key=f"options.{name}", joint=" ",
+                    expected=f"{level!r} in a scene", cure="press by `press` with it",
+                )  # fmt: skip
+        wanders = self.contact and self.contact_point == "per_step"
+        if wanders and self.options.split == "independent":
+            raise InputError(
+                "is 'independent', with which the stored energy jumps where a contact_point "
+                "'per_step' passes a ring, so that no force is its derivative",
+                key="options.split", joint=" ", expected="'continuous'",
+                cure="or keep the contact_point 'fixed'",
+            )  # fmt: skip
 
     def level(self, name: str) -> str:
         """The level of an effect."""

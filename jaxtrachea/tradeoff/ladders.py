@@ -57,7 +57,11 @@ def ladders(full: Full) -> tuple[list[Ladder], dict[str, str]]:
 
     flat, plan = one_plane(full), full.scene.plan
     add("form", "algebra", _words("form", "reactions", "recursion"), flat, second_plane="off")
-    add("split", "model", _words("split", "independent", "continuous"), flat, second_plane="off")
+    wanders = plan.contact and plan.contact_point == "per_step"
+    jumps = flat or (
+        "with 'independent' the energy of a contact that wanders jumps" if wanders else ""
+    )
+    add("split", "model", _words("split", "independent", "continuous"), jumps, second_plane="off")
     sliding = "friction needs coupling 'series'" if plan.friction else ""
     add("coupling", "model", _words("coupling", "total", "series"), sliding)
     reasons = {effect.name: effect.reason for effect in plan.effects}

@@ -1,7 +1,11 @@
 """What scenes cannot do yet is refused: a skeleton that softens, a tool's width off the midline."""
 
+import dataclasses
+import re
+
 import jax.numpy as jnp
 import pytest
+from small_scenes import BALL, BARE, MATERIAL, TUBE, ball
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.oblique import press_oblique, press_path
@@ -35,3 +39,37 @@ def test_oblique_presses_refuse(changes):
         press_oblique(table_1(), material, 75.0, 0.0, D, options)
     with pytest.raises(ValueError, match="half_width=0 and options.skeleton='linear'"):
         press_path(table_1(), material, 75.0, 0.0, D, 0.5, options)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"half_width": 2.4}, "options.half_width is 2.4; expected 0.0 in a scene; press by"),
+        ({"skeleton": "softening"}, "options.skeleton is 'softening'; expected 'linear' in a"),
+    ],
+)
+def test_plan_refuses(changes, says):
+    """One plane solved a softening skeleton as a linear one, and let a punch stand on a clamp."""
+    path = Presses(jnp.array([75.0]), jnp.zeros(1), jnp.array([[0.0, -1.0, 0.0]]))
+    plan = make_scene(table_1(), Material(**VALUES), path, effects=BARE).plan
+    with pytest.raises(InputError, match=re.escape(says)):
+        dataclasses.replace(plan, options=dataclasses.replace(plan.options, **changes))
+
+
+@pytest.mark.parametrize("contact_point", ["fixed", "per_step"])
+def test_plan_refuses_a_split_without_an_energy(contact_point):
+    """Of a tool that wanders; a place that is kept, and presses at places, have it."""
+    effects = dataclasses.replace(BARE, contact_point=contact_point)
+    plan = make_scene(
+        TUBE, MATERIAL, ball([75, 1, 0], [75, -2, 0]), tool=BALL, effects=effects
+    ).plan
+    options = dataclasses.replace(plan.options, split="independent")
+    if contact_point == "per_step":
+        with pytest.raises(InputError, match="options.split is 'independent'.*'continuous'.*fixed"):
+            dataclasses.replace(plan, options=options)
+    else:
+        assert dataclasses.replace(plan, options=options).options.split == "independent"
+    path = Presses(jnp.array([75.0, 62.0]), jnp.zeros(2), jnp.array([[0.0, -1.0, 0.0]] * 2))
+    plan = make_scene(TUBE, MATERIAL, path, effects=BARE).plan
+    assert plan.contact_point == "per_step"
+    assert dataclasses.replace(plan, options=options).options.split == "independent"
