@@ -38,18 +38,35 @@ class Fault(Exception):
 class Curve:
     """One trial: force against displacement at one contact point, in mm, N, rad.
 
+    Vectors in the plane of the section at the contact have two components: along the inward
+    normal at `phi_c`, and along the circumference, towards growing phi ("side").
+
     Attributes:
         specimen: name of the specimen.
         trial: name of the trial, unique within the specimen.
         s_c: contact position along the centreline, mm; None if the file does not say.
         phi_c: contact angle from the anterior midline, rad.
-        displacement: (N,) mm, positive inward (press).
-        force: (N,) N, positive resisting.
-        sigma: (N,) N, standard deviation of each force sample, or None.
+        displacement: (N,) mm of the tool along `direction`, positive inward (press).
+        force: (N,) N, component along `direction` of the force of the tool on the wall, positive
+            resisting.
+        sigma: (N,) N, standard deviation of each sample of the force, and of `side_force`, or None.
         joint_rings: (M,) 0-based ring index of each marker, or None.
-        joint_displacement: (N, M) mm along the inward normal, NaN where not observed, or None.
+        joint_displacement: (N, M) mm along the inward normal at `phi_c`, NaN where not observed, or
+            None.
         source: file, and lines or group, it came from.
         usage: what of the record this is, or None if nobody says.
+        direction: unit vector of the tool's displacement: components along the inward normal and
+            along the circumference, without unit.
+        side_force: (N,) N, component of the same force along `direction` turned by 90 degrees from
+            the inward normal towards growing phi: for a press along the normal the force along the
+            circumference. NaN where not observed, or None.
+        joint_side_displacement: (N, M) mm of the markers of `joint_rings` along the circumference
+            at `phi_c`, NaN where not observed, or None.
+        end_rings: (K,) 0-based index of each ring whose ends are observed, or None.
+        end_U: (N, K, 2) mm, displacement of the outer surface at the ring's end U, phi = -alpha:
+            components y (anterior) and z (to the side of positive phi); NaN where not observed, or
+            None.
+        end_V: (N, K, 2) mm, likewise at the end V, phi = +alpha, or None.
     """
 
     specimen: str
@@ -63,6 +80,12 @@ class Curve:
     joint_displacement: Float64[np.ndarray, "n m"] | None = None
     source: str = ""
     usage: Usage | None = None
+    direction: tuple[float, float] = (1.0, 0.0)
+    side_force: Float64[np.ndarray, " n"] | None = None
+    joint_side_displacement: Float64[np.ndarray, "n m"] | None = None
+    end_rings: Integer[np.ndarray, " k"] | None = None
+    end_U: Float64[np.ndarray, "n k 2"] | None = None
+    end_V: Float64[np.ndarray, "n k 2"] | None = None
 
 
 @dataclass(frozen=True)
@@ -124,6 +147,12 @@ class RawCurve:
     joint_rings: np.ndarray | None = None
     joint_displacement: np.ndarray | None = None
     time: np.ndarray | None = None
+    direction: tuple[float, float] = (1.0, 0.0)
+    side_force: np.ndarray | None = None
+    joint_side_displacement: np.ndarray | None = None
+    end_rings: np.ndarray | None = None
+    end_U: np.ndarray | None = None
+    end_V: np.ndarray | None = None
 
     @classmethod
     def of_columns(
