@@ -292,7 +292,9 @@ def column_unit(header: str) -> tuple[str, str | None]:
     match = re.fullmatch(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))", text)
     if match and match[1]:
         return match[1], (match[2] if match[2] is not None else match[3]).strip()
-    match = re.fullmatch(r"(.+?)\s*(?:_|\s/\s)\s*([^_]+)", text)
-    if match and is_unit(match[2]) and not re.fullmatch(r"[\d\s-]+", match[2]):
-        return match[1], match[2].strip()
+    # A name may hold underscores and still have its unit after a slash: joint_7 / mm.
+    for separator in ("_", r"\s/\s"):
+        match = re.fullmatch(rf"(.+?)\s*{separator}\s*([^_]+)", text)
+        if match and is_unit(match[2]) and not re.fullmatch(r"[\d\s-]+", match[2]):
+            return match[1], match[2].strip()
     return text, None

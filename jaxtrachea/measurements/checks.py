@@ -1,12 +1,18 @@
 """The checks every curve passes, whatever its file: sign, loading branch, window, plausibility."""
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 
 from jaxtrachea.measurements.curve import BadCurve, Curve, Fault, RawCurve, ReadOptions
 from jaxtrachea.measurements.loading import check_one_loading, segments_of, selection, usage_of
+from jaxtrachea.measurements.vectors import (
+    check_vector_shapes,
+    check_vector_sizes,
+    listed,
+    unit_direction,
+    vectors_of,
+)
 
 #: Positions that differ by less, mm and rad, are one: a stage of the rig stands no steadier.
 STEADY = {"s": 0.05, "phi": 1e-3}
@@ -17,8 +23,8 @@ UPSIDE_DOWN = -0.5
 def finish(raw: RawCurve, options: ReadOptions) -> Curve | BadCurve:
     """Turn what a reader found into a usable curve, or into the reason why it is none.
 
-    Order: shapes, finite numbers, signs, plausible size, segments, displacement window, number of
-    points, monotone displacement (where required), signal.
+    Order: shapes, finite numbers, position, direction, signs, plausible size, segments,
+    displacement window, number of points, monotone displacement (where required), signal.
 
     Args:
         raw: the curve as read, in mm, N, rad.
@@ -42,12 +48,14 @@ def bad(specimen: str, trial: str, source: str, fault: Fault) -> BadCurve:
 def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
     _check_shapes(raw)
     _check_finite(raw)
+    check_vector_sizes(raw, options)
     s_c = _position("s", raw.s, options.s_mm, "mm")
     phi_c = _position("phi", raw.phi, options.phi_rad, "rad") or 0.0
     if abs(phi_c) > 2 * math.pi:
         raise Fault(
             "absurd_scale", f"phi is {phi_c:g} rad, more than a turn", "is its unit deg, not rad?"
         )
+    direction = unit_direction(raw)
     displacement = options.displacement_sign * raw.displacement
     force = options.force_sign * raw.force
     _check_scale(raw, displacement, force, options)
@@ -57,7 +65,6 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
     if options.loading == "require-monotone":
         check_one_loading(raw, displacement, keep, found)
     _check_signal(displacement[keep], force[keep])
-    joints = raw.joint_displacement
     return Curve(
         specimen=raw.specimen,
         trial=raw.trial,
@@ -66,10 +73,10 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
         displacement=np.ascontiguousarray(displacement[keep], dtype=np.float64),
         force=np.ascontiguousarray(force[keep], dtype=np.float64),
         sigma=None if raw.sigma is None else raw.sigma[keep].astype(np.float64),
-        joint_rings=None if raw.joint_rings is None else raw.joint_rings.astype(np.int64),
-        joint_displacement=None if joints is None else joints[keep].astype(np.float64),
         source=raw.source,
         usage=usage_of(raw, displacement, force, keep, found, options),
+        direction=direction,
+        **vectors_of(raw, keep, options),
     )
 
 
@@ -87,31 +94,7 @@ def _check_shapes(raw: RawCurve) -> None:
         raise Fault("empty", "there are no samples", "remove the curve or export it again")
     if raw.time is not None and raw.time.shape != n:
         raise Fault("shape", f"time has shape {raw.time.shape}, displacement {n}", "store both")
-    rings, joints = raw.joint_rings, raw.joint_displacement
-    if (rings is None) != (joints is None):
-        raise Fault(
-            "shape", "joint displacements and ring numbers must come together", "store both"
-        )
-    if rings is None or joints is None:
-        return
-    if rings.ndim != 1 or joints.shape != (n[0], rings.size):
-        raise Fault(
-            "shape",
-            f"joint displacements have shape {joints.shape},"
-            f" expected {(n[0], rings.size)} (samples, markers)",
-            "store one row per sample and one column per ring",
-        )
-    if rings.size and (rings.min() < 0 or np.unique(rings).size != rings.size):
-        raise Fault(
-            "shape", "a ring number is repeated or below 1", "give each ring once, counted from 1"
-        )
-
-
-def _listed(rows: Iterable, word: str) -> str:
-    """``lines 3, 4, 9 and 12 more``."""
-    rows = [int(row) for row in rows]
-    more = f" and {len(rows) - 5} more" if len(rows) > 5 else ""
-    return f"{word}{'s' if len(rows) > 1 else ''} {', '.join(map(str, rows[:5]))}{more}"
+    check_vector_shapes(raw)
 
 
 def _check_finite(raw: RawCurve) -> None:
@@ -122,20 +105,13 @@ def _check_finite(raw: RawCurve) -> None:
             rows = raw.rows[~np.isfinite(values)]
             raise Fault(
                 "non_finite",
-                f"{name} is empty, NaN or infinite in {_listed(rows, raw.row_word)}",
+                f"{name} is empty, NaN or infinite in {listed(rows, raw.row_word)}",
                 "remove these samples from the file",
             )
-    if raw.joint_displacement is not None and np.isinf(raw.joint_displacement).any():
-        rows = raw.rows[np.isinf(raw.joint_displacement).any(axis=1)]
-        raise Fault(
-            "non_finite",
-            f"a joint displacement is infinite in {_listed(rows, raw.row_word)}",
-            "leave a marker that was not seen empty or NaN",
-        )
     if raw.sigma is not None and not (raw.sigma > 0).all():
         raise Fault(
             "bad_sigma",
-            f"sigma is not positive in {_listed(raw.rows[~(raw.sigma > 0)], raw.row_word)}",
+            f"sigma is not positive in {listed(raw.rows[~(raw.sigma > 0)], raw.row_word)}",
             "give the standard deviation of the force, or no sigma at all",
         )
 

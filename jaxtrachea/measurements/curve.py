@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Integer
 
 from jaxtrachea._errors import InputError
+from jaxtrachea.measurements.roles import RING_ROLES, ROLES, is_role, role_dimension
 from jaxtrachea.measurements.usage import Usage
 from jaxtrachea.units import UnitError, parse_quantity, unit_factor
 
@@ -98,7 +99,7 @@ class BadCurve:
         source: file, and lines or group, it came from.
         kind: short code: "empty", "too_few_points", "unparsable", "ragged", "column_missing",
             "ambiguous", "unit_missing", "unit_unknown", "shape", "non_finite", "bad_sigma",
-            "position", "absurd_scale", "time", "non_monotone", "no_signal", "sign",
+            "position", "direction", "absurd_scale", "time", "non_monotone", "no_signal", "sign",
             "metadata_missing", "unreadable".
         message: one line: file, place, what was found and what expected.
         cure: one line.
@@ -147,58 +148,16 @@ class RawCurve:
     joint_rings: np.ndarray | None = None
     joint_displacement: np.ndarray | None = None
     time: np.ndarray | None = None
-    direction: tuple[float, float] = (1.0, 0.0)
+    direction: tuple[float, ...] = (1.0, 0.0)
     side_force: np.ndarray | None = None
     joint_side_displacement: np.ndarray | None = None
     end_rings: np.ndarray | None = None
     end_U: np.ndarray | None = None
     end_V: np.ndarray | None = None
 
-    @classmethod
-    def of_columns(
-        cls, key: tuple[str, str], source: str, values: Mapping[str, np.ndarray], **fields
-    ) -> "RawCurve":
-        """The curve of a table's columns.
-
-        Args:
-            key: specimen and trial.
-            source: file and place.
-            values: columns by role, in mm and N.
-            fields: the other fields.
-        """
-        joints = [role for role in values if role.startswith("joint_")]
-        return cls(
-            *key,
-            source,
-            values["displacement"],
-            values["force"],
-            sigma=values.get("sigma"),
-            joint_rings=np.array([int(r[6:]) - 1 for r in joints]) if joints else None,
-            joint_displacement=np.stack([values[r] for r in joints], axis=1) if joints else None,
-            **fields,
-        )
-
 
 #: "loading" means "first".
 LOADINGS = ("last", "first", "loading", "all", "require-monotone")
-ROLE_DIMENSIONS = {
-    "s": "length",
-    "phi": "angle",
-    "displacement": "length",
-    "force": "force",
-    "sigma": "force",
-    "time": "time",
-    "joint": "length",
-}
-ROLES = ("specimen", "trial", *ROLE_DIMENSIONS)
-# A marker column in a header, and its role: ring numbers count from 1 at the carina end.
-JOINT = re.compile(r"joint[ _]?(\d{1,4})")
-JOINT_ROLE = re.compile(r"joint_[1-9]\d{0,3}")
-
-
-def role_dimension(role: str) -> str:
-    """Dimension of a role, e.g. ``"length"`` for ``"displacement"`` or ``"joint_7"``."""
-    return ROLE_DIMENSIONS["joint" if JOINT_ROLE.fullmatch(role) else role]
 
 
 @dataclass(frozen=True)
@@ -207,9 +166,12 @@ class ReadOptions:
 
     Attributes:
         format: "auto" (by content), or the name of one of `readers.READERS`.
-        columns: role -> column name. Roles: specimen, trial, s, phi, displacement, force, sigma,
-            time, and ``joint_7`` for the marker of ring number 7 (counted from 1).
+        columns: role -> column name. Roles: specimen, trial, s, phi, displacement, force,
+            side_force, sigma, time; of ring number 7 (counted from 1) ``joint_7`` and
+            ``joint_7_side`` for the marker, ``end_U_7_y``, ``end_U_7_z``, ``end_V_7_y`` and
+            ``end_V_7_z`` for the ends.
         units: role -> unit, for a file that names none; against what the file says, it is an error.
+            ``joint`` stands for the markers of all rings, ``end`` for all ends.
         specimen: how a file name gives specimen and trial: a template ``"{specimen}_A{trial}"`` for
             the name without suffix, or a regular expression searched in the name, such as
             ``r"(?P<specimen>EF\d+_\w+T)_A(?P<trial>\d)"``. ``s`` and ``phi`` may be named
@@ -221,8 +183,10 @@ class ReadOptions:
         loading: "last" or "first" (that full loading, from its foot to its peak, without holds;
             "loading" is "first"), "all" (every sample) or "require-monotone" (a record that is
             more than one loading, or holds its peak, is bad).
-        force_sign: -1 if the file counts the resisting force negative.
-        displacement_sign: -1 if the file counts inward displacement negative.
+        force_sign: -1 if the file counts the resisting force negative; it turns the whole force,
+            `side_force` too.
+        displacement_sign: -1 if the file counts inward displacement of the tool negative; it turns
+            neither the markers nor the ends of the rings nor the direction.
         sheet: which sheet of a workbook holds the table; None: the first that is not hidden.
         min_points: fewest samples of a curve.
         max_displacement: largest plausible displacement, mm.
@@ -256,12 +220,14 @@ class ReadOptions:
         _one_of("force_sign", self.force_sign, (1, -1))
         _one_of("displacement_sign", self.displacement_sign, (1, -1))
         for role in [*self.columns, *self.units]:
-            if role not in ROLES and not JOINT_ROLE.fullmatch(role):
+            if not is_role(role):
                 table = "columns" if role in self.columns else "units"
                 known = ", ".join(ROLES)
-                raise ValueError(f"role {role!r} in {table}; expected one of {known}, joint_<ring>")
+                raise ValueError(f"role {role!r} in {table}; expected one of {known}, {RING_ROLES}")
         if "joint" in self.columns:
             raise ValueError("columns: say which ring the marker is on, as in joint_7")
+        if "end" in self.columns:
+            raise ValueError("columns: say which end of which ring, and y or z, as in end_U_7_y")
         for role, unit in self.units.items():
             if role in ("specimen", "trial"):
                 raise ValueError(f"units: {role} is a name and has no unit; remove it")

@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxtrachea.files.tables import unquoted
 from jaxtrachea.measurements.checks import STEADY, bad
+from jaxtrachea.measurements.columns import curve_of_columns
 from jaxtrachea.measurements.curve import (
     BadCurve,
     DataError,
@@ -13,7 +14,6 @@ from jaxtrachea.measurements.curve import (
     RawCurve,
     ReadOptions,
     identify_file,
-    role_dimension,
 )
 from jaxtrachea.measurements.readers.lines import Line, Text, is_comment
 from jaxtrachea.measurements.readers.reader import Reader
@@ -29,9 +29,10 @@ from jaxtrachea.measurements.readers.text import (
     split_cells,
     time_values,
 )
+from jaxtrachea.measurements.roles import SAMPLED, is_ring_role, role_dimension
 from jaxtrachea.units import column_unit, parse_quantity
 
-NUMERIC = ("s", "phi", "displacement", "force", "sigma")
+NUMERIC = ("s", "phi", *SAMPLED)
 
 
 def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
@@ -56,7 +57,7 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
         units = {
             role: resolve_unit(role, table.units[i], options, f"column {table.names[i]!r}")
             for role, i in roles.items()
-            if role in NUMERIC or role.startswith("joint_")
+            if role in NUMERIC or is_ring_role(role)
         }
     except Fault as fault:
         raise DataError(fault.message, place=place, cure=fault.cure) from None
@@ -100,7 +101,20 @@ def _state(lines: list[Line], word: str) -> tuple[dict, list[Line]]:
                 raise DataError(
                     f"{word} {lines[0].number}: {key}: {error}",
                 ) from None
+    if "direction" in state:
+        known["direction"] = _two_numbers(state["direction"], f"{word} {lines[0].number}")
     return known, lines[1:]
+
+
+def _two_numbers(value: object, line: str) -> tuple[float, ...]:
+    """The direction of the tool from the first line; its length is checked later."""
+    numbers = value if isinstance(value, list) else []
+    if len(numbers) != 2 or any(type(v) not in (int, float) for v in numbers):
+        raise DataError(
+            f"{line}: direction is {json.dumps(value)[:80]}, expected two numbers, as [0.8, 0.6]",
+            cure="give the components along the inward normal and along the circumference",
+        )
+    return tuple(map(float, numbers))
 
 
 def _table(text: Text, lines: list[Line]) -> Table:
@@ -214,7 +228,7 @@ def _curve(
             role: role_values(table, role, roles[role], picked, unit)
             for role, unit in units.items()
         }
-        return RawCurve.of_columns(
+        return curve_of_columns(
             key,
             source,
             values,
@@ -223,6 +237,7 @@ def _curve(
             s=_constant("s", values, state, table, picked),
             phi=_constant("phi", values, state, table, picked),
             time=time_values(table, roles, picked, options),
+            direction=state.get("direction", (1.0, 0.0)),
         )
     except Fault as fault:
         return bad(*key, source, fault)

@@ -20,10 +20,13 @@ from jaxtrachea.measurements.readers.safe_hdf5 import (
     unit_of,
 )
 from jaxtrachea.measurements.readers.text import resolve_unit
+from jaxtrachea.measurements.roles import role_dimension
 from jaxtrachea.units import convert
 
 SCHEMA = "jaxtrachea-measurements"
 SCHEMA_VERSION = 1
+#: Datasets that a trial may have beside those of a normal press, with the unit they are written in.
+OPTIONAL = {"side_force": "N", "joint_side_displacement": "mm", "end_U": "mm", "end_V": "mm"}
 # Below this a chunk's overhead outweighs compression.
 COMPRESS_FROM = 512
 
@@ -97,13 +100,6 @@ def _trial(group: Any, key: tuple[str, str], source: str, options: ReadOptions) 
             "shape", "is a dataset, expected a group for the trial", "store a group per trial"
         )
     displacement = _quantity(group, "displacement", "displacement", source, options)
-    rings = joints = None
-    if "joint_displacement" in group or "joint_ring_number" in group:
-        joints = _quantity(group, "joint_displacement", "joint", source, options)
-        rings = numeric(group, "joint_ring_number")
-        if not (np.isfinite(rings).all() and (rings == np.round(rings)).all()):
-            raise Fault("shape", "joint_ring_number is not whole", "number rings 1, 2, ...")
-        rings = rings.astype(np.int64) - 1
     return RawCurve(
         *key,
         source,
@@ -114,10 +110,59 @@ def _trial(group: Any, key: tuple[str, str], source: str, options: ReadOptions) 
         s=_position(group, "s", source, options),
         phi=_position(group, "phi", source, options),
         sigma=_quantity(group, "sigma", "sigma", source, options) if "sigma" in group else None,
-        joint_rings=rings,
-        joint_displacement=joints,
         time=_time(group, source, options),
+        direction=_direction(group),
+        **_markers(group, source, options),
+        **_vectors(group, source, options),
     )
+
+
+def _markers(group: Any, source: str, options: ReadOptions) -> dict[str, np.ndarray]:
+    """Markers on the rings; what is stored without its ring numbers is missing them."""
+    names = ("joint_displacement", "joint_side_displacement")
+    if not any(name in group for name in (*names, "joint_ring_number")):
+        return {}
+    found = {"joint_rings": _ring_indices(group, "joint_ring_number")}
+    for name in names:
+        if name == "joint_displacement" or name in group:
+            found[name] = _quantity(group, name, "joint", source, options)
+    return found
+
+
+def _vectors(group: Any, source: str, options: ReadOptions) -> dict[str, np.ndarray]:
+    """Side force, and the ends of the rings with their numbers."""
+    found = {}
+    if "side_force" in group:
+        found["side_force"] = _quantity(group, "side_force", "side_force", source, options)
+    ends = [name for name in ("end_U", "end_V") if name in group]
+    if ends or "end_ring_number" in group:
+        found["end_rings"] = _ring_indices(group, "end_ring_number")
+    for name in ends:
+        found[name] = _quantity(group, name, "end", source, options)
+    return found
+
+
+def _ring_indices(group: Any, name: str) -> np.ndarray:
+    """Rings counted from 0, of a dataset that counts from 1."""
+    rings = numeric(group, name)
+    if not (np.isfinite(rings).all() and (rings == np.round(rings)).all()):
+        raise Fault("shape", f"{name} is not whole", "number rings 1, 2, ...")
+    return rings.astype(np.int64) - 1
+
+
+def _direction(group: Any) -> tuple[float, ...]:
+    """Attribute ``direction`` of a trial; its length is checked later."""
+    value = attribute(group, "direction")
+    if value is None:
+        return (1.0, 0.0)
+    numbers = np.asarray(value)
+    if numbers.dtype.kind not in "iuf" or numbers.shape != (2,):
+        raise Fault(
+            "direction",
+            f"attribute direction is {value!r}, expected two numbers",
+            "store its components along the inward normal and along the circumference",
+        )
+    return tuple(map(float, numbers))
 
 
 def _time(group: Any, source: str, options: ReadOptions) -> np.ndarray | None:
@@ -131,7 +176,7 @@ def _time(group: Any, source: str, options: ReadOptions) -> np.ndarray | None:
 def _quantity(group: Any, name: str, role: str, source: str, options: ReadOptions) -> np.ndarray:
     values = numeric(group, name)
     unit = resolve_unit(role, unit_of(group, name), options, f"{source}/{name}")
-    return np.atleast_1d(convert(values, unit, "force" if role in ("force", "sigma") else "length"))
+    return np.atleast_1d(convert(values, unit, role_dimension(role)))
 
 
 def _position(group: Any, role: str, source: str, options: ReadOptions) -> float | None:
@@ -211,6 +256,13 @@ def _write_curve(specimens: Any, curve: Curve) -> None:
     if curve.joint_rings is not None and curve.joint_displacement is not None:
         _write_dataset(group, "joint_displacement", curve.joint_displacement, "mm")
         _write_dataset(group, "joint_ring_number", np.asarray(curve.joint_rings) + 1, None)
+    if tuple(curve.direction) != (1.0, 0.0):
+        group.attrs["direction"] = np.array(curve.direction, dtype=np.float64)
+    for name, unit in OPTIONAL.items():
+        if (values := getattr(curve, name)) is not None:
+            _write_dataset(group, name, values, unit)
+    if curve.end_rings is not None:
+        _write_dataset(group, "end_ring_number", np.asarray(curve.end_rings) + 1, None)
 
 
 def _write_dataset(group: Any, name: str, values: np.ndarray, unit: str | None) -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxtrachea.measurements.checks import bad
+from jaxtrachea.measurements.columns import curve_of_columns
 from jaxtrachea.measurements.curve import BadCurve, Fault, RawCurve, ReadOptions, identify_file
 from jaxtrachea.measurements.readers.lines import Line, Text, is_comment
 from jaxtrachea.measurements.readers.reader import Reader
@@ -16,6 +17,7 @@ from jaxtrachea.measurements.readers.text import (
     split_cells,
     time_values,
 )
+from jaxtrachea.measurements.roles import SAMPLED, is_ring_role
 from jaxtrachea.units import column_unit, is_unit
 
 # A header further down than this is no header.
@@ -48,17 +50,17 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
             source = f"{text.place}:{rows[0]}-{rows[-1]}"
         values = _values(table, roles, options)
         time = time_values(table, roles, range(len(table.rows)), options)
+        place = {"rows": rows, "row_word": text.word, "s": who.s, "phi": who.phi}
+        return [curve_of_columns((who.specimen, trial), source, values, time=time, **place)]
     except Fault as fault:
         return [bad(who.specimen, trial, source, fault)]
-    place = {"rows": rows, "row_word": text.word, "s": who.s, "phi": who.phi}
-    return [RawCurve.of_columns((who.specimen, trial), source, values, time=time, **place)]
 
 
 def _values(table: Table, roles: dict[str, int], options: ReadOptions) -> dict[str, np.ndarray]:
     """Columns by role in mm and N; position columns are not looked for in a machine file."""
     values = {}
     for role, i in roles.items():
-        if role in ("displacement", "force", "sigma") or role.startswith("joint_"):
+        if role in SAMPLED or is_ring_role(role):
             place = f"{table.text.place}: column {table.names[i]!r}"
             unit = resolve_unit(role, table.units[i], options, place)
             values[role] = role_values(table, role, i, range(len(table.rows)), unit)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxtrachea.measurements.curve import JOINT, DataError, Fault, ReadOptions, role_dimension
+from jaxtrachea.measurements.curve import DataError, Fault, ReadOptions
 from jaxtrachea.measurements.readers.lines import Line, Text, is_comment
+from jaxtrachea.measurements.roles import general_role, ring_role_of, role_dimension
 from jaxtrachea.units import UnitError, column_unit, convert, unit_factor
 
 # Column names understood without `ReadOptions.columns`, in lower case.
@@ -19,6 +20,7 @@ ALIASES = {
     "phi": ("phi", "phi_c"),
     "displacement": ("displacement", "compression", "indentation", "compressive displacement"),
     "force": ("force", "load", "compressive load", "compressive force"),
+    "side_force": ("side_force", "side force"),
     "sigma": ("sigma", "force_sigma", "force_noise"),
 }
 # Columns of time, taken where they have a unit; they tell the duration of holds.
@@ -146,10 +148,10 @@ def find_roles(names: Sequence[str], options: ReadOptions) -> dict[str, int]:
         if hits:
             found[role] = hits[0]
     for i, name in enumerate(lower):
-        match = JOINT.fullmatch(name)
-        if match and i not in found.values():
-            role = f"joint_{int(match[1])}"
-            if int(match[1]) < 1 or role in found:
+        of_ring = ring_role_of(name)
+        if of_ring is not None and i not in found.values():
+            role, ring = of_ring
+            if ring < 1 or role in found:
                 raise Fault(
                     "ambiguous", f"column {names[i]!r}: ring below 1 or given twice", "count from 1"
                 )
@@ -178,7 +180,7 @@ def resolve_unit(role: str, found: str | None, options: ReadOptions, place: str)
     """The unit of a role, from the file or from the options, which must not contradict.
 
     Args:
-        role: e.g. ``"force"`` or ``"joint_7"``.
+        role: e.g. ``"force"``, ``"joint_7"`` or ``"end_U_7_y"``.
         found: the unit the file gives, or None.
         options: units for files that give none.
         place: for messages, e.g. ``"column 'Load'"``.
@@ -187,7 +189,7 @@ def resolve_unit(role: str, found: str | None, options: ReadOptions, place: str)
         Fault: no unit ("unit_missing") or an unknown one ("unit_unknown").
         DataError: file and options contradict each other.
     """
-    general = "joint" if role.startswith("joint_") else role
+    general = general_role(role)
     given = options.units.get(role, options.units.get(general))
     unit = given if found is None else found
     if unit is None:
