@@ -72,7 +72,7 @@ WITHIN = {
         {"press"},
     ],
     "fitting": [
-        {"parameters", "lane"},
+        {"parameters", "lane", "unread"},
         {"model"},
         {"lanes", "onset"},
         {"study"},

@@ -152,6 +152,8 @@ def test_no_quantity(text):
         ("Engineering Strain [-]", "Engineering Strain", "-"),
         ("joint_7 [mm]", "joint_7", "mm"),
         ("joint_7", "joint_7", None),
+        ("joint_7 / mm", "joint_7", "mm"),
+        ("stiffness_N / mm", "stiffness", "N / mm"),
         ("phi_c", "phi_c", None),
         ("load (kgs)", "load", "kgs"),
         ("force", "force", None),

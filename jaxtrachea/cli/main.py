@@ -7,6 +7,7 @@ heavy is imported inside the commands.
 
 import contextlib
 import dataclasses
+import math
 import sys
 import time
 from pathlib import Path
@@ -184,17 +185,24 @@ def _print_usage(out: Console, curves) -> None:
 
 
 def _curve_table(curves):
+    """Curves, one a row; angle and vectors only where some curve has them."""
+    from jaxtrachea.measurements.vectors import vector_words
+
     rows = []
+    turned, several = any(c.phi_c for c in curves), any(map(vector_words, curves))
     for curve in curves[:MANY]:
         where = "–" if curve.s_c is None else f"{curve.s_c:.4g}"
         markers = 0 if curve.joint_displacement is None else curve.joint_displacement.shape[1]
         spans = [f"{v.min():.3g} … {v.max():.3g}" for v in (curve.displacement, curve.force)]
         recorded = len(curve.force) if curve.usage is None else curve.usage.recorded
-        counts = [str(len(curve.force)), str(recorded)]
-        row = [curve.specimen, curve.trial, where, *counts, *spans, str(markers)]
+        row = [curve.specimen, curve.trial, where]
+        row += [f"{math.degrees(curve.phi_c):.4g}"] if turned else []
+        row += [str(len(curve.force)), str(recorded), *spans, str(markers)]
+        row += [vector_words(curve)] if several else []
         rows.append(row)
-    head = ["specimen", "trial", "s [mm]", "n", "of", "D [mm]", "F [N]", "markers"]
-    return table(f"{len(curves)} usable curves", head, rows)
+    head = ["specimen", "trial", "s [mm]", *(["phi [deg]"] if turned else [])]
+    head += ["n", "of", "D [mm]", "F [N]", "markers", *(["vectors"] if several else [])]
+    return table(f"{len(curves)} usable curves", head, rows, ("vectors",))
 
 
 def _parameter_table(parameters, options):

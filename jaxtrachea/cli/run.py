@@ -59,7 +59,8 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     write_tables(folder, findings)
     drawn, lost = draw_all(folder, findings)
     say_lost(lost)
-    title, used = loaded.title or spec.stem, usage_section(measurements.curves)
+    title = loaded.title or spec.stem
+    used = usage_section(measurements.curves, measurements.notes)
     text = without_lost(report_text(title, findings, measurements.bad, used), lost)
     write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]

@@ -8,6 +8,7 @@ from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, in_model, visible
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study, check_curve
+from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.measurements.read import (
     BadCurve,
     Measurements,
@@ -90,6 +91,8 @@ def _free(default: Parameter, section: ParameterSection) -> Parameter:
 def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
     """The measurements with curves that this tube and model cannot press moved to the bad ones.
 
+    What the model does not read of the others is left out, and a note says so.
+
     Raises:
         SpecError: not one curve is left; the message is that of the first.
     """
@@ -108,7 +111,9 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
             good.append(curve)
     if reasons and not good:
         raise SpecError(reasons[0])
-    return dataclasses.replace(measurements, curves=tuple(good), bad=tuple(bad))
+    good, unread = along_the_normal(good)
+    notes = measurements.notes if unread is None else (*measurements.notes, unread)
+    return dataclasses.replace(measurements, curves=tuple(good), bad=tuple(bad), notes=notes)
 
 
 #: Unknowns up to which a study with shared parameters is refitted as one dense lane.

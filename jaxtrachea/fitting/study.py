@@ -22,6 +22,7 @@ from jaxtrachea.fitting.lanes import Balance, Noise, Unknown, group, lanes_of, u
 from jaxtrachea.fitting.model import Common, FitModel, Loss, columns_of, numbers_of
 from jaxtrachea.fitting.onset import blends, natural_steps, onset_is_sought, within_reach
 from jaxtrachea.fitting.parameters import DEFAULTS, SKELETON, Parameter, in_model
+from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import Geometry
@@ -133,7 +134,8 @@ def build_study(
 
     Args:
         curves: at least one; `s_c` set wherever the skeleton enters. Of `Measurements` the usable
-            ones; a warning names what could not be used.
+            ones; a warning names what could not be used. Side forces, sideward markers and ring
+            ends are not read and left out of the study; a warning says so.
         geometry: the tube at rest (`Geometry.create` takes plain numbers; kept as float64).
         options: what the model includes.
         parameters: the table, in the order of `parameters.in_model`; or changes to the defaults of
@@ -160,6 +162,9 @@ def build_study(
         raise ValueError("no usable curve; nothing to fit")
     for curve in curves:
         check_curve(curve, geometry, options)
+    curves, unread = along_the_normal(curves)
+    if unread is not None:
+        warnings.warn(unread, stacklevel=2)
     parameters = natural_steps(_table(parameters, options, curves), curves)
     joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1
@@ -223,9 +228,9 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
     """Refuse a curve that the model cannot press.
 
     Raises:
-        InputError: no contact position, one outside the tube or off the midline, a tool whose width
-            reaches beyond an end of the tube, a marker on a ring that does not exist; specimen and
-            trial are named.
+        InputError: no contact position, one outside the tube or off the midline, a tool that moves
+            aside or whose width reaches beyond an end of the tube, a marker or an end of a ring
+            that does not exist; specimen and trial are named.
     """
     where = f"specimen {curve.specimen!r} trial {curve.trial!r}"
     length, rings = float(geometry.length), geometry.rings
@@ -249,8 +254,18 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
             "anterior midline (phi = 0) only",
             place=where,
         )
+    if abs(curve.direction[1]) > 1e-6:
+        shown = ", ".join(f"{v:.4g}" for v in curve.direction)
+        raise InputError(
+            f"the tool moves in the direction ({shown}); this model presses along the inward "
+            "normal (1, 0) only",
+            place=where,
+        )
     if curve.joint_rings is not None and np.any(curve.joint_rings >= rings):
         found = f"marker on ring {curve.joint_rings.max() + 1} of {rings}"
+        raise InputError(found, place=where)
+    if curve.end_rings is not None and np.any(curve.end_rings >= rings):
+        found = f"end of ring {curve.end_rings.max() + 1} of {rings}"
         raise InputError(found, place=where)
 
 

@@ -125,14 +125,20 @@ def _listed(curves: Sequence[Curve]) -> str:
     return ", ".join(names[:_NAMES]) + more
 
 
-def usage_section(curves: Sequence[Curve]) -> list[str]:
-    """The section of the report, if there is anything to say."""
-    said = sentences(curves)
+def usage_section(curves: Sequence[Curve], notes: Sequence[str] = ()) -> list[str]:
+    """The section of the report, if there is anything to say.
+
+    Args:
+        curves: as they are used.
+        notes: what else should be known of how they were read, a sentence each.
+    """
+    said = [f"{sentence[:1].upper()}{sentence[1:]}" for sentence in sentences(curves)]
+    said += notes  # which may begin with the name of a file
     if not said:
         return []
     return [
         "## Curves as used",
-        "\n".join(f"- {sentence[:1].upper()}{sentence[1:]}." for sentence in said),
+        "\n".join(f"- {sentence}." for sentence in said),
         "Where the force relaxes in a hold, an elastic fit gives the stiffness at the speed of the "
         "loading, not at rest. Samples used and left out of every curve, with segments and "
         "reasons: `curves.csv` (docs/measurements.md).",

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from jaxtrachea.measurements.curve import Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.curve import Curve, Fault, RawCurve, ReadOptions
 
 #: A direction whose length differs from 1 by less is taken, and made of length 1.
 UNIT_LENGTH = 1e-3
@@ -185,3 +185,17 @@ def vectors_of(raw: RawCurve, keep: np.ndarray, options: ReadOptions) -> dict[st
         if rings is not None:
             fields[name] = rings.astype(np.int64)
     return fields
+
+
+def vector_words(curve: Curve) -> str:
+    """What a curve holds beside forces and markers along the normal, for a table; may be empty."""
+    ends = [name[-1] for name in ("end_U", "end_V") if getattr(curve, name) is not None]
+    rings = 0 if curve.end_rings is None else curve.end_rings.size
+    angle = np.degrees(np.arctan2(curve.direction[1], curve.direction[0]))
+    words = {
+        "side force": curve.side_force is not None,
+        "markers aside": curve.joint_side_displacement is not None,
+        f"ends {' and '.join(ends)} of {rings} rings": bool(ends),
+        f"tool {angle:.3g}° off the normal": tuple(curve.direction) != (1.0, 0.0),
+    }
+    return ", ".join(word for word, held in words.items() if held)

@@ -12,6 +12,7 @@ from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.onset import onset_is_sought
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study, check_curve
+from jaxtrachea.fitting.unread import LEFT_OUT
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import force_and_slope
@@ -182,9 +183,15 @@ def measured_corners(
 
 
 def _apart(curve: Curve, i: int, sigma: np.ndarray | None) -> Curve:
-    """A curve with a name of its own, so that curves of equal name stay apart; without markers."""
+    """A curve with a name of its own, so that curves of equal name stay apart; force alone."""
     return dataclasses.replace(
-        curve, specimen=f"{i}", trial="", sigma=sigma, joint_rings=None, joint_displacement=None
+        curve,
+        specimen=f"{i}",
+        trial="",
+        sigma=sigma,
+        joint_rings=None,
+        joint_displacement=None,
+        **LEFT_OUT,
     )
 
 
