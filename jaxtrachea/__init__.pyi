@@ -2,6 +2,7 @@
 
 from .fitting.fit import fit as fit
 from .fitting.lanes import Noise as Noise
+from .fitting.lanes import Weighting as Weighting
 from .fitting.result import FitResult as FitResult
 from .fitting.settings import Settings as Settings
 from .fitting.study import Study as Study

@@ -20,8 +20,9 @@ import numpy as np
 import pytest
 
 import jaxtrachea
+from jaxtrachea.fitting.descent import Descent
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.mechanics import beam
@@ -100,6 +101,12 @@ def test_other_records():
         (Settings, {"tolerances": Tolerances(cost=-1.0)}),
         (Noise, {"force": 0.0}),
         (Noise, {"joints": math.inf}),
+        (Weighting, {"balance": "curves"}),
+        (Weighting, {"loss": "square"}),
+        (Weighting, {"loss_scale": 0.0}),
+        (Weighting, {"loss_scale": math.inf}),
+        (Descent, {"method": "sgd"}),
+        (Descent, {"learning_rate": math.nan}),
         (EffectOptions, {"contact_point": "every"}),
         (EffectOptions, {"onset_width": -1.0}),
         (EffectOptions, {"want_joints": "no"}),
@@ -173,7 +180,7 @@ def test_no_function_runs_a_misspelt_word():
             any_words(real, argument)
     assert seen >= INNER | {
         "mechanics.beam.deflect",
-        "fitting.study.build_study",
+        "mechanics.skeleton.skeleton_response",
         "mechanics.oblique.press_path",
     }
 
@@ -196,7 +203,10 @@ def test_no_record_keeps_a_misspelt_word():
                     seen.add(node.name)
                     with pytest.raises(ValueError, match="'no such word'; expected"):
                         bare(kind, **{field: "no such word"})
-    assert seen >= {"Options", "EffectOptions", "Plan", "Settings", "Parameter", "Levels"}
+    assert seen >= {
+        "Options", "EffectOptions", "Plan", "Settings", "Parameter", "Levels", "Weighting",
+        "Descent",
+    }  # fmt: skip
 
 
 #: Made by the package out of words that were checked.

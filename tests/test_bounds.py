@@ -8,7 +8,7 @@ import pytest
 import synthetic
 
 from jaxtrachea.fitting.cost import LaneCost
-from jaxtrachea.fitting.descent import descend
+from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.noise import first_sigma
@@ -113,9 +113,8 @@ def test_a_start_next_to_a_bound(gap):
 def test_first_order_methods_respect_bounds(method, blocks, count):
     study, start = bounded.random_study(11, count)
     sigma, rows = first_sigma(study), np.arange(count)
-    solved = descend(
-        study, rows, start, sigma, method=method, tolerances=Tolerances(iterations=blocks)
-    )
+    descent = Descent(method, Tolerances(iterations=blocks))
+    solved = descend(study, rows, start, sigma, descent)
     assert np.all(solved.status == FitStatus.CONVERGED)
     # Their tolerance is on the cost over a block of steps, no better than its square root.
     assert np.max(bounded.kkt_residual(study, solved.theta, sigma)) <= 1e-3

@@ -17,7 +17,7 @@ from small_scenes import MATERIAL, MESH, TUBE, presses
 from jaxtrachea import EffectOptions, make_scene, simulate
 from jaxtrachea.fitting.cost import LaneCost, evaluate
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.settings import Settings
@@ -58,7 +58,7 @@ def line(force, *, changes=None, options=Options(coupling="total"), **how):  # n
 
 @pytest.fixture(scope="module")
 def robust():
-    return fit(line(FORCE, loss="huber"), ONE)
+    return fit(line(FORCE, weighting=Weighting(loss="huber")), ONE)
 
 
 def test_noise_of_a_robust_fit_is_the_median_of_a_normal_distribution(robust):

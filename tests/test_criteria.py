@@ -15,7 +15,7 @@ from run_cli import run
 from jaxtrachea.cli.compare import _left_out_notes
 from jaxtrachea.fitting.criteria import penalised
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.onset import where_sought
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
@@ -32,6 +32,7 @@ from jaxtrachea.trachea.material import Material
 DEPTH = np.linspace(0.1, 3.0, 20)
 SIGMA = 0.05
 TOTAL = Options(coupling="total", onset_width=0.0, contact="bonded")
+HUBER = Weighting(loss="huber")
 LINEAR = {"lower": -1e3, "scale": "linear", "scope": "specimen"}
 
 
@@ -84,7 +85,7 @@ def test_linear_case_in_closed_form(sigma):
 
 @pytest.mark.slow
 def test_robust_losses_have_no_likelihood():
-    result = fit(linear_study(noisy(), loss="huber"), Settings(starts=1))
+    result = fit(linear_study(noisy(), weighting=HUBER), Settings(starts=1))
     assert np.isnan(result.criteria.AIC).all()
 
 
@@ -190,7 +191,7 @@ def test_other_data_or_noise_are_refused():
         (linear_study(curves[:-1]), "different samples"),
         (linear_study(noisy(1)), "different samples"),
         (linear_study(curves, noise=Noise(force=0.1)), "noise or curves"),
-        (linear_study(curves, loss="huber"), "likelihood"),
+        (linear_study(curves, weighting=HUBER), "likelihood"),
     ):
         with pytest.raises(ValueError, match=says):
             same_data([a, other], "ab")

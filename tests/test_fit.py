@@ -9,9 +9,9 @@ import synthetic
 from scipy.optimize import least_squares
 
 from jaxtrachea.fitting.cost import LaneCost
-from jaxtrachea.fitting.descent import descend
+from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
@@ -100,7 +100,7 @@ def test_intervals_cover_5000(given):
 def test_a_batch_is_its_lanes_one_by_one(noisy, loss):
     """The same lane alone, in a batch, elsewhere in the batch and among others: to 1e-8."""
     _, force, _ = noisy
-    study = synthetic.study(force, loss=loss)
+    study = synthetic.study(force, weighting=Weighting(loss=loss))
     starts = np.tile([p.to_scaled(p.value) for p, _, _ in study.unknowns[0]], (20, 1))
     sigma = first_sigma(study)
     objective = LaneCost(study.model, study.lanes, sigma)
@@ -331,7 +331,11 @@ def test_unequal_lengths_do_not_change_results():
 
     def make(data):
         return build_study(
-            data, synthetic.GEOMETRY, synthetic.OPTIONS, synthetic.parameters(), balance="sample"
+            data,
+            synthetic.GEOMETRY,
+            synthetic.OPTIONS,
+            synthetic.parameters(),
+            weighting=Weighting(balance="sample"),
         )
 
     both = fit(make([*long, *short]), ONE)
@@ -391,7 +395,7 @@ def test_robust_losses_as_scipy(noisy, loss):
     _, force, sigma = noisy
     force, level = force[:1].copy(), float(sigma[0, 0, 0])
     force[0, :, ::9] += 20 * level
-    study = synthetic.study(force, loss=loss, noise=Noise(force=level))
+    study = synthetic.study(force, weighting=Weighting(loss=loss), noise=Noise(force=level))
     result = fit(study, ONE)
     assert result.status[0] == FitStatus.CONVERGED
 
@@ -422,7 +426,7 @@ def test_descent_reaches_the_same_minimum(noisy, method, blocks):
     two = study.take(np.arange(2))
     best = levenberg_marquardt(LaneCost(study.model, two.lanes, sigma), truth)
     other = descend(
-        study, np.arange(2), truth, sigma, method=method, tolerances=Tolerances(iterations=blocks)
+        study, np.arange(2), truth, sigma, Descent(method, Tolerances(iterations=blocks))
     )
     assert np.all(other.cost <= best.cost * (1 + 1e-3))
     assert np.all(other.cost >= best.cost * (1 - 1e-9))

@@ -10,7 +10,7 @@ import pytest
 import synthetic
 
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
@@ -35,7 +35,9 @@ def linear_study(lengths, balance="curve", **noise):
         D = np.linspace(0.2, 2, n)
         curves.append(Curve("T", f"t{j}", None, 0.0, D, 1.3 * D + 0.05 * rng.normal(size=n)))
     options = Options(coupling="total", onset_width=0.0)
-    return build_study(curves, table_1(), options, rows, balance=balance, noise=Noise(**noise))
+    return build_study(
+        curves, table_1(), options, rows, weighting=Weighting(balance), noise=Noise(**noise)
+    )
 
 
 @pytest.mark.parametrize("noise", [{}, {"force": 0.05}])

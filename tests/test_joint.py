@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from jaxtrachea.cli import specification
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.joint_information import held_count, unknown_count
-from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
@@ -40,6 +40,7 @@ PAGE = (Path(__file__).parents[1] / "docs" / "results.md").read_text()
 TOTAL = Options(coupling="total", contact="bonded")
 LANES, DEPTH = 20, np.linspace(0.1, 2, 12)
 ONE_START = Settings(starts=1, batch=16)
+SAMPLE, HUBER = Weighting("sample"), Weighting(loss="huber")
 
 
 def columns(trials):
@@ -66,7 +67,7 @@ def linear_study(curves=None, k_3=None, **settings):
         for n in ("k_1", "k_3", "onset", "force_offset")
     ]
     curves = list(linear_curves()) if curves is None else curves
-    settings = {"joint": True, "balance": "sample"} | settings
+    settings = {"joint": True, "weighting": SAMPLE} | settings
     return build_study(curves, table_1(), TOTAL, table, **settings)
 
 
@@ -351,7 +352,7 @@ def test_twenty_specimens_are_the_dense_fit_of_scipy():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "settings", [{"balance": "sample"}, {"loss": "huber"}, {"noise": Noise(force=0.05)}]
+    "settings", [{"weighting": SAMPLE}, {"weighting": HUBER}, {"noise": Noise(force=0.05)}]
 )
 def test_twenty_specimens_are_one_dense_lane(settings):
     """Sandwich covariance, robust loss, given noise: as the path without Schur complements."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import synthetic
 
-from jaxtrachea.fitting.descent import descend
+from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.information import informations
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.predictions import predictions
@@ -81,8 +81,8 @@ def test_loops_over_lanes_compile_once(study, compiled, loop):
     elif loop == "informations":
         assert informations(study, np.arange(40), theta, sigma, 16).bread.shape == (40, 4, 4)
     else:
-        few = Tolerances(iterations=1)
-        solved = descend(study, np.arange(40), theta, sigma, batch=16, tolerances=few)
+        few = Descent(tolerances=Tolerances(iterations=1))
+        solved = descend(study, np.arange(40), theta, sigma, few, batch=16)
         assert solved.theta.shape == (40, 4)
     assert len(compiled) == 1
 

@@ -4,7 +4,7 @@ import dataclasses
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
-from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, in_model, visible
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study, check_curve
@@ -163,9 +163,7 @@ def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
             options,
             parameters_of(spec, options, joints=joints),
             noise=noise,
-            balance=spec.fit.balance,
-            loss=spec.fit.loss,
-            loss_scale=spec.fit.loss_scale,
+            weighting=Weighting(spec.fit.balance, spec.fit.loss, spec.fit.loss_scale),
             tool_radius=spec.data.tool_radius,
             joint=joint,
         )

@@ -4,6 +4,7 @@
 than `levenberg_marquardt` for a plain fit; use it where the loss is not a sum of squares.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Literal
 
@@ -13,7 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from jaxtrachea._arguments import check_word
+from jaxtrachea._arguments import check_record
 from jaxtrachea.fitting.cost import entry_scale, evaluate, robust, rounding_cost
 from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.map_lanes import map_lanes
@@ -44,16 +45,43 @@ def cost(
     return 0.5 * jnp.sum(rho * (lane.balance * lane.balance)[:, None])
 
 
+@dataclasses.dataclass(frozen=True)
+class Descent:
+    """How to descend, and when a start is done.
+
+    Attributes:
+        method: of optax.
+        tolerances: `iterations` counts tens of steps for L-BFGS and hundreds for Adam; a start is
+            done when the relative change of its cost over such a block is below `cost` per step.
+        learning_rate: of Adam; L-BFGS searches along its line.
+    """
+
+    method: Literal["lbfgs", "adam"] = "lbfgs"
+    tolerances: Tolerances = Tolerances()
+    learning_rate: float = 0.03
+
+    def __post_init__(self):
+        """Refuse words and numbers that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_record(self)
+
+    @property
+    def block(self) -> int:
+        """Steps between two looks at the cost."""
+        return {"lbfgs": 10, "adam": 100}[self.method]
+
+
 def descend(
     study: Study,
     rows: np.ndarray,
     starts: np.ndarray,
     sigma: np.ndarray,
+    descent: Descent = Descent(),
     *,
-    method: Literal["lbfgs", "adam"] = "lbfgs",
-    tolerances: Tolerances = Tolerances(),
     batch: int = 256,
-    learning_rate: float = 0.03,
     progress: Callable[[int], None] | None = None,
     dtype=np.float64,
 ) -> Solved:
@@ -62,26 +90,22 @@ def descend(
     `rows`: lane of each start; `sigma`: of each lane. The other arguments are those of
     `levenberg_marquardt`.
 
-    `tolerances.iterations` counts tens of steps for L-BFGS and hundreds for Adam; a start is done
-    when the relative change of its cost over such a block is below `tolerances.cost` per step.
     Where an unknown alone could still lower the residual's norm by more than `NEARLY_FLAT`, it has
     stalled.
     """
-    check_word("method", method, Literal["lbfgs", "adam"])
-    block = {"lbfgs": 10, "adam": 100}[method]
-    static = (method, learning_rate, block, tolerances)
     # optax mixes integer widths in its counters
     with jax.numpy_dtype_promotion("standard"):
         outcome = map_lanes(
             _descend, study, starts, sigma[rows], rows=rows, batch=min(batch, len(rows)),
-            static=static, dtype=dtype, progress=progress,
+            static=(descent,), dtype=dtype, progress=progress,
         )  # fmt: skip
     theta, value, status, iterations = outcome
     return Solved(theta, value, status.astype(int), iterations)
 
 
-def _descend(model, method, learning_rate, block, tolerances, start, lane, sigma):
+def _descend(model, descent: Descent, start, lane, sigma):
     """One start: blocks of steps until the cost settles."""
+    method, tolerances, block = descent.method, descent.tolerances, descent.block
 
     def loss(theta):
         return cost(model, theta, lane, sigma)
@@ -89,7 +113,7 @@ def _descend(model, method, learning_rate, block, tolerances, start, lane, sigma
     def box(theta):
         return jnp.clip(theta, lane.lower, lane.upper)
 
-    optimiser = optax.lbfgs() if method == "lbfgs" else optax.adam(learning_rate)
+    optimiser = optax.lbfgs() if method == "lbfgs" else optax.adam(descent.learning_rate)
 
     def step(_, carry):
         theta, state = carry

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.model import Loss
 from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.trachea.geometry import Geometry
@@ -46,6 +47,33 @@ class Noise:
                 raise ValueError(
                     f"{name} is {value:g}; expected a standard deviation of more than 0, or None"
                 )
+
+
+@dataclasses.dataclass(frozen=True)
+class Weighting:
+    """How much each residual counts, apart from its noise.
+
+    Attributes:
+        balance: `curve` (every curve weighs the same, however long) or `sample`.
+        loss: see `FitModel`.
+        loss_scale: see `FitModel`.
+    """
+
+    balance: Balance = "curve"
+    loss: Loss = "linear"
+    loss_scale: float = 1.345
+
+    def __post_init__(self):
+        """Refuse words and numbers that mean nothing.
+
+        Raises:
+            ValueError: naming the field, what was found and what is expected.
+        """
+        check_record(self)
+        if self.loss_scale <= 0:
+            raise ValueError(
+                f"loss_scale is {self.loss_scale}; expected a finite number, more than 0"
+            )
 
 
 def group(
@@ -130,7 +158,7 @@ def lanes_of(
         parameters: the table.
         geometry: the tube.
         noise: known standard deviations.
-        balance: see `study.build_study`.
+        balance: see `Weighting`.
         tool_radius: see `study.build_study`.
     """
     lengths = [len(c.force) for curves in groups for c in curves]

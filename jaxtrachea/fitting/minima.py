@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxtrachea.fitting.cost import LaneCost
-from jaxtrachea.fitting.descent import descend
+from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.information import Information, informations
 from jaxtrachea.fitting.joint_information import pooled, unknown_count
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, noise_rounds
@@ -144,9 +144,11 @@ def _solve(study: Study, settings: Settings, rows, starts, sigma, progress) -> S
     common = _common(settings, len(rows), progress)
     if settings.method == "levenberg-marquardt":
         return levenberg_marquardt(
-            LaneCost(study.model, study.lanes, sigma), starts, rows, **common
-        )
-    return descend(study, rows, starts, sigma, method=settings.method, **common)
+            LaneCost(study.model, study.lanes, sigma), starts, rows,
+            tolerances=settings.tolerances, **common,
+        )  # fmt: skip
+    descent = Descent(settings.method, settings.tolerances)
+    return descend(study, rows, starts, sigma, descent, **common)
 
 
 def _solve_jointly(
@@ -160,14 +162,16 @@ def _solve_jointly(
     # One size for all calls, so that it is compiled once.
     common["batch"] = batch_size(lanes * settings.starts, settings.batch)
     of_starts = np.swapaxes(starts.reshape(lanes, len(starts) // lanes, -1), 0, 1)
-    return solve_jointly(study, of_starts, sigma, separately=not near, **common)
+    return solve_jointly(
+        study, of_starts, sigma, separately=not near, tolerances=settings.tolerances, **common
+    )
 
 
 def _common(settings: Settings, starts: int, progress) -> dict[str, Any]:
     """What all solvers are told."""
     report = None if progress is None else lambda done: progress(done, starts)
-    common = {"tolerances": settings.tolerances, "batch": settings.batch, "progress": report}
-    return common | {"dtype": np.float32 if settings.float32 else np.float64}
+    dtype = np.float32 if settings.float32 else np.float64
+    return {"batch": settings.batch, "progress": report, "dtype": dtype}
 
 
 def information_per_lane(

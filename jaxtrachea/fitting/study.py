@@ -15,11 +15,10 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from jaxtrachea._arguments import check_word
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.lanes import Balance, Noise, Unknown, group, lanes_of, unknowns_of
-from jaxtrachea.fitting.model import Common, FitModel, Loss, columns_of, numbers_of
+from jaxtrachea.fitting.lanes import Noise, Unknown, Weighting, group, lanes_of, unknowns_of
+from jaxtrachea.fitting.model import Common, FitModel, columns_of, numbers_of
 from jaxtrachea.fitting.onset import blends, natural_steps, onset_is_sought, within_reach
 from jaxtrachea.fitting.parameters import DEFAULTS, SKELETON, Parameter, in_model
 from jaxtrachea.fitting.unread import along_the_normal
@@ -124,9 +123,7 @@ def build_study(
     parameters: Table | None = None,
     *,
     noise: Noise = Noise(),
-    balance: Balance = "curve",
-    loss: Loss = "linear",
-    loss_scale: float = 1.345,
+    weighting: Weighting = Weighting(),
     tool_radius: float | None = None,
     joint: bool = False,
 ) -> Study:
@@ -141,20 +138,19 @@ def build_study(
         parameters: the table, in the order of `parameters.in_model`; or changes to the defaults of
             the model, `{"k_1": {"value": 2.0}, "EI_L": {"fixed": True}}`; None: the defaults.
         noise: known standard deviations.
-        balance: `curve` (every curve weighs the same, however long) or `sample`.
-        loss: see `FitModel`.
-        loss_scale: see `FitModel`.
+        weighting: balance between curves, and the loss.
         tool_radius: mm; markers closer to the contact are held by the tool and left out. None: all
             are used.
         joint: one lane per specimen even if parameters are shared; without effect if none is, or
             if there is but one specimen.
 
     Raises:
-        ValueError: an unknown `balance` or `loss`, no curve, a marker on a ring that does not
+        ValueError: a `tool_radius` that is no length, no curve, a marker on a ring that does not
             exist, a curve without a contact position where one is needed, with specimen and trial
             named; a parameter that the model does not have.
     """
-    _check_choices(balance, loss, loss_scale, tool_radius)
+    if tool_radius is not None and not 0 <= tool_radius < np.inf:
+        raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
     if isinstance(curves, Measurements):
         _warn_of(curves.bad)
         curves = curves.curves
@@ -172,7 +168,7 @@ def build_study(
     unknowns = [unknowns_of(lane, parameters) for lane in groups]
     lanes = lanes_of(
         groups, unknowns, parameters, geometry,
-        noise=noise, balance=balance, tool_radius=tool_radius,
+        noise=noise, balance=weighting.balance, tool_radius=tool_radius,
     )  # fmt: skip
     if onset_is_sought(parameters, options):
         lanes = lanes._replace(blend=blends(lanes, groups, noise.force, parameters, options))
@@ -180,7 +176,8 @@ def build_study(
     known = noise.force is not None or all(c.sigma is not None for c in curves)
     model = FitModel(
         tube=numbers_of(geometry), options=options, columns=columns_of(parameters),
-        loss=loss, loss_scale=float(loss_scale), common=_common(unknowns, parameters),
+        loss=weighting.loss, loss_scale=float(weighting.loss_scale),
+        common=_common(unknowns, parameters),
     )  # fmt: skip
     return Study(
         model=model,
@@ -191,20 +188,6 @@ def build_study(
         noise_given=(known, noise.joints is not None),
         joint=joint,
     )
-
-
-def _check_choices(balance: str, loss: str, loss_scale: float, tool_radius: float | None) -> None:
-    """Refuse words and numbers that mean nothing.
-
-    Raises:
-        ValueError: naming the argument.
-    """
-    check_word("balance", balance, Balance)
-    check_word("loss", loss, Loss)
-    if not 0 < loss_scale < np.inf:
-        raise ValueError(f"loss_scale is {loss_scale}; expected a finite number, more than 0")
-    if tool_radius is not None and not 0 <= tool_radius < np.inf:
-        raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
 
 
 def _warn_of(bad: Sequence[BadCurve]) -> None:

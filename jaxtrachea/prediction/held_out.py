@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Weighting
 from jaxtrachea.fitting.onset import onset_is_sought
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study, check_curve
@@ -208,8 +209,8 @@ def _own_study(stored: StoredFit, own, members) -> Study:
     curves = [_apart(c, i, s) for i, (_, c, s) in enumerate(members)]
     model = study.model
     own_study = build_study(
-        curves, model.geometry, model.options, table, balance="sample", loss=model.loss,
-        loss_scale=model.loss_scale,
+        curves, model.geometry, model.options, table,
+        weighting=Weighting("sample", model.loss, model.loss_scale),
     )  # fmt: skip
     blend = np.array([[source.blend] for source, _, _ in members])
     lanes = own_study.lanes._replace(

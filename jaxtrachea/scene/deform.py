@@ -50,10 +50,10 @@ def deform(
 
     def one(moved, where, pose):
         s_c, phi_c, radius, tool = where
-        ends = _ends(scene, material, s_c, moved) if plan.end_motion else (None, None)
+        ends = _ends(scene, material, s_c, moved) if plan.end_motion else regions.Ends()
         keys = regions.clamped(
             s_c, moved.skeleton, moved.joints, moved.end_U, moved.end_V, moved.slopes,
-            moved.slope_C, end_A=ends[0], end_B=ends[1],
+            moved.slope_C, ends=ends,
         )  # fmt: skip
         share = regions.weigh(binding, phi_c) if weights is None else weights
         u = regions.interpolate(binding, share, keys, method=method)
@@ -85,7 +85,7 @@ def _distances(scene: Scene, made: Approach):
     return jnp.broadcast_to(found, seen.s.shape)
 
 
-def _ends(scene: Scene, material: Material, s_c, moved):
+def _ends(scene: Scene, material: Material, s_c, moved) -> regions.Ends:
     """Motion of both clamps on their axial springs."""
     passed, F = moved.loads[:, 0], moved.force[0]
     A = jnp.where(scene.geometry.ring_positions[0] <= s_c, passed[0], F - passed[-1])
@@ -93,7 +93,7 @@ def _ends(scene: Scene, material: Material, s_c, moved):
     def along(f, k):
         return None if k is None else jnp.zeros_like(moved.force).at[0].set(f / k)
 
-    return along(A, material.k_A), along(F - A, material.k_B)
+    return regions.Ends(along(A, material.k_A), along(F - A, material.k_B))
 
 
 def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.Dent:

@@ -18,7 +18,7 @@ mesh, `weigh` once for an angle of contact.
 
 import functools
 import math
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -94,6 +94,13 @@ class Keys(eqx.Module):
     contact_slope: Float[Array, "2"] | None = None
 
 
+class Ends(NamedTuple):
+    """Displacement of the ends A and B of the tube as a whole, mm; None: held."""
+
+    A: Float[Array, "3"] | None = None
+    B: Float[Array, "3"] | None = None
+
+
 def clamped(
     s_c: Float[Array, ""],
     contact: Float[Array, "3"],
@@ -103,8 +110,7 @@ def clamped(
     slopes: Float[Array, "rings 2"] | None = None,
     contact_slope: Float[Array, "2"] | None = None,
     *,
-    end_A: Float[Array, "3"] | None = None,
-    end_B: Float[Array, "3"] | None = None,
+    ends: Ends = Ends(),
 ) -> Keys:
     """Keys of a tube whose ends do not turn.
 
@@ -116,18 +122,17 @@ def clamped(
         V: of the ring ends at +alpha.
         slopes: d/ds of (y, z) at the joints.
         contact_slope: the same at C.
-        end_A: displacement of the end A as a whole, mm; None: held.
-        end_B: the same of B.
+        ends: how A and B move.
     """
     held = jnp.zeros_like(contact)
-    first, last = (held if end is None else end for end in (end_A, end_B))
+    first, last = (held if end is None else end for end in ends)
 
-    def ends(rows, a, b):
+    def between(a, rows, b):
         return jnp.concatenate([a[None], rows, b[None]])
 
-    joints, U, V = (ends(rows, first, last) for rows in (joints, U, V))
+    joints, U, V = (between(first, rows, last) for rows in (joints, U, V))
     if slopes is not None:
-        slopes = ends(slopes, held[:2], held[:2])
+        slopes = between(held[:2], slopes, held[:2])
     return Keys(s_c, contact, joints, U, V, slopes, contact_slope)
 
 
