@@ -10,7 +10,7 @@ import trimesh
 
 from jaxtrachea.trachea.cleaning import Surface, clean
 from jaxtrachea.trachea.geometry import Geometry, table_1
-from jaxtrachea.trachea.imported import STEPS, read_mesh
+from jaxtrachea.trachea.imported import STEPS, Landmarks, read_mesh
 from jaxtrachea.trachea.mesh import MeshError, edge_counts, place, volume
 from jaxtrachea.trachea.rings import _check_row
 from jaxtrachea.trachea.sections import Cells, contour
@@ -33,6 +33,7 @@ def rotation(seed=1):
 
 
 ROTATION, SHIFT = rotation(), np.array([730.0, -1500.0, 412.0])
+LARYNX, FRONT = Landmarks(larynx=ROTATION @ X), Landmarks(anterior=ROTATION @ Y)
 
 
 def write(path, mesh=TUBE, scale=1.0, vertices=None, faces=None):
@@ -149,7 +150,7 @@ def check(found, mesh, geometry, atol=0.35, scale=1.0):
 )
 def test_round_trip(tmp_path, suffix, scale, unit):
     path = write(tmp_path / f"tube.{suffix}", scale=scale)
-    found = read_mesh(path, unit=unit, larynx=ROTATION @ X)
+    found = read_mesh(path, LARYNX, unit=unit)
     check(found, TUBE, GEOMETRY, scale=scale)
     np.testing.assert_allclose(found.scale, 1 / scale)
     np.testing.assert_allclose(found.geometry.half_angle, 2 * math.pi / 3, atol=0.2)
@@ -160,28 +161,28 @@ def test_round_trip(tmp_path, suffix, scale, unit):
 
 
 def test_larynx_sets_the_direction(tmp_path):
-    found = read_mesh(write(tmp_path / "t.stl"), larynx=-ROTATION @ X)
+    found = read_mesh(write(tmp_path / "t.stl"), Landmarks(larynx=-ROTATION @ X))
     np.testing.assert_allclose(found.geometry.ring_positions, 92 - RINGS[::-1], atol=0.35)
 
 
 def test_the_wider_end_is_the_carina(tmp_path):
     vertices, _ = as_arrays(TUBE)
     wide = vertices * np.stack([np.ones(len(vertices))] + [1.3 - 0.5 * vertices[:, 0] / 92] * 2, 1)
-    found = read_mesh(write(tmp_path / "t.stl", vertices=wide), anterior=ROTATION @ Y)
+    found = read_mesh(write(tmp_path / "t.stl", vertices=wide), FRONT)
     np.testing.assert_allclose(found.geometry.ring_positions, RINGS, atol=0.5)
     other = wide * [-1, 1, -1]
-    found = read_mesh(write(tmp_path / "u.stl", vertices=other), anterior=ROTATION @ Y)
+    found = read_mesh(write(tmp_path / "u.stl", vertices=other), FRONT)
     np.testing.assert_allclose(found.geometry.ring_positions, RINGS, atol=0.5)
 
 
 def test_flat_back_is_found_without_rings(tmp_path):
     smooth = make_tube(GEOMETRY, around=48, along=60, relief=0.0, flatten=0.2)
     path = write(tmp_path / "t.stl", smooth)
-    found = read_mesh(path, larynx=ROTATION @ X, ring_positions=RINGS)
+    found = read_mesh(path, Landmarks(larynx=ROTATION @ X, ring_positions=RINGS))
     np.testing.assert_allclose(found.rotation @ (ROTATION @ Y), Y, atol=0.06)
     np.testing.assert_array_equal(found.geometry.ring_positions, RINGS)
     with pytest.raises(MeshError, match=r"t.stl: found \d rings in the relief .* ring_positions="):
-        read_mesh(path, larynx=ROTATION @ X)
+        read_mesh(path, LARYNX)
 
 
 def bent(vertices, radius=150.0):
@@ -199,7 +200,7 @@ def test_curved_double_walled_tube(tmp_path):
     both = np.concatenate([bent(vertices), bent(inner)])
     faces = np.concatenate([faces, faces[:, ::-1] + len(vertices)])
     path = write(tmp_path / "t.ply", vertices=both, faces=faces)
-    found = read_mesh(path, larynx=ROTATION @ X, anterior=ROTATION @ Y)
+    found = read_mesh(path, Landmarks(larynx=ROTATION @ X, anterior=ROTATION @ Y))
     np.testing.assert_allclose(found.geometry.length, 92, atol=0.6)
     np.testing.assert_allclose(found.geometry.ring_positions, RINGS, atol=0.6)
     mesh = found.mesh
@@ -237,7 +238,7 @@ def test_rings_from_their_own_surface(tmp_path):
     vertices = np.concatenate([one + [s, 0, 0] for s in RINGS])
     faces = np.concatenate([hoop.faces + i * len(one) for i in range(len(RINGS))])
     write(tmp_path / "hoops.stl", vertices=vertices, faces=faces)
-    found = read_mesh(tmp_path / "wall.stl", rings="hoops.stl", larynx=ROTATION @ X)
+    found = read_mesh(tmp_path / "wall.stl", LARYNX, rings="hoops.stl")
     check(found, smooth, GEOMETRY)
     np.testing.assert_allclose(found.geometry.half_angle, 2.0, atol=0.15)
     np.testing.assert_allclose(found.geometry.ring_height, 3.0, atol=0.5)
@@ -255,7 +256,7 @@ def test_dirt_is_cleaned_and_told(tmp_path):
         vertices=np.concatenate([vertices, dust]),
         faces=np.concatenate([faces, faces[:1], extra, bits])[:, ::-1],
     )
-    found = read_mesh(path, larynx=ROTATION @ X)
+    found = read_mesh(path, LARYNX)
     check(found, TUBE, GEOMETRY)
     assert volume(*as_arrays(found.mesh)) > 0
     told = " ".join(found.notes)
@@ -280,7 +281,7 @@ def test_much_dust(tmp_path):
 def test_progress_comes_to_its_end(tmp_path):
     seen = []
     path = write(tmp_path / "t.stl")
-    read_mesh(path, larynx=ROTATION @ X, progress=lambda done, of: seen.append((done, of)))
+    read_mesh(path, LARYNX, progress=lambda done, of: seen.append((done, of)))
     assert seen == [(1, len(seen))] * len(seen)
     assert len(seen) == STEPS
 
@@ -300,16 +301,16 @@ def test_a_u_bend_is_refused(tmp_path, given, angle, message):
     around = bent(vertices * [1, -1, 1], radius)
     path = write(tmp_path / "t.stl", vertices=around, faces=faces[:, ::-1])
     with pytest.raises(MeshError, match=message):
-        read_mesh(path, larynx=ROTATION @ X, **given)
+        read_mesh(path, Landmarks(larynx=ROTATION @ X, **given))
     s = np.linspace(0, 92, 60)
     line = bent(np.stack([s, 0 * s, 0 * s], axis=1), radius) @ ROTATION.T + SHIFT
     with pytest.raises(MeshError, match=r"its centreline turns by 1[127]\d degrees"):
-        read_mesh(path, centreline=line, **given)
+        read_mesh(path, Landmarks(centreline=line, **given))
 
 
 def test_open_tube(tmp_path):
     mesh = make_tube(GEOMETRY, around=32, along=120, flatten=0.0, lids=False)
-    found = read_mesh(write(tmp_path / "t.stl", mesh), larynx=ROTATION @ X)
+    found = read_mesh(write(tmp_path / "t.stl", mesh), LARYNX)
     check(found, mesh, GEOMETRY)
     assert "64 open edges" in found.notes
 
@@ -318,9 +319,8 @@ def test_a_given_centreline_is_taken(tmp_path):
     """Then s and phi are exact to rounding, also for the default tube with its flat back."""
     mesh = make_tube(GEOMETRY)
     line = np.array([[0.0, 0, 0], [92, 0, 0]]) @ ROTATION.T + SHIFT
-    found = read_mesh(
-        write(tmp_path / "t.ply", mesh), larynx=ROTATION @ X, anterior=ROTATION @ Y, centreline=line
-    )
+    landmarks = Landmarks(larynx=ROTATION @ X, anterior=ROTATION @ Y, centreline=line)
+    found = read_mesh(write(tmp_path / "t.ply", mesh), landmarks)
     np.testing.assert_allclose(np.sort(found.mesh.s), np.sort(mesh.s), atol=1e-3)
     np.testing.assert_allclose(found.rotation @ ROTATION, np.eye(3), atol=1e-6)
     np.testing.assert_allclose(np.sort(found.mesh.phi)[3:], np.sort(mesh.phi)[3:], atol=2e-3)
@@ -363,8 +363,12 @@ def _gutter(path):
     )
 
 
+def known(**landmarks):
+    return {"landmarks": Landmarks(**landmarks)}
+
+
 @pytest.mark.parametrize(
-    ("make", "options", "message"),
+    ("make", "given", "message"),
     [
         (lambda path: None, {}, r"bad.ply: there is no such file"),
         (_text, {}, r"bad.ply: could not be read as a surface"),
@@ -375,20 +379,20 @@ def _gutter(path):
         (lambda path: write(path, scale=0.05), {}, r"may be in cm or in .*give unit="),
         (write, {"unit": "N"}, r"does not measure length"),
         (write, {}, r"both ends are alike .*larynx="),
-        (write, {"larynx": ROTATION @ Y}, r"larynx= points across"),
-        (write, {"larynx": ROTATION @ X, "anterior": ROTATION @ X}, r"anterior= points along"),
-        (write, {"larynx": ROTATION @ X, "ring_positions": [3.0, 400.0]}, r"inside \(0, "),
+        (write, known(larynx=ROTATION @ Y), r"larynx= points across"),
+        (write, known(larynx=ROTATION @ X, anterior=ROTATION @ X), r"anterior= points along"),
+        (write, known(larynx=ROTATION @ X, ring_positions=[3.0, 400.0]), r"inside \(0, "),
         (write, {"part": "lung"}, r"no object 'lung' in it; expected one of"),
         (write, {"rings": "absent.stl"}, r"rings='absent.stl': there is no such file"),
-        (write, {"centreline": np.zeros((3, 2))}, r"centreline has shape \(3, 2\)"),
+        (write, known(centreline=np.zeros((3, 2))), r"centreline has shape \(3, 2\)"),
         (_flipped, {}, r"face opposite ways"),
         (_fin, {}, r"edges belong to more than two triangles"),
     ],
 )  # fmt: skip
-def test_bad_files(tmp_path, make, options, message):
+def test_bad_files(tmp_path, make, given, message):
     make(tmp_path / "bad.ply")
     with pytest.raises(MeshError, match=message):
-        read_mesh(tmp_path / "bad.ply", **options)
+        read_mesh(tmp_path / "bad.ply", **given)
 
 
 def lumen(bulges, height=0.1):
@@ -411,7 +415,7 @@ def test_bulges_of_a_lumen_are_no_rings(tmp_path, bulges, message):
     """The first was a trachea of two rings, with patches half its length."""
     vertices, faces = lumen(bulges)
     with pytest.raises(MeshError, match=message):
-        read_mesh(write(tmp_path / "t.stl", vertices=vertices, faces=faces), larynx=ROTATION @ X)
+        read_mesh(write(tmp_path / "t.stl", vertices=vertices, faces=faces), LARYNX)
 
 
 def test_crests_too_far_apart_are_no_rings():
@@ -426,14 +430,14 @@ def test_rings_near_the_ends_are_rings(tmp_path, end):
     rings = end + 6.5 * np.arange(14)
     geometry = Geometry.create(rings[-1] + end, rings, radius=9.0)
     mesh = make_tube(geometry, around=24, along=2 * int(rings[-1] + end))
-    found = read_mesh(write(tmp_path / "t.stl", mesh), larynx=ROTATION @ X)
+    found = read_mesh(write(tmp_path / "t.stl", mesh), LARYNX)
     np.testing.assert_allclose(found.geometry.ring_positions, rings, atol=0.35)
 
 
 def test_a_round_smooth_tube_has_no_front(tmp_path):
     smooth = make_tube(GEOMETRY, around=40, along=60, relief=0.0, flatten=0.0)
     with pytest.raises(MeshError, match="which side is anterior"):
-        read_mesh(write(tmp_path / "t.stl", smooth), larynx=ROTATION @ X)
+        read_mesh(write(tmp_path / "t.stl", smooth), LARYNX)
 
 
 def test_two_walls_are_asked_about(tmp_path):

@@ -16,7 +16,7 @@ from jaxtrachea.contact.line import skeleton_coordinates
 from jaxtrachea.contact.patches import Patches, gap_bounds, straight_patches, touch
 from jaxtrachea.contact.pose import Pose, pose_from_vector
 from jaxtrachea.contact.shapes import box, capsule, padded, sphere
-from jaxtrachea.contact.walls import patches_of
+from jaxtrachea.contact.walls import TubeSurface, patches_of
 from jaxtrachea.status import ContactStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.imported import read_mesh
@@ -258,7 +258,8 @@ def bent(relief: float, flatten: float) -> tuple[trimesh.Trimesh, Patches]:
     )  # fmt: skip
     s, phi, away = (np.asarray(v) for v in (m.s, m.phi, m.distance))
     vertices, centres, frames = on_arc(s, phi, away)
-    p = patches_of(vertices, m.faces, s, BORDERS, centres=centres, frames=frames, most=48)
+    surface = TubeSurface(vertices=vertices, faces=m.faces, s=s, centres=centres, frames=frames)
+    p = patches_of(surface, BORDERS, most=48)
     return trimesh.Trimesh(vertices, np.asarray(m.faces), process=False), p
 
 
@@ -340,8 +341,9 @@ def test_straight_is_a_line_along_x():
     m = make_tube(table_1())
     axis = np.asarray(m.s)[:, None] * np.eye(3)[0]
     frames = np.tile(np.eye(3), (len(axis), 1, 1))
-    a = patches_of(m.vertices, m.faces, m.s, BORDERS)
-    b = patches_of(m.vertices, m.faces, m.s, BORDERS, centres=axis, frames=frames)
+    surface = TubeSurface(vertices=m.vertices, faces=m.faces, s=m.s)
+    a = patches_of(surface, BORDERS)
+    b = patches_of(surface._replace(centres=axis, frames=frames), BORDERS)
     np.testing.assert_allclose(a.centres, b.centres, atol=1e-12)
     np.testing.assert_allclose(a.lost, b.lost, atol=1e-9)
     np.testing.assert_allclose(a.line.points[-1], b.line.points[-1], atol=1e-12)
@@ -369,7 +371,7 @@ def test_a_steep_funnel_has_a_bounded_patch():
     s, phi = np.asarray(m.s), np.asarray(m.phi)
     wide = 5 + np.minimum(s, 10.0)
     vertices = np.stack([s, wide * np.cos(phi), wide * np.sin(phi)], 1)
-    p = patches_of(vertices, m.faces, s, [0.0, 9.0], overlap=0.0)
+    p = patches_of(TubeSurface(vertices=vertices, faces=m.faces, s=s), [0.0, 9.0], overlap=0.0)
     assert np.abs(p.shapes.vertices[:, 1:]).max() < 15
     np.testing.assert_allclose(p.filled, 14 - 5, atol=0.5)
 
@@ -379,9 +381,9 @@ def test_a_steep_funnel_has_a_bounded_patch():
 def test_real_trachea():
     """Balls beside the outer wall of a real trachea, against closest points on its triangles."""
     m = read_mesh(REAL / "3d-vh-m-trachea.glb")
-    surface, outer, parts, line = outer_wall(m.mesh)
+    surface, outer, wall = outer_wall(m.mesh)
     borders = np.r_[0, m.geometry.ring_positions, m.geometry.length]
-    p = patches_of(*parts, borders, **line, most=48)
+    p = patches_of(wall, borders, most=48)
     at = beside(outer, LANES * 2, 2.0, -1.0, 3.0)
     c = solve(sphere(2.0), p, 0 * at, at, 3)
     error = c.gap - (distance_to(surface, at) - 2)
@@ -399,7 +401,7 @@ def test_real_trachea():
 
 
 def outer_wall(m):
-    """Whole surface, outer wall, the latter as arrays for `patches_of`, and its line."""
+    """Whole surface, outer wall, and the latter as arrays for `patches_of`."""
     v, f, s, n = (np.asarray(x) for x in (m.vertices, m.faces, m.s, m.normals))
     frames, phi = np.asarray(m.frames), np.asarray(m.phi)[:, None]
     out = np.cos(phi) * frames[:, :, 1] + np.sin(phi) * frames[:, :, 2]
@@ -407,13 +409,15 @@ def outer_wall(m):
     faces = (np.cumsum(kept) - 1)[f[kept[f].all(axis=1)]]
     centres = v - np.asarray(m.distance)[:, None] * out
     outer = trimesh.Trimesh(v[kept], faces, process=False)
-    line = {"centres": centres[kept], "frames": frames[kept]}
-    return trimesh.Trimesh(v, f, process=False), outer, (v[kept], faces, s[kept]), line
+    wall = TubeSurface(
+        vertices=v[kept], faces=faces, s=s[kept], centres=centres[kept], frames=frames[kept]
+    )
+    return trimesh.Trimesh(v, f, process=False), outer, wall
 
 
 def test_misuse_is_told():
     m = make_tube(table_1())
-    parts = m.vertices, m.faces, m.s
+    surface = TubeSurface(vertices=m.vertices, faces=m.faces, s=m.s)
     ring = Pose(jnp.eye(3), jnp.array([75.0, 13, 0]))
     for near in (0, 17):
         with pytest.raises(ValueError, match=r"near: expected 1 to 16 .* found"):
@@ -426,10 +430,10 @@ def test_misuse_is_told():
     with pytest.raises(ValueError, match="overlap"):
         straight_patches(BORDERS, 1.0, overlap=-1.0)
     with pytest.raises(ValueError, match="rounding, overlap, most"):
-        patches_of(*parts, BORDERS, rounding=1.0)
+        patches_of(surface, BORDERS, rounding=1.0)
     with pytest.raises(ValueError, match="centres, frames: expected both"):
-        patches_of(*parts, BORDERS, centres=np.zeros((3430, 3)))
+        patches_of(surface._replace(centres=np.zeros((3430, 3))), BORDERS)
     with pytest.raises(ValueError, match="vertices, s: expected finite"):
-        patches_of(m.vertices.at[0, 0].set(jnp.nan), m.faces, m.s, BORDERS)
+        patches_of(surface._replace(vertices=m.vertices.at[0, 0].set(jnp.nan)), BORDERS)
     with pytest.raises(ValueError, match=r"between s = 200 and 210 mm encloses nothing: 35 vert"):
-        patches_of(*parts, np.r_[BORDERS, 200.0, 210.0])
+        patches_of(surface, np.r_[BORDERS, 200.0, 210.0])

@@ -12,7 +12,7 @@ from jaxtrachea.contact.patches import straight_patches, touch
 from jaxtrachea.contact.pose import Pose, pose_from_vector
 from jaxtrachea.contact.search import STANDARD
 from jaxtrachea.contact.shapes import box, capsule, cloud, cylinder, padded, sphere
-from jaxtrachea.contact.walls import patches_of
+from jaxtrachea.contact.walls import TubeSurface, patches_of
 from jaxtrachea.status import ContactStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.tube import make_tube
@@ -258,7 +258,8 @@ def tubes():
     s, phi = np.asarray(m.s) * 2 * MIDDLE / float(table_1().length), np.asarray(m.phi)
     wall = np.stack([s, RADIUS * np.cos(phi), RADIUS * np.sin(phi)], axis=1)
     borders = np.linspace(0.0, 2 * MIDDLE, 8)
-    mesh = patches_of(wall, m.faces, s, borders, rounding=0.25, most=80)
+    surface = TubeSurface(vertices=wall, faces=m.faces, s=s)
+    mesh = patches_of(surface, borders, rounding=0.25, most=80)
     return {"round": straight_patches(borders, RADIUS), "mesh": mesh}
 
 

@@ -33,14 +33,29 @@ ACROSS = 8
 SPACING = 1.0
 
 
+class TubeSurface(NamedTuple):
+    """The surface of a tube, by the way along its centreline.
+
+    Attributes:
+        vertices: of the outer surface (an inner one does no harm, but counts as `filled`), mm;
+            shape (vertices, 3).
+        faces: its triangles; shape (faces, 3).
+        s: position of every vertex along the centreline, mm; shape (vertices,).
+        centres: point of the centreline beside each vertex, mm; None: straight along x, (s, 0, 0).
+        frames: columns tangent, anterior, lateral of the centreline there; None: identity.
+    """
+
+    vertices: ArrayLike
+    faces: ArrayLike
+    s: ArrayLike
+    centres: ArrayLike | None = None
+    frames: ArrayLike | None = None
+
+
 def patches_of(
-    vertices: ArrayLike,
-    faces: ArrayLike,
-    s: ArrayLike,
+    surface: TubeSurface,
     borders: ArrayLike,
     *,
-    centres: ArrayLike | None = None,
-    frames: ArrayLike | None = None,
     rounding: float = 0.5,
     overlap: float = 0.5,
     most: int = 32,
@@ -52,13 +67,8 @@ def patches_of(
     Open ends run on beyond the first and last border, rounded.
 
     Args:
-        vertices: of the outer surface (an inner one does no harm, but counts as `filled`), mm;
-            shape (vertices, 3).
-        faces: its triangles; shape (faces, 3).
-        s: position of every vertex along the centreline, mm; shape (vertices,).
+        surface: its vertices, faces and centreline.
         borders: s of the ends and of the borders between, mm, rising; shape (patches + 1,).
-        centres: point of the centreline beside each vertex, mm; None: straight along x, (s, 0, 0).
-        frames: columns tangent, anterior, lateral of the centreline there; None: identity.
         rounding: radius r of the ball over the largest that fits, in (0, 1). More is smoother, and
             needs fewer vertices, but loses more at corners.
         overlap: by how much a patch runs on beyond its borders before it is rounded, mm.
@@ -70,7 +80,8 @@ def patches_of(
         ValueError: naming the argument or the span.
     """
     at = check_borders(borders)
-    v, s, faces = np.asarray(vertices, float), np.asarray(s, float), np.asarray(faces)
+    v, s = np.asarray(surface.vertices, float), np.asarray(surface.s, float)
+    faces, centres, frames = np.asarray(surface.faces), surface.centres, surface.frames
     _check(v, s, (centres, frames), (rounding, overlap, most))
     if centres is not None and frames is not None:
         centres, frames = np.asarray(centres, float), np.asarray(frames, float)

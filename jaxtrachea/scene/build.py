@@ -20,7 +20,7 @@ from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import SizeError
 from jaxtrachea.scene.spec import SceneSpec, SceneTracheaSection, ToolSection
 from jaxtrachea.scene.stage import Poses, Presses, Scene
-from jaxtrachea.trachea.imported import read_mesh
+from jaxtrachea.trachea.imported import Landmarks, read_mesh
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import MeshError
 from jaxtrachea.trachea.section import geometry_of
@@ -33,7 +33,7 @@ KEYS = {
     "rings=": "cartilage=",
     "ring_positions": "rings",
     "ring_positions=": "rings=",
-    "centreline=": "centreline= to read_mesh (from Python)",
+    "centreline=": "centreline= of Landmarks to read_mesh (from Python)",
     "geometry.length": "trachea.length",
     "geometry.radius": "trachea.radius",
 }
@@ -164,10 +164,13 @@ def _imported(section: SceneTracheaSection, folder: Path, files: list[Path], pro
     if cartilage is not None and (folder / cartilage).is_file():
         cartilage = named_file(folder, cartilage, "trachea.cartilage", files)
     rings = section.rings if isinstance(section.rings, list) else None
+    landmarks = Landmarks(
+        larynx=section.larynx, anterior=section.anterior, ring_positions=rings,
+        half_angle=section.half_angle,
+    )  # fmt: skip
     try:
         read = read_mesh(
-            path, unit=section.unit, part=section.part, rings=cartilage, larynx=section.larynx,
-            anterior=section.anterior, ring_positions=rings, half_angle=section.half_angle,
+            path, landmarks, unit=section.unit, part=section.part, rings=cartilage,
             progress=progress,
         )  # fmt: skip
     except (MeshError, UnitError) as error:

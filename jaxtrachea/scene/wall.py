@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxtrachea.contact.patches import Patches, straight_patches
 from jaxtrachea.contact.shapes import Shape
-from jaxtrachea.contact.walls import patches_of
+from jaxtrachea.contact.walls import TubeSurface, patches_of
 from jaxtrachea.scene import wall_check
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh
@@ -58,8 +58,9 @@ def patches_of_wall(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
     parts = np.ceil(np.diff(borders) / (LONGEST * usual) - 1e-4).astype(int)
     spans = zip(borders[:-1], borders[1:], np.maximum(parts, 1), strict=True)
     borders = np.concatenate([*(np.linspace(a, b, n + 1)[:-1] for a, b, n in spans), borders[-1:]])
+    surface = TubeSurface(vertices=vertices, faces=faces, s=s, centres=centres, frames=frames)
     return patches_of(
-        vertices, faces, s, borders, centres=centres, frames=frames, rounding=ROUNDED, most=CORNERS,
+        surface, borders, rounding=ROUNDED, most=CORNERS,
         overlap=wall_check.overlap_of(geometry), dtype=geometry.length.dtype, progress=progress,
     )  # fmt: skip
 

@@ -5,9 +5,9 @@ the shape (unit, ends, centreline, anterior side, rings) can be given instead; w
 is refused.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -57,17 +57,33 @@ class Imported(eqx.Module):
     notes: tuple[str, ...] = eqx.field(static=True)
 
 
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class Landmarks:
+    """What is known of the anatomy; None: found in the shape.
+
+    Attributes:
+        larynx: direction from carina to larynx, in file axes. None: the carina is the wider end.
+        anterior: direction of the anterior side, in file axes. None: opposite the gap of the rings
+            or the flat side of the wall.
+        centreline: points from one end to the other, file unit; shape (points, 3).
+        ring_positions: s of the rings, mm from the carina's end.
+        half_angle: of the rings, rad.
+    """
+
+    larynx: Sequence[float] | np.ndarray | None = None
+    anterior: Sequence[float] | np.ndarray | None = None
+    centreline: np.ndarray | None = None
+    ring_positions: Sequence[float] | np.ndarray | None = None
+    half_angle: float | None = None
+
+
 def read_mesh(
     path: str | Path,
+    landmarks: Landmarks = Landmarks(),
     *,
     unit: str | None = None,
     part: str | None = None,
     rings: str | Path | None = None,
-    larynx: Sequence[float] | np.ndarray | None = None,
-    anterior: Sequence[float] | np.ndarray | None = None,
-    centreline: np.ndarray | None = None,
-    ring_positions: Sequence[float] | np.ndarray | None = None,
-    half_angle: float | None = None,
     dtype=None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Imported:
@@ -75,6 +91,7 @@ def read_mesh(
 
     Args:
         path: the file.
+        landmarks: what need not be found in the shape.
         unit: of the file, "mm" say. None: metres for GLB and glTF, as that format says; else the
             one of mm, cm, m, in that gives a plausible length, refused if there are two.
         part: name of the object that is the wall, if the file has several. None: the one with more
@@ -82,12 +99,6 @@ def read_mesh(
         rings: the cartilage: name of another object in the file, or another file of the same unit
             and position. None: an object whose name tells of cartilage or rings; without one the
             rings are looked for in the relief of the wall.
-        larynx: direction from carina to larynx, in file axes. None: the carina is the wider end.
-        anterior: direction of the anterior side, in file axes. None: opposite the gap of the rings
-            or the flat side of the wall.
-        centreline: points from one end to the other, file unit; shape (points, 3).
-        ring_positions: s of the rings, mm from the carina's end.
-        half_angle: of the rings, rad.
         dtype: of every array; the default float type of JAX if None.
         progress: called with (steps done since the last call, steps in all).
 
@@ -96,26 +107,12 @@ def read_mesh(
     """
     path = Path(path)
     try:
-        known = _Known(unit, part, rings, larynx, anterior, centreline, ring_positions, half_angle)
-        return _read(path, known, dtype, progress)
+        return _read(path, landmarks, unit, part, rings, dtype, progress)
     except MeshError as error:
         raise MeshError.like(error, place=path.name) from error.__cause__
 
 
-class _Known(NamedTuple):
-    """What the user says of the file, see `read_mesh`; None: found in the shape."""
-
-    unit: str | None
-    part: str | None
-    rings: str | Path | None
-    larynx: Sequence[float] | np.ndarray | None
-    anterior: Sequence[float] | np.ndarray | None
-    centreline: np.ndarray | None
-    ring_positions: Sequence[float] | np.ndarray | None
-    half_angle: float | None
-
-
-def _read(path: Path, known: _Known, dtype, progress) -> Imported:
+def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> Imported:
     """As `read_mesh`; its errors do not name the file."""
 
     def step():
@@ -123,13 +120,13 @@ def _read(path: Path, known: _Known, dtype, progress) -> Imported:
 
     parts = _parts(path)
     step()
-    name = _wall(parts, known.part)
+    name = _wall(parts, part)
     notes = [f"wall: {name}"] if len(parts) > 1 else []
     surface, cleaned = clean(parts[name])
     step()
-    scale = _scale(surface, path, known.unit, notes)
+    scale = _scale(surface, path, unit, notes)
     wall = Surface(surface.vertices * scale, surface.faces)
-    cartilage = _cartilage(parts, name, known.rings, path, scale, notes)
+    cartilage = _cartilage(parts, name, rings, path, scale, notes)
     given = None
     if known.centreline is not None:
         given = np.asarray(known.centreline, float) * scale

@@ -28,7 +28,7 @@ from jaxtrachea.contact.pose import Pose  # noqa: E402
 from jaxtrachea.contact.shapes import sphere  # noqa: E402
 from jaxtrachea.scene import wall as walls_of_scene  # noqa: E402
 from jaxtrachea.scene import wall_check  # noqa: E402
-from jaxtrachea.trachea.imported import read_mesh  # noqa: E402
+from jaxtrachea.trachea.imported import Landmarks, read_mesh  # noqa: E402
 from jaxtrachea.trachea.mesh import MeshError  # noqa: E402
 from jaxtrachea.trachea.tube import make_tube  # noqa: E402
 
@@ -131,7 +131,7 @@ def main(files):
         for name, read in (
             ("male, GLB", read_mesh(male)),
             ("male, STL", read_mesh(wall, rings=hoops)),
-            ("female, GLB", read_mesh(female, **up)),
+            ("female, GLB", read_mesh(female, Landmarks(**up))),
         ):
             row(f"{name}, {read.geometry.rings} rings", read.mesh, read.geometry)
     print("\n| surface | answer |\n|---|---|")
@@ -140,7 +140,7 @@ def main(files):
             path = Path(folder) / "surface.stl"
             trimesh.Trimesh(vertices, np.asarray(faces), process=False).export(path)
             try:
-                read = read_mesh(path, **given)
+                read = read_mesh(path, Landmarks(**given))
                 tube = walls_of_scene.checked_walls(read.geometry, read.mesh)
                 seen = wall_check.measure(read.mesh, read.geometry, tube)
                 answer = f"**read**: {read.notes[-1]}; {seen.sentence}"
