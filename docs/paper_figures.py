@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrachea.mechanics.oblique import ObliquePress, press_oblique
+from jaxtrachea.mechanics.oblique import ObliqueOptions, ObliquePress, press_oblique
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.plots import draw_surface
@@ -45,7 +45,8 @@ def pulled(direction, rings="mat") -> ObliquePress:
     unit = np.asarray(direction) / np.linalg.norm(direction)
     D = jnp.asarray(DEPTHS[:, None] * unit)
     at = jnp.asarray(S_C), jnp.asarray(0.0)
-    return press_oblique(table_1(), material(), *at, D, Options(contact="bonded"), rings=rings)
+    options = ObliqueOptions(Options(contact="bonded"), rings=rings)
+    return press_oblique(table_1(), material(), *at, D, options)
 
 
 def facts() -> dict:

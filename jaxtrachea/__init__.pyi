@@ -18,6 +18,8 @@ from .mechanics.beam import contact_compliance as contact_compliance
 from .mechanics.beam import deflect as deflect
 from .mechanics.force_law import Law as Law
 from .mechanics.force_law import duffing as duffing
+from .mechanics.friction import Coulomb as Coulomb
+from .mechanics.oblique import ObliqueOptions as ObliqueOptions
 from .mechanics.oblique import ObliquePath as ObliquePath
 from .mechanics.oblique import ObliquePress as ObliquePress
 from .mechanics.oblique import press_oblique as press_oblique
@@ -43,6 +45,7 @@ from .scene.simulation import simulate as simulate
 from .scene.stage import Poses as Poses
 from .scene.stage import Presses as Presses
 from .scene.stage import Scene as Scene
+from .scene.stage import Tool as Tool
 from .scene.sweep import sweep as sweep
 from .status import FitStatus as FitStatus
 from .status import PredictionStatus as PredictionStatus

@@ -26,7 +26,8 @@ from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.mechanics import beam
-from jaxtrachea.mechanics.oblique import press_oblique, press_path
+from jaxtrachea.mechanics.friction import Coulomb
+from jaxtrachea.mechanics.oblique import ObliqueOptions, press_oblique, press_path
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.skeleton import skeleton_response
 from jaxtrachea.optimisation.trust_region import Tolerances
@@ -105,6 +106,7 @@ def test_other_records():
         (Weighting, {"loss": "square"}),
         (Weighting, {"loss_scale": 0.0}),
         (Weighting, {"loss_scale": math.inf}),
+        (ObliqueOptions, {"axial": "on"}),
         (Descent, {"method": "sgd"}),
         (Descent, {"learning_rate": math.nan}),
         (EffectOptions, {"contact_point": "every"}),
@@ -181,7 +183,6 @@ def test_no_function_runs_a_misspelt_word():
     assert seen >= INNER | {
         "mechanics.beam.deflect",
         "mechanics.skeleton.skeleton_response",
-        "mechanics.oblique.press_path",
     }
 
 
@@ -205,7 +206,7 @@ def test_no_record_keeps_a_misspelt_word():
                         bare(kind, **{field: "no such word"})
     assert seen >= {
         "Options", "EffectOptions", "Plan", "Settings", "Parameter", "Levels", "Weighting",
-        "Descent",
+        "Descent", "ObliqueOptions",
     }  # fmt: skip
 
 
@@ -225,10 +226,10 @@ def compiled(which):
             out = press(g, m, s, [0.0, 1.0, 3.0], Options(**more))
             return out.status, out.force, out.compliance
         if which == "oblique":
-            out = press_oblique(g, m, s, 0.3, inward, Options(**more))
+            out = press_oblique(g, m, s, 0.3, inward, ObliqueOptions(Options(**more)))
             return out.status, out.force, out.joints
         if which == "path":
-            mu = values["friction"]
+            mu = Coulomb(values["friction"])
             out = press_path(g, m, s, 0.3, np.stack([inward, 2 * inward]), mu)
             return out.press.status, out.press.force, out.slip
         out = skeleton_response(g, m, s, 0.3, shear=True)
@@ -317,7 +318,9 @@ def test_python_numbers():
     for k in range(3):  # one program for every new number
         run(table_1(), Material(2.0 + k, 1.0, 1.0, 0.0), 40.0 + k, 2.0)
     assert run._cache_size() == 3
-    path = functools.partial(press_path, table_1(), Material(**FULL), 40, 0, [[0, -1, 0]], 1)
+    path = functools.partial(
+        press_path, table_1(), Material(**FULL), 40, 0, [[0, -1, 0]], Coulomb(1)
+    )
     assert jax.eval_shape(path).press.force.shape == (1, 3)
     assert Geometry(160, [20, 40], 11, 2, 4).ring_positions.dtype == jnp.float64
     deflect = jax.jit(lambda: (beam.deflect(BEAM, 2, 1).w_C, beam.contact_compliance(BEAM, [2, 4])))
@@ -362,10 +365,10 @@ def test_wrong_lengths_elsewhere():
         r"displacement has 2 values; expected shape \(..., 3\)":
             lambda: press_oblique(g, m, 40, 0, [1, 2]),
         r"displacement has 3 values; expected shape \(steps, 3\)":
-            lambda: press_path(g, m, 40, 0, [0, 1, 2], 0.5),
+            lambda: press_path(g, m, 40, 0, [0, 1, 2], Coulomb(0.5)),
         "phi_c has 2 values": lambda: press_oblique(g, m, 40, [0, 1], D),
-        "friction is 'a'": lambda: press_path(g, m, 40, 0, D, "a"),
-        "rounding is -1": lambda: press_path(g, m, 40, 0, D, 0.5, rounding=-1.0),
+        "friction is 'a'": lambda: press_path(g, m, 40, 0, D, Coulomb("a")),
+        "rounding is -1": lambda: Coulomb(0.5, rounding=-1.0),
         "Material.EA_L has 3 values; expected .*16": lambda: skeleton_response(g, bad, 40, 0),
         "s_c has 3 values": lambda: skeleton_response(g, m, [1, 2, 3], 0),
         "path.phi has 3 values; expected 2":
@@ -426,7 +429,7 @@ def test_a_value_that_would_be_ignored_is_refused(name, other):
     alone = Material(**given)
     for run in (
         lambda m: press(g, m, 40.0, 1.0),
-        lambda m: press_oblique(g, m, 40.0, 0.0, D, rings="mat", axial=False),
+        lambda m: press_oblique(g, m, 40.0, 0.0, D, ObliqueOptions(rings="mat", axial=False)),
         lambda m: make_scene(g, m, path, effects=EffectOptions(want_surface=False)),
         lambda m: simulate(scene, m, path),
         lambda m: sweep(scene, m, [40.0], [0.0], [1.0]),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from small_scenes import MATERIAL, TUBE
 
-from jaxtrachea import Options, press_oblique
+from jaxtrachea import ObliqueOptions, Options, press_oblique
 from jaxtrachea.mechanics.energy import StraightPress, gradient
 from jaxtrachea.mechanics.skeleton import local_frame
 
@@ -35,15 +35,16 @@ LEVELS = {
 
 def energy(material, options, rings, inward, s, phi):
     """Integral of the normal force over the depth, 12 points of Gauss; after the first touch."""
-    sharp = dataclasses.replace(options, onset_width=0.0)
+    sharp = ObliqueOptions(dataclasses.replace(options, onset_width=0.0), rings)
     normal = local_frame(phi)[0]
     D = (inward * (1 + NODES) / 2)[:, None] * normal[None]
-    force = press_oblique(TUBE, material, s, phi, D, sharp, rings=rings).force
+    force = press_oblique(TUBE, material, s, phi, D, sharp).force
     return jnp.sum(WEIGHTS * (force @ normal)) * inward / 2
 
 
 def solved_press(material, options, rings, inward, s, phi):
-    out = press_oblique(TUBE, material, s, phi, inward * local_frame(phi)[0], options, rings=rings)
+    D = inward * local_frame(phi)[0]
+    out = press_oblique(TUBE, material, s, phi, D, ObliqueOptions(options, rings))
     return StraightPress(s, phi, inward, out.force, out.depth, out.slope_C, out.loads)
 
 

@@ -9,7 +9,7 @@ import pytest
 import scipy.optimize
 
 from jaxtrachea.mechanics.force_law import Law
-from jaxtrachea.mechanics.friction import slide, slide_path
+from jaxtrachea.mechanics.friction import Coulomb, slide, slide_path
 from jaxtrachea.status import PressStatus
 
 MU = 0.66  # paper, Table 1
@@ -23,7 +23,7 @@ QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compil
 @functools.cache
 def compiled(rounding):
     def run(D, C, a, b, mu):
-        return slide_path(D, C, Law(a, b), mu, rounding=rounding)
+        return slide_path(D, C, Law(a, b), Coulomb(mu, rounding))
 
     return jax.jit(run, compiler_options=QUICK)
 
@@ -138,7 +138,7 @@ def test_any_coupling():
     k_1, k_3, mu = 10 ** rng.uniform(-1, 1, n), 10 ** rng.uniform(-3, 2, n), rng.uniform(0, 0.9, n)
 
     def one(D, C, a, b, m):
-        return slide(D, C, Law(a, b), m, jnp.zeros(2))
+        return slide(D, C, Law(a, b), Coulomb(m), jnp.zeros(2))
 
     step = jax.jit(jax.vmap(one))
     got = step(D, (C + C.mT) / 2, k_1, k_3, mu)
@@ -203,9 +203,8 @@ def test_rounding():
             jnp.stack([jnp.ones_like(x), x, jnp.zeros_like(x)]),
             jnp.diag(jnp.asarray([1.0, 2.0, 3.0])),
             Law(jnp.asarray(0.5), jnp.asarray(0.0)),
-            jnp.asarray(MU),
+            Coulomb(jnp.asarray(MU), rounding=w),
             jnp.zeros(2),
-            rounding=w,
         ).force[1]
     )
     both = jax.jit(jax.vmap(jax.value_and_grad(step)), compiler_options=QUICK)
@@ -238,7 +237,7 @@ def test_gradients(rounding, dtype):
     point |= {"k_1": 0.7, "k_3": 0.3, "mu": MU}
 
     def f(v):
-        got = slide_path(v["D"], v["C"], Law(v["k_1"], v["k_3"]), v["mu"], rounding=rounding)
+        got = slide_path(v["D"], v["C"], Law(v["k_1"], v["k_3"]), Coulomb(v["mu"], rounding))
         return jnp.concatenate([got.force.ravel(), got.slip.ravel()])
 
     here = {n: jnp.asarray(v, dtype) for n, v in point.items()}
@@ -275,7 +274,7 @@ def test_gradient_at_rest_is_finite(rounding):
     D = jnp.asarray([[0.0, 0, 0], [1.0, 0, 0], [-1.0, 2, 0], [0.0, 1, 0]])
 
     def f(D, mu):
-        return slide(D, C, local, mu, jnp.zeros(2), rounding=rounding).force
+        return slide(D, C, local, Coulomb(mu, rounding), jnp.zeros(2)).force
 
     slopes = jax.jit(jax.vmap(jax.jacrev(f, (0, 1)), (0, None)), compiler_options=QUICK)(D, mu)
     assert all(np.all(np.isfinite(slope)) for slope in slopes)
@@ -301,7 +300,8 @@ def summed(quintic):
     """Force, slip and friction's work of a step, and the step; NaN counts as nothing."""
 
     def one(D, C, a, b, e, mu):
-        got = slide(D, C, Law(a, b, e if quintic else None), mu, jnp.zeros(2, D.dtype))
+        law = Law(a, b, e if quintic else None)
+        got = slide(D, C, law, Coulomb(mu), jnp.zeros(2, D.dtype))
         known = jnp.where(got.status == PressStatus.OK, got.force, 0)
         return jnp.sum(known) + jnp.sum(got.slip) + got.dissipated, got
 
@@ -356,7 +356,7 @@ def test_a_failed_step_leaves_the_derivatives_of_the_others():
 
     def after(k_3, D):
         return jnp.sum(slide_path(D, jnp.asarray(COUPLED), Law(jnp.asarray(0.5), k_3),
-                                  jnp.asarray(MU)).force[-1])  # fmt: skip
+                                  Coulomb(jnp.asarray(MU))).force[-1])  # fmt: skip
 
     slope = jax.jit(jax.grad(after), compiler_options=QUICK)
     k_3 = jnp.asarray(-0.01)

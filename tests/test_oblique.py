@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtrachea.mechanics.oblique import ObliquePress, press_oblique, press_path
+from jaxtrachea.mechanics.friction import Coulomb
+from jaxtrachea.mechanics.oblique import ObliqueOptions, ObliquePress, press_oblique, press_path
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.ring import Ring, ring_compliance
 from jaxtrachea.mechanics.skeleton import local_frame, skeleton_response
@@ -23,6 +24,7 @@ MORE = {"k_A": 0.5, "k_B": 2.0, "EI_side": 5.0}
 QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
 MOVES = np.array([[0.0, -1.0, 0.0], [0.3, -1.0, 0.5], [-2.0, 0.4, 1.0], [0.0, 0.0, 0.0]])
 BONDED = Options(contact="bonded")
+STUCK = ObliqueOptions(BONDED)
 
 
 def material(dtype="float64", **changes):
@@ -31,7 +33,7 @@ def material(dtype="float64", **changes):
 
 @functools.cache
 def compiled(options, rings, axial):
-    run = functools.partial(press_oblique, options=options, rings=rings, axial=axial)
+    run = functools.partial(press_oblique, options=ObliqueOptions(options, rings, axial))
     return jax.jit(run, compiler_options=QUICK)
 
 
@@ -203,7 +205,12 @@ def test_status_of_lanes():
 
     def one(phi, D, k_3):
         return press_oblique(
-            table_1(), Material(**(VALUES | {"k_3": k_3})), jnp.asarray(63.0), phi, D, BONDED
+            table_1(),
+            Material(**(VALUES | {"k_3": k_3})),
+            jnp.asarray(63.0),
+            phi,
+            D,
+            STUCK,
         )
 
     run = jax.jit(jax.vmap(one), compiler_options=QUICK)
@@ -225,7 +232,7 @@ def test_path():
     D = 0.8 * frame[0] + x[:, None] * (frame[1] + frame[2])
     run = functools.partial(press_path, table_1(), material(), jnp.asarray(63.0), jnp.asarray(0.4))
     quick = jax.jit(run, compiler_options=QUICK)
-    stuck, slid = (quick(jnp.asarray(D), jnp.asarray(mu)) for mu in (1e3, 0.3))
+    stuck, slid = (quick(jnp.asarray(D), Coulomb(jnp.asarray(mu))) for mu in (1e3, 0.3))
     np.testing.assert_allclose(stuck.press.force, pressed(D=D).force, atol=1e-12)
     np.testing.assert_array_equal(stuck.slip, 0)
     local = np.asarray(slid.press.force) @ frame.T
@@ -234,7 +241,7 @@ def test_path():
     np.testing.assert_allclose(total, D, atol=1e-12)
     assert np.all(slid.dissipated >= 0)
     with pytest.raises(ValueError, match="unilateral"):
-        run(jnp.asarray(D), jnp.asarray(0.3), BONDED)
+        run(jnp.asarray(D), Coulomb(jnp.asarray(0.3)), STUCK)
 
 
 @pytest.mark.parametrize(
@@ -252,18 +259,16 @@ def test_missing_values_are_named(name, keywords):
     with pytest.raises(ValueError, match=name):
         jax.eval_shape(
             lambda: press_oblique(
-                table_1(), Material(**values), zero, zero, jnp.zeros(3), **keywords
+                table_1(), Material(**values), zero, zero, jnp.zeros(3), ObliqueOptions(**keywords)
             )
         )
 
 
 def test_wrong_options_are_named():
-    zero = jnp.zeros(())
-    run = functools.partial(press_oblique, table_1(), material(), zero, zero, jnp.zeros(3))
     with pytest.raises(ValueError, match="split"):
-        run(Options(split="independent"))
+        ObliqueOptions(Options(split="independent"))
     with pytest.raises((ValueError, TypeError), match="arch3"):  # TypeError: the shape checks
-        run(rings="arch3")  # pyright: ignore
+        ObliqueOptions(rings="arch3")  # pyright: ignore
 
 
 def test_unused_effects_are_not_in_the_program():
@@ -271,7 +276,8 @@ def test_unused_effects_are_not_in_the_program():
     args = table_1(), material(), jnp.asarray(63.0), jnp.asarray(0.4), jnp.asarray(MOVES)
 
     def operations(**keywords):
-        run = jax.jit(functools.partial(press_oblique, options=BONDED, **keywords))
+        options = ObliqueOptions(BONDED, **keywords)
+        run = jax.jit(functools.partial(press_oblique, options=options))
         return run.lower(*args).as_text().count(" = ")
 
     full = operations()
@@ -281,7 +287,7 @@ def test_unused_effects_are_not_in_the_program():
 
 def _values(v):
     m = Material(**{n: v[n] for n in (*VALUES, *MORE)})
-    got = press_oblique(table_1(dtype=v["s"].dtype), m, v["s"], v["phi"], v["D"], BONDED)
+    got = press_oblique(table_1(dtype=v["s"].dtype), m, v["s"], v["phi"], v["D"], STUCK)
     return jnp.concatenate([q.ravel() for q in got[:-1]])
 
 

@@ -15,7 +15,7 @@ from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.equilibrium import press_series, press_total
 from jaxtrachea.mechanics.force_law import Law, blend, coefficient, fold_depth
-from jaxtrachea.mechanics.friction import slide
+from jaxtrachea.mechanics.friction import Coulomb, slide
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.vector_equilibrium import press_vector, press_vector_total
 from jaxtrachea.status import PressStatus
@@ -199,7 +199,7 @@ def test_friction_balances():
     mu = rng.uniform(0, 0.9, n)
 
     def one(D, C, a, b, e, m):
-        return slide(D, C, Law(a, b, e), m, jnp.zeros(2))
+        return slide(D, C, Law(a, b, e), Coulomb(m), jnp.zeros(2))
 
     got = jax.jit(jax.vmap(one))(D, (C + C.mT) / 2, *k, mu)
     F, d = np.asarray(got.force), np.asarray(got.depth)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrachea.mechanics.oblique import local_frame, press_oblique
+from jaxtrachea.mechanics.oblique import ObliqueOptions, local_frame, press_oblique
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -63,9 +63,8 @@ def predict(values, s_c, phi_c, level, names):
 
     def one(s, phi):
         frame = local_frame(phi)
-        got = press_oblique(
-            geometry(), material, s, phi, frame[0], OPTIONS, rings=level, axial=False
-        )
+        options = ObliqueOptions(OPTIONS, rings=level, axial=False)
+        got = press_oblique(geometry(), material, s, phi, frame[0], options)
         local = frame[::2].T
         return got.force @ local, got.joints @ local, got.end_U[:, 1:], got.end_V[:, 1:]
 

@@ -11,12 +11,15 @@ that is nearly linear in it. Local law and skeleton are the elasticity that regu
 law: force and slip are continuous in everything, with a kink where sticking turns into sliding.
 """
 
+import math
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea._arguments import ArrayLike
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.mechanics._matrix2 import apply, solve
 from jaxtrachea.mechanics.equilibrium import press_series
@@ -25,6 +28,29 @@ from jaxtrachea.mechanics.vector_equilibrium import press_vector
 from jaxtrachea.status import PressStatus
 
 _ITERATIONS = 12
+
+
+class Coulomb(eqx.Module):
+    """Coulomb's law, with a corner that may be rounded.
+
+    Attributes:
+        mu: coefficient, not negative (paper, Table 1: 0.66); a scalar.
+        rounding: width w that rounds the kink (static). A step creeps once |F_t| > (1 - w) mu F_n
+            on trial; above (1 + w) it is exact. 0: the law itself, with one-sided derivatives where
+            a step passes from sticking to sliding.
+    """
+
+    mu: ArrayLike
+    rounding: float = eqx.field(static=True, default=0.0)
+
+    def __check_init__(self):
+        """Refuse a width that is none.
+
+        Raises:
+            ValueError: negative or not finite.
+        """
+        if not 0 <= self.rounding < math.inf:
+            raise ValueError(f"rounding is {self.rounding}; expected a finite number, not negative")
 
 
 class Slide(NamedTuple):
@@ -51,10 +77,8 @@ def slide_path(
     displacement: Float[Array, "steps 3"],
     compliance: Float[Array, "3 3"],
     law: Law,
-    friction: Float[Array, ""],
+    friction: Coulomb,
     slip: Float[Array, "2"] | None = None,
-    *,
-    rounding: float = 0.0,
 ) -> Slide:
     """Follow a tool along a path; the slip is carried from step to step.
 
@@ -63,9 +87,8 @@ def slide_path(
             the normal component is positive (unilateral: no tension).
         compliance: skeleton at the contact in the same frame, mm/N, symmetric.
         law: local law; k_1 > 0.
-        friction: mu, not negative.
+        friction: between tool and surface.
         slip: at the start, mm; None: 0 (first touch where the path begins).
-        rounding: as in `slide`.
 
     Returns:
         A `Slide` with a leading axis of steps. A step without a solution is NaN with its status and
@@ -74,7 +97,7 @@ def slide_path(
     start = jnp.zeros_like(displacement[0, 1:]) if slip is None else slip
 
     def step(slip, D):
-        out = slide(D, compliance, law, friction, slip, rounding=rounding)
+        out = slide(D, compliance, law, friction, slip)
         return out.slip, out
 
     return jax.lax.scan(step, start, displacement)[1]
@@ -84,10 +107,8 @@ def slide(
     displacement: Float[Array, "3"],
     compliance: Float[Array, "3 3"],
     law: Law,
-    friction: Float[Array, ""],
+    friction: Coulomb,
     slip: Float[Array, "2"],
-    *,
-    rounding: float = 0.0,
 ) -> Slide:
     """One step of the return mapping: stick if the friction cone allows it, else slide on the cone.
 
@@ -98,28 +119,26 @@ def slide(
         displacement: of the tool at the end of the step, see `slide_path`.
         compliance: see `slide_path`.
         law: see `slide_path`.
-        friction: mu, not negative.
+        friction: see `slide_path`.
         slip: at the beginning of the step, mm.
-        rounding: width w that rounds the kink. The step creeps once |F_t| > (1 - w) mu F_n on
-            trial; above (1 + w) it is exact. 0: Coulomb's law, with one-sided derivatives where a
-            step passes from sticking to sliding.
 
     Returns:
         The `Slide`. Where neither sticking nor sliding is an equilibrium that presses (a law that
         softens), force and depth are NaN and the slip stays: PULLS where sticking would need a
         pull, else PAST_FOLD.
     """
+    mu, rounding = jnp.asarray(friction.mu), friction.rounding
     touching = ~(displacement[0] <= 0)  # NaN stays in
     trial = jnp.where(touching, displacement - jnp.concatenate([jnp.zeros(1, slip.dtype), slip]), 0)
     stuck = press_vector(trial, compliance, law)
-    tangential, limit = _length(stuck.force[1:]), friction * stuck.force[0]
+    tangential, limit = _length(stuck.force[1:]), mu * stuck.force[0]
     sliding = touching & ~(tangential <= (1 - rounding) * limit)
-    mobilised = friction
+    mobilised = mu
     if rounding > 0:
         # min(ratio, 1) with its corner replaced by a parabola below it.
         inside = sliding & (tangential < (1 + rounding) * limit)
         room = 1 + rounding - jnp.where(inside, tangential, 1) / jnp.where(inside, limit, 1)
-        mobilised = friction * (1 - jnp.where(inside, room * room / (4 * rounding), 0))
+        mobilised = mu * (1 - jnp.where(inside, room * room / (4 * rounding), 0))
     on_cone = _on_cone(sliding, trial, compliance, law, mobilised)
     pulls = stuck.force[0] < 0
     solved = jnp.where(sliding, on_cone.solved, jnp.isfinite(jnp.sum(stuck.force)) & ~pulls)

@@ -4,18 +4,19 @@ Contact force, local indentation and skeleton in one; with friction along a path
 the frame of the tube: x along s towards the larynx, y anterior, z to the side of positive phi.
 """
 
-import math
+import dataclasses
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._arguments import ArrayLike, check_word, last_axis, shaped
+from jaxtrachea._arguments import ArrayLike, check_record, last_axis, shaped
 from jaxtrachea.mechanics import friction as _friction
 from jaxtrachea.mechanics import skeleton, vector_equilibrium
 from jaxtrachea.mechanics.admission import Admitted, admit, hide, status_of
 from jaxtrachea.mechanics.force_law import Law
+from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.press import Options, local_law, read_values, touch
 from jaxtrachea.mechanics.skeleton import Rings, Skeleton, local_frame
 from jaxtrachea.status import PressStatus, RingStatus
@@ -58,6 +59,41 @@ class ObliquePath(NamedTuple):
     sliding: Bool[Array, " steps"]
 
 
+def _only_default(options: Options):
+    if options.half_width != 0 or options.skeleton != "linear":
+        raise ValueError(
+            "oblique presses need options.half_width=0 and options.skeleton='linear': a tool with "
+            "a width and a skeleton that softens are for normal presses on the midline (`press`)"
+        )
+    if options.split != "continuous" or options.form != "recursion":
+        raise ValueError("oblique presses need options.split='continuous' and form='recursion'")
+
+
+@dataclasses.dataclass(frozen=True)
+class ObliqueOptions:
+    """What the model of presses in any direction includes; static.
+
+    Attributes:
+        press: as for `press`; `split`, `form`, `half_width` and `skeleton` have no other choice
+            than their defaults here.
+        rings: see `skeleton_response`.
+        axial: see `skeleton_response`.
+    """
+
+    press: Options = Options()
+    rings: Rings = "arch2"
+    axial: bool = True
+
+    def __post_init__(self):
+        """Refuse words that mean nothing, and options of normal presses alone.
+
+        Raises:
+            ValueError: naming the option, what was found and what is expected.
+        """
+        check_record(self)
+        _only_default(self.press)
+
+
 class Place(NamedTuple):
     """A contact position, and what a press there needs of tube and material.
 
@@ -82,10 +118,8 @@ def press_oblique(
     s_c: ArrayLike,
     phi_c: ArrayLike,
     displacement: ArrayLike,
-    options: Options = Options(),
+    options: ObliqueOptions = ObliqueOptions(),
     *,
-    rings: Rings = "arch2",
-    axial: bool = True,
     onset: ArrayLike | None = None,
 ) -> ObliquePress:
     """Move the tool, stuck to the surface at (s_c, phi_c), by a vector.
@@ -100,22 +134,19 @@ def press_oblique(
         s_c: contact position, mm, in [0, length].
         phi_c: contact angle from the anterior midline, rad, in [-alpha, alpha].
         displacement: of the tool, x, y, z, mm; inward along the normal: (0, -cos phi, -sin phi).
-        options: as for `press`; `split` and `form` have no other choice here.
-        rings: see `skeleton_response`.
-        axial: see `skeleton_response`.
+        options: what is modelled (static).
         onset: inward displacement at first touch, mm; 0 if None.
 
     Returns:
         The `ObliquePress`; as for `press`, OFF_TUBE and BAD_MATERIAL are NaN throughout.
 
     Raises:
-        ValueError: an option that is not for oblique presses, a missing value of the material, an
-            argument that is no number, or an array of a wrong length.
+        ValueError: a missing value of the material, an argument that is no number, or an array of
+            a wrong length.
     """
-    _only_default(options)
-    check_word("rings", rings, Rings)
-    place = place_at(geometry, material, s_c, phi_c, options, onset=onset, rings=rings, axial=axial)
-    return press_at(place, last_axis("displacement", displacement, 3, place.phi_c.dtype), options)
+    place = place_at(geometry, material, s_c, phi_c, options, onset=onset)
+    displacement = last_axis("displacement", displacement, 3, place.phi_c.dtype)
+    return press_at(place, displacement, options.press)
 
 
 def press_at(place: Place, displacement: Float[Array, "*n 3"], options: Options) -> ObliquePress:
@@ -150,13 +181,10 @@ def press_path(
     s_c: ArrayLike,
     phi_c: ArrayLike,
     displacement: ArrayLike,
-    friction: ArrayLike,
-    options: Options = Options(),
+    friction: Coulomb,
+    options: ObliqueOptions = ObliqueOptions(),
     *,
-    rings: Rings = "arch2",
-    axial: bool = True,
     onset: ArrayLike | None = None,
-    rounding: float = 0.0,
 ) -> ObliquePath:
     """Lead the tool along a path; it sticks and slides by Coulomb's law (unilateral, `series`).
 
@@ -168,40 +196,31 @@ def press_path(
         s_c: -
         phi_c: -
         displacement: of the tool at the end of each step, from rest, mm; (steps, 3).
-        friction: Coulomb's mu (paper, Table 1: 0.66).
+        friction: between tool and surface.
         options: -
-        rings: -
-        axial: -
         onset: -
-        rounding: see `mechanics.friction.slide`.
 
     Returns:
         The `ObliquePath`; OFF_TUBE and BAD_MATERIAL (also: a negative mu) are NaN throughout.
 
     Raises:
-        ValueError: as `press_oblique`; `rounding` below 0.
+        ValueError: as `press_oblique`; another contact or coupling.
     """
-    _only_default(options)
-    if options.contact != "unilateral" or options.coupling != "series":
+    if options.press.contact != "unilateral" or options.press.coupling != "series":
         raise ValueError(
             "friction needs options.contact='unilateral' and options.coupling='series'"
         )
-    if not 0 <= rounding < math.inf:
-        raise ValueError(f"rounding is {rounding}; expected a finite number, not negative")
     dtype = geometry.length.dtype
     displacement = shaped("displacement", displacement, ("steps", 3), dtype=dtype)
-    check_word("rings", rings, Rings)
-    asked, unit, law, phi_c, onset = place_at(
-        geometry, material, s_c, phi_c, options, onset=onset, rings=rings, axial=axial
-    )
-    mu = shaped("friction", friction, (), dtype=dtype)
-    friction = jnp.where(mu < 0, 0, mu)
+    asked, unit, law, phi_c, onset = place_at(geometry, material, s_c, phi_c, options, onset=onset)
+    mu = shaped("friction", friction.mu, (), dtype=dtype)
+    friction = Coulomb(jnp.where(mu < 0, 0, mu), friction.rounding)
     refused = jnp.where(mu < 0, PressStatus.BAD_MATERIAL, asked.refused).astype(jnp.int8)
     frame = local_frame(phi_c)
     D = displacement @ frame.T
-    D = D.at[:, 0].set(touch(D[:, 0], onset, options))
+    D = D.at[:, 0].set(touch(D[:, 0], onset, options.press))
     C = frame @ unit.compliance @ frame.T
-    slid = _friction.slide_path(D, C, law, friction, rounding=rounding)
+    slid = _friction.slide_path(D, C, law, friction)
     unit, slid = hide(refused, unit, slid)
     status = status_of(refused, slid.status)
     press = _assemble(unit, slid.force @ frame, slid.depth @ frame, status)
@@ -214,33 +233,20 @@ def place_at(
     material: Material,
     s_c: ArrayLike,
     phi_c: ArrayLike,
-    options: Options,
+    options: ObliqueOptions,
     *,
-    rings: Rings,
-    axial: bool,
     onset: ArrayLike | None = None,
 ) -> Place:
     """Checked arguments, and the skeleton and the local law at the contact."""
-    check_word("rings", rings, Rings)
     dtype = geometry.length.dtype
     phi_c = shaped("phi_c", phi_c, (), dtype=dtype)
     onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=dtype)
-    levels = {"axial": axial, "shear": options.shear}
-    used = (*read_values(options), *skeleton.read_values(rings, **levels))
+    rings, levels = options.rings, {"axial": options.axial, "shear": options.press.shear}
+    used = (*read_values(options.press), *skeleton.read_values(rings, **levels))
     asked = admit(geometry, material, s_c, dict.fromkeys(used))
     unit = skeleton.respond(geometry, asked.material, asked.s_c, phi_c, rings=rings, **levels)
-    law = local_law(geometry, asked.material, asked.s_c, options)
+    law = local_law(geometry, asked.material, asked.s_c, options.press)
     return Place(asked=asked, unit=unit, law=law, phi_c=phi_c, onset=onset)
-
-
-def _only_default(options: Options):
-    if options.half_width != 0 or options.skeleton != "linear":
-        raise ValueError(
-            "oblique presses need options.half_width=0 and options.skeleton='linear': a tool with "
-            "a width and a skeleton that softens are for normal presses on the midline (`press`)"
-        )
-    if options.split != "continuous" or options.form != "recursion":
-        raise ValueError("oblique presses need options.split='continuous' and form='recursion'")
 
 
 def _assemble(unit: Skeleton, force, depth, status) -> ObliquePress:

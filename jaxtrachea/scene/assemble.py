@@ -12,7 +12,7 @@ from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import check_sizes
-from jaxtrachea.scene.stage import Poses, Presses, Scene, check_material, check_path
+from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool, check_material, check_path
 from jaxtrachea.scene.wall import checked_walls, near_patches, round_wall
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
@@ -30,8 +30,7 @@ def make_scene(
     material: Material,
     path: Poses | Presses,
     *,
-    tool: Shape | None = None,
-    friction: float | None = None,
+    tool: Tool | Shape | None = None,
     mesh: Mesh | None = None,
     radius: float | None = None,
     effects: EffectOptions = EffectOptions(),
@@ -43,8 +42,7 @@ def make_scene(
         geometry: the tube at rest.
         material: read only for which optional values are there.
         path: what the plan is made for; other paths may follow if they need no more.
-        tool: needed for `Poses`.
-        friction: Coulomb's coefficient.
+        tool: with its friction, or its shape alone; a shape is needed for `Poses`.
         mesh: the surface; without one `effects.want_surface` must be false.
         radius: of the tube's outside, mm; None: that of the mesh (of an imported one it is
             `geometry.radius`); without a mesh `geometry.radius` + 1.3 (half of Table 1's wall).
@@ -55,34 +53,34 @@ def make_scene(
         PlanError: a wish that cannot be met.
         MeshError: patches for the contact that are not where an imported mesh is.
         SizeError: a length that no trachea and no tool has: the unit is wrong, most likely.
-        ValueError: a path without rows, arrays of a wrong length, or a negative friction.
+        ValueError: a path without rows, or arrays of a wrong length.
     """
     check_path(path)
     check_material(geometry, material)
     if not len(path.s if isinstance(path, Presses) else path.translation):
         raise ValueError("path has no rows; expected at least one")
-    if friction is not None and not 0 <= float(friction) < np.inf:
-        raise ValueError(f"friction is {friction}; expected a finite number, not negative")
+    tool = tool if isinstance(tool, Tool) else Tool(tool)
+    shape, friction = tool.shape, tool.friction
     dtype = geometry.length.dtype
     outer = _outer(geometry, mesh) if radius is None else jnp.asarray(radius, dtype)
-    check_sizes(geometry, float(outer), tool)
-    if isinstance(path, Poses) and tool is None:
+    check_sizes(geometry, float(outer), shape)
+    if isinstance(path, Poses) and shape is None:
         raise PlanError("contact", "the path moves a tool", "there is none", "give a tool")
     size, tube, near = LEAST, None, 1
-    if tool is not None and isinstance(path, Poses):
+    if shape is not None and isinstance(path, Poses):
         if mesh is None:
             tube = round_wall(geometry, float(outer))
         else:
             tube = checked_walls(geometry, mesh, progress)
-        near = near_patches(tool, geometry, tube.centres.shape[0])
-    if tool is not None:
-        extent = np.ptp(np.asarray(tool.vertices), axis=1).min() / 2 + float(tool.radius)
+        near = near_patches(shape, geometry, tube.centres.shape[0])
+    if shape is not None:
+        extent = np.ptp(np.asarray(shape.vertices), axis=1).min() / 2 + float(shape.radius)
         size = max(FOOTPRINT * extent, LEAST)
     mu = None if friction is None else jnp.asarray(friction, dtype)
     binding = None if mesh is None else regions.bind(mesh, geometry)
     spacing = jnp.asarray(size, dtype)
     scene = Scene(
-        geometry=geometry, radius=outer, tube=tube, tool=tool, friction=mu, mesh=mesh,
+        geometry=geometry, radius=outer, tube=tube, tool=shape, friction=mu, mesh=mesh,
         binding=binding, footprint=spacing, near=near,
         plan=make_plan(SceneFacts(mesh=False), EffectOptions(want_surface=False)),  # not read
     )  # fmt: skip

@@ -19,7 +19,7 @@ from jaxtrachea.scene.paths import named_file, path_of, read_table
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import SizeError
 from jaxtrachea.scene.spec import SceneSpec, SceneTracheaSection, ToolSection
-from jaxtrachea.scene.stage import Poses, Presses, Scene
+from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool
 from jaxtrachea.trachea.imported import Landmarks, read_mesh
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import MeshError
@@ -68,15 +68,16 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     counted = counted or _uncounted
     geometry, mesh, notes = _trachea(spec.trachea, folder, files, counted)
     material = Material(**spec.material.model_dump())
-    tool = None if spec.tool is None else _tool(spec.tool, folder, files)
+    tool = None
+    if spec.tool is not None:
+        tool = Tool(_shape(spec.tool, folder, files), spec.tool.friction)
     path = path_of(spec, folder, files, geometry)
-    friction = None if spec.tool is None else spec.tool.friction
     radius = float(geometry.radius) + spec.trachea.wall / 2
     if spec.trachea.file is not None:
         radius = float(geometry.radius)  # that of the outer wall
     try:
         scene = make_scene(
-            geometry, material, path, tool=tool, friction=friction, mesh=mesh, radius=radius,
+            geometry, material, path, tool=tool, mesh=mesh, radius=radius,
             effects=effects_of(spec), progress=counted("cutting its wall into patches"),
         )  # fmt: skip
     except PlanError as error:
@@ -185,7 +186,7 @@ def _of_file(error: InputError) -> SpecError:
     return SpecError.like(named, place="", key=key, joint=named.joint if named.key else ": ")
 
 
-def _tool(section: ToolSection, folder: Path, files: list[Path]) -> shapes.Shape:
+def _shape(section: ToolSection, folder: Path, files: list[Path]) -> shapes.Shape:
     rounding = section.rounding or 0.0
     if section.shape == "sphere":
         return shapes.sphere(section.radius or 0.0)

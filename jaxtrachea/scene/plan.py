@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea._errors import InputError
+from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.skeleton import Rings
 from jaxtrachea.scene.effects import EFFECTS
@@ -118,6 +119,11 @@ class Plan:
                 key="options.split", joint=" ", expected="'continuous'",
                 cure="or keep the contact_point 'fixed'",
             )  # fmt: skip
+
+    @property
+    def oblique(self) -> ObliqueOptions:
+        """What presses as vectors include."""
+        return ObliqueOptions(self.options, rings=self.rings, axial=self.axial)
 
     def level(self, name: str) -> str:
         """The level of an effect."""

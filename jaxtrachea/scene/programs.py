@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliquePress, press_oblique, press_path
 from jaxtrachea.mechanics.press import ligament_beam, local_law, respond, unit_deflection
 from jaxtrachea.scene.stage import Presses, Scene
@@ -77,21 +78,20 @@ def _anterior(v):
 def vectors(scene: Scene, material: Material, presses: Presses) -> Moved:
     """Presses in any direction, anywhere on the rings."""
     plan = scene.plan
-    how = {"rings": plan.rings, "axial": plan.axial}
     fixed = scene.geometry, material
     if plan.friction:
         if scene.friction is None:
             raise ValueError("scene.friction is None; the plan has friction")
         path = press_path(
-            *fixed, presses.s[0], presses.phi[0], presses.displacement, scene.friction,
-            plan.options, **how,
+            *fixed, presses.s[0], presses.phi[0], presses.displacement, Coulomb(scene.friction),
+            plan.oblique,
         )  # fmt: skip
         return moved_by(path.press)._replace(slip=path.slip, dissipated=path.dissipated)
     if plan.contact_point == "fixed":
         at = presses.s[0], presses.phi[0], presses.displacement
-        return moved_by(press_oblique(*fixed, *at, plan.options, **how))
+        return moved_by(press_oblique(*fixed, *at, plan.oblique))
 
     def one(s, phi, D):
-        return press_oblique(*fixed, s, phi, D, plan.options, **how)
+        return press_oblique(*fixed, s, phi, D, plan.oblique)
 
     return moved_by(jax.vmap(one)(presses.s, presses.phi, presses.displacement))

@@ -156,9 +156,7 @@ def place_of(scene: Scene, material: Material, seat: Seat) -> Place | None:
     if not plan.second_plane:
         return None
     s, phi, _ = on_the_tube(scene, seat.s, seat.phi)
-    return place_at(
-        scene.geometry, material, s, phi, plan.options, rings=plan.rings, axial=plan.axial
-    )
+    return place_at(scene.geometry, material, s, phi, plan.oblique)
 
 
 def way_of(scene: Scene, seat: Seat, path: Poses) -> Float[Array, "3"]:

@@ -1,5 +1,7 @@
 """The scene as arrays: trachea, tool, surface, path; and how the tool touches it at rest."""
 
+import dataclasses
+import math
 from functools import partial
 
 import equinox as eqx
@@ -50,6 +52,29 @@ class Poses(eqx.Module):
 
     rotation: Float[Array, "rows 3 3"] = eqx.field(converter=partial(real, "rotation"))
     translation: Float[Array, "rows 3"] = eqx.field(converter=partial(real, "translation"))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Tool:
+    """What touches the trachea.
+
+    Attributes:
+        shape: about its own origin; None: presses are given at their contact points.
+        friction: Coulomb's coefficient; None: the tool holds the surface.
+    """
+
+    shape: Shape | None = None
+    friction: float | None = None
+
+    def __post_init__(self):
+        """Refuse a friction that there is not.
+
+        Raises:
+            ValueError: negative or not finite.
+        """
+        friction = self.friction
+        if friction is not None and not 0 <= float(friction) < math.inf:
+            raise ValueError(f"friction is {friction}; expected a finite number, not negative")
 
 
 def check_material(geometry: Geometry, material: Material) -> None:

@@ -1,5 +1,6 @@
 """Normal presses at many contact points."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -64,7 +65,8 @@ def sweep(
         for name, value in (("phi", phi), ("depth", depth))
     )
 
-    unlike = set(lacking(scene, material)) - {"axial"}  # every press is along the normal
+    straight = dataclasses.replace(scene.plan.oblique, axial=False)  # along the normal
+    unlike = set(lacking(scene, material)) - {"axial"}
 
     def one(at):
         s_c, phi_at, d = at
@@ -73,8 +75,7 @@ def sweep(
         phi_c, d = (jnp.where(behind, 0, v) for v in (phi_at, d))  # needs nothing of the rings
         inward = local_frame(phi_c)[0]
         press = press_oblique(
-            scene.geometry, material, s_c, phi_c, d * inward, scene.plan.options,
-            rings=scene.plan.rings, axial=False,
+            scene.geometry, material, s_c, phi_c, d * inward, straight,
         )  # fmt: skip
         force, way, depth = (v @ inward for v in (press.force, press.skeleton, press.depth))
         free = ~(force != 0)

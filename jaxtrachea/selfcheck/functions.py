@@ -17,8 +17,8 @@ from jaxtrachea.mechanics.axial import stretch
 from jaxtrachea.mechanics.beam import Beam, deflect
 from jaxtrachea.mechanics.equilibrium import press_series, press_total
 from jaxtrachea.mechanics.force_law import Law, ring_weight
-from jaxtrachea.mechanics.friction import slide
-from jaxtrachea.mechanics.oblique import press_oblique
+from jaxtrachea.mechanics.friction import Coulomb, slide
+from jaxtrachea.mechanics.oblique import ObliqueOptions, press_oblique
 from jaxtrachea.mechanics.press import Options, compliance, press
 from jaxtrachea.mechanics.press import respond as touch_and_respond
 from jaxtrachea.mechanics.ring import Ring, respond, ring_compliance
@@ -147,7 +147,8 @@ def oblique(v: Values) -> Answer:
     names = ("EI_L", "k_M", "k_1", "k_3", "EA_L", "EI_C", "k_t", "k_A", "k_B")
     material = Material(**{n: v[n] for n in names})
     geometry = _tube(5, 60.0, v["s"].dtype)
-    got = press_oblique(geometry, material, v["s"], v["phi"], v["D"], Options(contact="bonded"))
+    options = ObliqueOptions(Options(contact="bonded"))
+    got = press_oblique(geometry, material, v["s"], v["phi"], v["D"], options)
     return {"force": got.force, "skeleton": got.skeleton}, got.status
 
 
@@ -200,7 +201,7 @@ def on_ring_weight(v: Values) -> Answer:
 def friction(v: Values) -> Answer:
     """`slide`: one step of the return mapping; skeleton compliance (normal, tangential)."""
     C = jnp.diag(jnp.stack([v["C"][0], v["C"][1], v["C"][1]]))
-    got = slide(v["D"], C, Law(v["k_1"], v["k_3"]), v["mu"], v["slip"])
+    got = slide(v["D"], C, Law(v["k_1"], v["k_3"]), Coulomb(v["mu"]), v["slip"])
     return {"force": got.force, "slip": got.slip}, got.status
 
 

@@ -12,6 +12,7 @@ from tool_ways import closed_loop, placed, turn
 
 from jaxtrachea import Poses, Session, make_scene, press_oblique, simulate
 from jaxtrachea.contact.shapes import capsule
+from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.stage import touch_tube
 from jaxtrachea.status import PressStatus
@@ -38,12 +39,12 @@ def led(translation, rotation=None):
 def stored(scene, material, path):
     """Energy of every row: the work of a press at its place, by 12 points of Gauss."""
     seen = touch_tube(scene, path)
-    rings = scene.plan.rings
+    options = ObliqueOptions(rings=scene.plan.rings, axial=False)
 
     def one(s, phi, depth):
         normal = local_frame(phi)[0]
         D = (depth * (1 + NODES) / 2)[:, None] * normal[None]
-        force = press_oblique(TUBE, material, s, phi, D, rings=rings, axial=False).force
+        force = press_oblique(TUBE, material, s, phi, D, options).force
         return jnp.sum(WEIGHTS * (force @ normal)) * depth / 2
 
     return jax.vmap(one)(seen.s, seen.phi, -seen.gap)

@@ -8,7 +8,7 @@ import pytest
 from small_scenes import BALL, BARE, MATERIAL, TUBE, ball
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.mechanics.oblique import press_oblique, press_path
+from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.scene.assemble import make_scene
 from jaxtrachea.scene.spec import MaterialSection
@@ -32,13 +32,8 @@ def test_scene_refuses_a_softening_skeleton():
 
 @pytest.mark.parametrize("changes", [{"half_width": 2.4}, {"skeleton": "softening"}])
 def test_oblique_presses_refuse(changes):
-    options = Options(**changes)
-    D = jnp.array([[0.0, -1.0, 0.0]])
-    material = Material(**VALUES, e_1=0.1, e_2=0.005)
     with pytest.raises(ValueError, match="half_width=0 and options.skeleton='linear'"):
-        press_oblique(table_1(), material, 75.0, 0.0, D, options)
-    with pytest.raises(ValueError, match="half_width=0 and options.skeleton='linear'"):
-        press_path(table_1(), material, 75.0, 0.0, D, 0.5, options)
+        ObliqueOptions(Options(**changes))
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 from small_scenes import BALL, MATERIAL, TUBE, ball
 
 from jaxtrachea import EffectOptions, Poses, Presses, make_scene, simulate, with_geometry
+from jaxtrachea.scene.stage import Tool
 from jaxtrachea.trachea.tube import make_tube
 
 COARSE = make_tube(TUBE, around=5, along=11)  # no row on a ring, where the ends have a kink
@@ -67,8 +68,7 @@ def test_of_the_tools_pose_the_material_and_the_geometry():
         TUBE,
         MATERIAL,
         path,
-        tool=BALL,
-        friction=0.66,
+        tool=Tool(BALL, 0.66),
         mesh=COARSE,
         effects=EffectOptions(rings="mat"),
     )

@@ -9,6 +9,7 @@ from small_scenes import BALL, BARE, MATERIAL, MESH, TUBE, ball, presses
 from jaxtrachea import EffectOptions, PlanError, Poses, make_scene, simulate
 from jaxtrachea.scene.declare import SceneFacts
 from jaxtrachea.scene.rules import make_plan
+from jaxtrachea.scene.stage import Tool
 
 ALL = frozenset({"EA_L", "EI_C", "k_t", "GA_L", "k_A", "k_B", "k_1_ring"})
 
@@ -88,7 +89,7 @@ def test_the_wrong_kind_of_path_is_refused():
 def test_what_the_scene_holds_reaches_the_rules():
     """Facts of a path of the tool: places, direction, friction, what the material gives."""
     path = ball([75, 1, 0.5], [77, -2, 1.0])
-    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, friction=0.66, mesh=MESH)
+    scene = make_scene(TUBE, MATERIAL, path, tool=Tool(BALL, 0.66), mesh=MESH)
     level = {e.name: e.level for e in scene.plan.effects}
     assert level["friction"] == level["axial"] == level["second_plane"] == "on"
     assert (level["rings"], level["dent"], level["contact_point"]) == ("arch2", "16", "fixed")
@@ -100,7 +101,7 @@ def test_what_the_scene_holds_reaches_the_rules():
 def test_one_step_from_afar_to_a_slanting_press():
     """The way along the surface between two rows, from first touch on, counts for the plan too."""
     path = ball([70, 4, 0], [76, -2, 0], 2)
-    scene = make_scene(TUBE, MATERIAL, path, tool=BALL, friction=0.66, effects=BARE)
+    scene = make_scene(TUBE, MATERIAL, path, tool=Tool(BALL, 0.66), effects=BARE)
     assert scene.plan.friction
     assert scene.plan.axial
     assert jax.jit(simulate)(scene, MATERIAL, path).status.tolist() == [1, 0]
@@ -113,4 +114,4 @@ def test_misuse_is_named(rows, friction, says):
     path = ball([75, 1, 0], [75, -2, 0], 2)
     path = Poses(path.rotation[:rows], path.translation[:rows])
     with pytest.raises(ValueError, match=says):
-        make_scene(TUBE, MATERIAL, path, tool=BALL, friction=friction, effects=BARE)
+        make_scene(TUBE, MATERIAL, path, tool=Tool(BALL, friction), effects=BARE)

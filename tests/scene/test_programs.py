@@ -22,6 +22,8 @@ from jaxtrachea import (
 )
 from jaxtrachea.contact.patches import touch
 from jaxtrachea.contact.pose import Pose
+from jaxtrachea.mechanics.friction import Coulomb
+from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.press import ligament_beam, local_law, respond, unit_deflection
 from jaxtrachea.mechanics.press import touch as first_touch
 from jaxtrachea.mechanics.skeleton import local_frame
@@ -30,7 +32,7 @@ from jaxtrachea.scene.lumen import in_lumen
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import refuse, status_of, without_negative_values
-from jaxtrachea.scene.stage import touch_tube
+from jaxtrachea.scene.stage import Tool, touch_tube
 from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.mesh import place
@@ -40,11 +42,12 @@ HELD, TOTAL = Options(contact="bonded"), Options(coupling="total")
 
 def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **how):  # noqa: B008
     """A program for presses at one contact point."""
+    oblique = ObliqueOptions(options, **how)
 
     def run(scene, m, p):
         m, led, used, status = admitted(scene, m, p)
         at = used.s[0], used.phi[0]
-        out = press_oblique(scene.geometry, m, *at, used.displacement, options, **how)
+        out = press_oblique(scene.geometry, m, *at, used.displacement, oblique)
         seen = [led, out.force, out.depth, out.skeleton, *status(out)]
         seen += [getattr(out, name) for name in more.split()]
         return (*seen, move_surface(scene, *at, out, surface)) if surface else seen
@@ -100,10 +103,10 @@ def normal(scene, m, p):
 
 
 def friction(scene, m, p):
-    mu = scene.friction
+    law = Coulomb(scene.friction)
     m, led, used, status = admitted(scene, m, p)
     at = used.s[0], used.phi[0]
-    out = press_path(scene.geometry, m, *at, used.displacement, mu, rings="mat")
+    out = press_path(scene.geometry, m, *at, used.displacement, law, ObliqueOptions(rings="mat"))
     f = out.press
     vectors = f.force, f.depth, f.skeleton, f.joints, f.loads, f.end_U, f.end_V
     return led, vectors, status(f), out.slip, out.dissipated
@@ -125,7 +128,7 @@ def oblique_presses(scene, m, used):
     at = used.s, used.phi, used.displacement
 
     def one(*at):
-        return press_oblique(scene.geometry, m, *at, rings="mat", axial=False)
+        return press_oblique(scene.geometry, m, *at, ObliqueOptions(rings="mat", axial=False))
 
     return jax.vmap(one)(*at)
 
@@ -199,7 +202,7 @@ def program(name):
     path, effects, hand = PROGRAMS[name]
     mu = 0.66 if name == "friction" else None
     scene = make_scene(
-        TUBE, MATERIAL, path, tool=BALL if name == "tool" else None, friction=mu, mesh=MESH,
+        TUBE, MATERIAL, path, tool=Tool(BALL if name == "tool" else None, mu), mesh=MESH,
         effects=EffectOptions(**effects),
     )  # fmt: skip
     return scene, path, hand
@@ -293,7 +296,7 @@ def test_each_effect_that_is_on_costs_operations():
     path = ball([75, 1, 0.5], [77, -2, 1.0])
     optional = {"GA_L": 9.0, "k_A": 0.2, "k_1_ring": 0.6}
     material = dataclasses.replace(MATERIAL, **{k: jnp.array(v) for k, v in optional.items()})
-    scene = make_scene(TUBE, material, path, tool=BALL, friction=0.66, mesh=MESH)
+    scene = make_scene(TUBE, material, path, tool=Tool(BALL, 0.66), mesh=MESH)
 
     def without(plan):
         return dataclasses.replace(scene, plan=plan)

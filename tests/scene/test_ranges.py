@@ -27,6 +27,7 @@ from small_scenes import (
 from jaxtrachea import Poses, Presses, Session, make_scene, press_oblique, simulate, sweep
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.contact.shapes import sphere
+from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.scene.assemble import with_mesh
 from jaxtrachea.scene.build import dropped_effects
 from jaxtrachea.scene.declare import SceneFacts
@@ -36,6 +37,7 @@ from jaxtrachea.scene.ranges import depth_share, lacking, unserved
 from jaxtrachea.scene.refusals import status_of, without_negative_values
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import SizeError
+from jaxtrachea.scene.stage import Tool
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.tube import make_tube
 
@@ -114,7 +116,7 @@ def test_ends_that_move_and_a_dent_are_effects_too():
 
 
 def test_a_negative_friction_is_a_bad_material():
-    scene = make_scene(TUBE, SPRINGS, presses([-2, -4, 0]), friction=0.5, effects=ONE)
+    scene = make_scene(TUBE, SPRINGS, presses([-2, -4, 0]), tool=Tool(friction=0.5), effects=ONE)
     assert scene.plan.friction
     for mu, expected in ((0.5, False), (-0.1, True)):
         scene = dataclasses.replace(scene, friction=jnp.asarray(mu))
@@ -146,7 +148,8 @@ def test_a_plan_without_bending_rings_refuses_a_material_with_them(material, exp
 @pytest.mark.slow
 def test_a_plan_of_the_midline_bends_its_rings_off_it():
     """Its rings were springs, and 83 % off at 60 degrees."""
-    single = jax.jit(lambda D: press_oblique(TUBE, MATERIAL, 75.0, 1.0, D, axial=False).force)
+    options = ObliqueOptions(axial=False)
+    single = jax.jit(lambda D: press_oblique(TUBE, MATERIAL, 75.0, 1.0, D, options).force)
     made = make_scene(TUBE, MATERIAL, Presses([75.0], [0.0], [[0, -2.0, 0]]), effects=ONE)
     right = single(ASIDE.displacement[0])
     np.testing.assert_allclose(run(made, MATERIAL, ASIDE).force[0], right, rtol=1e-12)
@@ -242,7 +245,7 @@ def test_friction_and_a_seat_that_the_plan_has_not_are_refused():
     down, led = ball([75, 1, 0], [75, -2, 0]), ball([75, 1, 0], [78, -2, 0])
     far = ball([75, -1, 0], [95, -1, 0])
     unstretched = dataclasses.replace(VECTORS, axial="off")
-    rough = make_scene(TUBE, SPRINGS, down, tool=BALL, friction=0.66, effects=unstretched)
+    rough = make_scene(TUBE, SPRINGS, down, tool=Tool(BALL, 0.66), effects=unstretched)
     smooth = make_scene(TUBE, SPRINGS, led, tool=BALL, effects=ONE)
     assert run(rough, SPRINGS, down).status.tolist() == [1, OK, OK, OK]
     assert run(rough, SPRINGS, led).status.tolist() == [1, OFF_PLAN, OFF_PLAN, OFF_PLAN]

@@ -24,9 +24,10 @@ from small_scenes import (
 from tool_ways import closed_loop, placed, random_way, step_lengths
 
 from jaxtrachea import EffectOptions, Poses, Session, make_scene, press, press_oblique, simulate
-from jaxtrachea.mechanics.oblique import place_at
+from jaxtrachea.mechanics.oblique import ObliqueOptions, place_at
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.seat import given_way
+from jaxtrachea.scene.stage import Tool
 from jaxtrachea.status import PressStatus
 
 EYE = np.eye(3)
@@ -227,7 +228,7 @@ def test_a_jump_grasps_anew(held):
 @pytest.mark.slow
 def test_a_fresh_seat_is_pressed_straight_in(held):
     """After a jump round the tube as well: the force of a single press there."""
-    single = jax.jit(partial(press_oblique, TUBE, MATERIAL, rings="arch2"))
+    single = jax.jit(partial(press_oblique, TUBE, MATERIAL))
     force, gap, _, s = led(held, [[75, 0, -0.5], [75, 0, 2.0], [75, 0.8, 2.0], [75, -0.4, 2.0]])
     for at, phi in ((2, 0.8), (3, -0.4)):
         D = gap[at] * np.array([0, np.cos(phi), np.sin(phi)])
@@ -261,8 +262,7 @@ def test_what_gives_way_only_loses_energy(held):
 
     @jax.jit
     def give(ways):
-        options = scene.plan.options
-        place = place_at(TUBE, stiff, 72.0, 1.0, options, rings="arch2", axial=True)
+        place = place_at(TUBE, stiff, 72.0, 1.0, ObliqueOptions(scene.plan.options))
 
         def one(way):
             return given_way(scene, way, jnp.asarray(2.0), place)
@@ -342,7 +342,7 @@ def test_a_bonded_tool_holds_its_first_place():
 def test_refusals():
     over = poses([70, OUTER + 4, 0], [76, OUTER + 3, 0])
     rubbing = make_scene(
-        TUBE, MATERIAL, over, tool=BALL, friction=0.3,
+        TUBE, MATERIAL, over, tool=Tool(BALL, 0.3),
         effects=dataclasses.replace(BARE, contact_point="fixed"),
     )  # fmt: skip
     with pytest.raises(ValueError, match="friction"):

@@ -1,6 +1,7 @@
 """The chain from the tool to the surface: against single presses, spheres, and bent meshes."""
 
 import dataclasses
+import functools
 import itertools
 
 import jax
@@ -36,7 +37,8 @@ from jaxtrachea import (
     with_geometry,
 )
 from jaxtrachea.contact.shapes import box, sphere
-from jaxtrachea.scene.stage import touch_tube
+from jaxtrachea.mechanics.oblique import ObliqueOptions
+from jaxtrachea.scene.stage import Tool, touch_tube
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.tube import make_tube
@@ -93,7 +95,7 @@ def test_without_a_contact_point_no_row_is_a_number(more, at):
     path = Presses(np.full(3, 75.0), np.zeros(3), np.outer([2.0, 1.0, 0.0], [0, -1.0, 0]))
     friction = 0.66 if more.get("friction") else None
     scene = make_scene(
-        TUBE, SPRINGS, path, mesh=MESH, friction=friction, effects=EffectOptions(**more)
+        TUBE, SPRINGS, path, mesh=MESH, tool=Tool(friction=friction), effects=EffectOptions(**more)
     )
     assert scene.plan.contact_point == "fixed"
     whole = run(scene, SPRINGS, path)
@@ -216,9 +218,9 @@ def test_sweep_agrees_with_single_presses_whatever_the_chunk():
     for value in (out.force, out.indentation, out.depth_share):
         assert (np.asarray(value)[idle] == 0).all()
     assert np.isnan(out.force[8])
-    i = 5
+    i, options = 5, ObliqueOptions(axial=False)
     inward = -jnp.array([0, jnp.cos(phi[i]), jnp.sin(phi[i])])
-    single = jax.jit(lambda s, phi, D: press_oblique(TUBE, MATERIAL, s, phi, D, axial=False))
+    single = jax.jit(functools.partial(press_oblique, TUBE, MATERIAL, options=options))
     one = single(s[i], phi[i], 2.0 * inward)
     np.testing.assert_allclose(out.force[i], one.force @ inward, rtol=1e-12)
     np.testing.assert_allclose(
