@@ -107,6 +107,8 @@ WITHIN = {
 }  # fmt: skip
 #: Rooms that only read or write: they may be told of, but not tell, the physics.
 HEAVY = ["matplotlib", "trimesh", "typer", "rich", "pydantic", "h5py"]
+#: Arguments that a function takes at most: more want a record that has a name of its own.
+MOST_ARGUMENTS = 8
 MODULES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")
 
 
@@ -174,6 +176,31 @@ def test_no_room_holds_too_much_of_the_package():
     share = {r: sum(n for p, n in lines.items() if p.relative_to(PACKAGE).parts[0] == r)
              for r in rooms}  # fmt: skip
     assert max(share.values()) <= 0.15 * sum(lines.values())
+
+
+def argument_counts(source):
+    """Name and number of arguments of every function, `self` and `cls` not counted."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            args = node.args
+            names = [arg.arg for arg in (*args.posonlyargs, *args.args, *args.kwonlyargs)]
+            own = names[:1] in (["self"], ["cls"])
+            yield getattr(node, "name", "lambda"), len(names) - own
+
+
+def test_no_function_takes_too_many_arguments():
+    counts = [
+        (str(path.relative_to(PACKAGE)), name, count)
+        for path in PACKAGE.rglob("*.py")
+        for name, count in argument_counts(path.read_text())
+    ]
+    assert len(counts) > 1000  # it has looked
+    assert not [row for row in counts if row[2] > MOST_ARGUMENTS]
+
+
+def test_arguments_are_counted():
+    source = "class C:\n    async def m(self, a, /, b, *rest, c=1, **more): return lambda x, y=0: x"
+    assert dict(argument_counts(source)) == {"m": 3, "lambda": 2}
 
 
 @pytest.mark.parametrize(
