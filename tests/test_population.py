@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import chi2, multivariate_normal, t
 
-from jaxtrachea.inference.population import Common, random_effects
+from jaxtrachea.inference.random_effects import Common, random_effects
 
 
 def draw(rng, m, tau, middle):
