@@ -27,12 +27,8 @@ from jaxtrachea.trachea.cleaning import Surface, clean
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh, MeshError, vertex_normals
 from jaxtrachea.trachea.rings import find_anterior, find_rings
-from jaxtrachea.units import UnitError, unit_factor
+from jaxtrachea.trachea.surface_file import cartilage_of, parts_of, scale_of, wall_of
 
-#: Length of a trachea with its wall, infant to adult, mm: what a guess of the unit goes by.
-PLAUSIBLE = 40.0, 250.0
-#: Length of anything this can be used for, mm: a unit that says more or less is a mistake.
-POSSIBLE = 1.0, 5000.0
 #: Steps of reading that take time: the file, its repair, centreline, sections, places of vertices.
 STEPS = 5
 
@@ -118,15 +114,15 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
     def step():
         return None if progress is None else progress(1, STEPS)
 
-    parts = _parts(path)
+    parts = parts_of(path)
     step()
-    name = _wall(parts, part)
+    name = wall_of(parts, part)
     notes = [f"wall: {name}"] if len(parts) > 1 else []
     surface, cleaned = clean(parts[name])
     step()
-    scale = _scale(surface, path, unit, notes)
+    scale = scale_of(surface, path, unit, notes)
     wall = Surface(surface.vertices * scale, surface.faces)
-    cartilage = _cartilage(parts, name, rings, path, scale, notes)
+    cartilage = cartilage_of(parts, name, rings, path, scale, notes)
     given = None
     if known.centreline is not None:
         given = np.asarray(known.centreline, float) * scale
@@ -172,112 +168,6 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
         names = ("ring_positions", "half_angle")
         raise MeshError.like(error, cure="give {} or {}", arguments=names) from error
     return Imported(mesh, geometry, cast(rotation), cast(origin / scale), scale, tuple(notes))
-
-
-def _parts(path: Path) -> dict[str, Surface]:
-    """Objects of a file by name, in the file's common frame."""
-    import trimesh  # only those who read meshes wait for it
-
-    if not path.is_file():
-        raise MeshError("there is no such file")
-    try:
-        scene = trimesh.load_scene(path, process=False)
-        nodes = [(node, *scene.graph[node]) for node in scene.graph.nodes_geometry]
-        objects = [(str(node), scene.geometry[name], frame) for node, frame, name in nodes]
-    except Exception as error:  # trimesh raises whatever its many readers raise
-        said = "" if isinstance(error, ImportError) else str(error).split("\n")[0][:200]
-        raise MeshError(
-            "could not be read as a surface, damaged or of another format"
-            f"{f' ({said})' if said else ''}; expected STL, OBJ, PLY or GLB with triangles"
-        ) from error
-    parts = {
-        name: Surface(
-            np.asarray(part.vertices, float) @ frame[:3, :3].T + frame[:3, 3],
-            np.asarray(part.faces, np.int64),
-        )
-        for name, part, frame in objects
-        if isinstance(part, trimesh.Trimesh) and len(part.faces)
-    }
-    if not parts:
-        raise MeshError("there are no triangles in it; expected a surface, not points or lines")
-    if any(not np.all(np.isfinite(part.vertices)) for part in parts.values()):
-        raise MeshError("a vertex is not finite; export the surface again")
-    if any(
-        part.faces.min() < 0 or part.faces.max() >= len(part.vertices) for part in parts.values()
-    ):
-        raise MeshError("a triangle names a vertex that is not there; export the surface again")
-    return parts
-
-
-def _area(surface: Surface) -> float:
-    a, b, c = (surface.vertices[surface.faces[:, i]] for i in range(3))
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
-
-
-def _wall(parts: dict[str, Surface], part: str | None) -> str:
-    names = ", ".join(sorted(parts))
-    if part is not None:
-        if part not in parts:
-            raise MeshError(f"there is no object {part!r} in it; expected one of {names}")
-        return part
-    areas = {name: _area(surface) for name, surface in parts.items()}
-    largest = max(areas, key=lambda name: areas[name])
-    if not areas[largest] > 0:
-        raise MeshError("all vertices lie in one point or line; expected the surface of a trachea")
-    if areas[largest] <= 0.5 * sum(areas.values()):
-        raise MeshError(f"which of the objects {names} is the wall?", cure="give part=")
-    return largest
-
-
-def _scale(surface: Surface, path: Path, unit: str | None, notes: list[str]) -> float:
-    """Millimetres per unit of the file."""
-    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    if unit is not None:
-        try:
-            scale = float(unit_factor(unit, "length"))
-        except UnitError as error:
-            raise MeshError.like(error, key="") from error
-        if not POSSIBLE[0] <= size * scale <= POSSIBLE[1]:
-            raise MeshError(f"unit={unit!r} makes it {size * scale:.4g} mm long; correct unit=")
-        return scale
-    names = ("m",) if path.suffix.lower() in (".glb", ".gltf") else ("mm", "cm", "in", "m")
-    low, high = PLAUSIBLE
-    fits = [name for name in names if low <= size * float(unit_factor(name, "length")) <= high]
-    if len(fits) != 1:
-        found = f"may be in {' or '.join(fits)}" if fits else f"is no trachea in {', '.join(names)}"
-        raise MeshError(
-            f"its size of {size:.4g} {found} (expected {low:g} to {high:g} mm); give unit="
-        )
-    notes.append(f"unit taken as {fits[0]}")
-    return float(unit_factor(fits[0], "length"))
-
-
-def _cartilage(parts, wall, rings, path, scale, notes) -> Surface | None:
-    """The rings' own surface, mm, or None."""
-    if rings is None:
-        named = [
-            n for n in parts if n != wall and ("cartilage" in n.lower() or "ring" in n.lower())
-        ]
-        if len(named) > 1:
-            found = f"which of the objects {', '.join(named)} are the rings?"
-            raise MeshError(found, cure="give {}", arguments=("rings=",))
-        rings = named[0] if named else None
-    if rings is None:
-        return None
-    if str(rings) in parts:
-        found = [parts[str(rings)]]
-    else:
-        other = path.parent / rings
-        try:
-            found = list(_parts(other).values())
-        except MeshError as error:
-            found = f"{str(rings)!r}: {error}"
-            raise MeshError(found, key="rings", joint="=") from error
-    notes.append(f"rings: {rings}")
-    shift = np.cumsum([0, *(len(f.vertices) for f in found[:-1])])
-    vertices = np.concatenate([f.vertices for f in found]) * scale
-    faces = np.concatenate([f.faces + at for f, at in zip(found, shift, strict=True)])
-    return Surface(vertices, faces)
 
 
 def _axes(along, anterior):
