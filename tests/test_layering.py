@@ -83,7 +83,7 @@ WITHIN = {
         {"covariance", "joint_information", "noise"},
         {"criteria", "settings", "verdict"},
         {"result"},
-        {"minima", "natural_sizes", "predictions", "profile_search"},
+        {"minima", "natural_sizes", "other_starts", "predictions", "profile_search"},
         {"doubt", "evaluate"},
         {"scrutiny"},
         {"fit"},

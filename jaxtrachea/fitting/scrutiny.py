@@ -11,32 +11,20 @@ reaches at least as far (likelihood region; Raue et al. 2009, doi:10.1093/bioinf
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fitting.doubt import APART
-from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.minima import Minima, data_weight
-from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.natural_sizes import natural_sizes
-from jaxtrachea.fitting.parameters import SKELETON
+from jaxtrachea.fitting.other_starts import soft_starts, twins
 from jaxtrachea.fitting.profile_search import Sides, find_ends
-from jaxtrachea.fitting.residual import inputs
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.starts import EXACT, box, scales
-from jaxtrachea.fitting.structure import Structure, positions
-from jaxtrachea.fitting.study import Study
-from jaxtrachea.mechanics.force_law import coefficient, power
-from jaxtrachea.optimisation.programs import program
+from jaxtrachea.fitting.starts import EXACT, scales
+from jaxtrachea.fitting.structure import Structure
 from jaxtrachea.status import FitStatus, ProfileEnd
 
-#: Indentation over skeleton deflection, and its inverse, of the two starts.
-SOFT = 19.0
-#: Skeletons with the same compliances: how many are tried, and the grid they are looked for on
-#: (half width in natural logarithms, points of each axis).
-TWINS, TWIN_REACH, TWIN_POINTS = 3, 9.0, 41
 #: Where the cost is looked up along the least determined direction, in half widths of its interval.
 WALK = np.geomspace(0.5, 64, 15)
 #: Longest walk, in relative coordinates (log: seven decades).
@@ -156,9 +144,9 @@ def _unseen(result: FitResult) -> Evidence:
 def _other_minima(region: _Region, lanes, known: Structure) -> Int[np.ndarray, " n"]:
     """Fits from further starts, added to the region; minima within the threshold, by lane."""
     starts = [
-        *_soft_starts(region.result, lanes),
+        *soft_starts(region.result, lanes),
         *_walks(region, lanes),
-        *_twins(region, lanes),
+        *twins(region.result, lanes),
         region.result.theta[lanes],
     ]
     theta, cost = region.sides.solve(
@@ -190,104 +178,6 @@ def _distinct(
         if min(np.max(np.abs(end - other) / relative) for other in kept) > APART:
             kept.append(end)
     return len(kept)
-
-
-def _soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
-    """The local law as the soft part of the curve's secant stiffness, then the skeleton as it."""
-    study = result.study
-    if not any(p.name in SKELETON for p in study.free) or study.model.options.coupling != "series":
-        return []
-    guess, low, high = box(study, 0.0)[0][lanes], study.lanes.lower, study.lanes.upper
-    compliance = _compliances(study, lanes, guess)
-    data = study.lanes
-    seen = data.precision[lanes] > 0
-    force = np.where(seen, np.abs(data.force[lanes]), 0)
-    deepest = np.argmax(force, axis=2)[..., None]
-    peak = np.take_along_axis(force, deepest, 2)[..., 0]
-    depth = np.abs(np.take_along_axis(np.asarray(data.displacement)[lanes], deepest, 2)[..., 0])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        stiffness = np.nanmedian(np.where(depth > 0, peak / depth, np.nan), axis=1)
-        depth = np.nanmedian(np.where(depth > 0, depth, np.nan), axis=1)
-    share = 1 / (1 + SOFT)
-    out = []
-    for of_skeleton in (share, 1 - share):
-        k_1 = stiffness / (1 - of_skeleton)
-        softer = of_skeleton / stiffness / compliance
-        start = result.theta[lanes].copy()
-        for n, lane in enumerate(lanes):
-            for i, (p, _, _) in enumerate(study.unknowns[lane]):
-                if p.name in SKELETON:
-                    start[n, i] = guess[n, i] - np.log(softer[n])
-                elif coefficient(p.name) == "k_1":
-                    start[n, i] = p.to_scaled(max(k_1[n], 1e-300))
-                elif coefficient(p.name):
-                    local = (depth[n] * (1 - of_skeleton)) ** (power(p.name) - 1)
-                    start[n, i] = p.to_scaled(0.1 * k_1[n] / local)
-        out.append(np.clip(np.nan_to_num(start), low[lanes], high[lanes]))
-    return out
-
-
-def _compliances(study: Study, lanes, theta) -> Float[np.ndarray, " n"]:
-    """Mean compliance of the observed trials, mm/N."""
-    observed = (study.lanes.precision[lanes] > 0).any(axis=2)
-    c = [_compliance(study, int(k), row[None])[0] for k, row in zip(lanes, theta, strict=True)]
-    return np.sum(np.array(c) * observed, axis=1) / np.sum(observed, axis=1)
-
-
-def _compliance(study: Study, lane: int, theta) -> Float[np.ndarray, "n T"]:
-    """Compliance at every trial of a lane, mm/N, at many points."""
-    row = jax.tree.map(lambda v: v[lane], study.lanes)
-    return np.asarray(program(_felt_compliance, study.model, axes=(0, None))(theta, row))
-
-
-def _felt_compliance(model: FitModel, theta, lane: Lane):
-    """Compliance at every trial of one lane, mm/N; (T,)."""
-    return inputs(model, theta, lane).compliance
-
-
-def _twins(region: _Region, lanes) -> list[Float[np.ndarray, "n P"]]:
-    """Starts at other skeletons with nearly the same compliances, by a grid of EI_L and k_M.
-
-    Local minima of the squared difference of ln c on the grid, the `TWINS` lowest of each lane;
-    the estimate where there are fewer.
-    """
-    result, study = region.result, region.result.study
-    out = np.repeat(result.theta[lanes][None], TWINS, axis=0)
-    for n, lane in enumerate(lanes):
-        place = {p.name: i for i, (p, _, _) in enumerate(study.unknowns[lane])}
-        if not {"EI_L", "k_M"} <= place.keys() or positions(study)[lane] < 2:
-            continue
-        low, high, best = (v[lane] for v in (study.lanes.lower, study.lanes.upper, result.theta))
-        beam = [place["EI_L"], place["k_M"]]
-        axes = [_axis(float(best[i]), float(low[i]), float(high[i])) for i in beam]
-        mesh = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-        theta = np.repeat(best[None], len(mesh) + 1, axis=0)
-        theta[1:, beam] = mesh
-        observed = (study.lanes.precision[lane] > 0).any(axis=1)
-        c = _compliance(study, int(lane), theta)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            change = np.log(c[1:] / c[0])[:, observed]
-        misfit = np.sum(change**2, axis=1).reshape(*map(len, axes))
-        for k, cell in enumerate(_valleys(misfit)[:TWINS]):
-            out[k, n, beam] = mesh[cell]
-    return list(out)
-
-
-def _axis(middle: float, low: float, high: float) -> Float[np.ndarray, " n"]:
-    """Grid of a logarithmic coordinate around the estimate, inside the bounds."""
-    return np.linspace(max(low, middle - TWIN_REACH), min(high, middle + TWIN_REACH), TWIN_POINTS)
-
-
-def _valleys(misfit: Float[np.ndarray, "a b"]) -> Int[np.ndarray, " n"]:
-    """Cells that are lower than all their neighbours, lowest first."""
-    padded = np.pad(np.nan_to_num(misfit, nan=np.inf), 1, constant_values=np.inf)
-    shape = misfit.shape
-    around = [
-        padded[1 + i : 1 + i + shape[0], 1 + j : 1 + j + shape[1]]
-        for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)
-    ]  # fmt: skip
-    cells = np.flatnonzero((misfit <= np.min(around, axis=0)).ravel())
-    return cells[np.argsort(misfit.ravel()[cells])]
 
 
 def _walks(region: _Region, lanes) -> list[Float[np.ndarray, "n P"]]:
