@@ -107,7 +107,7 @@ def moved(study, force, precision=None):
     return dataclasses.replace(many, lanes=lanes)
 
 
-CASES = {"linear": {}, "huber": {"loss": "huber", "noise": Noise(force=0.04)}}
+CASES = {"linear": {}, "huber": {"weighting": Weighting(loss="huber"), "noise": Noise(force=0.04)}}
 
 
 #: Curve and sample.

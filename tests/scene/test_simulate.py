@@ -118,9 +118,9 @@ def test_past_the_zero_of_the_law_every_program_says_pulls(more):
         SPRINGS, EI_L=jnp.asarray(1e3), k_M=jnp.asarray(10.0), k_3=-SPRINGS.k_1 / 4
     )
     path = Presses(np.full(4, 75.0), np.zeros(4), np.outer([0, 1.9, 2.1, 1.0], [0, -1.0, 0]))
-    rest = {"friction": 0.66} if more.get("friction") else {}
+    tool = Tool(friction=0.66) if more.get("friction") else None
     scene = make_scene(
-        TUBE, material, path, effects=EffectOptions(want_surface=False, **more), **rest
+        TUBE, material, path, tool=tool, effects=EffectOptions(want_surface=False, **more)
     )
     out = run(scene, material, path)
     none, pulls = PressStatus.NO_CONTACT, PressStatus.PULLS
@@ -263,7 +263,7 @@ def test_a_bent_tube_is_pressed_like_the_straight_one():
     led = np.array([[0, 1, 0.0], [0, -1, 0], [1.0, -3, 0.5]]) + [0, OUTER + 5, 0]
     eye = np.broadcast_to(np.eye(3), (3, 3, 3))
     paths = Poses(eye, led + [70, 0, 0]), Poses(eye @ turn, centre + led @ turn.T)
-    how = {"tool": BALL, "friction": 0.66, "effects": EffectOptions(rings="mat")}
+    how = {"tool": Tool(BALL, 0.66), "effects": EffectOptions(rings="mat")}
     outs = []
     for where, path in zip((mesh, bent), paths, strict=True):
         scene = make_scene(TUBE, MATERIAL, path, mesh=where, **how)
