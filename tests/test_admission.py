@@ -154,9 +154,8 @@ def any_words(function, argument):
         n: None if p.default is p.empty else p.default for n, p in signature.parameters.items()
     }
     known = {"geometry": table_1(), "material": Material(**FULL), "s_c": 40.0, "phi_c": 0.0,
-             "displacement": np.zeros((1, 3)), "friction": 0.5, "force": 1.0, "count": 100,
-             "block": 1, "options": Options(), "beam": BEAM, "loss_scale": 1.345, "loss": "linear",
-             "balance": "sample"}  # fmt: skip
+             "displacement": np.zeros((1, 3)), "force": 1.0, "count": 100,
+             "block": 1, "options": Options(), "beam": BEAM}  # fmt: skip
     filled |= {n: v for n, v in known.items() if n in filled}
     return function(**filled | {argument: "no such word"})
 
