@@ -4,6 +4,7 @@ Static misuse only: everything here looks at shapes, kinds and Python values, ne
 of an array, so that it works on traced arrays and adds nothing to a program.
 """
 
+import dataclasses
 import functools
 import math
 import numbers
@@ -88,10 +89,10 @@ def _shape_words(shape: tuple) -> str:
 
 
 def check_word(name: str, value: object, kind: Any) -> None:
-    """Refuse a word that is not one of a `Literal`.
+    """Refuse a word that is not one of a `Literal`, or a record of another class.
 
     Raises:
-        ValueError: with the words there are.
+        ValueError: with the words there are, or the class.
     """
     if not _fits(value, kind):
         raise ValueError(f"{name} is {_shown(value)}; expected {_expected(kind)}")
@@ -100,7 +101,8 @@ def check_word(name: str, value: object, kind: Any) -> None:
 def check_record(record: Any, **least: float) -> None:
     """Refuse a record of options whose values are not of the kind that its fields name.
 
-    Words, switches, counts, finite numbers and None are checked; of other kinds nothing is known.
+    Words, switches, counts, finite numbers, None and classes of records are checked; of other kinds
+    nothing is known.
 
     Args:
         record: a dataclass or named tuple.
@@ -137,6 +139,8 @@ def _fits(value: object, kind: Any) -> bool:
     if kind is float:
         number = isinstance(value, numbers.Real) and not isinstance(value, bool)
         return number and math.isfinite(float(value))  # pyright: ignore
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        return isinstance(value, kind)
     return True
 
 

@@ -1,6 +1,7 @@
 """Oblique presses: against a 3-D frame on ring springs, then symmetry, limits and gradients."""
 
 import functools
+import inspect
 import math
 
 import jax
@@ -9,7 +10,13 @@ import numpy as np
 import pytest
 
 from jaxtrachea.mechanics.friction import Coulomb
-from jaxtrachea.mechanics.oblique import ObliqueOptions, ObliquePress, press_oblique, press_path
+from jaxtrachea.mechanics.oblique import (
+    ObliqueOptions,
+    ObliquePress,
+    place_at,
+    press_oblique,
+    press_path,
+)
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.ring import Ring, ring_compliance
 from jaxtrachea.mechanics.skeleton import local_frame, skeleton_response
@@ -269,6 +276,20 @@ def test_wrong_options_are_named():
         ObliqueOptions(Options(split="independent"))
     with pytest.raises((ValueError, TypeError), match="arch3"):  # TypeError: the shape checks
         ObliqueOptions(rings="arch3")  # pyright: ignore
+
+
+def test_records_of_another_class_are_named():
+    """Without the suite's type checks, as a user calls them."""
+    call, tube = inspect.unwrap, table_1()
+    with pytest.raises(ValueError, match=r"options is Options.*expected ObliqueOptions"):
+        call(place_at)(tube, material(), 63.0, 0.4, Options())
+    with pytest.raises(ValueError, match=r"friction is 0.66; expected Coulomb"):
+        call(press_path)(tube, material(), 63.0, 0.4, MOVES, 0.66)
+    wrong = object.__new__(ObliqueOptions)
+    for name, value in {"press": STUCK, "rings": "mat", "axial": True}.items():
+        object.__setattr__(wrong, name, value)
+    with pytest.raises(ValueError, match=r"press is ObliqueOptions.*expected Options"):
+        wrong.__post_init__()
 
 
 def test_unused_effects_are_not_in_the_program():

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._arguments import ArrayLike, check_record, last_axis, shaped
+from jaxtrachea._arguments import ArrayLike, check_record, check_word, last_axis, shaped
 from jaxtrachea.mechanics import friction as _friction
 from jaxtrachea.mechanics import skeleton, vector_equilibrium
 from jaxtrachea.mechanics.admission import Admitted, admit, hide, status_of
@@ -206,6 +206,8 @@ def press_path(
     Raises:
         ValueError: as `press_oblique`; another contact or coupling.
     """
+    check_word("options", options, ObliqueOptions)
+    check_word("friction", friction, Coulomb)
     if options.press.contact != "unilateral" or options.press.coupling != "series":
         raise ValueError(
             "friction needs options.contact='unilateral' and options.coupling='series'"
@@ -238,6 +240,7 @@ def place_at(
     onset: ArrayLike | None = None,
 ) -> Place:
     """Checked arguments, and the skeleton and the local law at the contact."""
+    check_word("options", options, ObliqueOptions)
     dtype = geometry.length.dtype
     phi_c = shaped("phi_c", phi_c, (), dtype=dtype)
     onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=dtype)
