@@ -49,9 +49,11 @@ BEAM = beam.Beam(jnp.array([3.0]), jnp.array(9.0), jnp.ones(2), jnp.ones(1))
 
 def bare(kind, start=None, **changes):
     """Make a record as users do, who have no checker of annotations in front of it."""
-    record = object.__new__(kind)
+    record, kinds = object.__new__(kind), typing.get_type_hints(kind)
     for field in dataclasses.fields(kind):
         value = getattr(start, field.name, None if start else field.default)
+        if value is dataclasses.MISSING and dataclasses.is_dataclass(inner := kinds[field.name]):
+            value = object.__new__(inner)
         object.__setattr__(record, field.name, changes.get(field.name, value))
     if not start and kind is Parameter:
         return bare(kind, DEFAULTS["k_1"], **changes)
