@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 
@@ -16,31 +17,44 @@ class Factors(NamedTuple):
 
     Attributes:
         inverse: of each block's rest after the elimination of those before it.
-        upper: blocks [i, i + 1] of the matrix; that of the last node is zero.
+        gain: `inverse` times the blocks [i, i + 1] of the matrix; that of the last node is zero.
         negative: number of negative pivots.
     """
 
     inverse: Float[Array, "n m m"]
-    upper: Float[Array, "n m m"]
+    gain: Float[Array, "n m m"]
     negative: Int[Array, ""]
 
 
 def invert(matrix: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Int[Array, ""]]:
-    """Inverse by Gauss-Jordan without exchange, and the number of negative pivots."""
-    order = jnp.arange(matrix.shape[0])
+    """Inverse by Gauss-Jordan without exchange, and the number of negative pivots.
 
-    def eliminate(k, state):
-        A, negative = state
-        here = order == k
-        row = jnp.sum(jnp.where(here[:, None], A, 0), 0)
-        pivot = jnp.sum(jnp.where(here, row, 0))
-        row = jnp.where(here, 1, row) / pivot
-        column = jnp.sum(jnp.where(here[None], A, 0), 1)
-        A = jnp.where(here[None], 0, A) - column[:, None] * row[None]
-        return jnp.where(here[:, None], row[None], A), negative + (pivot < 0).astype(jnp.int32)
-
-    start = matrix, jnp.zeros((), jnp.int32)
-    return jax.lax.fori_loop(0, matrix.shape[0], eliminate, start)
+    Two pivots at a time, with the inverse of their 2 x 2 block in closed form: half as many
+    operations that wait for each other.
+    """
+    m = matrix.shape[0]
+    A, negative = matrix, jnp.zeros((), jnp.int32)
+    for k in range(0, m - 1, 2):
+        a, b, c, d = A[k, k], A[k, k + 1], A[k + 1, k], A[k + 1, k + 1]
+        det = a * d - b * c
+        pivots = (a < 0).astype(jnp.int32) + ((det < 0) != (a < 0)).astype(jnp.int32)
+        negative = negative + pivots
+        first, second = (d * A[k] - b * A[k + 1]) / det, (a * A[k + 1] - c * A[k]) / det
+        here = np.arange(m)
+        own = np.asarray(here == k), np.asarray(here == k + 1)
+        first = jnp.where(own[0], d / det, jnp.where(own[1], -b / det, first))
+        second = jnp.where(own[0], -c / det, jnp.where(own[1], a / det, second))
+        either = own[0] | own[1]
+        rest = jnp.where(either[None], 0, A)
+        rest = rest - A[:, k, None] * first[None] - A[:, k + 1, None] * second[None]
+        A = jnp.where(own[0][:, None], first, jnp.where(own[1][:, None], second, rest))
+    if m % 2:
+        p, last = A[-1, -1], np.arange(m) == m - 1
+        negative = negative + (p < 0).astype(jnp.int32)
+        row = jnp.where(last, 1, A[-1]) / p
+        rest = jnp.where(last[None], 0, A) - A[:, -1, None] * row[None]
+        A = jnp.where(last[:, None], row, rest)
+    return A, negative
 
 
 def factor(diagonal: Float[Array, "n m m"], upper: Float[Array, "n m m"]) -> Factors:
@@ -54,26 +68,30 @@ def factor(diagonal: Float[Array, "n m m"], upper: Float[Array, "n m m"]) -> Fac
     def step(carry, blocks):
         D, U = blocks
         inverse, negative = invert(D - carry)
-        return U.T @ inverse @ U, (inverse, negative)
+        gain = inverse @ U
+        return U.T @ gain, (inverse, gain, negative)
 
-    _, (inverse, negative) = jax.lax.scan(step, jnp.zeros_like(diagonal[0]), (diagonal, upper))
-    return Factors(inverse, upper, jnp.sum(negative))
+    _, (inverse, gain, negative) = jax.lax.scan(
+        step, jnp.zeros_like(diagonal[0]), (diagonal, upper)
+    )
+    return Factors(inverse, gain, jnp.sum(negative))
 
 
 def solve(factors: Factors, rhs: Float[Array, "n m k"]) -> Float[Array, "n m k"]:
     """Solution for k right-hand sides."""
 
-    def down(carry, node):
-        inverse, U, r = node
-        r = r - carry
-        return U.T @ (inverse @ r), r
+    def down(r, node):
+        gain, next_r = node
+        r = next_r - jnp.sum(gain[:, :, None] * r[:, None], 0)
+        return r, r
 
     def back(x, node):
-        inverse, U, r = node
-        x = inverse @ (r - U @ x)
+        gain, own = node
+        x = own - jnp.sum(gain[:, :, None] * x[None], 1)
         return x, x
 
-    none = jnp.zeros_like(rhs[0])
-    _, left = jax.lax.scan(down, none, (factors.inverse, factors.upper, rhs))
-    nodes = factors.inverse, factors.upper, left
-    return jax.lax.scan(back, none, nodes, reverse=True)[1]
+    first, gain = rhs[0], factors.gain[:-1]
+    rest = jax.lax.scan(down, first, (gain, rhs[1:]))[1]
+    own = factors.inverse @ jnp.concatenate([first[None], rest])
+    x = jax.lax.scan(back, own[-1], (gain, own[:-1]), reverse=True)[1]
+    return jnp.concatenate([x, own[-1:]])

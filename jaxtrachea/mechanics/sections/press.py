@@ -223,10 +223,10 @@ def _status(solved: Solved, path):
     return jnp.where(good, status, PressStatus.PAST_FOLD)
 
 
-def _imbalance(state: State, displacement, parts: System):
+def _imbalance(line: section.Line, state: State, displacement, parts: System):
     """Largest residual of the nodes over the force."""
-    state, displacement, parts = jax.lax.stop_gradient((state, displacement, parts))
-    r = system.residual(state, displacement, parts)
+    line, state, displacement, parts = jax.lax.stop_gradient((line, state, displacement, parts))
+    r = system.residual_of(line, state, displacement, parts)
     pushed = jnp.max(jnp.abs(state.force))
     return jnp.max(jnp.abs(r.y)) / jnp.where(pushed > 0, pushed, 1)
 
@@ -238,10 +238,12 @@ def _observe(state: State, displacement, parts: System) -> SectionPress:
     def vector(v):
         return v @ frame[: v.shape[0]]
 
-    v = system.surface(state.q_C.ravel(), parts)
+    line = system.lines(state, parts)
+    v = system.contact_surface(state, line, parts).motion
     modes = system.ring_modes(state, parts)
     alpha = parts.shape.half_angle
-    joints, end_U, end_V = _ring_motion(modes, jnp.stack([parts.phi_c, -alpha, alpha]), parts)
+    angles = jnp.stack([parts.phi_c, -alpha, alpha])
+    joints, end_U, end_V = _ring_motion(system.of_rings(line), angles, parts)
     return SectionPress(
         force=vector(state.force),
         depth=vector(displacement * parts.direction - v),
@@ -250,18 +252,18 @@ def _observe(state: State, displacement, parts: System) -> SectionPress:
         joints=joints,
         end_U=end_U,
         end_V=end_V,
-        energy=system.stored_energy(state, parts),
-        imbalance=_imbalance(state, displacement, parts),
+        energy=system.stored_energy_of(line, state, parts),
+        imbalance=_imbalance(line, state, displacement, parts),
         steps=jnp.zeros_like(displacement),
         status=jnp.zeros((), jnp.int8),
     )
 
 
-def _ring_motion(modes, angles, parts: System):
+def _ring_motion(line: section.Line, angles, parts: System):
     """Displacement of the outer surface of every ring at each angle; (angles, rings, 3)."""
 
-    def at(q, phi):
-        moved = section.surface_motion(q, phi, parts.grid, parts.shape)
+    def at(line, phi):
+        moved = section.line_motion(line, phi, parts.grid, parts.shape)
         return moved @ local_frame(phi)[::2]
 
-    return jax.vmap(lambda phi: jax.vmap(at, (0, None))(modes, phi))(angles)
+    return jax.vmap(lambda phi: jax.vmap(at, (0, None))(line, phi))(angles)

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtrachea._numerics import epsilon
+from jaxtrachea._numerics import cos_sin, epsilon
 
 #: Gauss points on the half of the cartilage and on that of the muscle, and on the way to a point.
 FRONT, BACK, WAY = 12, 8, 10
@@ -180,22 +180,18 @@ def small_solve(M: Float[Array, "c c"], r: Float[Array, "c ..."]) -> Float[Array
 
 
 def _gap(lam, turn, stretch, grid: Grid):
-    """Misfit of the ring's ends over R, along z and, off the midline, y."""
-    x = grid.phi + turn + lam @ grid.turn[grid.modes :]
-    along_z = jnp.sum(grid.weights * stretch * jnp.cos(x))
-    if grid.midline:
-        return along_z[None]
-    return jnp.stack([along_z, jnp.sum(grid.weights * stretch * jnp.sin(x))])
+    """Misfit of the ring's ends over R along z and, off the midline, y; its derivative by lam.
 
-
-def _gap_slope(lam, turn, stretch, grid: Grid):
-    """Its derivative by the multipliers; (gaps, multipliers)."""
+    The derivative is (gaps, multipliers).
+    """
     shapes = grid.turn[grid.modes :]
-    x = grid.phi + turn + lam @ shapes
-    along_z = shapes @ (-grid.weights * stretch * jnp.sin(x))
+    c, s = cos_sin(grid.phi + turn + lam @ shapes)
+    rows = grid.weights * jnp.concatenate([jnp.ones_like(grid.phi)[None], shapes])
+    along_z = rows @ (stretch * c)
+    along_y = rows @ (stretch * s)
     if grid.midline:
-        return along_z[None]
-    return jnp.stack([along_z, shapes @ (grid.weights * stretch * jnp.cos(x))])
+        return along_z[:1], -along_y[1:, None]
+    return jnp.stack([along_z[0], along_y[0]]), jnp.stack([-along_y[1:], along_z[1:]])
 
 
 @jax.custom_jvp
@@ -212,7 +208,8 @@ def close_ring(
 
     def step(state):
         lam, _, count = state
-        change = small_solve(_gap_slope(lam, turn, stretch, grid), _gap(lam, turn, stretch, grid))
+        gap, slope = _gap(lam, turn, stretch, grid)
+        change = small_solve(slope, gap)
         return lam - change, jnp.max(jnp.abs(change)), count + 1
 
     # A step of a tenth of the square root of eps leaves an error of less than eps.
@@ -230,8 +227,8 @@ def close_ring(
 @close_ring.defjvp
 def _close_ring_jvp(primals, tangents):
     lam = close_ring(*primals)
-    _, grown = jax.jvp(lambda *given: _gap(lam, *given), primals, tangents)
-    return lam, -small_solve(_gap_slope(lam, *primals), grown)
+    _, grown, slope = jax.jvp(lambda *given: _gap(lam, *given), primals, tangents, has_aux=True)
+    return lam, -small_solve(slope, grown)
 
 
 class Line(NamedTuple):
@@ -260,7 +257,7 @@ def deform(q: Float[Array, " modes"], grid: Grid, shape: Shape) -> Line:
     stretch = 1 + q[STRETCH] / shape.radius * grid.behind
     lam = close_ring(turn, stretch, grid)
     x = grid.phi + turn + lam @ grid.turn[grid.modes :]
-    c, s = jnp.cos(x), jnp.sin(x)
+    c, s = cos_sin(x)
     slope_y = shape.radius * (jnp.sin(grid.phi) - stretch * s)
     slope_z = shape.radius * (stretch * c - jnp.cos(grid.phi))
     return Line(jnp.concatenate([q, lam]), stretch, c, s, slope_y, slope_z)
@@ -289,7 +286,11 @@ def energy(q: Float[Array, " modes"], ring: Ring, grid: Grid, shape: Shape) -> F
         grid: of this shape.
         shape: the cross-section.
     """
-    line = deform(q, grid, shape)
+    return line_energy(deform(q, grid, shape), ring, grid, shape)
+
+
+def line_energy(line: Line, ring: Ring, grid: Grid, shape: Shape) -> Float[Array, ""]:
+    """`energy` of a line that is known."""
     EI = jnp.where(grid.behind > 0, ring.EI_M, ring.EI_C)
     kappa = line.w @ grid.curve / shape.radius
     bending = jnp.sum(grid.weights * EI * bend(kappa, ring.c_K)[0]) * shape.radius
@@ -298,7 +299,7 @@ def energy(q: Float[Array, " modes"], ring: Ring, grid: Grid, shape: Shape) -> F
     u_n, u_t = y * jnp.cos(phi) + z * jnp.sin(phi), z * jnp.cos(phi) - y * jnp.sin(phi)
     area = grid.weights[grid.back] * (shape.radius + shape.offset) * ring.pitch
     bed = jnp.sum(area * (ring.k_n * u_n**2 + ring.k_t * u_t**2)) / 2
-    return bending + bed + muscle(ring, shape) * q[STRETCH] ** 2 / 2
+    return bending + bed + muscle(ring, shape) * line.w[STRETCH] ** 2 / 2
 
 
 def muscle(ring: Ring, shape: Shape):
@@ -320,17 +321,46 @@ def surface_motion(
     Returns:
         Along the inward normal and along the circumference at phi.
     """
-    line = deform(q, grid, shape)
+    return line_motion(deform(q, grid, shape), phi, grid, shape)
+
+
+def line_motion(line: Line, phi: Float[Array, ""], grid: Grid, shape: Shape) -> Float[Array, "2"]:
+    """`surface_motion` of a line that is known."""
+    y, z = way_to(line, phi, grid, shape).motion
+    normal, side = jnp.cos(phi), jnp.sin(phi)
+    return jnp.stack([-y * normal - z * side, z * normal - y * side])
+
+
+class Way(NamedTuple):
+    """From the anterior midline to a point of the outer surface.
+
+    Attributes:
+        turn: rotation per mode and multiplier at Gauss points of the way and, last, at its end.
+        by_turn_y: derivative of y by the rotation at each of them, mm.
+        by_turn_z: that of z.
+        motion: displacement of the end, y and z, mm.
+    """
+
+    turn: Float[Array, "shapes points"]
+    by_turn_y: Float[Array, " points"]
+    by_turn_z: Float[Array, " points"]
+    motion: tuple[Float[Array, ""], Float[Array, ""]]
+
+
+def way_to(line: Line, phi: Float[Array, ""], grid: Grid, shape: Shape) -> Way:
+    """The way to an angle on the cartilage, rad, where nothing strains."""
     x, weights = _gauss(WAY, phi.dtype)
-    way = jnp.concatenate([phi * x, phi[None]])
-    turned = way + line.w @ turn_shapes(way, shape.radius, grid.midline)[0]
-    c, s = jnp.cos(turned), jnp.sin(turned)
-    c_0, s_0 = jnp.cos(way), jnp.sin(way)
+    points = jnp.concatenate([phi * x, phi[None]])
+    lengths = jnp.concatenate([shape.radius * phi * weights, shape.offset[None]])
+    turn = turn_shapes(points, shape.radius, grid.midline)[0]
+    c, s = cos_sin(points + line.w @ turn)
+    c_0, s_0 = cos_sin(points)
     mean = -mean_weights(grid.phi, grid.weights)
-    y = line.w[A1] + mean @ line.slope_y
-    y = y + shape.radius * phi * (weights @ (s_0 - s)[:-1]) + shape.offset * (c - c_0)[-1]
-    z = shape.radius * phi * (weights @ (c - c_0)[:-1]) + shape.offset * (s - s_0)[-1]
+    y = lengths[:-1] @ (s_0 - s)[:-1] + shape.offset * (c - c_0)[-1]
+    z = lengths[:-1] @ (c - c_0)[:-1] + shape.offset * (s - s_0)[-1]
+    y = y + line.w[A1] + mean @ line.slope_y
     if not grid.midline:
         z = z + line.w[B1] + mean @ line.slope_z
-    normal, side = c_0[-1], s_0[-1]
-    return jnp.stack([-y * normal - z * side, z * normal - y * side])
+    by_turn_y = -lengths * jnp.concatenate([c[:-1], s[-1:]])
+    by_turn_z = lengths * jnp.concatenate([-s[:-1], c[-1:]])
+    return Way(turn, by_turn_y, by_turn_z, (y, z))

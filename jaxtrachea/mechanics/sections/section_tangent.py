@@ -1,4 +1,4 @@
-"""Forces and stiffness of one ring by its modes, in closed form: half the time of AD twice.
+"""Forces and stiffness of one ring by its modes, and the motion of its surface, in closed form.
 
 With w = (q, l) the energy is explicit, and the closure holds by multipliers mu: the gradient is
 L_q and the Hessian Z^T L_ww Z for L = U - mu . closure, Z = (1; dl/dq).
@@ -7,6 +7,7 @@ L_q and the Hessian Z^T L_ww Z for L = U - mu . closure, Z = (1; dl/dq).
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea.mechanics.sections.section import (
@@ -20,8 +21,10 @@ from jaxtrachea.mechanics.sections.section import (
     bed_motion,
     bend,
     deform,
+    mean_weights,
     muscle,
     small_solve,
+    way_to,
 )
 
 
@@ -82,11 +85,16 @@ def _slopes(line: Line, grid: Grid, shape: Shape):
     )
 
 
-def _held(line: Line, loads: _Loads, ring: Ring, grid: Grid, shape: Shape):
-    """Loads with the multipliers of the closure taken off, the gradient then, and dl/dq."""
+def _gaps(line: Line, grid: Grid, shape: Shape):
+    """Derivative of the closure by w; (gaps, shapes)."""
     d_y, d_z = _slopes(line, grid, shape)
     slopes = (d_z,) if grid.midline else (d_z, d_y)
-    gaps = jnp.stack([v @ grid.weights for v in slopes])
+    return jnp.stack([v @ grid.weights for v in slopes])
+
+
+def _held(line: Line, loads: _Loads, ring: Ring, grid: Grid, shape: Shape):
+    """Loads with the multipliers of the closure taken off, the gradient then, and dl/dq."""
+    gaps = _gaps(line, grid, shape)
     by_lam = gaps[:, grid.modes :]
     free = _gradient(line, loads, ring, grid, shape)
     mu = small_solve(by_lam.T, free[grid.modes :])
@@ -101,7 +109,11 @@ def ring_forces(
     q: Float[Array, " modes"], ring: Ring, grid: Grid, shape: Shape
 ) -> Float[Array, " modes"]:
     """dU/dq of `section.energy`, N."""
-    line = deform(q, grid, shape)
+    return line_forces(deform(q, grid, shape), ring, grid, shape)
+
+
+def line_forces(line: Line, ring: Ring, grid: Grid, shape: Shape) -> Float[Array, " modes"]:
+    """`ring_forces` of a line that is known."""
     return _held(line, _loads(line, ring, grid, shape), ring, grid, shape)[1]
 
 
@@ -109,16 +121,90 @@ def ring_tangent(
     q: Float[Array, " modes"], ring: Ring, grid: Grid, shape: Shape
 ) -> tuple[Float[Array, " modes"], Float[Array, "modes modes"]]:
     """dU/dq, N, and d2U/dq2, N/mm."""
-    line = deform(q, grid, shape)
+    return line_tangent(deform(q, grid, shape), ring, grid, shape)
+
+
+def line_tangent(
+    line: Line, ring: Ring, grid: Grid, shape: Shape
+) -> tuple[Float[Array, " modes"], Float[Array, "modes modes"]]:
+    """`ring_tangent` of a line that is known."""
     loads, gradient, follow = _held(line, _loads(line, ring, grid, shape), ring, grid, shape)
-    hessian = _bed_part(line, ring, grid, shape) + _curved_part(line, loads, grid, shape)
-    EI = jnp.where(grid.behind > 0, ring.EI_M, ring.EI_C)
     kappa = line.w @ grid.curve / shape.radius
+    EI = jnp.where(grid.behind > 0, ring.EI_M, ring.EI_C)
     stiff = grid.weights * EI * bend(kappa, ring.c_K)[2] / shape.radius
-    hessian = hessian + _weighted_squares(grid.curve, stiff)
+    squares = _turn_squares(line, loads.y, loads.z, shape)
+    c, s = line.c[grid.back], line.s[grid.back]
+    squares = squares.at[grid.back].add(-shape.offset * (loads.bed_y * c + loads.bed_z * s))
+    hessian = _weighted_squares(grid.turn, squares) + _weighted_squares(grid.curve, stiff)
+    hessian = hessian + _bed_part(line, ring, grid, shape)
+    hessian = _mix_stretch(hessian, line, loads.y, loads.z, grid)
     hessian = hessian.at[STRETCH, STRETCH].add(muscle(ring, shape))
-    Z = jnp.concatenate([jnp.eye(grid.modes, dtype=q.dtype), follow])
-    return gradient, Z.T @ hessian @ Z
+    return gradient, _along_closed(hessian, follow)
+
+
+def _along_closed(hessian, follow):
+    """Z^T H Z with Z = (1; follow)."""
+    n = follow.shape[1]
+    mixed = hessian[:n, n:] @ follow
+    return hessian[:n, :n] + mixed + mixed.T + follow.T @ hessian[n:, n:] @ follow
+
+
+class Surface(NamedTuple):
+    """The outer surface at one angle: inward normal and circumference, with derivatives by q.
+
+    Attributes:
+        motion: mm.
+        slope: its derivative.
+        curved: second derivative of the motion along a given force, N/mm.
+    """
+
+    motion: Float[Array, " directions"]
+    slope: Float[Array, "directions modes"]
+    curved: Float[Array, "modes modes"]
+
+
+def surface_tangent(
+    line: Line, phi: Float[Array, ""], force: Float[Array, " directions"], grid: Grid, shape: Shape
+) -> Surface:
+    """`section.line_motion` with its derivatives, those of the second order along a force.
+
+    Args:
+        line: the section, closed.
+        phi: angle of the point on the cartilage, rad.
+        force: inward and, unless it has one entry, along the circumference, N.
+        grid: of the line.
+        shape: the cross-section.
+    """
+    way = way_to(line, phi, grid, shape)
+    y, z = way.motion
+    count = force.shape[0]
+    normal, side = jnp.cos(phi), jnp.sin(phi)
+    axes = jnp.stack([jnp.stack([-normal, -side]), jnp.stack([-side, normal])])[:count]
+    mean = mean_weights(grid.phi, grid.weights)
+    on_y, on_z = -axes[:, :1] * mean[None], -axes[:, 1:] * mean[None]
+    if grid.midline:
+        on_z = jnp.zeros_like(on_z)
+    # Gradient by w of each direction.
+    d_y, d_z = _slopes(line, grid, shape)
+    free = on_y @ d_y.T + on_z @ d_z.T
+    at_way = axes[:, :1] * way.by_turn_y[None] + axes[:, 1:] * way.by_turn_z[None]
+    free = (free + at_way @ way.turn.T).at[:, A1].add(axes[:, 0])
+    free = free if grid.midline else free.at[:, B1].add(axes[:, 1])
+    gaps, n = _gaps(line, grid, shape), grid.modes
+    mu = small_solve(gaps[:, n:].T, free[:, n:].T)
+    slope = free[:, :n] - mu.T @ gaps[:, :n]
+    # The second derivative along the force, with the multipliers of the closure.
+    held = mu @ force
+    loads_z = force @ on_z - held[0] * grid.weights
+    loads_y = force @ on_y - (0 if grid.midline else held[1] * grid.weights)
+    along = force @ axes
+    hessian = _weighted_squares(grid.turn, _turn_squares(line, loads_y, loads_z, shape))
+    # What turns y turns into z, and z into -y.
+    squares = along[1] * way.by_turn_y - along[0] * way.by_turn_z
+    hessian = hessian + (way.turn * squares[None]) @ way.turn.T
+    hessian = _mix_stretch(hessian, line, loads_y, loads_z, grid)
+    curved = _along_closed(hessian, -small_solve(gaps[:, n:], gaps[:, :n]))
+    return Surface(axes @ jnp.stack([y, z]), slope, curved)
 
 
 def _bed_part(line: Line, ring: Ring, grid: Grid, shape: Shape):
@@ -135,18 +221,21 @@ def _bed_part(line: Line, ring: Ring, grid: Grid, shape: Shape):
     return (normal * k_n[None]) @ normal.T + (tangential * k_t[None]) @ tangential.T
 
 
-def _curved_part(line: Line, loads: _Loads, grid: Grid, shape: Shape):
-    """Loads times second derivatives of what they act on."""
-    squares = shape.radius * line.stretch * (loads.y * line.s - loads.z * line.c)
-    c, s = line.c[grid.back], line.s[grid.back]
-    squares = squares.at[grid.back].add(-shape.offset * (loads.bed_y * c + loads.bed_z * s))
-    mixed = grid.turn @ (-grid.behind * (loads.y * line.c + loads.z * line.s))
-    part = _weighted_squares(grid.turn, squares)
-    return part.at[STRETCH].add(mixed).at[:, STRETCH].add(mixed)
+def _turn_squares(line: Line, y, z, shape: Shape):
+    """Second derivative by the rotation at each point, of loads y, z on the slopes."""
+    return shape.radius * line.stretch * (y * line.s - z * line.c)
+
+
+def _mix_stretch(hessian, line: Line, y, z, grid: Grid):
+    """Adds the second derivatives by rotation and stretch of the muscle."""
+    mixed = grid.turn @ (-grid.behind * (y * line.c + z * line.s))
+    return hessian.at[STRETCH].add(mixed).at[:, STRETCH].add(mixed)
 
 
 def _weighted_squares(shapes, weights):
     """sum_p w_p v_p v_p^T: the table of products is the same for all rings, one product a batch."""
-    count, points = shapes.shape
-    table = (shapes[:, None] * shapes[None]).reshape(count * count, points)
-    return (table @ weights).reshape(count, count)
+    i, j = np.triu_indices(shapes.shape[0])
+    packed = (shapes[i] * shapes[j]) @ weights
+    place = np.zeros((shapes.shape[0],) * 2, int)
+    place[i, j] = place[j, i] = np.arange(i.size)
+    return packed[place]

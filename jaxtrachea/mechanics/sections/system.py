@@ -19,9 +19,21 @@ from jaxtyping import Array, Float, Int
 
 from jaxtrachea.mechanics.sections import block
 from jaxtrachea.mechanics.sections.contact import Place
-from jaxtrachea.mechanics.sections.section import Grid, Ring, Shape, energy, surface_motion
-from jaxtrachea.mechanics.sections.section_tangent import ring_forces, ring_tangent
-from jaxtrachea.mechanics.sections.span import Span, span_energy, span_forces, span_tangent
+from jaxtrachea.mechanics.sections.section import Grid, Line, Ring, Shape, deform, line_energy
+from jaxtrachea.mechanics.sections.section_tangent import (
+    Surface,
+    line_forces,
+    line_tangent,
+    surface_tangent,
+)
+from jaxtrachea.mechanics.sections.span import (
+    WARPING,
+    Span,
+    selector,
+    span_energy,
+    span_forces,
+    span_tangent,
+)
 
 
 class State(NamedTuple):
@@ -68,25 +80,31 @@ class System(NamedTuple):
 
 
 class Tangent(NamedTuple):
-    """The residual's derivative, with the skeleton eliminated.
+    """The residual's derivative, with the contact condensed into the skeleton and that eliminated.
+
+    With M = B^T B / give - H, the contact's stiffness against q_C, and the span's own compliance S
+    between, the nodes feel N^T E N, E = M (I + S M)^-1. Its stable states are minima: no block of
+    K_T + N^T E N has a negative pivot there.
 
     Attributes:
-        factors: of the skeleton's block-tridiagonal stiffness.
-        border: N^T, scaled; (nodes, m, modes).
-        moved: the skeleton's motion under it.
-        compliance: at the contact, of skeleton and span, mm/N; (modes, modes).
+        factors: of K_T + N^T E N, block tridiagonal.
+        share: N, scaled, by unknown: each belongs to one mode only.
+        own: S.
+        stiffness: E, N/mm; (modes, modes).
         B: dv/dq; (directions, modes).
-        H: d2(v F)/dq2.
+        M: N/mm.
         give: mm/N.
+        negative: negative pivots of I + S M.
     """
 
     factors: block.Factors
-    border: Float[Array, "nodes m modes"]
-    moved: Float[Array, "nodes m modes"]
-    compliance: Float[Array, "modes modes"]
+    share: Float[Array, "nodes m"]
+    own: Float[Array, " modes"]
+    stiffness: Float[Array, "modes modes"]
     B: Float[Array, "directions modes"]
-    H: Float[Array, "modes modes"]
+    M: Float[Array, "modes modes"]
     give: Float[Array, " directions"]
+    negative: Int[Array, ""]
 
 
 def at_rest(system: System) -> State:
@@ -106,10 +124,45 @@ def ring_modes(state: State, system: System) -> Float[Array, "rings modes"]:
     return q.reshape(q.shape[0], -1)
 
 
-def surface(q: Float[Array, " modes"], system: System) -> Float[Array, " directions"]:
-    """Motion of the outer surface at the contact's angle, in the directions of the force."""
-    moved = surface_motion(q, system.phi_c, system.grid, system.shape)
-    return moved[: system.give.shape[0]]
+def lines(state: State, system: System) -> Line:
+    """The rings' mid-lines and, last, that of the section at the contact."""
+    q = jnp.concatenate([ring_modes(state, system), state.q_C.reshape(1, -1)])
+    return jax.vmap(deform, (0, None, None))(q, system.grid, system.shape)
+
+
+def of_rings(line: Line) -> Line:
+    """Those of `lines` that are rings."""
+    return jax.tree.map(lambda v: v[:-1], line)
+
+
+def contact_surface(state: State, line: Line, system: System) -> Surface:
+    """Motion of the outer surface at the contact, from `lines`."""
+    line = jax.tree.map(lambda v: v[-1], line)
+    return surface_tangent(line, system.phi_c, state.force, system.grid, system.shape)
+
+
+def _mode_of(parities: int) -> np.ndarray:
+    """The mode to which each unknown of a node belongs."""
+    one = [np.array([*range(4), *places]) for places in WARPING[:parities]]
+    return np.concatenate([4 * p + modes for p, modes in enumerate(one)])
+
+
+def _share(system: System):
+    """N by unknown, (nodes, m): no unknown moves two modes."""
+    nodes = system.scale.shape[0]
+    return (jnp.sum(system.place.shares, 2) * system.scale).reshape(nodes, -1)
+
+
+def _gather(share, y):
+    """N y of scaled unknowns (nodes, m); (modes,)."""
+    moved = jnp.sum(share * y, 0).reshape(-1, 7)
+    E = jnp.asarray(selector(moved.shape[0], moved.dtype))
+    return (moved[:, :4] + jnp.sum(E * moved[:, None, 4:], 2)).ravel()
+
+
+def _spread(share, g):
+    """N^T g, scaled; (nodes, m)."""
+    return share * g[_mode_of(share.shape[1] // 7)][None]
 
 
 def _pairs(Y):
@@ -130,33 +183,36 @@ def _held_ends(y, system: System):
 
 def _assemble(span, ring, state: State, system: System, g):
     """r_y from the forces of spans and rings and the force g on the modes of the contact."""
-    total = jnp.zeros_like(state.y).at[:-1].add(span[:, :, :7]).at[1:].add(span[:, :, 7:])
-    total = total.at[1:-1, :, :4].add(ring.reshape(ring.shape[0], -1, 4))
-    total = total - jnp.einsum("npkj,pk->npj", system.place.shares, g)
+    total = jnp.pad(span[:, :, :7], ((0, 1), (0, 0), (0, 0)))
+    total = total + jnp.pad(span[:, :, 7:], ((1, 0), (0, 0), (0, 0)))
+    total = total + jnp.pad(ring.reshape(ring.shape[0], -1, 4), ((1, 1), (0, 0), (0, 3)))
     own = _pinned(system) * state.y + _held_ends(state.y, system)
-    return system.scale * total + own
+    pushed = _spread(_share(system), g).reshape(total.shape)
+    return system.scale * total - pushed + own
 
 
-def _contact(state: State, displacement, system: System, B):
+def _contact(state: State, displacement, system: System, surface: Surface):
     """r_q and r_F, and the force on the modes."""
-    g = (B.T @ state.force).reshape(state.q_C.shape)
-    follows = jnp.einsum("npkj,npj->pk", system.place.shares, physical(state, system))
-    r_q = state.q_C - follows - system.place.own * g
-    v = surface(state.q_C.ravel(), system)
-    return r_q, v - displacement * system.direction + system.give * state.force, g
-
-
-def _surface_slope(state: State, system: System):
-    """B, by one pass back for each direction."""
-    return jax.jacrev(lambda q: surface(q, system))(state.q_C.ravel())
+    g = surface.slope.T @ state.force
+    nodes = system.scale.shape[0]
+    follows = _gather(_share(system), state.y.reshape(nodes, -1))
+    r_q = state.q_C.ravel() - follows - system.place.own.ravel() * g
+    r_F = surface.motion - displacement * system.direction + system.give * state.force
+    return r_q.reshape(state.q_C.shape), r_F, g
 
 
 def residual(state: State, displacement: Float[Array, ""], system: System) -> State:
     """What does not balance: N and N mm, mm, mm."""
-    r_q, r_F, g = _contact(state, displacement, system, _surface_slope(state, system))
+    return residual_of(lines(state, system), state, displacement, system)
+
+
+def residual_of(line: Line, state: State, displacement: Float[Array, ""], system: System) -> State:
+    """`residual` where the mid-lines are known."""
+    surface = contact_surface(state, line, system)
+    r_q, r_F, g = _contact(state, displacement, system, surface)
     span = jax.vmap(span_forces)(_pairs(physical(state, system)), system.spans)
-    rings = jax.vmap(ring_forces, (0, 0, None, None))
-    ring = rings(ring_modes(state, system), system.rings, system.grid, system.shape)
+    rings = jax.vmap(line_forces, (0, 0, None, None))
+    ring = rings(of_rings(line), system.rings, system.grid, system.shape)
     return State(_assemble(span, ring, state, system, g), r_q, r_F)
 
 
@@ -164,23 +220,25 @@ def linearise(
     state: State, displacement: Float[Array, ""], system: System
 ) -> tuple[State, Tangent]:
     """The residual and its derivative."""
-    q_C = state.q_C.ravel()
-    B = _surface_slope(state, system)
-    H = jax.hessian(lambda q: state.force @ surface(q, system))(q_C)
-    r_q, r_F, g = _contact(state, displacement, system, B)
+    line = lines(state, system)
+    surface = contact_surface(state, line, system)
+    r_q, r_F, g = _contact(state, displacement, system, surface)
     span, of_span = jax.vmap(span_tangent)(_pairs(physical(state, system)), system.spans)
-    rings = jax.vmap(ring_tangent, (0, 0, None, None))
-    ring, of_ring = rings(ring_modes(state, system), system.rings, system.grid, system.shape)
+    rings = jax.vmap(line_tangent, (0, 0, None, None))
+    ring, of_ring = rings(of_rings(line), system.rings, system.grid, system.shape)
     r = State(_assemble(span, ring, state, system, g), r_q, r_F)
-    factors = block.factor(*stiffness(of_span, of_ring, system))
-    shares = system.place.shares * system.scale[:, :, None]
-    nodes, parities = shares.shape[:2]
-    spread = jnp.eye(parities, dtype=q_C.dtype)[None, :, None, :, None]
-    border = shares.transpose(0, 1, 3, 2)[:, :, :, None] * spread
-    border = border.reshape(nodes, 7 * parities, 4 * parities)
-    moved = block.solve(factors, border)
-    compliance = jnp.einsum("nim,nik->mk", border, moved) + jnp.diag(system.place.own.ravel())
-    return r, Tangent(factors, border, moved, compliance, B, H, system.give)
+    B, own, share = surface.slope, system.place.own.ravel(), _share(system)
+    M = (B.T / system.give[None]) @ B - surface.curved
+    inverse, negative = block.invert(jnp.eye(own.size, dtype=own.dtype) + own[:, None] * M)
+    E = M @ inverse
+    diagonal, upper = stiffness(of_span, of_ring, system)
+    mode = _mode_of(system.scale.shape[1])
+    felt = E[mode[:, None], mode[None]][None]
+    diagonal = diagonal + felt * share[:, :, None] * share[:, None]
+    after = jnp.concatenate([share[1:], jnp.zeros_like(share[:1])])
+    upper = upper + felt * share[:, :, None] * after[:, None]
+    factors = block.factor(diagonal, upper)
+    return r, Tangent(factors, share, own, E, B, M, system.give, negative)
 
 
 def stiffness(
@@ -194,31 +252,33 @@ def stiffness(
     def part(i, j):
         return ends[:, :, i, :, :, j].reshape(-1, m, m)
 
+    def padded(v, before, after):
+        return jnp.pad(v, ((before, after), (0, 0), (0, 0)))
+
     s = system.scale.reshape(nodes, m)
-    diagonal = jnp.zeros((nodes, m, m), s.dtype).at[:-1].add(part(0, 0)).at[1:].add(part(1, 1))
-    q = np.concatenate([7 * p + np.arange(4) for p in range(parities)])
-    diagonal = diagonal.at[1:-1, q[:, None], q[None]].add(of_ring)
+    rings = of_ring.reshape(-1, parities, 4, parities, 4)
+    rings = jnp.pad(rings, ((1, 1), (0, 0), (0, 3), (0, 0), (0, 3))).reshape(nodes, m, m)
+    diagonal = padded(part(0, 0), 0, 1) + padded(part(1, 1), 1, 0) + rings
     diagonal = diagonal * s[:, :, None] * s[:, None]
     diagonal = diagonal + jnp.eye(m, dtype=s.dtype)[None] * _pinned(system).reshape(nodes, 1, m)
-    for p in range(parities):
-        psi = 7 * p + 4 + np.arange(3)
-        place = jnp.array([0, -1])[:, None, None], psi[None, :, None], psi[None, None]
-        diagonal = diagonal.at[place].add(system.ends[:, p])
-    upper = part(0, 1) * s[:-1, :, None] * s[1:, None]
-    return diagonal, jnp.concatenate([upper, jnp.zeros_like(upper[:1])])
+    held = jnp.pad(system.ends, ((0, 0), (0, 0), (4, 0), (4, 0)))
+    held = held[:, :, :, None] * jnp.eye(parities, dtype=s.dtype)[None, :, None, :, None]
+    held = held.reshape(2, m, m)
+    none = jnp.zeros((nodes - 2, m, m), s.dtype)
+    diagonal = diagonal + jnp.concatenate([held[:1], none, held[1:]])
+    return diagonal, padded(part(0, 1) * s[:-1, :, None] * s[1:, None], 0, 1)
 
 
 def solve_linear(tangent: Tangent, r: State) -> State:
     """J^-1 r."""
-    nodes, m, modes = tangent.border.shape
-    free = block.solve(tangent.factors, r.y.reshape(nodes, m, 1))[:, :, 0]
-    C, B = tangent.compliance, tangent.B
-    upper = jnp.concatenate([jnp.eye(modes, dtype=C.dtype) - C @ tangent.H, -C @ B.T], 1)
-    J = jnp.concatenate([upper, jnp.concatenate([B, jnp.diag(tangent.give)], 1)])
-    at_contact = r.q_C.ravel() + jnp.einsum("nim,ni->m", tangent.border, free)
-    local = jnp.linalg.solve(J, jnp.concatenate([at_contact, r.force]))
-    q, force = local[:modes], local[modes:]
-    y = free + tangent.moved @ (tangent.H @ q + B.T @ force)
+    share, own, E = tangent.share, tangent.own, tangent.stiffness
+    b = tangent.B.T @ (r.force / tangent.give)
+    fixed = r.q_C.ravel() + own * b
+    rhs = r.y.reshape(share.shape) + _spread(share, b - E @ fixed)
+    y = block.solve(tangent.factors, rhs[:, :, None])[:, :, 0]
+    moved = _gather(share, y) + fixed
+    q = moved - own * (E @ moved)
+    force = (r.force - tangent.B @ q) / tangent.give
     return State(y.reshape(r.y.shape), q.reshape(r.q_C.shape), force)
 
 
@@ -228,27 +288,24 @@ def excess_negative(tangent: Tangent) -> Int[Array, ""]:
     The forces within the span and of the tool are multipliers: of the symmetric form of the
     tangent in (y, their values, q_C) a minimum has as many negative eigenvalues as there are
     multipliers. That number is taken off; 0: stable while the tool is held.
+
+    Eliminated in the order F, (g, q_C), y: of F all pivots are negative, of [[-S, I], [I, M]] as
+    many as it has modes and those of I + S M, and what is left for y is K_T + N^T E N.
     """
-    C, B, H = tangent.compliance, tangent.B, tangent.H
-    size = jnp.sqrt(jnp.trace(C) / C.shape[0])  # mm and N to units of like size
-    size = jnp.where(size > 0, size, 1)
-    eye, none = jnp.eye(C.shape[0], dtype=C.dtype), jnp.zeros_like(B)
-    S = jnp.block([
-        [-C / size**2, eye, none.T],
-        [eye, -H * size**2, -B.T],
-        [none, -B, -jnp.diag(tangent.give) / size**2],
-    ])  # fmt: skip
-    values = jnp.linalg.eigvalsh((S + S.T) / 2)
-    multipliers = C.shape[0] + B.shape[0]
-    return tangent.factors.negative + jnp.sum(values < 0) - multipliers
+    return tangent.factors.negative + tangent.negative
 
 
 def stored_energy(state: State, system: System) -> Float[Array, ""]:
     """Energy of rings, spans, ends and the contact's own compliances, N mm."""
-    modes = ring_modes(state, system)
-    rings = jax.vmap(energy, (0, 0, None, None))(modes, system.rings, system.grid, system.shape)
+    return stored_energy_of(lines(state, system), state, system)
+
+
+def stored_energy_of(line: Line, state: State, system: System) -> Float[Array, ""]:
+    """`stored_energy` where the mid-lines are known."""
+    rings = jax.vmap(line_energy, (0, 0, None, None))
+    in_rings = rings(of_rings(line), system.rings, system.grid, system.shape)
     spans = jax.vmap(span_energy)(_pairs(physical(state, system)), system.spans)
     ends = jnp.sum(state.y * _held_ends(state.y, system)) / 2
-    g = (_surface_slope(state, system).T @ state.force).reshape(state.q_C.shape)
+    g = (contact_surface(state, line, system).slope.T @ state.force).reshape(state.q_C.shape)
     own = jnp.sum(system.place.own * g * g) + jnp.sum(system.give * state.force**2)
-    return jnp.sum(rings) + jnp.sum(spans) + ends + own / 2
+    return jnp.sum(in_rings) + jnp.sum(spans) + ends + own / 2
