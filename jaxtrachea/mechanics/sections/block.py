@@ -1,7 +1,8 @@
-"""Symmetric block-tridiagonal systems: elimination from one end, with the inertia of the matrix.
+"""Symmetric block-tridiagonal systems: elimination from both ends, with the inertia of the matrix.
 
-O(n) for n blocks. No pivots are exchanged: for positive definite matrices none need be, and
-of others the signs of the pivots are wanted (Sylvester: as many negative as eigenvalues).
+O(n) for n blocks; both ends at a time, so that half as many operations wait for each other. No
+pivots are exchanged: for positive definite matrices none need be, and of others the signs of the
+pivots are wanted (Sylvester: as many negative as eigenvalues).
 """
 
 from typing import NamedTuple
@@ -13,16 +14,21 @@ from jaxtyping import Array, Float, Int
 
 
 class Factors(NamedTuple):
-    """An eliminated matrix.
+    """An eliminated matrix: two chains of nodes, from either end, and the node between.
+
+    The second chain begins with a node of its own that is coupled to nothing where the number of
+    nodes is even.
 
     Attributes:
-        inverse: of each block's rest after the elimination of those before it.
-        gain: `inverse` times the blocks [i, i + 1] of the matrix; that of the last node is zero.
+        inverse: of each block's rest after the elimination of those before it in its chain.
+        gain: that times the block to the next node of the chain.
+        centre: the inverse for the node between.
         negative: number of negative pivots.
     """
 
-    inverse: Float[Array, "n m m"]
-    gain: Float[Array, "n m m"]
+    inverse: Float[Array, "half 2 m m"]
+    gain: Float[Array, "half 2 m m"]
+    centre: Float[Array, "m m"]
     negative: Int[Array, ""]
 
 
@@ -33,65 +39,85 @@ def invert(matrix: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Int[Array,
     operations that wait for each other.
     """
     m = matrix.shape[0]
-    A, negative = matrix, jnp.zeros((), jnp.int32)
+    A, pivots, places = matrix, [], np.arange(m)
     for k in range(0, m - 1, 2):
         a, b, c, d = A[k, k], A[k, k + 1], A[k + 1, k], A[k + 1, k + 1]
         det = a * d - b * c
-        pivots = (a < 0).astype(jnp.int32) + ((det < 0) != (a < 0)).astype(jnp.int32)
-        negative = negative + pivots
-        first, second = (d * A[k] - b * A[k + 1]) / det, (a * A[k + 1] - c * A[k]) / det
-        here = np.arange(m)
-        own = np.asarray(here == k), np.asarray(here == k + 1)
-        first = jnp.where(own[0], d / det, jnp.where(own[1], -b / det, first))
-        second = jnp.where(own[0], -c / det, jnp.where(own[1], a / det, second))
-        either = own[0] | own[1]
-        rest = jnp.where(either[None], 0, A)
+        pivots += [a, det / a]
+        share = 1 / det
+        one, two = places == k, places == k + 1
+        # Rows of the inverse of the 2 x 2 block, times the two rows or times 1.
+        row = jnp.where(one, 1, jnp.where(two, 0, A[k])) * share
+        other = jnp.where(two, 1, jnp.where(one, 0, A[k + 1])) * share
+        first, second = d * row - b * other, a * other - c * row
+        rest = jnp.where((one | two)[None], 0, A)
         rest = rest - A[:, k, None] * first[None] - A[:, k + 1, None] * second[None]
-        A = jnp.where(own[0][:, None], first, jnp.where(own[1][:, None], second, rest))
+        A = jnp.where(one[:, None], first[None], jnp.where(two[:, None], second[None], rest))
+        # XLA would compute every step again for each element of the next.
+        A = jax.lax.optimization_barrier(A)
     if m % 2:
-        p, last = A[-1, -1], np.arange(m) == m - 1
-        negative = negative + (p < 0).astype(jnp.int32)
+        p, last = A[-1, -1], places == m - 1
+        pivots.append(p)
         row = jnp.where(last, 1, A[-1]) / p
         rest = jnp.where(last[None], 0, A) - A[:, -1, None] * row[None]
-        A = jnp.where(last[:, None], row, rest)
-    return A, negative
+        A = jnp.where(last[:, None], row[None], rest)
+    return A, jnp.sum((jnp.stack(pivots) < 0).astype(jnp.int32))
+
+
+def _chains(nodes, fill):
+    """Entries of nodes in the order of both chains, (half, 2, ...), and that of the centre."""
+    half = nodes.shape[0] // 2
+    right = nodes[:half:-1]
+    if nodes.shape[0] % 2 == 0:
+        right = jnp.concatenate([fill[None], right])
+    return jnp.stack([nodes[:half], right], 1), nodes[half]
 
 
 def factor(diagonal: Float[Array, "n m m"], upper: Float[Array, "n m m"]) -> Factors:
-    """Eliminate the first block, then the next.
+    """Eliminate the first block and the last, then the next of either.
 
     Args:
         diagonal: blocks [i, i], symmetric.
         upper: blocks [i, i + 1]; the last is zero.
     """
+    eye = jnp.eye(diagonal.shape[1], dtype=diagonal.dtype)
+    D, centre = _chains(diagonal, eye)
+    half = D.shape[0]
+    lower = upper[half:-1].transpose(0, 2, 1)[::-1]
+    if lower.shape[0] < half:
+        lower = jnp.concatenate([jnp.zeros_like(eye)[None], lower])
+    U = jnp.stack([upper[:half], lower], 1)
 
     def step(carry, blocks):
         D, U = blocks
-        inverse, negative = invert(D - carry)
+        inverse, negative = jax.vmap(invert)(D - carry)
         gain = inverse @ U
-        return U.T @ gain, (inverse, gain, negative)
+        return U.transpose(0, 2, 1) @ gain, (inverse, gain, negative)
 
-    _, (inverse, gain, negative) = jax.lax.scan(
-        step, jnp.zeros_like(diagonal[0]), (diagonal, upper)
-    )
-    return Factors(inverse, gain, jnp.sum(negative))
+    carry, (inverse, gain, negative) = jax.lax.scan(step, jnp.zeros_like(D[0]), (D, U))
+    middle, own = invert(centre - carry[0] - carry[1])
+    return Factors(inverse, gain, middle, jnp.sum(negative) + own)
 
 
 def solve(factors: Factors, rhs: Float[Array, "n m k"]) -> Float[Array, "n m k"]:
     """Solution for k right-hand sides."""
+    n = rhs.shape[0]
+    sides, centre = _chains(rhs, jnp.zeros_like(rhs[0]))
 
-    def down(r, node):
-        gain, next_r = node
-        r = next_r - jnp.sum(gain[:, :, None] * r[:, None], 0)
-        return r, r
+    def down(taken, node):
+        gain, r = node
+        r = r - taken
+        return jnp.sum(gain[:, :, :, None] * r[:, :, None], 1), r
 
     def back(x, node):
         gain, own = node
-        x = own - jnp.sum(gain[:, :, None] * x[None], 1)
+        x = own - jnp.sum(gain[:, :, :, None] * x[:, None], 2)
         return x, x
 
-    first, gain = rhs[0], factors.gain[:-1]
-    rest = jax.lax.scan(down, first, (gain, rhs[1:]))[1]
-    own = factors.inverse @ jnp.concatenate([first[None], rest])
-    x = jax.lax.scan(back, own[-1], (gain, own[:-1]), reverse=True)[1]
-    return jnp.concatenate([x, own[-1:]])
+    taken, left = jax.lax.scan(down, jnp.zeros_like(sides[0]), (factors.gain, sides))
+    x = factors.centre @ (centre - taken[0] - taken[1])
+    own = factors.inverse @ left
+    start = jnp.broadcast_to(x[None], sides[0].shape)
+    sides = jax.lax.scan(back, start, (factors.gain, own), reverse=True)[1]
+    right = sides[::-1, 1][: n - n // 2 - 1]
+    return jnp.concatenate([sides[:, 0], x[None], right])

@@ -186,7 +186,7 @@ def _gap(lam, turn, stretch, grid: Grid):
     """
     shapes = grid.turn[grid.modes :]
     c, s = cos_sin(grid.phi + turn + lam @ shapes)
-    rows = grid.weights * jnp.concatenate([jnp.ones_like(grid.phi)[None], shapes])
+    rows = grid.weights[None] * jnp.concatenate([jnp.ones_like(grid.phi)[None], shapes])
     along_z = rows @ (stretch * c)
     along_y = rows @ (stretch * s)
     if grid.midline:
