@@ -1,10 +1,12 @@
 """Equilibria along a path of the tool: Newton's method, path following, implicit derivatives.
 
 One loop for each displacement of the path: every turn is one Newton step, after which the state is
-accepted (and the next substep predicted by the secant of the last two), corrected further, or given
-up (and tried again from the last state with half the substep). Lanes of a `vmap` go each their way.
+accepted (and the next substep predicted from the last two and their derivatives by the tool's
+displacement, which the tangent gives with the step), corrected further, or given up (and tried
+again from the last state with half the substep). Lanes of a `vmap` go each their way.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -36,99 +38,143 @@ class Solved(NamedTuple):
 
 
 class _Way(NamedTuple):
-    """Where the path following stands.
+    """Where the path following stands; few arrays, since each costs a turn of the loop a copy.
 
-    `there`, `before`: the last two states and their displacements; `state`: under correction for
-    the displacement `tried`; `count`: Newton steps of this substep, `total` of all; `reach`:
-    substep allowed; `lost`: given up; `stable`: no state so far that is no minimum of the energy.
+    Attributes:
+        known: the last two states and their derivatives by the tool's displacement, flat: THERE,
+            BEFORE, SLOPE, SLOPE_BEFORE.
+        z: under correction for the displacement TRIED, flat.
+        places: AT and AT_BEFORE of the two states, TRIED, and REACH: the substep allowed; mm.
+        steps: of Newton's method, of this substep and of all.
+        lost: given up.
+        stable: no state so far that is no minimum of the energy.
     """
 
-    there: State
-    before: State
-    at: Float[Array, ""]
-    at_before: Float[Array, ""]
-    state: State
-    tried: Float[Array, ""]
-    reach: Float[Array, ""]
-    count: Int[Array, ""]
-    total: Int[Array, ""]
+    known: Float[Array, "4 n"]
+    z: Float[Array, " n"]
+    places: Float[Array, "4"]
+    steps: Int[Array, "2"]
     lost: Bool[Array, ""]
     stable: Bool[Array, ""]
+
+
+THERE, BEFORE, SLOPE, SLOPE_BEFORE = range(4)
+AT, AT_BEFORE, TRIED, REACH_NOW = range(4)
+
+
+def _flat(state: State):
+    return jnp.concatenate([v.ravel() for v in state])
+
+
+def _state(z, system: System) -> State:
+    """The state of a flat array."""
+    y, q, count = system.scale.shape, system.place.own.shape, system.give.shape[0]
+    end = math.prod(y)
+    return State(z[:end].reshape(y), z[end:-count].reshape(q), z[-count:])
 
 
 def _choose(condition, a, b):
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
-def _predict(way: _Way, target) -> _Way:
-    """Next substep: at most `reach` on, from the secant of the last two states."""
-    tried = way.at + jnp.clip(target - way.at, -way.reach, way.reach)
-    tried = jnp.where(jnp.abs(target - tried) <= 0.01 * way.reach, target, tried)
-    past = way.at - way.at_before
-    ratio = jnp.where(past == 0, 0, (tried - way.at) / jnp.where(past == 0, 1, past))
-    state = jax.tree.map(lambda x, y: x + ratio * (x - y), way.there, way.before)
-    return way._replace(state=state, tried=tried, count=jnp.zeros_like(way.count))
+def _predict(known, places, target):
+    """Next substep, at most `reach` on: state and places.
+
+    Hermite's cubic through both states; along the tangent where it would reach far beyond them.
+    """
+    at, before, _, reach = places
+    tried = at + jnp.clip(target - at, -reach, reach)
+    tried = jnp.where(jnp.abs(target - tried) <= 0.01 * reach, target, tried)
+    past, on = at - before, tried - at
+    cubic = (past != 0) & (jnp.abs(on) <= 2 * jnp.abs(past))
+    x = jnp.where(cubic, on / jnp.where(past == 0, 1, past), 0)
+    own = jnp.where(cubic, x * (1 + x) ** 2 * past, on)
+    back, back_slope = x * x * (3 + 2 * x), x * x * (1 + x) * past
+    z = known[THERE] + back * (known[BEFORE] - known[THERE])
+    z = z + own * known[SLOPE] + back_slope * known[SLOPE_BEFORE]
+    return z, jnp.stack([at, before, tried, reach])
 
 
-def _size(step: State):
+def _size(step, system: System):
     """Largest change of a mode, mm."""
+    step = _state(step, system)
     return jnp.maximum(jnp.max(jnp.abs(step.y[:, :, :4])), jnp.max(jnp.abs(step.q_C)))
+
+
+def _newton(z, displacement, system: System):
+    """Newton's step from z, the derivative of the solution by the displacement, and stability."""
+    r, tangent = _system.linearise(_state(z, system), displacement, system)
+    along = jax.tree.map(jnp.zeros_like, r)._replace(force=system.direction)
+    both = jax.tree.map(lambda x, y: jnp.stack([x, y]), r, along)
+    both = jax.vmap(_system.solve_linear, (None, 0))(tangent, both)
+    step, slope = jax.vmap(_flat)(both)
+    return step, slope, _system.excess_negative(tangent) == 0
 
 
 def _advance(way: _Way, target, system: System) -> _Way:
     """One Newton step, and what follows from it."""
     longest = REACH * system.shape.radius
-    r, tangent = _system.linearise(way.state, way.tried, system)
-    step = _system.solve_linear(tangent, r)
-    state = jax.tree.map(lambda x, y: x - y, way.state, step)
-    size = _size(step)
-    finite = jnp.isfinite(size + jnp.sum(state.force) + jnp.sum(state.y))
-    scale = jnp.maximum(jnp.abs(way.tried), jnp.abs(way.tried - way.at))
+    at, before, tried, reach = way.places
+    step, slope, minimum = _newton(way.z, tried, system)
+    z = way.z - step
+    size = _size(step, system)
+    finite = jnp.isfinite(jnp.max(jnp.abs(z)))
+    scale = jnp.maximum(jnp.abs(tried), jnp.abs(tried - at))
     settled = finite & (size <= epsilon(size.dtype) ** 0.5 * scale)
-    count, total = way.count + 1, way.total + 1
+    count, total = way.steps + 1
     failed = ~finite | (size > 3 * system.shape.radius) | ((count >= STEPS) & ~settled)
-    on = way._replace(state=state, count=count, total=total)
-    # The tangent is that before the last step, which was small.
-    stable = way.stable & (_system.excess_negative(tangent) == 0)
-    quick = jnp.where(count <= 5, 2 * way.reach, way.reach)
-    accepted = _predict(
-        on._replace(
-            there=state,
-            before=way.there,
-            at=way.tried,
-            at_before=way.at,
-            reach=jnp.minimum(quick, longest),
-            stable=stable,
-        ),
-        target,
+    # The first step of all is from rest, whose derivative nothing else tells.
+    at_rest = (at == before) & (way.steps[0] == 0)
+    known = jnp.where(at_rest, way.known.at[SLOPE].set(slope), way.known)
+    on = way._replace(known=known, z=z, steps=way.steps + 1)
+    # Settled: slope and stability are those before the last step, which was small.
+    quick = jnp.minimum(jnp.where(count <= 5, 2 * reach, reach), longest)
+    grown = jnp.stack([z, known[THERE], slope, known[SLOPE]])
+    ahead = jnp.stack([tried, at, tried, quick])
+    shorter = jnp.minimum(reach, jnp.abs(tried - at)) / 2
+    given_up = failed & ((shorter < longest / 2**HALVINGS) | (total >= IN_ALL))
+    # Accepted, or back with a shorter substep; both begin from a prediction.
+    known = jnp.where(settled, grown, way.known)
+    places = jnp.where(settled, ahead, jnp.stack([at, before, tried, shorter]))
+    z, places = _predict(known, places, target)
+    again = _Way(
+        known=known,
+        z=z,
+        places=places,
+        steps=jnp.stack([jnp.zeros_like(total), total]),
+        lost=given_up,
+        stable=way.stable & (minimum | ~settled),
     )
-    shorter = jnp.minimum(way.reach, jnp.abs(way.tried - way.at)) / 2
-    back = _predict(way._replace(reach=shorter, total=total), target)
-    given_up = (shorter < longest / 2**HALVINGS) | (total >= IN_ALL)
-    back = back._replace(lost=given_up)
-    return _choose(settled, accepted, _choose(failed, back, on))
+    return _choose(settled | failed, again, on)
 
 
 def _follow(system: System, displacement) -> Solved:
     """States along the path, without derivatives."""
-    rest = _system.at_rest(system)
-    zero = jnp.zeros_like(system.phi_c)
-    count = jnp.zeros((), jnp.int32)
+    rest = _flat(_system.at_rest(system))
     reach = REACH * system.shape.radius
     no = jnp.zeros((), bool)
-    begin = _Way(rest, rest, zero, zero, rest, zero, reach, count, count, no, ~no)
+    none = jnp.zeros_like(reach)
+    begin = _Way(
+        known=jnp.zeros((4, rest.size), rest.dtype),
+        z=rest,
+        places=jnp.stack([none, none, none, reach]),
+        steps=jnp.zeros(2, jnp.int32),
+        lost=no,
+        stable=~no,
+    )
 
     def press_on(way, target):
         # No displacement is the state of rest, and that exactly.
         way = _choose(target == 0, begin._replace(stable=way.stable), way)
-        way = _predict(way._replace(total=count, lost=no, reach=reach), target)
+        z, places = _predict(way.known, way.places.at[REACH_NOW].set(reach), target)
+        way = _Way(way.known, z, places, jnp.zeros_like(way.steps), no, way.stable)
 
         def goes(way):
-            return (way.at != target) & ~way.lost
+            return (way.places[AT] != target) & ~way.lost
 
         way = jax.lax.while_loop(goes, lambda w: _advance(w, target, system), way)
-        state = _choose(way.lost, rest, way.there)
-        told = (~way.lost, way.stable, way.total)
+        state = _state(jnp.where(way.lost, rest, way.known[THERE]), system)
+        told = (~way.lost, way.stable, way.steps[1])
         return way, Solved(state, *(v.astype(target.dtype) for v in told))
 
     return jax.lax.scan(press_on, begin, displacement)[1]
