@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxtrachea._numerics import (
+    cos_sin,
     cubic_ratio,
     epsilon,
     first_positive_root,
@@ -313,3 +314,32 @@ def test_rising_root(dtype):
     want, rtol = np.tan(np.asarray(y, float)), 50 * np.finfo(dtype).eps
     np.testing.assert_allclose(found[:5], want[:5], rtol=rtol, atol=rtol)
     assert found[5] == start[5]
+
+
+@pytest.mark.parametrize(("dtype", "reach"), [("float32", 1e2), ("float64", 1e4)])
+def test_cosine_and_sine(dtype, reach):
+    """Against 40 digits, at random, small and huge angles and beside multiples of pi / 4."""
+    rng = np.random.default_rng(0)
+    beside = np.arange(-40, 41) * np.pi / 4
+    small = 10.0 ** -np.arange(1, 20)
+    x = np.concatenate([rng.uniform(-reach, reach, 300), rng.normal(size=300), beside, small])
+    x = np.append(x, [0.0, reach, -reach]).astype(dtype)
+    both = jax.jit(cos_sin)
+    got = np.asarray(both(jnp.asarray(x)))
+    assert got.dtype == dtype
+    with mp.workdps(40):
+        wanted = [[float(f(mp.mpf(float(v)))) for v in x] for f in (mp.cos, mp.sin)]
+    assert np.abs(got - wanted).max() <= np.finfo(dtype).eps
+    sine = np.abs(x) < 0.5  # to the last digits of small sines as well
+    np.testing.assert_allclose(
+        got[1, sine], np.array(wanted)[1, sine], rtol=3 * np.finfo(dtype).eps
+    )
+    assert np.all(np.isnan(both(jnp.asarray([np.nan, np.inf], dtype))))
+
+
+def test_cosine_and_sine_have_derivatives():
+    x = jnp.linspace(-9, 9, 41)
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        c, s = jacobian(cos_sin)(x)
+        np.testing.assert_allclose(np.diagonal(c), -np.sin(x), atol=1e-15)
+        np.testing.assert_allclose(np.diagonal(s), np.cos(x), atol=1e-15)

@@ -3,7 +3,7 @@
     python tests/bench/levels.py
 
 Table 1's tube, 15 rings, 200 displacements to 6 mm at one position: per call and per lane of 256.
-`sections` takes 8 displacements in place of 200 (a path by Newton's method) and no lanes.
+`sections` takes 8 displacements in place of 200 (a path by Newton's method).
 """
 
 import common  # isort: skip
@@ -44,14 +44,17 @@ def main() -> None:
         cases[f"{name}, 256 lanes"] = lambda f=lanes: jax.block_until_ready(f(places, material))
     wall, path = from_wall(geometry), jnp.linspace(0.75, 6, 8)
     for name, phi in (("sections", 0.0), ("sections, 90 deg", np.pi / 2)):
-        call = jax.jit(
-            lambda D, phi=phi: press_sections(geometry, wall, 74.0, phi, D, midline=phi == 0).force
-        )
-        cases[name] = lambda f=call: jax.block_until_ready(f(path))
-    samples = common.interleaved(cases, rounds=30)
+
+        def section(s, D, phi=phi):
+            return press_sections(geometry, wall, s, phi, D, midline=phi == 0).force
+
+        call, lanes = jax.jit(section), jax.jit(jax.vmap(section, (0, None)))
+        cases[name] = lambda f=call: jax.block_until_ready(f(jnp.asarray(74.0), path))
+        cases[f"{name}, 256 lanes"] = lambda f=lanes: jax.block_until_ready(f(places, path))
+    samples = common.interleaved(cases, rounds=10)
     best = {name: float(np.median(v)) for name, v in samples.items()}
     for name, seconds in best.items():
-        base = best["mat, 256 lanes" if "lanes" in name else "mat"]
+        base = best["mat, 256 lanes" if "256 lanes" in name else "mat"]
         print(f"{name:28s} {1e6 * seconds:10.1f} us  {seconds / base:8.2f} x mat")
 
 

@@ -17,7 +17,11 @@ from jaxtrachea.mechanics.sections.section import (
     make_grid,
     surface_motion,
 )
-from jaxtrachea.mechanics.sections.section_tangent import ring_forces, ring_tangent
+from jaxtrachea.mechanics.sections.section_tangent import (
+    ring_forces,
+    ring_tangent,
+    surface_tangent,
+)
 from jaxtrachea.mechanics.sections.span import linear_shapes
 
 R, OFFSET, ALPHA = 11.7, 0.9, 2.0
@@ -121,6 +125,29 @@ def test_forces_and_stiffness_are_the_derivatives_of_the_energy(midline):
     np.testing.assert_allclose(force, by_ad[0], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(alone, force, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(stiff, by_ad[1], rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("midline", [True, False])
+def test_the_surface_has_its_derivatives(midline):
+    """Slope and second derivative along a force, by AD of the motion; motions of 2 mm."""
+    _, grid, shape = parts(midline)
+    force = jnp.asarray([1.3] if midline else [1.3, -0.7])
+    phi = jnp.asarray(0.0 if midline else 0.9)
+    n = force.size
+
+    def motion(q):
+        return surface_motion(q, phi, grid, shape)[:n]
+
+    def closed_form(q):
+        return surface_tangent(deform(q, grid, shape), phi, force, grid, shape)
+
+    q = jnp.asarray(sample(midline))
+    got = jax.jit(jax.vmap(closed_form))(q)
+    along = jax.hessian(lambda q: force @ motion(q))
+    by_ad = jax.jit(jax.vmap(lambda q: (motion(q), jax.jacfwd(motion)(q), along(q))))(q)
+    for v, wanted in zip(got, by_ad, strict=True):
+        np.testing.assert_allclose(v, wanted, rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("midline", [pytest.param(True, marks=pytest.mark.slow), False])
