@@ -53,16 +53,26 @@ def _count(event, duration, **_):
 jax.monitoring.register_event_duration_secs_listener(_count)
 
 
+def _mapped() -> int:
+    """Pieces of memory that this process maps; 0 where the system does not tell."""
+    try:
+        with open("/proc/self/maps", "rb") as pieces:
+            return sum(1 for _ in pieces)
+    except OSError:
+        return 0
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _forget_programs():
     """Compiled programs are dropped after some files; all together would take gigabytes.
 
-    Not after every file: a fifth and more of the small ones serve the next file too. Many more at a
-    time exceed what a process may map of memory (65,530 pieces), and XLA ends it.
+    Not after every file: a fifth and more of the small ones serve the next file too. A process may
+    map 65,530 pieces of memory, and beyond XLA ends it: an optimised program takes some 100 of
+    them, that of a press on deforming sections 1,000. No file adds more than 20,000.
     """
     global _compiled
     yield
-    if _compiled > 400:
+    if _compiled > 400 or _mapped() > 30_000:
         jax.clear_caches()
         _compiled = 0
 

@@ -1,5 +1,7 @@
 """Derivatives of presses: forward = reverse = central differences, for every parameter."""
 
+import functools
+
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -13,6 +15,8 @@ from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 
 from .test_press import VALUES
+
+pytestmark = pytest.mark.compiling
 
 GEOMETRY = Geometry.create(41.0, [9.0, 19.0, 30.0], radius=11.7)
 EACH = {"EI_C": np.array([24.0, 22.0, 25.0]), "Gt_L": np.array([20.0, 21.0, 22.0, 20.5])}
@@ -30,11 +34,18 @@ def force(flat):
 
 
 def central_differences():
-    """Steps of 1e-4 of each value: an error of 1e-8 from the third derivative."""
+    """The value, and steps of 1e-4 of each input: an error of 1e-8 from the third derivative."""
     h = 1e-4 * np.abs(FLAT)
-    moved = jnp.asarray(np.asarray(FLAT)[None] + np.concatenate([np.diag(h), -np.diag(h)]))
-    up, down = np.split(np.asarray(jax.jit(jax.vmap(force))(moved)), 2)
-    return ((up - down) / (2 * h[:, None])).T
+    steps = np.concatenate([np.zeros((1, FLAT.size)), np.diag(h), -np.diag(h)])
+    value, *moved = np.asarray(jax.jit(jax.vmap(force))(FLAT[None] + steps))
+    up, down = np.split(np.array(moved), 2)
+    return value, ((up - down) / (2 * h[:, None])).T
+
+
+@functools.cache
+def forward():
+    """One program for the tests below."""
+    return np.asarray(jax.jit(jax.jacfwd(force))(FLAT))
 
 
 def force_alone(flat):
@@ -58,16 +69,15 @@ def test_along_one_direction():
 @pytest.mark.slow
 def test_forward_is_central_differences():
     """Each parameter by itself."""
-    value = np.asarray(jax.jit(force)(FLAT))
+    value, differences = central_differences()
     size = np.abs(value)[:, None] / np.abs(FLAT)[None]
-    forward = np.asarray(jax.jit(jax.jacfwd(force))(FLAT))
-    np.testing.assert_allclose(forward / size, central_differences() / size, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(forward() / size, differences / size, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.slow
 def test_reverse_is_forward():
-    forward, reverse = (np.asarray(jax.jit(of(force))(FLAT)) for of in (jax.jacfwd, jax.jacrev))
-    np.testing.assert_allclose(reverse, forward, atol=1e-9 * np.abs(forward).max())
+    reverse = np.asarray(jax.jit(jax.jacrev(force))(FLAT))
+    np.testing.assert_allclose(reverse, forward(), atol=1e-9 * np.abs(forward()).max())
 
 
 @pytest.mark.slow
@@ -80,10 +90,13 @@ def test_second_derivatives():
         return force(FLAT.at[jnp.array([i, last])].set(x))[2]
 
     x, h = FLAT[jnp.array([i, last])], 1e-4
-    hessian = jax.jit(jax.hessian(energy))(x)
-    slope = jax.jit(jax.grad(energy))
-    by_hand = [(slope(x.at[k].add(h)) - slope(x.at[k].add(-h))) / (2 * h) for k in (0, 1)]
+    # Slope and its change along a direction: one program for both.
+    slope = jax.jit(lambda x, v: jax.jvp(jax.grad(energy), (x,), (v,)))
+    unit = jnp.eye(2)
+    hessian = np.array([slope(x, v)[1] for v in unit])
+    by_hand = [(slope(x + h * v, v)[0] - slope(x - h * v, v)[0]) / (2 * h) for v in unit]
     np.testing.assert_allclose(hessian, by_hand, atol=1e-6)
+    np.testing.assert_allclose(hessian, hessian.T, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ from jaxtrachea.mechanics.sections.section_tangent import (
 )
 from jaxtrachea.mechanics.sections.span import linear_shapes
 
+pytestmark = pytest.mark.compiling
 R, OFFSET, ALPHA = 11.7, 0.9, 2.0
 VALUES = {"EI_C": 24.0, "EI_M": 2.0, "Et_M": 0.68, "k_n": 0.0186, "k_t": 0.0018, "c_K": 22.0}
 PITCH = 10.0

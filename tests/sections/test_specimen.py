@@ -17,6 +17,7 @@ from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 
+pytestmark = pytest.mark.compiling
 VIRTUAL = Path(__file__).parents[2] / "fits" / "virtual_trachea"
 RINGS = 10.0 * np.arange(1, 16)
 GEOMETRY = Geometry.create(160.0, RINGS, radius=11.7)
