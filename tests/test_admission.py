@@ -40,6 +40,8 @@ from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.material import Material
 
+pytestmark = pytest.mark.compiling
+
 VALUES = {"EI_L": 1.862, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02}
 FULL = VALUES | {"EA_L": 3.9, "EI_C": 13.0, "k_t": 0.4}
 OK, OFF, BAD = PressStatus.OK, PressStatus.OFF_TUBE, PressStatus.BAD_MATERIAL

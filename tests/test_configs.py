@@ -13,6 +13,8 @@ from run_cli import run, tree
 from jaxtrachea import table_1
 from jaxtrachea.trachea.tube import make_tube
 
+pytestmark = pytest.mark.compiling
+
 CONFIGS = Path(__file__).parents[1] / "configs"
 NAMES = sorted(path.stem for path in CONFIGS.glob("*.toml"))
 #: Effects that a scene must have (or not): what it is there to show.

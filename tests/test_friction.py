@@ -12,6 +12,8 @@ from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.friction import Coulomb, slide, slide_path
 from jaxtrachea.status import PressStatus
 
+pytestmark = pytest.mark.compiling
+
 MU = 0.66  # paper, Table 1
 DTYPES = ["float32", "float64"]
 COUPLED = np.array([[1.4, 0.3, -0.2], [0.3, 2.0, 0.15], [-0.2, 0.15, 0.6]])

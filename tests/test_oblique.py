@@ -24,6 +24,8 @@ from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
+pytestmark = pytest.mark.compiling
+
 DTYPES = ["float32", "float64"]
 ALPHA = 2 * math.pi / 3
 VALUES = {"EI_L": 1.862, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02, "EA_L": 3.9, "EI_C": 13.0, "k_t": 0.4}

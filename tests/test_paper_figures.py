@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
-pytestmark = pytest.mark.slow  # compiles every level of the rings
+# Compiles every level of the rings.
+pytestmark = [pytest.mark.slow, pytest.mark.compiling]
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,8 @@ from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.trachea.material import Material
 
+pytestmark = pytest.mark.compiling
+
 FREE = {"fixed": False}
 TRIAL = {"fixed": False, "scope": "trial"}
 BOTH = {"onset": TRIAL, "force_offset": TRIAL}

@@ -13,6 +13,8 @@ from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.mesh import Mesh
 from jaxtrachea.trachea.tube import make_tube
 
+pytestmark = pytest.mark.compiling
+
 ALPHA = 2 * math.pi / 3
 METHODS = ["linear", "hermite", "phong"]
 DTYPES = ["float64", "float32"]

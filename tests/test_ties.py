@@ -17,6 +17,8 @@ from jaxtrachea.status import ContactStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.tube import make_tube
 
+pytestmark = pytest.mark.compiling
+
 #: Most of the time here is compilation.
 quick = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 ZERO = (0.0, 0.0, 0.0)

@@ -17,6 +17,8 @@ from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.stage import touch_tube
 from jaxtrachea.status import PressStatus
 
+pytestmark = pytest.mark.compiling
+
 EACH = dataclasses.replace(
     BARE, contact_point="per_step", want_joints=False, want_ring_ends=False
 )  # fmt: skip

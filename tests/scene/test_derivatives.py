@@ -12,6 +12,8 @@ from jaxtrachea import EffectOptions, Poses, Presses, make_scene, simulate, with
 from jaxtrachea.scene.stage import Tool
 from jaxtrachea.trachea.tube import make_tube
 
+pytestmark = pytest.mark.compiling
+
 COARSE = make_tube(TUBE, around=5, along=11)  # no row on a ring, where the ends have a kink
 FAST = {"xla_backend_optimization_level": 0}
 

@@ -41,6 +41,8 @@ from jaxtrachea.scene.stage import Tool
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.tube import make_tube
 
+pytestmark = pytest.mark.compiling
+
 run = jax.jit(simulate)
 OK, OFF_PLAN = PressStatus.OK, PressStatus.OFF_PLAN
 #: Forces only: quick to compile.

@@ -30,6 +30,8 @@ from jaxtrachea.scene.seat import given_way
 from jaxtrachea.scene.stage import Tool
 from jaxtrachea.status import PressStatus
 
+pytestmark = pytest.mark.compiling
+
 EYE = np.eye(3)
 OK, NO_CONTACT, NON_FINITE = PressStatus.OK, PressStatus.NO_CONTACT, PressStatus.NON_FINITE
 #: Every effect of a press that holds its place, forces only.
@@ -320,7 +322,7 @@ def test_force_is_continuous_along_a_way(held):
 @pytest.mark.slow
 def test_force_is_continuous_along_many_ways(held):
     assert NON_FINITE in check_way(held, 5000, 0)
-    for seed in range(40):
+    for seed in range(20):
         check_loop(held, seed, 400)
 
 

@@ -43,6 +43,8 @@ from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.tube import make_tube
 
+pytestmark = pytest.mark.compiling
+
 run = jax.jit(simulate)
 FINE = make_tube(table_1())
 
@@ -246,7 +248,7 @@ def test_a_box_touches_flat():
     flat = box([4.0, 3.0, 4.0], 0.5)
     path = poses([75, OUTER + 3.5 - 1, 0], [75, OUTER + 3.5 - 1, 0], 1)
     scene = make_scene(TUBE, MATERIAL, path, tool=flat, effects=BARE)
-    seen = touch_tube(scene, path)
+    seen = jax.jit(touch_tube)(scene, path)
     np.testing.assert_allclose(seen.gap, -1, atol=0.15)
     np.testing.assert_allclose(seen.phi, 0, atol=1e-6)
 

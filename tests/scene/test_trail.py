@@ -15,6 +15,8 @@ from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.spec import load_scene_spec
 from jaxtrachea.surface import local
 
+pytestmark = pytest.mark.compiling
+
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 

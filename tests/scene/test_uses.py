@@ -13,6 +13,8 @@ from small_scenes import BARE, DOWN, MATERIAL, TUBE, presses
 from jaxtrachea import Presses, make_scene, simulate
 from jaxtrachea.trachea.tube import make_tube
 
+pytestmark = pytest.mark.compiling
+
 
 @pytest.mark.slow
 def test_material_from_a_deformed_surface():
