@@ -18,7 +18,8 @@ def _compile_quickly() -> None:
 
     Most of the suite is compilation of programs that run for milliseconds. A flag that this XLA
     does not know ends its process, so they are tried first. XLA_FLAGS from outside comes first:
-    the slow tests and one run of the others take the optimised programs (.ci/run).
+    slow tests that are not marked `compiling`, and one run of the default suite, take the optimised
+    programs (.ci/run).
     """
     if "XLA_FLAGS" in os.environ:
         return

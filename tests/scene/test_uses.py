@@ -21,7 +21,7 @@ def test_material_from_a_deformed_surface():
     """The muscle's stiffness, recovered from the vertices of one oblique press with optax."""
     path = presses([-2, -4, 0], rows=2)
     scene = make_scene(TUBE, MATERIAL, path, mesh=make_tube(TUBE, around=7, along=20))
-    seen = simulate(scene, MATERIAL, path).vertices
+    seen = jax.jit(simulate)(scene, MATERIAL, path).vertices
 
     def loss(log_k):
         m = dataclasses.replace(MATERIAL, k_M=jnp.exp(log_k))
