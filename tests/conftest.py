@@ -69,7 +69,7 @@ def _forget_programs():
 
     Not after every file: a fifth and more of the small ones serve the next file too. A process may
     map 65,530 pieces of memory, and beyond XLA ends it: an optimised program takes some 100 of
-    them, that of a press on deforming sections 1,000. No file adds more than 20,000.
+    them, that of a press on deforming sections 1,000; the largest files add 10,000.
     """
     global _compiled
     yield
