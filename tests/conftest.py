@@ -1,5 +1,6 @@
 """Strict settings for the whole suite: float64, no silent promotion, shapes checked."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -34,6 +35,9 @@ def _compile_quickly() -> None:
 
 
 _compile_quickly()
+# Tracing makes objects by the million that live on: searched for cycles as often as usual, they
+# cost a tenth of the suite. What is there before the first test is never searched.
+gc.disable()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -75,6 +79,7 @@ def _forget_programs():
     yield
     if _compiled > 400 or _mapped() > 30_000:
         jax.clear_caches()
+        gc.collect()
         _compiled = 0
 
 
@@ -95,6 +100,13 @@ LONGEST = (
     "test_spatial_beam.py",
     "test_gradients.py",
 )
+
+
+def pytest_collection_finish():
+    """The modules are read: from here on cycles are searched for, now and then."""
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 100)
+    gc.enable()
 
 
 def pytest_collection_modifyitems(config, items):

@@ -94,7 +94,7 @@ def _outer(geometry: Geometry, mesh: Mesh | None):
     """Radius of the outside, mm: of an imported mesh read with it, of a made one its crests."""
     if mesh is None:
         return geometry.radius + WALL / 2
-    return geometry.radius if mesh.frames is not None else jnp.max(mesh.distance)
+    return geometry.radius if mesh.frames is not None else jnp.asarray(np.max(mesh.distance))
 
 
 def with_geometry(scene: Scene, geometry: Geometry) -> Scene:

@@ -5,15 +5,15 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import first_touch
 from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.declare import SceneFacts
-from jaxtrachea.scene.effects import given_values
+from jaxtrachea.scene.effects import EffectOptions, given_values
 from jaxtrachea.scene.lumen import in_lumen
+from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.stage import (
     COVERED,
     Poses,
@@ -25,6 +25,8 @@ from jaxtrachea.scene.stage import (
 from jaxtrachea.surface import local
 from jaxtrachea.trachea.material import Material
 
+#: Rows that a path is filled up to, or twice, four times ...; longer ones than `MOST` are not.
+LEAST, MOST = 64, 4096
 
 def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> SceneFacts:
     """What the rules need to know of a scene and its path; rows in the lumen touch nothing.
@@ -36,16 +38,11 @@ def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> SceneFa
     """
     curved = scene.mesh is not None and scene.mesh.frames is not None
     if isinstance(path, Poses):
-        plan = dataclasses.replace(scene.plan, curved=curved)
-        seen, touching, row = _touched(dataclasses.replace(scene, plan=plan), path)
-        s, phi = (np.asarray(v, float) for v in (seen.s, seen.phi))
-        touching, row = np.asarray(touching), int(row)
-        frame = None
-        if curved and scene.tube is not None:
-            frame = frame_at(scene.tube.line, seen.s[row])
-        inward = local_frame(seen.phi[row])[0]
-        moved = contact_point_path(path, seen, jnp.asarray(row), inward, frame)
-        moved, at = np.asarray(moved, float), slice(row, row + 1)
+        seen = _touched(_what_is_touched(scene, curved), _filled_up(path))
+        rows = len(path.translation)
+        s, phi, touching, moved = (np.asarray(v)[:rows] for v in seen[:4])
+        s, phi, moved = (np.asarray(v, float) for v in (s, phi, moved))
+        at = slice(int(seen[4]), int(seen[4]) + 1)
     else:
         s, phi, moved = (np.asarray(v, float) for v in (path.s, path.phi, path.displacement))
         touching, at = np.ones(len(s), bool), slice(None)
@@ -80,18 +77,62 @@ def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> SceneFa
     )  # fmt: skip
 
 
+def _what_is_touched(scene: Scene, curved: bool) -> Scene:
+    """The scene without what a tool does not touch: other plans and meshes share one program."""
+    plan = make_plan(SceneFacts(mesh=False), EffectOptions(want_surface=False))
+    return dataclasses.replace(
+        scene, mesh=None, binding=None, runs=None, friction=None,
+        plan=dataclasses.replace(plan, curved=curved),
+    )  # fmt: skip
+
+
+def _filled_up(path: Poses) -> Poses:
+    """The path to a round number of rows by its last pose: paths of any length share a program."""
+    rows = len(path.translation)
+    if rows > MOST:
+        return path
+    round_number = LEAST
+    while round_number < rows:
+        round_number *= 2
+    filled = np.minimum(np.arange(round_number), rows - 1)
+    return Poses(np.asarray(path.rotation)[filled], np.asarray(path.translation)[filled])
+
+
 @jax.jit
-def _touched(scene: Scene, path: Poses) -> tuple[Touch, Bool[Array, " rows"], Int[Array, ""]]:
-    """Contact of every row, whether it is one with the outside, and the row of first touch."""
+def _touched(
+    scene: Scene, path: Poses
+) -> tuple[
+    Float[Array, " rows"],
+    Float[Array, " rows"],
+    Bool[Array, " rows"],
+    Float[Array, "rows 3"],
+    Int[Array, ""],
+]:
+    """Contact of every row and whether it is one with the outside; the way from first touch on.
+
+    Returns:
+        s, mm; phi, rad; whether the row touches from outside; displacement of the contact point,
+        mm; the row of first touch.
+    """
     seen = touch_tube(scene, path)
-    return seen, *first_touch(seen, in_lumen(scene, path, seen))
+    touching, row = first_touch(seen, in_lumen(scene, path, seen))
+    frame = None
+    if scene.plan.curved and scene.tube is not None:
+        frame = frame_at(scene.tube.line, seen.s[row])
+    inward = local_frame(seen.phi[row])[0]
+    moved = contact_point_path(path, seen, row, inward, frame)
+    return seen.s, seen.phi, touching, moved, row
 
 
 def _near(scene: Scene, s, phi) -> bool:
     """Whether a vertex lies within the reach of a dent at any of the contacts."""
     if scene.mesh is None:
         return False
-    r = float(scene.radius)
-    C = np.stack([s, r * np.cos(phi), r * np.sin(phi)], axis=1)
-    points, reach = np.asarray(scene.mesh.straight, float), local.REACH * float(scene.footprint)
+    mesh, reach = scene.mesh, local.REACH * float(scene.footprint)
+
+    def points_of(*at):
+        s, phi, r = (np.asarray(v, float) for v in at)
+        return np.stack([s, r * np.cos(phi), r * np.sin(phi)], axis=1)
+
+    C, points = points_of(s, phi, scene.radius), points_of(mesh.s, mesh.phi, mesh.distance)
     return any(bool((np.sum((points - c) ** 2, axis=1) < reach**2).any()) for c in C)

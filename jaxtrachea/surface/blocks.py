@@ -87,14 +87,15 @@ def in_blocks(
 
 
 def to_blocks(
-    values: Shaped[Array, " vertices"], blocks: Blocks | None
-) -> Shaped[Array, "blocks width"]:
-    """Values of the vertices, row by row of the blocks."""
+    values: Shaped[Array | np.ndarray, " vertices"], blocks: Blocks | None
+) -> Shaped[Array | np.ndarray, "blocks width"]:
+    """Values of the vertices, row by row of the blocks; by numpy where they are its own."""
     if blocks is None:
         return values[:, None]
-    vertex, count = blocks.vertex, len(values)
-    first = jnp.where(vertex[:, :1] < count, vertex[:, :1], 0)
-    return values[jnp.where(vertex < count, vertex, first)]
+    xp = np if isinstance(values, np.ndarray) else jnp
+    vertex, count = xp.asarray(blocks.vertex), len(values)
+    first = xp.where(vertex[:, :1] < count, vertex[:, :1], 0)
+    return values[xp.where(vertex < count, vertex, first)]
 
 
 def to_vertices(

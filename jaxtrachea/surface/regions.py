@@ -24,6 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
@@ -144,17 +145,28 @@ def bind(mesh: Mesh, geometry: Geometry, known: Binding | None = None) -> Bindin
         geometry: with the rings.
         known: binding of the same mesh to other rings: spares sorting the vertices anew.
     """
-    inner = geometry.ring_positions
-    nodes = jnp.concatenate([jnp.zeros_like(inner[:1]), inner, geometry.length[None]])
-    patch = jnp.searchsorted(inner, mesh.s, side="right").astype(jnp.int32)
+    given = (mesh.s, mesh.phi, geometry, known)
+    xp = _library(given)
+    inner, length, s, phi = (
+        xp.asarray(v) for v in (geometry.ring_positions, geometry.length, mesh.s, mesh.phi)
+    )
+    nodes = xp.concatenate([xp.zeros_like(inner[:1]), inner, length[None]])
+    patch = xp.searchsorted(inner, s, side="right").astype(np.int32)
     before = None if known is None else known.blocks
-    blocks = in_blocks(mesh.s, patch, nodes.shape[0] - 1, before)
-    s, phi, patch = (to_blocks(v, blocks) for v in (mesh.s, mesh.phi, patch))
-    patch = patch[:, 0]
+    blocks = in_blocks(mesh.s, jnp.asarray(patch), nodes.shape[0] - 1, before)
+    xp = _library((given, blocks))  # within a traced function blocks are traced in any case
+    s, phi, patch = (to_blocks(xp.asarray(v), blocks) for v in (s, phi, patch))
+    nodes, patch = xp.asarray(nodes), patch[:, 0]
     low, high = (nodes[v][:, None] for v in (patch, patch + 1))
-    fraction = jnp.clip((s - low) / (high - low), 0, 1)
-    s = jnp.clip(s, nodes[0], nodes[-1])
+    fraction = xp.clip((s - low) / (high - low), 0, 1)
+    s = xp.clip(s, nodes[0], nodes[-1])
+    s, phi, fraction, patch, nodes = (jnp.asarray(v) for v in (s, phi, fraction, patch, nodes))
     return Binding(s, phi, fraction, patch, nodes, geometry.half_angle, blocks)
+
+
+def _library(values):
+    """The numpy of concrete numbers, for which nothing is compiled, or that of traced ones."""
+    return jnp if any(isinstance(v, Tracer) for v in jax.tree.leaves(values)) else np
 
 
 def weigh(binding: Binding, phi_c: Float[Array, ""]) -> Weights:
