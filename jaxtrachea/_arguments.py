@@ -12,6 +12,7 @@ import types
 from collections.abc import Sequence
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike as _ArrayLike
@@ -39,7 +40,11 @@ def real(name: str, value: Any, dtype=None) -> Array:
         if isinstance(value, str | bytes):
             raise TypeError("text")
         number = isinstance(value, int) and not isinstance(value, bool)
-        array = jnp.asarray(float(value) if number else value)
+        if type(value) is np.ndarray:
+            # Of a copy, that the caller cannot change; `jnp.asarray` compiles for every shape.
+            array = jax.device_put(np.array(value))
+        else:
+            array = jnp.asarray(float(value) if number else value)
     except (TypeError, ValueError, OverflowError):
         array = None
     if array is None or not (

@@ -85,12 +85,16 @@ def _forget_programs():
 
 #: Files that take longest begin, so that none runs on alone at the end.
 LONGEST = (
-    "test_distance.py",
     "test_fit.py",
+    "test_configurational.py",
+    "test_distance.py",
+    "test_simulate.py",
     "test_oblique.py",
+    "test_session.py",
     "test_damaged.py",
+    "test_programs.py",
+    "test_press.py",
     "test_wall_check.py",
-    "test_plan.py",
     "test_tradeoff.py",
     "test_beam.py",
     "test_reports.py",

@@ -40,20 +40,25 @@ DTYPES = ["float32", "float64"]
 ROUNDING = {"float32": 3e-6, "float64": 1e-12}
 #: Most of the time here is compilation.
 quick = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+of_vectors = quick(jax.vmap(pose_from_vector))
+supports = quick(jax.vmap(support, (None, 0, None)))
+sharp_supports = quick(jax.vmap(sharp_support, (None, 0)))
 ZERO = (0.0, 0.0, 0.0)
 
 
 def stack(shapes, count, scale, dtype):
     """Shapes of different kinds in one batch, in another unit of length."""
     shapes = [padded(s, count) for s in shapes]
-    return jax.tree.map(lambda *v: jnp.asarray(np.stack(v) * scale, dtype), *shapes)
+    return jax.tree.map(
+        lambda *v: jnp.asarray(np.asarray(np.stack(v) * scale, dtype), dtype), *shapes
+    )
 
 
 def poses(vectors, translations, scale, dtype):
     def cast(v):
-        return jnp.asarray(np.asarray(v, float), dtype)
+        return jnp.asarray(np.asarray(v, dtype), dtype)
 
-    return jax.vmap(pose_from_vector)(cast(vectors), cast(np.asarray(translations) * scale))
+    return of_vectors(cast(vectors), cast(np.asarray(translations) * scale))
 
 
 def sizes(shapes_a, shapes_b):
@@ -271,14 +276,14 @@ def lanes(settings_, dtype):
 
 def test_box_and_capsule_against_a_ball():
     """Closed forms of the signed distance, balls all round and inside."""
-    p = np.random.default_rng(3).uniform(-2, 2, (200, 3))
+    p = np.random.default_rng(3).uniform(-2, 2, (250, 3))  # as many as random pairs: one program
     half, r = np.array([1.0, 0.7, 0.4]), 0.1
-    first = [box(half, r)] * 100 + [capsule(1.2, 0.3)] * 100
-    exact = np.append(box_distance(half, r, p[:100]), segment_distance(1.2, p[100:]) - 0.3) - 0.5
-    at = poses(np.zeros((200, 3)), p, 1, "float64")
-    second = stack([BALL] * 200, 12, 1, "float64")
+    first = [box(half, r)] * 125 + [capsule(1.2, 0.3)] * 125
+    exact = np.append(box_distance(half, r, p[:125]), segment_distance(1.2, p[125:]) - 0.3) - 0.5
+    at = poses(np.zeros((250, 3)), p, 1, "float64")
+    second = stack([BALL] * 250, 12, 1, "float64")
     c = lanes(STANDARD, "float64")(stack(first, 12, 1, "float64"), second, at)
-    bound = 2 * np.log(12) / STANDARD.sharpness * sizes(first, [BALL] * 200)
+    bound = 2 * np.log(12) / STANDARD.sharpness * sizes(first, [BALL] * 250)
     assert (c.distance <= exact + 1e-12).all()
     assert (c.distance >= exact - bound).all()
     assert (c.status == ContactStatus.OK).all()
@@ -306,13 +311,12 @@ def pairs(index, dtype, scale):
         size += np.linalg.norm(v - true_mean[:, None], axis=2).max(axis=1) + radius
 
         def cast(x):
-            return jnp.asarray(x * scale, dtype)
+            return jnp.asarray(np.asarray(x * scale, dtype), dtype)
 
         made.append(Shape(cast(v.transpose(0, 2, 1)), cast(radius)))
-    at = jax.vmap(pose_from_quaternion)(
-        jnp.asarray(data["quaternion"][index], dtype),
-        jnp.asarray(data["translation"][index].astype(float) * scale, dtype),
-    )
+    turn = np.asarray(data["quaternion"][index], dtype)
+    shift = np.asarray(data["translation"][index].astype(float) * scale, dtype)
+    at = quick(jax.vmap(pose_from_quaternion))(turn, shift)
     return (*made, at), size
 
 
@@ -415,10 +419,10 @@ def test_witness_points(name):
     moved = Shape(transform(there, B.vertices), B.radius)
     for shape, point, tight in ((A, c.point_a, -2), (moved, c.point_b, -1)):
         beta = jnp.asarray(1000.0 / sizes([A], [B])[0])
-        room = quick(jax.vmap(support, (None, 0, None)))(shape, d, beta).value - d @ point
+        room = supports(shape, d, beta).value - d @ point
         assert room.min() > -1e-12
         assert abs(room[tight]) < 1e-12
-        outside = d @ point - quick(jax.vmap(sharp_support, (None, 0)))(shape, d)
+        outside = d @ point - sharp_supports(shape, d)
         assert outside.max() <= np.log(8) / beta
 
 

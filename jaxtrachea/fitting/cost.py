@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea._numerics import epsilon
@@ -179,7 +180,7 @@ class LaneCost(eqx.Module):
         m, dtype = size(lane), lane.lower.dtype
 
         def zeros(*shape):
-            return jnp.zeros(shape, dtype)
+            return jnp.asarray(np.zeros(shape, dtype), dtype)  # nothing is compiled for it
 
         return Point(zeros(T, m), zeros(T, Jf, m), zeros(), zeros(P), zeros(P, P))
 

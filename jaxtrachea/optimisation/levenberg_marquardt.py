@@ -152,9 +152,12 @@ def _idle(objective: Objective, batch: int, dtype) -> State:
     """A batch of slots nobody works at."""
     one: Any = jax.tree.map(lambda v: v[0], objective)
 
+    def full(value, dtype, *shape):
+        return jnp.asarray(np.full((batch, *shape), value, dtype), dtype)  # nothing is compiled
+
     def zeros(*shape):
-        return jnp.zeros((batch, *shape), dtype)
+        return full(0, dtype, *shape)
 
     point = jax.tree.map(lambda v: zeros(*v.shape), one.blank())
-    done = jnp.full(batch, FitStatus.CONVERGED, jnp.int8)
-    return State(zeros(*one.lower.shape), point, zeros(), jnp.zeros(batch, jnp.int32), done)
+    done = full(FitStatus.CONVERGED, np.int8)
+    return State(zeros(*one.lower.shape), point, zeros(), full(0, np.int32), done)

@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -27,6 +26,7 @@ from jaxtrachea.trachea.material import Material
 
 #: Rows that a path is filled up to, or twice, four times ...; longer ones than `MOST` are not.
 LEAST, MOST = 64, 4096
+
 
 def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> SceneFacts:
     """What the rules need to know of a scene and its path; rows in the lumen touch nothing.

@@ -112,15 +112,19 @@ class Session:
             )
         self.scene, self.dtype = scene, np.dtype(scene.footprint.dtype)
         pose = (np.eye(3, dtype=self.dtype), np.zeros(3, self.dtype))
-        start = _start(scene, *pose)
+        start = jax.eval_shape(_start, scene, *pose)
 
-        def run(packed, _, *pose):
+        @jax.jit  # traced once, for the shapes of the result and for the program
+        def one(packed, *pose):
             state, result = _step(scene, material, _unpack(packed, start), *pose)
             return _pack(state), result
 
-        self._start = np.asarray(_pack(start))
-        empty = jax.eval_shape(run, self._start, None, *pose)[1]
-        zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), empty)
+        def run(packed, _, *pose):
+            return one(packed, *pose)
+
+        self._start = np.asarray(_packed_start(scene, *pose))
+        empty = jax.eval_shape(one, self._start, *pose)[1]
+        zeros = jax.tree.map(lambda v: jnp.asarray(np.zeros(v.shape, v.dtype), v.dtype), empty)
         # Donated: the new state and result are written where the old ones were.
         made = jax.jit(run, donate_argnums=(0, 1), keep_unused=True)
         self._run = made.lower(self._start, zeros, *pose).compile()
@@ -186,9 +190,9 @@ def _bits(dtype) -> int:
 
 def _unpack(packed: Float[Array, " numbers"], like: State) -> State:
     leaves, tree = jax.tree.flatten(like)
-    ends = np.cumsum([np.size(v) for v in leaves])
+    ends = np.cumsum([v.size for v in leaves])
     parts = jnp.split(packed, ends[:-1])
-    back = (p.reshape(np.shape(v)).astype(v.dtype) for p, v in zip(parts, leaves, strict=True))
+    back = (p.reshape(v.shape).astype(v.dtype) for p, v in zip(parts, leaves, strict=True))
     return jax.tree.unflatten(tree, back)
 
 
@@ -252,3 +256,8 @@ def _held(scene: Scene, material: Material, state: State, here: Instant, inside)
 
 def _pick(when, a, b):
     return jax.tree.map(lambda v, w: jnp.where(when, v, w), a, b)
+
+
+@jax.jit
+def _packed_start(scene: Scene, rotation, translation) -> Float[Array, " numbers"]:
+    return _pack(_start(scene, rotation, translation))

@@ -170,10 +170,11 @@ def test_steps_rows_and_precisions_agree():
         np.testing.assert_allclose(step.moment, out.moment[i], rtol=1e-9, atol=1e-9)
 
     def single(tree):
-        return jax.tree.map(
-            lambda v: v.astype(jnp.float32) if jnp.issubdtype(v.dtype, jnp.floating) else v,
-            jax.tree.map(jnp.asarray, tree),
-        )
+        def cast(v):
+            real = np.issubdtype(np.asarray(v).dtype, np.floating)
+            return jnp.asarray(np.asarray(v, np.float32), np.float32) if real else v
+
+        return jax.tree.map(cast, tree)
 
     short = simulated(*single((scene, MATERIAL, led(way))))
     assert short.force.dtype == short.moment.dtype == jnp.float32

@@ -125,7 +125,8 @@ def held(request):
     """A session of a ball that holds its place; as float32 it is compiled for all tests here."""
 
     def cast(tree):
-        return jax.tree.map(lambda v: v.astype(request.param), tree)
+        dtype = request.param
+        return jax.tree.map(lambda v: jnp.asarray(np.asarray(v, dtype), dtype), tree)
 
     tube, material, tool = cast((TUBE, MATERIAL, BALL))
     start = cast(ball([75, 1, 0], [76, -2, 0]))

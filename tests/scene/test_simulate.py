@@ -45,7 +45,7 @@ from jaxtrachea.trachea.tube import make_tube
 
 pytestmark = pytest.mark.compiling
 
-run = jax.jit(simulate)
+run, swept = jax.jit(simulate), jax.jit(sweep)
 FINE = make_tube(table_1())
 
 
@@ -81,8 +81,8 @@ def test_a_row_that_is_no_number_says_so(at, more):
     scene = make_scene(TUBE, SPRINGS, DOWN, effects=BARE)
     other = PressStatus.OFF_PLAN if more else PressStatus.OK
     wanted = [other, PressStatus.NON_FINITE, other]
-    swept, out = sweep(scene, material, s, phi, depth), run(scene, material, Presses(s, phi, D))
-    for got in (swept, out):
+    out = run(scene, material, Presses(s, phi, D))
+    for got in (swept(scene, material, s, phi, depth), out):
         assert got.status.tolist() == wanted
         assert np.any(np.isnan(got.force[1]))
 
