@@ -3,10 +3,12 @@
 import dataclasses
 
 import jax
+import numpy as np
 import pytest
-from small_scenes import BALL, BARE, MATERIAL, MESH, TUBE, ball, presses
+from small_scenes import BALL, BARE, MATERIAL, MESH, SPRINGS, TUBE, ball, presses
 
 from jaxtrachea import EffectOptions, PlanError, Poses, make_scene, simulate
+from jaxtrachea.scene import facts as scene_facts
 from jaxtrachea.scene.declare import SceneFacts
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.stage import Tool
@@ -115,3 +117,24 @@ def test_misuse_is_named(rows, friction, says):
     path = Poses(path.rotation[:rows], path.translation[:rows])
     with pytest.raises(ValueError, match=says):
         make_scene(TUBE, MATERIAL, path, tool=Tool(BALL, friction), effects=BARE)
+
+
+def test_facts_of_paths_of_any_length_are_one_program():
+    """Filled up by their last pose: the facts are those of the path without."""
+    short, long = (ball([75, 1, 0], [76, -2, 0], rows) for rows in (3, 61))
+    plans = [make_scene(TUBE, SPRINGS, p, tool=BALL, effects=BARE).plan for p in (short, long)]
+    assert plans[0] == plans[1]
+    before = scene_facts._touched._cache_size()
+    make_scene(TUBE, SPRINGS, ball([75, 1, 0], [76, -2, 0], 40), tool=BALL, effects=BARE)
+    assert scene_facts._touched._cache_size() == before
+
+
+def test_an_array_that_its_owner_changes_later_leaves_the_path():
+    """Of any place in memory: device and numpy may share what is aligned."""
+    store = np.zeros(4000)
+    for shift in range(8):
+        own = store[shift : shift + 3000].reshape(1000, 3)
+        path = Poses(np.broadcast_to(np.eye(3), (1000, 3, 3)), own)
+        own += 1.0
+        assert not np.asarray(path.translation).any()
+        own -= 1.0
