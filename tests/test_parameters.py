@@ -8,11 +8,19 @@ import numpy as np
 import pytest
 
 from jaxtrachea.config import SpecError
-from jaxtrachea.fitting.parameters import DEFAULTS, OF_THE_PRESS, SKELETON, in_model, visible
+from jaxtrachea.fitting.parameters import (
+    DECLARED,
+    DEFAULTS,
+    OF_THE_PRESS,
+    SKELETON,
+    in_model,
+    visible,
+)
 from jaxtrachea.mechanics.force_law import ON_RING, Law, coefficient, power
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMaterial
 from jaxtrachea.scene.spec import MaterialSection, load_scene_spec
-from jaxtrachea.trachea.material import PARAMETERS, VALUES, Material, material_of
+from jaxtrachea.trachea.material import OF_PRESS, VALUES, Material, material_of
 from jaxtrachea.units import unit_factor
 
 PAGE = (Path(__file__).parents[1] / "docs" / "parameters.md").read_text()
@@ -24,14 +32,14 @@ ROWS = [
 
 def test_page_has_the_declarations_and_no_others():
     """Name, unit, meaning, option, absence, array and all that a fit does; in this order."""
-    assert [row[0].strip("`") for row in ROWS] == list(PARAMETERS)
+    assert [row[0].strip("`") for row in ROWS] == list(DECLARED)
     for (_, unit, meaning, needs, absent, each, *fit), p in zip(
-        ROWS, PARAMETERS.values(), strict=True
+        ROWS, DECLARED.values(), strict=True
     ):
         assert unit == p.unit
         assert meaning == p.description + (f" `{p.symbol}`" if p.symbol else "")
         assert needs == (p.needs or "always")
-        assert absent == (p.absent or ("needed" if p.name in VALUES else "0"))
+        assert absent == (p.absent or ("0" if p.name in OF_PRESS else "needed"))
         assert each == (f"each {p.each}" if p.each else "")
         if p.fit is None:
             assert fit == ["not fitted", "", "", ""]
@@ -43,7 +51,7 @@ def test_page_has_the_declarations_and_no_others():
         assert fit[2:] == [p.fit.scale, p.fit.scope]
 
 
-@pytest.mark.parametrize("p", PARAMETERS.values(), ids=lambda p: p.name)
+@pytest.mark.parametrize("p", DECLARED.values(), ids=lambda p: p.name)
 def test_declaration_is_sound(p):
     """A unit of its dimension with factor 1 (it is the internal one); log scales are positive."""
     assert unit_factor(p.unit, p.dimension) == 1
@@ -68,6 +76,8 @@ def test_tables_follow():
     assert SKELETON == ("EI_L", "GA_L", "k_M")
     assert OF_THE_PRESS == ("onset", "force_offset")
     assert set(MaterialSection.model_fields) == set(VALUES)
+    assert list(SECTION_VALUES) == [f.name for f in dataclasses.fields(SectionMaterial)]
+    assert set(VALUES) & set(SECTION_VALUES) == {"EI_C"}
     assert material_of({n: jnp.ones(()) for n in [*needed, "onset"]}).GA_L is None
 
 
@@ -83,7 +93,13 @@ def test_models_see_what_their_options_read():
     assert "k_3_ring" in in_model(both, joints=False, named=["k_3_ring"])
     assert "k_3_ring" not in visible(Options(), joints=True)
     deep = Options(shear=True, local="two-material", skeleton="softening")
-    assert set(visible(deep, joints=True)) == set(DEFAULTS)
+    assert set(visible(deep, joints=True)) == set(DEFAULTS) - set(SECTION_VALUES)
+    sections = Options(skeleton="sections", contact="bonded")
+    assert visible(sections, joints=False) == [
+        n for n in DECLARED if n in SECTION_VALUES or n in press
+    ]
+    free = {n for n in visible(sections, joints=False) if not DEFAULTS[n].fixed}
+    assert free == {"EI_C", "Et_L", "D_L", "c_W", "bed_n", "bed_t"}
     assert {"e_1", "e_2"}.isdisjoint(visible(both, joints=True))
 
 

@@ -162,7 +162,9 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
 
     measurements, notes = measured_curves(stored, given)
     curves, unusable = pressable(stored, measurements.curves)
-    curves, unread = along_the_normal(curves)
+    unread = None
+    if stored.study.model.options.skeleton != "sections":
+        curves, unread = along_the_normal(curves)
     notes += [] if unread is None else [unread]
     bad = [*measurements.bad, *unusable]
     print_bad(dataclasses.replace(measurements, bad=tuple(bad)))

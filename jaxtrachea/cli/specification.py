@@ -111,7 +111,9 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
             good.append(curve)
     if reasons and not good:
         raise SpecError(reasons[0])
-    good, unread = along_the_normal(good)
+    unread = None
+    if options.skeleton != "sections":
+        good, unread = along_the_normal(good)
     notes = measurements.notes if unread is None else (*measurements.notes, unread)
     return dataclasses.replace(measurements, curves=tuple(good), bad=tuple(bad), notes=notes)
 

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea._numerics import epsilon
-from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lane import Lane, force_entries, forces, size
 from jaxtrachea.fitting.model import FitModel
-from jaxtrachea.fitting.residual import of_trials, residual, residual_value, size
+from jaxtrachea.fitting.residual import of_trials, residual, residual_value
 from jaxtrachea.trachea.geometry import Geometry
 
 #: Part of a step after which the residual's curvature along it is probed.
@@ -54,8 +54,8 @@ def robust(name: str, z2: Float[Array, "*n"], scale: float) -> tuple[Array, Arra
 
 def entry_scale(lane: Lane, sigma: Float[Array, "2"]) -> Float[Array, " m"]:
     """1 / sigma of each residual entry: forces by sigma[0], markers by sigma[1]."""
-    forces = jnp.arange(size(lane)) < lane.force.shape[-1]
-    return jnp.where(forces, 1 / sigma[0], 1 / sigma[1])
+    of_force = jnp.arange(size(lane)) < force_entries(lane)
+    return jnp.where(of_force, 1 / sigma[0], 1 / sigma[1])
 
 
 def weights(model: FitModel, value, lane: Lane, sigma: Float[Array, "2"]):
@@ -123,8 +123,9 @@ def assemble(model: FitModel, parts: Array, lane: Lane) -> Array:
 
 def rounding_cost(lane: Lane, sigma: Float[Array, "2"]) -> Float[Array, ""]:
     """Cost that rounding alone leaves: ten roundings of every force."""
-    scale = entry_scale(lane, sigma)[: lane.force.shape[-1]]
-    data = jnp.sum((lane.force * lane.precision * lane.balance[:, None] * scale[None]) ** 2)
+    balance = lane.balance[:, None]
+    parts = [kind.data * kind.precision * balance / sigma[0] for kind in forces(lane)]
+    data = sum(jnp.sum(part**2) for part in parts)
     return 0.5 * data * (10 * epsilon(lane.force.dtype)) ** 2
 
 
@@ -164,8 +165,14 @@ class LaneCost(eqx.Module):
         return evaluate(self.model, theta, self.lane, self.sigma, self.geometry)
 
     def ahead(self, point: Point, theta, step) -> Float[Array, " P"]:
-        """J^T times the residual's second derivative along the step, by a probe on the way."""
+        """J^T times the residual's second derivative along the step, by a probe on the way.
+
+        Of deforming cross-sections zeros: a probe costs as much as a step there, and twice the time
+        to compile, and the steps are straight enough.
+        """
         model, lane = self.model, self.lane
+        if model.options.skeleton == "sections":
+            return jnp.zeros_like(theta)
         along = of_trials(model, step, lane)
         probe = residual_value(model, theta + PROBE * step, lane, self.geometry)
         _, root = weights(model, point.value, lane, self.sigma)

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.joint_information import unknown_count
+from jaxtrachea.fitting.lane import forces, markers
 from jaxtrachea.fitting.study import Study
 
 #: Share of the largest datum that its own rounding may be: no residual counts for less.
@@ -56,23 +57,20 @@ def criteria(study: Study, info: Information, alive: Bool[np.ndarray, " lanes"])
 
     counts, squares = whole(np.asarray(info.counts, float)), whole(np.asarray(info.weighted))
     deviance = np.zeros(len(counts))
-    kinds = ((lanes.precision, lanes.force), (lanes.joint_precision, lanes.joints))
-    for kind, (precision, data) in enumerate(kinds):
+    for kind, parts in enumerate((forces(lanes), markers(lanes))):
         n, S = counts[:, kind], squares[:, kind]
-        if precision is None or data is None:
+        if not parts:
             continue
-
-        def flat(v):
-            return v.reshape(len(v), -1)
-
+        rows = len(counts)
         if estimated[kind]:
-            peak = np.max(np.abs(flat(data * precision)), axis=1, initial=0)
+            flat = [np.abs(v.data * v.precision).reshape(rows, -1) for v in parts]
+            peak = np.max(np.concatenate(flat, axis=1), axis=1, initial=0)
             peak = whole(peak, functools.partial(np.max, initial=0))
             S = np.maximum(S, np.maximum(n, 1) * (ROUNDING * peak) ** 2)
             with np.errstate(divide="ignore", invalid="ignore"):
                 deviance += np.where(n > 0, n * (np.log(2 * np.pi * S / n) + 1), 0)
         else:
-            seen = flat(precision)
+            seen = np.concatenate([v.precision.reshape(rows, -1) for v in parts], axis=1)
             logs = np.log(seen, where=seen > 0, out=np.zeros(seen.shape)).sum(axis=1)
             deviance += S + n * np.log(2 * np.pi) - 2 * whole(logs)
     if study.model.loss != "linear":

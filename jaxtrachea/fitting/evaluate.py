@@ -9,8 +9,9 @@ from jaxtrachea.fitting.cost import robust
 from jaxtrachea.fitting.covariance import Uncertainty, half_widths
 from jaxtrachea.fitting.criteria import criteria
 from jaxtrachea.fitting.information import Information
+from jaxtrachea.fitting.lane import forces, markers
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, precision_unit
-from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.status import FitStatus
@@ -27,7 +28,7 @@ def evaluated(study: Study) -> FitResult:
     """
     lanes = len(study.lanes.s_c)
     seen = predictions(study, np.zeros((lanes, 0)))
-    info = _information(study, seen.force, seen.joints)
+    info = _information(study, seen)
     sigma = next_sigma(study, info, first_sigma(study))
     unit = precision_unit(study)
     finite = np.asarray(np.isfinite(info.squares).all(axis=1))
@@ -51,22 +52,29 @@ def evaluated(study: Study) -> FitResult:
     )  # fmt: skip
 
 
-def _whitened(study: Study, force, joints) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Residuals of forces and markers in units of their precision, and which are observed."""
+def _whitened(study: Study, off: Prediction) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Residuals of forces and markers in units of their precision, and which are observed.
+
+    Both with the trials first, (lanes, trials * entries of a trial).
+    """
     lanes, parts, seen = study.lanes, [], []
-    pairs = ((force, lanes.precision), (joints, lanes.joint_precision))
-    for residual, precision in pairs:
-        if residual is None or precision is None:
+    shape = (*lanes.s_c.shape, -1)
+    for kinds in (forces(lanes), markers(lanes)):
+        if not kinds:
             continue
-        observed = precision > 0
-        parts.append(np.where(observed, residual * precision, 0).reshape(len(precision), -1))
-        seen.append(observed.reshape(len(precision), -1))
+        rows, there = [], []
+        for kind in kinds:
+            observed, residual = kind.precision > 0, getattr(off, kind.name)
+            rows.append(np.where(observed, residual * kind.precision, 0).reshape(shape))
+            there.append(observed.reshape(shape))
+        parts.append(np.concatenate(rows, axis=2).reshape(len(lanes.s_c), -1))
+        seen.append(np.concatenate(there, axis=2).reshape(len(lanes.s_c), -1))
     return parts, seen
 
 
-def _information(study: Study, force, joints) -> Information:
+def _information(study: Study, off: Prediction) -> Information:
     """Residual statistics; the matrices are empty."""
-    parts, seen = _whitened(study, force, joints)
+    parts, seen = _whitened(study, off)
     lanes, trials = study.lanes.s_c.shape
     zero = np.zeros(lanes)
 
@@ -98,7 +106,7 @@ def _information(study: Study, force, joints) -> Information:
 
 def _cost(study: Study, seen, sigma: np.ndarray) -> np.ndarray:
     """Half the weighted sum of the loss."""
-    parts, _ = _whitened(study, seen.force, seen.joints)
+    parts, _ = _whitened(study, seen)
     trials, total = study.lanes.s_c.shape[1], np.zeros(len(sigma))
     for kind, part in enumerate(parts):
         weight = np.repeat(study.lanes.balance, part.shape[1] // trials, axis=1) ** 2

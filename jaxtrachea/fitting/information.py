@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea.fitting.cost import assemble, entry_scale, robust
-from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lane import Lane, observations
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
-from jaxtrachea.fitting.residual import observations, residual
+from jaxtrachea.fitting.residual import residual
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.optimisation.programs import batch_size
 

@@ -5,10 +5,10 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from jaxtrachea.fitting.information import Information
-from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lane import Lane, observations
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
-from jaxtrachea.fitting.residual import observations, residual_value
+from jaxtrachea.fitting.residual import residual_value
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.optimisation.schur import eliminate_others

@@ -1,7 +1,12 @@
-"""A lane: the arrays of all that is fitted together."""
+"""A lane: the arrays of all that is fitted together, and what of them is observed.
 
-from typing import NamedTuple
+The residual of a trial is one row: force, side force, then what markers and ring ends show. What
+is `None` in a lane is not in the row.
+"""
 
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 
@@ -16,8 +21,8 @@ class Lane(NamedTuple):
         displacement: mm; (T, N).
         force: N; (T, N).
         precision: 1 / sigma of each force sample, or 1 where the noise is estimated; (T, N).
-        joints: marker displacement, mm; (T, N, rings); None without markers.
-        joint_precision: as `precision`; None without markers.
+        joints: marker displacement, mm; (T, N, rings); None without markers and ring ends.
+        joint_precision: as `precision`; None without markers and ring ends.
         balance: weight of each trial against the others; (T,).
         blend: smooth first touch of each trial, mm, see `first_touch`; (T,); None where no onset is
             fitted.
@@ -26,6 +31,15 @@ class Lane(NamedTuple):
         lower: bounds of the unknowns in scaled coordinates; (P,).
         upper: (P,).
         active: whether the unknown exists in this lane; (P,).
+        phi_c: contact angle, rad; (T,); None where all trials of the study press along the normal
+            on the midline. This and all below: deforming cross-sections alone.
+        direction: of the tool along the inward normal and the circumference; (T, 2); with `phi_c`.
+        side_force: N, see `Curve`; (T, N); None where no curve has it.
+        side_precision: as `precision`; (T, N).
+        joint_side: marker displacement along the circumference, mm; (T, N, rings).
+        joint_side_precision: as `precision`.
+        ends: motion of ring ends, mm: U and V, each y and z; (T, N, rings, 2, 2).
+        end_precision: as `precision`.
     """
 
     s_c: Float[Array, "*l T"]
@@ -41,3 +55,94 @@ class Lane(NamedTuple):
     lower: Float[Array, "*l P"]
     upper: Float[Array, "*l P"]
     active: Float[Array, "*l P"]
+    phi_c: Float[Array, "*l T"] | None = None
+    direction: Float[Array, "*l T 2"] | None = None
+    side_force: Float[Array, "*l T N"] | None = None
+    side_precision: Float[Array, "*l T N"] | None = None
+    joint_side: Float[Array, "*l T N rings"] | None = None
+    joint_side_precision: Float[Array, "*l T N rings"] | None = None
+    ends: Float[Array, "*l T N rings 2 2"] | None = None
+    end_precision: Float[Array, "*l T N rings 2 2"] | None = None
+
+
+#: Fields that are observed, each with that of its precision, in the order of the residual's row.
+FORCES = (("force", "precision"), ("side_force", "side_precision"))
+MARKERS = (
+    ("joints", "joint_precision"),
+    ("joint_side", "joint_side_precision"),
+    ("ends", "end_precision"),
+)
+
+
+class Observed(NamedTuple):
+    """One kind of observation of a lane, or of many.
+
+    Attributes:
+        name: field of the `Lane`.
+        data: in N or mm.
+        precision: of the same shape.
+        places: how many entries a sample has (static): 1, the rings, or four times the rings.
+    """
+
+    name: str
+    data: Any
+    precision: Any
+    places: int
+
+
+def forces(lane: Lane) -> list[Observed]:
+    """Forces that a lane may observe, in the order of the residual's row."""
+    return _present(lane, FORCES)
+
+
+def markers(lane: Lane) -> list[Observed]:
+    """Motions that a lane may observe, likewise."""
+    return _present(lane, MARKERS)
+
+
+def _present(lane: Lane, kinds) -> list[Observed]:
+    axes, out = lane.force.ndim, []
+    for name, weight in kinds:
+        data, precision = getattr(lane, name), getattr(lane, weight)
+        if data is not None and precision is not None:
+            places = 1
+            for n in data.shape[axes:]:
+                places *= n
+            out.append(Observed(name, data, precision, places))
+    return out
+
+
+def force_entries(lane: Lane) -> int:
+    """Entries of the residual of a trial that are forces (static); they come first."""
+    return lane.force.shape[-1] * len(forces(lane))
+
+
+def size(lane: Lane) -> int:
+    """Entries of the residual per trial (static)."""
+    return lane.force.shape[-1] * sum(kind.places for kind in forces(lane) + markers(lane))
+
+
+def observations(lane: Lane) -> tuple[Float[Array, "T m"], int]:
+    """Which entries of the residual are observed (1 or 0), and how many of them are forces."""
+    rows = lane.force.shape[:-1]
+    kinds = forces(lane) + markers(lane)
+    seen = jnp.concatenate([(kind.precision > 0).reshape(*rows, -1) for kind in kinds], axis=-1)
+    return seen.astype(lane.force.dtype), force_entries(lane)
+
+
+def weighted(v: Float[Array, "*n"], precision: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Observed entries over their standard deviation, exact zeros elsewhere."""
+    return jnp.where(precision > 0, v, 0) * precision
+
+
+def without_data(lane: Lane, hidden: Any) -> Lane:
+    """The lane, or lanes, with the trials `hidden` (of the shape of `s_c`) unobserved."""
+    blind = {}
+    for kind, name in zip(
+        forces(lane) + markers(lane),
+        [weight for data, weight in FORCES + MARKERS if getattr(lane, data) is not None],
+        strict=True,
+    ):
+        over = hidden.reshape(*hidden.shape, *[1] * (kind.precision.ndim - hidden.ndim))
+        blind[name] = kind.precision * ~over
+    return lane._replace(**blind)

@@ -122,7 +122,9 @@ class _Layout:
         trials: of a lane, at most.
         samples: of a curve, at most.
         unknowns: of a lane, at most.
-        joints: whether any curve has markers.
+        joints: whether any curve has markers, or ring ends.
+        vectors: whether the model shows more than normal forces and motions on the midline.
+        curves: all of them.
     """
 
     parameters: Sequence[Parameter]
@@ -134,6 +136,8 @@ class _Layout:
     samples: int
     unknowns: int
     joints: bool
+    vectors: bool
+    curves: Sequence[Curve]
 
     def curve_weight(self, samples: int) -> float:
         """Weight of the residuals of a curve of so many samples."""
@@ -149,6 +153,7 @@ def lanes_of(
     noise: Noise,
     balance: Balance,
     tool_radius: float | None,
+    vectors: bool = False,
 ) -> Lane:
     """The lanes of a study, stacked along a leading axis.
 
@@ -160,8 +165,10 @@ def lanes_of(
         noise: known standard deviations.
         balance: see `Weighting`.
         tool_radius: see `study.build_study`.
+        vectors: see `Lane.phi_c`; whether the model reads what is below it there.
     """
-    lengths = [len(c.force) for curves in groups for c in curves]
+    every = [c for curves in groups for c in curves]
+    lengths = [len(c.force) for c in every]
     layout = _Layout(
         parameters=parameters,
         geometry=geometry,
@@ -171,7 +178,9 @@ def lanes_of(
         trials=max(map(len, groups)),
         samples=max(lengths),
         unknowns=max(map(len, unknowns)),
-        joints=any(c.joint_displacement is not None for curves in groups for c in curves),
+        joints=any(_has_motion(c, vectors=vectors) for c in every),
+        vectors=vectors,
+        curves=every,
     )
     lanes = [_lane(layout, *lane) for lane in zip(groups, unknowns, strict=True)]
     return jax.tree.map(lambda *arrays: np.stack(arrays), *lanes)
@@ -197,6 +206,8 @@ def _lane(layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown])
         "upper": np.zeros(P),
         "active": np.zeros(P),
     }
+    if layout.vectors:
+        lane |= _blank_vectors(layout)
     place = {key: i for i, key in enumerate(unknowns)}
     for i, (p, _, _) in enumerate(unknowns):
         lane["lower"][i], lane["upper"][i] = p.to_scaled(p.lower), p.to_scaled(p.upper)
@@ -217,11 +228,86 @@ def _lane(layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown])
             seen, at = _seen_joints(curve, geometry, layout.reach), curve.joint_rings
             lane["joints"][t, :n, at] = np.where(seen, curve.joint_displacement, 0).T
             lane["joint_precision"][t, :n, at] = np.where(seen, weight, 0).T
+        if layout.vectors:
+            _add_vectors(lane, layout, t, curve)
     return Lane(**lane)
+
+
+def has_ends(curve: Curve) -> bool:
+    """Whether the motion of ring ends is given."""
+    given = curve.end_U is not None or curve.end_V is not None
+    return curve.end_rings is not None and given
+
+
+def _has_motion(curve: Curve, *, vectors: bool) -> bool:
+    """Whether a curve has markers, or ring ends where the model reads them."""
+    more = curve.joint_side_displacement is not None or has_ends(curve)
+    return curve.joint_displacement is not None or (vectors and more)
+
+
+def _blank_vectors(layout: _Layout) -> dict[str, Any]:
+    """Arrays of what is off the midline or not along the normal; None where no curve has it."""
+    T, N, rings, curves = layout.trials, layout.samples, layout.geometry.rings, layout.curves
+    shapes = {
+        "side_force": (any(c.side_force is not None for c in curves), (T, N)),
+        "joint_side": (
+            any(c.joint_side_displacement is not None for c in curves), (T, N, rings),
+        ),
+        "ends": (any(map(has_ends, curves)), (T, N, rings, 2, 2)),
+    }  # fmt: skip
+    weights = {"side_force": "side_precision", "joint_side": "joint_side_precision"}
+    out: dict[str, Any] = {}
+    for name, (there, shape) in shapes.items():
+        out[name] = np.zeros(shape) if there else None
+        out[weights.get(name, "end_precision")] = np.zeros(shape) if there else None
+    out |= {"phi_c": None, "direction": None}
+    if any(off_midline(c) for c in curves):
+        out |= {"phi_c": np.zeros(T), "direction": np.tile([1.0, 0.0], (T, 1))}
+    return out
+
+
+def off_midline(curve: Curve) -> bool:
+    """Whether a press is off the midline, or not along the normal."""
+    return curve.phi_c != 0 or tuple(curve.direction) != (1.0, 0.0)
+
+
+def _add_vectors(lane: dict[str, Any], layout: _Layout, t: int, curve: Curve) -> None:
+    """Put what a curve has of vectors into the arrays of its lane."""
+    n, geometry = len(curve.force), layout.geometry
+    if lane["phi_c"] is not None:
+        lane["phi_c"][t], lane["direction"][t] = curve.phi_c, curve.direction
+    if curve.side_force is not None:
+        seen = np.isfinite(curve.side_force)
+        lane["side_force"][t, :n] = np.where(seen, curve.side_force, 0)
+        lane["side_precision"][t, :n] = np.where(seen, lane["precision"][t, :n], 0)
+    weight = 1.0 if layout.noise.joints is None else 1 / layout.noise.joints
+    moved = curve.joint_side_displacement
+    if moved is not None and curve.joint_rings is not None:
+        seen = np.isfinite(moved) & _away(curve, geometry, layout.reach, curve.joint_rings)
+        lane["joint_side"][t, :n, curve.joint_rings] = np.where(seen, moved, 0).T
+        lane["joint_side_precision"][t, :n, curve.joint_rings] = np.where(seen, weight, 0).T
+    if curve.end_rings is None:
+        return
+    for k, (end, side) in enumerate(((curve.end_U, -1.0), (curve.end_V, 1.0))):
+        if end is None:
+            continue
+        around = abs(side * float(geometry.half_angle) - curve.phi_c) * float(geometry.radius)
+        far = _away(curve, geometry, layout.reach, curve.end_rings, around)
+        for ring, which, moved in zip(curve.end_rings, far, np.moveaxis(end, 1, 0), strict=True):
+            seen = np.isfinite(moved) & which
+            lane["ends"][t, :n, ring, k] = np.where(seen, moved, 0)
+            lane["end_precision"][t, :n, ring, k] = np.where(seen, weight, 0)
+
+
+def _away(curve: Curve, geometry: Geometry, reach: float, rings, around: float = 0.0) -> np.ndarray:
+    """Which of some rings lie beyond the tool, at a distance along the circumference; (M,)."""
+    x = np.asarray(geometry.ring_positions)[rings]
+    if curve.s_c is None:
+        return np.ones(len(x), bool)
+    return np.hypot(x - curve.s_c, around) > reach
 
 
 def _seen_joints(curve: Curve, geometry: Geometry, reach: float) -> np.ndarray:
     """Which markers of a curve count: observed, and not under the tool; (N, M)."""
     seen = np.isfinite(np.asarray(curve.joint_displacement))
-    x = np.asarray(geometry.ring_positions)[curve.joint_rings]
-    return seen if curve.s_c is None else seen & (np.abs(x - curve.s_c) > reach)
+    return seen & _away(curve, geometry, reach, curve.joint_rings)

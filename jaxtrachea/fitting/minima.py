@@ -10,6 +10,7 @@ from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.information import Information, informations
 from jaxtrachea.fitting.joint_information import pooled, unknown_count
+from jaxtrachea.fitting.lane import forces
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, noise_rounds
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.shared import solve_jointly
@@ -135,8 +136,9 @@ def _solve_more(study, settings, sigma, progress, rows, starts) -> Solved:
 def data_weight(study: Study, sigma: np.ndarray) -> np.ndarray:
     """Half the weighted sum of squares of the measured forces; (lanes,)."""
     lanes = study.lanes
-    z = lanes.force * lanes.precision * lanes.balance[:, :, None] / sigma[:, :1, None]
-    return 0.5 * np.sum(z * z, axis=(1, 2))
+    weight = lanes.balance[:, :, None] / sigma[:, :1, None]
+    parts = [kind.data * kind.precision * weight for kind in forces(lanes)]
+    return 0.5 * np.sum([np.sum(z * z, axis=(1, 2)) for z in parts], axis=0)
 
 
 def _solve(study: Study, settings: Settings, rows, starts, sigma, progress) -> Solved:

@@ -3,9 +3,10 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea._arguments import check_word
@@ -89,6 +90,20 @@ class FitModel:
     def free_columns(self) -> tuple[int, ...]:
         """Where the fitted columns stand in the parameter table."""
         return tuple(j for j, c in enumerate(self.columns) if not c.fixed)
+
+
+def values_of(model: FitModel, free, value) -> dict[str, Any]:
+    """Every parameter of one trial in its unit, by name.
+
+    Args:
+        model: what is fitted (static).
+        free: free parameters, scaled coordinates; (F,).
+        value: all parameters in their units, used where they are not free; (J,).
+    """
+    values = {p.name: value[j] for j, p in enumerate(model.columns)}
+    for p, scaled in zip(model.free, free, strict=True):
+        values[p.name] = jnp.exp(scaled) if p.scale == "log" else scaled * p.step
+    return values
 
 
 def columns_of(parameters: Sequence[Parameter]) -> tuple[Column, ...]:

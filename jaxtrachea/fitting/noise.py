@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxtrachea.fitting.information import Information
+from jaxtrachea.fitting.lane import forces, markers
 from jaxtrachea.fitting.study import Study
 
 
@@ -20,16 +21,17 @@ def first_sigma(study: Study) -> np.ndarray:
     """
     lanes = study.lanes
 
-    def peak(v):
-        of_lane = np.maximum(np.abs(v).reshape(len(v), -1).max(axis=1), 1e-300)
-        return (
-            np.full(len(v), np.max(np.nan_to_num(of_lane, nan=1e-300))) if study.joint else of_lane
-        )
+    def peak(kinds):
+        each = [np.abs(v.data).reshape(len(v.data), -1) for v in kinds]
+        of_lane = np.maximum(np.concatenate(each, axis=1).max(axis=1), 1e-300)
+        if not study.joint:
+            return of_lane
+        return np.full(len(of_lane), np.max(np.nan_to_num(of_lane, nan=1e-300)))
 
-    force = np.ones(len(lanes.s_c)) if study.noise_given[0] else 0.02 * peak(lanes.force)
+    force = np.ones(len(lanes.s_c)) if study.noise_given[0] else 0.02 * peak(forces(lanes))
     joints = np.ones(len(lanes.s_c))
     if lanes.joints is not None and not study.noise_given[1]:
-        joints = 0.02 * peak(lanes.joints)
+        joints = 0.02 * peak(markers(lanes))
     return np.stack([force, joints], axis=1)
 
 
@@ -56,11 +58,11 @@ def next_sigma(
 def precision_unit(study: Study) -> np.ndarray:
     """Given sigma that one unit of whitened residual stands for (median); (lanes, 2)."""
 
-    def typical(precision, given):
-        if precision is None or not given:
+    def typical(kinds, given):
+        if not kinds or not given:
             return np.ones(len(study.lanes.s_c))
-        flat = precision.reshape(len(precision), -1)
+        flat = np.concatenate([v.precision.reshape(len(v.data), -1) for v in kinds], axis=1)
         return np.array([1 / np.median(row[row > 0]) if np.any(row > 0) else 1.0 for row in flat])
 
     lanes, (force, joints) = study.lanes, study.noise_given
-    return np.stack([typical(lanes.precision, force), typical(lanes.joint_precision, joints)], 1)
+    return np.stack([typical(forces(lanes), force), typical(markers(lanes), joints)], 1)

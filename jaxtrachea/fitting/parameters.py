@@ -2,12 +2,16 @@
 
 import dataclasses
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+
+import numpy as np
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.trachea.material import PARAMETERS, Declaration, Fitted, Scale, Scope
+from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMaterial, Wall, from_wall
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import OF_PRESS, VALUES, Declaration, Fitted, Scale, Scope
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,27 +102,34 @@ def _of(declared: Declaration, fit: Fitted) -> Parameter:
     )  # fmt: skip
 
 
-#: Every parameter that can be identified, with its defaults, as `trachea.material` declares it.
-DEFAULTS = {name: _of(p, p.fit) for name, p in PARAMETERS.items() if p.fit is not None}
-#: Parameters of the beam; all others act at the contact.
-SKELETON = tuple(name for name in DEFAULTS if PARAMETERS[name].part == "skeleton")
+#: Every parameter there is, as `trachea.material` and `mechanics.sections.material` declare it.
+DECLARED: Mapping[str, Declaration] = VALUES | SECTION_VALUES | OF_PRESS
+#: Every parameter that can be identified, with its defaults.
+DEFAULTS = {name: _of(p, p.fit) for name, p in DECLARED.items() if p.fit is not None}
+#: Parameters of the beam; of a line of joints all others act at the contact.
+SKELETON = tuple(
+    name for name in DEFAULTS if DECLARED[name].part == "skeleton" and name not in SECTION_VALUES
+)
 #: Parameters of single presses that are no property of the specimen: errors are measured against
 #: the range of displacement and the largest force.
-OF_THE_PRESS = tuple(name for name in DEFAULTS if PARAMETERS[name].part == "press")
+OF_THE_PRESS = tuple(OF_PRESS)
 
 
 def visible(options: Options, *, joints: bool) -> list[str]:
     """Names of the parameters that the chosen model can see, in table order.
 
-    With coupling `total` and no joint markers the skeleton does not enter: force-displacement
-    curves then see the local law alone.
+    A skeleton of deforming cross-sections has its own, whatever there is to see. With coupling
+    `total` and no joint markers the skeleton does not enter: force-displacement curves then see the
+    local law alone.
     """
+    if options.skeleton == "sections":
+        return [name for name in DEFAULTS if name in SECTION_VALUES or name in OF_PRESS]
     has = {"": True, "shear": options.shear, "two-material": options.local == "two-material",
            "softening": options.skeleton == "softening"}  # fmt: skip
     blind = options.coupling == "total" and not joints
     return [
         name for name in DEFAULTS
-        if has[PARAMETERS[name].needs] and not (blind and name in SKELETON)
+        if has.get(DECLARED[name].needs, False) and not (blind and name in SKELETON)
     ]  # fmt: skip
 
 
@@ -130,5 +141,39 @@ def in_model(options: Options, *, joints: bool, named: Collection[str] = ()) -> 
         joints: whether there are markers.
         named: parameters that the specification names.
     """
-    tacit = {name for name, p in PARAMETERS.items() if p.fit is not None and p.fit.if_named}
+    tacit = {name for name, p in DECLARED.items() if p.fit is not None and p.fit.if_named}
     return [n for n in visible(options, joints=joints) if n not in tacit or n in named]
+
+
+def defaults_of(
+    options: Options, geometry: Geometry, wall: Wall | None = None
+) -> Mapping[str, Parameter]:
+    """Parameters by name as a fit begins with them.
+
+    `DEFAULTS`, but for deforming cross-sections: those begin at what moduli and thicknesses of the
+    wall give for this tube (`from_wall`; of rings with pitches of their own the median).
+
+    Args:
+        options: of the model.
+        geometry: the tube.
+        wall: moduli and thicknesses; None: those of the paper and the virtual specimen.
+
+    Raises:
+        InputError: a wall for a model that does not read it.
+    """
+    if options.skeleton != "sections":
+        if wall is not None:
+            raise InputError(
+                "moduli and thicknesses are read by the skeleton 'sections' alone", key="wall",
+                cure="leave it out, or choose skeleton = 'sections'",
+            )  # fmt: skip
+        return DEFAULTS
+    material = from_wall(geometry, Wall() if wall is None else wall)
+    values = {f.name: getattr(material, f.name) for f in dataclasses.fields(SectionMaterial)}
+    begun = {n: _begun(DEFAULTS[n], float(np.median(np.asarray(v)))) for n, v in values.items()}
+    return DEFAULTS | begun
+
+
+def _begun(p: Parameter, value: float) -> Parameter:
+    """A parameter with another initial value, its bounds as far from that as need be."""
+    return dataclasses.replace(p, value=value, lower=min(p.lower, value), upper=max(p.upper, value))

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from jaxtrachea.fitting.lane import forces, markers
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.residual import residual_value
 from jaxtrachea.fitting.study import Study
@@ -12,26 +13,30 @@ from jaxtrachea.optimisation.programs import batch_size
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Prediction:
-    """Model minus data in units; NaN where nothing was observed.
+    """Model minus data in units; NaN where nothing was observed, None where no lane observes it.
 
     Attributes:
         force: N; (lanes, trials, samples).
         joints: mm; (lanes, trials, samples, rings), or None.
+        side_force: N, see `Curve`; (lanes, trials, samples), or None.
+        joint_side: mm, along the circumference; as `joints`, or None.
+        ends: mm, of ring ends U and V, y and z; (lanes, trials, samples, rings, 2, 2), or None.
     """
 
     force: np.ndarray
     joints: np.ndarray | None
+    side_force: np.ndarray | None = None
+    joint_side: np.ndarray | None = None
+    ends: np.ndarray | None = None
 
 
 def predictions(study: Study, theta: np.ndarray, batch: int = 256) -> Prediction:
     """Residuals of all lanes at `theta` (lanes, P), in N and mm."""
     value = map_lanes(residual_value, study, theta, batch=batch_size(len(theta), batch))
-    lanes = study.lanes
-    samples = lanes.force.shape[-1]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        force = np.where(lanes.precision > 0, value[..., :samples] / lanes.precision, np.nan)
-        joints = None
-        if lanes.joints is not None and lanes.joint_precision is not None:
-            markers = value[..., samples:].reshape(lanes.joints.shape) / lanes.joint_precision
-            joints = np.where(lanes.joint_precision > 0, markers, np.nan)
-    return Prediction(force, joints)
+    lanes, found, first = study.lanes, {"joints": None}, 0
+    for kind in forces(lanes) + markers(lanes):
+        after = first + lanes.force.shape[-1] * kind.places
+        part, first = value[..., first:after].reshape(kind.data.shape), after
+        with np.errstate(invalid="ignore", divide="ignore"):
+            found[kind.name] = np.where(kind.precision > 0, part / kind.precision, np.nan)
+    return Prediction(**found)

@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxtrachea.fitting.lane import Lane
-from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting import section_residual
+from jaxtrachea.fitting.lane import Lane, weighted
+from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.parameters import SKELETON
 from jaxtrachea.mechanics.equilibrium import sensitivity
 from jaxtrachea.mechanics.force_law import Law, coefficient
@@ -82,7 +83,12 @@ def inputs(
         theta: unknowns in scaled coordinates.
         lane: the lane's arrays (no leading axis).
         geometry: the tube, may be traced; None: of the model.
+
+    Raises:
+        ValueError: a skeleton of deforming cross-sections, which no few numbers describe.
     """
+    if model.options.skeleton == "sections":
+        raise ValueError("a skeleton of deforming cross-sections has no compliance of its own")
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
     skeleton = _skeleton(model, free, _places(lane), tube)
 
@@ -106,12 +112,14 @@ def residual(
         geometry: the tube, may be traced; None: of the model.
     """
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
+    if model.options.skeleton == "sections":
+        return Residual(*section_residual.residual(model, free, of_press(lane), tube))
     skeleton, by_beam = _skeleton_and_derivative(model, free, _places(lane), tube)
 
     def one(*trial):
         return _of_trial_with_jacobian(model, tube, *trial)
 
-    return Residual(*jax.vmap(one)(free, skeleton, by_beam, _trials(lane)))
+    return Residual(*jax.vmap(one)(free, skeleton, by_beam, of_press(lane)))
 
 
 def residual_value(
@@ -119,6 +127,8 @@ def residual_value(
 ) -> Float[Array, "T m"]:
     """`residual` without its Jacobian."""
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
+    if model.options.skeleton == "sections":
+        return section_residual.residual_value(model, free, of_press(lane), tube)
     skeleton = _skeleton(model, free, _places(lane), tube)
 
     def one(free, skeleton, trial):
@@ -131,7 +141,7 @@ def residual_value(
         joints = None if skeleton.joints is None else _times(load, skeleton.joints)
         return _whitened(solved.force + at.force_offset, joints, trial)
 
-    return jax.vmap(one)(free, skeleton, _trials(lane))
+    return jax.vmap(one)(free, skeleton, of_press(lane))
 
 
 def of_trials(model: FitModel, v: Float[Array, " P"], lane: Lane) -> Float[Array, "T Jf"]:
@@ -142,7 +152,7 @@ def of_trials(model: FitModel, v: Float[Array, " P"], lane: Lane) -> Float[Array
     return jnp.where(index >= 0, v[jnp.maximum(index, 0)], 0)
 
 
-def _trials(lane: Lane) -> Lane:
+def of_press(lane: Lane) -> Lane:
     """The arrays of a lane that have a trial axis."""
     return lane._replace(lower=None, upper=None, active=None, index=None)
 
@@ -154,9 +164,7 @@ def _beam_columns(model: FitModel) -> tuple[int, ...]:
 
 def material_and_values(model: FitModel, free, value) -> tuple[Material, dict[str, Array]]:
     """Material of one trial, and the value of every parameter by name."""
-    values = {p.name: value[j] for j, p in enumerate(model.columns)}
-    for p, scaled in zip(model.free, free, strict=True):
-        values[p.name] = jnp.exp(scaled) if p.scale == "log" else scaled * p.step
+    values = values_of(model, free, value)
     one = jnp.ones((), free.dtype)  # where the skeleton is not part of the model
     return material_of({"EI_L": one, "k_M": one} | values), values
 
@@ -254,14 +262,10 @@ def _whitened(force, joints, trial: Lane) -> Float[Array, " m"]:
 
 def _masked(force, joints, trial: Lane) -> Float[Array, " m"]:
     """Observed entries over their standard deviation, exact zeros elsewhere; in one row."""
-
-    def seen(v, precision):
-        return jnp.where(precision > 0, v, 0) * precision
-
-    r = seen(force, trial.precision)
-    if joints is None:
+    r = weighted(force, trial.precision)
+    if joints is None or trial.joint_precision is None:
         return r
-    markers = seen(joints, trial.joint_precision)
+    markers = weighted(joints, trial.joint_precision)
     return jnp.concatenate([r, markers.reshape(*r.shape[:-1], -1)], axis=-1)
 
 
@@ -400,6 +404,8 @@ def force_jacobian(
         blend: rounded corner at the onset, mm, see `Lane`.
     """
     tube = _tube(model, None, free.dtype)
+    if model.options.skeleton == "sections":
+        return section_residual.force_jacobian(model, free, value, s_c, displacement, tube)
     places = _Places(s_c[None], value[None], marked=False)
     of_lane = _skeleton_and_derivative(model, free[None], places, tube)
     skeleton, by_beam = jax.tree.map(lambda v: v[0], of_lane)
@@ -416,18 +422,3 @@ def _felt_through(model: FitModel) -> set[str]:
     """Through what the free parameters act on the contact force: only these terms are computed."""
     names = (p.name for p in model.free)
     return {"compliance" if name in SKELETON else coefficient(name) or name for name in names}
-
-
-def observations(lane: Lane) -> tuple[Float[Array, "T m"], int]:
-    """Which entries of the residual are observed (1 or 0), and how many of them are forces."""
-    seen = lane.precision > 0
-    if lane.joint_precision is not None:
-        markers = (lane.joint_precision > 0).reshape(*seen.shape[:-1], -1)
-        seen = jnp.concatenate([seen, markers], axis=-1)
-    return seen.astype(lane.force.dtype), lane.force.shape[-1]
-
-
-def size(lane: Lane) -> int:
-    """Entries of the residual per trial (static)."""
-    samples = lane.force.shape[-1]
-    return samples if lane.joints is None else samples * (1 + lane.joints.shape[-1])

@@ -20,7 +20,7 @@ from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.lanes import Noise, Unknown, Weighting, group, lanes_of, unknowns_of
 from jaxtrachea.fitting.model import Common, FitModel, columns_of, numbers_of
 from jaxtrachea.fitting.onset import blends, natural_steps, onset_is_sought, within_reach
-from jaxtrachea.fitting.parameters import DEFAULTS, SKELETON, Parameter, in_model
+from jaxtrachea.fitting.parameters import DEFAULTS, SKELETON, Parameter, defaults_of, in_model
 from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
@@ -132,11 +132,13 @@ def build_study(
     Args:
         curves: at least one; `s_c` set wherever the skeleton enters. Of `Measurements` the usable
             ones; a warning names what could not be used. Side forces, sideward markers and ring
-            ends are not read and left out of the study; a warning says so.
+            ends are read by the skeleton `sections` alone; else they are left out of the study,
+            and a warning says so.
         geometry: the tube at rest (`Geometry.create` takes plain numbers; kept as float64).
         options: what the model includes.
         parameters: the table, in the order of `parameters.in_model`; or changes to the defaults of
-            the model, `{"k_1": {"value": 2.0}, "EI_L": {"fixed": True}}`; None: the defaults.
+            the model, `{"k_1": {"value": 2.0}, "EI_L": {"fixed": True}}`; None: the defaults. Of
+            another wall than `parameters.defaults_of` takes, the table by `default_parameters`.
         noise: known standard deviations.
         weighting: balance between curves, and the loss.
         tool_radius: mm; markers closer to the contact are held by the tool and left out. None: all
@@ -158,10 +160,11 @@ def build_study(
         raise ValueError("no usable curve; nothing to fit")
     for curve in curves:
         check_curve(curve, geometry, options)
-    curves, unread = along_the_normal(curves)
-    if unread is not None:
-        warnings.warn(unread, stacklevel=2)
-    parameters = natural_steps(_table(parameters, options, curves), curves)
+    if options.skeleton != "sections":
+        curves, unread = along_the_normal(curves)
+        if unread is not None:
+            warnings.warn(unread, stacklevel=2)
+    parameters = natural_steps(_table(parameters, options, curves, geometry), curves)
     joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1
     groups = group(curves, parameters, joint=joint)
@@ -169,6 +172,7 @@ def build_study(
     lanes = lanes_of(
         groups, unknowns, parameters, geometry,
         noise=noise, balance=weighting.balance, tool_radius=tool_radius,
+        vectors=options.skeleton == "sections",
     )  # fmt: skip
     if onset_is_sought(parameters, options):
         lanes = lanes._replace(blend=blends(lanes, groups, noise.force, parameters, options))
@@ -198,22 +202,26 @@ def _warn_of(bad: Sequence[BadCurve]) -> None:
         warnings.warn(f"curves left out: {first}{more}", stacklevel=3)
 
 
-def _table(parameters: Table | None, options: Options, curves) -> Sequence[Parameter]:
+def _table(
+    parameters: Table | None, options: Options, curves, geometry: Geometry
+) -> Sequence[Parameter]:
     """The table itself, or the defaults of the model with changes."""
     if parameters is not None and not isinstance(parameters, Mapping):
         return parameters
     changes = parameters or {}
     joints = any(c.joint_displacement is not None for c in curves)
-    return default_parameters(in_model(options, joints=joints, named=changes), changes)
+    names = in_model(options, joints=joints, named=changes)
+    return default_parameters(names, changes, defaults_of(options, geometry))
 
 
 def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
     """Refuse a curve that the model cannot press.
 
     Raises:
-        InputError: no contact position, one outside the tube or off the midline, a tool that moves
-            aside or whose width reaches beyond an end of the tube, a marker or an end of a ring
-            that does not exist; specimen and trial are named.
+        InputError: no contact position, one outside the tube, one off the midline or a tool that
+            moves aside where the skeleton is a line of joints, a tool whose width reaches beyond an
+            end of the tube, a marker or an end of a ring that does not exist; specimen and trial
+            are named.
     """
     where = f"specimen {curve.specimen!r} trial {curve.trial!r}"
     length, rings = float(geometry.length), geometry.rings
@@ -231,11 +239,36 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
         )
     else:
         _check_width(curve.s_c, length, options, where)
+    if options.skeleton == "sections":
+        if not abs(curve.phi_c) <= float(geometry.half_angle):
+            raise InputError(
+                f"contact at phi = {np.degrees(curve.phi_c):.3g} deg, expected on the cartilage, "
+                f"within {np.degrees(float(geometry.half_angle)):.3g} deg of the midline",
+                place=where,
+            )
+    else:
+        _check_normal(curve, options, where)
+    if curve.joint_rings is not None and np.any(curve.joint_rings >= rings):
+        found = f"marker on ring {curve.joint_rings.max() + 1} of {rings}"
+        raise InputError(found, place=where)
+    if curve.end_rings is not None and np.any(curve.end_rings >= rings):
+        found = f"end of ring {curve.end_rings.max() + 1} of {rings}"
+        raise InputError(found, place=where)
+
+
+def _check_normal(curve: Curve, options: Options, where: str) -> None:
+    """Refuse a press that a line of joints does not have.
+
+    Raises:
+        InputError: naming specimen and trial, and the level that has it.
+    """
+    cure = "choose skeleton = 'sections' and contact = 'bonded', or leave the curve out"
     if options.coupling == "series" and abs(curve.phi_c) > 1e-6:
         raise InputError(
             f"contact at phi = {np.degrees(curve.phi_c):.3g} deg; this model presses on the "
             "anterior midline (phi = 0) only",
             place=where,
+            cure=cure,
         )
     if abs(curve.direction[1]) > 1e-6:
         shown = ", ".join(f"{v:.4g}" for v in curve.direction)
@@ -243,13 +276,8 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
             f"the tool moves in the direction ({shown}); this model presses along the inward "
             "normal (1, 0) only",
             place=where,
+            cure=cure,
         )
-    if curve.joint_rings is not None and np.any(curve.joint_rings >= rings):
-        found = f"marker on ring {curve.joint_rings.max() + 1} of {rings}"
-        raise InputError(found, place=where)
-    if curve.end_rings is not None and np.any(curve.end_rings >= rings):
-        found = f"end of ring {curve.end_rings.max() + 1} of {rings}"
-        raise InputError(found, place=where)
 
 
 def _check_width(s_c: float, length: float, options: Options, where: str) -> None:
@@ -284,9 +312,16 @@ def _common(unknowns, parameters) -> Common:
 
 
 def default_parameters(
-    names: Sequence[str], changes: Mapping[str, Mapping[str, object]]
+    names: Sequence[str],
+    changes: Mapping[str, Mapping[str, object]],
+    defaults: Mapping[str, Parameter] = DEFAULTS,
 ) -> tuple[Parameter, ...]:
     """Table rows for `names` with the user's changes.
+
+    Args:
+        names: parameters of the model.
+        changes: fields of `Parameter` by name.
+        defaults: what is changed; see `parameters.defaults_of`.
 
     Raises:
         ValueError: a change names a parameter that the chosen model does not contain, or something
@@ -304,4 +339,4 @@ def default_parameters(
                 raise ValueError(
                     f"parameters.{name}: {key!r} is not known; expected one of {', '.join(known)}"
                 )
-    return tuple(dataclasses.replace(DEFAULTS[n], **changes.get(n, {})) for n in names)
+    return tuple(dataclasses.replace(defaults[n], **changes.get(n, {})) for n in names)

@@ -25,10 +25,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrachea.fitting.cost import assemble, entry_scale, robust
 from jaxtrachea.fitting.covariance import SINGULAR
-from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lane import Lane, observations
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
-from jaxtrachea.fitting.residual import observations, residual
+from jaxtrachea.fitting.residual import residual
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.estimate import hessian

@@ -24,9 +24,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea.fitting.cost import weights
-from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lane import Lane, observations
 from jaxtrachea.fitting.model import FitModel
-from jaxtrachea.fitting.residual import observations, residual_value
+from jaxtrachea.fitting.residual import residual_value
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.chains import grade, lenient, mixing, quantiles
 from jaxtrachea.inference.labels import succeeded

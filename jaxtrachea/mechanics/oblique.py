@@ -17,7 +17,7 @@ from jaxtrachea.mechanics import skeleton, vector_equilibrium
 from jaxtrachea.mechanics.admission import Admitted, admit, hide, status_of
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.friction import Coulomb
-from jaxtrachea.mechanics.press import Options, local_law, read_values, touch
+from jaxtrachea.mechanics.press import Options, check_line, local_law, read_values, touch
 from jaxtrachea.mechanics.skeleton import Rings, Skeleton, local_frame
 from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -60,6 +60,7 @@ class ObliquePath(NamedTuple):
 
 
 def _only_default(options: Options):
+    check_line(options, "an oblique press")
     if options.half_width != 0 or options.skeleton != "linear":
         raise ValueError(
             "oblique presses need options.half_width=0 and options.skeleton='linear': a tool with "

@@ -39,7 +39,9 @@ class Options:
             `recursion` and `continuous`). All of it has to lie on the tube, else OFF_TUBE. 0: the
             tool touches at a point.
         skeleton: `linear`, or `softening` for deep presses: it yields more the further it moves
-            (needs `Material.e_1` and `e_2`, and `series`).
+            (needs `Material.e_1` and `e_2`, and `series`); or `sections`, in fits: deforming
+            cross-sections, anywhere on the rings and at finite strain (`bonded`; no other option
+            applies). `press_sections` presses that one.
     """
 
     coupling: Literal["series", "total"] = "series"
@@ -51,7 +53,7 @@ class Options:
     onset_width: float = 1e-3
     transition: float | None = None
     half_width: float = 0.0
-    skeleton: Literal["linear", "softening"] = "linear"
+    skeleton: Literal["linear", "softening", "sections"] = "linear"
 
     def __post_init__(self):
         """Refuse words and numbers that no model has, and options that exclude each other.
@@ -72,6 +74,39 @@ class Options:
                 "skeleton='softening' needs coupling='series': with 'total' the force does not "
                 "depend on the skeleton"
             )
+        if self.skeleton == "sections":
+            _check_sections(self)
+
+
+#: Options that a skeleton of deforming cross-sections has: no others apply to it.
+_OF_SECTIONS = {
+    "coupling": "series", "split": "continuous", "form": "recursion", "shear": False,
+    "local": "uniform", "transition": None, "half_width": 0.0, "contact": "bonded",
+}  # fmt: skip
+
+
+def _check_sections(options: Options) -> None:
+    """Refuse options of the line of joints.
+
+    Raises:
+        ValueError: naming the option and the value that it must have.
+    """
+    for name, only in _OF_SECTIONS.items():
+        if (value := getattr(options, name)) != only:
+            why = "the tool sticks to the wall" if name == "contact" else "no other applies to it"
+            raise ValueError(f"skeleton='sections' needs {name}={only!r}, found {value!r}: {why}")
+
+
+def check_line(options: Options, what: str) -> None:
+    """Refuse a skeleton of deforming cross-sections where a line of joints is pressed.
+
+    Raises:
+        ValueError: naming what was called and the cure.
+    """
+    if options.skeleton == "sections":
+        raise ValueError(
+            f"{what} presses a line of joints, not skeleton='sections'; use press_sections"
+        )
 
     def places(self, length: float) -> tuple[float, float]:
         """Lowest and highest contact position, mm, at which all of the tool lies on the tube."""
@@ -149,7 +184,7 @@ def softening_of(material: Material, options: Options) -> Softening | None:
     Raises:
         ValueError: `softening` without `material.e_1` or `e_2`.
     """
-    if options.skeleton == "linear":
+    if options.skeleton != "softening":
         return None
     values = {name: getattr(material, name) for name in Softening._fields}
     for name, value in values.items():
@@ -271,8 +306,9 @@ def press(
 
     Raises:
         ValueError: an argument that is no number, an array of a length that does not fit the tube,
-            or a value of the material that the options need.
+            a value of the material that the options need, or the skeleton `sections`.
     """
+    check_line(options, "press")
     dtype = geometry.length.dtype
     displacement = real("displacement", displacement, dtype)
     onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=displacement.dtype)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jaxtrachea.files.atomic import write_whole
-from jaxtrachea.fitting import residual
+from jaxtrachea.fitting import lane
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.optimisation.levenberg_marquardt import MOST_SLOTS, PART_OF_MEMORY
@@ -39,7 +39,7 @@ def lanes_per_shard(study: Study, starts: int) -> int:
     if study.joint:
         return len(study.curves)
     trials = study.lanes.s_c.shape[1]
-    entries = trials * residual.size(study.lanes) * starts
+    entries = trials * lane.size(study.lanes) * starts
     return max(1, min(MOST_LANES, MOST_ENTRIES // entries))
 
 
@@ -54,7 +54,7 @@ def bytes_per_slot(study: Study) -> int:
     Five numbers per residual entry and free column, as XLA counts them for a Levenberg-Marquardt
     step in float64 (3.7 to 5 in ten studies), and the matrices of the unknowns.
     """
-    entries = study.lanes.s_c.shape[1] * residual.size(study.lanes)
+    entries = study.lanes.s_c.shape[1] * lane.size(study.lanes)
     return 8 * (5 * len(study.free) * entries + 8 * study.size**2 + 500)
 
 

@@ -16,8 +16,11 @@ from jaxtrachea._arguments import check_word, real
 
 Scope = Literal["shared", "specimen", "trial"]
 Scale = Literal["log", "linear"]
-Part = Literal["skeleton", "contact", "finite strain", "press"]
-Needs = Literal["", "shear", "two-material", "softening", "axial", "arch", "second plane"]
+Part = Literal["skeleton", "contact", "finite strain", "sections", "press"]
+Needs = Literal[
+    "", "shear", "two-material", "softening", "axial", "arch", "second plane", "sections",
+    "arch, sections",
+]  # fmt: skip
 Each = Literal["", "span", "ring"]
 
 
@@ -65,8 +68,9 @@ class Declaration:
         dimension: for `units.parse_quantity`.
         description: what the user reads in tables.
         part: `skeleton` (it changes the compliance under the contact), `contact` (the local law),
-            `finite strain` (how the skeleton leaves that compliance in deep presses) or `press` (of
-            a single press: no property of the specimen, not in `Material`).
+            `finite strain` (how the skeleton leaves that compliance in deep presses), `sections`
+            (of a skeleton of deforming cross-sections, in `SectionMaterial`) or `press` (of a
+            single press: no property of the specimen, not in `Material`).
         symbol: in the paper.
         needs: option or effect that reads it; "" where every press does. A fit has it in its model
             where `mechanics.press.Options` has that option.
@@ -222,7 +226,8 @@ class Material(eqx.Module):
     EI_C: Float[Array, ""] | None = _field(
         Declaration(
             "EI_C", "N mm^2", "bending_stiffness", "cartilage bending stiffness in a ring's plane",
-            symbol="E_C I_C", part="skeleton", needs="arch", absent="rings do not bend",
+            symbol="E_C I_C", part="skeleton", needs="arch, sections", absent="rings do not bend",
+            fit=Fitted(25.0, 1e-3, 1e6),
         )
     )  # fmt: skip
     k_t: Float[Array, ""] | None = _field(
@@ -260,8 +265,10 @@ _OF_THE_PRESS = (
 VALUES: dict[str, Declaration] = {
     field.name: field.metadata["declaration"] for field in dataclasses.fields(Material)
 }
-#: Every parameter, likewise; those of single presses last.
-PARAMETERS: dict[str, Declaration] = VALUES | {p.name: p for p in _OF_THE_PRESS}
+#: Those of single presses.
+OF_PRESS: dict[str, Declaration] = {p.name: p for p in _OF_THE_PRESS}
+#: Every parameter of a line of joints, likewise; those of single presses last.
+PARAMETERS: dict[str, Declaration] = VALUES | OF_PRESS
 #: Values of a skeleton that softens in deep presses.
 DEEP = tuple(name for name, p in VALUES.items() if p.needs == "softening")
 

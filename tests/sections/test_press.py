@@ -24,7 +24,7 @@ pytestmark = pytest.mark.compiling
 RINGS = 10.0 * np.arange(1, 7)
 LENGTH, RADIUS = 70.0, 11.7
 VALUES = {
-    "offset": 0.9, "EI_C": 24.2, "EI_M": 2.0, "Et_M": 0.68, "k_n": 0.0186, "k_t": 0.0018,
+    "offset": 0.9, "EI_C": 24.2, "EI_M": 2.0, "Et_M": 0.68, "bed_n": 0.0186, "bed_t": 0.0018,
     "Gt_L": 20.9, "Et_L": 1.19, "D_L": 3.5, "c_W": 0.68, "c_K": 22.3, "rho": 1e-3, "k_end": 0.146,
     "footprint": 2.74, "c_n": 0.003, "c_t": 0.1, "c_t_ring": 0.01,
 }  # fmt: skip
@@ -83,6 +83,7 @@ def test_linear_limit():
     for case, got in zip(LINEAR, press(LINEAR), strict=True):
         change, s, phi, path = case
         p = VALUES | change | {"R": RADIUS, "alpha": 2 * np.pi / 3}
+        p |= {"k_n": p["bed_n"], "k_t": p["bed_t"]}
         wanted = linear_force(p, LENGTH, RINGS, s, phi)
         force = inward(got, phi)[-1] / path[-1]
         np.testing.assert_allclose(force, wanted, atol=2e-5 * wanted[0])
@@ -150,8 +151,8 @@ HARD = {
     "hard rings": ({"EI_C": 24e4, "EI_M": 2e4}, 35.0, 0.7, PATH / 2),
     "soft wall": ({"Gt_L": 2e-3, "Et_L": 1e-4, "D_L": 4e-4}, 30.0, 0.7, PATH / 2),
     "hard wall": ({"Gt_L": 2e5, "Et_L": 1e4, "D_L": 4e4}, 35.0, 0.7, PATH / 2),
-    "hard bed": ({"k_n": 189.0, "k_t": 18.0}, 35.0, 0.7, PATH / 2),
-    "soft bed": ({"k_n": 2e-6, "k_t": 2e-7}, 35.0, 0.7, PATH / 2),
+    "hard bed": ({"bed_n": 189.0, "bed_t": 18.0}, 35.0, 0.7, PATH / 2),
+    "soft bed": ({"bed_n": 2e-6, "bed_t": 2e-7}, 35.0, 0.7, PATH / 2),
     "hard muscle": ({"Et_M": 6.8e3}, 35.0, 0.7, PATH / 2),
     "one step, back and forth": ({}, 30.0, 0.7, np.array([6.0, -3, 0, 6, 6, 1, 2, -2, 4])),
 }
@@ -277,7 +278,7 @@ def test_refusals():
     cases = {
         PressStatus.OFF_TUBE: ({}, 70.1, 0.0, PATH),
         PressStatus.BEHIND_GAP: ({}, 30.0, 2.2, PATH),
-        PressStatus.BAD_MATERIAL: ({"k_n": -1.0}, 30.0, 0.0, PATH),
+        PressStatus.BAD_MATERIAL: ({"bed_n": -1.0}, 30.0, 0.0, PATH),
         PressStatus.NON_FINITE: ({"EI_C": np.nan}, 30.0, 0.0, PATH),
     }
     zero = ({"Gt_L": 0.0}, 30.0, 0.0, PATH)
@@ -301,7 +302,15 @@ def test_a_beam_on_springs_is_the_limit():
     k_M, EI, GA, c_n = 0.216, 1402.0, 9.31, 0.003
     geometry = Geometry.create(160.0, 10.0 * np.arange(1, 16), radius=RADIUS)
     bed = k_M / (2 * np.pi / 3 * 10 * (RADIUS + 0.9))
-    rigid = {"EI_C": 1e9, "EI_M": 1e9, "Et_M": 1e9, "k_n": bed, "k_t": bed, "Gt_L": GA, "Et_L": EI}
+    rigid = {
+        "EI_C": 1e9,
+        "EI_M": 1e9,
+        "Et_M": 1e9,
+        "bed_n": bed,
+        "bed_t": bed,
+        "Gt_L": GA,
+        "Et_L": EI,
+    }
     material = SectionMaterial(**(VALUES | rigid | {"k_end": np.inf, "footprint": 1.0, "D_L": 0.0}))
     beam = Material(EI_L=EI, GA_L=GA, k_M=k_M, k_1=1 / c_n, k_3=0.0)
     options = mat.Options(shear=True)

@@ -103,7 +103,7 @@ def test_second_derivatives():
 def test_a_bad_row_does_not_touch_the_derivatives_of_others():
     def total(k_n):
         def one(k_n, s_c):
-            material = SectionMaterial(**(VALUES | {"k_n": k_n}))
+            material = SectionMaterial(**(VALUES | {"bed_n": k_n}))
             return press_sections(GEOMETRY, material, s_c, 0.4, jnp.asarray([1.0, 2.0]))
 
         got = jax.vmap(one)(k_n, jnp.asarray([17.0, 99.0, 17.0]))

@@ -1,7 +1,7 @@
 r"""What a skeleton of deforming cross-sections is made of, and where its numbers come from.
 
 Four stiffnesses and the bed are what force-displacement curves and markers determine: EI_C, Et_L,
-D_L, c_W, k_n and k_t. `from_wall` derives all from moduli and thicknesses; what the wall's own
+D_L, c_W, bed_n and bed_t. `from_wall` derives all from moduli and thicknesses; what the wall's own
 numbers leave open are `Factors`, each with its name.
 """
 
@@ -17,10 +17,28 @@ from jaxtyping import Array, Float
 from jaxtrachea._arguments import real, shaped
 from jaxtrachea._errors import InputError
 from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import VALUES, Declaration, Fitted
 
 
-def _value(name: str, **default: Any) -> Any:
-    return eqx.field(converter=functools.partial(real, name), **default)
+def _field(name: str, unit: str, dimension: str, description: str, fit: Fitted, **more: Any) -> Any:
+    """A field and its declaration; `default`: of the field."""
+    default = {"default": more.pop("default")} if "default" in more else {}
+    absent = f"{default['default']:g}" if default else ""
+    declaration = Declaration(
+        name, unit, dimension, description, part="sections", needs="sections", absent=absent,
+        fit=fit, **more,
+    )  # fmt: skip
+    return _declared(declaration, **default)
+
+
+def _declared(declaration: Declaration, **default: Any) -> Any:
+    convert = functools.partial(real, declaration.name)
+    return eqx.field(converter=convert, metadata={"declaration": declaration}, **default)
+
+
+def _fixed(value: float, lower: float = 1e-9, upper: float = 1e9, **more: Any) -> Fitted:
+    """Not fitted unless named: what a few presses do not determine."""
+    return Fitted(value, lower, upper, fixed=True, **more)
 
 
 class SectionMaterial(eqx.Module):
@@ -34,8 +52,8 @@ class SectionMaterial(eqx.Module):
         EI_C: bending stiffness in front, N mm^2 for each ring with its pitch of wall; a ring.
         EI_M: likewise of the muscle behind; a ring.
         Et_M: modulus times thickness of the muscle around the tube, N/mm; a ring.
-        k_n: bed behind the muscle, along the normal, N/mm^3; a ring.
-        k_t: likewise along the circumference; a ring.
+        bed_n: bed behind the muscle, along the normal, N/mm^3; a ring.
+        bed_t: likewise along the circumference; a ring.
         Gt_L: shear modulus times thickness of the wall between rings, N/mm; a span. Large values
             stand for a wall without membrane shear.
         Et_L: modulus along the tube times thickness of that wall, N/mm; a span.
@@ -50,27 +68,79 @@ class SectionMaterial(eqx.Module):
         c_t_ring: that on a ring.
     """
 
-    offset: Float[Array, ""] = _value("offset")
-    EI_C: Float[Array, "..."] = _value("EI_C")
-    EI_M: Float[Array, "..."] = _value("EI_M")
-    Et_M: Float[Array, "..."] = _value("Et_M")
-    k_n: Float[Array, "..."] = _value("k_n")
-    k_t: Float[Array, "..."] = _value("k_t")
-    Gt_L: Float[Array, "..."] = _value("Gt_L")
-    Et_L: Float[Array, "..."] = _value("Et_L")
-    D_L: Float[Array, "..."] = _value("D_L")
-    c_W: Float[Array, "..."] = _value("c_W")
-    c_K: Float[Array, "..."] = _value("c_K", default=0.0)
-    rho: Float[Array, "..."] = _value("rho", default=1e-3)
-    k_end: Float[Array, ""] = _value("k_end", default=float("inf"))
-    footprint: Float[Array, ""] = _value("footprint", default=1.0)
-    c_n: Float[Array, ""] = _value("c_n", default=3e-3)
-    c_t: Float[Array, ""] = _value("c_t", default=0.1)
-    c_t_ring: Float[Array, ""] = _value("c_t_ring", default=0.01)
+    offset: Float[Array, ""] = _field(
+        "offset", "mm", "length", "from the mid-line of the wall to its outer surface",
+        _fixed(0.9, 1e-3, 100.0),
+    )  # fmt: skip
+    EI_C: Float[Array, "..."] = _declared(VALUES["EI_C"])
+    EI_M: Float[Array, "..."] = _field(
+        "EI_M", "N mm^2", "bending_stiffness", "bending stiffness of the muscle behind, each ring",
+        _fixed(2.0), each="ring",
+    )  # fmt: skip
+    Et_M: Float[Array, "..."] = _field(
+        "Et_M", "N/mm", "stiffness", "modulus times thickness of the muscle around the tube",
+        _fixed(0.65), each="ring",
+    )  # fmt: skip
+    bed_n: Float[Array, "..."] = _field(
+        "bed_n", "N/mm^3", "cubic_stiffness", "bed behind the muscle, along the normal",
+        Fitted(0.02, 1e-8, 1e3), each="ring",
+    )  # fmt: skip
+    bed_t: Float[Array, "..."] = _field(
+        "bed_t", "N/mm^3", "cubic_stiffness", "bed behind the muscle, along the circumference",
+        Fitted(0.002, 1e-8, 1e3), each="ring",
+    )  # fmt: skip
+    Gt_L: Float[Array, "..."] = _field(
+        "Gt_L", "N/mm", "stiffness", "shear modulus times thickness of the wall between rings",
+        _fixed(20.0), each="span",
+    )  # fmt: skip
+    Et_L: Float[Array, "..."] = _field(
+        "Et_L", "N/mm", "stiffness", "modulus along the tube times thickness of that wall",
+        Fitted(1.2, 1e-5, 1e5), each="span",
+    )  # fmt: skip
+    D_L: Float[Array, "..."] = _field(
+        "D_L", "N mm", "moment", "bending stiffness of that wall, each length",
+        Fitted(4.0, 1e-5, 1e5), each="span",
+    )  # fmt: skip
+    c_W: Float[Array, "..."] = _field(
+        "c_W", "1/N/mm", "inverse_energy", "softening of a span with its energy",
+        Fitted(0.9, 1e-6, 1e4), each="span",
+    )  # fmt: skip
+    c_K: Float[Array, "..."] = _field(
+        "c_K", "mm^2", "area", "softening of bending in a ring",
+        _fixed(0.0, 0.0, 1e6, scale="linear", step=10.0), default=0.0, signed=True, each="ring",
+    )  # fmt: skip
+    rho: Float[Array, "..."] = _field(
+        "rho", "1", "dimensionless", "share of the muscle in shear and stretch of the wall",
+        _fixed(1e-3, 1e-9, 10.0), default=1e-3, each="span",
+    )  # fmt: skip
+    k_end: Float[Array, ""] = _field(
+        "k_end", "1/mm", "inverse_length", "how the clamped ends hold the warping",
+        _fixed(0.16, 1e-6, 1e9), default=float("inf"),
+    )  # fmt: skip
+    footprint: Float[Array, ""] = _field(
+        "footprint", "1", "dimensionless", "exponent by which a tool near a ring rests on it",
+        _fixed(2.85, 1.0, 100.0), default=1.0,
+    )  # fmt: skip
+    c_n: Float[Array, ""] = _field(
+        "c_n", "mm/N", "compliance", "local compliance along the normal",
+        _fixed(3e-3, 1e-9, 1e3), default=3e-3,
+    )  # fmt: skip
+    c_t: Float[Array, ""] = _field(
+        "c_t", "mm/N", "compliance", "local compliance along the circumference, mid-span",
+        _fixed(0.1, 1e-9, 1e3), default=0.1,
+    )  # fmt: skip
+    c_t_ring: Float[Array, ""] = _field(
+        "c_t_ring", "mm/N", "compliance", "local compliance along the circumference, on a ring",
+        _fixed(0.01, 1e-9, 1e3), default=0.01,
+    )  # fmt: skip
 
 
+#: Values of the sections by name, as `SectionMaterial` has them; `EI_C` is that of `Material`.
+SECTION_VALUES: dict[str, Declaration] = {
+    field.name: field.metadata["declaration"] for field in dataclasses.fields(SectionMaterial)
+}
 #: Fields that may differ from ring to ring and from span to span; the others are scalars.
-EACH_RING = ("EI_C", "EI_M", "Et_M", "k_n", "k_t", "c_K")
+EACH_RING = ("EI_C", "EI_M", "Et_M", "bed_n", "bed_t", "c_K")
 EACH_SPAN = ("Gt_L", "Et_L", "D_L", "c_W", "rho")
 #: Values that must be more than zero; the others must not be negative.
 POSITIVE = ("EI_C", "EI_M", "Et_M", "Gt_L", "Et_L", "c_n", "c_t", "c_t_ring")
@@ -196,8 +266,8 @@ def from_wall(
         "EI_C": factors.EI_C * EI_C,
         "EI_M": wall.E_M * wall.h_M**3 / 12 * pitches,
         "Et_M": factors.Et_M * wall.E_M * wall.h_M,
-        "k_n": wall.bed_n,
-        "k_t": wall.bed_t,
+        "bed_n": wall.bed_n,
+        "bed_t": wall.bed_t,
         "Gt_L": factors.Gt_L * wall.E_L * wall.h / 2 / (1 + wall.nu),
         "Et_L": factors.Et_L * wall.E_L * wall.h,
         "D_L": factors.D_L * ligament / plane,

@@ -161,6 +161,10 @@ def _safe_values(material: SectionMaterial) -> tuple[dict[str, Any], Array, Arra
     return safe, bad, unknown
 
 
+#: Names of the bed in the equations of a ring.
+_OF_RING = {"bed_n": "k_n", "bed_t": "k_t"}
+
+
 def build(
     geometry: Geometry,
     material: SectionMaterial,
@@ -175,7 +179,7 @@ def build(
     values = {f.name: getattr(material, f.name).astype(dtype) for f in dataclasses.fields(material)}
     shape = section.Shape(geometry.radius, values["offset"], geometry.half_angle)
     grid = section.make_grid(shape, midline=midline)
-    per_ring = {k: jnp.broadcast_to(values[k], (n,)) for k in EACH_RING}
+    per_ring = {_OF_RING.get(k, k): jnp.broadcast_to(values[k], (n,)) for k in EACH_RING}
     per_span = {k: jnp.broadcast_to(values[k], (n + 1,)) for k in EACH_SPAN}
     rings = section.Ring(pitch=ring_pitches(geometry), **per_ring)
     nodes = ends_and_rings(geometry)
