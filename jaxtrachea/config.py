@@ -60,6 +60,8 @@ def _number_or_quantity(value: Any) -> Any:
 
 Length = Annotated[float, quantity("length")]
 PositiveLength = Annotated[float, quantity("length", positive=True)]
+Stress = Annotated[float, quantity("stress", positive=True)]
+Bed = Annotated[float, quantity("foundation_stiffness", positive=True)]
 Angle = Annotated[float, quantity("angle")]
 Estimate = Literal["estimate"]
 ForceNoise = Annotated[Estimate | float, quantity("force", positive=True, word="estimate")]
@@ -144,7 +146,24 @@ class ModelSection(Section):
     onset_width: PositiveLength = 1e-3
     transition: PositiveLength | None = None
     half_width: Length = 0.0
-    skeleton: Literal["linear", "softening"] = "linear"
+    skeleton: Literal["linear", "softening", "sections"] = "linear"
+
+
+class WallSection(Section):
+    """[wall]: moduli and thicknesses that a fit of deforming cross-sections begins with.
+
+    See `jaxtrachea.mechanics.sections.material.Wall`.
+    """
+
+    E_C: Stress = 5.8
+    E_L: Stress = 0.65
+    E_M: Stress = 0.30
+    nu: float = 0.45
+    h: PositiveLength = 2.6
+    h_C: PositiveLength = 1.56
+    h_M: PositiveLength = 2.0
+    bed_n: Bed = 0.02
+    bed_t: Bed = 0.002
 
 
 class ParameterSection(Section):
@@ -255,6 +274,7 @@ class FitSpec(Section):
     data: DataSection
     trachea: TracheaSection = TracheaSection()
     model: ModelSection = ModelSection()
+    wall: WallSection | None = None
     parameters: dict[str, ParameterSection] = {}
     noise: NoiseSection = NoiseSection()
     fit: FitSection = Field(default_factory=lambda: FitSection.model_validate({}))

@@ -177,7 +177,8 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
         rows = {"predictions": [], "bands": [], "joints": []}
         for c in compared:
             p, phi = c.prediction, c.curve.phi_c
-            rows["predictions"] += tables.prediction_rows(p, c.curve.force, phi)
+            side = c.curve.side_force
+            rows["predictions"] += tables.prediction_rows(p, c.curve.force, phi, side)
             rows["bands"] += tables.band_rows(p, phi)
             deepest = [int(np.argmax(np.abs(p.displacement)))]
             rows["joints"] += tables.joint_rows(p, rings, deepest, _markers(c, len(rings)), phi)

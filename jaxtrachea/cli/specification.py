@@ -1,11 +1,12 @@
 """From a fit specification to a study: opens the files, names what is wrong, builds the lanes."""
 
 import dataclasses
+from collections.abc import Mapping
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
 from jaxtrachea.fitting.lanes import Noise, Weighting
-from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, in_model, visible
+from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, defaults_of, in_model, visible
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study, check_curve
 from jaxtrachea.fitting.unread import along_the_normal
@@ -14,6 +15,7 @@ from jaxtrachea.measurements.read import (
     Measurements,
 )
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.sections.material import Wall
 from jaxtrachea.optimisation.levenberg_marquardt import MOST_SLOTS
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.trachea.section import geometry_of
@@ -24,15 +26,45 @@ def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Par
     """The parameter table of the chosen model with the user's changes.
 
     Raises:
-        SpecError: a parameter the model does not have, or values that contradict each other.
+        SpecError: a parameter the model does not have, values that contradict each other, or a wall
+            that the model does not read or that cannot be.
     """
+    defaults = _defaults(spec, options)
     known = visible(options, joints=joints)
     for name in spec.parameters:
         if name not in known:
             reason = "not a parameter" if name not in DEFAULTS else "not seen by this model"
             raise SpecError(f"parameters.{name}: {reason}; expected one of {', '.join(known)}")
     names = in_model(options, joints=joints, named=spec.parameters)
-    return tuple(_parameter(DEFAULTS[n], spec.parameters.get(n)) for n in names)
+    return tuple(_parameter(defaults[n], spec.parameters.get(n)) for n in names)
+
+
+def _defaults(spec: FitSpec, options: Options) -> Mapping[str, Parameter]:
+    """Parameters as the model begins with them.
+
+    Raises:
+        SpecError: with the key.
+    """
+    try:
+        wall = None if spec.wall is None else Wall(**spec.wall.model_dump())
+    except InputError as error:
+        raise SpecError.like(error, key=f"wall.{error.key}") from None
+    try:
+        return defaults_of(options, geometry_of(spec.trachea), wall)
+    except InputError as error:
+        raise SpecError.like(error) from None
+
+
+def options_of(spec: FitSpec) -> Options:
+    """What the [model] section includes.
+
+    Raises:
+        SpecError: options that exclude each other.
+    """
+    try:
+        return Options(**spec.model.model_dump())
+    except ValueError as error:
+        raise SpecError(f"model: {error}") from None
 
 
 def _parameter(default: Parameter, section: ParameterSection | None) -> Parameter:
@@ -96,7 +128,7 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
     Raises:
         SpecError: not one curve is left; the message is that of the first.
     """
-    geometry, options = geometry_of(spec.trachea), Options(**spec.model.model_dump())
+    geometry, options = geometry_of(spec.trachea), options_of(spec)
     good, bad = [], list(measurements.bad)
     reasons = []
     for curve in measurements.curves:
@@ -153,7 +185,7 @@ def study_of(spec: FitSpec, measurements: Measurements, *, refits: bool = False)
 
 
 def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
-    options = Options(**spec.model.model_dump())
+    options = options_of(spec)
     curves = measurements.curves
     joints = any(c.joint_displacement is not None for c in curves)
     given = (spec.noise.force, spec.noise.joints)

@@ -23,15 +23,18 @@ from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.parameters import SKELETON
-from jaxtrachea.fitting.residual import Inputs, inputs
+from jaxtrachea.fitting.residual import Inputs, inputs, of_trials, residual
 from jaxtrachea.fitting.starts import box
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.press import respond
 from jaxtrachea.mechanics.softening import Softening
+from jaxtrachea.optimisation.programs import batch_size
 
 #: Points of the parameter box, and half its width in decades.
 POINTS, DECADES = 8, 2.0
+#: Likewise of deforming cross-sections, so that the presses of the study have an equilibrium.
+DECADES_OF_SECTIONS = 0.3
 #: Ratio of singular values, and part of an unknown in a direction, that are taken as zero.
 ZERO, NO_PART = 1e-7, 1e-3
 #: Lanes computed together.
@@ -80,10 +83,12 @@ def structure_of(study: Study, lanes: Bool[np.ndarray, " lanes"]) -> Structure:
 def suspicious(study: Study) -> Bool[np.ndarray, " lanes"]:
     """Lanes that may leave something open: a count of positions, which needs no program.
 
-    Whatever this misses shows in a singular Jacobian at the estimate: one that is regular proves
-    the full rank.
+    Of deforming cross-sections none: nothing is counted there. Whatever this misses shows in a
+    singular Jacobian at the estimate: one that is regular proves the full rank.
     """
     lanes = study.lanes
+    if study.model.options.skeleton == "sections":
+        return np.zeros(len(lanes.s_c), bool)
     beam = sum(p.name in SKELETON for p in study.free)
     places = positions(study)
     if lanes.joint_precision is not None:
@@ -224,6 +229,8 @@ def _joint_null_spaces(study: Study, J, active, nullity) -> list[np.ndarray]:
 
 def _seen(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     """V J of each lane: all combinations of inputs that its curves tell, by the unknowns."""
+    if study.model.options.skeleton == "sections":
+        return _seen_of_sections(study, lanes, theta)
     J = map_lanes(_inputs_by_unknowns, _without_curves(study), theta, rows=lanes, batch=_BATCH)
     log = _log(study)[lanes]
     J = J * np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))[:, None, None]
@@ -237,6 +244,28 @@ def _seen(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     observed = (study.lanes.precision[lanes] > 0).any(axis=2)
     J = np.concatenate([of_curve, motion], axis=2) * observed[:, :, None, None]
     return np.nan_to_num(J).reshape(len(lanes), -1, J.shape[-1])
+
+
+def _seen_of_sections(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
+    """Derivative of the curves themselves, every trial in its own natural measure.
+
+    No few numbers stand for a press on deforming cross-sections: what its samples tell is decided
+    by number, at the displacements of the study, whatever they measured.
+    """
+    J = map_lanes(_curves_by_unknowns, study, theta, rows=lanes, batch=batch_size(len(lanes), 16))
+    log = _log(study)[lanes]
+    J = J * np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))[:, None, None]
+    J = np.nan_to_num(J)
+    size = np.max(np.linalg.norm(J, axis=3), axis=2)[:, :, None, None]
+    return (J / np.where(size > 0, size, 1)).reshape(len(lanes), -1, J.shape[-1])
+
+
+def _curves_by_unknowns(model: FitModel, theta: Float[Array, " P"], lane: Lane):
+    """Derivative of the residual by the unknowns of the lane; (T, m, P)."""
+    J = residual(model, theta, lane).jacobian
+    unit = jnp.eye(theta.shape[0], dtype=theta.dtype)
+    reads = jax.vmap(lambda v: of_trials(model, v, lane))(unit)  # (P, T, Jf)
+    return jnp.einsum("tim,pti->tmp", J, reads)
 
 
 def _inputs_by_unknowns(model: FitModel, theta: Float[Array, " P"], lane: Lane):
@@ -328,7 +357,8 @@ def _kinds(study: Study) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " lanes
 
 def _points(study: Study) -> Float[np.ndarray, "lanes points P"]:
     """Generic points of every lane's box; shared unknowns are the same in all lanes."""
-    _, low, high = box(study, DECADES)
+    sections = study.model.options.skeleton == "sections"
+    _, low, high = box(study, DECADES_OF_SECTIONS if sections else DECADES)
     unit = np.random.default_rng(20091).uniform(0.02, 0.98, (POINTS, study.size))
     return low[:, None] + unit * (high - low)[:, None]
 

@@ -97,6 +97,18 @@ class Study:
         if self.joint:
             raise ValueError(f"{what} needs lanes without shared unknowns; build with joint=False")
 
+    def refuse_sections(self, what: str) -> None:
+        """Say that something is made for a line of joints.
+
+        Raises:
+            ValueError: the skeleton is of deforming cross-sections.
+        """
+        if self.model.options.skeleton == "sections":
+            raise ValueError(
+                f"{what} is not available for the skeleton 'sections'; leave it out (standard "
+                "errors, profiles, the bootstrap and leaving out are), or choose another skeleton"
+            )
+
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":
         """The same study with these lanes, in this order; a lane may come more than once."""
         return dataclasses.replace(

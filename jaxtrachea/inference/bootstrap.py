@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lane import Lane, Observed, forces, markers
 from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
@@ -111,51 +111,52 @@ def _check(count, kind, block) -> None:
 
 def _draw(result: FitResult, seen: Prediction, lanes, count, kind, block, seed) -> Lane:
     """Lanes of `count` resampled data sets of each of `lanes`."""
-    data = result.study.lanes
     draw = _normal if kind == "parametric" else _blocks
-    force, joints = [], []
+    kinds = _kinds(result)
+    found: dict[str, list[np.ndarray]] = {kind.name: [] for kind, _ in kinds}
     for lane in lanes:
         rng = np.random.default_rng([seed, int(lane)])
-        noise, marker_noise = draw(rng, result, seen, lane, count, block)
-        force.append(data.force[lane] + np.nan_to_num(seen.force[lane]) + noise)
-        if data.joints is not None and seen.joints is not None and marker_noise is not None:
-            joints.append(data.joints[lane] + np.nan_to_num(seen.joints[lane]) + marker_noise)
+        noise = draw(rng, result, seen, lane, count, block)
+        for kind, _ in kinds:
+            model = kind.data[lane] + np.nan_to_num(getattr(seen, kind.name)[lane])
+            found[kind.name].append(model + noise[kind.name])
     drawn = result.study.take(lanes.repeat(count)).lanes
-    drawn = drawn._replace(force=np.concatenate(force))
-    return drawn._replace(joints=np.concatenate(joints)) if joints else drawn
+    return drawn._replace(**{name: np.concatenate(parts) for name, parts in found.items()})
+
+
+def _kinds(result: FitResult) -> list[tuple[Observed, int]]:
+    """What the lanes observe, and which standard deviation each has: of force 0, of markers 1."""
+    lanes = result.study.lanes
+    return [(kind, 0) for kind in forces(lanes)] + [(kind, 1) for kind in markers(lanes)]
 
 
 def _normal(rng, result: FitResult, seen: Prediction, lane, count, block):
-    """Normal noise of every observed entry, N and mm; (count, T, N) and (count, T, N, rings)."""
-    data, sigma = result.study.lanes, result.whitened_sigma[lane]
-
-    def noise(precision, sigma):
-        seen = precision > 0
-        level = np.where(seen, sigma / np.where(seen, precision, 1), 0)
-        return level * rng.normal(size=(count, *precision.shape))
-
-    markers = None if data.joint_precision is None else noise(data.joint_precision[lane], sigma[1])
-    return noise(data.precision[lane], sigma[0]), markers
+    """Normal noise of every observed entry by its field, N and mm; (count, *shape of a lane)."""
+    sigma, out = result.whitened_sigma[lane], {}
+    # Markers first, as ever: the same seed draws the same data.
+    for kind, which in sorted(_kinds(result), key=lambda pair: -pair[1]):
+        precision = kind.precision[lane]
+        known = precision > 0
+        level = np.where(known, sigma[which] / np.where(known, precision, 1), 0)
+        out[kind.name] = level * rng.normal(size=(count, *precision.shape))
+    return out
 
 
 def _blocks(rng, result: FitResult, seen: Prediction, lane, count, block):
     """Residuals of each curve drawn in blocks, in units of their own sigma; as `_normal`."""
-    data = result.study.lanes
+    data, kinds = result.study.lanes, _kinds(result)
     total = float(result.samples[lane])
     unknowns = float(data.active[lane].sum())
     enlarge = np.sqrt(total / max(total - unknowns, 1))
-    noise = np.zeros((count, *data.force[lane].shape))
-    markers = None if data.joints is None else np.zeros((count, *data.joints[lane].shape))
+    noise = {kind.name: np.zeros((count, *kind.data[lane].shape)) for kind, _ in kinds}
     for t, curve in enumerate(result.study.curves[lane]):
         n = len(curve.force)
         starts = rng.integers(n, size=(count, -(-n // block)))
         at = ((starts[:, :, None] + np.arange(block)) % n).reshape(count, -1)[:, :n]
-        r, precision = seen.force[lane, t, :n], data.precision[lane, t, :n]
-        noise[:, t, :n] = enlarge * _resample(r, precision, at)
-        if markers is not None and seen.joints is not None and data.joint_precision is not None:
-            r, precision = seen.joints[lane, t, :n], data.joint_precision[lane, t, :n]
-            markers[:, t, :n] = enlarge * _resample(r, precision, at)
-    return noise, markers
+        for kind, _ in kinds:
+            r, precision = getattr(seen, kind.name)[lane, t, :n], kind.precision[lane, t, :n]
+            noise[kind.name][:, t, :n] = enlarge * _resample(r, precision, at)
+    return noise
 
 
 def _resample(residual, precision, at) -> np.ndarray:

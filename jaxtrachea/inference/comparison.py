@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.fitting.criteria import Criteria
+from jaxtrachea.fitting.lane import forces, markers
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
@@ -100,8 +101,18 @@ def _curves(study: Study) -> set[tuple]:
     def said(v):
         return None if v is None else v.tobytes()
 
+    def vectors(c):
+        return c.side_force, c.joint_side_displacement, c.end_U, c.end_V
+
     return {
-        (c.specimen, c.trial, c.s_c, *map(said, (c.displacement, c.force, c.joint_displacement)))
+        (
+            c.specimen,
+            c.trial,
+            c.s_c,
+            c.phi_c,
+            tuple(c.direction),
+            *map(said, (c.displacement, c.force, c.joint_displacement, *vectors(c))),
+        )
         for lane in study.curves
         for c in lane
     }
@@ -112,8 +123,7 @@ def _same_noise(a: Study, b: Study) -> bool:
 
     def known(study):
         lanes = study.lanes
-        seen = [lanes.precision, lanes.joint_precision]
-        weighted = (np.ravel(v) for v in seen if v is not None)
+        weighted = (np.ravel(kind.precision) for kind in forces(lanes) + markers(lanes))
         curves = sum(map(len, study.curves))
         balance = np.ravel(lanes.balance * np.any(lanes.precision > 0, axis=2))
         parts = [*weighted, balance]

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lane import without_data
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
@@ -133,14 +134,7 @@ def leave_one_out(study: Study, settings: Settings, progress=None) -> LeftOut:
 
 def without(study: Study, held: Bool[np.ndarray, "lanes T"]) -> Study:
     """The same lanes, blind to the trials held back; what these alone read is no unknown."""
-
-    def blind(v):
-        return None if v is None else np.where(held[:, :, *[None] * (v.ndim - 2)], 0, v)
-
-    lanes = study.lanes
-    seen = lanes._replace(
-        precision=blind(lanes.precision), joint_precision=blind(lanes.joint_precision)
-    )
+    seen = without_data(study.lanes, held)
     own = own_unknowns(study, held)
     if own.any():
         seen = seen._replace(active=np.where(own, 0, seen.active))

@@ -111,9 +111,10 @@ def check(study: Study) -> None:
     """Refuse a study whose unknowns a new curve would not share.
 
     Raises:
-        ValueError: naming the parameters; or a joint study.
+        ValueError: naming the parameters; or a joint study, or one of deforming cross-sections.
     """
     study.refuse_joint("a design")
+    study.refuse_sections("a design")
     own = [p.name for p in study.free if p.scope == "trial"]
     if len(own) == len(study.free):
         raise ValueError(

@@ -61,9 +61,11 @@ def share_independent(correlation: Float[np.ndarray, "*l"]) -> Float[np.ndarray,
 def effective_samples(seen: Prediction) -> Float[np.ndarray, " lanes"]:
     """Independent samples that the forces, and the markers of each ring, are worth; (lanes,)."""
     kinds = [seen.force]
-    if seen.joints is not None:
-        kinds.append(np.moveaxis(seen.joints, -1, 2).reshape(len(seen.joints), -1,
-                                                             seen.joints.shape[2]))  # fmt: skip
+    for more in (seen.side_force, seen.joints, seen.joint_side, seen.ends):
+        if more is not None:
+            lanes, trials, samples = more.shape[:3]
+            rows = np.moveaxis(more.reshape(lanes, trials, samples, -1), -1, 2)
+            kinds.append(rows.reshape(lanes, -1, samples))
     total = np.zeros(len(seen.force))
     for residual in kinds:
         count = np.sum(np.isfinite(residual), axis=(1, 2))

@@ -227,7 +227,11 @@ def influence(result: FitResult, batch: int = 128) -> Influence:
     Args:
         result: the fit.
         batch: lanes computed together.
+
+    Raises:
+        ValueError: a skeleton of deforming cross-sections.
     """
+    result.study.refuse_sections("influence")
     free = np.asarray(result.study.lanes.active) * ~result.at_bound
     diagnostics = map_lanes(
         diagnose, result.study, result.theta, result.whitened_sigma, result.relative, free,

@@ -216,11 +216,12 @@ def posterior(
         progress: called with (lanes done since the last call, lanes in all).
 
     Raises:
-        ValueError: too few draws or chains.
+        ValueError: too few draws or chains, or a skeleton of deforming cross-sections.
         MissingSampler: blackjax is not installed.
     """
     if draws < 100 or chains < 2:
         raise ValueError(f"{draws} draws of {chains} chains; expected 100 of 2, or more")
+    result.study.refuse_sections("the posterior")
     sampler()
     study, base = result.study, mode(result)
     markers = study.lanes.joints is not None

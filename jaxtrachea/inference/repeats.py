@@ -84,9 +84,11 @@ def _groups(curves: tuple[Curve, ...], *, shared: bool) -> list[tuple[str, list[
         specimens.setdefault(curve.specimen, []).append(t)
     out = []
     for trials in specimens.values():
-        places: dict[float | None, list[int]] = {}
+        places: dict[tuple[object, ...], list[int]] = {}
         for t in trials:
-            places.setdefault(curves[t].s_c, []).append(t)
+            curve = curves[t]
+            place = curve.s_c, curve.phi_c, tuple(curve.direction)
+            places.setdefault(place, []).append(t)
         if len(places) > 1:
             out.append(("positions", list(places.values())))
         elif len(trials) > 1:

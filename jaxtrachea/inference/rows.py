@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxtrachea.fitting.lane import forces, markers
 from jaxtrachea.fitting.result import FitResult
 
 #: Lanes that are listed and drawn one by one; of more, the worst.
@@ -33,8 +34,8 @@ def trials_of(result: FitResult, lane: int, specimen: str) -> list[int]:
 def samples_of(result: FitResult, lane: int, trials: list[int]) -> int:
     """Observed forces and markers of some trials of a lane."""
     lanes = result.study.lanes
-    kinds = (v for v in (lanes.precision, lanes.joint_precision) if v is not None)
-    return sum(int(np.sum(v[lane, trials] > 0)) for v in kinds)
+    kinds = forces(lanes) + markers(lanes)
+    return sum(int(np.sum(kind.precision[lane, trials] > 0)) for kind in kinds)
 
 
 def over_peak(result: FitResult) -> np.ndarray:

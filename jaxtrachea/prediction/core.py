@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import material_and_values
+from jaxtrachea.fitting.section_residual import Tool, answer
 from jaxtrachea.mechanics.press import press
 
 #: Slope along a direction of the null space, over what its terms add up to, from which it counts.
@@ -23,13 +24,31 @@ class Response(NamedTuple):
 
     Attributes:
         force: at the load cell, with its offset, N; (N,).
-        joints: deflection of the ligament at each ring, mm; (N, rings).
-        reactions: force of each ring against the load, N; (N, rings).
+        joints: deflection of the ligament at each ring, mm; of deforming cross-sections that of the
+            outer surface at the contact's angle, along the inward normal; (N, rings).
+        reactions: force of each ring against the load, N; (N, rings). None of deforming
+            cross-sections, whose rings stand on a bed.
+        side_force: of deforming cross-sections, N, see `Curve`; (N,).
+        joint_side: of those, along the circumference, mm; (N, rings).
     """
 
     force: Float[Array, "*n"]
     joints: Float[Array, "*n rings"]
-    reactions: Float[Array, "*n rings"]
+    reactions: Float[Array, "*n rings"] | None
+    side_force: Float[Array, "*n"] | None = None
+    joint_side: Float[Array, "*n rings"] | None = None
+
+
+class Aside(NamedTuple):
+    """Where a press is beside the position along the tube; deforming cross-sections only.
+
+    Attributes:
+        phi_c: angle from the anterior midline, rad.
+        direction: of the tool, along the inward normal and the circumference; (2,).
+    """
+
+    phi_c: Float[Array, ""]
+    direction: Float[Array, "2"]
 
 
 class Predicted(NamedTuple):
@@ -76,6 +95,7 @@ def respond(
     s_c: Float[Array, ""],
     displacement: Float[Array, " N"],
     blend: Float[Array, ""] | None = None,
+    aside: Aside | None = None,
 ) -> tuple[Response, Int[Array, " N"]]:
     """The fitted model at one position: response and `PressStatus`; pure.
 
@@ -87,7 +107,10 @@ def respond(
         displacement: mm.
         blend: rounded corner of a curve whose onset was fitted, mm, see `Lane`; None: that of the
             options.
+        aside: off the midline, or not along the normal; None: neither.
     """
+    if model.options.skeleton == "sections":
+        return _respond_sections(model, free, value, s_c, displacement, aside)
     material, values = material_and_values(model, free, value)
     geometry = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), model.geometry)
     solved = press(
@@ -98,18 +121,27 @@ def respond(
     return Response(force, solved.joints, solved.reactions), solved.status
 
 
-def jacobian(model: FitModel, free, value, s_c, displacement, blend=None):
+def _respond_sections(model: FitModel, free, value, s_c, displacement, aside: Aside | None):
+    """As `respond`, on deforming cross-sections."""
+    tube = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), model.geometry)
+    tool = Tool(s_c, displacement, *(aside or ()))
+    found, status = answer(model, free, value, tool, tube)
+    given = {name: getattr(found, name) for name in ("force", "joints", "side_force", "joint_side")}
+    return Response(reactions=None, **given), status
+
+
+def jacobian(model: FitModel, free, value, s_c, displacement, blend=None, aside=None):
     """`respond`, its statuses, and its derivative by every free column, a leading axis (F, ...)."""
 
     def push(tangent):
         def at(free):
-            return respond(model, free, value, s_c, displacement, blend)
+            return respond(model, free, value, s_c, displacement, blend, aside)
 
         out, moved, status = jax.jvp(at, (free,), (tangent,), has_aux=True)
         return out, status, moved
 
     if not len(free):
-        out, status = respond(model, free, value, s_c, displacement, blend)
+        out, status = respond(model, free, value, s_c, displacement, blend, aside)
         return out, status, jax.tree.map(lambda v: jnp.zeros((0, *v.shape), v.dtype), out)
     eye = jnp.eye(free.shape[0], dtype=free.dtype)
     return jax.vmap(push, out_axes=(None, None, 0))(eye)
@@ -153,6 +185,7 @@ def predicted(
     displacement: Float[Array, " N"],
     blend: Float[Array, ""] | None = None,
     slack: Float[Array, "N F"] | None = None,
+    aside: Aside | None = None,
 ) -> Predicted:
     """One curve with its standard errors; pure, for `jit` and `vmap`, float32 and float64.
 
@@ -164,9 +197,10 @@ def predicted(
         blend: see `respond`.
         slack: where the fit has pressed, how far it sees slopes: its least ratio of singular values
             times the root of its samples, times the size of each unknown; elsewhere 0; None: 0.
+        aside: see `respond`.
     """
     free, value, covariance, null_space, half_width = estimate
-    out, status, slopes = jacobian(model, free, value, s_c, displacement, blend)
+    out, status, slopes = jacobian(model, free, value, s_c, displacement, blend, aside)
     se = jax.tree.map(lambda slope: standard_errors(slope, covariance, null_space), slopes)
     if slack is not None:
         unseen = _unseen(slopes.force, slack)
@@ -179,13 +213,17 @@ def predicted(
     straight = jnp.einsum("f...,f->...", slopes.force, step)
 
     def bend(sign):
-        end, _ = respond(model, free + sign * step, value, s_c, displacement, blend)
+        end, _ = respond(model, free + sign * step, value, s_c, displacement, blend, aside)
         return end.force - out.force - sign * straight
 
-    return Predicted(out, se, status, jnp.stack([bend(1.0), bend(-1.0)]), deepest)
+    if model.options.skeleton == "sections":  # one program for both: it is long to compile
+        bends = jax.vmap(bend)(jnp.asarray([1.0, -1.0], free.dtype))
+    else:
+        bends = jnp.stack([bend(1.0), bend(-1.0)])
+    return Predicted(out, se, status, bends, deepest)
 
 
-def force_and_slope(model: FitModel, free, value, s_c, displacement, blend=None):
+def force_and_slope(model: FitModel, free, value, s_c, displacement, blend=None, aside=None):
     """Force of one curve and its derivative by the free columns; (N,) and (F, N)."""
-    out, _, slopes = jacobian(model, free, value, s_c, displacement, blend)
+    out, _, slopes = jacobian(model, free, value, s_c, displacement, blend, aside)
     return out.force, slopes.force

@@ -16,7 +16,7 @@ from jaxtrachea.fitting.study import Study, build_study, check_curve
 from jaxtrachea.fitting.unread import LEFT_OUT
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.optimisation.programs import program
-from jaxtrachea.prediction.core import force_and_slope
+from jaxtrachea.prediction.core import Aside, force_and_slope
 from jaxtrachea.prediction.predict import CurvePrediction, predict_sources
 from jaxtrachea.prediction.sources import Source, source_of
 from jaxtrachea.results.stored import StoredFit
@@ -42,6 +42,14 @@ class Compared:
     def residual(self) -> np.ndarray:
         """Predicted minus measured force, N; (N,)."""
         return self.prediction.force - self.curve.force
+
+    @property
+    def side_residual(self) -> np.ndarray:
+        """Predicted minus measured side force, N; NaN where there is none of both; (N,)."""
+        predicted, measured = self.prediction.side_force, self.curve.side_force
+        if predicted is None or measured is None:
+            return np.full(len(self.curve.force), np.nan)
+        return predicted - measured
 
     @property
     def covered(self) -> np.ndarray:
@@ -109,7 +117,11 @@ def compare(
     ]
     sources = with_own(stored, sources, curves, sigmas)
     s = [np.nan if c.s_c is None else c.s_c for c in curves]
-    found = predict_sources(stored, sources, s, [c.displacement for c in curves], sigmas)
+    aside = None
+    if stored.study.model.options.skeleton == "sections":
+        aside = [(c.phi_c, (c.direction[0], c.direction[1])) for c in curves]
+    depths = [c.displacement for c in curves]
+    found = predict_sources(stored, sources, s, depths, sigmas, aside=aside)
     return [Compared(*row) for row in zip(curves, found, words, strict=True)]
 
 
@@ -119,6 +131,7 @@ def _in_fit(used: Curve | None, curve: Curve) -> str:
     same = np.array_equal(used.force, curve.force)
     same = same and np.array_equal(used.displacement, curve.displacement)
     same = same and (used.s_c == curve.s_c)
+    same = same and used.phi_c == curve.phi_c and tuple(used.direction) == tuple(curve.direction)
     return "yes" if same else "changed"
 
 
@@ -246,7 +259,10 @@ def _slopes(stored: StoredFit, own, sources, theta, own_study: Study) -> list[np
     value = np.stack([source.value for source in sources])
     columns = [free, value, lanes.s_c[:, 0], lanes.displacement[:, 0]]
     columns += [] if lanes.blend is None else [lanes.blend[:, 0]]
-    _, slopes = run(*map(jnp.asarray, columns))
+    more = {}
+    if lanes.phi_c is not None and lanes.direction is not None:
+        more = {"aside": Aside(jnp.asarray(lanes.phi_c[:, 0]), jnp.asarray(lanes.direction[:, 0]))}
+    _, slopes = run(*map(jnp.asarray, columns), **more)
     return [np.asarray(slopes[k])[:, lanes.precision[k, 0] > 0] for k in range(len(sources))]
 
 

@@ -17,7 +17,7 @@ from jaxtyping import ArrayLike
 
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.optimisation.programs import program
-from jaxtrachea.prediction.core import Estimate, Predicted, Response, predicted
+from jaxtrachea.prediction.core import Aside, Estimate, Predicted, Response, predicted
 from jaxtrachea.prediction.sources import Source, slack_of, source_of
 from jaxtrachea.results.stored import StoredFit, from_result
 from jaxtrachea.status import PredictionStatus, PressStatus
@@ -50,6 +50,13 @@ class CurvePrediction:
         status: the worst there is to say.
         message: in words.
         press_status: `PressStatus`; (N,).
+        phi: contact angle, rad.
+        direction: of the tool along the inward normal and the circumference.
+        side_force: across the tool's direction, N, see `Curve`; (N,); None where the model has
+            none. Like the next three, of a skeleton of deforming cross-sections.
+        side_se: its standard error from the parameters.
+        joint_side: of each ring along the circumference, mm; (N, rings).
+        joint_side_se: from the parameters.
     """
 
     specimen: str
@@ -68,6 +75,18 @@ class CurvePrediction:
     status: PredictionStatus
     message: str
     press_status: np.ndarray
+    phi: float = 0.0
+    direction: tuple[float, float] = (1.0, 0.0)
+    side_force: np.ndarray | None = None
+    side_se: np.ndarray | None = None
+    joint_side: np.ndarray | None = None
+    joint_side_se: np.ndarray | None = None
+
+    @property
+    def side_half(self) -> np.ndarray:
+        """Half of the band of a new sample of the side force, N; (N,)."""
+        se = np.full_like(self.force, np.nan) if self.side_se is None else self.side_se
+        return self.half_width * np.hypot(se, self.sigma)
 
     @property
     def has_skeleton(self) -> bool:
@@ -102,6 +121,7 @@ def predict_sources(
     displacements: list[np.ndarray],
     sigmas: Sequence[np.ndarray | None] | None = None,
     batch: int = 64,
+    aside: Sequence[tuple[float, tuple[float, float]]] | None = None,
 ) -> list[CurvePrediction]:
     """Predictions for many curves in one program.
 
@@ -112,7 +132,10 @@ def predict_sources(
         displacements: of each, mm.
         sigmas: noise of each sample, N, where it is not that of the fit.
         batch: curves computed together.
+        aside: contact angle, rad, and direction of the tool of each; None: on the midline, along
+            the normal.
     """
+    turned = [(0.0, (1.0, 0.0))] * len(s) if aside is None else list(aside)
     run = program(predicted, stored.study.model)
     most = _rounded(max(map(len, displacements)), 32)
     padded = np.stack([np.pad(d, (0, most - len(d)), mode="edge") for d in displacements])
@@ -123,7 +146,15 @@ def predict_sources(
 
     columns = [Estimate._make(map(stack, Estimate._fields)), places, padded]
     presses = zip(sources, s, padded, strict=True)
-    slack = np.stack([slack_of(stored, source, float(at), D) for source, at, D in presses])
+    slack = np.stack(
+        [
+            slack_of(stored, source, (float(at), *how), D)
+            for (source, at, D), how in zip(presses, turned, strict=True)
+        ]
+    )
+    off = None
+    if any(how != (0.0, (1.0, 0.0)) for how in turned):
+        off = Aside(*(np.array(v, np.float64) for v in zip(*turned, strict=True)))
     blend = stack("blend")
     out: dict[int, CurvePrediction] = {}
     for members in (np.flatnonzero(np.isnan(blend)), np.flatnonzero(~np.isnan(blend))):
@@ -133,12 +164,14 @@ def predict_sources(
         for first in range(0, len(members), size):
             at = members[first : first + size]
             rows = np.pad(at, (0, size - len(at)), mode="edge")
-            of_rows = jax.tree.map(lambda v, rows=rows: jnp.asarray(v[rows]), [*arrays, slack])
-            part = jax.tree.map(np.asarray, run(*of_rows[:-1], slack=of_rows[-1]))
+            more = {"slack": slack} | ({} if off is None else {"aside": off})
+            of_rows, more = jax.tree.map(lambda v, rows=rows: jnp.asarray(v[rows]), (arrays, more))
+            part = jax.tree.map(np.asarray, run(*of_rows, **more))
             for row, k in enumerate(at):
                 own = jax.tree.map(lambda v, row=row: v[row], part)
                 sigma = None if sigmas is None else sigmas[k]
-                out[k] = _on_host(stored, sources[k], s[k], displacements[k], own, sigma)
+                where = (s[k], *turned[k])
+                out[k] = _on_host(stored, sources[k], where, displacements[k], own, sigma)
     return [out[k] for k in range(len(sources))]
 
 
@@ -147,9 +180,10 @@ def _rounded(count: int, least: int) -> int:
     return max(least, 1 << (count - 1).bit_length())
 
 
-def _on_host(stored: StoredFit, source: Source, s, displacement, part: Predicted, sigma):
-    """One curve, cut to its length, with its status."""
+def _on_host(stored: StoredFit, source: Source, where, displacement, part: Predicted, sigma):
+    """One curve at `where` (s, angle, direction), cut to its length, with its status."""
     n = len(displacement)
+    s, phi, direction = where
 
     def cut(v):
         return np.asarray(v[:n], np.float64)
@@ -160,15 +194,19 @@ def _on_host(stored: StoredFit, source: Source, s, displacement, part: Predicted
     def hide(v):
         return v if usable else np.full_like(v, np.nan)
 
-    skeleton = any(p.name == "k_M" for p in stored.study.parameters)
+    sections = stored.study.model.options.skeleton == "sections"
+    skeleton = sections or any(p.name == "k_M" for p in stored.study.parameters)
 
     def show(v):
         return hide(v) if skeleton else np.full_like(v, np.nan)
 
+    def maybe(v):
+        return None if v is None else hide(v)
+
     presses = np.asarray(part.status[:n])
     bend = _bend(source, cut(part.bend.T).T, value, se, int(part.deepest))
     status, message = _verdict(source, value, se, presses, bend)
-    if usable and (beyond := _beyond(stored.spans[source.lane], float(s), displacement)):
+    if usable and (beyond := _beyond(stored, source.lane, where, displacement)):
         message = f"{message}; {beyond}"
     return CurvePrediction(
         specimen=source.specimen,
@@ -181,13 +219,24 @@ def _on_host(stored: StoredFit, source: Source, s, displacement, part: Predicted
         sigma=np.full(n, source.sigma[0]) if sigma is None else sigma,
         joints=show(value.joints),
         joints_se=show(se.joints),
-        reactions=show(value.reactions),
-        reactions_se=show(se.reactions),
+        reactions=show(_nothing(value) if value.reactions is None else value.reactions),
+        reactions_se=show(_nothing(value) if se.reactions is None else se.reactions),
         joint_sigma=float(source.sigma[1]),
         status=status,
         message=message,
         press_status=presses,
+        phi=float(phi),
+        direction=direction,
+        side_force=maybe(value.side_force),
+        side_se=maybe(se.side_force),
+        joint_side=maybe(value.joint_side),
+        joint_side_se=maybe(se.joint_side),
     )
+
+
+def _nothing(value: Response) -> np.ndarray:
+    """Reactions of a model that has none."""
+    return np.full_like(value.joints, np.nan)
 
 
 def _bend(source: Source, off: np.ndarray, value: Response, se: Response, deepest: int) -> float:
@@ -206,15 +255,18 @@ def _bend(source: Source, off: np.ndarray, value: Response, se: Response, deepes
     return float(worst) if np.isfinite(worst) else np.inf
 
 
-def _beyond(spans: np.ndarray, s: float, displacement: np.ndarray) -> str:
+def _beyond(stored: StoredFit, lane: int, where, displacement: np.ndarray) -> str:
     """What of a curve lies outside the data of its lane, in words; "" if nothing does."""
-    low, high, first, last = spans
-    words = []
+    low, high, first, last = stored.spans[lane]
+    s, phi, words = float(where[0]), where[1], []
     if displacement.max() > high + 1e-9 or displacement.min() < min(low, 0.0) - 1e-9:
         words.append(f"D = {low:.3g} to {high:.3g} mm")
     known = first <= last  # else no curve of the lane says where it was pressed
     if known and (s < first - 1e-9 or s > last + 1e-9):
         words.append(f"s = {first:.4g} to {last:.4g} mm")
+    left, right = stored.angles[lane]
+    if phi < left - 1e-9 or phi > right + 1e-9:
+        words.append(f"phi = {np.degrees(left):.3g} to {np.degrees(right):.3g} deg")
     return f"extrapolated from data at {' and '.join(words)}" if words else ""
 
 
@@ -245,6 +297,8 @@ def predict(
     displacement: ArrayLike | Sequence[float],
     specimen: str | None = None,
     trial: str | None = None,
+    phi: float = 0.0,
+    direction: tuple[float, float] = (1.0, 0.0),
 ) -> CurvePrediction:
     """A curve that was not measured, from a finished fit.
 
@@ -263,6 +317,9 @@ def predict(
         trial: of the fit, whose own parameters (onset, say) count, with the rounded corner of its
             onset; None: onset and force offset of single trials are 0, the corner is sharp
             (`onset_width` of the model).
+        phi: contact angle from the anterior midline, rad; with direction: of a skeleton of
+            deforming cross-sections.
+        direction: of the tool's displacement along the inward normal and the circumference.
 
     Raises:
         ValueError: a position outside the tube, a displacement that is no finite number, a specimen
@@ -273,6 +330,7 @@ def predict(
     if D.ndim != 1 or not D.size or not np.isfinite(D).all():
         raise ValueError("displacement: expected a finite number or a vector of them, mm")
     check_position(results, s)
+    _check_aside(results, phi, direction)
     if specimen is None:
         specimen = _only_specimen(results)
     elif specimen not in results.specimens:
@@ -280,7 +338,29 @@ def predict(
     source = source_of(results, specimen, trial)
     if not source.status.predicts:
         raise ValueError(f"{specimen}: {source.message or source.status.message}")
-    return predict_sources(results, [source], [float(s)], [D])[0]
+    along = float(direction[0]), float(direction[1])
+    return predict_sources(results, [source], [float(s)], [D], aside=[(float(phi), along)])[0]
+
+
+def _check_aside(results: StoredFit, phi: float, direction: tuple[float, float]) -> None:
+    """Refuse a press that the model does not have.
+
+    Raises:
+        ValueError: with what is expected.
+    """
+    model = results.study.model
+    if model.options.skeleton != "sections":
+        if phi != 0 or tuple(direction) != (1.0, 0.0):
+            raise ValueError(
+                "this fit presses on the midline along the normal; phi and direction need a fit "
+                "with skeleton = 'sections'"
+            )
+        return
+    alpha = float(model.geometry.half_angle)
+    if not abs(phi) <= alpha:
+        raise ValueError(f"phi = {phi:g} rad is not on the cartilage; expected within {alpha:.4g}")
+    if not abs(np.hypot(*direction) - 1) < 1e-6:
+        raise ValueError(f"direction is {direction}; expected a unit vector")
 
 
 def check_position(results: StoredFit, s: float) -> None:

@@ -198,16 +198,26 @@ def _none(stored: StoredFit, specimen, trial, status: PredictionStatus, message:
     )
 
 
-def slack_of(stored: StoredFit, source: Source, s: float, displacement: np.ndarray) -> np.ndarray:
-    """How far the fit sees slopes where it has pressed, see `prediction_core.predicted`; (N, F)."""
+def slack_of(
+    stored: StoredFit,
+    source: Source,
+    where: tuple[float, float, tuple[float, float]],
+    displacement: np.ndarray,
+) -> np.ndarray:
+    """How far the fit sees slopes where it has pressed, see `prediction_core.predicted`; (N, F).
+
+    `where`: position, mm, angle, rad, and direction.
+    """
     free = stored.study.free
     out = np.zeros((len(displacement), len(free)))
     curves = [c for c, k in zip(stored.curves, stored.curve_lane, strict=True) if k == source.lane]
 
     def place(c):
-        return np.nan if c.s_c is None else c.s_c
+        return [np.nan if c.s_c is None else c.s_c, c.phi_c, *c.direction]
 
-    here = [c for c in curves if np.isclose(place(c), s, rtol=0, atol=1e-9, equal_nan=True)]
+    s, phi, direction = where
+    at = [s, phi, *direction]
+    here = [c for c in curves if np.allclose(place(c), at, rtol=0, atol=1e-9, equal_nan=True)]
     if not here or not source.null_space.any():
         return out
     # Of a scaled coordinate; an onset's steps are as large as the presses.

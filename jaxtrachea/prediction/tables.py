@@ -33,15 +33,36 @@ def _place(p: CurvePrediction, phi: float, i: int) -> Row:
 
 
 def prediction_rows(
-    p: CurvePrediction, measured: np.ndarray | None = None, phi: float = 0.0
+    p: CurvePrediction,
+    measured: np.ndarray | None = None,
+    phi: float = 0.0,
+    side: np.ndarray | None = None,
 ) -> Iterator[Row]:
-    """One row per displacement; the band is that of a new sample."""
+    """One row per displacement; the band is that of a new sample.
+
+    Args:
+        p: the prediction.
+        measured: force, N; (N,).
+        phi: contact angle, rad.
+        side: measured side force, N; (N,).
+    """
     low, high = p.low95, p.high95
     for i in range(len(p.displacement)):
         force = np.nan if measured is None else float(measured[i])
         numbers = (force, float(p.force[i]), float(low[i]), float(high[i]))
         cells = dict(zip(COLUMNS[5:], map(_cell, numbers), strict=True))
-        yield _place(p, phi, i) | cells
+        yield _place(p, phi, i) | cells | _side_cells(p, i, side)
+
+
+def _side_cells(p: CurvePrediction, i: int, measured: np.ndarray | None) -> Row:
+    """Side force of a sample, where the model has one."""
+    if p.side_force is None:
+        return {}
+    force, half = float(p.side_force[i]), float(p.side_half[i])
+    seen = np.nan if measured is None else float(measured[i])
+    names = ("side force [N]", "predicted side [N]", "side low95 [N]", "side high95 [N]")
+    values = (seen, force, force - half, force + half)
+    return dict(zip(names, map(_cell, values), strict=True))
 
 
 def band_rows(p: CurvePrediction, phi: float = 0.0) -> Iterator[Row]:

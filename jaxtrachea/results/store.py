@@ -74,6 +74,7 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
     group["samples"] = np.array([len(c.force) for c in curves], np.int64)
     group["s_c"] = np.array([np.nan if c.s_c is None else c.s_c for c in curves])
     group["phi_c"] = np.array([c.phi_c for c in curves])
+    group["direction"] = np.array([c.direction for c in curves], np.float64)
     blend = study.lanes.blend
     group["blend"] = np.array([np.nan if blend is None else blend[k, t] for k, t, _ in placed])
     seen = predictions(study, result.theta)
@@ -89,8 +90,19 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
         found = [seen.joints[k, t, : len(c.force)] for k, t, c in placed]
         columns["joint_residual"] = found
         columns["joints"] = [_on_rings(c, study.model.geometry.rings) for c in curves]
+    if seen.side_force is not None:
+        found = [seen.side_force[k, t, : len(c.force)] for k, t, c in placed]
+        given = [_side(c) for c in curves]
+        columns["side_force"], columns["side_residual"] = given, found
+        columns["side_predicted"] = [F + r for F, r in zip(given, found, strict=True)]
     for name, parts in columns.items():
         group.create_dataset(name, data=np.concatenate(parts), compression="gzip")
+
+
+def _side(curve: Curve) -> np.ndarray:
+    """Side force, NaN where not observed; (N,)."""
+    unknown = np.full(len(curve.force), np.nan)
+    return unknown if curve.side_force is None else curve.side_force
 
 
 def _on_rings(curve: Curve, rings: int) -> np.ndarray:

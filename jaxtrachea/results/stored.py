@@ -98,6 +98,14 @@ class StoredFit:
             out[lane] = np.fmin(out[lane] * [1, -1, 1, -1], ends) * [1, -1, 1, -1]
         return out
 
+    @functools.cached_property
+    def angles(self) -> np.ndarray:
+        """Range of contact angle of the data of each lane, rad; (L, 2)."""
+        out = np.tile([np.inf, -np.inf], (len(self.status), 1))
+        for curve, lane in zip(self.curves, self.curve_lane, strict=True):
+            out[lane] = min(out[lane][0], curve.phi_c), max(out[lane][1], curve.phi_c)
+        return out
+
     @property
     def tool_radius(self) -> float | None:
         """Distance from the contact within which markers are held by the tool, mm."""
@@ -277,6 +285,8 @@ def _read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str
     samples = numeric(group, "samples").astype(int)
     ends = np.cumsum(samples)
     column = {c: numeric(group, c) for c in ("displacement", "force", "sigma", "s_c", "phi_c")}
+    known = "direction" in group
+    direction = numeric(group, "direction") if known else np.tile([1.0, 0.0], (len(samples), 1))
     curves = []
     texts = zip(names["specimen"], names["trial"], names["source"], strict=True)
     for i, (specimen, trial, source) in enumerate(texts):
@@ -292,6 +302,7 @@ def _read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str
                 force=column["force"][part],
                 sigma=None if np.isnan(sigma).all() else sigma,
                 source=source,
+                direction=(float(direction[i][0]), float(direction[i][1])),
             )
         )
     return tuple(curves), numeric(group, "lane").astype(int), names["files"]
