@@ -7,6 +7,7 @@ is `None` in a lane is not in the row.
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 
@@ -136,7 +137,7 @@ def weighted(v: Float[Array, "*n"], precision: Float[Array, "*n"]) -> Float[Arra
 
 
 def without_data(lane: Lane, hidden: Any) -> Lane:
-    """The lane, or lanes, with the trials `hidden` (of the shape of `s_c`) unobserved."""
+    """The lane, or lanes, with the trials `hidden` (of the shape of `s_c`) unobserved; numpy."""
     blind = {}
     for kind, name in zip(
         forces(lane) + markers(lane),
@@ -144,5 +145,5 @@ def without_data(lane: Lane, hidden: Any) -> Lane:
         strict=True,
     ):
         over = hidden.reshape(*hidden.shape, *[1] * (kind.precision.ndim - hidden.ndim))
-        blind[name] = kind.precision * ~over
+        blind[name] = np.where(over, 0, kind.precision)
     return lane._replace(**blind)

@@ -57,10 +57,13 @@ def _panels(result: FitResult) -> list[int]:
 
 
 def draw_fit(result: FitResult, prediction: Prediction):
-    """Data (dots) and fitted force (line) against displacement; markers in a second row of axes."""
+    """Data (dots) and fitted force (line) by displacement; side force and markers beside."""
     shown = _panels(result)
-    with_joints = prediction.joints is not None and result.lanes <= 3
-    figure, axes = grid(len(shown) * (2 if with_joints else 1), 3.2 if with_joints else 2.7)
+    few = result.lanes <= 3
+    with_joints = prediction.joints is not None and few
+    side = prediction.side_force if few else None
+    more = with_joints + (side is not None)
+    figure, axes = grid(len(shown) * (1 + more), 3.2 if more else 2.7)
     axes = iter(axes)
     for lane in shown:
         axis = next(axes)
@@ -77,6 +80,8 @@ def draw_fit(result: FitResult, prediction: Prediction):
         axis.set(title=name, xlabel="displacement [mm]", ylabel="force [N]")
         if 1 < len(curves) <= 12:
             axis.legend(ncols=2, title="dots: measured, lines: model", title_fontsize=7)
+        if side is not None:
+            _draw_side(next(axes), result, side[lane], lane, colours)
         if with_joints:
             _draw_joints(next(axes), result, prediction, lane, colours)
     if len(shown) < result.lanes:
@@ -86,6 +91,17 @@ def draw_fit(result: FitResult, prediction: Prediction):
             "best; all: summary.csv"
         )
     return figure
+
+
+def _draw_side(axis, result, residual, lane, colours) -> None:
+    """Force across the tool's direction against displacement; `residual`: (trials, samples)."""
+    for t, (curve, colour) in enumerate(zip(result.study.curves[lane], colours, strict=True)):
+        if curve.side_force is None:
+            continue
+        n = len(curve.force)
+        axis.plot(curve.displacement, curve.side_force, ".", color=colour, ms=4)
+        axis.plot(curve.displacement, curve.side_force + residual[t, :n], "-", color=colour, lw=1.2)
+    axis.set(title="side force", xlabel="displacement [mm]", ylabel="side force [N]")
 
 
 def _draw_joints(axis, result, prediction, lane, colours) -> None:

@@ -1,0 +1,375 @@
+"""Fits of deforming cross-sections: residual, Jacobian, lanes, recovery of known parameters."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrachea.cli.specification import options_of, parameters_of
+from jaxtrachea.config import SpecError, load_fit_spec
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lane import observations, size, without_data
+from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.parameters import DEFAULTS, defaults_of
+from jaxtrachea.fitting.residual import inputs, residual, residual_value
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import build_study, check_curve
+from jaxtrachea.inference.design import check
+from jaxtrachea.inference.influence import influence
+from jaxtrachea.inference.posterior import posterior
+from jaxtrachea.inference.repeats import repeats
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.oblique import press_oblique
+from jaxtrachea.mechanics.press import Options, press
+from jaxtrachea.mechanics.sections.material import SectionMaterial, Wall, from_wall
+from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.status import FitStatus
+from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.material import Material
+
+RINGS = [10.0, 20.0, 30.0]
+GEOMETRY = Geometry.create(40.0, RINGS, radius=11.7)
+SECTIONS = Options(skeleton="sections", contact="bonded")
+#: Position, angle and direction of each press; 0.6 and 0.8 are oblique.
+PLACES = [(20.0, 0.0, (1.0, 0.0)), (14.0, 0.5, (1.0, 0.0)), (23.0, np.pi / 2, (0.8, -0.6))]
+PATH = np.array([0.5, 2.0, 5.0])
+QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
+FREE = {"fixed": False}
+#: Every kind of parameter: of rings, spans, ends, contact, bed, and of the press.
+NAMED = {
+    "Gt_L": FREE, "c_K": FREE | {"value": 5.0}, "k_end": FREE, "footprint": FREE, "c_t": FREE,
+    "onset": FREE | {"scope": "specimen"}, "force_offset": FREE | {"scope": "specimen"},
+}  # fmt: skip
+NOISE = Noise(force=0.05, joints=0.2)
+
+
+def curve(place, path=PATH, **changes):
+    """A press whose data are numbers of no meaning."""
+    s, phi, direction = place
+    n, rng = len(path), np.random.default_rng(3)
+    fields = {
+        "displacement": np.array(path), "force": rng.normal(size=n),
+        "side_force": rng.normal(size=n), "joint_rings": np.array([0, 2]),
+        "joint_displacement": rng.normal(size=(n, 2)),
+        "joint_side_displacement": rng.normal(size=(n, 2)), "end_rings": np.array([1]),
+        "end_U": rng.normal(size=(n, 1, 2)), "end_V": rng.normal(size=(n, 1, 2)),
+    }  # fmt: skip
+    trial = f"{s} {phi:.2f} {direction}"
+    return Curve("one", trial, s, phi, direction=direction, **(fields | changes))
+
+
+def study_of(curves, table=NAMED, **changes):
+    return build_study(curves, GEOMETRY, SECTIONS, table, noise=NOISE, **changes)
+
+
+@functools.cache
+def programs(model):
+    """Residual with Jacobian, and its value; compiled once for lanes of equal shapes."""
+    both = jax.jit(functools.partial(residual, model), compiler_options=QUICK)
+    value = jax.jit(functools.partial(residual_value, model), compiler_options=QUICK)
+    return both, value
+
+
+def lane_of(study, dtype=np.float64):
+    def cast(v):
+        return jnp.asarray(v[0] if v.dtype == np.int32 else v[0].astype(dtype))
+
+    return jax.tree.map(cast, study.lanes)
+
+
+def point_of(study):
+    """Near the guess; the onset and the offset are not zero."""
+    guess = [p.to_scaled(p.value) for p, _, _ in study.unknowns[0]]
+    names = [p.name for p, _, _ in study.unknowns[0]]
+    off = np.random.default_rng(1).uniform(-0.1, 0.1, len(guess))
+    off[[names.index("onset"), names.index("force_offset")]] = 0.05, 0.3
+    return jnp.asarray(np.array(guess) + off)
+
+
+def shown(study, theta, k):
+    """What `press_sections` shows of trial k, with frames written out here; by kind."""
+    c = study.curves[0][k]
+    values = {p.name: p.value for p in study.parameters}
+    values |= {
+        p.name: p.from_scaled(float(v))
+        for (p, _, _), v in zip(study.unknowns[0], theta, strict=True)
+    }
+    onset, offset = values.pop("onset"), values.pop("force_offset")
+    got = jax.jit(
+        lambda m, s, phi, D, along: press_sections(GEOMETRY, m, s, phi, D, along),
+        compiler_options=QUICK,
+    )(
+        SectionMaterial(**values), jnp.asarray(c.s_c), jnp.asarray(c.phi_c),
+        jnp.asarray(c.displacement - onset), jnp.asarray(c.direction),
+    )  # fmt: skip
+    normal = np.array([0, -np.cos(c.phi_c), -np.sin(c.phi_c)])
+    around = np.array([0, -np.sin(c.phi_c), np.cos(c.phi_c)])
+    a, b = c.direction
+    F, J = np.asarray(got.force), np.asarray(got.joints)
+    ends = np.stack([got.end_U, got.end_V], 2)[..., 1:]
+    return {
+        "force": F @ (a * normal + b * around) + offset,
+        "side": F @ (-b * normal + a * around),
+        "joints": J @ normal, "aside": J @ around, "ends": ends,
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def evaluated():
+    study = study_of([curve(place) for place in PLACES])
+    both, value = programs(study.model)
+    theta, lane = point_of(study), lane_of(study)
+    return study, theta, lane, both(theta, lane), value(theta, lane)
+
+
+def test_row_is_what_a_press_shows(evaluated):
+    """Force, side force, markers, sideward markers, ends; in this order, over their sigma."""
+    study, theta, lane, r, value = evaluated
+    assert np.all(np.isfinite(value))
+    np.testing.assert_allclose(r.value, value, rtol=0, atol=1e-9)
+    n = len(PATH)
+    assert size(lane) == value.shape[1] == n * (2 + 3 + 3 + 12)
+    assert observations(lane)[1] == 2 * n
+    for k in range(len(PLACES)):
+        got, c = shown(study, theta, k), study.curves[0][k]
+        row = {
+            "force": (got["force"] - c.force) / 0.05,
+            "side": (got["side"] - c.side_force) / 0.05,
+        }
+        for name, data in (
+            ("joints", c.joint_displacement), ("aside", c.joint_side_displacement),
+        ):  # fmt: skip
+            row[name] = np.zeros((n, 3))
+            row[name][:, [0, 2]] = (got[name][:, [0, 2]] - data) / 0.2
+        row["ends"] = np.zeros((n, 3, 2, 2))
+        data = np.stack([c.end_U, c.end_V], 2)[:, 0]
+        row["ends"][:, 1] = (got["ends"][:, 1] - data) / 0.2
+        wanted = np.concatenate([v.ravel() for v in row.values()])
+        np.testing.assert_allclose(value[k], wanted, rtol=1e-7, atol=1e-7)
+
+
+def test_jacobian_against_central_differences(evaluated):
+    """To 5 mm, at 90 degrees and obliquely, by every kind of parameter; one path each way."""
+    study, theta, lane, r, _ = evaluated
+    _, value = programs(study.model)
+    names = [p.name for p, _, _ in study.unknowns[0]]
+    for i, name in enumerate(names):
+        h = 1e-4
+        ahead, back = (value(theta.at[i].add(sign * h), lane) for sign in (1, -1))
+        numeric = (ahead - back) / (2 * h)
+        largest = float(jnp.max(jnp.abs(numeric)))
+        assert largest > 1e-6, name
+        np.testing.assert_allclose(
+            r.jacobian[:, i], numeric, rtol=1e-5, atol=2e-6 * largest, err_msg=name
+        )
+
+
+def test_what_is_not_observed_counts_nothing(evaluated):
+    """NaN in a curve, and a sample past any equilibrium: exact zeros, the others as they were."""
+    study, theta, lane, before, _ = evaluated
+    both, _ = programs(study.model)
+    curves = [curve(place) for place in PLACES]
+    side, moved, end = (np.array(v) for v in (curves[1].side_force, curves[1].joint_displacement,
+                                              curves[1].end_V))  # fmt: skip
+    side[0], moved[2, 1], end[1, 0, 1] = np.nan, np.nan, np.nan
+    curves[1] = dataclasses.replace(curves[1], side_force=side, joint_displacement=moved, end_V=end)
+    sparse = study_of(curves)
+    got = both(theta, lane_of(sparse))
+    gone = np.zeros(before.value.shape, bool)
+    n = len(PATH)
+    ends = 2 * n + 2 * 3 * n
+    gone[1, [n, 2 * n + 3 * 2 + 2, ends + 12 + 4 + 3]] = True
+    assert np.all(np.asarray(got.value)[gone] == 0)
+    assert np.all(np.asarray(got.jacobian).transpose(0, 2, 1)[gone] == 0)
+    np.testing.assert_allclose(np.asarray(got.value)[~gone], np.asarray(before.value)[~gone])
+    # A trial that nothing observes is not pressed, wherever it would go.
+    far = study_of([curve(PLACES[0]), curve(PLACES[1]), curve(PLACES[2], [0.5, 2.0, 60.0])])
+    lost = both(theta, lane_of(far))
+    assert np.all(np.isfinite(lost.value[:2]))
+    assert np.isnan(lost.value[2]).any()
+    assert not np.isfinite(np.sum(np.square(lost.value)))
+    hidden = without_data(far.lanes, np.array([[False, False, True]]))
+    blind = lane_of(dataclasses.replace(far, lanes=hidden))
+    kept = both(theta, blind)
+    assert np.all(np.asarray(kept.value[2]) == 0)
+    assert np.all(np.asarray(kept.jacobian[2]) == 0)
+    np.testing.assert_allclose(kept.value[:2], before.value[:2], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_single_precision(evaluated):
+    study, theta, _, r, _ = evaluated
+    both, _ = programs(study.model)
+    got = both(theta.astype(np.float32), lane_of(study, np.float32))
+    assert got.value.dtype == got.jacobian.dtype == np.float32
+    np.testing.assert_allclose(got.value, r.value, atol=2e-3 * float(jnp.max(jnp.abs(r.value))))
+    size = jnp.max(jnp.abs(r.jacobian), axis=(0, 2), keepdims=True)
+    np.testing.assert_allclose(got.jacobian / size, r.jacobian / size, atol=1e-2)
+
+
+def pressed(material, place, path=PATH):
+    """A curve as `press_sections` shows it, with vectors."""
+    s, phi, direction = place
+    got = press_sections(GEOMETRY, material, s, phi, jnp.asarray(path), direction)
+    got = jax.tree.map(np.asarray, got)
+    frame = np.array([[0, -np.cos(phi), -np.sin(phi)], [0, -np.sin(phi), np.cos(phi)]])
+    F, moved = got.force @ frame.T, got.joints @ frame.T
+    a, b = direction
+    return curve(
+        place, path, force=F @ [a, b], side_force=F @ [-b, a],
+        joint_rings=np.arange(3), joint_displacement=moved[..., 0],
+        joint_side_displacement=moved[..., 1], end_rings=np.arange(3),
+        end_U=got.end_U[..., 1:], end_V=got.end_V[..., 1:],
+    )  # fmt: skip
+
+
+TRUTH = {"EI_C": 31.0, "bed_n": 0.013, "bed_t": 0.0031, "Et_L": 0.9, "D_L": 5.5, "c_W": 1.4}
+
+
+@pytest.mark.slow
+def test_known_parameters_are_found():
+    """From vectors of three presses, to rounding; nothing on a bound, nothing open."""
+    start = from_wall(GEOMETRY)
+    fields = {f.name: np.median(getattr(start, f.name)) for f in dataclasses.fields(start)}
+    material = SectionMaterial(**(fields | TRUTH))
+    study = study_of([pressed(material, place) for place in PLACES], {})
+    assert {p.name for p in study.free} == set(TRUTH)
+    result = fit(study, Settings(starts=1, more_starts=0))
+    assert result.status[0] == FitStatus.CONVERGED
+    found = {p.name: v for (p, _, _), v in zip(study.unknowns[0], result.value[0], strict=True)}
+    for name, true in TRUTH.items():
+        assert found[name] == pytest.approx(true, rel=1e-4), name
+    assert np.all(np.isfinite(result.standard_error))
+    assert not result.undetermined.any()
+    for what, asked in (("influence", influence), ("the posterior", posterior)):
+        with pytest.raises(ValueError, match=f"{what} is not available.*'sections'"):
+            asked(result)
+
+
+def test_lanes():
+    """On the midline the small program; markers under the tool do not count, ends far away do."""
+    plain = study_of([curve((20.0, 0.0, (1.0, 0.0)))]).lanes
+    assert plain.phi_c is None
+    assert plain.direction is None
+    near = study_of([curve((10.5, 0.5, (1.0, 0.0)))], tool_radius=1.0).lanes
+    np.testing.assert_array_equal(near.phi_c, [[0.5]])
+    for seen in (near.joint_precision, near.joint_side_precision):
+        np.testing.assert_array_equal(np.any(seen > 0, axis=(0, 1, 2)), [False, False, True])
+    assert np.sum(near.end_precision > 0) == 3 * 4
+    at_end = curve((20.0, 2 * np.pi / 3, (1.0, 0.0)))
+    ends = study_of([at_end], tool_radius=1.0).lanes.end_precision
+    assert np.sum(ends[..., 0, :] > 0) == np.sum(ends > 0) == 3 * 2
+    bare = {name: None for name in ("side_force", "joint_side_displacement", "end_U", "end_V",
+                                    "end_rings", "joint_rings", "joint_displacement")}  # fmt: skip
+    force = study_of([curve(PLACES[1], **bare)]).lanes
+    assert force.joints is force.side_force is force.ends is None
+    only_ends = bare | {"end_rings": np.array([0]), "end_U": np.ones((3, 1, 2))}
+    lanes = study_of([curve(PLACES[1], **only_ends)]).lanes
+    assert np.sum(lanes.end_precision > 0) == 6
+    assert np.sum(lanes.joint_precision > 0) == 0
+
+
+def test_repeats_are_of_the_same_angle_and_direction():
+    places = [(20.0, 0.0, (1.0, 0.0)), (20.0, 0.5, (1.0, 0.0)), (20.0, 0.5, (0.8, 0.6))]
+    study = study_of([curve(place) for place in places])
+    assert [row.sum() for row in repeats(study).held] == [1, 1, 1]
+
+
+def test_a_fit_begins_at_the_wall():
+    """Medians of `from_wall`, whatever the declared defaults; a wall for another model is none."""
+    uneven = Geometry.create(40.0, [10.0, 14.0, 30.0], radius=11.7)
+    wall = Wall(E_C=8.0)
+    begun, there = defaults_of(SECTIONS, uneven, wall), from_wall(uneven, wall)
+    for field in dataclasses.fields(there):
+        value = np.median(getattr(there, field.name))
+        if np.isfinite(value):
+            assert begun[field.name].value == pytest.approx(value, rel=1e-12)
+    assert defaults_of(Options(), uneven) is DEFAULTS
+    with pytest.raises(ValueError, match="wall: .*'sections' alone; leave it out"):
+        defaults_of(Options(), uneven, wall)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"contact": "unilateral"}, "contact='bonded', found 'unilateral'"),
+        ({"shear": True}, "shear=False, found True"),
+        ({"local": "two-material"}, "local='uniform'"),
+        ({"coupling": "total"}, "coupling='series'"),
+        ({"half_width": 2.0}, "half_width=0.0, found 2.0"),
+        ({"split": "independent"}, "split='continuous'"),
+        ({"form": "reactions"}, "form='recursion'"),
+        ({"transition": 2.0}, "transition=None"),
+    ],
+)
+def test_options_that_exclude_each_other(change, words):
+    with pytest.raises(ValueError, match=f"skeleton='sections' needs {words}"):
+        Options(**({"skeleton": "sections", "contact": "bonded"} | change))
+
+
+def test_presses_of_a_line_refuse():
+    material = Material(1.0, 1.0, 1.0, 0.0, EA_L=1.0, EI_C=1.0, k_t=1.0)
+    with pytest.raises(ValueError, match="use press_sections"):
+        press(GEOMETRY, material, 20.0, 1.0, SECTIONS)
+    with pytest.raises(ValueError, match="use press_sections"):
+        press_oblique(GEOMETRY, material, 20.0, 0.0, jnp.ones((1, 3)), SECTIONS)
+    study = study_of([curve(PLACES[0])])
+    with pytest.raises(ValueError, match="no compliance"):
+        inputs(study.model, point_of(study), lane_of(study))
+    with pytest.raises(ValueError, match="a design is not available"):
+        check(study)
+
+
+def test_curves_that_a_model_cannot_press():
+    aside = curve((20.0, 0.5, (1.0, 0.0)))
+    with pytest.raises(ValueError, match="phi = 28.6 deg.*choose skeleton = 'sections'"):
+        check_curve(aside, GEOMETRY, Options())
+    turned = curve((20.0, 0.0, (0.8, 0.6)))
+    with pytest.raises(ValueError, match=r"\(0.8, 0.6\).*choose skeleton = 'sections'"):
+        check_curve(turned, GEOMETRY, Options())
+    check_curve(turned, GEOMETRY, SECTIONS)
+    behind = curve((20.0, 2.2, (1.0, 0.0)))
+    with pytest.raises(ValueError, match="phi = 126 deg, expected on the cartilage, within 120"):
+        check_curve(behind, GEOMETRY, SECTIONS)
+    with pytest.raises(ValueError, match="end of ring 4 of 3"):
+        check_curve(curve(PLACES[0], end_rings=np.array([3])), GEOMETRY, SECTIONS)
+
+
+SPEC = """
+[data]
+files = "a.h5"
+[model]
+skeleton = "{}"
+contact = "{}"
+{}
+"""
+
+
+def test_specification(tmp_path):
+    """The [wall] table is read with units; what cannot be is named by its key."""
+    path = tmp_path / "fit.toml"
+
+    def table(skeleton="sections", contact="bonded", more=""):
+        path.write_text(SPEC.format(skeleton, contact, more))
+        spec = load_fit_spec(path)
+        return {p.name: p for p in parameters_of(spec, options_of(spec), joints=True)}
+
+    found = table(more='[wall]\nE_M = "600 kPa"\nbed_n = "30 kPa/mm"\n[parameters]\nGt_L = {}')
+    assert found["Et_M"].value == pytest.approx(1.08 * 0.6 * 2.0)
+    assert found["bed_n"].value == pytest.approx(0.03)
+    assert not found["Gt_L"].fixed
+    assert found["Et_M"].fixed
+    for arguments, words in (
+        ({"more": '[wall]\nh = "1 mm"'}, "wall.h_C is 1.56 mm; expected at most"),
+        ({"more": "[wall]\nnu = 0.5"}, "wall.nu is 0.5"),
+        ({"more": '[wall]\nE_C = "3 mm"'}, "wall.E_C"),
+        ({"contact": "unilateral"}, "model: skeleton='sections' needs contact='bonded'"),
+        ({"skeleton": "linear", "more": "[wall]"}, "wall: moduli and thicknesses are read by"),
+        ({"more": "[parameters]\nk_M = {}"}, "parameters.k_M: not seen by this model"),
+    ):
+        with pytest.raises(SpecError) as error:
+            table(**arguments)
+        assert words in str(error.value), str(error.value)
