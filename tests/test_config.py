@@ -18,6 +18,7 @@ SECTIONS = {
     "## [trachea]": config.TracheaSection,
     "### trachea.rings": config.EvenRings,
     "## [model]": config.ModelSection,
+    "## [wall]": config.WallSection,
     "## [parameters.NAME]": config.ParameterSection,
     "## [noise]": config.NoiseSection,
     "## [fit]": config.FitSection,

@@ -321,6 +321,8 @@ def test_presses_of_a_line_refuse():
         inputs(study.model, point_of(study), lane_of(study))
     with pytest.raises(ValueError, match="a design is not available"):
         check(study)
+    with pytest.raises(ValueError, match="fit.method = 'adam' is not available"):
+        fit(study, Settings(method="adam"))
 
 
 def test_curves_that_a_model_cannot_press():

@@ -173,6 +173,11 @@ def study_of(spec: FitSpec, measurements: Measurements, *, refits: bool = False)
     asked = u.profile or u.bootstrap or u.posterior or u.influence
     joint = not (refits or asked or spec.fit.method != "levenberg-marquardt")
     study = _built(spec, measurements, joint)
+    if spec.fit.method != "levenberg-marquardt":
+        try:
+            study.refuse_sections(f"fit.method = {spec.fit.method!r}")
+        except ValueError as error:
+            raise SpecError(str(error)) from None
     shared = [p.name for p in study.free if p.scope == "shared"]
     if shared and not joint and study.size > MOST_DENSE:
         raise SpecError(

@@ -92,7 +92,11 @@ def descend(
 
     Where an unknown alone could still lower the residual's norm by more than `NEARLY_FLAT`, it has
     stalled.
+
+    Raises:
+        ValueError: a skeleton of deforming cross-sections.
     """
+    study.refuse_sections(f"fit.method = {descent.method!r}")
     # optax mixes integer widths in its counters
     with jax.numpy_dtype_promotion("standard"):
         outcome = map_lanes(

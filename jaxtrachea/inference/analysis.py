@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, Literal
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea.config import FitSpec
+from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
@@ -49,6 +49,17 @@ class Request:
     settings: Settings
     options: Collection[str] = ()
     command: Literal["fit", "design"] = "fit"
+
+    def refuse_sections(self, what: str) -> None:
+        """Say that an analysis is made for a line of joints.
+
+        Raises:
+            SpecError: the skeleton is of deforming cross-sections.
+        """
+        try:
+            self.study.refuse_sections(what)
+        except ValueError as error:
+            raise SpecError(str(error)) from None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -77,6 +77,10 @@ class Options:
         if self.skeleton == "sections":
             _check_sections(self)
 
+    def places(self, length: float) -> tuple[float, float]:
+        """Lowest and highest contact position, mm, at which all of the tool lies on the tube."""
+        return self.half_width, length - self.half_width
+
 
 #: Options that a skeleton of deforming cross-sections has: no others apply to it.
 _OF_SECTIONS = {
@@ -107,10 +111,6 @@ def check_line(options: Options, what: str) -> None:
         raise ValueError(
             f"{what} presses a line of joints, not skeleton='sections'; use press_sections"
         )
-
-    def places(self, length: float) -> tuple[float, float]:
-        """Lowest and highest contact position, mm, at which all of the tool lies on the tube."""
-        return self.half_width, length - self.half_width
 
 
 class Press(NamedTuple):
@@ -223,6 +223,7 @@ def compliance(
     Far cheaper than `press` where the joints are not asked for: many positions share one sweep
     over the rings. NaN where a part of a tool with a width lies off the tube.
     """
+    check_line(options, "compliance")
     beam = ligament_beam(geometry, material, options)
     if options.form == "recursion" and options.half_width == 0:
         return _beam.contact_compliance(beam, s_c, split=options.split)

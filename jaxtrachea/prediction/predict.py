@@ -206,8 +206,10 @@ def _on_host(stored: StoredFit, source: Source, where, displacement, part: Predi
     presses = np.asarray(part.status[:n])
     bend = _bend(source, cut(part.bend.T).T, value, se, int(part.deepest))
     status, message = _verdict(source, value, se, presses, bend)
-    if usable and (beyond := _beyond(stored, source.lane, where, displacement)):
-        message = f"{message}; {beyond}"
+    if usable:
+        spans, angles = stored.spans[source.lane], stored.angles[source.lane]
+        beyond = _beyond(spans, float(s), displacement, angles, phi)
+        message = f"{message}; {beyond}" if beyond else message
     return CurvePrediction(
         specimen=source.specimen,
         trial=source.trial,
@@ -255,16 +257,18 @@ def _bend(source: Source, off: np.ndarray, value: Response, se: Response, deepes
     return float(worst) if np.isfinite(worst) else np.inf
 
 
-def _beyond(stored: StoredFit, lane: int, where, displacement: np.ndarray) -> str:
+def _beyond(
+    spans: np.ndarray, s: float, displacement: np.ndarray, angles=(-np.inf, np.inf), phi: float = 0
+) -> str:
     """What of a curve lies outside the data of its lane, in words; "" if nothing does."""
-    low, high, first, last = stored.spans[lane]
-    s, phi, words = float(where[0]), where[1], []
+    low, high, first, last = spans
+    words = []
     if displacement.max() > high + 1e-9 or displacement.min() < min(low, 0.0) - 1e-9:
         words.append(f"D = {low:.3g} to {high:.3g} mm")
     known = first <= last  # else no curve of the lane says where it was pressed
     if known and (s < first - 1e-9 or s > last + 1e-9):
         words.append(f"s = {first:.4g} to {last:.4g} mm")
-    left, right = stored.angles[lane]
+    left, right = angles
     if phi < left - 1e-9 or phi > right + 1e-9:
         words.append(f"phi = {np.degrees(left):.3g} to {np.degrees(right):.3g} deg")
     return f"extrapolated from data at {' and '.join(words)}" if words else ""

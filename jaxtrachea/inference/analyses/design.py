@@ -51,6 +51,7 @@ class Design:
 
 
 def _refuse(request: Request) -> None:
+    request.refuse_sections("design")
     if not request.study.free:
         raise SpecError("design: every parameter is fixed; free what the presses shall tell")
     candidates_of(request.spec, request.study)

@@ -22,6 +22,10 @@ REASONS = (
 )
 
 
+def _refuse(request: Request) -> None:
+    request.refuse_sections("uncertainty.influence")
+
+
 def _compute(request: Request, findings: Findings, progress: Progress) -> Influence:
     return influence(findings.result, request.settings.batch)
 
@@ -208,6 +212,7 @@ INFLUENCE = Analysis(
     name="influence",
     after="left_out",
     compute=_compute,
+    refuse=_refuse,
     option="influence",
     key="influence",
     tables=_tables,

@@ -21,6 +21,7 @@ POSTERIOR_HEAD = [
 
 
 def _refuse(request: Request) -> None:
+    request.refuse_sections("uncertainty.posterior")
     try:
         sampler()
     except MissingSampler as error:
