@@ -124,8 +124,9 @@ def assemble(model: FitModel, parts: Array, lane: Lane) -> Array:
 def rounding_cost(lane: Lane, sigma: Float[Array, "2"]) -> Float[Array, ""]:
     """Cost that rounding alone leaves: ten roundings of every force."""
     balance = lane.balance[:, None]
-    parts = [kind.data * kind.precision * balance / sigma[0] for kind in forces(lane)]
-    data = sum(jnp.sum(part**2) for part in parts)
+    kinds = forces(lane)
+    parts = [jnp.sum((kind.data * kind.precision * balance / sigma[0]) ** 2) for kind in kinds]
+    data = jnp.sum(jnp.stack(parts))
     return 0.5 * data * (10 * epsilon(lane.force.dtype)) ** 2
 
 

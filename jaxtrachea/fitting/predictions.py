@@ -1,6 +1,7 @@
 """The fitted model at the measured points, for plots, residual tables and cross-validation."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,8 @@ class Prediction:
 def predictions(study: Study, theta: np.ndarray, batch: int = 256) -> Prediction:
     """Residuals of all lanes at `theta` (lanes, P), in N and mm."""
     value = map_lanes(residual_value, study, theta, batch=batch_size(len(theta), batch))
-    lanes, found, first = study.lanes, {"joints": None}, 0
+    lanes, first = study.lanes, 0
+    found: dict[str, Any] = {"joints": None}
     for kind in forces(lanes) + markers(lanes):
         after = first + lanes.force.shape[-1] * kind.places
         part, first = value[..., first:after].reshape(kind.data.shape), after

@@ -154,7 +154,8 @@ def predict_sources(
     )
     off = None
     if any(how != (0.0, (1.0, 0.0)) for how in turned):
-        off = Aside(*(np.array(v, np.float64) for v in zip(*turned, strict=True)))
+        phis, ways = zip(*turned, strict=True)
+        off = Aside(jnp.asarray(np.array(phis, float)), jnp.asarray(np.array(ways, float)))
     blend = stack("blend")
     out: dict[int, CurvePrediction] = {}
     for members in (np.flatnonzero(np.isnan(blend)), np.flatnonzero(~np.isnan(blend))):

@@ -130,10 +130,11 @@ def error_rows(
     """One row per curve, per contact position, of all, and per curve that could not be used."""
     rows = [_errors("curve", [c], tool_radius, rings) for c in compared]
     good = [c for c in compared if c.prediction.status.predicts]
-    places: dict[float, list[Compared]] = {}
+    places: dict[tuple[float, ...], list[Compared]] = {}
     for c in good:
-        if not np.isnan(c.prediction.s):
-            places.setdefault(round(c.prediction.s, 6), []).append(c)
+        p = c.prediction
+        if not np.isnan(p.s):
+            places.setdefault((round(p.s, 6), round(p.phi, 9), *p.direction), []).append(c)
     for s in sorted(places):
         rows.append(_errors("position", places[s], tool_radius, rings))
     if good:
@@ -185,4 +186,17 @@ def _errors(of: str, group: Sequence[Compared], tool_radius, rings) -> Row:
         "worst joint [mm]": _cell(float(marker[np.argmax(np.abs(marker))])) if len(marker) else "",
         "status": status.name.lower(),
         "message": first.prediction.message if one else status.message,
-    }  # fmt: skip
+    } | _side_errors(of, group)  # fmt: skip
+
+
+def _side_errors(of: str, group: Sequence[Compared]) -> Row:
+    """Angle and error of the side force, where the model has one."""
+    if group[0].prediction.side_force is None:
+        return {}
+    off = np.concatenate([c.side_residual for c in group])
+    off = off[np.isfinite(off)]
+    angle = float(np.degrees(group[0].prediction.phi))
+    return {
+        "phi [deg]": angle if of != "all" else "",
+        "rms side [N]": float(np.sqrt(np.mean(off**2))) if len(off) else "",
+    }
