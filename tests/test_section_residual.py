@@ -22,7 +22,7 @@ from jaxtrachea.inference.influence import influence
 from jaxtrachea.inference.posterior import posterior
 from jaxtrachea.inference.repeats import repeats
 from jaxtrachea.measurements.read import Curve
-from jaxtrachea.mechanics.oblique import press_oblique
+from jaxtrachea.mechanics.oblique import ObliqueOptions, press_oblique
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.sections.material import SectionMaterial, Wall, from_wall
 from jaxtrachea.mechanics.sections.press import press_sections
@@ -315,7 +315,9 @@ def test_presses_of_a_line_refuse():
     with pytest.raises(ValueError, match="use press_sections"):
         press(GEOMETRY, material, 20.0, 1.0, SECTIONS)
     with pytest.raises(ValueError, match="use press_sections"):
-        press_oblique(GEOMETRY, material, 20.0, 0.0, jnp.ones((1, 3)), SECTIONS)
+        press_oblique(
+            GEOMETRY, material, 20.0, 0.0, jnp.ones((1, 3)), ObliqueOptions(press=SECTIONS)
+        )
     study = study_of([curve(PLACES[0])])
     with pytest.raises(ValueError, match="no compliance"):
         inputs(study.model, point_of(study), lane_of(study))
