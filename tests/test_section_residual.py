@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +27,7 @@ from jaxtrachea.mechanics.oblique import ObliqueOptions, press_oblique
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.sections.material import SectionMaterial, Wall, from_wall
 from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.results.store import write_hdf5
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -231,7 +233,7 @@ TRUTH = {"EI_C": 31.0, "bed_n": 0.013, "bed_t": 0.0031, "Et_L": 0.9, "D_L": 5.5,
 
 
 @pytest.mark.slow
-def test_known_parameters_are_found():
+def test_known_parameters_are_found(tmp_path):
     """From vectors of three presses, to rounding; nothing on a bound, nothing open."""
     start = from_wall(GEOMETRY)
     fields = {f.name: np.median(getattr(start, f.name)) for f in dataclasses.fields(start)}
@@ -248,6 +250,18 @@ def test_known_parameters_are_found():
     for what, asked in (("influence", influence), ("the posterior", posterior)):
         with pytest.raises(ValueError, match=f"{what} is not available.*'sections'"):
             asked(result)
+    write_hdf5(tmp_path / "r.h5", Findings(result), {})
+    with h5py.File(tmp_path / "r.h5") as file:
+        data = {name: file["data"][name][()] for name in file["data"]}
+    curves, n = study.curves[0], len(PATH)
+    for i, c in enumerate(curves):
+        row = slice(i * n, (i + 1) * n)
+        np.testing.assert_array_equal(data["side_force"][row], c.side_force)
+        np.testing.assert_array_equal(data["joint_side"][row], c.joint_side_displacement)
+        np.testing.assert_array_equal(data["ends"][row, :, 1], c.end_V)
+        np.testing.assert_array_equal(data["direction"][i], c.direction)
+    for name, size in (("side", 1e-4), ("joint_side", 1e-4), ("ends", 1e-4)):
+        assert np.max(np.abs(data[f"{name}_residual"])) < size
 
 
 def test_lanes():

@@ -11,6 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from jaxtrachea.fitting.lane import markers
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.measurements.read import Curve
@@ -95,6 +96,13 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
         given = [_side(c) for c in curves]
         columns["side_force"], columns["side_residual"] = given, found
         columns["side_predicted"] = [F + r for F, r in zip(given, found, strict=True)]
+    for kind in markers(study.lanes):
+        left = getattr(seen, kind.name)
+        if kind.name == "joints" or left is None:
+            continue
+        used = np.where(kind.precision > 0, kind.data, np.nan)
+        columns[kind.name] = [used[k, t, : len(c.force)] for k, t, c in placed]
+        columns[f"{kind.name}_residual"] = [left[k, t, : len(c.force)] for k, t, c in placed]
     for name, parts in columns.items():
         group.create_dataset(name, data=np.concatenate(parts), compression="gzip")
 
