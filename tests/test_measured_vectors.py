@@ -50,7 +50,7 @@ def full(specimen="T01", **changes):
 
 
 def stored(path, *curves):
-    write_hdf5(path, Measurements(curves, (), ()))
+    write_hdf5(path, Measurements(curves, (), ()), schema_version=1)
     return path
 
 

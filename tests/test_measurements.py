@@ -555,7 +555,7 @@ def test_round_trip(tmp_path):
     long = Curve("Z %", ".", 1.0, 0.0, depths, forces, source="µ")
     wrote = (curve("Z %", "1"), plain, curve("A", "2"), long)
     path = tmp_path / "m.h5"
-    write_hdf5(path, Measurements(wrote, (), ()), attrs={"licence": "CC0"})
+    write_hdf5(path, Measurements(wrote, (), ()), attrs={"licence": "CC0"}, schema_version=1)
     found = read_measurements([path])
     assert found.bad == ()
     # Specimens in the order of their first curve.
@@ -598,7 +598,7 @@ def test_writing_refuses(tmp_path):
 def study(tmp_path):
     """Two specimens in a file of ours, to be spoilt."""
     path = tmp_path / "m.h5"
-    write_hdf5(path, Measurements((curve("T01"), curve("T02")), (), ()))
+    write_hdf5(path, Measurements((curve("T01"), curve("T02")), (), ()), schema_version=1)
     return path
 
 
@@ -692,7 +692,8 @@ def test_specimen_without_trials(study):
     ("attrs", "message"),
     [
         ({"schema": "other"}, "schema is 'other', expected 'jaxtrachea-measurements'"),
-        ({"schema_version": 2}, "schema_version is 2"),
+        ({"schema_version": 3}, "schema_version is 3, this program reads 1 and 2"),
+        ({"schema_version": 2}, "/curves: no such group"),
         ({"schema": 5.0}, "expected text"),
     ],
 )
@@ -847,7 +848,7 @@ def test_damaged_values_cost_their_curve(tmp_path):
         Curve("T01", "1", None, 0.0, n, n**1.5),
         Curve("T02", "1", None, 0.0, n, n**1.5),
     )
-    write_hdf5(study, Measurements(pair, (), ()))
+    write_hdf5(study, Measurements(pair, (), ()), schema_version=1)
     with h5py.File(study) as file:
         offset = file["specimens/T01/1/force"].id.get_chunk_info(0).byte_offset
     data = bytearray(study.read_bytes())

@@ -76,6 +76,7 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
         source=raw.source,
         usage=usage_of(raw, displacement, force, keep, found, options),
         direction=direction,
+        time=None if raw.time is None else raw.time[keep].astype(np.float64),
         **vectors_of(raw, keep, options),
     )
 

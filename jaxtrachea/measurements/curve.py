@@ -68,6 +68,7 @@ class Curve:
             components y (anterior) and z (to the side of positive phi); NaN where not observed, or
             None.
         end_V: (N, K, 2) mm, likewise at the end V, phi = +alpha, or None.
+        time: (N,) s of each sample, never falling but with ``loading = "all"``, or None.
     """
 
     specimen: str
@@ -87,6 +88,7 @@ class Curve:
     end_rings: Integer[np.ndarray, " k"] | None = None
     end_U: Float64[np.ndarray, "n k 2"] | None = None
     end_V: Float64[np.ndarray, "n k 2"] | None = None
+    time: Float64[np.ndarray, " n"] | None = None
 
 
 @dataclass(frozen=True)

@@ -124,6 +124,7 @@ def write_hdf5(
     *,
     attrs: Mapping[str, str | int | float] | None = None,
     overwrite: bool = False,
+    schema_version: int = 2,
 ) -> None:
     """Write the usable curves in the project's own HDF5 schema; bad ones are not written.
 
@@ -134,12 +135,15 @@ def write_hdf5(
         measurements: the curves.
         attrs: further root attributes, such as licence and source.
         overwrite: replace an existing file.
+        schema_version: 2 keeps all curves of a quantity in one dataset, which is read a hundred
+            times faster; 1 keeps a group for each trial, for older readers.
 
     Raises:
         FileExistsError: `path` exists and `overwrite` is False.
-        ValueError: `attrs` sets the schema, or a (specimen, trial) comes twice.
+        ValueError: `attrs` sets the schema, there is no such version, a name cannot be written, or
+            a (specimen, trial) comes twice.
     """
-    hdf5.write(Path(path), measurements.curves, dict(attrs or {}), overwrite)
+    hdf5.write(Path(path), measurements.curves, dict(attrs or {}), overwrite, schema_version)
 
 
 def _check_file(path: Path) -> None:

@@ -1,4 +1,7 @@
-"""The project's own HDF5 schema, ``specimens/<name>/<trial>``; see docs/measurements.md."""
+"""The project's own HDF5 schema; see docs/measurements.md.
+
+Version 1, in this file, keeps ``specimens/<name>/<trial>``; version 2 is in `ragged`.
+"""
 
 import os
 import tempfile
@@ -11,6 +14,8 @@ import numpy as np
 
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.readers.ragged import limits_of, read_curves
+from jaxtrachea.measurements.readers.ragged_writer import write_ragged
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.safe_hdf5 import (
     attribute,
@@ -24,9 +29,15 @@ from jaxtrachea.measurements.roles import role_dimension
 from jaxtrachea.units import convert
 
 SCHEMA = "jaxtrachea-measurements"
-SCHEMA_VERSION = 1
+VERSIONS = (1, 2)
 #: Datasets that a trial may have beside those of a normal press, with the unit they are written in.
-OPTIONAL = {"side_force": "N", "joint_side_displacement": "mm", "end_U": "mm", "end_V": "mm"}
+OPTIONAL = {
+    "time": "s",
+    "side_force": "N",
+    "joint_side_displacement": "mm",
+    "end_U": "mm",
+    "end_V": "mm",
+}
 # Below this a chunk's overhead outweighs compression.
 COMPRESS_FROM = 512
 
@@ -35,7 +46,7 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
     """Read every trial; a fault within one costs this trial only.
 
     Args:
-        path: the file.
+        path: the file, of version 1 or 2.
         options: units for datasets that have none.
 
     Returns:
@@ -44,21 +55,27 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
     Raises:
         DataError: damaged or hostile file, another schema or version, or no trial in it.
     """
-    with opened(path) as file:
-        _check_schema(path, file)
-        found: list[RawCurve | BadCurve] = []
-        for specimen, group in file["specimens"].items():
-            if not hasattr(group, "items") or len(group) == 0:
-                fault = Fault("empty", "the specimen has no trials", "add one group per trial")
-                found.append(bad(unquote(specimen), "-", f"{path}:/specimens/{specimen}", fault))
-                continue
-            for trial, item in group.items():
-                source = f"{path}:/specimens/{specimen}/{trial}"
-                key = (unquote(specimen), unquote(trial))
-                try:
-                    found.append(_trial(item, key, source, options))
-                except Fault as fault:
-                    found.append(bad(*key, source, fault))
+    with opened(path, limits=limits_of) as file:
+        if _checked_version(path, file) == 2:
+            return read_curves(path, file, options)
+        return _trials(path, file, options)
+
+
+def _trials(path: Path, file: Any, options: ReadOptions) -> list[RawCurve | BadCurve]:
+    """All trials of version 1."""
+    found: list[RawCurve | BadCurve] = []
+    for specimen, group in file["specimens"].items():
+        if not hasattr(group, "items") or len(group) == 0:
+            fault = Fault("empty", "the specimen has no trials", "add one group per trial")
+            found.append(bad(unquote(specimen), "-", f"{path}:/specimens/{specimen}", fault))
+            continue
+        for trial, item in group.items():
+            source = f"{path}:/specimens/{specimen}/{trial}"
+            key = (unquote(specimen), unquote(trial))
+            try:
+                found.append(_trial(item, key, source, options))
+            except Fault as fault:
+                found.append(bad(*key, source, fault))
     if not found:
         raise DataError(
             "/specimens is empty",
@@ -68,7 +85,8 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
     return found
 
 
-def _check_schema(path: Path, file: Any) -> None:
+def _checked_version(path: Path, file: Any) -> int:
+    """Version of the schema, one of `VERSIONS`."""
     try:
         schema = text_attribute(file, "schema")
         version = attribute(file, "schema_version")
@@ -80,18 +98,19 @@ def _check_schema(path: Path, file: Any) -> None:
             place=str(path),
             cure="see docs/measurements.md",
         )
-    if not isinstance(version, (int, np.integer)) or version != SCHEMA_VERSION:
+    if not isinstance(version, (int, np.integer)) or version not in VERSIONS:
         raise DataError(
-            f"schema_version is {version}, this program reads {SCHEMA_VERSION}",
+            f"schema_version is {version}, this program reads {' and '.join(map(str, VERSIONS))}",
             place=str(path),
             cure="update the program or the file",
         )
-    if not hasattr(file.get("specimens"), "items"):
+    if version == 1 and not hasattr(file.get("specimens"), "items"):
         raise DataError(
             "no group /specimens",
             place=str(path),
             cure="expected specimens/<name>/<trial>",
         )
+    return int(version)
 
 
 def _trial(group: Any, key: tuple[str, str], source: str, options: ReadOptions) -> RawCurve:
@@ -192,7 +211,11 @@ def _position(group: Any, role: str, source: str, options: ReadOptions) -> float
 
 
 def write(
-    path: Path, curves: Iterable[Curve], attrs: Mapping[str, str | int | float], overwrite: bool
+    path: Path,
+    curves: Iterable[Curve],
+    attrs: Mapping[str, str | int | float],
+    overwrite: bool,
+    version: int,
 ) -> None:
     """Write curves in the schema; the file appears complete or not at all.
 
@@ -201,10 +224,12 @@ def write(
         curves: what to write, in this order.
         attrs: further root attributes (licence, source, ...).
         overwrite: replace an existing file.
+        version: of the schema, 1 or 2.
 
     Raises:
         FileExistsError: `path` exists and `overwrite` is False.
-        ValueError: `attrs` touches schema or schema_version, or a (specimen, trial) comes twice.
+        ValueError: `attrs` touches schema or schema_version, there is no such version, a name
+            cannot be written, or a (specimen, trial) comes twice.
     """
     import h5py
 
@@ -212,14 +237,19 @@ def write(
         raise FileExistsError(f"{path} exists; choose another name or pass overwrite=True")
     if {"schema", "schema_version"} & set(attrs):
         raise ValueError("attrs must not set schema or schema_version; they are fixed")
+    if version not in VERSIONS:
+        raise ValueError(f"schema_version must be 1 or 2, got {version!r}")
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
     os.close(handle)
     try:
         with h5py.File(name, "w") as file:
-            file.attrs.update({**attrs, "schema": SCHEMA, "schema_version": SCHEMA_VERSION})
-            specimens = file.create_group("specimens", track_order=True)
-            for curve in curves:
-                _write_curve(specimens, curve)
+            file.attrs.update({**attrs, "schema": SCHEMA, "schema_version": version})
+            if version == 2:
+                write_ragged(file, tuple(curves))
+            else:
+                specimens = file.create_group("specimens", track_order=True)
+                for curve in curves:
+                    _write_curve(specimens, curve)
         with open(name, "rb") as written:
             os.fsync(written.fileno())
         os.chmod(name, 0o644)

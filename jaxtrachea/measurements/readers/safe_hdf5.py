@@ -7,10 +7,10 @@ and anything of the kind refuses the file; links other than hard ones are never 
 
 import math
 import mmap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,12 +22,36 @@ MAX_OBJECTS = 200_000
 MAX_DEPTH = 8
 MAX_ATTRIBUTES = 256
 MAX_ATTRIBUTE_BYTES = 2**20
+#: Longest text of a dataset of texts, bytes.
+MAX_TEXT_BYTES = 1024
+#: Deflate packs 1032 numbers of one byte into one at most; more is declared and not stored.
+MOST_PACKED = 1100
 # deflate, shuffle, fletcher32, lzf: others would load plug-ins chosen by the file.
 FILTERS = (1, 2, 3, 32000)
 
 
+class Limits(NamedTuple):
+    """What a file may hold.
+
+    Attributes:
+        elements: most numbers in a dataset.
+        total: most numbers in the file.
+        texts: datasets that may hold text of fixed length, by their place from the root.
+    """
+
+    elements: int = MAX_ELEMENTS
+    total: int = MAX_TOTAL_ELEMENTS
+    texts: tuple[str, ...] = ()
+
+
 @contextmanager
-def opened(path: Path, *, audit: bool = True, read: tuple[str, ...] | None = None) -> Iterator[Any]:
+def opened(
+    path: Path,
+    *,
+    audit: bool = True,
+    read: tuple[str, ...] | None = None,
+    limits: Callable[[Any], Limits] = lambda file: Limits(),
+) -> Iterator[Any]:
     """Open an HDF5 file for reading after walking through all of it.
 
     Args:
@@ -35,6 +59,7 @@ def opened(path: Path, *, audit: bool = True, read: tuple[str, ...] | None = Non
         audit: walk through it; without that only names may be asked for, no value be read.
         read: groups and datasets, from the root, whose values will be read; None: all. Others may
             hold text, and as much as they like.
+        limits: of a file, by the names in it.
 
     Yields:
         The open `h5py.File`.
@@ -52,7 +77,7 @@ def opened(path: Path, *, audit: bool = True, read: tuple[str, ...] | None = Non
     with file:
         try:
             if audit:
-                _Audit(path, read).group(file, "", 0)
+                _Audit(path, read, limits(file)).group(file, "", 0)
         except DataError:
             raise
         except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
@@ -105,11 +130,12 @@ def _check_heaps(path: Path) -> None:
 class _Audit:
     """Walks a file and refuses what a measurement never needs."""
 
-    def __init__(self, path: Path, read: tuple[str, ...] | None = None) -> None:
+    def __init__(self, path: Path, read: tuple[str, ...] | None, limits: Limits) -> None:
         import h5py
 
         self.path = path
         self.read = read
+        self.limits = limits
         self.h5: Any = h5py
         self.objects = 0
         self.elements = 0
@@ -160,9 +186,12 @@ class _Audit:
         read = self.read or ("",)
         if not any(name == start or name.startswith(f"{start}/") for start in read):
             return
-        numeric = (self.h5.h5t.INTEGER, self.h5.h5t.FLOAT, self.h5.h5t.ENUM)
         kind = dataset.id.get_type()
-        if kind.get_class() not in numeric or kind.get_size() > 16:
+        if name in self.limits.texts and not self.is_number(kind):
+            if not self.is_short_text(kind):
+                found = f"holds no text of fixed length of at most {MAX_TEXT_BYTES} bytes"
+                raise self.refuse(name, found, "store such text, in UTF-8")
+        elif not self.is_number(kind):
             raise self.refuse(
                 name,
                 "holds no plain numbers (but object, reference, text, compound or variable length)",
@@ -171,16 +200,37 @@ class _Audit:
         filters = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
         if any(code not in FILTERS for code in filters):
             raise self.refuse(name, f"needs compression filters {filters}", "use gzip")
+        self.size(dataset, kind.get_size(), name)
+        self.attributes(dataset, name)
+
+    def is_number(self, kind: Any) -> bool:
+        numeric = (self.h5.h5t.INTEGER, self.h5.h5t.FLOAT, self.h5.h5t.ENUM)
+        return kind.get_class() in numeric and kind.get_size() <= 16
+
+    def is_short_text(self, kind: Any) -> bool:
+        if kind.get_class() != self.h5.h5t.STRING or kind.is_variable_str():
+            return False
+        return kind.get_size() <= MAX_TEXT_BYTES
+
+    def size(self, dataset: Any, width: int, name: str) -> None:
+        """Refuse more numbers than are read, and many that are declared but not stored."""
         size = math.prod(dataset.id.get_space().get_simple_extent_dims() or ())
-        self.elements += size
-        if size > MAX_ELEMENTS or self.elements > MAX_TOTAL_ELEMENTS:
+        # Text counts as the numbers of 8 bytes that would fill its place.
+        self.elements += size * max(1, width // 8)
+        if size > self.limits.elements or self.elements > self.limits.total:
             raise self.refuse(
                 name,
                 f"declares {size} elements ({self.elements} in the file so far),"
-                f" at most {MAX_ELEMENTS} ({MAX_TOTAL_ELEMENTS}) are read",
+                f" at most {self.limits.elements} ({self.limits.total}) are read",
                 "thin out or split the recording",
             )
-        self.attributes(dataset, name)
+        stored = dataset.id.get_storage_size()
+        if size > MAX_ELEMENTS and size * width > MOST_PACKED * stored:
+            raise self.refuse(
+                name,
+                f"declares {size} elements but stores only {stored} bytes",
+                "copy or export the file again",
+            )
 
     def attributes(self, holder: Any, name: str) -> None:
         count = self.h5.h5a.get_num_attrs(holder.id)

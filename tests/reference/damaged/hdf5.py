@@ -14,8 +14,8 @@ TRIAL = "specimens/T01/1"
 BESIDE = '[data]\nfiles = ["data.h5", "good.csv"]\n'
 
 
-@functools.lru_cache(maxsize=1)
-def pristine() -> bytes:
+@functools.lru_cache(maxsize=2)
+def pristine(version=1) -> bytes:
     """A study of two specimens in the project's own schema."""
     line = np.linspace(0, 2, 12)
     markers = {"joint_rings": np.array([2, 6]), "joint_displacement": np.ones((12, 2))}
@@ -25,7 +25,7 @@ def pristine() -> bytes:
     )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "m.h5"
-        write_hdf5(path, Measurements(curves, (), ()))
+        write_hdf5(path, Measurements(curves, (), ()), schema_version=version)
         return path.read_bytes()
 
 
@@ -34,13 +34,16 @@ def _beside(make, says, codes=(1,)):
     return Case(("data.h5", *says), files, make, ("check", "spec.toml"), codes)
 
 
-def of_bytes(change, *says, codes=(1,)):
-    return _beside(lambda folder: (folder / "data.h5").write_bytes(change(pristine())), says, codes)
-
-
-def of_file(change, *says):
+def of_bytes(change, *says, codes=(1,), version=1):
     def make(folder):
-        (folder / "data.h5").write_bytes(pristine())
+        (folder / "data.h5").write_bytes(change(pristine(version)))
+
+    return _beside(make, says, codes)
+
+
+def of_file(change, *says, version=1):
+    def make(folder):
+        (folder / "data.h5").write_bytes(pristine(version))
         with h5py.File(folder / "data.h5", "r+") as file:
             change(file)
 
@@ -164,7 +167,8 @@ CASES = {
     "deep": of_file(lambda f: f.create_group("/".join("abcdefghijkl")), "nested"),
     "escape in a name": of_file(lambda f: f["specimens"].create_group("T\x1b[31m"), "control"),
     "schema of another": of_file(attribute("schema", "other", "/"), "schema"),
-    "schema version 2": of_file(attribute("schema_version", 2, "/"), "schema_version"),
+    "schema version 3": of_file(attribute("schema_version", 3, "/"), "schema_version"),
+    "schema version 2 without its groups": of_file(attribute("schema_version", 2, "/"), "/curves"),
     "schema a number": of_file(attribute("schema", 5.0, "/"), "schema"),
     "schema removed": of_file(attribute("schema", None, "/"), "schema"),
     "specimens removed": of_file(lambda f: f.__delitem__("specimens")),
@@ -208,4 +212,42 @@ CASES = {
     "position text": of_file(attribute("s_c", "35", TRIAL), TRIAL),
     "position without unit": of_file(attribute("s_c_unit", None, TRIAL), TRIAL, "unit"),
     "position in newton": of_file(attribute("s_c_unit", "N", TRIAL), TRIAL, "'N'"),
+    **{
+        f"version 2, cut to {n} bytes": of_bytes(lambda data, n=n: data[:n], version=2)
+        for n in (96, 1000, 4096)
+    },
+    **{
+        f"version 2, bits flipped, seed {seed}": of_bytes(
+            lambda data, seed=seed: flipped(data, seed, 1 + 7 * (seed % 3)),
+            codes=(0, 1),
+            version=2,
+        )
+        for seed in range(40)
+    },
+    "version 2, offsets fall": of_file(
+        lambda f: f["offsets/force"].__setitem__(1, 30), "/offsets/force", "falls", version=2
+    ),
+    "version 2, offsets beyond": of_file(
+        lambda f: f["offsets/force"].__setitem__(2, 30), "/offsets/force", "24", version=2
+    ),
+    "version 2, offsets 2^63": of_file(
+        lambda f: f["offsets/force"].__setitem__(2, 2**63 - 1), "/offsets/force", version=2
+    ),
+    "version 2, force without unit": of_file(
+        attribute("unit", None, "samples/force"), "/samples/force", "unit", version=2
+    ),
+    "version 2, force nan": of_file(
+        lambda f: f["samples/force"].__setitem__(3, np.nan), "/curves[0]", "NaN", version=2
+    ),
+    "version 2, force removed": of_file(
+        lambda f: f.__delitem__("samples/force"), "/samples/force", version=2
+    ),
+    "version 2, names of any length": of_file(
+        lambda f: (f.__delitem__("curves/trial"), f.__setitem__("curves/trial", ["1", "1"])),
+        "/curves/trial",
+        version=2,
+    ),
+    "version 2, curves a dataset": of_file(
+        lambda f: (f.__delitem__("curves"), f.__setitem__("curves", [1.0])), "/curves", version=2
+    ),
 }
