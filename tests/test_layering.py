@@ -59,6 +59,7 @@ WITHIN = {
         {"curve"},
         {"loading", "names", "vectors", "columns"},
         {"checks"},
+        {"together"},
         {"readers"},
         {"read"},
         {"data_files", "usage_tables"},

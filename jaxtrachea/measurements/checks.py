@@ -49,8 +49,8 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
     _check_shapes(raw)
     _check_finite(raw)
     check_vector_sizes(raw, options)
-    s_c = _position("s", raw.s, options.s_mm, "mm")
-    phi_c = _position("phi", raw.phi, options.phi_rad, "rad") or 0.0
+    s_c = position("s", raw.s, options.s_mm, "mm")
+    phi_c = position("phi", raw.phi, options.phi_rad, "rad") or 0.0
     if abs(phi_c) > 2 * math.pi:
         raise Fault(
             "absurd_scale", f"phi is {phi_c:g} rad, more than a turn", "is its unit deg, not rad?"
@@ -117,8 +117,18 @@ def _check_finite(raw: RawCurve) -> None:
         )
 
 
-def _position(name: str, own: float | None, common: float | None, unit: str) -> float | None:
-    """Position of the curve from the file and from the options, which must agree."""
+def position(name: str, own: float | None, common: float | None, unit: str) -> float | None:
+    """Position of the curve from the file and from the options, which must agree.
+
+    Args:
+        name: "s" or "phi".
+        own: from the file, mm or rad.
+        common: from the options, mm or rad.
+        unit: for messages.
+
+    Raises:
+        Fault: they differ, or one is not finite or absurd ("position").
+    """
     for value in (own, common):
         if value is not None and not abs(value) <= 1e5:
             raise Fault("position", f"{name} is {value:g} {unit}", "give a finite position")

@@ -82,6 +82,26 @@ def may_hold(travel: Float64[np.ndarray, " n"]) -> bool:
     return least < 0.25 * lag / travel.size * float(travel[-1] - travel[0])
 
 
+def rises_evenly(travel: Float64[np.ndarray, " s"], edges: np.ndarray) -> np.ndarray:
+    """Of many rising records end to end, which can nowhere hold: `may_hold` is False.
+
+    Args:
+        travel: the records, mm.
+        edges: (C + 1,) first sample of each, and the end of the last.
+
+    Returns:
+        (C,) bool.
+    """
+    starts, sizes = edges[:-1], np.diff(edges)
+    lag = np.maximum(2, (0.07 * sizes).astype(np.int64))
+    later = np.arange(travel.size) + np.repeat(lag, sizes)
+    inside = later < np.repeat(edges[1:], sizes)
+    gain = np.where(inside, travel[np.minimum(later, travel.size - 1)] - travel, np.inf)
+    least = np.minimum.reduceat(gain, starts)
+    usual = 0.25 * lag / sizes * (travel[edges[1:] - 1] - travel[starts])
+    return (sizes <= FEWEST + 1) | ~(least < usual)
+
+
 def holds(rise: Rise) -> tuple[int, tuple[Hold, ...], Hold | None]:
     """Where the tool stands still.
 
@@ -107,7 +127,8 @@ def holds(rise: Rise) -> tuple[int, tuple[Hold, ...], Hold | None]:
         if last - first < FEWEST or dip > 2 * rise.band or _rises(rise, first, last):
             continue
         hold = _hold(rise, _where_force_stops(rise, first), last)
-        scatter = 3 * noise(rise.force) / float(np.ptp(rise.force))
+        spread = float(np.ptp(rise.force))
+        scatter = 3 * noise(rise.force) / spread if spread > 0 else 0.0
         if hold.duration < short and hold.relaxed < max(FALLS, scatter):
             continue
         if stop >= size:

@@ -22,7 +22,11 @@ def doubt(displacement: np.ndarray, force: np.ndarray) -> str | None:
     Returns:
         One sentence, or None.
     """
-    extent, peak = float(np.ptp(displacement)), float(np.ptp(force))
+    return doubt_of(float(np.ptp(displacement)), float(np.ptp(force)))
+
+
+def doubt_of(extent: float, peak: float) -> str | None:
+    """As `doubt`, of the range of the displacement (mm) and of the force (N)."""
     if _within(extent, peak) or (extent < DISPLACEMENT[0] and peak < FORCE[0]):
         return None
     units = [f"force in {u} ({peak * f:.3g} N)" for u, f in FORCES.items()

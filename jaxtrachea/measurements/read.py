@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxtrachea.measurements.checks import finish
 from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, RawCurve, ReadOptions
 from jaxtrachea.measurements.readers import READERS, hdf5, reader_of
 from jaxtrachea.measurements.readers.lines import Line, Text, first_bytes, read_lines
@@ -20,6 +19,7 @@ from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.recognise import HEAD, kind_of
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.measurements.readers.workbook import listed, read_sheet
+from jaxtrachea.measurements.together import finish_all
 
 __all__ = [
     "BadCurve",
@@ -110,7 +110,7 @@ def read_measurements(
                     cure="rename one, or give a specimen pattern that tells files apart",
                 )
             seen[key] = record.source
-            done = record if isinstance(record, BadCurve) else finish(record, options)
+        for done in finish_all(records, options):
             if isinstance(done, BadCurve):
                 bad.append(done)
             else:
