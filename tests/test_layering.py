@@ -57,7 +57,7 @@ WITHIN = {
         {"segments"},
         {"usage"},
         {"curve"},
-        {"loading", "names", "vectors", "columns"},
+        {"loading", "names", "vectors", "columns", "tidy_writer"},
         {"checks"},
         {"together"},
         {"readers"},
@@ -106,7 +106,7 @@ WITHIN = {
     "report": [{"plots", "tables"}, {"fit"}, {"overview"}],
     "cli": [{"terminal_table", "specification", "options"}, {"terminal"},
             {"fit", "load", "predict_data", "run", "scene", "selfcheck"},
-            {"compare", "predict", "tradeoff"}, {"main"}],
+            {"compare", "convert", "predict", "tradeoff"}, {"main"}],
 }  # fmt: skip
 #: Rooms that only read or write: they may be told of, but not tell, the physics.
 HEAVY = ["matplotlib", "trimesh", "typer", "rich", "pydantic", "h5py"]

@@ -19,6 +19,7 @@ from rich.markup import escape
 
 from jaxtrachea import __version__
 from jaxtrachea.cli import compare as cli_compare
+from jaxtrachea.cli import convert as cli_convert
 from jaxtrachea.cli import fit as cli_fit
 from jaxtrachea.cli import predict as cli_predict
 from jaxtrachea.cli import scene as cli_scene
@@ -36,8 +37,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help=(
         "Mechanics of the trachea: identify stiffnesses from force-displacement curves "
-        "(check, fit, predict, design, compare); simulate a tool on a trachea (plan, simulate, "
-        "sweep)."
+        "(check, fit, predict, design, compare; convert); simulate a tool on a trachea (plan, "
+        "simulate, sweep)."
     ),
 )
 #: Rows of a terminal table; the files hold all.
@@ -165,7 +166,7 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
 
 
 for _command in (
-    cli_compare.compare, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
+    cli_convert.convert, cli_compare.compare, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
     cli_tradeoff.tradeoff, cli_selfcheck.selfcheck,
 ):  # fmt: skip
     app.command()(_command)

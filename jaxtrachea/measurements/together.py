@@ -121,8 +121,7 @@ def _measured(raws: Sequence[RawCurve], options: ReadOptions) -> _Block:
             plain &= low >= options.displacement_min
         if options.displacement_max is not None:
             plain &= high <= options.displacement_max
-        # Whatever does not draw outward for certain; of a rising record the first is the lowest.
-        plain &= (displacement[starts] - low <= high - displacement[starts]) | (-low <= abs(high))
+        # A record that nowhere falls is a press: it begins at its lowest.
         plain &= _rises(displacement, edges) & rises_evenly(displacement, edges)
         plain &= _along(displacement, force, edges) >= UPSIDE_DOWN + _MARGIN
         plain &= _noise_is_sound(raws, edges) & _time_is_even(raws, edges)

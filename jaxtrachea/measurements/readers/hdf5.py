@@ -3,8 +3,7 @@
 Version 1, in this file, keeps ``specimens/<name>/<trial>``; version 2 is in `ragged`.
 """
 
-import os
-import tempfile
+import io
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, Fault, RawCurve, ReadOptions
 from jaxtrachea.measurements.readers.ragged import limits_of, read_curves
@@ -239,24 +239,16 @@ def write(
         raise ValueError("attrs must not set schema or schema_version; they are fixed")
     if version not in VERSIONS:
         raise ValueError(f"schema_version must be 1 or 2, got {version!r}")
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-    os.close(handle)
-    try:
-        with h5py.File(name, "w") as file:
-            file.attrs.update({**attrs, "schema": SCHEMA, "schema_version": version})
-            if version == 2:
-                write_ragged(file, tuple(curves))
-            else:
-                specimens = file.create_group("specimens", track_order=True)
-                for curve in curves:
-                    _write_curve(specimens, curve)
-        with open(name, "rb") as written:
-            os.fsync(written.fileno())
-        os.chmod(name, 0o644)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
+    image = io.BytesIO()  # as files.atomic says why
+    with h5py.File(image, "w") as file:
+        file.attrs.update({**attrs, "schema": SCHEMA, "schema_version": version})
+        if version == 2:
+            write_ragged(file, tuple(curves))
+        else:
+            specimens = file.create_group("specimens", track_order=True)
+            for curve in curves:
+                _write_curve(specimens, curve)
+    write_whole(path, image.getvalue())
 
 
 def _group_name(name: str) -> str:
