@@ -213,7 +213,7 @@ def _curve(
             check_vector_sizes(raw, options)
         s_c = position("s", raw.s, common[0], "mm")
         phi_c = position("phi", raw.phi, common[1], "rad") or 0.0
-        direction = raw.direction if raw.direction == (1.0, 0.0) else unit_direction(raw)
+        direction = (1.0, 0.0) if raw.direction == (1.0, 0.0) else unit_direction(raw)
     except Fault:
         return None
     if abs(phi_c) > 2 * math.pi:

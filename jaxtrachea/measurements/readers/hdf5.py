@@ -19,6 +19,7 @@ from jaxtrachea.measurements.readers.ragged_writer import write_ragged
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.safe_hdf5 import (
     attribute,
+    measured,
     numeric,
     opened,
     text_attribute,
@@ -118,6 +119,7 @@ def _trial(group: Any, key: tuple[str, str], source: str, options: ReadOptions) 
         raise Fault(
             "shape", "is a dataset, expected a group for the trial", "store a group per trial"
         )
+    names = frozenset(group)
     displacement = _quantity(group, "displacement", "displacement", source, options)
     return RawCurve(
         *key,
@@ -128,33 +130,37 @@ def _trial(group: Any, key: tuple[str, str], source: str, options: ReadOptions) 
         "sample",
         s=_position(group, "s", source, options),
         phi=_position(group, "phi", source, options),
-        sigma=_quantity(group, "sigma", "sigma", source, options) if "sigma" in group else None,
-        time=_time(group, source, options),
+        sigma=_quantity(group, "sigma", "sigma", source, options) if "sigma" in names else None,
+        time=_time(group, source, options) if "time" in names else None,
         direction=_direction(group),
-        **_markers(group, source, options),
-        **_vectors(group, source, options),
+        **_markers(group, names, source, options),
+        **_vectors(group, names, source, options),
     )
 
 
-def _markers(group: Any, source: str, options: ReadOptions) -> dict[str, np.ndarray]:
+def _markers(
+    group: Any, stored: frozenset[str], source: str, options: ReadOptions
+) -> dict[str, np.ndarray]:
     """Markers on the rings; what is stored without its ring numbers is missing them."""
     names = ("joint_displacement", "joint_side_displacement")
-    if not any(name in group for name in (*names, "joint_ring_number")):
+    if stored.isdisjoint((*names, "joint_ring_number")):
         return {}
     found = {"joint_rings": _ring_indices(group, "joint_ring_number")}
     for name in names:
-        if name == "joint_displacement" or name in group:
+        if name == "joint_displacement" or name in stored:
             found[name] = _quantity(group, name, "joint", source, options)
     return found
 
 
-def _vectors(group: Any, source: str, options: ReadOptions) -> dict[str, np.ndarray]:
+def _vectors(
+    group: Any, stored: frozenset[str], source: str, options: ReadOptions
+) -> dict[str, np.ndarray]:
     """Side force, and the ends of the rings with their numbers."""
     found = {}
-    if "side_force" in group:
+    if "side_force" in stored:
         found["side_force"] = _quantity(group, "side_force", "side_force", source, options)
-    ends = [name for name in ("end_U", "end_V") if name in group]
-    if ends or "end_ring_number" in group:
+    ends = [name for name in ("end_U", "end_V") if name in stored]
+    if ends or "end_ring_number" in stored:
         found["end_rings"] = _ring_indices(group, "end_ring_number")
     for name in ends:
         found[name] = _quantity(group, name, "end", source, options)
@@ -186,15 +192,14 @@ def _direction(group: Any) -> tuple[float, ...]:
 
 def _time(group: Any, source: str, options: ReadOptions) -> np.ndarray | None:
     """Time of a trial, s, where it is stored with a unit."""
-    if "time" not in group or (unit_of(group, "time") or options.units.get("time")) is None:
+    if (unit_of(group, "time") or options.units.get("time")) is None:
         return None
-    unit = resolve_unit("time", unit_of(group, "time"), options, f"{source}/time")
-    return np.atleast_1d(convert(numeric(group, "time"), unit, "time"))
+    return _quantity(group, "time", "time", source, options)
 
 
 def _quantity(group: Any, name: str, role: str, source: str, options: ReadOptions) -> np.ndarray:
-    values = numeric(group, name)
-    unit = resolve_unit(role, unit_of(group, name), options, f"{source}/{name}")
+    values, unit = measured(group, name)
+    unit = resolve_unit(role, unit, options, f"{source}/{name}")
     return np.atleast_1d(convert(values, unit, role_dimension(role)))
 
 

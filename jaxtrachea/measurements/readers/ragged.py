@@ -5,6 +5,7 @@ curves, those of curve i from ``offsets/<quantity>[i]`` up to ``offsets/<quantit
 docs/measurements.md.
 """
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.curve import BadCurve, DataError, Fault, RawCurve, ReadOptions
-from jaxtrachea.measurements.readers.safe_hdf5 import Limits, numeric, unit_of
+from jaxtrachea.measurements.readers.safe_hdf5 import Limits, measured, numeric, unit_of
 from jaxtrachea.measurements.readers.text import resolve_unit
 from jaxtrachea.measurements.roles import role_dimension
 from jaxtrachea.units import convert
@@ -88,15 +89,20 @@ def read_curves(path: Path, file: Any, options: ReadOptions) -> list[RawCurve | 
     for i, key in enumerate(zip(specimens, trials, strict=True)):
         source = f"{path}:/curves[{i}]"
         try:
-            fields = dict(_fields(samples, i))
+            fields: dict[str, Any] = dict(_fields(samples, i))
         except Fault as fault:
             records.append(bad(*key, source, fault))
             continue
         rows = np.arange(1, fields["displacement"].size + 1)
-        # NaN, the only number that differs from itself, stands for a position that nobody knows.
-        where = {"s": s[i] if s[i] == s[i] else None, "phi": phi[i] if phi[i] == phi[i] else None}
         record = RawCurve(
-            *key, source, rows=rows, row_word="sample", direction=directions[i], **where, **fields
+            *key,
+            source,
+            rows=rows,
+            row_word="sample",
+            s=s[i],
+            phi=phi[i],
+            direction=directions[i],
+            **fields,
         )
         records.append(record)
     return records
@@ -194,8 +200,7 @@ class _Store:
         try:
             if role is None:
                 return numeric(self.file[group], last)
-            unit = unit_of(self.file[group], last) if last in self.file[group] else "?"
-            values = numeric(self.file[group], last)
+            values, unit = measured(self.file[group], last)
             unit = resolve_unit(role, unit, self.options, last)
         except Fault as fault:
             raise self.error(name, fault.message, fault.cure) from None
@@ -203,15 +208,15 @@ class _Store:
             raise DataError.like(error, place=f"{self.path}:/{name}") from None
         return np.asarray(convert(values, unit, role_dimension(role)))
 
-    def position(self, role: str, size: int) -> list[float]:
-        """A table of positions, NaN where none is known."""
+    def position(self, role: str, size: int) -> list[float | None]:
+        """A table of positions, None where it says NaN."""
         name = f"curves/{role}_c"
         if f"{role}_c" not in self.file["curves"]:
-            return [float("nan")] * size
+            return [None] * size
         values = self.quantity(name, role)
         if values.shape != (size,):
             raise self.wrong_length(name, len(np.atleast_1d(values)), size)
-        return values.tolist()
+        return [None if math.isnan(value) else value for value in values.tolist()]
 
     def directions(self, size: int) -> list[tuple[float, ...]]:
         """A table of directions; the normal where there is none."""

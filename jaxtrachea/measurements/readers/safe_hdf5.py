@@ -254,13 +254,37 @@ def numeric(group: Any, name: str) -> np.ndarray:
     Raises:
         Fault: no such dataset ("column_missing"), or its bytes are damaged ("unreadable").
     """
-    dataset = group.get(name)
-    if dataset is None or hasattr(dataset, "items"):
+    return _values(_dataset(group, name), name)
+
+
+def measured(group: Any, name: str) -> tuple[np.ndarray, str | None]:
+    """Values of a dataset in an audited file, as float64, and its unit; see `unit_of`.
+
+    Raises:
+        Fault: as `numeric` and `unit_of`.
+    """
+    dataset = _dataset(group, name)
+    return _values(dataset, name), _unit(dataset, name)
+
+
+def _dataset(group: Any, name: str) -> Any:
+    """A dataset of a group, opened in one step: far cheaper than `group.get`."""
+    import h5py
+
+    try:
+        identifier = h5py.h5o.open(group.id, name.encode())
+    except KeyError:
+        identifier = None
+    if not isinstance(identifier, h5py.h5d.DatasetID):
         raise Fault(
             "column_missing",
             f"no dataset {name!r}; there are {', '.join(map(repr, group)) or 'none'}",
             "store it, or correct its name",
         )
+    return h5py.Dataset(identifier)
+
+
+def _values(dataset: Any, name: str) -> np.ndarray:
     if dataset.shape is None:
         raise Fault("shape", f"dataset {name!r} has no shape", "store a vector")
     try:
@@ -277,7 +301,10 @@ def unit_of(group: Any, name: str) -> str | None:
     Raises:
         Fault: the attribute is no text, or the two differ.
     """
-    dataset = group[name]
+    return _unit(group[name], name)
+
+
+def _unit(dataset: Any, name: str) -> str | None:
     texts = {text_attribute(dataset, key) for key in ("unit", "units")} - {None}
     if len(texts) > 1:
         raise Fault(
