@@ -271,17 +271,18 @@ def _dataset(group: Any, name: str) -> Any:
     """A dataset of a group, opened in one step: far cheaper than `group.get`."""
     import h5py
 
+    h5: Any = h5py
     try:
-        identifier = h5py.h5o.open(group.id, name.encode())
+        identifier = h5.h5o.open(group.id, name.encode())
     except KeyError:
         identifier = None
-    if not isinstance(identifier, h5py.h5d.DatasetID):
+    if not isinstance(identifier, h5.h5d.DatasetID):
         raise Fault(
             "column_missing",
             f"no dataset {name!r}; there are {', '.join(map(repr, group)) or 'none'}",
             "store it, or correct its name",
         )
-    return h5py.Dataset(identifier)
+    return h5.Dataset(identifier)
 
 
 def _values(dataset: Any, name: str) -> np.ndarray:
