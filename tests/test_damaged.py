@@ -76,7 +76,7 @@ def test_damaged(name, folder, monkeypatch, capsys):
 #: One of each kind in a process of its own, where no check of shapes and no test settings help.
 IN_A_PROCESS = (
     "CSV: JSON position a list",
-    "HDF5: bits flipped, seed 0",
+    "HDF5: bits flipped, seed 1",
     "folder: specification a device",
 )
 
