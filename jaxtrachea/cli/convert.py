@@ -24,10 +24,10 @@ MANY = 40
 
 
 def convert(paths: PathsArgument, spec: SpecOption = None) -> None:
-    """Write the curves of data files into one HDF5 file, or a table (.csv); every sample is kept.
+    """Write curves of data files as HDF5 or as a table (CSV).
 
-    With --spec its [data] holds, but for the files; samples are left out only where it names a
-    loading or a window.
+    Every sample is kept. With --spec its [data] holds, but for the files; samples are left out only
+    where it names a loading or a window.
     """
     if len(paths) < 2:
         raise Stop("convert: expected SOURCE... TARGET; name the file to write last")

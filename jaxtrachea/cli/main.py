@@ -37,7 +37,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help=(
         "Mechanics of the trachea: identify stiffnesses from force-displacement curves "
-        "(check, fit, predict, design, compare; convert); simulate a tool on a trachea (plan, "
+        "(check, fit, predict, design, compare, convert); simulate a tool on a trachea (plan, "
         "simulate, sweep)."
     ),
 )
@@ -166,7 +166,7 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
 
 
 for _command in (
-    cli_convert.convert, cli_compare.compare, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
+    cli_compare.compare, cli_convert.convert, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
     cli_tradeoff.tradeoff, cli_selfcheck.selfcheck,
 ):  # fmt: skip
     app.command()(_command)
