@@ -33,6 +33,7 @@ from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 
+pytestmark = pytest.mark.compiling
 RINGS = [10.0, 20.0, 30.0]
 GEOMETRY = Geometry.create(40.0, RINGS, radius=11.7)
 SECTIONS = Options(skeleton="sections", contact="bonded")
