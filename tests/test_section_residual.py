@@ -28,7 +28,7 @@ from jaxtrachea.mechanics.oblique import ObliqueOptions, press_oblique
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.sections.material import SectionMaterial, Wall, from_wall
 from jaxtrachea.mechanics.sections.press import press_sections
-from jaxtrachea.results.store import write_hdf5
+from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
