@@ -1,5 +1,7 @@
 """Guarded functions: closed forms, smoothness, derivatives at the awkward points."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import mpmath as mp
@@ -11,12 +13,14 @@ from jaxtrachea._numerics import (
     cubic_ratio,
     epsilon,
     first_positive_root,
+    largest,
     newton_tolerance,
     positive_part,
     quintic_past_fold,
     quintic_ratio,
     rising_root,
     solve_spd,
+    total,
 )
 
 DTYPES = ["float32", "float64"]
@@ -343,3 +347,25 @@ def test_cosine_and_sine_have_derivatives():
         c, s = jacobian(cos_sin)(x)
         np.testing.assert_allclose(np.diagonal(c), -np.sin(x), atol=1e-15)
         np.testing.assert_allclose(np.diagonal(s), np.cos(x), atol=1e-15)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 32, 33, 64, 97, 120, 128, 1000, 1500])
+def test_total_and_largest(n, dtype):
+    """Against exact sums, with entries of both signs, in rows, at every way of summing."""
+    x = np.random.default_rng(n).normal(size=(2, 3, n)).astype(dtype)
+    got, top = jax.jit(total)(x), jax.jit(largest)(x)
+    assert got.dtype == top.dtype == jnp.dtype(dtype)
+    assert got.shape == top.shape == (2, 3)
+    exact = [[math.fsum(map(float, row)) for row in rows] for rows in x]
+    size = np.abs(x.astype(float)).sum(axis=-1).max()
+    np.testing.assert_allclose(got, exact, rtol=0, atol=n * np.finfo(dtype).eps * size)
+    np.testing.assert_array_equal(top, [[max(row) for row in rows] for rows in x])
+    np.testing.assert_array_equal(jax.grad(lambda v: total(v))(x[0, 0]), np.ones(n, dtype))
+    worst = x[0, 0].copy()
+    worst[-1] = np.nan
+    assert np.isnan(total(jnp.asarray(worst)))
+    assert np.isnan(largest(jnp.asarray(worst)))
+    worst[-1] = -np.inf
+    assert np.isneginf(total(jnp.asarray(worst)))
+    np.testing.assert_array_equal(largest(jnp.full(n, -3, dtype)), -3)

@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._numerics import epsilon, solve_2x2
+from jaxtrachea._numerics import epsilon, largest, solve_2x2, total
 from jaxtrachea.contact.pose import Pose, rotate
 from jaxtrachea.contact.search import (
     FLOOR,
@@ -48,7 +48,7 @@ from jaxtrachea.contact.search import (
     sharp_table,
     tangents,
 )
-from jaxtrachea.contact.shapes import Shape, Support, sharp_support, support
+from jaxtrachea.contact.shapes import Shape, Support, mean, sharp_support, support
 from jaxtrachea.status import ContactStatus
 
 #: Share of 1/beta by which a stopped search may miss its minimum and still count as converged.
@@ -159,8 +159,8 @@ def track(
     """
     scaled = _scaled(a, b, pose, settings, beta)
     d, pair = jax.lax.stop_gradient((direction, scaled.pair))
-    d = d / jnp.max(jnp.abs(d))
-    d, _ = polish(pair, d / jnp.sqrt(jnp.sum(d * d)), settings.warm_steps)
+    d = d / largest(jnp.abs(d))
+    d, _ = polish(pair, d / jnp.sqrt(total(d * d)), settings.warm_steps)
     return _contact(a, b, scaled, d)
 
 
@@ -187,7 +187,7 @@ def approach(
 
 def direction_table(a: Shape, settings: Settings = STANDARD) -> Float[Array, " directions"]:
     """Support of A about its centre over the coarse directions, mm; the same for every pose."""
-    centre = jnp.mean(a.vertices, axis=1)
+    centre = mean(a.vertices)
     return sharp_table(a.vertices - centre[:, None], settings.directions)
 
 
@@ -201,16 +201,14 @@ class _Scaled(eqx.Module):
 
 def _scaled(a: Shape, b: Shape, pose: Pose, settings: Settings, beta) -> _Scaled:
     """Lengths over the size, about A's centre: translations cancel before they are rounded."""
-    centre = jax.lax.stop_gradient(jnp.mean(a.vertices, axis=1))
+    centre = jax.lax.stop_gradient(mean(a.vertices))
     turned = rotate(pose.rotation, b.vertices)
     v_a = a.vertices - centre[:, None]
     v_b = turned + (pose.translation - centre)[:, None]
 
-    def largest(*v):
-        return jnp.max(jnp.abs(jnp.concatenate([x.ravel() for x in v])))
-
-    v_a = _without_rounding(v_a, largest(a.vertices))
-    v_b = _without_rounding(v_b, largest(turned, pose.translation, centre))
+    others = jnp.maximum(jnp.abs(pose.translation), jnp.abs(centre))
+    v_a = _without_rounding(v_a, largest(largest(jnp.abs(a.vertices))))
+    v_b = _without_rounding(v_b, largest(jnp.maximum(largest(jnp.abs(turned)), others)))
     size = jax.lax.stop_gradient(_size(v_a, v_b, a.radius + b.radius))
     sharpness = jnp.asarray(settings.sharpness, size.dtype) if beta is None else beta * size
     return _Scaled(Pair(v_a / size, v_b / size, sharpness), centre, size)
@@ -228,24 +226,24 @@ def _without_rounding(v, largest):
 
 def _size(v_a, v_b, radius):
     """Sum of both half-extents; for two bare points their distance, or 1 mm where they coincide."""
-    centre_b = jnp.mean(v_b, axis=1)
+    centre_b = mean(v_b)
     extent = _reach(v_a) + _reach(v_b - centre_b[:, None]) + radius
-    apart = jnp.max(jnp.abs(centre_b))
+    apart = largest(jnp.abs(centre_b))
     size = jnp.where(extent > 0, extent, apart)
     return jnp.where(size > 0, size, 1)
 
 
 def _reach(vertices):
     """Largest distance from the origin, without squaring a length in its own unit."""
-    scale = jnp.max(jnp.abs(vertices))
+    scale = largest(largest(jnp.abs(vertices)))
     unit = vertices / jnp.where(scale > 0, scale, 1)
-    return scale * jnp.sqrt(jnp.max(jnp.sum(unit * unit, axis=0)))
+    return scale * jnp.sqrt(largest(total((unit * unit).T)))
 
 
 def _towards(pair: Pair):
     """Unit vector from A's centre (the origin) to B's; z where they coincide."""
-    v = jnp.mean(pair.b, axis=1)
-    length = jnp.sqrt(jnp.sum(v * v))
+    v = mean(pair.b)
+    length = jnp.sqrt(total(v * v))
     ahead = jnp.zeros_like(v).at[2].set(1)
     return jnp.where(length > FLOOR, v / jnp.where(length > FLOOR, length, 1), ahead)
 
@@ -309,7 +307,7 @@ def _bounds(a: Shape, b: Shape, at_a: Support, at_b: Support, n):
     """Lower and upper bound of the sharp distance, from the normal and from points of the cores."""
     a, b, at_a, at_b, n = jax.lax.stop_gradient((a, b, at_a, at_b, n))
     gap = at_b.core - at_a.core
-    upper = jnp.sqrt(jnp.sum(gap * gap)) - (a.radius + b.radius)
+    upper = jnp.sqrt(total(gap * gap)) - (a.radius + b.radius)
     return -(sharp_support(a, n) + sharp_support(b, -n)), upper
 
 

@@ -5,6 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxtrachea._numerics import total
+
 #: Newton steps to the nearest point of the centreline without, then with derivative.
 STEPS, LAST_STEPS = 3, 2
 #: Smallest slope of the projection, 1 - curvature x distance: the centre of the bend is not passed.
@@ -43,18 +45,18 @@ def skeleton_coordinates(
 
     def step(s, p, line):
         c, t, bend, _ = point_at(line, s)
-        slope = jnp.sum(t * t) - jnp.sum(bend * (p - c))
-        return s + jnp.sum(t * (p - c)) / jnp.maximum(slope, LEAST_SLOPE)
+        slope = total(t * t) - total(bend * (p - c))
+        return s + total(t * (p - c)) / jnp.maximum(slope, LEAST_SLOPE)
 
     p, fixed = jax.lax.stop_gradient((point, line))
-    s = fixed.s[jnp.argmin(jnp.sum((fixed.points - p[None]) ** 2, axis=1))]
+    s = fixed.s[jnp.argmin(total((fixed.points - p[None]) ** 2))]
     for _ in range(STEPS):
         s = step(s, p, fixed)
     for _ in range(LAST_STEPS):
         s = step(s, point, line)
     c, t, _, anterior = point_at(line, s)
     out, lateral = point - c, jnp.cross(t, anterior)
-    y, z = jnp.sum(out * anterior), jnp.sum(out * lateral)
+    y, z = total(out * anterior), total(out * lateral)
     on_line = (y == 0) & (z == 0)
     return s, jnp.arctan2(jnp.where(on_line, 0, z), jnp.where(on_line, 1, y))
 

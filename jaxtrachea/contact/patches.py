@@ -24,11 +24,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea._numerics import largest, total
 from jaxtrachea.contact.distance import approach, signed_distance
 from jaxtrachea.contact.line import Centreline, skeleton_coordinates
 from jaxtrachea.contact.pose import Pose, transform
 from jaxtrachea.contact.search import LEAD, PREFERRED, STANDARD, Settings
 from jaxtrachea.contact.shapes import ArrayLike, Shape, heights, sharp_support
+from jaxtrachea.contact.shapes import mean as middle
 from jaxtrachea.status import ContactStatus
 
 #: Steps towards the nearest points of two cores in the broad phase.
@@ -181,13 +183,14 @@ def touch(
         return approach(patch, tool, pose, direction, settings, beta=beta)
 
     each = jax.vmap(contact)(shapes, directions[chosen])
-    low = jax.lax.stop_gradient(jnp.min(each.distance))
+    low = jax.lax.stop_gradient(-largest(-each.distance))
     e = jnp.exp(-beta * (each.distance - low))
-    weight = e / jnp.sum(e)
-    gap = low - jnp.log(jnp.sum(e)) / beta
+    whole = total(e)
+    weight = e / whole
+    gap = low - jnp.log(whole) / beta
 
     def mean(v):
-        return jnp.sum(weight[:, None] * v, axis=0)
+        return total((weight[:, None] * v).T)
 
     point = mean(each.point_a)
     s, phi = skeleton_coordinates(patches.line, point)
@@ -224,14 +227,14 @@ def gap_bounds(
     moved = Shape(transform(pose, tool.vertices), tool.radius)
 
     def bound(patch, centre):
-        z = jnp.mean(moved.vertices, axis=1) - centre
+        z = middle(moved.vertices) - centre
         for _ in range(NEARING):  # Frank-Wolfe on the difference of the cores, exact steps
             # Of vertices equally far (flat faces), a fixed one: roundings would choose others.
-            ahead = z + LEAD * jnp.max(jnp.abs(z)) * jnp.asarray(PREFERRED, z.dtype)
+            ahead = z + LEAD * largest(jnp.abs(z)) * jnp.asarray(PREFERRED, z.dtype)
             tip = moved.vertices[:, jnp.argmin(heights(moved.vertices, ahead))]
             step = tip - patch.vertices[:, jnp.argmax(heights(patch.vertices, ahead))] - z
-            square = jnp.sum(step * step)
-            share = -jnp.sum(z * step) / jnp.where(square > 0, square, 1)
+            square = total(step * step)
+            share = -total(z * step) / jnp.where(square > 0, square, 1)
             z = z + jnp.clip(share, 0, 1) * step
         d = _unit(z)
         return -(sharp_support(patch, d) + sharp_support(moved, -d)), d
@@ -241,7 +244,7 @@ def gap_bounds(
 
 def _unit(v):
     """Unit vector; z for a zero one."""
-    square = jnp.sum(v * v)
+    square = total(v * v)
     ahead = jnp.zeros_like(v).at[2].set(1)
     return jnp.where(square > 0, v, ahead) / jnp.sqrt(jnp.where(square > 0, square, 1))
 
@@ -251,7 +254,7 @@ def _size(tool: Shape, patches: Patches):
     tool, shapes = jax.lax.stop_gradient((tool, patches.shapes))
 
     def reach(v):
-        return jnp.sqrt(jnp.max(jnp.sum((v - jnp.mean(v, axis=1, keepdims=True)) ** 2, axis=0)))
+        return jnp.sqrt(largest(total(((v - middle(v)[:, None]) ** 2).T)))
 
     return (
         reach(tool.vertices)

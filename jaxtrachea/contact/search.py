@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import check_record
-from jaxtrachea._numerics import epsilon
+from jaxtrachea._numerics import epsilon, largest, total
 from jaxtrachea.contact.shapes import heights, log_mean
 
 #: Sharpness times size at which annealing begins: the whole pair is then one smooth bowl.
@@ -151,10 +151,10 @@ def _moments(vertices, beta, d, e1, e2):
     """Support value, softmax means along (d, e1, e2), and beta times the tangent covariance."""
     along, s1, s2 = heights(vertices, d), heights(vertices, e1), heights(vertices, e2)
     value, p = log_mean(along, beta)
-    m1, m2 = jnp.sum(p * s1), jnp.sum(p * s2)
+    m1, m2 = total(p * s1), total(p * s2)
     r1, r2 = s1 - m1, s2 - m2
-    spread = (jnp.sum(p * r1 * r1), jnp.sum(p * r1 * r2), jnp.sum(p * r2 * r2))
-    return value, jnp.sum(p * along), (m1, m2), tuple(beta * v for v in spread)
+    spread = (total(p * r1 * r1), total(p * r1 * r2), total(p * r2 * r2))
+    return value, total(p * along), (m1, m2), tuple(beta * v for v in spread)
 
 
 def model(pair: Pair, d: Float[Array, "3"]) -> Model:
@@ -183,7 +183,12 @@ def floor_of(hessian):
 
 def extent(pair: Pair) -> Float[Array, ""]:
     """Largest coordinates of the pair: roundings of f and of its gradient are in units of it."""
-    return jnp.max(jnp.abs(pair.a)) + jnp.max(jnp.abs(pair.b))
+    return _furthest(pair.a) + _furthest(pair.b)
+
+
+def _furthest(vertices):
+    """Largest coordinate."""
+    return largest(largest(jnp.abs(vertices)))
 
 
 def newton_step(m: Model, noise: Float[Array, ""] | float = 0.0):
@@ -218,7 +223,7 @@ def _walk(d, step, trust):
     length = jnp.sqrt(step[0] ** 2 + step[1] ** 2)
     k = jnp.minimum(1, trust / jnp.maximum(length, jnp.finfo(d.dtype).tiny))
     moved = d + (k * step[0]) * e1 + (k * step[1]) * e2
-    return moved / jnp.sqrt(jnp.sum(moved * moved)), jnp.minimum(length, trust)
+    return moved / jnp.sqrt(total(moved * moved)), jnp.minimum(length, trust)
 
 
 def anneal(pair: Pair, d, first, steps: int):
@@ -277,7 +282,7 @@ def _newton(pair: Pair, d, steps: int, trust, radii):
         radii: from a radius, a step's length and both its ends with their models: the next radius
             where the step is taken, and where it is not.
     """
-    slack = 8 * epsilon(d.dtype) * (1 + jnp.max(jnp.abs(pair.b)))
+    slack = 8 * epsilon(d.dtype) * (1 + _furthest(pair.b))
     noise = _noise(pair)
 
     def body(carry, _):
@@ -296,7 +301,7 @@ def _newton(pair: Pair, d, steps: int, trust, radii):
 def _slope(d, m: Model, way):
     """Change of f along a way from d, by its gradient there."""
     e1, e2 = tangents(d)
-    return m.gradient[0] * jnp.sum(e1 * way) + m.gradient[1] * jnp.sum(e2 * way)
+    return m.gradient[0] * total(e1 * way) + m.gradient[1] * total(e2 * way)
 
 
 def _noise(pair: Pair):
@@ -317,7 +322,7 @@ def sharp_table(vertices: Float[Array, "3 n"], count: int) -> Float[Array, " cou
     """max_i v_i . d over the coarse directions."""
     x, y, z = jnp.asarray(coarse_directions(count)[0].T, vertices.dtype)[:, :, None]
     u, v, w = vertices[:, None]
-    return jnp.max(x * u + y * v + z * w, axis=1)
+    return largest(x * u + y * v + z * w)
 
 
 def starts(pair: Pair, table, centre, count: int):
@@ -358,7 +363,7 @@ def find_normal(pair: Pair, table, centre, settings: Settings):
 
 def _survivors(pair: Pair, d, count: int):
     """The lowest directions; of those that have come together only the lowest is kept first."""
-    sharp = jax.vmap(lambda d: jnp.max(heights(pair.a, d)) + jnp.max(heights(-pair.b, d)))(d)
+    sharp = jax.vmap(lambda d: largest(heights(pair.a, d)) + largest(heights(-pair.b, d)))(d)
     rank = sharp - LEAD * extent(pair) * _along(d)
     together = jnp.sum(d[:, None] * d[None], axis=2) > SAME
     again = jnp.any(together & (rank[None] < rank[:, None]), axis=1)

@@ -27,6 +27,8 @@ from jax.core import Tracer
 from jax.typing import ArrayLike as _ArrayLike
 from jaxtyping import Array, Float
 
+from jaxtrachea._numerics import largest, total
+
 #: Numbers, arrays and nested lists of them.
 ArrayLike = _ArrayLike | Sequence
 
@@ -69,8 +71,8 @@ def support(shape: Shape, direction: Float[Array, "3"], beta: Float[Array, ""]) 
     """
     along = heights(shape.vertices, direction)
     value, weights = log_mean(along, beta)
-    core = jnp.sum(shape.vertices * weights[None], axis=1)
-    beyond = value - jnp.sum(weights * along) + shape.radius
+    core = total(shape.vertices * weights[None])
+    beyond = value - total(weights * along) + shape.radius
     return Support(value + shape.radius, core + beyond * direction, core)
 
 
@@ -82,15 +84,20 @@ def heights(vertices: Float[Array, "3 n"], direction: Float[Array, "3"]) -> Floa
 
 def log_mean(along: Float[Array, " n"], beta: Float[Array, ""]):
     """(1/beta) log sum exp(beta x) and the softmax weights, without overflow."""
-    top = jax.lax.stop_gradient(jnp.max(along))
+    top = jax.lax.stop_gradient(largest(along))
     e = jnp.exp(beta * (along - top))
-    total = jnp.sum(e)
-    return top + jnp.log(total) / beta, e / total
+    whole = total(e)
+    return top + jnp.log(whole) / beta, e / whole
+
+
+def mean(vertices: Float[Array, "3 n"]) -> Float[Array, "3"]:
+    """Mean of the vertices, mm."""
+    return total(vertices) / vertices.shape[1]
 
 
 def sharp_support(shape: Shape, direction: Float[Array, "3"]) -> Float[Array, ""]:
     """max_i v_i . d + r, mm: the support function without smoothing."""
-    return jnp.max(heights(shape.vertices, direction)) + shape.radius
+    return largest(heights(shape.vertices, direction)) + shape.radius
 
 
 def cloud(points: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
