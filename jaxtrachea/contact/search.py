@@ -286,16 +286,25 @@ def _newton(pair: Pair, d, steps: int, trust, radii):
     noise = _noise(pair)
 
     def body(carry, _):
-        d, m, trust = carry
+        d, m, trust = _unpacked(carry)
         new, length = _walk(d, newton_step(m, noise), trust)
         m_new = model(pair, new)
         onward, back = radii(trust, length, d, m, new, m_new)
         better = m_new.value <= m.value + slack
-        taken, kept = (new, m_new, onward), (d, m, back)
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), taken, kept), None
+        return jnp.where(better, _packed(new, m_new, onward), _packed(d, m, back)), None
 
-    (d, m, _), _ = jax.lax.scan(body, (d, model(pair, d), trust), None, length=steps)
-    return d, m.value
+    end, _ = jax.lax.scan(body, _packed(d, model(pair, d), trust), None, length=steps)
+    return end[:3], end[3]
+
+
+def _packed(d, m: Model, trust):
+    """What a step hands to the next one as a single array: XLA copies each one that it is given."""
+    return jnp.concatenate([d, jnp.stack([m.value, *m.gradient, *m.hessian, trust])])
+
+
+def _unpacked(v):
+    """Direction, model and radius from `_packed`."""
+    return v[:3], Model(v[3], (v[4], v[5]), (v[6], v[7], v[8])), v[9]
 
 
 def _slope(d, m: Model, way):
