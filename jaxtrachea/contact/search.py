@@ -150,6 +150,9 @@ def tangents(d: Float[Array, "3"]):
 def _moments(vertices, beta, d, e1, e2):
     """Support value, softmax means along (d, e1, e2), and beta times the tangent covariance."""
     along, s1, s2 = heights(vertices, d), heights(vertices, e1), heights(vertices, e2)
+    if vertices.shape[1] == 1:  # a ball
+        none = jnp.zeros_like(beta)
+        return along[0], along[0], (s1[0], s2[0]), (none, none, none)
     value, p = log_mean(along, beta)
     m1, m2 = total(p * s1), total(p * s2)
     r1, r2 = s1 - m1, s2 - m2

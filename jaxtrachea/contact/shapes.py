@@ -84,6 +84,8 @@ def heights(vertices: Float[Array, "3 n"], direction: Float[Array, "3"]) -> Floa
 
 def log_mean(along: Float[Array, " n"], beta: Float[Array, ""]):
     """(1/beta) log sum exp(beta x) and the softmax weights, without overflow."""
+    if along.shape[0] == 1:  # a ball
+        return along[0], jnp.ones_like(along)
     top = jax.lax.stop_gradient(largest(along))
     e = jnp.exp(beta * (along - top))
     whole = total(e)
