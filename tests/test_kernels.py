@@ -1,0 +1,129 @@
+"""What XLA makes of the contact, which runs at every pose: kernels, loops and `reduce-window`.
+
+Counted in the optimised program, compiled with a user's flags: hence in a process of its own, since
+conftest.py sets others. No time is measured. A kernel is an instruction that runs by itself; those
+in the loop count once for each of its rounds.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+#: Kernels of a single contact, value and with gradient, jaxlib 0.10.2: of a ball on the round tube,
+#: of a box on patches of 120 corners. Before sums were written out: 697, 716, 1,030 and 1,048. The
+#: margin is for other versions of XLA and other processors.
+MOST = {"round": (506, 525), "corners": (847, 864)}
+MARGIN = 1.15
+
+PROGRAM = """
+import json, sys
+import jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_enable_x64", True)
+from jaxtrachea.contact.patches import straight_patches, touch
+from jaxtrachea.contact.pose import pose_from_vector
+from jaxtrachea.contact.shapes import Shape, box, sphere
+import dataclasses
+
+borders = np.r_[0.0, np.arange(10, 151, 10), 160.0]
+tube, near, tool = straight_patches(borders, 12.6), 2, sphere(5.0)
+if sys.argv[1] == "corners":
+    turn = np.arange(60) * (2 * np.pi / 60)
+    ring = [np.tile(12 * f(turn), 2) for f in (np.cos, np.sin)]
+    x = np.repeat(np.stack([borders[:-1], borders[1:]], 1), 60, axis=1)
+    vertices = np.stack([np.stack([row, *ring]) for row in x])
+    shapes = Shape(jnp.asarray(vertices), jnp.full(16, 0.6))
+    tube, tool = dataclasses.replace(tube, shapes=shapes), box([2.0, 1.5, 4.0], 0.3)
+
+def contact(v):
+    seen = touch(tool, pose_from_vector(v[:3], v[3:]), tube, near=near)
+    return seen.gap, seen
+
+texts = []
+for f in (contact, jax.value_and_grad(contact, has_aux=True)):
+    texts.append(jax.jit(f).lower(jnp.asarray([0.1, 0.2, 0.3, 73, 15.6, 0])).compile().as_text())
+print(json.dumps(texts))
+"""
+
+#: The opcode of an instruction, behind its name and its type.
+OPCODE = r"\s*(?:ROOT )?%?\S+ = (?:\(.*?\)|\S+) ([\w\-]+)\("
+
+#: Instructions that start no kernel.
+FREE = "parameter constant tuple get-tuple-element bitcast while call".split()
+
+
+def computations(text):
+    """Name of the first computation to run, and opcode and line of every instruction of each."""
+    bodies, entry = {}, None
+    for block in text.split("\n\n"):
+        lines = block.strip().split("\n")
+        head = re.match(r"(ENTRY )?%?([\w.\-]+) .*\{$", lines[0])
+        if head:
+            found = [re.match(OPCODE, line) for line in lines]
+            bodies[head[2]] = [(m[1], v) for m, v in zip(found, lines, strict=True) if m]
+            entry = head[2] if head[1] else entry
+    return entry, bodies
+
+
+def kernels(name, bodies):
+    """Kernels that one run of a computation starts, and the loops in it."""
+    count, loops = 0, 0
+    for opcode, line in bodies[name]:
+        rounds = 1
+        if opcode == "while":
+            loops += 1
+            rounds = int(re.search(r'known_trip_count":\{"n":"(\d+)"', line)[1])
+        for inner in re.findall(r"(?:body|condition|to_apply)=%?([\w.\-]+)", line):
+            if opcode in ("while", "call"):
+                more = kernels(inner, bodies)
+                count, loops = count + rounds * more[0], loops + more[1]
+        count += opcode not in FREE
+    return count, loops
+
+
+@pytest.mark.parametrize("tube", list(MOST))
+def test_the_contact_starts_few_kernels(tube):
+    environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    run = subprocess.run(
+        [sys.executable, "-c", PROGRAM, tube], capture_output=True, text=True, env=environment
+    )
+    assert run.returncode == 0, run.stderr
+    for text, most in zip(json.loads(run.stdout), MOST[tube], strict=True):
+        # More than 32 entries in one reduction: it would fuse with nothing and run scalar.
+        assert "reduce-window(" not in text
+        entry, bodies = computations(text)
+        started, loops = kernels(entry, bodies)
+        assert loops == 1
+        # The count finds what it counts: twelve rounds of a loop are the larger part of it.
+        assert started > 100
+        assert started <= MARGIN * most, f"{started} kernels"
+
+
+def test_the_count_of_kernels():
+    """By hand: 2 + 3 rounds of (1 + 1) + the reduction in a call."""
+    text = """
+%step (p: f64[2]) -> f64[2] {
+  %p = f64[2]{0} parameter(0)
+  ROOT %f = f64[2]{0} fusion(%p), kind=kLoop, calls=%c
+}
+
+%ahead (p: f64[2]) -> pred[] {
+  ROOT %w = pred[] fusion(%p), kind=kLoop, calls=%c
+}
+
+%inner (p: f64[2]) -> f64[] {
+  ROOT %r = f64[] reduce(%p, %z), dimensions={0}, to_apply=%add
+}
+
+ENTRY %main (v: f64[2]) -> f64[] {
+  %v = f64[2]{0} parameter(0)
+  %a = f64[2]{0} fusion(%v), kind=kLoop, calls=%c
+  %b = f64[2]{0} copy(%a)
+  %l = (f64[2], /*i*/f64[]) while(%b), condition=%ahead, body=%step, known_trip_count":{"n":"3"}
+  ROOT %o = f64[] call(%l), to_apply=%inner
+}
+"""
+    assert kernels(*computations(text)) == (2 + 3 * 2 + 1, 1)
