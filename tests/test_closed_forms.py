@@ -85,7 +85,7 @@ def test_resampled_residuals_have_the_variance_of_the_noise():
     result = fit(line(np.stack([FORCE, FORCE[::-1]])), ONE)
     residual = np.stack([FORCE, FORCE[::-1]]) - result.value[0, 0] * D
     seen = Prediction(residual[None], None)
-    noise, _ = bootstrap._blocks(np.random.default_rng(0), result, seen, 0, 20_000, 1)
+    noise = bootstrap._blocks(np.random.default_rng(0), result, seen, 0, 20_000, 1)["force"]
     expected = np.var(residual, axis=1) * 24 / 23
     # 240,000 draws of heavy tails tell a variance to 1 %; the factor is 4.3 %.
     np.testing.assert_allclose(np.var(noise, axis=(0, 2)), expected, rtol=0.01)
