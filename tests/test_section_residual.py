@@ -11,15 +11,19 @@ import pytest
 
 from jaxtrachea.cli.specification import options_of, parameters_of
 from jaxtrachea.config import SpecError, load_fit_spec
+from jaxtrachea.fitting import structure
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lane import observations, size, without_data
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS, defaults_of
+from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.residual import inputs, residual, residual_value
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study, check_curve
 from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.comparison import same_data
 from jaxtrachea.inference.design import check
+from jaxtrachea.inference.effective import effective_samples
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.inference.posterior import posterior
 from jaxtrachea.inference.repeats import repeats
@@ -141,13 +145,15 @@ def test_row_is_what_a_press_shows(evaluated):
         got, c = shown(study, theta, k), study.curves[0][k]
         row = {
             "force": (got["force"] - c.force) / 0.05,
-            "side": (got["side"] - c.side_force) / 0.05,
+            # Of a normal press on the midline it is 0 by symmetry, and does not count.
+            "side": (got["side"] - c.side_force) / 0.05 * (k > 0),
         }
         for name, data in (
             ("joints", c.joint_displacement), ("aside", c.joint_side_displacement),
         ):  # fmt: skip
             row[name] = np.zeros((n, 3))
             row[name][:, [0, 2]] = (got[name][:, [0, 2]] - data) / 0.2
+        row["aside"] *= k > 0
         row["ends"] = np.zeros((n, 3, 2, 2))
         data = np.stack([c.end_U, c.end_V], 2)[:, 0]
         row["ends"][:, 1] = (got["ends"][:, 1] - data) / 0.2
@@ -190,7 +196,8 @@ def test_what_is_not_observed_counts_nothing(evaluated):
     assert np.all(np.asarray(got.jacobian).transpose(0, 2, 1)[gone] == 0)
     np.testing.assert_allclose(np.asarray(got.value)[~gone], np.asarray(before.value)[~gone])
     # A trial that nothing observes is not pressed, wherever it would go.
-    far = study_of([curve(PLACES[0]), curve(PLACES[1]), curve(PLACES[2], [0.5, 2.0, 60.0])])
+    far = study_of([curve(place) for place in PLACES])
+    far.lanes.displacement[0, 2] = [0.5, 2.0, 60.0]  # no curve of a study goes as deep
     lost = both(theta, lane_of(far))
     assert np.all(np.isfinite(lost.value[:2]))
     assert np.isnan(lost.value[2]).any()
@@ -357,6 +364,46 @@ def test_curves_that_a_model_cannot_press():
         check_curve(behind, GEOMETRY, SECTIONS)
     with pytest.raises(ValueError, match="end of ring 4 of 3"):
         check_curve(curve(PLACES[0], end_rings=np.array([3])), GEOMETRY, SECTIONS)
+    with pytest.raises(ValueError, match="12 mm deep, expected no more than the radius, 11.7 mm"):
+        check_curve(curve(PLACES[0], np.array([0.5, 2.0, 12.0])), GEOMETRY, SECTIONS)
+
+
+def test_lanes_pressed_otherwise_are_of_another_kind():
+    """Their structure is decided at their own displacements, angles and observations."""
+    kinds = structure._kinds(
+        study_of([
+            curve(PLACES[0]), dataclasses.replace(curve(PLACES[1]), specimen="two", s_c=20.0),
+        ])
+    )  # fmt: skip
+    np.testing.assert_array_equal(kinds[0], [0, 1])
+
+
+def test_a_kind_of_few_samples_is_taken_for_as_alike_as_the_forces():
+    """Ends seen at every tenth sample have no neighbours, and zeros no correlation at all."""
+    n = 4000
+    noise = np.random.default_rng(0).normal(size=n + 1)
+    alike = np.zeros(n)
+    for i in range(n):
+        alike[i] = 0.8 * (alike[i - 1] if i else 0) + noise[i]
+    ends = np.full((1, 1, n, 1, 2, 2), np.nan)
+    ends[..., ::10, :, :, :] = 1.0
+    share = (1 - 0.8) / (1 + 0.8)
+    force = alike[None, None]
+    for more, count in (({}, n), ({"ends": ends}, n + 4 * n / 10),
+                        ({"side_force": np.zeros((1, 1, n))}, 2 * n)):  # fmt: skip
+        found = effective_samples(Prediction(force, None, **more))
+        np.testing.assert_allclose(found, count * share, rtol=0.15)
+
+
+def test_a_comparison_says_which_model_reads_more():
+    plain = dataclasses.replace(
+        curve(PLACES[0]), joint_rings=None, joint_displacement=None, joint_side_displacement=None
+    )
+    with pytest.warns(UserWarning, match="not read: side force"):
+        line = build_study([plain], GEOMETRY, Options(contact="bonded"), noise=NOISE)
+    both = study_of([plain]), line
+    with pytest.raises(ValueError, match="'sections' reads side forces.*from a file without those"):
+        same_data(both, ["a.toml", "b.toml"])
 
 
 SPEC = """
@@ -390,6 +437,8 @@ def test_specification(tmp_path):
         ({"contact": "unilateral"}, "model: skeleton='sections' needs contact='bonded'"),
         ({"skeleton": "linear", "more": "[wall]"}, "wall: moduli and thicknesses are read by"),
         ({"more": "[parameters]\nk_M = {}"}, "parameters.k_M: not seen by this model"),
+        ({"more": "[parameters]\nfootprint = { fixed = 0.5 }"}, "expected 1 or more"),
+        ({"more": '[parameters]\nc_K = { fixed = "-5 mm^2" }'}, "expected 0 or more"),
     ):
         with pytest.raises(SpecError) as error:
             table(**arguments)

@@ -15,7 +15,7 @@ from jaxtrachea.measurements.read import (
     Measurements,
 )
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.mechanics.sections.material import Wall
+from jaxtrachea.mechanics.sections.material import LEAST, SECTION_VALUES, Wall
 from jaxtrachea.optimisation.levenberg_marquardt import MOST_SLOTS
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.trachea.section import geometry_of
@@ -100,6 +100,9 @@ def _fixed(default: Parameter, given: str | float | int) -> Parameter:
     if default.scale == "log" and value <= 0:
         found = f"{value:g} {default.unit} is no stiffness"
         raise InputError(found, key="fixed", expected="more than 0")
+    if default.name in SECTION_VALUES and value < (least := LEAST.get(default.name, 0.0)):
+        found = f"{value:g} {default.unit}".strip()
+        raise InputError(found, key="fixed", expected=f"{least:g} or more")
     return dataclasses.replace(default, value=value, fixed=True)
 
 

@@ -139,11 +139,8 @@ def weighted(v: Float[Array, "*n"], precision: Float[Array, "*n"]) -> Float[Arra
 def without_data(lane: Lane, hidden: Any) -> Lane:
     """The lane, or lanes, with the trials `hidden` (of the shape of `s_c`) unobserved; numpy."""
     blind = {}
-    for kind, name in zip(
-        forces(lane) + markers(lane),
-        [weight for data, weight in FORCES + MARKERS if getattr(lane, data) is not None],
-        strict=True,
-    ):
-        over = hidden.reshape(*hidden.shape, *[1] * (kind.precision.ndim - hidden.ndim))
-        blind[name] = np.where(over, 0, kind.precision)
+    for _, name in FORCES + MARKERS:
+        if (precision := getattr(lane, name)) is not None:
+            over = hidden.reshape(*hidden.shape, *[1] * (precision.ndim - hidden.ndim))
+            blind[name] = np.where(over, 0, precision)
     return lane._replace(**blind)

@@ -276,13 +276,15 @@ def _add_vectors(lane: dict[str, Any], layout: _Layout, t: int, curve: Curve) ->
     n, geometry = len(curve.force), layout.geometry
     if lane["phi_c"] is not None:
         lane["phi_c"][t], lane["direction"][t] = curve.phi_c, curve.direction
-    if curve.side_force is not None:
+    # By symmetry the model knows nothing but 0 of a normal press on the midline.
+    aside = off_midline(curve)
+    if aside and curve.side_force is not None:
         seen = np.isfinite(curve.side_force)
         lane["side_force"][t, :n] = np.where(seen, curve.side_force, 0)
         lane["side_precision"][t, :n] = np.where(seen, lane["precision"][t, :n], 0)
     weight = 1.0 if layout.noise.joints is None else 1 / layout.noise.joints
     moved = curve.joint_side_displacement
-    if moved is not None and curve.joint_rings is not None:
+    if aside and moved is not None and curve.joint_rings is not None:
         seen = np.isfinite(moved) & _away(curve, geometry, layout.reach, curve.joint_rings)
         lane["joint_side"][t, :n, curve.joint_rings] = np.where(seen, moved, 0).T
         lane["joint_side_precision"][t, :n, curve.joint_rings] = np.where(seen, weight, 0).T

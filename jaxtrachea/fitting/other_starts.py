@@ -83,9 +83,11 @@ def twins(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     """Starts at other skeletons with nearly the same compliances, by a grid of EI_L and k_M.
 
     Local minima of the squared difference of ln c on the grid, the `TWINS` lowest of each lane;
-    the estimate where there are fewer.
+    the estimate where there are fewer. None where the two are not both free.
     """
     study = result.study
+    if not {"EI_L", "k_M"} <= {p.name for p in study.free}:
+        return []
     out = np.repeat(result.theta[lanes][None], TWINS, axis=0)
     for n, lane in enumerate(lanes):
         place = {p.name: i for i, (p, _, _) in enumerate(study.unknowns[lane])}

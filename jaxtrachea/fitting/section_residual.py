@@ -116,7 +116,7 @@ def residual(
             return jax.jvp(lambda free: _seen(model, free, trial, tube), (free,), (tangent,))
 
         seen, slopes = jax.vmap(push, out_axes=(None, 0))(eye)
-        return _row(seen, trial), jax.vmap(lambda slope: _rate(slope, trial))(slopes)
+        return _row(seen, trial), jax.vmap(lambda slope: _whitened(slope, trial))(slopes)
 
     return jax.vmap(one)(free, trials)
 
@@ -170,10 +170,10 @@ def _seen(model: FitModel, free, trial: Lane, tube: Geometry) -> list[Array]:
 def _row(seen: list[Array], trial: Lane) -> Float[Array, " m"]:
     """Differences to the data over their standard deviation."""
     kinds = forces(trial) + markers(trial)
-    return _rate([v - kind.data for v, kind in zip(seen, kinds, strict=True)], trial)
+    return _whitened([v - kind.data for v, kind in zip(seen, kinds, strict=True)], trial)
 
 
-def _rate(parts: list[Array], trial: Lane) -> Float[Array, " m"]:
+def _whitened(parts: list[Array], trial: Lane) -> Float[Array, " m"]:
     """Observed entries over their standard deviation in one row."""
     kinds = forces(trial) + markers(trial)
     rows = [weighted(v, kind.precision).ravel() for v, kind in zip(parts, kinds, strict=True)]

@@ -343,8 +343,8 @@ def _kinds(study: Study) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " lanes
     """One lane of every kind (all of a joint study), and the kind of each lane."""
     lanes = study.lanes
     count = len(lanes.s_c)
-    if study.joint:
-        return np.arange(count), np.arange(count)
+    if study.joint or study.model.options.skeleton == "sections":
+        return np.arange(count), np.arange(count)  # of sections every displacement counts
     marked = lanes.joint_precision
     parts = [lanes.s_c, lanes.index, lanes.value, lanes.active, lanes.lower, lanes.upper]
     parts.append((lanes.precision > 0).any(axis=2))

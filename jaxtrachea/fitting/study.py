@@ -258,6 +258,13 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
                 f"within {np.degrees(float(geometry.half_angle)):.3g} deg of the midline",
                 place=where,
             )
+        if (deepest := float(np.max(np.abs(curve.displacement)))) > float(geometry.radius):
+            raise InputError(
+                f"pressed {deepest:.3g} mm deep, expected no more than the radius, "
+                f"{float(geometry.radius):g} mm",
+                place=where,
+                cure="cut the curve off (displacement_max) or leave it out",
+            )
     else:
         _check_normal(curve, options, where)
     if curve.joint_rings is not None and np.any(curve.joint_rings >= rings):

@@ -87,6 +87,13 @@ def same_data(studies: Sequence[Study], names: Sequence[str]) -> None:
         if study.model.loss != "linear" or first.model.loss != "linear":
             raise ValueError(f"fit.loss of {pair}: criteria need a likelihood; use 'linear'")
         if _curves(study) != _curves(first):
+            skeletons = {s.model.options.skeleton for s in (study, first)}
+            if "sections" in skeletons and len(skeletons) > 1:
+                raise ValueError(
+                    f"{pair} use different samples: skeleton 'sections' reads side forces, "
+                    "sideward markers, ring ends and presses off the midline, which the other does "
+                    "not; compare them on presses along the normal, from a file without those"
+                )
             raise ValueError(f"{pair} use different samples; give both the same [data] section")
         if study.noise_given != first.noise_given or not _same_noise(study, first):
             raise ValueError(
@@ -112,6 +119,7 @@ def _curves(study: Study) -> set[tuple]:
             c.phi_c,
             tuple(c.direction),
             *map(said, (c.displacement, c.force, c.joint_displacement, *vectors(c))),
+            *map(said, (c.joint_rings, c.end_rings)),
         )
         for lane in study.curves
         for c in lane

@@ -67,9 +67,12 @@ def effective_samples(seen: Prediction) -> Float[np.ndarray, " lanes"]:
             rows = np.moveaxis(more.reshape(lanes, trials, samples, -1), -1, 2)
             kinds.append(rows.reshape(lanes, -1, samples))
     total = np.zeros(len(seen.force))
+    of_forces = share_independent(lag_correlation(Prediction(seen.force, None)))
     for residual in kinds:
         count = np.sum(np.isfinite(residual), axis=(1, 2))
         share = share_independent(lag_correlation(Prediction(residual, None)))
+        # Too few neighbours of one kind, or no residual at all: taken for as alike as the forces.
+        share = np.where(np.isnan(share), of_forces, share)
         total += np.where(count > 0, count * share, 0)
     return total
 

@@ -112,6 +112,8 @@ def same_curves(curves: Sequence[Curve]) -> Iterator[str]:
     for curve in curves:
         digest = sha256(curve.displacement.tobytes())
         digest.update(curve.force.tobytes())
+        for more in (curve.side_force, curve.joint_displacement, curve.end_U, curve.end_V):
+            digest.update(b"" if more is None else more.tobytes())
         groups.setdefault(digest.digest(), []).append(curve)
     for group in groups.values():
         if len(group) > 1:

@@ -86,6 +86,7 @@ class Options:
 _OF_SECTIONS = {
     "coupling": "series", "split": "continuous", "form": "recursion", "shear": False,
     "local": "uniform", "transition": None, "half_width": 0.0, "contact": "bonded",
+    "onset_width": 1e-3,
 }  # fmt: skip
 
 

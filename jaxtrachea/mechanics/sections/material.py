@@ -144,6 +144,8 @@ EACH_RING = ("EI_C", "EI_M", "Et_M", "bed_n", "bed_t", "c_K")
 EACH_SPAN = ("Gt_L", "Et_L", "D_L", "c_W", "rho")
 #: Values that must be more than zero; the others must not be negative.
 POSITIVE = ("EI_C", "EI_M", "Et_M", "Gt_L", "Et_L", "c_n", "c_t", "c_t_ring")
+#: Smallest values where these are not 0.
+LEAST = {"footprint": 1.0}
 
 
 def check_sections(geometry: Geometry, material: SectionMaterial) -> None:

@@ -20,6 +20,7 @@ from jaxtrachea.mechanics.sections.contact import place_on
 from jaxtrachea.mechanics.sections.material import (
     EACH_RING,
     EACH_SPAN,
+    LEAST,
     POSITIVE,
     SectionMaterial,
     check_sections,
@@ -93,8 +94,9 @@ def press_sections(
 
     Returns:
         The `SectionPress`. Rows that Newton's method does not solve or that are no minimum of the
-        energy (and those after the latter) are NaN, PAST_FOLD; others are untouched. Derivatives
-        are those of the equilibrium, in either mode.
+        energy (and those after the latter) are NaN, PAST_FOLD; others are untouched. Rows deeper
+        than the radius are TOO_DEEP, with their values. Derivatives are those of the equilibrium,
+        in either mode.
 
     Raises:
         ValueError: an argument that is no number, or an array of a length that does not fit.
@@ -117,7 +119,9 @@ def press_sections(
     found = found._replace(steps=solved.steps, status=status)
     valid = (status == PressStatus.OK) | (status == PressStatus.NO_CONTACT)
     hidden = jax.vmap(hide)(jnp.where(valid, PressStatus.OK, status), found)
-    return hidden._replace(steps=solved.steps)
+    deep = (status == PressStatus.OK) & (jnp.abs(path) > geometry.radius)
+    status = jnp.where(deep, PressStatus.TOO_DEEP, status).astype(jnp.int8)
+    return hidden._replace(steps=solved.steps, status=status)
 
 
 class _Asked(NamedTuple):
@@ -154,7 +158,7 @@ def _safe_values(material: SectionMaterial) -> tuple[dict[str, Any], Array, Arra
     for field in dataclasses.fields(material):
         value, name = getattr(material, field.name), field.name
         low = value <= 0 if name in POSITIVE else value < 0
-        low = value < 1 if name == "footprint" else low
+        low = value < LEAST[name] if name in LEAST else low
         odd = jnp.isnan(value) | (jnp.isinf(value) & (name != "k_end") & ~low)
         safe[name] = jnp.where(low | odd, 1, value)
         bad, unknown = bad | jnp.any(low), unknown | jnp.any(odd)
