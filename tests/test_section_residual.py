@@ -266,11 +266,12 @@ def test_known_parameters_are_found(tmp_path):
     for i, c in enumerate(curves):
         row = slice(i * n, (i + 1) * n)
         np.testing.assert_array_equal(data["side_force"][row], c.side_force)
-        np.testing.assert_array_equal(data["joint_side"][row], c.joint_side_displacement)
+        aside = c.joint_side_displacement if c.phi_c else np.full((n, 3), np.nan)  # 0 by symmetry
+        np.testing.assert_array_equal(data["joint_side"][row], aside)
         np.testing.assert_array_equal(data["ends"][row, :, 1], c.end_V)
         np.testing.assert_array_equal(data["direction"][i], c.direction)
     for name in ("side", "joint_side", "ends"):
-        assert np.max(np.abs(data[f"{name}_residual"])) < 1e-4
+        assert np.nanmax(np.abs(data[f"{name}_residual"])) < 1e-4
 
 
 def test_lanes():
