@@ -173,6 +173,15 @@ def test_hard_cases():
     np.testing.assert_allclose(repeated[[3, 4]], repeated[[0, 0]], atol=1e-10)
 
 
+def test_deeper_than_the_radius_is_said():
+    """By how far the wall moves: a tool on a soft spring may move further."""
+    [got] = press([({}, 30.0, 0.0, np.array([1.0, 5, 11, 11.65, 12, 13, 14, 9, -2]))])
+    moved = -got.skeleton[:, 1]
+    assert np.all(np.isfinite(got.force))
+    np.testing.assert_array_equal(got.status == PressStatus.TOO_DEEP, moved > RADIUS)
+    assert np.sum(moved > RADIUS) == 3
+
+
 def test_past_a_fold():
     """Soft rings snap through under a tool on a soft spring: no row from there on looks valid.
 

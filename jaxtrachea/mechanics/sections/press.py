@@ -94,9 +94,9 @@ def press_sections(
 
     Returns:
         The `SectionPress`. Rows that Newton's method does not solve or that are no minimum of the
-        energy (and those after the latter) are NaN, PAST_FOLD; others are untouched. Rows deeper
-        than the radius are TOO_DEEP, with their values. Derivatives are those of the equilibrium,
-        in either mode.
+        energy (and those after the latter) are NaN, PAST_FOLD; others are untouched. Rows whose
+        wall moves further than the radius are TOO_DEEP, with their values. Derivatives are those
+        of the equilibrium, in either mode.
 
     Raises:
         ValueError: an argument that is no number, or an array of a length that does not fit.
@@ -119,7 +119,8 @@ def press_sections(
     found = found._replace(steps=solved.steps, status=status)
     valid = (status == PressStatus.OK) | (status == PressStatus.NO_CONTACT)
     hidden = jax.vmap(hide)(jnp.where(valid, PressStatus.OK, status), found)
-    deep = (status == PressStatus.OK) & (jnp.abs(path) > geometry.radius)
+    moved = jnp.sum(found.skeleton**2, axis=1)
+    deep = (status == PressStatus.OK) & (moved > geometry.radius**2)
     status = jnp.where(deep, PressStatus.TOO_DEEP, status).astype(jnp.int8)
     return hidden._replace(steps=solved.steps, status=status)
 
