@@ -273,6 +273,7 @@ def test_few_and_many_rings(count):
         return press_sections(geometry, SectionMaterial(**values), s_c, 0.9, path)
 
     p = values | {"R": RADIUS, "alpha": 2 * np.pi / 3}
+    p |= {"k_n": p["bed_n"], "k_t": p["bed_t"]}
     small = inward(jax.tree.map(np.asarray, at(jnp.asarray(SMALL))), 0.9)[-1] / SMALL[-1]
     wanted = linear_force(p, length, rings, s_c, 0.9)
     np.testing.assert_allclose(small, wanted, atol=2e-5 * wanted[0])
