@@ -76,11 +76,12 @@ class PredictionStatus(_Described):
     AT_BOUND = 1, "predicted, but the bands leave out the uncertainty of an unknown on its bound"
     BENT = 2, "predicted, but the model bends within the bands: the linear bands are off"
     UNDETERMINED = 3, "predicted, but the data of the fit do not limit it: infinite bands"
-    NO_SOLUTION = 4, "no stable solution at some displacements"
-    NO_OWN = 5, "the curve's own parameters could not be fitted to it"
-    NO_ESTIMATE = 6, "the fit has no estimate for it"
-    UNKNOWN_SPECIMEN = 7, "the fit does not know this specimen"
-    BAD_DATA = 8, "the measurements could not be used"
+    TOO_DEEP = 4, "predicted, but where the wall moves further than the tube's radius"
+    NO_SOLUTION = 5, "no stable solution at some displacements"
+    NO_OWN = 6, "the curve's own parameters could not be fitted to it"
+    NO_ESTIMATE = 7, "the fit has no estimate for it"
+    UNKNOWN_SPECIMEN = 8, "the fit does not know this specimen"
+    BAD_DATA = 9, "the measurements could not be used"
 
     @property
     def predicts(self) -> bool:

@@ -205,7 +205,9 @@ def test_bad_specification(name, tmp_path, monkeypatch, capsys):
     spec.write_bytes(text if isinstance(text, bytes) else text.encode())
     out, err = complains(monkeypatch, capsys, tmp_path, [*says, "spec.toml"], "fit", spec)
     assert out == ""
-    assert err.startswith("error:")
+    note = "note: 1 of 1 curves go to 1.5 mm"  # of the good data: a linear skeleton
+    lines = [line for line in err.splitlines() if not line.startswith(note)]
+    assert lines[0].startswith("error:")
 
 
 @pytest.mark.parametrize("name", BAD_DATA)

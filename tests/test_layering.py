@@ -73,7 +73,7 @@ WITHIN = {
         {"press"},
     ],
     "fitting": [
-        {"parameters", "lane", "unread"},
+        {"parameters", "lane", "tested", "unread"},
         {"model"},
         {"lanes", "onset"},
         {"study"},

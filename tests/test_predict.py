@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
+from jaxtrachea.fitting.tested import deeper_than_tested
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import leave_one_out, with_own_touch
 from jaxtrachea.inference.labels import verdict_sentence
@@ -37,11 +39,11 @@ from jaxtrachea.prediction import held_out
 from jaxtrachea.prediction import plots as prediction_plots
 from jaxtrachea.prediction.core import Estimate, predicted
 from jaxtrachea.prediction.predict import predict_sources
-from jaxtrachea.prediction.sources import source_of
+from jaxtrachea.prediction.sources import Source, source_of
 from jaxtrachea.results import stored
 from jaxtrachea.results.hdf5 import read_hdf5, write_hdf5
 from jaxtrachea.results.rows import lane_rows
-from jaxtrachea.status import FitStatus, PredictionStatus
+from jaxtrachea.status import FitStatus, PredictionStatus, PressStatus
 from jaxtrachea.trachea.geometry import table_1
 
 ROOT = Path(__file__).parents[1]
@@ -52,8 +54,8 @@ DEPTHS = np.linspace(0.1, 6.0, 25)
 SEEN, UNSEEN = (22.0, 45.0, 75.0, 80.0), (61.0, 107.0)
 LANES = 24
 NOISE = 0.02
-COLUMNS = ("specimen", "trial", "s [mm]", "phi [deg]", "displacement [mm]", "force [N]",
-           "predicted [N]", "low95 [N]", "high95 [N]")  # fmt: skip
+COLUMNS = ("specimen", "trial", "s [mm]", "phi [deg]", "tilt [deg]", "displacement [mm]",
+           "force [N]", "predicted [N]", "low95 [N]", "high95 [N]")  # fmt: skip
 
 
 def true_force(s, depths=DEPTHS):
@@ -649,8 +651,8 @@ def test_fixed_specification_on_the_command_line(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", "expected s, D, specimen or trial"),
-        ("75", "expected s, D, specimen or trial"),
+        ("", "expected s, D, phi, tilt, specimen or trial"),
+        ("75", "expected s, D, phi, tilt, specimen or trial"),
         ("s=75", "no displacement D"),
         ("D=2", "no contact position s"),
         ("s=75,D=two", "neither a length nor a range"),
@@ -662,7 +664,9 @@ def test_fixed_specification_on_the_command_line(tmp_path, monkeypatch, capsys):
         ("s=0:160:0.1,D=0:6:0.01", "more than 100000"),
         ("s=75,D=1e999", "finite"),
         ("s=75,D=2,q=1", "'q=1' is not understood"),
-        ("s=75,D=2,phi=30 deg", "anterior midline"),
+        ("s=75,D=2,phi=north", "phi:"),
+        ("s=75,D=2,tilt=90", "moves inwards; expected within 90 deg"),
+        ("s=75,D=2,tilt=1 mm", "tilt:"),
     ],
 )
 def test_presses_that_make_no_sense(text, says):
@@ -678,6 +682,25 @@ def test_presses_in_units_and_ranges():
     assert np.allclose(
         parse_presses("D=1:-0.5:-0.5", needs_position=False).displacement, [1, 0.5, 0, -0.5]
     )
+
+
+def test_presses_aside_in_degrees_or_a_unit():
+    """Tan 45 deg is 1; growing phi is positive."""
+    found = parse_presses("s=75,D=2,phi=-30,tilt=0.25 rad", needs_position=True)
+    assert np.isclose(found.phi, -np.pi / 6, rtol=1e-15)
+    assert np.isclose(found.direction[1] / found.direction[0], np.tan(0.25), rtol=1e-15)
+    plain = parse_presses("s=75,D=2,phi=0", needs_position=True)
+    assert (plain.phi, plain.direction) == (0.0, (1.0, 0.0))
+
+
+@pytest.mark.parametrize("aside", ["phi=30 deg", "tilt=10"])
+def test_a_line_of_joints_is_pressed_on_the_midline(study, tmp_path, monkeypatch, capsys, aside):
+    at = ("--at", f"s=75,D=2,{aside}", "--out", tmp_path / "a")
+    code, _, err = run(monkeypatch, capsys, "predict", study[0], *at)
+    assert code == 2
+    assert "anterior midline" in err
+    assert "skeleton = 'sections'" in " ".join(err.split())
+    assert not (tmp_path / "a").exists()
 
 
 def test_command_writes_what_the_page_says(study, tmp_path, monkeypatch, capsys):
@@ -975,3 +998,64 @@ def test_a_fit_that_knows_no_position_has_no_range_of_them():
     assert _beyond(nowhere, 15.0, deep[:1]) == ""
     assert _beyond(nowhere, 15.0, deep) == "extrapolated from data at D = 0 to 2 mm"
     assert _beyond(here, 30.0, deep[:1]).endswith("s = 10 to 20 mm")
+
+
+def test_an_angle_that_was_not_pressed_is_extrapolated():
+    """Data at 0 to 30 deg along the normal; each angle is asked for by itself."""
+    from jaxtrachea.prediction.predict import _beyond
+
+    spans, angles = np.array([0.0, 2.0, 10.0, 20.0]), np.array([0.0, np.pi / 6])
+    deep = np.array([0.0, 2.0])
+
+    def words(phi, tilt):
+        return _beyond(spans, 15.0, deep, [(angles, phi, "phi"), ((0.0, 0.0), tilt, "tilt")])
+
+    assert words(np.pi / 6, 0.0) == ""
+    assert words(-0.01, 0.0) == "extrapolated from data at phi = 0 to 30 deg"
+    assert words(0.1, 0.1) == "extrapolated from data at tilt = 0 to 0 deg"
+    assert words(1.0, -0.1).endswith("phi = 0 to 30 deg and tilt = 0 to 0 deg")
+
+
+def test_rows_where_the_wall_moves_further_than_the_radius_are_told():
+    from jaxtrachea.prediction.core import Response
+    from jaxtrachea.prediction.predict import _verdict
+
+    source = source_like(PredictionStatus.OK)
+    force = np.array([0.1, 0.2, 0.3])
+    value, se = Response(force, force[:, None], None), Response(force / 9, force[:, None], None)
+    presses = np.array([PressStatus.OK, PressStatus.TOO_DEEP, PressStatus.TOO_DEEP])
+    status, message = _verdict(source, value, se, presses, 0.0)
+    assert status == PredictionStatus.TOO_DEEP
+    assert status.predicts
+    assert "2 samples: solved, but the wall is pressed in" in message
+    assert _verdict(source, value, se, 0 * presses, 0.0)[0] == PredictionStatus.OK
+    # A row without a number is worse.
+    lost = value._replace(force=np.array([0.1, 0.2, np.nan]))
+    presses[2] = PressStatus.PAST_FOLD
+    status, message = _verdict(source, lost, se, presses, 0.0)
+    assert status == PredictionStatus.NO_SOLUTION
+    assert "1 samples: solved, but" in message
+
+
+def source_like(status):
+    none = np.zeros((0, 0))
+    return Source(
+        "a", "", 0, none[0:], none[0:], none, none, np.array(2.0), np.ones(2), (), status, ""
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "depths", "says"),
+    [
+        # A tenth of 12 mm, a half of it; without a skeleton nothing yields but the contact.
+        (Options(), (1.0, 1.2), None),
+        (Options(), (1.3, 0.5), "1 of 2 curves go to 1.3 mm; .*'linear' was tested to 1.2 mm"),
+        (Options(skeleton="softening"), (6.0, 1.0), None),
+        (Options(skeleton="softening"), (7.0, 6.5), "2 of 2 curves go to 7 mm; .* to 6 mm"),
+        (Options(coupling="total"), (20.0, 1.0), None),
+    ],
+)
+def test_curves_deeper_than_a_skeleton_was_tested(options, depths, says):
+    curves = [Curve("a", "", 50.0, 0.0, d * np.linspace(0, 1, 5), np.ones(5)) for d in depths]
+    sentence = deeper_than_tested(curves, options, 12.0)
+    assert sentence is None if says is None else re.search(says, sentence)

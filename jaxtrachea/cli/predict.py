@@ -25,7 +25,7 @@ AtOption = Annotated[
     typer.Option(
         "--at",
         metavar="s=75,D=0:6:0.5",
-        help="Contact position and displacement, mm; repeatable.",
+        help="Contact position and displacement, mm (and phi, tilt, deg); repeatable.",
     ),
 ]
 DataOption = Annotated[
@@ -93,9 +93,9 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
     from jaxtrachea.prediction.plots import draw_predictions
     from jaxtrachea.prediction.predict import predict_sources
 
-    sources, s, depths = _asked(stored, texts)
+    sources, s, depths, aside = _asked(stored, texts)
     with into(out_dir, default) as (folder, stop_if_asked):
-        curves = predict_sources(stored, sources, s, depths)
+        curves = predict_sources(stored, sources, s, depths, aside=aside)
         stop_if_asked()
         rings = np.asarray(stored.study.model.geometry.ring_positions)
         write_csv(
@@ -118,16 +118,17 @@ def _predict_at(stored, texts: Sequence[str], out_dir, default: Path, digest: st
 
 
 def _asked(stored, texts: Sequence[str]):
-    """Sources, positions and displacements of every --at."""
+    """Sources, positions, displacements, and angle with direction, of every --at."""
     from jaxtrachea.measurements.presses import parse_presses
-    from jaxtrachea.prediction.predict import check_position
+    from jaxtrachea.prediction.predict import check_aside, check_position
     from jaxtrachea.prediction.sources import source_of
 
     needs = stored.study.model.options.coupling == "series"
-    sources, places, depths = [], [], []
+    sources, places, depths, aside = [], [], [], []
     for text in texts:
         try:
             asked = parse_presses(text, needs_position=needs)
+            check_aside(stored, asked.phi, asked.direction)
             names = stored.specimens if asked.specimen is None else (asked.specimen,)
             if asked.specimen is not None and asked.specimen not in stored.specimens:
                 raise ValueError(_unknown("specimen", asked.specimen, stored.specimens))
@@ -146,7 +147,8 @@ def _asked(stored, texts: Sequence[str]):
                 sources.append(source)
                 places.append(place)
                 depths.append(asked.displacement)
-    return sources, places, depths
+                aside.append((asked.phi, asked.direction))
+    return sources, places, depths, aside
 
 
 def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, digest) -> int:
@@ -176,12 +178,11 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
         rings = np.asarray(stored.study.model.geometry.ring_positions)
         rows = {"predictions": [], "bands": [], "joints": []}
         for c in compared:
-            p, phi = c.prediction, c.curve.phi_c
-            side = c.curve.side_force
-            rows["predictions"] += tables.prediction_rows(p, c.curve.force, phi, side)
-            rows["bands"] += tables.band_rows(p, phi)
+            p = c.prediction
+            rows["predictions"] += tables.prediction_rows(p, c.curve.force, c.curve.side_force)
+            rows["bands"] += tables.band_rows(p)
             deepest = [int(np.argmax(np.abs(p.displacement)))]
-            rows["joints"] += tables.joint_rows(p, rings, deepest, _markers(c, len(rings)), phi)
+            rows["joints"] += tables.joint_rows(p, rings, deepest, _markers(c, len(rings)))
         if not any(c.prediction.has_skeleton for c in compared):
             del rows["joints"]
         for name, content in rows.items():

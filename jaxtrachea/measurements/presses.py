@@ -1,6 +1,7 @@
 """Presses that a user asks a prediction for, as text: "s=75, D=0:6:0.5 mm, specimen=T01"."""
 
 import dataclasses
+import math
 import re
 
 import numpy as np
@@ -9,7 +10,7 @@ from jaxtrachea.units import UnitError, convert, parse_quantity
 
 #: Presses that one text may stand for.
 MOST = 100_000
-_KEYS = {"s": "s", "D": "D", "d": "D", "displacement": "D", "phi": "phi",
+_KEYS = {"s": "s", "D": "D", "d": "D", "displacement": "D", "phi": "phi", "tilt": "tilt",
          "specimen": "specimen", "trial": "trial"}  # fmt: skip
 _START = re.compile(r",(?=\s*\w+\s*=)")
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -26,12 +27,16 @@ class Presses:
         displacement: mm.
         specimen: only this one; None: all.
         trial: of the fit, whose own parameters count; None: a new curve.
+        phi: contact angle from the anterior midline, rad.
+        direction: of the tool, along the inward normal and the circumference.
     """
 
     s: np.ndarray | None
     displacement: np.ndarray
     specimen: str | None
     trial: str | None
+    phi: float = 0.0
+    direction: tuple[float, float] = (1.0, 0.0)
 
 
 def parse_presses(text: str, *, needs_position: bool) -> Presses:
@@ -39,7 +44,8 @@ def parse_presses(text: str, *, needs_position: bool) -> Presses:
 
     Args:
         text: KEY=VALUE, separated by commas; s and D are numbers (mm) with or without a unit, or
-            ranges START:STOP or START:STOP:STEP that include the end.
+            ranges START:STOP or START:STOP:STEP that include the end; phi, and tilt of the tool
+            from the inward normal towards growing phi, are angles (degrees) with or without one.
         needs_position: whether s must be given.
 
     Raises:
@@ -50,7 +56,8 @@ def parse_presses(text: str, *, needs_position: bool) -> Presses:
         key, sign, value = (v.strip() for v in part.partition("="))
         if not sign or key not in _KEYS or not value:
             raise ValueError(
-                f"{part.strip()!r} is not understood; expected s, D, specimen or trial, {EXAMPLE}"
+                f"{part.strip()!r} is not understood; expected s, D, phi, tilt, specimen or trial, "
+                f"{EXAMPLE}"
             )
         name = _KEYS[key]
         if name in found:
@@ -60,26 +67,27 @@ def parse_presses(text: str, *, needs_position: bool) -> Presses:
         raise ValueError(f"no displacement D; give it, {EXAMPLE}")
     if "s" not in found and needs_position:
         raise ValueError(f"no contact position s; give it, {EXAMPLE}")
-    if "phi" in found and abs(_angle(found["phi"])) > 1e-6:
-        raise ValueError(
-            f"phi = {found['phi']}: this model presses on the anterior midline (phi = 0) only; "
-            "leave it out"
-        )
+    phi, tilt = (_angle(name, found.get(name, "0")) for name in ("phi", "tilt"))
+    if not abs(tilt) < np.pi / 2:
+        raise ValueError(f"tilt = {found['tilt']}: the tool moves inwards; expected within 90 deg")
     s = _lengths("s", found["s"]) if "s" in found else None
     D = _lengths("D", found["D"])
     if len(D) * (1 if s is None else len(s)) > MOST:
         raise ValueError(f"{text!r} stands for more than {MOST} presses; take larger steps")
-    return Presses(s, D, found.get("specimen"), found.get("trial"))
+    direction = (1.0, 0.0) if tilt == 0 else (float(np.cos(tilt)), float(np.sin(tilt)))
+    return Presses(s, D, found.get("specimen"), found.get("trial"), phi, direction)
 
 
-def _angle(text: str) -> float:
+def _angle(name: str, text: str) -> float:
+    """An angle, rad; a bare number is in degrees, as in all tables."""
+    try:
+        return math.radians(float(text))
+    except ValueError:
+        pass
     try:
         return parse_quantity(text, "angle")
     except UnitError as error:
-        try:
-            return float(text)
-        except ValueError:
-            raise ValueError(f"phi: {error}") from None
+        raise ValueError(f"{name}: {error}") from None
 
 
 def _lengths(name: str, text: str) -> np.ndarray:

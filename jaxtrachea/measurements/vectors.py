@@ -1,6 +1,7 @@
 """Checks of what a curve holds beside force and displacement: vectors, markers, ends of rings."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -192,11 +193,16 @@ def vectors_of(raw: RawCurve, keep: np.ndarray, options: ReadOptions) -> dict[st
     return fields
 
 
+def tilt_of(direction: Sequence[float]) -> float:
+    """Angle of a tool's direction to the inward normal, rad, positive towards growing phi."""
+    return math.atan2(direction[1], direction[0])
+
+
 def vector_words(curve: Curve) -> str:
     """What a curve holds beside forces and markers along the normal, for a table; may be empty."""
     ends = [name[-1] for name in ("end_U", "end_V") if getattr(curve, name) is not None]
     rings = 0 if curve.end_rings is None else curve.end_rings.size
-    angle = np.degrees(np.arctan2(curve.direction[1], curve.direction[0]))
+    angle = np.degrees(tilt_of(curve.direction))
     words = {
         "side force": curve.side_force is not None,
         "markers aside": curve.joint_side_displacement is not None,

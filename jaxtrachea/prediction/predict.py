@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.tested import tested_depth
+from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Aside, Estimate, Predicted, Response, predicted
 from jaxtrachea.prediction.sources import Source, slack_of, source_of
@@ -209,8 +211,11 @@ def _on_host(stored: StoredFit, source: Source, where, displacement, part: Predi
     status, message = _verdict(source, value, se, presses, bend)
     if usable:
         spans, angles = stored.spans[source.lane], stored.angles[source.lane]
-        beyond = _beyond(spans, float(s), displacement, angles, phi)
-        message = f"{message}; {beyond}" if beyond else message
+        tilts = stored.tilts[source.lane]
+        aside = (angles, phi, "phi"), (tilts, tilt_of(direction), "tilt")
+        beyond = _beyond(spans, float(s), displacement, aside)
+        untested = _untested(stored, displacement)
+        message = "; ".join(filter(None, [message, beyond, untested]))
     return CurvePrediction(
         specimen=source.specimen,
         trial=source.trial,
@@ -258,10 +263,23 @@ def _bend(source: Source, off: np.ndarray, value: Response, se: Response, deepes
     return float(worst) if np.isfinite(worst) else np.inf
 
 
-def _beyond(
-    spans: np.ndarray, s: float, displacement: np.ndarray, angles=(-np.inf, np.inf), phi: float = 0
-) -> str:
-    """What of a curve lies outside the data of its lane, in words; "" if nothing does."""
+def _untested(stored: StoredFit, displacement: np.ndarray) -> str:
+    """Whether a curve goes deeper than the model was tested, in words; "" if it does not."""
+    model = stored.study.model
+    most = tested_depth(model.options, float(model.geometry.radius))
+    deep = np.max(np.abs(displacement)) > most * (1 + 1e-9)
+    return f"the model was tested to D = {most:.3g} mm" if deep else ""
+
+
+def _beyond(spans: np.ndarray, s: float, displacement: np.ndarray, aside=()) -> str:
+    """What of a curve lies outside the data of its lane, in words; "" if nothing does.
+
+    Args:
+        spans: of displacement and position, mm; (4,).
+        s: mm.
+        displacement: mm; (N,).
+        aside: of each angle: the range of the data, rad, that of the curve, and its name.
+    """
     low, high, first, last = spans
     words = []
     if displacement.max() > high + 1e-9 or displacement.min() < min(low, 0.0) - 1e-9:
@@ -269,9 +287,9 @@ def _beyond(
     known = first <= last  # else no curve of the lane says where it was pressed
     if known and (s < first - 1e-9 or s > last + 1e-9):
         words.append(f"s = {first:.4g} to {last:.4g} mm")
-    left, right = angles
-    if phi < left - 1e-9 or phi > right + 1e-9:
-        words.append(f"phi = {np.degrees(left):.3g} to {np.degrees(right):.3g} deg")
+    for (left, right), angle, name in aside:
+        if angle < left - 1e-9 or angle > right + 1e-9:
+            words.append(f"{name} = {np.degrees(left):.3g} to {np.degrees(right):.3g} deg")
     return f"extrapolated from data at {' and '.join(words)}" if words else ""
 
 
@@ -283,6 +301,9 @@ def _verdict(source: Source, value: Response, se: Response, presses, bend: float
         if lost.any():
             word = PressStatus(int(presses[lost][0])).message
             found.append((PredictionStatus.NO_SOLUTION, f"{int(lost.sum())} samples: {word}"))
+        if (deep := presses == PressStatus.TOO_DEEP).any():
+            word = f"{int(deep.sum())} samples: {PressStatus.TOO_DEEP.message}"
+            found.append((PredictionStatus.TOO_DEEP, word))
         if np.isinf(se.force).any() or np.isinf(source.half_width):
             found.append((PredictionStatus.UNDETERMINED, ""))
         if bend > BENT:
@@ -335,7 +356,7 @@ def predict(
     if D.ndim != 1 or not D.size or not np.isfinite(D).all():
         raise ValueError("displacement: expected a finite number or a vector of them, mm")
     check_position(results, s)
-    _check_aside(results, phi, direction)
+    check_aside(results, phi, direction)
     if specimen is None:
         specimen = _only_specimen(results)
     elif specimen not in results.specimens:
@@ -347,7 +368,7 @@ def predict(
     return predict_sources(results, [source], [float(s)], [D], aside=[(float(phi), along)])[0]
 
 
-def _check_aside(results: StoredFit, phi: float, direction: tuple[float, float]) -> None:
+def check_aside(results: StoredFit, phi: float, direction: tuple[float, float]) -> None:
     """Refuse a press that the model does not have.
 
     Raises:
@@ -357,8 +378,8 @@ def _check_aside(results: StoredFit, phi: float, direction: tuple[float, float])
     if model.options.skeleton != "sections":
         if phi != 0 or tuple(direction) != (1.0, 0.0):
             raise ValueError(
-                "this fit presses on the midline along the normal; phi and direction need a fit "
-                "with skeleton = 'sections'"
+                "this fit presses on the anterior midline along the normal; phi and direction "
+                "(tilt) need a fit with skeleton = 'sections'"
             )
         return
     alpha = float(model.geometry.half_angle)

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from jaxtrachea.measurements.read import BadCurve
+from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.prediction.held_out import Compared
 from jaxtrachea.prediction.predict import CurvePrediction
 from jaxtrachea.status import PredictionStatus, PressStatus
@@ -12,7 +13,7 @@ from jaxtrachea.status import PredictionStatus, PressStatus
 Row = dict[str, object]
 #: Columns of predictions.csv, always these.
 COLUMNS = (
-    "specimen", "trial", "s [mm]", "phi [deg]", "displacement [mm]", "force [N]",
+    "specimen", "trial", "s [mm]", "phi [deg]", "tilt [deg]", "displacement [mm]", "force [N]",
     "predicted [N]", "low95 [N]", "high95 [N]",
 )  # fmt: skip
 
@@ -22,12 +23,13 @@ def _cell(value: float) -> object:
     return "" if np.isnan(value) else float(value)
 
 
-def _place(p: CurvePrediction, phi: float, i: int) -> Row:
+def _place(p: CurvePrediction, i: int) -> Row:
     return {
         "specimen": p.specimen,
         "trial": p.trial,
         "s [mm]": _cell(p.s),
-        "phi [deg]": float(np.degrees(phi)),
+        "phi [deg]": float(np.degrees(p.phi)),
+        "tilt [deg]": float(np.degrees(tilt_of(p.direction))),
         "displacement [mm]": float(p.displacement[i]),
     }
 
@@ -35,7 +37,6 @@ def _place(p: CurvePrediction, phi: float, i: int) -> Row:
 def prediction_rows(
     p: CurvePrediction,
     measured: np.ndarray | None = None,
-    phi: float = 0.0,
     side: np.ndarray | None = None,
 ) -> Iterator[Row]:
     """One row per displacement; the band is that of a new sample.
@@ -43,15 +44,14 @@ def prediction_rows(
     Args:
         p: the prediction.
         measured: force, N; (N,).
-        phi: contact angle, rad.
         side: measured side force, N; (N,).
     """
     low, high = p.low95, p.high95
     for i in range(len(p.displacement)):
         force = np.nan if measured is None else float(measured[i])
         numbers = (force, float(p.force[i]), float(low[i]), float(high[i]))
-        cells = dict(zip(COLUMNS[5:], map(_cell, numbers), strict=True))
-        yield _place(p, phi, i) | cells | _side_cells(p, i, side)
+        cells = dict(zip(COLUMNS[6:], map(_cell, numbers), strict=True))
+        yield _place(p, i) | cells | _side_cells(p, i, side)
 
 
 def _side_cells(p: CurvePrediction, i: int, measured: np.ndarray | None) -> Row:
@@ -65,7 +65,7 @@ def _side_cells(p: CurvePrediction, i: int, measured: np.ndarray | None) -> Row:
     return dict(zip(names, map(_cell, values), strict=True))
 
 
-def band_rows(p: CurvePrediction, phi: float = 0.0) -> Iterator[Row]:
+def band_rows(p: CurvePrediction) -> Iterator[Row]:
     """One row per displacement: both bands, standard errors, statuses."""
     columns = {
         "predicted [N]": p.force,
@@ -84,7 +84,7 @@ def band_rows(p: CurvePrediction, phi: float = 0.0) -> Iterator[Row]:
             "status": p.status.name.lower(),
             "message": p.message,
         }
-        yield _place(p, phi, i) | cells | words
+        yield _place(p, i) | cells | words
 
 
 def joint_rows(
@@ -92,7 +92,6 @@ def joint_rows(
     rings: np.ndarray,
     at: Sequence[int],
     measured: np.ndarray | None = None,
-    phi: float = 0.0,
 ) -> Iterator[Row]:
     """One row per displacement of `at` and ring: deflection and reaction with their bands.
 
@@ -101,7 +100,6 @@ def joint_rows(
         rings: ring positions, mm.
         at: which displacements.
         measured: marker displacement, mm, NaN where there was none; (N, rings).
-        phi: contact angle, rad.
     """
     half = p.half_width
     noisy = np.hypot(p.joints_se, p.joint_sigma)
@@ -118,7 +116,7 @@ def joint_rows(
             }  # fmt: skip
             cells: Row = {name: _cell(number) for name, number in numbers.items()}
             where: Row = {"ring": ring + 1, "ring s [mm]": float(x)}
-            yield _place(p, phi, i) | where | cells
+            yield _place(p, i) | where | cells
 
 
 def error_rows(
@@ -195,8 +193,10 @@ def _side_errors(of: str, group: Sequence[Compared]) -> Row:
         return {}
     off = np.concatenate([c.side_residual for c in group])
     off = off[np.isfinite(off)]
-    angle = float(np.degrees(group[0].prediction.phi))
+    first = group[0].prediction
+    phi, tilt = np.degrees([first.phi, tilt_of(first.direction)]).tolist()
     return {
-        "phi [deg]": angle if of != "all" else "",
+        "phi [deg]": phi if of != "all" else "",
+        "tilt [deg]": tilt if of != "all" else "",
         "rms side [N]": float(np.sqrt(np.mean(off**2))) if len(off) else "",
     }

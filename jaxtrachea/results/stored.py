@@ -20,6 +20,7 @@ from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.read import Curve, DataError
 from jaxtrachea.measurements.readers.safe_hdf5 import attribute, numeric, opened
+from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.results.arrays import STORED_AS
 from jaxtrachea.results.store import GEOMETRY
@@ -101,9 +102,18 @@ class StoredFit:
     @functools.cached_property
     def angles(self) -> np.ndarray:
         """Range of contact angle of the data of each lane, rad; (L, 2)."""
+        return self._range([c.phi_c for c in self.curves])
+
+    @functools.cached_property
+    def tilts(self) -> np.ndarray:
+        """Range of the tool's angle to the normal of the data of each lane, rad; (L, 2)."""
+        return self._range([tilt_of(c.direction) for c in self.curves])
+
+    def _range(self, values: list[float]) -> np.ndarray:
+        """Least and largest of the values of the curves of each lane; (L, 2)."""
         out = np.tile([np.inf, -np.inf], (len(self.status), 1))
-        for curve, lane in zip(self.curves, self.curve_lane, strict=True):
-            out[lane] = min(out[lane][0], curve.phi_c), max(out[lane][1], curve.phi_c)
+        for value, lane in zip(values, self.curve_lane, strict=True):
+            out[lane] = min(out[lane][0], value), max(out[lane][1], value)
         return out
 
     @property
