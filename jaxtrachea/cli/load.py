@@ -1,5 +1,6 @@
 """What commands on fit specifications share: reading everything, saying what is wrong with it."""
 
+import dataclasses
 from pathlib import Path
 
 from rich.markup import escape
@@ -35,11 +36,24 @@ def load(path: Path, data: Path | None, *, refits: bool = False, quiet: bool = F
             print_notes(measurements)
         if not measurements.curves:
             raise Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
-        return spec, measurements, study_of(spec, measurements, refits=refits)
+        study = study_of(spec, measurements, refits=refits)
+        return spec, _with_depths(measurements, study.model, quiet), study
     except SpecError as error:
         raise Stop(str(SpecError.like(error, place=str(path)))) from None
     except DataError as error:
         raise Stop(str(error)) from None
+
+
+def _with_depths(measurements, model, quiet: bool):
+    """The measurements with a note on curves that go deeper than the model was tested."""
+    from jaxtrachea.fitting.tested import deeper_than_tested
+
+    note = deeper_than_tested(measurements.curves, model.options, float(model.geometry.radius))
+    if note is None:
+        return measurements
+    if not quiet:
+        to_stderr(f"[yellow]note:[/] {escape(note)}")
+    return dataclasses.replace(measurements, notes=(*measurements.notes, note))
 
 
 def print_notes(measurements) -> None:

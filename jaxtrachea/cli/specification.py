@@ -9,7 +9,6 @@ from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, defaults_of, in_model, visible
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study, check_curve
-from jaxtrachea.fitting.tested import deeper_than_tested
 from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.measurements.read import (
     BadCurve,
@@ -127,8 +126,7 @@ def _free(default: Parameter, section: ParameterSection) -> Parameter:
 def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
     """The measurements with curves that this tube and model cannot press moved to the bad ones.
 
-    What the model does not read of the others is left out, and a note says so; another which go
-    deeper than it was tested.
+    What the model does not read of the others is left out, and a note says so.
 
     Raises:
         SpecError: not one curve is left; the message is that of the first.
@@ -151,8 +149,7 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
     unread = None
     if options.skeleton != "sections":
         good, unread = along_the_normal(good)
-    deep = deeper_than_tested(good, options, float(geometry.radius))
-    notes = (*measurements.notes, *(note for note in (unread, deep) if note))
+    notes = measurements.notes if unread is None else (*measurements.notes, unread)
     return dataclasses.replace(measurements, curves=tuple(good), bad=tuple(bad), notes=notes)
 
 

@@ -23,9 +23,11 @@ def deeper_than_tested(curves: Sequence[Curve], options: Options, radius: float)
     deep = [d for c in curves if (d := float(np.max(np.abs(c.displacement)))) > most * (1 + 1e-9)]
     if not deep:
         return None
-    cure = "; see skeleton = 'softening' or 'sections'" if options.skeleton == "linear" else ""
+    cure = "cut them off or leave them out where that matters"
+    if options.skeleton == "linear":
+        cure = "choose skeleton = 'softening' or 'sections'"
     return (
         f"{len(deep)} of {len(curves)} curves go to {max(deep):.3g} mm; skeleton = "
         f"{options.skeleton!r} was tested to {most:.3g} mm ({TESTED[options.skeleton]:g} of the "
-        f"radius), beyond it the model may be off by more than its bands say{cure}"
+        f"radius), beyond it the model may be off by more than its bands say; {cure}"
     )

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, RawCurve, ReadOptions
 from jaxtrachea.measurements.readers import READERS, hdf5, reader_of
-from jaxtrachea.measurements.readers.lines import Line, Text, first_bytes, read_lines
+from jaxtrachea.measurements.readers.lines import Lines, Text, first_bytes, read_lines
 from jaxtrachea.measurements.readers.patterns import ensure_quick
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.recognise import HEAD, kind_of
@@ -223,7 +223,7 @@ def _read_workbook(
     return records, [note] if others else []
 
 
-def _recognise(lines: list[Line], readers: Sequence[Reader]) -> Reader:
+def _recognise(lines: Lines, readers: Sequence[Reader]) -> Reader:
     """Format of a text by its lines; the last reader takes any."""
     return next(reader for reader in readers if reader.is_text(lines))
 

@@ -29,10 +29,10 @@ from jaxtrachea.measurements.curve import (
     ReadOptions,
     identify_file,
 )
-from jaxtrachea.measurements.readers.lines import Line, read_lines
+from jaxtrachea.measurements.readers.lines import Lines, read_lines
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.safe_hdf5 import attribute, numeric, opened, unit_of
-from jaxtrachea.measurements.readers.text import numbers, read_rows, resolve_unit
+from jaxtrachea.measurements.readers.text import numbers, read_columns, resolve_unit
 from jaxtrachea.units import convert
 
 # afmformats fixes the unit of each column to SI; its tab files do not repeat it.
@@ -117,11 +117,11 @@ def _read_tab(path: Path, who: FileIdentity, options: ReadOptions) -> RawCurve |
     try:
         lines = read_lines(path)
         names, metadata, lines = _tab_head(path, lines)
-        line_numbers, rows = read_rows(lines, len(names), "\t")
+        line_numbers, cells_of = read_columns(lines, len(names), "\t")
         columns = {}
         for i, name in enumerate(names):
             if name in _wanted(options):
-                cells = [_truth(row[i]) if name == "segment" else row[i] for row in rows]
+                cells = [*map(_truth, cells_of[i])] if name == "segment" else cells_of[i]
                 columns[name] = numbers(cells, line_numbers, name, ",")
         units = {name: SI_UNITS.get(name) for name in columns}
         place = (who, trial, source)
@@ -139,7 +139,7 @@ def _truth(cell: str) -> str:
     return {"True": "1", "False": "0"}.get(cell, cell)
 
 
-def _tab_head(path: Path, lines: list[Line]) -> tuple[list[str], Mapping[str, Any], list[Line]]:
+def _tab_head(path: Path, lines: Lines) -> tuple[list[str], Mapping[str, Any], Lines]:
     """Metadata and column names, both in comments; the rows are what is left."""
     texts = [line.text.strip().removeprefix("#").strip() for line in lines]
     if "BEGIN METADATA" not in texts or "END METADATA" not in texts:
@@ -158,12 +158,17 @@ def _tab_head(path: Path, lines: list[Line]) -> tuple[list[str], Mapping[str, An
     for i in range(end + 1, len(lines)):
         if lines[i].text.startswith("#") and texts[i]:
             names, first = _split_glued(texts[i].split("\t"))
-            return names, metadata, [Line(lines[i].number, row) for row in first] + lines[i + 1 :]
+            return names, metadata, _put_before(lines[i].number, first, lines[i + 1 :])
     raise DataError(
         "no line with column names after the metadata",
         place=str(path),
         cure="export the file again",
     )
+
+
+def _put_before(number: int, first: list[str], lines: Lines) -> Lines:
+    """The lines with the rows that stand on the line of the names."""
+    return Lines([number] * len(first) + [*lines.numbers], [*first, *lines.texts])
 
 
 def _split_glued(cells: list[str]) -> tuple[list[str], list[str]]:

@@ -1,6 +1,9 @@
 """Tidy CSV or TSV: one row per sample, one table for a whole study."""
 
 import json
+from collections.abc import Iterator
+from itertools import compress, islice, pairwise
+from operator import ne
 
 import numpy as np
 
@@ -15,14 +18,14 @@ from jaxtrachea.measurements.curve import (
     ReadOptions,
     identify_file,
 )
-from jaxtrachea.measurements.readers.lines import Line, Text, is_comment
+from jaxtrachea.measurements.readers.lines import Lines, Text
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.text import (
     ALIASES,
     Table,
     find_roles,
     guess_delimiter,
-    read_rows,
+    read_columns,
     require_roles,
     resolve_unit,
     role_values,
@@ -48,7 +51,7 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
     Raises:
         DataError: the header, a unit or the shape of the table is wrong.
     """
-    place, lines = text.place, [line for line in text.lines if not is_comment(line)]
+    place, lines = text.place, text.lines.without_comments()
     try:
         state, lines = _state(lines, text.word)
         table = _table(text, lines)
@@ -76,7 +79,7 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
     ]
 
 
-def _state(lines: list[Line], word: str) -> tuple[dict, list[Line]]:
+def _state(lines: Lines, word: str) -> tuple[dict, Lines]:
     """The optional JSON object on the first line: what holds for the whole table."""
     if not lines or not lines[0].text.lstrip().startswith("{"):
         return {}, lines
@@ -117,7 +120,7 @@ def _two_numbers(value: object, line: str) -> tuple[float, ...]:
     return tuple(map(float, numbers))
 
 
-def _table(text: Text, lines: list[Line]) -> Table:
+def _table(text: Text, lines: Lines) -> Table:
     if not lines:
         raise DataError(
             "is empty",
@@ -136,8 +139,8 @@ def _table(text: Text, lines: list[Line]) -> Table:
             place=text.place,
             cure="rename one",
         )
-    numbers, rows = read_rows(lines[1:], len(header), delimiter, text.word)
-    if not rows:
+    numbers, columns = read_columns(lines[1:], len(header), delimiter, text.word)
+    if not numbers:
         raise DataError(
             f"no rows below the header in {text.word} {lines[0].number}",
             place=text.place,
@@ -149,31 +152,32 @@ def _table(text: Text, lines: list[Line]) -> Table:
         units=list(units),
         header_line=lines[0].number,
         lines=numbers,
-        rows=rows,
+        columns=columns,
         delimiter=delimiter,
     )
 
 
 def _group(
     table: Table, roles: dict[str, int], state: dict, options: ReadOptions
-) -> dict[tuple[str, str], list[int]]:
-    """Row indices of each (specimen, trial); a curve must be one block, or it is there twice."""
+) -> dict[tuple[str, str], slice]:
+    """Rows of each (specimen, trial); a curve must be one block, or it is there twice."""
     name = None if "specimen" in {**roles, **state} else identify_file(table.text.path, options)
     fixed = {
         "specimen": name.specimen if name else "",
         "trial": (name and name.trial) or "1",
         **state,
     }
-    groups: dict[tuple[str, str], list[int]] = {}
+    groups: dict[tuple[str, str], slice] = {}
     last = None
-    for i, row in enumerate(table.rows):
+    names = [table.columns[roles[role]] for role in ("specimen", "trial") if role in roles]
+    for i, stop in _blocks(names, len(table.lines)):
         specimen, trial = (
-            unquoted(row[roles[role]]) if role in roles else fixed[role]
+            unquoted(table.columns[roles[role]][i]) if role in roles else fixed[role]
             for role in ("specimen", "trial")
         )
         key = (specimen, trial)
-        if key == last:
-            groups[key].append(i)
+        if key == last:  # written otherwise, as one that an apostrophe protects
+            groups[key] = slice(groups[key].start, stop)
             continue
         if fault := _name_fault(table, "specimen", specimen) or _name_fault(table, "trial", trial):
             raise DataError(
@@ -182,15 +186,23 @@ def _group(
                 cure=fault[1],
             )
         if key in groups:
-            first = table.lines[groups[key][0]]
+            first = table.lines[groups[key].start]
             raise DataError(
                 f"specimen {key[0]!r} trial {key[1]!r} starts in {table.text.word} {first} "
                 f"and again in {table.text.word} {table.lines[i]}",
                 place=table.text.place,
                 cure="keep the rows of a curve together, or rename it",
             )
-        groups[key], last = [i], key
+        groups[key], last = slice(i, stop), key
     return groups
+
+
+def _blocks(columns: list[list[str]], count: int) -> Iterator[tuple[int, int]]:
+    """First row, and that after the last, of rows that have the same cells in these columns."""
+    ends: set[int] = set()
+    for cells in columns:
+        ends.update(compress(range(1, count), map(ne, cells, islice(cells, 1, None))))
+    return pairwise([0, *sorted(ends), count])
 
 
 def _name_fault(table: Table, role: str, name: str) -> tuple[str, str] | None:
@@ -218,10 +230,10 @@ def _curve(
     units: dict[str, str],
     state: dict,
     key: tuple[str, str],
-    picked: list[int],
+    picked: slice,
     options: ReadOptions,
 ) -> RawCurve | BadCurve:
-    rows = np.array([table.lines[i] for i in picked])
+    rows = np.array(table.lines[picked])
     source = f"{table.text.place}:{rows[0]}-{rows[-1]}"
     try:
         values = {
@@ -244,7 +256,7 @@ def _curve(
 
 
 def _constant(
-    role: str, values: dict[str, np.ndarray], state: dict, table: Table, picked: list[int]
+    role: str, values: dict[str, np.ndarray], state: dict, table: Table, picked: slice
 ) -> float | None:
     """Position of a curve, which must be the same in all its rows; None if all are empty."""
     column = values.get(role)
@@ -254,12 +266,12 @@ def _constant(
         return None
     unknown = np.isnan(column)
     if unknown.any():
-        line = table.lines[picked[int(np.argmax(unknown))]]
+        line = table.lines[picked][int(np.argmax(unknown))]
         raise Fault(
             "position", f"{table.text.word} {line}: {role} is empty or NaN", "give it in every row"
         )
     if not np.isfinite(column).all():
-        line = table.lines[picked[int(np.argmin(np.isfinite(column)))]]
+        line = table.lines[picked][int(np.argmin(np.isfinite(column)))]
         raise Fault("position", f"{table.text.word} {line}: {role} is infinite", "correct it")
     if np.ptp(column) > STEADY[role]:
         raise Fault(
@@ -270,9 +282,9 @@ def _constant(
     return float(column[0] if np.ptp(column) == 0 else column.mean())
 
 
-def _is_tidy(lines: list[Line]) -> bool:
+def _is_tidy(lines: Lines) -> bool:
     """Whether the first line is a JSON object, or names a column of specimens."""
-    content = [line.text for line in lines if not is_comment(line)]
+    content = lines.without_comments().texts
     if not content:
         return False
     if content[0].lstrip().startswith("{"):

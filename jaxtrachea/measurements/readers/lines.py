@@ -1,10 +1,13 @@
 """Lines of a text file, packed or not: bounded reading, encoding, line ends."""
 
 import gzip
-import re
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress, repeat
+from operator import contains
 from pathlib import Path
+from typing import NamedTuple, overload
 
 from jaxtrachea.measurements.curve import DataError
 
@@ -15,12 +18,50 @@ GZIP = b"\x1f\x8b"
 CELL_ERRORS = ("#N/A", "#NV", "#REF!", "#VALUE!", "#DIV/0!", "#NUM!", "#NAME?", "#NULL!")
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """One line of a text file or row of a sheet, and its number, counted from 1."""
 
     number: int
     text: str
+
+
+@dataclass(frozen=True)
+class Lines(Sequence[Line]):
+    """Lines, of which a file may have a million: two lists, each line made when it is asked for.
+
+    Attributes:
+        numbers: counted from 1, rising.
+        texts: of each line.
+    """
+
+    numbers: Sequence[int]
+    texts: Sequence[str]
+
+    def __len__(self) -> int:
+        """How many lines there are."""
+        return len(self.texts)
+
+    @overload
+    def __getitem__(self, at: int) -> Line: ...
+    @overload
+    def __getitem__(self, at: slice) -> "Lines": ...
+    def __getitem__(self, at: int | slice) -> "Line | Lines":
+        """One line, or some of them."""
+        if isinstance(at, slice):
+            return Lines(self.numbers[at], self.texts[at])
+        return Line(self.numbers[at], self.texts[at])
+
+    def where(self, kept: Sequence[object]) -> "Lines":
+        """Those whose `kept` is true."""
+        if all(kept):
+            return self
+        return Lines([*compress(self.numbers, kept)], [*compress(self.texts, kept)])
+
+    def without_comments(self) -> "Lines":
+        """Those that are no comments."""
+        if not any(map(contains, self.texts, repeat("#"))):
+            return self
+        return self.where([not _comments(text) for text in self.texts])
 
 
 @dataclass(frozen=True)
@@ -34,7 +75,7 @@ class Text:
     """
 
     path: Path
-    lines: list[Line]
+    lines: Lines
     sheet: str | None = None
 
     @property
@@ -74,7 +115,7 @@ def first_unpacked(path: Path, count: int) -> bytes:
         raise _damaged_gzip(path, error) from None
 
 
-def read_lines(path: Path) -> list[Line]:
+def read_lines(path: Path) -> Lines:
     """All lines of a text file that hold something, with their numbers.
 
     UTF-8 (with or without byte-order mark) and UTF-16 with one are decoded; other bytes are taken
@@ -100,13 +141,13 @@ def read_lines(path: Path) -> list[Line]:
             place=str(path),
             cure="export it as CSV or HDF5",
         )
-    lines = re.split(r"\r\n|\n|\r", text)
-    return [Line(i, line) for i, line in enumerate(lines, 1) if line.strip()]
+    texts = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    return Lines(range(1, len(texts) + 1), texts).where([*map(str.strip, texts)])
 
 
-def is_comment(line: Line) -> bool:
+def _comments(text: str) -> bool:
     """Whether a line is a ``#`` comment; ``#N/A`` and the like are cells of a spreadsheet."""
-    text = line.text.lstrip()
+    text = text.lstrip()
     return text.startswith("#") and not text.upper().startswith(CELL_ERRORS)
 
 

@@ -5,12 +5,12 @@ import numpy as np
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.columns import curve_of_columns
 from jaxtrachea.measurements.curve import BadCurve, Fault, RawCurve, ReadOptions, identify_file
-from jaxtrachea.measurements.readers.lines import Line, Text, is_comment
+from jaxtrachea.measurements.readers.lines import Lines, Text
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.text import (
     Table,
     find_roles,
-    read_rows,
+    read_columns,
     require_roles,
     resolve_unit,
     role_values,
@@ -49,7 +49,7 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
         if rows.size:
             source = f"{text.place}:{rows[0]}-{rows[-1]}"
         values = _values(table, roles, options)
-        time = time_values(table, roles, range(len(table.rows)), options)
+        time = time_values(table, roles, slice(None), options)
         place = {"rows": rows, "row_word": text.word, "s": who.s, "phi": who.phi}
         return [curve_of_columns((who.specimen, trial), source, values, time=time, **place)]
     except Fault as fault:
@@ -63,13 +63,13 @@ def _values(table: Table, roles: dict[str, int], options: ReadOptions) -> dict[s
         if role in SAMPLED or is_ring_role(role):
             place = f"{table.text.place}: column {table.names[i]!r}"
             unit = resolve_unit(role, table.units[i], options, place)
-            values[role] = role_values(table, role, i, range(len(table.rows)), unit)
+            values[role] = role_values(table, role, i, slice(None), unit)
     return values
 
 
 def _table(text: Text, options: ReadOptions) -> tuple[Table, dict[str, int]]:
     """Find the header: the first line, by any delimiter, that names displacement and force."""
-    lines = [line for line in text.lines if not is_comment(line)]
+    lines = text.lines.without_comments()
     if not lines:
         raise Fault("empty", "the file is empty", "export it again")
     reason: Fault | None = None
@@ -99,14 +99,14 @@ def _table(text: Text, options: ReadOptions) -> tuple[Table, dict[str, int]]:
                     " specimen after the file",
                 )
             at, units = _units_row(lines, at, delimiter, units)
-            numbers, rows = read_rows(lines[at + 1 :], len(names), delimiter, text.word)
+            numbers, columns = read_columns(lines[at + 1 :], len(names), delimiter, text.word)
             table = Table(
                 text=text,
                 names=names,
                 units=units,
                 header_line=line.number,
                 lines=numbers,
-                rows=rows,
+                columns=columns,
                 delimiter=delimiter,
             )
             return table, roles
@@ -121,7 +121,7 @@ def _table(text: Text, options: ReadOptions) -> tuple[Table, dict[str, int]]:
 
 
 def _units_row(
-    lines: list[Line], at: int, delimiter: str, units: list[str | None]
+    lines: Lines, at: int, delimiter: str, units: list[str | None]
 ) -> tuple[int, list[str | None]]:
     """Some machines put the units in a row of their own below the names: ``(s),(mm),(N)``."""
     if at + 1 >= len(lines) or any(units):

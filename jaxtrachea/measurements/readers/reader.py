@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxtrachea.measurements.curve import BadCurve, RawCurve, ReadOptions
-from jaxtrachea.measurements.readers.lines import Line, Text
+from jaxtrachea.measurements.readers.lines import Lines, Text
 
 Records = list[RawCurve | BadCurve]
 
@@ -28,6 +28,6 @@ class Reader(NamedTuple):
     read: Callable[[Path, ReadOptions], Records] | None = None
     read_text: Callable[[Text, ReadOptions], Records] | None = None
     is_file: Callable[[bytes], bool] = lambda head: False
-    is_text: Callable[[list[Line]], bool] = lambda lines: False
+    is_text: Callable[[Lines], bool] = lambda lines: False
     is_hdf5: Callable[[Any], bool] = lambda file: False
     layout: str = ""

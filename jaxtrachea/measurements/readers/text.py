@@ -4,11 +4,12 @@ import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 
 from jaxtrachea.measurements.curve import DataError, Fault, ReadOptions
-from jaxtrachea.measurements.readers.lines import Line, Text, is_comment
+from jaxtrachea.measurements.readers.lines import Lines, Text
 from jaxtrachea.measurements.roles import general_role, ring_role_of, role_dimension
 from jaxtrachea.units import UnitError, column_unit, convert, unit_factor
 
@@ -61,7 +62,7 @@ class Table:
         units: column units, None where the header gives none.
         header_line: number of the header, in the file or sheet.
         lines: number of each row.
-        rows: the cells.
+        columns: the cells of each column.
         delimiter: what separates them.
     """
 
@@ -69,27 +70,48 @@ class Table:
     names: list[str]
     units: list[str | None]
     header_line: int
-    lines: list[int]
-    rows: list[list[str]]
+    lines: Sequence[int]
+    columns: list[list[str]]
     delimiter: str
 
-    def column(self, index: int) -> list[str]:
-        """Cells of one column."""
-        return [row[index] for row in self.rows]
 
+def read_columns(
+    lines: Lines, width: int, delimiter: str, word: str = "line"
+) -> tuple[Sequence[int], list[list[str]]]:
+    """Cells of the columns of a table; empty cells beyond the header are dropped.
 
-def read_rows(
-    lines: Sequence[Line], width: int, delimiter: str, word: str = "line"
-) -> tuple[list[int], list[list[str]]]:
-    """Cells of the rows of a table; empty cells beyond the header are dropped.
+    Args:
+        lines: below the header.
+        width: columns of the header.
+        delimiter: what separates cells.
+        word: what the lines are called in messages.
+
+    Returns:
+        Number of each row, and the cells of each column.
 
     Raises:
         Fault: a row that has not `width` cells ("ragged"), or unbalanced quotes.
     """
+    lines = lines.without_comments()
+    even = width > 1 and set(map(str.count, lines.texts, repeat(delimiter))) == {width - 1}
+    together = delimiter.join(lines.texts) if even else '"'
+    if '"' not in together:
+        cells = together.split(delimiter)
+        if together.split(None, 1) != [together]:
+            cells = [*map(str.strip, cells)]
+        columns = [cells[k::width] for k in range(width)]
+        if all(columns[0]):  # else rows may be empty, and are left out
+            return lines.numbers, columns
+    numbers, rows = _read_rows(lines, width, delimiter, word)
+    return numbers, [*map(list, zip(*rows, strict=True))] or [[] for _ in range(width)]
+
+
+def _read_rows(
+    lines: Lines, width: int, delimiter: str, word: str
+) -> tuple[list[int], list[list[str]]]:
+    """As `read_columns`, row by row: quotes, empty rows, empty cells at the end, messages."""
     numbers, rows = [], []
     for line in lines:
-        if is_comment(line):
-            continue
         try:
             cells = split_cells(line.text, delimiter)
         except Fault as fault:
@@ -223,6 +245,11 @@ def numbers(
     Raises:
         Fault: a cell is no number ("unparsable").
     """
+    if "_" not in "".join(cells):
+        try:
+            return np.array([*map(float, cells)])
+        except ValueError:
+            pass
     values = np.full(len(cells), np.nan)
     pointed = delimiter == "," or any("." in cell for cell in cells)
     for i, cell in enumerate(cells):
@@ -254,18 +281,15 @@ def _number_cure(cell: str) -> str:
     return "write numbers as 1.5 or 1.5e-3, and leave a missing value empty"
 
 
-def role_values(
-    table: Table, role: str, index: int, picked: Sequence[int], unit: str
-) -> np.ndarray:
+def role_values(table: Table, role: str, index: int, picked: slice, unit: str) -> np.ndarray:
     """Numbers of some rows of a role's column, in internal units (mm, N, rad, s)."""
-    cells = [table.rows[i][index] for i in picked]
-    lines = [table.lines[i] for i in picked]
+    cells, lines = table.columns[index][picked], table.lines[picked]
     values = numbers(cells, lines, table.names[index], table.delimiter, table.text.word)
     return convert(values, unit, role_dimension(role))
 
 
 def time_values(
-    table: Table, roles: dict[str, int], picked: Sequence[int], options: ReadOptions
+    table: Table, roles: dict[str, int], picked: slice, options: ReadOptions
 ) -> np.ndarray | None:
     """Time of some rows, s: of `columns.time`, else of the only column named so, if usable.
 

@@ -18,7 +18,7 @@ from typing import Any
 from xml.etree.ElementTree import ParseError
 
 from jaxtrachea.measurements.curve import DataError
-from jaxtrachea.measurements.readers.lines import BLOCK, Line, Text
+from jaxtrachea.measurements.readers.lines import BLOCK, Lines, Text
 
 #: Bounds of a workbook: members of the archive, unpacked bytes of its sheets together, of its
 #: table of texts, and of each further part that is read.
@@ -66,8 +66,9 @@ def read_sheet(path: Path, sheet: str | None) -> tuple[Text, list[str]]:
             with _opened(path, values=False) as written:
                 _put_formulas(rows, _rows(path, written[page.title]))
     width = max((len(row) for row in rows.values()), default=0)
-    lines = [Line(number, _line(row, width)) for number, row in sorted(rows.items())]
-    return Text(path, [line for line in lines if line.text.strip()], page.title), names
+    numbers = sorted(rows)
+    lines = Lines(numbers, [_line(rows[number], width) for number in numbers])
+    return Text(path, lines.where([*map(str.strip, lines.texts)]), page.title), names
 
 
 @contextmanager
