@@ -68,6 +68,12 @@ def test_what_is_no_number_is_named(cell):
         numbers(["0.5", cell], [7, 8], "force", ";")
 
 
+def test_empty_rows_are_left_out():
+    found, columns = read_columns(lines_of(["T1,2", " ,", ",\u00a0", "T2,3"]), 2, ",")
+    assert [*found] == [2, 5]
+    assert columns == [["T1", "T2"], ["2", "3"]]
+
+
 HEAD = "specimen,trial,s [mm],displacement [mm],force [N]\n"
 
 
