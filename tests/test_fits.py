@@ -13,7 +13,7 @@ import pytest
 from run_cli import run
 
 from jaxtrachea.config import load_fit_spec
-from jaxtrachea.measurements.data_files import read_data
+from jaxtrachea.measurements.data_files import find_files, read_data
 from jaxtrachea.status import FitStatus
 
 ROOT = Path(__file__).parents[1]
@@ -197,6 +197,19 @@ def compare(found, known):
 
 @needs_ecoflex
 @pytest.mark.slow
+@pytest.mark.parametrize("folders", [("data", "EF30_0T"), ()], ids=["as published", "flat"])
+@pytest.mark.parametrize("name", ["fit", "fit_67"])
+def test_ecoflex_files_are_found(name, folders, tmp_path):
+    """The publisher keeps each material in a folder of its own, and a second series (B) beside."""
+    place = tmp_path.joinpath(*folders)
+    place.mkdir(parents=True, exist_ok=True)
+    names = [f"EF30_0T_{trial}.csv" for trial in ("A1", "A5", "B1")]
+    for file in names:
+        (place / file).touch()
+    spec = load_fit_spec(ROOT / "fits" / "ecoflex" / f"{name}.toml")
+    assert [path.name for path in find_files(spec, tmp_path)] == names[:2]
+
+
 @pytest.mark.parametrize("name", ["fit", "fit_67"])
 def test_ecoflex(name, tmp_path, monkeypatch, capsys):
     """70 published curves; the law against plain linear least squares where no bound binds."""
