@@ -195,8 +195,6 @@ def compare(found, known):
             assert found[name] == value
 
 
-@needs_ecoflex
-@pytest.mark.slow
 @pytest.mark.parametrize("folders", [("data", "EF30_0T"), ()], ids=["as published", "flat"])
 @pytest.mark.parametrize("name", ["fit", "fit_67"])
 def test_ecoflex_files_are_found(name, folders, tmp_path):
@@ -210,6 +208,8 @@ def test_ecoflex_files_are_found(name, folders, tmp_path):
     assert [path.name for path in find_files(spec, tmp_path)] == names[:2]
 
 
+@needs_ecoflex
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fit", "fit_67"])
 def test_ecoflex(name, tmp_path, monkeypatch, capsys):
     """70 published curves; the law against plain linear least squares where no bound binds."""
