@@ -301,6 +301,7 @@ def test_zero_limits():
     np.testing.assert_allclose(out.compliance[1:], [160.0**3 / (192 * 1.862), 0, 0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_python_numbers():
     """Numbers, integers, lists and numpy arrays are the arrays they stand for, in both dtypes."""
     run = jax.jit(press)
@@ -394,6 +395,7 @@ def test_wrong_lengths_elsewhere():
             call() if says.startswith("path.") else jax.eval_shape(call)
 
 
+@pytest.mark.slow
 def test_scenes_and_sweeps():
     """Rows off the tube, a negative stiffness or friction: their own status; the others keep it."""
     g, m = table_1(), Material(**FULL)
@@ -419,6 +421,7 @@ def test_scenes_and_sweeps():
     assert swept.status.tolist() == [BAD] * 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "other"), [("k_3_ring", "k_1_ring"), ("k_5_ring", "k_1_ring"), ("GA_side", "GA_L")]
 )

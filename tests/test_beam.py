@@ -60,6 +60,8 @@ def assert_exact(errors, beam, s, solution, dtype):
         assert error <= limit, (quantity, error, limit, s)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("tube", beam_accuracy.TUBES)
 def test_recursion_against_fem(tube, dtype):
@@ -71,6 +73,8 @@ def test_recursion_against_fem(tube, dtype):
         assert_exact(errors, beam, s, solution, dtype)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("tube", ["1 ring", "15 rings"])
 def test_recursion_beats_reactions(tube, dtype):
@@ -96,6 +100,8 @@ def _random_beam(rng, n, with_shear, with_load):
     return np.float32(x), np.float32(160), draw(n + 1), 0.1 * draw(n), GA, load, rng.uniform(1, 159)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("with_shear", [False, True])
 @pytest.mark.parametrize("with_load", [False, True])

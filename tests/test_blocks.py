@@ -31,6 +31,8 @@ def grouped(patch, patches):
     return blocks
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(("vertices", "patches"), [(1000, 16), (997, 3), (64, 8), (5000, 2)])
 def test_a_block_holds_vertices_of_one_patch(vertices, patches):
     patch = drawn(vertices, patches)
@@ -109,6 +111,8 @@ def alone(mesh, geometry):
     return regions.Binding(s, phi, fraction, patch, grouped.nodes, grouped.half_angle)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("method", ["linear", "hermite", "phong"])
 def test_a_surface_in_blocks_is_that_of_its_vertices(method):
     """Values and gradients; C in mid-patch (a block is split) and on a node."""
@@ -155,6 +159,8 @@ def test_bound_to_other_rings():
     np.testing.assert_allclose((up - down) / 2e-6, slope[3], rtol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_second_derivatives():
     """Of the rule for derivatives: both orders of forward and reverse, and difference quotients."""
     binding, keys, weight = regions.bind(TUBE, GEOMETRY), keys_at(73.4), draw(len(TUBE.s), 3)

@@ -39,6 +39,8 @@ def make_study(noises):
     return build_study(curves, table_1(), Options(coupling="total", onset_width=0.0), rows)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("kind", ["parametric", "residual"])
 def test_white_noise_gives_the_standard_error_of_the_covariance(kind):
     """1,000 replicates tell a standard deviation to 2.2 %; bar four of them; and 1.96 of it."""
@@ -56,6 +58,8 @@ def test_white_noise_gives_the_standard_error_of_the_covariance(kind):
     np.testing.assert_array_equal(again.theta, found.theta)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_blocks_see_correlated_noise():
     """AR(1) of 0.7: true error by the closed form of generalised least squares; median of 20."""
     n, r = 400, 0.7
@@ -102,6 +106,8 @@ def columns(heading):
     return re.findall(r"^\| `([\w/]+)` \|", body, re.M)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_command_writes_what_its_page_says(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("good.csv").write_text(GOOD)

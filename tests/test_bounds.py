@@ -64,6 +64,8 @@ def check_nothing_lower(study, sigma, solved, dtype):
     return cost
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_random_bounds_against_scipy(dtype):
     """Most lanes end on a bound."""
@@ -102,6 +104,7 @@ def test_a_start_next_to_a_bound(gap):
     assert np.max(bounded.kkt_residual(tight, solved.theta, sigma)) <= promise_allowed(np.float64)
 
 
+@pytest.mark.compiling
 @pytest.mark.parametrize(
     ("method", "blocks", "count"),
     [
@@ -152,6 +155,7 @@ def joint_study(seed, specimens=3):
     )
 
 
+@pytest.mark.compiling
 @pytest.mark.parametrize(
     "seeds", [range(100, 101), pytest.param(range(101, 130), marks=pytest.mark.slow)]
 )
@@ -178,6 +182,8 @@ def fitted():
     return result
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_profiles_with_bounds(fitted):
     """Given the profiled unknown, all others satisfy the KKT conditions at every point."""
     cornered = fitted.at_bound.all(axis=1)

@@ -480,6 +480,8 @@ def test_hostile_hdf5_costs_its_own_row(study, monkeypatch, capsys):
     assert "1 bad curves" in out
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_a_second_start_compiles_nothing(tmp_path):
     """Programs are kept in the user's cache; the second start adds none, with the same numbers."""
     scene = tmp_path / "scene.toml"

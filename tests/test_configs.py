@@ -110,6 +110,7 @@ def test_scene_runs(scene, monkeypatch, capsys):
         np.testing.assert_allclose(ply.extents, 1e3 * glb.extents, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_sweep_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     code, out, _ = run(monkeypatch, capsys, "sweep", CONFIGS / "scan.toml", "--out", "maps")

@@ -82,6 +82,8 @@ IN_A_PROCESS = (
 )
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("name", IN_A_PROCESS)
 def test_damaged_in_a_process(name, folder):
     case = CASES[name]

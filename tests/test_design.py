@@ -77,6 +77,8 @@ def test_predicted_errors_come_true(known):
     assert np.exp(np.mean(np.log(realised / np.std(without.theta, axis=0)))) < 0.9
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_information_of_a_candidate_is_that_of_finite_differences(known):
     """At s = 51 mm to 4 mm: central differences of `press`, with the noise of the study."""
     theta, h = known.theta[0], 1e-5
@@ -151,6 +153,8 @@ def test_what_cannot_be_designed_is_said(result):
         situation(dataclasses.replace(result, status=nothing))
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_command_writes_its_files_or_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     rows = ["specimen,trial,s [mm],displacement [mm],force [N]"]

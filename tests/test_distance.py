@@ -192,6 +192,8 @@ def with_derivatives(dtype):
     return quick(jax.vmap(one))
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_hard_cases(dtype, scale):
@@ -274,6 +276,8 @@ def lanes(settings_, dtype):
     return quick(jax.vmap(one))
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_box_and_capsule_against_a_ball():
     """Closed forms of the signed distance, balls all round and inside."""
     p = np.random.default_rng(3).uniform(-2, 2, (250, 3))  # as many as random pairs: one program
@@ -345,6 +349,8 @@ def check_pairs(index, settings_, dtype, scale, missed):
     assert not (c.status == ContactStatus.NON_FINITE).any()
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(("dtype", "scale"), [("float64", 1.0), ("float32", 1e3)])
 def test_random_pairs_against_outside_numbers(dtype, scale):
     check_pairs(np.arange(0, 2000, 8), STANDARD, dtype, scale, missed=2)
@@ -379,6 +385,8 @@ def place(v):
 cold_lanes = quick(jax.vmap(lambda v: signed_distance(A, B, place(v))))
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @few
 @given(short_vectors, short_vectors)
 def test_swapping_the_shapes(w, t):
@@ -426,6 +434,8 @@ def test_witness_points(name):
         assert outside.max() <= np.log(8) / beta
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_lanes_are_single_calls():
     batch = jnp.tile(jnp.stack(list(PLACES.values())), (40, 1))
     together = cold_lanes(batch)
@@ -435,6 +445,8 @@ def test_lanes_are_single_calls():
             np.testing.assert_allclose(x[i], y, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_a_table_is_shared_between_poses():
     """Of a box off its origin; a ball inside near its end leaves by the thin side, not ahead."""
     half, off = jnp.array([3.0, 1.0, 0.3]), jnp.array([20.0, -30.0, 5.0])
@@ -499,6 +511,8 @@ def central(f, v, step):
     return np.stack([np.asarray(r) for r in rows], axis=-1)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("name", PLACES)
 def test_gradients(name):
     """Pose and size of a box: reverse = forward = central differences; second = first of first."""
@@ -557,6 +571,8 @@ def test_gradients_of_random_pairs(scale):
 # ---------------------------------------------------------------- outcomes and misuse
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_outcomes():
     here = place(PLACES["apart"])
     nowhere = Pose(here.rotation, here.translation * jnp.nan)
@@ -570,6 +586,8 @@ def test_outcomes():
     assert all(member.message for member in ContactStatus)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("start", [(1.0, 1, 0), (1.0, 1, 1), (0.0, -1, 1)])
 def test_a_saddle_by_symmetry_is_not_converged(start):
     """A cube of 2 mm in itself is 2 mm deep, to a face; towards an edge or a corner 2.8 and 3.5."""

@@ -119,6 +119,8 @@ def test_links_lead_somewhere(page):
             assert anchor in slugs, target
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(("page", "i"), list(python_blocks()))
 def test_python_runs(page, i, tmp_path):
     code = BEFORE.get((page.stem, i), "") + blocks(page, "python")[i]

@@ -60,6 +60,8 @@ def fourth_order(f, x):
     return (8 * (up - down) - (up_2 - down_2)) / (12 * STEPS)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("name", LEVELS)
 def test_gradient_is_that_of_the_work_over_the_depth(name):
     """Between rings and close to one, on the midline and off it, up to 70 degrees.

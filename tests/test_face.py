@@ -195,6 +195,8 @@ def test_profiles_and_bootstrap_go_by_the_same_names():
     np.testing.assert_allclose(again.standard_error, result.standard_error, rtol=0.22)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_a_fit_in_single_precision_is_said_once():
     """With the cure, at the user's line; not where float32 was asked for, nor in float64."""
     study = jt.build_study(curves(forces(TRUTH[:1])[0]), GEOMETRY, OPTIONS, parameters())

@@ -82,6 +82,8 @@ def _coverage(count, given):
     return np.mean((result.lower <= truth) & (truth <= result.upper), axis=0)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("given", [False, True])
 def test_intervals_cover(given):
     """600 fits: 95 % within four binomial standard deviations, 0.95 -+ 4 sqrt(.95 .05 / 600)."""
@@ -96,6 +98,7 @@ def test_intervals_cover_5000(given):
     assert np.all((covered >= 0.93) & (covered <= 0.97)), covered
 
 
+@pytest.mark.compiling
 @pytest.mark.parametrize("loss", ["linear", pytest.param("huber", marks=pytest.mark.slow)])
 def test_a_batch_is_its_lanes_one_by_one(noisy, loss):
     """The same lane alone, in a batch, elsewhere in the batch and among others: to 1e-8."""
@@ -168,6 +171,8 @@ def test_bad_specimens_cost_only_themselves(tmp_path):
         np.testing.assert_array_equal(getattr(with_bad, name), getattr(without, name))
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_an_infeasible_start_is_a_status_and_disturbs_nobody(noisy):
     """Softening so strong that the start lies past the fold for one specimen's deep curves."""
     truth, force, _ = noisy
@@ -269,6 +274,8 @@ def test_a_bound_is_hit_and_said(noisy):
     assert np.isfinite(result.standard_error[:, 3]).all()
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(("scope", "lanes", "unknowns"), [("shared", 1, 4), ("specimen", 3, 4)])
 def test_scopes_count_their_unknowns(scope, lanes, unknowns):
     truth = np.tile(CLEAR, (3, 1))
@@ -279,6 +286,8 @@ def test_scopes_count_their_unknowns(scope, lanes, unknowns):
     np.testing.assert_allclose(result.value, np.tile(CLEAR, (lanes, 1)), rtol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_shared_and_specimen_mix():
     """Skeleton shared by three specimens, contact of each its own: 2 + 3 x 2 unknowns."""
     truth = np.tile(CLEAR, (3, 1))
@@ -345,6 +354,8 @@ def test_unequal_lengths_do_not_change_results():
     assert both.samples.tolist() == [200, 140]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_float32_agrees(noisy):
     _, force, _ = noisy
     double = fit(synthetic.study(force), ONE)
@@ -364,6 +375,8 @@ def test_more_starts_never_cost_more(noisy):
     np.testing.assert_allclose(four.value, one.value, rtol=1e-4)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_markers_with_both_noise_levels_estimated():
     """Forces with 2 % and ring deflections with 0.02 mm noise: both levels are found."""
     force, joints = synthetic.forces(synthetic.draw(13, 10, 1.2, CLEAR))
@@ -387,6 +400,7 @@ def test_markers_with_both_noise_levels_estimated():
     assert np.all(result.standard_error[:, 1] < force_only.standard_error[:, 1])
 
 
+@pytest.mark.compiling
 @pytest.mark.parametrize(
     "loss", ["huber", *(pytest.param(n, marks=pytest.mark.slow) for n in ("soft_l1", "cauchy"))]
 )
@@ -417,6 +431,8 @@ def test_robust_losses_as_scipy(noisy, loss):
     assert stray(result) < stray(plain)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(("method", "blocks"), [("lbfgs", 60), ("adam", 100)])
 def test_descent_reaches_the_same_minimum(noisy, method, blocks):
     _, force, _ = noisy

@@ -196,6 +196,7 @@ def test_bad_step_is_flagged_and_left_behind():
         np.testing.assert_allclose(got.force[3], good.force[3], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_rounding():
     """Within w of Coulomb's limit, exact outside (1 +- w) of it, and without a kink."""
     w = 0.1
@@ -269,6 +270,7 @@ def test_gradients(rounding, dtype):
         np.testing.assert_allclose(along, (up - down) / 2e-6, atol=tolerance, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rounding", [0.0, 0.05])
 def test_gradient_at_rest_is_finite(rounding):
     """No tangential motion, no pressure: nothing divides by the length of zero."""
@@ -310,6 +312,7 @@ def summed(quintic):
     return one
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("quintic", [False, True])
 def test_softening_steps_are_right_or_refused(quintic, dtype):
@@ -351,6 +354,7 @@ def test_past_the_zero_of_a_softening_law_it_pulls(mu):
     np.testing.assert_array_equal(got.slip, 0)
 
 
+@pytest.mark.slow
 def test_a_failed_step_leaves_the_derivatives_of_the_others():
     """The same path without the step that folds: same slips after it, same gradients."""
     D = sideways(np.array([0.2, 2.0, 2.1, 2.2]))

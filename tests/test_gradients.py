@@ -99,6 +99,8 @@ def deflection(split, form, loaded=False):
     return f
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("s", [25.3, 5.5, 55.2])
 @pytest.mark.parametrize("k", [1e-9, 1e-3, 0.1, 10.0, 1e12])
 @pytest.mark.parametrize("f", [compliance, compliance_independent])
@@ -106,6 +108,8 @@ def test_compliance(f, k, s):
     check(f, beam_values(s, k), rtol=3e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(
     ("form", "split", "shear"),
     [
@@ -252,6 +256,8 @@ def pressing(options):
     return f
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(
     "options",
     [

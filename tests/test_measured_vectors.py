@@ -548,6 +548,8 @@ def spec(tmp_path):
     return put(tmp_path, SPEC, "study.toml")
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_commands_say_once_what_is_not_read(spec, tmp_path, monkeypatch, capsys):
     said = "Measured and not read: side force in 1, ring ends U in 1 of 1 curves"
     code, out, err = run(monkeypatch, capsys, "check", spec)

@@ -144,6 +144,8 @@ def check(found, mesh, geometry, atol=0.35, scale=1.0):
     np.testing.assert_allclose(found.geometry.length, geometry.length, atol=0.2)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(
     ("suffix", "scale", "unit"),
     [("stl", 1.0, None), ("obj", 0.1, "cm"), ("ply", 1.0, None), ("glb", 1e-3, None)],

@@ -98,6 +98,7 @@ def frame_fem(s_c, phi, force, v):
     return u[at_C : at_C + 3], u[at_C + 3 : at_C + 5], joints, slopes, joints[:, 1:] @ spring.T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [{}, MORE], ids=["plain", "ends and sides"])
 @pytest.mark.parametrize(("s", "phi"), [(63.0, 0.4), (60.0, -1.9), (4.0, 0.0), (155.0, ALPHA)])
 def test_against_frame(s, phi, more):
@@ -234,6 +235,7 @@ def test_status_of_lanes():
         np.testing.assert_array_equal(a[0], b[0])
 
 
+@pytest.mark.slow
 def test_path():
     """Sticking, a path is the bonded press; sliding, the force is on the cone, off the midline."""
     frame = turned(0.4)

@@ -27,6 +27,8 @@ def of(rings, fitted):
     return next(r for r in RECORD if (r["rings"], r["fitted"]) == (rings, fitted))
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("rings", ["mat", "arch2"])
 def test_errors_are_the_recorded_ones(rings):
     """Parameters as recorded, everything else computed: forces, side forces, joints, ends."""

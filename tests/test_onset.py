@@ -120,6 +120,8 @@ def coverage(result, truth):
     return inside, (result.value - truth[:, :4]) / result.standard_error
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_every_noisy_curve_converges(studied):
     """A third of them stopped at 200 iterations, with the touch smooth over 1e-3 mm."""
     result, truth = studied
@@ -337,6 +339,8 @@ def test_where_no_onset_is_fitted_nothing_changes():
     assert study.parameters[-1].step == 0.1
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_a_stored_fit_predicts_with_its_corners_and_in_its_steps(owned, tmp_path):
     """Used curves come back to 1e-9 N; a press ten times as deep, in other steps: SciPy."""
     write_hdf5(tmp_path / "results.h5", Findings(owned), {})

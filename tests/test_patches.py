@@ -86,6 +86,8 @@ def turned(angle):
     return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(("dtype", "rounding"), [("float32", 3e-5), ("float64", 1e-11)])
 def test_sphere_against_an_endless_cylinder(dtype, rounding):
     """Too small by at most the bound; point, normal and phi across exactly, s within the tilt."""
@@ -137,6 +139,8 @@ def test_lanes_are_single_calls():
             np.testing.assert_allclose(getattr(many, name)[i], getattr(c, name), atol=1e-10)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_broad_phase_leaves_out_nothing():
     """Two patches searched from the broad phase's direction, or all over all directions."""
     _, _, _, at, turn = places(SEARCHED, low=10)
@@ -202,6 +206,8 @@ POSES = {
 }
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_derivatives():
     """Reverse = forward = differences, of gap, s, phi, normal, witness by all six of the pose."""
     count, h = len(POSES), 1e-5

@@ -143,6 +143,8 @@ def test_bands_cover_in_2000_fits(noise, tmp_path):
     check_coverage(jaxtrachea.read_results(tmp_path), noise)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_everything_comes_back_from_the_file(study, read):
     _, result = study
     assert np.array_equal(read.theta, result.theta)
@@ -955,6 +957,8 @@ def test_virtual_trachea_ten_positions_by_the_command(tmp_path, monkeypatch, cap
         assert json.loads((tmp_path / f"f{k}" / "provenance.json").read_text())["inputs"]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_a_lane_with_one_place_predicts_that_place(study, tmp_path):
     """k_M too small to be seen in one press: the press itself is known, one elsewhere is not."""
     truth = true_force(75.0)

@@ -73,6 +73,8 @@ def curved():
     return force, result, profiles(result, ONE, points=4)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_every_point_is_the_constrained_optimum_of_scipy(curved):
     """Two specimens, four parameters, nine points each: cost to 1e-6 (measured 1e-12)."""
     force, result, found = curved
@@ -110,6 +112,8 @@ def test_ends_lie_on_the_threshold_and_batch_equals_one(curved):
     np.testing.assert_allclose(alone.coordinate[:, [1, 9]], edge[of], rtol=1e-9)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_what_one_position_cannot_tell_is_open():
     """EI_L and k_M act through one number: flat up to the bounds, and said so."""
     force, _ = synthetic.forces(np.array([[100.0, 1.0, 2.0, 0.2]]), s_c=np.array([75.0]))

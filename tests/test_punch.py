@@ -70,6 +70,8 @@ def test_against_finite_elements(dtype, shear):
     assert np.all(np.asarray(got.theta_C) == 0)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_narrow_punch_is_a_point_that_does_not_tilt():
     """As the square of the width, in the middle of a uniform beam, where a point does not either.
 
@@ -135,6 +137,8 @@ def test_mean_ring_weight(dtype):
         np.testing.assert_allclose(got, mean, atol=2e-4)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_compliance_and_law_of_press():
     """`press`, `compliance` and the fit's law see one and the same punch."""
     geometry = table_1()
@@ -150,6 +154,8 @@ def test_compliance_and_law_of_press():
         np.testing.assert_allclose(got.force, 0.1 / (c[i] + local), rtol=1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("skeleton", ["linear", "softening"])
 def test_beyond_an_end_is_refused(dtype, skeleton):

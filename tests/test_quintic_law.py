@@ -140,6 +140,8 @@ def as_vector(v):
     return press_vector(D, jnp.asarray(C_FULL) * v["c"], Law(v["k_1"], v["k_3"], v["k_5"]))[:2]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("press", [in_series, in_total, as_vector])
 @pytest.mark.parametrize("k", LAWS)
 def test_derivatives(k, press):
@@ -261,6 +263,8 @@ def curves(positions):
             for i, (s, F) in enumerate(zip(positions, forces, strict=True))]  # fmt: skip
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_a_fit_has_it_back():
     """Noiseless curves at four positions: the five numbers they were made of."""
     study = build_study(curves([20.0, 45.0, 62.0, 80.0]), table_1(), Options(), SIGNED,

@@ -242,6 +242,8 @@ def dense():
     return fit(build_study(curves, table_1(), BONDED, table(**changes)), ONE)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_one_lane_of_several_specimens_has_a_row_for_each(dense):
     """All columns of a specimen's own unknowns; what it has several of is named, not dropped."""
     assert dense.lanes == 1
@@ -339,6 +341,8 @@ def test_fewer_independent_samples_than_unknowns_leave_no_limit():
     assert "correlated in 1 of 1 lanes" in " ".join(shown(overview(widened(result))).split())
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_the_command_with_names_of_mathematics(tmp_path, monkeypatch, capsys):
     """Two `$` ended the run in a traceback; leaving out and influence reach the terminal."""
     monkeypatch.chdir(tmp_path)

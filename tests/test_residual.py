@@ -134,6 +134,7 @@ def _press(options, material, s_c, onset, displacement):
     return out.force, out.joints
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EACH)
 def test_is_model_minus_data(name):
     study = make_study(name)
@@ -179,6 +180,7 @@ def test_jacobian_is_that_of_the_value(name):
             assert np.all(truth[t][:, others] == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["all", "several beams", "total, markers"])
 def test_float32_follows_float64(name):
     study = make_study(name)

@@ -288,6 +288,8 @@ reverse = jax.jit(jax.jacrev(_all), compiler_options=QUICK)
 value = jax.jit(_all, compiler_options=QUICK)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("phi", [0.0, 0.4, -1.9])
 @pytest.mark.parametrize("changes", [{}, {"k_t": 20.0, "EI": 1e3}, {"k_t": 0.975}])
 def test_gradients(phi, changes):

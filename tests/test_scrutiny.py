@@ -111,6 +111,8 @@ def test_the_specimens_are_those_of_the_case(pressed):
     assert pressed.compliance[:4, 0].max() < 0.6
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_one_press_has_one_verdict_and_an_estimate(result, pressed):
     """One cause, one verdict: no lane fails, and none calls k_1 known where it is not."""
     word, outside, false = verdicts(result, pressed.truth)
@@ -263,6 +265,7 @@ def joint_study(seed, shared, count, share):
     return build_study(list(data), GEOMETRY, OPTIONS, parameters, joint=True), truth
 
 
+@pytest.mark.compiling
 @pytest.mark.parametrize(
     ("seeds", "shared", "count"),
     [

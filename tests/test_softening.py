@@ -63,6 +63,8 @@ def exact(D, c, k_1, k_3, e_1, e_2):
         return sign * d, sign * u, sign * (k_1 * d + k_3 * d**3), (1 + slope) / (rise + slope)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_roots(dtype):
     """All three to a few roundings relative to themselves, however unequal; folds are told."""
@@ -104,6 +106,8 @@ def test_linear_limit(dtype):
     np.testing.assert_allclose(got.force, want.force, rtol=rtol)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("D", [3.0, -3.0, 0.0])
 def test_derivatives(D):
     """Forward, reverse and second order against differences; `sensitivity` is the forward one."""
@@ -155,6 +159,8 @@ def test_not_finite(bad):
     assert got.status.tolist() == [PressStatus.OK, PressStatus.NON_FINITE]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -181,6 +187,8 @@ def test_not_finite_is_no_fold(name, bad, dtype):
     np.testing.assert_allclose(slope[0], jax.grad(total)(rows[:1])[0], rtol=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_press(dtype):
     """In `press` the joints follow the deflection of C; work along a path is the stored energy."""

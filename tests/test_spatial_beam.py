@@ -91,6 +91,8 @@ def cases(k, with_load):
     return found
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(("k", "with_load", "dtype"), AGAINST_FEM)
 def test_against_fem(k, with_load, dtype):
     """Oblique force, rings with axes of their own, ring loads, shear, soft to stiff rings.
@@ -149,6 +151,8 @@ def test_planes_of_their_own():
     np.testing.assert_allclose(got.w[:, 0], alone.w, atol=1e-13)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("k", [1e-3, 0.1, 1e5])
 def test_reciprocity(k):
     """Maxwell-Betti: motion at ring i for a load at C = motion of C for that load at ring i."""
@@ -179,6 +183,8 @@ def test_energy_and_equilibrium(k):
     np.testing.assert_allclose(got.w, moved, atol=1e-12 * np.max(np.abs(got.w)))
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_compliance_of_many_points(dtype):
     """M positions at once are the single answers; symmetric, positive, 0 on the clamps."""
@@ -196,6 +202,8 @@ def test_compliance_of_many_points(dtype):
     assert compliances(b, s[2]).shape == (2, 2)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_smooth_across_a_ring():
     """Left limit, value and right limit of C and dC/ds agree on every ring."""
     b = beam_of(tube(np.random.default_rng(6), 0.1))
@@ -212,6 +220,8 @@ def test_smooth_across_a_ring():
     np.testing.assert_allclose(slope(b, jnp.asarray([0.0] * 7 + [160.0] * (N - 7))), 0, atol=1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_cut_and_rigid_rings(dtype):
     """Integrity 0 is a ring that is not there; compliance 0 a ring that does not move."""

@@ -347,6 +347,7 @@ AT32 = bind(points([68.0, 71, 74], [0.3, 0.5, -2.5], dtype="float32"), table_1("
 SLOPES = {method: slopes_of(lambda x, m=method: surface_of(m)(AT, *x)) for method in METHODS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1.0, 0.0])
 @pytest.mark.parametrize("method", METHODS)
 def test_gradients(method, size):
@@ -530,6 +531,7 @@ def test_repeated_centres():
     np.testing.assert_allclose(correction(odd, at)[0, 0], 2, atol=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [(0.2, -1.0, 0.3), (0.0, 0.0, 0.0)])
 @pytest.mark.parametrize("count", [1, 16])
 def test_dent_gradients(count, depth):

@@ -377,6 +377,8 @@ def test_processes_notice_each_other(tmp_path):
         third.wait_for(0)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_no_cluster_is_said(study):
     code, _, err = finish(start(study, *FIT, "--distributed"))
     assert code == 2
@@ -512,6 +514,7 @@ def from_peace(folder):
     return fitted
 
 
+@pytest.mark.compiling
 @pytest.mark.parametrize(
     ("code", "every"),
     [
@@ -608,6 +611,8 @@ def garbled(path):
     yield
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_a_damaged_manifest_costs_no_shard(peace, study, monkeypatch, capsys):
     """Every shard holds the manifest of its run: rebuilt, still checked, and said."""
     begun(peace, study, monkeypatch, capsys)

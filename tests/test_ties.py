@@ -162,6 +162,7 @@ def same(one, two, size, dtype, name):
     np.testing.assert_array_equal(one["status"], two["status"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_ties_are_right_and_told(dtype, scale):
@@ -209,6 +210,7 @@ def test_both_dtypes_give_the_same(name):
     same(one, two, sizes(cases), "float32", list(cases))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ties", "single"])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_alone_as_in_a_batch(name, dtype):
@@ -276,6 +278,7 @@ def led_over(kind):
     return quick(jax.vmap(one, (None, 0, 0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["round", "mesh"])
 @pytest.mark.parametrize("name", BOXES)
 def test_a_level_box_touches_a_symmetric_tube_in_the_middle(name, kind):

@@ -161,6 +161,8 @@ def test_same_as_one_by_one(name, block, monkeypatch):
         same(a, b)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("seed", range(4))
 def test_same_for_records_at_random(seed):
     """Ramps with noise, pauses, uneven clocks and reversals of all sizes, and holes in them."""

@@ -141,6 +141,8 @@ def test_the_finest_level_is_no_wish_of_the_user():
     assert not full.levels.plan.second_plane
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_a_measured_rung_errs_as_by_hand(monkeypatch):
     """`total` is F = k_1 D + k_3 D^3, by hand; `series` solves d + c F(d) = D."""
     full = full_scene(*staged(GA_L=None, k_1_ring=None))
@@ -193,6 +195,8 @@ def off(found, reference):
     return worst
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_chosen_plan_is_within_the_tolerance():
     spec, made = staged()
     full = full_scene(spec, made)
@@ -217,6 +221,8 @@ def test_chosen_plan_is_within_the_tolerance():
     assert choice.cost[0] == choice.cost[1]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_two_effects_within_tolerance_can_break_it_together():
     spec, made = staged(GA_L="10 N")
     full = full_scene(spec, made)
@@ -311,6 +317,8 @@ pictures = false
 """
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(("precision", "dtype"), [("auto", "float32"), ("float64", "float64")])
 def test_simulate_takes_the_plan_within_the_tolerance(
     precision, dtype, tmp_path, monkeypatch, capsys

@@ -59,6 +59,8 @@ def exact(D, C, k_1, k_3):
         return np.array([float(v) for v in depth(low)])
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_any_compliance(dtype):
     """12 decades of stiffness, 4 of compliance: rounding times the condition of M = 1 + kappa C.
@@ -91,6 +93,8 @@ def test_against_scipy(k_3):
     np.testing.assert_allclose(got.force, force(found.x), rtol=1e-10)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("k_3", [0.0, 1e-9, 0.1, 1e9, -0.003])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_along_an_axis_it_is_press_series(k_3, dtype):

@@ -104,6 +104,8 @@ def columns(heading):
     return re.findall(r"^\| `([\w/ ]+)` \|", body, re.M)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_command_writes_what_its_page_says(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     data = GOOD + GOOD.partition("\n")[2].replace("T01,1,", "T01,2,")

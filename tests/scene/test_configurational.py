@@ -140,6 +140,7 @@ def test_loops_do_no_work(material):
     assert found[:, 1, 0].min() > -2e-5
 
 
+@pytest.mark.slow
 def test_a_wall_alike_everywhere_pushes_nothing_along():
     """Total coupling with one local law: the energy knows nothing of the place.
 
@@ -158,6 +159,7 @@ def test_a_wall_alike_everywhere_pushes_nothing_along():
     np.testing.assert_allclose(aside, 0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_steps_rows_and_precisions_agree():
     """A session step is the row of `simulate`, and float32 the same within its roundings."""
     scene = scene_of()

@@ -51,6 +51,8 @@ def test_plan_refuses(changes, says):
         dataclasses.replace(plan, options=dataclasses.replace(plan.options, **changes))
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("contact_point", ["fixed", "per_step"])
 def test_plan_refuses_a_split_without_an_energy(contact_point):
     """Of a tool that wanders; a place that is kept, and presses at places, have it."""

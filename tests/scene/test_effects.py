@@ -121,6 +121,8 @@ def test_former_words_are_refused_from_python():
 DOWN = [[75.0, 18.0, 0.0], [75.5, 16.0, 0.0], [76.0, 15.0, 0.0]]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_rows_in_the_lumen_are_no_contacts_of_the_plan():
     """The facts are those of the path without them; they made another contact point of each."""
     small = dataclasses.replace(BARE)
@@ -142,6 +144,8 @@ def test_rows_in_the_lumen_are_no_contacts_of_the_plan():
     np.testing.assert_allclose(found.force[2:], alone.force[:4], rtol=1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_a_bad_material_is_one_in_simulate_and_in_sweep():
     """Off the plan too: `sweep` said OFF_PLAN where `simulate` says BAD_MATERIAL."""
     path = poses([75, 18, 0], [75, 15, 0], 2)

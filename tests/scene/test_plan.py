@@ -88,6 +88,8 @@ def test_the_wrong_kind_of_path_is_refused():
         simulate(scene, MATERIAL, ball([75, 1, 0], [75, -2, 0]))
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_what_the_scene_holds_reaches_the_rules():
     """Facts of a path of the tool: places, direction, friction, what the material gives."""
     path = ball([75, 1, 0.5], [77, -2, 1.0])
@@ -100,6 +102,8 @@ def test_what_the_scene_holds_reaches_the_rules():
     assert far.plan.contact_point == "per_step"
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_one_step_from_afar_to_a_slanting_press():
     """The way along the surface between two rows, from first touch on, counts for the plan too."""
     path = ball([70, 4, 0], [76, -2, 0], 2)

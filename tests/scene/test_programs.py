@@ -208,6 +208,8 @@ def program(name):
     return scene, path, hand
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_an_unused_effect_adds_no_operation(name):
     """In the traced program: exactly those of the program by hand."""

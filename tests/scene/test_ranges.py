@@ -336,6 +336,7 @@ def too_deep(path, out, contact_point):
         np.testing.assert_allclose(share[-1], 50 / 12.6, atol=0.02)
 
 
+@pytest.mark.slow
 def test_a_tool_driven_through_the_tube_is_beyond_its_range(through):
     """It was OK with 3.5 to 5 N: the wall may go as far as the axis of the tube."""
     too_deep(*through[1:], "first")

@@ -168,6 +168,7 @@ def check_jumps(force, gap, lengths):
     assert (jump <= stiffness * (lengths + 1e-4)).all(), (jump / lengths).max()
 
 
+@pytest.mark.slow
 def test_float32_and_states_by_status(held):
     held.reset()
     step = held.step(EYE, [163, OUTER + 3, 0])

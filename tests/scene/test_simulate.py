@@ -49,6 +49,7 @@ run, swept = jax.jit(simulate), jax.jit(sweep)
 FINE = make_tube(table_1())
 
 
+@pytest.mark.slow
 def test_one_plane_agrees_with_vectors():
     scene = make_scene(TUBE, SPRINGS, DOWN, mesh=MESH)
     full = make_scene(TUBE, SPRINGS, DOWN, mesh=MESH, effects=EffectOptions(second_plane="on"))
@@ -69,6 +70,7 @@ def test_rows_off_the_plan_are_refused_by_status():
     assert np.isnan(out.force[1:]).any(axis=1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [False, True])
 @pytest.mark.parametrize("at", ["s", "phi", "depth"])
 def test_a_row_that_is_no_number_says_so(at, more):
@@ -87,6 +89,7 @@ def test_a_row_that_is_no_number_says_so(at, more):
         assert np.any(np.isnan(got.force[1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", ["s", "phi"])
 @pytest.mark.parametrize("more", [{}, {"second_plane": "on"}, {"friction": "on"}])
 def test_without_a_contact_point_no_row_is_a_number(more, at):
@@ -113,6 +116,7 @@ def test_without_a_contact_point_no_row_is_a_number(more, at):
     np.testing.assert_array_equal(out.force[0], whole.force[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [{}, {"second_plane": "on"}, {"friction": "on"}])
 def test_past_the_zero_of_the_law_every_program_says_pulls(more):
     """F(2 mm) = 0 with k_3 = -k_1 / 4 mm^2, whatever the stiff skeleton; the rows stay apart."""
@@ -133,6 +137,7 @@ def test_past_the_zero_of_the_law_every_program_says_pulls(more):
     assert np.isnan(out.force[2, 1])
 
 
+@pytest.mark.slow
 def test_a_press_elsewhere_is_refused_by_status():
     """A program for one contact point gave every row the answer of the first."""
     there = Presses([75.0, 40.0, 75.0], [0.0, 0.0, 0.3], [[0, -2.0, 0]] * 3)
@@ -152,6 +157,7 @@ def test_another_geometry_moves_the_surface_with_its_rings():
     np.testing.assert_allclose(a, b, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rings", ["mat", "arch2"])
 def test_behind_the_rings_nothing_is_solved(rings):
     """Not only the arches: the surface is NaN there, and an OK would be misleading."""
@@ -164,6 +170,7 @@ def test_behind_the_rings_nothing_is_solved(rings):
     np.testing.assert_array_equal(out.vertices[0], MESH.vertices)
 
 
+@pytest.mark.slow
 def test_a_ball_led_down_presses_as_deep_as_it_goes():
     path = ball([75, 1, 0], [75, -3, 0], 5)
     scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=BARE)
@@ -205,6 +212,7 @@ def test_the_dent_follows_the_tool():
     assert after < 0.35  # mm; what 16 centres of 4 mm spacing leave
 
 
+@pytest.mark.slow
 def test_sweep_agrees_with_single_presses_whatever_the_chunk():
     scene = make_scene(TUBE, MATERIAL, OFF, effects=BARE)
     grid = list(itertools.product((20.0, 75.0), (-0.4, 0.0, 0.4)))

@@ -44,6 +44,7 @@ def test_material_from_a_deformed_surface():
     np.testing.assert_allclose(jnp.exp(x), 0.1, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_network_learns_which_motion_reaches_a_force():
     """Depth of the tool from the force wanted: nothing is shown to it but the simulated force."""
     scene = make_scene(TUBE, MATERIAL, DOWN, effects=BARE)

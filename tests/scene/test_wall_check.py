@@ -97,6 +97,8 @@ def spacings():
     return found
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(("where", "limit"), [("on vertices", 0.03), ("between", FACET)])
 def test_a_finer_mesh_moves_the_gap_by_less_than_0_03_mm(spacings, where, limit):
     """Between its vertices a coarse mesh is flat, up to R (1 - cos(pi / 35)) lower: 0.05 mm."""

@@ -53,6 +53,8 @@ def random_blocks(n, m, indefinite):
     return np.stack(D), np.stack([*U, np.zeros((m, m))]), dense
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("n", [2, 3, 8, 9])
 @pytest.mark.parametrize("indefinite", [False, True])
 def test_block_elimination_is_dense(indefinite, n):

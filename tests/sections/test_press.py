@@ -78,6 +78,7 @@ LINEAR = [
 ]
 
 
+@pytest.mark.slow
 def test_linear_limit():
     """Against the differential equations, linearised by hand; D = 1e-4 mm leaves 1e-6."""
     for case, got in zip(LINEAR, press(LINEAR), strict=True):
@@ -158,6 +159,7 @@ HARD = {
 }
 
 
+@pytest.mark.slow
 def test_hard_cases():
     """Every one is in balance, pushes back, and stores the energy that its force does."""
     for (name, case), got in zip(HARD.items(), press(list(HARD.values())), strict=True):
@@ -182,6 +184,7 @@ def test_deeper_than_the_radius_is_said():
     assert np.sum(moved > RADIUS) == 3
 
 
+@pytest.mark.slow
 def test_past_a_fold():
     """Soft rings snap through under a tool on a soft spring: no row from there on looks valid.
 
@@ -307,6 +310,7 @@ def test_refusals():
         press_sections(geometry, material, 30.0, 0.0, PATH)
 
 
+@pytest.mark.slow
 def test_a_beam_on_springs_is_the_limit():
     """Rings that do not bend and uncoupled modes: the paper's ligament with shear on k_M."""
     k_M, EI, GA, c_n = 0.216, 1402.0, 9.31, 0.003

@@ -55,6 +55,7 @@ def force_alone(flat):
     return solve_path(parts, path).state.force[-1]
 
 
+@pytest.mark.slow
 def test_along_one_direction():
     """All of geometry, material, place and path at once, midline and 5 mm."""
     along = jnp.asarray(np.random.default_rng(0).normal(size=FLAT.size)) * FLAT
