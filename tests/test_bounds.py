@@ -104,6 +104,7 @@ def test_a_start_next_to_a_bound(gap):
     assert np.max(bounded.kkt_residual(tight, solved.theta, sigma)) <= promise_allowed(np.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize(
     ("method", "blocks", "count"),
@@ -155,6 +156,7 @@ def joint_study(seed, specimens=3):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize(
     "seeds", [range(100, 101), pytest.param(range(101, 130), marks=pytest.mark.slow)]

@@ -40,6 +40,7 @@ def covered(level, count):
     return inside(result.lower, result.upper, truth), inside(low, high, truth[lanes])
 
 
+@pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize("count", [200, pytest.param(600, marks=pytest.mark.slow)])
 def test_profiles_cover_where_local_errors_do_not(count):

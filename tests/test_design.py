@@ -92,6 +92,8 @@ def test_information_of_a_candidate_is_that_of_finite_differences(known):
     np.testing.assert_allclose(found, J @ J.T / SIGMA**2, rtol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_criteria_are_their_definitions_and_greedy_takes_the_best(known):
     candidates = grid((10.0, 150.0), (2.0, 6.0), 300)
     added = gains(known, candidates)

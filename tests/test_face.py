@@ -62,6 +62,8 @@ def test_no_name_is_hidden_by_a_room():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_table_holds_the_truth_with_units(result):
     table = result.table()
     assert len(table) == 8
@@ -159,6 +161,8 @@ def test_dataset_says_what_is_missing(result, monkeypatch):
         result.to_dataset()
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_a_fit_predicts_what_the_model_says(result):
     """At a position that was not pressed; the truth is the model at the true parameters."""
     wanted = forces(TRUTH, np.array([60.0]))[0][1, 0]
@@ -180,6 +184,8 @@ def test_one_file_and_its_curves_are_a_study():
         jt.build_study(Measurements(read.curves, (bad,), ()), jt.table_1(), jt.Options())
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_profiles_and_bootstrap_go_by_the_same_names():
     """With little noise the model is linear: both agree with the local standard errors."""
     force, _ = forces(TRUTH)

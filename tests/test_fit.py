@@ -98,6 +98,7 @@ def test_intervals_cover_5000(given):
     assert np.all((covered >= 0.93) & (covered <= 0.97)), covered
 
 
+@pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize("loss", ["linear", pytest.param("huber", marks=pytest.mark.slow)])
 def test_a_batch_is_its_lanes_one_by_one(noisy, loss):
@@ -241,6 +242,8 @@ def test_same_optimum_and_errors_as_scipy(noisy):
         np.testing.assert_allclose(error, np.sqrt(np.diag(covariance)), rtol=1e-4)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_one_position_leaves_skeleton_undetermined():
     """As on an elastic foundation (c ~ EI^-1/4 k_M^-3/4) only EI k_M^3 is seen from one place."""
     force, _ = synthetic.forces(np.array([[100.0, 1.0, 2.0, 0.2]]), s_c=np.array([75.0]))
@@ -325,6 +328,8 @@ def test_onset_and_offset_of_each_trial_are_recovered():
     )
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_unequal_lengths_do_not_change_results():
     """A short curve padded beside long ones gives what it gives alone."""
     truth = synthetic.draw(11, 2, 1.2, CLEAR)
@@ -400,6 +405,7 @@ def test_markers_with_both_noise_levels_estimated():
     assert np.all(result.standard_error[:, 1] < force_only.standard_error[:, 1])
 
 
+@pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize(
     "loss", ["huber", *(pytest.param(n, marks=pytest.mark.slow) for n in ("soft_l1", "cauchy"))]

@@ -224,6 +224,7 @@ def test_rounding():
     assert (1 - w) * limit < creeping.force[-1, 1] <= limit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rounding", "dtype"),
     [

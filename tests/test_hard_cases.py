@@ -58,6 +58,8 @@ def solved(name, dtype):
     return got, gradient, status
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", CASES)
 def test_value_and_gradient(name, dtype):

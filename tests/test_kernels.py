@@ -84,6 +84,7 @@ def kernels(name, bodies):
     return count, loops
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tube", list(MOST))
 def test_the_contact_starts_few_kernels(tube):
     environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}

@@ -288,6 +288,8 @@ def test_progress_comes_to_its_end(tmp_path):
     assert len(seen) == STEPS
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("given", [{}, {"anterior": ROTATION @ Z, "ring_positions": RINGS}])
 @pytest.mark.parametrize(
     ("angle", "message"),

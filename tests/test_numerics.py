@@ -100,6 +100,8 @@ def test_cubic_ratio_maps_row_by_row():
     assert np.isnan(two[1])
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("width", [0.0, 1e-3, 2.0])
 def test_positive_part(width, dtype):
@@ -349,6 +351,8 @@ def test_cosine_and_sine_have_derivatives():
         np.testing.assert_allclose(np.diagonal(s), np.cos(x), atol=1e-15)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 32, 33, 64, 97, 120, 128, 1000, 1500])
 def test_total_and_largest(n, dtype):

@@ -136,6 +136,8 @@ def test_every_noisy_curve_converges(studied):
     assert np.all(np.abs(np.median(z[inner], axis=0)) < 0.3)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_rounding_moves_the_onset_by_little_of_its_error(studied):
     """SciPy with the sharp hinge: onset scanned, all else least squares; 3 curves."""
     result, truth = studied

@@ -129,6 +129,8 @@ def test_capsule_against_an_endless_cylinder():
     np.testing.assert_allclose(turned(c.phi - angle)[tilted], 0, atol=0.02)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_lanes_are_single_calls():
     _, _, _, at, turn = places(3)
     many = solve(TOOLS["box"], TUBE, turn, at)
@@ -279,6 +281,8 @@ def test_skeleton_coordinates_on_an_arc():
     np.testing.assert_allclose(turned(found[1] - phi), 0, atol=1 / (8 * BEND))
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_sphere_against_a_bent_tube():
     """Closed form of the torus, within thinning, bridged hollows and smoothing."""
     s, phi, away, _, turn = places(LANES, low=10, high=18)
@@ -357,6 +361,8 @@ def test_straight_is_a_line_along_x():
     assert a.filled.max() < 0.6 + 12.6 * 0.15
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_deep_is_told_and_a_broken_lane_keeps_to_itself():
     at = np.array([[75.0, 13, 0], [75, 0.1, 0.1], [np.nan, 13, 0], [75, 13, 0]])
     tool = box([3.0, 3.0, 3.0], 0.1)

@@ -164,6 +164,8 @@ def test_everything_comes_back_from_the_file(study, read):
         assert np.array_equal(file["data/residual"][: len(DEPTHS)], seen.force[0, 0])
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_three_lines_of_python(study):
     results = jaxtrachea.read_results(study[0])
     curve = jaxtrachea.predict(results, s=61.0, displacement=[1.0, 2.0], specimen="s0003")

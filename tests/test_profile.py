@@ -98,6 +98,8 @@ def test_every_point_is_the_constrained_optimum_of_scipy(curved):
             assert np.isclose(least + statistic / 2, scipy.cost, rtol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_ends_lie_on_the_threshold_and_batch_equals_one(curved):
     _, result, found = curved
     assert np.all(found.end == ProfileEnd.CLOSED)
@@ -165,6 +167,8 @@ def columns(heading):
     return re.findall(r"^\| `([\w/]+)` \|", body, re.M)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_command_writes_what_its_page_says(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("good.csv").write_text(GOOD)

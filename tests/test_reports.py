@@ -265,6 +265,8 @@ def test_one_lane_of_several_specimens_has_a_row_for_each(dense):
     np.testing.assert_allclose([r["rms_force_N"] for r in rows], own, rtol=1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_influence_says_why_there_is_no_number(dense):
     """An unknown of one curve is its own; a lane without an estimate has none; bounds hold."""
     diagnosed = influence(dense)

@@ -161,6 +161,7 @@ def test_is_model_minus_data(name):
         assert np.all(value[len(curves) :] == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EACH)
 def test_jacobian_is_that_of_the_value(name):
     study = make_study(name)

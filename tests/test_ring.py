@@ -306,6 +306,8 @@ def test_gradients(phi, changes):
         np.testing.assert_allclose(ahead[name], numeric, atol=2e-7 * size, err_msg=name)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(
     "changes",
     [{"EI": math.inf}, {"k_t": 0.0}, {"k_t": math.inf}, {"phi": ALPHA}, {"phi": 3.0}],

@@ -126,6 +126,8 @@ def test_one_press_has_one_verdict_and_an_estimate(result, pressed):
     np.testing.assert_allclose(result.rms[:4, 0] / peak, 0.002, rtol=0.35)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_a_twin_skeleton_belongs_to_the_interval(result, pressed):
     """Both skeletons have the same compliances; the truth is inside whichever was found."""
     word, outside, _ = verdicts(result, pressed.truth)
@@ -134,6 +136,8 @@ def test_a_twin_skeleton_belongs_to_the_interval(result, pressed):
     assert result.minima[4] > 1
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_all_that_is_written_agrees(result, tmp_path):
     lanes = range(result.lanes)
     table = [row[-1] for row in estimate_rows(result, lanes)]
@@ -150,6 +154,8 @@ def test_all_that_is_written_agrees(result, tmp_path):
     assert low == [judgement(result, k, i).low for k in lanes for i in range(4)]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_widened_intervals_hold_the_plain_ones(result):
     """They were drawn about the estimate by its local error, inside the evidence.
 
@@ -186,6 +192,8 @@ def test_widened_intervals_hold_the_plain_ones(result):
     np.testing.assert_allclose(found, ratio * local, rtol=1e-9)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_local_intervals_end_at_the_bounds(result):
     """k_3 of [0, 1e6] had a low95 of -40."""
     lower, upper = result.lower.copy(), result.upper.copy()
@@ -196,6 +204,8 @@ def test_local_intervals_end_at_the_bounds(result):
     assert [(j.low, j.high) for j in judged] == [(0.5, result.study.free[2].upper), (0, 3)]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_population_and_medians_take_what_is_identifiable(result):
     with pytest.raises(ValueError, match="no parameter is determined in 3 specimens"):
         population(result)
@@ -203,6 +213,8 @@ def test_population_and_medians_take_what_is_identifiable(result):
     assert told == ["1 of 6", "1 of 6", "2 of 6", "2 of 6"]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_an_end_that_was_not_found_is_no_proof(result):
     """A narrow interval of which an end failed: not shown, in place of identifiable."""
     end, low, high = (v.copy() for v in (
@@ -218,6 +230,8 @@ def test_an_end_that_was_not_found_is_no_proof(result):
     assert words == ["identifiable", "not shown"]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_no_doubt_costs_nothing(study, monkeypatch):
     """Nothing is looked for where nothing gives cause: the estimate is that of the plain fit."""
     clear = study.take(np.full(6, 5))

@@ -133,6 +133,7 @@ def evaluated():
     return study, theta, lane, both(theta, lane), value(theta, lane)
 
 
+@pytest.mark.slow
 def test_row_is_what_a_press_shows(evaluated):
     """Force, side force, markers, sideward markers, ends; in this order, over their sigma."""
     study, theta, lane, r, value = evaluated
@@ -161,6 +162,7 @@ def test_row_is_what_a_press_shows(evaluated):
         np.testing.assert_allclose(value[k], wanted, rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_jacobian_against_central_differences(evaluated):
     """To 5 mm, at 90 degrees and obliquely, by every kind of parameter; one path each way."""
     study, theta, lane, r, _ = evaluated
@@ -177,6 +179,7 @@ def test_jacobian_against_central_differences(evaluated):
         )
 
 
+@pytest.mark.slow
 def test_what_is_not_observed_counts_nothing(evaluated):
     """NaN in a curve, and a sample past any equilibrium: exact zeros, the others as they were."""
     study, theta, lane, before, _ = evaluated

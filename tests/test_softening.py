@@ -130,6 +130,8 @@ def test_derivatives(D):
         np.testing.assert_allclose(by_load[name], load[i], rtol=1e-12, atol=1e-15, err_msg=name)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_past_the_fold():
     """Softening to a peak of the skeleton at u = 1/(2 e_1): no row beyond it, gradients finite."""
     law, softening = Law(jnp.asarray(1e6), jnp.asarray(0.0)), Softening(0.25, 0.0)

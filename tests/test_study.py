@@ -112,8 +112,6 @@ class _Silent:
         return self
 
 
-@pytest.mark.slow
-@pytest.mark.compiling
 def test_every_specimen_has_a_row_and_bad_ones_a_reason(batch):
     ill, _, bad, codes = batch
     rows = table(ill / "summary.csv")

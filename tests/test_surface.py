@@ -360,6 +360,7 @@ def test_gradients(method, size):
     check_gradient(SLOPES[method], x, random_like(x, 1), (5, 3), step=step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_gradients_at_the_ends_of_the_rings(method, side):
@@ -457,6 +458,7 @@ def shuffled(mesh, seed=3):
     return mesh.straight[order]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("order", ["by s", "shuffled"])
 def test_dent_of_the_vertices_near_it_is_that_of_all(order, dtype):

@@ -514,6 +514,7 @@ def from_peace(folder):
     return fitted
 
 
+@pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize(
     ("code", "every"),

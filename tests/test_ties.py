@@ -180,6 +180,7 @@ def test_ties_are_right_and_told(dtype, scale):
         assert got["status"][i] == ContactStatus.FLAT, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_off_a_tie_the_normal_is_the_only_one(dtype, scale):
@@ -222,6 +223,7 @@ def test_alone_as_in_a_batch(name, dtype):
         same(one, {k: v[i] for k, v in together.items()}, size, dtype, [case])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
 def test_derivatives_at_ties_are_finite_and_those_of_the_normal_taken(dtype):
     """By a shift of B: the gap changes with the normal; forward = reverse."""

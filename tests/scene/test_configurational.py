@@ -71,6 +71,7 @@ def stored(scene, material, path):
     return jax.vmap(one)(seen.s, seen.phi, -seen.gap)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["ball", pytest.param("capsule", marks=pytest.mark.slow)])
 def test_force_and_moment_are_what_changes_the_stored_energy(shape):
     """Six directions of each pose, by central differences of the energy.
@@ -119,6 +120,7 @@ def work(scene, material, seed, steps):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "material",
     [

@@ -342,6 +342,7 @@ def test_a_tool_driven_through_the_tube_is_beyond_its_range(through):
     too_deep(*through[1:], "first")
 
 
+@pytest.mark.slow
 def test_only_motion_inwards_counts_as_depth(through):
     """Drawn out by 20 mm, or 2 mm in and 14 mm along, was TOO_DEEP: "pressed in by more"."""
     inward = -np.array([0, np.cos(0.5), np.sin(0.5)])

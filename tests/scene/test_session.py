@@ -181,6 +181,7 @@ def test_float32_and_states_by_status(held):
     assert held.step(EYE, [75, OUTER + 6, 0]).force.tolist() == [0, 0, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", [(3.0, 0.0), (0.0, 0.3), (-2.0, -0.2)])
 def test_force_ends_where_the_tool_leaves(held, by):
     """Led along the surface and lifted: it fell to 0 within one step, at a gap of -0.2 mm."""

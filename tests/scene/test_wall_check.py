@@ -106,6 +106,8 @@ def test_a_finer_mesh_moves_the_gap_by_less_than_0_03_mm(spacings, where, limit)
         assert np.ptp(spacings[where, depth][0], axis=0).max() < limit
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("where", ["on vertices", "between"])
 def test_a_finer_mesh_moves_the_force_by_less_than_2_per_cent(spacings, where):
     """3 mm deep: of that the facets of the coarse mesh, 0.05 mm, are 1.7 %."""

@@ -95,6 +95,7 @@ WORK = [({}, 30.0, 0.0, PATH), ({}, 33.0, 1.0, PATH), ({}, 40.0, np.pi / 2, PATH
         ({"c_K": 0.0}, 25.0, -1.5, -0.7 * PATH)]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_work_is_the_stored_energy():
     """8 Gauss points of the force along the path; a draw as well."""
     for case, got in zip(WORK, press(WORK), strict=True):
