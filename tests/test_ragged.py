@@ -14,6 +14,7 @@ from jaxtrachea.measurements.read import (
     ReadOptions,
     read_measurements,
 )
+from jaxtrachea.measurements.readers.safe_hdf5 import Limits
 
 
 def read(path, **options):
@@ -122,6 +123,24 @@ def test_writing_refuses(tmp_path):
         stored(path, full(), overwrite=True, schema_version=3)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["m.h5"]
+
+
+@pytest.mark.parametrize(
+    ("elements", "total", "says"),
+    [(79, 1000, "displacement holds 80 numbers"), (80, 159, r"force holds 80 numbers \(160 with")],
+)
+def test_what_is_not_read_back_is_not_written(tmp_path, monkeypatch, elements, total, says):
+    """Two curves of 40 samples: 80 displacements and as many forces."""
+    from jaxtrachea.measurements.readers import ragged_writer
+
+    for limits in (Limits(elements=elements, total=total), Limits(elements=80, total=160)):
+        monkeypatch.setattr(ragged_writer, "LIMITS", limits)
+        if limits.total == 160:
+            stored(tmp_path / "m.h5", plain("T1"), plain("T2"))
+            continue
+        with pytest.raises(ValueError, match=f"{says}.*split the study"):
+            stored(tmp_path / "m.h5", plain("T1"), plain("T2"))
+        assert not list(tmp_path.iterdir())
 
 
 def test_more_curves_than_objects_are_allowed(tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxtrachea.measurements.curve import Curve
-from jaxtrachea.measurements.readers.ragged import FIELDS, NAMES, QUANTITIES
+from jaxtrachea.measurements.readers.ragged import FIELDS, LIMITS, NAMES, QUANTITIES
 from jaxtrachea.measurements.readers.safe_hdf5 import MAX_TEXT_BYTES
 
 #: Numbers that are packed together: 512 KiB.
@@ -21,10 +21,11 @@ def write_ragged(file: Any, curves: Sequence[Curve]) -> None:
         curves: what to write, in this order.
 
     Raises:
-        ValueError: a name is empty, unprintable or longer than 1024 bytes, or a (specimen, trial)
-            comes twice.
+        ValueError: a name is empty, unprintable or longer than 1024 bytes, a (specimen, trial)
+            comes twice, or there are more numbers than are read back.
     """
     _check_names(curves)
+    _check_sizes(curves)
     tables = file.create_group("curves")
     for name in NAMES:
         _text(tables, name, [getattr(curve, name).encode() for curve in curves])
@@ -64,6 +65,21 @@ def _check_names(curves: Iterable[Curve]) -> None:
         if key in seen:
             raise ValueError(f"specimen {key[0]!r} trial {key[1]!r} comes twice; rename one")
         seen.add(key)
+
+
+def _check_sizes(curves: Sequence[Curve]) -> None:
+    """Refuse what no reader would take back."""
+    total = 0
+    for name in QUANTITIES:
+        kept = (getattr(curve, FIELDS.get(name, name)) for curve in curves)
+        size = sum(values.size for values in kept if values is not None)
+        total += size
+        if size > LIMITS.elements or total > LIMITS.total:
+            raise ValueError(
+                f"{name} holds {size} numbers ({total} with those before), at most "
+                f"{LIMITS.elements} ({LIMITS.total} a file) are read back; split the study into "
+                "several files"
+            )
 
 
 def _short(source: str) -> bytes:
