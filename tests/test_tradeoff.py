@@ -9,6 +9,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from run_cli import run
 
 from jaxtrachea.scene.build import stage
@@ -24,7 +25,7 @@ from jaxtrachea.tradeoff.errors import Errors, relative, remesh, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import full_scene, kept_rings, program
 from jaxtrachea.tradeoff.page import choice_rows
-from jaxtrachea.tradeoff.plots import draw, pareto
+from jaxtrachea.tradeoff.plots import QUESTIONS, draw, pareto
 
 K_1, K_3, DEPTH = 0.3, 0.02, 4.0
 SCENE = {
@@ -89,29 +90,56 @@ def test_pareto_front_by_hand():
     assert pareto(x, y).tolist() == [3, 2]
 
 
-def test_every_point_lies_within_its_panel():
-    """Of the four panels one stays empty; times beyond the usual limits widen theirs."""
+def rung(ladder, kind, level, error, seconds, finest=False):
+    time = {"median": seconds, "p99": 3 * seconds}
+    errors = {"force": error, "joints": None, "surface": error / 2, "gradient": 2 * error}
+    names = {"ladder": ladder, "kind": kind, "level": level, "finest": finest}
+    return names | {"errors": errors, "times": {"call": time, "gradient": time}}
 
-    def point(kind, level, error, seconds):
-        time = {"median": seconds, "p99": 3 * seconds}
-        errors = {"force": error, "joints": None, "surface": error / 2, "gradient": error}
-        times = {"call": time, "gradient": time}
-        return {"ladder": "l", "kind": kind, "level": level, "errors": errors, "times": times}
 
-    points = [point("algebra", "a", 0.0, 2e-6), point("algebra", "b", 1e-3, 0.05),
-              point("model", "c", np.inf, 5e-4)]  # fmt: skip
+def test_every_level_has_its_row_and_lies_within_its_panels():
+    """Errors of 0 and infinity are words; the finest level is what the others are drawn against."""
+    points = [rung("a", "model", "late", np.inf, 5e-4), rung("a", "model", "full", 0.0, 2e-3, True),
+              rung("b", "algebra", "same", 0.0, 2e-6), rung("b", "algebra", "near", 1e-3, 0.05),
+              rung("b", "algebra", "best", 0.0, 1e-2, True)]  # fmt: skip
     figure = draw(points, "scene")
-    limits = [axis.get_ylim() for axis in figure.axes]
-    assert limits[1] == (5e-5, 5e-3)  # Empty.
-    assert limits[2] == (5e-5, 5e-3)
-    for low, high in (limits[0], limits[3]):
-        assert low < 2e-6
-        assert high > 3 * 0.05
     figure.draw_without_rendering()
+    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert names == ["b: same", "b: near", "a: late"]
+    assert len(figure.axes) == 4
     for axis in figure.axes:
+        (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
         box = axis.get_tightbbox()
         assert box is not None
         assert min(box.x0, box.y0) >= 0
+        dots = [line for line in axis.lines if line.get_marker() == "o"]
+        for line in dots:
+            assert left < line.get_xdata()[0] < right
+            assert low > line.get_ydata()[0] > high
+    errors, times = ([line.get_xdata()[0] for line in axis.lines if line.get_marker() == "o"]
+                     for axis in figure.axes[:2])  # fmt: skip
+    assert errors == [1e-3]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["exact", "infinite"]
+    assert times == [2e-6, 0.05, 5e-4]
+    finest = [line.get_xdata()[0] for line in figure.axes[1].lines if line.get_marker() == "|"]
+    assert finest == [1e-2, 1e-2, 2e-3]
+
+
+def test_no_text_of_a_picture_lies_on_another():
+    points = [rung("b", "algebra", f"level {i}", 10.0**-i, 1e-5 * (i + 1)) for i in range(30)]
+    figure = draw([*points, rung("b", "algebra", "best", 0.0, 1e-2, True)], "scene")
+    figure.draw_without_rendering()
+    axis = figure.axes[0]
+    titles = [t for a in figure.axes for t in a.findobj(Text) if t.get_text() in QUESTIONS]
+    boxes = [t.get_window_extent() for t in (*axis.get_yticklabels(), *titles)]
+    assert len(boxes) == 34
+    for i, one in enumerate(boxes):
+        assert not any(one.overlaps(other) for other in boxes[i + 1 :])
+
+
+def test_a_scene_without_choices_has_a_picture():
+    figure = draw([rung("b", "algebra", "best", 0.0, 1e-2, True)], "scene")
+    figure.draw_without_rendering()
 
 
 def test_ladders_of_a_scene_and_why_others_are_left_out():

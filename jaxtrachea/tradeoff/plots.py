@@ -1,10 +1,12 @@
-"""Work-precision diagrams: error along x, time along y, both logarithmic (matplotlib)."""
+"""What each choice costs in accuracy and saves in time: a row a choice, a panel a question."""
 
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from jaxtrachea.files.pictures import STYLE, plain
 
@@ -12,22 +14,56 @@ from jaxtrachea.files.pictures import STYLE, plain
 EXACT = 1e-17
 #: Times that the paper states: skeleton at 10 kHz, surface at 1 kHz; s.
 GOALS = {"100 µs": 1e-4, "1 ms": 1e-3}
-PANELS = ("algebra", "truncation", "model", "gradient")
+#: Kinds of ladders in the order of their rows, and their colours (Okabe and Ito, for all eyes).
+KINDS = {"algebra": "#0072B2", "truncation": "#009E73", "model": "#D55E00"}
+QUESTIONS = (
+    "How wrong is it?\nlargest relative error:\nforce, joints, surface",
+    "How long is a call?\nµs; grey: the finest level",
+    "How wrong are derivatives?\nrelative error of\nd force / d log parameter",
+    "How long with derivatives?\nµs; grey: the finest level",
+)
 
 
 def draw(points: list[dict[str, Any]], title: str) -> Figure:
-    """The four panels of one scene: three kinds, and the gradient over all kinds.
+    """Four panels of one scene, with a row for each level that is not the finest of its ladder.
+
+    Levels that no other beats in error and time together (the Pareto front) have a black edge.
 
     Args:
         points: of one scene, as `measure.measure` gives them.
         title: of the figure.
     """
+    rows = _rows(points)
+    finest = {p["ladder"]: p for p in points if p["finest"]}
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(11.6, 7.6), layout="constrained")
+        figure = Figure(figsize=(11.6, 1.7 + 0.21 * max(len(rows), 4)), layout="constrained")
         figure.suptitle(plain(title, 100))
-        colours = _colours(points)
-        for axis, panel in zip(figure.subplots(2, 2).flat, PANELS, strict=True):
-            _panel(axis, points, panel, colours)
+        axes = figure.subplots(1, 4, sharey=True)
+        for k, which in enumerate(("call", "gradient")):
+            errors = np.array([_error(p, which) for p in rows])
+            times = np.array([p["times"][which]["median"] for p in rows])
+            full = [
+                finest[p["ladder"]]["times"][which]["median"] if p["ladder"] in finest else np.nan
+                for p in rows
+            ]
+            best = np.isin(np.arange(len(rows)), pareto(errors, times))
+            colours = [KINDS[p["kind"]] for p in rows]
+            edges = ["k" if b else c for b, c in zip(best, colours, strict=True)]
+            _errors(axes[2 * k], errors, colours, edges)
+            _times(axes[2 * k + 1], times, np.array(full), colours, edges)
+        _names(axes[0], rows)
+        for axis, question in zip(axes, QUESTIONS, strict=True):
+            axis.set_title(question, fontsize=8, loc="left")
+        handles = [
+            Line2D([], [], marker="o", ls="", color=colour, label=kind)
+            for kind, colour in KINDS.items()
+            if any(p["kind"] == kind for p in rows)
+        ]
+        if rows:
+            front = {"mfc": "none", "mec": "k", "mew": 1.3, "label": "Pareto front"}
+            handles.append(Line2D([], [], marker="o", ls="", **front))
+        if handles:
+            figure.legend(handles=handles, loc="outside upper right", ncols=4)
         return figure
 
 
@@ -48,57 +84,68 @@ def pareto(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.array(front, int)
 
 
-def _colours(points) -> dict[str, Any]:
-    names = list(dict.fromkeys(point["ladder"] for point in points))
-    shades = mpl.colormaps["tab20"](np.linspace(0, 1, max(len(names), 2)))
-    return dict(zip(names, shades, strict=False))
+def _rows(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Levels by kind, ladder and rising error; the finest are what the others are compared with."""
+    shown = [p for p in points if not p["finest"]]
+    ladders = list(dict.fromkeys(p["ladder"] for p in shown))
+    kinds = list(KINDS)
+
+    def place(p):
+        return kinds.index(p["kind"]), ladders.index(p["ladder"]), worst(p)
+
+    return sorted(shown, key=place)
 
 
-def _panel(axis, points, panel: str, colours) -> None:
-    gradient = panel == "gradient"
-    shown = [p for p in points if gradient or p["kind"] == panel]
-    axis.set(xscale="log", yscale="log", title=panel if not gradient else "gradient, all kinds")
-    axis.set_ylim(5e-5, 5e-3)
-    axis.set_xlabel(
-        "error of d force / d log parameter"
-        if gradient
-        else "largest error: force, joints, surface"
-    )
-    axis.set_ylabel("time of a call with derivatives [s]" if gradient else "time of a call [s]")
-    for name, at in GOALS.items():
-        axis.axhline(at, color="0.5", lw=0.8, ls="--")
-        axis.annotate(name, (1, at), xycoords=("axes fraction", "data"), fontsize=7, ha="right")
-    if not shown:
-        axis.text(0.5, 0.5, "no such ladder in this scene", transform=axis.transAxes, ha="center")
-        return
-    value = (lambda p: float(p["errors"]["gradient"])) if gradient else worst
-    x = np.array([value(p) for p in shown])
-    time = [p["times"]["gradient" if gradient else "call"] for p in shown]
-    y, high = (np.array([t[k] for t in time]) for k in ("median", "p99"))
-    low, top = axis.get_ylim()
-    axis.set_ylim(min(low, y.min() / 2), max(top, 2 * high.max()))
-    lost = ~np.isfinite(x)
-    if lost.any():
-        axis.plot(np.ones(lost.sum()), y[lost], "x", color="0.3", clip_on=False,
-                  transform=axis.get_yaxis_transform(), label="infinite error")  # fmt: skip
-    exact = x <= EXACT
-    left = x[np.isfinite(x) & ~exact].min(initial=1) / 100
-    x = np.where(np.isfinite(x), np.where(exact, left, x), np.nan)
-    axis.set_xlim(left / 3, 3 * np.nanmax(x, initial=100 * left))
-    if exact.any():
-        axis.axvline(left * 10, color="0.8", lw=0.8)
-        axis.annotate("exact", (left, 0.97), xycoords=("data", "axes fraction"), fontsize=7,
-                      ha="center", va="top")  # fmt: skip
-    for name in dict.fromkeys(p["ladder"] for p in shown):
-        on = np.array([p["ladder"] == name for p in shown])
-        up = np.maximum(high[on] - y[on], 0)
-        axis.errorbar(x[on], y[on], yerr=[0 * up, up], fmt="o-", ms=4, lw=0.8, elinewidth=0.6,
-                      color=colours[name], label=plain(name))  # fmt: skip
-        if not gradient:
-            for i in np.flatnonzero(on & np.isfinite(x) & ~exact):
-                axis.annotate(plain(shown[i]["level"]), (x[i], y[i]), fontsize=6, xytext=(3, 3),
-                              textcoords="offset points")  # fmt: skip
-    front = pareto(x, y)
-    axis.step(x[front], y[front], where="post", color="k", lw=0.8, label="Pareto front")
-    axis.plot(x[front], y[front], "ko", mfc="none", ms=8, lw=0)
-    axis.legend(fontsize=6, loc="upper left", bbox_to_anchor=(1, 1))
+def _error(point: dict[str, Any], which: str) -> float:
+    return worst(point) if which == "call" else float(point["errors"]["gradient"])
+
+
+def _names(axis, rows) -> None:
+    """The rows' names, the first on top; a thin line between ladders."""
+    axis.set_yticks(range(len(rows)), [plain(f"{p['ladder']}: {p['level']}") for p in rows])
+    axis.set_ylim(max(len(rows), 4) - 0.4, -0.6)
+    for panel in axis.figure.axes:
+        panel.tick_params(axis="y", length=0)
+        for i in range(1, len(rows)):
+            if rows[i]["ladder"] != rows[i - 1]["ladder"]:
+                panel.axhline(i - 0.5, color="0.85", lw=0.6)
+
+
+def _errors(axis, errors: np.ndarray, colours, edges) -> None:
+    """Dots; an error of 0 stands at the left as "exact", an infinite one at the right."""
+    known = np.isfinite(errors) & (errors > EXACT)
+    low, high = errors[known].min(initial=1e-3), errors[known].max(initial=1.0)
+    decades = np.log10(high / low) + 1
+    left, right = low * 10 ** (-0.22 * decades), high * 10 ** (0.12 * decades)
+    axis.set(xscale="log", xlim=(left / 10 ** (0.12 * decades), right * 10 ** (0.12 * decades)))
+    x = np.where(known, errors, np.where(np.isfinite(errors), left, right))
+    for i, at in enumerate(x):
+        word = None if known[i] else "exact" if np.isfinite(errors[i]) else "infinite"
+        if word is None:
+            axis.plot(at, i, "o", ms=5.5, color=colours[i], mec=edges[i], mew=1.3)
+        else:
+            axis.text(at, i, word, fontsize=6, ha="center", va="center", color=colours[i])
+    axis.xaxis.set_major_locator(LogLocator(numticks=5))
+    axis.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _times(axis, times: np.ndarray, full: np.ndarray, colours, edges) -> None:
+    """A line from the time of the finest level to that of this one."""
+    axis.set(xscale="log")
+    for i, (time, finest) in enumerate(zip(times, full, strict=True)):
+        axis.plot([finest, time], [i, i], color=colours[i], lw=1.2, alpha=0.5)
+        axis.plot(finest, i, "|", ms=8, color="0.4")
+        axis.plot(time, i, "o", ms=5.5, color=colours[i], mec=edges[i], mew=1.3)
+    ends = [v for v in (*times, *full) if np.isfinite(v)]
+    low, high = min(ends, default=1e-4), max(ends, default=1e-3)
+    # At least a decade, so that rounding of the clock does not look like a gain.
+    spare = max(1.3, np.sqrt(10 / (high / low)))
+    axis.set_xlim(low / spare, high * spare)
+    for name, goal in GOALS.items():
+        if low / spare < goal < high * spare:
+            axis.axvline(goal, color="0.5", lw=0.8, ls="--")
+            axis.annotate(name, (goal, 0), xycoords=("data", "axes fraction"), fontsize=6,
+                          xytext=(2, 2), textcoords="offset points")  # fmt: skip
+    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.xaxis.set_major_formatter(lambda seconds, _: f"{1e6 * seconds:.4g}")
+    axis.xaxis.set_minor_formatter(NullFormatter())
