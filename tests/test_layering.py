@@ -106,7 +106,7 @@ WITHIN = {
     "report": [{"plots", "tables"}, {"fit"}, {"overview"}],
     "cli": [{"terminal_table", "specification", "options"}, {"terminal"},
             {"fit", "load", "predict_data", "run", "scene", "selfcheck"},
-            {"compare", "convert", "predict", "tradeoff"}, {"main"}],
+            {"compare", "cache", "convert", "predict", "tradeoff"}, {"main"}],
 }  # fmt: skip
 #: Rooms that only read or write: they may be told of, but not tell, the physics.
 HEAVY = ["matplotlib", "trimesh", "typer", "rich", "pydantic", "h5py"]

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from jaxtrachea import __version__
+from jaxtrachea.cli import cache as cli_cache
 from jaxtrachea.cli import compare as cli_compare
 from jaxtrachea.cli import convert as cli_convert
 from jaxtrachea.cli import fit as cli_fit
@@ -167,7 +168,7 @@ def design(spec: SpecArgument, data: DataOption = None, out_dir: OutOption = Non
 
 for _command in (
     cli_compare.compare, cli_convert.convert, cli_scene.plan, cli_scene.simulate, cli_scene.sweep,
-    cli_tradeoff.tradeoff, cli_selfcheck.selfcheck,
+    cli_tradeoff.tradeoff, cli_selfcheck.selfcheck, cli_cache.cache,
 ):  # fmt: skip
     app.command()(_command)
 

@@ -23,10 +23,11 @@ from rich.text import Text
 
 from jaxtrachea.cli.terminal_table import wide_table as table
 from jaxtrachea.files.pictures import sentence
+from jaxtrachea.files.programs import keep_bounds
 
 __all__ = [
-    "Kept", "Stages", "Stop", "cache_folder", "complain", "interrupts", "into", "progress_bar",
-    "say_lost", "set_up_jax", "table", "to_stderr",
+    "Kept", "Stages", "Stop", "cache_folder", "complain", "interrupts", "into", "programs_folder",
+    "progress_bar", "say_lost", "set_up_jax", "table", "to_stderr",
 ]  # fmt: skip
 
 
@@ -97,20 +98,30 @@ def interrupts() -> Iterator[Callable[[], None]]:
 def set_up_jax() -> None:
     """The command line computes in float64 and keeps compiled programs for the next start.
 
-    They lie in `cache_folder()`, or where JAX_COMPILATION_CACHE_DIR says;
-    JAX_ENABLE_COMPILATION_CACHE=false keeps none. All are kept, unless
-    JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS says which.
+    They lie in `cache_folder()`, within the bounds of `files.programs`, or where
+    JAX_COMPILATION_CACHE_DIR says, without; JAX_ENABLE_COMPILATION_CACHE=false keeps none.
+    All are kept, unless JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS says which.
     """
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    wanted = jax.config.values["jax_enable_compilation_cache"]
-    chosen = jax.config.values["jax_compilation_cache_dir"]
-    if wanted and chosen is None and (folder := cache_folder()) is not None:
+    folder = programs_folder()
+    if folder is not None and folder == cache_folder():
+        keep_bounds(folder)
         jax.config.update("jax_compilation_cache_dir", str(folder))
-    if wanted and "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+    if folder is not None and "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         # Also the many small ones, which jax leaves out by itself: about a quarter of a start.
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+
+def programs_folder() -> Path | None:
+    """Where compiled programs are kept, `cache_folder()` unless jax is told otherwise, or None."""
+    import jax
+
+    if not jax.config.values["jax_enable_compilation_cache"]:
+        return None
+    chosen = jax.config.values["jax_compilation_cache_dir"]
+    return cache_folder() if chosen is None else Path(chosen)
 
 
 def cache_folder() -> Path | None:

@@ -1,0 +1,31 @@
+"""The command cache: where compiled programs are kept, and how much they take."""
+
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from jaxtrachea.cli.terminal import Stop, cache_folder, programs_folder
+from jaxtrachea.files.programs import MOST_BYTES, MOST_DAYS, delete, programs
+
+ClearOption = Annotated[bool, typer.Option("--clear", help="Delete all kept programs.")]
+
+
+def cache(clear: ClearOption = False) -> None:
+    """Say where compiled programs are kept, and how much they take; or delete them."""
+    folder = programs_folder()
+    if folder is None:
+        raise Stop(
+            "cache: no compiled programs are kept: JAX_ENABLE_COMPILATION_CACHE is false, or the "
+            "user's cache folder cannot be written; set XDG_CACHE_HOME to one that can"
+        )
+    kept = list(programs(folder))
+    if clear:
+        gone = sum(delete(program) for program in kept)
+        text = f"{gone} of {len(kept)} programs deleted from {folder}"
+    else:
+        size = sum(program.size for program in kept) / 2**20
+        text = f"{len(kept)} programs, {size:.1f} MiB, in {folder}"
+        if folder == cache_folder():
+            text += f"\nat most {MOST_BYTES // 2**20} MiB, and none unused for {MOST_DAYS:g} days"
+    Console().print(text, markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,70 @@
+"""Compiled programs that are kept for the next start: which there are, and their bounds."""
+
+import contextlib
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+#: Bytes of all programs beyond which those that were not used for longest go.
+MOST_BYTES = 2**30
+#: Days without use after which a program goes; jaxlib's next version compiles anew anyway.
+MOST_DAYS = 90.0
+#: Time between two looks at the bounds, s.
+BETWEEN = 86_400.0
+#: File whose time of change is that of the last look.
+LAST_LOOK = ".trimmed"
+
+
+class Program(NamedTuple):
+    """A file with a compiled program: its size in bytes and when it was last used, s."""
+
+    path: Path
+    size: int
+    used: float
+
+
+def programs(folder: Path) -> Iterator[Program]:
+    """The programs in a folder; other files are not looked at.
+
+    Args:
+        folder: may not exist.
+    """
+    for path in folder.glob("*-cache"):
+        with contextlib.suppress(OSError):  # another process deletes it
+            found = path.stat()
+            # Where the file system keeps no time of access, that of writing.
+            yield Program(path, found.st_size, max(found.st_atime, found.st_mtime))
+
+
+def keep_bounds(folder: Path, now: float | None = None) -> int:
+    """Delete programs beyond the bounds of size and age, at most once a day.
+
+    Args:
+        folder: of the programs.
+        now: seconds since the epoch; None: those of the clock.
+
+    Returns:
+        How many were deleted.
+    """
+    now = time.time() if now is None else now
+    mark = folder / LAST_LOOK
+    with contextlib.suppress(OSError):
+        if 0 <= now - mark.stat().st_mtime < BETWEEN:
+            return 0
+    with contextlib.suppress(OSError):
+        mark.touch()
+    kept, gone = 0, 0
+    for program in sorted(programs(folder), key=lambda program: -program.used):
+        kept += program.size
+        if kept > MOST_BYTES or now - program.used > MOST_DAYS * 86_400:
+            gone += delete(program)
+    return gone
+
+
+def delete(program: Program) -> bool:
+    """Whether the program could be deleted."""
+    with contextlib.suppress(OSError):
+        program.path.unlink()
+        return True
+    return False

@@ -1,0 +1,95 @@
+"""Programs kept for the next start: the bounds of their folder, and the command that tells."""
+
+import os
+from pathlib import Path
+
+import pytest
+from run_cli import run
+
+from jaxtrachea.files import programs as kept
+
+DAY = 86_400.0
+NOW = 1.9e9
+
+
+def program(folder, name, size, days):
+    path = folder / f"{name}-cache"
+    path.write_bytes(b"x" * size)
+    os.utime(path, (NOW - days * DAY,) * 2)
+
+
+def names(folder):
+    return sorted(path.name.removesuffix("-cache") for path in folder.iterdir())
+
+
+def test_bounds_of_size_and_age(tmp_path, monkeypatch):
+    """300 bytes, newest first: 100 + 150 fit, 100 more do not; a year is too long."""
+    monkeypatch.setattr(kept, "MOST_BYTES", 300)
+    for name, size, days in (("new", 100, 1), ("used", 150, 2), ("old", 100, 3), ("year", 1, 365)):
+        program(tmp_path, name, size, days)
+    (tmp_path / "other.txt").write_text("not ours")
+    os.utime(tmp_path / "other.txt", (0, 0))
+    assert kept.keep_bounds(tmp_path, NOW) == 2
+    assert names(tmp_path) == [kept.LAST_LOOK, "new", "other.txt", "used"]
+
+
+def test_what_was_read_lately_is_kept(tmp_path):
+    """Written a year ago, read yesterday."""
+    program(tmp_path, "read", 10, 365)
+    os.utime(tmp_path / "read-cache", (NOW - DAY, NOW - 365 * DAY))
+    assert kept.keep_bounds(tmp_path, NOW) == 0
+
+
+def test_bounds_are_looked_at_once_a_day(tmp_path):
+    assert kept.keep_bounds(tmp_path, NOW) == 0
+    os.utime(tmp_path / kept.LAST_LOOK, (NOW, NOW))
+    program(tmp_path, "year", 1, 365)
+    assert kept.keep_bounds(tmp_path, NOW + DAY - 1) == 0
+    assert kept.keep_bounds(tmp_path, NOW + DAY + 1) == 1
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    assert kept.keep_bounds(tmp_path / "none", NOW) == 0
+    assert list(kept.programs(tmp_path / "none")) == []
+
+
+def test_command(tmp_path, monkeypatch, capsys):
+    import jax
+
+    from jaxtrachea.cli import cache as command
+
+    monkeypatch.setattr(command, "programs_folder", lambda: tmp_path)
+    program(tmp_path, "a", 2**20, 1)
+    program(tmp_path, "b", 2**19, 1)
+    code, out, err = run(monkeypatch, capsys, "cache")
+    assert (code, err) == (0, "")
+    assert f"2 programs, 1.5 MiB, in {tmp_path}" in out
+    code, out, _ = run(monkeypatch, capsys, "cache", "--clear")
+    assert code == 0
+    assert f"2 of 2 programs deleted from {tmp_path}" in out
+    assert names(tmp_path) == []
+    monkeypatch.undo()
+    assert not jax.config.values["jax_enable_compilation_cache"]  # in all tests
+    code, _, err = run(monkeypatch, capsys, "cache")
+    assert code == 2
+    assert "no compiled programs are kept" in err
+    assert "XDG_CACHE_HOME" in err
+
+
+@pytest.mark.parametrize("name", ["XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR"])
+def test_where_programs_are_kept(name, tmp_path):
+    """A folder that the user chose is left alone; that of the package is kept within bounds."""
+    import subprocess
+    import sys
+
+    folder = tmp_path / "jaxtrachea" if name == "XDG_CACHE_HOME" else tmp_path
+    folder.mkdir(exist_ok=True)
+    program(folder, "year", 1, 3650)
+    kept_on = {"JAX_ENABLE_COMPILATION_CACHE": "true", name: str(tmp_path), "JAX_PLATFORMS": "cpu"}
+    code = "from jaxtrachea.cli.terminal import *; set_up_jax(); print(programs_folder())"
+    environment = {k: v for k, v in os.environ.items() if "CACHE" not in k} | kept_on
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert Path(done.stdout.strip()) == folder
+    assert (folder / "year-cache").exists() == (name == "JAX_COMPILATION_CACHE_DIR")
