@@ -21,7 +21,11 @@ class PressStatus(_Described):
 
     OK = 0, "solved"
     NO_CONTACT = 1, "the tool does not touch: no force"
-    PAST_FOLD = 2, "past a fold (law with k_3 or k_5 < 0, or sections): no stable equilibrium"
+    PAST_FOLD = (
+        2,
+        "past a fold (law with k_3 or k_5 < 0, softening skeleton, sections): "
+        "no stable equilibrium",
+    )
     NEGATIVE_LOCAL = 3, "coupling 'total': the skeleton moves further than the tool presses"
     NON_FINITE = 4, "an input or a result is not finite"
     BEHIND_GAP = 5, "the contact lies behind the ends of the rings, where there is no cartilage"

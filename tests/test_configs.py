@@ -21,6 +21,7 @@ NAMES = sorted(path.stem for path in CONFIGS.glob("*.toml"))
 SHOWS = {
     "bonded_pull": {"contact law": "bonded", "second_plane": "off"},
     "capsule": {"contact": "on", "end_motion": "on", "axial": "on"},
+    "deep": {"contact": "on", "skeleton": "softening", "second_plane": "off", "shear": "on"},
     "friction": {"friction": "on", "axial": "on", "contact_point": "fixed"},
     "imported": {"curved": "off", "rings": "arch2"},
     "imported_tool": {"contact": "on", "curved": "on"},
@@ -128,6 +129,31 @@ def test_sweep_runs(tmp_path, monkeypatch, capsys):
     assert (force[:, 1] < 0.9 * force[:, 3]).all()
 
 
+def test_a_sweep_of_a_skeleton_that_softens_is_one_of_the_midline(tmp_path, monkeypatch, capsys):
+    """Off it the command names the cure; on it, it says which skeleton it pressed."""
+    monkeypatch.chdir(tmp_path)
+    law = 'e_1 = "0.1 1/mm"\ne_2 = "0.005 1/mm^2"\n'
+    text = GOOD + law + PRESS + '[output]\nsurface = false\n[sweep]\ndepth = "2 mm"\ns_count = 3\n'
+    Path("scene.toml").write_text(text)
+    for command in ("plan", "sweep"):
+        code, _, err = run(monkeypatch, capsys, command, "scene.toml")
+        assert (code, err.count("\n"), "Traceback" in err) == (2, 1, False)
+        for words in ("sweep: effects.skeleton", "second plane", "'linear'", "phi_count = 1"):
+            assert words in err
+    Path("scene.toml").write_text(text + "phi_count = 1")
+    code, out, _ = run(monkeypatch, capsys, "sweep", "scene.toml", "--out", "maps")
+    assert code == 0
+    assert "sweep: skeleton 'softening', the wall is moved by 16 % of the" in " ".join(out.split())
+    with h5py.File("maps/sweep.h5") as file:
+        soft = file["force"][:]
+    Path("scene.toml").write_text(text.replace(law, "") + "phi_count = 1")
+    code, out, _ = run(monkeypatch, capsys, "sweep", "scene.toml", "--out", "linear")
+    assert code == 0
+    assert "sweep: skeleton 'linear', but the wall is moved by 16 % of the" in " ".join(out.split())
+    with h5py.File("linear/sweep.h5") as file:
+        assert (soft < file["force"][:]).all()
+
+
 GOOD = """
 [material]
 EI_L = "1.862 N mm^2"
@@ -191,6 +217,18 @@ BAD = {
     "dent without tool": (
         GOOD + PRESS + "[effects]\ndent = 16",
         ["effects.dent", "no tool", "use 8 or 'off'"],
+    ),
+    "softening without its law": (
+        GOOD + PRESS + "[effects]\nskeleton = 'softening'",
+        ["effects.skeleton", "e_1 and e_2 are not given", "give both"],
+    ),
+    "half a law of softening": (
+        GOOD + 'e_1 = "0.1 1/mm"\n' + PRESS,
+        ["material: e_1 needs e_2", "remove e_1"],
+    ),
+    "softening off the midline": (
+        GOOD + 'e_1 = "0.1 1/mm"\ne_2 = "0.005 1/mm^2"\n' + PRESS + "phi = '20 deg'",
+        ["effects.skeleton", "30 % of the radius", "second plane", "set skeleton 'linear'"],
     ),
     "plane too few": (
         GOOD + PRESS + "phi = '20 deg'\n[effects]\nsecond_plane = 'off'",

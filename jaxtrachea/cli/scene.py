@@ -42,7 +42,7 @@ def plan(scene: SceneArgument) -> None:
     if choice is not None:
         out.print(choice.sentence, highlight=False)
     if swept is not None:
-        out.print(_rings_of(swept), highlight=False)
+        out.print(_levels_of(swept), highlight=False)
     for note in staged.notes:
         out.print(escape(note), highlight=False)
 
@@ -124,7 +124,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
         _write_json(folder, made)
     failed = int((np.asarray(out.status) > PressStatus.NO_CONTACT).sum())
     console = Console()
-    console.print(_rings_of(swept), highlight=False)
+    console.print(_levels_of(swept), highlight=False)
     console.print(
         f"{total} contact points, {failed} without a solution, "
         f"{clock[2] - clock[1]:.2f} s with compilation", highlight=False,
@@ -183,6 +183,7 @@ def _for_sweep(path: Path, spec, staged):
     """The scene with the program of its sweep, and the s and phi of the grid."""
     import numpy as np
 
+    from jaxtrachea.config import SpecError
     from jaxtrachea.scene.build import stage_sweep
 
     want, geometry = spec.sweep, staged.scene.geometry
@@ -195,14 +196,20 @@ def _for_sweep(path: Path, spec, staged):
         )
     s = (np.arange(want.s_count) + 0.5) * float(geometry.length) / want.s_count
     phi = np.linspace(-widest, widest, want.phi_count) if want.phi_count > 1 else np.zeros(1)
-    # The widest angle of the grid decides, wherever it is.
-    return stage_sweep(spec, staged, np.full_like(phi, s[0]), phi), s, phi
+    try:
+        # The widest angle of the grid decides, wherever it is.
+        return stage_sweep(spec, staged, np.full_like(phi, s[0]), phi), s, phi
+    except SpecError as error:
+        raise Stop(str(SpecError.like(error, place=str(path)))) from None
 
 
-def _rings_of(scene) -> str:
-    """Which rings a sweep presses on, and why."""
-    rings = next(e for e in scene.plan.effects if e.name == "rings")
-    return f"sweep: rings {rings.level!r}, {rings.reason}"
+def _levels_of(scene) -> str:
+    """Which rings and which skeleton a sweep presses on, and why."""
+    effects = {e.name: e for e in scene.plan.effects}
+    return "\n".join(
+        f"sweep: {name} {effects[name].level!r}, {effects[name].doubt or effects[name].reason}"
+        for name in ("rings", "skeleton")
+    )
 
 
 def _default(scene: Path, ending: str = "") -> Path:

@@ -17,6 +17,11 @@ d/ds G(s, s) is twice the derivative by one of them): a normal force on an incli
 load on ring i and C_i its compliance: the bending stiffness of the ligament turns with the frame
 (least complementary energy). In `total` coupling the skeleton takes no part: E = W(p(delta); s).
 
+A skeleton that softens (`mechanics.softening`; in one plane, deflection u, c F = g(u)) stores
+G(u) / c, G the integral of g: its part of dE/ds is -G(u) / c^2 dc/ds = -L w' times
+`Softening.energy_ratio`, with L = u / c, the load under which a linear skeleton would deflect by u,
+and w' the slope under that load.
+
 With shear C(s) has a kink where a ring stands (dE/ds jumps there); with the `split` "independent" a
 jump, which no derivative has.
 
@@ -130,10 +135,15 @@ def _by_position(
     axial: bool,
     one_plane: bool,
 ):
-    """-F . (dC/ds) F / 2, N."""
-    F = solved.force
+    """-F . (dC/ds) F / 2, N; F the load, times the energy ratio, where the skeleton softens."""
+    F, stored = solved.force, jnp.ones_like(solved.inward)
+    softening = press.softening_of(material, options)
+    if softening is not None:
+        moved = press.touch(solved.inward, jnp.zeros_like(solved.inward), options)
+        u = moved + solved.depth[1]  # The normal of the midline is -y.
+        F, stored = F / softening.ratio(u), softening.energy_ratio(u)
     if not options.shear and options.split == "continuous":
-        return -jnp.sum(F[1:] * solved.slope_C)
+        return -stored * jnp.sum(F[1:] * solved.slope_C)
 
     # With shear the slope is another on either side of the force.
     def yielding(s):
@@ -143,7 +153,7 @@ def _by_position(
         C = skeleton.respond(geometry, material, s, solved.phi, **levels).compliance
         return jnp.sum(F * (C @ F))
 
-    return -jax.grad(yielding)(solved.s) / 2
+    return -stored * jax.grad(yielding)(solved.s) / 2
 
 
 def _by_angle(geometry: Geometry, material: Material, solved: StraightPress, rings: Rings):

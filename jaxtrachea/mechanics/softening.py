@@ -42,6 +42,10 @@ class Softening(NamedTuple):
         """Secant stiffness over that at small strain."""
         return 1 + deflection * (self.e_2 * deflection - self.e_1)
 
+    def energy_ratio(self, deflection: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Energy stored at a deflection over that of a linear skeleton at the same deflection."""
+        return 1 + deflection * (self.e_2 / 2 * deflection - 2 / 3 * self.e_1)
+
     def tangent(self, deflection: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Derivative of `linear`."""
         return 1 + deflection * (3 * self.e_2 * deflection - 2 * self.e_1)

@@ -105,11 +105,14 @@ def _uncounted(_: str) -> None:
 
 
 def dropped_effects(scene: Scene) -> tuple[str, ...]:
-    """Friction that was asked for and is not in the program, with its reason."""
-    if scene.friction is None or scene.plan.friction:
-        return ()
-    effect = next(e for e in scene.plan.effects if e.name == "friction")
-    return (f"friction: off, {effect.reason}",)
+    """Friction that was asked for and is not in the program; levels that make numbers doubtful."""
+    notes = []
+    for effect in scene.plan.effects:
+        if effect.name == "friction" and scene.friction is not None and not scene.plan.friction:
+            notes.append(f"friction: off, {effect.reason}")
+        if effect.doubt:
+            notes.append(f"{effect.name}: {effect.level}, {effect.doubt}")
+    return tuple(notes)
 
 
 def stage_sweep(spec: SceneSpec, staged: Staged, s: np.ndarray, phi: np.ndarray) -> Scene:
@@ -120,6 +123,9 @@ def stage_sweep(spec: SceneSpec, staged: Staged, s: np.ndarray, phi: np.ndarray)
         staged: from `stage`.
         s: of every contact point, mm; shape (points,).
         phi: rad.
+
+    Raises:
+        SpecError: a sweep that no program of a scene can press.
     """
     assert spec.sweep is not None
     inward = np.stack([0 * phi, -np.cos(phi), -np.sin(phi)], axis=1)
@@ -130,7 +136,12 @@ def stage_sweep(spec: SceneSpec, staged: Staged, s: np.ndarray, phi: np.ndarray)
         end_motion="off", surface="off", dent="off", want_surface=False, want_joints=False,
         want_ring_ends=False,
     )  # fmt: skip
-    return dataclasses.replace(staged.scene, plan=make_plan(facts, bare_effects))
+    try:
+        plan = make_plan(facts, bare_effects)
+    except PlanError as error:
+        cure = f"{error.cure}; a sweep of the midline alone has phi_count = 1"
+        raise SpecError.like(error, key=f"sweep: effects.{error.key}", cure=cure) from None
+    return dataclasses.replace(staged.scene, plan=plan)
 
 
 def effects_of(spec: SceneSpec) -> EffectOptions:

@@ -39,6 +39,9 @@ class SceneFacts:
         mesh: whether there is a surface.
         curved: whether its centreline is.
         near: whether the contact comes near a vertex of it.
+        way_fixed: least and largest inward motion of the tool since first touch (of presses: of
+            each), over the radius, where its contact point is fixed.
+        way_per_step: the same of a tool whose rows are presses of their own.
     """
 
     poses: bool = False
@@ -53,6 +56,8 @@ class SceneFacts:
     mesh: bool = True
     curved: bool = False
     near: bool = True
+    way_fixed: tuple[float, float] = (0.0, 0.0)
+    way_per_step: tuple[float, float] = (0.0, 0.0)
 
 
 class Case(NamedTuple):
@@ -84,12 +89,14 @@ class Verdict(NamedTuple):
         reason: for that.
         refused: levels that this scene cannot have: why, and the cure.
         free: the user's word counts; else the level is as it is.
+        doubt: what makes numbers at that level doubtful, and the cure; a note of the scene.
     """
 
     level: str
     reason: str
     refused: Mapping[str, tuple[str, str]] = {}
     free: bool = True
+    doubt: str = ""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args, get_type_hints
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.scene import depth
 from jaxtrachea.scene.declare import Case, Effect, PlanError, Verdict
 from jaxtrachea.trachea.material import Material
 
@@ -184,6 +185,7 @@ class EffectOptions:
         dent: centres of the local correction, or off.
         shear: the ligament shears.
         two_material: the rings have a local law of their own.
+        skeleton: `softening`: it yields more the deeper it is pressed, see `Options`.
         want_surface: deformed vertices are asked for.
         want_joints: joints and their loads are asked for.
         want_ring_ends: ends of the rings are asked for.
@@ -224,6 +226,10 @@ class EffectOptions:
         _given("two_material"), field="options.local",
         values={"off": "uniform", "on": "two-material"}, material=("k_1_ring",), rungs=ON_OFF,
         ladder="local", words={"off": "uniform", "on": "two-material"},
+    )  # fmt: skip
+    skeleton: Literal["auto", "linear", "softening"] = _effect(
+        depth.skeleton, least="linear", field="options.skeleton", values={},
+        material=depth.SOFTENING, rungs=("linear", "softening"),
     )  # fmt: skip
     want_surface: bool = True
     want_joints: bool = True

@@ -43,16 +43,25 @@ def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> SceneFa
         s, phi, touching, moved = (np.asarray(v)[:rows] for v in seen[:4])
         s, phi, moved = (np.asarray(v, float) for v in (s, phi, moved))
         at = slice(int(seen[4]), int(seen[4]) + 1)
+        gap = np.asarray(seen[5], float)[:rows]
+        outside = touching | ~(gap < 0)
+        after = outside & (np.arange(rows) >= int(seen[4]))
     else:
         s, phi, moved = (np.asarray(v, float) for v in (path.s, path.phi, path.displacement))
         touching, at = np.ones(len(s), bool), slice(None)
+        gap, outside, after = np.zeros(len(s)), touching, touching
     here = np.broadcast_to(phi[at], s.shape)
     across = np.abs(moved[:, 2] * np.cos(here) - moved[:, 1] * np.sin(here))
+    inward = -(moved[:, 1] * np.cos(here) + moved[:, 2] * np.sin(here))
     along, way = np.abs(moved[:, 0]), np.sqrt((moved**2).sum(axis=1))
     whole = max(way[touching].max(initial=0), 1e-9)  # not what the tool goes before it touches
 
     def share(v):
         return float(v.max(initial=0) / whole)
+
+    def reach(way, drawn):
+        least, most = np.fmin.reduce(way[drawn], initial=0), np.fmax.reduce(way[outside], initial=0)
+        return float(least) / float(scene.radius), float(most) / float(scene.radius)
 
     def keep(v):
         return v if v > COVERED else 0.0
@@ -74,6 +83,8 @@ def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> SceneFa
         mesh=scene.mesh is not None,
         curved=curved,
         near=_near(scene, s, phi),
+        way_fixed=reach(inward, after),
+        way_per_step=reach(-gap, outside),
     )  # fmt: skip
 
 
@@ -107,12 +118,13 @@ def _touched(
     Bool[Array, " rows"],
     Float[Array, "rows 3"],
     Int[Array, ""],
+    Float[Array, " rows"],
 ]:
     """Contact of every row and whether it is one with the outside; the way from first touch on.
 
     Returns:
         s, mm; phi, rad; whether the row touches from outside; displacement of the contact point,
-        mm; the row of first touch.
+        mm; the row of first touch; gap, mm.
     """
     seen = touch_tube(scene, path)
     touching, row = first_touch(seen, in_lumen(scene, path, seen))
@@ -121,7 +133,7 @@ def _touched(
         frame = frame_at(scene.tube.line, seen.s[row])
     inward = local_frame(seen.phi[row])[0]
     moved = contact_point_path(path, seen, row, inward, frame)
-    return seen.s, seen.phi, touching, moved, row
+    return seen.s, seen.phi, touching, moved, row, seen.gap
 
 
 def _near(scene: Scene, s, phi) -> bool:

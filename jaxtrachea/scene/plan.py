@@ -21,12 +21,16 @@ OUTPUTS = ("joints", "ring_ends")
 
 @dataclasses.dataclass(frozen=True)
 class Decision:
-    """One decision: its level (`on`, `off` or a word), the reason, and whether it was forced."""
+    """One decision: its level (`on`, `off` or a word), the reason, and whether it was forced.
+
+    `doubt`: what makes numbers at that level doubtful, and the cure; empty: nothing does.
+    """
 
     name: str
     level: str
     reason: str
     forced: bool = False
+    doubt: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,12 +109,19 @@ class Plan:
         Raises:
             InputError: naming the option.
         """
-        for name, level in (("half_width", 0.0), ("skeleton", "linear")):
-            if (found := getattr(self.options, name)) != level:
+        for name, levels in (("half_width", (0.0,)), ("skeleton", EFFECTS["skeleton"].levels)):
+            if (found := getattr(self.options, name)) not in levels:
                 raise InputError(
                     f"is {found!r}", key=f"options.{name}", joint=" ",
-                    expected=f"{level!r} in a scene", cure="press by `press` with it",
+                    expected=f"{' or '.join(map(repr, levels))} in a scene",
+                    cure="press by `press` or `press_sections` with it",
                 )  # fmt: skip
+        if self.second_plane and self.options.skeleton != "linear":
+            raise InputError(
+                f"is {self.options.skeleton!r}, with a second_plane", key="options.skeleton",
+                joint=" ", expected="'linear', or no second_plane",
+                cure="press straight in on the midline with it",
+            )  # fmt: skip
         wanders = self.contact and self.contact_point == "per_step"
         if wanders and self.options.split == "independent":
             raise InputError(

@@ -7,7 +7,13 @@ import jax.numpy as jnp
 
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliquePress, press_oblique, press_path
-from jaxtrachea.mechanics.press import ligament_beam, local_law, respond, unit_deflection
+from jaxtrachea.mechanics.press import (
+    ligament_beam,
+    local_law,
+    respond,
+    softening_of,
+    unit_deflection,
+)
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.trachea.material import Material
 
@@ -38,14 +44,21 @@ def moved_by(press: ObliquePress) -> Moved:
 
 
 def one_plane(scene: Scene, material: Material, presses: Presses) -> Moved:
-    """Normal press on the midline: scalars, then spread to vectors."""
+    """Normal press on the midline: scalars, then spread to vectors.
+
+    What moves with the skeleton follows the force, or the load under which a skeleton that softens
+    would move as much if it were linear; what the rings bear follows the force (as in `press`).
+    """
     plan, geometry = scene.plan, scene.geometry
     beam = ligament_beam(geometry, material, plan.options)
+    softening = softening_of(material, plan.options)
 
     def at(s_c, inward):
         unit = unit_deflection(beam, s_c, plan.options)
         law = local_law(geometry, material, s_c, plan.options)
-        return unit, respond(inward, jnp.zeros_like(s_c), unit.w_C, law, plan.options)
+        rest = jnp.zeros_like(s_c)
+        solved = respond(inward, rest, unit.w_C, law, plan.options, softening=softening)
+        return unit, solved
 
     inward = -presses.displacement[:, 1]
     if plan.contact_point == "fixed":
@@ -54,19 +67,16 @@ def one_plane(scene: Scene, material: Material, presses: Presses) -> Moved:
     else:
         unit, solved = jax.vmap(at)(presses.s, inward)
     F = -solved.force  # along y
-
-    def per_ring(v):
-        return _anterior(F[:, None] * v)
-
-    joints = per_ring(unit.w)
+    load = F if solved.load is None else -solved.load
+    joints, bears = (_anterior(v[:, None] * w) for v, w in ((load, unit.w), (F, unit.reaction)))
 
     def slope(v):
         return jnp.stack([v, jnp.zeros_like(v)], -1)
 
     return Moved(
-        force=_anterior(F), depth=_anterior(-solved.depth), skeleton=_anterior(F * unit.w_C),
-        slope_C=slope(F * unit.theta_C), joints=joints, slopes=slope(F[:, None] * unit.theta),
-        loads=per_ring(unit.reaction), end_U=joints, end_V=joints, status=solved.status,
+        force=_anterior(F), depth=_anterior(-solved.depth), skeleton=_anterior(load * unit.w_C),
+        slope_C=slope(load * unit.theta_C), joints=joints, slopes=slope(load[:, None] * unit.theta),
+        loads=bears, end_U=joints, end_V=joints, status=solved.status,
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jaxtrachea.contact.patches import Touch
+from jaxtrachea.scene.depth import SHALLOW
 from jaxtrachea.scene.effects import EFFECTS, given_values
 from jaxtrachea.scene.plan import Served
 from jaxtrachea.scene.stage import COVERED, Presses, Scene
@@ -40,9 +41,9 @@ def unserved(
     """Rows that press and need an effect that is off.
 
     Off the midline or oblique without vectors, along the tube without stretch, along the surface
-    without friction, elsewhere or too far for one contact point, near a surface without a dent; or
-    anywhere with a material that bends, shears, lets the ends move or has rings of their own where
-    the plan did not.
+    without friction, deep without a skeleton that softens, elsewhere or too far for one contact
+    point, near a surface without a dent; or anywhere with a material that bends, shears, lets the
+    ends move or has rings of their own where the plan did not.
 
     Args:
         scene: -
@@ -69,7 +70,9 @@ def unserved(
             found.append(jnp.cumsum(slides) > 0)  # what slid leaves its trace in later rows
     if plan.served is not None:
         found.append(_beyond(plan.served, presses))
-    if set(less) - {"axial"}:
+    if "skeleton" in less:
+        found.append(deep(scene, _inward(presses)))
+    if set(less) - {"axial", "skeleton"}:
         found.append(jnp.ones_like(pressing))
     if plan.surface is not None and not plan.dent and "dent" not in plan.ignored:
         found.append(_near_surface(scene, presses))
@@ -83,10 +86,23 @@ def _beyond(served: Served, presses: Presses):
     reach = (
         (jnp.abs(phi), served.angle), (jnp.abs(D[:, 0]), served.along),
         (jnp.abs(c * D[:, 2] - n * D[:, 1]), served.across),
-        (-c * D[:, 1] - n * D[:, 2], served.inward), (s, served.s[1]), (-s, -served.s[0]),
+        (_inward(presses), served.inward), (s, served.s[1]), (-s, -served.s[0]),
     )  # fmt: skip
     beyond = [v > limit + COVERED * (1 + abs(limit)) for v, limit in reach]
     return functools.reduce(jnp.logical_or, beyond)
+
+
+def deep(scene: Scene, inward):
+    """Where the wall is moved so far that a skeleton which can soften does: as `depth` has it."""
+    if scene.plan.options.contact == "bonded":
+        inward = jnp.abs(inward)
+    return inward > SHALLOW * scene.radius + COVERED
+
+
+def _inward(presses: Presses):
+    """Way along the inward normal, mm."""
+    D, phi = presses.displacement, presses.phi
+    return -jnp.cos(phi) * D[:, 1] - jnp.sin(phi) * D[:, 2]
 
 
 def _off_plane(presses: Presses):

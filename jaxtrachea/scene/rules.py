@@ -60,7 +60,7 @@ def _decided(effect: Effect, case: Case) -> Decision:
     free = wish != "auto" and verdict.free
     level = case.levels[effect.name] = wish if free else verdict.level
     if not free:
-        return Decision(effect.name, level, verdict.reason)
+        return Decision(effect.name, level, verdict.reason, doubt=verdict.doubt)
     if effect.name in case.finest:
         return Decision(effect.name, level, "the finest level")
     return Decision(effect.name, level, "as you wish", forced=True)

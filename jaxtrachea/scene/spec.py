@@ -82,8 +82,9 @@ class MaterialSection(_material_keys()):
         given = (name for name in VALUES if getattr(self, name) is not None)
         for name, other in meaningless(given).items():
             raise ValueError(f"{name} needs {other}; give {other} too, or remove {name}")
-        for name in (name for name in DEEP if getattr(self, name) is not None):
-            raise ValueError(f"{name}: the skeleton of a scene is linear; remove {name}")
+        deep = [name for name in DEEP if getattr(self, name) is not None]
+        for other in (name for name in DEEP if deep and name not in deep):
+            raise ValueError(f"{deep[0]} needs {other}; give {other} too, or remove {deep[0]}")
         return self
 
 

@@ -78,18 +78,19 @@ class Tool:
 
 
 def check_material(geometry: Geometry, material: Material) -> None:
-    """Refuse arrays of a wrong length, and values that no scene reads.
+    """Refuse arrays of a wrong length, and half of what a skeleton softens by.
 
     Raises:
         ValueError: naming the value, what was expected and the cure.
     """
     check_shapes(geometry, material)
-    for name in DEEP:
-        if getattr(material, name) is not None:
-            raise InputError(
-                "the skeleton of a scene is linear, and would ignore it", key=f"Material.{name}",
-                cure="leave it out, or press by `press` with Options(skeleton='softening')",
-            )  # fmt: skip
+    given = {name: getattr(material, name) is not None for name in DEEP}
+    if any(given.values()) and not all(given.values()):
+        one, other = sorted(DEEP, key=given.__getitem__, reverse=True)
+        raise InputError(
+            f"given without Material.{other}, and would be ignored", key=f"Material.{one}",
+            cure=f"give Material.{other} too (0 where the law has no such part), or leave it out",
+        )  # fmt: skip
 
 
 def check_path(path: Presses | Poses) -> None:

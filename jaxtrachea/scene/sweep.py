@@ -9,10 +9,12 @@ from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, shaped
 from jaxtrachea.mechanics.oblique import press_oblique
+from jaxtrachea.mechanics.press import press
+from jaxtrachea.mechanics.ring import on_ring
 from jaxtrachea.mechanics.skeleton import local_frame
-from jaxtrachea.scene.ranges import depth_share, lacking
+from jaxtrachea.scene.ranges import deep, depth_share, lacking
 from jaxtrachea.scene.refusals import REFUSALS, on_the_tube, status_of
-from jaxtrachea.scene.stage import Scene
+from jaxtrachea.scene.stage import COVERED, Scene
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
 
@@ -23,7 +25,8 @@ class Sweep(NamedTuple):
     Attributes:
         force: normal contact force, N; shape (points,).
         indentation: local, along the normal, mm.
-        compliance: of the skeleton along the normal, mm/N; NaN where nothing moves.
+        compliance: of the skeleton along the normal, mm/N: of one that softens, its deflection
+            over the force; NaN where nothing moves.
         depth_share: as in `Simulation`.
         status: a `PressStatus` each.
     """
@@ -47,8 +50,9 @@ def sweep(
     """Press along the normal at many contact points, `chunk` of them at a time.
 
     Args:
-        scene: its geometry and the level of rings, shear and laws of its plan are used; OFF_PLAN
-            where a point presses and the material gives more than the plan has (as in `simulate`).
+        scene: its geometry and the level of rings, skeleton, shear and laws of its plan are used;
+            OFF_PLAN where a point presses and the material gives more than the plan has (as in
+            `simulate`), or off the midline on a skeleton that softens.
         material: -
         s: mm.
         phi: rad, within the half-angle of the rings; else BEHIND_GAP where it presses.
@@ -65,8 +69,8 @@ def sweep(
         for name, value in (("phi", phi), ("depth", depth))
     )
 
-    straight = dataclasses.replace(scene.plan.oblique, axial=False)  # along the normal
     unlike = set(lacking(scene, material)) - {"axial"}
+    softens = scene.plan.has("skeleton")
 
     def one(at):
         s_c, phi_at, d = at
@@ -74,23 +78,51 @@ def sweep(
         behind = on_the_tube(scene, s_c, phi_at)[2] & ~acting
         phi_c, d = (jnp.where(behind, 0, v) for v in (phi_at, d))  # needs nothing of the rings
         inward = local_frame(phi_c)[0]
-        press = press_oblique(
-            scene.geometry, material, s_c, phi_c, d * inward, straight,
-        )  # fmt: skip
-        force, way, depth = (v @ inward for v in (press.force, press.skeleton, press.depth))
+        found = (_softening if softens else _vectors)(scene, material, s_c, phi_c, d)
+        force, way, depth = (v @ inward for v in (found.force, found.skeleton, found.depth))
         free = ~(force != 0)
         softness = jnp.where(free, jnp.nan, way / jnp.where(free, 1, force))
-        share = depth_share(scene, press.depth, press.skeleton, inward)
+        share = depth_share(scene, found.depth, found.skeleton, inward)
         refused = {PressStatus.NON_FINITE: jnp.isnan(s_c + phi_at + d)}
-        if unlike:
-            refused = {code: refused.get(code, False) | (press.status == code) for code in REFUSALS}
-            refused[PressStatus.OFF_PLAN] = acting
-            force, depth, softness = (
-                jnp.where(acting, jnp.nan, v) for v in (force, depth, softness)
-            )
-        status = status_of(press.status, share, None, refused)
+        if unlike or softens:
+            off = acting
+            if softens and not unlike:
+                off = acting & (jnp.abs(phi_at) > COVERED)
+            elif unlike == {"skeleton"}:
+                off = acting & deep(scene, d)
+            refused = {code: refused.get(code, False) | (found.status == code) for code in REFUSALS}
+            refused[PressStatus.OFF_PLAN] = off
+            force, depth, softness = (jnp.where(off, jnp.nan, v) for v in (force, depth, softness))
+        status = status_of(found.status, share, None, refused)
         return Sweep(
             force=force, indentation=depth, compliance=softness, depth_share=share, status=status
         )
 
     return jax.lax.map(one, (s, phi, depth), batch_size=chunk)
+
+
+class _Pressed(NamedTuple):
+    """A press along the normal: fields as in `ObliquePress`."""
+
+    force: Float[Array, "3"]
+    depth: Float[Array, "3"]
+    skeleton: Float[Array, "3"]
+    status: Int[Array, ""]
+
+
+def _vectors(scene: Scene, material: Material, s_c, phi_c, depth) -> _Pressed:
+    """On a linear skeleton, anywhere on the rings."""
+    straight = dataclasses.replace(scene.plan.oblique, axial=False)  # along the normal
+    D = depth * local_frame(phi_c)[0]
+    press = press_oblique(scene.geometry, material, s_c, phi_c, D, straight)
+    return _Pressed(press.force, press.depth, press.skeleton, press.status)
+
+
+def _softening(scene: Scene, material: Material, s_c, phi_c, depth) -> _Pressed:
+    """On a skeleton that softens: a press on the midline, whatever the angle on the rings."""
+    inward = local_frame(phi_c)[0]
+    on = on_ring(scene.geometry.half_angle, phi_c)[0]
+    found = press(scene.geometry, material, s_c, depth, scene.plan.options)
+    status = jnp.where(on, found.status, PressStatus.BEHIND_GAP)
+    force, depth, skeleton = (v * inward for v in (found.force, found.depth, found.skeleton))
+    return _Pressed(force, depth, skeleton, status)

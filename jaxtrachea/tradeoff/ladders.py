@@ -62,8 +62,10 @@ def ladders(full: Full) -> tuple[list[Ladder], dict[str, str]]:
         "with 'independent' the energy of a contact that wanders jumps" if wanders else ""
     )
     add("split", "model", _words("split", "independent", "continuous"), jumps, second_plane="off")
-    sliding = "friction needs coupling 'series'" if plan.friction else ""
-    add("coupling", "model", _words("coupling", "total", "series"), sliding)
+    series = "friction needs coupling 'series'" if plan.friction else ""
+    if plan.has("skeleton"):
+        series = "a skeleton that softens needs coupling 'series'"
+    add("coupling", "model", _words("coupling", "total", "series"), series)
     reasons = {effect.name: effect.reason for effect in plan.effects}
     if plan.second_plane:
         reasons["second_plane"] = flat

@@ -148,6 +148,9 @@ def _finest(
     bends = EFFECTS["rings"].given(given_values(material))
     if given.rings == "auto" and bends and given.second_plane != "off":
         finest["rings"] = EFFECTS["rings"].rungs[-1]
+    softens = EFFECTS["skeleton"].given(given_values(material)) and given.coupling == "series"
+    if given.skeleton == "auto" and softens and not scene.plan.second_plane:
+        finest["skeleton"] = EFFECTS["skeleton"].rungs[-1]
     if given.dent == "auto" and scene.plan.dent and isinstance(path, Poses):
         finest["dent"] = EFFECTS["dent"].rungs[-1]
     return dataclasses.replace(given, **finest), frozenset(finest)

@@ -1,4 +1,4 @@
-"""What scenes cannot do yet is refused: a skeleton that softens, a tool's width off the midline."""
+"""What scenes cannot do is refused: a tool's width, and what softens as vectors."""
 
 import dataclasses
 import re
@@ -11,23 +11,11 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.scene.assemble import make_scene
-from jaxtrachea.scene.spec import MaterialSection
 from jaxtrachea.scene.stage import Presses
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
 VALUES = {"EI_L": 1.862, "k_M": 0.1, "k_1": 0.3, "k_3": 0.02}
-UNITS = {"EI_L": "N mm^2", "k_M": "N/mm", "k_1": "N/mm", "k_3": "N/mm^3"}
-
-
-def test_scene_refuses_a_softening_skeleton():
-    path = Presses(jnp.array([75.0]), jnp.zeros(1), jnp.array([[0.0, -1.0, 0.0]]))
-    material = Material(**VALUES, e_1=0.1, e_2=0.005)
-    with pytest.raises(InputError, match=r"Material\.e_1.*linear"):
-        make_scene(table_1(), material, path)
-    written = {name: f"{v} {UNITS[name]}" for name, v in VALUES.items()}
-    with pytest.raises(ValueError, match="e_2: the skeleton of a scene is linear"):
-        MaterialSection(**written, e_2="0.005 1/mm^2")
 
 
 @pytest.mark.parametrize("changes", [{"half_width": 2.4}, {"skeleton": "softening"}])
@@ -40,11 +28,14 @@ def test_oblique_presses_refuse(changes):
     ("changes", "says"),
     [
         ({"half_width": 2.4}, "options.half_width is 2.4; expected 0.0 in a scene; press by"),
-        ({"skeleton": "softening"}, "options.skeleton is 'softening'; expected 'linear' in a"),
+        (
+            {"skeleton": "sections", "contact": "bonded"},
+            "options.skeleton is 'sections'; expected 'linear' or 'softening' in a scene; press by",
+        ),
     ],
 )
 def test_plan_refuses(changes, says):
-    """One plane solved a softening skeleton as a linear one, and let a punch stand on a clamp."""
+    """In one plane a punch could stand on a clamp."""
     path = Presses(jnp.array([75.0]), jnp.zeros(1), jnp.array([[0.0, -1.0, 0.0]]))
     plan = make_scene(table_1(), Material(**VALUES), path, effects=BARE).plan
     with pytest.raises(InputError, match=re.escape(says)):
