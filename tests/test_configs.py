@@ -21,6 +21,7 @@ NAMES = sorted(path.stem for path in CONFIGS.glob("*.toml"))
 SHOWS = {
     "bonded_pull": {"contact law": "bonded", "second_plane": "off"},
     "capsule": {"contact": "on", "end_motion": "on", "axial": "on"},
+    "cross_sections": {"skeleton": "sections", "surface": "off", "second_plane": "on"},
     "deep": {"contact": "on", "skeleton": "softening", "second_plane": "off", "shear": "on"},
     "friction": {"friction": "on", "axial": "on", "contact_point": "fixed"},
     "imported": {"curved": "off", "rings": "arch2"},
@@ -72,6 +73,7 @@ LATER = {
     "imported",
     "imported_tool",
     "capsule",
+    "cross_sections",
     "friction",
     "left_down",
     "right_down",
@@ -230,6 +232,23 @@ BAD = {
         GOOD + 'e_1 = "0.1 1/mm"\ne_2 = "0.005 1/mm^2"\n' + PRESS + "phi = '20 deg'",
         ["effects.skeleton", "30 % of the radius", "second plane", "set skeleton 'linear'"],
     ),
+    "cross-sections without their radius": (
+        '[wall]\n[model]\ncontact = "bonded"\n' + PRESS,
+        ["trachea.radius: missing", "mid-line"],
+    ),
+    "surface of cross-sections": (
+        '[wall]\n[trachea]\nradius = "11.7 mm"\n[model]\ncontact = "bonded"\n' + PRESS,
+        ["effects.surface", "no surface in a scene", "output.surface = false"],
+    ),
+    "cross-sections that the tool may leave": (
+        '[wall]\n[trachea]\nradius = "11.7 mm"\n[output]\nsurface = false\n' + PRESS,
+        ["effects.skeleton", "contact='bonded'", "set contact = 'bonded'"],
+    ),
+    "wall that cannot be": (
+        '[wall]\nh_C = "4 mm"\n[trachea]\nradius = "11.7 mm"\n' + PRESS,
+        ["wall.h_C is 4.0 mm", "at most the thickness"],
+    ),
+    "two skeletons": (GOOD + "[wall]\n" + PRESS, ["wall", "not together with [material]"]),
     "plane too few": (
         GOOD + PRESS + "phi = '20 deg'\n[effects]\nsecond_plane = 'off'",
         ["effects.second_plane", "20 deg off the midline", "auto"],

@@ -246,7 +246,7 @@ def _provenance(scene: Path, staged, clock: list[float]) -> dict:
 
     inputs = {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in staged.files}
     seconds = {name: clock[i + 1] - clock[i] for i, name in enumerate(("read", "compute"))}
-    dtype = str(staged.material.k_1.dtype)
+    dtype = str(jax.tree.leaves(staged.material)[0].dtype)
     return provenance(scene, inputs, str(jax.devices()[0]), dtype, seconds)
 
 

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea.contact.shapes import Shape
-from jaxtrachea.scene.declare import PlanError, SceneFacts
+from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.scene.declare import AnyMaterial, PlanError, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.rules import make_plan
@@ -16,7 +17,6 @@ from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool, check_material, 
 from jaxtrachea.scene.wall import checked_walls, near_patches, round_wall
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import Mesh
 
 #: Distance between the circles of the dent's centres: share of the tool's size; mm at least.
@@ -27,7 +27,7 @@ WALL = 2.6
 
 def make_scene(
     geometry: Geometry,
-    material: Material,
+    material: AnyMaterial,
     path: Poses | Presses,
     *,
     tool: Tool | Shape | None = None,
@@ -40,11 +40,13 @@ def make_scene(
 
     Args:
         geometry: the tube at rest.
-        material: read only for which optional values are there.
+        material: read only for which optional values are there; a `SectionMaterial` makes a scene
+            of deforming cross-sections.
         path: what the plan is made for; other paths may follow if they need no more.
         tool: with its friction, or its shape alone; a shape is needed for `Poses`.
         mesh: the surface; without one `effects.want_surface` must be false.
-        radius: of the tube's outside, mm; None: that of the mesh (of an imported one it is
+        radius: of the tube's outside, mm; None: of a `SectionMaterial` that of its mid-line and
+            offset; else that of the mesh (of an imported one it is
             `geometry.radius`); without a mesh `geometry.radius` + 1.3 (half of Table 1's wall).
         effects: what is not left to the rules.
         progress: called with (patches of the wall done since the last call, patches in all).
@@ -62,7 +64,10 @@ def make_scene(
     tool = tool if isinstance(tool, Tool) else Tool(tool)
     shape, friction = tool.shape, tool.friction
     dtype = geometry.length.dtype
-    outer = _outer(geometry, mesh) if radius is None else jnp.asarray(radius, dtype)
+    if radius is None and isinstance(material, SectionMaterial):
+        outer = geometry.radius + material.offset
+    else:
+        outer = _outer(geometry, mesh) if radius is None else jnp.asarray(radius, dtype)
     check_sizes(geometry, float(outer), shape)
     if isinstance(path, Poses) and shape is None:
         raise PlanError("contact", "the path moves a tool", "there is none", "give a tool")

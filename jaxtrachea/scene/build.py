@@ -10,9 +10,10 @@ import numpy as np
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.contact import shapes
+from jaxtrachea.mechanics.sections.material import SectionMaterial, Wall, from_wall
 from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.assemble import make_scene
-from jaxtrachea.scene.declare import PlanError
+from jaxtrachea.scene.declare import AnyMaterial, PlanError
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.paths import named_file, path_of, read_table
@@ -20,6 +21,7 @@ from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import SizeError
 from jaxtrachea.scene.spec import SceneSpec, SceneTracheaSection, ToolSection
 from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool
+from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.imported import Landmarks, read_mesh
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import MeshError
@@ -47,7 +49,7 @@ class Staged(NamedTuple):
     """A scene ready to run: the scene, its material and path, the files read, notes on the mesh."""
 
     scene: Scene
-    material: Material
+    material: AnyMaterial
     path: Poses | Presses
     files: tuple[Path, ...]
     notes: tuple[str, ...]
@@ -67,7 +69,7 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     files: list[Path] = []
     counted = counted or _uncounted
     geometry, mesh, notes = _trachea(spec.trachea, folder, files, counted)
-    material = Material(**spec.material.model_dump())
+    material = material_of(spec, geometry)
     tool = None
     if spec.tool is not None:
         tool = Tool(_shape(spec.tool, folder, files), spec.tool.friction)
@@ -75,6 +77,9 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     radius = float(geometry.radius) + spec.trachea.wall / 2
     if spec.trachea.file is not None:
         radius = float(geometry.radius)  # that of the outer wall
+    if isinstance(material, SectionMaterial):
+        # The round wall whose mid-line they bend about.
+        mesh, radius = None, float(geometry.radius) + float(material.offset)
     try:
         scene = make_scene(
             geometry, material, path, tool=tool, mesh=mesh, radius=radius,
@@ -98,6 +103,24 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
             notes += (doubt,)
     notes += dropped_effects(scene)
     return Staged(scene=scene, material=material, path=path, files=tuple(files), notes=notes)
+
+
+def material_of(spec: SceneSpec, geometry: Geometry) -> AnyMaterial:
+    """The material of [material], or of [sections] and what [wall] gives beside it.
+
+    Raises:
+        SpecError: a wall that cannot be.
+    """
+    if spec.material is not None:
+        return Material(**spec.material.model_dump())
+    named = {} if spec.sections is None else spec.sections.model_dump(exclude_none=True)
+    if spec.wall is None:
+        return SectionMaterial(**named)
+    try:
+        wall = from_wall(geometry, Wall(**spec.wall.model_dump()))
+    except InputError as error:
+        raise SpecError.like(error, key=f"wall.{error.key}") from None
+    return dataclasses.replace(wall, **named)
 
 
 def _uncounted(_: str) -> None:

@@ -7,6 +7,13 @@ from typing import Any, Literal, NamedTuple
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea._errors import InputError
+from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.trachea.material import Material
+
+#: What a scene can be of: a line of joints, or deforming cross-sections.
+AnyMaterial = Material | SectionMaterial
+#: What stands for the latter among the values that a material gives.
+SECTIONS = "sections"
 
 
 class PlanError(InputError):
@@ -35,7 +42,8 @@ class SceneFacts:
         slip: largest motion of the tool along the surface while it touches, mm.
         spacing: smallest distance of two rings, mm.
         friction: whether the tool has a coefficient of friction.
-        known: optional values of the material that are there.
+        known: optional values of the material that are there; `SECTIONS` alone: of a
+            `SectionMaterial`.
         mesh: whether there is a surface.
         curved: whether its centreline is.
         near: whether the contact comes near a vertex of it.

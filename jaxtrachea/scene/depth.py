@@ -6,7 +6,8 @@ linear skeleton errs there by 1.4 % at R / 100 and by 13 % at R / 10. A ring alo
 two points, is off by 15 % at R / 4 (`ranges.DEEPEST`).
 """
 
-from jaxtrachea.scene.declare import Case, PlanError, Verdict
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.scene.declare import SECTIONS, Case, PlanError, Verdict
 
 #: Inward motion over the tube's radius up to which a linear skeleton will do: it errs by some 1 %.
 SHALLOW = 0.01
@@ -20,7 +21,10 @@ _TOO_STIFF = (
     "a wall is softer there than a linear skeleton (drawn: stiffer), by 13 % at a tenth of the "
     "radius on the finite-element trachea of docs/virtual_trachea.md, by more beyond"
 )
-_MIDLINE = "e_1 and e_2 in [material] soften a press straight in on the midline (rings 'mat')"
+_MIDLINE = (
+    "e_1 and e_2 in [material] soften a press straight in on the midline (rings 'mat'), [sections] "
+    "in the place of [material] deform anywhere on the rings"
+)
 _ONE_PLANE = "which is for presses straight in on the midline, and this scene has a second plane"
 _SERIES = "which needs coupling 'series': with 'total' the force knows nothing of the skeleton"
 
@@ -39,6 +43,8 @@ def skeleton(case: Case) -> Verdict:
     Raises:
         PlanError: a deep press of a material that softens, where no skeleton of a scene does.
     """
+    if SECTIONS in case.facts.known:
+        return _sections(case)
     given = all(name in case.facts.known for name in SOFTENING)
     share = reached(case)
     far = f"the wall is moved by {100 * share:.2g} % of the radius"
@@ -47,12 +53,17 @@ def skeleton(case: Case) -> Verdict:
         cannot, cure = "e_1 and e_2 are not given", "give both, or use 'linear'"
     elif case.levels["second_plane"] != "off":
         cannot = f"a skeleton softens by e_1 and e_2, {_ONE_PLANE}"
-        cure = "set skeleton 'linear', or press straight in on the midline: " + (
-            "no friction, no axial motion, rings 'mat'"
+        cure = (
+            "set skeleton 'linear', give [sections] in the place of [material], or press straight "
+            "in on the midline: no friction, no axial motion, rings 'mat'"
         )
     elif case.options.coupling != "series":
         cannot, cure = f"a skeleton softens by e_1 and e_2, {_SERIES}", "set skeleton 'linear'"
     refused = {"softening": (cannot, cure)} if cannot else {}
+    refused["sections"] = (
+        "the material is that of a line of joints",
+        "give a SectionMaterial, [sections] in a file, in its place",
+    )
     if share <= SHALLOW:
         least = f"{far}: a linear skeleton errs by some {100 * SHALLOW:g} % at most"
         return Verdict("linear", least if share > 0 else "nothing is pressed", refused)
@@ -64,3 +75,34 @@ def skeleton(case: Case) -> Verdict:
     if share > DEEP:
         doubt = f"but {far}: {_TOO_STIFF}; {_MIDLINE}"
     return Verdict("linear", f"{far}; {cannot}", refused, doubt=doubt)
+
+
+def _sections(case: Case) -> Verdict:
+    """Deforming cross-sections, which have no other level; what they cannot do is refused.
+
+    Raises:
+        PlanError: naming what the user asked for and the cure.
+    """
+    facts, options, levels = case.facts, case.options, case.levels
+    why, cure = "the material is that of deforming cross-sections", "use 'sections', or 'auto'"
+    refused = {"linear": (why, cure), "softening": (why, cure)}
+    if case.led and facts.along > SMALL_SHARE:
+        why = "the tool moves along the tube, which deforming cross-sections do not follow"
+        raise PlanError("skeleton", "'sections'", why, "press across the tube")
+    if facts.poses and levels["contact_point"] == "per_step":
+        why = "the tool wanders, and its force along the surface is not known on cross-sections"
+        cure = "set contact_point 'fixed', shorten the path, or give it as presses (s, phi)"
+        raise PlanError("skeleton", "'sections'", why, cure)
+    try:
+        Options(
+            options.coupling, contact=options.contact, onset_width=options.onset_width,
+            transition=options.transition, skeleton="sections",
+        )  # fmt: skip
+    except ValueError as error:
+        cure = "set contact = 'bonded' and no other key of [model]"
+        raise PlanError("skeleton", "'sections'", str(error), cure) from None
+    return Verdict("sections", "the material is that of deforming cross-sections", refused)
+
+
+#: Share of the tool's motion along the tube below which there is none.
+SMALL_SHARE = 1e-6

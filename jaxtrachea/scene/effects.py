@@ -14,9 +14,9 @@ from typing import Any, Literal, get_args, get_type_hints
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene import depth
-from jaxtrachea.scene.declare import Case, Effect, PlanError, Verdict
-from jaxtrachea.trachea.material import Material
+from jaxtrachea.scene.declare import SECTIONS, AnyMaterial, Case, Effect, PlanError, Verdict
 
 Switch = Literal["auto", "on", "off"]
 
@@ -95,6 +95,8 @@ def _rings(case: Case) -> Verdict:
     if case.facts.angle > SMALL:
         reason = "off the midline a ring would bend, but EI_C and k_t are not given"
     why = "EI_C or k_t is not given", "give both, or use 'mat'"
+    if SECTIONS in case.facts.known:
+        reason, why = "its cross-sections deform", ("a ring is a cross-section", "use 'mat'")
     return Verdict("mat", reason, {"arch": why, "arch2": why})
 
 
@@ -113,6 +115,9 @@ def _surface(case: Case) -> Verdict:
         levels = EFFECTS["surface"].levels
         refused = {level: why for level in levels if level != "off"}
         return Verdict("off", "not asked for", refused, free=False)
+    if SECTIONS in case.facts.known:
+        why = "a skeleton of deforming cross-sections has no surface in a scene"
+        raise PlanError("surface", "asked for", why, "do not ask (output.surface = false)")
     if not case.facts.mesh:
         cure = "give one, or do not ask (want_surface)"
         raise PlanError("surface", "asked for", "the scene has no mesh", cure)
@@ -185,7 +190,8 @@ class EffectOptions:
         dent: centres of the local correction, or off.
         shear: the ligament shears.
         two_material: the rings have a local law of their own.
-        skeleton: `softening`: it yields more the deeper it is pressed, see `Options`.
+        skeleton: `softening`: it yields more the deeper it is pressed; `sections`: deforming
+            cross-sections, of a `SectionMaterial`; see `Options`.
         want_surface: deformed vertices are asked for.
         want_joints: joints and their loads are asked for.
         want_ring_ends: ends of the rings are asked for.
@@ -227,7 +233,7 @@ class EffectOptions:
         values={"off": "uniform", "on": "two-material"}, material=("k_1_ring",), rungs=ON_OFF,
         ladder="local", words={"off": "uniform", "on": "two-material"},
     )  # fmt: skip
-    skeleton: Literal["auto", "linear", "softening"] = _effect(
+    skeleton: Literal["auto", "linear", "softening", "sections"] = _effect(
         depth.skeleton, least="linear", field="options.skeleton", values={},
         material=depth.SOFTENING, rungs=("linear", "softening"),
     )  # fmt: skip
@@ -267,8 +273,10 @@ def _declared() -> dict[str, Effect]:
 EFFECTS = _declared()
 
 
-def given_values(material: Material) -> frozenset[str]:
-    """Optional values that effects read and the material gives."""
+def given_values(material: AnyMaterial) -> frozenset[str]:
+    """Optional values that effects read and the material gives; `SECTIONS` of one of sections."""
+    if isinstance(material, SectionMaterial):
+        return frozenset({SECTIONS})
     names = {name for effect in EFFECTS.values() for name in effect.material}
     return frozenset(name for name in names if getattr(material, name) is not None)
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import first_touch
 from jaxtrachea.scene.curve import frame_at
-from jaxtrachea.scene.declare import SceneFacts
+from jaxtrachea.scene.declare import AnyMaterial, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions, given_values
 from jaxtrachea.scene.lumen import in_lumen
 from jaxtrachea.scene.rules import make_plan
@@ -22,13 +22,12 @@ from jaxtrachea.scene.stage import (
     touch_tube,
 )
 from jaxtrachea.surface import local
-from jaxtrachea.trachea.material import Material
 
 #: Rows that a path is filled up to, or twice, four times ...; longer ones than `MOST` are not.
 LEAST, MOST = 64, 4096
 
 
-def facts_of(scene: Scene, material: Material, path: Poses | Presses) -> SceneFacts:
+def facts_of(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> SceneFacts:
     """What the rules need to know of a scene and its path; rows in the lumen touch nothing.
 
     Args:

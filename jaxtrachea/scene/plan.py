@@ -17,6 +17,8 @@ from jaxtrachea.surface.regions import Method
 
 #: What a simulation can leave out of its result.
 OUTPUTS = ("joints", "ring_ends")
+#: Effects of a line of joints, and what no other skeleton has.
+OF_JOINTS = ("friction", "rings", "axial", "surface", "end_motion", "dent", "shear", "two_material")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,19 +111,12 @@ class Plan:
         Raises:
             InputError: naming the option.
         """
-        for name, levels in (("half_width", (0.0,)), ("skeleton", EFFECTS["skeleton"].levels)):
-            if (found := getattr(self.options, name)) not in levels:
-                raise InputError(
-                    f"is {found!r}", key=f"options.{name}", joint=" ",
-                    expected=f"{' or '.join(map(repr, levels))} in a scene",
-                    cure="press by `press` or `press_sections` with it",
-                )  # fmt: skip
-        if self.second_plane and self.options.skeleton != "linear":
+        if (found := self.options.half_width) != 0:
             raise InputError(
-                f"is {self.options.skeleton!r}, with a second_plane", key="options.skeleton",
-                joint=" ", expected="'linear', or no second_plane",
-                cure="press straight in on the midline with it",
+                f"is {found!r}", key="options.half_width", joint=" ",
+                expected="0.0 in a scene", cure="press by `press` with it",
             )  # fmt: skip
+        self._check_skeleton()
         wanders = self.contact and self.contact_point == "per_step"
         if wanders and self.options.split == "independent":
             raise InputError(
@@ -129,6 +124,27 @@ class Plan:
                 "'per_step' passes a ring, so that no force is its derivative",
                 key="options.split", joint=" ", expected="'continuous'",
                 cure="or keep the contact_point 'fixed'",
+            )  # fmt: skip
+
+    def _check_skeleton(self) -> None:
+        """Refuse effects that a skeleton has not.
+
+        Raises:
+            InputError: naming the effect.
+        """
+        level = self.options.skeleton
+        without = {"softening": ("second_plane",), "sections": OF_JOINTS}.get(level, ())
+        for name in without:
+            if self.has(name):
+                raise InputError(
+                    f"is {level!r}, with {name} {self.level(name)!r}", key="options.skeleton",
+                    joint=" ", expected=f"'linear', or {name} {EFFECTS[name].least!r}",
+                    cure="press by `press` or `press_sections` with it",
+                )  # fmt: skip
+        if level == "sections" and self.contact and self.contact_point == "per_step":
+            raise InputError(
+                "is 'sections', with contact_point 'per_step' of a tool", key="options.skeleton",
+                joint=" ", expected="contact_point 'fixed', or presses at given points",
             )  # fmt: skip
 
     @property
@@ -163,6 +179,8 @@ class Plan:
             less = dataclasses.replace(self, **{name: False})
             return None if less == self else less
         if name not in EFFECTS or not EFFECTS[name].least:
+            return None
+        if self.level(name) == "sections":  # another material
             return None
         if any(name in e.holds and self.has(e.name) for e in EFFECTS.values()):
             return None

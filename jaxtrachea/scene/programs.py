@@ -14,6 +14,9 @@ from jaxtrachea.mechanics.press import (
     softening_of,
     unit_deflection,
 )
+from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.trachea.material import Material
 
@@ -21,7 +24,8 @@ from jaxtrachea.trachea.material import Material
 class Moved(NamedTuple):
     """Force and skeleton, whichever program found them; fields as in `Simulation`.
 
-    Slopes are those of the ligament at the contact and at the rings.
+    Slopes are those of the ligament at the contact and at the rings; these and the loads are None
+    where there is no ligament.
     """
 
     force: Any
@@ -105,3 +109,35 @@ def vectors(scene: Scene, material: Material, presses: Presses) -> Moved:
         return press_oblique(*fixed, s, phi, D, plan.oblique)
 
     return moved_by(jax.vmap(one)(presses.s, presses.phi, presses.displacement))
+
+
+def cross_sections(scene: Scene, material: SectionMaterial, presses: Presses) -> Moved:
+    """Presses across the tube on deforming cross-sections, anywhere on the rings.
+
+    Every row is a press of its own, straight from rest to its displacement: what is stored does not
+    depend on the way. With one plane the program is that of the midline.
+    """
+    flat = not scene.plan.second_plane
+
+    def one(s, phi, D):
+        inward, _, across = local_frame(phi)
+        way = jnp.stack([jnp.sum(D * inward), jnp.sum(D * across)])
+        if flat:
+            size, direction = way[0], jnp.asarray([1.0, 0.0], D.dtype)
+        else:
+            still = jnp.all(way == 0)
+            size = jnp.where(still, 0, jnp.sqrt(jnp.sum(jnp.where(still, 1, way * way))))
+            rest = jnp.asarray([1.0, 0.0], D.dtype)
+            direction = jnp.where(still, rest, way / jnp.where(still, 1, size))
+        found = press_sections(
+            scene.geometry, material, s, jnp.zeros_like(phi) if flat else phi, size[None],
+            direction, midline=flat,
+        )  # fmt: skip
+        return jax.tree.map(lambda v: v[0], found)
+
+    found = jax.vmap(one)(presses.s, presses.phi, presses.displacement)
+    return Moved(
+        force=found.force, depth=found.depth, skeleton=found.skeleton, slope_C=None,
+        joints=found.joints, slopes=None, loads=None, end_U=found.end_U, end_V=found.end_V,
+        status=found.status,
+    )  # fmt: skip

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jaxtrachea.contact.patches import Touch
+from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.depth import SHALLOW
 from jaxtrachea.scene.effects import EFFECTS, given_values
 from jaxtrachea.scene.plan import Served
 from jaxtrachea.scene.stage import COVERED, Presses, Scene
 from jaxtrachea.surface import local
-from jaxtrachea.trachea.material import Material
 
 #: Largest inward motion of the wall, against the tube's radius. Ring and ligament are linear: a
 #: ring pinched between two points (inextensible elastica) is softer than its linear theory says by
@@ -25,7 +25,7 @@ from jaxtrachea.trachea.material import Material
 DEEPEST = 1.0
 
 
-def lacking(scene: Scene, material: Material) -> list[str]:
+def lacking(scene: Scene, material: AnyMaterial) -> list[str]:
     """Effects that the material gives, but not the plan; the user did not leave them out."""
     plan, known = scene.plan, given_values(material)
     return [
@@ -36,7 +36,7 @@ def lacking(scene: Scene, material: Material) -> list[str]:
 
 
 def unserved(
-    scene: Scene, material: Material, presses: Presses, pressing: Bool[Array, " rows"]
+    scene: Scene, material: AnyMaterial, presses: Presses, pressing: Bool[Array, " rows"]
 ) -> Bool[Array, " rows"] | None:
     """Rows that press and need an effect that is off.
 
@@ -61,6 +61,8 @@ def unserved(
     given = not plan.contact
     if not plan.second_plane:
         found.append(_off_plane(presses))
+    elif plan.options.skeleton == "sections":
+        found.append(jnp.abs(D[:, 0]) > COVERED * _length(D) + COVERED)
     elif "axial" in less and (given or plan.contact_point == "fixed"):
         found.append(jnp.abs(D[:, 0]) > COVERED * _length(D) + COVERED)
     if plan.contact_point == "fixed":

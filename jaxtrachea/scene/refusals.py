@@ -7,26 +7,31 @@ from jaxtyping import Array, Bool, Float
 from jaxtrachea.mechanics.admission import without_negative
 from jaxtrachea.mechanics.press import read_values
 from jaxtrachea.mechanics.ring import on_ring
+from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.mechanics.sections.press import safe_values
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.mechanics.skeleton import read_values as skeleton_values
 from jaxtrachea.scene.approach import Approach
+from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.lumen import off_the_end
 from jaxtrachea.scene.ranges import DEEPEST, unserved
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.status import ContactStatus, PressStatus
-from jaxtrachea.trachea.material import Material
 
 #: Statuses of rows that are refused; of several that a row could have, the last.
 REFUSALS = (PressStatus.OFF_TUBE, PressStatus.OFF_PLAN, PressStatus.BEHIND_GAP,
             PressStatus.IN_LUMEN, PressStatus.NON_FINITE, PressStatus.BAD_MATERIAL)  # fmt: skip
 
 
-def without_negative_values(scene: Scene, material: Material):
+def without_negative_values(scene: Scene, material: AnyMaterial):
     """The material with 1 in place of negative values that the plan reads, and whether it had any.
 
-    A negative coefficient of friction counts as well (`press_path` puts 0 in its place).
+    A negative coefficient of friction counts as well (`press_path` puts 0 in its place). Presses of
+    deforming cross-sections see to their own values.
     """
     plan = scene.plan
+    if isinstance(material, SectionMaterial):
+        return material, safe_values(material)[1]
     shear = plan.options.shear
     skeleton = skeleton_values(plan.rings, axial=plan.axial, shear=shear)
     used = (*read_values(plan.options), *(skeleton if plan.second_plane else ()))
@@ -36,7 +41,7 @@ def without_negative_values(scene: Scene, material: Material):
     return material, bad
 
 
-def refuse(scene: Scene, material: Material, path: Presses | None, made: Approach | None, bad):
+def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Approach | None, bad):
     """The presses, NaN where refused; the same as computed; inward normals; refusals by status.
 
     A row that does not press needs nothing of the plan, the rings and the tube: off the plan or

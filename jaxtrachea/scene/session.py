@@ -13,7 +13,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.approach import approach
+from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.seat import (
     Instant,
@@ -90,7 +92,7 @@ class Session:
     `jax.config.update("jax_cpu_enable_async_dispatch", False)` before the first use of JAX.
     """
 
-    def __init__(self, scene: Scene, material: Material, *, keep: int = 10_000):
+    def __init__(self, scene: Scene, material: AnyMaterial, *, keep: int = 10_000):
         """Compile.
 
         Args:
@@ -99,12 +101,18 @@ class Session:
             keep: latencies of so many last steps are kept.
 
         Raises:
-            ValueError: a scene without contact, or with friction, which depends on the whole path.
+            ValueError: a scene without contact, with deforming cross-sections, or with friction,
+                which depends on the whole path.
         """
         if keep < 1:
             raise ValueError(f"keep is {keep}; expected at least 1")
         if not scene.plan.contact:
             raise ValueError("the plan has no contact; make the scene with a path of Poses")
+        if isinstance(material, SectionMaterial) or scene.plan.options.skeleton == "sections":
+            raise ValueError(
+                "a session has no skeleton 'sections'; use simulate, or make the scene with the "
+                "Material of a line of joints"
+            )
         if scene.plan.friction:
             raise ValueError(
                 "the plan has friction, which depends on the whole path; use simulate, or make the "

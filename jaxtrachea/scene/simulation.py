@@ -9,10 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea.mechanics.oblique import Place, press_at
+from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.configurational import force_by_pose
+from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.deform import deform
-from jaxtrachea.scene.programs import moved_by, one_plane, vectors
+from jaxtrachea.scene.programs import cross_sections, moved_by, one_plane, vectors
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import refuse, status_of, without_negative_values
 from jaxtrachea.scene.stage import Poses, Presses, Scene, check_material, check_path
@@ -41,7 +43,8 @@ class Simulation(NamedTuple):
         depth: local indentation.
         skeleton: displacement of C with the skeleton.
         joints: displacement of each joint; shape (rows, rings, 3).
-        loads: force of the ligament on each ring; x: axial force that passes.
+        loads: force of the ligament on each ring; x: axial force that passes. None of deforming
+            cross-sections: a wall joins their rings, no line.
         end_U: displacement of the rings' ends at -alpha.
         end_V: at +alpha.
         slip: way the tool has slid over the surface (friction).
@@ -77,7 +80,7 @@ class Simulation(NamedTuple):
     status: Int[Array, " rows"]
 
 
-def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulation:
+def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simulation:
     """Follow a path through the program of `scene.plan`; pure, to be jitted and differentiated.
 
     The rows of a path with `contact_point` fixed belong together: the tool stays on the place that
@@ -89,7 +92,7 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
 
     Args:
         scene: from `make_scene`, or put together by hand.
-        material: as the plan needs it.
+        material: as the plan needs it; a `SectionMaterial` for a skeleton `sections`.
         path: `Poses` if the plan has contact, else `Presses`.
 
     Raises:
@@ -99,6 +102,10 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
     plan = scene.plan
     check_path(path)
     check_material(scene.geometry, material)
+    if (plan.options.skeleton == "sections") != isinstance(material, SectionMaterial):
+        kinds = ("Material", "SectionMaterial (the plan has a skeleton 'sections')")
+        expected = kinds[plan.options.skeleton == "sections"]
+        raise ValueError(f"material is {type(material).__name__}; expected {expected}")
     if plan.contact != isinstance(path, Poses):
         kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
         raise ValueError(f"path is {type(path).__name__}; expected {kinds[not plan.contact]}")
@@ -107,7 +114,7 @@ def simulate(scene: Scene, material: Material, path: Poses | Presses) -> Simulat
 
 def follow(
     scene: Scene,
-    material: Material,
+    material: AnyMaterial,
     path: Poses | Presses,
     made: Approach | None,
     place: Place | None = None,
@@ -120,16 +127,19 @@ def follow(
     material, bad = without_negative_values(scene, material)
     given = path if isinstance(path, Presses) else None
     presses, used, inward, refused = refuse(scene, material, given, made, bad)
-    if place is not None:
+    if isinstance(material, SectionMaterial):
+        moved = cross_sections(scene, material, used)
+    elif place is not None:
         moved = moved_by(press_at(place, used.displacement, plan.options))
     else:
         moved = (vectors if plan.second_plane else one_plane)(scene, material, used)
     vertices = None
-    if plan.surface is not None:
+    if plan.surface is not None and isinstance(material, Material):
         vertices = deform(scene, material, used, moved, path, made)
     share = depth_share(scene, moved.depth, moved.skeleton, inward)
     force, moment, solved = moved.force, None, moved.status
-    if made is not None and made.pull is not None and isinstance(path, Poses):
+    of_joints = isinstance(material, Material)
+    if made is not None and made.pull is not None and isinstance(path, Poses) and of_joints:
         force, moment = force_by_pose(scene, material, path, used, moved, made)
         lost = (solved == PressStatus.OK) & ~jnp.isfinite(jnp.sum(force + moment, axis=1))
         solved = jnp.where(lost, PressStatus.NON_FINITE, solved)

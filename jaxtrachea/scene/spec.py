@@ -4,6 +4,7 @@ As in `config`: every problem with its dotted key, what was found and what is ex
 the specification is opened here.
 """
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,9 +16,11 @@ from jaxtrachea.config import (
     PositiveLength,
     Rings,
     Section,
+    WallSection,
     load_spec,
     quantity,
 )
+from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMaterial
 from jaxtrachea.scene.declare import Effect
 from jaxtrachea.scene.effects import EFFECTS
 from jaxtrachea.trachea.material import DEEP, VALUES, meaningless
@@ -87,6 +90,24 @@ class MaterialSection(_material_keys()):
             raise ValueError(f"{deep[0]} needs {other}; give {other} too, or remove {deep[0]}")
         return self
 
+
+def _section_keys() -> type[Section]:
+    """A key for each value that `SectionMaterial` declares; a wall may give what is left out."""
+    keys: dict[str, Any] = {}
+    for name, p in SECTION_VALUES.items():
+        number: Any = Annotated[float, quantity(p.dimension, positive=not p.signed)]
+        keys[name] = (number | None, None)
+    return create_model("SectionKeys", __base__=Section, **keys)
+
+
+class SectionsSection(_section_keys()):
+    """[sections]: see `SectionMaterial`; one value for all rings and spans."""
+
+
+#: Values of [sections] that have no default of their own.
+NEEDED = tuple(
+    f.name for f in dataclasses.fields(SectionMaterial) if f.default is dataclasses.MISSING
+)
 
 #: Keys that each shape of tool needs, and those it may have.
 TOOLS = {
@@ -240,7 +261,9 @@ class SceneSpec(Section):
     trachea: SceneTracheaSection = Field(
         default_factory=lambda: SceneTracheaSection.model_validate({})
     )
-    material: MaterialSection
+    material: MaterialSection | None = None
+    sections: SectionsSection | None = None
+    wall: WallSection | None = None
     tool: ToolSection | None = None
     path: list[PathSection] = Field(min_length=1)
     model: LawSection = LawSection()
@@ -255,6 +278,34 @@ class SceneSpec(Section):
         if isinstance(data, dict) and isinstance(data.get("path"), dict):
             return {**data, "path": [data["path"]]}
         return data
+
+    @model_validator(mode="after")
+    def _one_material(self) -> "SceneSpec":
+        sections = self.sections is not None or self.wall is not None
+        if self.material is None and not sections:
+            raise ValueError("material: missing; give [material], or [sections] or [wall]")
+        if self.material is not None and sections:
+            given = "sections" if self.sections is not None else "wall"
+            raise ValueError(
+                f"{given}: not together with [material], which is of a line of joints; remove one"
+            )
+        if sections and self.trachea.file is not None:
+            raise ValueError(
+                "trachea.file: it tells the radius of the outer wall, and deforming cross-sections "
+                "need that of the wall's mid-line; give length, rings and radius of a tube"
+            )
+        if sections and "radius" not in self.trachea.model_fields_set:
+            raise ValueError(
+                "trachea.radius: missing; deforming cross-sections need that of the wall's "
+                "mid-line (11.7 mm of an inner radius of 10 mm and the wall of Table 1)"
+            )
+        if self.wall is None and self.sections is not None:
+            lacking = [name for name in NEEDED if getattr(self.sections, name) is None]
+            if lacking:
+                raise ValueError(
+                    f"sections.{lacking[0]}: missing; give it, or [wall] to derive it from"
+                )
+        return self
 
     @model_validator(mode="after")
     def _agree(self) -> "SceneSpec":

@@ -16,10 +16,12 @@ from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import STANDARD, Settings
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.admission import check_shapes
+from jaxtrachea.mechanics.sections.material import SectionMaterial, check_sections
+from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
-from jaxtrachea.trachea.material import DEEP, Material
+from jaxtrachea.trachea.material import DEEP
 from jaxtrachea.trachea.mesh import Mesh
 
 #: What counts as a normal press on the midline and as one contact point: rad, mm, and share of the
@@ -77,12 +79,15 @@ class Tool:
             raise ValueError(f"friction is {friction}; expected a finite number, not negative")
 
 
-def check_material(geometry: Geometry, material: Material) -> None:
+def check_material(geometry: Geometry, material: AnyMaterial) -> None:
     """Refuse arrays of a wrong length, and half of what a skeleton softens by.
 
     Raises:
         ValueError: naming the value, what was expected and the cure.
     """
+    if isinstance(material, SectionMaterial):
+        check_sections(geometry, material)
+        return
     check_shapes(geometry, material)
     given = {name: getattr(material, name) is not None for name in DEEP}
     if any(given.values()) and not all(given.values()):

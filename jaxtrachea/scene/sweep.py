@@ -11,7 +11,10 @@ from jaxtrachea._arguments import ArrayLike, shaped
 from jaxtrachea.mechanics.oblique import press_oblique
 from jaxtrachea.mechanics.press import press
 from jaxtrachea.mechanics.ring import on_ring
+from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.mechanics.skeleton import local_frame
+from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.ranges import deep, depth_share, lacking
 from jaxtrachea.scene.refusals import REFUSALS, on_the_tube, status_of
 from jaxtrachea.scene.stage import COVERED, Scene
@@ -40,7 +43,7 @@ class Sweep(NamedTuple):
 
 def sweep(
     scene: Scene,
-    material: Material,
+    material: AnyMaterial,
     s: ArrayLike,
     phi: ArrayLike,
     depth: ArrayLike,
@@ -52,7 +55,7 @@ def sweep(
     Args:
         scene: its geometry and the level of rings, skeleton, shear and laws of its plan are used;
             OFF_PLAN where a point presses and the material gives more than the plan has (as in
-            `simulate`), or off the midline on a skeleton that softens.
+            `simulate`), or off the midline on a skeleton that softens or has one plane.
         material: -
         s: mm.
         phi: rad, within the half-angle of the rings; else BEHIND_GAP where it presses.
@@ -70,7 +73,8 @@ def sweep(
     )
 
     unlike = set(lacking(scene, material)) - {"axial"}
-    softens = scene.plan.has("skeleton")
+    flat = scene.plan.has("skeleton") and not scene.plan.second_plane
+    pressed = _PRESSED[scene.plan.options.skeleton]
 
     def one(at):
         s_c, phi_at, d = at
@@ -78,15 +82,15 @@ def sweep(
         behind = on_the_tube(scene, s_c, phi_at)[2] & ~acting
         phi_c, d = (jnp.where(behind, 0, v) for v in (phi_at, d))  # needs nothing of the rings
         inward = local_frame(phi_c)[0]
-        found = (_softening if softens else _vectors)(scene, material, s_c, phi_c, d)
+        found = pressed(scene, material, s_c, phi_c, d)
         force, way, depth = (v @ inward for v in (found.force, found.skeleton, found.depth))
         free = ~(force != 0)
         softness = jnp.where(free, jnp.nan, way / jnp.where(free, 1, force))
         share = depth_share(scene, found.depth, found.skeleton, inward)
         refused = {PressStatus.NON_FINITE: jnp.isnan(s_c + phi_at + d)}
-        if unlike or softens:
+        if unlike or flat:
             off = acting
-            if softens and not unlike:
+            if flat and not unlike:
                 off = acting & (jnp.abs(phi_at) > COVERED)
             elif unlike == {"skeleton"}:
                 off = acting & deep(scene, d)
@@ -126,3 +130,21 @@ def _softening(scene: Scene, material: Material, s_c, phi_c, depth) -> _Pressed:
     status = jnp.where(on, found.status, PressStatus.BEHIND_GAP)
     force, depth, skeleton = (v * inward for v in (found.force, found.depth, found.skeleton))
     return _Pressed(force, depth, skeleton, status)
+
+
+def _sections(scene: Scene, material: SectionMaterial, s_c, phi_c, depth) -> _Pressed:
+    """On deforming cross-sections, anywhere on the rings; with one plane on the midline."""
+    flat = not scene.plan.second_plane
+    inward = local_frame(phi_c)[0]
+    on = on_ring(scene.geometry.half_angle, phi_c)[0]
+    at = jnp.zeros_like(phi_c) if flat else phi_c
+    found = press_sections(scene.geometry, material, s_c, at, depth[None], midline=flat)
+    status = jnp.where(on, found.status[0], PressStatus.BEHIND_GAP)
+    normal = local_frame(at)[0]
+    force, way, skeleton = (
+        jnp.sum(v[0] * normal) * inward for v in (found.force, found.depth, found.skeleton)
+    )
+    return _Pressed(force, way, skeleton, status)
+
+
+_PRESSED = {"linear": _vectors, "softening": _softening, "sections": _sections}

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea.contact.search import FINE
+from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.assemble import with_geometry, with_mesh
 from jaxtrachea.scene.build import Staged, effects_of
 from jaxtrachea.scene.declare import PlanError, SceneFacts
@@ -124,6 +125,9 @@ def full_scene(spec: SceneSpec, staged: Staged, *, coupling: str | None = None) 
         PlanError: a wish that cannot be met.
     """
     scene, material, path = staged.scene, staged.material, staged.path
+    if isinstance(material, SectionMaterial):
+        why = "nothing of deforming cross-sections is traded for time"
+        raise PlanError("skeleton", "'sections'", why, "leave [plan] out, or give [material]")
     facts, given = facts_of(scene, material, path), effects_of(spec)
     options, finest = _finest(given, scene, material, path)
     if coupling is not None:

@@ -401,7 +401,7 @@ def test_half_a_law_is_refused(one, other):
 def test_a_plan_of_vectors_has_no_skeleton_that_softens():
     plan = make_scene(TUBE, MATERIAL, down([4.0]), effects=BARE).plan
     assert plan.second_plane
-    with pytest.raises(InputError, match="options.skeleton is 'softening', with a second_plane"):
+    with pytest.raises(InputError, match="options.skeleton is 'softening', with second_plane 'on'"):
         plan.at(skeleton="softening")
     flat = make_scene(TUBE, SOFT, down([4.0]), effects=BARE).plan
     assert flat.without("skeleton").ignored >= {"skeleton"}

@@ -138,7 +138,7 @@ class _Asked(NamedTuple):
 def _admit(geometry, material, s_c, phi_c, direction, midline) -> _Asked:
     off_tube = ~((s_c >= 0) & (s_c <= geometry.length))
     on, phi = on_ring(geometry.half_angle, phi_c)
-    material, bad, unknown = _safe_values(material)
+    material, bad, unknown = safe_values(material)
     place = jnp.isfinite(s_c) & jnp.isfinite(phi_c) & jnp.all(jnp.isfinite(direction))
     refused = jnp.where(bad, PressStatus.BAD_MATERIAL, PressStatus.OK)
     refused = jnp.where(on, refused, PressStatus.BEHIND_GAP)
@@ -153,7 +153,7 @@ def _admit(geometry, material, s_c, phi_c, direction, midline) -> _Asked:
     return _Asked(SectionMaterial(**material), s_c, phi, direction, refused)
 
 
-def _safe_values(material: SectionMaterial) -> tuple[dict[str, Any], Array, Array]:
+def safe_values(material: SectionMaterial) -> tuple[dict[str, Any], Array, Array]:
     """Values with 1 for those that no press can have; whether any is too low, or not finite."""
     safe, bad, unknown = {}, jnp.zeros((), bool), jnp.zeros((), bool)
     for field in dataclasses.fields(material):

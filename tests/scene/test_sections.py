@@ -1,0 +1,270 @@
+"""Deforming cross-sections in scenes: presses anywhere on the rings, and what is refused."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_scenes import BALL, BARE, MATERIAL, ball
+
+from jaxtrachea import (
+    EffectOptions,
+    Geometry,
+    PlanError,
+    Presses,
+    Session,
+    make_scene,
+    simulate,
+    sweep,
+)
+from jaxtrachea._errors import InputError
+from jaxtrachea.mechanics.sections.material import from_wall
+from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.mechanics.skeleton import local_frame
+from jaxtrachea.scene.build import stage
+from jaxtrachea.scene.declare import SECTIONS, SceneFacts
+from jaxtrachea.scene.rules import make_plan
+from jaxtrachea.scene.spec import SceneSpec
+from jaxtrachea.status import PressStatus
+from jaxtrachea.tradeoff.levels import full_scene
+
+pytestmark = pytest.mark.compiling
+
+ROOT = Path(__file__).parents[2]
+TUBE = Geometry.create(160.0, 10.0 * np.arange(1, 16), radius=11.7)
+WALL = from_wall(TUBE)
+BONDED = dataclasses.replace(BARE, contact="bonded")
+OK, OFF_PLAN = PressStatus.OK, PressStatus.OFF_PLAN
+run = jax.jit(simulate)
+
+
+def straight(s, phi, depth):
+    """Presses along the inward normal."""
+    s, phi, depth = np.broadcast_arrays(
+        *(np.atleast_1d(np.asarray(v, float)) for v in (s, phi, depth))
+    )
+    D = depth[:, None] * np.stack([0 * phi, -np.cos(phi), -np.sin(phi)], 1)
+    return Presses(s, phi, D)
+
+
+#: Any place on the rings, in any direction across the tube: one program.
+ANYWHERE = make_scene(TUBE, WALL, straight([75, 70], [0.5, 0.0], 2.0), effects=BONDED)
+
+
+def finite_element(angle):
+    """Displacement, normal and side force of the specimen of fits/virtual_trachea, s = 70 mm."""
+    with h5py.File(ROOT / "fits" / "virtual_trachea" / "off_midline.h5") as file:
+        curve = file[f"specimens/virtual/s070.0 phi{angle}"]
+        return {k: curve[k][()] for k in ("displacement", "force", "side_force")}
+
+
+def test_rows_are_presses_of_their_own_in_any_order():
+    """Each as `press_sections` has it along a path of its own; a draw and no motion among them."""
+    s, phi = [75.0, 70.0, 75.0, 75.0, 22.0], [0.5, 0.0, -0.5, 0.5, 1.2]
+    depth = [4.0, 2.0, 4.0, 0.0, -2.0]
+    path = straight(s, phi, depth)
+    out = run(ANYWHERE, WALL, path)
+    assert out.status.tolist() == [OK, OK, OK, PressStatus.NO_CONTACT, OK]
+    assert out.loads is out.vertices is None
+    alone = jax.jit(press_sections)
+    for i in range(5):
+        one = alone(TUBE, WALL, s[i], phi[i], jnp.array([0.5, 1.0]) * depth[i])
+        for name in ("force", "depth", "skeleton", "joints", "end_U", "end_V"):
+            found, true = getattr(out, name)[i], getattr(one, name)[-1]
+            np.testing.assert_allclose(found, true, atol=1e-11, err_msg=name)
+    # The other side is the mirror image: z turned round, the ends exchanged.
+    mirror = np.array([1.0, 1.0, -1.0])
+    np.testing.assert_allclose(out.force[2], mirror * np.asarray(out.force[0]), atol=1e-11)
+    np.testing.assert_allclose(out.end_V[2], mirror * np.asarray(out.end_U[0]), atol=1e-11)
+    np.testing.assert_allclose(out.skeleton[0] + out.depth[0], path.displacement[0], atol=1e-12)
+
+
+def test_an_oblique_press_is_that_of_its_direction():
+    inward, _, across = np.asarray(local_frame(jnp.asarray(0.4)))
+    path = Presses([70.0] * 5, [0.4] * 5, np.tile(3 * inward - 1 * across, (5, 1)))
+    out = run(ANYWHERE, WALL, path)
+    one = jax.jit(press_sections)(
+        TUBE, WALL, 70.0, 0.4, jnp.array([0.5, 1.0]) * 10**0.5, jnp.array([3.0, -1.0]) / 10**0.5
+    )
+    np.testing.assert_allclose(out.force[0], one.force[-1], atol=1e-11)
+    np.testing.assert_allclose(out.joints[4], one.joints[-1], atol=1e-11)
+
+
+def test_each_row_has_its_status():
+    """Along the tube, off the tube, behind the rings, not finite, too deep; a bad stiffness."""
+    path = straight([75, 500, 75, 75, 75], [0.3, 0.3, 3.0, np.nan, 0.3], [1, 1, 1, 1, 14.0])
+    D = np.array(path.displacement)
+    D[0, 0] = 0.5
+    out = run(ANYWHERE, WALL, Presses(path.s, path.phi, D))
+    status = np.asarray(out.status).tolist()
+    assert status[:4] == [
+        OFF_PLAN, PressStatus.OFF_TUBE, PressStatus.BEHIND_GAP, PressStatus.NON_FINITE
+    ]  # fmt: skip
+    assert status[4] in (PressStatus.TOO_DEEP, PressStatus.PAST_FOLD)
+    assert np.isnan(out.force[:4]).any(axis=1).all()
+    bad = dataclasses.replace(WALL, EI_C=-1.0 * WALL.EI_C)
+    assert run(ANYWHERE, bad, path).status.tolist() == [PressStatus.BAD_MATERIAL] * 5
+
+
+@pytest.mark.slow
+def test_against_finite_elements_off_the_midline():
+    """At 30 and 90 deg to 6 mm, stiffnesses from the wall's moduli: within 6 % of the peak.
+
+    A line of joints errs by 44 % at 90 deg (docs/off_midline.md).
+    """
+    for angle in (30, 90):
+        curve = finite_element(angle)
+        D, phi = curve["displacement"], np.radians(angle)
+        out = run(ANYWHERE, WALL, straight(70.0, phi, D))
+        normal = np.asarray(out.force) @ np.array([0, -np.cos(phi), -np.sin(phi)])
+        force = curve["force"]
+        assert np.abs(normal - force).max() < 0.06 * force.max()
+        side = np.asarray(out.force) @ np.array([0, -np.sin(phi), np.cos(phi)])
+        deep = D >= 0.5
+        off = side[deep] / normal[deep] - curve["side_force"][deep] / force[deep]
+        assert np.abs(off).max() < 0.08
+
+
+def test_a_tool_presses_as_presses_do():
+    """Led down on the midline, glued where it touches: the program of one plane."""
+    path = ball([75, 1, 0], [75, -3, 0], 4, top=float(TUBE.radius + WALL.offset))
+    scene = make_scene(TUBE, WALL, path, tool=BALL, effects=BONDED)
+    assert (scene.plan.second_plane, scene.plan.level("skeleton")) == (False, "sections")
+    out = run(scene, WALL, path)
+    assert out.status.tolist() == [PressStatus.NO_CONTACT, OK, OK, OK]
+    depth = -np.asarray(out.displacement[:, 1])
+    assert float(out.s[0]) == pytest.approx(75.0, abs=0.01)
+    one = jax.jit(lambda s: press_sections(TUBE, WALL, s, 0.0, depth, midline=True))(out.s[0])
+    np.testing.assert_allclose(out.force, one.force, atol=1e-9)
+    np.testing.assert_allclose(out.end_U, one.end_U, atol=1e-9)
+    with pytest.raises(ValueError, match="session has no skeleton 'sections'"):
+        Session(scene, WALL)
+    with pytest.raises(ValueError, match="material is Material; expected SectionMaterial"):
+        simulate(scene, MATERIAL, path)
+    # Off the midline it has no program, and says so.
+    flat = dataclasses.replace(scene, plan=dataclasses.replace(scene.plan, contact=False))
+    asked = jax.eval_shape(simulate, flat, WALL, straight([75.0] * 4, 0.3, 1.0))
+    assert asked.status.shape == (4,)
+
+
+@pytest.mark.slow
+def test_derivatives_are_those_of_the_equilibrium():
+    """By the material and the way: forward = reverse = differences of fourth order."""
+    path = straight([75.0, 70.0], [0.5, 1.2], 3.0)
+
+    def values(x):
+        material = dataclasses.replace(WALL, EI_C=WALL.EI_C * x[0], c_W=WALL.c_W * x[1])
+        out = simulate(ANYWHERE, material, Presses(path.s, path.phi, path.displacement * x[2]))
+        return jnp.concatenate([out.force.ravel(), out.end_U[:, 7].ravel()])
+
+    x = jnp.ones(3)
+    value = jax.jit(values)
+    forward, reverse = jax.jit(jax.jacfwd(values))(x), jax.jit(jax.jacrev(values))(x)
+    np.testing.assert_allclose(forward, reverse, atol=1e-10)
+    h = 1e-3
+    for i, e in enumerate(np.eye(3)):
+        near = [value(x + k * h * e) for k in (1, -1, 2, -2)]
+        difference = (8 * (near[0] - near[1]) - (near[2] - near[3])) / (12 * h)
+        np.testing.assert_allclose(forward[:, i], difference, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_sweep_goes_round_the_rings():
+    s, phi, depth = [75.0, 75.0, 70.0, 75.0, 75.0], [0.6, -0.6, 0.0, 3.0, 0.2], [2.0, 2, 2, 2, 0]
+    out = jax.jit(sweep)(ANYWHERE, WALL, s, phi, depth)
+    assert out.status.tolist() == [OK, OK, OK, PressStatus.BEHIND_GAP, PressStatus.NO_CONTACT]
+    np.testing.assert_allclose(out.force[0], out.force[1], rtol=1e-10)
+    rows = run(ANYWHERE, WALL, straight(s, phi, depth))
+    force = np.asarray(rows.force)
+    along = -force[:, 1] * np.cos(phi) - force[:, 2] * np.sin(phi)
+    np.testing.assert_allclose(out.force[:3], along[:3], rtol=1e-10)
+    np.testing.assert_allclose((out.compliance * out.force + out.indentation)[:3], 2.0)
+
+
+KNOWN = {"known": frozenset({SECTIONS})}
+ASKED = {"want_surface": False, "contact": "bonded"}
+
+
+@pytest.mark.parametrize(
+    ("facts", "effects", "says"),
+    [
+        ({}, {"contact": "bonded"}, "surface: asked for, but .* no surface.*output.surface"),
+        ({}, {"want_surface": False}, "needs contact='bonded', found 'unilateral'.*set contact"),
+        ({}, ASKED | {"coupling": "total"}, "needs coupling='series'"),
+        ({}, ASKED | {"onset_width": 0.1}, "needs onset_width"),
+        ({"along": 0.5}, ASKED, "moves along the tube"),
+        ({"poses": True, "slip": 9.0, "spacing": 2.0}, ASKED | {"contact_point": "per_step"},
+         "wanders.*contact_point 'fixed'"),
+        ({}, ASKED | {"skeleton": "linear"}, "'linear', but the material is that of deforming"),
+        ({}, ASKED | {"skeleton": "softening"}, "'softening', but the material is that of def"),
+        ({}, ASKED | {"rings": "arch2"}, "rings: 'arch2', but a ring is a cross-section"),
+        ({}, ASKED | {"axial": "on"}, "EA_L is not given"),
+        ({}, ASKED | {"shear": "on"}, "GA_L is not given"),
+    ],
+)  # fmt: skip
+def test_what_cross_sections_have_not_is_refused(facts, effects, says):
+    with pytest.raises(PlanError, match=says):
+        make_plan(SceneFacts(**KNOWN, **facts), EffectOptions(**effects))
+
+
+def test_a_line_of_joints_has_no_cross_sections():
+    with pytest.raises(PlanError, match="skeleton: 'sections', but the material is that of a line"):
+        make_plan(SceneFacts(), EffectOptions(**ASKED, skeleton="sections"))
+    plan = make_plan(SceneFacts(**KNOWN), EffectOptions(**ASKED))
+    assert (plan.without("skeleton"), plan.level("skeleton")) == (None, "sections")
+    for changed in ({"axial": "on"}, {"rings": "arch2"}, {"surface": "hermite"}, {"shear": "on"}):
+        with pytest.raises((InputError, ValueError), match="sections"):
+            plan.at(second_plane="on", **changed)
+    with pytest.raises(InputError, match="contact_point 'per_step' of a tool"):
+        dataclasses.replace(plan, contact=True, contact_point="per_step")
+
+
+SCENE = {
+    "trachea": {"radius": "11.7 mm"},
+    "wall": {"E_C": "5.8 MPa"},
+    "model": {"contact": "bonded"},
+    "path": {"s": "75 mm", "phi": "30 deg", "displacement": ["0 mm", "-1 mm", "0 mm"], "steps": 2},
+    "output": {"surface": False},
+}  # fmt: skip
+
+
+def test_material_of_a_file():
+    """What [wall] gives, and [sections] names; or all of it in [sections]."""
+
+    def material(**tables):
+        return stage(SceneSpec.model_validate(SCENE | tables), Path()).material
+
+    tube = Geometry.create(160.0, 10.0 * np.arange(1, 16), radius=11.7)
+    staged = stage(SceneSpec.model_validate(SCENE), Path())
+    outer = 10.0 + 2.6 + 11.7 - 11.730  # mid-line of a ring: tests/sections/test_specimen.py
+    assert float(staged.scene.radius) == pytest.approx(outer, abs=1e-3)
+    both = material(sections={"EI_C": "30 N mm^2", "c_n": "0.004 mm/N"})
+    expected = dataclasses.replace(from_wall(tube), EI_C=30.0, c_n=0.004)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), both, expected))
+    said = {
+        "offset": "0.9 mm", "EI_C": "23 N mm^2", "EI_M": "2 N mm^2", "Et_M": "0.6 N/mm",
+        "bed_n": "0.02 N/mm^3", "bed_t": "0.002 N/mm^3", "Gt_L": "20 N/mm", "Et_L": "1.2 N/mm",
+        "D_L": "4 N mm", "c_W": "0.9 1/N/mm",
+    }  # fmt: skip
+    alone = material(wall=None, sections=said)
+    assert (float(alone.D_L), float(alone.rho)) == (4.0, 1e-3)
+    assert np.isinf(alone.k_end)
+    with pytest.raises(ValueError, match=re.escape("sections.D_L: missing; give it, or [wall]")):
+        material(wall=None, sections={k: v for k, v in said.items() if k != "D_L"})
+    with pytest.raises(ValueError, match=r"sections: not together with \[material\]"):
+        material(sections=said, material={"EI_L": "1 N mm^2", "k_M": "1 N/mm", "k_1": "1 N/mm",
+                                          "k_3": "0 N/mm^3"})  # fmt: skip
+    with pytest.raises(ValueError, match="trachea.file: .* outer wall"):
+        material(trachea={"file": "a.stl"})
+    with pytest.raises(ValueError, match="wall.h_C is 4.0 mm"):
+        material(wall={"h_C": "4 mm"})
+
+
+def test_cross_sections_are_not_traded():
+    spec = SceneSpec.model_validate(SCENE)
+    with pytest.raises(PlanError, match="nothing of deforming cross-sections is traded"):
+        full_scene(spec, stage(spec, Path()))
