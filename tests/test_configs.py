@@ -74,6 +74,7 @@ LATER = {
     "imported_tool",
     "capsule",
     "cross_sections",
+    "deep",
     "friction",
     "left_down",
     "right_down",
@@ -131,6 +132,7 @@ def test_sweep_runs(tmp_path, monkeypatch, capsys):
     assert (force[:, 1] < 0.9 * force[:, 3]).all()
 
 
+@pytest.mark.slow
 def test_a_sweep_of_a_skeleton_that_softens_is_one_of_the_midline(tmp_path, monkeypatch, capsys):
     """Off it the command names the cure; on it, it says which skeleton it pressed."""
     monkeypatch.chdir(tmp_path)

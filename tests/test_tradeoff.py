@@ -156,6 +156,7 @@ def test_ladders_of_a_scene_and_why_others_are_left_out():
     assert (kinds["form"], kinds["dtype"], kinds["shear"]) == ("algebra", "truncation", "model")
 
 
+@pytest.mark.slow
 def test_ladder_of_the_skeleton():
     """Linear instead of softening errs as by hand; coupling is not climbed; vectors have none."""
     law = {"e_1": "0.1 1/mm", "e_2": "0.005 1/mm^2", "k_1": "1e6 N/mm", "k_3": "0 N/mm^3"}

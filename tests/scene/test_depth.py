@@ -104,6 +104,7 @@ def test_force_and_skeleton_are_those_of_the_law(s):
             assert not found[:, [0, 2]].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_without_softening_it_is_the_linear_skeleton(dtype):
     """e_1 = e_2 = 0: force, joints and surface, to rounding; and both precisions agree."""
@@ -162,6 +163,7 @@ def test_the_work_of_the_tool_is_what_is_stored():
         np.testing.assert_allclose(work, float(stored), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shear", [False, True])
 def test_the_energy_by_the_place_is_that_of_the_work(shear):
     """Differences of fourth order of W(d) + G(u) / c in 40 digits; shear: another branch of it."""
@@ -198,6 +200,7 @@ def test_the_energy_by_the_place_is_that_of_the_work(shear):
     np.testing.assert_allclose(by, float(true), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_closed_loops_of_a_tool_that_wanders_do_no_work():
     """On the midline, up and down along the tube; the trapezoidal rule errs by its square."""
     effects = dataclasses.replace(BARE, contact_point="per_step")
@@ -218,6 +221,7 @@ def test_closed_loops_of_a_tool_that_wanders_do_no_work():
     assert found[1] < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contact_point", ["fixed", "per_step"])
 def test_steps_of_a_session_are_the_rows_of_simulate(contact_point):
     """Past the fold too: that row is NaN, the next is as if it had not been."""
@@ -244,6 +248,7 @@ def test_steps_of_a_session_are_the_rows_of_simulate(contact_point):
             )
 
 
+@pytest.mark.slow
 def test_derivatives_and_lanes():
     """Forward = reverse = differences by material and displacement; `vmap` over e_1."""
     path = down([1.0, 4.0], 73.3)
@@ -349,6 +354,7 @@ def test_ways_of_a_path_over_the_radius():
         assert least <= 0
 
 
+@pytest.mark.slow
 def test_rows_that_need_a_softer_skeleton_are_off_the_plan():
     """A plan made shallow: its linear skeleton serves what is shallow."""
     limit = SHALLOW * OUTER

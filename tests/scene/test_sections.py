@@ -62,6 +62,7 @@ def finite_element(angle):
         return {k: curve[k][()] for k in ("displacement", "force", "side_force")}
 
 
+@pytest.mark.slow
 def test_rows_are_presses_of_their_own_in_any_order():
     """Each as `press_sections` has it along a path of its own; a draw and no motion among them."""
     s, phi = [75.0, 70.0, 75.0, 75.0, 22.0], [0.5, 0.0, -0.5, 0.5, 1.2]
@@ -100,6 +101,7 @@ def test_float32():
         np.testing.assert_allclose(a, b, atol=1e-3 * np.abs(b).max(), err_msg=name)
 
 
+@pytest.mark.slow
 def test_an_oblique_press_is_that_of_its_direction():
     inward, _, across = np.asarray(local_frame(jnp.asarray(0.4)))
     path = Presses([70.0] * 5, [0.4] * 5, np.tile(3 * inward - 1 * across, (5, 1)))
@@ -111,6 +113,7 @@ def test_an_oblique_press_is_that_of_its_direction():
     np.testing.assert_allclose(out.joints[4], one.joints[-1], atol=1e-11)
 
 
+@pytest.mark.slow
 def test_each_row_has_its_status():
     """Along the tube, off the tube, behind the rings, not finite, too deep; a bad stiffness."""
     path = straight([75, 500, 75, 75, 75], [0.3, 0.3, 3.0, np.nan, 0.3], [1, 1, 1, 1, 14.0])
@@ -146,6 +149,7 @@ def test_against_finite_elements_off_the_midline():
         assert np.abs(off).max() < 0.08
 
 
+@pytest.mark.slow
 def test_a_tool_presses_as_presses_do():
     """Led down on the midline, glued where it touches: the program of one plane."""
     path = ball([75, 1, 0], [75, -3, 0], 4, top=float(TUBE.radius + WALL.offset))
