@@ -132,7 +132,7 @@ def test_each_row_has_its_status():
 
 @pytest.mark.slow
 def test_against_finite_elements_off_the_midline():
-    """At 30 and 90 deg to 6 mm, stiffnesses from the wall's moduli: within 6 % of the peak.
+    """At 30 and 90 deg to 6 mm, stiffnesses from the wall's moduli: within 4 % of the peak.
 
     A line of joints errs by 44 % at 90 deg (docs/off_midline.md).
     """
@@ -142,7 +142,7 @@ def test_against_finite_elements_off_the_midline():
         out = run(ANYWHERE, WALL, straight(70.0, phi, D))
         normal = np.asarray(out.force) @ np.array([0, -np.cos(phi), -np.sin(phi)])
         force = curve["force"]
-        assert np.abs(normal - force).max() < 0.06 * force.max()
+        assert np.abs(normal - force).max() < 0.04 * force.max()
         side = np.asarray(out.force) @ np.array([0, -np.sin(phi), np.cos(phi)])
         deep = D >= 0.5
         off = side[deep] / normal[deep] - curve["side_force"][deep] / force[deep]
