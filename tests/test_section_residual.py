@@ -11,9 +11,9 @@ import pytest
 
 from jaxtrachea.cli.specification import options_of, parameters_of
 from jaxtrachea.config import SpecError, load_fit_spec
-from jaxtrachea.fitting import structure
+from jaxtrachea.fitting import shared, structure
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.lane import observations, size, without_data
+from jaxtrachea.fitting.lane import data_weight, observations, size, without_data
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS, defaults_of
 from jaxtrachea.fitting.predictions import Prediction
@@ -32,6 +32,7 @@ from jaxtrachea.mechanics.oblique import ObliqueOptions, press_oblique
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.sections.material import SectionMaterial, Wall, from_wall
 from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -298,6 +299,33 @@ def test_lanes():
     lanes = study_of([curve(PLACES[1], **only_ends)]).lanes
     assert np.sum(lanes.end_precision > 0) == 6
     assert np.sum(lanes.joint_precision > 0) == 0
+
+
+def test_weight_of_the_data_is_that_of_all_forces():
+    """Side forces, curve weights and noise count, of one lane and of the lanes of a joint fit."""
+    of = zip(("one", "one", "two"), PLACES, (3, 5, 4), strict=True)
+    curves = [
+        dataclasses.replace(curve(place, np.linspace(0.5, 5.0, n)), specimen=specimen)
+        for specimen, place, n in of
+    ]
+    table = NAMED | {"EI_C": {"scope": "shared"}}
+    study = study_of(curves, table, joint=True)
+    sigma = np.array([[2.0, 1.0], [2.0, 1.0]])
+    # A normal press on the midline has no side force to tell; every curve weighs as one of 4.
+    squares = [np.sum(c.force**2) + (c.phi_c != 0) * np.sum(c.side_force**2) for c in curves]
+    each = [
+        4 / len(c.force) * s / (0.05 * 2.0) ** 2 / 2 for c, s in zip(curves, squares, strict=True)
+    ]
+    wanted = np.array([each[0] + each[1], each[2]])
+    np.testing.assert_allclose(data_weight(study.lanes, sigma), wanted, rtol=1e-12)
+    one = lane_of(study)
+    np.testing.assert_allclose(data_weight(one, jnp.asarray(sigma[0])), wanted[0], rtol=1e-12)
+    # Nothing is left of the cost but roundings: a hundred of each force, in each of two lanes.
+    task = shared._Task(study, sigma, Tolerances(), 1, np.float64, study.shared)
+    none, P = np.zeros(2), study.size
+    here = shared.Evaluated(np.zeros((2, P)), none, np.zeros((2, P)), np.zeros((2, P, P)))
+    exact = np.sum(wanted) / 2 * (100 * np.finfo(float).eps) ** 2
+    np.testing.assert_allclose(shared._floor(task, here, none == 0), exact, rtol=1e-12)
 
 
 def test_repeats_are_of_the_same_angle_and_direction():

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea._numerics import epsilon
-from jaxtrachea.fitting.lane import Lane, force_entries, forces, size
+from jaxtrachea.fitting.lane import Lane, data_weight, force_entries, size
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import of_trials, residual, residual_value
 from jaxtrachea.trachea.geometry import Geometry
@@ -121,15 +121,21 @@ def assemble(model: FitModel, parts: Array, lane: Lane) -> Array:
     return zero.at[place[:, :, None], place[:, None, :]].add(parts, mode="drop")
 
 
-def rounding_cost(
-    lane: Lane, sigma: Float[Array, "2"], roundings: float = 10.0
-) -> Float[Array, ""]:
-    """Cost that rounding alone leaves: so many roundings of every force."""
-    balance = lane.balance[:, None]
-    kinds = forces(lane)
-    parts = [jnp.sum((kind.data * kind.precision * balance / sigma[0]) ** 2) for kind in kinds]
-    data = jnp.sum(jnp.stack(parts))
-    return 0.5 * data * (roundings * epsilon(lane.force.dtype)) ** 2
+def rounding_cost(model: FitModel, lane: Lane, sigma: Any, dtype: Any = None) -> Any:
+    """Cost that rounding alone leaves: ten roundings of every force, of one lane or of many.
+
+    Of deforming cross-sections a hundred: an equilibrium found by iteration leaves more than a
+    formula.
+
+    Args:
+        model: what is fitted (static).
+        lane: without or with leading axes.
+        sigma: of (force, markers), likewise.
+        dtype: of the computation; None: that of the lane.
+    """
+    roundings = 100.0 if model.options.skeleton == "sections" else 10.0
+    of_one = roundings * epsilon(lane.force.dtype if dtype is None else dtype)
+    return data_weight(lane, sigma) * of_one**2
 
 
 class LaneCost(eqx.Module):
@@ -195,6 +201,5 @@ class LaneCost(eqx.Module):
         return Point(zeros(T, m), zeros(T, Jf, m), zeros(), zeros(P), zeros(P, P))
 
     def rounding(self) -> Float[Array, ""]:
-        """See `rounding_cost`; an equilibrium found by iteration leaves more than a formula."""
-        iterated = self.model.options.skeleton == "sections"
-        return rounding_cost(self.lane, self.sigma, 100.0 if iterated else 10.0)
+        """See `rounding_cost`."""
+        return rounding_cost(self.model, self.lane, self.sigma)

@@ -148,7 +148,7 @@ def _descend(model, descent: Descent, start, lane, sigma):
     point = evaluate(model, theta, lane, sigma)
     left = jnp.max(promise(theta, point, lane))
     steep = left > NEARLY_FLAT * jnp.sqrt(2 * point.cost)
-    steep &= (status == FitStatus.CONVERGED) & (value > rounding_cost(lane, sigma))
+    steep &= (status == FitStatus.CONVERGED) & (value > rounding_cost(model, lane, sigma))
     status = jnp.where(steep, FitStatus.STALLED, status)
     bad = jnp.where(blocks == 0, FitStatus.INFEASIBLE_START, FitStatus.NON_FINITE)
     return theta, value, jnp.where(jnp.isfinite(value), status, bad), block * blocks

@@ -136,6 +136,18 @@ def weighted(v: Float[Array, "*n"], precision: Float[Array, "*n"]) -> Float[Arra
     return jnp.where(precision > 0, v, 0) * precision
 
 
+def data_weight(lane: Lane, sigma: Any) -> Any:
+    """Half the weighted sum of squares of measured forces, of one lane or many; numpy or JAX.
+
+    Args:
+        lane: without or with leading axes.
+        sigma: of force and markers in units of the lane's precision; (*leading axes, 2).
+    """
+    weight = lane.balance[..., None] / sigma[..., :1, None]
+    parts = [kind.data * kind.precision * weight for kind in forces(lane)]
+    return 0.5 * sum((z * z).sum(axis=(-2, -1)) for z in parts)
+
+
 def without_data(lane: Lane, hidden: Any) -> Lane:
     """The lane, or lanes, with the trials `hidden` (of the shape of `s_c`) unobserved; numpy."""
     blind = {}

@@ -10,7 +10,7 @@ from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.information import Information, informations
 from jaxtrachea.fitting.joint_information import pooled, unknown_count
-from jaxtrachea.fitting.lane import forces
+from jaxtrachea.fitting.lane import data_weight
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, noise_rounds
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.shared import solve_jointly
@@ -110,7 +110,8 @@ def _from_starts(study: Study, settings: Settings, starts, sigma, progress):
     solved = _solve(study, settings, rows, starts, sigma, progress)
     if drawn:
         again = functools.partial(_solve_more, study, settings, sigma, progress)
-        rows, solved = add_starts(study, settings, rows, solved, data_weight(study, sigma), again)
+        weight = data_weight(study.lanes, sigma)
+        rows, solved = add_starts(study, settings, rows, solved, weight, again)
     lowest, agree = best(rows, solved, lanes)
     tried = np.bincount(rows, minlength=lanes)
     chosen = Solved(*(v[lowest] for v in solved))
@@ -131,14 +132,6 @@ def _solve_more(study, settings, sigma, progress, rows, starts) -> Solved:
     alive = None if progress is None else lambda done, of: progress(0, of)
     solved = _solve(study, settings, rows[filled], starts[filled], sigma, alive)
     return Solved(*(v[: len(rows)] for v in solved))
-
-
-def data_weight(study: Study, sigma: np.ndarray) -> np.ndarray:
-    """Half the weighted sum of squares of the measured forces; (lanes,)."""
-    lanes = study.lanes
-    weight = lanes.balance[:, :, None] / sigma[:, :1, None]
-    parts = [kind.data * kind.precision * weight for kind in forces(lanes)]
-    return 0.5 * np.sum([np.sum(z * z, axis=(1, 2)) for z in parts], axis=0)
 
 
 def _solve(study: Study, settings: Settings, rows, starts, sigma, progress) -> Solved:

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fitting.doubt import APART
-from jaxtrachea.fitting.minima import Minima, data_weight
+from jaxtrachea.fitting.lane import data_weight
+from jaxtrachea.fitting.minima import Minima
 from jaxtrachea.fitting.natural_sizes import natural_sizes
 from jaxtrachea.fitting.other_starts import soft_starts, twins
 from jaxtrachea.fitting.profile_search import Sides, find_ends
@@ -56,7 +57,7 @@ class _Region:
         self.cost[lanes] = sides.costs(lanes, result.theta[lanes])
         self.dispersion = result.uncertainty.dispersion
         self.threshold = result.uncertainty.half_width**2
-        self.floor = EXACT * data_weight(result.study, result.whitened_sigma)
+        self.floor = EXACT * data_weight(result.study.lanes, result.whitened_sigma)
         self.low, self.high = result.theta.copy(), result.theta.copy()
         self.at_low = np.repeat(result.theta[:, None], result.theta.shape[1], axis=1)
         self.at_high = self.at_low.copy()

@@ -19,7 +19,7 @@ import scipy.linalg
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._numerics import epsilon
-from jaxtrachea.fitting.cost import LaneCost, evaluate
+from jaxtrachea.fitting.cost import LaneCost, evaluate, rounding_cost
 from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
@@ -278,10 +278,10 @@ def _floor(task: _Task, here: Evaluated, alive) -> float:
     alive = alive & here.finite
     if not alive.any():
         return 0.0
-    lanes = task.study.lanes
-    data = np.sum((lanes.force * lanes.precision)[alive] ** 2) / task.sigma[alive][0, 0] ** 2
-    total = 0.01 * task.tolerance * np.sum(here.cost[alive])
-    return (total + 0.5 * data * (10 * epsilon(task.dtype)) ** 2) / np.sum(alive)
+    study = task.study
+    exact = rounding_cost(study.model, study.lanes, task.sigma, task.dtype)[alive]
+    share = 0.01 * task.tolerance * np.sum(here.cost[alive])
+    return (share + np.sum(exact)) / np.sum(alive)
 
 
 def _rounding(task: _Task, here: Evaluated, alive) -> float:
