@@ -18,7 +18,7 @@ from jaxtrachea.measurements.parts import Segment
 from jaxtrachea.measurements.plausible import doubt_of
 from jaxtrachea.measurements.usage import Usage
 from jaxtrachea.measurements.vectors import (
-    VECTORS,
+    FURTHER_FIELDS,
     check_vector_shapes,
     check_vector_sizes,
     unit_direction,
@@ -204,7 +204,7 @@ def _curve(
     options: ReadOptions,
 ) -> Curve | None:
     """The curve of a plain record; None if its position, direction or vectors are odd."""
-    some = any(getattr(raw, name) is not None for name in VECTORS)
+    some = any(getattr(raw, name) is not None for name in FURTHER_FIELDS)
     start, stop = block.edges[k : k + 2]
     size = stop - start
     try:

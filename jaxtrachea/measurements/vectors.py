@@ -12,7 +12,7 @@ UNIT_LENGTH = 1e-3
 #: Below this difference a length is 1 but for rounding, and its direction left as it is.
 _ROUNDING = 1e-12
 #: Fields that a curve of force and displacement alone does not have.
-VECTORS = (
+FURTHER_FIELDS = (
     "side_force", "joint_rings", "joint_displacement", "joint_side_displacement", "end_rings",
     "end_U", "end_V",
 )  # fmt: skip
