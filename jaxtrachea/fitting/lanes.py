@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jaxtrachea._arguments import check_record
-from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lane import FORCES, MARKERS, Lane
 from jaxtrachea.fitting.model import Loss
 from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.measurements.read import Curve
@@ -255,11 +255,11 @@ def _blank_vectors(layout: _Layout) -> dict[str, Any]:
         ),
         "ends": (any(map(has_ends, curves)), (T, N, rings, 2, 2)),
     }  # fmt: skip
-    weights = {"side_force": "side_precision", "joint_side": "joint_side_precision"}
+    precision_of = dict(FORCES + MARKERS)
     out: dict[str, Any] = {}
     for name, (there, shape) in shapes.items():
         out[name] = np.zeros(shape) if there else None
-        out[weights.get(name, "end_precision")] = np.zeros(shape) if there else None
+        out[precision_of[name]] = np.zeros(shape) if there else None
     out |= {"phi_c": None, "direction": None}
     if any(off_midline(c) for c in curves):
         out |= {"phi_c": np.zeros(T), "direction": np.tile([1.0, 0.0], (T, 1))}
