@@ -112,14 +112,14 @@ def _check(count, kind, block) -> None:
 def _draw(result: FitResult, seen: Prediction, lanes, count, kind, block, seed) -> Lane:
     """Lanes of `count` resampled data sets of each of `lanes`."""
     draw = _normal if kind == "parametric" else _blocks
-    kinds = _kinds(result)
-    found: dict[str, list[np.ndarray]] = {kind.name: [] for kind, _ in kinds}
+    channels = [channel for channel, _ in _kinds(result)]
+    found: dict[str, list[np.ndarray]] = {channel.name: [] for channel in channels}
     for lane in lanes:
         rng = np.random.default_rng([seed, int(lane)])
         noise = draw(rng, result, seen, lane, count, block)
-        for kind, _ in kinds:
-            model = kind.data[lane] + np.nan_to_num(getattr(seen, kind.name)[lane])
-            found[kind.name].append(model + noise[kind.name])
+        for channel in channels:
+            model = channel.data[lane] + np.nan_to_num(getattr(seen, channel.name)[lane])
+            found[channel.name].append(model + noise[channel.name])
     drawn = result.study.take(lanes.repeat(count)).lanes
     return drawn._replace(**{name: np.concatenate(parts) for name, parts in found.items()})
 
