@@ -303,10 +303,10 @@ def test_lanes():
 
 def test_weight_of_the_data_is_that_of_all_forces():
     """Side forces, curve weights and noise count, of one lane and of the lanes of a joint fit."""
-    of = zip(("one", "one", "two"), PLACES, (3, 5, 4), strict=True)
+    presses = zip(("one", "one", "two"), PLACES, (3, 5, 4), strict=True)
     curves = [
         dataclasses.replace(curve(place, np.linspace(0.5, 5.0, n)), specimen=specimen)
-        for specimen, place, n in of
+        for specimen, place, n in presses
     ]
     table = NAMED | {"EI_C": {"scope": "shared"}}
     study = study_of(curves, table, joint=True)
