@@ -11,10 +11,17 @@ import pytest
 
 from jaxtrachea.cli.specification import options_of, parameters_of
 from jaxtrachea.config import SpecError, load_fit_spec
-from jaxtrachea.fitting import shared, structure
+from jaxtrachea.fitting import joint_information, shared, structure
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.lane import data_weight, observations, size, without_data
-from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.information import Information
+from jaxtrachea.fitting.lane import (
+    data_weight,
+    force_entries,
+    observations,
+    size,
+    without_data,
+)
+from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, defaults_of
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.residual import inputs, residual, residual_value
@@ -22,9 +29,7 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study, check_curve
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.comparison import same_data
-from jaxtrachea.inference.design import check
 from jaxtrachea.inference.effective import effective_samples
-from jaxtrachea.inference.influence import influence
 from jaxtrachea.inference.posterior import posterior
 from jaxtrachea.inference.repeats import repeats
 from jaxtrachea.measurements.read import Curve
@@ -260,9 +265,8 @@ def test_known_parameters_are_found(tmp_path):
         assert found[name] == pytest.approx(true, rel=1e-4), name
     assert np.all(np.isfinite(result.standard_error))
     assert not result.undetermined.any()
-    for what, asked in (("influence", influence), ("the posterior", posterior)):
-        with pytest.raises(ValueError, match=f"{what} is not available.*'sections'"):
-            asked(result)
+    with pytest.raises(ValueError, match="the posterior is not available.*'sections'"):
+        posterior(result)
     write_hdf5(tmp_path / "r.h5", Findings(result), {})
     with h5py.File(tmp_path / "r.h5") as file:
         data = {name: file["data"][name][()] for name in file["data"]}
@@ -328,6 +332,23 @@ def test_weight_of_the_data_is_that_of_all_forces():
     np.testing.assert_allclose(shared._floor(task, here, none == 0), exact, rtol=1e-12)
 
 
+def test_noise_of_a_joint_fit_is_of_all_forces(monkeypatch):
+    """With a robust loss it is a median: side forces are forces there, and no markers."""
+    curves = [curve(PLACES[1]), dataclasses.replace(curve(PLACES[2]), specimen="two")]
+    study = study_of(
+        curves, NAMED | {"EI_C": {"scope": "shared"}}, joint=True, weighting=Weighting(loss="huber")
+    )
+    lane = study.lanes
+    row = np.full((2, 1, size(lane)), 5.0)
+    row[..., : force_entries(lane)] = [1.0] * 3 + [3.0] * 3
+    monkeypatch.setattr(joint_information, "map_lanes", lambda *_, **__: row)
+    one, two, P = np.ones(2), np.ones((2, 2)), study.size
+    none = np.zeros((2, P, P))
+    info = Information(none, none, np.zeros((2, P)), two, two, two, two, one, one)
+    found = joint_information.pooled(study, info, np.zeros((2, P)), one > 0)
+    np.testing.assert_array_equal(found.spread, [[2.0, 5.0]] * 2)
+
+
 def test_repeats_are_of_the_same_angle_and_direction():
     places = [(20.0, 0.0, (1.0, 0.0)), (20.0, 0.5, (1.0, 0.0)), (20.0, 0.5, (0.8, 0.6))]
     study = study_of([curve(place) for place in places])
@@ -377,8 +398,6 @@ def test_presses_of_a_line_refuse():
     study = study_of([curve(PLACES[0])])
     with pytest.raises(ValueError, match="no compliance"):
         inputs(study.model, point_of(study), lane_of(study))
-    with pytest.raises(ValueError, match="a design is not available"):
-        check(study)
     with pytest.raises(ValueError, match="fit.method = 'adam' is not available"):
         fit(study, Settings(method="adam"))
 

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from jaxtrachea.fitting.information import Information
-from jaxtrachea.fitting.lane import Lane, observations
+from jaxtrachea.fitting.lane import Lane, force_entries, observations
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import residual_value
@@ -39,7 +39,7 @@ def pooled(
 
     spread = np.zeros(2)
     if study.model.loss != "linear":
-        batch, forces = batch_size(len(theta), 128), study.lanes.force.shape[-1]
+        batch, forces = batch_size(len(theta), 128), force_entries(study.lanes)
         r = map_lanes(_absolute_residual, study, theta, batch=batch)[alive]
         kinds = (r[..., :forces], r[..., forces:])
         spread = np.array([np.nanmedian(v) if np.any(np.isfinite(v)) else 0.0 for v in kinds])
