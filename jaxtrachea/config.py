@@ -257,7 +257,8 @@ class DesignSection(Section):
     depth: tuple[PositiveLength, PositiveLength] | None = Field(None, strict=False)
     points: int = Field(3, ge=1, le=100)
     criterion: Literal["D", "A", "E"] = "D"
-    candidates: int = Field(10_000, ge=5, le=10_000_000)
+    candidates: int | None = Field(None, ge=5, le=10_000_000)
+    phi: tuple[Angle, ...] | None = Field(None, strict=False, min_length=1)
 
     @model_validator(mode="after")
     def _ordered(self) -> "DesignSection":

@@ -392,8 +392,11 @@ def force_jacobian(
     s_c: Float[Array, ""],
     displacement: Float[Array, " N"],
     blend: Float[Array, ""] | None = None,
-) -> Float[Array, "Jf N"]:
+    phi_c: Float[Array, ""] | None = None,
+) -> Float[Array, "Jf m"]:
     """Derivative of the force at the load cell by the free columns, of a press without data.
+
+    Shape (Jf, N); where `phi_c` is given the side force follows, (Jf, 2 N).
 
     Args:
         model: what is fitted (static).
@@ -402,10 +405,14 @@ def force_jacobian(
         s_c: mm.
         displacement: of the tool, mm.
         blend: rounded corner at the onset, mm, see `Lane`.
+        phi_c: contact angle, rad, the tool along the normal; deforming cross-sections alone; None:
+            on the midline.
     """
     tube = _tube(model, None, free.dtype)
     if model.options.skeleton == "sections":
-        return section_residual.force_jacobian(model, free, value, s_c, displacement, tube)
+        along = None if phi_c is None else jnp.asarray([1.0, 0.0], free.dtype)
+        tool = section_residual.Tool(s_c, displacement, phi_c, along)
+        return section_residual.force_jacobian(model, free, value, tool, tube)
     places = _Places(s_c[None], value[None], marked=False)
     of_lane = _skeleton_and_derivative(model, free[None], places, tube)
     skeleton, by_beam = jax.tree.map(lambda v: v[0], of_lane)

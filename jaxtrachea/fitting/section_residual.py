@@ -17,6 +17,7 @@ from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.mechanics.skeleton import local_frame
+from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
 
 
@@ -136,17 +137,25 @@ def force_jacobian(
     model: FitModel,
     free: Float[Array, " Jf"],
     value: Float[Array, " J"],
-    s_c: Float[Array, ""],
-    displacement: Float[Array, " N"],
+    tool: Tool,
     tube: Geometry,
-) -> Float[Array, "Jf N"]:
-    """Derivative of the force by the free columns, of a press on the midline without data."""
+) -> Float[Array, "Jf m"]:
+    """Derivative of the forces by the free columns, of a press without data.
+
+    Of the force along the tool, (Jf, N); off the midline of the side force too, after it,
+    (Jf, 2 N). NaN at samples without equilibrium, and too deep.
+    """
+
+    def at(free):
+        found, status = answer(model, free, value, tool, tube)
+        if tool.phi_c is None:
+            return found.force, status
+        return jnp.concatenate([found.force, found.side_force]), jnp.concatenate([status] * 2)
 
     def push(tangent):
-        def at(free):
-            return answer(model, free, value, Tool(s_c, displacement), tube)[0].force
-
-        return jax.jvp(at, (free,), (tangent,))[1]
+        _, slope, status = jax.jvp(at, (free,), (tangent,), has_aux=True)
+        solved = (status == PressStatus.OK) | (status == PressStatus.NO_CONTACT)
+        return jnp.where(solved, slope, jnp.nan)
 
     return jax.vmap(push)(jnp.eye(free.shape[0], dtype=free.dtype))
 

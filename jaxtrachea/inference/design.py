@@ -1,10 +1,12 @@
 """Where to press next: what a further curve would add to the information, at every candidate.
 
-A candidate is a press at (s, phi = 0) up to a depth. Its sensitivities come from the residual of
-the fit itself, so that model, scales and scopes are the same; its information adds to that of the
-data (Fisher information of normal noise; Fedorov 1972). Relative coordinates: 1 is a change of
-100 %. Bounds count as a weak prior, of the variance of a uniform distribution between them, so that
-nothing is infinite where the data so far leave a combination undetermined.
+A candidate is a press at s up to a depth, on the midline or, of deforming cross-sections, at an
+angle phi. Its sensitivities come from the residual of the fit itself, so that model, scales and
+scopes are the same; its information adds to that of the data (Fisher information of normal noise;
+Fedorov 1972). It observes the force along the normal, and off the midline the side force where the
+study has one. Relative coordinates: 1 is a change of 100 %. Bounds count as a weak prior, of the
+variance of a uniform distribution between them, so that nothing is infinite where the data so far
+leave a combination undetermined.
 
 Unknowns of single trials (an onset, an offset) are told apart from those that are sought: a new
 press brings its own, about which nothing is known, and the measured curves keep theirs. Both are
@@ -12,6 +14,7 @@ marginalised, so that information, scores and errors are those of the other unkn
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -32,6 +35,10 @@ from jaxtrachea.inference.labels import succeeded
 from jaxtrachea.optimisation.programs import program
 
 Criterion = Literal["D", "A", "E"]
+#: Candidates of deforming cross-sections: in all where the user does not say, and at a time.
+_FEW, _TOGETHER = 250, 16
+#: Those of a line of joints, which cost next to nothing.
+_MANY = 10_000
 #: Estimates of a lane, out of its bootstrap replicates, that a design is averaged over.
 _DRAWS = 16
 
@@ -42,10 +49,12 @@ class Candidates(NamedTuple):
     Attributes:
         s: contact position, mm.
         depth: largest tool displacement, mm.
+        phi: contact angle, rad; None: all on the midline.
     """
 
     s: Float[np.ndarray, " C"]
     depth: Float[np.ndarray, " C"]
+    phi: Float[np.ndarray, " C"] | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -99,22 +108,34 @@ class Choice:
     error: Float[np.ndarray, "m P"]
 
 
-def grid(s: tuple[float, float], depth: tuple[float, float], count: int = 10_000) -> Candidates:
-    """About `count` candidates in a reachable region, five depths at even positions."""
+def grid(
+    s: tuple[float, float],
+    depth: tuple[float, float],
+    count: int = 10_000,
+    phi: Sequence[float] = (0.0,),
+) -> Candidates:
+    """About `count` candidates in a reachable region, five depths at even positions.
+
+    Args:
+        s: first and last position, mm.
+        depth: least and largest, mm.
+        count: of all candidates.
+        phi: angles, rad; each at every position and depth.
+    """
     depths = np.linspace(*depth, 5) if depth[1] > depth[0] else np.array([depth[0]])
-    positions = np.linspace(*s, max(count // len(depths), 1))
-    at, down = np.meshgrid(positions, depths, indexing="ij")
-    return Candidates(at.ravel(), down.ravel())
+    positions = np.linspace(*s, max(count // (len(depths) * len(phi)), 1))
+    turned, at, down = np.meshgrid(phi, positions, depths, indexing="ij")
+    angles = turned.ravel() if np.any(turned) else None
+    return Candidates(at.ravel(), down.ravel(), angles)
 
 
 def check(study: Study) -> None:
     """Refuse a study whose unknowns a new curve would not share.
 
     Raises:
-        ValueError: naming the parameters; or a joint study, or one of deforming cross-sections.
+        ValueError: naming the parameters; or a joint study.
     """
     study.refuse_joint("a design")
-    study.refuse_sections("a design")
     own = [p.name for p in study.free if p.scope == "trial"]
     if len(own) == len(study.free):
         raise ValueError(
@@ -178,18 +199,23 @@ def situation(
 def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q Q"]:
     """Information of a press at every candidate on the unknowns it shares, for every guess.
 
-    In relative coordinates; what the press has of its own is eliminated.
+    In relative coordinates; what the press has of its own is eliminated. A candidate without
+    equilibrium at some sample, on deforming cross-sections, tells nothing: zeros.
+
+    Raises:
+        ValueError: angles for a skeleton that is pressed on the midline alone.
     """
     study = known.study
-    run = program(_information, study.model, known.samples, axes=(*[None] * 4, 0, 0))
-    place = jnp.asarray(candidates.s), jnp.asarray(candidates.depth)
+    if candidates.phi is not None and study.model.options.skeleton != "sections":
+        raise ValueError("presses off the midline need the skeleton 'sections'; leave phi out")
     parts = []
     for g, k in enumerate(known.lane):
         lanes = study.lanes
         blend = None if known.blend is None else jnp.asarray(known.blend[g])
         rows = lanes.value[k, 0], lanes.index[k, 0], blend
-        matrix = run(jnp.asarray(known.theta[g]), *rows, *place) / known.sigma[g] ** 2
-        parts.append(np.asarray(matrix) * known.relative[g][:, None] * known.relative[g])
+        matrix = _of_all(study, known.samples, (jnp.asarray(known.theta[g]), *rows), candidates)
+        matrix = np.nan_to_num(matrix / known.sigma[g] ** 2)
+        parts.append(matrix * known.relative[g][:, None] * known.relative[g])
     added = np.stack(parts)
     if known.own.shape[1] == 0:
         return added
@@ -202,15 +228,38 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
     return marginal(of_press, shared)
 
 
-def _information(model: FitModel, samples: int, theta, value, index, blend, s, depth):
+def _of_all(study: Study, samples: int, guess, candidates: Candidates) -> np.ndarray:
+    """`_information` of every candidate; of deforming cross-sections so many at a time; (C, P, P).
+
+    Each is a path of its own there, and all together would take the memory.
+    """
+    sides, angles = study.lanes.side_force is not None, candidates.phi
+    axes = (*[None] * 4, 0, 0, None if angles is None else 0)
+    run = program(_information, study.model, samples, sides, axes=axes)
+    count = len(candidates.s)
+    together = _TOGETHER if study.model.options.skeleton == "sections" else count
+    parts = []
+    for first in range(0, count, together):
+        row = np.minimum(np.arange(first, first + together), count - 1)
+        place = (None if v is None else jnp.asarray(v[row]) for v in candidates)
+        s, depth, phi = place
+        parts.append(np.array(run(*guess, s, depth, phi))[: count - first])
+    return np.concatenate(parts)
+
+
+def _information(
+    model: FitModel, samples: int, sides: bool, theta, value, index, blend, s, depth, phi
+):
     """Information of one press with noise of 1 N on the unknowns; (P, P).
 
-    `value` and `index`: rows of the trial it is like, see `Lane`; `blend`: as `force_jacobian`.
+    `value` and `index`: rows of the trial it is like, see `Lane`; `blend`: as `force_jacobian`;
+    `sides`: whether it observes the side force.
     """
     displacement = depth * jnp.arange(1, samples + 1, dtype=theta.dtype) / samples
     index = index[jnp.array(model.free_columns)]
     free = jnp.where(index >= 0, theta[jnp.maximum(index, 0)], 0)
-    J = force_jacobian(model, free, value, s, displacement, blend)
+    J = force_jacobian(model, free, value, s, displacement, blend, phi)
+    J = J if sides else J[:, :samples]
     place = jnp.where(index >= 0, index, len(theta))
     zero = jnp.zeros((len(theta), len(theta)), theta.dtype)
     gram = jnp.einsum("im,jm->ij", J, J)
@@ -229,7 +278,11 @@ def scores(information: Float[np.ndarray, "G C P P"], criterion: Criterion):
 
 
 def next_points(
-    known: Situation, candidates: Candidates, count: int = 1, criterion: Criterion = "D"
+    known: Situation,
+    candidates: Candidates,
+    count: int = 1,
+    criterion: Criterion = "D",
+    added: Float[np.ndarray, "G C Q Q"] | None = None,
 ) -> Choice:
     """Choose presses one by one, each the best after those before it; one may come twice.
 
@@ -238,9 +291,10 @@ def next_points(
         candidates: reachable presses.
         count: how many to choose.
         criterion: D (volume of the error ellipsoid), A (mean variance) or E (worst combination).
+        added: the `gains`, where they are known; None: computed.
     """
     check_word("criterion", criterion, Criterion)
-    added = gains(known, candidates)
+    added = gains(known, candidates) if added is None else added
     base, chosen, table = known.base, [], []
     errors = [_errors(base)]
     for _ in range(count):
@@ -261,23 +315,29 @@ class Map(NamedTuple):
 
     Attributes:
         s: mm; (n,).
+        phi: of all presses, rad.
         condition: after a press at s on top of the data; of the scaled Jacobian, as in a fit; (n,).
         weakest: unit vector of the least determined combination then, relative; (n, P).
         pairs: condition of a press at s and one at s', without any data; (n, n).
     """
 
     s: Float[np.ndarray, " n"]
+    phi: float
     condition: Float[np.ndarray, " n"]
     weakest: Float[np.ndarray, "n P"]
     pairs: Float[np.ndarray, "n n"]
 
 
-def identifiability(known: Situation, s: Float[np.ndarray, " n"], depth: float) -> Map:
+def identifiability(
+    known: Situation, s: Float[np.ndarray, " n"], depth: float, phi: float = 0.0
+) -> Map:
     """Condition and weakest direction of presses to `depth` (mm) at every position (mm).
 
-    Conditions are geometric means over the guesses, directions those of the first guess.
+    At one angle (rad). Conditions are geometric means over the guesses, directions those of the
+    first guess.
     """
-    added = gains(known, Candidates(s, np.full(len(s), depth)))
+    angles = np.full(len(s), phi) if phi else None
+    added = gains(known, Candidates(s, np.full(len(s), depth), angles))
     values, vectors = np.linalg.eigh(known.base[:, None] + added)
     condition = np.exp(np.mean(0.5 * np.log(values[..., -1] / values[..., 0]), axis=0))
     weakest = vectors[0, :, :, 0]
@@ -286,18 +346,21 @@ def identifiability(known: Situation, s: Float[np.ndarray, " n"], depth: float) 
     for matrix in added:
         values = np.linalg.eigvalsh(matrix[:, None] + matrix[None])
         low = np.maximum(values[..., 0], 1e-14 * values[..., -1])
-        total = total + 0.5 * np.log(values[..., -1] / low)
-    return Map(s, condition, weakest * np.sign(largest), np.exp(total / len(added)))
+        nothing = values[..., -1] <= 0  # neither press tells anything
+        ratio = values[..., -1] / np.where(nothing, 1, low)
+        total = total + np.where(nothing, np.inf, 0.5 * np.log(np.where(nothing, 1, ratio)))
+    return Map(s, phi, condition, weakest * np.sign(largest), np.exp(total / len(added)))
 
 
 def candidates_of(spec: FitSpec, study: Study) -> Candidates:
     """The presses of the [design] section; left out: first to last ring, half to full depth.
 
-    From ring to ring as far as all of the tool lies on the tube.
+    From ring to ring as far as all of the tool lies on the tube; of deforming cross-sections at
+    every angle that was measured.
 
     Raises:
-        SpecError: positions outside the tube or where the tool reaches beyond its ends, or unknowns
-            that a new curve would not share.
+        SpecError: positions outside the tube or where the tool reaches beyond its ends, angles or
+            depths that the model does not have, or unknowns that a new curve would not share.
     """
     try:
         check(study)
@@ -315,4 +378,38 @@ def candidates_of(spec: FitSpec, study: Study) -> Candidates:
             f"{tool if low > 0 else ''}; give places on it"
         )
     depth = (0.5 * deepest, deepest) if section.depth is None else section.depth
-    return grid(s, depth, section.candidates)
+    sections = study.model.options.skeleton == "sections"
+    radius = float(study.model.geometry.radius)
+    if sections and depth[1] > radius:
+        raise SpecError(
+            f"design.depth: {depth[1]:g} mm, this model presses no deeper than the radius, "
+            f"{radius:g} mm; give less"
+        )
+    count = (_FEW if sections else _MANY) if section.candidates is None else section.candidates
+    return grid(s, depth, count, _angles(section.phi, study))
+
+
+def _angles(asked: tuple[float, ...] | None, study: Study) -> list[float]:
+    """Angles of the candidates, rad, each once.
+
+    Raises:
+        SpecError: one that the model does not press.
+    """
+    if study.model.options.skeleton != "sections":
+        if asked is not None:
+            raise SpecError(
+                "design.phi: this model presses on the midline alone; leave it out, or choose "
+                "skeleton = 'sections'"
+            )
+        return [0.0]
+    if asked is None:
+        measured = (c.phi_c for curves in study.curves for c in curves)
+        return sorted({round(float(phi), 9) + 0.0 for phi in measured})
+    reach = float(study.model.geometry.half_angle)
+    for phi in asked:
+        if not abs(phi) <= reach:
+            raise SpecError(
+                f"design.phi: {np.degrees(phi):.4g} deg, the rings reach "
+                f"{np.degrees(reach):.4g} deg to both sides; give angles on them"
+            )
+    return sorted(set(asked))
