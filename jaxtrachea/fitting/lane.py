@@ -123,7 +123,7 @@ def size(lane: Lane) -> int:
     return lane.force.shape[-1] * sum(kind.places for kind in forces(lane) + markers(lane))
 
 
-def observations(lane: Lane) -> tuple[Float[Array, "T m"], int]:
+def observations(lane: Lane) -> tuple[Float[Array, "*l T m"], int]:
     """Which entries of the residual are observed (1 or 0), and how many of them are forces."""
     rows = lane.force.shape[:-1]
     kinds = forces(lane) + markers(lane)

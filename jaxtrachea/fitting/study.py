@@ -106,7 +106,8 @@ class Study:
         if self.model.options.skeleton == "sections":
             raise ValueError(
                 f"{what} is not available for the skeleton 'sections'; leave it out (standard "
-                "errors, profiles, the bootstrap and leaving out are), or choose another skeleton"
+                "errors, profiles, the bootstrap, influence, leaving out and designs are), or "
+                "choose another skeleton"
             )
 
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":

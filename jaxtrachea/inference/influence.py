@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxtrachea.fitting.cost import assemble, entry_scale, robust
 from jaxtrachea.fitting.covariance import SINGULAR
-from jaxtrachea.fitting.lane import Lane, observations
+from jaxtrachea.fitting.lane import Lane, force_entries, observations
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import residual
@@ -40,7 +40,7 @@ _ALONE = 1e-9
 
 
 class Diagnostics(NamedTuple):
-    """One lane; T curves of m entries (forces, then markers), Jf free parameters of a curve.
+    """One lane; T curves of m entries (as the residual's row, `Lane`), Jf free parameters each.
 
     Attributes:
         leverage: (T, m).
@@ -227,11 +227,7 @@ def influence(result: FitResult, batch: int = 128) -> Influence:
     Args:
         result: the fit.
         batch: lanes computed together.
-
-    Raises:
-        ValueError: a skeleton of deforming cross-sections.
     """
-    result.study.refuse_sections("influence")
     free = np.asarray(result.study.lanes.active) * ~result.at_bound
     diagnostics = map_lanes(
         diagnose, result.study, result.theta, result.whitened_sigma, result.relative, free,
@@ -272,17 +268,12 @@ def _conclude(result: FitResult, found: Diagnostics) -> Influence:
 
 def _seen(study: Study) -> np.ndarray:
     """Observed entries of the residual; (lanes, T, m)."""
-    lanes = study.lanes
-    seen = np.asarray(lanes.precision) > 0
-    if lanes.joint_precision is None:
-        return seen
-    markers = np.asarray(lanes.joint_precision).reshape(*seen.shape[:-1], -1) > 0
-    return np.concatenate([seen, markers], axis=-1)
+    return np.asarray(observations(study.lanes)[0]) > 0
 
 
 def _external(result: FitResult, t: np.ndarray) -> np.ndarray:
     """Studentised t times sqrt((n - 1) / (n - t^2)), n degrees of freedom; t if sigma is given."""
-    study, samples = result.study, result.study.lanes.force.shape[-1]
+    study, samples = result.study, force_entries(result.study.lanes)
     if study.model.loss != "linear":
         return t
     seen = _seen(study)

@@ -1,10 +1,12 @@
 """Influence of samples and curves in tables and report."""
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxtrachea.files.tables import markdown_table, number
+from jaxtrachea.fitting.lane import Lane, forces, markers
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
 from jaxtrachea.inference.influence import Influence, influence
 from jaxtrachea.inference.labels import succeeded
@@ -14,16 +16,18 @@ from jaxtrachea.inference.rows import ONE_BY_ONE, and_more
 _TOP = 12
 #: Change of an estimate, in standard errors, from which a curve is named.
 _MOVES = 1.0
+#: What entries of the residual are called, by field of the lane and place at a ring.
+_FORCES = {"force": "force", "side_force": "side force"}
+_MOTIONS = {
+    "joints": ("marker",), "joint_side": ("sideward marker",),
+    "ends": ("end U y", "end U z", "end V y", "end V z"),
+}  # fmt: skip
 #: What stands in a table of influence where a number cannot be given.
 REASONS = (
     "`own`: nobody else tells of this unknown. `needed`: without this curve the others do not "
     "determine all unknowns. `held`: the unknown is on its bound. `undetermined`: it has no "
     "standard error. `no estimate`: the fit failed."
 )
-
-
-def _refuse(request: Request) -> None:
-    request.refuse_sections("uncertainty.influence")
 
 
 def _compute(request: Request, findings: Findings, progress: Progress) -> Influence:
@@ -35,20 +39,21 @@ def _tables(found: Influence):
 
 
 def sample_rows(found: Influence) -> Iterator[Cells]:
-    """One row per observed force and marker for influence.csv."""
+    """One row per observation for influence.csv."""
     study, of = found.result.study, found.of
     names = [p.name for p in study.free]
     for lane, curves in enumerate(study.curves):
         for t, curve in enumerate(curves):
             for e in np.flatnonzero(np.isfinite(of.leverage[lane, t])):
                 at = lane, t, e
-                sample, ring = _place(found, int(e))
+                place = _place(study.lanes, int(e))
                 yield {
                     "specimen": curve.specimen,
                     "trial": curve.trial,
-                    "sample": sample + 1,
-                    "ring": "" if ring is None else ring + 1,
-                    "displacement_mm": float(curve.displacement[sample]),
+                    "sample": place.sample + 1,
+                    "observed": place.observed,
+                    "ring": "" if place.ring is None else place.ring + 1,
+                    "displacement_mm": float(curve.displacement[place.sample]),
                     "leverage": float(of.leverage[at]),
                     "studentised": float(of.studentised[at]),
                     "studentised_external": float(found.external[at]),
@@ -89,21 +94,48 @@ def top_samples(found: Influence, count: int) -> list[tuple[int, int, int]]:
     return [(int(k), int(t), int(e)) for k, t, e in places if cook[k, t, e] >= 0]
 
 
-def _place(found: Influence, entry: int) -> tuple[int, int | None]:
-    """Sample and ring (None: a force) of an entry of the residual."""
-    lanes = found.result.study.lanes
+class Place(NamedTuple):
+    """What an entry of the residual observes.
+
+    Attributes:
+        sample: counted from 0.
+        observed: `force`, `side force`, `marker`, `sideward marker`, or `end U y` and the like.
+        ring: counted from 0; None of a force.
+    """
+
+    sample: int
+    observed: str
+    ring: int | None
+
+    def label(self, displacement: float) -> str:
+        """In words: 2.5 mm; 2.5 mm, side force; 2.5 mm, ring 3; 2.5 mm, ring 3, end U y."""
+        where = f"{displacement:.3g} mm"
+        where += "" if self.ring is None else f", ring {self.ring + 1}"
+        return where if self.observed in ("force", "marker") else f"{where}, {self.observed}"
+
+
+def _place(lanes: Lane, entry: int) -> Place:
+    """What an entry of the residual of some lanes observes."""
     samples = lanes.force.shape[-1]
-    if entry < samples or lanes.joints is None:
-        return entry, None
-    sample, ring = divmod(entry - samples, lanes.joints.shape[-1])
-    return sample, ring
+    for channel in forces(lanes) + markers(lanes):
+        if entry < samples * channel.places:
+            break
+        entry -= samples * channel.places
+    else:
+        raise IndexError("no such entry")
+    sample, part = divmod(entry, channel.places)
+    if channel.name in _FORCES:
+        return Place(sample, _FORCES[channel.name], None)
+    rings = channel.data.shape[lanes.force.ndim]
+    ring, component = divmod(part, channel.places // rings)
+    return Place(sample, _MOTIONS[channel.name][component], ring)
 
 
 def sample_label(found: Influence, lane: int, t: int, entry: int) -> str:
-    """Where a sample is, in words: 2.5 mm, or 2.5 mm, ring 3."""
-    sample, ring = _place(found, entry)
-    where = f"{found.result.study.curves[lane][t].displacement[sample]:.3g} mm"
-    return where if ring is None else f"{where}, ring {ring + 1}"
+    """Where a sample is, see `Place.label`."""
+    study = found.result.study
+    place = _place(study.lanes, entry)
+    return place.label(float(study.curves[lane][t].displacement[place.sample]))
 
 
 def influence_head(found: Influence) -> list[str]:
@@ -212,7 +244,6 @@ INFLUENCE = Analysis(
     name="influence",
     after="left_out",
     compute=_compute,
-    refuse=_refuse,
     option="influence",
     key="influence",
     tables=_tables,

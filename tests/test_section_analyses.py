@@ -1,0 +1,337 @@
+"""Analyses of fits of deforming cross-sections, against refits by SciPy on single presses."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from jaxtrachea.config import DesignSection, FitSpec, SpecError
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lane import size
+from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import build_study
+from jaxtrachea.inference.analyses import influence as analysis
+from jaxtrachea.inference.design import (
+    Candidates,
+    candidates_of,
+    gains,
+    identifiability,
+    next_points,
+    situation,
+)
+from jaxtrachea.inference.influence import _external, influence
+from jaxtrachea.inference.profile import profiles
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
+from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.status import FitStatus, ProfileEnd
+from jaxtrachea.trachea.geometry import Geometry
+
+pytestmark = pytest.mark.compiling
+GEOMETRY = Geometry.create(30.0, [10.0, 20.0], radius=11.7)
+SECTIONS = Options(skeleton="sections", contact="bonded")
+#: Position and angle of each press; all along the normal.
+PLACES = ((15.0, 0.0), (8.0, 0.0), (18.0, 0.6))
+PATH = np.linspace(0.5, 3.0, 6)
+#: What is fitted, and its truth; all else stays as the wall gives it.
+TRUTH = {"EI_C": 31.0, "bed_n": 0.013}
+FIXED = {name: {"fixed": True} for name in ("bed_t", "Et_L", "D_L", "c_W")}
+SIGMA = 0.01
+ONE = Settings(starts=1, more_starts=0, scrutiny=False)
+#: Threshold of chi^2 with one degree of freedom at 95 %.
+CHI2 = 3.841458820694124
+
+
+@functools.cache
+def wall():
+    """Parameters of the wall by name, as the fits begin."""
+    given = from_wall(GEOMETRY)
+    return {f.name: np.median(getattr(given, f.name)) for f in dataclasses.fields(given)}
+
+
+@functools.cache
+def program():
+    """Force and side force of all presses by the logarithms of what is fitted; (presses, 2, N)."""
+    given = wall()
+
+    def one(theta, place):
+        material = SectionMaterial(**(given | dict(zip(TRUTH, jnp.exp(theta), strict=True))))
+        s, phi = place
+        got = press_sections(GEOMETRY, material, s, phi, jnp.asarray(PATH), (1.0, 0.0))
+        cos, sin = jnp.cos(phi), jnp.sin(phi)
+        y, z = got.force[:, 1], got.force[:, 2]
+        return jnp.stack([-cos * y - sin * z, -sin * y + cos * z])
+
+    return jax.jit(jax.vmap(one, (None, 0)))
+
+
+def shown(theta):
+    """As `program`, numpy."""
+    return np.array(program()(jnp.asarray(theta), jnp.asarray(PLACES)))
+
+
+def measured(seed, sigma=SIGMA, specimen="one", **truth):
+    """Curves with noise, as the presses show them."""
+    clean = shown(np.log(list((TRUTH | truth).values())))
+    noisy = clean + sigma * np.random.default_rng(seed).normal(size=clean.shape)
+    return [
+        Curve(specimen, f"{s:g} {phi:g}", s, phi, PATH, force, side_force=side if phi else None)
+        for (s, phi), (force, side) in zip(PLACES, noisy, strict=True)
+    ]
+
+
+def residual(theta, curves, sigma=SIGMA):
+    """Whitened differences that count, of one specimen."""
+    parts = []
+    for (force, side), c in zip(shown(theta), curves, strict=True):
+        parts += [force - c.force] + ([] if c.side_force is None else [side - c.side_force])
+    return np.concatenate(parts) / sigma
+
+
+def refit(curves, fixed=(), sigma=SIGMA):
+    """SciPy's minimum, some unknowns pinned, `fixed` (index, value): theta and the cost."""
+    pinned = dict(fixed)
+    free = [i for i in range(len(TRUTH)) if i not in pinned]
+
+    def full(x):
+        theta = np.zeros(len(TRUTH))
+        theta[free], theta[list(pinned)] = x, list(pinned.values())
+        return theta
+
+    start = np.log(list(TRUTH.values()))[free]
+    found = least_squares(
+        lambda x: residual(full(x), curves, sigma), start, "3-point", xtol=1e-12, ftol=1e-14
+    )
+    return full(found.x), found.cost
+
+
+def study_of(curves, table=None, sigma=SIGMA, **more):
+    return build_study(
+        curves, GEOMETRY, SECTIONS, FIXED | (table or {}), noise=Noise(force=sigma), **more
+    )
+
+
+@pytest.fixture(scope="module")
+def result():
+    return fit(study_of(measured(0)), ONE)
+
+
+@pytest.mark.slow
+def test_profile_is_the_refit_at_every_point(result):
+    """Estimate, whole grid and ends of the interval, against SciPy with one unknown pinned."""
+    curves = result.study.curves[0]
+    assert [p.name for p in result.study.free] == list(TRUTH)
+    theta, lowest = refit(curves)
+    np.testing.assert_allclose(result.theta[0], theta, atol=1e-6)
+    found = profiles(result, ONE, points=3)
+    assert np.all(found.end == ProfileEnd.CLOSED)
+    for k, i in enumerate(found.unknown):
+        at, rise = found.coordinate[k], found.statistic[k]
+        assert rise[3] == 0
+        assert at[3] == result.theta[0, i]
+        wanted = [2 * (refit(curves, [(int(i), v)])[1] - lowest) for v in at]
+        np.testing.assert_allclose(rise, wanted, rtol=1e-5, atol=1e-6)
+        for end in (found.lower[k], found.upper[k]):
+            there = 2 * (refit(curves, [(int(i), float(np.log(end)))])[1] - lowest)
+            assert there == pytest.approx(CHI2, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_profile_of_little_noise_is_that_of_the_covariance():
+    """With a hundredth of the noise the model is straight across the interval."""
+    sigma = SIGMA / 100
+    result = fit(study_of(measured(0, sigma), sigma=sigma), ONE)
+    found = profiles(result, ONE, points=2)
+    half = np.sqrt(CHI2) * result.uncertainty.se[0]
+    np.testing.assert_allclose(np.log(found.upper) - result.theta[0], half, rtol=2e-3)
+    np.testing.assert_allclose(result.theta[0] - np.log(found.lower), half, rtol=2e-3)
+    away = (found.coordinate - result.theta[0][:, None]) / result.uncertainty.se[0][:, None]
+    np.testing.assert_allclose(found.statistic, away**2, rtol=4e-3, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_joint_fit_is_dense_least_squares():
+    """Two specimens, one bed: estimates and standard errors of SciPy on all residuals at once."""
+    curves = [measured(1), measured(2, specimen="two", EI_C=24.0)]
+    study = study_of(sum(curves, []), {"bed_n": {"scope": "shared"}}, joint=True)
+    assert study.joint
+    result = fit(study, ONE)
+    assert np.all(result.status == FitStatus.CONVERGED)
+
+    def whole(x):
+        rows = [residual([x[k], x[2]], of_specimen) for k, of_specimen in enumerate(curves)]
+        return np.concatenate(rows)
+
+    start = np.log([31.0, 24.0, 0.013])
+    ends = {"xtol": 1e-12, "ftol": 1e-14}
+    found = least_squares(whole, start, "3-point", **ends)
+    se = np.sqrt(np.diagonal(np.linalg.inv(found.jac.T @ found.jac)))
+    np.testing.assert_allclose(result.theta, found.x[[[0, 2], [1, 2]]], atol=1e-6)
+    np.testing.assert_allclose(result.uncertainty.se, se[[[0, 2], [1, 2]]], rtol=1e-4)
+    np.testing.assert_allclose(np.sum(result.cost), found.cost, rtol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def known(result):
+    return situation(result)
+
+
+@pytest.mark.slow
+def test_information_of_a_candidate_is_that_of_differences(known):
+    """Of presses as those measured, of single presses, whose side force counts off the midline."""
+    theta, h = known.theta[0], 1e-4
+    places = np.array(PLACES)
+    candidates = Candidates(places[:, 0], np.full(3, PATH[-1]), places[:, 1])
+    found = gains(known, candidates)[0]
+    step = h * np.eye(len(TRUTH))
+    J = np.stack([(shown(theta + v) - shown(theta - v)) / (2 * h) for v in step])
+    for k, (_, phi) in enumerate(PLACES):
+        rows = J[:, k, : 2 if phi else 1].reshape(len(TRUTH), -1)
+        np.testing.assert_allclose(found[k], rows @ rows.T / SIGMA**2, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_predicted_error_is_that_of_a_fit_with_the_press_added(known, result):
+    """The chosen press, measured without noise: the new standard errors are those predicted."""
+    places = np.array(PLACES)
+    at = Candidates(places[:, 0], np.full(3, PATH[-1]), places[:, 1])
+    choice = next_points(known, at, 1)
+    k = int(choice.chosen[0])
+    (s, phi), (force, side) = PLACES[k], shown(result.theta[0])[k]
+    more = Curve("one", "next", s, phi, PATH, force, side_force=side if phi else None)
+    after = fit(study_of([*result.study.curves[0], more]), ONE)
+    np.testing.assert_allclose(after.theta, result.theta, atol=1e-6)
+    # Bounds count as a prior in the prediction: no more than a thousandth here.
+    np.testing.assert_allclose(choice.error[1], after.uncertainty.se[0], rtol=1e-3)
+    np.testing.assert_allclose(choice.error[0], result.uncertainty.se[0], rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_candidate_without_equilibrium_tells_nothing(known):
+    """Past what the model presses: zeros, beside another as it is alone; never chosen."""
+    alone = gains(known, Candidates(np.array([15.0]), np.array([3.0])))
+    both = Candidates(np.array([15.0, 15.0]), np.array([3.0, 30.0]))
+    found = gains(known, both)
+    np.testing.assert_array_equal(found[:, 1], 0)
+    np.testing.assert_allclose(found[:, :1], alone)
+    assert np.all(found[:, 0].diagonal(axis1=1, axis2=2) > 0)
+    assert next_points(known, both).chosen.tolist() == [0]
+    chart = identifiability(known, np.array([15.0, 20.0]), 30.0)
+    assert np.all(np.isinf(chart.pairs))
+
+
+def test_angles_of_candidates():
+    """Of the measured curves where none are named; each position and depth at every angle."""
+    study = study_of([Curve("one", str(p), *p, PATH, PATH) for p in PLACES])
+    spec = FitSpec.model_validate({"data": {"files": "a.csv"}})
+
+    def at(**section):
+        design = DesignSection.model_validate(section)
+        return candidates_of(spec.model_copy(update={"design": design}), study)
+
+    plain = at()
+    assert len(plain.s) == 250
+    np.testing.assert_array_equal(np.unique(plain.phi), [0.0, 0.6])
+    both = set(zip(plain.s[plain.phi == 0], plain.depth[plain.phi == 0], strict=True))
+    assert both == set(zip(plain.s[plain.phi > 0], plain.depth[plain.phi > 0], strict=True))
+    assert at(phi=["0 deg"]).phi is None
+    np.testing.assert_allclose(np.unique(at(phi=["90 deg", "90 deg"]).phi), [np.pi / 2])
+    for section, words in (
+        ({"phi": ["130 deg"]}, "design.phi: 130 deg, the rings reach 120 deg"),
+        ({"depth": ["1 mm", "12 mm"]}, "design.depth: 12 mm, this model presses no deeper"),
+    ):
+        with pytest.raises(SpecError, match=words):
+            at(**section)
+    line = build_study([Curve("one", "1", 15.0, 0.0, PATH, PATH)], GEOMETRY, Options())
+    named = spec.model_copy(update={"design": DesignSection.model_validate({"phi": ["30 deg"]})})
+    with pytest.raises(SpecError, match="design.phi: .* on the midline alone; leave it out"):
+        candidates_of(named, line)
+    assert len(candidates_of(spec, line).s) == 10_000
+
+
+def test_entries_of_influence_have_names():
+    """Of a row of all kinds: where each entry stands in the lane is where its name says."""
+    n, rings = 6, 2
+    full = {
+        "side_force": PATH, "joint_rings": np.arange(2), "joint_displacement": np.ones((n, 2)),
+        "joint_side_displacement": np.ones((n, 2)), "end_rings": np.arange(2),
+        "end_U": np.ones((n, 2, 2)), "end_V": np.ones((n, 2, 2)),
+    }  # fmt: skip
+    study = study_of([Curve("one", "1", 18.0, 0.6, PATH, PATH, **full)])
+    shapes = {
+        "force": ((n,), [("force", None)]),
+        "side_force": ((n,), [("side force", None)]),
+        "joints": ((n, rings), [("marker", r) for r in range(rings)]),
+        "joint_side": ((n, rings), [("sideward marker", r) for r in range(rings)]),
+        "ends": (
+            (n, rings, 2, 2),
+            [(f"end {e} {c}", r) for r in range(rings) for e in "UV" for c in "yz"],
+        ),
+    }
+    first = 0
+    for name, (shape, names) in shapes.items():
+        assert getattr(study.lanes, name).shape == (1, 1, *shape)
+        for i in range(int(np.prod(shape))):
+            sample, place = divmod(i, len(names))
+            observed, ring = names[place]
+            assert analysis._place(study.lanes, first + i) == (sample, observed, ring)
+        first += int(np.prod(shape))
+    assert first == size(study.lanes)
+    assert analysis._place(study.lanes, n + 2).label(1.5) == "1.5 mm, side force"
+    assert analysis._place(study.lanes, 2 * n + 5).label(1.5) == "1.5 mm, ring 2"
+    assert analysis._place(study.lanes, 6 * n + 1).label(0.5) == "0.5 mm, ring 1, end U z"
+
+
+def perturbed(curves, keep, shift, sigma):
+    """SciPy's minimum with entries left out or moved; `keep` and `shift` (presses, 2, N)."""
+    data = np.stack([np.stack([c.force, c.force if c.side_force is None else c.side_force])
+                     for c in curves])  # fmt: skip
+
+    def off(theta):
+        return ((shown(theta) - data - shift)[keep] / sigma).ravel()
+
+    start = np.log(list(TRUTH.values()))
+    return least_squares(off, start, "3-point", xtol=1e-13, ftol=1e-15).x
+
+
+@pytest.mark.slow
+def test_influence_is_that_of_refits():
+    """Samples and curves left out, and samples moved, of forces and side forces; little noise."""
+    sigma = SIGMA / 30
+    curves = measured(3, sigma)
+    result = fit(study_of(curves, sigma=sigma), ONE)
+    found = influence(result)
+    keep = np.ones((3, 2, len(PATH)), bool)
+    keep[:2, 1] = False  # no side force on the midline
+    none, se = np.zeros(keep.shape), result.uncertainty.se[0]
+    best = perturbed(curves, keep, none, sigma)
+    np.testing.assert_allclose(result.theta[0], best, atol=1e-7)
+    assert np.nansum(found.of.leverage) == pytest.approx(len(TRUTH), rel=1e-9)
+    np.testing.assert_array_equal(np.isfinite(found.of.leverage[0]), keep.reshape(3, -1))
+    for t, kind, n in ((0, 0, 5), (2, 0, 5), (2, 1, 5), (1, 0, 2)):
+        entry, without, moved = kind * len(PATH) + n, keep.copy(), none.copy()
+        without[t, kind, n], moved[t, kind, n] = False, sigma
+        gone = (perturbed(curves, without, none, sigma) - best) / se
+        np.testing.assert_allclose(found.of.left_out[0, t, :, entry], gone, atol=2e-3)
+        ahead, back = (perturbed(curves, keep, s * moved, sigma) for s in (1, -1))
+        slope = (ahead - back) / 2 / se
+        np.testing.assert_allclose(found.of.per_sigma[0, t, :, entry], slope, atol=2e-3)
+    for t in range(3):
+        without = keep.copy()
+        without[t] = False
+        gone = (perturbed(curves, without, none, sigma) - best) / se
+        np.testing.assert_allclose(found.of.curve_left_out[0, t], gone, atol=1e-2)
+    # Where sigma is estimated it is that of all forces: 24 of them, less their share of unknowns.
+    estimated = dataclasses.replace(result.study, noise_given=(False, False))
+    t = found.of.studentised
+    n = 24 - len(TRUTH)
+    np.testing.assert_allclose(
+        _external(dataclasses.replace(result, study=estimated), np.asarray(t)),
+        t * np.sqrt((n - 1) / (n - t**2)),
+    )
