@@ -1,12 +1,15 @@
 """Analyses of fits of deforming cross-sections, against refits by SciPy on single presses."""
 
+import csv
 import dataclasses
 import functools
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from run_cli import run
 from scipy.optimize import least_squares
 
 from jaxtrachea.config import DesignSection, FitSpec, SpecError
@@ -26,7 +29,8 @@ from jaxtrachea.inference.design import (
 )
 from jaxtrachea.inference.influence import _external, influence
 from jaxtrachea.inference.profile import profiles
-from jaxtrachea.measurements.read import Curve
+from jaxtrachea.inference.repeats import leave_repeats_out
+from jaxtrachea.measurements.read import Curve, Measurements, write_hdf5
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
 from jaxtrachea.mechanics.sections.press import press_sections
@@ -37,7 +41,7 @@ pytestmark = pytest.mark.compiling
 GEOMETRY = Geometry.create(30.0, [10.0, 20.0], radius=11.7)
 SECTIONS = Options(skeleton="sections", contact="bonded")
 #: Position and angle of each press; all along the normal.
-PLACES = ((15.0, 0.0), (8.0, 0.0), (18.0, 0.6))
+PLACES = ((15.0, 0.0), (8.0, 0.0), (15.0, 0.6))
 PATH = np.linspace(0.5, 3.0, 6)
 #: What is fitted, and its truth; all else stays as the wall gives it.
 TRUTH = {"EI_C": 31.0, "bed_n": 0.013}
@@ -335,3 +339,120 @@ def test_influence_is_that_of_refits():
         _external(dataclasses.replace(result, study=estimated), np.asarray(t)),
         t * np.sqrt((n - 1) / (n - t**2)),
     )
+
+
+@pytest.mark.slow
+def test_leaving_positions_out_is_by_angle_too(result):
+    """Of a position pressed at two angles one is left out; against SciPy's fits of the others."""
+    curves = result.study.curves[0]
+    assert PLACES[0][0] == PLACES[2][0]
+    missed = leave_repeats_out(result.study, ONE)
+    assert missed.refits[0] == 3
+    assert missed.lost[0] == missed.unconverged[0] == 0
+    keep = np.ones((3, 2, len(PATH)), bool)
+    keep[:2, 1] = False
+    off = []
+    for t, c in enumerate(curves):
+        without = keep.copy()
+        without[t] = False
+        theta = perturbed(curves, without, np.zeros(keep.shape), SIGMA)
+        off.append(shown(theta)[t, 0] - c.force)
+    wanted = np.sqrt(np.mean(np.square(off))) / max(np.max(np.abs(c.force)) for c in curves)
+    np.testing.assert_allclose(missed.error[0], wanted, rtol=1e-4)
+
+
+SPEC = """title = "{title}"
+[data]
+files = "{files}"
+[trachea]
+length = "30 mm"
+rings = ["10 mm", "20 mm"]
+radius = "11.7 mm"
+[model]
+skeleton = "{title}"
+contact = "bonded"
+[parameters]
+{parameters}
+[noise]
+force = "0.01 N"
+[fit]
+starts = 1
+{more}
+"""
+PINNED = """bed_t = {{ fixed = "{bed_t} N/mm^3" }}
+Et_L = {{ fixed = "{Et_L} N/mm" }}
+D_L = {{ fixed = "{D_L} N mm" }}
+c_W = {{ fixed = "{c_W} 1/N/mm" }}
+"""
+
+
+def specification(title, files="data.h5", more=""):
+    parameters = PINNED.format(**wall()) if title == "sections" else ""
+    return SPEC.format(title=title, files=files, parameters=parameters, more=more)
+
+
+def stored(path, curves):
+    write_hdf5(path, Measurements(tuple(curves), (), ()))
+
+
+@pytest.mark.slow
+def test_command_compares_sections_with_lines(tmp_path, monkeypatch, capsys):
+    """Curves of sections on the midline: AICc and left-out error by SciPy; the line is far off."""
+    monkeypatch.chdir(tmp_path)
+    places = ((15.0, 0.0), (8.0, 0.0), (12.0, 0.0))
+    monkeypatch.setitem(globals(), "PLACES", places)
+    curves = measured(4)
+    stored("data.h5", curves)
+    for title in ("linear", "sections"):
+        Path(f"{title}.toml").write_text(specification(title))
+    code, out, _ = run(monkeypatch, capsys, "compare", "linear.toml", "sections.toml", "--out", "o")
+    assert code == 0
+    assert "one: the data prefer sections decisively" in " ".join(out.split())
+    with Path("o/compare.csv").open(newline="") as stream:
+        rows = {row["model"]: row for row in csv.DictReader(stream)}
+    theta, cost = refit(curves)
+    n, k = 18, 2
+    AICc = 2 * cost + n * np.log(2 * np.pi * SIGMA**2) + 2 * k + 2 * k * (k + 1) / (n - k - 1)
+    assert float(rows["sections"]["AICc"]) == pytest.approx(AICc, rel=1e-6)
+    keep = np.zeros((3, 2, len(PATH)), bool)
+    off = []
+    for t in range(3):
+        keep[:, 0] = (np.arange(3) != t)[:, None]
+        theta = perturbed(curves, keep, np.zeros(keep.shape), SIGMA)
+        off.append(shown(theta)[t, 0] - curves[t].force)
+    wanted = np.sqrt(np.mean(np.square(off))) / max(np.max(np.abs(c.force)) for c in curves)
+    assert float(rows["sections"]["left_out"]) == pytest.approx(wanted, rel=1e-4)
+    # Neither the angle nor the width of the wall is in the line: it cannot fit what sections show.
+    assert float(rows["linear"]["left_out"]) > 5 * wanted
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["compare", "sections.toml", "linear.toml"], "presses along the normal, from a file"),
+        (["compare", "sections.toml", "other.toml"], "other.toml: data.files: other content"),
+        (["fit", "posterior.toml"], "uncertainty.posterior is not available for the skeleton"),
+        (["design", "deep.toml"], "design.depth: 12 mm, this model presses no deeper"),
+        (["design", "behind.toml"], "design.phi: 130 deg, the rings reach 120 deg"),
+        (["design", "line.toml"], "design.phi: this model presses on the midline alone"),
+    ],
+)
+def test_what_is_refused_is_refused_before_the_fit(arguments, says, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    data = [Curve("one", f"{p}", *p, PATH, 0.8 * PATH) for p in PLACES]
+    stored("data.h5", data)
+    stored("other.h5", data[:2])
+    for name, text in {
+        "sections": specification("sections"),
+        "linear": specification("linear"),
+        "other": specification("sections", "other.h5"),
+        "posterior": specification("sections", more="[uncertainty]\nposterior = 100"),
+        "deep": specification("sections", more='[design]\ndepth = ["1 mm", "12 mm"]'),
+        "behind": specification("sections", more='[design]\nphi = ["130 deg"]'),
+        "line": specification("linear", "other.h5", '[design]\nphi = ["30 deg"]'),
+    }.items():
+        Path(f"{name}.toml").write_text(text)
+    code, out, err = run(monkeypatch, capsys, *arguments)
+    assert (code, out) == (2, "")
+    assert says in " ".join(err.split())
+    assert not Path("out").exists()
