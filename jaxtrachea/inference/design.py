@@ -15,11 +15,11 @@ marginalised, so that information, scores and errors are those of the other unkn
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.config import FitSpec, SpecError
@@ -212,8 +212,8 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
     for g, k in enumerate(known.lane):
         lanes = study.lanes
         blend = None if known.blend is None else jnp.asarray(known.blend[g])
-        rows = lanes.value[k, 0], lanes.index[k, 0], blend
-        matrix = _of_all(study, known.samples, (jnp.asarray(known.theta[g]), *rows), candidates)
+        guess = _Guess(jnp.asarray(known.theta[g]), lanes.value[k, 0], lanes.index[k, 0], blend)
+        matrix = _of_all(study, known.samples, guess, candidates)
         matrix = np.nan_to_num(matrix / known.sigma[g] ** 2)
         parts.append(matrix * known.relative[g][:, None] * known.relative[g])
     added = np.stack(parts)
@@ -228,42 +228,58 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
     return marginal(of_press, shared)
 
 
-def _of_all(study: Study, samples: int, guess, candidates: Candidates) -> np.ndarray:
+class _Guess(NamedTuple):
+    """Unknowns of a guess, and the trial that a press is like.
+
+    `value` and `index`: its rows, see `Lane`; `blend`: as `force_jacobian`.
+    """
+
+    theta: Float[Array, " P"]
+    value: Any
+    index: Any
+    blend: Float[Array, ""] | None
+
+
+class _Place(NamedTuple):
+    """A candidate, or with a leading axis many; see `Candidates`."""
+
+    s: Any
+    depth: Any
+    phi: Any
+
+
+def _of_all(study: Study, samples: int, guess: _Guess, candidates: Candidates) -> np.ndarray:
     """`_information` of every candidate; of deforming cross-sections so many at a time; (C, P, P).
 
     Each is a path of its own there, and all together would take the memory.
     """
-    sides, angles = study.lanes.side_force is not None, candidates.phi
-    axes = (*[None] * 4, 0, 0, None if angles is None else 0)
-    run = program(_information, study.model, samples, sides, axes=axes)
+    sides = study.lanes.side_force is not None
+    run = program(_information, study.model, samples, sides, axes=(None, 0))
     count = len(candidates.s)
     together = _TOGETHER if study.model.options.skeleton == "sections" else count
     parts = []
     for first in range(0, count, together):
         row = np.minimum(np.arange(first, first + together), count - 1)
-        place = (None if v is None else jnp.asarray(v[row]) for v in candidates)
-        s, depth, phi = place
-        parts.append(np.array(run(*guess, s, depth, phi))[: count - first])
+        place = _Place(*(None if v is None else jnp.asarray(v[row]) for v in candidates))
+        parts.append(np.array(run(guess, place))[: count - first])
     return np.concatenate(parts)
 
 
-def _information(
-    model: FitModel, samples: int, sides: bool, theta, value, index, blend, s, depth, phi
-):
+def _information(model: FitModel, samples: int, sides: bool, guess: _Guess, place: _Place):
     """Information of one press with noise of 1 N on the unknowns; (P, P).
 
-    `value` and `index`: rows of the trial it is like, see `Lane`; `blend`: as `force_jacobian`;
     `sides`: whether it observes the side force.
     """
-    displacement = depth * jnp.arange(1, samples + 1, dtype=theta.dtype) / samples
+    theta, value, index, blend = guess
+    displacement = place.depth * jnp.arange(1, samples + 1, dtype=theta.dtype) / samples
     index = index[jnp.array(model.free_columns)]
     free = jnp.where(index >= 0, theta[jnp.maximum(index, 0)], 0)
-    J = force_jacobian(model, free, value, s, displacement, blend, phi)
+    J = force_jacobian(model, free, value, place.s, displacement, blend, place.phi)
     J = J if sides else J[:, :samples]
-    place = jnp.where(index >= 0, index, len(theta))
+    at = jnp.where(index >= 0, index, len(theta))
     zero = jnp.zeros((len(theta), len(theta)), theta.dtype)
     gram = jnp.einsum("im,jm->ij", J, J)
-    return zero.at[place[:, None], place[None]].add(gram, mode="drop")
+    return zero.at[at[:, None], at[None]].add(gram, mode="drop")
 
 
 def scores(information: Float[np.ndarray, "G C P P"], criterion: Criterion):

@@ -37,6 +37,8 @@ from jaxtrachea.optimisation.programs import batch_size
 
 #: det(1 - hat matrix of a curve) below which the curve alone determines some combination.
 _ALONE = 1e-9
+#: Lanes of deforming cross-sections together: second derivatives of their paths take memory.
+_TOGETHER = 16
 
 
 class Diagnostics(NamedTuple):
@@ -226,8 +228,10 @@ def influence(result: FitResult, batch: int = 128) -> Influence:
 
     Args:
         result: the fit.
-        batch: lanes computed together.
+        batch: lanes computed together; of deforming cross-sections no more than `_TOGETHER`.
     """
+    if result.study.model.options.skeleton == "sections":
+        batch = min(batch, _TOGETHER)
     free = np.asarray(result.study.lanes.active) * ~result.at_bound
     diagnostics = map_lanes(
         diagnose, result.study, result.theta, result.whitened_sigma, result.relative, free,
