@@ -165,7 +165,7 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
     measurements, notes = measured_curves(stored, given)
     curves, unusable = pressable(stored, measurements.curves)
     unread = None
-    if stored.study.model.options.skeleton != "sections":
+    if not stored.study.model.options.deforms_sections:
         curves, unread = along_the_normal(curves)
     notes += [] if unread is None else [unread]
     bad = [*measurements.bad, *unusable]

@@ -147,7 +147,7 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
     if reasons and not good:
         raise SpecError(reasons[0])
     unread = None
-    if options.skeleton != "sections":
+    if not options.deforms_sections:
         good, unread = along_the_normal(good)
     notes = measurements.notes if unread is None else (*measurements.notes, unread)
     return dataclasses.replace(measurements, curves=tuple(good), bad=tuple(bad), notes=notes)

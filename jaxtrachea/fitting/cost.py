@@ -133,7 +133,7 @@ def rounding_cost(model: FitModel, lane: Lane, sigma: Any, dtype: Any = None) ->
         sigma: of (force, markers), likewise.
         dtype: of the computation; None: that of the lane.
     """
-    roundings = 100.0 if model.options.skeleton == "sections" else 10.0
+    roundings = 100.0 if model.options.deforms_sections else 10.0
     of_one = roundings * epsilon(lane.force.dtype if dtype is None else dtype)
     return data_weight(lane, sigma) * of_one**2
 
@@ -180,7 +180,7 @@ class LaneCost(eqx.Module):
         to compile, and the steps are straight enough.
         """
         model, lane = self.model, self.lane
-        if model.options.skeleton == "sections":
+        if model.options.deforms_sections:
             return jnp.zeros_like(theta)
         along = of_trials(model, step, lane)
         probe = residual_value(model, theta + PROBE * step, lane, self.geometry)

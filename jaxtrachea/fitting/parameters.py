@@ -122,7 +122,7 @@ def visible(options: Options, *, joints: bool) -> list[str]:
     `total` and no joint markers the skeleton does not enter: force-displacement curves then see the
     local law alone.
     """
-    if options.skeleton == "sections":
+    if options.deforms_sections:
         return [name for name in DEFAULTS if name in SECTION_VALUES or name in OF_PRESS]
     has = {"": True, "shear": options.shear, "two-material": options.local == "two-material",
            "softening": options.skeleton == "softening"}  # fmt: skip
@@ -161,7 +161,7 @@ def defaults_of(
     Raises:
         InputError: a wall for a model that does not read it.
     """
-    if options.skeleton != "sections":
+    if not options.deforms_sections:
         if wall is not None:
             raise InputError(
                 "moduli and thicknesses are read by the skeleton 'sections' alone", key="wall",

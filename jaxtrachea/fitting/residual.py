@@ -87,7 +87,7 @@ def inputs(
     Raises:
         ValueError: a skeleton of deforming cross-sections, which no few numbers describe.
     """
-    if model.options.skeleton == "sections":
+    if model.options.deforms_sections:
         raise ValueError("a skeleton of deforming cross-sections has no compliance of its own")
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
     skeleton = _skeleton(model, free, _places(lane), tube)
@@ -112,7 +112,7 @@ def residual(
         geometry: the tube, may be traced; None: of the model.
     """
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
-    if model.options.skeleton == "sections":
+    if model.options.deforms_sections:
         return Residual(*section_residual.residual(model, free, of_press(lane), tube))
     skeleton, by_beam = _skeleton_and_derivative(model, free, _places(lane), tube)
 
@@ -127,7 +127,7 @@ def residual_value(
 ) -> Float[Array, "T m"]:
     """`residual` without its Jacobian."""
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
-    if model.options.skeleton == "sections":
+    if model.options.deforms_sections:
         return section_residual.residual_value(model, free, of_press(lane), tube)
     skeleton = _skeleton(model, free, _places(lane), tube)
 
@@ -409,7 +409,7 @@ def force_jacobian(
             on the midline.
     """
     tube = _tube(model, None, free.dtype)
-    if model.options.skeleton == "sections":
+    if model.options.deforms_sections:
         along = None if phi_c is None else jnp.asarray([1.0, 0.0], free.dtype)
         tool = section_residual.Tool(s_c, displacement, phi_c, along)
         return section_residual.force_jacobian(model, free, value, tool, tube)

@@ -87,7 +87,7 @@ def suspicious(study: Study) -> Bool[np.ndarray, " lanes"]:
     singular Jacobian at the estimate: one that is regular proves the full rank.
     """
     lanes = study.lanes
-    if study.model.options.skeleton == "sections":
+    if study.model.options.deforms_sections:
         return np.zeros(len(lanes.s_c), bool)
     beam = sum(p.name in SKELETON for p in study.free)
     places = positions(study)
@@ -229,7 +229,7 @@ def _joint_null_spaces(study: Study, J, active, nullity) -> list[np.ndarray]:
 
 def _seen(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     """V J of each lane: all combinations of inputs that its curves tell, by the unknowns."""
-    if study.model.options.skeleton == "sections":
+    if study.model.options.deforms_sections:
         return _seen_of_sections(study, lanes, theta)
     J = map_lanes(_inputs_by_unknowns, _without_curves(study), theta, rows=lanes, batch=_BATCH)
     log = _log(study)[lanes]
@@ -343,7 +343,7 @@ def _kinds(study: Study) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " lanes
     """One lane of every kind (all of a joint study), and the kind of each lane."""
     lanes = study.lanes
     count = len(lanes.s_c)
-    if study.joint or study.model.options.skeleton == "sections":
+    if study.joint or study.model.options.deforms_sections:
         return np.arange(count), np.arange(count)  # of sections every displacement counts
     marked = lanes.joint_precision
     parts = [lanes.s_c, lanes.index, lanes.value, lanes.active, lanes.lower, lanes.upper]
@@ -357,7 +357,7 @@ def _kinds(study: Study) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " lanes
 
 def _points(study: Study) -> Float[np.ndarray, "lanes points P"]:
     """Generic points of every lane's box; shared unknowns are the same in all lanes."""
-    sections = study.model.options.skeleton == "sections"
+    sections = study.model.options.deforms_sections
     _, low, high = box(study, DECADES_OF_SECTIONS if sections else DECADES)
     unit = np.random.default_rng(20091).uniform(0.02, 0.98, (POINTS, study.size))
     return low[:, None] + unit * (high - low)[:, None]

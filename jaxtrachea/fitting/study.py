@@ -103,7 +103,7 @@ class Study:
         Raises:
             ValueError: the skeleton is of deforming cross-sections.
         """
-        if self.model.options.skeleton == "sections":
+        if self.model.options.deforms_sections:
             raise ValueError(
                 f"{what} is not available for the skeleton 'sections'; leave it out (standard "
                 "errors, profiles, the bootstrap, influence, leaving out and designs are), or "
@@ -173,7 +173,7 @@ def build_study(
         raise ValueError("no usable curve; nothing to fit")
     for curve in curves:
         check_curve(curve, geometry, options)
-    if options.skeleton != "sections":
+    if not options.deforms_sections:
         curves, unread = along_the_normal(curves)
         if unread is not None:
             warnings.warn(unread, stacklevel=2)
@@ -185,7 +185,7 @@ def build_study(
     lanes = lanes_of(
         groups, unknowns, parameters, geometry,
         noise=noise, balance=weighting.balance, tool_radius=tool_radius,
-        vectors=options.skeleton == "sections",
+        vectors=options.deforms_sections,
     )  # fmt: skip
     if onset_is_sought(parameters, options):
         lanes = lanes._replace(blend=blends(lanes, groups, noise.force, parameters, options))
@@ -252,7 +252,7 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
         )
     else:
         _check_width(curve.s_c, length, options, where)
-    if options.skeleton == "sections":
+    if options.deforms_sections:
         if not abs(curve.phi_c) <= float(geometry.half_angle):
             raise InputError(
                 f"contact at phi = {np.degrees(curve.phi_c):.3g} deg, expected on the cartilage, "

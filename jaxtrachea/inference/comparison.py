@@ -87,8 +87,7 @@ def same_data(studies: Sequence[Study], names: Sequence[str]) -> None:
         if study.model.loss != "linear" or first.model.loss != "linear":
             raise ValueError(f"fit.loss of {pair}: criteria need a likelihood; use 'linear'")
         if _curves(study) != _curves(first):
-            skeletons = {s.model.options.skeleton for s in (study, first)}
-            if "sections" in skeletons and len(skeletons) > 1:
+            if len({s.model.options.deforms_sections for s in (study, first)}) > 1:
                 raise ValueError(
                     f"{pair} use different samples: skeleton 'sections' reads side forces, "
                     "sideward markers, ring ends and presses off the midline, which the other does "

@@ -206,7 +206,7 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
         ValueError: angles for a skeleton that is pressed on the midline alone.
     """
     study = known.study
-    if candidates.phi is not None and study.model.options.skeleton != "sections":
+    if candidates.phi is not None and not study.model.options.deforms_sections:
         raise ValueError("presses off the midline need the skeleton 'sections'; leave phi out")
     parts = []
     for g, k in enumerate(known.lane):
@@ -256,7 +256,7 @@ def _of_all(study: Study, samples: int, guess: _Guess, candidates: Candidates) -
     sides = study.lanes.side_force is not None
     run = program(_information, study.model, samples, sides, axes=(None, 0))
     count = len(candidates.s)
-    together = _TOGETHER if study.model.options.skeleton == "sections" else count
+    together = _TOGETHER if study.model.options.deforms_sections else count
     parts = []
     for first in range(0, count, together):
         row = np.minimum(np.arange(first, first + together), count - 1)
@@ -394,7 +394,7 @@ def candidates_of(spec: FitSpec, study: Study) -> Candidates:
             f"{tool if low > 0 else ''}; give places on it"
         )
     depth = (0.5 * deepest, deepest) if section.depth is None else section.depth
-    sections = study.model.options.skeleton == "sections"
+    sections = study.model.options.deforms_sections
     radius = float(study.model.geometry.radius)
     if sections and depth[1] > radius:
         raise SpecError(
@@ -411,7 +411,7 @@ def _angles(asked: tuple[float, ...] | None, study: Study) -> list[float]:
     Raises:
         SpecError: one that the model does not press.
     """
-    if study.model.options.skeleton != "sections":
+    if not study.model.options.deforms_sections:
         if asked is not None:
             raise SpecError(
                 "design.phi: this model presses on the midline alone; leave it out, or choose "

@@ -230,7 +230,7 @@ def influence(result: FitResult, batch: int = 128) -> Influence:
         result: the fit.
         batch: lanes computed together; of deforming cross-sections no more than `_TOGETHER`.
     """
-    if result.study.model.options.skeleton == "sections":
+    if result.study.model.options.deforms_sections:
         batch = min(batch, _TOGETHER)
     free = np.asarray(result.study.lanes.active) * ~result.at_bound
     diagnostics = map_lanes(

@@ -74,8 +74,13 @@ class Options:
                 "skeleton='softening' needs coupling='series': with 'total' the force does not "
                 "depend on the skeleton"
             )
-        if self.skeleton == "sections":
+        if self.deforms_sections:
             _check_sections(self)
+
+    @property
+    def deforms_sections(self) -> bool:
+        """Whether rings change their shape: pressed by `press_sections`, and no line of joints."""
+        return self.skeleton == "sections"
 
     def places(self, length: float) -> tuple[float, float]:
         """Lowest and highest contact position, mm, at which all of the tool lies on the tube."""
@@ -108,7 +113,7 @@ def check_line(options: Options, what: str) -> None:
     Raises:
         ValueError: naming what was called and the cure.
     """
-    if options.skeleton == "sections":
+    if options.deforms_sections:
         raise ValueError(
             f"{what} presses a line of joints, not skeleton='sections'; use press_sections"
         )

@@ -109,7 +109,7 @@ def respond(
             options.
         aside: off the midline, or not along the normal; None: neither.
     """
-    if model.options.skeleton == "sections":
+    if model.options.deforms_sections:
         return _respond_sections(model, free, value, s_c, displacement, aside)
     material, values = material_and_values(model, free, value)
     geometry = jax.tree.map(lambda v: jnp.asarray(v, free.dtype), model.geometry)
@@ -216,7 +216,7 @@ def predicted(
         end, _ = respond(model, free + sign * step, value, s_c, displacement, blend, aside)
         return end.force - out.force - sign * straight
 
-    if model.options.skeleton == "sections":  # one program for both: it is long to compile
+    if model.options.deforms_sections:  # one program for both: it is long to compile
         bends = jax.vmap(bend)(jnp.asarray([1.0, -1.0], free.dtype))
     else:
         bends = jnp.stack([bend(1.0), bend(-1.0)])

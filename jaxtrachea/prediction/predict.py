@@ -197,7 +197,7 @@ def _on_host(stored: StoredFit, source: Source, where, displacement, part: Predi
     def hide(v):
         return v if usable else np.full_like(v, np.nan)
 
-    sections = stored.study.model.options.skeleton == "sections"
+    sections = stored.study.model.options.deforms_sections
     skeleton = sections or any(p.name == "k_M" for p in stored.study.parameters)
 
     def show(v):
@@ -375,7 +375,7 @@ def check_aside(results: StoredFit, phi: float, direction: tuple[float, float]) 
         ValueError: with what is expected.
     """
     model = results.study.model
-    if model.options.skeleton != "sections":
+    if not model.options.deforms_sections:
         if phi != 0 or tuple(direction) != (1.0, 0.0):
             raise ValueError(
                 "this fit presses on the anterior midline along the normal; phi and direction "

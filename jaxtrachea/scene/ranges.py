@@ -61,7 +61,7 @@ def unserved(
     given = not plan.contact
     if not plan.second_plane:
         found.append(_off_plane(presses))
-    elif plan.options.skeleton == "sections":
+    elif plan.options.deforms_sections:
         found.append(jnp.abs(D[:, 0]) > COVERED * _length(D) + COVERED)
     elif "axial" in less and (given or plan.contact_point == "fixed"):
         found.append(jnp.abs(D[:, 0]) > COVERED * _length(D) + COVERED)

@@ -108,7 +108,7 @@ class Session:
             raise ValueError(f"keep is {keep}; expected at least 1")
         if not scene.plan.contact:
             raise ValueError("the plan has no contact; make the scene with a path of Poses")
-        if isinstance(material, SectionMaterial) or scene.plan.options.skeleton == "sections":
+        if isinstance(material, SectionMaterial) or scene.plan.options.deforms_sections:
             raise ValueError(
                 "a session has no skeleton 'sections'; use simulate, or make the scene with the "
                 "Material of a line of joints"

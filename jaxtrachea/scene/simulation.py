@@ -102,9 +102,9 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
     plan = scene.plan
     check_path(path)
     check_material(scene.geometry, material)
-    if (plan.options.skeleton == "sections") != isinstance(material, SectionMaterial):
+    if plan.options.deforms_sections != isinstance(material, SectionMaterial):
         kinds = ("Material", "SectionMaterial (the plan has a skeleton 'sections')")
-        expected = kinds[plan.options.skeleton == "sections"]
+        expected = kinds[plan.options.deforms_sections]
         raise ValueError(f"material is {type(material).__name__}; expected {expected}")
     if plan.contact != isinstance(path, Poses):
         kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
