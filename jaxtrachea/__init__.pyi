@@ -16,6 +16,8 @@ from .measurements.read import read_measurements as read_measurements
 from .mechanics.beam import Beam as Beam
 from .mechanics.beam import contact_compliance as contact_compliance
 from .mechanics.beam import deflect as deflect
+from .mechanics.bound import BoundPress as BoundPress
+from .mechanics.bound import bind as bind
 from .mechanics.force_law import Law as Law
 from .mechanics.force_law import duffing as duffing
 from .mechanics.friction import Coulomb as Coulomb

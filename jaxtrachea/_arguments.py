@@ -73,6 +73,29 @@ def shaped(name: str, value: Any, *shapes: tuple[int | str, ...], dtype=None, wh
     raise ValueError(f"{name} has {_shape_words(array.shape)}; expected {expected}{why}")
 
 
+def check_fits(name: str, value: Array, like: Any, cure: str, *, spread: bool = False) -> None:
+    """Refuse an array that a program compiled for arrays `like` this one cannot take.
+
+    Args:
+        name: of the argument, for the message.
+        value: from `real`.
+        like: has the shape and dtype.
+        cure: what else to do, for the message.
+        spread: a single number fits any shape.
+
+    Raises:
+        ValueError: another shape, or another dtype (a Python number fits any).
+    """
+    if value.shape != like.shape and not (spread and value.shape == ()):
+        found, known = _shape_words(value.shape), _shape_words(like.shape)
+        raise ValueError(f"{name} has {found}; the program was compiled for {known}: {cure}")
+    if value.dtype != like.dtype and not getattr(value, "weak_type", False):
+        raise ValueError(
+            f"{name} is {value.dtype}; the program was compiled for {like.dtype}: convert it, or "
+            f"{cure}"
+        )
+
+
 def last_axis(name: str, value: Any, length: int, dtype=None) -> Array:
     """As `real`, any shape that ends in an axis of `length`.
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._arguments import ArrayLike, shaped
+from jaxtrachea._arguments import ArrayLike, check_fits, shaped
 from jaxtrachea._errors import InputError
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -93,6 +93,28 @@ def check_shapes(geometry: Geometry, material: Material) -> None:
             f"given without Material.{other}, and would be ignored", key=f"Material.{name}",
             cure=f"give Material.{other} too, or leave it out",
         )  # fmt: skip
+
+
+def check_alike(material: Material, like: Any, cure: str) -> None:
+    """Refuse a material that a program compiled for one `like` this cannot take.
+
+    Args:
+        material: its shapes fit the tube (`check_shapes`).
+        like: a `Material` of arrays or of their shapes and dtypes.
+        cure: what else to do, for the message.
+
+    Raises:
+        ValueError: a value that is missing or was not there, of another shape or dtype. A single
+            number fits any shape, one from Python any dtype.
+    """
+    for name in VALUES:
+        value, known, key = getattr(material, name), getattr(like, name), f"Material.{name}"
+        if value is not None and known is not None:
+            check_fits(key, value, known, cure, spread=True)
+        elif value is not known:
+            found, was = ("missing", "with") if value is None else ("given", "without")
+            raise InputError(f"is {found}; the program was compiled {was} it", key=key,
+                             joint=" ", cure=f"give the same values, or {cure}")  # fmt: skip
 
 
 def without_negative(material: Material, used: Iterable[str]) -> tuple[Material, Array]:

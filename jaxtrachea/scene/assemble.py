@@ -6,6 +6,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea._arguments import check_fits
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.declare import AnyMaterial, PlanError, SceneFacts
@@ -23,6 +24,8 @@ from jaxtrachea.trachea.mesh import Mesh
 FOOTPRINT, LEAST = 0.6, 4.0
 #: Wall of Table 1, mm, where nothing else is known of it.
 WALL = 2.6
+#: Of a tool that a program does not fit.
+CURE = "make a scene for this tool (a program for the largest tool serves smaller ones)"
 
 
 def make_scene(
@@ -79,8 +82,7 @@ def make_scene(
             tube = checked_walls(geometry, mesh, progress)
         near = near_patches(shape, geometry, tube.centres.shape[0])
     if shape is not None:
-        extent = np.ptp(np.asarray(shape.vertices), axis=1).min() / 2 + float(shape.radius)
-        size = max(FOOTPRINT * extent, LEAST)
+        size = _footprint(shape)
     mu = None if friction is None else jnp.asarray(friction, dtype)
     binding = None if mesh is None else regions.bind(mesh, geometry)
     spacing = jnp.asarray(size, dtype)
@@ -93,6 +95,12 @@ def make_scene(
     if plan.surface is None or mesh is None:
         return dataclasses.replace(scene, mesh=None, binding=None, plan=plan)
     return dataclasses.replace(scene, plan=plan, runs=local.runs(mesh.s, spacing))
+
+
+def _footprint(tool: Shape) -> float:
+    """Distance between the circles of the dent's centres, mm."""
+    extent = np.ptp(np.asarray(tool.vertices), axis=1).min() / 2 + float(tool.radius)
+    return max(FOOTPRINT * extent, LEAST)
 
 
 def _outer(geometry: Geometry, mesh: Mesh | None):
@@ -112,6 +120,36 @@ def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
     if scene.mesh is not None:
         binding = regions.bind(scene.mesh, geometry, scene.binding)
     return dataclasses.replace(scene, geometry=geometry, binding=binding)
+
+
+def with_tool(scene: Scene, tool: Shape) -> Scene:
+    """The scene with a tool of another size (concrete numbers) and the same program.
+
+    Raises:
+        ValueError: more or fewer corners than the tool before, another dtype, or so large that the
+            program searches too few patches or moves too few vertices.
+        SizeError: larger than any tool.
+    """
+    before, tube, geometry = scene.tool, scene.tube, scene.geometry
+    if not isinstance(tool, Shape):
+        raise ValueError(f"tool is {type(tool).__name__}; expected a Shape")
+    if before is None or tube is None:
+        raise ValueError("the scene has no tool; make it with one and a path of Poses")
+    for name in ("vertices", "radius"):
+        check_fits(f"tool.{name}", getattr(tool, name), getattr(before, name), CURE)
+    check_sizes(geometry, float(scene.radius), tool)
+    near = near_patches(tool, geometry, tube.centres.shape[0])
+    if near > scene.near:
+        raise ValueError(
+            f"tool lies along up to {near} patches of the wall, and the program searches "
+            f"{scene.near}: {CURE}"
+        )
+    spacing = jnp.asarray(_footprint(tool), scene.footprint.dtype)
+    if scene.plan.dent and scene.runs is not None and scene.mesh is not None:
+        reached = local.runs(scene.mesh.s, spacing).longest
+        if any(a > b for a, b in zip(reached, scene.runs.longest, strict=True)):
+            raise ValueError(f"the dent of tool is wider than the program's: {CURE}")
+    return dataclasses.replace(scene, tool=tool, footprint=spacing)
 
 
 def with_mesh(scene: Scene, mesh: Mesh) -> Scene:

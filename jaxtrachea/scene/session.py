@@ -1,10 +1,12 @@
 """A scene step by step: one position of the tool in, forces and surface out, without a pause.
 
 For loops in real time (haptics, a simulator's frame). Everything is compiled when the session is
-made; a step compiles nothing and writes into the memory of the step before.
+made; a step compiles nothing. State and result go in and out as one array each (`_packed`).
 """
 
+import dataclasses
 import time
+from operator import itemgetter
 from typing import NamedTuple
 
 import jax
@@ -13,8 +15,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxtrachea._packed import Packing
+from jaxtrachea.contact.shapes import Shape
+from jaxtrachea.mechanics.admission import check_alike
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.approach import approach
+from jaxtrachea.scene.assemble import with_tool
 from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.seat import (
@@ -31,12 +37,15 @@ from jaxtrachea.scene.seat import (
     way_of,
 )
 from jaxtrachea.scene.simulation import Simulation, follow
-from jaxtrachea.scene.stage import Poses, Scene, touch_tube
+from jaxtrachea.scene.stage import Poses, Scene, check_material, touch_tube
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
 
 #: Borders of the histogram of latencies, s: four a decade from 10 us to 1 s.
 EDGES = np.logspace(-5, 0, 21)
+
+#: Arrays of the result that have a number for every ring or vertex.
+LARGE = ("joints", "loads", "end_U", "end_V", "vertices")
 
 
 class State(NamedTuple):
@@ -77,6 +86,20 @@ class Latency(NamedTuple):
     counts: np.ndarray
 
 
+class Changeable(NamedTuple):
+    """What may change from step to step: an argument of the program, not a constant in it.
+
+    Attributes:
+        material: -
+        tool: its shape about its own origin.
+        footprint: of the scene, which goes with the tool.
+    """
+
+    material: Material
+    tool: Shape
+    footprint: Float[Array, ""]
+
+
 class Session:
     """A scene and its material, compiled for one pose at a time.
 
@@ -87,9 +110,16 @@ class Session:
     continuous in the pose. A pose that is not finite is a row of NaN with NON_FINITE and changes
     nothing else.
 
-    A step gives up the arrays of the step before: copy what must last longer
-    (`jax.tree.map(np.array, result)`). On the CPU 7 to 9 us of a step go away with
+    Material and tool are arguments of the program: `set_material` and `set_tool` compile nothing.
+
+    A step gives up the arrays for rings and vertices of the step before: copy what must last longer
+    (`np.array(result.vertices)`). On the CPU 7 to 9 us of a step go away with
     `jax.config.update("jax_cpu_enable_async_dispatch", False)` before the first use of JAX.
+
+    Attributes:
+        scene: with the tool as it is now.
+        material: as it is now.
+        dtype: of poses.
     """
 
     def __init__(self, scene: Scene, material: AnyMaterial, *, keep: int = 10_000):
@@ -97,16 +127,16 @@ class Session:
 
         Args:
             scene: from `make_scene` with a path of `Poses`.
-            material: as the plan needs it; its numbers become constants of the program.
+            material: as the plan needs it.
             keep: latencies of so many last steps are kept.
 
         Raises:
             ValueError: a scene without contact, with deforming cross-sections, or with friction,
-                which depends on the whole path.
+                which depends on the whole path; a material that does not fit the tube.
         """
         if keep < 1:
             raise ValueError(f"keep is {keep}; expected at least 1")
-        if not scene.plan.contact:
+        if not scene.plan.contact or scene.tool is None:
             raise ValueError("the plan has no contact; make the scene with a path of Poses")
         if isinstance(material, SectionMaterial) or scene.plan.options.deforms_sections:
             raise ValueError(
@@ -118,26 +148,47 @@ class Session:
                 "the plan has friction, which depends on the whole path; use simulate, or make the "
                 "scene with EffectOptions(friction='off')"
             )
-        self.scene, self.dtype = scene, np.dtype(scene.footprint.dtype)
-        pose = (np.eye(3, dtype=self.dtype), np.zeros(3, self.dtype))
-        start = jax.eval_shape(_start, scene, *pose)
+        check_material(scene.geometry, material)
+        self.scene, self.material = scene, material
+        self.dtype = np.dtype(scene.footprint.dtype)
+        given = Changeable(material, scene.tool, scene.footprint)
+        self._given = Packing(given, weak=self.dtype)
+        self._numbers = jax.device_put(self._given.fill(given))
+        self._compile()
+        self._seconds, self._steps = np.zeros(keep), 0
+
+    def _compile(self) -> None:
+        """The program of a step, its first state and the memory that it writes into."""
+        scene, given = self.scene, self._given
+        pose = np.eye(3, dtype=self.dtype), np.zeros(3, self.dtype)
+        self._start = np.asarray(_packed_start(scene, *pose))
+        states = Packing(jax.eval_shape(_start, scene, *pose))
 
         @jax.jit  # traced once, for the shapes of the result and for the program
-        def one(packed, *pose):
-            state, result = _step(scene, material, _unpack(packed, start), *pose)
-            return _pack(state), result
+        def one(state, rotation, translation, numbers):
+            now = given.unpack(numbers)
+            scene_now = dataclasses.replace(scene, tool=now.tool, footprint=now.footprint)
+            state, result = _step(
+                scene_now, now.material, states.unpack(state), rotation, translation
+            )
+            return states.pack(state), *_apart(result)
 
-        def run(packed, _, *pose):
-            return one(packed, *pose)
+        _, contact, large = jax.eval_shape(one, self._start, *pose, self._numbers)
+        contacts = Packing(contact)
 
-        self._start = np.asarray(_packed_start(scene, *pose))
-        empty = jax.eval_shape(one, self._start, *pose)[1]
-        zeros = jax.tree.map(lambda v: jnp.asarray(np.zeros(v.shape, v.dtype), v.dtype), empty)
-        # Donated: the new state and result are written where the old ones were.
+        def run(state, _, *given):
+            # State and contact as two arrays: in one, much of what both need is computed twice.
+            state, contact, large = one(state, *given)
+            return state, contacts.pack(contact), tuple(large.values())
+
+        zeros = tuple(jnp.array(np.zeros(v.shape, v.dtype)) for v in large.values())
+        # Donated: the new state and the large arrays are written where the old ones were.
         made = jax.jit(run, donate_argnums=(0, 1), keep_unused=True)
-        self._run = made.lower(self._start, zeros, *pose).compile()
-        self._state, self._result = jnp.array(self._start), zeros
-        self._seconds, self._steps = np.zeros(keep), 0
+        self._run = made.lower(self._start, zeros, *pose, self._numbers).compile()
+        self._state, self._large, self._contacts = jnp.array(self._start), zeros, contacts
+        names = [n for n in Simulation._fields if getattr(contact, n) is not None]
+        where = {name: at for at, name in enumerate([*names, *large])}
+        self._in_order = itemgetter(*(where.get(n, len(where)) for n in Simulation._fields))
 
     def step(self, rotation: ArrayLike, translation: ArrayLike) -> Simulation:
         """Move the tool.
@@ -147,22 +198,68 @@ class Session:
             translation: of its origin, mm; shape (3,).
 
         Returns:
-            Fields as those of `simulate`, without the axis of rows; finished, on the device.
+            Fields as those of `simulate`, without the axis of rows, finished: numpy arrays, which
+            last; but what there is for every ring or vertex (`joints`, `loads`, `end_U`, `end_V`,
+            `vertices`) lies on the device until the next step.
 
         Raises:
             ValueError: another shape.
         """
         begin = time.perf_counter()
-        pose = np.asarray(rotation, self.dtype), np.asarray(translation, self.dtype)
-        if pose[0].shape != (3, 3) or pose[1].shape != (3,):
+        turn, place = np.asarray(rotation, self.dtype), np.asarray(translation, self.dtype)
+        if turn.shape != (3, 3) or place.shape != (3,):
             raise ValueError(
-                f"rotation {pose[0].shape}, translation {pose[1].shape}; expected (3, 3) and (3,)"
+                f"rotation {turn.shape}, translation {place.shape}; expected (3, 3) and (3,)"
             )
-        self._state, self._result = self._run(self._state, self._result, *pose)
-        jax.block_until_ready(self._result)
+        # Two arrays: to make one of them takes longer than it saves.
+        given = turn, place, self._numbers
+        self._state, packed, self._large = self._run(self._state, self._large, *given)
+        contact = self._contacts.leaves(np.asarray(packed))  # waits for all of them
+        result = Simulation._make(self._in_order((*contact, *self._large, None)))
         self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin
         self._steps += 1
-        return self._result
+        return result
+
+    def set_material(self, material: Material) -> None:
+        """Go on with other values of the material; nothing is compiled.
+
+        The tool stays on its seat (`reset` lets it begin anew). A single number may stand where the
+        session was made with an array: it holds for every span or ring.
+
+        Args:
+            material: the values that the session was made with, no more and no less.
+
+        Raises:
+            ValueError: a value that is missing or was not there before, of another shape or dtype,
+                or that no scene reads.
+        """
+        check_material(self.scene.geometry, material)
+        check_alike(material, self._given.like.material, "make a new Session")
+        self._change(self.scene, material)
+
+    def set_tool(self, tool: Shape) -> None:
+        """Go on with a tool of another size; nothing is compiled.
+
+        It has as many corners as the first, and is not so much larger that it would need a program
+        of its own: make the session with the largest tool. A smaller one is as in a session of its
+        own but for the smoothing of the contact, which may take one more patch into account. What
+        the old tool held is forgotten, as by `reset`; latencies are kept.
+
+        Args:
+            tool: about its own origin, mm.
+
+        Raises:
+            ValueError: another number of corners or another dtype, or a size that the program does
+                not reach (or no tool has).
+        """
+        self._change(with_tool(self.scene, tool), self.material)
+        self._state = jnp.array(self._start)
+
+    def _change(self, scene: Scene, material: Material) -> None:
+        assert scene.tool is not None
+        given = Changeable(material, scene.tool, scene.footprint)
+        self._numbers = jax.device_put(self._given.fill(given))
+        self.scene, self.material = scene, material
 
     def reset(self) -> None:
         """Forget where the tool was, and all latencies."""
@@ -185,23 +282,11 @@ class Session:
         )  # fmt: skip
 
 
-def _pack(state: State) -> Float[Array, " numbers"]:
-    """One array instead of 30: each costs some 2 us a step. All is held exactly."""
-    leaves = jax.tree.leaves(state)
-    widest = max((v.dtype for v in leaves if jnp.issubdtype(v.dtype, jnp.floating)), key=_bits)
-    return jnp.concatenate([jnp.ravel(v).astype(widest) for v in leaves])
-
-
-def _bits(dtype) -> int:
-    return jnp.finfo(dtype).bits
-
-
-def _unpack(packed: Float[Array, " numbers"], like: State) -> State:
-    leaves, tree = jax.tree.flatten(like)
-    ends = np.cumsum([v.size for v in leaves])
-    parts = jnp.split(packed, ends[:-1])
-    back = (p.reshape(v.shape).astype(v.dtype) for p, v in zip(parts, leaves, strict=True))
-    return jax.tree.unflatten(tree, back)
+def _apart(result: Simulation) -> tuple[Simulation, dict[str, Array]]:
+    """The result without what there is for every ring or vertex, and that by name."""
+    found = {name: getattr(result, name) for name in LARGE}
+    large = {name: v for name, v in found.items() if v is not None}
+    return result._replace(**dict.fromkeys(LARGE)), large
 
 
 def _start(scene: Scene, rotation, translation) -> State:
@@ -268,4 +353,5 @@ def _pick(when, a, b):
 
 @jax.jit
 def _packed_start(scene: Scene, rotation, translation) -> Float[Array, " numbers"]:
-    return _pack(_start(scene, rotation, translation))
+    start = _start(scene, rotation, translation)
+    return Packing(start).pack(start)

@@ -1,5 +1,6 @@
 """Steps of a session are rows of the simulation of their path."""
 
+import contextlib
 import dataclasses
 from functools import partial
 
@@ -24,6 +25,7 @@ from small_scenes import (
 from tool_ways import closed_loop, placed, random_way, step_lengths
 
 from jaxtrachea import EffectOptions, Poses, Session, make_scene, press, press_oblique, simulate
+from jaxtrachea.contact.shapes import capsule, sphere
 from jaxtrachea.mechanics.oblique import ObliqueOptions, place_at
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.seat import given_way
@@ -43,6 +45,8 @@ HELD = dataclasses.replace(
     want_joints=False,
     want_ring_ends=False,
 )
+#: Straight down between two rings.
+DOWN_BALL = ball([80, 1, 0], [80, -2, 0])
 # Comes down slanting, presses, and goes on along the tube, still in contact: s, height, z.
 WAY = np.array([[72, 3, 0], [73, 1, 0], [74, -1, 0], [74.5, -3, 0], [75, -4, 0.2], [74, -2, 0]])
 
@@ -358,3 +362,151 @@ def test_refusals():
         )
     with pytest.raises(ValueError, match="keep"):
         Session(rubbing, MATERIAL, keep=0)
+
+
+def cast(tree, dtype):
+    return jax.tree.map(lambda v: jnp.asarray(np.asarray(v, dtype), dtype), tree)
+
+
+@contextlib.contextmanager
+def compilations():
+    """Counts the programs compiled within."""
+    counted = []
+
+    def listen(event, duration, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            counted.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield counted
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+
+
+OTHER = dataclasses.replace(
+    MATERIAL, **{k: 1.7 * getattr(MATERIAL, k) for k in ("EI_L", "k_M", "k_1", "EI_C", "EA_L")}
+)
+
+
+def same_rows(found, expected, dtype):
+    for a, b in zip(found, expected, strict=True):
+        for name, v, w in zip(a._fields, a, b, strict=True):
+            if w is None:
+                assert v is None, name
+            else:
+                assert (v.shape, v.dtype) == (w.shape, w.dtype), name
+                tolerance = 1e3 * np.finfo(dtype).eps
+                np.testing.assert_allclose(v, w, rtol=tolerance, atol=tolerance, err_msg=name)
+
+
+def test_another_material_and_tool_compile_nothing(held):
+    """The same numbers as a session made with them; then those of before again."""
+    dtype, way = held.dtype, cast(ball([75, 1, 0], [76, -2, 1], rows=7), held.dtype)
+    other, first, tool = cast((OTHER, MATERIAL, sphere(4.0)), dtype)
+    held.reset()
+    before = rows(held, way)
+    with compilations() as counted:
+        held.set_material(other)
+        held.reset()
+        softer = rows(held, way)
+        held.set_tool(tool)
+        smaller = rows(held, way)
+        held.set_material(first)
+        held.set_tool(cast(BALL, dtype))
+        again = rows(held, way)
+    assert not counted
+    assert not np.allclose(softer[-1].force, before[-1].force, rtol=0.1)
+    assert smaller[-1].gap > softer[-1].gap + 0.5
+    for a, b in zip(again, before, strict=True):
+        jax.tree.map(np.testing.assert_array_equal, a, b)
+    same_rows(softer, rows(Session(held.scene, other), way), dtype)
+    scene = make_scene(cast(TUBE, dtype), other, way, tool=tool, effects=HELD)
+    assert scene.near <= held.scene.near
+    scene = dataclasses.replace(scene, near=held.scene.near)
+    same_rows(smaller, rows(Session(scene, other), way), dtype)
+
+
+def test_force_of_another_material_in_closed_form():
+    """Springs in series, without seat and program in common: a press on a beam without rings."""
+    bare = dataclasses.replace(SPRINGS, k_M=jnp.asarray(0.0), k_3=jnp.asarray(0.0))
+    effects = dataclasses.replace(BARE, contact_point="fixed", want_joints=False)
+    session = Session(make_scene(TUBE, bare, DOWN_BALL, tool=BALL, effects=effects), bare)
+    for EI, k_1 in ((1.86, 0.3), (700.0, 5.0)):
+        session.set_material(dataclasses.replace(bare, EI_L=jnp.asarray(EI), k_1=jnp.asarray(k_1)))
+        session.reset()
+        for depth in (-1.0, 1.5):
+            step = session.step(EYE, [80, OUTER + 5 - depth, 0])
+        s, C = float(step.s), 160.0**3 / (192 * EI)
+        assert abs(s - 80) < 0.05
+        np.testing.assert_allclose(-step.force[1], -float(step.gap) / (C + 1 / k_1), rtol=1e-4)
+
+
+def test_a_single_number_for_an_array():
+    rings = dataclasses.replace(SPRINGS, k_M=jnp.full(15, 0.1))
+    effects = dataclasses.replace(BARE, contact_point="fixed", want_joints=False)
+    session = Session(make_scene(TUBE, rings, DOWN_BALL, tool=BALL, effects=effects), rings)
+    before = rows(session, DOWN_BALL)
+    session.set_material(SPRINGS)
+    session.reset()
+    same_rows(rows(session, DOWN_BALL), before, "float64")
+
+
+def test_results_last_and_a_negative_stiffness_is_told(held):
+    dtype = held.dtype
+    held.reset()
+    first = held.step(EYE, [75, OUTER + 4, 0])
+    force, status = first.force.copy(), int(first.status)
+    held.set_material(cast(dataclasses.replace(MATERIAL, k_1=jnp.asarray(-0.3)), dtype))
+    bad = held.step(EYE, [75, OUTER + 4, 0])
+    assert bad.status == PressStatus.BAD_MATERIAL
+    assert np.isnan(bad.force).all()
+    held.set_material(cast(MATERIAL, dtype))
+    np.testing.assert_array_equal(first.force, force)
+    assert int(first.status) == status == OK
+    held.reset()
+    np.testing.assert_array_equal(held.step(EYE, [75, OUTER + 4, 0]).force, force)
+
+
+def test_refusals_of_another_material_and_tool(held):
+    dtype, old = held.dtype, (held.material, held.scene)
+    m = cast(MATERIAL, dtype)
+    other = np.float32 if dtype == np.float64 else np.float64
+    for change, says in (
+        ({"k_M": jnp.ones(4, dtype)}, "Material.k_M has 4 values; expected"),
+        ({"k_M": jnp.ones(15, dtype)}, "k_M has 15 values; the program was compiled for no axis"),
+        ({"EA_L": None}, "Material.EA_L is missing; the program was compiled with it"),
+        ({"GA_L": jnp.ones((), dtype)}, "Material.GA_L is given; .*without it; .*a new Session"),
+        ({"k_1": jnp.ones((), other)}, f"k_1 is {np.dtype(other)}; .*compiled for {dtype}"),
+        ({"e_1": jnp.ones((), dtype)}, "Material.e_1.*would ignore it"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            held.set_material(dataclasses.replace(m, **change))
+    for tool, says in (
+        (cast(capsule(2.0, 2.0), dtype), r"tool.vertices has shape \(3, 2\);.*for shape \(3, 1\)"),
+        (sphere(2.0, dtype=other), f"tool.vertices is {np.dtype(other)}"),
+        (cast(sphere(60.0), dtype), "tool lies along up to .* searches .* largest tool"),
+        (cast(sphere(5000.0), dtype), "tool is 1e.04 mm across"),
+        (cast(sphere(np.nan), dtype), "tool is nan mm across"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            held.set_tool(tool)
+    assert held.material is old[0]
+    assert held.scene is old[1]
+
+
+@pytest.mark.slow
+def test_the_surface_under_a_smaller_tool():
+    """A dent that is no wider than the program's; a wider one is refused."""
+    way = ball([75, 1, 0], [75, -2, 0], rows=5)
+    large, small = sphere(8.0), sphere(7.0)
+    effects = EffectOptions(contact_point="fixed")
+    scenes = [make_scene(TUBE, MATERIAL, way, tool=v, mesh=MESH, effects=effects)
+              for v in (large, small)]  # fmt: skip
+    session = Session(scenes[0], MATERIAL)
+    session.set_tool(small)
+    found = rows(session, way)
+    alone = dataclasses.replace(scenes[1], near=scenes[0].near)
+    same_rows(found, rows(Session(alone, MATERIAL), way), "float64")
+    with pytest.raises(ValueError, match="largest tool"):
+        Session(scenes[1], MATERIAL).set_tool(sphere(12.0))
