@@ -124,7 +124,7 @@ def bind(
     onset: ArrayLike | None = None,
     blend: ArrayLike | None = None,
 ) -> BoundPress:
-    """Compile `press` on this tube for many single calls, each of which costs about half as long.
+    """Compile `press` on this tube for many single calls, each of which takes about half as long.
 
     The tube becomes a constant of the program, everything else is read at every call. For batches
     and derivatives `press` itself under `jit` and `vmap` is as fast.

@@ -233,6 +233,8 @@ class Session:
             ValueError: a value that is missing or was not there before, of another shape or dtype,
                 or that no scene reads.
         """
+        if not isinstance(material, Material):
+            raise ValueError(f"material is {type(material).__name__}; expected a Material")
         check_material(self.scene.geometry, material)
         check_alike(material, self._given.like.material, "make a new Session")
         self._change(self.scene, material)
