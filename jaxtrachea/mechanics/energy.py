@@ -136,14 +136,15 @@ def _by_position(
     one_plane: bool,
 ):
     """-F . (dC/ds) F / 2, N; F the load, times the energy ratio, where the skeleton softens."""
-    F, stored = solved.force, jnp.ones_like(solved.inward)
+    F, stored = solved.force, None
     softening = press.softening_of(material, options)
     if softening is not None:
         moved = press.touch(solved.inward, jnp.zeros_like(solved.inward), options)
         u = moved + solved.depth[1]  # The normal of the midline is -y.
         F, stored = F / softening.ratio(u), softening.energy_ratio(u)
     if not options.shear and options.split == "continuous":
-        return -stored * jnp.sum(F[1:] * solved.slope_C)
+        by_load = -jnp.sum(F[1:] * solved.slope_C)
+        return by_load if stored is None else stored * by_load
 
     # With shear the slope is another on either side of the force.
     def yielding(s):
@@ -153,7 +154,8 @@ def _by_position(
         C = skeleton.respond(geometry, material, s, solved.phi, **levels).compliance
         return jnp.sum(F * (C @ F))
 
-    return -stored * jax.grad(yielding)(solved.s) / 2
+    by_load = -jax.grad(yielding)(solved.s) / 2
+    return by_load if stored is None else stored * by_load
 
 
 def _by_angle(geometry: Geometry, material: Material, solved: StraightPress, rings: Rings):
