@@ -13,13 +13,13 @@ NOW = 1.9e9
 
 
 def program(folder, name, size, days):
-    path = folder / f"{name}-cache"
+    path = folder / f"jit_{name}-{'0a' * 32}-cache"
     path.write_bytes(b"x" * size)
     os.utime(path, (NOW - days * DAY,) * 2)
 
 
 def names(folder):
-    return sorted(path.name.removesuffix("-cache") for path in folder.iterdir())
+    return sorted(path.name.removeprefix("jit_").split("-")[0] for path in folder.iterdir())
 
 
 def test_bounds_of_size_and_age(tmp_path, monkeypatch):
@@ -36,7 +36,8 @@ def test_bounds_of_size_and_age(tmp_path, monkeypatch):
 def test_what_was_read_lately_is_kept(tmp_path):
     """Written a year ago, read yesterday."""
     program(tmp_path, "read", 10, 365)
-    os.utime(tmp_path / "read-cache", (NOW - DAY, NOW - 365 * DAY))
+    (path,) = tmp_path.iterdir()
+    os.utime(path, (NOW - DAY, NOW - 365 * DAY))
     assert kept.keep_bounds(tmp_path, NOW) == 0
 
 
@@ -46,6 +47,12 @@ def test_bounds_are_looked_at_once_a_day(tmp_path):
     program(tmp_path, "year", 1, 365)
     assert kept.keep_bounds(tmp_path, NOW + DAY - 1) == 0
     assert kept.keep_bounds(tmp_path, NOW + DAY + 1) == 1
+
+
+def test_other_files_are_no_programs(tmp_path):
+    (tmp_path / "my-cache").write_text("notes")
+    (tmp_path / f"jit_f-{'0' * 64}-cache").mkdir()
+    assert list(kept.programs(tmp_path)) == []
 
 
 def test_a_folder_that_is_not_there(tmp_path):
@@ -92,4 +99,15 @@ def test_where_programs_are_kept(name, tmp_path):
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert Path(done.stdout.strip()) == folder
-    assert (folder / "year-cache").exists() == (name == "JAX_COMPILATION_CACHE_DIR")
+    assert ("year" in names(folder)) == (name == "JAX_COMPILATION_CACHE_DIR")
+
+
+def test_an_empty_name_keeps_none(monkeypatch):
+    """As jax reads it."""
+    import jax
+
+    from jaxtrachea.cli.terminal import programs_folder
+
+    found = {"jax_enable_compilation_cache": True, "jax_compilation_cache_dir": ""}
+    monkeypatch.setattr(type(jax.config), "values", property(lambda config: found))
+    assert programs_folder() is None

@@ -168,7 +168,7 @@ def test_command_writes_its_files_or_nothing(tmp_path, monkeypatch, capsys):
     Path("spec.toml").write_text(text + 's = ["20 mm", "140 mm"]\npoints = 2\n')
     code, out, err = run(monkeypatch, capsys, "design", "spec.toml", "--out", "out")
     assert code == 0
-    assert "note:" not in err
+    assert "note: spec.toml" not in err
     assert max(map(len, out.splitlines())) <= 80
     page = (Path(__file__).parents[1] / "docs" / "design.md").read_text()
     for name in ("next_points", "candidates", "identifiability"):

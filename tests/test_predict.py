@@ -669,6 +669,8 @@ def test_fixed_specification_on_the_command_line(tmp_path, monkeypatch, capsys):
         ("s=75,D=1e999", "finite"),
         ("s=75,D=2,q=1", "'q=1' is not understood"),
         ("s=75,D=2,phi=north", "phi:"),
+        ("s=75,D=2,phi=1_0", "phi:"),
+        ("s=75,D=2,phi=nan", "expected a finite angle"),
         ("s=75,D=2,tilt=90", "moves inwards; expected within 90 deg"),
         ("s=75,D=2,tilt=1 mm", "tilt:"),
     ],

@@ -138,6 +138,15 @@ def test_no_text_of_a_picture_lies_on_another():
         assert not any(one.overlaps(other) for other in boxes[i + 1 :])
 
 
+def test_what_the_finest_level_beats_is_not_on_the_front():
+    """Error and time of `worse` are both more than those of the finest; `quick` is quicker."""
+    points = [rung("b", "algebra", "worse", 0.1, 2e-4), rung("b", "algebra", "quick", 0.2, 5e-5),
+              rung("b", "algebra", "best", 0.0, 1e-4, True)]  # fmt: skip
+    for axis in draw(points, "scene").axes:
+        dots = [line for line in axis.lines if line.get_marker() == "o"]
+        assert [line.get_markeredgecolor() == "k" for line in dots] == [False, True]
+
+
 def test_a_scene_without_choices_has_a_picture():
     figure = draw([rung("b", "algebra", "best", 0.0, 1e-2, True)], "scene")
     figure.draw_without_rendering()

@@ -121,7 +121,9 @@ def programs_folder() -> Path | None:
     if not jax.config.values["jax_enable_compilation_cache"]:
         return None
     chosen = jax.config.values["jax_compilation_cache_dir"]
-    return cache_folder() if chosen is None else Path(chosen)
+    if chosen is None:
+        return cache_folder()
+    return Path(chosen) if chosen else None  # jax keeps none for an empty name
 
 
 def cache_folder() -> Path | None:

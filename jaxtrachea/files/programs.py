@@ -1,6 +1,7 @@
 """Compiled programs that are kept for the next start: which there are, and their bounds."""
 
 import contextlib
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,8 @@ MOST_BYTES = 2**30
 MOST_DAYS = 90.0
 #: Time between two looks at the bounds, s.
 BETWEEN = 86_400.0
+#: Names of programs: that of the function and a digest.
+_NAME = re.compile(r".*-[0-9a-f]{64}-cache", re.DOTALL)
 #: File whose time of change is that of the last look.
 LAST_LOOK = ".trimmed"
 
@@ -31,6 +34,8 @@ def programs(folder: Path) -> Iterator[Program]:
         folder: may not exist.
     """
     for path in folder.glob("*-cache"):
+        if not _NAME.fullmatch(path.name) or not path.is_file():
+            continue
         with contextlib.suppress(OSError):  # another process deletes it
             found = path.stat()
             # Where the file system keeps no time of access, that of writing.

@@ -5,11 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea.measurements.read import Curve
-from jaxtrachea.mechanics.press import Options
-
-#: Depth to which a skeleton was compared with finite elements, in radii of the tube. At a tenth
-#: that specimen yields 12 % more than a linear skeleton; the others were pressed to half.
-TESTED = {"linear": 0.1, "softening": 0.5, "sections": 0.5}
+from jaxtrachea.mechanics.press import TESTED, Options
 
 
 def tested_depth(options: Options, radius: float) -> float:

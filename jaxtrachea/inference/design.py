@@ -200,7 +200,7 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
     """Information of a press at every candidate on the unknowns it shares, for every guess.
 
     In relative coordinates; what the press has of its own is eliminated. A candidate without
-    equilibrium at some sample, on deforming cross-sections, tells nothing: zeros.
+    equilibrium at some sample tells nothing: zeros.
 
     Raises:
         ValueError: angles for a skeleton that is pressed on the midline alone.
@@ -214,7 +214,7 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
         blend = None if known.blend is None else jnp.asarray(known.blend[g])
         guess = _Guess(jnp.asarray(known.theta[g]), lanes.value[k, 0], lanes.index[k, 0], blend)
         matrix = _of_all(study, known.samples, guess, candidates)
-        matrix = np.nan_to_num(matrix / known.sigma[g] ** 2)
+        matrix = np.nan_to_num(matrix / known.sigma[g] ** 2, posinf=0.0, neginf=0.0)
         parts.append(matrix * known.relative[g][:, None] * known.relative[g])
     added = np.stack(parts)
     if known.own.shape[1] == 0:

@@ -81,13 +81,15 @@ def parse_presses(text: str, *, needs_position: bool) -> Presses:
 def _angle(name: str, text: str) -> float:
     """An angle, rad; a bare number is in degrees, as in all tables."""
     try:
-        return math.radians(float(text))
+        angle = math.radians(float("_" if "_" in text else text))
     except ValueError:
-        pass
-    try:
-        return parse_quantity(text, "angle")
-    except UnitError as error:
-        raise ValueError(f"{name}: {error}") from None
+        try:
+            angle = parse_quantity(text, "angle")
+        except UnitError as error:
+            raise ValueError(f"{name}: {error}") from None
+    if not math.isfinite(angle):
+        raise ValueError(f"{name} = {text}: expected a finite angle")
+    return angle
 
 
 def _lengths(name: str, text: str) -> np.ndarray:

@@ -384,7 +384,10 @@ def check_aside(results: StoredFit, phi: float, direction: tuple[float, float]) 
         return
     alpha = float(model.geometry.half_angle)
     if not abs(phi) <= alpha:
-        raise ValueError(f"phi = {phi:g} rad is not on the cartilage; expected within {alpha:.4g}")
+        raise ValueError(
+            f"phi = {phi:g} rad ({np.degrees(phi):.4g} deg) is not on the cartilage; expected "
+            f"within {alpha:.4g} rad ({np.degrees(alpha):.4g} deg)"
+        )
     if not abs(np.hypot(*direction) - 1) < 1e-6:
         raise ValueError(f"direction is {direction}; expected a unit vector")
 

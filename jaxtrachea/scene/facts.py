@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import first_touch
 from jaxtrachea.scene.curve import frame_at
@@ -22,6 +23,7 @@ from jaxtrachea.scene.stage import (
     touch_tube,
 )
 from jaxtrachea.surface import local
+from jaxtrachea.trachea.material import DEEP
 
 #: Rows that a path is filled up to, or twice, four times ...; longer ones than `MOST` are not.
 LEAST, MOST = 64, 4096
@@ -55,12 +57,15 @@ def facts_of(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Scen
     along, way = np.abs(moved[:, 0]), np.sqrt((moved**2).sum(axis=1))
     whole = max(way[touching].max(initial=0), 1e-9)  # not what the tool goes before it touches
 
+    sections = isinstance(material, SectionMaterial)
+    radius = float(scene.geometry.radius if sections else scene.radius)
+
     def share(v):
         return float(v.max(initial=0) / whole)
 
     def reach(way, drawn):
         least, most = np.fmin.reduce(way[drawn], initial=0), np.fmax.reduce(way[outside], initial=0)
-        return float(least) / float(scene.radius), float(most) / float(scene.radius)
+        return float(least) / radius, float(most) / radius
 
     def keep(v):
         return v if v > COVERED else 0.0
@@ -84,7 +89,16 @@ def facts_of(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Scen
         near=_near(scene, s, phi),
         way_fixed=reach(inward, after),
         way_per_step=reach(-gap, outside),
+        softness=_softness(material, radius),
     )  # fmt: skip
+
+
+def _softness(material: AnyMaterial, radius: float) -> tuple[float, float]:
+    """Size of e_1 R and e_2 R^2; 0 where the material does not soften."""
+    e_1, e_2 = (getattr(material, name, None) for name in DEEP)
+    if e_1 is None or e_2 is None:
+        return 0.0, 0.0
+    return abs(float(e_1)) * radius, abs(float(e_2)) * radius**2
 
 
 def _what_is_touched(scene: Scene, curved: bool) -> Scene:

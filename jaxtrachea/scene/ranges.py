@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool
 
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.scene.declare import AnyMaterial
-from jaxtrachea.scene.depth import SHALLOW
+from jaxtrachea.scene.depth import SHALLOW, departure
 from jaxtrachea.scene.effects import EFFECTS, given_values
 from jaxtrachea.scene.plan import Served
 from jaxtrachea.scene.stage import COVERED, Presses, Scene
@@ -73,7 +73,7 @@ def unserved(
     if plan.served is not None:
         found.append(_beyond(plan.served, presses))
     if "skeleton" in less:
-        found.append(deep(scene, _inward(presses)))
+        found.append(deep(scene, material, _inward(presses)))
     if set(less) - {"axial", "skeleton"}:
         found.append(jnp.ones_like(pressing))
     if plan.surface is not None and not plan.dent and "dent" not in plan.ignored:
@@ -94,11 +94,12 @@ def _beyond(served: Served, presses: Presses):
     return functools.reduce(jnp.logical_or, beyond)
 
 
-def deep(scene: Scene, inward):
+def deep(scene: Scene, material, inward):
     """Where the wall is moved so far that a skeleton which can soften does: as `depth` has it."""
     if scene.plan.options.contact == "bonded":
         inward = jnp.abs(inward)
-    return inward > SHALLOW * scene.radius + COVERED
+    error = departure((jnp.abs(material.e_1), jnp.abs(material.e_2)), jnp.maximum(inward, 0))
+    return error > SHALLOW + COVERED
 
 
 def _inward(presses: Presses):
@@ -169,7 +170,8 @@ def _length(D):
 def depth_share(scene: Scene, depth, skeleton, inward):
     """Inward motion of the wall at the contact (indentation and skeleton) over the tube's radius.
 
-    Motion outwards counts as 0, motion along the surface as nothing.
+    That of the outside, on deforming cross-sections of their mid-line. Motion outwards counts as 0,
+    motion along the surface as nothing.
 
     Args:
         scene: -
@@ -178,7 +180,8 @@ def depth_share(scene: Scene, depth, skeleton, inward):
         inward: inward normal of the tube at the contact; likewise.
     """
     way = jnp.sum((depth + skeleton) * inward, axis=-1)
-    return jax.lax.stop_gradient(jnp.maximum(way, 0) / scene.radius)
+    radius = scene.geometry.radius if scene.plan.options.deforms_sections else scene.radius
+    return jax.lax.stop_gradient(jnp.maximum(way, 0) / radius)
 
 
 def contact_share(scene: Scene, seen: Touch):

@@ -17,7 +17,7 @@ from jaxtrachea.scene.deform import deform
 from jaxtrachea.scene.programs import cross_sections, moved_by, one_plane, vectors
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import refuse, status_of, without_negative_values
-from jaxtrachea.scene.stage import Poses, Presses, Scene, check_material, check_path
+from jaxtrachea.scene.stage import Poses, Presses, Scene, check_kind, check_material, check_path
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
 
@@ -102,10 +102,7 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
     plan = scene.plan
     check_path(path)
     check_material(scene.geometry, material)
-    if plan.options.deforms_sections != isinstance(material, SectionMaterial):
-        kinds = ("Material", "SectionMaterial (the plan has a skeleton 'sections')")
-        expected = kinds[plan.options.deforms_sections]
-        raise ValueError(f"material is {type(material).__name__}; expected {expected}")
+    check_kind(scene, material)
     if plan.contact != isinstance(path, Poses):
         kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
         raise ValueError(f"path is {type(path).__name__}; expected {kinds[not plan.contact]}")

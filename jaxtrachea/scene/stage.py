@@ -98,6 +98,18 @@ def check_material(geometry: Geometry, material: AnyMaterial) -> None:
         )  # fmt: skip
 
 
+def check_kind(scene: "Scene", material: AnyMaterial) -> None:
+    """Refuse the material of another skeleton than the plan has.
+
+    Raises:
+        ValueError: what was expected.
+    """
+    sections = scene.plan.options.deforms_sections
+    if sections != isinstance(material, SectionMaterial):
+        kinds = ("Material", "SectionMaterial (the plan has a skeleton 'sections')")
+        raise ValueError(f"material is {type(material).__name__}; expected {kinds[sections]}")
+
+
 def check_path(path: Presses | Poses) -> None:
     """Refuse a path whose arrays do not belong together.
 

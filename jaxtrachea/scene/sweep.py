@@ -17,7 +17,7 @@ from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.ranges import deep, depth_share, lacking
 from jaxtrachea.scene.refusals import REFUSALS, on_the_tube, status_of
-from jaxtrachea.scene.stage import COVERED, Scene
+from jaxtrachea.scene.stage import COVERED, Scene, check_kind
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
 
@@ -63,8 +63,9 @@ def sweep(
         chunk: points computed together.
 
     Raises:
-        ValueError: arrays of different lengths, or no numbers.
+        ValueError: arrays of different lengths, or no numbers; the material of another skeleton.
     """
+    check_kind(scene, material)
     dtype = scene.geometry.length.dtype
     s = shaped("s", s, ("points",), dtype=dtype)
     phi, depth = (
@@ -93,7 +94,7 @@ def sweep(
             if flat and not unlike:
                 off = acting & (jnp.abs(phi_at) > COVERED)
             elif unlike == {"skeleton"}:
-                off = acting & deep(scene, d)
+                off = acting & deep(scene, material, d)
             refused = {code: refused.get(code, False) | (found.status == code) for code in REFUSALS}
             refused[PressStatus.OFF_PLAN] = off
             force, depth, softness = (jnp.where(off, jnp.nan, v) for v in (force, depth, softness))

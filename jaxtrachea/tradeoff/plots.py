@@ -46,7 +46,7 @@ def draw(points: list[dict[str, Any]], title: str) -> Figure:
                 finest[p["ladder"]]["times"][which]["median"] if p["ladder"] in finest else np.nan
                 for p in rows
             ]
-            best = np.isin(np.arange(len(rows)), pareto(errors, times))
+            best = np.isin(np.arange(len(rows)), _front(rows + list(finest.values()), which))
             colours = [KINDS[p["kind"]] for p in rows]
             edges = ["k" if b else c for b, c in zip(best, colours, strict=True)]
             _errors(axes[2 * k], errors, colours, edges)
@@ -98,6 +98,12 @@ def _rows(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _error(point: dict[str, Any], which: str) -> float:
     return worst(point) if which == "call" else float(point["errors"]["gradient"])
+
+
+def _front(points: list[dict[str, Any]], which: str) -> np.ndarray:
+    """Indices of the Pareto front of error and time."""
+    errors = np.array([_error(p, which) for p in points])
+    return pareto(errors, np.array([p["times"][which]["median"] for p in points]))
 
 
 def _names(axis, rows) -> None:
