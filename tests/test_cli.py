@@ -372,7 +372,7 @@ def test_help_lists_the_commands_in_the_order_of_use(monkeypatch, capsys):
     lines = out.partition("Commands:\n")[2].rstrip().splitlines()
     assert [line.split()[0] for line in lines] == [
         "check", "fit", "predict", "design", "compare", "convert", "plan", "simulate", "sweep",
-        "tradeoff", "selfcheck",
+        "tradeoff", "selfcheck", "cache",
     ]  # fmt: skip
 
 

@@ -279,6 +279,7 @@ def joint_study(seed, shared, count, share):
     return build_study(list(data), GEOMETRY, OPTIONS, parameters, joint=True), truth
 
 
+@pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize(
     ("seeds", "shared", "count"),

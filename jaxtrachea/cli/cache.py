@@ -12,7 +12,7 @@ ClearOption = Annotated[bool, typer.Option("--clear", help="Delete all kept prog
 
 
 def cache(clear: ClearOption = False) -> None:
-    """Say where compiled programs are kept, and how much they take; or delete them."""
+    """Say where compiled programs are kept; --clear deletes them."""
     folder = programs_folder()
     if folder is None:
         raise Stop(

@@ -185,6 +185,7 @@ def test_steps_rows_and_precisions_agree():
     np.testing.assert_allclose(short.force, out.force, atol=3e-4)
 
 
+@pytest.mark.slow
 def test_force_is_continuous_in_the_pose():
     """Along the tube and round it, 2 mm deep: jumps shrink with the steps.
 

@@ -400,6 +400,7 @@ def same_rows(found, expected, dtype):
                 np.testing.assert_allclose(v, w, rtol=tolerance, atol=tolerance, err_msg=name)
 
 
+@pytest.mark.slow
 def test_another_material_and_tool_compile_nothing(held):
     """The same numbers as a session made with them; then those of before again."""
     dtype, way = held.dtype, cast(ball([75, 1, 0], [76, -2, 1], rows=7), held.dtype)
@@ -442,6 +443,7 @@ def test_force_of_another_material_in_closed_form():
         np.testing.assert_allclose(-step.force[1], -float(step.gap) / (C + 1 / k_1), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_single_number_for_an_array():
     """It holds for every ring: as an array of it, and not as the stiffer rings of before."""
     stiff, soft = (dataclasses.replace(SPRINGS, k_M=jnp.full(15, k)) for k in (0.3, 0.1))

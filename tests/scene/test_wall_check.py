@@ -126,6 +126,8 @@ def test_crests_of_the_rings_are_as_high_in_every_mesh(along):
         np.testing.assert_allclose(height, 11.0, rtol=1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_the_measure_is_the_gap_of_touch():
     """The same balls by `touch`, which smooths by at most its bound."""
     wall = walls_.patches_of_wall(TUBE, MESHES[1])

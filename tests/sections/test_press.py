@@ -123,6 +123,7 @@ def test_the_midline_program_is_the_other_one():
     assert np.all(np.isnan(off.force))
 
 
+@pytest.mark.slow
 def test_mirror_images():
     """What is at +phi is at -phi with z turned; so are the two ends of a symmetric tube."""
     left, right, far = press([({}, 22.0, 0.8, PATH), ({}, 22.0, -0.8, PATH), ({}, 48.0, 0.8, PATH)])

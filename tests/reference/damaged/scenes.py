@@ -91,7 +91,7 @@ ONE = np.eye(3, dtype="<f4").tobytes()
 SCENES = {
     "cut in a string": of(GOOD[:20], "TOML", "line 2"),
     "cut after the material": of(MATERIAL, "path"),
-    "empty": of("", "material"),
+    "empty": of("", "path", "add a table"),
     "Latin-1": of(b'title = "\xe4"\n' + GOOD.encode(), "UTF-8"),
     "key twice": of(GOOD + 's = "3 mm"', "TOML", "line 9"),
     **{
