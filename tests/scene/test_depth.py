@@ -119,7 +119,8 @@ def test_without_softening_it_is_the_linear_skeleton(dtype):
 
     found = []
     for material in (ZERO, SPRINGS, SOFT):
-        scene = make_scene(TUBE, material, path, mesh=MESH)
+        level = "linear" if material is SPRINGS else "softening"
+        scene = make_scene(TUBE, material, path, mesh=MESH, effects=EffectOptions(skeleton=level))
         assert scene.plan.has("skeleton") == (material is not SPRINGS)
         found.append(run(*cast((scene, material, path))))
     none, linear, soft = found
