@@ -1,11 +1,10 @@
 """A bound press is `press`: numbers, statuses, errors, derivatives; and it compiles once."""
 
-import contextlib
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilations import compilations
 
 import jaxtrachea as jt
 from jaxtrachea import Material, Options, press, table_1
@@ -14,22 +13,6 @@ from jaxtrachea.status import PressStatus
 DEPTHS = np.linspace(0.0, 6.0, 7)
 VALUES = {"EI_L": 1400.0, "k_M": 0.2, "k_1": 20.0, "k_3": 0.5, "GA_L": 9.0}
 SHEAR = Options(shear=True)
-
-
-@contextlib.contextmanager
-def compilations():
-    """Counts the programs compiled within."""
-    counted = []
-
-    def listen(event, duration, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
-            counted.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield counted
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def material(dtype, **changes):

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic
+from compilations import compilations
 
 from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.information import informations
@@ -13,8 +14,6 @@ from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.optimisation.trust_region import Tolerances
-
-EVENT = "/jax/core/compile/backend_compile_duration"
 
 
 @pytest.fixture(scope="module")
@@ -26,17 +25,10 @@ def study():
 
 
 @pytest.fixture
-def compiled(monkeypatch):
+def compiled():
     """Programs compiled so far, by XLA's own events."""
-    seen, at_work = [], [True]
-
-    def listen(event, duration, **_):
-        if event == EVENT and at_work:
-            seen.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield seen
-    at_work.clear()
+    with compilations() as seen:
+        yield seen
 
 
 def peak(model, factor, theta, lane, offset):

@@ -10,13 +10,14 @@ from jaxtrachea.mechanics.press import TESTED, Options
 
 def tested_depth(options: Options, radius: float) -> float:
     """Depth to which the model was tested, mm; inf without a skeleton (coupling `total`)."""
-    return np.inf if options.coupling == "total" else TESTED[options.skeleton] * radius
+    # With what rounding takes.
+    return np.inf if options.coupling == "total" else TESTED[options.skeleton] * radius * (1 + 1e-9)
 
 
 def deeper_than_tested(curves: Sequence[Curve], options: Options, radius: float) -> str | None:
     """A sentence on curves that go deeper than the model was tested; None: there are none."""
     most = tested_depth(options, radius)
-    deep = [d for c in curves if (d := float(np.max(np.abs(c.displacement)))) > most * (1 + 1e-9)]
+    deep = [d for c in curves if (d := float(np.max(np.abs(c.displacement)))) > most]
     if not deep:
         return None
     cure = "cut them off or leave them out where that matters"

@@ -267,7 +267,7 @@ def _untested(stored: StoredFit, displacement: np.ndarray) -> str:
     """Whether a curve goes deeper than the model was tested, in words; "" if it does not."""
     model = stored.study.model
     most = tested_depth(model.options, float(model.geometry.radius))
-    deep = np.max(np.abs(displacement)) > most * (1 + 1e-9)
+    deep = np.max(np.abs(displacement)) > most
     return f"the model was tested to D = {most:.3g} mm" if deep else ""
 
 

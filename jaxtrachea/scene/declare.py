@@ -50,7 +50,7 @@ class SceneFacts:
         way_fixed: least and largest inward motion of the tool since first touch (of presses: of
             each), over the radius, where its contact point is fixed.
         way_per_step: the same of a tool whose rows are presses of their own.
-        softness: |e_1| R and |e_2| R^2 of the material, R the radius; 0 where they are not known.
+        softness: e_1 R and e_2 R^2 of the material, R the radius; 0 where they are not known.
     """
 
     poses: bool = False

@@ -8,13 +8,12 @@ two points, is off by 15 % at R / 4 (`ranges.DEEPEST`).
 
 from jaxtrachea.mechanics.press import TESTED, Options
 from jaxtrachea.scene.declare import SECTIONS, Case, PlanError, Verdict
+from jaxtrachea.trachea.material import DEEP
 
 #: Error of a linear skeleton up to which it will do, where the material says how it softens.
 SHALLOW = 0.015
 #: Inward motion over the radius to which nothing is said where it does not: a hundredth of it.
 LITTLE = 0.01
-#: Values of the material that a skeleton softens by.
-SOFTENING = ("e_1", "e_2")
 
 _TOO_STIFF = (
     "a wall is softer there than a linear skeleton (drawn: stiffer), by 13 % at a tenth of the "
@@ -41,7 +40,7 @@ def reached(case: Case) -> float:
 
 def departure(softness, way):
     """Bound of what a linear skeleton errs by: |e_1| u + |e_2| u^2 at a way u, any units."""
-    e_1, e_2 = softness
+    e_1, e_2 = map(abs, softness)
     return way * (e_1 + e_2 * way)
 
 
@@ -63,7 +62,7 @@ def skeleton(case: Case) -> Verdict:
     """
     if SECTIONS in case.facts.known:
         return _sections(case)
-    given = all(name in case.facts.known for name in SOFTENING)
+    given = all(name in case.facts.known for name in DEEP)
     share = reached(case)
     far = f"the wall is moved by {100 * share:.2g} % of the radius"
     cannot, cure = "", ""

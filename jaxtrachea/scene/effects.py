@@ -17,6 +17,7 @@ from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene import depth
 from jaxtrachea.scene.declare import SECTIONS, AnyMaterial, Case, Effect, PlanError, Verdict
+from jaxtrachea.trachea.material import DEEP
 
 Switch = Literal["auto", "on", "off"]
 
@@ -235,7 +236,7 @@ class EffectOptions:
     )  # fmt: skip
     skeleton: Literal["auto", "linear", "softening", "sections"] = _effect(
         depth.skeleton, least="linear", field="options.skeleton", values={},
-        material=depth.SOFTENING, rungs=("linear", "softening"),
+        material=DEEP, rungs=("linear", "softening"),
     )  # fmt: skip
     want_surface: bool = True
     want_joints: bool = True

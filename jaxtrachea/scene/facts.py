@@ -94,11 +94,11 @@ def facts_of(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Scen
 
 
 def _softness(material: AnyMaterial, radius: float) -> tuple[float, float]:
-    """Size of e_1 R and e_2 R^2; 0 where the material does not soften."""
+    """e_1 R and e_2 R^2; 0 where the material does not soften."""
     e_1, e_2 = (getattr(material, name, None) for name in DEEP)
     if e_1 is None or e_2 is None:
         return 0.0, 0.0
-    return abs(float(e_1)) * radius, abs(float(e_2)) * radius**2
+    return float(e_1) * radius, float(e_2) * radius**2
 
 
 def _what_is_touched(scene: Scene, curved: bool) -> Scene:

@@ -98,7 +98,7 @@ def deep(scene: Scene, material, inward):
     """Where the wall is moved so far that a skeleton which can soften does: as `depth` has it."""
     if scene.plan.options.contact == "bonded":
         inward = jnp.abs(inward)
-    error = departure((jnp.abs(material.e_1), jnp.abs(material.e_2)), jnp.maximum(inward, 0))
+    error = departure((material.e_1, material.e_2), jnp.maximum(inward, 0))
     return error > SHALLOW + COVERED
 
 

@@ -1,6 +1,5 @@
 """Steps of a session are rows of the simulation of their path."""
 
-import contextlib
 import dataclasses
 from functools import partial
 
@@ -8,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilations import compilations
 from small_scenes import (
     BALL,
     BARE,
@@ -366,22 +366,6 @@ def test_refusals():
 
 def cast(tree, dtype):
     return jax.tree.map(lambda v: jnp.asarray(np.asarray(v, dtype), dtype), tree)
-
-
-@contextlib.contextmanager
-def compilations():
-    """Counts the programs compiled within."""
-    counted = []
-
-    def listen(event, duration, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
-            counted.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield counted
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 OTHER = dataclasses.replace(

@@ -117,7 +117,7 @@ def _read_tab(path: Path, who: FileIdentity, options: ReadOptions) -> RawCurve |
     try:
         lines = read_lines(path)
         names, metadata, lines = _tab_head(path, lines)
-        line_numbers, cells_of = read_columns(lines, len(names), "\t")
+        line_numbers, cells_of = read_columns(lines.without_comments(), len(names), "\t")
         columns = {}
         for i, name in enumerate(names):
             if name in _wanted(options):

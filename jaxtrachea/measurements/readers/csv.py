@@ -18,7 +18,7 @@ from jaxtrachea.measurements.curve import (
     ReadOptions,
     identify_file,
 )
-from jaxtrachea.measurements.readers.lines import Lines, Text
+from jaxtrachea.measurements.readers.lines import Lines, Text, is_comment
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.text import (
     ALIASES,
@@ -284,13 +284,13 @@ def _constant(
 
 def _is_tidy(lines: Lines) -> bool:
     """Whether the first line is a JSON object, or names a column of specimens."""
-    content = lines.without_comments().texts
-    if not content:
+    first = next((text for text in lines.texts if not is_comment(text)), None)
+    if first is None:
         return False
-    if content[0].lstrip().startswith("{"):
+    if first.lstrip().startswith("{"):
         return True
     try:
-        cells = split_cells(content[0], guess_delimiter(content[0]))
+        cells = split_cells(first, guess_delimiter(first))
     except Fault:
         return False
     names = {column_unit(cell)[0].lower() for cell in cells}

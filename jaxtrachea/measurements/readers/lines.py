@@ -61,7 +61,7 @@ class Lines(Sequence[Line]):
         """Those that are no comments."""
         if not any(map(contains, self.texts, repeat("#"))):
             return self
-        return self.where([not _comments(text) for text in self.texts])
+        return self.where([not is_comment(text) for text in self.texts])
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def read_lines(path: Path) -> Lines:
     return Lines(range(1, len(texts) + 1), texts).where([*map(str.strip, texts)])
 
 
-def _comments(text: str) -> bool:
+def is_comment(text: str) -> bool:
     """Whether a line is a ``#`` comment; ``#N/A`` and the like are cells of a spreadsheet."""
     text = text.lstrip()
     return text.startswith("#") and not text.upper().startswith(CELL_ERRORS)

@@ -81,7 +81,7 @@ def read_columns(
     """Cells of the columns of a table; empty cells beyond the header are dropped.
 
     Args:
-        lines: below the header.
+        lines: below the header, without comments.
         width: columns of the header.
         delimiter: what separates cells.
         word: what the lines are called in messages.
@@ -92,7 +92,6 @@ def read_columns(
     Raises:
         Fault: a row that has not `width` cells ("ragged"), or unbalanced quotes.
     """
-    lines = lines.without_comments()
     even = width > 1 and set(map(str.count, lines.texts, repeat(delimiter))) == {width - 1}
     together = delimiter.join(lines.texts) if even else '"'
     if '"' not in together:
