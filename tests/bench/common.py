@@ -14,6 +14,7 @@ os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ["JAX_ENABLE_X64"] = "1"
 
+import datetime  # noqa: E402
 import importlib.metadata  # noqa: E402
 import json  # noqa: E402
 import platform  # noqa: E402
@@ -25,7 +26,6 @@ from pathlib import Path  # noqa: E402
 
 FOLDER = Path(__file__).parent
 RESULTS = FOLDER / "results"
-DATE = "2026-11-21"
 
 
 def cpu_model() -> str:
@@ -45,6 +45,15 @@ def versions(*names: str) -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             found[name] = "not installed"
     return found
+
+
+def commit() -> str:
+    """Of the package that is measured; "+" where files differ from it, "unknown" without git."""
+    git = ["git", "-C", str(FOLDER), "describe", "--always", "--dirty=+", "--exclude=*"]
+    try:
+        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
 
 
 def compiler() -> str:
@@ -93,7 +102,8 @@ class Writer:
             {
                 "kind": "environment",
                 "suite": suite,
-                "date": DATE,
+                "date": datetime.date.today().isoformat(),
+                "commit": commit(),
                 "cpu": cpu_model(),
                 "cores_of_machine": os.cpu_count(),
                 "cores_used": len(CORES),
