@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import punch_fem
 import pytest
 from jax.test_util import check_grads
 
@@ -28,29 +29,8 @@ def beam(dtype="float64", shear=True):
 
 
 def by_elements(s, shear, half=HALF):
-    """Compliance and ring deflections per unit force: dense stiffness, both points held at 1 mm."""
-    ends = [s - half, s + half]
-    nodes = np.unique(np.concatenate([[0.0, LENGTH], X, ends]))
-    stiffness = np.zeros((2 * len(nodes),) * 2)
-    for i, h in enumerate(np.diff(nodes)):
-        span = np.searchsorted(X, (nodes[i] + nodes[i + 1]) / 2)
-        P = 12 * EI[span] / (GA[span] * h * h) if shear else 0.0
-        element = np.array([
-            [12, 6 * h, -12, 6 * h],
-            [6 * h, (4 + P) * h * h, -6 * h, (2 - P) * h * h],
-            [-12, -6 * h, 12, -6 * h],
-            [6 * h, (2 - P) * h * h, -6 * h, (4 + P) * h * h],
-        ])  # fmt: skip
-        stiffness[2 * i : 2 * i + 4, 2 * i : 2 * i + 4] += EI[span] / ((1 + P) * h**3) * element
-    ring = 2 * np.searchsorted(nodes, X)
-    stiffness[ring, ring] += K
-    held = 2 * np.searchsorted(nodes, ends)
-    free = np.setdiff1d(np.arange(2, len(stiffness) - 2), held)
-    w = np.zeros(len(stiffness))
-    w[held] = 1
-    w[free] = np.linalg.solve(stiffness[np.ix_(free, free)], -stiffness[np.ix_(free, held)].sum(1))
-    force = np.sum(stiffness[held] @ w)
-    return 1 / force, w[ring] / force, K * w[ring] / force
+    """Dense stiffness, both points held at 1 mm."""
+    return punch_fem.held(X, LENGTH, EI, K, s, half, GA if shear else None)
 
 
 PLACES = [2.5, 22.0, 30.0, 31.2, 27.6, 32.4, 35.0, 75.0, 157.0]
@@ -63,11 +43,24 @@ def test_against_finite_elements(dtype, shear):
     got = held(jnp.asarray(PLACES, dtype))
     rtol = {"float32": 2e-3, "float64": 1e-9}[dtype]
     for i, s in enumerate(PLACES):
-        c, w, reaction = by_elements(s, shear)
+        true = by_elements(s, shear)
+        c = true.w_C
         np.testing.assert_allclose(got.w_C[i], c, rtol=rtol, err_msg=f"{s}")
-        np.testing.assert_allclose(got.w[i], w, rtol=rtol, atol=rtol * c)
-        np.testing.assert_allclose(got.reaction[i], reaction, rtol=rtol, atol=rtol * c)
-    assert np.all(np.asarray(got.theta_C) == 0)
+        np.testing.assert_allclose(got.w[i], true.w, rtol=rtol, atol=rtol * c)
+        np.testing.assert_allclose(got.reaction[i], true.reaction, rtol=rtol, atol=rtol * c)
+        size = rtol * np.abs(true.edges).max()
+        np.testing.assert_allclose(got.edges[i], true.edges, rtol=rtol, atol=size)
+        np.testing.assert_allclose(got.theta_C[i], true.share @ true.edges, rtol=rtol, atol=size)
+
+
+@pytest.mark.parametrize("s", [22.0, 31.2, 35.0])
+def test_rotation_is_half_of_what_the_place_changes(s):
+    """Without shear, by differences of fourth order of the finite elements' compliance."""
+    h = 0.05
+    c = {i: by_elements(s + i * h, shear=False).w_C for i in (-2, -1, 1, 2)}
+    slope = (8 * (c[1] - c[-1]) - c[2] + c[-2]) / (12 * h)
+    theta = jax.jit(lambda s: punch_deflection(beam(shear=False), s, HALF).theta_C)(s)
+    np.testing.assert_allclose(2 * theta, slope, rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -3,7 +3,8 @@
 Two forces, half a width before and behind C, hold the ligament at one and the same deflection (a
 flat punch that does not tilt, not even where it is so narrow that it is a point). The tool then
 feels less of what lies between two rings than a point does. With shear the compliance has a corner,
-no jump, where a ring comes under an edge, as that of a point has on a ring.
+no jump, where a ring comes under an edge, as that of a point has on a ring. Between the two forces
+the ligament is free: it bows away from the tool by some half a width squared times its curvature.
 
 For the flat end of a cylinder of radius r the mean half chord, pi/4 r, is its half width along s.
 """
@@ -28,10 +29,12 @@ class UnitDeflection(NamedTuple):
 
     Attributes:
         w_C: deflection of C, mm.
-        theta_C: rotation at C, rad; of a punch 0, it does not tilt.
+        theta_C: rotation at C, rad; of a punch, which does not tilt, the mean of that at its edges,
+            each weighed by its force. Without shear 2 theta_C is the derivative of w_C by s_c.
         w: deflection of the beam at each support, mm; shape (n,).
         theta: rotation of the section at each support, rad; shape (n,).
         reaction: force of each support against the load, N; shape (n,).
+        edges: rotation of the ligament at both edges of a punch, rad; None: a point.
     """
 
     w_C: Float[Array, ""]
@@ -39,6 +42,7 @@ class UnitDeflection(NamedTuple):
     w: Float[Array, " n"]
     theta: Float[Array, " n"]
     reaction: Float[Array, " n"]
+    edges: Float[Array, "2"] | None = None
 
 
 def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> UnitDeflection:
@@ -54,11 +58,10 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
         half_width: mm, more than 0.
     """
     ends = jnp.clip(jnp.stack([s_c - half_width, s_c + half_width]), 0, beam.length)
-    marked, ring = _with_marks(beam, ends)
+    marked, ring, marks = _with_marks(beam, ends)
     unit = jax.vmap(lambda s: deflect(marked, s, jnp.ones_like(s)))(ends)
-    mark = jnp.sum(beam.x <= ends[1]) + 1
     c_11, c_22 = unit.w_C
-    c_12 = unit.w[0, mark]
+    c_12 = unit.w[0, marks[1]]
     first, second = c_22 - c_12, c_11 - c_12
     total = first + second
     share = jnp.stack([first, second]) / jnp.where(total > 0, total, 1)
@@ -66,14 +69,15 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
     def per_ring(v):
         return share @ v[:, ring]
 
-    w_C = c_12 + share[0] * second
+    edges = share @ unit.theta[:, marks]
     return UnitDeflection(
-        w_C, jnp.zeros_like(w_C), *map(per_ring, (unit.w, unit.theta, unit.reaction))
-    )
+        w_C=c_12 + share[0] * second, theta_C=share @ edges, w=per_ring(unit.w),
+        theta=per_ring(unit.theta), reaction=per_ring(unit.reaction), edges=edges,
+    )  # fmt: skip
 
 
-def _with_marks(beam: Beam, ends) -> tuple[Beam, Array]:
-    """The beam with two more supports, of no stiffness, and where the others then stand.
+def _with_marks(beam: Beam, ends) -> tuple[Beam, Array, Array]:
+    """The beam with two more supports, of no stiffness; where the others then stand, and they.
 
     A mark at a support stands behind it.
     """
@@ -85,7 +89,7 @@ def _with_marks(beam: Beam, ends) -> tuple[Beam, Array]:
     k = jnp.zeros(n + 2, beam.k.dtype).at[ring].set(beam.k)
     span = jnp.arange(n + 3) - jnp.sum(mark[None] < jnp.arange(n + 3)[:, None], axis=1)
     GA = None if beam.GA is None else beam.GA[span]
-    return Beam(x, beam.length, beam.EI[span], k, GA), ring
+    return Beam(x, beam.length, beam.EI[span], k, GA), ring, mark
 
 
 def mean_ring_weight(

@@ -2,8 +2,9 @@ r"""Global shape: the motion of the skeleton's key points carried to every verte
 
 The key points lie on three lines along the tube: J at phi_c, and the ring ends U at -alpha and V at
 +alpha; on each, at the clamp A, the rings and the clamp B (the nodes). The contact C splits the J
-line. Along the tube a vertex lies in a patch between two nodes, round the tube in one of three
-regions, U-J, J-V and the back V-U. The three lines are interpolated along s, then linearly in phi.
+line; of a tool with a width its two edges do. Along the tube a vertex lies in a patch between two
+nodes, round the tube in one of three regions, U-J, J-V and the back V-U. The three lines are
+interpolated along s, then linearly in phi.
 
 - `linear`: displacement vectors, linear between the key points.
 - `hermite` (default): the same, but the transverse displacement of the J line is the beam's cubic,
@@ -76,23 +77,23 @@ class Keys(eqx.Module):
     """Motion of the key points; rows are A, the rings, B (see `clamped`).
 
     Attributes:
-        s_c: contact position, mm.
+        s_c: contact position, mm; of a tool with a width the two positions of its edges, in order.
         contact: displacement of C with the skeleton, mm; shape (3,).
         joints: displacement of the J line at the nodes, mm; shape (nodes, 3).
         U: displacement of the ring ends at -alpha, mm; shape (nodes, 3).
         V: displacement of the ring ends at +alpha, mm; shape (nodes, 3).
         slopes: d/ds of the (y, z) displacement of the J line at the nodes; shape (nodes, 2). Only
             `hermite` needs it.
-        contact_slope: the same at C; shape (2,).
+        contact_slope: the same at C; shape (2,). At each of two edges: shape (2, 2).
     """
 
-    s_c: Float[Array, ""]
+    s_c: Float[Array, "*edges"]
     contact: Float[Array, "3"]
     joints: Float[Array, "nodes 3"]
     U: Float[Array, "nodes 3"]
     V: Float[Array, "nodes 3"]
     slopes: Float[Array, "nodes 2"] | None = None
-    contact_slope: Float[Array, "2"] | None = None
+    contact_slope: Float[Array, "*edges 2"] | None = None
 
 
 class Ends(NamedTuple):
@@ -103,26 +104,26 @@ class Ends(NamedTuple):
 
 
 def clamped(
-    s_c: Float[Array, ""],
+    s_c: Float[Array, "*edges"],
     contact: Float[Array, "3"],
     joints: Float[Array, "rings 3"],
     U: Float[Array, "rings 3"],
     V: Float[Array, "rings 3"],
     slopes: Float[Array, "rings 2"] | None = None,
-    contact_slope: Float[Array, "2"] | None = None,
+    contact_slope: Float[Array, "*edges 2"] | None = None,
     *,
     ends: Ends = Ends(),
 ) -> Keys:
     """Keys of a tube whose ends do not turn.
 
     Args:
-        s_c: contact position, mm.
+        s_c: contact position, mm; or those of both edges of a tool with a width, shape (2,).
         contact: displacement of C, mm.
         joints: displacement of the joints J_i, mm; so for `U` and `V`.
         U: of the ring ends at -alpha.
         V: of the ring ends at +alpha.
         slopes: d/ds of (y, z) at the joints.
-        contact_slope: the same at C.
+        contact_slope: the same at C, or at each edge.
         ends: how A and B move.
     """
     held = jnp.zeros_like(contact)
@@ -238,7 +239,7 @@ HERMITE = [[1, 0, 0, 0], [0, 0, 1, 0], [-3, 3, -2, -1], [2, -2, 1, 1]]
 
 
 def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None = None):
-    """The J line, with C as one more node.
+    """The J line, with C (or both edges of the tool) as one more node.
 
     Linear between the nodes; where `slopes` are given (nodes, C), the last components are cubic.
 
@@ -246,12 +247,16 @@ def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None 
         Where each patch begins, mm, and one over its length; shape (nodes,). The coefficients of
         t = 0..1 in it; shape (nodes, 4, components).
     """
-    below = jnp.sum(nodes[1:-1] <= s_c)
-    nodes, values = _insert(nodes, s_c, below), _insert(joints, contact, below)
+    values, below = joints, []
+    for s in _each(s_c):
+        below.append(jnp.sum(nodes[1:-1] <= s))
+        nodes, values = _insert(nodes, s, below[-1]), _insert(values, contact, below[-1])
     span, low, high = jnp.diff(nodes), values[:-1], values[1:]
     leave = land = high - low
     if slopes is not None:
-        turn = _insert(slopes[0], slopes[1], below)
+        turn = slopes[0]
+        for own, at in zip(_each(slopes[1], 1), below, strict=True):
+            turn = _insert(turn, own, at)
         straight = leave[:, : leave.shape[1] - turn.shape[1]]
         leave, land = (
             jnp.concatenate([straight, span[:, None] * v], 1) for v in (turn[:-1], turn[1:])
@@ -263,13 +268,18 @@ def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None 
     return nodes[:-1], 1 / jnp.where(span > 0, span, jnp.inf), cubic
 
 
+def _each(v, dimensions: int = 0):
+    """What there is at the contact, or at both edges of a tool with a width."""
+    return [v] if v.ndim == dimensions else [v[i] for i in range(v.shape[0])]
+
+
 def _carry(binding: Binding, weights: Weights, s_c, line, U, V):
     """Along the tube between the nodes, round it between the lines.
 
     Args:
         binding: -
         weights: -
-        s_c: contact position, mm.
+        s_c: contact position, mm, or those of both edges.
         line: from `_joint_line`.
         U: values at the nodes; shape (nodes, components).
         V: -
@@ -277,16 +287,23 @@ def _carry(binding: Binding, weights: Weights, s_c, line, U, V):
     Returns:
         Shape (blocks, components, width).
     """
-    patch, beyond = binding.patch, binding.s >= s_c
+    patch, beyond = binding.patch, tuple(binding.s >= s for s in _each(s_c))
     begin, density, cubic = line
 
     # Of the patch that C splits, a vertex belongs to the lower or to the upper part.
+    def part(v, i):
+        return v[patch + i if i else patch]
+
     def side(v):
-        return jnp.where(beyond, v[patch + 1][:, None], v[patch][:, None])
+        *upper, own = (part(v, i)[:, None] for i in range(len(beyond), -1, -1))
+        for past, other in zip(beyond, reversed(upper), strict=True):
+            own = jnp.where(past, other, own)
+        return own
 
     t = (binding.s - side(begin)) * side(density)
     ends = jnp.stack([U[:-1], U[1:] - U[:-1], V[:-1], V[1:] - V[:-1]], axis=1)
-    table = jnp.concatenate([cubic[patch], cubic[patch + 1], ends[patch]], axis=1)
+    cubics = [part(cubic, i) for i in range(1 + len(beyond))]
+    table = jnp.concatenate([*cubics, ends[patch]], axis=1)
     return _combine((weights.U, weights.J, weights.V, t), beyond, binding.fraction, table)
 
 
@@ -297,10 +314,11 @@ def _combine(where, beyond, fraction, table):
     Args:
         where: U, J, V and the way t through the patch, or through its part on one side of C; each
             of shape (blocks, width).
-        beyond: whether on the side away from A.
+        beyond: whether on the side away from A; of C, or of each edge in order.
         fraction: way through the whole patch.
-        table: rows: coefficients of 1, t, t^2, t^3 on the side of A, and on the other; of U, of
-            the line U by fraction, of V and the line V by it; shape (blocks, 12, components).
+        table: rows: coefficients of 1, t, t^2, t^3 on the side of A, and on the other (between
+            both edges, and beyond them); of U, of the line U by fraction, of V and the line V by
+            it; shape (blocks, 12 or 16, components).
 
     Derivatives are written as matrix products, one for each block: their transposes then are such
     products too. Of the plain sums the compiler makes, going back, a reduction over the vertices
@@ -308,11 +326,13 @@ def _combine(where, beyond, fraction, table):
     """
     U, J, V, t, f = (v[:, None] for v in (*where, fraction))
     rows = [row[:, :, None] for row in table.swapaxes(0, 1)]
-    a, b, c, d = (
-        jnp.where(beyond[:, None], upper, lower)
-        for lower, upper in zip(rows[:4], rows[4:8], strict=True)
-    )
-    u, along_u, v, along_v = rows[8:]
+    a, b, c, d = rows[:4]
+    for i, past in enumerate(beyond):
+        a, b, c, d = (
+            jnp.where(past[:, None], upper, lower)
+            for lower, upper in zip((a, b, c, d), rows[4 * i + 4 : 4 * i + 8], strict=True)
+        )
+    u, along_u, v, along_v = rows[-4:]
     line = a + t * (b + t * (c + t * d))
     return U * (u + f * along_u) + J * line + V * (v + f * along_v)
 
@@ -329,8 +349,11 @@ def _combine_jvp(primals, tangents):
 
     def basis(where, fraction):
         U, J, V, t = where
-        zero = jnp.zeros_like(J)
-        sides = jnp.where(beyond, zero, J), jnp.where(beyond, J, zero)
+        zero, rest, sides = jnp.zeros_like(J), J, []
+        for past in beyond:
+            sides.append(jnp.where(past, zero, rest))
+            rest = jnp.where(past, rest, zero)
+        sides.append(rest)
         line = [w * t**k for w in sides for k in range(4)]
         return jnp.stack([*line, U, U * fraction, V, V * fraction], axis=1)
 
