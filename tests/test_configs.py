@@ -22,7 +22,7 @@ SHOWS = {
     "bonded_pull": {"contact law": "bonded", "second_plane": "off"},
     "capsule": {"contact": "on", "end_motion": "on", "axial": "on"},
     "cross_sections": {"skeleton": "sections", "surface": "off", "second_plane": "on"},
-    "deep": {"contact": "on", "skeleton": "softening", "second_plane": "off", "shear": "on"},
+    "deep": {"contact": "on", "skeleton": "softening", "width": "punch", "shear": "on"},
     "friction": {"friction": "on", "axial": "on", "contact_point": "fixed"},
     "imported": {"curved": "off", "rings": "arch2"},
     "imported_tool": {"contact": "on", "curved": "on"},

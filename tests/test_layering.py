@@ -38,7 +38,7 @@ STRANGERS = [("scene", {"fitting", "inference", "results", "prediction", "runs"}
 WITHIN = {
     "scene": [
         {"operations", "curve", "sizes", "wall_check", "declare"},
-        {"depth"},
+        {"depth", "width"},
         {"wall", "effects"},
         {"plan", "spec"},
         {"rules", "stage"},

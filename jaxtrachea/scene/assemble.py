@@ -13,7 +13,7 @@ from jaxtrachea.scene.declare import AnyMaterial, PlanError, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.rules import make_plan
-from jaxtrachea.scene.sizes import check_sizes
+from jaxtrachea.scene.sizes import check_sizes, check_width
 from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool, check_material, check_path
 from jaxtrachea.scene.wall import checked_walls, near_patches, round_wall
 from jaxtrachea.surface import local, regions
@@ -57,7 +57,8 @@ def make_scene(
     Raises:
         PlanError: a wish that cannot be met.
         MeshError: patches for the contact that are not where an imported mesh is.
-        SizeError: a length that no trachea and no tool has: the unit is wrong, most likely.
+        SizeError: a length that no trachea and no tool has: the unit is wrong, most likely; a
+            `half_width` beyond the tool.
         ValueError: a path without rows, or arrays of a wrong length.
     """
     check_path(path)
@@ -92,6 +93,7 @@ def make_scene(
         plan=make_plan(SceneFacts(mesh=False), EffectOptions(want_surface=False)),  # not read
     )  # fmt: skip
     plan = make_plan(facts_of(scene, material, path), effects)
+    check_width(geometry, shape, plan.options.half_width)
     if plan.surface is None or mesh is None:
         return dataclasses.replace(scene, mesh=None, binding=None, plan=plan)
     return dataclasses.replace(scene, plan=plan, runs=local.runs(mesh.s, spacing))
@@ -128,7 +130,7 @@ def with_tool(scene: Scene, tool: Shape) -> Scene:
     Raises:
         ValueError: more or fewer corners than the tool before, another dtype, or so large that the
             program searches too few patches or moves too few vertices.
-        SizeError: larger than any tool.
+        SizeError: larger than any tool, or smaller than its width (`half_width`).
     """
     before, tube, geometry = scene.tool, scene.tube, scene.geometry
     if not isinstance(tool, Shape):
@@ -138,6 +140,7 @@ def with_tool(scene: Scene, tool: Shape) -> Scene:
     for name in ("vertices", "radius"):
         check_fits(f"tool.{name}", getattr(tool, name), getattr(before, name), CURE)
     check_sizes(geometry, float(scene.radius), tool)
+    check_width(geometry, tool, scene.plan.options.half_width)
     near = near_patches(tool, geometry, tube.centres.shape[0])
     if near > scene.near:
         raise ValueError(

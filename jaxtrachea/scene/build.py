@@ -38,6 +38,7 @@ KEYS = {
     "centreline=": "centreline= of Landmarks to read_mesh (from Python)",
     "geometry.length": "trachea.length",
     "geometry.radius": "trachea.radius",
+    "half_width": "model.half_width",
 }
 
 

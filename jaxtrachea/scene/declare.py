@@ -118,6 +118,7 @@ class Effect:
         least: level of a program without it; empty: none is without.
         field: where a `Plan` keeps it, empty: under its name. `options.` leads to those.
         values: what a plan keeps for a level; other levels are kept as they are.
+        measured: level of which a plan keeps a number, an option of the user; empty: none is.
         material: optional values of the material that it reads.
         either: one of those is enough.
         requires: effects without which it cannot be.
@@ -137,6 +138,7 @@ class Effect:
     values: Mapping[str, Any] = dataclasses.field(
         default_factory=lambda: {"on": True, "off": False}
     )
+    measured: str = ""
     material: tuple[str, ...] = ()
     either: bool = False
     requires: tuple[str, ...] = ()
@@ -163,7 +165,8 @@ class Effect:
 
     def level(self, value: Any) -> str:
         """The level of what a plan keeps."""
-        return next((word for word, kept in self.values.items() if kept == value), value)
+        other = self.measured or value
+        return next((word for word, kept in self.values.items() if kept == value), other)
 
     def given(self, known: frozenset[str]) -> bool:
         """Whether the material gives what it reads; no effect is given by nothing."""

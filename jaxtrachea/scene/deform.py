@@ -52,8 +52,9 @@ def deform(
         s_c, phi_c, radius, tool = where
         ends = _ends(scene, material, s_c, moved) if plan.end_motion else regions.Ends()
         keys = regions.clamped(
-            s_c, moved.skeleton, moved.joints, moved.end_U, moved.end_V, moved.slopes,
-            moved.slope_C, ends=ends,
+            _held_at(scene, s_c), moved.skeleton, moved.joints, moved.end_U, moved.end_V,
+            moved.slopes, moved.slope_C if moved.slope_edges is None else moved.slope_edges,
+            ends=ends,
         )  # fmt: skip
         share = regions.weigh(binding, phi_c) if weights is None else weights
         u = regions.interpolate(binding, share, keys, method=method)
@@ -73,6 +74,12 @@ def deform(
     moved = moved._replace(dissipated=None, status=None)
     led = path if slides and made is not None else None
     return jax.vmap(one, (0, None if together else 0, 0))(moved, where, led)
+
+
+def _held_at(scene: Scene, s_c):
+    """Where the tool holds the ligament, mm: at the contact, or at both edges of its width."""
+    half = scene.plan.options.half_width
+    return jnp.stack([s_c - half, s_c + half]) if half > 0 else s_c
 
 
 def _distances(scene: Scene, made: Approach):

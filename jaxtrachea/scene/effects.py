@@ -15,7 +15,7 @@ from typing import Any, Literal, get_args, get_type_hints
 from jaxtrachea._arguments import check_record
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.sections.material import SectionMaterial
-from jaxtrachea.scene import depth
+from jaxtrachea.scene import depth, width
 from jaxtrachea.scene.declare import SECTIONS, AnyMaterial, Case, Effect, PlanError, Verdict
 from jaxtrachea.trachea.material import DEEP
 
@@ -191,15 +191,17 @@ class EffectOptions:
         dent: centres of the local correction, or off.
         shear: the ligament shears.
         two_material: the rings have a local law of their own.
+        width: `punch`: the tool has that of `half_width`; `point`: it has none.
         skeleton: `softening`: it yields more the deeper it is pressed; `sections`: deforming
             cross-sections, of a `SectionMaterial`; see `Options`.
         want_surface: deformed vertices are asked for.
         want_joints: joints and their loads are asked for.
         want_ring_ends: ends of the rings are asked for.
-        coupling: see `Options`; with `contact`, `onset_width` and `transition`.
+        coupling: see `Options`, as those below.
         contact: -
         onset_width: -
         transition: -
+        half_width: -
     """
 
     contact_point: Literal["auto", "fixed", "per_step"] = _effect(
@@ -234,6 +236,10 @@ class EffectOptions:
         values={"off": "uniform", "on": "two-material"}, material=("k_1_ring",), rungs=ON_OFF,
         ladder="local", words={"off": "uniform", "on": "two-material"},
     )  # fmt: skip
+    width: Literal["auto", "point", "punch"] = _effect(
+        width.width, least="point", field="options.half_width", values={"point": 0.0},
+        measured="punch", rungs=("point", "punch"),
+    )  # fmt: skip
     skeleton: Literal["auto", "linear", "softening", "sections"] = _effect(
         depth.skeleton, least="linear", field="options.skeleton", values={},
         material=DEEP, rungs=("linear", "softening"),
@@ -245,6 +251,7 @@ class EffectOptions:
     contact: Literal["unilateral", "bonded"] = "unilateral"
     onset_width: float = 1e-3
     transition: float | None = None
+    half_width: float = 0.0
 
     def __post_init__(self):
         """Refuse words and numbers that mean nothing.
@@ -254,7 +261,7 @@ class EffectOptions:
         """
         check_record(self)
         Options(self.coupling, contact=self.contact, onset_width=self.onset_width,
-                transition=self.transition)  # fmt: skip
+                transition=self.transition, half_width=self.half_width)  # fmt: skip
 
 
 def _declared() -> dict[str, Effect]:

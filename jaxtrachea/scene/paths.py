@@ -40,21 +40,26 @@ def path_of(
         SpecError: a file or a value that cannot be used, with its key.
     """
     if spec.path[0].kind == "press":
-        return _presses(spec.path, geometry)
+        reach = 0.0 if spec.effects.width == "point" else spec.model.half_width
+        return _presses(spec.path, geometry, reach)
     legs = [_leg(leg, i, folder, files) for i, leg in enumerate(spec.path)]
     translation, vectors = (np.concatenate(v) for v in zip(*legs, strict=True))
     turn = jax.vmap(lambda v: pose_from_vector(v, jnp.zeros_like(v)).rotation)
     return Poses(turn(jnp.asarray(vectors)), jnp.asarray(translation))
 
 
-def _presses(legs: list[PathSection], geometry: Geometry) -> Presses:
+def _presses(legs: list[PathSection], geometry: Geometry, reach: float) -> Presses:
+    """Presses at places where all of the tool, which reaches so far along s, lies on the tube."""
     s, phi, D = [], [], []
     length, alpha = float(geometry.length), float(geometry.half_angle)
+    low = reach if reach <= length / 2 else 0.0  # a wider one is refused as such
+    width = f", where all of the tool (model.half_width {reach:g} mm) lies on it" if low else ""
     for i, leg in enumerate(legs):
         at, angle, steps = leg.s or 0.0, leg.phi or 0.0, leg.steps or STEPS
-        if not 0 <= at <= length:
+        if not low <= at <= length - low:
             raise SpecError(
-                f"path.{i}.s: {at:g} mm; expected a place on the tube, 0 to {length:g} mm"
+                f"path.{i}.s: {at:g} mm; expected a place on the tube, {low:g} to {length - low:g} "
+                f"mm{width}"
             )
         if abs(angle) > alpha:
             raise SpecError(

@@ -18,7 +18,8 @@ from jaxtrachea.surface.regions import Method
 #: What a simulation can leave out of its result.
 OUTPUTS = ("joints", "ring_ends")
 #: Effects of a line of joints, and what no other skeleton has.
-OF_JOINTS = ("friction", "rings", "axial", "surface", "end_motion", "dent", "shear", "two_material")
+OF_JOINTS = ("friction", "rings", "axial", "surface", "end_motion", "dent", "shear", "two_material",
+             "width")  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,10 +112,11 @@ class Plan:
         Raises:
             InputError: naming the option.
         """
-        if (found := self.options.half_width) != 0:
+        if self.has("width") and self.second_plane:
             raise InputError(
-                f"is {found!r}", key="options.half_width", joint=" ",
-                expected="0.0 in a scene", cure="press by `press` with it",
+                f"is {self.options.half_width:g}, with second_plane 'on'", joint=" ",
+                key="options.half_width", expected="0.0, or second_plane 'off'",
+                cure="a width is for presses straight in on the midline",
             )  # fmt: skip
         self._check_skeleton()
         wanders = self.contact and self.contact_point == "per_step"
@@ -164,7 +166,14 @@ class Plan:
         return self.level(name) != EFFECTS[name].least
 
     def at(self, **levels: str) -> "Plan":
-        """The plan with these levels of effects; what cannot be without an effect goes with it."""
+        """The plan with these levels of effects; what cannot be without an effect goes with it.
+
+        Raises:
+            ValueError: a level with a number that the plan does not know.
+        """
+        for name, level in levels.items():
+            if level == EFFECTS[name].measured and not self.has(name):
+                raise ValueError(f"{name} {level!r} needs a number that this plan has not")
         own, model = stored(levels)
         made = dataclasses.replace(self, options=dataclasses.replace(self.options, **model), **own)
         lost = {
@@ -192,9 +201,14 @@ class Plan:
 
 
 def stored(levels: Mapping[str, str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Fields of a `Plan`, and of its options, that hold these levels of effects."""
+    """Fields of a `Plan`, and of its options, that hold these levels of effects.
+
+    Not of those that keep a number (`Effect.measured`).
+    """
     own, model = {}, {}
     for name, level in levels.items():
+        if level == EFFECTS[name].measured:
+            continue
         field = EFFECTS[name].field.split(".")
         (own if len(field) == 1 else model)[field[-1]] = EFFECTS[name].value(level)
     return own, model

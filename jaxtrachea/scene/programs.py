@@ -25,7 +25,8 @@ class Moved(NamedTuple):
     """Force and skeleton, whichever program found them; fields as in `Simulation`.
 
     Slopes are those of the ligament at the contact and at the rings; these and the loads are None
-    where there is no ligament.
+    where there is no ligament. Of a tool with a width, `slope_C` is the mean of those at its edges,
+    each weighed by its force, and `slope_edges` are they; else None.
     """
 
     force: Any
@@ -40,6 +41,7 @@ class Moved(NamedTuple):
     status: Any
     slip: Any = None
     dissipated: Any = None
+    slope_edges: Any = None
 
 
 def moved_by(press: ObliquePress) -> Moved:
@@ -77,10 +79,11 @@ def one_plane(scene: Scene, material: Material, presses: Presses) -> Moved:
     def slope(v):
         return jnp.stack([v, jnp.zeros_like(v)], -1)
 
+    edges = None if unit.edges is None else slope(load[:, None] * unit.edges)
     return Moved(
         force=_anterior(F), depth=_anterior(-solved.depth), skeleton=_anterior(load * unit.w_C),
         slope_C=slope(load * unit.theta_C), joints=joints, slopes=slope(load[:, None] * unit.theta),
-        loads=bears, end_U=joints, end_V=joints, status=solved.status,
+        loads=bears, end_U=joints, end_V=joints, status=solved.status, slope_edges=edges,
     )  # fmt: skip
 
 

@@ -50,13 +50,14 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
     """
     presses = path if made is None else made.presses
     assert presses is not None
-    D, phi, geometry = presses.displacement, presses.phi, scene.geometry
+    D, phi = presses.displacement, presses.phi
     inward = jax.vmap(local_frame)(phi)[:, 0] if made is None else made.inward
     pressing = ~(jnp.sum(D * inward, axis=1) <= 0)
     acting = pressing
     if scene.plan.options.contact == "bonded":
         acting = ~jnp.all(D == 0, axis=1)
-    outside = ~((presses.s >= 0) & (presses.s <= geometry.length))
+    low, high = _places(scene)
+    outside = ~((presses.s >= low) & (presses.s <= high))
     if made is not None:
         outside = pressing & (outside | off_the_end(scene, made.own))
     refused = {PressStatus.OFF_TUBE: outside}
@@ -80,11 +81,21 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
 
 
 def on_the_tube(scene: Scene, s: Float[Array, "*n"], phi: Float[Array, "*n"]):
-    """Contact positions to compute with (an end, the midline in place of none); who is behind."""
+    """Contact positions to compute with (an end, the midline in place of none); who is behind.
+
+    The end is the last place at which all of the tool lies on the tube.
+    """
     geometry = scene.geometry
+    low, high = _places(scene)
     behind = ~on_ring(geometry.half_angle, phi)[0] & ~jnp.isnan(phi)
-    s = jnp.where(s < 0, 0, jnp.where(s > geometry.length, geometry.length, s))
+    s = jnp.where(s < low, low, jnp.where(s > high, high, s))
     return s, jnp.where(behind, 0, phi), behind
+
+
+def _places(scene: Scene):
+    """Lowest and highest contact position, mm, at which all of the tool lies on the tube."""
+    half, length = scene.plan.options.half_width, scene.geometry.length
+    return (half, length - half) if half > 0 else (0, length)
 
 
 def status_of(status, share, made: Approach | None, refused: dict[PressStatus, Bool[Array, "*n"]]):

@@ -35,9 +35,10 @@ def make_plan(
         if decision.level != "on" and (decision.forced or effect.name in finest):
             ignored.add(effect.name)
     own, of_model = stored(case.levels)
+    half_width = of_model.pop("half_width", options.half_width)
     model = Options(
         coupling=options.coupling, contact=options.contact, onset_width=options.onset_width,
-        transition=options.transition, **of_model,
+        transition=options.transition, half_width=half_width, **of_model,
     )  # fmt: skip
     plan = Plan(
         contact=facts.poses, curved=facts.poses and facts.curved, joints=options.want_joints,

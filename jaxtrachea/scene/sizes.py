@@ -54,6 +54,31 @@ def check_sizes(geometry: Geometry, outer: float, tool: Shape | None) -> None:
             )
 
 
+def check_width(geometry: Geometry, tool: Shape | None, half_width: float) -> None:
+    """Refuse a width that the tube has no place for, or that the tool has not.
+
+    Args:
+        geometry: the tube at rest.
+        tool: or None.
+        half_width: of its flat end along the tube, mm.
+
+    Raises:
+        SizeError: how wide it is, and how wide it may be.
+    """
+    most, of = float(geometry.length) / 2, "half the length of the tube"
+    if tool is not None:
+        corners = np.asarray(tool.vertices, float)
+        far = np.sqrt(np.sum((corners - corners.mean(1, keepdims=True)) ** 2, axis=0)).max()
+        reach = float(far) + float(tool.radius)
+        most, of = min((most, of), (reach, "as far as the tool reaches from its middle"))
+    if half_width > most:
+        raise SizeError(
+            f"is {half_width:.4g} mm", key="half_width", joint=" ",
+            expected=f"at most {most:.4g} mm, {of}",
+            cure="of a flat round end it is pi/4 of the radius",
+        )  # fmt: skip
+
+
 def _within(name: str, value: float, limits: tuple[float, float]) -> None:
     low, high = limits
     if not low <= value <= high:

@@ -190,6 +190,7 @@ class LawSection(Section):
     contact: Literal["unilateral", "bonded"] = "unilateral"
     onset_width: PositiveLength = 1e-3
     transition: PositiveLength | None = None
+    half_width: Annotated[Length, Field(ge=0)] = 0.0
 
 
 def _one_or_auto(value: Any) -> Any:

@@ -55,7 +55,8 @@ def sweep(
     Args:
         scene: its geometry and the level of rings, skeleton, shear and laws of its plan are used;
             OFF_PLAN where a point presses and the material gives more than the plan has (as in
-            `simulate`), or off the midline on a skeleton that softens or has one plane.
+            `simulate`), or off the midline with a tool's width or on a skeleton that softens or has
+            one plane.
         material: -
         s: mm.
         phi: rad, within the half-angle of the rings; else BEHIND_GAP where it presses.
@@ -74,8 +75,10 @@ def sweep(
     )
 
     unlike = set(lacking(scene, material)) - {"axial"}
-    flat = scene.plan.has("skeleton") and not scene.plan.second_plane
-    pressed = _PRESSED[scene.plan.options.skeleton]
+    straight_in = scene.plan.has("skeleton") or scene.plan.has("width")
+    flat = straight_in and not scene.plan.second_plane
+    kind = "width" if scene.plan.has("width") else scene.plan.options.skeleton
+    pressed = _PRESSED[kind]
 
     def one(at):
         s_c, phi_at, d = at
@@ -123,8 +126,8 @@ def _vectors(scene: Scene, material: Material, s_c, phi_c, depth) -> _Pressed:
     return _Pressed(press.force, press.depth, press.skeleton, press.status)
 
 
-def _softening(scene: Scene, material: Material, s_c, phi_c, depth) -> _Pressed:
-    """On a skeleton that softens: a press on the midline, whatever the angle on the rings."""
+def _on_the_midline(scene: Scene, material: Material, s_c, phi_c, depth) -> _Pressed:
+    """By a tool with a width or on a skeleton that softens, whatever the angle on the rings."""
     inward = local_frame(phi_c)[0]
     on = on_ring(scene.geometry.half_angle, phi_c)[0]
     found = press(scene.geometry, material, s_c, depth, scene.plan.options)
@@ -148,4 +151,5 @@ def _sections(scene: Scene, material: SectionMaterial, s_c, phi_c, depth) -> _Pr
     return _Pressed(force, way, skeleton, status)
 
 
-_PRESSED = {"linear": _vectors, "softening": _softening, "sections": _sections}
+_PRESSED = {"linear": _vectors, "width": _on_the_midline, "softening": _on_the_midline,
+            "sections": _sections}  # fmt: skip

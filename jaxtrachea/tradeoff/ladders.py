@@ -56,9 +56,10 @@ def ladders(full: Full) -> tuple[list[Ladder], dict[str, str]]:
             found.append(Ladder(name=name, kind=kind, rungs=rungs, base=base, effect=effect))
 
     flat, plan = one_plane(full), full.scene.plan
-    add("form", "algebra", _words("form", "reactions", "recursion"), flat, second_plane="off")
+    alone = flat or ("a tool with a width has one form and one split" if plan.has("width") else "")
+    add("form", "algebra", _words("form", "reactions", "recursion"), alone, second_plane="off")
     wanders = plan.contact and plan.contact_point == "per_step"
-    jumps = flat or (
+    jumps = alone or (
         "with 'independent' the energy of a contact that wanders jumps" if wanders else ""
     )
     add("split", "model", _words("split", "independent", "continuous"), jumps, second_plane="off")

@@ -21,7 +21,9 @@ from jaxtrachea.status import PressStatus
 
 run, swept = jax.jit(simulate), jax.jit(sweep)
 ALL = frozenset({"EA_L", "EI_C", "k_t", "GA_L", "k_A", "k_B", "k_1_ring"})
-#: A scene in which every effect is on, but a skeleton that softens: it has no second plane.
+#: What has no second plane: a tool with a width, a skeleton that softens.
+FLAT = {"width", "skeleton"}
+#: A scene in which every other effect is on.
 EVERYTHING = SceneFacts(
     poses=True, angle=0.3, along=0.5, across=0.5, slip=1.0, spacing=10.0, friction=True, known=ALL
 )
@@ -40,8 +42,8 @@ def test_the_table_has_the_words_of_the_declarations():
 
 def test_a_plan_keeps_every_level_it_is_given():
     plan = make_plan(EVERYTHING)
-    assert {name for name in EFFECTS if not plan.has(name)} == {"skeleton"}
-    for effect in (effect for effect in EFFECTS.values() if effect.name != "skeleton"):
+    assert {name for name in EFFECTS if not plan.has(name)} == FLAT
+    for effect in (effect for effect in EFFECTS.values() if effect.name not in FLAT):
         for level in effect.levels:
             assert plan.at(**{effect.name: level}).level(effect.name) == level
 
