@@ -63,6 +63,24 @@ def test_rotation_is_half_of_what_the_place_changes(s):
     np.testing.assert_allclose(2 * theta, slope, rtol=1e-5)
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_punch_too_narrow_for_its_digits_says_nothing(dtype):
+    """Without shear, where two points a width apart differ by the square of it."""
+    s, D = jnp.asarray(35.0, dtype), jnp.asarray([1.0], dtype)
+    material = Material(*(jnp.asarray(v, dtype) for v in (1200.0, 0.2, 6.8, 0.01)))
+    tube, limit = table_1(dtype), {"float32": 0.05, "float64": 1e-4}[dtype]
+    for half in (limit, 1e-2 * limit, 1e-8 * limit):
+        got = press(tube, material, s, D, Options(half_width=half))
+        if half < limit:
+            assert got.status[0] == PressStatus.NON_FINITE
+            assert np.isnan(got.force[0])
+            continue
+        true = punch_fem.held(X, LENGTH, np.full(16, 1200.0), np.full(15, 0.2), 35.0, 0.05, None)
+        assert got.status[0] == PressStatus.OK
+        np.testing.assert_allclose(got.compliance, true.w_C, rtol=2e-3)
+        np.testing.assert_allclose(got.joints[0], float(got.force[0]) * true.w, atol=1e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.compiling
 def test_narrow_punch_is_a_point_that_does_not_tilt():

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtrachea._numerics import epsilon
 from jaxtrachea.mechanics.beam import deflect
 from jaxtrachea.mechanics.compliance import Beam
 from jaxtrachea.mechanics.force_law import ring_weight
@@ -49,8 +50,9 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
     """Deflections under a punch at s_c whose forces sum to 1 N.
 
     Not for a punch that reaches beyond an end of the beam (`press` refuses it): what reaches beyond
-    is taken to stand on the clamp there, and nothing moves. Loses digits where the punch is
-    narrower than some thousandth of a span: two points then are one.
+    is taken to stand on the clamp there, and nothing moves. NaN where the punch is so narrow that
+    its two points differ by rounding alone (a beam without shear feels the square of the width: in
+    float32 some hundredth of a span).
 
     Args:
         beam: the beam and its supports.
@@ -64,7 +66,9 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
     c_12 = unit.w[0, marks[1]]
     first, second = c_22 - c_12, c_11 - c_12
     total = first + second
+    apart = (total > 100 * epsilon(total.dtype) * (c_11 + c_22)) | (c_11 + c_22 == 0)
     share = jnp.stack([first, second]) / jnp.where(total > 0, total, 1)
+    share = jnp.where(apart, share, jnp.nan)
 
     def per_ring(v):
         return share @ v[:, ring]
