@@ -2,9 +2,9 @@
 
 Every effect is dropped alone from the full program, the cheapest rung within the tolerance is
 taken, and all of them together are checked. Effects do not add up: while the whole is too far off,
-the effect that errs most per operation saved comes back by one rung. Cost is the number of
-operations, those in float32 counted half, so that the choice does not depend on the machine; errors
-are those of force, joints and surface over the path and two sample paths beside it.
+the effect that errs most per cost saved comes back by one rung. Cost is a `price.Price`:
+operations, so that the choice does not depend on the machine, or the time predicted on this one;
+errors are those of force, joints and surface over the path and two sample paths beside it.
 """
 
 import dataclasses
@@ -19,24 +19,20 @@ from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.effects import EFFECTS
-from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.plan import Decision, Served
 from jaxtrachea.scene.simulation import Simulation, simulate
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.tradeoff.errors import Errors, compare
+from jaxtrachea.tradeoff.kernels import count_kernels
 from jaxtrachea.tradeoff.ladders import QUALITY, Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
+from jaxtrachea.tradeoff.price import OPERATIONS, Price
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
 BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
-#: What an operation costs.
-COST = {"float32": 0.5, "float64": 1.0}
-
-#: `simulate` for several paths; compiled quickly, since every program is called once.
-_simulate = jax.jit(
-    jax.vmap(simulate, (None, None, 0)), compiler_options={"xla_backend_optimization_level": 0}
-)
+#: `simulate` for a sample path; compiled quickly, since every program is called three times.
+_simulate = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
 
 
 class Rung(NamedTuple):
@@ -47,7 +43,7 @@ class Rung(NamedTuple):
         effect: that it is of.
         level: on the ladder.
         errors: what that changes.
-        saved: share of operations.
+        saved: share of the cost.
     """
 
     ladder: str
@@ -70,7 +66,8 @@ class Choice(NamedTuple):
         refused: rungs that are too far off alone.
         returned: rungs that were within the tolerance alone, but not together with the others.
         errors: of the choice against the full program, on all sample paths.
-        cost: of the full program and of the choice, for the path: operations, in float32 half.
+        cost: of the full program and of the choice: s, or operations for the path, see `price`.
+        price: what was made least.
     """
 
     scene: Scene
@@ -83,22 +80,22 @@ class Choice(NamedTuple):
     returned: tuple[Rung, ...]
     errors: Errors
     cost: tuple[float, float]
+    price: Price = OPERATIONS
 
     @property
     def sentence(self) -> str:
         """What was found, in a line."""
         if not self.dropped:
             return f"no program but the full one is within {percent(self.tolerance)}; it is taken"
-        share = self.cost[1] / self.cost[0]
         return (
             f"within {percent(self.tolerance)}: {changes(self.errors)} off the full program, "
-            f"{100 * share:.0f} % of its cost"
+            f"{self.price.words(self.cost)}"
         )
 
 
 def choose(
     full: Full, tolerance: float, report: Callable[[str], None] = lambda text: None,
-    *, precision: Literal["auto", "float64"] = "auto",
+    *, precision: Literal["auto", "float64"] = "auto", price: Price = OPERATIONS,
 ) -> Choice:  # fmt: skip
     """Choose the cheapest levels within the tolerance.
 
@@ -107,12 +104,13 @@ def choose(
         tolerance: largest error of force, joints and surface, relative to the largest value.
         report: called with what is tried next; may raise to stop.
         precision: `auto`: float32 where that is within the tolerance.
+        price: what is made least; operations unless told otherwise.
 
     Raises:
         PlanError: the path, or a sample path beside it, has no row with a force.
     """
     check_word("precision", precision, Literal["auto", "float64"])
-    trial, every = _Trial(full, report), _ladders(full, precision)
+    trial, every = _Trial(full, report, price), _ladders(full, precision)
     refused: list[Rung] = []
     options: dict[str, list[Rung]] = {}
     for ladder in every:
@@ -142,21 +140,22 @@ def choose(
     return Choice(
         scene=scene, material=material, path=path, levels=levels, tolerance=tolerance,
         dropped=tuple(picked), refused=tuple(refused), returned=tuple(returned), errors=errors,
-        cost=cost,
+        cost=cost, price=price,
     )  # fmt: skip
 
 
 class _Trial:
     """Runs programs on the sample paths, each once."""
 
-    def __init__(self, full: Full, report: Callable[[str], None]):
-        self.full, self.report = full, report
+    def __init__(self, full: Full, report: Callable[[str], None], price: Price):
+        self.full, self.report, self.price = full, report, price
         self.paths = samples(full)
         self.known: dict[Levels, Errors] = {}
         self.costs: dict[Levels, float] = {}
+        self.kernels: dict[Levels, int] = {}
         report("full program")
         self.reference = self._run(full.levels)
-        pressed = np.nan_to_num(self.reference.force).any(axis=(1, 2))
+        pressed = np.nan_to_num(np.asarray(self.reference.force)).any(axis=(1, 2))
         if not pressed.all():
             where = "the path" + (" a quarter of a ring spacing beside it" if pressed[0] else "")
             raise PlanError(
@@ -174,17 +173,24 @@ class _Trial:
 
     def cost(self, levels: Levels) -> float:
         if levels not in self.costs:
-            count = count_operations(simulate, *program(self.full, levels))
-            self.costs[levels] = count * COST[levels.dtype]
+            if self.price.timed and levels not in self.kernels:
+                self.errors(levels)  # compiles it, and keeps its kernels
+            kernels = self.kernels.get(levels, 0)
+            self.costs[levels] = self.price.of(program(self.full, levels), kernels)
         return self.costs[levels]
 
     def saved(self, levels: Levels) -> float:
-        return 1 - self.cost(levels) / self.cost(self.full.levels)
+        return self.price.saved(self.cost(levels), self.cost(self.full.levels))
 
-    def _run(self, levels: Levels):
+    def _run(self, levels: Levels) -> Simulation:
+        """The sample paths, one after the other, with a leading axis."""
         scene, material, _ = program(self.full, levels)
         paths = cast(self.paths, levels.dtype)
-        return jax.tree.map(np.asarray, _simulate(scene, material, paths))
+        each = [jax.tree.map(lambda v, i=i: v[i], paths) for i in range(len(BESIDE))]
+        made = _simulate.lower(scene, material, each[0]).compile()
+        self.kernels[levels] = count_kernels(made.as_text())[0]
+        outs = [made(scene, material, path) for path in each]
+        return jax.tree.map(lambda *v: np.stack(v), *outs)
 
 
 def samples(full: Full) -> Poses | Presses:
@@ -218,7 +224,7 @@ def changes(errors: Errors) -> str:
 
 
 def _ladders(full: Full, precision: str) -> list[Ladder]:
-    """Those of the choice: what saves operations, and what the user has not decided."""
+    """Those of the choice: what saves work, and what the user has not decided."""
     every = ladders(full)[0]
     found = [v for v in every if v.effect in EFFECTS and getattr(full.given, v.effect) == "auto"]
     if full.scene.plan.contact:
@@ -239,6 +245,7 @@ def _within(
     Dearer than `above` if given.
     """
     names = list(ladder.rungs)[:-1]
+    trial.report(ladder.name)
     saved = {name: trial.saved(ladder.levels(trial.full, name)) for name in names}
     for worth in sorted(set(saved.values()), reverse=True):
         if worth <= 0 or (above is not None and worth >= above.saved):

@@ -19,6 +19,7 @@ from jaxtrachea.tradeoff.choice import Choice
 from jaxtrachea.tradeoff.errors import Errors, compare, relative, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
+from jaxtrachea.tradeoff.time_model import processor
 
 #: Turns in which the rungs of a ladder are called one after the other, so that all see the same
 #: machine.
@@ -276,16 +277,6 @@ def _environment(settings: Settings) -> dict[str, Any]:
     return {
         "calls": settings.calls, "lanes": settings.lanes, "load": round(os.getloadavg()[0], 2),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "device": str(jax.devices()[0]), "processor": _processor(),
+        "device": str(jax.devices()[0]), "processor": processor(),
         "versions": {"python": platform.python_version()} | {n: version(n) for n in names},
     }  # fmt: skip
-
-
-def _processor() -> str:
-    """Name of the processor where Linux tells it."""
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            names = [line.split(":", 1)[1].strip() for line in file if "model name" in line]
-    except OSError:
-        names = []
-    return names[0] if names else platform.processor()
