@@ -105,9 +105,10 @@ WITHIN = {
     "prediction": [{"core", "sources"}, {"predict"}, {"held_out"}, {"plots", "report", "tables"}],
     "runs": [{"meet", "manifest"}, {"processes", "shards"}, {"folder"}, {"rerun", "checkpoint"}],
     "tradeoff": [
-        {"errors", "kernels", "levels", "page", "plots", "time_model"},
-        {"ladders", "price"},
-        {"calibrate", "choice"},
+        {"errors", "kernels", "levels", "load", "plots", "time_model"},
+        {"ladders", "page", "parts", "price"},
+        {"calibrate", "timing", "trial"},
+        {"choice"},
         {"measure"},
     ],
     "report": [{"plots", "tables"}, {"fit"}, {"overview"}],

@@ -27,6 +27,7 @@ from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import full_scene, kept_rings, program
 from jaxtrachea.tradeoff.page import choice_rows
 from jaxtrachea.tradeoff.plots import QUESTIONS, draw, pareto
+from jaxtrachea.tradeoff.trial import Trial
 
 K_1, K_3, DEPTH = 0.3, 0.02, 4.0
 SCENE = {
@@ -331,7 +332,7 @@ def test_of_rungs_that_cost_the_same_the_best_is_taken():
     rungs = {name: {"kept": i} for i, name in enumerate(("worst", "best", "good"), 1)}
     ladder = Ladder("made up", "truncation", rungs | {"finest": {}}, {})
     errors = {1: 0.5, 2: 0.001, 3: 0.01}
-    trial = object.__new__(choosing._Trial)
+    trial = object.__new__(Trial)
     trial.full, trial.report, trial.saved = full, lambda text: None, lambda levels: 0.25
     trial.errors = lambda levels: Errors(errors[levels.kept], None, None, None, None, None)
     refused = []

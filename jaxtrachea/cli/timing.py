@@ -1,7 +1,6 @@
 """The model of this machine's time: kept beside the compiled programs, measured where it is not."""
 
 from collections.abc import Callable
-
 from typing import Literal
 
 from jaxtrachea.cli.terminal import programs_folder

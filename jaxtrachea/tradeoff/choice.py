@@ -9,30 +9,21 @@ errors are those of force, joints and surface over the path and two sample paths
 
 import dataclasses
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea.scene.approach import approach
-from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.effects import EFFECTS
 from jaxtrachea.scene.plan import Decision, Served
-from jaxtrachea.scene.simulation import Simulation, simulate
+from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
-from jaxtrachea.tradeoff.errors import Errors, compare
-from jaxtrachea.tradeoff.kernels import count_kernels
+from jaxtrachea.tradeoff.errors import Errors
 from jaxtrachea.tradeoff.ladders import QUALITY, Ladder, ladders
-from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
+from jaxtrachea.tradeoff.levels import Full, Levels, program
 from jaxtrachea.tradeoff.price import OPERATIONS, Price
-
-#: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
-BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
-#: `simulate` for a sample path; compiled quickly, since every program is called three times.
-_simulate = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
+from jaxtrachea.tradeoff.trial import Trial
 
 
 class Rung(NamedTuple):
@@ -61,6 +52,7 @@ class Choice(NamedTuple):
         material: in the precision chosen.
         path: likewise.
         levels: chosen.
+        changed: what they change in those of the full program.
         tolerance: relative.
         dropped: effects at a lower level than in the full program.
         refused: rungs that are too far off alone.
@@ -74,6 +66,7 @@ class Choice(NamedTuple):
     material: Material
     path: Poses | Presses
     levels: Levels
+    changed: dict[str, Any]
     tolerance: float
     dropped: tuple[Rung, ...]
     refused: tuple[Rung, ...]
@@ -94,13 +87,13 @@ class Choice(NamedTuple):
 
 
 def choose(
-    full: Full, tolerance: float, report: Callable[[str], None] = lambda text: None,
+    full: Full | Trial, tolerance: float, report: Callable[[str], None] = lambda text: None,
     *, precision: Literal["auto", "float64"] = "auto", price: Price = OPERATIONS,
 ) -> Choice:  # fmt: skip
     """Choose the cheapest levels within the tolerance.
 
     Args:
-        full: the scene at its finest.
+        full: the scene at its finest; or a `Trial` of it, which keeps what it has tried.
         tolerance: largest error of force, joints and surface, relative to the largest value.
         report: called with what is tried next; may raise to stop.
         precision: `auto`: float32 where that is within the tolerance.
@@ -110,7 +103,9 @@ def choose(
         PlanError: the path, or a sample path beside it, has no row with a force.
     """
     check_word("precision", precision, Literal["auto", "float64"])
-    trial, every = _Trial(full, report, price), _ladders(full, precision)
+    trial = full if isinstance(full, Trial) else Trial(full, report)
+    trial.price, full = price, trial.full
+    every = _ladders(full, precision)
     refused: list[Rung] = []
     options: dict[str, list[Rung]] = {}
     for ladder in every:
@@ -121,7 +116,8 @@ def choose(
     returned: list[Rung] = []
     while True:
         picked = [rungs[-1] for rungs in options.values()]
-        levels = _combined(full, named, picked)
+        changed = _combined(named, picked)
+        levels = full.levels.changed(**changed)
         errors = trial.errors(levels)
         if errors.worst <= tolerance or not picked:
             break
@@ -138,78 +134,10 @@ def choose(
     scene = dataclasses.replace(scene, plan=plan)
     cost = trial.cost(full.levels), trial.cost(levels)
     return Choice(
-        scene=scene, material=material, path=path, levels=levels, tolerance=tolerance,
+        scene=scene, material=material, path=path, levels=levels, changed=changed, tolerance=tolerance,
         dropped=tuple(picked), refused=tuple(refused), returned=tuple(returned), errors=errors,
         cost=cost, price=price,
     )  # fmt: skip
-
-
-class _Trial:
-    """Runs programs on the sample paths, each once."""
-
-    def __init__(self, full: Full, report: Callable[[str], None], price: Price):
-        self.full, self.report, self.price = full, report, price
-        self.paths = samples(full)
-        self.known: dict[Levels, Errors] = {}
-        self.costs: dict[Levels, float] = {}
-        self.kernels: dict[Levels, int] = {}
-        report("full program")
-        self.reference = self._run(full.levels)
-        pressed = np.nan_to_num(np.asarray(self.reference.force)).any(axis=(1, 2))
-        if not pressed.all():
-            where = "the path" + (" a quarter of a ring spacing beside it" if pressed[0] else "")
-            raise PlanError(
-                "plan.tolerance",
-                f"no row of {where} is solved with a force: nothing that a tolerance could be "
-                "measured by",
-                cure="press deeper, further from the ends, or take no tolerance",
-            )
-
-    def errors(self, levels: Levels) -> Errors:
-        if levels not in self.known:
-            found = self._run(levels)
-            self.known[levels] = compare(found, self.reference, (self.full.scene, self.full.scene))
-        return self.known[levels]
-
-    def cost(self, levels: Levels) -> float:
-        if levels not in self.costs:
-            if self.price.timed and levels not in self.kernels:
-                self.errors(levels)  # compiles it, and keeps its kernels
-            kernels = self.kernels.get(levels, 0)
-            self.costs[levels] = self.price.of(program(self.full, levels), kernels)
-        return self.costs[levels]
-
-    def saved(self, levels: Levels) -> float:
-        return self.price.saved(self.cost(levels), self.cost(self.full.levels))
-
-    def _run(self, levels: Levels) -> Simulation:
-        """The sample paths, one after the other, with a leading axis."""
-        scene, material, _ = program(self.full, levels)
-        paths = cast(self.paths, levels.dtype)
-        each = [jax.tree.map(lambda v, i=i: v[i], paths) for i in range(len(BESIDE))]
-        made = _simulate.lower(scene, material, each[0]).compile()
-        self.kernels[levels] = count_kernels(made.as_text())[0]
-        outs = [made(scene, material, path) for path in each]
-        return jax.tree.map(lambda *v: np.stack(v), *outs)
-
-
-def samples(full: Full) -> Poses | Presses:
-    """The path, and the same beside it (`BESIDE`); a leading axis."""
-    path, geometry = full.path, full.scene.geometry
-    spacing = min(full.facts.spacing, float(geometry.length))
-    if isinstance(path, Presses):
-        moved = [
-            Presses(jnp.clip(path.s + a * spacing, 0, geometry.length), path.phi,
-                    path.displacement * (1 + d)) for a, d in BESIDE
-        ]  # fmt: skip
-    else:
-        made = jax.jit(approach)(full.scene, path)
-        row = int(np.argmin(np.asarray(made.seen.gap)))
-        deep = max(-float(made.seen.gap[row]), 0.0)
-        along = jnp.eye(3)[0] if made.frame is None else made.frame[row][:, 0]
-        shifts = [a * spacing * along - d * deep * made.seen.normal[row] for a, d in BESIDE]
-        moved = [Poses(path.rotation, path.translation + v) for v in shifts]
-    return jax.tree.map(lambda *v: jnp.stack(v), *moved)
 
 
 def percent(v: float) -> str:
@@ -238,7 +166,7 @@ def _ladders(full: Full, precision: str) -> list[Ladder]:
 
 
 def _within(
-    trial: _Trial, ladder: Ladder, tolerance: float, refused: list[Rung], above: Rung | None = None
+    trial: Trial, ladder: Ladder, tolerance: float, refused: list[Rung], above: Rung | None = None
 ) -> Rung | None:
     """The cheapest rung within the tolerance alone, of equal ones that which errs least.
 
@@ -266,11 +194,12 @@ def _within(
     return None
 
 
-def _combined(full: Full, named: dict[str, Ladder], picked: list[Rung]) -> Levels:
+def _combined(named: dict[str, Ladder], picked: list[Rung]) -> dict[str, Any]:
+    """What all rungs together change in the finest levels."""
     changed = {}
     for rung in picked:
         changed |= named[rung.ladder].rungs[rung.level]
-    return full.levels.changed(**changed)
+    return changed
 
 
 def _served(reference: Simulation) -> Served:
