@@ -134,7 +134,8 @@ def choose(
     scene = dataclasses.replace(scene, plan=plan)
     cost = trial.cost(full.levels), trial.cost(levels)
     return Choice(
-        scene=scene, material=material, path=path, levels=levels, changed=changed, tolerance=tolerance,
+        scene=scene, material=material, path=path, levels=levels, changed=changed,
+        tolerance=tolerance,
         dropped=tuple(picked), refused=tuple(refused), returned=tuple(returned), errors=errors,
         cost=cost, price=price,
     )  # fmt: skip

@@ -14,9 +14,9 @@ from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.tradeoff.choice import Choice
 from jaxtrachea.tradeoff.errors import Errors, compare, relative, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
-from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
+from jaxtrachea.tradeoff.levels import Full, Levels, program, quick_options, solve
 from jaxtrachea.tradeoff.load import Load
-from jaxtrachea.tradeoff.parts import QUICK, inputs, part_of
+from jaxtrachea.tradeoff.parts import inputs, part_of
 from jaxtrachea.tradeoff.time_model import processor
 from jaxtrachea.tradeoff.timing import Compiled, Settings, compiled, timed, with_part
 
@@ -185,7 +185,7 @@ def _picked(ladder: Ladder, rungs: int) -> list[str]:
 
 def _solved(full: Full, levels: Levels) -> Solved:
     made = program(full, levels)
-    out, gradient = jax.jit(solve, compiler_options=QUICK)(*made)
+    out, gradient = jax.jit(solve, compiler_options=quick_options())(*made)
     return Solved(made[0], jax.tree.map(np.asarray, out), np.asarray(gradient))
 
 
@@ -211,7 +211,7 @@ def environment(settings: Settings, load: Load) -> dict[str, Any]:
     """Where and when something was timed, and how busy others kept the machine meanwhile."""
     names = ("jaxtrachea", "jax", "jaxlib", "numpy")
     return {
-        "calls": settings.calls, "lanes": settings.lanes, "load": load.others(),
+        "calls": settings.calls, "lanes": settings.lanes, "others": load.others(),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "device": str(jax.devices()[0]), "processor": processor(),
         "versions": {"python": platform.python_version()} | {n: version(n) for n in names},

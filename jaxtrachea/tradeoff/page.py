@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from jaxtrachea.tradeoff.front import front
 from jaxtrachea.tradeoff.load import QUIET
-from jaxtrachea.tradeoff.plots import front
 
 HEAD = ["ladder", "level", "force", "joints", "surface", "contact [mm]", "gradient",
         "part [µs]", "call [µs]", "99 %", "part, lane [µs]", "lane [µs]", "gradient [µs]",
@@ -80,7 +80,9 @@ def measured(points: list[dict[str, Any]]) -> str:
 
 def busy(points: list[dict[str, Any]]) -> str:
     """How many cores others kept busy meanwhile, and what follows of it."""
-    loads = [p["load"] for p in points]
+    if "load" in points[0]:  # measured before others were told from this run
+        return f"load {points[0]['load']}"
+    loads = [p["others"] for p in points]
     if None in loads:
         return "load of others unknown"
     text = f"others kept up to {max(loads):.2g} cores busy"
@@ -103,8 +105,9 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
         )
         ratio = call["chosen"] / call["full"]
         found.append([
-            row["scene"], f"{100 * row['tolerance']:g} %", row["by"], dropped or "nothing",
-            returned or "-", f"{100 * worst:.2g} %", f"{100 * row['cost']:.0f} %",
+            row["scene"], f"{100 * row['tolerance']:g} %", row.get("by", "operations"),
+            dropped or "nothing", returned or "-",
+            f"{100 * worst:.2g} %", f"{100 * row['cost']:.0f} %",
             f"{_micro(call['chosen'])} / {_micro(call['full'])}", f"{ratio:.2f}",
             f"{ratio / row['cost']:.2f}",
         ])  # fmt: skip

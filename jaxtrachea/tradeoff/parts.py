@@ -6,12 +6,13 @@ from typing import Literal, NamedTuple
 
 import jax
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.deform import deform
 from jaxtrachea.scene.programs import Moved, one_plane, vectors
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.stage import Poses, Presses
-from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
+from jaxtrachea.tradeoff.levels import Full, Levels, cast, program, quick_options
 
 Part = Literal["contact", "skeleton", "surface"]
 #: What each ladder changes; of those not named here the force and the skeleton.
@@ -21,8 +22,6 @@ PART: dict[str, Part] = {
 }  # fmt: skip
 #: Ladders that change every part: there the whole is all there is.
 WHOLE = ("dtype", "together")
-#: Programs that are called a few times only are compiled quickly.
-QUICK = {"xla_backend_optimization_level": 0}
 
 
 class Inputs(NamedTuple):
@@ -68,7 +67,11 @@ def part(name: Part, full: Full, levels: Levels, given: Inputs) -> tuple[Callabl
         full: the scene at its finest.
         levels: -
         given: see `inputs`.
+
+    Raises:
+        ValueError: another word.
     """
+    check_word("name", name, Part)
     scene, material, _ = program(full, levels)
     path, made, presses, moved = cast(given, levels.dtype)
     if name == "skeleton":
@@ -88,4 +91,4 @@ def _skeleton(scene, material, presses) -> Moved:
 
 
 def _quickly(function: Callable) -> Callable:
-    return jax.jit(function, compiler_options=QUICK)
+    return jax.jit(function, compiler_options=quick_options())

@@ -9,6 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from jaxtrachea.files.pictures import STYLE, plain
+from jaxtrachea.tradeoff.front import error, front, time, worst
 
 #: An error up to this is drawn as exact, left of all others.
 EXACT = 1e-17
@@ -54,10 +55,10 @@ def draw(points: list[dict[str, Any]], title: str) -> Figure:
             colours = [KINDS[p["kind"]] for p in rows]
             edges = _edges(rows, list(finest.values()), which)
             if kind == "error":
-                _errors(axis, np.array([_error(p, which) for p in rows]), colours, edges)
+                _errors(axis, np.array([error(p, which) for p in rows]), colours, edges)
                 continue
-            full = [_time(finest.get(p["ladder"]), which) for p in rows]
-            times = np.array([_time(p, which) for p in rows])
+            full = [time(finest.get(p["ladder"]), which) for p in rows]
+            times = np.array([time(p, which) for p in rows])
             _times(axis, times, np.array(full), colours, edges)
         _names(axes[0], rows)
         _legend(figure, rows)
@@ -77,32 +78,10 @@ def _legend(figure: Figure, rows) -> None:
         figure.legend(handles=handles, loc="outside upper right", ncols=len(handles))
 
 
-def _time(point: dict[str, Any] | None, which: str) -> float:
-    """Median seconds, NaN where that was not timed."""
-    return point["times"][which]["median"] if point and which in point["times"] else np.nan
-
-
 def _edges(rows, finest, which: str) -> list[str]:
     """Black for levels on the front, else the colour of the kind; a part has no front."""
     best = set() if which == "part" else set(front(rows + finest, which))
     return ["k" if i in best else KINDS[p["kind"]] for i, p in enumerate(rows)]
-
-
-def worst(point: dict[str, Any]) -> float:
-    """Largest of the relative errors of force, joints and surface."""
-    values = [point["errors"][k] for k in ("force", "joints", "surface")]
-    return max(float(v) for v in values if v is not None)
-
-
-def pareto(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Indices of the points that no other beats in both, by rising x."""
-    order = np.lexsort((y, x))
-    best, front = np.inf, []
-    for i in order:
-        if np.isfinite(x[i]) and y[i] < best:
-            best = y[i]
-            front.append(i)
-    return np.array(front, int)
 
 
 def _rows(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -115,17 +94,6 @@ def _rows(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
         return kinds.index(p["kind"]), ladders.index(p["ladder"]), worst(p)
 
     return sorted(shown, key=place)
-
-
-def _error(point: dict[str, Any], which: str) -> float:
-    return float(point["errors"]["gradient"]) if which == "gradient" else worst(point)
-
-
-def front(points: list[dict[str, Any]], which: str) -> np.ndarray:
-    """Indices of the Pareto front of error and time."""
-    errors = np.array([_error(p, which) for p in points])
-    times = np.array([_time(p, which) for p in points])
-    return pareto(np.where(np.isfinite(times), errors, np.nan), times)
 
 
 def _names(axis, rows) -> None:
@@ -160,12 +128,12 @@ def _errors(axis, errors: np.ndarray, colours, edges) -> None:
 def _times(axis, times: np.ndarray, full: np.ndarray, colours, edges) -> None:
     """A line from the time of the finest level to that of this one."""
     axis.set(xscale="log")
-    for i, (time, finest) in enumerate(zip(times, full, strict=True)):
-        if not np.isfinite(time):
+    for i, (seconds, finest) in enumerate(zip(times, full, strict=True)):
+        if not np.isfinite(seconds):
             continue
-        axis.plot([finest, time], [i, i], color=colours[i], lw=1.2, alpha=0.5)
+        axis.plot([finest, seconds], [i, i], color=colours[i], lw=1.2, alpha=0.5)
         axis.plot(finest, i, "|", ms=8, color="0.4")
-        axis.plot(time, i, "o", ms=5.5, color=colours[i], mec=edges[i], mew=1.3)
+        axis.plot(seconds, i, "o", ms=5.5, color=colours[i], mec=edges[i], mew=1.3)
     ends = [v for v in (*times, *full) if np.isfinite(v)]
     low, high = min(ends, default=1e-4), max(ends, default=1e-3)
     # At least a decade, so that rounding of the clock does not look like a gain.

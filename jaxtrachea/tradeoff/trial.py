@@ -12,13 +12,11 @@ from jaxtrachea.scene.simulation import Simulation, simulate
 from jaxtrachea.scene.stage import Poses, Presses
 from jaxtrachea.tradeoff.errors import Errors, compare
 from jaxtrachea.tradeoff.kernels import count_kernels
-from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
+from jaxtrachea.tradeoff.levels import Full, Levels, cast, program, quick_options
 from jaxtrachea.tradeoff.price import OPERATIONS, Price
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
 BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
-#: `simulate` for a sample path; compiled quickly, since every program is called three times.
-_simulate = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
 
 
 class Trial:
@@ -73,7 +71,8 @@ class Trial:
         scene, material, _ = program(self.full, levels)
         paths = cast(self.paths, levels.dtype)
         each = [jax.tree.map(lambda v, i=i: v[i], paths) for i in range(len(BESIDE))]
-        made = _simulate.lower(scene, material, each[0]).compile()
+        solve = jax.jit(simulate, compiler_options=quick_options())
+        made = solve.lower(scene, material, each[0]).compile()
         self.kernels[levels] = count_kernels(made.as_text())[0]
         outs = [made(scene, material, path) for path in each]
         return jax.tree.map(lambda *v: np.stack(v), *outs)
