@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
 from jaxtrachea.tradeoff.parts import Inputs, Part, part
@@ -76,7 +77,12 @@ def compiled(full: Full, levels: Levels, settings: Settings, *, path: bool = Fal
 def with_part(
     made: Compiled, name: Part, full: Full, levels: Levels, given: Inputs, lanes: int
 ) -> Compiled:
-    """The same with the part that a ladder changes, where the scene has it."""
+    """The same with the part that a ladder changes, where the scene has it.
+
+    Raises:
+        ValueError: another word than those of `Part`.
+    """
+    check_word("name", name, Part)
     found = part(name, full, levels, given)
     if found is None:
         return made
