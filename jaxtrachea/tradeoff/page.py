@@ -80,8 +80,9 @@ def measured(points: list[dict[str, Any]]) -> str:
 
 def busy(points: list[dict[str, Any]]) -> str:
     """How many cores others kept busy meanwhile, and what follows of it."""
-    if "load" in points[0]:  # measured before others were told from this run
-        return f"load {points[0]['load']}"
+    old = [p["load"] for p in points if "load" in p]
+    if old:  # measured before others were told from this run
+        return f"**load average up to {max(old)}: compare ratios, not times**"
     loads = [p["others"] for p in points]
     if None in loads:
         return "load of others unknown"

@@ -2,8 +2,9 @@
 
 `a` is a call, `b` the start of a kernel, `c` an operation, for each dtype. The four are fitted to
 the times of a few small programs of the package (`calibrate`) and kept beside the compiled programs
-for the next start. Predictions are for programs of this package in an otherwise idle process: those
-of single calls within some 30 % (docs/tradeoff.md); none is for another device.
+for the next start. Predictions are for programs of this package whose scene is a constant; they
+know no caches and weigh all operations alike: ratios of plans are better predicted than times
+(docs/tradeoff.md). None is for another device.
 """
 
 import contextlib

@@ -3,7 +3,7 @@
 Run: python tests/bench/tradeoff.py. It measures everything on the page: choices, ladders, levels of
 the skeleton (tests/bench/levels.py); some fifteen minutes on two cores with nothing else to do.
 Options: `--quick` (few calls, two rungs a ladder, no fits), `--scenes A,B` (these only; "": none),
-`--page` (write the page and the pictures from the JSON, measure nothing).
+`--no-levels`, `--page` (write the page and the pictures from the JSON, measure nothing).
 """
 
 import argparse
@@ -127,7 +127,7 @@ def pages() -> None:
     from jaxtrachea.tradeoff.page import read
     from jaxtrachea.tradeoff.plots import draw
 
-    for name in SCENES:
+    for name in (name for name in SCENES if (FOLDER / f"{name}.jsonl").exists()):
         rows = read(FOLDER / f"{name}.jsonl")
         points = [row for row in rows if "left_out" not in row]
         draw(points, name).savefig(FOLDER / f"{name}.png")
@@ -143,12 +143,13 @@ def measure_all(asked) -> None:
     from jaxtrachea.tradeoff.timing import Settings
 
     FOLDER.mkdir(exist_ok=True)
-    say("levels of the skeleton")
-    (FOLDER / "levels.jsonl").write_text(lines(levels.rows(quick=asked.quick)), "utf-8")
+    if not asked.no_levels:
+        say("levels of the skeleton")
+        (FOLDER / "levels.jsonl").write_text(lines(levels.rows(quick=asked.quick)), "utf-8")
     model = calibrate(say)
     say(model.sentence)
     file = FOLDER / "choice.jsonl"
-    rows = read(file) if file.exists() else []
+    rows = [row for row in read(file) if row["scene"] in SCENES] if file.exists() else []
     for name in filter(None, asked.scenes.split(",")):
         rungs = 2 if asked.quick else SCENES[name][1]
         settings = Settings(20 if asked.quick else asked.calls, 256, rungs, slopes=False)
@@ -162,7 +163,7 @@ def main() -> None:
     import jax
 
     parser = argparse.ArgumentParser(description=__doc__)
-    for option in ("--quick", "--page"):
+    for option in ("--quick", "--page", "--no-levels"):
         parser.add_argument(option, action="store_true")
     parser.add_argument("--calls", type=int, default=300)
     parser.add_argument("--scenes", default=",".join(SCENES))
