@@ -7,11 +7,12 @@ in the loop count once for each of its rounds.
 
 import json
 import os
-import re
 import subprocess
 import sys
 
 import pytest
+
+from jaxtrachea.tradeoff.kernels import count_kernels
 
 #: Kernels of a single contact, value and with gradient, jaxlib 0.10.2: of a ball on the round tube,
 #: of a box on patches of 120 corners. Before sums were written out: 697, 716, 1,030 and 1,048. The
@@ -48,41 +49,6 @@ for f in (contact, jax.value_and_grad(contact, has_aux=True)):
 print(json.dumps(texts))
 """
 
-#: The opcode of an instruction, behind its name and its type.
-OPCODE = r"\s*(?:ROOT )?%?\S+ = (?:\(.*?\)|\S+) ([\w\-]+)\("
-
-#: Instructions that start no kernel.
-FREE = "parameter constant tuple get-tuple-element bitcast while call".split()
-
-
-def computations(text):
-    """Name of the first computation to run, and opcode and line of every instruction of each."""
-    bodies, entry = {}, None
-    for block in text.split("\n\n"):
-        lines = block.strip().split("\n")
-        head = re.match(r"(ENTRY )?%?([\w.\-]+) .*\{$", lines[0])
-        if head:
-            found = [re.match(OPCODE, line) for line in lines]
-            bodies[head[2]] = [(m[1], v) for m, v in zip(found, lines, strict=True) if m]
-            entry = head[2] if head[1] else entry
-    return entry, bodies
-
-
-def kernels(name, bodies):
-    """Kernels that one run of a computation starts, and the loops in it."""
-    count, loops = 0, 0
-    for opcode, line in bodies[name]:
-        rounds = 1
-        if opcode == "while":
-            loops += 1
-            rounds = int(re.search(r'known_trip_count":\{"n":"(\d+)"', line)[1])
-        for inner in re.findall(r"(?:body|condition|to_apply)=%?([\w.\-]+)", line):
-            if opcode in ("while", "call"):
-                more = kernels(inner, bodies)
-                count, loops = count + rounds * more[0], loops + more[1]
-        count += opcode not in FREE
-    return count, loops
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tube", list(MOST))
@@ -95,8 +61,7 @@ def test_the_contact_starts_few_kernels(tube):
     for text, most in zip(json.loads(run.stdout), MOST[tube], strict=True):
         # More than 32 entries in one reduction: it would fuse with nothing and run scalar.
         assert "reduce-window(" not in text
-        entry, bodies = computations(text)
-        started, loops = kernels(entry, bodies)
+        started, loops = count_kernels(text)
         assert loops == 1
         # The count finds what it counts: twelve rounds of a loop are the larger part of it.
         assert started > 100
@@ -127,4 +92,27 @@ ENTRY %main (v: f64[2]) -> f64[] {
   ROOT %o = f64[] call(%l), to_apply=%inner
 }
 """
-    assert kernels(*computations(text)) == (2 + 3 * 2 + 1, 1)
+    assert count_kernels(text) == (2 + 3 * 2 + 1, 1)
+
+
+def test_a_loop_without_a_count_and_branches():
+    """One round of (1 + 1), and the longer of two branches of 1 and 2 kernels."""
+    text = """
+%step (p: f64[]) -> f64[] {
+  ROOT %f = f64[] fusion(%p), kind=kLoop, calls=%c
+}
+
+%two (p: f64[]) -> f64[] {
+  %g = f64[] fusion(%p), kind=kLoop, calls=%c
+  ROOT %f = f64[] fusion(%g), kind=kLoop, calls=%c
+}
+
+ENTRY %main (v: f64[]) -> f64[] {
+  %v = f64[] parameter(0)
+  %l = f64[] while(%v), condition=%step, body=%step
+  ROOT %o = f64[] conditional(%i, %l, %v), branch_computations={%step, %two}
+}
+"""
+    assert count_kernels(text) == (2 + 2, 1)
+    with pytest.raises(ValueError, match="no ENTRY"):
+        count_kernels("nothing")

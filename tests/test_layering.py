@@ -104,8 +104,15 @@ WITHIN = {
     "results": [{"arrays", "store"}, {"rows", "stored"}, {"hdf5"}],
     "prediction": [{"core", "sources"}, {"predict"}, {"held_out"}, {"plots", "report", "tables"}],
     "runs": [{"meet", "manifest"}, {"processes", "shards"}, {"folder"}, {"rerun", "checkpoint"}],
+    "tradeoff": [
+        {"errors", "front", "kernels", "levels", "load", "time_model"},
+        {"ladders", "page", "parts", "plots", "price"},
+        {"calibrate", "timing", "trial"},
+        {"choice"},
+        {"measure"},
+    ],
     "report": [{"plots", "tables"}, {"fit"}, {"overview"}],
-    "cli": [{"terminal_table", "specification", "options"}, {"terminal"},
+    "cli": [{"terminal_table", "specification", "options"}, {"terminal"}, {"timing"},
             {"fit", "load", "predict_data", "run", "scene", "selfcheck"},
             {"compare", "cache", "convert", "predict", "tradeoff"}, {"main"}],
 }  # fmt: skip

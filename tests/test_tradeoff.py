@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 from run_cli import run
+from tradeoff_scene import DEPTH, K_1, K_3, SCENE, TOML
 
 from jaxtrachea.config import SpecError
 from jaxtrachea.scene.build import stage
@@ -23,22 +24,13 @@ from jaxtrachea.tradeoff import choice as choosing
 from jaxtrachea.tradeoff import measure as measuring
 from jaxtrachea.tradeoff.choice import choose
 from jaxtrachea.tradeoff.errors import Errors, relative, remesh, spread
+from jaxtrachea.tradeoff.front import pareto
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import full_scene, kept_rings, program
+from jaxtrachea.tradeoff.load import Load
 from jaxtrachea.tradeoff.page import choice_rows
-from jaxtrachea.tradeoff.plots import QUESTIONS, draw, pareto
-
-K_1, K_3, DEPTH = 0.3, 0.02, 4.0
-SCENE = {
-    "trachea": {"length": "80 mm", "rings": {"count": 7, "first": "10 mm", "last": "70 mm"}},
-    "material": {
-        "EI_L": "1.86 N mm^2", "k_M": "0.1 N/mm", "k_1": f"{K_1} N/mm", "k_3": f"{K_3} N/mm^3",
-        "GA_L": "20 N", "k_1_ring": "0.28 N/mm",
-    },
-    "model": {"contact": "bonded"},
-    "path": {"s": "42 mm", "displacement": ["0 mm", f"-{DEPTH} mm", "0 mm"], "steps": 2},
-    "output": {"surface": False, "ring_ends": False},
-}  # fmt: skip
+from jaxtrachea.tradeoff.plots import QUESTIONS, draw
+from jaxtrachea.tradeoff.trial import Trial
 
 
 def staged(scene=SCENE, **material):
@@ -215,7 +207,7 @@ def test_a_measured_rung_errs_as_by_hand(monkeypatch):
     full = full_scene(*staged(GA_L=None, k_1_ring=None))
     ladder = Ladder("coupling", "model", {v: {"coupling": v} for v in ("total", "series")}, {})
     monkeypatch.setattr(measuring, "ladders", lambda full: ([ladder], {"x": "why"}))
-    rows = measuring.measure("small", full, measuring.Settings(calls=10, lanes=0))
+    rows = measuring.measure("small", full, measuring.Settings(calls=10, lanes=4))
     total, series, left = rows
     solve = jax.jit(simulate, compiler_options={"xla_backend_optimization_level": 0})
     out = solve(full.scene, full.material, full.path)
@@ -245,6 +237,7 @@ def test_a_measured_rung_errs_as_by_hand(monkeypatch):
         times = row["times"]
         assert 0 < times["call"]["median"] <= times["call"]["p99"]
         assert times["gradient"]["median"] > 0
+        assert 0 < times["part_lane"]["median"] < times["part"]["median"]
         assert times["compile"] > 0
     assert left == {"scene": "small", "ladder": "x", "left_out": "why"}
 
@@ -331,7 +324,7 @@ def test_of_rungs_that_cost_the_same_the_best_is_taken():
     rungs = {name: {"kept": i} for i, name in enumerate(("worst", "best", "good"), 1)}
     ladder = Ladder("made up", "truncation", rungs | {"finest": {}}, {})
     errors = {1: 0.5, 2: 0.001, 3: 0.01}
-    trial = object.__new__(choosing._Trial)
+    trial = object.__new__(Trial)
     trial.full, trial.report, trial.saved = full, lambda text: None, lambda levels: 0.25
     trial.errors = lambda levels: Errors(errors[levels.kept], None, None, None, None, None)
     refused = []
@@ -344,10 +337,13 @@ def test_of_rungs_that_cost_the_same_the_best_is_taken():
 def test_a_choice_can_be_shown():
     full = full_scene(*staged())
     choice = choose(full, 0.1, precision="float64")
-    times = {v: {"call": {"median": 1e-5}} for v in (choice.levels, full.levels)}
-    row = measuring.choice_row("small", full, choice, times, measuring.Settings())
-    ((*_, error, cost, calls, ratio),) = choice_rows([json.loads(json.dumps(row))])
+    both = {"path": {"median": 1e-5}, "call": {"median": 2e-5}}
+    times = {v: both for v in (choice.levels, full.levels)}
+    end = measuring.environment(measuring.Settings(), Load())
+    row = measuring.choice_row("small", full, choice, times, end)
+    ((*_, error, cost, calls, ratio, share),) = choice_rows([json.loads(json.dumps(row))])
     assert (calls, ratio) == ("10 / 10", "1.00")
+    assert float(share) == pytest.approx(1 / row["cost"], abs=0.005)
     assert float(error.removesuffix(" %")) <= 10
     assert float(cost.removesuffix(" %")) < 100
 
@@ -360,30 +356,6 @@ def test_a_wish_is_kept():
     assert choice.levels.plan.options.shear
 
 
-TOML = f"""
-[trachea]
-length = "80 mm"
-rings = {{ count = 7, first = "10 mm", last = "70 mm" }}
-[material]
-EI_L = "1.86 N mm^2"
-k_M = "0.1 N/mm"
-k_1 = "{K_1} N/mm"
-k_3 = "{K_3} N/mm^3"
-GA_L = "20 N"
-k_1_ring = "0.28 N/mm"
-[model]
-contact = "bonded"
-[path]
-s = "42 mm"
-displacement = ["0 mm", "-{DEPTH} mm", "0 mm"]
-steps = 2
-[output]
-surface = false
-ring_ends = false
-pictures = false
-"""
-
-
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize(("precision", "dtype"), [("auto", "float32"), ("float64", "float64")])
@@ -391,7 +363,7 @@ def test_simulate_takes_the_plan_within_the_tolerance(
     precision, dtype, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    plan = f'[plan]\ntolerance = "10 %"\nprecision = "{precision}"\n'
+    plan = f'[plan]\ntolerance = "10 %"\nprecision = "{precision}"\ncost = "operations"\n'
     Path("scene.toml").write_text(TOML + plan)
     code, out, _ = run(monkeypatch, capsys, "simulate", "scene.toml", "--out", "result")
     assert code == 0

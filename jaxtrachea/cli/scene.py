@@ -22,11 +22,14 @@ from jaxtrachea.cli.terminal import (
 )
 
 SceneArgument = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
+TimeOption = Annotated[
+    bool, typer.Option("--time", help="Predict the time on this machine; compiles the program.")
+]
 #: Rows of a terminal table; the files hold all.
 MANY = 12
 
 
-def plan(scene: SceneArgument) -> None:
+def plan(scene: SceneArgument, predict: TimeOption = False) -> None:
     """Show which effects a scene needs, why, and their cost."""
     from jaxtrachea.scene.cost import shares
     from jaxtrachea.scene.results import plan_rows
@@ -39,6 +42,8 @@ def plan(scene: SceneArgument) -> None:
     head = ["effect", "level", "chosen", "operations", "reason"]
     out.print(table("Plan", head, plan_rows(staged.scene.plan, found), ("reason",)))
     out.print(f"{whole:,} operations for {_rows(staged)} rows", highlight=False)
+    if predict:
+        out.print(_predicted(staged), highlight=False)
     if choice is not None:
         out.print(choice.sentence, highlight=False)
     if swept is not None:
@@ -155,6 +160,7 @@ def _chosen(path: Path, spec, staged):
     """The scene with the plan within its tolerance, and that choice; as it is without tolerance."""
     if spec.plan is None:
         return staged, None
+    from jaxtrachea.cli.timing import price_of
     from jaxtrachea.scene.declare import PlanError
     from jaxtrachea.tradeoff.choice import choose
     from jaxtrachea.tradeoff.levels import full_scene
@@ -171,12 +177,39 @@ def _chosen(path: Path, spec, staged):
             bar.update(task, description=f"choosing: {text}", advance=1)
 
         wish = spec.plan
+        price, why = price_of(wish.cost, report)
         try:
-            choice = choose(full, wish.tolerance, report, precision=wish.precision)
+            choice = choose(full, wish.tolerance, report, precision=wish.precision, price=price)
         except PlanError as error:
             raise Stop(f"{path}: {error}") from None
     chosen = {name: getattr(choice, name) for name in ("scene", "material", "path")}
-    return staged._replace(**chosen), choice
+    notes = (*staged.notes, why) if why else staged.notes
+    return staged._replace(**chosen, notes=notes), choice
+
+
+def _predicted(staged) -> str:
+    """Time of the whole path in one call and of a pose a call, and what they are predicted by."""
+    from jaxtrachea.cli.timing import time_model
+    from jaxtrachea.tradeoff.calibrate import predicted
+    from jaxtrachea.tradeoff.time_model import Uncalibrated
+
+    with interrupts() as stop_if_asked, progress_bar(transient=True) as bar:
+        task = bar.add_task("time model", total=None)
+
+        def report(text: str) -> None:
+            stop_if_asked()
+            bar.update(task, description=text, advance=1)
+
+        try:
+            model = time_model(report)
+        except Uncalibrated as error:
+            return f"no time is predicted: {error}"
+        report("compiling")
+        whole, pose, kernels = predicted(model, (staged.scene, staged.material, staged.path))
+    return (
+        f"time predicted on this machine: {1e3 * whole:.2g} ms for the path in one call, "
+        f"{1e3 * pose:.2g} ms for one pose a call ({kernels:,} kernels)\n({model.sentence})"
+    )
 
 
 def _for_sweep(path: Path, spec, staged):

@@ -32,7 +32,7 @@ def tradeoff(
     scene: SceneArgument = None,
     out_dir: OutOption = None,
     calls: CallsOption = 1000,
-    lanes: LanesOption = 64,
+    lanes: LanesOption = 256,
     quick: QuickOption = False,
     data: DataOption = None,
 ) -> None:
@@ -43,7 +43,7 @@ def tradeoff(
     curves, radius, inputs = measured_curves(data)
     from jaxtrachea.tradeoff.measure import Settings, measure
 
-    settings = Settings(100, 0, True) if quick else Settings(calls, lanes)
+    settings = Settings(100, 0, 3) if quick else Settings(calls, lanes)
     clock.append(time.perf_counter())
     with into(out_dir, Path("out") / f"{name}-tradeoff") as (folder, stop_if_asked):
         with progress_bar() as bar:

@@ -15,6 +15,8 @@ MOST_DAYS = 90.0
 BETWEEN = 86_400.0
 #: Names of programs: that of the function and a digest.
 _NAME = re.compile(r".*-[0-9a-f]{64}-cache", re.DOTALL)
+#: File with the times of this machine (`tradeoff.time_model`).
+TIME_MODEL = "time_model.json"
 #: File whose time of change is that of the last look.
 LAST_LOOK = ".trimmed"
 

@@ -243,6 +243,7 @@ class PlanSection(Section):
 
     tolerance: Annotated[float, quantity("dimensionless", positive=True), Field(lt=1)]
     precision: Literal["auto", "float64"] = "auto"
+    cost: Literal["path", "step", "operations"] = "path"
 
 
 class SweepSection(Section):

@@ -2,41 +2,28 @@
 
 Every effect is dropped alone from the full program, the cheapest rung within the tolerance is
 taken, and all of them together are checked. Effects do not add up: while the whole is too far off,
-the effect that errs most per operation saved comes back by one rung. Cost is the number of
-operations, those in float32 counted half, so that the choice does not depend on the machine; errors
-are those of force, joints and surface over the path and two sample paths beside it.
+the effect that errs most per cost saved comes back by one rung. Cost is a `price.Price`:
+operations, so that the choice does not depend on the machine, or the time predicted on this one;
+errors are those of force, joints and surface over the path and two sample paths beside it.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea.scene.approach import approach
-from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.effects import EFFECTS
-from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.plan import Decision, Served
-from jaxtrachea.scene.simulation import Simulation, simulate
+from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
-from jaxtrachea.tradeoff.errors import Errors, compare
+from jaxtrachea.tradeoff.errors import Errors
 from jaxtrachea.tradeoff.ladders import QUALITY, Ladder, ladders
-from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
-
-#: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
-BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
-#: What an operation costs.
-COST = {"float32": 0.5, "float64": 1.0}
-
-#: `simulate` for several paths; compiled quickly, since every program is called once.
-_simulate = jax.jit(
-    jax.vmap(simulate, (None, None, 0)), compiler_options={"xla_backend_optimization_level": 0}
-)
+from jaxtrachea.tradeoff.levels import Full, Levels, program
+from jaxtrachea.tradeoff.price import OPERATIONS, Price
+from jaxtrachea.tradeoff.trial import Trial
 
 
 class Rung(NamedTuple):
@@ -47,7 +34,7 @@ class Rung(NamedTuple):
         effect: that it is of.
         level: on the ladder.
         errors: what that changes.
-        saved: share of operations.
+        saved: share of the cost.
     """
 
     ladder: str
@@ -65,54 +52,60 @@ class Choice(NamedTuple):
         material: in the precision chosen.
         path: likewise.
         levels: chosen.
+        changed: what they change in those of the full program.
         tolerance: relative.
         dropped: effects at a lower level than in the full program.
         refused: rungs that are too far off alone.
         returned: rungs that were within the tolerance alone, but not together with the others.
         errors: of the choice against the full program, on all sample paths.
-        cost: of the full program and of the choice, for the path: operations, in float32 half.
+        cost: of the full program and of the choice: s, or operations for the path, see `price`.
+        price: what was made least.
     """
 
     scene: Scene
     material: Material
     path: Poses | Presses
     levels: Levels
+    changed: dict[str, Any]
     tolerance: float
     dropped: tuple[Rung, ...]
     refused: tuple[Rung, ...]
     returned: tuple[Rung, ...]
     errors: Errors
     cost: tuple[float, float]
+    price: Price = OPERATIONS
 
     @property
     def sentence(self) -> str:
         """What was found, in a line."""
         if not self.dropped:
             return f"no program but the full one is within {percent(self.tolerance)}; it is taken"
-        share = self.cost[1] / self.cost[0]
         return (
             f"within {percent(self.tolerance)}: {changes(self.errors)} off the full program, "
-            f"{100 * share:.0f} % of its cost"
+            f"{self.price.words(self.cost)}"
         )
 
 
 def choose(
-    full: Full, tolerance: float, report: Callable[[str], None] = lambda text: None,
-    *, precision: Literal["auto", "float64"] = "auto",
+    full: Full | Trial, tolerance: float, report: Callable[[str], None] = lambda text: None,
+    *, precision: Literal["auto", "float64"] = "auto", price: Price = OPERATIONS,
 ) -> Choice:  # fmt: skip
     """Choose the cheapest levels within the tolerance.
 
     Args:
-        full: the scene at its finest.
+        full: the scene at its finest; or a `Trial` of it, which keeps what it has tried.
         tolerance: largest error of force, joints and surface, relative to the largest value.
         report: called with what is tried next; may raise to stop.
         precision: `auto`: float32 where that is within the tolerance.
+        price: what is made least; operations unless told otherwise.
 
     Raises:
         PlanError: the path, or a sample path beside it, has no row with a force.
     """
     check_word("precision", precision, Literal["auto", "float64"])
-    trial, every = _Trial(full, report), _ladders(full, precision)
+    trial = full if isinstance(full, Trial) else Trial(full, report)
+    trial.price, full = price, trial.full
+    every = _ladders(full, precision)
     refused: list[Rung] = []
     options: dict[str, list[Rung]] = {}
     for ladder in every:
@@ -123,7 +116,8 @@ def choose(
     returned: list[Rung] = []
     while True:
         picked = [rungs[-1] for rungs in options.values()]
-        levels = _combined(full, named, picked)
+        changed = _combined(named, picked)
+        levels = full.levels.changed(**changed)
         errors = trial.errors(levels)
         if errors.worst <= tolerance or not picked:
             break
@@ -140,70 +134,11 @@ def choose(
     scene = dataclasses.replace(scene, plan=plan)
     cost = trial.cost(full.levels), trial.cost(levels)
     return Choice(
-        scene=scene, material=material, path=path, levels=levels, tolerance=tolerance,
+        scene=scene, material=material, path=path, levels=levels, changed=changed,
+        tolerance=tolerance,
         dropped=tuple(picked), refused=tuple(refused), returned=tuple(returned), errors=errors,
-        cost=cost,
+        cost=cost, price=price,
     )  # fmt: skip
-
-
-class _Trial:
-    """Runs programs on the sample paths, each once."""
-
-    def __init__(self, full: Full, report: Callable[[str], None]):
-        self.full, self.report = full, report
-        self.paths = samples(full)
-        self.known: dict[Levels, Errors] = {}
-        self.costs: dict[Levels, float] = {}
-        report("full program")
-        self.reference = self._run(full.levels)
-        pressed = np.nan_to_num(self.reference.force).any(axis=(1, 2))
-        if not pressed.all():
-            where = "the path" + (" a quarter of a ring spacing beside it" if pressed[0] else "")
-            raise PlanError(
-                "plan.tolerance",
-                f"no row of {where} is solved with a force: nothing that a tolerance could be "
-                "measured by",
-                cure="press deeper, further from the ends, or take no tolerance",
-            )
-
-    def errors(self, levels: Levels) -> Errors:
-        if levels not in self.known:
-            found = self._run(levels)
-            self.known[levels] = compare(found, self.reference, (self.full.scene, self.full.scene))
-        return self.known[levels]
-
-    def cost(self, levels: Levels) -> float:
-        if levels not in self.costs:
-            count = count_operations(simulate, *program(self.full, levels))
-            self.costs[levels] = count * COST[levels.dtype]
-        return self.costs[levels]
-
-    def saved(self, levels: Levels) -> float:
-        return 1 - self.cost(levels) / self.cost(self.full.levels)
-
-    def _run(self, levels: Levels):
-        scene, material, _ = program(self.full, levels)
-        paths = cast(self.paths, levels.dtype)
-        return jax.tree.map(np.asarray, _simulate(scene, material, paths))
-
-
-def samples(full: Full) -> Poses | Presses:
-    """The path, and the same beside it (`BESIDE`); a leading axis."""
-    path, geometry = full.path, full.scene.geometry
-    spacing = min(full.facts.spacing, float(geometry.length))
-    if isinstance(path, Presses):
-        moved = [
-            Presses(jnp.clip(path.s + a * spacing, 0, geometry.length), path.phi,
-                    path.displacement * (1 + d)) for a, d in BESIDE
-        ]  # fmt: skip
-    else:
-        made = jax.jit(approach)(full.scene, path)
-        row = int(np.argmin(np.asarray(made.seen.gap)))
-        deep = max(-float(made.seen.gap[row]), 0.0)
-        along = jnp.eye(3)[0] if made.frame is None else made.frame[row][:, 0]
-        shifts = [a * spacing * along - d * deep * made.seen.normal[row] for a, d in BESIDE]
-        moved = [Poses(path.rotation, path.translation + v) for v in shifts]
-    return jax.tree.map(lambda *v: jnp.stack(v), *moved)
 
 
 def percent(v: float) -> str:
@@ -218,7 +153,7 @@ def changes(errors: Errors) -> str:
 
 
 def _ladders(full: Full, precision: str) -> list[Ladder]:
-    """Those of the choice: what saves operations, and what the user has not decided."""
+    """Those of the choice: what saves work, and what the user has not decided."""
     every = ladders(full)[0]
     found = [v for v in every if v.effect in EFFECTS and getattr(full.given, v.effect) == "auto"]
     if full.scene.plan.contact:
@@ -232,13 +167,14 @@ def _ladders(full: Full, precision: str) -> list[Ladder]:
 
 
 def _within(
-    trial: _Trial, ladder: Ladder, tolerance: float, refused: list[Rung], above: Rung | None = None
+    trial: Trial, ladder: Ladder, tolerance: float, refused: list[Rung], above: Rung | None = None
 ) -> Rung | None:
     """The cheapest rung within the tolerance alone, of equal ones that which errs least.
 
     Dearer than `above` if given.
     """
     names = list(ladder.rungs)[:-1]
+    trial.report(ladder.name)
     saved = {name: trial.saved(ladder.levels(trial.full, name)) for name in names}
     for worth in sorted(set(saved.values()), reverse=True):
         if worth <= 0 or (above is not None and worth >= above.saved):
@@ -259,11 +195,12 @@ def _within(
     return None
 
 
-def _combined(full: Full, named: dict[str, Ladder], picked: list[Rung]) -> Levels:
+def _combined(named: dict[str, Ladder], picked: list[Rung]) -> dict[str, Any]:
+    """What all rungs together change in the finest levels."""
     changed = {}
     for rung in picked:
         changed |= named[rung.ladder].rungs[rung.level]
-    return full.levels.changed(**changed)
+    return changed
 
 
 def _served(reference: Simulation) -> Served:

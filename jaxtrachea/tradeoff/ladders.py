@@ -1,7 +1,7 @@
 """The ladders of a scene: every accuracy choice that it uses, from coarse to fine.
 
 Each has a kind: `truncation` (how far something is computed), `algebra` (another way to the same
-numbers) or `model` (something left out).
+numbers), `model` (something left out) or `together` (several of them at once).
 """
 
 from typing import Any, Literal, NamedTuple
@@ -10,7 +10,7 @@ from jaxtrachea.contact.search import FINE
 from jaxtrachea.scene.effects import EFFECTS, Effect
 from jaxtrachea.tradeoff.levels import Full, Levels, one_plane
 
-Kind = Literal["truncation", "algebra", "model"]
+Kind = Literal["truncation", "algebra", "model", "together"]
 
 #: Sharpness of the contact at the finest number of steps, and steps at the finest sharpness.
 SHARPNESS = (100.0, 300.0, 1000.0, 3000.0)

@@ -1,29 +1,28 @@
 """Measure what every rung of a scene errs and costs."""
 
 import datetime
-import functools
-import os
 import platform
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxtrachea.scene.simulation import Simulation, simulate
+from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.tradeoff.choice import Choice
 from jaxtrachea.tradeoff.errors import Errors, compare, relative, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
-from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
+from jaxtrachea.tradeoff.levels import Full, Levels, program, quick_options, solve
+from jaxtrachea.tradeoff.load import Load
+from jaxtrachea.tradeoff.parts import inputs, part_of
+from jaxtrachea.tradeoff.time_model import processor
+from jaxtrachea.tradeoff.timing import Compiled, Settings, compiled, timed, with_part
 
-#: Turns in which the rungs of a ladder are called one after the other, so that all see the same
-#: machine.
-TURNS = 10
+__all__ = ["Settings", "choice_row", "environment", "measure"]
 
+DEFAULT = Settings()
 Report = Callable[[str], None]
 
 
@@ -35,32 +34,9 @@ class Solved(NamedTuple):
     gradient: np.ndarray
 
 
-class Compiled(NamedTuple):
-    """Programs of one pose, ready to be called, and the seconds that the first took to compile."""
-
-    call: Callable
-    gradient: Callable | None
-    lanes: Callable | None
-    seconds: float
-
-
-class Settings(NamedTuple):
-    """How much is measured.
-
-    Attributes:
-        calls: timed calls of each program.
-        lanes: poses of one batch; 0: batches are not timed.
-        quick: the coarsest, the middle and the finest rung of each ladder only.
-    """
-
-    calls: int = 1000
-    lanes: int = 64
-    quick: bool = False
-
-
 def measure(
-    name: str, full: Full, settings: Settings = Settings(), report: Report = lambda text: None,
-    curves: Sequence[Any] = (), radius: float = -1.0,
+    name: str, full: Full, settings: Settings = DEFAULT, report: Report = lambda text: None,
+    curves: Sequence[Any] = (), radius: float = -1.0, more: Sequence[Ladder] = (),
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Errors and times of every rung, one dict each; then one for each ladder left out.
 
@@ -73,36 +49,41 @@ def measure(
         report: called with what is done next.
         curves: measured curves of the scene's specimen; or none.
         radius: markers no further from the contact say nothing, mm; negative: all count.
+        more: ladders beside those of the scene.
     """
     if curves:
         check_curves(full.path, curves)
     found, left_out = ladders(full)
     solved: dict[Levels, Solved] = {}
     kept: dict[Levels, Compiled] = {}
-    rows = []
-    for ladder in found:
+    rows, given = [], inputs(full)
+    for ladder in (*found, *more):
         programs, points = {}, []
-        finest = ladder.levels(full, list(ladder.rungs)[-1])
-        for rung in _picked(ladder, settings.quick):
+        finest, own = ladder.levels(full, list(ladder.rungs)[-1]), part_of(ladder.name)
+        for rung in _picked(ladder, settings.rungs):
             levels = ladder.levels(full, rung)
             report(f"{ladder.name} {rung}")
             for one in (finest, levels):
                 if one not in solved:
                     solved[one] = _solved(full, one)
-            programs[levels] = kept.get(levels) or compiled(full, levels, settings.lanes)
+            made = kept.get(levels) or compiled(full, levels, settings)
+            kept = {levels: made} if levels == full.levels else kept
+            if own is not None:
+                made = with_part(made, own, full, levels, given, settings.lanes)
+            programs[levels] = made
             errors = _errors(solved[levels], solved[finest])
             point = _point(name, ladder, rung, levels == finest, errors)
             if curves:
                 point["data"] = against(full, solved[levels], curves, radius)
             points.append((levels, point))
         report(f"{ladder.name}: timing")
+        load = Load()
         times = timed(programs, settings)
-        end = _environment(settings)
+        end = environment(settings, load)
         rows += [point | {"times": times[levels]} | end for levels, point in points]
         # A system allows a process so many memory maps (Linux: 65,530), and a program takes
         # hundreds: what is not needed again goes.
-        kept = {levels: made for levels, made in programs.items() if levels == full.levels} or kept
-        del programs
+        del programs, made
         jax.clear_caches()
     return rows + [{"scene": name, "ladder": k, "left_out": v} for k, v in left_out.items()]
 
@@ -156,100 +137,55 @@ def against(full: Full, solved: Solved, curves: Sequence[Any], radius: float) ->
     return {name: _number(relative(*v)) for name, v in both.items() if v[0]}
 
 
-def compiled(full: Full, levels: Levels, lanes: int, *, slopes: bool = True) -> Compiled:
-    """The program of one pose: material and path in, everything out; and those beside it."""
-    scene, material, path = program(full, levels)
-    row = jax.tree.map(lambda v: v[-1:], path)
-    start = time.perf_counter()
-    call = jax.jit(lambda m, p: simulate(scene, m, p)).lower(material, row).compile()
-    seconds = time.perf_counter() - start
-
-    def derivatives(m, p):
-        out, change = solve(scene, m, p)
-        return out.force, change
-
-    many = gradient = None
-    if slopes:
-        both = jax.jit(derivatives).lower(material, row).compile()
-        gradient = functools.partial(both, material, row)
-
-    if lanes:
-        wide = jax.tree.map(lambda v: jnp.stack([v] * lanes), (material, row))
-        batch = jax.jit(jax.vmap(lambda m, p: simulate(scene, m, p))).lower(*wide).compile()
-        many = functools.partial(batch, *wide)
-
-    return Compiled(lambda: call(material, row), gradient, many, seconds)
-
-
-def timed(programs: dict[Levels, Compiled], settings: Settings) -> dict[Levels, dict]:
-    """Seconds: median and 99 % of single calls, median per lane of batches, compilation."""
-    samples = {levels: {"call": [], "gradient": [], "lane": []} for levels in programs}
-    block = max(settings.calls // TURNS, 1)
-    for _ in range(TURNS):
-        for levels, made in programs.items():
-            seen = samples[levels]
-            seen["call"] += sampled(made.call, block)
-            if made.gradient is not None:
-                seen["gradient"] += sampled(made.gradient, block)
-            if made.lanes is not None:
-                batches = sampled(made.lanes, max(block // settings.lanes, 2))
-                seen["lane"] += [v / settings.lanes for v in batches]
-
-    def short(v):
-        return float(f"{v:.4g}")
-
-    found = {}
-    for levels, seen in samples.items():
-        found[levels] = {
-            name: {"median": short(np.median(v)), "p99": short(np.quantile(v, 0.99))}
-            for name, v in seen.items() if v
-        } | {"compile": short(programs[levels].seconds)}  # fmt: skip
-    return found
-
-
 def choice_row(
-    name: str, full: Full, choice: Choice, times: dict[Levels, dict], settings: Settings
+    name: str, full: Full, choice: Choice, times: Mapping[Any, dict], end: dict[str, Any]
 ) -> dict[str, Any]:
-    """A choice as a line of JSON, with the times of its program and of the full one."""
+    """A choice as a line of JSON, with the times of its program and of the full one.
+
+    Args:
+        name: of the scene.
+        full: at its finest.
+        choice: -
+        times: of both programs, see `timed`.
+        end: what `environment` gives.
+    """
 
     def said(rungs):
         return [
             {"ladder": r.ladder, "level": r.level, "error": _number(r.errors.worst)} for r in rungs
         ]
 
-    def call(levels):
-        return times[levels]["call"]["median"]
-
+    measured = "call" if choice.price.by == "step" else "path"
     return {
-        "scene": name, "tolerance": choice.tolerance, "dropped": said(choice.dropped),
-        "refused": said(choice.refused), "returned": said(choice.returned),
+        "scene": name, "tolerance": choice.tolerance, "by": choice.price.by,
+        "dropped": said(choice.dropped), "refused": said(choice.refused),
+        "returned": said(choice.returned),
         "errors": {k: _number(v) for k, v in choice.errors._asdict().items()},
         "cost": round(choice.cost[1] / choice.cost[0], 4),
-        "times": {"chosen": call(choice.levels), "full": call(full.levels)},
-    } | _environment(settings)  # fmt: skip
+        "predicted": [_number(v) for v in choice.cost] if choice.price.timed else None,
+        "times": {
+            which: times[v][measured]["median"]
+            for which, v in (("chosen", choice.levels), ("full", full.levels))
+        },
+        "all": {
+            which: {k: v["median"] for k, v in times[levels].items() if k != "compile"}
+            for which, levels in (("chosen", choice.levels), ("full", full.levels))
+        },
+    } | end  # fmt: skip
 
 
-def sampled(call: Callable, calls: int) -> list[float]:
-    """Seconds of single calls, each waited for; one before them is not counted."""
-    jax.block_until_ready(call())
-    taken = []
-    for _ in range(calls):
-        start = time.perf_counter()
-        jax.block_until_ready(call())
-        taken.append(time.perf_counter() - start)
-    return taken
-
-
-def _picked(ladder: Ladder, quick: bool) -> list[str]:
+def _picked(ladder: Ladder, rungs: int) -> list[str]:
+    """At most so many rungs, evenly, the coarsest and the finest among them; 0: all."""
     names = list(ladder.rungs)
-    if not quick or len(names) <= 3:
+    if not rungs or len(names) <= rungs:
         return names
-    return [names[0], names[len(names) // 2], names[-1]]
+    at = np.linspace(0, len(names) - 1, max(rungs, 2)).round().astype(int)
+    return [names[i] for i in at]
 
 
 def _solved(full: Full, levels: Levels) -> Solved:
     made = program(full, levels)
-    out, gradient = jax.jit(solve)(*made)
+    out, gradient = jax.jit(solve, compiler_options=quick_options())(*made)
     return Solved(made[0], jax.tree.map(np.asarray, out), np.asarray(gradient))
 
 
@@ -271,21 +207,12 @@ def _number(v: float | None) -> float | str | None:
     return float(f"{v:.4g}") if np.isfinite(v) else "inf"
 
 
-def _environment(settings: Settings) -> dict[str, Any]:
+def environment(settings: Settings, load: Load) -> dict[str, Any]:
+    """Where and when something was timed, and how busy others kept the machine meanwhile."""
     names = ("jaxtrachea", "jax", "jaxlib", "numpy")
     return {
-        "calls": settings.calls, "lanes": settings.lanes, "load": round(os.getloadavg()[0], 2),
+        "calls": settings.calls, "lanes": settings.lanes, "others": load.others(),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "device": str(jax.devices()[0]), "processor": _processor(),
+        "device": str(jax.devices()[0]), "processor": processor(),
         "versions": {"python": platform.python_version()} | {n: version(n) for n in names},
     }  # fmt: skip
-
-
-def _processor() -> str:
-    """Name of the processor where Linux tells it."""
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            names = [line.split(":", 1)[1].strip() for line in file if "model name" in line]
-    except OSError:
-        names = []
-    return names[0] if names else platform.processor()

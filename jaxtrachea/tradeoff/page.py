@@ -4,12 +4,17 @@ import json
 from pathlib import Path
 from typing import Any
 
+from jaxtrachea.tradeoff.front import front
+from jaxtrachea.tradeoff.load import QUIET
+
 HEAD = ["ladder", "level", "force", "joints", "surface", "contact [mm]", "gradient",
-        "call [µs]", "99 %", "gradient [µs]", "lane [µs]", "compile [s]"]  # fmt: skip
+        "part [µs]", "call [µs]", "99 %", "part, lane [µs]", "lane [µs]", "gradient [µs]",
+        "compile [s]"]  # fmt: skip
 KINDS = {
     "algebra": "Algebra: another way to the same numbers",
     "truncation": "Truncation: how far something is computed",
     "model": "Model: something left out",
+    "together": "Together: plans within a tolerance",
 }
 
 
@@ -35,9 +40,9 @@ def cells(point: dict[str, Any]) -> list[str]:
     names = ("force", "joints", "surface", "contact_mm", "gradient")
     return [
         point["ladder"], point["level"] + (" *" if point["finest"] else ""),
-        *(_error(error[name]) for name in names), _micro(time["call"]["median"]),
-        _micro(time["call"]["p99"]), _micro(time["gradient"]["median"]),
-        _micro(time["lane"]["median"]) if "lane" in time else "-", f"{time['compile']:.2g}",
+        *(_error(error[name]) for name in names),
+        *(_time(time, v) for v in ("part", "call")), _time(time, "call", "p99"),
+        *(_time(time, v) for v in ("part_lane", "lane", "gradient")), f"{time['compile']:.2g}",
     ]  # fmt: skip
 
 
@@ -68,50 +73,99 @@ def measured(points: list[dict[str, Any]]) -> str:
     versions = ", ".join(f"{name} {v}" for name, v in first["versions"].items())
     lanes = f"batches of {first['lanes']}" if first["lanes"] else "no batches"
     return (
-        f"Measured {first['date']}, {first['device']}, {first['processor']}, load {first['load']}, "
+        f"Measured {first['date']}, {first['device']}, {first['processor']}, {busy(points)}, "
         f"{first['calls']} calls, {lanes}; {versions}.\n"
     )
 
 
+def busy(points: list[dict[str, Any]]) -> str:
+    """How many cores others kept busy meanwhile, and what follows of it."""
+    old = [p["load"] for p in points if "load" in p]
+    if old:  # measured before others were told from this run
+        return f"**load average up to {max(old)}: compare ratios, not times**"
+    loads = [p["others"] for p in points]
+    if None in loads:
+        return "load of others unknown"
+    text = f"others kept up to {max(loads):.2g} cores busy"
+    return text if max(loads) < QUIET else f"**{text}: compare ratios, not times**"
+
+
+CHOICE_HEAD = ["scene", "tolerance", "least", "dropped (changes alone)", "came back",
+               "verified error", "cost", "chosen / full [µs]", "ratio", "ratio / cost"]  # fmt: skip
+
+
 def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
-    """Scene, tolerance, what was dropped, verified error, times."""
+    """Scene, tolerance, what was made least, what was dropped, verified error, times."""
     found = []
     for row in rows:
         error, call = row["errors"], row["times"]
         worst = max(v for k in ("force", "joints", "surface") if (v := error[k]) is not None)
-        dropped, refused, returned = (
+        dropped, returned = (
             ", ".join(f"{d['ladder']} {d['level']} ({_percent(d['error'])})" for d in row[k])
-            for k in ("dropped", "refused", "returned")
+            for k in ("dropped", "returned")
         )
+        ratio = call["chosen"] / call["full"]
         found.append([
-            row["scene"], f"{100 * row['tolerance']:g} %", dropped or "nothing", refused or "-",
-            returned or "-",
+            row["scene"], f"{100 * row['tolerance']:g} %", row.get("by", "operations"),
+            dropped or "nothing", returned or "-",
             f"{100 * worst:.2g} %", f"{100 * row['cost']:.0f} %",
-            f"{_micro(call['chosen'])} / {_micro(call['full'])}",
-            f"{call['chosen'] / call['full']:.2f}",
+            f"{_micro(call['chosen'])} / {_micro(call['full'])}", f"{ratio:.2f}",
+            f"{ratio / row['cost']:.2f}",
         ])  # fmt: skip
     return found
 
 
-CHOICE_HEAD = ["scene", "tolerance", "dropped (changes alone)", "too far off alone", "came back",
-               "verified error", "cost", "call, chosen / full [µs]", "ratio"]  # fmt: skip
+def fronts(scenes: dict[str, list[dict[str, Any]]]) -> list[list[str]]:
+    """Scene, and by which factor the times of its Pareto front differ: a call, a lane."""
+    found = []
+    for name, rows in scenes.items():
+        points = [row for row in rows if "left_out" not in row]
+        spans = []
+        for which in ("call", "lane"):
+            own = [p for p in points if which in p["times"]]
+            times = [own[i]["times"][which]["median"] for i in front(own, which)]
+            spans.append(f"{max(times) / min(times):.2g}" if times else "-")
+        found.append([name, *spans])
+    return found
+
+
+def level_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
+    """Level of a press, its time against the first, fits a second."""
+    call, lane = rows[0]["call"], rows[0]["lane"]
+    return [
+        [row["level"], f"{row['call'] / call:.2g}", f"{row['lane'] / lane:.2g}",
+         "-" if row["fits"] is None else f"{row['fits']:.3g}"]
+        for row in rows
+    ]  # fmt: skip
 
 
 def document(folder: Path, head: str) -> str:
     """docs/tradeoff.md: a head, the choices, every scene.
 
     Args:
-        folder: with `choice.jsonl`, and `NAME.jsonl` and `NAME.png` of each scene.
-        head: Markdown; `{choice}` is the table of choices.
+        folder: with `choice.jsonl`, `levels.jsonl`, and `NAME.jsonl` and `NAME.png` of each scene.
+        head: Markdown; `{choice}` is the table of choices, `{fronts}` that of the fronts' spans,
+            `{levels}` that of the levels of the skeleton.
     """
-    choices = read(folder / "choice.jsonl")
-    body = table(CHOICE_HEAD, choice_rows(choices), 5) + "\n" + measured(choices)
-    parts = [head.replace("{choice}", body)]
-    for path in sorted(folder.glob("*.jsonl")):
-        if path.stem != "choice":
-            picture = f"{folder.name}/{path.stem}.png"
-            parts.append(f"## {path.stem}\n\n{scene_text(read(path), picture)}")
+    choices, levels = (read(folder / f"{name}.jsonl") for name in ("choice", "levels"))
+    scenes = {p.stem: read(p) for p in sorted(folder.glob("*.jsonl"))
+              if p.stem not in ("choice", "levels")}  # fmt: skip
+    tables = {
+        "choice": table(CHOICE_HEAD, choice_rows(choices), 5) + "\n" + measured(choices),
+        "fronts": table(["scene", "a call", "a lane"], fronts(scenes), 1),
+        "levels": table(["level", "a call", "a lane of 256", "fits/s"], level_rows(levels), 1)
+        + f"\n{levels[0]['where']}\n",
+    }
+    for name, text in tables.items():
+        head = head.replace(f"{{{name}}}", text)
+    parts = [head]
+    for name, rows in scenes.items():
+        parts.append(f"## {name}\n\n{scene_text(rows, f'{folder.name}/{name}.png')}")
     return "\n".join(parts)
+
+
+def _time(times: dict[str, Any], which: str, part: str = "median") -> str:
+    return _micro(times[which][part]) if which in times else "-"
 
 
 def _error(v: float | str | None) -> str:

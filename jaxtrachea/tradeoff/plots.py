@@ -9,25 +9,34 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from jaxtrachea.files.pictures import STYLE, plain
+from jaxtrachea.tradeoff.front import error, front, time, worst
 
 #: An error up to this is drawn as exact, left of all others.
 EXACT = 1e-17
 #: Times that the paper states: skeleton at 10 kHz, surface at 1 kHz; s.
 GOALS = {"100 µs": 1e-4, "1 ms": 1e-3}
 #: Kinds of ladders in the order of their rows, and their colours (Okabe and Ito, for all eyes).
-KINDS = {"algebra": "#0072B2", "truncation": "#009E73", "model": "#D55E00"}
-QUESTIONS = (
-    "How wrong is it?\nlargest relative error:\nforce, joints, surface",
-    "How long is a call?\nµs; grey: the finest level",
-    "How wrong are derivatives?\nrelative error of\nd force / d log parameter",
-    "How long with derivatives?\nµs; grey: the finest level",
-)
+KINDS = {
+    "algebra": "#0072B2", "truncation": "#009E73", "model": "#D55E00", "together": "#CC79A7",
+}  # fmt: skip
+#: What each panel asks: an error or a time, of which programs.
+PANELS = {
+    ("error", "call"): "How wrong is it?\nlargest relative error:\nforce, joints, surface",
+    ("time", "part"): "How long is the part\nthat it changes?\nµs a call; grey: the finest level",
+    ("time", "call"): "How long is a call?\nµs; grey: the finest level",
+    ("time", "lane"): "How long in a batch?\nµs a lane; grey: the finest level",
+    ("error", "gradient"): "How wrong are derivatives?\nrelative error of\n"
+    "d force / d log parameter",
+    ("time", "gradient"): "How long with derivatives?\nµs; grey: the finest level",
+}
+QUESTIONS = tuple(PANELS.values())
 
 
 def draw(points: list[dict[str, Any]], title: str) -> Figure:
-    """Four panels of one scene, with a row for each level that is not the finest of its ladder.
+    """Panels of one scene, with a row for each level that is not the finest of its ladder.
 
-    Levels that no other beats in error and time together (the Pareto front) have a black edge.
+    A panel for each question that was measured. Levels that no other beats in error and time
+    together (the Pareto front) have a black edge.
 
     Args:
         points: of one scene, as `measure.measure` gives them.
@@ -35,53 +44,44 @@ def draw(points: list[dict[str, Any]], title: str) -> Figure:
     """
     rows = _rows(points)
     finest = {p["ladder"]: p for p in points if p["finest"]}
+    shown = [panel for panel in PANELS if any(panel[1] in p["times"] for p in points)]
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(11.6, 1.7 + 0.21 * max(len(rows), 4)), layout="constrained")
+        size = (2.9 * len(shown), 1.7 + 0.21 * max(len(rows), 4))
+        figure = Figure(figsize=size, layout="constrained")
         figure.suptitle(plain(title, 100))
-        axes = figure.subplots(1, 4, sharey=True)
-        for k, which in enumerate(("call", "gradient")):
-            errors = np.array([_error(p, which) for p in rows])
-            times = np.array([p["times"][which]["median"] for p in rows])
-            full = [
-                finest[p["ladder"]]["times"][which]["median"] if p["ladder"] in finest else np.nan
-                for p in rows
-            ]
-            best = np.isin(np.arange(len(rows)), _front(rows + list(finest.values()), which))
+        axes = np.atleast_1d(figure.subplots(1, len(shown), sharey=True))
+        for axis, (kind, which) in zip(axes, shown, strict=True):
+            axis.set_title(PANELS[kind, which], fontsize=8, loc="left")
             colours = [KINDS[p["kind"]] for p in rows]
-            edges = ["k" if b else c for b, c in zip(best, colours, strict=True)]
-            _errors(axes[2 * k], errors, colours, edges)
-            _times(axes[2 * k + 1], times, np.array(full), colours, edges)
+            edges = _edges(rows, list(finest.values()), which)
+            if kind == "error":
+                _errors(axis, np.array([error(p, which) for p in rows]), colours, edges)
+                continue
+            full = [time(finest.get(p["ladder"]), which) for p in rows]
+            times = np.array([time(p, which) for p in rows])
+            _times(axis, times, np.array(full), colours, edges)
         _names(axes[0], rows)
-        for axis, question in zip(axes, QUESTIONS, strict=True):
-            axis.set_title(question, fontsize=8, loc="left")
-        handles = [
-            Line2D([], [], marker="o", ls="", color=colour, label=kind)
-            for kind, colour in KINDS.items()
-            if any(p["kind"] == kind for p in rows)
-        ]
-        if rows:
-            front = {"mfc": "none", "mec": "k", "mew": 1.3, "label": "Pareto front"}
-            handles.append(Line2D([], [], marker="o", ls="", **front))
-        if handles:
-            figure.legend(handles=handles, loc="outside upper right", ncols=4)
+        _legend(figure, rows)
         return figure
 
 
-def worst(point: dict[str, Any]) -> float:
-    """Largest of the relative errors of force, joints and surface."""
-    values = [point["errors"][k] for k in ("force", "joints", "surface")]
-    return max(float(v) for v in values if v is not None)
+def _legend(figure: Figure, rows) -> None:
+    """Colours of the kinds that are there, and the edge of the front."""
+    handles = [
+        Line2D([], [], marker="o", ls="", color=colour, label=kind)
+        for kind, colour in KINDS.items()
+        if any(p["kind"] == kind for p in rows)
+    ]
+    if handles:
+        front = {"mfc": "none", "mec": "k", "mew": 1.3, "label": "Pareto front"}
+        handles.append(Line2D([], [], marker="o", ls="", **front))
+        figure.legend(handles=handles, loc="outside upper right", ncols=len(handles))
 
 
-def pareto(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Indices of the points that no other beats in both, by rising x."""
-    order = np.lexsort((y, x))
-    best, front = np.inf, []
-    for i in order:
-        if np.isfinite(x[i]) and y[i] < best:
-            best = y[i]
-            front.append(i)
-    return np.array(front, int)
+def _edges(rows, finest, which: str) -> list[str]:
+    """Black for levels on the front, else the colour of the kind; a part has no front."""
+    best = set() if which == "part" else set(front(rows + finest, which))
+    return ["k" if i in best else KINDS[p["kind"]] for i, p in enumerate(rows)]
 
 
 def _rows(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -94,16 +94,6 @@ def _rows(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
         return kinds.index(p["kind"]), ladders.index(p["ladder"]), worst(p)
 
     return sorted(shown, key=place)
-
-
-def _error(point: dict[str, Any], which: str) -> float:
-    return worst(point) if which == "call" else float(point["errors"]["gradient"])
-
-
-def _front(points: list[dict[str, Any]], which: str) -> np.ndarray:
-    """Indices of the Pareto front of error and time."""
-    errors = np.array([_error(p, which) for p in points])
-    return pareto(errors, np.array([p["times"][which]["median"] for p in points]))
 
 
 def _names(axis, rows) -> None:
@@ -138,10 +128,12 @@ def _errors(axis, errors: np.ndarray, colours, edges) -> None:
 def _times(axis, times: np.ndarray, full: np.ndarray, colours, edges) -> None:
     """A line from the time of the finest level to that of this one."""
     axis.set(xscale="log")
-    for i, (time, finest) in enumerate(zip(times, full, strict=True)):
-        axis.plot([finest, time], [i, i], color=colours[i], lw=1.2, alpha=0.5)
+    for i, (seconds, finest) in enumerate(zip(times, full, strict=True)):
+        if not np.isfinite(seconds):
+            continue
+        axis.plot([finest, seconds], [i, i], color=colours[i], lw=1.2, alpha=0.5)
         axis.plot(finest, i, "|", ms=8, color="0.4")
-        axis.plot(time, i, "o", ms=5.5, color=colours[i], mec=edges[i], mew=1.3)
+        axis.plot(seconds, i, "o", ms=5.5, color=colours[i], mec=edges[i], mew=1.3)
     ends = [v for v in (*times, *full) if np.isfinite(v)]
     low, high = min(ends, default=1e-4), max(ends, default=1e-3)
     # At least a decade, so that rounding of the clock does not look like a gain.

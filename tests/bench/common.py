@@ -6,7 +6,8 @@ it must come before numpy and jax.
 
 import os
 
-CORES = sorted(os.sched_getaffinity(0))[-1:]
+ALL_CORES = os.sched_getaffinity(0)
+CORES = sorted(ALL_CORES)[-1:]
 os.sched_setaffinity(0, CORES)
 for _name in ("OMP", "OPENBLAS", "MKL"):
     os.environ[f"{_name}_NUM_THREADS"] = "1"

@@ -1,32 +1,40 @@
 """Accuracy against time of the repository's scenes, and docs/tradeoff.md from it.
 
-Run: python tests/bench/tradeoff.py. Options: `--quick` (three rungs a ladder, 100 calls),
-`--scenes A,B` and `--choices A,B` (these only; "": none), `--page` (write the page from the JSON,
-measure nothing).
+Run: python tests/bench/tradeoff.py. It measures everything on the page: choices, ladders, levels of
+the skeleton (tests/bench/levels.py); some fifteen minutes on two cores with nothing else to do.
+Options: `--quick` (few calls, two rungs a ladder, no fits), `--scenes A,B` (these only; "": none),
+`--no-levels`, `--page` (write the page and the pictures from the JSON, measure nothing).
 """
 
 import argparse
+import os
+import sys
+import tempfile
+import time
 from pathlib import Path
 
 if __name__ == "__main__":
-    import common  # noqa: F401 (pins one core; before jax)
+    import common
+
+    # One thread computes, on any core; programs are compiled on all of them.
+    os.sched_setaffinity(0, common.ALL_CORES)
 
 ROOT = Path(__file__).parents[2]
 FOLDER, DOCUMENT = ROOT / "docs" / "tradeoff", ROOT / "docs" / "tradeoff.md"
 HEAD = ROOT / "docs" / "tradeoff.md.in"
+#: The scenes, and at most how many rungs of each ladder.
 SCENES = {
-    "table_1": "",  # the scene that `jaxtrachea tradeoff` takes by itself
-    "normal": "configs/normal.toml",
-    "capsule": "configs/capsule.toml",
-    "off_midline": "configs/off_midline.toml",
-    "friction": "configs/friction.toml",
-    "virtual_trachea": "fits/virtual_trachea/scene.toml",
+    "no_surface": ("configs/no_surface.toml", 3),
+    "bonded_pull": ("configs/bonded_pull.toml", 3),
+    "normal": ("configs/normal.toml", 3),
+    "virtual_trachea": ("fits/virtual_trachea/scene.toml", 3),
+    "deep": ("configs/deep.toml", 3),
+    "table_1": ("", 2),  # the scene that `jaxtrachea tradeoff` takes by itself
 }
 DATA = {"virtual_trachea": "fits/virtual_trachea/fit.toml"}
-#: Scenes and tolerances of the table of choices; names not in `SCENES` are those of configs/.
-CHOICES = ("table_1", "no_surface", "bonded_pull", "normal", "off_midline", "friction",
-           "virtual_trachea")  # fmt: skip
-TOLERANCES = (0.1, 0.01, 0.001)
+TOLERANCES = (0.5, 0.1, 0.01, 0.001)
+#: What is made least: see `price.By`.
+LEAST = ("path", "step")
 
 
 def document() -> str:
@@ -42,47 +50,112 @@ def full_of(name: str, coupling: str | None = None):
     from jaxtrachea.scene.spec import SceneSpec, load_scene_spec
     from jaxtrachea.tradeoff.levels import BUILT_IN, full_scene
 
-    path = ROOT / (SCENES.get(name, f"configs/{name}.toml") or "configs")
+    path = ROOT / (SCENES[name][0] or "configs")
     spec = SceneSpec.model_validate(BUILT_IN) if path.is_dir() else load_scene_spec(path)
     return full_scene(spec, stage(spec, path.parent), coupling=coupling)
 
 
-def scene(name: str, settings) -> None:
-    """Measure one scene; writes its JSON lines and its picture."""
-    from jaxtrachea.cli.tradeoff import measured_curves
-    from jaxtrachea.tradeoff.measure import measure
-    from jaxtrachea.tradeoff.page import lines
-    from jaxtrachea.tradeoff.plots import draw
-
-    curves, radius, _ = measured_curves(ROOT / DATA[name] if name in DATA else None)
-
-    def say(text):
-        return print(name, text, flush=True)
-
-    rows = measure(name, full_of(name, "series"), settings, say, curves, radius)
-    (FOLDER / f"{name}.jsonl").write_text(lines(rows), "utf-8")
-    draw([row for row in rows if "left_out" not in row], name).savefig(FOLDER / f"{name}.png")
+def say(text: str) -> None:
+    """A line with the time since the start."""
+    print(f"{time.perf_counter() - START:6.0f} s  {text}", flush=True)
 
 
-def choices(names: list[str], settings) -> None:
-    """Choose plans for these scenes at every tolerance, and time them against the full ones."""
+def choices(name: str, full, model, settings) -> tuple[list[dict], list]:
+    """Rows of the table of choices of one scene, and the choices."""
     import jax
 
     from jaxtrachea.tradeoff.choice import choose
-    from jaxtrachea.tradeoff.measure import choice_row, compiled, timed
+    from jaxtrachea.tradeoff.load import Load
+    from jaxtrachea.tradeoff.measure import choice_row, environment
+    from jaxtrachea.tradeoff.price import price
+    from jaxtrachea.tradeoff.timing import compiled, timed
+    from jaxtrachea.tradeoff.trial import Trial
+
+    settings = settings._replace(lanes=0, slopes=False)
+    trial = Trial(full, lambda text: say(f"{name}: choice: {text}"))
+    found = [
+        choose(trial, tolerance, price=price(by, model))
+        for by in LEAST for tolerance in TOLERANCES
+    ]  # fmt: skip
+    say(f"{name}: choice: timing")
+    levels = {full.levels, *(choice.levels for choice in found)}
+    programs = {v: compiled(full, v, settings, path=True) for v in levels}
+    load = Load()
+    times = timed(programs, settings)
+    end = environment(settings, load)
+    rows = [choice_row(name, full, choice, times, end) for choice in found]
+    del programs
+    jax.clear_caches()  # programs of one scene at a time: see measure
+    return rows, found
+
+
+def together(full, found):
+    """The ladder of the plans chosen, and of everything at its coarsest."""
+    from jaxtrachea.tradeoff.ladders import Ladder, ladders
+
+    coarsest: dict = {}
+    for ladder in ladders(full)[0]:
+        if ladder.kind != "algebra" and ladder.name not in ("split", "coupling"):
+            coarsest |= next(iter(ladder.rungs.values()))
+    rungs, seen = {"all at the coarsest": coarsest}, [full.levels.changed(**coarsest)]
+    for choice in found:
+        if choice.levels not in (*seen, full.levels):
+            rungs[f"{100 * choice.tolerance:g} %, {choice.price.by}"] = choice.changed
+            seen.append(choice.levels)
+    return Ladder("together", "together", rungs | {"full": {}}, {})
+
+
+def scene(name: str, model, settings) -> list[dict]:
+    """Measure one scene; writes its JSON lines and its picture; rows of its choices."""
+    from jaxtrachea.cli.tradeoff import measured_curves
+    from jaxtrachea.tradeoff.measure import measure
     from jaxtrachea.tradeoff.page import lines
 
-    rows, settings = [], settings._replace(lanes=0)
-    for name in names:
-        full = full_of(name)
-        found = [choose(full, v, lambda text: print(text, flush=True)) for v in TOLERANCES]
-        levels = {full.levels, *(choice.levels for choice in found)}
-        programs = {v: compiled(full, v, 0, slopes=False) for v in levels}
-        times = timed(programs, settings)
-        rows += [choice_row(name, full, choice, times, settings) for choice in found]
-        (FOLDER / "choice.jsonl").write_text(lines(rows), "utf-8")
-        del programs
-        jax.clear_caches()  # programs of one scene at a time: see measure
+    full = full_of(name, "series")
+    rows, found = choices(name, full, model, settings)
+    curves, radius, _ = measured_curves(ROOT / DATA[name] if name in DATA else None)
+    measured = measure(
+        name, full, settings, lambda text: say(f"{name}: {text}"), curves, radius,
+        [together(full, found)],
+    )  # fmt: skip
+    (FOLDER / f"{name}.jsonl").write_text(lines(measured), "utf-8")
+    return rows
+
+
+def pages() -> None:
+    """The pictures of all scenes, and the page."""
+    from jaxtrachea.tradeoff.page import read
+    from jaxtrachea.tradeoff.plots import draw
+
+    for name in (name for name in SCENES if (FOLDER / f"{name}.jsonl").exists()):
+        rows = read(FOLDER / f"{name}.jsonl")
+        points = [row for row in rows if "left_out" not in row]
+        draw(points, name).savefig(FOLDER / f"{name}.png")
+    DOCUMENT.write_text(document(), "utf-8")
+
+
+def measure_all(asked) -> None:
+    """Everything asked for, a scene at a time."""
+    import levels
+
+    from jaxtrachea.tradeoff.calibrate import calibrate
+    from jaxtrachea.tradeoff.page import lines, read
+    from jaxtrachea.tradeoff.timing import Settings
+
+    FOLDER.mkdir(exist_ok=True)
+    if not asked.no_levels:
+        say("levels of the skeleton")
+        (FOLDER / "levels.jsonl").write_text(lines(levels.rows(quick=asked.quick)), "utf-8")
+    model = calibrate(say)
+    say(model.sentence)
+    file = FOLDER / "choice.jsonl"
+    rows = [row for row in read(file) if row["scene"] in SCENES] if file.exists() else []
+    for name in filter(None, asked.scenes.split(",")):
+        rungs = 2 if asked.quick else SCENES[name][1]
+        settings = Settings(20 if asked.quick else asked.calls, 256, rungs, slopes=False)
+        rows = [row for row in rows if row["scene"] != name] + scene(name, model, settings)
+        rows.sort(key=lambda row: list(SCENES).index(row["scene"]))
+        file.write_text(lines(rows), "utf-8")
 
 
 def main() -> None:
@@ -90,24 +163,22 @@ def main() -> None:
     import jax
 
     parser = argparse.ArgumentParser(description=__doc__)
-    for option in ("--quick", "--page"):
+    for option in ("--quick", "--page", "--no-levels"):
         parser.add_argument(option, action="store_true")
-    parser.add_argument("--calls", type=int, default=1000)
+    parser.add_argument("--calls", type=int, default=300)
     parser.add_argument("--scenes", default=",".join(SCENES))
-    parser.add_argument("--choices", default=",".join(CHOICES))
     asked = parser.parse_args()
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    from jaxtrachea.tradeoff.measure import Settings
-
-    settings = Settings(100, 0, True) if asked.quick else Settings(asked.calls)
-    FOLDER.mkdir(exist_ok=True)
+    sys.path.insert(0, str(Path(__file__).parent))
     if not asked.page:
-        for name in filter(None, asked.scenes.split(",")):
-            scene(name, settings)
-        if asked.choices:
-            choices(asked.choices.split(","), settings)
-    DOCUMENT.write_text(document(), "utf-8")
+        with tempfile.TemporaryDirectory() as folder:
+            jax.config.update("jax_compilation_cache_dir", folder)
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+            measure_all(asked)
+    pages()
+    say("written")
 
 
 if __name__ == "__main__":
+    START = time.perf_counter()
     main()

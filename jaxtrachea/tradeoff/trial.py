@@ -1,0 +1,97 @@
+"""Programs of a scene run on its path and on two sample paths beside it, each once."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtrachea.scene.approach import approach
+from jaxtrachea.scene.declare import PlanError
+from jaxtrachea.scene.simulation import Simulation, simulate
+from jaxtrachea.scene.stage import Poses, Presses
+from jaxtrachea.tradeoff.errors import Errors, compare
+from jaxtrachea.tradeoff.kernels import count_kernels
+from jaxtrachea.tradeoff.levels import Full, Levels, cast, program, quick_options
+from jaxtrachea.tradeoff.price import OPERATIONS, Price
+
+#: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
+BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
+
+
+class Trial:
+    """Runs programs on the sample paths, each once, for any number of choices.
+
+    Raises:
+        PlanError: the path, or a sample path beside it, has no row with a force.
+    """
+
+    def __init__(self, full: Full, report: Callable[[str], None] = lambda text: None):
+        """Run the full program; `report` is called with what is tried next, and may raise."""
+        self.full, self.report, self.price = full, report, OPERATIONS
+        self.paths = samples(full)
+        self.known: dict[Levels, Errors] = {}
+        self.costs: dict[tuple[Price, Levels], float] = {}
+        self.kernels: dict[Levels, int] = {}
+        report("full program")
+        self.reference = self._run(full.levels)
+        pressed = [bool(np.nan_to_num(v).any()) for v in np.asarray(self.reference.force)]
+        if not all(pressed):
+            where = "the path" + (" a quarter of a ring spacing beside it" if pressed[0] else "")
+            raise PlanError(
+                "plan.tolerance",
+                f"no row of {where} is solved with a force: nothing that a tolerance could be "
+                "measured by",
+                cure="press deeper, further from the ends, or take no tolerance",
+            )
+
+    def errors(self, levels: Levels) -> Errors:
+        """Of these levels against the full program."""
+        if levels not in self.known:
+            found = self._run(levels)
+            self.known[levels] = compare(found, self.reference, (self.full.scene, self.full.scene))
+        return self.known[levels]
+
+    def cost(self, levels: Levels) -> float:
+        """What these levels cost."""
+        key = self.price, levels
+        if key not in self.costs:
+            if self.price.timed and levels not in self.kernels:
+                self.errors(levels)  # compiles it, and keeps its kernels
+            kernels = self.kernels.get(levels, 0)
+            self.costs[key] = self.price.of(program(self.full, levels), kernels)
+        return self.costs[key]
+
+    def saved(self, levels: Levels) -> float:
+        """Share of the full program's cost that they save."""
+        return self.price.saved(self.cost(levels), self.cost(self.full.levels))
+
+    def _run(self, levels: Levels) -> Simulation:
+        """The sample paths, one after the other, with a leading axis."""
+        scene, material, _ = program(self.full, levels)
+        paths = cast(self.paths, levels.dtype)
+        each = [jax.tree.map(lambda v, i=i: v[i], paths) for i in range(len(BESIDE))]
+        solve = jax.jit(simulate, compiler_options=quick_options())
+        made = solve.lower(scene, material, each[0]).compile()
+        self.kernels[levels] = count_kernels(made.as_text())[0]
+        outs = [made(scene, material, path) for path in each]
+        return jax.tree.map(lambda *v: np.stack(v), *outs)
+
+
+def samples(full: Full) -> Poses | Presses:
+    """The path, and the same beside it (`BESIDE`); a leading axis."""
+    path, geometry = full.path, full.scene.geometry
+    spacing = min(full.facts.spacing, float(geometry.length))
+    if isinstance(path, Presses):
+        moved = [
+            Presses(jnp.clip(path.s + a * spacing, 0, geometry.length), path.phi,
+                    path.displacement * (1 + d)) for a, d in BESIDE
+        ]  # fmt: skip
+    else:
+        made = jax.jit(approach)(full.scene, path)
+        row = int(np.argmin(np.asarray(made.seen.gap)))
+        deep = max(-float(made.seen.gap[row]), 0.0)
+        along = jnp.eye(3)[0] if made.frame is None else made.frame[row][:, 0]
+        shifts = [a * spacing * along - d * deep * made.seen.normal[row] for a, d in BESIDE]
+        moved = [Poses(path.rotation, path.translation + v) for v in shifts]
+    return jax.tree.map(lambda *v: jnp.stack(v), *moved)

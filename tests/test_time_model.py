@@ -1,0 +1,235 @@
+"""The model of a machine's time: known numbers come back, what is kept is read, choices by it."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from run_cli import run
+from tradeoff_scene import SCENE, TOML
+
+from jaxtrachea.files.programs import TIME_MODEL
+from jaxtrachea.scene.build import stage
+from jaxtrachea.scene.operations import count_operations
+from jaxtrachea.scene.simulation import simulate
+from jaxtrachea.scene.spec import SceneSpec
+from jaxtrachea.tradeoff import time_model as timing
+from jaxtrachea.tradeoff.choice import choose
+from jaxtrachea.tradeoff.errors import Errors
+from jaxtrachea.tradeoff.ladders import ladders
+from jaxtrachea.tradeoff.levels import full_scene, program
+from jaxtrachea.tradeoff.load import Load
+from jaxtrachea.tradeoff.price import OPERATIONS, Price, price
+from jaxtrachea.tradeoff.time_model import TimeModel, Uncalibrated, Work, fitted, keep, kept
+from jaxtrachea.tradeoff.trial import Trial
+
+#: s: a call, a kernel, an operation in float32 and in float64.
+TRUTH = np.array([20e-6, 80e-9, 0.1e-9, 0.2e-9])
+WORK = [Work(k, a, b) for k, a, b in (
+    (260, 0, 2e3), (30, 0, 1e4), (530, 6e5, 0), (530, 0, 6e5), (550, 2.4e6, 0), (1200, 0, 5e5),
+)]  # fmt: skip
+SECONDS = [float(TRUTH @ (1, *w)) for w in WORK]
+MODEL = TimeModel(*map(float, TRUTH), worst=0.1, date="2026-11-23")
+
+
+def full():
+    spec = SceneSpec.model_validate(SCENE)
+    return full_scene(spec, stage(spec, Path()))
+
+
+def test_known_numbers_come_back():
+    found = fitted(WORK, SECONDS)
+    np.testing.assert_allclose(found[:4], TRUTH, rtol=1e-9)
+    assert found.worst < 1e-9
+    assert found.seconds(WORK[3]) == pytest.approx(SECONDS[3])
+
+
+def test_noise_moves_them_little():
+    """5 % on every time; the error that the model names bounds that of its own programs."""
+    noisy = np.array(SECONDS) * (1 + 0.05 * np.cos(np.arange(len(WORK)) * 2.4))
+    found = fitted(WORK, noisy.tolist())
+    np.testing.assert_allclose(found[1:4], TRUTH[1:], rtol=0.35)
+    predicted = [found.seconds(w) for w in WORK]
+    np.testing.assert_allclose(predicted / noisy, 1, atol=found.worst * (1 + 1e-9))
+    assert 0 < found.worst < 0.06
+
+
+def test_times_that_make_no_sense_are_refused():
+    with pytest.raises(Uncalibrated, match="do not rise"):
+        fitted(WORK, [1e-5] * len(WORK))
+
+
+def test_a_kept_model_is_read_back(tmp_path):
+    assert kept(tmp_path) is None
+    keep(MODEL, tmp_path)
+    assert kept(tmp_path) == MODEL
+
+
+def damage(change):
+    """The file with something changed in it."""
+    read = {"device": timing.device(), "model": MODEL._asdict()}
+    change(read)
+    return json.dumps(read)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda v: v["device"].update(processor="another"),
+        lambda v: v["device"].update(jaxlib="0.0"),
+        lambda v: v["model"].pop("kernel"),
+        lambda v: v["model"].update(kernel=0.0),
+        lambda v: v["model"].update(float64=-1e-9),
+        lambda v: v["model"].update(call=float("nan")),
+        lambda v: v["model"].update(float32="fast"),
+        lambda v: v["model"].update(date="tomorrow"),
+        lambda v: v.update(model=[1, 2, 3]),
+    ],
+)
+def test_a_damaged_model_is_not_read(change, tmp_path):
+    (tmp_path / TIME_MODEL).write_text(damage(change))
+    assert kept(tmp_path) is None
+    keep(MODEL, tmp_path)  # what is measured anew takes its place
+    assert kept(tmp_path) == MODEL
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "\x00\x01"])
+def test_what_is_no_model_is_not_read(text, tmp_path):
+    (tmp_path / TIME_MODEL).write_text(text)
+    assert kept(tmp_path) is None
+
+
+def test_another_kind_of_device_has_no_model(monkeypatch):
+    monkeypatch.setattr(timing.jax, "default_backend", lambda: "gpu")
+    with pytest.raises(Uncalibrated, match="the device is a gpu"):
+        timing.device()
+
+
+@pytest.mark.parametrize(
+    ("kernel", "operation", "expected"), [(1e-6, 1e-12, "off"), (1e-12, 1e-6, "uniform")]
+)
+def test_a_plan_by_time_takes_what_is_truly_cheaper(kernel, operation, expected, monkeypatch):
+    """Two rungs of one ladder: one with few kernels, one with few operations; both are exact."""
+    whole = full()
+    trial = object.__new__(Trial)
+    trial.full, trial.report, trial.costs, trial.known = whole, lambda text: None, {}, {}
+    trial.price = Price("path", TimeModel(0.0, kernel, operation, operation))
+    found = {ladder.name: ladder for ladder in ladders(whole)[0]}
+    few = found["local"].levels(whole, "uniform"), found["shear"].levels(whole, "off")
+    kernels = {whole.levels: 1000, few[0]: 900, few[1]: 100}
+    operations = {whole.levels: 10_000, few[0]: 100, few[1]: 9_000}
+    trial.kernels = kernels
+    by_plan = {v.plan.options: operations[v] for v in kernels}
+    monkeypatch.setattr(
+        "jaxtrachea.tradeoff.price.count_operations",
+        lambda f, scene, *rest: by_plan[scene.plan.options],
+    )
+    saved = {name: trial.saved(v) for name, v in zip(("uniform", "off"), few, strict=True)}
+    assert max(saved, key=lambda name: saved[name]) == expected
+    assert saved[expected] == pytest.approx(0.9 if expected == "off" else 0.99)
+
+
+def test_operations_are_the_cost_unless_told_otherwise():
+    """As by hand: those in float32 counted half, of the whole path; kernels do not count."""
+    whole = full()
+    arguments = program(whole, whole.levels)
+    count = count_operations(simulate, *arguments)
+    assert OPERATIONS.of(arguments, 10**9) == count
+    half = program(whole, dataclasses.replace(whole.levels, dtype="float32"))
+    assert OPERATIONS.of(half, 0) == count / 2
+    assert price("operations", MODEL) == OPERATIONS == price("path", None)
+
+
+def test_a_step_is_one_pose_and_a_path_is_all():
+    whole = full()
+    arguments = program(whole, whole.levels)
+    scene, material, path = arguments
+    last = type(path)(path.s[-1:], path.phi[-1:], path.displacement[-1:])
+    kernels = 300
+    for by, own in (("path", arguments), ("step", (scene, material, last))):
+        expected = TRUTH @ (1, kernels, 0, count_operations(simulate, *own))
+        assert Price(by, MODEL).of(arguments, kernels) == pytest.approx(expected)
+
+
+def test_time_is_known_to_a_per_cent():
+    """Rungs that save less than half of one are not worth an error."""
+    timed = Price("path", MODEL)
+    assert timed.saved(0.996, 1.0) == 0
+    assert timed.saved(0.994, 1.0) == pytest.approx(0.01)
+    assert OPERATIONS.saved(0.996, 1.0) == pytest.approx(0.004)
+
+
+def test_choices_by_operations_and_by_time_keep_the_tolerance():
+    """On a machine whose float32 is no faster and whose kernels cost nothing, float64 stays."""
+    trial = Trial(full())
+    same = TimeModel(0.0, 1e-15, 1e-9, 1e-9)
+    by_time = choose(trial, 0.1, price=Price("path", same))
+    by_operations = choose(trial, 0.1)
+    assert by_operations.levels == choose(full(), 0.1).levels
+    assert {r.ladder for r in by_operations.dropped} == {"shear", "local", "dtype"}
+    assert "dtype" not in {r.ladder for r in by_time.dropped}
+    for found in (by_time, by_operations):
+        assert found.errors.worst <= 0.1
+        assert isinstance(found.errors, Errors)
+    assert "of its cost" in by_operations.sentence
+    if by_time.dropped:
+        assert "predicted here for the whole path in one call" in by_time.sentence
+
+
+@pytest.mark.parametrize("cost", ["path", "operations"])
+def test_plan_says_what_was_made_least(cost, tmp_path, monkeypatch, capsys):
+    from jaxtrachea.cli import timing as command
+
+    monkeypatch.setattr(command, "programs_folder", lambda: tmp_path)
+    keep(MODEL, tmp_path)
+    path = tmp_path / "scene.toml"
+    path.write_text(TOML + f'[plan]\ntolerance = "10 %"\ncost = "{cost}"\n')
+    code, out, _ = run(monkeypatch, capsys, "plan", path, "--time")
+    out = " ".join(out.split())
+    assert code == 0
+    assert ("of its time (predicted here" in out) == (cost == "path")
+    assert "of its cost" in out or cost == "path"
+    assert "time predicted on this machine" in out
+    assert "measured 2026-11-23" in out
+
+
+def test_a_bad_word_for_the_cost(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "scene.toml"
+    path.write_text(TOML + '[plan]\ntolerance = "10 %"\ncost = "lane"\n')
+    code, _, err = run(monkeypatch, capsys, "plan", path)
+    assert code == 2
+    assert "plan.cost" in err
+
+
+def test_no_model_falls_back_to_operations(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(timing.jax, "default_backend", lambda: "gpu")
+    path = tmp_path / "scene.toml"
+    path.write_text(TOML + '[plan]\ntolerance = "10 %"\n')
+    code, out, _ = run(monkeypatch, capsys, "plan", path)
+    out = " ".join(out.split())
+    assert code == 0
+    assert "cost: operations in place of time: the device is a gpu" in out
+    assert "of its cost" in out
+
+
+def test_the_cache_shows_and_clears_the_model(tmp_path, monkeypatch, capsys):
+    from jaxtrachea.cli import cache as command
+
+    monkeypatch.setattr(command, "programs_folder", lambda: tmp_path)
+    keep(MODEL, tmp_path)
+    _, out, _ = run(monkeypatch, capsys, "cache")
+    assert "a kernel 80 ns" in out
+    (tmp_path / TIME_MODEL).write_text("{")
+    _, out, _ = run(monkeypatch, capsys, "cache")
+    assert "of another machine or damaged" in out
+    _, out, _ = run(monkeypatch, capsys, "cache", "--clear")
+    assert "model of time deleted" in out
+    assert not (tmp_path / TIME_MODEL).exists()
+
+
+def test_load_of_others_is_not_negative():
+    load = Load()
+    np.linalg.svd(np.ones((300, 300)))
+    others = load.others()
+    assert others is None or others >= 0
