@@ -21,8 +21,8 @@ NAMES = sorted(path.stem for path in CONFIGS.glob("*.toml"))
 SHOWS = {
     "bonded_pull": {"contact law": "bonded", "second_plane": "off"},
     "capsule": {"contact": "on", "end_motion": "on", "axial": "on"},
-    "cross_sections": {"skeleton": "sections", "surface": "off", "second_plane": "on"},
     "deep": {"contact": "on", "skeleton": "softening", "width": "punch", "shear": "on"},
+    "cross_sections": {"skeleton": "sections", "surface": "sections", "dent": "8"},
     "friction": {"friction": "on", "axial": "on", "contact_point": "fixed"},
     "imported": {"curved": "off", "rings": "arch2"},
     "imported_tool": {"contact": "on", "curved": "on"},
@@ -238,9 +238,15 @@ BAD = {
         '[wall]\n[model]\ncontact = "bonded"\n' + PRESS,
         ["trachea.radius: missing", "mid-line"],
     ),
-    "surface of cross-sections": (
-        '[wall]\n[trachea]\nradius = "11.7 mm"\n[model]\ncontact = "bonded"\n' + PRESS,
-        ["effects.surface", "no surface in a scene", "output.surface = false"],
+    "surface of a line of joints": (
+        '[wall]\n[trachea]\nradius = "11.7 mm"\n[model]\ncontact = "bonded"\n'
+        + PRESS
+        + "[effects]\nsurface = 'hermite'",
+        ["effects.surface", "a line of joints", "use 'sections'"],
+    ),
+    "thickness of deforming cross-sections": (
+        '[wall]\n[trachea]\nradius = "11.7 mm"\nwall = "2 mm"\n' + PRESS,
+        ["trachea.wall", "`offset` outside", "remove it"],
     ),
     "cross-sections that the tool may leave": (
         '[wall]\n[trachea]\nradius = "11.7 mm"\n[output]\nsurface = false\n' + PRESS,

@@ -69,7 +69,7 @@ WITHIN = {
         {"section", "block", "material"},
         {"section_tangent", "span"},
         {"contact"},
-        {"system"},
+        {"system", "wall"},
         {"solve"},
         {"press"},
     ],
@@ -231,14 +231,15 @@ def test_the_walk_sees_a_fault(room, source):
     assert faults(room, source)
 
 
-def test_only_the_press_of_the_sections_is_known_outside():
+def test_only_the_press_and_the_wall_of_the_sections_are_known_outside():
     """The other parts of the mechanics stand beside the sections; none is made of them."""
     for path in set(PACKAGE.rglob("*.py")) - set((PACKAGE / "mechanics" / "sections").glob("*.py")):
         names = imported(path.read_text(), ["jaxtrachea", *path.relative_to(PACKAGE).parts[:-1]])
         own = [n for n in names if n.startswith("jaxtrachea.mechanics.sections")]
         if path.parent == PACKAGE / "mechanics":
             assert not own, path
-        allowed = ("jaxtrachea.mechanics.sections.press", "jaxtrachea.mechanics.sections.material")
+        parts = ("press", "material", "wall")
+        allowed = tuple(f"jaxtrachea.mechanics.sections.{part}" for part in parts)
         assert all(n.startswith(allowed) for n in own), path
 
 

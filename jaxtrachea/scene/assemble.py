@@ -9,6 +9,7 @@ import numpy as np
 from jaxtrachea._arguments import check_fits
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.mechanics.sections.wall import Points, gather_points
 from jaxtrachea.scene.declare import AnyMaterial, PlanError, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.facts import facts_of
@@ -47,7 +48,8 @@ def make_scene(
             of deforming cross-sections.
         path: what the plan is made for; other paths may follow if they need no more.
         tool: with its friction, or its shape alone; a shape is needed for `Poses`.
-        mesh: the surface; without one `effects.want_surface` must be false.
+        mesh: the surface; without one `effects.want_surface` must be false. Of deforming
+            cross-sections a straight one only follows: a tool touches a round wall of `radius`.
         radius: of the tube's outside, mm; None: of a `SectionMaterial` that of its mid-line and
             offset; else that of the mesh (of an imported one it is
             `geometry.radius`); without a mesh `geometry.radius` + 1.3 (half of Table 1's wall).
@@ -68,6 +70,7 @@ def make_scene(
     tool = tool if isinstance(tool, Tool) else Tool(tool)
     shape, friction = tool.shape, tool.friction
     dtype = geometry.length.dtype
+    sections = isinstance(material, SectionMaterial)
     if radius is None and isinstance(material, SectionMaterial):
         outer = geometry.radius + material.offset
     else:
@@ -77,7 +80,7 @@ def make_scene(
         raise PlanError("contact", "the path moves a tool", "there is none", "give a tool")
     size, tube, near = LEAST, None, 1
     if shape is not None and isinstance(path, Poses):
-        if mesh is None:
+        if mesh is None or (sections and mesh.frames is None):
             tube = round_wall(geometry, float(outer))
         else:
             tube = checked_walls(geometry, mesh, progress)
@@ -85,7 +88,7 @@ def make_scene(
     if shape is not None:
         size = _footprint(shape)
     mu = None if friction is None else jnp.asarray(friction, dtype)
-    binding = None if mesh is None else regions.bind(mesh, geometry)
+    binding = None if mesh is None or sections else regions.bind(mesh, geometry)
     spacing = jnp.asarray(size, dtype)
     scene = Scene(
         geometry=geometry, radius=outer, tube=tube, tool=shape, friction=mu, mesh=mesh,
@@ -96,7 +99,13 @@ def make_scene(
     check_width(geometry, shape, plan.options.half_width)
     if plan.surface is None or mesh is None:
         return dataclasses.replace(scene, mesh=None, binding=None, plan=plan)
-    return dataclasses.replace(scene, plan=plan, runs=local.runs(mesh.s, spacing))
+    runs, points = local.runs(mesh.s, spacing), _points(mesh) if sections else None
+    return dataclasses.replace(scene, plan=plan, runs=runs, points=points)
+
+
+def _points(mesh: Mesh) -> Points:
+    """Vertices on the wall of deforming cross-sections."""
+    return gather_points(mesh.s, mesh.phi, mesh.distance)
 
 
 def _footprint(tool: Shape) -> float:
@@ -119,7 +128,7 @@ def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
     the scene by hand leaves the surface on the old rings.)
     """
     binding = None
-    if scene.mesh is not None:
+    if scene.mesh is not None and not scene.plan.options.deforms_sections:
         binding = regions.bind(scene.mesh, geometry, scene.binding)
     return dataclasses.replace(scene, geometry=geometry, binding=binding)
 
@@ -165,7 +174,12 @@ def with_mesh(scene: Scene, mesh: Mesh) -> Scene:
     """
     curved = scene.plan.contact and mesh.frames is not None
     plan = dataclasses.replace(scene.plan, curved=curved)
-    tube = None if scene.tube is None else checked_walls(scene.geometry, mesh)
-    binding, runs = regions.bind(mesh, scene.geometry), local.runs(mesh.s, scene.footprint)
-    parts = {"mesh": mesh, "binding": binding, "tube": tube, "runs": runs, "plan": plan}
-    return dataclasses.replace(scene, **parts)
+    sections, tube, binding = scene.plan.options.deforms_sections, scene.tube, None
+    if tube is not None and not (sections and mesh.frames is None):
+        tube = checked_walls(scene.geometry, mesh)
+    if not sections:
+        binding = regions.bind(mesh, scene.geometry)
+    return dataclasses.replace(
+        scene, mesh=mesh, binding=binding, tube=tube, plan=plan,
+        runs=local.runs(mesh.s, scene.footprint), points=_points(mesh) if sections else None,
+    )  # fmt: skip

@@ -79,8 +79,8 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     if spec.trachea.file is not None:
         radius = float(geometry.radius)  # that of the outer wall
     if isinstance(material, SectionMaterial):
-        # The round wall whose mid-line they bend about.
-        mesh, radius = None, float(geometry.radius) + float(material.offset)
+        radius = float(geometry.radius) + float(material.offset)
+        mesh = _round_tube(spec.trachea, geometry, float(material.offset))
     try:
         scene = make_scene(
             geometry, material, path, tool=tool, mesh=mesh, radius=radius,
@@ -93,7 +93,7 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
         raise _of_file(error) from None
     except SizeError as error:
         raise SpecError.like(error.renamed(KEYS)) from None
-    if scene.tube is not None and mesh is not None:
+    if scene.tube is not None and isinstance(material, Material):
         lost, filled = float(scene.tube.lost.max()), float(scene.tube.filled.max())
         notes += (
             f"contact patches: the surface stands out of them by up to {lost:.2g} mm; hollows (and "
@@ -192,6 +192,17 @@ def _trachea(section: SceneTracheaSection, folder: Path, files: list[Path], coun
     except ValueError as error:
         raise SpecError(f"trachea: {error}") from None
     return geometry, mesh, ()
+
+
+def _round_tube(section: SceneTracheaSection, geometry: Geometry, offset: float):
+    """The outside of deforming cross-sections: round, so far outside of their mid-line."""
+    try:
+        return make_tube(
+            geometry, around=section.around, along=section.along, wall=2 * offset, relief=0.0,
+            flatten=0.0,
+        )  # fmt: skip
+    except ValueError as error:
+        raise SpecError(f"sections.offset: is {offset:g} mm, half a wall: {error}") from None
 
 
 def _imported(section: SceneTracheaSection, folder: Path, files: list[Path], progress):

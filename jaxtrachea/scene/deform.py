@@ -9,6 +9,7 @@ from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
 from jaxtrachea.contact.shapes import Shape, sphere
+from jaxtrachea.mechanics.sections.wall import Points, around, wall_motion
 from jaxtrachea.scene import trail
 from jaxtrachea.scene.approach import Approach, backed_out
 from jaxtrachea.scene.curve import distance_from, lay
@@ -32,15 +33,10 @@ def deform(
         made: how the tool comes, or None for presses at given points.
     """
     plan, mesh, binding = scene.plan, scene.mesh, scene.binding
-    if mesh is None or binding is None or plan.surface is None:
+    if mesh is None or binding is None or plan.surface is None or plan.surface == "sections":
         raise ValueError("scene.mesh or scene.binding is None; the plan has a surface")
     method = plan.surface
-    straight, runs = mesh.straight, scene.runs if plan.dent else None
-    if plan.dent and runs is None:
-        raise ValueError("scene.runs is None; the plan has a dent")
-    radius = tool = None
-    if plan.dent > 8 and made is not None:
-        radius, tool = _distances(scene, made), backed_out(path, made)
+    straight, (runs, radius, tool) = mesh.straight, _dent_parts(scene, path, made)
     where = presses.s, presses.phi, radius, tool
     together = plan.contact_point == "fixed"
     if together:  # one contact point for all rows: what depends on it alone is computed once
@@ -80,6 +76,54 @@ def _held_at(scene: Scene, s_c):
     """Where the tool holds the ligament, mm: at the contact, or at both edges of its width."""
     half = scene.plan.options.half_width
     return jnp.stack([s_c - half, s_c + half]) if half > 0 else s_c
+
+
+def deform_sections(scene: Scene, presses: Presses, moved: Any, path: Any, made: Approach | None):
+    """Deformed vertices of a wall of deforming cross-sections; as `deform`.
+
+    The dent is what the wall at the contact lacks of the tool's way: the local indentation, and
+    what a tool that rests on a ring moves beside it. Rows are computed one after the other: the
+    sections of all vertices would be a lot of memory for long paths.
+    """
+    plan, mesh, points = scene.plan, scene.mesh, scene.points
+    if mesh is None or points is None:
+        raise ValueError("scene.mesh or scene.points is None; the plan has a surface")
+    straight, (runs, radius, tool) = mesh.straight, _dent_parts(scene, path, made)
+    phi = presses.phi if plan.second_plane else jnp.zeros_like(presses.phi)
+    shape = scene.geometry.radius, scene.geometry.half_angle
+    at_rest = around(points, *shape)
+
+    def contact(phi_c):
+        C = Points(points.s, jnp.full(1, points.s.shape[0]), phi_c[None], scene.radius[None])
+        return around(C, *shape)
+
+    def one(row):
+        along, way, s_c, phi_c, C, radius, tool = row
+        both = jax.tree.map(lambda *v: jnp.concatenate(v), at_rest, C)
+        u = wall_motion(along, both, phi_c, *shape)
+        if runs is None:
+            return place(mesh, u[:-1])
+        dent = _dent(scene, s_c, phi_c, radius, tool, way - u[-1])
+        return place(mesh, local.add_correction(u[:-1], dent, straight, runs, s_c))
+
+    way = moved.depth + moved.skeleton
+    C = jax.vmap(contact)(phi)
+    return jax.lax.map(one, (moved.along, way, presses.s, phi, C, radius, tool))
+
+
+def _dent_parts(scene: Scene, path: Any, made: Approach | None):
+    """Order of the vertices, distance of the contacts from the centreline and the tool backed out.
+
+    None: without a dent; what a dent without the tool's shape does not need.
+    """
+    plan = scene.plan
+    if not plan.dent:
+        return None, None, None
+    if scene.runs is None:
+        raise ValueError("scene.runs is None; the plan has a dent")
+    if plan.dent <= 8 or made is None:
+        return scene.runs, None, None
+    return scene.runs, _distances(scene, made), backed_out(path, made)
 
 
 def _distances(scene: Scene, made: Approach):

@@ -17,6 +17,7 @@ from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene import depth, width
 from jaxtrachea.scene.declare import SECTIONS, AnyMaterial, Case, Effect, PlanError, Verdict
+from jaxtrachea.surface.regions import Method
 from jaxtrachea.trachea.material import DEEP
 
 Switch = Literal["auto", "on", "off"]
@@ -116,13 +117,15 @@ def _surface(case: Case) -> Verdict:
         levels = EFFECTS["surface"].levels
         refused = {level: why for level in levels if level != "off"}
         return Verdict("off", "not asked for", refused, free=False)
-    if SECTIONS in case.facts.known:
-        why = "a skeleton of deforming cross-sections has no surface in a scene"
-        raise PlanError("surface", "asked for", why, "do not ask (output.surface = false)")
     if not case.facts.mesh:
         cure = "give one, or do not ask (want_surface)"
         raise PlanError("surface", "asked for", "the scene has no mesh", cure)
-    return Verdict("hermite", "asked for; exact for the beam without shear")
+    if SECTIONS in case.facts.known:
+        why = "it interpolates a line of joints, and the wall has a shape of its own"
+        refused = {level: (why, "use 'sections', or 'auto'") for level in get_args(Method)}
+        return Verdict("sections", "asked for; the wall has the shape of its sections", refused)
+    refused = {"sections": ("the material is that of a line of joints", "use 'hermite', or 'auto'")}
+    return Verdict("hermite", "asked for; exact for the beam without shear", refused)
 
 
 def _end_motion(case: Case) -> Verdict:
@@ -186,7 +189,7 @@ class EffectOptions:
         second_plane: bending along the circumference, vectors; off: a normal press on the midline.
         rings: see `skeleton_response`.
         axial: the ligament stretches.
-        surface: method of interpolation, or off.
+        surface: method of interpolation, `sections`: the wall of deforming cross-sections, or off.
         end_motion: the clamps move on axial springs, and the surface with them.
         dent: centres of the local correction, or off.
         shear: the ligament shears.
@@ -216,7 +219,7 @@ class EffectOptions:
         rungs=("mat", "arch", "arch2"),
     )  # fmt: skip
     axial: Switch = _effect(_axial, material=("EA_L",), brings=("second_plane",), rungs=ON_OFF)
-    surface: Literal["auto", "off", "linear", "hermite", "phong"] = _effect(
+    surface: Literal["auto", "off", "linear", "hermite", "phong", "sections"] = _effect(
         _surface, values={"off": None}, rungs=("linear", "phong", "hermite"),
         ladder="interpolation",
     )  # fmt: skip

@@ -5,7 +5,7 @@ An effect that is off adds no operation to it. `rules` makes it of the facts and
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea._errors import InputError
@@ -18,8 +18,7 @@ from jaxtrachea.surface.regions import Method
 #: What a simulation can leave out of its result.
 OUTPUTS = ("joints", "ring_ends")
 #: Effects of a line of joints, and what no other skeleton has.
-OF_JOINTS = ("friction", "rings", "axial", "surface", "end_motion", "dent", "shear", "two_material",
-             "width")  # fmt: skip
+OF_JOINTS = ("friction", "rings", "axial", "end_motion", "shear", "two_material", "width")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +67,7 @@ class Plan:
         rings: -
         axial: -
         end_motion: -
-        surface: method of interpolation, None: off.
+        surface: method of interpolation, or the wall of deforming cross-sections; None: off.
         dent: number of centres, 0: off.
         joints: they are in the result.
         ring_ends: they are in the result.
@@ -88,7 +87,7 @@ class Plan:
     rings: Rings
     axial: bool
     end_motion: bool
-    surface: Method | None
+    surface: Method | Literal["sections"] | None
     dent: int
     joints: bool
     ring_ends: bool
@@ -143,7 +142,14 @@ class Plan:
                     joint=" ", expected=f"'linear', or {name} {EFFECTS[name].least!r}",
                     cure="press by `press` or `press_sections` with it",
                 )  # fmt: skip
-        if level == "sections" and self.contact and self.contact_point == "per_step":
+        sections = level == "sections"
+        if self.surface is not None and sections != (self.surface == "sections"):
+            kinds = ("sections",) if sections else get_args(Method)
+            raise InputError(
+                f"is {self.surface!r}, with a skeleton {level!r}", key="surface", joint=" ",
+                expected=f"{', '.join(map(repr, kinds))} or None",
+            )  # fmt: skip
+        if sections and self.contact and self.contact_point == "per_step":
             raise InputError(
                 "is 'sections', with contact_point 'per_step' of a tool", key="options.skeleton",
                 joint=" ", expected="contact_point 'fixed', or presses at given points",
@@ -189,7 +195,7 @@ class Plan:
             return None if less == self else less
         if name not in EFFECTS or not EFFECTS[name].least:
             return None
-        if self.level(name) == "sections":  # another material
+        if name == "skeleton" and self.level(name) == "sections":  # another material
             return None
         if any(name in e.holds and self.has(e.name) for e in EFFECTS.values()):
             return None

@@ -26,7 +26,8 @@ class Moved(NamedTuple):
 
     Slopes are those of the ligament at the contact and at the rings; these and the loads are None
     where there is no ligament. Of a tool with a width, `slope_C` is the mean of those at its edges,
-    each weighed by its force, and `slope_edges` are they; else None.
+    each weighed by its force, and `slope_edges` are they; else None. `along`: modes of the sections
+    that a surface asks for, and of that at the contact.
     """
 
     force: Any
@@ -42,6 +43,7 @@ class Moved(NamedTuple):
     slip: Any = None
     dissipated: Any = None
     slope_edges: Any = None
+    along: Any = None
 
 
 def moved_by(press: ObliquePress) -> Moved:
@@ -120,7 +122,11 @@ def cross_sections(scene: Scene, material: SectionMaterial, presses: Presses) ->
     Every row is a press of its own, straight from rest to its displacement: what is stored does not
     depend on the way. With one plane the program is that of the midline.
     """
-    flat = not scene.plan.second_plane
+    flat, points = not scene.plan.second_plane, None
+    if scene.plan.surface is not None:
+        if scene.points is None:
+            raise ValueError("scene.points is None; the plan has a surface of cross-sections")
+        points = scene.points.s
 
     def one(s, phi, D):
         inward, _, across = local_frame(phi)
@@ -132,9 +138,10 @@ def cross_sections(scene: Scene, material: SectionMaterial, presses: Presses) ->
             size = jnp.where(still, 0, jnp.sqrt(jnp.sum(jnp.where(still, 1, way * way))))
             rest = jnp.asarray([1.0, 0.0], D.dtype)
             direction = jnp.where(still, rest, way / jnp.where(still, 1, size))
+        places = None if points is None else jnp.append(points, s)
         found = press_sections(
             scene.geometry, material, s, jnp.zeros_like(phi) if flat else phi, size[None],
-            direction, midline=flat,
+            direction, midline=flat, places=places,
         )  # fmt: skip
         return jax.tree.map(lambda v: v[0], found)
 
@@ -142,5 +149,5 @@ def cross_sections(scene: Scene, material: SectionMaterial, presses: Presses) ->
     return Moved(
         force=found.force, depth=found.depth, skeleton=found.skeleton, slope_C=None,
         joints=found.joints, slopes=None, loads=None, end_U=found.end_U, end_V=found.end_V,
-        status=found.status,
+        status=found.status, along=found.along,
     )  # fmt: skip

@@ -13,7 +13,7 @@ from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.configurational import force_by_pose
 from jaxtrachea.scene.declare import AnyMaterial
-from jaxtrachea.scene.deform import deform
+from jaxtrachea.scene.deform import deform, deform_sections
 from jaxtrachea.scene.programs import cross_sections, moved_by, one_plane, vectors
 from jaxtrachea.scene.ranges import contact_share, depth_share
 from jaxtrachea.scene.refusals import refuse, status_of, without_negative_values
@@ -133,6 +133,8 @@ def follow(
     vertices = None
     if plan.surface is not None and isinstance(material, Material):
         vertices = deform(scene, material, used, moved, path, made)
+    elif plan.surface is not None:
+        vertices = deform_sections(scene, used, moved, path, made)
     share = depth_share(scene, moved.depth, moved.skeleton, inward)
     force, moment, solved = moved.force, None, moved.status
     of_joints = isinstance(material, Material)

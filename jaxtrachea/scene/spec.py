@@ -301,6 +301,11 @@ class SceneSpec(Section):
                 "trachea.radius: missing; deforming cross-sections need that of the wall's "
                 "mid-line (11.7 mm of an inner radius of 10 mm and the wall of Table 1)"
             )
+        if sections and "wall" in self.trachea.model_fields_set:
+            raise ValueError(
+                "trachea.wall: the outside of deforming cross-sections lies `offset` outside of "
+                "their mid-line; remove it, and give [wall] h or [sections] offset"
+            )
         if self.wall is None and self.sections is not None:
             lacking = [name for name in NEEDED if getattr(self.sections, name) is None]
             if lacking:

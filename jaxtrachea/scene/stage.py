@@ -17,6 +17,7 @@ from jaxtrachea.contact.search import STANDARD, Settings
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.admission import check_shapes
 from jaxtrachea.mechanics.sections.material import SectionMaterial, check_sections
+from jaxtrachea.mechanics.sections.wall import Points
 from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.plan import Plan
 from jaxtrachea.surface import local, regions
@@ -140,6 +141,7 @@ class Scene(eqx.Module):
         binding: of the mesh, or None.
         footprint: distance between the circles of the dent's centres, mm.
         runs: order of the mesh's vertices, for a dent of this footprint; or None.
+        points: the vertices on the wall of deforming cross-sections, in the place of `binding`.
         plan: the program (static).
         quality: accuracy and work of the search for a contact (static).
     """
@@ -156,6 +158,7 @@ class Scene(eqx.Module):
     plan: Plan = eqx.field(static=True)
     quality: Settings = eqx.field(static=True, default=STANDARD)
     runs: local.Runs | None = None
+    points: Points | None = None
 
 
 def touch_tube(scene: Scene, path: Poses) -> Touch:

@@ -44,7 +44,7 @@ def test_a_plan_keeps_every_level_it_is_given():
     plan = make_plan(EVERYTHING)
     assert {name for name in EFFECTS if not plan.has(name)} == FLAT
     for effect in (effect for effect in EFFECTS.values() if effect.name not in FLAT):
-        for level in effect.levels:
+        for level in set(effect.levels) - {"sections"}:  # with its skeleton: test_sections_surface
             assert plan.at(**{effect.name: level}).level(effect.name) == level
 
 

@@ -213,7 +213,6 @@ ASKED = {"want_surface": False, "contact": "bonded"}
 @pytest.mark.parametrize(
     ("facts", "effects", "says"),
     [
-        ({}, {"contact": "bonded"}, "surface: asked for, but .* no surface.*output.surface"),
         ({}, {"want_surface": False}, "needs contact='bonded', found 'unilateral'.*set contact"),
         ({}, ASKED | {"coupling": "total"}, "needs coupling='series'"),
         ({}, ASKED | {"onset_width": 0.1}, "needs onset_width"),

@@ -12,7 +12,8 @@ it is.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from jaxtrachea.mechanics.sections.span import Span, selector
 
@@ -50,6 +51,75 @@ def effective_place(s_c: Float[Array, ""], left, right, footprint):
     return jnp.where(near_left, left + half * moved, right - half * moved)
 
 
+def span_of(nodes: Float[Array, " nodes"], s: Float[Array, "*n"]) -> Int[Array, "*n"]:
+    """Number of the span that holds s; of two the upper."""
+    j = jnp.sum(nodes <= s[..., None], -1) - 1
+    return jnp.clip(j, 0, nodes.shape[0] - 2)
+
+
+def acting_place(nodes: Float[Array, " nodes"], s_c, footprint):
+    """The span that holds a contact, and how far behind its lower end the contact acts, mm."""
+    j = span_of(nodes, s_c)
+    return j, effective_place(s_c, nodes[j], nodes[j + 1], footprint) - nodes[j]
+
+
+class Modal(NamedTuple):
+    """A span as a beam for each mode.
+
+    Attributes:
+        shear: a, N/mm times mm.
+        bending: c; 1 for modes that do not warp.
+        warps: 1 for those that do, else 0.
+    """
+
+    shear: Float[Array, "parities 4"]
+    bending: Float[Array, "parities 4"]
+    warps: Float[np.ndarray, "parities 4"]
+
+
+def modal_stiffness(shear: Float[Array, "p 4"], axial: Float[Array, "p 3 3"]) -> Modal:
+    """The modes of `Span.shear` and `Span.axial`, each for itself."""
+    E = selector(shear.shape[0], shear.dtype)
+    warps = E.sum(2)
+    c = jnp.einsum("pkw,pww->pk", jnp.asarray(E), axial)
+    return Modal(shear, jnp.where(warps > 0, c, 1), warps)
+
+
+def _bending_share(h, beam: Modal):
+    """1 / (1 + 12 c / (a h^2)): 1 for a beam that only bends, 0 for modes that do not warp."""
+    return beam.warps / (1 + 12 * beam.bending / (beam.shear * h * h))
+
+
+def end_shares(x: Float[Array, ""], h: Float[Array, ""], beam: Modal):
+    """Shape functions of q and psi of the lower end and of the upper, at x behind the lower one.
+
+    Returns:
+        Two pairs (of q, 1; of psi, mm), of shape (parities, 4) each.
+    """
+    both, z = _bending_share(h, beam), x / h
+    w_L = 1 - z + both * (z - 3 * z**2 + 2 * z**3)
+    w_R = z - both * (z - 3 * z**2 + 2 * z**3)
+    shear = (1 - both) * (z - z**2) / 2
+    r_L, r_R = h * (both * (z - 2 * z**2 + z**3) + shear), h * (both * (z**3 - z**2) - shear)
+    return (w_L, r_L), (w_R, r_R)
+
+
+def own_deflection(
+    x: Float[Array, ""], load: Float[Array, ""], h: Float[Array, ""], beam: Modal
+) -> Float[Array, "parities 4"]:
+    """Deflection of a span with both ends held, at x by a unit force at `load`, mm/N.
+
+    The mean, by the share of bending, of a beam that only bends and of one whose ends turn alike.
+    """
+    near, far = jnp.minimum(x, load), h - jnp.maximum(x, load)
+    both, product = _bending_share(h, beam), near * far
+    rest = h - far
+    clamped = product**2 * (3 * rest * (h - near) - far * near) / (6 * h**3)
+    turned = 3 * h * (near + far) - h * h - 3 * product - 2 * (near**2 + far**2)
+    bent = both * clamped + (1 - both) * product * turned / (12 * h)
+    return product / (h * beam.shear) + beam.warps * bent / beam.bending
+
+
 def place_on(
     nodes: Float[Array, " nodes"],
     s_c: Float[Array, ""],
@@ -64,31 +134,17 @@ def place_on(
         spans: all of them, stacked.
         footprint: see `effective_place`.
     """
-    count = nodes.shape[0] - 1
-    j = jnp.clip(jnp.sum(nodes <= s_c) - 1, 0, count - 1)
-    left, right, h = nodes[j], nodes[j + 1], spans.h[j]
-    x = effective_place(s_c, left, right, footprint) - left
-    a = spans.shear[j]
-    parities = a.shape[0]
-    E = jnp.asarray(selector(parities, a.dtype))
-    warps = jnp.sum(E, 2)
-    c = jnp.einsum("pkw,pww->pk", E, spans.axial[j])
-    c = jnp.where(warps > 0, c, 1)
-    both = warps / (1 + 12 * c / (a * h * h))  # share of bending; 0 for modes that do not warp
-    z, y = x / h, h - x
-    w_L = 1 - z + both * (z - 3 * z**2 + 2 * z**3)
-    w_R = z - both * (z - 3 * z**2 + 2 * z**3)
-    shear = (1 - both) * (z - z**2) / 2
-    r_L, r_R = h * (both * (z - 2 * z**2 + z**3) + shear), h * (both * (z**3 - z**2) - shear)
+    j, x = acting_place(nodes, s_c, footprint)
+    h, stiff = spans.h[j], modal_stiffness(spans.shear[j], spans.axial[j])
+    E = jnp.asarray(selector(stiff.shear.shape[0], x.dtype))
+    (w_L, r_L), (w_R, r_R) = end_shares(x, h, stiff)
 
     def share(w, r):
         held = jnp.eye(4, dtype=w.dtype)[None] * w[:, :, None]
         return jnp.concatenate([held, E * r[:, :, None]], 2)
 
-    none = jnp.zeros((count + 1, *E.shape[:2], 7), a.dtype)
+    none = jnp.zeros((nodes.shape[0], *E.shape[:2], 7), x.dtype)
     shares = none.at[j].set(share(w_L, r_L)).at[j + 1].set(share(w_R, r_R))
-    # A simply supported span, less what moments hold at its ends; exact for any shear.
-    bent = (x * y / h) ** 2 * h / (12 * c) * (1 - both * (1 - 2 * z) ** 2)
-    own = x * y / (h * a) + warps * bent
-    weight = jnp.sin(jnp.pi * (s_c - left) / h) ** 2
+    own = own_deflection(x, x, h, stiff)
+    weight = jnp.sin(jnp.pi * (s_c - nodes[j]) / h) ** 2
     return Place(shares, own, weight)

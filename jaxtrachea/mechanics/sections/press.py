@@ -29,6 +29,7 @@ from jaxtrachea.mechanics.sections.material import (
 )
 from jaxtrachea.mechanics.sections.solve import Solved, solve_path
 from jaxtrachea.mechanics.sections.system import State, System
+from jaxtrachea.mechanics.sections.wall import Contact, WallModes, modes_along
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -50,6 +51,8 @@ class SectionPress(NamedTuple):
         imbalance: of the forces on the nodes over the contact's force.
         steps: Newton steps made.
         status: a `PressStatus` each.
+        along: modes of the sections at `places`, as `wall.wall_motion` takes them; None: no places
+            were given.
     """
 
     force: Float[Array, "n 3"]
@@ -63,6 +66,7 @@ class SectionPress(NamedTuple):
     imbalance: Float[Array, " n"]
     steps: Float[Array, " n"]
     status: Int[Array, " n"]
+    along: WallModes | None = None
 
 
 def press_sections(
@@ -74,6 +78,7 @@ def press_sections(
     direction: ArrayLike = (1.0, 0.0),
     *,
     midline: bool = False,
+    places: ArrayLike | None = None,
 ) -> SectionPress:
     """Press or draw the tool, stuck to the surface at (s_c, phi_c), along a path from rest.
 
@@ -91,6 +96,7 @@ def press_sections(
         direction: displacement per unit of that, along the inward normal and the circumference.
         midline: a program for phi_c = 0 and a normal direction only, a quarter of the work; other
             presses are OFF_PLAN in it.
+        places: positions along the tube, mm, where the sections' modes are wanted; None: nowhere.
 
     Returns:
         The `SectionPress`. Rows that Newton's method does not solve or that are no minimum of the
@@ -116,6 +122,12 @@ def press_sections(
     status = jnp.where(asked.refused != PressStatus.OK, asked.refused, status).astype(jnp.int8)
     observe = jax.vmap(_observe, (0, 0, None))
     found = observe(solved.state, path, parts)
+    if places is not None:
+        places = shaped("places", places, ("any number of",), dtype=dtype)
+        nodes, footprint = ends_and_rings(geometry), asked.material.footprint.astype(dtype)
+        along = jax.vmap(_along, (0, None, None, None, None))
+        contact = asked.s_c, footprint
+        found = found._replace(along=along(solved.state, places, nodes, contact, parts))
     found = found._replace(steps=solved.steps, status=status)
     valid = (status == PressStatus.OK) | (status == PressStatus.NO_CONTACT)
     hidden = jax.vmap(hide)(jnp.where(valid, PressStatus.OK, status), found)
@@ -266,6 +278,16 @@ def _observe(state: State, displacement, parts: System) -> SectionPress:
         steps=jnp.zeros_like(displacement),
         status=jnp.zeros((), jnp.int8),
     )
+
+
+def _along(state: State, places, nodes, contact, parts: System):
+    """Modes of the sections at each place, for a contact (s_c, footprint)."""
+    line = system.lines(state, parts)
+    slope = system.contact_surface(state, line, parts).slope
+    pushed = (slope.T @ state.force).reshape(state.q_C.shape)
+    unknowns = system.physical(state, parts)
+    acting = Contact(contact[0], contact[1], pushed)
+    return modes_along(places, nodes, unknowns, parts.spans, acting)
 
 
 def _ring_motion(line: section.Line, angles, parts: System):
