@@ -939,6 +939,7 @@ def test_bad_input_ends_with_a_cure(arguments, says, study, tmp_path, monkeypatc
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_virtual_trachea_ten_positions_by_the_command(tmp_path, monkeypatch, capsys):
     """The command on fits of nine positions predicts the tenth as `--leave-one-out` does."""
     from jaxtrachea.cli.specification import settings_of, study_of
