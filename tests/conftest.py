@@ -104,6 +104,32 @@ LONGEST = (
     "test_mesh.py",
     "test_survive.py",
 )
+#: The same for the slow tests, both halves.
+LONGEST_SLOW = (
+    "test_scrutiny.py",
+    "test_survive.py",
+    "test_press_derivatives.py",
+    "test_section_analyses.py",
+    "test_configs.py",
+    "test_fits.py",
+    "test_coverage.py",
+    "test_predict.py",
+    "test_selfcheck.py",
+    "test_joint.py",
+    "test_sections.py",
+    "test_ranges.py",
+    "test_configurational.py",
+    "test_programs.py",
+    "test_derivatives.py",
+    "test_session.py",
+    "test_distance.py",
+    "test_bounds.py",
+    "test_section_residual.py",
+    "test_influence.py",
+    "test_residual.py",
+    "test_docs.py",
+    "test_fit.py",
+)
 
 
 def pytest_collection_finish():
@@ -114,7 +140,8 @@ def pytest_collection_finish():
 
 
 def pytest_collection_modifyitems(config, items):
-    """Order of the files in the default suite; --no-loadscope-reorder leaves it so."""
-    if config.getoption("markexpr") == "not slow":
-        rank = {name: place for place, name in enumerate(LONGEST)}
-        items.sort(key=lambda item: rank.get(item.path.name, len(LONGEST)))
+    """Order of the files as CI runs them; --no-loadscope-reorder leaves it so."""
+    chosen = config.getoption("markexpr")
+    longest = LONGEST if chosen == "not slow" else LONGEST_SLOW if "slow" in chosen else ()
+    rank = {name: place for place, name in enumerate(longest)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(longest)))

@@ -134,6 +134,7 @@ def test_command_writes_what_its_page_says(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("kind", ["parametric", "residual"])
 def test_markers_are_resampled_as_well(kind):
     """Four unknowns from forces and markers: bootstrap and local errors agree to 15 %."""

@@ -42,17 +42,16 @@ def covered(level, count):
 
 @pytest.mark.slow
 @pytest.mark.compiling
-@pytest.mark.parametrize("count", [200, pytest.param(600, marks=pytest.mark.slow)])
-def test_profiles_cover_where_local_errors_do_not(count):
+def test_profiles_cover_where_local_errors_do_not():
     """3 % noise, relative errors of 10 to 22 %; four binomial standard deviations of the fits."""
-    local, profile = covered(0.03, count)
-    assert np.all(np.abs(profile - 0.95) <= 4 * np.sqrt(0.95 * 0.05 / count)), profile
+    local, profile = covered(0.03, 600)
+    assert np.all(np.abs(profile - 0.95) <= 4 * np.sqrt(0.95 * 0.05 / 600)), profile
     # EI_L: the valley is curved; measured 90 % with 5,000 fits.
     assert local[0] < 0.93
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("level", [0.01, 0.03, 0.1])
+@pytest.mark.parametrize("level", [0.01, 0.1])
 def test_profiles_cover_5000(level):
     _, profile = covered(level, 5000)
     assert np.all((profile >= 0.93) & (profile <= 0.97)), profile

@@ -84,6 +84,7 @@ def test_linear_case_in_closed_form(sigma):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_robust_losses_have_no_likelihood():
     result = fit(linear_study(noisy(), weighting=HUBER), Settings(starts=1))
     assert np.isnan(result.criteria.AIC).all()
@@ -396,6 +397,7 @@ def test_what_cannot_be_compared(arguments, says, two, monkeypatch, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("shear", [False, True])
 def test_simulated_data_choose_the_beam_they_came_from(shear):
     """Ten specimens of four positions, 0.3 % noise: Bernoulli-Euler or shear, told by the sum."""

@@ -63,6 +63,7 @@ def known(result):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_predicted_errors_come_true(known):
     """1,000 repetitions with the chosen point: standard deviation within 20 % of the prediction."""
     depth = float(synthetic.DEPTHS[-1])

@@ -249,6 +249,7 @@ def test_check_of_the_page_runs(monkeypatch, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_page_on_predictions_runs(tmp_path):
     """Its three commands, then its Python: a folder of results and what it predicts."""
     (tmp_path / "fits").symlink_to(ROOT / "fits")

@@ -145,6 +145,7 @@ def test_page_holds_the_recorded_numbers():
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(
     "known", EXPECTED["options"], ids=lambda o: f"{o['shear']} {o['local']} {o['half_width']}"
 )
@@ -155,6 +156,7 @@ def test_other_options(known, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(
     "known", EXPECTED["finite_strain"], ids=lambda o: f"{o['depth_mm']} mm {o['skeleton']}"
 )

@@ -131,6 +131,7 @@ def quiet():
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("name", list(CASES))
 def test_four_unknowns_against_refits(noisy, name):
     """Central differences of refits; a hat matrix of trace P."""
@@ -158,6 +159,7 @@ def test_four_unknowns_against_refits(noisy, name):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_left_out_is_a_refit_to_first_order(quiet):
     """Shifts of up to half a standard error, of a nearly linear model: to 5 % of the largest."""
     study = synthetic.study(quiet)
@@ -175,6 +177,7 @@ def test_left_out_is_a_refit_to_first_order(quiet):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_an_unknown_on_its_bound_is_held(noisy):
     """An unknown on its bound is held: it carries nothing, and the others as if it were fixed."""
     low = {"k_M": {"value": 2.0, "lower": 1.6}}
@@ -186,6 +189,7 @@ def test_an_unknown_on_its_bound_is_held(noisy):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_estimate_of_one_unknown_is_differentiable():
     """k_1 = D F / D D: derivatives by force and, forward over reverse, by D; many lanes at once."""
     study = linear_study((12,))
@@ -213,6 +217,7 @@ def test_estimate_of_one_unknown_is_differentiable():
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_estimate_follows_data_and_geometry(noisy):
     """Forward = reverse = central differences of the solver, by force, contact and rings."""
     study = synthetic.study(noisy)

@@ -173,6 +173,7 @@ def test_a_lane_that_cannot_be_evaluated_costs_itself(linear):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_result_does_not_depend_on_chunks_nor_much_on_precision(linear):
     other = fit(linear_study(), dataclasses.replace(ONE_START, batch=7, starts=2))
     np.testing.assert_allclose(other.theta, linear.theta, rtol=1e-9, atol=1e-9)
@@ -339,6 +340,7 @@ def dense_reference(force):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_twenty_specimens_are_the_dense_fit_of_scipy():
     """Estimates and standard errors within 1e-6 (relative)."""
     force, study = skeleton_study(20)
@@ -351,6 +353,7 @@ def test_twenty_specimens_are_the_dense_fit_of_scipy():
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(
     "settings", [{"weighting": SAMPLE}, {"weighting": HUBER}, {"noise": Noise(force=0.05)}]
 )

@@ -42,6 +42,7 @@ def test_errors_are_the_recorded_ones(rings):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_fit_is_the_recorded_one():
     data = script.read()
     rows = np.flatnonzero(data["phi_c"] == 0)

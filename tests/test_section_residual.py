@@ -103,6 +103,13 @@ def point_of(study):
     return jnp.asarray(np.array(guess) + off)
 
 
+#: One press, whatever its place: compiled once.
+single = jax.jit(
+    lambda m, s, phi, D, along: press_sections(GEOMETRY, m, s, phi, D, along),
+    compiler_options=QUICK,
+)
+
+
 def shown(study, theta, k):
     """What `press_sections` shows of trial k, with frames written out here; by kind."""
     c = study.curves[0][k]
@@ -112,10 +119,7 @@ def shown(study, theta, k):
         for (p, _, _), v in zip(study.unknowns[0], theta, strict=True)
     }
     onset, offset = values.pop("onset"), values.pop("force_offset")
-    got = jax.jit(
-        lambda m, s, phi, D, along: press_sections(GEOMETRY, m, s, phi, D, along),
-        compiler_options=QUICK,
-    )(
+    got = single(
         SectionMaterial(**values), jnp.asarray(c.s_c), jnp.asarray(c.phi_c),
         jnp.asarray(c.displacement - onset), jnp.asarray(c.direction),
     )  # fmt: skip
@@ -234,8 +238,8 @@ def test_single_precision(evaluated):
 def pressed(material, place, path=PATH):
     """A curve as `press_sections` shows it, with vectors."""
     s, phi, direction = place
-    got = press_sections(GEOMETRY, material, s, phi, jnp.asarray(path), direction)
-    got = jax.tree.map(np.asarray, got)
+    at = (jnp.asarray(v) for v in (s, phi, path, direction))
+    got = jax.tree.map(np.asarray, single(material, *at))
     frame = np.array([[0, -np.cos(phi), -np.sin(phi)], [0, -np.sin(phi), np.cos(phi)]])
     F, moved = got.force @ frame.T, got.joints @ frame.T
     a, b = direction

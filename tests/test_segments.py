@@ -266,6 +266,7 @@ def _seconds(raw):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_k_1_of_the_records_by_the_fit():
     """The same by the package's own fit, 147 lanes at once."""
     rows = {row[0]: row for row in load_hold.summary()}

@@ -19,6 +19,13 @@ CASES, TRUTHS = table.read_cases(), table.read_truth()
 DOCUMENT = Path(__file__).parents[1] / "docs" / "hard_cases.md"
 #: Functions whose programs compile at once; the others are slow tests.
 QUICK = ("series", "quintic", "first_touch", "axial")
+#: Compiled without optimisation; the programs of the others are those of users.
+LARGE = ("oblique", "friction", "spheres", "boxes")
+EACH = [
+    pytest.param(f, marks=pytest.mark.compiling if f in LARGE else ())
+    for f in FUNCTIONS
+    if f not in QUICK
+]
 
 
 def wrong(outcomes):
@@ -31,7 +38,7 @@ def test_quick_functions():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("function", [f for f in FUNCTIONS if f not in QUICK])
+@pytest.mark.parametrize("function", EACH)
 def test_function(function):
     rows = [c for c in CASES if c.function == function]
     assert not wrong(run_table(rows, TRUTHS, table.DTYPES))

@@ -275,6 +275,7 @@ value = jax.jit(_flat, compiler_options=QUICK)
 @pytest.mark.parametrize("s", [25.3, 3.0])
 @pytest.mark.parametrize("k", [1e-3, 0.1, 1e3])
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_gradients(k, s):
     """Forward = reverse = central differences along a random direction of every argument."""
     rng = np.random.default_rng(9)

@@ -681,6 +681,7 @@ cp -r disk/out done
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("size", ["8k", "32k", "64k", "160k"])
 def test_a_disk_that_is_really_full(peace, study, size):
     """A tiny file system of its own, filled by the run and then enlarged."""
@@ -702,6 +703,7 @@ def test_a_disk_that_is_really_full(peace, study, size):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_killed_runs_give_the_same_numbers(tmp_path):
     kill_often(tmp_path, 2)
 
@@ -716,6 +718,7 @@ def two(folder, *arguments):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_two_processes_and_two_devices(peace, study):
     found = [finish(p) for p in two(study, *FIT)]
     assert [code for code, _, _ in found] == [0, 0], found
@@ -729,6 +732,7 @@ def test_two_processes_and_two_devices(peace, study):
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("lost", [0, 1])
 def test_a_lost_process_ends_the_other(lost, tmp_path):
     """Exit code 3 and a clear line within the timeout; one process goes on alone."""

@@ -158,6 +158,7 @@ def test_ladders_of_a_scene_and_why_others_are_left_out():
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_ladder_of_the_skeleton():
     """Linear instead of softening errs as by hand; coupling is not climbed; vectors have none."""
     law = {"e_1": "0.1 1/mm", "e_2": "0.005 1/mm^2", "k_1": "1e6 N/mm", "k_3": "0 N/mm^3"}
@@ -400,6 +401,7 @@ def test_data_must_cover_the_scene():
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_command_writes_every_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("scene.toml").write_text(TOML)

@@ -280,6 +280,7 @@ def test_refusals_cost_no_more_than_counted_on_paper():
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_an_unused_effect_adds_none_to_the_compiled_program(name):
     """After XLA's optimisation, by its own count; which folds the two in orders of their own.

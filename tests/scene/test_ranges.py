@@ -141,7 +141,7 @@ def test_a_plan_without_bending_rings_refuses_a_material_with_them(material, exp
     """Rings as springs at 60 degrees were 83 % off, with OK, in sweeps too."""
     scene = make_scene(TUBE, SPRINGS, ASIDE, effects=ONE)
     assert run(scene, material, ASIDE).status.tolist() == [expected]
-    out = sweep(scene, material, [75.0] * 3, [1.0] * 3, [2.0, 0.0, -1.0])
+    out = jax.jit(sweep)(scene, material, [75.0] * 3, [1.0] * 3, [2.0, 0.0, -1.0])
     assert out.status.tolist() == [expected, PressStatus.NO_CONTACT, PressStatus.NO_CONTACT]
     assert np.isnan(out.force[0]) == (expected == OFF_PLAN)
     assert out.force[1:].tolist() == [0, 0]
