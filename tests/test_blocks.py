@@ -137,6 +137,8 @@ def test_a_surface_in_blocks_is_that_of_its_vertices(method):
             np.testing.assert_allclose(a, b, atol=1e-9)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_bound_to_other_rings():
     """Rings that moved, traced, with the order known: the same as bound anew, slopes too."""
     known = regions.bind(TUBE, GEOMETRY)

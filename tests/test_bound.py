@@ -94,6 +94,8 @@ def test_other_numbers_compile_nothing(bound):
     assert counted
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_within_jit_vmap_and_derivatives(bound):
     program, whole, dtype = bound
     m, D = material(dtype), DEPTHS.astype(dtype)
@@ -121,6 +123,8 @@ def test_within_jit_vmap_and_derivatives(bound):
         np.testing.assert_allclose(slope.s_c, numeric, rtol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_python_numbers_and_blend():
     program = jt.bind(table_1(), Material(1.862, 0.1, 0.3, 0.02), 75, [1, 2], blend=0.2)
     assert program.dtype == np.float64

@@ -92,6 +92,8 @@ def test_1000_random_bounds(dtype):
     assert np.sum(np.abs(cost / other - 1) > 1e-3) <= 40
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("gap", [0.0, 5e-14, 1e-9])
 def test_a_start_next_to_a_bound(gap):
     """The free optimum lies beyond: the others must not stay where it has them."""
@@ -212,6 +214,8 @@ def test_profiles_with_bounds(fitted):
     assert np.max(kkt) <= promise_allowed(np.float64)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_bootstrap_with_bounds(fitted, monkeypatch):
     """Every replicate is a minimum of its own data in the box."""
     seen = []

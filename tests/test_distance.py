@@ -401,6 +401,8 @@ def test_swapping_the_shapes(w, t):
     np.testing.assert_allclose(transform(there, two.point_b[:, None])[:, 0], one.point_a, atol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @few
 @given(short_vectors, short_vectors)
 def test_rigid_motion_of_the_frame_of_a(w, t):
@@ -458,6 +460,8 @@ def test_a_table_is_shared_between_poses():
     np.testing.assert_allclose(shared.distance, solve(slab, BALL, there).distance, rtol=1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_tracking_follows_a_path():
     """From the normal of the step before, the whole path is the cold solution."""
     start, end = PLACES["apart"], PLACES["touching"]

@@ -298,6 +298,8 @@ def test_shared_and_specimen_mix():
     np.testing.assert_allclose(k_1, truth[:, 2], rtol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_onset_and_offset_of_each_trial_are_recovered():
     """Each trial touches elsewhere and its load cell has another zero."""
     onset, offset = np.array([0.31, 0.47, 0.22, 0.6]), np.array([0.05, -0.1, 0.2, 0.0])

@@ -125,6 +125,8 @@ def test_deflect(form, split, shear):
     check(deflection(split, form), beam_values(25.3, **more), rtol=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_deflect_with_ring_loads():
     load = np.array([0.1, -0.2, 0.0, 0.3, 0.05])
     values = beam_values(25.3, force=0.4, load=load)

@@ -191,6 +191,8 @@ def test_mat_and_arch():
     np.testing.assert_allclose(arch.loads[..., 1:], k * arch.joints[..., 1:], atol=1e-14)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_bonded_is_odd_and_unilateral_does_not_pull():
     one, two = pressed(), pressed(D=-MOVES)
     np.testing.assert_allclose(two.force, -one.force, atol=1e-14)
@@ -207,6 +209,8 @@ def test_bonded_is_odd_and_unilateral_does_not_pull():
     np.testing.assert_allclose(got.force[0], pressed(D=D).force[0], rtol=1e-12)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_status_of_lanes():
     """Behind the gap, not finite and past the fold, each in its own lane; the others unchanged."""
     phi = jnp.asarray([0.4, 2.2, 0.4, 0.4, ALPHA])

@@ -109,6 +109,8 @@ def test_sphere_against_an_endless_cylinder(dtype, rounding):
     np.testing.assert_allclose(np.hypot(*c.point[:, 1:].T), R, atol=0.02)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_capsule_against_an_endless_cylinder():
     """In the plane across the axis: the origin against a segment."""
     _, _, _, at, turn = places(LANES, low=14, ends=(10.0, 150.0))
@@ -321,6 +323,8 @@ def beside(surface: trimesh.Trimesh, count, radius, low, high, seed=0):
     return points + (radius + height)[:, None] * surface.face_normals[face]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_sphere_against_a_bent_and_flattened_surface():
     """Closest points on triangles, with rings, a flat back and a bend."""
     surface, p = bent(0.6, 0.15)

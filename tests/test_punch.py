@@ -63,6 +63,8 @@ def test_rotation_is_half_of_what_the_place_changes(s):
     np.testing.assert_allclose(2 * theta, slope, rtol=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_punch_too_narrow_for_its_digits_says_nothing(dtype):
     """Without shear, where two points a width apart differ by the square of it."""
@@ -98,6 +100,8 @@ def test_narrow_punch_is_a_point_that_does_not_tilt():
         assert punch_deflection(beam(), jnp.asarray(end), HALF).w_C == 0
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_derivatives():
     def values(s, EI, k, GA):
         s, EI, k, GA = map(jnp.asarray, (s, EI, k, GA))

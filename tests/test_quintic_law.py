@@ -190,6 +190,8 @@ def test_a_vector_along_an_axis_is_the_scalar(dtype):
     assert far.status == PressStatus.PAST_FOLD
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_friction_balances():
     """300 steps on coupled skeletons: in equilibrium and on the cone, never gaining energy."""
     rng, n = np.random.default_rng(4), 300
@@ -274,6 +276,8 @@ def test_a_fit_has_it_back():
     np.testing.assert_allclose(result.value[0], list(TRUTH.values()), rtol=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_structure_knows_it():
     """k_5 is told by the shape of a curve; one position still leaves the skeleton open."""
     for positions, nullity in (([20.0, 45.0, 62.0], 0), ([45.0], 1)):

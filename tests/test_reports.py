@@ -294,6 +294,8 @@ def autoregressive(shape, r, seed):
     return noise
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_widened_intervals_cover(given):
     """1,000 linear lanes of two curves of 100 samples, AR(1) noise of 0.8: 90 to 98 %, not < 75."""
@@ -326,6 +328,8 @@ def test_independent_residuals_widen_nothing():
     assert share_independent(np.array([-0.5, 0.0, 0.5, 1.0])).tolist() == [1, 1, 1 / 3, 0]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_fewer_independent_samples_than_unknowns_leave_no_limit():
     """A straight line through a bent curve: residuals of one sign, one after the other."""
     depth = np.linspace(0, 1, 40)

@@ -219,6 +219,8 @@ def test_press(dtype):
     np.testing.assert_allclose(one, got.force[::500], rtol=rtol)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_options():
     with pytest.raises(ValueError, match="coupling='series'"):
         Options(skeleton="softening", coupling="total")

@@ -112,6 +112,8 @@ def test_against_fem(k, with_load, dtype):
     assert rotation < 10 * TOLERANCE[dtype]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("k", [1e-9, 0.1, 10.0, 1e9])
 def test_equal_rings_are_two_plane_beams(k):
     """Diagonal and equal ring compliances: each plane is `beam.deflect`."""

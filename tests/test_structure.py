@@ -57,6 +57,8 @@ CASES = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize(("positions", "changes", "left_open"), CASES, ids=["law", "line", "zero"])
 def test_unknowns_left_open(positions, changes, left_open):
     study = make_study(positions, changes=changes)

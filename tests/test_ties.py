@@ -194,6 +194,8 @@ def test_off_a_tie_the_normal_is_the_only_one(dtype, scale):
         assert got["status"][i] == ContactStatus.OK, name
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("name", ["ties", "single"])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_every_unit_gives_the_same(name, dtype):

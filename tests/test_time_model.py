@@ -160,6 +160,8 @@ def test_time_is_known_to_a_per_cent():
     assert OPERATIONS.saved(0.996, 1.0) == pytest.approx(0.004)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_choices_by_operations_and_by_time_keep_the_tolerance():
     """On a machine whose float32 is no faster and whose kernels cost nothing, float64 stays."""
     trial = Trial(full())

@@ -163,6 +163,8 @@ def test_a_bad_material_is_one_in_simulate_and_in_sweep():
     assert out.status.tolist() == [off, PressStatus.NO_CONTACT, off]
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_behind_the_rings_or_without_a_number_a_row_is_not_off_the_plan():
     """Of two reasons the same one is named as in `simulate`."""
     path = ball([75, 1, 0], [75, -2, 0], 2)

@@ -413,6 +413,8 @@ def test_another_material_and_tool_compile_nothing(held):
     same_rows(smaller, rows(Session(scene, other), way), dtype)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_force_of_another_material_in_closed_form():
     """Springs in series, without seat and program in common: a press on a beam without rings."""
     bare = dataclasses.replace(SPRINGS, k_M=jnp.asarray(0.0), k_3=jnp.asarray(0.0))

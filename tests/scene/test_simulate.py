@@ -148,6 +148,8 @@ def test_a_press_elsewhere_is_refused_by_status():
         assert np.isnan(out.force[1:, 1]).all()
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_another_geometry_moves_the_surface_with_its_rings():
     """As if made anew; the vertices were bound to the old rings, up to 0.6 mm off."""
     shifted = dataclasses.replace(TUBE, ring_positions=TUBE.ring_positions + 3.0)

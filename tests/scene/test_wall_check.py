@@ -217,6 +217,8 @@ def test_patches_beside_the_wall_are_refused():
         with_mesh(dataclasses.replace(scene(), tube=good), thin)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_touches_beyond_the_rings_are_unsure_where_the_gap_is_off():
     """The same waist beyond the last ring: no reason to refuse the mesh, but none for OK."""
     rings = dataclasses.replace(TUBE, ring_positions=TUBE.ring_positions[:10])

@@ -134,6 +134,8 @@ def test_mirror_images():
     np.testing.assert_allclose(left.joints, far.joints[:, ::-1] * [-1, 1, 1], atol=1e-10)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_continuous_where_the_contact_crosses_a_ring_or_mid_span():
     places = [29.999, 30.0, 30.001, 34.999, 35.0, 35.001]
     changes = ({}, {"footprint": 1.0})

@@ -128,6 +128,8 @@ def carried(q, phi=PHI, distance=DISTANCE, dtype="float64"):
     return np.asarray(move(modes, points, jnp.zeros((), dtype), *shape))
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @EITHER
 @pytest.mark.parametrize("midline", [True, False])
 def test_sections_against_brute_force(midline, dtype):
