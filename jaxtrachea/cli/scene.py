@@ -227,21 +227,24 @@ def _for_sweep(path: Path, spec, staged):
             f"{path}: sweep.phi_max: {np.degrees(widest):.4g} deg; expected 0 to "
             f"{np.degrees(alpha):.4g} deg, the ends of the rings"
         )
-    s = (np.arange(want.s_count) + 0.5) * float(geometry.length) / want.s_count
+    length, share = float(geometry.length), (np.arange(want.s_count) + 0.5) / want.s_count
     phi = np.linspace(-widest, widest, want.phi_count) if want.phi_count > 1 else np.zeros(1)
     try:
         # The widest angle of the grid decides, wherever it is.
-        return stage_sweep(spec, staged, np.full_like(phi, s[0]), phi), s, phi
+        scene = stage_sweep(spec, staged, np.full_like(phi, length * share[0]), phi)
     except SpecError as error:
         raise Stop(str(SpecError.like(error, place=str(path)))) from None
+    low, high = scene.plan.options.places(length)
+    return scene, low + share * (high - low), phi
 
 
 def _levels_of(scene) -> str:
-    """Which rings and which skeleton a sweep presses on, and why."""
+    """Which rings and which skeleton a sweep presses on, with which width, and why."""
     effects = {e.name: e for e in scene.plan.effects}
+    width = ("width",) if scene.plan.options.half_width > 0 else ()
     return "\n".join(
         f"sweep: {name} {effects[name].level!r}, {effects[name].doubt or effects[name].reason}"
-        for name in ("rings", "skeleton")
+        for name in ("rings", "skeleton", *width)
     )
 
 

@@ -24,7 +24,7 @@ from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.imported import Landmarks, read_mesh
 from jaxtrachea.trachea.material import Material
-from jaxtrachea.trachea.mesh import MeshError
+from jaxtrachea.trachea.mesh import Mesh, MeshError
 from jaxtrachea.trachea.section import geometry_of
 from jaxtrachea.trachea.tube import make_tube
 from jaxtrachea.units import UnitError
@@ -71,6 +71,8 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     counted = counted or _uncounted
     geometry, mesh, notes = _trachea(spec.trachea, folder, files, counted)
     material = material_of(spec, geometry)
+    if mesh is None:
+        mesh = _tube(spec.trachea, geometry, material)
     tool = None
     if spec.tool is not None:
         tool = Tool(_shape(spec.tool, folder, files), spec.tool.friction)
@@ -80,7 +82,6 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
         radius = float(geometry.radius)  # that of the outer wall
     if isinstance(material, SectionMaterial):
         radius = float(geometry.radius) + float(material.offset)
-        mesh = _round_tube(spec.trachea, geometry, float(material.offset))
     try:
         scene = make_scene(
             geometry, material, path, tool=tool, mesh=mesh, radius=radius,
@@ -186,23 +187,19 @@ def _trachea(section: SceneTracheaSection, folder: Path, files: list[Path], coun
         given["rings"] = section.rings
     if given.get("half_angle", 0) is None:
         del given["half_angle"]
-    geometry = geometry_of(TracheaSection.model_construct(**given))
-    try:
-        mesh = make_tube(geometry, around=section.around, along=section.along, wall=section.wall)
-    except ValueError as error:
-        raise SpecError(f"trachea: {error}") from None
-    return geometry, mesh, ()
+    return geometry_of(TracheaSection.model_construct(**given)), None, ()
 
 
-def _round_tube(section: SceneTracheaSection, geometry: Geometry, offset: float):
-    """The outside of deforming cross-sections: round, so far outside of their mid-line."""
+def _tube(section: SceneTracheaSection, geometry: Geometry, material: AnyMaterial) -> Mesh:
+    """The generated surface; of deforming cross-sections round, at the outside of their wall."""
+    key, size = "trachea", {"wall": section.wall}
+    if isinstance(material, SectionMaterial):
+        size = {"wall": 2 * float(material.offset), "relief": 0.0, "flatten": 0.0}
+        key = f"trachea: a wall of deforming cross-sections of {size['wall']:g} mm (twice offset)"
     try:
-        return make_tube(
-            geometry, around=section.around, along=section.along, wall=2 * offset, relief=0.0,
-            flatten=0.0,
-        )  # fmt: skip
+        return make_tube(geometry, around=section.around, along=section.along, lids=True, **size)
     except ValueError as error:
-        raise SpecError(f"sections.offset: is {offset:g} mm, half a wall: {error}") from None
+        raise SpecError(f"{key}: {error}") from None
 
 
 def _imported(section: SceneTracheaSection, folder: Path, files: list[Path], progress):

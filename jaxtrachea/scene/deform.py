@@ -14,6 +14,7 @@ from jaxtrachea.scene import trail
 from jaxtrachea.scene.approach import Approach, backed_out
 from jaxtrachea.scene.curve import distance_from, lay
 from jaxtrachea.scene.stage import Poses, Presses, Scene
+from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import place
@@ -83,7 +84,8 @@ def deform_sections(scene: Scene, presses: Presses, moved: Any, path: Any, made:
 
     The dent is what the wall at the contact lacks of the tool's way: the local indentation, and
     what a tool that rests on a ring moves beside it. Rows are computed one after the other: the
-    sections of all vertices would be a lot of memory for long paths.
+    sections of all vertices would be a lot of memory for long paths. Those without a solution are
+    computed at rest and hidden then: by 0 times NaN they would reach the derivatives of the others.
     """
     plan, mesh, points = scene.plan, scene.mesh, scene.points
     if mesh is None or points is None:
@@ -106,9 +108,16 @@ def deform_sections(scene: Scene, presses: Presses, moved: Any, path: Any, made:
         dent = _dent(scene, s_c, phi_c, radius, tool, way - u[-1])
         return place(mesh, local.add_correction(u[:-1], dent, straight, runs, s_c))
 
-    way = moved.depth + moved.skeleton
+    solved = (moved.status == PressStatus.OK) | (moved.status == PressStatus.NO_CONTACT)
+
+    def rows(v, otherwise):
+        return jnp.where(solved.reshape(-1, *[1] * (v.ndim - 1)), v, otherwise)
+
+    seen = moved.along, moved.depth + moved.skeleton
+    along, way = jax.tree.map(lambda v: rows(v, 0), seen)
     C = jax.vmap(contact)(phi)
-    return jax.lax.map(one, (moved.along, way, presses.s, phi, C, radius, tool))
+    vertices = jax.lax.map(one, (along, way, presses.s, phi, C, radius, tool))
+    return rows(vertices, jnp.nan)
 
 
 def _dent_parts(scene: Scene, path: Any, made: Approach | None):

@@ -82,9 +82,10 @@ def samples(full: Full) -> Poses | Presses:
     """The path, and the same beside it (`BESIDE`); a leading axis."""
     path, geometry = full.path, full.scene.geometry
     spacing = min(full.facts.spacing, float(geometry.length))
+    low, high = full.scene.plan.options.places(float(geometry.length))
     if isinstance(path, Presses):
         moved = [
-            Presses(jnp.clip(path.s + a * spacing, 0, geometry.length), path.phi,
+            Presses(jnp.clip(path.s + a * spacing, low, high), path.phi,
                     path.displacement * (1 + d)) for a, d in BESIDE
         ]  # fmt: skip
     else:

@@ -41,7 +41,8 @@ from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.tube import make_tube
 from jaxtrachea.tradeoff.ladders import ladders
-from jaxtrachea.tradeoff.levels import full_scene, program
+from jaxtrachea.tradeoff.levels import Full, full_scene, program
+from jaxtrachea.tradeoff.trial import samples
 
 pytestmark = pytest.mark.compiling
 
@@ -265,6 +266,39 @@ def test_a_sweep_of_the_midline():
         true = by_elements(s[i])
         np.testing.assert_allclose(out.compliance[i], true.w_C, rtol=1e-8)
     assert np.isnan(np.asarray(out.force)[2:5]).all()
+
+
+def test_paths_beside_a_path_lie_on_the_tube():
+    """Those that a choice by tolerance tries too: all of the tool's width does."""
+    length = float(TUBE.length)
+    for s_c, furthest in ((HALF, np.min), (length - HALF, np.max)):
+        path = down([2.0], [s_c])
+        scene = make_scene(TUBE, STIFF, path, effects=PUNCH)
+        known = SceneFacts(spacing=10.0)
+        full = Full(scene, STIFF, path, {}, known, PUNCH, PUNCH, None, np.array([s_c]))
+        beside = np.ravel(samples(full).s)
+        assert furthest(beside) == s_c
+        assert np.ptp(beside) == pytest.approx(2.5)
+
+
+@pytest.mark.slow
+def test_a_sweep_by_command_lies_on_the_tube(tmp_path, monkeypatch, capsys):
+    """Its points are spread over where all of the tool does, and it says the width."""
+    monkeypatch.chdir(tmp_path)
+    Path("scene.toml").write_text(
+        '[material]\nEI_L = "900 N mm^2"\nk_M = "0.2 N/mm"\nk_1 = "20 N/mm"\nk_3 = "0 N/mm^3"\n'
+        '[model]\nhalf_width = "2.36 mm"\n[path]\ns = "75 mm"\nsteps = 1\n'
+        'displacement = ["0 mm", "-0.1 mm", "0 mm"]\n[output]\nsurface = false\npictures = false\n'
+        '[sweep]\ndepth = "0.1 mm"\nphi_count = 1\n'
+    )
+    code, out, _ = run_cli(monkeypatch, capsys, "sweep", "scene.toml", "--out", "maps")
+    assert code == 0
+    assert "0 without a solution" in out
+    assert "sweep: width 'punch', half_width is 2.36 mm" in " ".join(out.split())
+    with h5py.File("maps/sweep.h5") as file:
+        s = np.unique(file["s"][:])
+    step = (160 - 2 * 2.36) / len(s)
+    np.testing.assert_allclose(s, 2.36 + step * (0.5 + np.arange(len(s))))
 
 
 @pytest.mark.slow
