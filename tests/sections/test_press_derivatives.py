@@ -73,6 +73,21 @@ def test_along_one_direction():
 
 
 @pytest.mark.slow
+def test_many_directions_at_once():
+    """As one after the other; a compiler has failed on them before (`mechanics.skeleton`)."""
+    chosen = UNIT[:: FLAT.size // 6]
+
+    def along(v):
+        return jax.jvp(force_alone, (FLAT,), (v,))[1]
+
+    together = jax.jit(jax.vmap(along))(chosen)
+    alone = jax.jit(along)
+    each = np.stack([alone(v) for v in chosen])
+    assert np.abs(each).max() > 0.01
+    np.testing.assert_allclose(together, each, atol=1e-10 * np.abs(each).max())
+
+
+@pytest.mark.slow
 def test_forward_is_central_differences():
     """Each parameter by itself."""
     value, differences = central_differences()
