@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,13 +15,15 @@ from jaxtrachea.scene.build import stage
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import SceneSpec
+from jaxtrachea.tradeoff import calibrate as counted
 from jaxtrachea.tradeoff import time_model as timing
+from jaxtrachea.tradeoff import trial as trying
 from jaxtrachea.tradeoff.choice import choose
 from jaxtrachea.tradeoff.errors import Errors
 from jaxtrachea.tradeoff.ladders import ladders
 from jaxtrachea.tradeoff.levels import full_scene, program
 from jaxtrachea.tradeoff.load import Load
-from jaxtrachea.tradeoff.price import OPERATIONS, Price, price
+from jaxtrachea.tradeoff.price import OPERATIONS, Price, price, started
 from jaxtrachea.tradeoff.time_model import TimeModel, Uncalibrated, Work, fitted, keep, kept
 from jaxtrachea.tradeoff.trial import Trial
 
@@ -117,9 +120,9 @@ def test_a_plan_by_time_takes_what_is_truly_cheaper(kernel, operation, expected,
     trial.price = Price("path", TimeModel(0.0, kernel, operation, operation))
     found = {ladder.name: ladder for ladder in ladders(whole)[0]}
     few = found["local"].levels(whole, "uniform"), found["shear"].levels(whole, "off")
-    kernels = {whole.levels: 1000, few[0]: 900, few[1]: 100}
+    kernels = dict(zip((whole.levels, *few), (1000, 900, 100), strict=True))
     operations = {whole.levels: 10_000, few[0]: 100, few[1]: 9_000}
-    trial.kernels = kernels
+    trial.kernels = {("path", v): n for v, n in kernels.items()}
     by_plan = {v.plan.options: operations[v] for v in kernels}
     monkeypatch.setattr(
         "jaxtrachea.tradeoff.price.count_operations",
@@ -213,6 +216,65 @@ def test_no_model_falls_back_to_operations(tmp_path, monkeypatch, capsys):
     assert code == 0
     assert "cost: operations in place of time: the device is a gpu" in out
     assert "of its cost" in out
+
+
+#: With a quintic law, whose Newton solve stops where it has converged.
+QUINTIC = TOML.replace("[model]", 'k_5 = "0.001 N/mm^5"\n[model]')
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+@pytest.mark.parametrize("cost", ["path", "step"])
+def test_no_time_is_predicted_where_rounds_are_not_fixed(cost, tmp_path, monkeypatch, capsys):
+    from jaxtrachea.cli import timing as command
+
+    monkeypatch.setattr(command, "programs_folder", lambda: tmp_path)
+    keep(MODEL, tmp_path)
+    path = tmp_path / "scene.toml"
+    path.write_text(QUINTIC + f'[plan]\ntolerance = "10 %"\ncost = "{cost}"\n')
+    code, out, _ = run(monkeypatch, capsys, "plan", path, "--time")
+    out, why = " ".join(out.split()), "the program has loops without a fixed number of rounds"
+    assert code == 0
+    assert f"no time is predicted: {why}" in out
+    assert f"cost: operations in place of time: {why}" in out
+    assert "of its cost" in out
+
+
+def test_a_pose_alone_starts_the_kernels_of_its_own_program(monkeypatch):
+    """By rows: a path of two starts ten, a pose alone three; a press is no pose of a `Session`."""
+    whole = full()
+    arguments = program(whole, whole.levels)
+    monkeypatch.setattr(counted, "started", lambda made: {2: 10, 1: 3}[made])
+    rows = SimpleNamespace(lower=lambda *a: SimpleNamespace(compile=lambda: len(a[2].s)))
+    monkeypatch.setattr(counted.jax, "jit", lambda f, **options: rows)
+    assert [v and v.kernels for v in counted.predicted(MODEL, arguments)] == [10, None]
+    monkeypatch.setattr(counted, "check_scene", lambda scene, material: None)
+    assert [v and v.kernels for v in counted.predicted(MODEL, arguments)] == [10, 3]
+
+
+@pytest.mark.parametrize(("by", "kernels"), [("path", 10), ("step", 3)])
+def test_a_trial_counts_what_one_call_starts(by, kernels, monkeypatch):
+    """As above; a trial made for operations counts nothing until a time is asked for."""
+    count = {2: 10, 1: 3}
+    monkeypatch.setattr(trying, "started", lambda made: count[made])
+    monkeypatch.setattr(trying, "_compiled", lambda *arguments: len(arguments[2].s))
+    whole = full()
+    trial = object.__new__(Trial)
+    trial.full, trial.kernels, trial.costs = whole, {}, {}
+    trial.known = {whole.levels: Errors(0.0, None, None, None, None, None)}
+    trial.price = OPERATIONS
+    operations = trial.cost(whole.levels)
+    assert not trial.kernels
+    trial.price = Price(by, TimeModel(0.0, 1.0, 1e-12, 1e-12))
+    assert trial.cost(whole.levels) == pytest.approx(kernels, abs=2e-12 * operations)
+    assert trial.kernels == {(by, whole.levels): kernels}
+
+
+@pytest.mark.parametrize("text", [None, "odd", "ENTRY %m (v: f64[]) -> f64[] {\n"
+                                  "  ROOT %o = f64[] call(%v), to_apply=%gone\n}"])  # fmt: skip
+def test_a_program_whose_text_cannot_be_read_has_no_time(text):
+    with pytest.raises(Uncalibrated, match="ENTRY|gone"):
+        started(SimpleNamespace(as_text=lambda: text))
 
 
 def test_the_cache_shows_and_clears_the_model(tmp_path, monkeypatch, capsys):

@@ -160,10 +160,11 @@ def _chosen(path: Path, spec, staged):
     """The scene with the plan within its tolerance, and that choice; as it is without tolerance."""
     if spec.plan is None:
         return staged, None
-    from jaxtrachea.cli.timing import price_of
+    from jaxtrachea.cli.timing import in_place, price_of
     from jaxtrachea.scene.declare import PlanError
     from jaxtrachea.tradeoff.choice import choose
     from jaxtrachea.tradeoff.levels import full_scene
+    from jaxtrachea.tradeoff.time_model import Uncalibrated
 
     try:
         full = full_scene(spec, staged)
@@ -179,7 +180,11 @@ def _chosen(path: Path, spec, staged):
         wish = spec.plan
         price, why = price_of(wish.cost, report)
         try:
-            choice = choose(full, wish.tolerance, report, precision=wish.precision, price=price)
+            try:
+                choice = choose(full, wish.tolerance, report, precision=wish.precision, price=price)
+            except Uncalibrated as error:
+                why = in_place(error)
+                choice = choose(full, wish.tolerance, report, precision=wish.precision)
         except PlanError as error:
             raise Stop(f"{path}: {error}") from None
     chosen = {name: getattr(choice, name) for name in ("scene", "material", "path")}
@@ -205,11 +210,16 @@ def _predicted(staged) -> str:
         except Uncalibrated as error:
             return f"no time is predicted: {error}"
         report("compiling")
-        whole, pose, kernels = predicted(model, (staged.scene, staged.material, staged.path))
-    return (
-        f"time predicted on this machine: {1e3 * whole:.2g} ms for the path in one call, "
-        f"{1e3 * pose:.2g} ms for one pose a call ({kernels:,} kernels)\n({model.sentence})"
-    )
+        try:
+            found = predicted(model, (staged.scene, staged.material, staged.path))
+        except Uncalibrated as error:
+            return f"no time is predicted: {error}"
+    words = ("the path in one call", "one pose a call")
+    each = ", ".join(
+        f"{1e3 * v.seconds:.2g} ms for {what} ({v.kernels:,} kernels)"
+        for v, what in zip(found, words, strict=True) if v is not None
+    )  # fmt: skip
+    return f"time predicted on this machine: {each}\n({model.sentence})"
 
 
 def _for_sweep(path: Path, spec, staged):

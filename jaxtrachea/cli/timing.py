@@ -43,4 +43,9 @@ def price_of(wish: Literal["path", "step", "operations"], report: Callable[[str]
     try:
         return price(wish, time_model(report)), ""
     except Uncalibrated as error:
-        return OPERATIONS, f"cost: operations in place of time: {error}"
+        return OPERATIONS, in_place(error)
+
+
+def in_place(error: Exception) -> str:
+    """Why operations are the cost where a time was asked for."""
+    return f"cost: operations in place of time: {error}"

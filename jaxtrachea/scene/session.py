@@ -100,6 +100,27 @@ class Changeable(NamedTuple):
     footprint: Float[Array, ""]
 
 
+def check_scene(scene: Scene, material: AnyMaterial) -> None:
+    """Refuse what a `Session` cannot take.
+
+    Raises:
+        ValueError: see `Session`.
+    """
+    if not scene.plan.contact or scene.tool is None:
+        raise ValueError("the plan has no contact; make the scene with a path of Poses")
+    if isinstance(material, SectionMaterial) or scene.plan.options.deforms_sections:
+        raise ValueError(
+            "a session has no skeleton 'sections'; use simulate, or make the scene with the "
+            "Material of a line of joints"
+        )
+    if scene.plan.friction:
+        raise ValueError(
+            "the plan has friction, which depends on the whole path; use simulate, or make the "
+            "scene with EffectOptions(friction='off')"
+        )
+    check_material(scene.geometry, material)
+
+
 class Session:
     """A scene and its material, compiled for one pose at a time.
 
@@ -136,19 +157,7 @@ class Session:
         """
         if keep < 1:
             raise ValueError(f"keep is {keep}; expected at least 1")
-        if not scene.plan.contact or scene.tool is None:
-            raise ValueError("the plan has no contact; make the scene with a path of Poses")
-        if isinstance(material, SectionMaterial) or scene.plan.options.deforms_sections:
-            raise ValueError(
-                "a session has no skeleton 'sections'; use simulate, or make the scene with the "
-                "Material of a line of joints"
-            )
-        if scene.plan.friction:
-            raise ValueError(
-                "the plan has friction, which depends on the whole path; use simulate, or make the "
-                "scene with EffectOptions(friction='off')"
-            )
-        check_material(scene.geometry, material)
+        check_scene(scene, material)
         self.scene, self.material = scene, material
         self.dtype = np.dtype(scene.footprint.dtype)
         given = Changeable(material, scene.tool, scene.footprint)

@@ -9,11 +9,11 @@ import jax
 import numpy as np
 
 from jaxtrachea.scene.build import stage
+from jaxtrachea.scene.session import check_scene
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import SceneSpec
-from jaxtrachea.tradeoff.kernels import count_kernels
 from jaxtrachea.tradeoff.levels import BUILT_IN, cast
-from jaxtrachea.tradeoff.price import single, work_of
+from jaxtrachea.tradeoff.price import single, started, work_of
 from jaxtrachea.tradeoff.time_model import TimeModel, Work, device, fitted
 
 #: Turns in which the programs are called one after the other, and seconds of each in a turn.
@@ -53,7 +53,7 @@ def calibrate(report: Callable[[str], None] = lambda text: None) -> TimeModel:
         report: called with what is done next; may raise to stop.
 
     Raises:
-        Uncalibrated: the device is no CPU, or its times make no sense.
+        Uncalibrated: the device is no CPU, its times make no sense, or kernels are not known.
     """
     device()
     programs = []
@@ -65,19 +65,36 @@ def calibrate(report: Callable[[str], None] = lambda text: None) -> TimeModel:
     return fitted([p.work for p in programs], quickest([p.call for p in programs]))
 
 
-def predicted(model: TimeModel, arguments: tuple) -> tuple[float, float, int]:
-    """Seconds of the whole path in one call and of its last pose alone, and the kernels of a call.
+class Predicted(NamedTuple):
+    """One call of a program: s, and the kernels that it starts."""
 
-    Compiles the program, which `simulate` then finds.
+    seconds: float
+    kernels: int
+
+
+def predicted(model: TimeModel, arguments: tuple) -> tuple[Predicted, Predicted | None]:
+    """The whole path in one call, and its last pose alone: None where no `Session` is possible.
+
+    Compiles both programs; `simulate` finds that of the path.
 
     Args:
         model: of this machine.
         arguments: scene, material and path.
+
+    Raises:
+        Uncalibrated: the kernels of a program are not known.
     """
-    kernels = count_kernels(jax.jit(simulate).lower(*arguments).compile().as_text())[0]
-    both = (work_of(v, kernels) for v in (arguments, single(arguments)))
-    whole, pose = (model.seconds(work) for work in both)
-    return whole, pose, kernels
+    whole = _call(model, arguments)
+    try:
+        check_scene(*arguments[:2])
+    except ValueError:
+        return whole, None
+    return whole, _call(model, single(arguments))
+
+
+def _call(model: TimeModel, arguments: tuple) -> Predicted:
+    kernels = started(jax.jit(simulate).lower(*arguments).compile())
+    return Predicted(model.seconds(work_of(arguments, kernels)), kernels)
 
 
 def quickest(calls: list[Callable[[], object]]) -> list[float]:
@@ -100,4 +117,4 @@ def _compiled(name: str, dtype: str) -> Timed:
     scene, *given = arguments
     # As in a `Session`: the scene is a constant of the program.
     made = jax.jit(lambda material, path: simulate(scene, material, path)).lower(*given).compile()
-    return Timed(work_of(arguments, count_kernels(made.as_text())[0]), lambda: made(*given))
+    return Timed(work_of(arguments, started(made)), lambda: made(*given))

@@ -101,9 +101,11 @@ def choose(
 
     Raises:
         PlanError: the path, or a sample path beside it, has no row with a force.
+        Uncalibrated: the price is a time, and a program has loops without a fixed number of
+            rounds, or what its compiler made of it cannot be read.
     """
     check_word("precision", precision, Literal["auto", "float64"])
-    trial = full if isinstance(full, Trial) else Trial(full, report)
+    trial = full if isinstance(full, Trial) else Trial(full, report, price)
     trial.price, full = price, trial.full
     every = _ladders(full, precision)
     refused: list[Rung] = []

@@ -24,13 +24,14 @@ Bodies = dict[str, list[tuple[str, str]]]
 def count_kernels(text: str | None) -> tuple[int, int]:
     """Kernels that one call of a compiled program starts, and the loops in it.
 
-    A loop without a known number of rounds counts as one round; of branches the longest counts.
+    Of branches the longest counts.
 
     Args:
         text: `as_text()` of the compiled program.
 
     Raises:
-        ValueError: it is no text of a compiled program.
+        ValueError: a loop has no fixed number of rounds, so that none is known before it runs (a
+            Newton solve that stops where it has converged), or it is no text of a compiled program.
     """
     return _count(*computations(text or ""))
 
@@ -77,4 +78,6 @@ def _inner(opcode: str, line: str) -> list[str]:
 
 def _rounds(line: str) -> int:
     known = re.search(r'known_trip_count":\{"n":"(\d+)"', line)
-    return int(known[1]) if known else 1
+    if known is None:
+        raise ValueError("the program has loops without a fixed number of rounds")
+    return int(known[1])

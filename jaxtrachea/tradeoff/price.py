@@ -1,6 +1,6 @@
 """What a program costs, for the choice by tolerance: seconds on this machine, or operations."""
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 
@@ -9,7 +9,8 @@ from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.stage import Poses, Presses, Scene
-from jaxtrachea.tradeoff.time_model import TimeModel, Work
+from jaxtrachea.tradeoff.kernels import count_kernels
+from jaxtrachea.tradeoff.time_model import TimeModel, Uncalibrated, Work
 
 #: What is made least: time of the whole path in one call (`simulate`), of a pose a call
 #: (`Session`), or operations, those in float32 counted half: the same on every machine.
@@ -34,14 +35,18 @@ class Price(NamedTuple):
         """Whether it is a time, for which the kernels of a program must be known."""
         return self.model is not None
 
+    def call(self, arguments: tuple[Scene, AnyMaterial, Poses | Presses]) -> tuple:
+        """Scene, material and what of the path one call takes: all of it, or its last row."""
+        return single(arguments) if self.by == "step" else arguments
+
     def of(self, arguments: tuple[Scene, AnyMaterial, Poses | Presses], kernels: int) -> float:
         """Cost of `simulate` for scene, material and path: s, or operations.
 
         Args:
             arguments: scene, material and path.
-            kernels: that the compiled program of the path starts (a pose alone: as many).
+            kernels: that the compiled program of `call` starts; no matter for operations.
         """
-        work = work_of(single(arguments) if self.by == "step" else arguments, kernels)
+        work = work_of(self.call(arguments), kernels)
         return work.operations if self.model is None else self.model.seconds(work)
 
     def saved(self, cost: float, full: float) -> float:
@@ -77,6 +82,23 @@ def work_of(arguments: tuple, kernels: int) -> Work:
     count = count_operations(simulate, *arguments)
     half = str(jax.tree.leaves(arguments[1])[0].dtype) == "float32"
     return Work(kernels, count * half, count * (not half))
+
+
+def started(program: Any) -> int:
+    """Kernels that a call of a compiled program starts.
+
+    Args:
+        program: as `jax.jit(...).lower(...).compile()` gives it.
+
+    Raises:
+        Uncalibrated: no number is known, see `kernels.count_kernels`; the message says why.
+    """
+    try:
+        return count_kernels(program.as_text())[0]
+    except ValueError as error:
+        raise Uncalibrated(str(error)) from None
+    except KeyError as error:
+        raise Uncalibrated(f"the program's text names {error}, which is not in it") from None
 
 
 def single(arguments: tuple) -> tuple:

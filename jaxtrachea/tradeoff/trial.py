@@ -1,6 +1,7 @@
 """Programs of a scene run on its path and on two sample paths beside it, each once."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +12,8 @@ from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.simulation import Simulation, simulate
 from jaxtrachea.scene.stage import Poses, Presses
 from jaxtrachea.tradeoff.errors import Errors, compare
-from jaxtrachea.tradeoff.kernels import count_kernels
 from jaxtrachea.tradeoff.levels import Full, Levels, cast, program, quick_options
-from jaxtrachea.tradeoff.price import OPERATIONS, Price
+from jaxtrachea.tradeoff.price import OPERATIONS, By, Price, started
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
 BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
@@ -24,15 +24,25 @@ class Trial:
 
     Raises:
         PlanError: the path, or a sample path beside it, has no row with a force.
+        Uncalibrated: `price` is a time, and the kernels of the full program are not known.
     """
 
-    def __init__(self, full: Full, report: Callable[[str], None] = lambda text: None):
-        """Run the full program; `report` is called with what is tried next, and may raise."""
-        self.full, self.report, self.price = full, report, OPERATIONS
+    def __init__(
+        self, full: Full, report: Callable[[str], None] = lambda text: None,
+        price: Price = OPERATIONS,
+    ):  # fmt: skip
+        """Run the full program.
+
+        Args:
+            full: the scene at its finest.
+            report: called with what is tried next; may raise to stop.
+            price: kernels are counted as programs are compiled where this asks for them.
+        """
+        self.full, self.report, self.price = full, report, price
         self.paths = samples(full)
         self.known: dict[Levels, Errors] = {}
         self.costs: dict[tuple[Price, Levels], float] = {}
-        self.kernels: dict[Levels, int] = {}
+        self.kernels: dict[tuple[By, Levels], int] = {}
         report("full program")
         self.reference = self._run(full.levels)
         pressed = [bool(np.nan_to_num(v).any()) for v in np.asarray(self.reference.force)]
@@ -53,14 +63,25 @@ class Trial:
         return self.known[levels]
 
     def cost(self, levels: Levels) -> float:
-        """What these levels cost."""
+        """What these levels cost.
+
+        Raises:
+            Uncalibrated: it is a time, and the kernels of the program are not known.
+        """
         key = self.price, levels
         if key not in self.costs:
-            if self.price.timed and levels not in self.kernels:
-                self.errors(levels)  # compiles it, and keeps its kernels
-            kernels = self.kernels.get(levels, 0)
+            kernels = self._kernels(levels) if self.price.timed else 0
             self.costs[key] = self.price.of(program(self.full, levels), kernels)
         return self.costs[key]
+
+    def _kernels(self, levels: Levels) -> int:
+        """Of a call: of the path, as it is compiled for its errors, or of a pose alone."""
+        key = self.price.by, levels
+        if key not in self.kernels and self.price.by == "path":
+            self.errors(levels)
+        if key not in self.kernels:  # a pose, or compiled when no time was asked for
+            self.kernels[key] = started(_compiled(*self.price.call(program(self.full, levels))))
+        return self.kernels[key]
 
     def saved(self, levels: Levels) -> float:
         """Share of the full program's cost that they save."""
@@ -71,11 +92,16 @@ class Trial:
         scene, material, _ = program(self.full, levels)
         paths = cast(self.paths, levels.dtype)
         each = [jax.tree.map(lambda v, i=i: v[i], paths) for i in range(len(BESIDE))]
-        solve = jax.jit(simulate, compiler_options=quick_options())
-        made = solve.lower(scene, material, each[0]).compile()
-        self.kernels[levels] = count_kernels(made.as_text())[0]
+        made = _compiled(scene, material, each[0])
+        if self.price.timed and self.price.by == "path":
+            self.kernels["path", levels] = started(made)
         outs = [made(scene, material, path) for path in each]
         return jax.tree.map(lambda *v: np.stack(v), *outs)
+
+
+def _compiled(*arguments: Any):
+    """The program of scene, material and path."""
+    return jax.jit(simulate, compiler_options=quick_options()).lower(*arguments).compile()
 
 
 def samples(full: Full) -> Poses | Presses:

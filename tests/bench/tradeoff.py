@@ -60,23 +60,34 @@ def say(text: str) -> None:
     print(f"{time.perf_counter() - START:6.0f} s  {text}", flush=True)
 
 
+def cheapest(name: str, full, model) -> list:
+    """The choices by time; by operations where no time is predicted."""
+    from jaxtrachea.tradeoff.choice import choose
+    from jaxtrachea.tradeoff.price import OPERATIONS, price
+    from jaxtrachea.tradeoff.time_model import Uncalibrated
+    from jaxtrachea.tradeoff.trial import Trial
+
+    def all_of(prices):
+        trial = Trial(full, lambda text: say(f"{name}: choice: {text}"), prices[0])
+        return [choose(trial, v, price=one) for one in prices for v in TOLERANCES]
+
+    try:
+        return all_of([price(by, model) for by in LEAST])
+    except Uncalibrated as error:
+        say(f"{name}: no time is predicted: {error}")
+        return all_of([OPERATIONS])
+
+
 def choices(name: str, full, model, settings) -> tuple[list[dict], list]:
     """Rows of the table of choices of one scene, and the choices."""
     import jax
 
-    from jaxtrachea.tradeoff.choice import choose
     from jaxtrachea.tradeoff.load import Load
     from jaxtrachea.tradeoff.measure import choice_row, environment
-    from jaxtrachea.tradeoff.price import price
     from jaxtrachea.tradeoff.timing import compiled, timed
-    from jaxtrachea.tradeoff.trial import Trial
 
     settings = settings._replace(lanes=0, slopes=False)
-    trial = Trial(full, lambda text: say(f"{name}: choice: {text}"))
-    found = [
-        choose(trial, tolerance, price=price(by, model))
-        for by in LEAST for tolerance in TOLERANCES
-    ]  # fmt: skip
+    found = cheapest(name, full, model)
     say(f"{name}: choice: timing")
     levels = {full.levels, *(choice.levels for choice in found)}
     programs = {v: compiled(full, v, settings, path=True) for v in levels}
