@@ -85,6 +85,8 @@ def damage(change):
         lambda v: v["model"].update(kernel=0.0),
         lambda v: v["model"].update(float64=-1e-9),
         lambda v: v["model"].update(call=float("nan")),
+        lambda v: v["model"].update(call=10**400),
+        lambda v: v["device"].pop("cores"),
         lambda v: v["model"].update(float32="fast"),
         lambda v: v["model"].update(date="tomorrow"),
         lambda v: v.update(model=[1, 2, 3]),
@@ -97,7 +99,7 @@ def test_a_damaged_model_is_not_read(change, tmp_path):
     assert kept(tmp_path) == MODEL
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "\x00\x01"])
+@pytest.mark.parametrize("text", ["", "{", "[]", "\x00\x01", "[" * 200_000])
 def test_what_is_no_model_is_not_read(text, tmp_path):
     (tmp_path / TIME_MODEL).write_text(text)
     assert kept(tmp_path) is None
@@ -284,12 +286,57 @@ def test_the_cache_shows_and_clears_the_model(tmp_path, monkeypatch, capsys):
     keep(MODEL, tmp_path)
     _, out, _ = run(monkeypatch, capsys, "cache")
     assert "a kernel 80 ns" in out
+    for name, value, words in (
+        ("flags", "--xla_other", "of XLA_FLAGS '--xla_other'"),
+        ("cores", "512", "of number of cores '512'"),
+        ("processor", "another", "of processor 'another'"),
+    ):
+        (tmp_path / TIME_MODEL).write_text(
+            damage(lambda v, n=name, x=value: v["device"].update({n: x}))
+        )
+        _, out, _ = run(monkeypatch, capsys, "cache")
+        assert out.rstrip().endswith(
+            f"not for here, the next choice measures it anew: it is {words}"
+        )
     (tmp_path / TIME_MODEL).write_text("{")
     _, out, _ = run(monkeypatch, capsys, "cache")
-    assert "of another machine or damaged" in out
+    assert "model of time: damaged; the next choice measures it anew" in out
     _, out, _ = run(monkeypatch, capsys, "cache", "--clear")
     assert "model of time deleted" in out
     assert not (tmp_path / TIME_MODEL).exists()
+
+
+def test_a_model_that_cannot_be_deleted_is_said(tmp_path, monkeypatch, capsys):
+    """A folder of that name; a file that goes between the look and the deletion."""
+    from jaxtrachea.cli import cache as command
+
+    monkeypatch.setattr(command, "programs_folder", lambda: tmp_path)
+    (tmp_path / TIME_MODEL).mkdir()
+    code, out, _ = run(monkeypatch, capsys, "cache", "--clear")
+    assert code == 0
+    assert f"model of time not deleted: {tmp_path / TIME_MODEL}: " in out
+    code, out, _ = run(monkeypatch, capsys, "cache")
+    assert (code, "model of time: damaged" in out) == (0, True)
+    (tmp_path / TIME_MODEL).rmdir()
+    monkeypatch.setattr(command.os.path, "lexists", lambda path: True)
+    code, out, _ = run(monkeypatch, capsys, "cache", "--clear")
+    assert (code, "another process deleted it" in out) == (0, True)
+
+
+def test_the_cache_starts_no_device(tmp_path, monkeypatch, capsys):
+    """As with JAX_PLATFORMS=cuda where there is none."""
+    from jaxtrachea.cli import cache as command
+
+    def absent():
+        raise RuntimeError("Unable to initialize backend 'cuda'")
+
+    monkeypatch.setattr(command, "programs_folder", lambda: tmp_path)
+    keep(MODEL, tmp_path)
+    monkeypatch.setattr(timing.jax, "default_backend", absent)
+    code, out, _ = run(monkeypatch, capsys, "cache")
+    assert code == 0
+    assert "a kernel 80 ns" in out
+    assert "not for here" not in out
 
 
 def test_load_of_others_is_not_negative():

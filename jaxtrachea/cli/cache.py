@@ -1,5 +1,6 @@
 """The command cache: where compiled programs are kept, and how much they take; the time model."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -24,27 +25,37 @@ def cache(clear: ClearOption = False) -> None:
     if clear:
         gone = sum(delete(program) for program in kept)
         text = f"{gone} of {len(kept)} programs deleted from {folder}"
-        if (folder / TIME_MODEL).exists():
-            (folder / TIME_MODEL).unlink()
-            text += "\nmodel of time deleted"
+        if os.path.lexists(folder / TIME_MODEL):
+            text += f"\n{_cleared(folder / TIME_MODEL)}"
     else:
         size = sum(program.size for program in kept) / 2**20
         text = f"{len(kept)} programs, {size:.1f} MiB, in {folder}"
         if folder == cache_folder():
             text += f"\nat most {MOST_BYTES // 2**20} MiB, and none unused for {MOST_DAYS:g} days"
-        if (folder / TIME_MODEL).exists():
+        if os.path.lexists(folder / TIME_MODEL):
             text += f"\n{_of_time(folder)}"
     Console().print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _of_time(folder: Path) -> str:
-    """The kept model of time in words."""
-    from jaxtrachea.tradeoff.time_model import Uncalibrated, kept
+    """The kept model of time in words; starts no device."""
+    from jaxtrachea.tradeoff.time_model import others_than_here, stored
 
+    found = stored(folder)
+    if found is None:
+        return "model of time: damaged; the next choice measures it anew"
+    where, model = found
+    off = ", ".join(others_than_here(where))
+    anew = f"\nnot for here, the next choice measures it anew: it is of {off}" if off else ""
+    return f"model of time: {model.sentence}{anew}"
+
+
+def _cleared(path: Path) -> str:
+    """Delete the model of time; what became of it."""
     try:
-        model = kept(folder)
-    except Uncalibrated as error:
-        return f"model of time: not read: {error}"
-    if model is None:
-        return "model of time: of another machine or damaged; the next choice measures it anew"
-    return f"model of time: {model.sentence}"
+        path.unlink()
+    except FileNotFoundError:
+        return "model of time: another process deleted it"
+    except OSError as error:
+        return f"model of time not deleted: {path}: {error.strerror or error}"
+    return "model of time deleted"

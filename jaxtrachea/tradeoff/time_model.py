@@ -28,6 +28,10 @@ HALF = 0.5
 #: What is kept: names of the numbers of a model.
 NUMBERS = ("call", "kernel", "float32", "float64", "worst")
 
+#: What a model belongs to, in words.
+WORDS = {"processor": "processor", "cores": "number of cores", "flags": "XLA_FLAGS",
+         "jaxlib": "jaxlib", "jaxtrachea": "jaxtrachea"}  # fmt: skip
+
 
 class Uncalibrated(Exception):
     """No model of time can be had here; the message says why."""
@@ -112,6 +116,11 @@ def device() -> dict[str, str]:
     kind = jax.default_backend()
     if kind != "cpu":
         raise Uncalibrated(f"the device is a {kind}; times are modelled on a CPU only")
+    return this_machine()
+
+
+def this_machine() -> dict[str, str]:
+    """What a model of its CPU belongs to; starts no device."""
     return {
         "processor": processor(), "cores": str(cores()), "flags": os.environ.get("XLA_FLAGS", ""),
         **{name: installed(name) for name in ("jaxlib", "jaxtrachea")},
@@ -143,15 +152,30 @@ def keep(model: TimeModel, folder: Path) -> None:
 
 
 def kept(folder: Path) -> TimeModel | None:
-    """The model that is kept for this device, or None: there is none, or it is damaged."""
+    """The model that is kept for this device, or None: there is none, or it is damaged.
+
+    Raises:
+        Uncalibrated: the device is no CPU.
+    """
+    found, here = stored(folder), device()
+    return None if found is None or found[0] != here else found[1]
+
+
+def stored(folder: Path) -> tuple[dict[str, str], TimeModel] | None:
+    """What the kept model belongs to, and the model; None: there is none, or it is damaged."""
     try:
         read = json.loads((folder / TIME_MODEL).read_text("utf-8"))
-        if read["device"] != device():
-            return None
+        where = {name: str(read["device"][name]) for name in this_machine()}
         numbers = [float(read["model"][name]) for name in NUMBERS]
         date = datetime.date.fromisoformat(read["model"]["date"]).isoformat()
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
     if not (np.isfinite(numbers).all() and min(numbers) >= 0 and min(numbers[1:4]) > 0):
         return None
-    return TimeModel(*numbers, date=date)
+    return where, TimeModel(*numbers, date=date)
+
+
+def others_than_here(where: dict[str, str]) -> list[str]:
+    """What of `stored` is not as here, in words."""
+    here = this_machine()
+    return [f"{WORDS[name]} {where[name]!r}" for name in here if where[name] != here[name]]
