@@ -105,7 +105,8 @@ WITHIN = {
     "prediction": [{"core", "sources"}, {"predict"}, {"held_out"}, {"plots", "report", "tables"}],
     "runs": [{"meet", "manifest"}, {"processes", "shards"}, {"folder"}, {"rerun", "checkpoint"}],
     "tradeoff": [
-        {"errors", "front", "kernels", "levels", "load", "time_model"},
+        {"errors", "front", "kernels", "levels", "load"},
+        {"time_model"},
         {"ladders", "page", "parts", "plots", "price"},
         {"calibrate", "timing", "trial"},
         {"choice"},

@@ -105,6 +105,74 @@ def test_what_is_no_model_is_not_read(text, tmp_path):
     assert kept(tmp_path) is None
 
 
+BUSY, POOR = MODEL._replace(others=0.9), MODEL._replace(worst=1.3)
+
+
+@pytest.mark.parametrize(("model", "why"), [
+    (BUSY, "others kept 0.9 cores busy while it was measured"),
+    (POOR, "the worst error of its fit is 130 %"),
+])  # fmt: skip
+def test_a_model_of_a_busy_machine_is_not_kept(model, why, tmp_path, monkeypatch):
+    """Used for the run; a quiet one is kept, and read by the next."""
+    from jaxtrachea.cli import timing as command
+
+    monkeypatch.setattr(command, "programs_folder", lambda: tmp_path)
+    monkeypatch.setattr(counted, "calibrate", lambda report: model)
+    found, said = command.time_model(print)
+    monkeypatch.setattr(counted, "calibrate", None)  # once a run
+    assert found == model
+    assert said == f"model of time: for this run only, not kept: {why}"
+    assert not list(tmp_path.iterdir())
+    assert command.price_of("step", print) == (Price("step", model), said)
+    monkeypatch.setattr(command, "_of_this_run", {})  # the next start
+    monkeypatch.setattr(counted, "calibrate", lambda report: MODEL._replace(others=0.1))
+    assert command.time_model(print)[1] == ""
+    monkeypatch.setattr(counted, "calibrate", None)
+    assert command.time_model(print) == (MODEL, "")
+
+
+def test_a_model_that_cannot_be_kept_is_said(tmp_path):
+    assert "cannot be written" in keep(MODEL, tmp_path / "none")
+    assert keep(MODEL, tmp_path) == ""
+
+
+def test_a_predicted_time_says_how_good_the_model_is():
+    words = Price("step", MODEL._replace(worst=0.45)).words((2e-3, 1e-3))
+    assert words == (
+        "50 % of its time (predicted here for one pose a call: 1 ms of 2 ms, within 45 %)"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_plan_measures_and_keeps_a_model(tmp_path, monkeypatch, capsys):
+    """With an empty folder; where others are busy it says why none is kept."""
+    from jaxtrachea.cli import timing as command
+
+    measured = []
+
+    def calibrate(report, real=counted.calibrate):
+        measured.append(real(report))
+        return measured[-1]
+
+    monkeypatch.setattr(command, "programs_folder", lambda: tmp_path)
+    monkeypatch.setattr(counted, "calibrate", calibrate)
+    path = tmp_path / "scene.toml"
+    path.write_text(TOML)
+    code, out, _ = run(monkeypatch, capsys, "plan", path, "--time")
+    (model,) = measured
+    assert code == 0
+    assert "time predicted on this machine" in out
+    assert np.isfinite(model[:5]).all()
+    assert min(model[:5]) >= 0
+    assert min(model[1:4]) > 0  # a kernel, an operation in float32 and in float64
+    if model.doubt:
+        assert f"not kept: {model.doubt}" in " ".join(out.split())
+        assert not (tmp_path / TIME_MODEL).exists()
+    else:
+        assert kept(tmp_path) == model._replace(others=None)
+
+
 def test_another_kind_of_device_has_no_model(monkeypatch):
     monkeypatch.setattr(timing.jax, "default_backend", lambda: "gpu")
     with pytest.raises(Uncalibrated, match="the device is a gpu"):

@@ -206,7 +206,7 @@ def _predicted(staged) -> str:
             bar.update(task, description=text, advance=1)
 
         try:
-            model = time_model(report)
+            model, why = time_model(report)
         except Uncalibrated as error:
             return f"no time is predicted: {error}"
         report("compiling")
@@ -219,7 +219,7 @@ def _predicted(staged) -> str:
         f"{1e3 * v.seconds:.2g} ms for {what} ({v.kernels:,} kernels)"
         for v, what in zip(found, words, strict=True) if v is not None
     )  # fmt: skip
-    return f"time predicted on this machine: {each}\n({model.sentence})"
+    return f"time predicted on this machine: {each}\n({model.sentence})" + (why and f"\n{why}")
 
 
 def _for_sweep(path: Path, spec, staged):

@@ -5,9 +5,12 @@ from typing import Literal
 
 from jaxtrachea.cli.terminal import programs_folder
 
+#: What was measured and not kept, by the folder: a choice and `plan --time` are one run.
+_of_this_run: dict = {}
+
 
 def time_model(report: Callable[[str], None]):
-    """The kept `TimeModel`, or one measured now and kept.
+    """The kept `TimeModel`, or one measured now, and why that is not kept (empty: it is).
 
     Args:
         report: called with what is done next; may raise to stop.
@@ -21,15 +24,20 @@ def time_model(report: Callable[[str], None]):
     device()
     folder = programs_folder()
     found = None if folder is None else kept(folder)
-    if found is None:
+    if found is not None:
+        return found, ""
+    if folder not in _of_this_run:
         found = calibrate(report)
-        if folder is not None:
-            keep(found, folder)
-    return found
+        why = found.doubt if folder is None else keep(found, folder)
+        why = why and f"model of time: for this run only, not kept: {why}"
+        _of_this_run[folder] = found, why
+    return _of_this_run[folder]
 
 
 def price_of(wish: Literal["path", "step", "operations"], report: Callable[[str], None]):
-    """The `Price` for a word of `[plan] cost`, and why it is operations where a time was asked for.
+    """The `Price` for a word of `[plan] cost`, and what is to be said of it.
+
+    That is: why it is operations where a time was asked for, or why its model is not kept.
 
     Args:
         wish: `path`, `step` or `operations`.
@@ -41,7 +49,8 @@ def price_of(wish: Literal["path", "step", "operations"], report: Callable[[str]
     if wish == "operations":
         return OPERATIONS, ""
     try:
-        return price(wish, time_model(report)), ""
+        model, why = time_model(report)
+        return price(wish, model), why
     except Uncalibrated as error:
         return OPERATIONS, in_place(error)
 

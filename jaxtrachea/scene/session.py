@@ -158,6 +158,8 @@ class Session:
         if keep < 1:
             raise ValueError(f"keep is {keep}; expected at least 1")
         check_scene(scene, material)
+        assert scene.tool is not None
+        assert not isinstance(material, SectionMaterial)
         self.scene, self.material = scene, material
         self.dtype = np.dtype(scene.footprint.dtype)
         given = Changeable(material, scene.tool, scene.footprint)

@@ -13,6 +13,7 @@ from jaxtrachea.scene.session import check_scene
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.tradeoff.levels import BUILT_IN, cast
+from jaxtrachea.tradeoff.load import Load
 from jaxtrachea.tradeoff.price import single, started, work_of
 from jaxtrachea.tradeoff.time_model import TimeModel, Work, device, fitted
 
@@ -62,7 +63,10 @@ def calibrate(report: Callable[[str], None] = lambda text: None) -> TimeModel:
             report(f"time model: {name}, {dtype}")
             programs.append(_compiled(name, dtype))
     report("time model: timing")
-    return fitted([p.work for p in programs], quickest([p.call for p in programs]))
+    load = Load()
+    seconds = quickest([p.call for p in programs])
+    others = load.others()
+    return fitted([p.work for p in programs], seconds)._replace(others=others)
 
 
 class Predicted(NamedTuple):

@@ -61,7 +61,8 @@ class Price(NamedTuple):
             return f"{share} of its cost"
         full, own = (f"{1e3 * v:.2g} ms" for v in cost)
         what = {"path": "the whole path in one call", "step": "one pose a call"}[self.by]
-        return f"{share} of its time (predicted here for {what}: {own} of {full})"
+        within = f"within {100 * self.model.worst:.0f} %"
+        return f"{share} of its time (predicted here for {what}: {own} of {full}, {within})"
 
 
 OPERATIONS = Price()

@@ -7,7 +7,6 @@ know no caches and weigh all operations alike: ratios of plans are better predic
 (docs/tradeoff.md). None is for another device.
 """
 
-import contextlib
 import datetime
 import json
 import os
@@ -22,9 +21,12 @@ import numpy as np
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.files.programs import TIME_MODEL
 from jaxtrachea.files.provenance import installed
+from jaxtrachea.tradeoff.load import QUIET
 
 #: What an operation in float32 counts where operations are the cost.
 HALF = 0.5
+#: Relative error of the fit above which a model is not kept.
+MOST_ERROR = 1.0
 #: What is kept: names of the numbers of a model.
 NUMBERS = ("call", "kernel", "float32", "float64", "worst")
 
@@ -60,6 +62,7 @@ class TimeModel(NamedTuple):
         float64: s.
         worst: largest relative error over the programs that it was fitted to.
         date: of the calibration.
+        others: cores that others kept busy meanwhile; None: not known, or read from a file.
     """
 
     call: float
@@ -68,6 +71,16 @@ class TimeModel(NamedTuple):
     float64: float
     worst: float = 0.0
     date: str = ""
+    others: float | None = None
+
+    @property
+    def doubt(self) -> str:
+        """Why the next start should measure anew; empty: it need not."""
+        if self.others is not None and self.others > QUIET:
+            return f"others kept {self.others:.2g} cores busy while it was measured"
+        if self.worst > MOST_ERROR:
+            return f"the worst error of its fit is {100 * self.worst:.0f} %"
+        return ""
 
     def seconds(self, work: Work) -> float:
         """Time predicted for one call, s."""
@@ -144,11 +157,17 @@ def processor() -> str:
     return names[0] if names else platform.processor()
 
 
-def keep(model: TimeModel, folder: Path) -> None:
-    """Write a model for the next start; a folder that cannot be written keeps none."""
-    text = json.dumps({"device": device(), "model": model._asdict()}, indent=2) + "\n"
-    with contextlib.suppress(OSError):
+def keep(model: TimeModel, folder: Path) -> str:
+    """Write a model for the next start, or say why not: `doubt`, or it cannot be written."""
+    if model.doubt:
+        return model.doubt
+    numbers = {name: getattr(model, name) for name in (*NUMBERS, "date")}
+    text = json.dumps({"device": device(), "model": numbers}, indent=2) + "\n"
+    try:
         write_whole(folder / TIME_MODEL, text.encode())
+    except OSError as error:
+        return f"{folder / TIME_MODEL} cannot be written ({error.strerror or error})"
+    return ""
 
 
 def kept(folder: Path) -> TimeModel | None:
