@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxtrachea.tradeoff.page import read
+from jaxtrachea.tradeoff.page import measured, read
 
 BENCH = Path(__file__).parent / "bench" / "tradeoff.py"
 FOLDER = Path(__file__).parents[1] / "docs" / "tradeoff"
@@ -61,6 +61,22 @@ def test_choices_hold_their_tolerance_and_are_no_dearer():
             assert rung["error"] <= row["tolerance"]
         for rung in row["refused"]:
             assert float(rung["error"]) > row["tolerance"]
+
+
+def test_every_run_has_a_line_of_its_own():
+    """Two scenes of one run, one of another day and processor, by hand."""
+    common = {"device": "cpu:0", "lanes": 0, "versions": {"jax": "1"}}
+    old = common | {"date": "2026-01-01", "processor": "old", "calls": 1000, "load": 2.5}
+    new = common | {"date": "2026-02-02", "processor": "new", "calls": 20, "others": 0.1}
+    rows = [new | {"scene": "a"}, old | {"scene": "b"}, old | {"scene": "c"}]
+    first, second = measured(rows).split("\n\n")
+    assert first == (
+        "a: measured 2026-02-02, cpu:0, new, others kept up to 0.1 cores busy, 20 calls, "
+        "no batches; jax 1."
+    )
+    assert second.startswith("b, c: measured 2026-01-01, cpu:0, old, **load average up to 2.5")
+    assert "1000 calls" in second
+    assert measured(rows[:1]).startswith("Measured 2026-02-02, cpu:0, new")
 
 
 def test_levels_of_the_skeleton_are_there():

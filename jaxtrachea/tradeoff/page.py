@@ -17,6 +17,9 @@ KINDS = {
     "together": "Together: plans within a tolerance",
 }
 
+#: What makes two runs different ones.
+WHERE = ("date", "device", "processor", "calls", "lanes", "versions")
+
 
 def read(path: Path) -> list[dict[str, Any]]:
     """The lines of a file of JSON lines."""
@@ -68,12 +71,22 @@ def scene_text(rows: list[dict[str, Any]], picture: str = "") -> str:
 
 
 def measured(points: list[dict[str, Any]]) -> str:
-    """Where and when, with the load of the machine."""
+    """Where and when, with the load of the machine: a line for each run that differs in these."""
+    runs: dict[str, list[dict[str, Any]]] = {}
+    for point in points:
+        where = {name: point[name] for name in WHERE}
+        runs.setdefault(json.dumps(where, sort_keys=True), []).append(point)
+    return "\n".join(_measured(run, named=len(runs) > 1) for run in runs.values())
+
+
+def _measured(points: list[dict[str, Any]], named: bool) -> str:
     first = points[0]
+    scenes = ", ".join(dict.fromkeys(point["scene"] for point in points))
     versions = ", ".join(f"{name} {v}" for name, v in first["versions"].items())
     lanes = f"batches of {first['lanes']}" if first["lanes"] else "no batches"
     return (
-        f"Measured {first['date']}, {first['device']}, {first['processor']}, {busy(points)}, "
+        (f"{scenes}: measured " if named else "Measured ")
+        + f"{first['date']}, {first['device']}, {first['processor']}, {busy(points)}, "
         f"{first['calls']} calls, {lanes}; {versions}.\n"
     )
 
