@@ -339,6 +339,8 @@ def test_sphere_against_a_bent_and_flattened_surface():
     np.testing.assert_array_equal(c.status, ContactStatus.OK)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_surface_lies_where_the_patches_say():
     """Points of the surface as tools: their depth is within what is lost and filled."""
     surface, p = bent(0.6, 0.15)

@@ -206,6 +206,8 @@ def test_every_unit_gives_the_same(name, dtype):
         same(results(name, dtype, scale), results(name, dtype, 1.0), size, dtype, list(cases))
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("name", ["ties", "single"])
 def test_both_dtypes_give_the_same(name):
     cases = {"ties": TIES, "single": SINGLE}[name]

@@ -205,6 +205,8 @@ def waist(mesh, at, depth, width):
     return dataclasses.replace(mesh, vertices=vertices, distance=mesh.distance * drawn[:, 0])
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_patches_beside_the_wall_are_refused():
     """A waist of 4 mm within one patch: a ball would touch where there is nothing."""
     thin = waist(MESHES[1], 70, 0.35, 4)

@@ -179,6 +179,8 @@ def test_hard_cases():
     np.testing.assert_allclose(repeated[[3, 4]], repeated[[0, 0]], atol=1e-10)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_deeper_than_the_radius_is_said():
     """By how far the wall moves: a tool on a soft spring may move further."""
     [got] = press([({}, 30.0, 0.0, np.array([1.0, 5, 11, 11.65, 12, 13, 14, 9, -2]))])
