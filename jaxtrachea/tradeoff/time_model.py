@@ -3,8 +3,8 @@
 `a` is a call, `b` the start of a kernel, `c` an operation, for each dtype. The four are fitted to
 the times of a few small programs of the package (`calibrate`) and kept beside the compiled programs
 for the next start. Predictions are for programs of this package whose scene is a constant; they
-know no caches and weigh all operations alike: ratios of plans are better predicted than times
-(docs/tradeoff.md). None is for another device.
+know no caches and weigh all operations alike; docs/tradeoff.md has how far ratios of plans were
+off. None is for another device.
 """
 
 import datetime
