@@ -78,6 +78,15 @@ def test_predicted_errors_come_true(known):
     assert np.exp(np.mean(np.log(realised / np.std(without.theta, axis=0)))) < 0.9
 
 
+def test_before_any_measurement_an_unknown_may_be_anywhere_between_its_bounds(result):
+    """Errors without data: the standard deviation of points even between the bounds."""
+    before, lanes = situation(result, with_data=False), result.study.lanes
+    for g, k in enumerate(before.lane):
+        even = np.linspace(lanes.lower[k], lanes.upper[k], 10_001).std(axis=0)
+        spread = before.relative[g] * np.diag(np.linalg.inv(before.base[g])) ** 0.5
+        np.testing.assert_allclose(spread, even, rtol=1e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.compiling
 def test_information_of_a_candidate_is_that_of_finite_differences(known):
