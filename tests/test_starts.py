@@ -55,6 +55,18 @@ def run(study, wells, settings):
 GUESS = np.log(synthetic.CHANGES["EI_L"]["value"])
 
 
+def test_starts_are_a_latin_hypercube(study):
+    """Each unknown has one start in each tenth of its range; ranks of two do not go together."""
+    P, count = study.size, 11
+    drawn = draw_starts(study, Settings(starts=count)).reshape(LANES, count, P)[:, 1:]
+    every = draw_starts(study, Settings(starts=2001)).reshape(LANES, 2001, P)[:, 1:]
+    low, high = every.min(axis=1, keepdims=True), every.max(axis=1, keepdims=True)
+    tenth = np.clip(np.floor(10 * (drawn - low) / (high - low)), 0, 9).astype(int)
+    np.testing.assert_array_equal(np.sort(tenth, axis=1), np.arange(10)[None, :, None] + 0 * tenth)
+    pairs = [np.corrcoef(rows.T)[np.triu_indices(P, 1)] for rows in tenth]
+    assert abs(np.mean(pairs)) < 0.25  # of 36 pairs: an error of 1 / sqrt(9 * 36) = 0.06
+
+
 def one_well(wall=-np.inf):
     """The same minimum from everywhere that is allowed."""
     return Wells(np.full(LANES, GUESS), np.full(LANES, np.inf), wall)
