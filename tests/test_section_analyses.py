@@ -27,7 +27,6 @@ from jaxtrachea.inference.design import (
     next_points,
     situation,
 )
-from jaxtrachea.inference.estimate import estimate, lane_of
 from jaxtrachea.inference.influence import _external, influence
 from jaxtrachea.inference.population import population
 from jaxtrachea.inference.profile import profiles
@@ -474,36 +473,3 @@ def test_population_of_sections_has_the_spread_of_its_specimens():
         effects = found.effects
         np.testing.assert_allclose(effects.mean[0], np.mean(logs), atol=2e-3)
         np.testing.assert_allclose(effects.sd[0], np.std(logs, ddof=1), rtol=0.02)
-
-
-@pytest.mark.slow
-def test_estimate_of_sections_follows_the_data():
-    """One press and one unknown: derivative by all forces against SciPy's refits."""
-    path, h = jnp.array([1.0, 2.5]), 1e-3
-    given = {n: v for n, v in wall().items() if n != "EI_C"}
-
-    @jax.jit
-    def force(theta):
-        material = SectionMaterial(**given, EI_C=jnp.exp(theta))
-        return -press_sections(GEOMETRY, material, 15.0, 0.0, path, midline=True).force[:, 1]
-
-    data = np.array(force(np.log(31.0))) + [0.02, -0.01]
-    fixed = {name: {"fixed": True} for name in ("bed_n", *FIXED)}
-    curve = Curve("one", "1", 15.0, 0.0, np.array(path), data)
-    study = build_study([curve], GEOMETRY, SECTIONS, fixed, noise=Noise(force=SIGMA))
-    lane, along = lane_of(study, 0), np.array([0.3, -0.7])
-
-    def theta(t):
-        moved = lane._replace(force=lane.force + t * along)
-        return estimate(study.model, jnp.log(jnp.array([31.0])), moved, jnp.ones(2)).theta
-
-    value, slope = jax.jit(lambda: jax.jvp(theta, (0.0,), (1.0,)))()
-
-    def refitted(t):
-        def off(theta):
-            return np.array(force(theta[0])) - data - t * along
-
-        return least_squares(off, np.log([31.0]), "3-point", xtol=1e-14, ftol=1e-15, gtol=1e-15).x
-
-    np.testing.assert_allclose(value, refitted(0), atol=1e-7)
-    np.testing.assert_allclose(slope, (refitted(h) - refitted(-h)) / (2 * h), rtol=1e-4)

@@ -1,6 +1,6 @@
 """What each level of a normal press costs against `mat` with shear, in one run, and its fits.
 
-    python tests/bench/levels.py
+    python tests/bench/levels.py [--fits]
 
 Table 1's tube, 15 rings, 200 displacements to 6 mm at one position: per call and per lane of 256.
 `sections` (32 lanes) takes 8 displacements in place of 200 (a path by Newton's method). Fits: a
@@ -187,7 +187,8 @@ def rows(*, quick: bool = False) -> list[dict[str, Any]]:
 def main() -> None:
     """Print them."""
     if "--fits" in sys.argv[1:]:
-        return fits()
+        fits()
+        return
     found = rows()
     for row in found:
         call, lane = row["call"] / found[0]["call"], row["lane"] / found[0]["lane"]
