@@ -154,8 +154,8 @@ class ModelSection(Section):
         if isinstance(data, dict) and "rings" in data:
             raise ValueError(
                 f"rings = {data['rings']!r}: a key of scenes. Presses on the midline cannot tell "
-                "an arch from its mat: in a fit k_M is the whole ring, as with 'mat'. Leave it out, "
-                "or choose skeleton = 'sections' for rings that bend, anywhere on them"
+                "an arch from its mat: in a fit k_M is the whole ring, as with 'mat'. Leave it "
+                "out, or choose skeleton = 'sections' for rings that bend, anywhere on them"
             )
         return data
 
