@@ -148,6 +148,17 @@ class ModelSection(Section):
     half_width: Length = 0.0
     skeleton: Literal["linear", "softening", "sections"] = "linear"
 
+    @model_validator(mode="before")
+    @classmethod
+    def _no_level_of_rings(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "rings" in data:
+            raise ValueError(
+                f"rings = {data['rings']!r}: a key of scenes. Presses on the midline cannot tell "
+                "an arch from its mat: in a fit k_M is the whole ring, as with 'mat'. Leave it "
+                "out, or choose skeleton = 'sections' for rings that bend, anywhere on them"
+            )
+        return data
+
 
 class WallSection(Section):
     """[wall]: moduli and thicknesses that a fit of deforming cross-sections begins with.

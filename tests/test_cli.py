@@ -92,6 +92,11 @@ BAD_SPECS = {
         DATA + "[parameters]\nGA_L = {}",
         ["parameters.GA_L: not seen by this model", "EI_L"],
     ),
+    "arch2": (DATA + '[model]\nrings = "arch2"', ["rings = 'arch2'", "k_M is the whole ring"]),
+    "parameter of the arch": (
+        DATA + "[parameters]\nEI_C = {}",
+        ["parameters.EI_C: of a ring that bends", "skeleton = 'sections'"],
+    ),
     "parameter a number": (K1 + "3", ["parameters.k_1: expected a table", "found 3"]),
     "bounds reversed": (K1 + "{ bounds = [9, 1] }", ["parameters.k_1: lower bound 9", "upper"]),
     "bounds one": (K1 + "{ bounds = [9] }", ["parameters.k_1.bounds"]),

@@ -28,6 +28,7 @@ from jaxtrachea.inference.design import (
     situation,
 )
 from jaxtrachea.inference.influence import _external, influence
+from jaxtrachea.inference.population import population
 from jaxtrachea.inference.profile import profiles
 from jaxtrachea.inference.repeats import leave_repeats_out
 from jaxtrachea.measurements.read import Curve, Measurements, write_hdf5
@@ -456,3 +457,19 @@ def test_what_is_refused_is_refused_before_the_fit(arguments, says, tmp_path, mo
     assert (code, out) == (2, "")
     assert says in " ".join(err.split())
     assert not Path("out").exists()
+
+
+@pytest.mark.slow
+def test_population_of_sections_has_the_spread_of_its_specimens():
+    """Hardly any noise: mean and spread are those of the true values, one bed shared or not."""
+    truth, sigma = [31.0, 24.0, 35.0, 28.0], SIGMA / 30
+    parts = [measured(i, sigma, str(i), EI_C=v) for i, v in enumerate(truth)]
+    curves, logs = sum(parts, []), np.log(truth)
+    for table, joint in (({}, False), ({"bed_n": {"scope": "shared"}}, True)):
+        result = fit(study_of(curves, table, sigma, joint=joint), ONE)
+        assert np.all(result.status == FitStatus.CONVERGED)
+        found = population(result)
+        assert [p.name for p in found.parameters][0] == "EI_C"
+        effects = found.effects
+        np.testing.assert_allclose(effects.mean[0], np.mean(logs), atol=2e-3)
+        np.testing.assert_allclose(effects.sd[0], np.std(logs, ddof=1), rtol=0.02)

@@ -34,9 +34,18 @@ def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Par
     for name in spec.parameters:
         if name not in known:
             reason = "not a parameter" if name not in DEFAULTS else "not seen by this model"
+            if name in OF_THE_ARCH and not options.deforms_sections:
+                reason = (
+                    "of a ring that bends; on the midline k_M is the whole ring, arch and mat; "
+                    "leave it out, or choose model.skeleton = 'sections'"
+                )
             raise SpecError(f"parameters.{name}: {reason}; expected one of {', '.join(known)}")
     names = in_model(options, joints=joints, named=spec.parameters)
     return tuple(_parameter(defaults[n], spec.parameters.get(n)) for n in names)
+
+
+#: Parameters of the levels `arch` and `arch2`, which no fit of a line of joints has.
+OF_THE_ARCH = ("EI_C", "k_t")
 
 
 def _defaults(spec: FitSpec, options: Options) -> Mapping[str, Parameter]:

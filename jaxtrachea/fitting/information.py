@@ -13,7 +13,6 @@ from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import residual
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.optimisation.programs import batch_size
 
 
 class Information(NamedTuple):
@@ -101,5 +100,5 @@ def informations(
     study: Study, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, batch: int = 128
 ) -> Information:
     """`information` of many lanes, on the host; leading axis = order of `lanes`."""
-    batch = batch_size(len(lanes), batch)
+    batch = study.together(len(lanes), batch)
     return map_lanes(information, study, theta, sigma, rows=lanes, batch=batch)

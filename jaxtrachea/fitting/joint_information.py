@@ -10,7 +10,6 @@ from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import residual_value
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.optimisation.schur import eliminate_others
 
 
@@ -39,7 +38,7 @@ def pooled(
 
     spread = np.zeros(2)
     if study.model.loss != "linear":
-        batch, forces = batch_size(len(theta), 128), force_entries(study.lanes)
+        batch, forces = study.together(len(theta), 128), force_entries(study.lanes)
         r = map_lanes(_absolute_residual, study, theta, batch=batch)[alive]
         kinds = (r[..., :forces], r[..., forces:])
         spread = np.array([np.nanmedian(v) if np.any(np.isfinite(v)) else 0.0 for v in kinds])

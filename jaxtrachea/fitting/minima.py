@@ -18,7 +18,6 @@ from jaxtrachea.fitting.starts import add_starts, best, draw_starts
 from jaxtrachea.fitting.structure import Structure, reduced
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
-from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.status import FitStatus
 
 #: Lanes computed together where only a few are left.
@@ -128,7 +127,8 @@ def refit_with_sigma(study: Study, settings: Settings, theta, sigma) -> Solved:
 def _solve_more(study, settings, sigma, progress, rows, starts) -> Solved:
     """Further starts of a few lanes; their batch does not depend on how many there are."""
     settings = dataclasses.replace(settings, batch=min(settings.batch, FEW))
-    filled = np.arange(max(len(rows), 2)) % len(rows)  # one alone would be another program
+    fewest = study.together(2, settings.batch)  # one alone would be another program
+    filled = np.arange(max(len(rows), min(fewest, 2))) % len(rows)
     alive = None if progress is None else lambda done, of: progress(0, of)
     solved = _solve(study, settings, rows[filled], starts[filled], sigma, alive)
     return Solved(*(v[: len(rows)] for v in solved))
@@ -136,7 +136,7 @@ def _solve_more(study, settings, sigma, progress, rows, starts) -> Solved:
 
 def _solve(study: Study, settings: Settings, rows, starts, sigma, progress) -> Solved:
     """Every start of lane `rows`; sigma of each lane."""
-    common = _common(settings, len(rows), progress)
+    common = _common(study, settings, len(rows), progress)
     if settings.method == "levenberg-marquardt":
         return levenberg_marquardt(
             LaneCost(study.model, study.lanes, sigma), starts, rows,
@@ -153,20 +153,21 @@ def _solve_jointly(
     if settings.method != "levenberg-marquardt":
         raise ValueError(f"a joint study needs levenberg-marquardt, not {settings.method}")
     lanes = study.lanes.lower.shape[0]
-    common = _common(settings, len(starts), progress)
+    common = _common(study, settings, len(starts), progress)
     # One size for all calls, so that it is compiled once.
-    common["batch"] = batch_size(lanes * settings.starts, settings.batch)
+    common["batch"] = study.together(lanes * settings.starts, settings.batch)
     of_starts = np.swapaxes(starts.reshape(lanes, len(starts) // lanes, -1), 0, 1)
     return solve_jointly(
         study, of_starts, sigma, separately=not near, tolerances=settings.tolerances, **common
     )
 
 
-def _common(settings: Settings, starts: int, progress) -> dict[str, Any]:
+def _common(study: Study, settings: Settings, starts: int, progress) -> dict[str, Any]:
     """What all solvers are told."""
     report = None if progress is None else lambda done: progress(done, starts)
     dtype = np.float32 if settings.float32 else np.float64
-    return {"batch": settings.batch, "progress": report, "dtype": dtype}
+    batch = study.together(starts, settings.batch)
+    return {"batch": batch, "progress": report, "dtype": dtype}
 
 
 def information_per_lane(

@@ -9,7 +9,6 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.structure import leaving_alone, pins
 from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
-from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.status import FitStatus, ProfileEnd
 
 #: Rounds of the search for the ends; each is one batched solve.
@@ -54,7 +53,7 @@ class Sides:
         self.first = np.clip(self.target * u.se[lane, unknown], 1e-9 * (1 + np.abs(here)), None)
         self.first = np.where(np.isfinite(self.first), self.first, 1.0)
         starts = result.lanes * settings.starts
-        self.batch = batch_size(max(starts, 16), settings.batch)
+        self.batch = result.study.together(max(starts, 16), settings.batch)
         self.sigma = result.whitened_sigma
         self.cost = self._costs_at_estimate()
 

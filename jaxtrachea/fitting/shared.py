@@ -25,7 +25,6 @@ from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
-from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.optimisation.schur import eliminate, trust_region_step
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.status import FitStatus
@@ -340,7 +339,7 @@ def _evaluate_or_refit(
 
 def _evaluate(task: _Task, theta: Float[np.ndarray, "L P"]) -> Evaluated:
     """Cost and normal equations of all lanes, a batch at a time."""
-    batch = batch_size(len(theta), task.batch)
+    batch = task.study.together(len(theta), task.batch)
     cost, gradient, hessian = map_lanes(
         _normal_equations, task.study, theta, task.sigma, batch=batch, dtype=task.dtype
     )

@@ -29,7 +29,6 @@ from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import Law, coefficient
 from jaxtrachea.mechanics.press import respond
 from jaxtrachea.mechanics.softening import Softening
-from jaxtrachea.optimisation.programs import batch_size
 
 #: Points of the parameter box, and half its width in decades.
 POINTS, DECADES = 8, 2.0
@@ -252,7 +251,9 @@ def _seen_of_sections(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     No few numbers stand for a press on deforming cross-sections: what its samples tell is decided
     by number, at the displacements of the study, whatever they measured.
     """
-    J = map_lanes(_curves_by_unknowns, study, theta, rows=lanes, batch=batch_size(len(lanes), 16))
+    J = map_lanes(
+        _curves_by_unknowns, study, theta, rows=lanes, batch=study.together(len(lanes), 16)
+    )
     log = _log(study)[lanes]
     J = J * np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))[:, None, None]
     J = np.nan_to_num(J)

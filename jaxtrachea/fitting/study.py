@@ -24,6 +24,7 @@ from jaxtrachea.fitting.parameters import DEFAULTS, SKELETON, Parameter, default
 from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.trachea.geometry import Geometry
 
 #: The table of parameters, or what differs from the defaults of the model, by name.
@@ -109,6 +110,16 @@ class Study:
                 "errors, profiles, the bootstrap, influence, leaving out and designs are), or "
                 "choose another skeleton"
             )
+
+    def together(self, total: int, most: int) -> int:
+        """Lanes computed together, of `total` and of `most` at most: a size of few.
+
+        Of deforming cross-sections one on a CPU: lanes side by side gain nothing there, wait for
+        the slowest of them, and each size is a program of half a minute.
+        """
+        if self.model.options.deforms_sections and jax.default_backend() == "cpu":
+            return 1
+        return batch_size(total, most)
 
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":
         """The same study with these lanes, in this order; a lane may come more than once."""

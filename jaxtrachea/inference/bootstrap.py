@@ -20,7 +20,6 @@ from jaxtrachea.fitting.lane import Lane, Observed, forces, markers
 from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.optimisation.programs import batch_size
 
 Kind = Literal["parametric", "residual"]
 #: Refits handed to the solver at a time; bounds the memory.
@@ -83,7 +82,7 @@ def bootstrap(
     _check(count, kind, block)
     result.study.refuse_joint("the bootstrap")
     seen = predictions(result.study, result.theta)
-    batch = batch_size(max(result.lanes * settings.starts, 16), settings.batch)
+    batch = result.study.together(max(result.lanes * settings.starts, 16), settings.batch)
     one = dataclasses.replace(settings, starts=1, batch=batch, scrutiny=False)
     thetas, usable = [], []
     together = max(_AT_ONCE // count, 1)

@@ -33,7 +33,6 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.estimate import hessian
 from jaxtrachea.inference.labels import succeeded
-from jaxtrachea.optimisation.programs import batch_size
 
 #: det(1 - hat matrix of a curve) below which the curve alone determines some combination.
 _ALONE = 1e-9
@@ -235,7 +234,7 @@ def influence(result: FitResult, batch: int = 128) -> Influence:
     free = np.asarray(result.study.lanes.active) * ~result.at_bound
     diagnostics = map_lanes(
         diagnose, result.study, result.theta, result.whitened_sigma, result.relative, free,
-        batch=batch_size(result.lanes, batch),
+        batch=result.study.together(result.lanes, batch),
     )  # fmt: skip
     return _conclude(result, diagnostics)
 

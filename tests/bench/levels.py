@@ -1,6 +1,6 @@
 """What each level of a normal press costs against `mat` with shear, in one run, and its fits.
 
-    python tests/bench/levels.py
+    python tests/bench/levels.py [--fits]
 
 Table 1's tube, 15 rings, 200 displacements to 6 mm at one position: per call and per lane of 256.
 `sections` (32 lanes) takes 8 displacements in place of 200 (a path by Newton's method). Fits: a
@@ -13,6 +13,7 @@ import common  # isort: skip
 
 import dataclasses
 import functools
+import sys
 import time
 from typing import Any
 
@@ -139,6 +140,20 @@ def fits_per_second(study, specimens: int) -> tuple[float, int]:
     return specimens / taken, int(sum(FitStatus(int(v)).succeeded for v in result.status))
 
 
+def fits() -> None:
+    """Print the fits a second of every level, in one run."""
+    load = Load()
+    for name in (*LEVELS, *SECTIONS):
+        deforms = name in SECTIONS
+        count = FEW if deforms else 64
+        make = functools.partial(section_study, SECTIONS[name]) if deforms else (
+            functools.partial(line_study, LEVELS[name])
+        )  # fmt: skip
+        found, good = fits_per_second(make(count), count)
+        print(f"{name:20s} {found:10.4g} fits/s, {good} of {count} estimated", flush=True)
+    print(f"others kept {load.others() or 0.0:.2g} cores busy")
+
+
 def rows(*, quick: bool = False) -> list[dict[str, Any]]:
     """Every level: seconds of a call and of a lane, fits a second; the first names the machine."""
     load = Load()
@@ -171,6 +186,9 @@ def rows(*, quick: bool = False) -> list[dict[str, Any]]:
 
 def main() -> None:
     """Print them."""
+    if "--fits" in sys.argv[1:]:
+        fits()
+        return
     found = rows()
     for row in found:
         call, lane = row["call"] / found[0]["call"], row["lane"] / found[0]["lane"]
