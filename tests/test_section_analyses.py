@@ -460,6 +460,7 @@ def test_what_is_refused_is_refused_before_the_fit(arguments, says, tmp_path, mo
 
 
 @pytest.mark.slow
+@pytest.mark.compiling
 def test_population_of_sections_has_the_spread_of_its_specimens():
     """Hardly any noise: mean and spread are those of the true values, one bed shared or not."""
     truth, sigma = [31.0, 24.0, 35.0, 28.0], SIGMA / 30
