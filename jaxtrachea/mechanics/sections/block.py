@@ -12,6 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+#: Largest matrix that `invert` eliminates entry by entry.
+LEAF = 4
+
 
 class Factors(NamedTuple):
     """An eliminated matrix: two chains of nodes, from either end, and the node between.
@@ -33,7 +36,24 @@ class Factors(NamedTuple):
 
 
 def invert(matrix: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Int[Array, ""]]:
-    """Inverse by Gauss-Jordan without exchange, and the number of negative pivots.
+    """Inverse without exchange of pivots, and the number of negative ones.
+
+    By halves down to `LEAF`: products of matrices are quicker than the elimination of a large one.
+    """
+    m = matrix.shape[0]
+    if m <= LEAF:
+        return _eliminate(matrix)
+    k = (m + 1) // 2
+    upper, right, left = matrix[:k, :k], matrix[:k, k:], matrix[k:, :k]
+    first, negative = invert(upper)
+    gain, rows = first @ right, left @ first
+    last, more = invert(matrix[k:, k:] - left @ gain)
+    side, below = gain @ last, last @ rows
+    return jnp.block([[first + side @ rows, -side], [-below, last]]), negative + more
+
+
+def _eliminate(matrix: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Int[Array, ""]]:
+    """`invert` by Gauss-Jordan.
 
     Two pivots at a time, with the inverse of their 2 x 2 block in closed form: half as many
     operations that wait for each other.
@@ -107,11 +127,11 @@ def solve(factors: Factors, rhs: Float[Array, "n m k"]) -> Float[Array, "n m k"]
     def down(taken, node):
         gain, r = node
         r = r - taken
-        return jnp.sum(gain[:, :, :, None] * r[:, :, None], 1), r
+        return gain.transpose(0, 2, 1) @ r, r
 
     def back(x, node):
         gain, own = node
-        x = own - jnp.sum(gain[:, :, :, None] * x[:, None], 2)
+        x = own - gain @ x
         return x, x
 
     taken, left = jax.lax.scan(down, jnp.zeros_like(sides[0]), (factors.gain, sides))
