@@ -17,8 +17,8 @@ def epsilon(dtype) -> float:
     return float(jnp.finfo(dtype).eps)
 
 
-#: Entries up to which a reduction is written out, and most that one reduction may have: of more, XLA
-#: for CPUs makes a `reduce-window`, which fuses with nothing.
+#: Entries up to which a reduction is written out, and most that one may have: of more, XLA for CPUs
+#: makes a `reduce-window`, which fuses with nothing.
 WRITTEN_OUT, ONE_REDUCTION = 8, 32
 
 
