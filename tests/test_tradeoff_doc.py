@@ -44,10 +44,15 @@ def test_measurements_are_complete(path):
         assert len(rungs) > 1
 
 
-def test_a_scene_with_a_tool_and_one_with_measured_curves_are_there():
-    assert {"table_1", "virtual_trachea"} <= {path.stem for path in SCENES}
+def test_every_scene_has_its_ladders_choices_and_picture():
+    module = bench()
+    names = {path.stem for path in SCENES}
+    assert set(module.SCENES) - {"deep"} <= names <= set(module.SCENES)
     for path in SCENES:
         assert path.with_suffix(".png").is_file()
+    chosen = [(row["scene"], row["tolerance"]) for row in read(FOLDER / "choice.jsonl")]
+    for name in names:
+        assert {v for scene, v in chosen if scene == name} >= {0.1, 0.01, 0.001}
 
 
 def test_choices_hold_their_tolerance_and_are_no_dearer():
