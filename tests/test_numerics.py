@@ -12,6 +12,7 @@ from jaxtrachea._numerics import (
     cos_sin,
     cubic_ratio,
     epsilon,
+    first_largest,
     first_positive_root,
     largest,
     newton_tolerance,
@@ -373,3 +374,16 @@ def test_total_and_largest(n, dtype):
     worst[-1] = -np.inf
     assert np.isneginf(total(jnp.asarray(worst)))
     np.testing.assert_array_equal(largest(jnp.full(n, -3, dtype)), -3)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("n", [1, 5, 8, 9, 120, 300])
+def test_first_largest(n, dtype):
+    """As numpy's argmax, of equal entries the first, also in lanes; an index even without one."""
+    draw = np.random.default_rng(n)
+    x = np.vstack(
+        [draw.normal(size=(4, n)), draw.integers(-3, 0, (4, n)), np.full((1, n), -np.inf)]
+    )
+    found = jax.jit(jax.vmap(first_largest))(x.astype(dtype))
+    np.testing.assert_array_equal(found, x.argmax(axis=1))
+    assert 0 <= int(first_largest(jnp.full(n, jnp.nan, dtype))) < n

@@ -220,7 +220,7 @@ capsule, and the angular weights prepared; called through ctypes. coal is called
 capsules. The paper states 10 kHz for the skeleton and 1 kHz with the surface (100 and 1,000 µs).
 
 With a dent, single calls of the whole update take two to three times as long as the C loop. The
-contact alone starts some 500 small kernels with a ball on the round tube and 850 with a box on the
+contact alone starts some 500 small kernels with a ball on the round tube and 800 with a box on the
 mesh, most of them in a loop of twelve rounds (700 and 1,030 when these times were taken; counted by
 `tests/test_kernels.py`); that their starts cost more than their work is the likely reason, since
 256 poses together pay 9 to 16 µs each for contact and skeleton.
