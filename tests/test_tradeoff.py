@@ -28,7 +28,7 @@ from jaxtrachea.tradeoff.front import pareto
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import full_scene, kept_rings, program
 from jaxtrachea.tradeoff.load import Load
-from jaxtrachea.tradeoff.page import choice_rows
+from jaxtrachea.tradeoff.page import choice_rows, fronts
 from jaxtrachea.tradeoff.plots import QUESTIONS, draw
 from jaxtrachea.tradeoff.trial import Trial
 
@@ -128,6 +128,18 @@ def test_no_text_of_a_picture_lies_on_another():
     assert len(boxes) == 34
     for i, one in enumerate(boxes):
         assert not any(one.overlaps(other) for other in boxes[i + 1 :])
+
+
+def test_span_of_a_front_is_that_of_whole_plans():
+    """Three plans by hand, one beaten; a quicker finest level of another ladder does not count."""
+
+    def row(ladder, error, call):
+        errors = {"force": error, "joints": None, "surface": None}
+        return {"ladder": ladder, "errors": errors, "times": {"call": {"median": call}}}
+
+    plans = [row("together", 0.0, 6e-4), row("together", 0.1, 3e-4), row("together", 0.2, 5e-4)]
+    others = [row("form", 0.0, 1e-4), {"ladder": "mesh", "left_out": "-"}]
+    assert fronts({"a": plans + others, "b": others}) == [["a", "2", "-"], ["b", "-", "-"]]
 
 
 def test_what_the_finest_level_beats_is_not_on_the_front():

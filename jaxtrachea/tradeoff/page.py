@@ -129,10 +129,14 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
 
 
 def fronts(scenes: dict[str, list[dict[str, Any]]]) -> list[list[str]]:
-    """Scene, and by which factor the times of its Pareto front differ: a call, a lane."""
+    """Scene, and by which factor the times of its Pareto front differ: a call, a lane.
+
+    Of the ladder `together`: whole plans, timed in the same turns. Finest levels of other ladders
+    can be other programs, and were timed at other times.
+    """
     found = []
     for name, rows in scenes.items():
-        points = [row for row in rows if "left_out" not in row]
+        points = [row for row in rows if row.get("ladder") == "together"]
         spans = []
         for which in ("call", "lane"):
             own = [p for p in points if which in p["times"]]
