@@ -43,7 +43,7 @@ def largest(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
 
 
 def first_largest(x: Float[Array, " n"]) -> Int[Array, ""]:
-    """Index of the largest entry, of equal ones the first: `jnp.argmax` several times as quick.
+    """Index of the largest entry, of equal ones the first: as `jnp.argmax`.
 
     XLA for CPUs walks through an `argmax` entry by entry. With a NaN the index is the last one.
 

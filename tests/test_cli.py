@@ -97,6 +97,7 @@ BAD_SPECS = {
         DATA + "[parameters]\nEI_C = {}",
         ["parameters.EI_C: of a ring that bends", "skeleton = 'sections'"],
     ),
+    "tie of the arch": (DATA + "[parameters]\nk_t = {}", ["parameters.k_t: of a ring that bends"]),
     "parameter a number": (K1 + "3", ["parameters.k_1: expected a table", "found 3"]),
     "bounds reversed": (K1 + "{ bounds = [9, 1] }", ["parameters.k_1: lower bound 9", "upper"]),
     "bounds one": (K1 + "{ bounds = [9] }", ["parameters.k_1.bounds"]),

@@ -21,6 +21,13 @@ from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.trachea.section import geometry_of
 from jaxtrachea.units import UnitError, parse_quantity
 
+#: Parameters of the levels `arch` and `arch2` of scenes, and what a fit takes instead.
+OF_THE_ARCH = {
+    "EI_C": "on the midline k_M is the whole ring, arch and mat; leave it out, or choose "
+    "model.skeleton = 'sections'",
+    "k_t": "the tie between its ends is known to scenes alone; leave it out",
+}
+
 
 def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Parameter, ...]:
     """The parameter table of the chosen model with the user's changes.
@@ -34,18 +41,11 @@ def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Par
     for name in spec.parameters:
         if name not in known:
             reason = "not a parameter" if name not in DEFAULTS else "not seen by this model"
-            if name in OF_THE_ARCH and not options.deforms_sections:
-                reason = (
-                    "of a ring that bends; on the midline k_M is the whole ring, arch and mat; "
-                    "leave it out, or choose model.skeleton = 'sections'"
-                )
+            if name in OF_THE_ARCH:
+                reason = f"of a ring that bends; {OF_THE_ARCH[name]}"
             raise SpecError(f"parameters.{name}: {reason}; expected one of {', '.join(known)}")
     names = in_model(options, joints=joints, named=spec.parameters)
     return tuple(_parameter(defaults[n], spec.parameters.get(n)) for n in names)
-
-
-#: Parameters of the levels `arch` and `arch2`, which no fit of a line of joints has.
-OF_THE_ARCH = ("EI_C", "k_t")
 
 
 def _defaults(spec: FitSpec, options: Options) -> Mapping[str, Parameter]:

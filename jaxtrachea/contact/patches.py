@@ -251,7 +251,7 @@ def _furthest(vertices, direction):
 
 
 def _rows_at(shapes: Shape, chosen) -> Shape:
-    """Some of the patches. By rows: XLA starts kernels on arrays of up to 512 bytes faster."""
+    """Some of the patches. By rows: XLA runs a program of arrays of at most 512 bytes in order."""
     rows = [shapes.vertices[:, i][chosen] for i in range(3)]
     return Shape(jnp.stack(rows, axis=1), shapes.radius[chosen])
 

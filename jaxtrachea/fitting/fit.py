@@ -100,7 +100,7 @@ def _scrutinised(result, minima: Minima, known: Structure, settings, progress) -
         if not turns_left or not len(rows):
             return dataclasses.replace(result, **evidence._asdict())
         # As many as the fit computes together: the same program.
-        batch = result.study.together(max(result.lanes * settings.starts, 16), settings.batch)
+        batch = result.study.batch_size(max(result.lanes * settings.starts, 16), settings.batch)
         full = rows[np.arange(max(len(rows), batch)) % len(rows)]
         part = reduced(result.study.take(full), known.pinned[full])
         solved, sigma = refit_with_noise(part, settings, None, minima.sigma[full], better[full])

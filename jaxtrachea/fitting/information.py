@@ -100,5 +100,5 @@ def informations(
     study: Study, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, batch: int = 128
 ) -> Information:
     """`information` of many lanes, on the host; leading axis = order of `lanes`."""
-    batch = study.together(len(lanes), batch)
+    batch = study.batch_size(len(lanes), batch)
     return map_lanes(information, study, theta, sigma, rows=lanes, batch=batch)

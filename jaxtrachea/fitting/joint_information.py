@@ -38,7 +38,7 @@ def pooled(
 
     spread = np.zeros(2)
     if study.model.loss != "linear":
-        batch, forces = study.together(len(theta), 128), force_entries(study.lanes)
+        batch, forces = study.batch_size(len(theta), 128), force_entries(study.lanes)
         r = map_lanes(_absolute_residual, study, theta, batch=batch)[alive]
         kinds = (r[..., :forces], r[..., forces:])
         spread = np.array([np.nanmedian(v) if np.any(np.isfinite(v)) else 0.0 for v in kinds])

@@ -127,7 +127,7 @@ def refit_with_sigma(study: Study, settings: Settings, theta, sigma) -> Solved:
 def _solve_more(study, settings, sigma, progress, rows, starts) -> Solved:
     """Further starts of a few lanes; their batch does not depend on how many there are."""
     settings = dataclasses.replace(settings, batch=min(settings.batch, FEW))
-    fewest = study.together(2, settings.batch)  # one alone would be another program
+    fewest = study.batch_size(2, settings.batch)  # one alone would be another program
     filled = np.arange(max(len(rows), min(fewest, 2))) % len(rows)
     alive = None if progress is None else lambda done, of: progress(0, of)
     solved = _solve(study, settings, rows[filled], starts[filled], sigma, alive)
@@ -155,7 +155,7 @@ def _solve_jointly(
     lanes = study.lanes.lower.shape[0]
     common = _common(study, settings, len(starts), progress)
     # One size for all calls, so that it is compiled once.
-    common["batch"] = study.together(lanes * settings.starts, settings.batch)
+    common["batch"] = study.batch_size(lanes * settings.starts, settings.batch)
     of_starts = np.swapaxes(starts.reshape(lanes, len(starts) // lanes, -1), 0, 1)
     return solve_jointly(
         study, of_starts, sigma, separately=not near, tolerances=settings.tolerances, **common
@@ -166,7 +166,7 @@ def _common(study: Study, settings: Settings, starts: int, progress) -> dict[str
     """What all solvers are told."""
     report = None if progress is None else lambda done: progress(done, starts)
     dtype = np.float32 if settings.float32 else np.float64
-    batch = study.together(starts, settings.batch)
+    batch = study.batch_size(starts, settings.batch)
     return {"batch": batch, "progress": report, "dtype": dtype}
 
 

@@ -32,7 +32,7 @@ class Prediction:
 
 def predictions(study: Study, theta: np.ndarray, batch: int = 256) -> Prediction:
     """Residuals of all lanes at `theta` (lanes, P), in N and mm."""
-    value = map_lanes(residual_value, study, theta, batch=study.together(len(theta), batch))
+    value = map_lanes(residual_value, study, theta, batch=study.batch_size(len(theta), batch))
     lanes, first = study.lanes, 0
     found: dict[str, Any] = {"joints": None}
     for kind in forces(lanes) + markers(lanes):

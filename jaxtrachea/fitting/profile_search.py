@@ -53,7 +53,7 @@ class Sides:
         self.first = np.clip(self.target * u.se[lane, unknown], 1e-9 * (1 + np.abs(here)), None)
         self.first = np.where(np.isfinite(self.first), self.first, 1.0)
         starts = result.lanes * settings.starts
-        self.batch = result.study.together(max(starts, 16), settings.batch)
+        self.batch = result.study.batch_size(max(starts, 16), settings.batch)
         self.sigma = result.whitened_sigma
         self.cost = self._costs_at_estimate()
 

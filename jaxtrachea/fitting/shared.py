@@ -339,7 +339,7 @@ def _evaluate_or_refit(
 
 def _evaluate(task: _Task, theta: Float[np.ndarray, "L P"]) -> Evaluated:
     """Cost and normal equations of all lanes, a batch at a time."""
-    batch = task.study.together(len(theta), task.batch)
+    batch = task.study.batch_size(len(theta), task.batch)
     cost, gradient, hessian = map_lanes(
         _normal_equations, task.study, theta, task.sigma, batch=batch, dtype=task.dtype
     )

@@ -252,7 +252,7 @@ def _seen_of_sections(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     by number, at the displacements of the study, whatever they measured.
     """
     J = map_lanes(
-        _curves_by_unknowns, study, theta, rows=lanes, batch=study.together(len(lanes), 16)
+        _curves_by_unknowns, study, theta, rows=lanes, batch=study.batch_size(len(lanes), 16)
     )
     log = _log(study)[lanes]
     J = J * np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))[:, None, None]

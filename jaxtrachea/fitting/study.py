@@ -111,7 +111,7 @@ class Study:
                 "choose another skeleton"
             )
 
-    def together(self, total: int, most: int) -> int:
+    def batch_size(self, total: int, most: int) -> int:
         """Lanes computed together, of `total` and of `most` at most: a size of few.
 
         Of deforming cross-sections one on a CPU: lanes side by side gain nothing there, wait for

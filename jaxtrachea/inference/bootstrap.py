@@ -82,7 +82,7 @@ def bootstrap(
     _check(count, kind, block)
     result.study.refuse_joint("the bootstrap")
     seen = predictions(result.study, result.theta)
-    batch = result.study.together(max(result.lanes * settings.starts, 16), settings.batch)
+    batch = result.study.batch_size(max(result.lanes * settings.starts, 16), settings.batch)
     one = dataclasses.replace(settings, starts=1, batch=batch, scrutiny=False)
     thetas, usable = [], []
     together = max(_AT_ONCE // count, 1)

@@ -234,7 +234,7 @@ def influence(result: FitResult, batch: int = 128) -> Influence:
     free = np.asarray(result.study.lanes.active) * ~result.at_bound
     diagnostics = map_lanes(
         diagnose, result.study, result.theta, result.whitened_sigma, result.relative, free,
-        batch=result.study.together(result.lanes, batch),
+        batch=result.study.batch_size(result.lanes, batch),
     )  # fmt: skip
     return _conclude(result, diagnostics)
 

@@ -140,17 +140,22 @@ def fits_per_second(study, specimens: int) -> tuple[float, int]:
     return specimens / taken, int(sum(FitStatus(int(v)).succeeded for v in result.status))
 
 
+def fits_of(name: str, specimens: int) -> tuple[float, int]:
+    """Fits a second of a level, and how many have an estimate; prints them."""
+    study = (
+        section_study(SECTIONS[name], specimens) if name in SECTIONS
+        else line_study(LEVELS[name], specimens)
+    )  # fmt: skip
+    found, good = fits_per_second(study, specimens)
+    print(f"{name:20s} {found:10.4g} fits/s, {good} of {specimens} estimated", flush=True)
+    return found, good
+
+
 def fits() -> None:
     """Print the fits a second of every level, in one run."""
     load = Load()
     for name in (*LEVELS, *SECTIONS):
-        deforms = name in SECTIONS
-        count = FEW if deforms else 64
-        make = functools.partial(section_study, SECTIONS[name]) if deforms else (
-            functools.partial(line_study, LEVELS[name])
-        )  # fmt: skip
-        found, good = fits_per_second(make(count), count)
-        print(f"{name:20s} {found:10.4g} fits/s, {good} of {count} estimated", flush=True)
+        fits_of(name, FEW if name in SECTIONS else 64)
     print(f"others kept {load.others() or 0.0:.2g} cores busy")
 
 
@@ -164,12 +169,7 @@ def rows(*, quick: bool = False) -> list[dict[str, Any]]:
         few = FEW if name in SECTIONS else SPECIMENS
         fits, good = None, 0
         if not quick:
-            study = (
-                section_study(SECTIONS[name], few) if name in SECTIONS
-                else line_study(LEVELS[name], few)
-            )  # fmt: skip
-            fits, good = fits_per_second(study, few)
-            print(f"{name:20s} {fits:10.4g} fits/s, {good} of {few} estimated", flush=True)
+            fits, good = fits_of(name, few)
         lanes = 32 if name in SECTIONS else 256
         row = {"level": name, "call": best[name], "lane": best[f"{name}, lanes"] / lanes}
         found.append(row | {"fits": fits, "estimated": good, "specimens": few})
