@@ -269,7 +269,7 @@ def rising_root(
 ) -> Float[Array, "*n"]:
     """Roots of functions that rise from `low` to `high`, by Newton steps kept in the bracket.
 
-    A step that leaves the bracket goes to its middle instead. Up to 64 steps; callers give the
+    A step that leaves the bracket goes to its middle instead. Up to 68 steps; callers give the
     derivatives of the root, none is taken through the loop.
 
     Args:
@@ -281,24 +281,30 @@ def rising_root(
         sought: which roots; the others keep their start.
     """
 
+    def newton(x, low, high):
+        value, slope = value_and_slope(x)
+        low, high = jnp.where(value < 0, x, low), jnp.where(value < 0, high, x)
+        new = x - value / slope
+        return jnp.where((new >= low) & (new <= high), new, (low + high) / 2), low, high
+
     def moving(x, step):
         return jnp.abs(step) > least_step(x)
 
-    def newton(state):
+    def newton_where_moving(state):
         x, low, high, step, count = state
-        (value, slope), goes = value_and_slope(x), moving(x, step)
-        low, high = jnp.where(value < 0, x, low), jnp.where(value < 0, high, x)
-        new = x - value / slope
-        new = jnp.where((new >= low) & (new <= high), new, (low + high) / 2)
+        (new, low, high), goes = newton(x, low, high), moving(x, step)
         # What has settled stays, whatever the others do: no row knows of its neighbours.
         return jnp.where(goes, new, x), low, high, jnp.where(goes, new - x, step), count + 1
 
     def unsettled(state):
         return jnp.any(moving(state[0], state[3])) & (state[4] < 64)
 
-    first = jnp.where(sought, jnp.full_like(start, jnp.inf), 0)
-    begin = start, low, high, first, jnp.zeros((), jnp.int32)
-    return jax.lax.while_loop(unsettled, newton, begin)[0]
+    # Steps that every row takes in the bracket given, none waited for: most rows need no others,
+    # and a round of the loop below takes several times as long.
+    x = jax.lax.fori_loop(0, 3, lambda _, x: newton(x, low, high)[0], start)
+    new, low, high = newton(x, low, high)
+    begin = jnp.where(sought, new, start), low, high, jnp.where(sought, new - x, 0)
+    return jax.lax.while_loop(unsettled, newton_where_moving, (*begin, jnp.zeros((), jnp.int32)))[0]
 
 
 @jax.custom_jvp
