@@ -137,9 +137,17 @@ def test_span_of_a_front_is_that_of_whole_plans():
         errors = {"force": error, "joints": None, "surface": None}
         return {"ladder": ladder, "errors": errors, "times": {"call": {"median": call}}}
 
-    plans = [row("together", 0.0, 6e-4), row("together", 0.1, 3e-4), row("together", 0.2, 5e-4)]
-    others = [row("form", 0.0, 1e-4), {"ladder": "mesh", "left_out": "-"}]
-    assert fronts({"a": plans + others, "b": others}) == [["a", "2", "-"], ["b", "-", "-"]]
+    plans = [row("together", *v) for v in ((0, 6e-4), (0.05, 4e-4), (0.08, 5e-4), (0.8, 1e-4))]
+    others = [row("form", 0.0, 5e-5), {"ladder": "mesh", "left_out": "-"}]
+    assert fronts({"a": plans + others, "b": others}) == [
+        ["a", "1.5", "-", "6", "-", "80 %"], ["b", "-", "-", "-", "-", "-"],
+    ]  # fmt: skip
+
+
+def test_no_plan_is_left_out_of_the_plans_compared():
+    rungs = {str(i): {} for i in range(7)}
+    assert picked(Ladder("together", "together", rungs, {}), 3) == list(rungs)
+    assert picked(Ladder("mesh", "truncation", rungs, {}), 3) == ["0", "3", "6"]
 
 
 def test_what_the_finest_level_beats_is_not_on_the_front():

@@ -60,7 +60,7 @@ def measure(
     for ladder in (*found, *more):
         programs, points = {}, []
         finest, own = ladder.levels(full, list(ladder.rungs)[-1]), part_of(ladder.name)
-        for rung in _picked(ladder, settings.rungs):
+        for rung in picked(ladder, settings.rungs):
             levels = ladder.levels(full, rung)
             report(f"{ladder.name} {rung}")
             for one in (finest, levels):
@@ -174,10 +174,13 @@ def choice_row(
     } | end  # fmt: skip
 
 
-def _picked(ladder: Ladder, rungs: int) -> list[str]:
-    """At most so many rungs, evenly, the coarsest and the finest among them; 0: all."""
+def picked(ladder: Ladder, rungs: int) -> list[str]:
+    """At most so many rungs, evenly, the coarsest and the finest among them; 0: all.
+
+    All of whole plans: they are there to be compared with one another.
+    """
     names = list(ladder.rungs)
-    if not rungs or len(names) <= rungs:
+    if not rungs or len(names) <= rungs or ladder.kind == "together":
         return names
     at = np.linspace(0, len(names) - 1, max(rungs, 2)).round().astype(int)
     return [names[i] for i in at]

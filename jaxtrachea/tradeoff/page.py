@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from jaxtrachea.tradeoff.front import front
+from jaxtrachea.tradeoff.front import front, worst
 from jaxtrachea.tradeoff.load import QUIET
 
 HEAD = ["ladder", "level", "force", "joints", "surface", "contact [mm]", "gradient",
@@ -103,6 +103,8 @@ def busy(points: list[dict[str, Any]]) -> str:
     return text if max(loads) < QUIET else f"**{text}: compare ratios, not times**"
 
 
+FRONT_HEAD = ["scene", "within 10 %: a call", "a lane", "all: a call", "a lane",
+              "error of the quickest of all"]  # fmt: skip
 CHOICE_HEAD = ["scene", "tolerance", "least", "dropped (changes alone)", "came back",
                "verified error", "cost", "chosen / full [µs]", "ratio", "ratio / cost"]  # fmt: skip
 
@@ -128,22 +130,34 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
     return found
 
 
-def fronts(scenes: dict[str, list[dict[str, Any]]]) -> list[list[str]]:
-    """Scene, and by which factor the times of its Pareto front differ: a call, a lane.
+#: Errors within which a plan is one to use; plans beyond count in a front of their own columns.
+WITHIN = (0.1, float("inf"))
 
-    Of the ladder `together`: whole plans, timed in the same turns. Finest levels of other ladders
-    can be other programs, and were timed at other times.
+
+def fronts(scenes: dict[str, list[dict[str, Any]]]) -> list[list[str]]:
+    """Scene; by which factor the times of its Pareto front differ, a call and a lane; its end.
+
+    Twice: of plans within 10 % of the full one, and of all; then the largest error of the quickest
+    of all. Of the ladder `together`: whole plans, timed in the same turns. Finest levels of other
+    ladders can be other programs, and were timed at other times.
     """
     found = []
     for name, rows in scenes.items():
         points = [row for row in rows if row.get("ladder") == "together"]
-        spans = []
-        for which in ("call", "lane"):
-            own = [p for p in points if which in p["times"]]
-            times = [own[i]["times"][which]["median"] for i in front(own, which)]
-            spans.append(f"{max(times) / min(times):.2g}" if times else "-")
-        found.append([name, *spans])
+        row = [name]
+        for most in WITHIN:
+            near = [p for p in points if worst(p) <= most]
+            row += [_span([p for p in near if which in p["times"]], which)
+                    for which in ("call", "lane")]  # fmt: skip
+        quickest = min(points, key=lambda p: p["times"]["call"]["median"], default=None)
+        found.append([*row, "-" if quickest is None else _percent(worst(quickest))])
     return found
+
+
+def _span(points: list[dict[str, Any]], which: str) -> str:
+    """Slowest over quickest of a front; - where nothing was timed."""
+    times = [points[i]["times"][which]["median"] for i in front(points, which)]
+    return f"{max(times) / min(times):.2g}" if times else "-"
 
 
 def level_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
@@ -169,7 +183,7 @@ def document(folder: Path, head: str) -> str:
               if p.stem not in ("choice", "levels")}  # fmt: skip
     tables = {
         "choice": table(CHOICE_HEAD, choice_rows(choices), 5) + "\n" + measured(choices),
-        "fronts": table(["scene", "a call", "a lane"], fronts(scenes), 1),
+        "fronts": table(FRONT_HEAD, fronts(scenes), 1),
         "levels": table(["level", "a call", "a lane of 256", "fits/s"], level_rows(levels), 1)
         + f"\n{levels[0]['where']}\n",
     }
