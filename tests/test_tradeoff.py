@@ -146,8 +146,8 @@ def test_span_of_a_front_is_that_of_whole_plans():
 
 def test_no_plan_is_left_out_of_the_plans_compared():
     rungs = {str(i): {} for i in range(7)}
-    assert picked(Ladder("together", "together", rungs, {}), 3) == list(rungs)
-    assert picked(Ladder("mesh", "truncation", rungs, {}), 3) == ["0", "3", "6"]
+    assert measuring.picked(Ladder("together", "together", rungs, {}), 3) == list(rungs)
+    assert measuring.picked(Ladder("mesh", "truncation", rungs, {}), 3) == ["0", "3", "6"]
 
 
 def test_what_the_finest_level_beats_is_not_on_the_front():
