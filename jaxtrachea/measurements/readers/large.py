@@ -5,9 +5,10 @@ test here is for what pyarrow would take in another way than `text.read_columns`
 what it refuses is odd, too. Both round decimal numbers to the nearest float64.
 """
 
+import importlib
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -175,11 +176,11 @@ def _parsed(
     decimal: str,
     names: Sequence[int],
     numbers: Sequence[int],
-):
+) -> Any:
     """The table of pyarrow, columns by their place; None if it refuses a row or a cell."""
     try:
-        import pyarrow as pa
-        from pyarrow import csv
+        pa = importlib.import_module("pyarrow")
+        csv = importlib.import_module("pyarrow.csv")
     except ImportError:
         return None
     kinds = dict.fromkeys(map(str, names), pa.dictionary(pa.int32(), pa.string()))
