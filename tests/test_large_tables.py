@@ -117,6 +117,7 @@ ODD = {
     "a line end of old Macs": (with_line("A,1,35.5,0.4,1.0\rA,1,35.5,0.4,1.0"), {}),
     "UTF-16": (TABLE.encode("utf-16"), {}),
     "zero byte": (TABLE.replace("B", "B\0"), {}),
+    "zero byte where nobody reads": (column("operator", ["a\0b"] * 32), {}),
     "names in latin-1": (with_specimen("Trachée").encode("latin-1"), {}),
     "latin-1 that would pass for UTF-8": (
         with_specimen("é").encode() + "A,9,35.5,0,0,\xe9".encode("latin-1"), {}),
