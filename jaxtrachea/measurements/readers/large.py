@@ -161,12 +161,14 @@ def _is_odd(found: Opened, end: int, all_read: bool) -> bool:
 
 
 def _decimal_sign(found: Opened, end: int, delimiter: str) -> str | None:
-    """Point or comma; None if some cells may have this and some that."""
-    if delimiter == "," or found.data.find(b",", found.begin) < 0:
+    """Point or comma; None if pyarrow would take a comma with no digit after it.
+
+    Where rows have points and commas, numbers with commas are refused by pyarrow, and so odd.
+    """
+    data, begin = found.data, found.begin
+    if delimiter == "," or data.find(b",", begin) < 0 or data.find(b".", begin) >= 0:
         return "."
-    if found.data.find(b".", found.begin) >= 0:
-        return None
-    return None if _NO_DIGIT_AFTER_COMMA.search(found.data, found.begin, end) else ","
+    return None if _NO_DIGIT_AFTER_COMMA.search(data, begin, end) else ","
 
 
 def _parsed(
