@@ -14,19 +14,19 @@ import numpy as np
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, Fault, RawCurve, ReadOptions
-from jaxtrachea.measurements.readers.ragged import limits_of, read_curves
-from jaxtrachea.measurements.readers.ragged_writer import write_ragged
-from jaxtrachea.measurements.readers.reader import Reader
-from jaxtrachea.measurements.readers.safe_hdf5 import (
+from jaxtrachea.measurements.readers.hdf5_values import (
     attribute,
     measured,
     names_in,
     number_attribute,
     numeric,
-    opened,
     text_attribute,
     unit_of,
 )
+from jaxtrachea.measurements.readers.ragged import limits_of, read_curves
+from jaxtrachea.measurements.readers.ragged_writer import write_ragged
+from jaxtrachea.measurements.readers.reader import Reader
+from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.measurements.readers.text import resolve_unit
 from jaxtrachea.measurements.roles import role_dimension
 from jaxtrachea.units import convert

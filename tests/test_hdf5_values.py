@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxtrachea.measurements.curve import Fault
-from jaxtrachea.measurements.readers.safe_hdf5 import (
+from jaxtrachea.measurements.readers.hdf5_values import (
     attribute,
     names_in,
     number_attribute,
