@@ -57,7 +57,8 @@ def _refuse_results(given: Sequence[str]) -> None:
     import contextlib
 
     from jaxtrachea.measurements.read import DataError
-    from jaxtrachea.measurements.readers.safe_hdf5 import attribute, opened
+    from jaxtrachea.measurements.readers.hdf5_values import attribute
+    from jaxtrachea.measurements.readers.safe_hdf5 import opened
     from jaxtrachea.results.stored import SCHEMA
 
     for name in given:

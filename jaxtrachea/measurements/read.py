@@ -11,11 +11,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, RawCurve, ReadOptions
+from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, ReadOptions
 from jaxtrachea.measurements.readers import READERS, hdf5, reader_of
-from jaxtrachea.measurements.readers.lines import Lines, Text, first_bytes, read_lines
+from jaxtrachea.measurements.readers.large import MIN_BYTES, first_lines
+from jaxtrachea.measurements.readers.lines import (
+    Lines,
+    Text,
+    first_bytes,
+    read_bytes,
+    split_lines,
+)
 from jaxtrachea.measurements.readers.patterns import ensure_quick
-from jaxtrachea.measurements.readers.reader import Reader
+from jaxtrachea.measurements.readers.reader import Reader, Records
 from jaxtrachea.measurements.readers.recognise import HEAD, kind_of
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.measurements.readers.workbook import listed, read_sheet
@@ -162,7 +169,7 @@ def _check_file(path: Path) -> None:
         )
 
 
-def _read_file(path: Path, options: ReadOptions) -> tuple[list[RawCurve | BadCurve], list[str]]:
+def _read_file(path: Path, options: ReadOptions) -> tuple[Records, list[str]]:
     """What one file holds, and what should be said of it.
 
     Raises:
@@ -188,7 +195,11 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[list[RawCurve | BadCur
             place=str(path),
             cure="remove data.format",
         )
-    text = Text(path, read_lines(path))
+    data = read_bytes(path)
+    if (records := _read_large(path, data, asked, options)) is not None:
+        return records, []
+    text = Text(path, split_lines(path, data))
+    del data
     reader = asked or _recognise(text.lines, READERS)
     if reader.read_text is not None:
         return reader.read_text(text, options), []
@@ -196,9 +207,19 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[list[RawCurve | BadCur
     return reader.read(path, options), []
 
 
+def _read_large(
+    path: Path, data: bytes, asked: Reader | None, options: ReadOptions
+) -> Records | None:
+    """What a large text holds; None if it is not large, or must be read line by line."""
+    if len(data) < MIN_BYTES:
+        return None
+    reader = asked or _recognise(first_lines(data), READERS)
+    return reader.read_large and reader.read_large(path, data, options)
+
+
 def _read_workbook(
     path: Path, asked: Reader | None, options: ReadOptions
-) -> tuple[list[RawCurve | BadCurve], list[str]]:
+) -> tuple[Records, list[str]]:
     """The curves of a sheet, and which sheet it is if there are several.
 
     Raises:

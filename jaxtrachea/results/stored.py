@@ -19,7 +19,8 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.read import Curve, DataError
-from jaxtrachea.measurements.readers.safe_hdf5 import attribute, numeric, opened
+from jaxtrachea.measurements.readers.hdf5_values import attribute, numeric
+from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.results.arrays import STORED_AS

@@ -29,9 +29,10 @@ from jaxtrachea.measurements.curve import (
     ReadOptions,
     identify_file,
 )
+from jaxtrachea.measurements.readers.hdf5_values import attribute, numeric, unit_of
 from jaxtrachea.measurements.readers.lines import Lines, read_lines
 from jaxtrachea.measurements.readers.reader import Reader
-from jaxtrachea.measurements.readers.safe_hdf5 import attribute, numeric, opened, unit_of
+from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.measurements.readers.text import numbers, read_columns, resolve_unit
 from jaxtrachea.units import convert
 

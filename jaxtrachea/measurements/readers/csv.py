@@ -1,9 +1,9 @@
 """Tidy CSV or TSV: one row per sample, one table for a whole study."""
 
-import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import compress, islice, pairwise
 from operator import ne
+from pathlib import Path
 
 import numpy as np
 
@@ -18,24 +18,26 @@ from jaxtrachea.measurements.curve import (
     ReadOptions,
     identify_file,
 )
+from jaxtrachea.measurements.readers import large
 from jaxtrachea.measurements.readers.lines import Lines, Text, is_comment
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.text import (
     ALIASES,
     Table,
-    find_roles,
     guess_delimiter,
     read_columns,
-    require_roles,
-    resolve_unit,
     role_values,
     split_cells,
+    time_column,
     time_values,
 )
-from jaxtrachea.measurements.roles import SAMPLED, is_ring_role, role_dimension
-from jaxtrachea.units import column_unit, parse_quantity
-
-NUMERIC = ("s", "phi", *SAMPLED)
+from jaxtrachea.measurements.readers.tidy_head import (
+    Header,
+    read_header,
+    read_state,
+    roles_and_units,
+)
+from jaxtrachea.units import column_unit
 
 
 def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
@@ -53,24 +55,59 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
     """
     place, lines = text.place, text.lines.without_comments()
     try:
-        state, lines = _state(lines, text.word)
-        table = _table(text, lines)
-        roles = find_roles(table.names, options)
-        require_roles(roles, table.names)
-        units = {
-            role: resolve_unit(role, table.units[i], options, f"column {table.names[i]!r}")
-            for role, i in roles.items()
-            if role in NUMERIC or is_ring_role(role)
-        }
+        state, lines = read_state(lines, text.word)
+        header = read_header(text, lines)
+        table = _table(text, lines, header)
+        roles, units = roles_and_units(header, options)
     except Fault as fault:
         raise DataError(fault.message, place=place, cure=fault.cure) from None
     except DataError as error:
         raise DataError.like(error, place=error.place or place) from None
+    return _curves(table, roles, units, state, options)
+
+
+def read_large(path: Path, data: bytes, options: ReadOptions) -> list[RawCurve | BadCurve] | None:
+    """Read a large tidy table in which no row is odd; see `large`.
+
+    Args:
+        path: the file.
+        data: the text.
+        options: columns, units and naming.
+
+    Returns:
+        The records of `read`; None if `read` must say what is odd, or read it.
+    """
+    found = large.opened(data)
+    if found is None:
+        return None
+    text = Text(path, found.lines)
+    try:
+        state, lines = read_state(found.lines, text.word)
+        header = read_header(text, lines)
+        roles, units = roles_and_units(header, options)
+        time = time_column(header.names, header.units, roles, options)
+        names = {roles[role] for role in ("specimen", "trial") if role in roles}
+        numbers = {roles[role] for role in units} | ({time[0]} if time else set())
+        width = len(header.names)
+        if names & numbers:
+            return None
+        cells = large.read_cells(found, width, header.delimiter, [*names], [*numbers])
+        if cells is None:
+            return None
+        return _curves(_filled(text, header, *cells), roles, units, state, options)
+    except (Fault, DataError):
+        return None
+
+
+def _curves(
+    table: Table, roles: dict[str, int], units: dict[str, str], state: dict, options: ReadOptions
+) -> list[RawCurve | BadCurve]:
+    """A record of each curve, in the order of the table."""
     twice = [key for key in state if key in roles]
     if twice:
         raise DataError(
             f"{twice[0]} stands in the first line and in a column",
-            place=place,
+            place=table.text.place,
             cure="remove one",
         )
     groups = _group(table, roles, state, options)
@@ -79,81 +116,32 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
     ]
 
 
-def _state(lines: Lines, word: str) -> tuple[dict, Lines]:
-    """The optional JSON object on the first line: what holds for the whole table."""
-    if not lines or not lines[0].text.lstrip().startswith("{"):
-        return {}, lines
-    try:
-        state = json.loads(lines[0].text)
-    except (ValueError, RecursionError) as error:
-        raise DataError(
-            f"{word} {lines[0].number}: not a JSON object ({error})",
-            cure="correct it",
-        ) from None
-    known: dict = {key: str(state[key]) for key in ("specimen", "trial") if key in state}
-    for key in ("s", "phi"):
-        if key in state:
-            if not isinstance(state[key], str | int | float):
-                raise DataError(
-                    f"{word} {lines[0].number}: {key}: expected a quantity with its unit, as "
-                    '"17 mm"',
-                )
-            try:
-                known[key] = parse_quantity(state[key], role_dimension(key))
-            except (ValueError, TypeError) as error:
-                raise DataError(
-                    f"{word} {lines[0].number}: {key}: {error}",
-                ) from None
-    if "direction" in state:
-        known["direction"] = _two_numbers(state["direction"], f"{word} {lines[0].number}")
-    return known, lines[1:]
-
-
-def _two_numbers(value: object, line: str) -> tuple[float, ...]:
-    """The direction of the tool from the first line; its length is checked later."""
-    numbers = value if isinstance(value, list) else []
-    if len(numbers) != 2 or any(type(v) not in (int, float) for v in numbers):
-        raise DataError(
-            f"{line}: direction is {json.dumps(value)[:80]}, expected two numbers, as [0.8, 0.6]",
-            cure="give the components along the inward normal and along the circumference",
-        )
-    return tuple(map(float, numbers))
-
-
-def _table(text: Text, lines: Lines) -> Table:
-    if not lines:
-        raise DataError(
-            "is empty",
-            place=text.place,
-            cure="expected a header with displacement and force",
-        )
-    delimiter = guess_delimiter(lines[0].text)
-    header = split_cells(lines[0].text, delimiter)
-    while header and header[-1] == "":
-        header.pop()
-    names, units = zip(*map(column_unit, header), strict=True)
-    repeated = {name for name in names if name and names.count(name) > 1}
-    if repeated:
-        raise DataError(
-            f"{text.word} {lines[0].number}: column {min(repeated)!r} is there twice",
-            place=text.place,
-            cure="rename one",
-        )
-    numbers, columns = read_columns(lines[1:], len(header), delimiter, text.word)
+def _table(text: Text, lines: Lines, header: Header) -> Table:
+    width = len(header.names)
+    numbers, columns = read_columns(lines[1:], width, header.delimiter, text.word)
     if not numbers:
         raise DataError(
-            f"no rows below the header in {text.word} {lines[0].number}",
+            f"no rows below the header in {text.word} {header.line}",
             place=text.place,
             cure="export it again",
         )
+    return _filled(text, header, numbers, columns)
+
+
+def _filled(
+    text: Text,
+    header: Header,
+    lines: Sequence[int],
+    columns: Sequence[list[str] | np.ndarray],
+) -> Table:
     return Table(
         text=text,
-        names=list(names),
-        units=list(units),
-        header_line=lines[0].number,
-        lines=numbers,
+        names=header.names,
+        units=header.units,
+        header_line=header.line,
+        lines=lines,
         columns=columns,
-        delimiter=delimiter,
+        delimiter=header.delimiter,
     )
 
 
@@ -197,7 +185,7 @@ def _group(
     return groups
 
 
-def _blocks(columns: list[list[str]], count: int) -> Iterator[tuple[int, int]]:
+def _blocks(columns: Sequence[Sequence[str] | np.ndarray], count: int) -> Iterator[tuple[int, int]]:
     """First row, and that after the last, of rows that have the same cells in these columns."""
     ends: set[int] = set()
     for cells in columns:
@@ -233,7 +221,8 @@ def _curve(
     picked: slice,
     options: ReadOptions,
 ) -> RawCurve | BadCurve:
-    rows = np.array(table.lines[picked])
+    lines = table.lines[picked]
+    rows = np.arange(lines.start, lines.stop) if isinstance(lines, range) else np.array(lines)
     source = f"{table.text.place}:{rows[0]}-{rows[-1]}"
     try:
         values = {
@@ -262,6 +251,8 @@ def _constant(
     column = values.get(role)
     if column is None:
         return state.get(role)
+    if np.isfinite(column[0]) and (column == column[0]).all():
+        return float(column[0])
     if np.isnan(column).all():
         return None
     unknown = np.isnan(column)
@@ -279,7 +270,7 @@ def _constant(
             f"{role} varies from {np.nanmin(column):g} to {np.nanmax(column):g} within the curve",
             "give each position its own trial",
         )
-    return float(column[0] if np.ptp(column) == 0 else column.mean())
+    return float(column.mean())
 
 
 def _is_tidy(lines: Lines) -> bool:
@@ -297,4 +288,4 @@ def _is_tidy(lines: Lines) -> bool:
     return bool(names & set(ALIASES["specimen"]))
 
 
-TIDY = Reader("tidy", read_text=read, is_text=_is_tidy)
+TIDY = Reader("tidy", read_text=read, read_large=read_large, is_text=_is_tidy)

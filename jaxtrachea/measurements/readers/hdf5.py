@@ -14,17 +14,19 @@ import numpy as np
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, Fault, RawCurve, ReadOptions
-from jaxtrachea.measurements.readers.ragged import limits_of, read_curves
-from jaxtrachea.measurements.readers.ragged_writer import write_ragged
-from jaxtrachea.measurements.readers.reader import Reader
-from jaxtrachea.measurements.readers.safe_hdf5 import (
+from jaxtrachea.measurements.readers.hdf5_values import (
     attribute,
     measured,
+    names_in,
+    number_attribute,
     numeric,
-    opened,
     text_attribute,
     unit_of,
 )
+from jaxtrachea.measurements.readers.ragged import limits_of, read_curves
+from jaxtrachea.measurements.readers.ragged_writer import write_ragged
+from jaxtrachea.measurements.readers.reader import Reader
+from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.measurements.readers.text import resolve_unit
 from jaxtrachea.measurements.roles import role_dimension
 from jaxtrachea.units import convert
@@ -119,7 +121,7 @@ def _trial(group: Any, key: tuple[str, str], source: str, options: ReadOptions) 
         raise Fault(
             "shape", "is a dataset, expected a group for the trial", "store a group per trial"
         )
-    names = frozenset(group)
+    names = names_in(group)
     displacement = _quantity(group, "displacement", "displacement", source, options)
     return RawCurve(
         *key,
@@ -206,7 +208,7 @@ def _quantity(group: Any, name: str, role: str, source: str, options: ReadOption
 def _position(group: Any, role: str, source: str, options: ReadOptions) -> float | None:
     """Attribute ``s_c`` or ``phi_c`` of a trial; its unit is in ``s_c_unit``, ``phi_c_unit``."""
     name = f"{role}_c"
-    value = attribute(group, name)
+    value = number_attribute(group, name)
     if value is None:
         return None
     if np.ndim(value) != 0 or not isinstance(value, (int, float, np.number)):

@@ -116,17 +116,36 @@ def first_unpacked(path: Path, count: int) -> bytes:
 
 
 def read_lines(path: Path) -> Lines:
-    """All lines of a text file that hold something, with their numbers.
-
-    UTF-8 (with or without byte-order mark) and UTF-16 with one are decoded; other bytes are taken
-    for Latin-1, in which many instruments write µ and °. Unix, DOS and old Mac line ends. A file
-    packed by gzip is unpacked in memory.
+    """All lines of a text file that hold something; see `read_bytes` and `split_lines`.
 
     Raises:
-        DataError: the file is too large, packed or unpacked, or unreadable, damaged or binary.
+        DataError: as these.
     """
-    packed = first_bytes(path, 2) == GZIP
-    data = _unpacked(path) if packed else _bytes(path)
+    return split_lines(path, read_bytes(path))
+
+
+def read_bytes(path: Path) -> bytes:
+    """What a text file holds; one packed by gzip is unpacked in memory.
+
+    Raises:
+        DataError: the file is too large, packed or unpacked, or unreadable or damaged.
+    """
+    return _unpacked(path) if first_bytes(path, 2) == GZIP else _bytes(path)
+
+
+def split_lines(path: Path, data: bytes) -> Lines:
+    """All lines of a text that hold something, with their numbers.
+
+    UTF-8 (with or without byte-order mark) and UTF-16 with one are decoded; other bytes are taken
+    for Latin-1, in which many instruments write µ and °. Unix, DOS and old Mac line ends.
+
+    Args:
+        path: the file, for messages.
+        data: the text.
+
+    Raises:
+        DataError: it holds zero bytes.
+    """
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         text = data.decode("utf-16", errors="replace")
     else:

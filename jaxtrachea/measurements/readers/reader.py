@@ -17,6 +17,8 @@ class Reader(NamedTuple):
         name: by which `data.format` asks for it.
         read: reads a file by its path; None: text and sheets only.
         read_text: reads the lines of a text or of a sheet of a workbook; None: files only.
+        read_large: reads the bytes of a large text in a quicker way; None in place of records:
+            something is odd, and `read_text` must read it or say what is wrong.
         is_file: whether a file that begins with these bytes is of this format; `read` then gets
             it. Text, HDF5 and workbooks need no such sign.
         is_text: whether lines are of this format.
@@ -27,6 +29,7 @@ class Reader(NamedTuple):
     name: str
     read: Callable[[Path, ReadOptions], Records] | None = None
     read_text: Callable[[Text, ReadOptions], Records] | None = None
+    read_large: Callable[[Path, bytes, ReadOptions], Records | None] | None = None
     is_file: Callable[[bytes], bool] = lambda head: False
     is_text: Callable[[Lines], bool] = lambda lines: False
     is_hdf5: Callable[[Any], bool] = lambda file: False

@@ -12,9 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from jaxtrachea.measurements.curve import DataError, Fault
+from jaxtrachea.measurements.curve import DataError
 
 MAX_ELEMENTS = 10_000_000
 MAX_TOTAL_ELEMENTS = 100_000_000
@@ -77,7 +75,7 @@ def opened(
     with file:
         try:
             if audit:
-                _Audit(path, read, limits(file)).group(file, "", 0)
+                _Audit(path, read, limits(file)).group(file.id, "", 0)
         except DataError:
             raise
         except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
@@ -140,12 +138,15 @@ class _Audit:
         self.objects = 0
         self.elements = 0
         self.groups: set = set()
+        kinds = self.h5.h5t
+        self.numbers = (kinds.INTEGER, kinds.FLOAT, kinds.ENUM)
+        self.plain = (*self.numbers, kinds.STRING)
 
     def refuse(self, name: str, what: str, cure: str) -> DataError:
         return DataError(what, place=f"{self.path}:{name or '/'}", cure=cure)
 
     def group(self, group: Any, name: str, depth: int) -> None:
-        info = self.h5.h5o.get_info(group.id)
+        info = self.h5.h5o.get_info(group)
         if (info.fileno, info.addr) in self.groups:
             raise self.refuse(
                 name, "is linked from several places or from within itself", "store it once"
@@ -154,8 +155,7 @@ class _Audit:
         if depth > MAX_DEPTH:
             raise self.refuse(name, f"nested deeper than {MAX_DEPTH} groups", "flatten the file")
         self.attributes(group, name)
-        links = group.id.links
-        for child in group.id:
+        for child, kind in self.links(group):
             self.objects += 1
             if self.objects > MAX_OBJECTS:
                 raise self.refuse(name, f"more than {MAX_OBJECTS} objects in the file", "split it")
@@ -163,22 +163,33 @@ class _Audit:
             where = f"{name}/{text}"
             if not text.isprintable() or "\ufffd" in text:
                 raise self.refuse(f"{name}/{text!r}", "name with control characters", "rename it")
-            if links.get_info(child).type != self.h5.h5l.TYPE_HARD:
+            if kind != self.h5.h5l.TYPE_HARD:
                 raise self.refuse(
                     where, "is a soft or external link", "store the data itself in its place"
                 )
-            self.member(self.h5.h5o.open(group.id, child), where, depth)
+            self.member(self.h5.h5o.open(group, child), where, depth)
+
+    def links(self, group: Any) -> list[tuple[bytes, int]]:
+        """Names and kinds of the links of a group, at most one more than are allowed."""
+        found: list[tuple[bytes, int]] = []
+
+        def note(name: bytes, info: Any) -> bool | None:
+            found.append((name, info.type))
+            return True if len(found) > MAX_OBJECTS else None
+
+        group.links.iterate(note, info=True)
+        return found
 
     def member(self, identifier: Any, where: str, depth: int) -> None:
         if isinstance(identifier, self.h5.h5g.GroupID):
-            self.group(self.h5.Group(identifier), where, depth + 1)
+            self.group(identifier, where, depth + 1)
         elif isinstance(identifier, self.h5.h5d.DatasetID):
-            self.dataset(self.h5.Dataset(identifier), where)
+            self.dataset(identifier, where)
         else:
             raise self.refuse(where, "is neither group nor dataset", "remove it")
 
     def dataset(self, dataset: Any, name: str) -> None:
-        plan = dataset.id.get_create_plist()
+        plan = dataset.get_create_plist()
         if plan.get_layout() == self.h5.h5d.VIRTUAL:
             raise self.refuse(name, "is a virtual dataset", "store the data itself")
         if plan.get_external_count() > 0:
@@ -186,7 +197,7 @@ class _Audit:
         read = self.read or ("",)
         if not any(name == start or name.startswith(f"{start}/") for start in read):
             return
-        kind = dataset.id.get_type()
+        kind = dataset.get_type()
         if name in self.limits.texts and not self.is_number(kind):
             if not self.is_short_text(kind):
                 found = f"holds no text of fixed length of at most {MAX_TEXT_BYTES} bytes"
@@ -204,8 +215,7 @@ class _Audit:
         self.attributes(dataset, name)
 
     def is_number(self, kind: Any) -> bool:
-        numeric = (self.h5.h5t.INTEGER, self.h5.h5t.FLOAT, self.h5.h5t.ENUM)
-        return kind.get_class() in numeric and kind.get_size() <= 16
+        return kind.get_class() in self.numbers and kind.get_size() <= 16
 
     def is_short_text(self, kind: Any) -> bool:
         if kind.get_class() != self.h5.h5t.STRING or kind.is_variable_str():
@@ -214,7 +224,7 @@ class _Audit:
 
     def size(self, dataset: Any, width: int, name: str) -> None:
         """Refuse more numbers than are read, and many that are declared but not stored."""
-        size = math.prod(dataset.id.get_space().get_simple_extent_dims() or ())
+        size = math.prod(dataset.get_space().get_simple_extent_dims() or ())
         # Text counts as the numbers of 8 bytes that would fill its place.
         self.elements += size * max(1, width // 8)
         if size > self.limits.elements or self.elements > self.limits.total:
@@ -224,7 +234,7 @@ class _Audit:
                 f" at most {self.limits.elements} ({self.limits.total}) are read",
                 "thin out or split the recording",
             )
-        stored = dataset.id.get_storage_size()
+        stored = dataset.get_storage_size()
         if size > MAX_ELEMENTS and size * width > MOST_PACKED * stored:
             raise self.refuse(
                 name,
@@ -233,115 +243,18 @@ class _Audit:
             )
 
     def attributes(self, holder: Any, name: str) -> None:
-        count = self.h5.h5a.get_num_attrs(holder.id)
+        count = self.h5.h5a.get_num_attrs(holder)
         if count > MAX_ATTRIBUTES:
             raise self.refuse(name, f"{count} attributes, at most {MAX_ATTRIBUTES}", "remove some")
-        plain = (self.h5.h5t.INTEGER, self.h5.h5t.FLOAT, self.h5.h5t.ENUM, self.h5.h5t.STRING)
         for i in range(count):
-            attribute = self.h5.h5a.open(holder.id, index=i)
+            attribute = self.h5.h5a.open(holder, index=i)
             kind = attribute.get_type()
-            label = f"{name or '/'}@{attribute.name.decode('utf-8', 'replace')}"
-            if kind.get_class() not in plain:
-                raise self.refuse(label, "attribute is neither number nor text", "remove it")
             size = kind.get_size() * math.prod(attribute.shape or ())
-            if size > MAX_ATTRIBUTE_BYTES:
-                raise self.refuse(label, f"attribute of {size} bytes", "remove it")
-
-
-def numeric(group: Any, name: str) -> np.ndarray:
-    """Values of a dataset in an audited file, as float64.
-
-    Raises:
-        Fault: no such dataset ("column_missing"), or its bytes are damaged ("unreadable").
-    """
-    return _values(_dataset(group, name), name)
-
-
-def measured(group: Any, name: str) -> tuple[np.ndarray, str | None]:
-    """Values of a dataset in an audited file, as float64, and its unit; see `unit_of`.
-
-    Raises:
-        Fault: as `numeric` and `unit_of`.
-    """
-    dataset = _dataset(group, name)
-    return _values(dataset, name), _unit(dataset, name)
-
-
-def _dataset(group: Any, name: str) -> Any:
-    """A dataset of a group, opened in one step: far cheaper than `group.get`."""
-    import h5py
-
-    h5: Any = h5py
-    try:
-        identifier = h5.h5o.open(group.id, name.encode())
-    except KeyError:
-        identifier = None
-    if not isinstance(identifier, h5.h5d.DatasetID):
-        raise Fault(
-            "column_missing",
-            f"no dataset {name!r}; there are {', '.join(map(repr, group)) or 'none'}",
-            "store it, or correct its name",
-        )
-    return h5.Dataset(identifier)
-
-
-def _values(dataset: Any, name: str) -> np.ndarray:
-    if dataset.shape is None:
-        raise Fault("shape", f"dataset {name!r} has no shape", "store a vector")
-    try:
-        return np.asarray(dataset[()], dtype=np.float64)
-    except (OSError, RuntimeError, ValueError, TypeError) as error:
-        raise Fault(
-            "unreadable", f"dataset {name!r} is damaged ({error})", "copy the file again"
-        ) from None
-
-
-def unit_of(group: Any, name: str) -> str | None:
-    """Text of the attribute ``unit`` (or ``units``) of a dataset; None if there is none.
-
-    Raises:
-        Fault: the attribute is no text, or the two differ.
-    """
-    return _unit(group[name], name)
-
-
-def _unit(dataset: Any, name: str) -> str | None:
-    texts = {text_attribute(dataset, key) for key in ("unit", "units")} - {None}
-    if len(texts) > 1:
-        raise Fault(
-            "unit_unknown", f"{name!r} has two units, {sorted(map(str, texts))}", "remove one"
-        )
-    return texts.pop() if texts else None
-
-
-def text_attribute(holder: Any, name: str) -> str | None:
-    """A text attribute; None if there is none.
-
-    Raises:
-        Fault: it is no text.
-    """
-    value = attribute(holder, name)
-    if isinstance(value, bytes):
-        value = value.decode("utf-8", "replace")
-    if value is not None and not isinstance(value, str):
-        raise Fault(
-            "shape", f"attribute {name!r} is {value!r}, expected text", "store it as a string"
-        )
-    return value
-
-
-def attribute(holder: Any, name: str) -> Any:
-    """An attribute of a group or dataset; None if there is none.
-
-    Raises:
-        Fault: its bytes are damaged ("unreadable").
-    """
-    import h5py
-
-    try:
-        # Far cheaper than the exception behind `attrs.get`.
-        return holder.attrs[name] if h5py.h5a.exists(holder.id, name.encode()) else None
-    except (OSError, RuntimeError, ValueError, TypeError) as error:
-        raise Fault(
-            "unreadable", f"attribute {name!r} is damaged ({error})", "copy the file again"
-        ) from None
+            allowed = kind.get_class() in self.plain
+            if allowed and size <= MAX_ATTRIBUTE_BYTES:
+                continue
+            label = f"{name or '/'}@{attribute.name.decode('utf-8', 'replace')}"
+            what = (
+                f"attribute of {size} bytes" if allowed else "attribute is neither number nor text"
+            )
+            raise self.refuse(label, what, "remove it")

@@ -62,7 +62,7 @@ class Table:
         units: column units, None where the header gives none.
         header_line: number of the header, in the file or sheet.
         lines: number of each row.
-        columns: the cells of each column.
+        columns: the cells of each column; numbers where `large` has read them, NaN where empty.
         delimiter: what separates them.
     """
 
@@ -71,7 +71,7 @@ class Table:
     units: list[str | None]
     header_line: int
     lines: Sequence[int]
-    columns: list[list[str]]
+    columns: Sequence[list[str] | np.ndarray]
     delimiter: str
 
 
@@ -282,9 +282,40 @@ def _number_cure(cell: str) -> str:
 
 def role_values(table: Table, role: str, index: int, picked: slice, unit: str) -> np.ndarray:
     """Numbers of some rows of a role's column, in internal units (mm, N, rad, s)."""
-    cells, lines = table.columns[index][picked], table.lines[picked]
-    values = numbers(cells, lines, table.names[index], table.delimiter, table.text.word)
+    values = table.columns[index][picked]
+    if not isinstance(values, np.ndarray):
+        lines, name = table.lines[picked], table.names[index]
+        values = numbers(values, lines, name, table.delimiter, table.text.word)
     return convert(values, unit, role_dimension(role))
+
+
+def time_column(
+    names: Sequence[str], units: Sequence[str | None], roles: dict[str, int], options: ReadOptions
+) -> tuple[int, str] | None:
+    """The column of time and its unit: of `columns.time`, else the only one named so.
+
+    Args:
+        names: of the columns, without units.
+        units: of the columns, None where the header gives none.
+        roles: columns by role.
+        options: units for columns that have none.
+
+    Returns:
+        None if there is no such column, or it has no unit.
+
+    Raises:
+        Fault: the column named in the options has no unit.
+    """
+    if "time" in roles:
+        i = roles["time"]
+        return i, resolve_unit("time", units[i], options, f"column {names[i]!r}")
+    hits = [i for i, name in enumerate(names) if name.lower() in TIMES]
+    if len(hits) != 1:
+        return None
+    try:
+        return hits[0], resolve_unit("time", units[hits[0]], options, "column of time")
+    except Fault:
+        return None
 
 
 def time_values(
@@ -298,16 +329,14 @@ def time_values(
     Raises:
         Fault: the column named in the options has no unit or holds text.
     """
-    if "time" in roles:
-        i = roles["time"]
-        unit = resolve_unit("time", table.units[i], options, f"column {table.names[i]!r}")
-        return role_values(table, "time", i, picked, unit)
-    hits = [i for i, name in enumerate(table.names) if name.lower() in TIMES]
-    if len(hits) != 1:
+    found = time_column(table.names, table.units, roles, options)
+    if found is None:
         return None
+    index, unit = found
+    if "time" in roles:
+        return role_values(table, "time", index, picked, unit)
     try:
-        unit = resolve_unit("time", table.units[hits[0]], options, "column of time")
-        values = role_values(table, "time", hits[0], picked, unit)
+        values = role_values(table, "time", index, picked, unit)
     except Fault:
         return None
     return values if np.isfinite(values).all() else None
