@@ -91,7 +91,7 @@ WITHIN = {
         {"scrutiny"},
         {"fit"},
     ],
-    "optimisation": [{"programs", "schur", "trust_region"}, {"levenberg_marquardt"}],
+    "optimisation": [{"curvature", "programs", "schur"}, {"trust_region"}, {"levenberg_marquardt"}],
     "inference": [
         {"rows", "residuals", "chains", "weakest_direction", "estimate", "design_press",
          "random_effects"},

@@ -1,4 +1,4 @@
-"""The solver on a function of its own: Rosenbrock's valley inside boxes, minima in closed form."""
+"""The solver on functions of its own, minima in closed form or published."""
 
 from typing import Any, NamedTuple
 
@@ -9,50 +9,62 @@ import numpy as np
 import pytest
 
 from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
-from jaxtrachea.optimisation.trust_region import (
-    FIRST_RADIUS,
-    RUNNING,
-    State,
-    Tolerances,
-    iterate,
-)
+from jaxtrachea.optimisation.trust_region import RUNNING, Tolerances, begun, iterate
 from jaxtrachea.status import FitStatus
 
 
 class Point(NamedTuple):
-    """What the solver needs, and the residual's Jacobian."""
+    """What the solver needs, the residual and its Jacobian."""
 
     cost: Any
     gradient: Any
     hessian: Any
+    value: Any
     jacobian: Any
 
 
-def residual(theta):
+def rosenbrock(theta):
     """Rosenbrock (1960) as least squares: minimum 0 at (1, 1)."""
     return jnp.stack([10 * (theta[1] - theta[0] ** 2), 1 - theta[0]])
 
 
+def jennrich_sampson(theta):
+    """Jennrich and Sampson (1968), ten residuals that stay large at the minimum."""
+    i = jnp.arange(1, 11).astype(theta.dtype)
+    return 2 + 2 * i - jnp.exp(i * theta[0]) - jnp.exp(i * theta[1])
+
+
+def brown_dennis(theta):
+    """Brown and Dennis (1971), twenty residuals that stay large at the minimum."""
+    t = jnp.arange(1, 21).astype(theta.dtype) / 5
+    first = theta[0] + t * theta[1] - jnp.exp(t)
+    return first**2 + (theta[2] + theta[3] * jnp.sin(t) - jnp.cos(t)) ** 2
+
+
 class Valley(eqx.Module):
-    """Its cost inside a box."""
+    """The cost of a residual inside a box."""
 
     lower: Any
     upper: Any
     active: Any
+    residual: Any = eqx.field(static=True, default=rosenbrock)
 
     def evaluate(self, theta):
-        r, J = residual(theta), jax.jacfwd(residual)(theta)
-        return Point(0.5 * jnp.sum(r * r), J.T @ r, J.T @ J, J)
+        r, J = self.residual(theta), jax.jacfwd(self.residual)(theta)
+        return Point(0.5 * jnp.sum(r * r), J.T @ r, J.T @ J, r, J)
 
     def ahead(self, point, theta, step):
         def along(t):
-            return jax.jvp(residual, (t,), (step,))[1]
+            return jax.jvp(self.residual, (t,), (step,))[1]
 
         return point.jacobian.T @ jax.jvp(along, (theta,), (step,))[1]
 
+    def cross_gradient(self, point, other):
+        return point.jacobian.T @ other.value
+
     def blank(self):
-        zero = jnp.zeros((2, 2), self.lower.dtype)
-        return Point(zero[0, 0], zero[0], zero, zero)
+        shapes = jax.eval_shape(self.evaluate, jnp.zeros(self.lower.shape, self.lower.dtype))
+        return jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
 
     def rounding(self):
         return jnp.zeros((), self.lower.dtype)
@@ -73,7 +85,7 @@ BOXES = [
 ]
 
 
-@pytest.mark.parametrize(("count", "batch"), [(1, 16), (40, 16)])
+@pytest.mark.parametrize(("count", "batch"), [(1, 16), (1000, 64)])
 def test_minima_of_a_valley_inside_boxes(count, batch):
     """From `count` starts of each box, in batches with a rest: all end where the algebra says."""
     valley = Valley(*(np.array(column) for column in list(zip(*BOXES, strict=True))[:3]))
@@ -113,11 +125,9 @@ def test_a_blank_start_that_cannot_be_evaluated_costs_infinitely():
     valley = Valley(*map(jnp.array, BOXES[0][:3]))
 
     def first(theta):
-        radius, count = jnp.asarray(FIRST_RADIUS), jnp.int32(0)
-        return iterate(Tolerances(), valley, State(theta, blank, radius, count, jnp.int8(RUNNING)))
+        return iterate(Tolerances(), valley, begun(theta, valley))
 
-    blank = valley.blank()
-    assert blank.cost == 0
+    assert valley.blank().cost == 0
     lost = first(jnp.array([jnp.nan, 0.0]))
     assert (lost.status, lost.point.cost) == (FitStatus.INFEASIBLE_START, jnp.inf)
     good = first(jnp.array([-1.2, 1.0]))
@@ -135,3 +145,22 @@ def test_float32_ends_on_the_bound_as_given():
     assert solved.theta.dtype == np.float64
     assert solved.theta[0, 0] == bound
     np.testing.assert_allclose(solved.theta[0, 1], bound**2, rtol=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize(
+    ("residual", "start", "cost", "steps"),
+    [(jennrich_sampson, (0.3, 0.4), 124.362, 16), (brown_dennis, (25, 5, -5, -1), 85822.2, 20)],
+)
+def test_minima_with_large_residuals(residual, start, cost, steps, dtype: Any):
+    """Published sums of squares (More, Garbow, Hillstrom 1981, doi:10.1145/355934.355936).
+
+    There the Gauss-Newton matrix is wrong by a factor.
+    """
+    start = np.array(start, float)[None]
+    far = np.full_like(start, 100)
+    valley = Valley(-far, far, np.ones_like(far), residual)
+    solved = levenberg_marquardt(valley, start, dtype=dtype)
+    assert solved.status[0] == FitStatus.CONVERGED
+    np.testing.assert_allclose(2 * solved.cost[0], cost, rtol=4e-6)
+    assert solved.iterations[0] <= steps, solved.iterations

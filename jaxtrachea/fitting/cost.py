@@ -189,6 +189,12 @@ class LaneCost(eqx.Module):
         curvature = 2 / PROBE * ((probe - point.value) / PROBE * root - linear)
         return assemble(model, jnp.einsum("tim,tm->ti", point.jacobian, curvature), lane)
 
+    def cross_gradient(self, point: Point, other: Point) -> Float[Array, " P"]:
+        """J^T of one point times the residual of another."""
+        _, root = weights(self.model, other.value, self.lane, self.sigma)
+        parts = jnp.einsum("tim,tm->ti", point.jacobian, other.value * root)
+        return assemble(self.model, parts, self.lane)
+
     def blank(self) -> Point:
         """Zeros in the shapes of `evaluate`."""
         lane = self.lane

@@ -16,7 +16,7 @@ from jaxtrachea.fitting.cost import LaneCost, evaluate
 from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.optimisation.trust_region import FIRST_RADIUS, RUNNING, State, Tolerances, iterate
+from jaxtrachea.optimisation.trust_region import RUNNING, State, Tolerances, begun, iterate
 from jaxtrachea.trachea.geometry import Geometry
 
 
@@ -85,12 +85,10 @@ def hessian(
 def _solve(model: FitModel, tolerances: Tolerances, start, data) -> State:
     """Levenberg-Marquardt of one lane, as a loop inside the program."""
     objective = LaneCost(model, *data)
-    radius = jnp.full((), FIRST_RADIUS, start.dtype)
-    state = State(start, objective.blank(), radius, jnp.int32(0), jnp.int8(RUNNING))
     return jax.lax.while_loop(
         lambda state: state.status == RUNNING,
         lambda state: iterate(tolerances, objective, state),
-        state,
+        begun(start, objective),
     )
 
 

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea.optimisation.curvature import Rest
 from jaxtrachea.optimisation.programs import batch_size, cast, program
 from jaxtrachea.optimisation.trust_region import (
     FIRST_RADIUS,
@@ -59,6 +60,7 @@ def _advance(tolerances, rounds, objective, start, refill, state):
         radius=put(FIRST_RADIUS, state.radius),
         iteration=put(0, state.iteration),
         status=put(jnp.int8(RUNNING), state.status),
+        rest=state.rest,  # forgotten by the first iteration
     )
     one = jax.vmap(functools.partial(iterate, tolerances))
 
@@ -160,4 +162,6 @@ def _idle(objective: Objective, batch: int, dtype) -> State:
 
     point = jax.tree.map(lambda v: zeros(*v.shape), one.blank())
     done = full(FitStatus.CONVERGED, np.int8)
-    return State(zeros(*one.lower.shape), point, zeros(), full(0, np.int32), done)
+    unknowns = one.lower.shape
+    rest = Rest(zeros(*unknowns, *unknowns), full(False, np.bool_))
+    return State(zeros(*unknowns), point, zeros(), full(0, np.int32), done, rest)

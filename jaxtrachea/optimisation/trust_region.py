@@ -4,9 +4,10 @@ MINPACK's tests of convergence and trust region (More 1978, doi:10.1007/BFb00677
 long as the radius allows, in coordinates that are scaled already. Each step bends along the curve
 that a second directional derivative predicts (geodesic acceleration, Transtrum and Sethna 2012,
 arXiv:1201.5885): the valleys of this model are narrow and curved, since stiffness of skeleton and
-contact nearly trade off, and straight steps crawl in them. Bounds by an active set: an unknown on
-its bound whose gradient points outwards is held; one that a step would carry over its bound stops
-on it exactly, and the others go to where that leaves their minimum.
+contact nearly trade off, and straight steps crawl in them. The matrix of a step is that of
+Gauss-Newton, with what that leaves out where it foretells better (`curvature`). Bounds by an active
+set: an unknown on its bound whose gradient points outwards is held; one that a step would carry
+over its bound stops on it exactly, and the others go to where that leaves their minimum.
 
 What is minimised is an `Objective`.
 """
@@ -19,6 +20,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import epsilon, solve_spd
+from jaxtrachea.optimisation import curvature
+from jaxtrachea.optimisation.curvature import Rest
 from jaxtrachea.status import FitStatus
 
 RUNNING = -1
@@ -80,6 +83,10 @@ class Objective(Box, Protocol):
         """
         ...
 
+    def cross_gradient(self, point: Any, other: Any) -> Float[Array, " P"]:
+        """J^T of one `Point` times the residual of another, (P,)."""
+        ...
+
     def blank(self) -> Any:
         """A point of the shapes and dtypes that `evaluate` gives, of any content."""
         ...
@@ -107,13 +114,22 @@ class Tolerances(NamedTuple):
 
 
 class State(NamedTuple):
-    """One lane under way; `radius` bounds the length of the next step."""
+    """One lane under way; `radius` bounds the length of the next step, `rest` mends its matrix."""
 
     theta: Float[Array, " P"]
     point: Any
     radius: Float[Array, ""]
     iteration: Int[Array, ""]
     status: Int[Array, ""]
+    rest: Rest
+
+
+def begun(theta: Float[Array, " P"], objective: Objective) -> State:
+    """A start of one lane, not yet evaluated."""
+    unknowns = theta.shape[0]
+    rest = Rest(jnp.zeros((unknowns, unknowns), theta.dtype), jnp.asarray(False))
+    radius = jnp.full((), FIRST_RADIUS, theta.dtype)
+    return State(theta, objective.blank(), radius, jnp.int32(0), jnp.int8(RUNNING), rest)
 
 
 class _Step(NamedTuple):
@@ -177,13 +193,12 @@ def trust_region_step(radius, hessian, gradient, free):
     return step * jnp.minimum(1, 1.2 * radius / _length(step)), damped
 
 
-def _onto_bounds(theta, straight, damped, point: Point, free, radius, box: Box):
+def _onto_bounds(theta, straight, damped, g, H, free, radius, box: Box):
     """Step with what would leave the box on its bound, the others minimal given that.
 
     Returns:
         The step, and which unknowns stop on a bound by it.
     """
-    g, H = point.gradient, point.hessian
     ahead = theta + straight
     stops = free & ((ahead < box.lower) | (ahead > box.upper))
     onto = jnp.where(stops, jnp.clip(ahead, box.lower, box.upper) - theta, 0)
@@ -203,10 +218,11 @@ def _length(v):
 def _step(objective: Objective, state: State) -> _Step:
     """Step of the trust region inside the box, bent by the residual's curvature along it."""
     point, theta = state.point, state.theta
-    g, H = point.gradient, point.hessian
+    g = point.gradient
     free = ~active_set(theta, g, objective)
+    H = curvature.hessian(point, state.rest, free)
     straight, damped = trust_region_step(state.radius, H, g, free)
-    straight, stops = _onto_bounds(theta, straight, damped, point, free, state.radius, objective)
+    straight, stops = _onto_bounds(theta, straight, damped, g, H, free, state.radius, objective)
 
     def clip(theta):
         return jnp.clip(theta, objective.lower, objective.upper)
@@ -254,7 +270,10 @@ def iterate(tolerances: Tolerances, objective: Objective, state: State) -> State
     point = jax.tree.map(pick, new, old)
     theta = pick(trial, state.theta)
     radius = jnp.where(fresh, state.radius, radius)
-    moved = State(theta, point, radius, state.iteration + 1, state.status)
+    cross = objective.cross_gradient(old, new)
+    rest = curvature.learned(state.rest, old, new, cross, step.delta)
+    rest = Rest(jnp.where(fresh, 0, rest.matrix), rest.trusted & ~fresh)
+    moved = State(theta, point, radius, state.iteration + 1, state.status, rest)
     done = _status(tolerances, old.cost, moved, objective, fresh, finite, step, actual)
     running = state.status == RUNNING
     moved = moved._replace(status=done)
