@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea.fitting.cost import LaneCost, evaluate
@@ -92,7 +93,9 @@ def _solve(model: FitModel, tolerances: Tolerances, start, data) -> State:
     )
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def _gradient(model: FitModel, theta, data):
+    """`gradient`, as one program: outside of `jit` its derivatives were thousands of small ones."""
     return gradient(model, theta, *data)
 
 
@@ -102,18 +105,36 @@ def _implicit(model: FitModel, theta: Float[Array, " P"], data: Any) -> Float[Ar
     return theta
 
 
-@_implicit.defjvp
 def _implicit_jvp(model: FitModel, primals, tangents):
+    """The rule: what is not moved costs nothing, forces alone no second derivative of a press."""
     theta, data = _implicit(model, *primals), primals[1]
-    tangent = tangents[1]
-    lane, d_lane = data[0], tangent[0]
-    g, d_g = jax.jvp(lambda data: _gradient(model, theta, data), (data,), (tangent,))
+    leaves, structure = jax.tree.flatten(data)
+    tangent = structure.flatten_up_to(tangents[1])
+    moved = [i for i, v in enumerate(tangent) if not isinstance(v, SymbolicZero)]
+
+    def of_moved(values):
+        changed = dict(zip(moved, values, strict=True))
+        new = [changed.get(i, v) for i, v in enumerate(leaves)]
+        return _gradient(model, theta, jax.tree.unflatten(structure, new))
+
+    given, along = [leaves[i] for i in moved], [tangent[i] for i in moved]
+    g, d_g = jax.jvp(of_moved, (given,), (along,))
     H = jax.jacfwd(lambda theta: _gradient(model, theta, data))(theta)
+    lane, d_lane = data[0], tangents[1][0]
     low = (theta <= lane.lower) & (g > 0)
     high = (theta >= lane.upper) & (g < 0)
     free = ~low & ~high & (lane.active > 0)
-    pushed = jnp.where(low, d_lane.lower, jnp.where(high, d_lane.upper, 0))
+    lower, upper = _instance(d_lane.lower, lane.lower), _instance(d_lane.upper, lane.upper)
+    pushed = jnp.where(low, lower, jnp.where(high, upper, 0))
     rhs = jnp.where(free, -d_g - jnp.sum(H * pushed[None], axis=1), pushed)
     both = free[:, None] & free[None]
     matrix = jnp.where(both, H, jnp.eye(len(theta), dtype=H.dtype))
     return theta, jnp.linalg.solve(matrix, rhs)
+
+
+_implicit.defjvp(_implicit_jvp, symbolic_zeros=True)
+
+
+def _instance(tangent: Any, of: Array) -> Array:
+    """The tangent of an array, zeros where it does not move."""
+    return jnp.zeros_like(of) if isinstance(tangent, SymbolicZero) else tangent

@@ -1,0 +1,87 @@
+"""The estimate as a function of the data: of deforming cross-sections, and outside of `jit`.
+
+Estimates of a line of rings against refits: test_influence.py.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compilations import compilations
+
+from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.study import build_study
+from jaxtrachea.inference.estimate import estimate, lane_of
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.optimisation.trust_region import Tolerances
+from jaxtrachea.status import FitStatus
+from jaxtrachea.trachea.geometry import Geometry
+
+QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
+D = np.array([0.5, 2.0, 5.0])
+#: Forces, N, of a press of the default wall at 20 and at 14 mm, rounded.
+FORCES = {20.0: [0.49, 1.60, 2.83], 14.0: [0.53, 1.69, 2.87]}
+FREE = ("EI_C", "Et_L")
+TUBE = Geometry.create(40.0, [10.0, 20.0, 30.0], radius=11.7)
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_derivatives_by_the_data_forward_and_reverse():
+    """Forward is reverse, and both the change of refits; by forces and by where they were taken."""
+    curves = [Curve("one", f"{s}", s, 0.0, D, np.array(F)) for s, F in FORCES.items()]
+    table = {name: {"fixed": True} for name in ("D_L", "c_W", "bed_n", "bed_t")}
+    options = Options(skeleton="sections", contact="bonded")
+    study = build_study(curves, TUBE, options, table, noise=Noise(force=0.05, joints=0.2))
+    assert tuple(p.name for p in study.model.free) == FREE
+    lane, sigma = lane_of(study, 0), jnp.ones(2)
+    sharp = Tolerances(1e-14, 1e-14, 1e-14, 100)
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def fitted(force, s_c):
+        moved = lane._replace(force=force, s_c=s_c)
+        return estimate(study.model, jnp.zeros(2), moved, sigma, None, sharp)
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def both(force, s_c, along):
+        def theta(*data):
+            moved = lane._replace(force=data[0], s_c=data[1])
+            return estimate(study.model, start, moved, sigma, None, sharp).theta
+
+        return jax.jvp(theta, (force, s_c), along)[1], jax.jacrev(theta, (0, 1))(force, s_c)
+
+    at = lane.force, lane.s_c
+    start, status = fitted(*at)
+    assert status == FitStatus.CONVERGED
+    rng = np.random.default_rng(0)
+    along = tuple(jnp.asarray(rng.normal(size=v.shape)) for v in at)
+    along = (0.1 * along[0], along[1])
+    forward, reverse = both(*at, along)
+    products = sum(jnp.tensordot(r, v, v.ndim) for r, v in zip(reverse, along, strict=True))
+    np.testing.assert_allclose(products, forward, rtol=1e-9)
+    h = 1e-3
+    apart = [
+        fitted(*(a + sign * h * v for a, v in zip(at, along, strict=True))).theta
+        for sign in (1, -1)
+    ]
+    np.testing.assert_allclose(forward, (apart[0] - apart[1]) / (2 * h), rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_outside_of_jit_few_programs_are_compiled():
+    """43, of what was one for every operation: 257 of this small model, of sections thousands."""
+    curve = Curve("one", "one", 20.0, 0.0, D, 1.3 * D)
+    study = build_study([curve], TUBE, Options(coupling="total"))
+    lane, start = lane_of(study, 0), jnp.zeros(study.lanes.lower.shape[1])
+
+    def theta(force):
+        return estimate(study.model, start, lane._replace(force=force), jnp.ones(2)).theta
+
+    with compilations() as counted:
+        by_force = jax.jacrev(theta)(lane.force)
+    assert 0 < len(counted) < 80
+    assert by_force.shape == (2, *lane.force.shape)
