@@ -12,7 +12,7 @@ from sections_linear import linear_force
 from jaxtrachea.mechanics import press as mat
 from jaxtrachea.mechanics.sections import system
 from jaxtrachea.mechanics.sections.contact import place_on
-from jaxtrachea.mechanics.sections.material import SectionMaterial
+from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
 from jaxtrachea.mechanics.sections.press import build, press_sections
 from jaxtrachea.mechanics.sections.solve import solve_path
 from jaxtrachea.mechanics.sections.span import Wall, make_forms, make_span
@@ -26,7 +26,7 @@ LENGTH, RADIUS = 70.0, 11.7
 VALUES = {
     "offset": 0.9, "EI_C": 24.2, "EI_M": 2.0, "Et_M": 0.68, "bed_n": 0.0186, "bed_t": 0.0018,
     "Gt_L": 20.9, "Et_L": 1.19, "D_L": 3.5, "c_W": 0.68, "c_K": 22.3, "rho": 1e-3, "k_end": 0.146,
-    "footprint": 2.74, "c_n": 0.003, "c_t": 0.1, "c_t_ring": 0.01,
+    "c_end": 0.4, "footprint": 2.74, "c_n": 0.003, "c_t": 0.1, "c_t_ring": 0.01,
 }  # fmt: skip
 #: Gauss points of the work from 0 to 6 mm, and 6 mm.
 POINTS, WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -290,6 +290,21 @@ def test_few_and_many_rings(count):
     assert np.all(got.status == PressStatus.OK)
     work = 3 * (WEIGHTS @ inward(got, 0.9)[:-1, 0])
     assert work == pytest.approx(got.energy[-1], rel=1e-8)
+
+
+def test_spans_at_the_clamps_have_their_share_of_the_softening():
+    """Of a scalar and of an array; from moduli and thicknesses none, as no clamped end flattens."""
+    geometry = Geometry.create(LENGTH, RINGS, radius=RADIUS)
+    place = tuple(jnp.asarray(v) for v in (30.0, 0.0, [1.0, 0.0]))
+    of_spans = jnp.linspace(0.5, 1.1, 7)
+    share = np.array([0.4, 1, 1, 1, 1, 1, 0.4])
+    for c_W in (jnp.asarray(0.68), of_spans):
+        material = SectionMaterial(**(VALUES | {"c_W": c_W}))
+        parts = build(geometry, material, *place, midline=True)
+        np.testing.assert_allclose(parts.spans.c_W, share * c_W, rtol=1e-15)
+    plain = SectionMaterial(**{k: v for k, v in VALUES.items() if k != "c_end"})
+    np.testing.assert_allclose(build(geometry, plain, *place, midline=True).spans.c_W, 0.68)
+    assert from_wall(geometry).c_end == 0
 
 
 def test_refusals():

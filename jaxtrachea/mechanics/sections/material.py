@@ -61,6 +61,7 @@ class SectionMaterial(eqx.Module):
         c_W: softening of a span with its energy, 1/(N mm); 0: linear; a span.
         c_K: softening of bending in a ring, mm^2; 0: linear; a ring.
         rho: share of the muscle in shear and stretch of the wall; a span.
+        c_end: factor on c_W in the two spans at the clamped ends, 0: these are linear; a scalar.
         k_end: how the clamped ends hold the warping, 1/mm, in [0, inf]; a scalar.
         footprint: exponent by which a tool near a ring rests on it, 1 (a point) or more; a scalar.
         c_n: local compliance along the normal, mm/N, positive; a scalar.
@@ -112,6 +113,10 @@ class SectionMaterial(eqx.Module):
     rho: Float[Array, "..."] = _field(
         "rho", "1", "dimensionless", "share of the muscle in shear and stretch of the wall",
         _fixed(1e-3, 1e-9, 10.0), default=1e-3, each="span",
+    )  # fmt: skip
+    c_end: Float[Array, ""] = _field(
+        "c_end", "1", "dimensionless", "share of c_W that the spans at the clamped ends have",
+        _fixed(0.0, 0.0, 10.0, scale="linear", step=0.5), default=1.0, signed=True,
     )  # fmt: skip
     k_end: Float[Array, ""] = _field(
         "k_end", "1/mm", "inverse_length", "how the clamped ends hold the warping",
@@ -228,6 +233,8 @@ class Factors:
         Et_M: on E_M h_M.
         c_W: on 1 / (E_L h R p), p the mean span: softening at a given strain, an assumption for
             other sizes than that of the specimen.
+        c_end: as in `SectionMaterial`. None of the softening: a clamped section cannot flatten, and
+            it is flattened sections that make the wall between them yield. Reasoned, not fitted.
         k_end: times R is this: warping held within about a diameter.
         footprint: of a punch of 3 mm radius on rings 10 mm apart.
     """
@@ -238,6 +245,7 @@ class Factors:
     Gt_L: float = 35.0
     Et_M: float = 1.08
     c_W: float = 181.0
+    c_end: float = 0.0
     k_end: float = 1.86
     footprint: float = 2.85
 
@@ -274,6 +282,7 @@ def from_wall(
         "Et_L": factors.Et_L * wall.E_L * wall.h,
         "D_L": factors.D_L * ligament / plane,
         "c_W": factors.c_W / (wall.E_L * wall.h * R * mean_span),
+        "c_end": factors.c_end,
         "k_end": factors.k_end / R,
         "footprint": factors.footprint,
     }

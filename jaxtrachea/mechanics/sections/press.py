@@ -198,6 +198,8 @@ def build(
     grid = section.make_grid(shape, midline=midline)
     per_ring = {_OF_RING.get(k, k): jnp.broadcast_to(values[k], (n,)) for k in EACH_RING}
     per_span = {k: jnp.broadcast_to(values[k], (n + 1,)) for k in EACH_SPAN}
+    share = jnp.ones(n + 1, dtype).at[jnp.array([0, -1])].set(values["c_end"])
+    per_span["c_W"] = per_span["c_W"] * share
     rings = section.Ring(pitch=ring_pitches(geometry), **per_ring)
     nodes = ends_and_rings(geometry)
     forms = span.make_forms(grid, shape)
