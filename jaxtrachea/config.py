@@ -92,6 +92,7 @@ class DataSection(Section):
     displacement_sign: Literal[1, -1] = 1
     sheet: str | None = None
     tool_radius: PositiveLength | None = None
+    together: list[Annotated[list[str], Field(min_length=2)]] | None = None
 
     @model_validator(mode="before")
     @classmethod

@@ -93,7 +93,7 @@ WITHIN = {
     ],
     "optimisation": [{"curvature", "programs", "schur"}, {"trust_region"}, {"levenberg_marquardt"}],
     "inference": [
-        {"rows", "residuals", "chains", "weakest_direction", "estimate", "design_press",
+        {"rows", "residuals", "chains", "together", "weakest_direction", "estimate", "design_press",
          "random_effects"},
         {"cross_validation", "bootstrap", "profile", "posterior_start"},
         {"effective", "labels", "population", "repeats"},

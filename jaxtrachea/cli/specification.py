@@ -10,6 +10,7 @@ from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, defaults_of, in_m
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study, check_curve
 from jaxtrachea.fitting.unread import along_the_normal
+from jaxtrachea.inference.together import left_out_together
 from jaxtrachea.measurements.read import (
     BadCurve,
     Measurements,
@@ -184,7 +185,7 @@ def study_of(spec: FitSpec, measurements: Measurements, *, refits: bool = False)
     u = spec.uncertainty
     asked = u.profile or u.bootstrap or u.posterior or u.influence
     joint = not (refits or asked or spec.fit.method != "levenberg-marquardt")
-    study = _built(spec, measurements, joint)
+    study = _with_groups(_built(spec, measurements, joint), spec, measurements)
     if spec.fit.method != "levenberg-marquardt":
         try:
             study.refuse_sections(f"fit.method = {spec.fit.method!r}")
@@ -199,6 +200,20 @@ def study_of(spec: FitSpec, measurements: Measurements, *, refits: bool = False)
             "(the joint fit has no limit), or give it the scope 'specimen'"
         )
     return study
+
+
+def _with_groups(study: Study, spec: FitSpec, measurements: Measurements) -> Study:
+    """With the groups of `data.together`.
+
+    Raises:
+        SpecError: groups that the trials do not have.
+    """
+    if not spec.data.together:
+        return study
+    try:
+        return left_out_together(study, spec.data.together, measurements.bad)
+    except InputError as error:
+        raise SpecError.like(error, key=f"data.together.{error.key}") from None
 
 
 def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:

@@ -43,6 +43,8 @@ class Study:
         unknowns: for each lane, the (parameter, specimen or "", trial or "") of every unknown.
         noise_given: whether sigma of (force, markers) is known.
         joint: whether shared unknowns are one and the same in all lanes.
+        together: names of trials, in groups that are left out together; see
+            `inference.together.left_out_together`.
     """
 
     model: FitModel
@@ -52,6 +54,7 @@ class Study:
     unknowns: tuple[tuple[Unknown, ...], ...]
     noise_given: tuple[bool, bool]
     joint: bool = False
+    together: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self):
         """Refuse a model of another parameter table.

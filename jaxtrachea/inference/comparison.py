@@ -94,6 +94,10 @@ def same_data(studies: Sequence[Study], names: Sequence[str]) -> None:
                     "not; compare them on presses along the normal, from a file without those"
                 )
             raise ValueError(f"{pair} use different samples; give both the same [data] section")
+        if sorted(map(sorted, study.together)) != sorted(map(sorted, first.together)):
+            raise ValueError(
+                f"{pair} leave out different trials together; give both the same data.together"
+            )
         if study.noise_given != first.noise_given or not _same_noise(study, first):
             raise ValueError(
                 f"{pair} count noise or curves differently; give both the same [noise], "

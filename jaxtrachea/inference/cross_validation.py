@@ -15,6 +15,7 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.starts import draw_starts
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.residuals import rms
+from jaxtrachea.inference.together import companions
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -70,6 +71,8 @@ def refits_sentence(refits: int, unconverged: int, lost: int) -> str:
 def curves_to_leave_out(study: Study) -> list[tuple[int, int]]:
     """Lane and trial of every curve that the others of its lane can predict.
 
+    Those that are left out together with it (`Study.together`) are no others.
+
     Raises:
         ValueError: no lane has two curves, or an unknown other than onset and offset belongs to a
             trial (a curve left out could then not be predicted).
@@ -81,16 +84,25 @@ def curves_to_leave_out(study: Study) -> list[tuple[int, int]]:
             f"{', '.join(own)} belongs to single trials, which no other curve can tell; fix it, or "
             "give it the scope 'specimen' or 'shared'"
         )
-    pairs = [(k, t) for k, c in enumerate(study.curves) if len(c) > 1 for t in range(len(c))]
+    pairs = [
+        (k, t)
+        for k, curves in enumerate(study.curves)
+        for t, out in enumerate(companions(curves, study.together))
+        if len(out) < len(curves)
+    ]
     if not pairs:
-        raise ValueError("needs at least two curves that share their parameters; found none")
+        apart = ", not all left out together" if study.together else ""
+        raise ValueError(
+            f"needs at least two curves that share their parameters{apart}; found none"
+        )
     return pairs
 
 
 def leave_one_out(study: Study, settings: Settings, progress=None) -> LeftOut:
     """Fit every lane once without each of its curves, and predict that curve.
 
-    A curve left out fits an onset or an offset of its own, all other unknowns kept.
+    Those that are left out together with it (`Study.together`) take no part, either. A curve left
+    out fits an onset or an offset of its own, all other unknowns kept.
 
     Args:
         study: lanes with two curves or more are used.
@@ -105,7 +117,8 @@ def leave_one_out(study: Study, settings: Settings, progress=None) -> LeftOut:
     lanes = chosen.lanes
     rows = np.arange(len(lane))
     held = np.zeros(lanes.s_c.shape, bool)
-    held[rows, trial] = True
+    for row, (k, t) in enumerate(zip(lane, trial, strict=True)):
+        held[row, companions(study.curves[k], study.together)[t]] = True
     result, touched, seen = refitted(chosen, held, settings, progress)
     force, data = seen.force[rows, trial], lanes.force[rows, trial]
     observed = lanes.precision[rows, trial] > 0

@@ -1,6 +1,6 @@
 """Leaving out all curves of a position, or of a trial: what a model says of places not seen."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.cross_validation import refitted
 from jaxtrachea.inference.residuals import rms
+from jaxtrachea.inference.together import companions
 from jaxtrachea.measurements.read import Curve
 
 
@@ -55,9 +56,10 @@ class Repeats(NamedTuple):
 def repeats(study: Study) -> Repeats:
     """What each specimen repeats, within every lane.
 
-    Contact positions where a specimen has several (repeats of a position go together), else its
-    trials; where all unknowns are shared, a specimen of one curve as a whole. None where a
-    stiffness belongs to a single curve: no other tells of it. (Its onset and offset are fitted.)
+    Contact positions where a specimen has several (repeats of a position go together, and so do
+    positions of trials that `Study.together` names), else its trials; where all unknowns are
+    shared, a specimen of one curve as a whole. None where a stiffness belongs to a single curve: no
+    other tells of it. (Its onset and offset are fitted.)
     """
     free = [p for p in study.parameters if not p.fixed]
     width = study.lanes.s_c.shape[1]
@@ -65,7 +67,7 @@ def repeats(study: Study) -> Repeats:
     own = any(p.scope == "trial" and p.name not in OF_THE_PRESS for p in free)
     shared = all(p.scope == "shared" or p.name in OF_THE_PRESS for p in free)
     for lane, curves in enumerate(() if own else study.curves):
-        for kind, groups in _groups(curves, shared=shared):
+        for kind, groups in _groups(curves, study.together, shared=shared):
             for group in groups:
                 row = np.zeros(width, bool)
                 row[group] = True
@@ -77,8 +79,11 @@ def repeats(study: Study) -> Repeats:
     )
 
 
-def _groups(curves: tuple[Curve, ...], *, shared: bool) -> list[tuple[str, list[list[int]]]]:
+def _groups(
+    curves: tuple[Curve, ...], together: Sequence[Sequence[str]], *, shared: bool
+) -> list[tuple[str, list[list[int]]]]:
     """For each specimen of a lane, what is left out and the trials of each."""
+    twins = companions(curves, together)
     specimens: dict[str, list[int]] = {}
     for t, curve in enumerate(curves):
         specimens.setdefault(curve.specimen, []).append(t)
@@ -89,13 +94,26 @@ def _groups(curves: tuple[Curve, ...], *, shared: bool) -> list[tuple[str, list[
             curve = curves[t]
             place = curve.s_c, curve.phi_c, tuple(curve.direction)
             places.setdefault(place, []).append(t)
-        if len(places) > 1:
-            out.append(("positions", list(places.values())))
-        elif len(trials) > 1:
-            out.append(("trials", [[t] for t in trials]))
+        kind, parts = "positions", list(places.values())
+        if len(parts) == 1:
+            kind, parts = "trials", [[t] for t in trials]
+        parts = _merged(parts, twins)
+        if len(parts) > 1:
+            out.append((kind, parts))
         elif shared and len(specimens) > 1:
             out.append(("specimens", [trials]))
     return out
+
+
+def _merged(parts: list[list[int]], twins: list[list[int]]) -> list[list[int]]:
+    """Parts with those that hold twins made one."""
+    out: list[list[int]] = []
+    for part in parts:
+        near = {twin for t in part for twin in twins[t]}
+        joined = [other for other in out if near.intersection(other)]
+        out = [other for other in out if other not in joined]
+        out.append(sorted({t for other in (*joined, part) for t in other}))
+    return sorted(out)
 
 
 def leave_repeats_out(

@@ -12,6 +12,7 @@ from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, R
 from jaxtrachea.inference.cross_validation import LeftOut, curves_to_leave_out, leave_one_out
 from jaxtrachea.inference.residuals import rms
 from jaxtrachea.inference.rows import ONE_BY_ONE, and_more
+from jaxtrachea.inference.together import together_sentence
 
 LEFT_OUT_HEAD = ["specimen", "left out", "force / model", "rms force / peak", "rms joints / D"]
 
@@ -81,6 +82,7 @@ def _section(found: LeftOut) -> list[str]:
     parts = ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, rows)]
     parts += [f"{text}." for text in further]
     parts += own_touch_sentence(found.study, "A curve left out")
+    parts += [f"{text}." for text in together_sentence(found.study)]
     return [*parts, f"{found.sentence}."] if found.sentence else parts
 
 
@@ -89,6 +91,7 @@ def _shown(found: LeftOut, lanes: list[int]) -> Iterator[Table | str]:
     rows, further = left_out_table(found)
     yield "Leaving one curve out", LEFT_OUT_HEAD, rows
     yield from further
+    yield from together_sentence(found.study)
     if found.sentence:
         yield found.sentence
     if not np.isfinite(rms(found.force)):
