@@ -154,7 +154,7 @@ def _left_out_notes(models) -> list[str]:
 
     said = []
     if any(model.left_out is not None for model in models):
-        said += [f"{text}." for text in together_sentence(models[0].result.study)]
+        said += [f"{text}." for text in together_sentence(models[0].result.study.together)]
     for model in models:
         if model.left_out is None:
             continue

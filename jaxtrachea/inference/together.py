@@ -78,11 +78,11 @@ def companions(curves: Sequence[Curve], together: Sequence[Sequence[str]]) -> li
     return [members[key] for key in keys]
 
 
-def together_sentence(study: Study) -> list[str]:
+def together_sentence(together: Sequence[Sequence[str]]) -> list[str]:
     """Which trials are left out together, in words; empty if none are."""
-    if not study.together:
+    if not together:
         return []
-    groups = [", ".join(group) for group in study.together[:MANY]]
-    if len(study.together) > MANY:
-        groups.append(f"{len(study.together) - MANY} more groups")
+    groups = [", ".join(group) for group in together[:MANY]]
+    if len(together) > MANY:
+        groups.append(f"{len(together) - MANY} more groups")
     return [f"Left out together: {'; '.join(groups)}"]

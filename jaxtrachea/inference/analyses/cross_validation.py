@@ -82,7 +82,7 @@ def _section(found: LeftOut) -> list[str]:
     parts = ["## Leaving one curve out", markdown_table(LEFT_OUT_HEAD, rows)]
     parts += [f"{text}." for text in further]
     parts += own_touch_sentence(found.study, "A curve left out")
-    parts += [f"{text}." for text in together_sentence(found.study)]
+    parts += [f"{text}." for text in together_sentence(found.study.together)]
     return [*parts, f"{found.sentence}."] if found.sentence else parts
 
 
@@ -91,7 +91,7 @@ def _shown(found: LeftOut, lanes: list[int]) -> Iterator[Table | str]:
     rows, further = left_out_table(found)
     yield "Leaving one curve out", LEFT_OUT_HEAD, rows
     yield from further
-    yield from together_sentence(found.study)
+    yield from together_sentence(found.study.together)
     if found.sentence:
         yield found.sentence
     if not np.isfinite(rms(found.force)):

@@ -5,6 +5,7 @@ pivots are exchanged: for positive definite matrices none need be, and of others
 pivots are wanted (Sylvester: as many negative as eigenvalues).
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -12,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-#: Largest matrix that `invert` eliminates entry by entry.
-LEAF = 4
+#: Largest matrix that `invert` eliminates entry by entry: a node of the midline.
+LEAF = 7
 
 
 class Factors(NamedTuple):
@@ -35,41 +36,54 @@ class Factors(NamedTuple):
     negative: Int[Array, ""]
 
 
-def invert(matrix: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Int[Array, ""]]:
+def invert(
+    matrix: Float[Array, "m m"], *, symmetric: bool = False
+) -> tuple[Float[Array, "m m"], Int[Array, ""]]:
     """Inverse without exchange of pivots, and the number of negative ones.
 
     By halves down to `LEAF`: products of matrices are quicker than the elimination of a large one.
+    What an inverse of the first half gives has errors of its condition number times those of an
+    elimination; one correction by the residual takes them off again. Without it the pivots of the
+    second half lose the square of the condition number, and with them their signs.
+
+    Args:
+        matrix: no leading part of it is singular.
+        symmetric: it is its own transpose up to rounding, and so is the inverse.
     """
     m = matrix.shape[0]
     if m <= LEAF:
         return _eliminate(matrix)
     k = (m + 1) // 2
     upper, right, left = matrix[:k, :k], matrix[:k, k:], matrix[k:, :k]
-    first, negative = invert(upper)
-    gain, rows = first @ right, left @ first
-    last, more = invert(matrix[k:, k:] - left @ gain)
-    side, below = gain @ last, last @ rows
+    first, negative = invert(upper, symmetric=symmetric)
+    gain = first @ right
+    gain = gain + first @ (right - upper @ gain)
+    rows = gain.T if symmetric else left @ first
+    last, more = invert(matrix[k:, k:] - left @ gain, symmetric=symmetric)
+    side = gain @ last
+    below = side.T if symmetric else last @ rows
     return jnp.block([[first + side @ rows, -side], [-below, last]]), negative + more
 
 
 def _eliminate(matrix: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Int[Array, ""]]:
     """`invert` by Gauss-Jordan.
 
-    Two pivots at a time, with the inverse of their 2 x 2 block in closed form: half as many
-    operations that wait for each other.
+    Two pivots at a time, so that half as many operations wait for each other. The second is what
+    the first leaves of it: the closed inverse of the 2 x 2 block, by its determinant, would lose
+    the square of its condition number.
     """
     m = matrix.shape[0]
     A, pivots, places = matrix, [], np.arange(m)
     for k in range(0, m - 1, 2):
         a, b, c, d = A[k, k], A[k, k + 1], A[k + 1, k], A[k + 1, k + 1]
-        det = a * d - b * c
-        pivots += [a, det / a]
-        share = 1 / det
+        one_over, share = 1 / a, c / a
+        pivot = d - share * b
+        pivots += [a, pivot]
         one, two = places == k, places == k + 1
-        # Rows of the inverse of the 2 x 2 block, times the two rows or times 1.
-        row = jnp.where(one, 1, jnp.where(two, 0, A[k])) * share
-        other = jnp.where(two, 1, jnp.where(one, 0, A[k + 1])) * share
-        first, second = d * row - b * other, a * other - c * row
+        row = jnp.where(one, 1, jnp.where(two, 0, A[k]))
+        other = jnp.where(two, 1, jnp.where(one, 0, A[k + 1]))
+        second = (other - share * row) * (1 / pivot)
+        first = (row - b * second) * one_over
         rest = jnp.where((one | two)[None], 0, A)
         rest = rest - A[:, k, None] * first[None] - A[:, k + 1, None] * second[None]
         A = jnp.where(one[:, None], first[None], jnp.where(two[:, None], second[None], rest))
@@ -110,12 +124,12 @@ def factor(diagonal: Float[Array, "n m m"], upper: Float[Array, "n m m"]) -> Fac
 
     def step(carry, blocks):
         D, U = blocks
-        inverse, negative = jax.vmap(invert)(D - carry)
+        inverse, negative = jax.vmap(functools.partial(invert, symmetric=True))(D - carry)
         gain = inverse @ U
         return U.transpose(0, 2, 1) @ gain, (inverse, gain, negative)
 
     carry, (inverse, gain, negative) = jax.lax.scan(step, jnp.zeros_like(D[0]), (D, U))
-    middle, own = invert(centre - carry[0] - carry[1])
+    middle, own = invert(centre - carry[0] - carry[1], symmetric=True)
     return Factors(inverse, gain, middle, jnp.sum(negative) + own)
 
 
