@@ -3,6 +3,7 @@
 import json
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -11,6 +12,7 @@ import trimesh
 from run_cli import run, tree
 
 from jaxtrachea import table_1
+from jaxtrachea.cli import scene as scenes
 from jaxtrachea.trachea.tube import make_tube
 
 pytestmark = pytest.mark.compiling
@@ -121,6 +123,7 @@ def test_sweep_runs(tmp_path, monkeypatch, capsys):
     assert code == 0
     assert "112 contact points, 0 without a solution" in out
     assert "sweep: rings 'arch2', EI_C and k_t are given: a ring bends" in out
+    assert "e_1 and e_2 in [material] soften" in " ".join(out.split())
     names = {p.name for p in (tmp_path / "maps").iterdir()}
     assert names == {"force.png", "compliance.png", "sweep.h5", "provenance.json"}
     with h5py.File(tmp_path / "maps" / "sweep.h5") as file:
@@ -153,9 +156,30 @@ def test_a_sweep_of_a_skeleton_that_softens_is_one_of_the_midline(tmp_path, monk
     Path("scene.toml").write_text(text.replace(law, "") + "phi_count = 1")
     code, out, _ = run(monkeypatch, capsys, "sweep", "scene.toml", "--out", "linear")
     assert code == 0
-    assert "sweep: skeleton 'linear', but the wall is moved by 16 % of the" in " ".join(out.split())
+    said = " ".join(out.split())
+    assert "sweep: skeleton 'linear', but the wall is moved by 16 % of the" in said
+    assert "[material] soften" in said
+    assert "[sections] in the place of [material]" in said
     with h5py.File("linear/sweep.h5") as file:
         assert (soft < file["force"][:]).all()
+
+
+@pytest.mark.parametrize("command", ["plan", pytest.param("simulate", marks=pytest.mark.slow)])
+def test_sentences_with_tables_in_them_are_shown_whole(command, tmp_path, monkeypatch, capsys):
+    """rich takes [material] for markup and shows nothing in its place."""
+    monkeypatch.chdir(tmp_path)
+    tail = '[output]\nsurface = false\npictures = false\n[sweep]\ndepth = "2 mm"\nphi_count = 1\n'
+    Path("scene.toml").write_text(GOOD + PRESS + tail)
+    choice = SimpleNamespace(sentence="as [plan] wishes")
+    monkeypatch.setattr(scenes, "_chosen", lambda path, spec, staged: (staged, choice))
+    code, out, _ = run(monkeypatch, capsys, command, "scene.toml")
+    said = " ".join(out.split())
+    assert code == 0
+    assert "as [plan] wishes" in said
+    if command == "plan":
+        sweep = said[said.index("sweep: skeleton") :].partition("skeleton: linear")[0]
+        assert "e_1 and e_2 in [material] soften a press" in sweep
+        assert "[sections] in the place of [material]" in sweep
 
 
 GOOD = """

@@ -43,11 +43,11 @@ def plan(scene: SceneArgument, predict: TimeOption = False) -> None:
     out.print(table("Plan", head, plan_rows(staged.scene.plan, found), ("reason",)))
     out.print(f"{whole:,} operations for {_rows(staged)} rows", highlight=False)
     if predict:
-        out.print(_predicted(staged), highlight=False)
+        out.print(escape(_predicted(staged)), highlight=False)
     if choice is not None:
-        out.print(choice.sentence, highlight=False)
+        out.print(escape(choice.sentence), highlight=False)
     if swept is not None:
-        out.print(_levels_of(swept), highlight=False)
+        out.print(escape(_levels_of(swept)), highlight=False)
     for note in staged.notes:
         out.print(escape(note), highlight=False)
 
@@ -83,7 +83,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     for note in staged.notes:
         Console().print(escape(note), highlight=False)
     if choice is not None:
-        Console().print(choice.sentence, highlight=False)
+        Console().print(escape(choice.sentence), highlight=False)
     if last_solved(out) is None:
         Console().print("no row was solved: no mesh, no picture of the surface")
     Console().print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
@@ -129,7 +129,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
         _write_json(folder, made)
     failed = int((np.asarray(out.status) > PressStatus.NO_CONTACT).sum())
     console = Console()
-    console.print(_levels_of(swept), highlight=False)
+    console.print(escape(_levels_of(swept)), highlight=False)
     console.print(
         f"{total} contact points, {failed} without a solution, "
         f"{clock[2] - clock[1]:.2f} s with compilation", highlight=False,
