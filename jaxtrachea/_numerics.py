@@ -45,7 +45,8 @@ def largest(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
 def first_largest(x: Float[Array, " n"]) -> Int[Array, ""]:
     """Index of the largest entry, of equal ones the first: as `jnp.argmax`.
 
-    XLA for CPUs walks through an `argmax` entry by entry. With a NaN the index is the last one.
+    XLA for CPUs walks through an `argmax` entry by entry. With a NaN it is some index from 0 to
+    n - 1: which one depends on n.
 
     Args:
         x: n >= 1 entries.

@@ -386,4 +386,5 @@ def test_first_largest(n, dtype):
     )
     found = jax.jit(jax.vmap(first_largest))(x.astype(dtype))
     np.testing.assert_array_equal(found, x.argmax(axis=1))
-    assert 0 <= int(first_largest(jnp.full(n, jnp.nan, dtype))) < n
+    for bad in (np.full(n, np.nan), np.where(np.arange(n) == n // 2, np.nan, x[0])):
+        assert 0 <= int(first_largest(jnp.asarray(bad, dtype))) < n
