@@ -32,6 +32,7 @@ RUN_BY = {
     "--version": "test_cli.py",
     "check fits/virtual_trachea/fit.toml": "test_docs.py",
     "fit fits/virtual_trachea/fit.toml": "test_fits.py",
+    "fit fits/virtual_trachea/off_midline.toml": "test_off_midline.py",
     "fit fits/virtual_trachea/fit.toml --out out/virtual": "test_docs.py",
     "predict out/virtual --at s=75,D=0:0.1:0.02 --at 's=3.1 cm,D=100 um'": "test_docs.py",
     "predict out/virtual --data fits/virtual_trachea/fit.toml": "test_docs.py",

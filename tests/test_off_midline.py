@@ -4,9 +4,13 @@ import importlib.util
 import json
 from pathlib import Path
 
+import h5py
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from run_cli import run
+
+from jaxtrachea.config import load_fit_spec
 
 ROOT = Path(__file__).parents[1]
 VIRTUAL = ROOT / "fits" / "virtual_trachea"
@@ -67,6 +71,63 @@ def test_what_the_page_claims():
     assert min(e["compliance"] for e in arch["off"]) > 0.6
     assert arch2["midline"]["ends"] < 0.013
     assert all(e["compliance"] > 0.23 for e in at(of("arch2", "all"), 90))
+
+
+def test_the_page_begins_with_the_skeleton_for_it():
+    """Its first paragraph names the option and a command; its verdicts are of a line of joints."""
+    page = (ROOT / "docs" / "off_midline.md").read_text(encoding="utf-8")
+    first = page.split("\n\n")[2]
+    assert '`skeleton = "sections"`' in first
+    assert "](fit.md)" in first
+    assert "jaxtrachea fit fits/virtual_trachea/off_midline.toml" in page.split("\n\n")[3]
+    assert load_fit_spec(VIRTUAL / "off_midline.toml").model.skeleton == "sections"
+    for words in ("No level is right", "fits of this model"):
+        assert words not in page
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_the_fit_of_sections_errs_as_the_page_says(tmp_path, monkeypatch, capsys):
+    """The command of the page, its force, side force, joints and ends against finite elements."""
+    spec, out = VIRTUAL / "off_midline.toml", tmp_path / "out"
+    assert run(monkeypatch, capsys, "fit", spec, "--out", out)[0] == 0
+    with h5py.File(out / "results.h5") as file:
+        data = {name: values[()] for name, values in file["data"].items()}
+    most = largest_errors(data)
+    # As on the page, to the digits it has.
+    assert round(100 * most["30 deg"], 1) == 3.7
+    assert round(100 * most["90 deg"], 1) == 4.8
+    assert round(100 * most["0 deg"], 1) == 2.3
+    assert round(100 * most["s = 22"], 1) == 5.9
+    assert round(most["side"], 3) == 0.063
+    assert round(100 * max(most[n] for n in most if n.endswith("residual")), 1) == 3.1
+
+
+def largest_errors(data):
+    """By place, of the normal force over its peak; of the ratio of forces; rms of markers over D."""
+    most = {}
+    for s_c, phi, rows in zip(data["s_c"], np.rad2deg(data["phi_c"]), slices(data), strict=True):
+        curve = {n: v[rows] for n, v in data.items() if len(v) == data["samples"].sum()}
+        force, normal, D = (curve[n] for n in ("force", "predicted", "displacement"))
+        place = "s = 22" if round(s_c) == 22 else f"{round(phi)} deg"
+        found = {place: np.abs(normal - force).max() / force.max()}
+        if round(phi):
+            deep = D >= 0.5
+            side, measured = (curve[n][deep] for n in ("side_predicted", "side_force"))
+            found["side"] = np.abs(side / normal[deep] - measured / force[deep]).max()
+        else:
+            curve["joint_side_residual"] = np.zeros(len(D))  # 0 by symmetry, not measured
+        for name in ("joint_residual", "joint_side_residual", "ends_residual"):
+            error = curve[name].reshape(len(D), -1)[D > 0] / D[D > 0, None]
+            found[name] = np.sqrt(np.nanmean(error**2, axis=1)).max()
+        most = {name: max(most.get(name, 0), found.get(name, 0)) for name in most | found}
+    return most
+
+
+def slices(data):
+    """Rows of each curve."""
+    ends = np.cumsum(data["samples"])
+    return [slice(end - count, end) for end, count in zip(ends, data["samples"], strict=True)]
 
 
 def test_page_holds_the_recorded_numbers():
