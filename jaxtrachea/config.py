@@ -58,6 +58,15 @@ def _number_or_quantity(value: Any) -> Any:
     return value
 
 
+def _value_or_true(value: Any) -> Any:
+    """As `_number_or_quantity`, or true."""
+    if value is True:
+        return value
+    if value is False:
+        raise ValueError("expected true, a number, or a quantity with its unit; leave it out")
+    return _number_or_quantity(value)
+
+
 Length = Annotated[float, quantity("length")]
 PositiveLength = Annotated[float, quantity("length", positive=True)]
 Stress = Annotated[float, quantity("stress", positive=True)]
@@ -67,6 +76,7 @@ Estimate = Literal["estimate"]
 ForceNoise = Annotated[Estimate | float, quantity("force", positive=True, word="estimate")]
 LengthNoise = Annotated[Estimate | float, quantity("length", positive=True, word="estimate")]
 Number = Annotated[Any, BeforeValidator(_number_or_quantity)]
+NumberOrTrue = Annotated[Any, BeforeValidator(_value_or_true)]
 
 
 class Section(BaseModel):
@@ -152,13 +162,16 @@ class ModelSection(Section):
     @model_validator(mode="before")
     @classmethod
     def _no_level_of_rings(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "rings" in data:
-            raise ValueError(
-                f"rings = {data['rings']!r}: a key of scenes. Presses on the midline cannot tell "
-                "an arch from its mat: in a fit k_M is the whole ring, as with 'mat'. Leave it "
-                "out, or choose skeleton = 'sections' for rings that bend, anywhere on them"
-            )
-        return data
+        if not isinstance(data, dict) or "rings" not in data:
+            return data
+        key = f"rings = {data['rings']!r}: a key of scenes."
+        if data.get("skeleton") == "sections":
+            raise ValueError(f"{key} With skeleton = 'sections' rings bend as they are; leave it out")
+        raise ValueError(
+            f"{key} Presses on the midline cannot tell an arch from its mat: in a fit k_M is the "
+            "whole ring, as with 'mat'. Leave it out, or choose skeleton = 'sections' for rings "
+            "that bend, anywhere on them"
+        )
 
 
 class WallSection(Section):
@@ -182,10 +195,11 @@ class ParameterSection(Section):
     """[parameters.NAME]: `fixed`, or free with any of `initial`, `bounds`, `scale`, `scope`.
 
     Names and units are those that `jaxtrachea.trachea.material` declares (docs/parameters.md).
-    Numbers are in the parameter's own unit, or quantities with a unit.
+    Numbers are in the parameter's own unit, or quantities with a unit. `fixed = true` keeps the
+    initial value: with deforming cross-sections what `[wall]` gives.
     """
 
-    fixed: Number | None = None
+    fixed: NumberOrTrue | None = None
     initial: Number | None = None
     bounds: tuple[Number, Number] | None = Field(None, strict=False)
     scale: Literal["log", "linear"] | None = None

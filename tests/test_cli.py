@@ -93,6 +93,10 @@ BAD_SPECS = {
         ["parameters.GA_L: not seen by this model", "EI_L"],
     ),
     "arch2": (DATA + '[model]\nrings = "arch2"', ["rings = 'arch2'", "k_M is the whole ring"]),
+    "arch2 of sections": (
+        DATA + '[model]\nrings = "arch2"\nskeleton = "sections"\ncontact = "bonded"',
+        ["rings = 'arch2'", "rings bend as they are; leave it out"],
+    ),
     "parameter of the arch": (
         DATA + "[parameters]\nEI_C = {}",
         ["parameters.EI_C: of a ring that bends", "skeleton = 'sections'"],
@@ -114,7 +118,8 @@ BAD_SPECS = {
     "initial huge": (K1 + f"{{ initial = {10**400} }}", ["parameters.k_1.initial", "finite"]),
     "initial infinite": (K1 + "{ initial = inf }", ["parameters.k_1", "finite"]),
     "fixed negative": (K1 + "{ fixed = -1 }", ["parameters.k_1: fixed: -1 N/mm", "more than 0"]),
-    "fixed a truth": (K1 + "{ fixed = true }", ["parameters.k_1.fixed", "number", "True"]),
+    "fixed false": (K1 + "{ fixed = false }", ["parameters.k_1.fixed", "true, a number", "False"]),
+    "fixed true and initial": (K1 + "{ fixed = true, initial = 1 }", ["parameters.k_1: fixed"]),
     "fixed and bounds": (K1 + "{ fixed = 1, scale = 'log' }", ["parameters.k_1: fixed excludes"]),
     "nothing free to be doubted": (
         K1 + "{ fixed = 1 }\nk_3 = { fixed = 0 }\nEI_L = { fixed = 1 }\nk_M = { fixed = 1 }\n"

@@ -1,6 +1,7 @@
 """A batch through the command line: a bad file costs its own row and touches no other number."""
 
 import csv
+import dataclasses
 import json
 import re
 
@@ -231,6 +232,14 @@ def test_parameters_take_quantities_bounds_and_scales(two):
     assert (made["EI_L"].value, made["EI_L"].fixed) == (1e6, True)
     assert not made["onset"].fixed
     assert DEFAULTS["onset"].fixed
+
+
+def test_fixed_is_a_number_or_true_for_the_initial_value(two):
+    """As {"fixed": True} in Python."""
+    made = parameters(two, "k_1 = { fixed = true }\nk_M = { fixed = 1 }\nonset = { fixed = true }")
+    for name in ("k_1", "onset"):
+        assert made[name] == dataclasses.replace(DEFAULTS[name], fixed=True)
+    assert (made["k_M"].value, made["k_M"].fixed) == (1.0, True)  # 1 is a number, not true
 
 
 def test_ring_hardening_is_free_only_if_named(two):

@@ -86,6 +86,8 @@ def _parameter(default: Parameter, section: ParameterSection | None) -> Paramete
     if section is None:
         return default
     try:
+        if section.fixed is True:
+            return dataclasses.replace(default, fixed=True)
         if section.fixed is not None:
             return _fixed(default, section.fixed)
         return _free(default, section)
