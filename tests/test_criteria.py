@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 import scipy.stats
 import synthetic
-from run_cli import run
+from run_cli import GOOD, run
 
+from jaxtrachea.cli import compare
 from jaxtrachea.cli.compare import _left_out_notes
+from jaxtrachea.cli.fit import describe
+from jaxtrachea.cli.load import load
+from jaxtrachea.cli.options import FitOptions
+from jaxtrachea.cli.terminal import Stop
 from jaxtrachea.fitting.criteria import penalised
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise, Weighting
@@ -25,6 +30,7 @@ from jaxtrachea.inference.comparison import Model, Row, compared, same_data, sen
 from jaxtrachea.inference.repeats import Missed, leave_repeats_out, repeats
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options, press
+from jaxtrachea.runs.manifest import as_dict
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
@@ -425,3 +431,42 @@ def test_simulated_data_choose_the_beam_they_came_from(shear):
         for o in options
     ]
     assert AICc[shear] + 10 < AICc[not shear]
+
+
+def test_notes_are_said_of_every_model_and_curves_named_once(tmp_path, monkeypatch, capsys):
+    """What is true of the second model alone is told, though the first was silent about it."""
+    bad = "".join(f"T02,1,35,{d},{f}\n" for d, f in ((0, 0), (1, "x"), (1.5, 2)))
+    (tmp_path / "data.csv").write_text(GOOD + bad)
+    for title, contact in (("sections", '\ncontact = "bonded"'), ("linear", "")):
+        (tmp_path / f"{title}.toml").write_text(
+            f'title = "{title}"\n[data]\nfiles = "data.csv"\n[trachea]\nradius = "11.7 mm"\n'
+            f'[model]\nskeleton = "{title}"{contact}\n[fit]\nbatch = 64\n'
+        )
+
+    def stop(specs, titles):
+        raise Stop("far enough")
+
+    monkeypatch.setattr(compare, "_names", stop)
+    monkeypatch.chdir(tmp_path)
+    code, _, err = run(monkeypatch, capsys, "compare", "sections.toml", "linear.toml")
+    said = " ".join(err.split())
+    assert (code, "far enough" in said) == (2, True)
+    assert said.count("skeleton = 'linear' was tested to 1.17 mm") == 1
+    assert said.count("not usable: T02 1:") == 1
+    # Sections take one lane at a time, whatever was asked for.
+    assert said.count("fit.batch = 64 is not used: sections take one lane at a time") == 1
+    _, _, err = run(monkeypatch, capsys, "check", "linear.toml")
+    assert "fit.batch" not in err
+
+
+def test_the_batch_that_is_recorded_is_the_one_used(tmp_path):
+    (tmp_path / "data.csv").write_text(GOOD)
+    for skeleton, batch in (("linear", 64), ("sections", 1)):
+        path = tmp_path / f"{skeleton}.toml"
+        path.write_text(
+            f'[data]\nfiles = "data.csv"\n[model]\nskeleton = "{skeleton}"\ncontact = "bonded"\n'
+            "[fit]\nbatch = 64\n"
+        )
+        options = FitOptions(spec=path)
+        now = describe(options, *load(path, None), analyses=[])
+        assert as_dict(now)["chunk"] == batch

@@ -575,5 +575,10 @@ def test_table_of_curves_shows_vectors(virtual):
     assert row["phi [deg]"] == "30"
     assert row["vectors"] == "side force, markers aside, ends U and V of 15 rings"
     assert shown.rows[2][-1].endswith("ends U and V of 3 rings, tool 53.1° off the normal")
+    # A column that is empty for this curve tells nothing of it.
+    curve = virtual[70, 30]
+    nothing = {name: np.full_like(getattr(curve, name), np.nan) for name in ("side_force", "end_U")}
+    shown = _curve_table([dataclasses.replace(curve, **nothing)])
+    assert shown.rows[0][-1] == "markers aside, ends V of 15 rings"
     plain = dataclasses.replace(virtual[70, 0], **dict.fromkeys(ARRAYS))
     assert {"phi [deg]", "vectors"}.isdisjoint(_curve_table([plain]).head)

@@ -34,7 +34,8 @@ def compare(
     clock = [time.perf_counter()]
     if len(specs) < 2:
         raise Stop("compare: one model has nothing to be compared with; give two or more SPEC")
-    loaded = [_loaded(path, data, first=i == 0) for i, path in enumerate(specs)]
+    said: set[str] = set()
+    loaded = [load(path, data, refits=True, said=said) for path in specs]
     names = _names(specs, [spec.title for spec, _, _ in loaded])
     _same_data(specs, loaded, names)
     clock.append(time.perf_counter())
@@ -45,13 +46,6 @@ def compare(
         rows, failed, said = _write(folder, specs, loaded, models, clock)
     _print(rows, said, failed, models, folder.parent)
     raise typer.Exit(1 if failed or loaded[0][1].bad else 0)
-
-
-def _loaded(path: Path, data: Path | None, *, first: bool):
-    """As `load`; curves that cannot be used are named once."""
-    if first:
-        return load(path, data, refits=True)
-    return load(path, data, refits=True, quiet=True)
 
 
 def _names(specs: list[Path], titles: list[str]) -> list[str]:

@@ -114,15 +114,18 @@ class Study:
                 "choose another skeleton"
             )
 
-    def batch_size(self, total: int, most: int) -> int:
-        """Lanes computed together, of `total` and of `most` at most: a size of few.
+    @property
+    def one_at_a_time(self) -> bool:
+        """Whether lanes are fitted one after the other, whatever batch is asked for.
 
-        Of deforming cross-sections one on a CPU: lanes side by side gain nothing there, wait for
-        the slowest of them, and each size is a program of half a minute.
+        Of deforming cross-sections on a CPU: lanes side by side gain nothing there, wait for the
+        slowest of them, and each size is a program of half a minute.
         """
-        if self.model.options.deforms_sections and jax.default_backend() == "cpu":
-            return 1
-        return batch_size(total, most)
+        return self.model.options.deforms_sections and jax.default_backend() == "cpu"
+
+    def batch_size(self, total: int, most: int) -> int:
+        """Lanes computed together, of `total` and of `most` at most: a size of few."""
+        return 1 if self.one_at_a_time else batch_size(total, most)
 
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":
         """The same study with these lanes, in this order; a lane may come more than once."""

@@ -107,7 +107,7 @@ def _check_finite(raw: RawCurve) -> None:
             raise Fault(
                 "non_finite",
                 f"{name} is empty, NaN or infinite in {listed(rows, raw.row_word)}",
-                "remove these samples from the file",
+                "remove these samples from the file: no sample is used without it",
             )
     if raw.sigma is not None and not (raw.sigma > 0).all():
         raise Fault(

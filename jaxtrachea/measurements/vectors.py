@@ -200,12 +200,17 @@ def tilt_of(direction: Sequence[float]) -> float:
 
 def vector_words(curve: Curve) -> str:
     """What a curve holds beside forces and markers along the normal, for a table; may be empty."""
-    ends = [name[-1] for name in ("end_U", "end_V") if getattr(curve, name) is not None]
+
+    def observed(name: str) -> bool:
+        values = getattr(curve, name)
+        return values is not None and bool(np.isfinite(values).any())
+
+    ends = [name[-1] for name in ("end_U", "end_V") if observed(name)]
     rings = 0 if curve.end_rings is None else curve.end_rings.size
     angle = np.degrees(tilt_of(curve.direction))
     words = {
-        "side force": curve.side_force is not None,
-        "markers aside": curve.joint_side_displacement is not None,
+        "side force": observed("side_force"),
+        "markers aside": observed("joint_side_displacement"),
         f"ends {' and '.join(ends)} of {rings} rings": bool(ends),
         f"tool {angle:.3g}° off the normal": tuple(curve.direction) != (1.0, 0.0),
     }
