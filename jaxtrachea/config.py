@@ -166,7 +166,9 @@ class ModelSection(Section):
             return data
         key = f"rings = {data['rings']!r}: a key of scenes."
         if data.get("skeleton") == "sections":
-            raise ValueError(f"{key} With skeleton = 'sections' rings bend as they are; leave it out")
+            raise ValueError(
+                f"{key} With skeleton = 'sections' rings bend as they are; leave it out"
+            )
         raise ValueError(
             f"{key} Presses on the midline cannot tell an arch from its mat: in a fit k_M is the "
             "whole ring, as with 'mat'. Leave it out, or choose skeleton = 'sections' for rings "

@@ -166,7 +166,7 @@ def test_a_sweep_of_a_skeleton_that_softens_is_one_of_the_midline(tmp_path, monk
 
 @pytest.mark.parametrize("command", ["plan", pytest.param("simulate", marks=pytest.mark.slow)])
 def test_sentences_with_tables_in_them_are_shown_whole(command, tmp_path, monkeypatch, capsys):
-    """rich takes [material] for markup and shows nothing in its place."""
+    """As markup [material] would be taken by rich, which shows nothing in its place."""
     monkeypatch.chdir(tmp_path)
     tail = '[output]\nsurface = false\npictures = false\n[sweep]\ndepth = "2 mm"\nphi_count = 1\n'
     Path("scene.toml").write_text(GOOD + PRESS + tail)

@@ -485,7 +485,8 @@ def test_specification(tmp_path):
     assert found["bed_n"].value == pytest.approx(0.03)
     assert not found["Gt_L"].fixed
     assert found["Et_M"].fixed
-    kept = table(more='[wall]\nbed_n = "30 kPa/mm"\n[parameters]\nbed_n = { fixed = true }')["bed_n"]
+    held = table(more='[wall]\nbed_n = "30 kPa/mm"\n[parameters]\nbed_n = { fixed = true }')
+    kept = held["bed_n"]
     assert (kept.value, kept.fixed) == (found["bed_n"].value, True)
     for arguments, words in (
         ({"more": '[wall]\nh = "1 mm"'}, "wall.h_C is 1.56 mm; expected at most"),

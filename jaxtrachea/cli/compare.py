@@ -34,8 +34,8 @@ def compare(
     clock = [time.perf_counter()]
     if len(specs) < 2:
         raise Stop("compare: one model has nothing to be compared with; give two or more SPEC")
-    said: set[str] = set()
-    loaded = [load(path, data, refits=True, said=said) for path in specs]
+    told: set[str] = set()
+    loaded = [load(path, data, refits=True, said=told) for path in specs]
     names = _names(specs, [spec.title for spec, _, _ in loaded])
     _same_data(specs, loaded, names)
     clock.append(time.perf_counter())
