@@ -277,7 +277,10 @@ def _number_cure(cell: str) -> str:
         return "a spreadsheet took it for a date: set the column to numbers and write it anew"
     if "," in cell:
         return "use one decimal sign throughout and no thousands separator"
-    return "write numbers as 1.5 or 1.5e-3, and leave a missing value empty"
+    return (
+        "write numbers as 1.5 or 1.5e-3; leave a missing marker, ring end or side force empty, and "
+        "remove a sample without displacement or force"
+    )
 
 
 def role_values(table: Table, role: str, index: int, picked: slice, unit: str) -> np.ndarray:
