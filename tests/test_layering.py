@@ -13,7 +13,7 @@ PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 #: Rooms from the bottom up; `fit` and `scene` are neighbours, neither knows the other.
 ORDER = [
     {"_errors"},
-    {"units", "status", "_numerics", "_arguments", "_packed"},
+    {"units", "status", "_numerics", "_arguments", "_packed", "_in_order"},
     {"files", "optimisation"},
     {"config"},
     {"trachea"},

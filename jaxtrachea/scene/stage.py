@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import real, shaped
 from jaxtrachea._errors import InputError
+from jaxtrachea._in_order import in_order
 from jaxtrachea.contact.patches import Patches, Touch, touch
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import STANDARD, Settings
@@ -176,7 +177,7 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
     def one(R, T):
         return touch(tool, Pose(R, T), tube, scene.quality, near=scene.near)
 
-    return jax.vmap(one)(path.rotation, path.translation)
+    return jax.vmap(in_order(one))(path.rotation, path.translation)
 
 
 def contact_point_path(path: Poses, seen: Touch, first, inward, frame):
