@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Num
 
 
 def epsilon(dtype) -> float:
@@ -22,7 +22,7 @@ def epsilon(dtype) -> float:
 WRITTEN_OUT, ONE_REDUCTION = 8, 32
 
 
-def total(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
+def total(x: Num[Array, "*rows n"]) -> Num[Array, "*rows"]:
     """Sum over the last axis, such that XLA for CPUs starts few kernels and vectorises them.
 
     The order of summation differs from that of `jnp.sum`.

@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxtrachea._in_order import in_order
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
@@ -159,12 +160,18 @@ def _ends(scene: Scene, material: Material, s_c, moved) -> regions.Ends:
 def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.Dent:
     """The local correction for one row."""
     count, spacing = scene.plan.dent, scene.footprint
-    where = local.centres(s_c, phi_c, scene.radius if radius is None else radius, spacing, count)
-    sag = jnp.zeros_like(where[:, 0])
-    if tool is not None and scene.tool is not None:
-        bent = scene.tube if scene.plan.curved else None
-        sag = _sag(scene.tool, tool, where if bent is None else lay(bent.line, where))
-    return local.fit(where, local.targets(depth, sag), local.REACH * spacing)
+
+    def lay_out(s_c, phi_c, radius, tool, depth):
+        where = local.centres(s_c, phi_c, radius, spacing, count)
+        sag = jnp.zeros_like(where[:, 0])
+        if tool is not None and scene.tool is not None:
+            bent = scene.tube if scene.plan.curved else None
+            sag = _sag(scene.tool, tool, where if bent is None else lay(bent.line, where))
+        return where, local.shares(depth, sag)
+
+    radius = scene.radius if radius is None else radius
+    where, share = in_order(lay_out)(s_c, phi_c, radius, tool, depth)
+    return local.fit(where, share[:, None], local.REACH * spacing, depth)
 
 
 def _sag(tool: Shape, pose: Poses, points):

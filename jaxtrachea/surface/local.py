@@ -22,7 +22,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._numerics import epsilon
+from jaxtrachea._in_order import in_order
+from jaxtrachea._numerics import epsilon, total
 
 #: Centres on circles round C, by the number of centres; the outermost circle is the collar.
 CIRCLES = {1: (), 8: (7,), 16: (6, 9), 32: (6, 10, 15)}
@@ -35,13 +36,15 @@ class Dent(eqx.Module):
 
     Attributes:
         centres: mm; shape (centres, 3).
-        weights: mm; shape (centres, 3).
+        weights: mm; shape (centres, 3), or (centres, 1) with `way`.
         reach: r, beyond which nothing moves, mm.
+        way: along which all centres move, mm, of which `weights` are shares; None: each its own.
     """
 
     centres: Float[Array, "centres 3"]
-    weights: Float[Array, "centres 3"]
+    weights: Float[Array, "centres components"]
     reach: Float[Array, ""]
+    way: Float[Array, "3"] | None = None
 
 
 class Runs(eqx.Module):
@@ -52,11 +55,13 @@ class Runs(eqx.Module):
         rank: place of each vertex in it, or None.
         longest: most vertices that a dent with 0, 1, 2 or 3 circles can reach, wherever it lies
             (static: the number of vertices a program computes).
+        s: of the vertices in order, mm; None: one run of all.
     """
 
     order: Int[Array, " vertices"] | None
     rank: Int[Array, " vertices"] | None
     longest: tuple[int, ...] = eqx.field(static=True)
+    s: Float[Array, " vertices"] | None = None
 
 
 def runs(s: Float[Array, " vertices"], spacing: Float[Array, ""]) -> Runs:
@@ -76,9 +81,11 @@ def runs(s: Float[Array, " vertices"], spacing: Float[Array, ""]) -> Runs:
         for half in (_half_width(circles, float(spacing)) for circles in range(4))
     )
     if (np.diff(order) > 0).all():
-        return Runs(None, None, longest)
+        return Runs(None, None, longest, jnp.asarray(s))
     rank = np.argsort(order)
-    return Runs(jnp.asarray(order, jnp.int32), jnp.asarray(rank, jnp.int32), longest)
+    return Runs(
+        jnp.asarray(order, jnp.int32), jnp.asarray(rank, jnp.int32), longest, jnp.asarray(s)[order]
+    )
 
 
 def _half_width(circles: int, spacing):
@@ -140,18 +147,24 @@ def targets(local: Float[Array, "3"], sag: Float[Array, " centres"]) -> Float[Ar
     Returns:
         mm; shape (centres, 3): `local` at C, 0 on the collar.
     """
+    return shares(local, sag)[:, None] * local[None]
+
+
+def shares(local: Float[Array, "3"], sag: Float[Array, " centres"]) -> Float[Array, " centres"]:
+    """Share of each centre in the local part of the displacement of C; see `targets`."""
     collar = pattern(sag.shape[0])[1]
     square = jnp.sum(local**2)
     depth = jnp.sqrt(jnp.where(square > 0, square, 1))
     share = jnp.where(square > 0, jnp.maximum(1 - sag / depth, 0), 0)
-    share = jnp.where(collar, 0, share).at[0].set(1)
-    return share[:, None] * local[None]
+    at_C = np.arange(len(collar)) == 0
+    return jnp.where(at_C, 1, jnp.where(collar, 0, share))
 
 
 def fit(
     centres: Float[Array, "centres 3"],
-    targets: Float[Array, "centres 3"],
+    targets: Float[Array, "centres components"],
     reach: Float[Array, ""],
+    way: Float[Array, "3"] | None = None,
 ) -> Dent:
     """The correction that takes the values `targets` at `centres`, by Cholesky factors.
 
@@ -160,19 +173,35 @@ def fit(
 
     Args:
         centres: mm.
-        targets: displacement at each centre, mm.
+        targets: displacement at each centre, mm; with `way` shares of it, shape (centres, 1).
         reach: r, mm, positive. 2 to 5 spacings keep the condition number below 1e3.
+        way: of centres that all move along it, mm: a third of the work.
     """
     n = centres.shape[0]
-    matrix = _kernel(centres, centres, reach)
-    matrix = matrix + 16 * n * epsilon(matrix.dtype) * jnp.eye(n, dtype=matrix.dtype)
-    factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
-    return Dent(centres, jax.scipy.linalg.cho_solve(factor, targets), reach)
+
+    def solve(centres, targets, reach):
+        matrix = _kernel(centres, centres, reach)
+        matrix = matrix + 16 * n * epsilon(matrix.dtype) * jnp.eye(n, dtype=matrix.dtype)
+        factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
+        return jax.scipy.linalg.cho_solve(factor, targets)
+
+    return Dent(centres, in_order(solve)(centres, targets, reach), reach, way)
 
 
 def correction(dent: Dent, points: Float[Array, "points 3"]) -> Float[Array, "points 3"]:
     """Local displacement of every point, mm; exactly 0 beyond the reach of all centres."""
-    return _kernel(points, dent.centres, dent.reach) @ dent.weights
+    return _together(dent, _columns(dent, points))
+
+
+def _columns(dent: Dent, points):
+    """Its components at the points, or with a way the share of it."""
+    near = _kernel(dent.centres, points, dent.reach)
+    # One at a time: XLA for CPUs takes five times as long for a product with three columns.
+    return [jnp.dot(w, near, precision="highest") for w in dent.weights.T]
+
+
+def _together(dent: Dent, columns):
+    return jnp.stack(columns, axis=1) if dent.way is None else columns[0][:, None] * dent.way
 
 
 def add_correction(
@@ -197,23 +226,35 @@ def add_correction(
     """
     circles = len(CIRCLES[dent.centres.shape[0]])
     length = min(runs.longest[circles], points.shape[0])
-    half = _half_width(circles, dent.reach / REACH)
 
-    def reached(v):
-        return jnp.sum(jnp.abs(v[:, 0] - s_c) <= half * (1 - 5e-4))
+    def find(s_c, reach):
+        half = _half_width(circles, reach / REACH)
+        start = jnp.zeros((), jnp.int32)
+        if runs.s is not None:
+            first = jnp.searchsorted(runs.s, s_c - half).astype(jnp.int32)
+            start = jnp.minimum(first, points.shape[0] - length)
+        place = jnp.arange(points.shape[0], dtype=jnp.int32) if runs.rank is None else runs.rank
+        outside = (place < start) | (place >= start + length)
+        reached = jnp.abs(points[:, 0] - s_c) <= half * (1 - 5e-4)
+        whole = total((outside & reached).astype(jnp.int32)) == 0
 
-    start = jnp.minimum(jnp.sum(points[:, 0] < s_c - half), points.shape[0] - length)
+        def cut(v):
+            return jax.lax.dynamic_slice_in_dim(v, start, length)
 
-    def cut(v):
-        return jax.lax.dynamic_slice_in_dim(v, start, length)
+        run = cut(points) if runs.order is None else points[cut(runs.order)]
+        return start, whole, run.T
 
-    run = cut(points) if runs.order is None else points[cut(runs.order)]
-    here = jnp.where(reached(points) == reached(run), correction(dent, run), jnp.nan)
-    # A slice of what is padded by zeros: cheaper than writing the run into zeros.
+    # By itself: of vertices that begin anywhere the processor would take one after the other.
+    start, whole, run = in_order(find)(s_c, dent.reach)
+    here = _columns(dent, run.T)
     rest = points.shape[0] - length
-    padded = jnp.pad(here, ((rest, rest), (0, 0)))
-    whole = jax.lax.dynamic_slice_in_dim(padded, rest - start, points.shape[0])
-    return u + (whole if runs.rank is None else whole[runs.rank])
+
+    def spread(v):
+        # A slice of what is padded by zeros: cheaper than writing the run into zeros.
+        v = jax.lax.dynamic_slice_in_dim(jnp.pad(v, (rest, rest)), rest - start, points.shape[0])
+        return v if runs.rank is None else v[runs.rank]
+
+    return u + _together(dent, [spread(jnp.where(whole, v, jnp.nan)) for v in here])
 
 
 def _kernel(points, centres, reach):
@@ -221,7 +262,7 @@ def _kernel(points, centres, reach):
     square = sum(
         ((p[:, None] - c[None]) ** 2 for p, c in zip(points.T, centres.T, strict=True)),
         jnp.zeros((), points.dtype),
-    ) / (reach * reach)
+    ) * (1 / (reach * reach))
     inside = square < 1
     away = inside & (square > 0)  # before the root, whose derivative at 0 is not finite
     q = jnp.where(away, jnp.sqrt(jnp.where(away, square, 1)), 0)

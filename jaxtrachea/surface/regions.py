@@ -30,6 +30,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import check_word
+from jaxtrachea._in_order import in_order
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.surface import phong
 from jaxtrachea.surface.blocks import Blocks, in_blocks, to_blocks, to_vertices
@@ -65,12 +66,19 @@ class Binding(eqx.Module):
 
 
 class Weights(eqx.Module):
-    """Share of the lines U, J and V in the motion of every vertex; they add up to 1."""
+    """Share of the lines U, J and V in the motion of every vertex; they add up to 1.
 
-    U: Float[Array, "blocks width"]
-    J: Float[Array, "blocks width"]
-    V: Float[Array, "blocks width"]
+    Attributes:
+        lines: of U, J and V; one array, since the processor then computes them in one loop.
+        phi_c: angle of contact, rad.
+    """
+
+    lines: Float[Array, "3 blocks width"]
     phi_c: Float[Array, ""]
+
+    U = property(lambda self: self.lines[..., 0, :, :])
+    J = property(lambda self: self.lines[..., 1, :, :])
+    V = property(lambda self: self.lines[..., 2, :, :])
 
 
 class Keys(eqx.Module):
@@ -188,17 +196,19 @@ def weigh(binding: Binding, phi_c: Float[Array, ""]) -> Weights:
     on = jnp.abs(phi_c) <= alpha * (1 + 8 * epsilon(phi.dtype))
     to_U = jnp.maximum(alpha, NARROWEST - phi_c)
     to_V = jnp.maximum(alpha, NARROWEST + phi_c)
-    from_U = jnp.clip((phi + to_U) / (phi_c + to_U), 0, 1)
-    from_V = jnp.clip((to_V - phi) / (to_V - phi_c), 0, 1)
-    behind = jnp.maximum(phi - to_V, -phi - to_U) / (2 * math.pi - to_U - to_V)
-    behind = jnp.clip(behind, 0, 1)
-    U = (1 - from_U) * (1 - behind) + (1 - from_V) * behind
-    V = (1 - from_V) * (1 - behind) + (1 - from_U) * behind
 
-    def hide(weight):
-        return jnp.where(on, weight, jnp.nan)
+    def share(phi_c, to_U, to_V, on):
+        # One division for all vertices of a region. Hidden by NaN: behind the ends of the rings.
+        hidden = jnp.where(on, 1, jnp.nan).astype(phi.dtype)
+        from_U = jnp.clip((phi + to_U) * (hidden / (phi_c + to_U)), 0, 1)
+        from_V = jnp.clip((to_V - phi) * (hidden / (to_V - phi_c)), 0, 1)
+        behind = jnp.maximum(phi - to_V, -phi - to_U) * (1 / (2 * math.pi - to_U - to_V))
+        behind = jnp.clip(behind, 0, 1)
+        U = (1 - from_U) * (1 - behind) + (1 - from_V) * behind
+        V = (1 - from_V) * (1 - behind) + (1 - from_U) * behind
+        return jnp.stack([U, from_U * from_V, V])
 
-    return Weights(hide(U), hide(from_U * from_V), hide(V), phi_c)
+    return Weights(in_order(share)(phi_c, to_U, to_V, on), phi_c)
 
 
 def interpolate(
@@ -229,13 +239,36 @@ def interpolate(
         if keys.slopes is None or keys.contact_slope is None:
             raise ValueError("method='hermite' needs slopes and contact_slope; or use 'linear'")
         slopes = keys.slopes, keys.contact_slope
-    line = _joint_line(binding.nodes, keys.s_c, keys.joints, keys.contact, slopes)
-    u = _carry(binding, weights, keys.s_c, line, keys.U, keys.V)
+    u = _carry(binding, weights, keys.s_c, keys.joints, keys.contact, keys.U, keys.V, slopes)
     return to_vertices(u, binding.blocks)
 
 
-#: Hermite's cubic c_0 + t (c_1 + t (c_2 + t c_3)) from its values and slopes at both ends.
-HERMITE = [[1, 0, 0, 0], [0, 0, 1, 0], [-3, 3, -2, -1], [2, -2, 1, 1]]
+def _carry(binding: Binding, weights: Weights, s_c, joints, contact, U, V, slopes=None):
+    """Along the tube between the nodes, round it between the lines.
+
+    Each by itself: of the lines all arrays are small, and the processor takes several vertices of a
+    block at a time. With `to_vertices` in one loop it would take one after the other.
+
+    Returns:
+        Shape (blocks, components, width).
+    """
+
+    def lines(s_c, joints, contact, U, V, slopes):
+        line = _joint_line(binding.nodes, s_c, joints, contact, slopes)
+        return line, _ends(U, s_c), _ends(V, s_c)
+
+    def across(weights, s_c, line, ends):
+        return _across(binding, weights, s_c, line, ends)
+
+    line, *ends = in_order(lines)(s_c, joints, contact, U, V, slopes)
+    return in_order(across)(weights, s_c, line, ends)
+
+
+def _ends(values, s_c):
+    """What there is at a node and how it rises to the next; rows as of `_joint_line`."""
+    above = jnp.concatenate([values[1:], *[values[-1:]] * len(_each(s_c))])
+    below = jnp.concatenate([values, *[values[-1:]] * (len(_each(s_c)) - 1)])
+    return below, above - below
 
 
 def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None = None):
@@ -245,7 +278,7 @@ def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None 
 
     Returns:
         Where each patch begins, mm, and one over its length; shape (nodes,). The coefficients of
-        t = 0..1 in it; shape (nodes, 4, components).
+        1, t, t^2, t^3 in it, t = 0..1; shape (nodes, components) each.
     """
     values, below = joints, []
     for s in _each(s_c):
@@ -261,10 +294,8 @@ def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None 
         leave, land = (
             jnp.concatenate([straight, span[:, None] * v], 1) for v in (turn[:-1], turn[1:])
         )
-    weights = jnp.asarray(np.array(HERMITE, float), low.dtype)
-    cubic = jnp.einsum(
-        "ck,pkd->pcd", weights, jnp.stack([low, high, leave, land], 1), precision="highest"
-    )
+    rise = high - low
+    cubic = low, leave, 3 * rise - 2 * leave - land, leave + land - 2 * rise
     return nodes[:-1], 1 / jnp.where(span > 0, span, jnp.inf), cubic
 
 
@@ -273,37 +304,31 @@ def _each(v, dimensions: int = 0):
     return [v] if v.ndim == dimensions else [v[i] for i in range(v.shape[0])]
 
 
-def _carry(binding: Binding, weights: Weights, s_c, line, U, V):
-    """Along the tube between the nodes, round it between the lines.
+def _across(binding: Binding, weights: Weights, s_c, line, ends):
+    """The vertices of each patch; `line` from `_joint_line`, `ends` from `_ends` of U and of V."""
+    beyond = tuple(binding.s >= s for s in _each(s_c))
+    (begin, density, cubic), parts = line, 1 + len(beyond)
+    columns = [begin[:, None], density[:, None], *cubic, *ends[0], *ends[1]]
+    patches = jnp.concatenate(columns, axis=1)
 
-    Args:
-        binding: -
-        weights: -
-        s_c: contact position, mm, or those of both edges.
-        line: from `_joint_line`.
-        U: values at the nodes; shape (nodes, components).
-        V: -
+    # Of the patch that C splits, a vertex belongs to the lower or to the upper part. What a block
+    # needs of all parts is read at once.
+    def read(patch):
+        return jax.lax.dynamic_slice_in_dim(patches, patch, parts)
 
-    Returns:
-        Shape (blocks, components, width).
-    """
-    patch, beyond = binding.patch, tuple(binding.s >= s for s in _each(s_c))
-    begin, density, cubic = line
+    rows = jax.vmap(read)(binding.patch)
 
-    # Of the patch that C splits, a vertex belongs to the lower or to the upper part.
-    def part(v, i):
-        return v[patch + i if i else patch]
-
-    def side(v):
-        *upper, own = (part(v, i)[:, None] for i in range(len(beyond), -1, -1))
-        for past, other in zip(beyond, reversed(upper), strict=True):
+    def side(column):
+        own, *upper = (rows[:, i, column, None] for i in range(parts))
+        for past, other in zip(beyond, upper, strict=True):
             own = jnp.where(past, other, own)
         return own
 
-    t = (binding.s - side(begin)) * side(density)
-    ends = jnp.stack([U[:-1], U[1:] - U[:-1], V[:-1], V[1:] - V[:-1]], axis=1)
-    cubics = [part(cubic, i) for i in range(1 + len(beyond))]
-    table = jnp.concatenate([*cubics, ends[patch]], axis=1)
+    t = (binding.s - side(0)) * side(1)
+    width = cubic[0].shape[1]
+    own = [rows[:, i, 2 : 2 + 4 * width] for i in range(parts)]
+    table = jnp.concatenate([*own, rows[:, 0, 2 + 4 * width :]], axis=1)
+    table = table.reshape(table.shape[0], -1, width)
     return _combine((weights.U, weights.J, weights.V, t), beyond, binding.fraction, table)
 
 
@@ -384,8 +409,7 @@ def _phong(binding: Binding, weights: Weights, keys: Keys):
     def encode(v):
         return phong.encode(v, phi_c, pole)
 
-    joints, contact = encode(keys.joints.T).T, encode(keys.contact)
-    line = _joint_line(binding.nodes, keys.s_c, joints, contact)
-    channels = _carry(binding, weights, keys.s_c, line, encode(keys.U.T).T, encode(keys.V.T).T)
+    joints, U, V = (encode(v.T).T for v in (keys.joints, keys.U, keys.V))
+    channels = _carry(binding, weights, keys.s_c, joints, encode(keys.contact), U, V)
     u = phong.decode(channels.swapaxes(0, 1), phi_c, pole).swapaxes(0, 1)
     return to_vertices(u, binding.blocks)
