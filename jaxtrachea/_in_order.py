@@ -7,13 +7,10 @@ small part is a computation of its own.
 """
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 from jax.core import Tracer
-from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 
 Out = TypeVar("Out")
 
@@ -21,41 +18,69 @@ Out = TypeVar("Out")
 def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
     """The same function, compiled as a computation of its own: one pose at a time, on a CPU.
 
-    Many lanes at once, or on another device, it is compiled into the program around it as if this
-    were not here. Values and derivatives are the same.
+    Many lanes at once (`vmap` over an argument, or what gives the first result), on another device,
+    or with a JAX that cannot mark a call, it is compiled into the program around it as if this were
+    not here; so too where the first result is not used. Values and derivatives are the same, but
+    for rounding.
 
     Args:
         part: from arrays to arrays (or trees of them); may close over traced ones.
     """
 
     def run(*arguments):
-        if not any(isinstance(v, Tracer) for v in jax.tree.leaves(arguments)):
+        inputs = jax.tree.leaves(arguments)
+        if _not_inlined_p is None or not any(isinstance(v, Tracer) for v in inputs):
             return part(*arguments)
         leaves, tree = jax.tree.flatten(jax.jit(part)(*arguments))
-        # One result is enough: what is marked is the call that it comes from.
-        return jax.tree.unflatten(tree, [_not_inlined_p.bind(leaves[0]), *leaves[1:]])
+        if leaves:  # one that is used is enough: what is marked is the call that it comes from
+            leaves[0] = _not_inlined_p.bind(leaves[0], *inputs)
+        return jax.tree.unflatten(tree, leaves)
 
     return run
-
-
-#: The identity, that marks what its argument comes from.
-_not_inlined_p = Primitive("not_inlined")
-_not_inlined_p.def_impl(lambda x: x)
-_not_inlined_p.def_abstract_eval(lambda x: x)
 
 
 def _jvp(primals, tangents):
     return _not_inlined_p.bind(*primals), tangents[0]
 
 
-def _lanes(arguments, axes):
-    (x,), (axis,) = arguments, axes
-    return (_not_inlined_p.bind(x) if x.shape[axis] == 1 else x), axis
+def _lanes(operands, axes):
+    x, axis = operands[0], axes[0]
+    lanes = [v.shape[i] for v, i in zip(operands, axes, strict=True) if i is not None]
+    return (x if max(lanes) > 1 else _not_inlined_p.bind(*operands)), axis
 
 
-ad.primitive_jvps[_not_inlined_p] = _jvp
-batching.primitive_batchers[_not_inlined_p] = _lanes
-_mark = mlir.lower_fun(lambda x: set_xla_metadata(x, inlineable="false"), multiple_results=False)
-# Not cacheable: a function of its own would not see where its argument comes from.
-mlir.register_lowering(_not_inlined_p, _mark, platform="cpu", cacheable=False)
-mlir.register_lowering(_not_inlined_p, lambda _, x: [x])
+def _mark() -> Any:
+    """The identity of its first operand, which marks the call that this comes from.
+
+    The others, what goes into the call, tell how many lanes there are: the result may have none.
+
+    Returns:
+        None where this JAX does not offer what it takes (0.6).
+    """
+    try:
+        from jax.experimental.xla_metadata import set_xla_metadata
+        from jax.extend.core import Primitive
+        from jax.interpreters import ad, batching, mlir
+
+        def mark(x, *_):
+            return set_xla_metadata(x, inlineable="false")
+
+        jax.eval_shape(mark, jax.ShapeDtypeStruct((), "float32"))
+        primitive = Primitive("not_inlined")
+        primitive.def_impl(lambda x, *_: x)
+        primitive.def_abstract_eval(lambda x, *_: x)
+        ad.primitive_jvps[primitive] = _jvp
+        ad.primitive_transposes[primitive] = lambda cotangent, x, *inputs: (
+            [cotangent if ad.is_undefined_primal(x) else None, *[None] * len(inputs)]
+        )
+        batching.primitive_batchers[primitive] = _lanes
+        lowered = mlir.lower_fun(mark, multiple_results=False)
+        # Not cacheable: a function of its own would not see where its argument comes from.
+        mlir.register_lowering(primitive, lowered, platform="cpu", cacheable=False)
+        mlir.register_lowering(primitive, lambda _, x, *inputs: [x])
+    except (ImportError, AttributeError, TypeError):
+        return None
+    return primitive
+
+
+_not_inlined_p = _mark()

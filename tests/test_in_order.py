@@ -1,0 +1,244 @@
+"""A part compiled by itself: values and derivatives are those of the part, whatever is done to it.
+
+The outside truth is the function without the mark, and for one case the derivative by hand. What
+the mark does is read in the compiled program: one pose calls the part, several lanes do not.
+"""
+
+import sys
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrachea import _in_order
+from jaxtrachea._in_order import in_order
+from jaxtrachea._numerics import epsilon
+
+DTYPES = ["float32", "float64"]
+NOT_INLINED = 'inlineable="false"'
+
+
+class Out(NamedTuple):
+    nothing: None
+    sine: jax.Array
+    both: tuple
+
+
+def part(x, y):
+    """A tree of results with None in it; the first does not depend on y."""
+    return Out(None, jnp.sin(x) * x, (jnp.sum(jnp.exp(x) * y**2, axis=-1), x * y[..., ::-1]))
+
+
+def numbers(dtype, lanes=()):
+    rng = np.random.default_rng(5)
+    return [jnp.asarray(rng.normal(size=(*lanes, 3)), dtype) for _ in range(2)]
+
+
+def close(got, expected):
+    """To rounding: what is fused with what differs."""
+    assert jax.tree.structure(got) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        assert (a.dtype, a.shape) == (b.dtype, b.shape)
+        atol = 8 * epsilon(b.dtype) * max(1, np.abs(b).max()) if b.dtype.kind == "f" else 0
+        np.testing.assert_allclose(a, b, rtol=0, atol=atol)
+
+
+def total(f, x, y):
+    return sum(jnp.sum(v) for v in jax.tree.leaves(f(x, y)))
+
+
+def second(f, x, y):
+    """A row of the second derivatives, forward over reverse and reverse over reverse."""
+    slope = jax.grad(total, argnums=(1, 2))
+    along = jax.jvp(lambda *v: slope(f, *v), (x, y), (y, x))[1]
+    back = jax.grad(lambda *v: sum(jnp.sum(g**2) for g in slope(f, *v)), argnums=(0, 1))(x, y)
+    return along, back
+
+
+def rounds(f, x, y):
+    """As the body of a loop, and mapped one after the other."""
+    step = jax.lax.scan(lambda c, v: (f(c, v)[1], f(c, v)), x, jnp.stack([y, 2 * y]))
+    loop = jax.lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, f(c[1], y)[1]), (0, x))
+    return step, loop, jax.lax.map(lambda v: f(v, y), jnp.stack([x, y]))
+
+
+def transposed(f, x, y):
+    """The part is linear in the second argument if only its last result is taken."""
+    return jax.linear_transpose(lambda v: f(x, v).both[1], y)(x)
+
+
+WAYS = {
+    "value": lambda f, x, y: f(x, y),
+    "grad": lambda f, *v: jax.value_and_grad(total, argnums=(1, 2))(f, *v),
+    "jvp": lambda f, x, y: jax.jvp(f, (x, y), (y, x)),
+    "jacrev": lambda f, *v: jax.jacrev(f, argnums=(0, 1))(*v),
+    "jacfwd": lambda f, *v: jax.jacfwd(f)(*v),
+    "second": second,
+    "loops": rounds,
+    "gradient of loops": lambda f, x, y: jax.grad(
+        lambda v: sum(jnp.sum(w) for w in jax.tree.leaves(jax.lax.map(lambda u: f(u, y), v)))
+    )(jnp.stack([x, y])),
+    "gradient of scan": lambda f, x, y: jax.grad(
+        lambda x: jnp.sum(jax.lax.scan(lambda c, v: (f(c, v)[1], None), x, jnp.stack([y, x]))[0])
+    )(x),
+    "checkpoint": lambda f, *v: jax.grad(
+        lambda *v: total(jax.checkpoint(f), *v), argnums=(0, 1)
+    )(*v),
+    "linearize": lambda f, *v: jax.linearize(f, *v)[1](*v),
+    "closure": lambda f, x, y: jax.jacrev(lambda t: in_order_or(f)(lambda w: part(t, w))(y))(x),
+}  # fmt: skip
+
+
+def in_order_or(f):
+    """`in_order` again if f is marked, else the identity."""
+    return (lambda g: g) if f is part else in_order
+
+
+LANES = {
+    "none": lambda way: way,
+    "one": lambda way: jax.vmap(way),
+    "many": lambda way: jax.vmap(way),
+    "of lanes": lambda way: jax.vmap(jax.vmap(way)),
+    "one of many": lambda way: jax.vmap(jax.vmap(way)),
+    "many of one": lambda way: jax.vmap(jax.vmap(way)),
+    "first argument": lambda way: jax.vmap(way, (0, None)),
+    "second argument": lambda way: jax.vmap(way, (None, 0)),
+    "last axis": lambda way: jax.vmap(way, (-1, None), -1),
+}
+SIZES = {
+    "one": (1,),
+    "many": (4,),
+    "of lanes": (2, 3),
+    "one of many": (4, 1),
+    "many of one": (1, 4),
+    "first argument": (4,),
+    "second argument": (4,),
+    "last axis": (4,),
+}
+
+
+def arguments(lanes, dtype):
+    x, y = numbers(dtype, SIZES.get(lanes, ()))
+    alone = numbers(dtype)
+    if lanes == "first argument":
+        return x, alone[1]
+    if lanes == "second argument":
+        return alone[0], y
+    return (x.T, alone[1]) if lanes == "last axis" else (x, y)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("way", list(WAYS))
+def test_it_is_the_part(way, dtype):
+    """Alone, and one or many lanes, in the same program and one operation after the other."""
+    do = WAYS[way]
+    marked = in_order(part)
+    close(do(marked, *numbers(dtype)), do(part, *numbers(dtype)))
+    chosen = list(LANES) if way in ("value", "jacrev") else ["none", "many", "second argument"]
+    for lanes in chosen:
+        at = arguments(lanes, dtype)
+        got, expected = (
+            jax.jit(LANES[lanes](lambda x, y, f=f: do(f, x, y)))(*at) for f in (marked, part)
+        )
+        close(got, expected)
+
+
+def test_the_derivative_by_hand():
+    """d/dx of x sin(x) at 0.7, once and twice."""
+    marked, x = in_order(lambda x: (x * jnp.sin(x),)), jnp.asarray(0.7)
+    slope = jax.jit(jax.grad(lambda x: marked(x)[0]))
+    np.testing.assert_allclose(slope(x), np.sin(0.7) + 0.7 * np.cos(0.7), rtol=1e-14)
+    np.testing.assert_allclose(jax.grad(slope)(x), 2 * np.cos(0.7) - 0.7 * np.sin(0.7), rtol=1e-14)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("first", ["index", "truth"])
+def test_a_first_result_without_a_derivative(first, dtype):
+    """The mark is put on an integer or a truth value; what comes after it is differentiated."""
+
+    def lead(x, n):
+        found = jnp.argmax(x) + n if first == "index" else (x > 0) & (n > 0)
+        return found, x[n] ** 3
+
+    x, n = numbers(dtype)[0], jnp.asarray(1)
+    for f in (lead, in_order(lead)):
+        got = jax.jit(f)(x, n)
+        close(got, lead(x, n))
+        slope = jax.jit(jax.grad(lambda x, f=f: f(x, n)[1]))(x)
+        close(slope, jnp.zeros_like(x).at[1].set(3 * x[1] ** 2))
+        tangents = jax.jit(lambda x, f=f: jax.jvp(lambda x: f(x, n), (x,), (x,)))(x)[1]
+        assert tangents[0].dtype == jax.dtypes.float0
+        close(tangents[1], 3 * x[1] ** 3)
+        close(jax.jit(jax.vmap(f, (None, 0)))(x, jnp.arange(3))[1], x**3)
+
+
+def test_no_results_and_no_arguments():
+    assert jax.jit(in_order(lambda x: (None, ())))(jnp.ones(3)) == (None, ())
+    assert in_order(lambda: 3)() == 3  # nothing traced: the part itself, not through JAX
+    assert jax.jit(lambda x: in_order(lambda: x + 1)())(jnp.ones(())) == 2
+
+
+def test_linear_parts_are_transposed():
+    x, y = numbers("float64")
+    f = in_order(lambda v: (2 * v, x * v[::-1]))
+    got = jax.linear_transpose(f, y)((x, y))
+    np.testing.assert_allclose(got[0], 2 * x + (x * y)[::-1], rtol=1e-15)
+    # The marked result does not depend on what it is linear in.
+    got = jax.linear_transpose(lambda v: in_order(part_of_it)(x, v)[1], y)(x)
+    np.testing.assert_allclose(got[0], (x * x)[::-1], rtol=1e-15)
+
+
+def part_of_it(x, v):
+    return jnp.sin(x), x * v[::-1]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_one_pose_calls_it_and_many_lanes_hold_it(dtype):
+    """In the compiled program; with lanes also where the first result has none of its own."""
+
+    def program(f, *at):
+        return jax.jit(f).lower(*at).compile().as_text()
+
+    marked, one = in_order(part), numbers(dtype)
+    assert NOT_INLINED not in program(part, *one)
+    text = program(marked, *one)
+    assert sum(" call(" in v and NOT_INLINED in v for v in text.split("\n")) == 1
+    for lanes in ("one", "many", "of lanes", "one of many", "many of one", "second argument"):
+        text = program(LANES[lanes](marked), *arguments(lanes, dtype))
+        assert (NOT_INLINED in text) == (lanes == "one"), lanes
+    # Lanes that only a closure brings are seen if the first result has them.
+    x, y = numbers(dtype, (8,))
+    text = program(jax.vmap(lambda x, y: in_order(lambda w: part(x, w))(y), (0, None)), x, y[0])
+    assert NOT_INLINED not in text
+    # With the value: a gradient alone does not use the result that is marked.
+    gradient = jax.value_and_grad(lambda x, y: total(marked, x, y))
+    assert NOT_INLINED in program(gradient, *one)
+    assert NOT_INLINED not in program(jax.vmap(gradient), x, y)
+
+
+@pytest.mark.parametrize("missing", ["cacheable", "value", "module"])
+def test_an_older_jax_has_the_part_itself(missing, monkeypatch):
+    """Without what JAX 0.6 lacks, and without the module, nothing is marked and nothing fails."""
+    from jax.interpreters import mlir
+
+    def without_cacheable(primitive, rule, platform=None):
+        """As of JAX 0.6."""
+
+    def without_value(**attributes):
+        """As of JAX 0.6."""
+
+    if missing == "cacheable":
+        monkeypatch.setattr(mlir, "register_lowering", without_cacheable)
+    elif missing == "value":
+        monkeypatch.setattr("jax.experimental.xla_metadata.set_xla_metadata", without_value)
+    else:
+        monkeypatch.setitem(sys.modules, "jax.experimental.xla_metadata", None)
+    mark = _in_order._mark()
+    assert mark is None
+    monkeypatch.setattr(_in_order, "_not_inlined_p", mark)
+    x, y = numbers("float64")
+    marked = in_order(part)
+    close(jax.jit(marked)(x, y), part(x, y))
+    assert NOT_INLINED not in jax.jit(marked).lower(x, y).compile().as_text()
