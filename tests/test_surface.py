@@ -1,5 +1,6 @@
 """Surface: what the interpolation must reproduce, its borders, the local dent, derivatives."""
 
+import functools
 import math
 
 import jax
@@ -496,6 +497,42 @@ def test_dent_of_the_vertices_near_it_is_that_of_all(order, dtype):
             near, far = (np.asarray(slope[:, i]) for i in (0, 1))
             scale = 4 * count * np.finfo(dtype).eps * np.abs(far).max()
             np.testing.assert_allclose(near, far, rtol=0, atol=scale)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_shares_of_a_way_are_its_targets(dtype):
+    """Three columns of weights, and one times the way: values and derivatives, near and of all."""
+    at, count = jnp.asarray(shuffled(TUBE), dtype), 16
+    spacing, radius = jnp.asarray(1.5, dtype), jnp.asarray(12.0, dtype)
+    chosen = local.runs(at[:, 0], spacing)
+
+    def move(kind, s_c, phi_c, depth, sag, spacing):
+        where = local.centres(s_c, phi_c, radius, spacing, count)
+        if kind == "way":
+            found = local.fit(where, local.shares(depth, sag)[:, None], 3 * spacing, depth)
+            assert found.weights.shape == (count, 1)
+        else:
+            found = local.fit(where, local.targets(depth, sag), 3 * spacing)
+        near = local.add_correction(0 * at, found, at, chosen, s_c)
+        return near, local.correction(found, where)
+
+    @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICK)
+    def program(kind, x, tangent, cotangent):
+        f = functools.partial(move, kind)
+        return jax.jvp(f, x, tangent), jax.vjp(f, *x)[1](cotangent)
+
+    for depth in ((0.2, -1.0, 0.3), (0.0, 0.0, 0.0)):
+        s_c, phi_c, depth = (jnp.asarray(v, dtype) for v in (73.3, 0.4, depth))
+        x = s_c, phi_c, depth, jnp.linspace(0, 1.5, count, dtype=dtype), spacing
+        moved = jax.eval_shape(functools.partial(move, "way"), *x)
+        given = x, random_like(x, 4), random_like(moved, 5)
+        given = jax.tree.map(lambda v: v.astype(dtype), given)
+        way, columns = program("way", *given), program("targets", *given)
+        for a, b in zip(jax.tree.leaves(way), jax.tree.leaves(columns), strict=True):
+            assert a.dtype == b.dtype == jnp.dtype(dtype)
+            # Rounding only: both solve with the same factors.
+            atol = 64 * np.finfo(dtype).eps * max(np.abs(b).max(), 1)
+            np.testing.assert_allclose(a, b, rtol=0, atol=atol)
 
 
 def test_vertices_of_a_dent_wider_than_prepared_are_nan():

@@ -201,7 +201,7 @@ def _columns(dent: Dent, points):
 
 
 def _together(dent: Dent, columns):
-    return jnp.stack(columns, axis=1) if dent.way is None else columns[0][:, None] * dent.way
+    return jnp.stack(columns, axis=1) if dent.way is None else columns[0][:, None] * dent.way[None]
 
 
 def add_correction(
