@@ -77,6 +77,43 @@ def test_the_contact_starts_few_kernels(tube):
         assert largest_array(text) <= LARGEST[tube], f"{largest_array(text)} bytes"
 
 
+UPDATE = """
+import jax, jax.numpy as jnp
+jax.config.update("jax_enable_x64", True)
+from jaxtrachea import EffectOptions, Material, Poses, make_scene, simulate, table_1
+from jaxtrachea.contact.shapes import sphere
+from jaxtrachea.trachea.tube import make_tube
+
+geometry, material = table_1(), Material(EI_L=1.862, k_M=0.1, k_1=0.3, k_3=0.02)
+material = jax.tree.map(jnp.asarray, material)
+path = Poses(jnp.eye(3)[None], jnp.asarray([[73.0, 15.6, 0.0]]))
+shown = EffectOptions(dent="16", want_surface=True)
+scene = make_scene(
+    geometry, material, path, tool=sphere(5.0), mesh=make_tube(geometry), effects=shown
+)
+
+def update(place):
+    out = simulate(scene, material, Poses(path.rotation, place[None]))
+    return out.force[0], out.vertices[0]
+
+print(jax.jit(update).lower(path.translation[0]).compile().as_text())
+"""
+
+
+@pytest.mark.slow
+def test_the_whole_update_of_one_pose():
+    """Contact, skeleton, surface and dent: no `reduce-window`, small parts in calls."""
+    environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    run = subprocess.run(
+        [sys.executable, "-c", UPDATE], capture_output=True, text=True, env=environment
+    )
+    assert run.returncode == 0, run.stderr
+    assert "reduce-window(" not in run.stdout
+    called = [v for v in run.stdout.split("\n") if " call(" in v and 'inlineable="false"' in v]
+    # The contact, the skeleton, shares and lines of the surface, and what goes into the dent.
+    assert len(called) >= 6
+
+
 def largest_array(text: str) -> int:
     """Bytes of the largest array that an instruction outside of a fusion gives."""
     bodies = computations(text)[1]
