@@ -155,8 +155,9 @@ def test_a_step_is_bent_by_the_second_derivative():
     @jax.jit
     def one_step(theta, lane, sigma):
         point = evaluate(study.model, theta, lane, sigma)
-        state = trust_region.State(theta, point, jnp.array(10.0), jnp.array(1), jnp.array(0))
-        step = trust_region._step(LaneCost(study.model, lane, sigma), state)
+        objective = LaneCost(study.model, lane, sigma)
+        state = trust_region.begun(theta, objective)._replace(point=point, radius=jnp.array(10.0))
+        step = trust_region._step(objective, state)
         return step.straight, step.delta
 
     straight, delta = one_step(theta, lane, sigma)
