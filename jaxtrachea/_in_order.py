@@ -13,6 +13,8 @@ import jax
 from jax.core import Tracer
 
 Out = TypeVar("Out")
+#: Name of the operation that marks a call: no work, and reads its first operand alone.
+MARK = "not_inlined"
 
 
 def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
@@ -66,7 +68,7 @@ def _mark() -> Any:
             return set_xla_metadata(x, inlineable="false")
 
         jax.eval_shape(mark, jax.ShapeDtypeStruct((), "float32"))
-        primitive = Primitive("not_inlined")
+        primitive = Primitive(MARK)
         primitive.def_impl(lambda x, *_: x)
         primitive.def_abstract_eval(lambda x, *_: x)
         ad.primitive_jvps[primitive] = _jvp

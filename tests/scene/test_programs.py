@@ -20,6 +20,7 @@ from jaxtrachea import (
     press_path,
     simulate,
 )
+from jaxtrachea._in_order import in_order
 from jaxtrachea.contact.patches import touch
 from jaxtrachea.contact.pose import Pose
 from jaxtrachea.mechanics.friction import Coulomb
@@ -78,8 +79,8 @@ def move_surface(scene, s, phi, out, kind):
         keys = regions.clamped(s, skeleton, joints, U, V, slopes, slope_C)
         u = regions.interpolate(scene.binding, weights, keys)
         if kind == "with a dent":
-            goal = local.targets(depth, jnp.zeros(8))
-            dent = local.fit(where, goal, 3 * scene.footprint)
+            share = local.shares(depth, jnp.zeros(8))[:, None]
+            dent = local.fit(where, share, 3 * scene.footprint, depth)
             u = local.add_correction(u, dent, straight, scene.runs, s)
         return place(mesh, u)
 
@@ -149,7 +150,8 @@ def tool(scene, m, p):
     inside = in_lumen(scene, p, seen)
     made = Approach(seen, presses, inward, None, None, seen, inside)
     m, led, used, status = admitted(scene, m, None, made)
-    out = oblique_presses(scene, m, used)
+    # As `simulate` does: across the border of a computation XLA finds nothing that is there twice.
+    out = in_order(lambda used: oblique_presses(scene, m, used))(used)
     wrench = force_and_moment(p, pull, inward, used, out)
     # A row is OK only with a force and a moment that are finite.
     finite = jnp.isfinite(jnp.sum(wrench[0] + wrench[1], axis=1))
