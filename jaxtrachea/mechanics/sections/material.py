@@ -221,9 +221,10 @@ class Wall:
 class Factors:
     """What the moduli leave open, as factors on what they give; fitted to one virtual specimen.
 
-    Fit of 10 parameters to its presses on the midline and at 30 and 90 degrees, D to 6 mm
-    (errors: tests/sections): EI_C 23.6 N mm^2, Et_L 1.18 N/mm, D_L 4.19 N mm, Gt_L 20.7 N/mm,
-    Et_M 0.65 N/mm, c_W 0.915 /(N mm), k_end 0.159 /mm, footprint 2.85; bed as given to 10 %.
+    Fit of 10 parameters, with `c_end = 1`, to its presses on the midline and at 30 and 90 degrees,
+    D to 6 mm (errors, with `c_end = 0`: tests/sections): EI_C 23.6 N mm^2, Et_L 1.18 N/mm, D_L
+    4.19 N mm, Gt_L 20.7 N/mm, Et_M 0.65 N/mm, c_W 0.915 /(N mm), k_end 0.159 /mm, footprint 2.85;
+    bed as given to 10 %.
 
     Attributes:
         EI_C: on the composite section in plane strain.
