@@ -25,6 +25,7 @@ from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, defaults_of
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.residual import inputs, residual, residual_value
+from jaxtrachea.fitting.section_residual import section_material
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study, check_curve
 from jaxtrachea.inference.analysis import Findings
@@ -501,3 +502,18 @@ def test_specification(tmp_path):
         with pytest.raises(SpecError) as error:
             table(**arguments)
         assert words in str(error.value), str(error.value)
+
+
+def test_results_from_before_a_parameter_was_there_have_its_default():
+    """Without `c_end`, which older results do not name: all of c_W at the ends, as then."""
+    study = study_of([curve(PLACES[0])])
+    columns = study.model.columns
+    keep = [j for j, column in enumerate(columns) if column.name != "c_end"]
+    assert len(keep) == len(columns) - 1
+    older = dataclasses.replace(study.model, columns=tuple(columns[j] for j in keep))
+    value = jnp.asarray(study.lanes.value[0, 0, np.array(keep)])
+    free = jnp.array([p.to_scaled(p.value) for p in study.parameters if not p.fixed])
+    material, values = section_material(older, free, value)
+    assert "c_end" not in values
+    assert material.c_end == 1
+    assert material.c_W == values["c_W"]

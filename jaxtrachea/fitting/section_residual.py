@@ -58,9 +58,12 @@ class Answer(NamedTuple):
 def section_material(
     model: FitModel, free: Float[Array, " Jf"], value: Float[Array, " J"]
 ) -> tuple[SectionMaterial, dict[str, Array]]:
-    """Material of one trial, and the value of every parameter by name."""
+    """Material of one trial, and the value of every parameter by name.
+
+    Results of a fit made before a parameter was there do not have it: then it is its default.
+    """
     values = values_of(model, free, value)
-    names = [field.name for field in dataclasses.fields(SectionMaterial)]
+    names = [field.name for field in dataclasses.fields(SectionMaterial) if field.name in values]
     return SectionMaterial(**{name: values[name] for name in names}), values
 
 

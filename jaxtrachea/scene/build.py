@@ -71,6 +71,7 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     counted = counted or _uncounted
     geometry, mesh, notes = _trachea(spec.trachea, folder, files, counted)
     material = material_of(spec, geometry)
+    notes += ends_not_given(spec)
     if mesh is None:
         mesh = _tube(spec.trachea, geometry, material)
     tool = None
@@ -123,6 +124,21 @@ def material_of(spec: SceneSpec, geometry: Geometry) -> AnyMaterial:
     except InputError as error:
         raise SpecError.like(error, key=f"wall.{error.key}") from None
     return dataclasses.replace(wall, **named)
+
+
+def ends_not_given(spec: SceneSpec) -> tuple[str, ...]:
+    """Of numbers in [sections] alone: what a fit takes from [wall], and here is another default."""
+    if spec.material is not None or spec.wall is not None or spec.sections is None:
+        return ()
+    default = {f.name: f.default for f in dataclasses.fields(SectionMaterial)}
+    taken = [f"{name} = {default[name]:g}" for name in ("c_end", "k_end", "footprint")
+             if getattr(spec.sections, name) is None]  # fmt: skip
+    if not taken:
+        return ()
+    return (
+        f"sections: {', '.join(taken)} (not given). A fit has what its wall gives, c_end = 0 among "
+        "it: for estimates of a fit name them, or give the [wall] of the fit",
+    )
 
 
 def _uncounted(_: str) -> None:

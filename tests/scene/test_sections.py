@@ -25,7 +25,7 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.sections.material import from_wall
 from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.mechanics.skeleton import local_frame
-from jaxtrachea.scene.build import stage
+from jaxtrachea.scene.build import ends_not_given, stage
 from jaxtrachea.scene.declare import SECTIONS, SceneFacts
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.spec import SceneSpec
@@ -273,6 +273,11 @@ def test_material_of_a_file():
         "D_L": "4 N mm", "c_W": "0.9 1/N/mm",
     }  # fmt: skip
     alone = material(wall=None, sections=said)
+    (note,) = ends_not_given(SceneSpec.model_validate(SCENE | {"wall": None, "sections": said}))
+    assert "c_end = 1, k_end = inf, footprint = 1 (not given)" in note
+    own = said | {"c_end": "0", "k_end": "0.16 1/mm", "footprint": "2.85"}
+    assert ends_not_given(SceneSpec.model_validate(SCENE | {"wall": None, "sections": own})) == ()
+    assert ends_not_given(SceneSpec.model_validate(SCENE)) == ()
     assert (float(alone.D_L), float(alone.rho)) == (4.0, 1e-3)
     assert np.isinf(alone.k_end)
     with pytest.raises(ValueError, match=re.escape("sections.D_L: missing; give it, or [wall]")):
