@@ -238,4 +238,4 @@ def test_shipped_twins_are_mirror_images(name):
     assert pairs == {tuple(group) for group in spec.data.together or ()}
     for a, b in pairs:
         scale = np.max(np.abs(curves[a].force))
-        np.testing.assert_allclose(curves[a].force, curves[b].force, atol=0.02 * scale)
+        np.testing.assert_allclose(curves[a].force, curves[b].force, atol=1e-9 * scale)

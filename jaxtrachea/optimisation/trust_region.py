@@ -161,9 +161,9 @@ def promise(theta, point: Point, box: Box):
     """
     diagonal = jnp.diagonal(point.hessian)
     moves = (diagonal > 0) & (box.active > 0)
-    curvature = jnp.where(moves, diagonal, 1)
-    newton = jnp.clip(theta - point.gradient / curvature, box.lower, box.upper) - theta
-    return jnp.where(moves, jnp.abs(newton) * jnp.sqrt(curvature), 0)
+    own = jnp.where(moves, diagonal, 1)
+    newton = jnp.clip(theta - point.gradient / own, box.lower, box.upper) - theta
+    return jnp.where(moves, jnp.abs(newton) * jnp.sqrt(own), 0)
 
 
 def trust_region_step(radius, hessian, gradient, free):

@@ -104,7 +104,7 @@ def busy(points: list[dict[str, Any]]) -> str:
 
 
 FRONT_HEAD = ["scene", "within 10 %: a call", "a lane", "all: a call", "a lane",
-              "error of the quickest of all"]  # fmt: skip
+              "error of the quickest call"]  # fmt: skip
 CHOICE_HEAD = ["scene", "tolerance", "least", "dropped (changes alone)", "came back",
                "verified error", "cost", "chosen / full [µs]", "ratio", "ratio / cost"]  # fmt: skip
 
