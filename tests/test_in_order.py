@@ -129,6 +129,8 @@ def arguments(lanes, dtype):
     return (x.T, alone[1]) if lanes == "last axis" else (x, y)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("way", list(WAYS))
 def test_it_is_the_part(way, dtype):

@@ -227,6 +227,8 @@ def test_read_line_by_line(name, tmp_path, monkeypatch):
     assert not check(stored(tmp_path, content), ReadOptions(**options), monkeypatch)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
 @pytest.mark.parametrize("place", range(5))
 def test_any_cell(place, delimiter, tmp_path, monkeypatch):

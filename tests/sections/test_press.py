@@ -292,6 +292,8 @@ def test_few_and_many_rings(count):
     assert work == pytest.approx(got.energy[-1], rel=1e-8)
 
 
+@pytest.mark.slow
+@pytest.mark.compiling
 def test_spans_at_the_clamps_have_their_share_of_the_softening():
     """Of a scalar and of an array; from moduli and thicknesses none, as no clamped end flattens."""
     geometry = Geometry.create(LENGTH, RINGS, radius=RADIUS)
