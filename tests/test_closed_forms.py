@@ -156,7 +156,9 @@ def test_a_step_is_bent_by_the_second_derivative():
     def one_step(theta, lane, sigma):
         point = evaluate(study.model, theta, lane, sigma)
         objective = LaneCost(study.model, lane, sigma)
-        state = trust_region.begun(theta, objective)._replace(point=point, radius=jnp.array(10.0))
+        state = trust_region.initial_state(theta, objective)._replace(
+            point=point, radius=jnp.array(10.0)
+        )
         step = trust_region._step(objective, state)
         return step.straight, step.delta
 

@@ -17,7 +17,7 @@ from jaxtrachea.fitting.cost import LaneCost, evaluate
 from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.optimisation.trust_region import RUNNING, State, Tolerances, begun, iterate
+from jaxtrachea.optimisation.trust_region import RUNNING, State, Tolerances, initial_state, iterate
 from jaxtrachea.trachea.geometry import Geometry
 
 
@@ -89,7 +89,7 @@ def _solve(model: FitModel, tolerances: Tolerances, start, data) -> State:
     return jax.lax.while_loop(
         lambda state: state.status == RUNNING,
         lambda state: iterate(tolerances, objective, state),
-        begun(start, objective),
+        initial_state(start, objective),
     )
 
 

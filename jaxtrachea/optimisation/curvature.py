@@ -35,7 +35,7 @@ def hessian(point: Any, rest: Rest, free: Bool[Array, " P"]) -> Float[Array, "P 
     return jnp.where(rest.trusted & definite, whole, point.hessian)
 
 
-def learned(rest: Rest, old: Any, new: Any, cross: Float[Array, " P"], step) -> Rest:
+def secant_update(rest: Rest, old: Any, new: Any, cross: Float[Array, " P"], step) -> Rest:
     """The rest after a step.
 
     Args:

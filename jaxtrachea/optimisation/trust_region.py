@@ -124,7 +124,7 @@ class State(NamedTuple):
     rest: Rest
 
 
-def begun(theta: Float[Array, " P"], objective: Objective) -> State:
+def initial_state(theta: Float[Array, " P"], objective: Objective) -> State:
     """A start of one lane, not yet evaluated."""
     unknowns = theta.shape[0]
     rest = Rest(jnp.zeros((unknowns, unknowns), theta.dtype), jnp.asarray(False))
@@ -271,7 +271,7 @@ def iterate(tolerances: Tolerances, objective: Objective, state: State) -> State
     theta = pick(trial, state.theta)
     radius = jnp.where(fresh, state.radius, radius)
     cross = objective.cross_gradient(old, new)
-    rest = curvature.learned(state.rest, old, new, cross, step.delta)
+    rest = curvature.secant_update(state.rest, old, new, cross, step.delta)
     rest = Rest(jnp.where(fresh, 0, rest.matrix), rest.trusted & ~fresh)
     moved = State(theta, point, radius, state.iteration + 1, state.status, rest)
     done = _status(tolerances, old.cost, moved, objective, fresh, finite, step, actual)

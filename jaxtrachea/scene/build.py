@@ -10,7 +10,7 @@ import numpy as np
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.contact import shapes
-from jaxtrachea.mechanics.sections.material import SectionMaterial, Wall, from_wall
+from jaxtrachea.mechanics.sections.material import Factors, SectionMaterial, Wall, from_wall
 from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.assemble import make_scene
 from jaxtrachea.scene.declare import AnyMaterial, PlanError
@@ -19,7 +19,7 @@ from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.paths import named_file, path_of, read_table
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import SizeError
-from jaxtrachea.scene.spec import SceneSpec, SceneTracheaSection, ToolSection
+from jaxtrachea.scene.spec import NEEDED, SceneSpec, SceneTracheaSection, ToolSection
 from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.imported import Landmarks, read_mesh
@@ -130,9 +130,12 @@ def ends_not_given(spec: SceneSpec) -> tuple[str, ...]:
     """Of numbers in [sections] alone: what a fit takes from [wall], and here is another default."""
     if spec.material is not None or spec.wall is not None or spec.sections is None:
         return ()
-    default = {f.name: f.default for f in dataclasses.fields(SectionMaterial)}
-    taken = [f"{name} = {default[name]:g}" for name in ("c_end", "k_end", "footprint")
-             if getattr(spec.sections, name) is None]  # fmt: skip
+    of_wall = {f.name for f in dataclasses.fields(Factors)}
+    taken = [
+        f"{f.name} = {f.default:g}"
+        for f in dataclasses.fields(SectionMaterial)
+        if f.name in of_wall - {*NEEDED} and getattr(spec.sections, f.name) is None
+    ]
     if not taken:
         return ()
     return (

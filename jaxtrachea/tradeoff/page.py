@@ -103,6 +103,8 @@ def busy(points: list[dict[str, Any]]) -> str:
     return text if max(loads) < QUIET else f"**{text}: compare ratios, not times**"
 
 
+#: Largest error of the plans of a front, for each pair of columns: those of use, and all.
+WITHIN = (0.1, float("inf"))
 FRONT_HEAD = ["scene", "within 10 %: a call", "a lane", "all: a call", "a lane",
               "error of the quickest call"]  # fmt: skip
 CHOICE_HEAD = ["scene", "tolerance", "least", "dropped (changes alone)", "came back",
@@ -130,16 +132,12 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
     return found
 
 
-#: Errors within which a plan is one to use; plans beyond count in a front of their own columns.
-WITHIN = (0.1, float("inf"))
-
-
 def fronts(scenes: dict[str, list[dict[str, Any]]]) -> list[list[str]]:
-    """Scene; by which factor the times of its Pareto front differ, a call and a lane; its end.
+    """Scene; by which factor the times of its Pareto front differ, a call and a lane; an error.
 
-    Twice: of plans within 10 % of the full one, and of all; then the largest error of the quickest
-    of all. Of the ladder `together`: whole plans, timed in the same turns. Finest levels of other
-    ladders can be other programs, and were timed at other times.
+    The factors of plans within 10 % of the full one, then those of all plans; the error is that of
+    the plan with the quickest call. Of the ladder `together`: whole plans, timed in the same turns.
+    Finest levels of other ladders can be other programs, and were timed at other times.
     """
     found = []
     for name, rows in scenes.items():

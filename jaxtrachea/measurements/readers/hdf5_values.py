@@ -17,6 +17,13 @@ _NUMBER = np.dtype(np.float64)
 _ODD = object()
 
 
+def _library() -> Any:
+    """h5py, imported when first used; what is called of its lower level has no types."""
+    import h5py
+
+    return h5py
+
+
 def names_in(group: Any) -> frozenset[str]:
     """Names of what an audited group holds; far cheaper than to iterate over the group."""
     found: list[bytes] = []
@@ -45,9 +52,7 @@ def measured(group: Any, name: str) -> tuple[np.ndarray, str | None]:
 
 def _dataset(group: Any, name: str) -> Any:
     """Identifier of a dataset of a group, opened in one step: far cheaper than `group.get`."""
-    import h5py
-
-    h5: Any = h5py
+    h5 = _library()
     try:
         identifier = h5.h5o.open(group.id, name.encode())
     except KeyError:
@@ -63,9 +68,7 @@ def _dataset(group: Any, name: str) -> Any:
 
 def _values(dataset: Any, name: str) -> np.ndarray:
     """Values of a dataset by its identifier."""
-    import h5py
-
-    h5: Any = h5py
+    h5 = _library()
     space = dataset.get_space()
     if space.get_simple_extent_type() == h5.h5s.NULL:
         raise Fault("shape", f"dataset {name!r} has no shape", "store a vector")
@@ -144,9 +147,7 @@ def number_attribute(holder: Any, name: str) -> Any:
 
 def _attribute(holder: Any, name: str) -> Any:
     """An attribute of what has this identifier."""
-    import h5py
-
-    h5: Any = h5py
+    h5 = _library()
     try:
         # Far cheaper than the exception behind `attrs.get`.
         if not h5.h5a.exists(holder, name.encode()):
@@ -176,9 +177,7 @@ def _scalar(holder: Any, name: str, kind: np.dtype) -> Any:
         Bytes or float64; None if there is none, `_ODD` if it is of another kind or shape, or
         damaged.
     """
-    import h5py
-
-    h5: Any = h5py
+    h5 = _library()
     key = name.encode()
     try:
         if not h5.h5a.exists(holder, key):
