@@ -49,12 +49,18 @@ def versions(*names: str) -> dict[str, str]:
 
 
 def commit() -> str:
-    """Of the package that is measured; "+" where files differ from it, "unknown" without git."""
-    git = ["git", "-C", str(FOLDER), "describe", "--always", "--dirty=+", "--exclude=*"]
+    """Last that changed the package; "+" where its files differ from it, "unknown" without git."""
+    package = ["--", "jaxtrachea"]
     try:
-        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+        last = _git("log", "-1", "--format=%h", *package)
+        return last + "+" * bool(_git("status", "--porcelain", *package)) if last else "unknown"
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
+
+
+def _git(*words: str) -> str:
+    command = ["git", "-C", str(FOLDER.parents[1]), *words]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def compiler() -> str:

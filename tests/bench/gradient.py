@@ -136,19 +136,15 @@ def fits(out: common.Writer) -> None:
 
     point = jax.jit(of(cost.evaluate))(theta, lanes, sigma)
 
-    def same(v, dtype):
-        return jnp.full(FITS, v, dtype)
-
-    state = trust_region.State(
-        theta, point, same(trust_region.FIRST_RADIUS, float), same(1, jnp.int32),
-        same(trust_region.RUNNING, jnp.int8),
-    )  # fmt: skip
+    objective = cost.LaneCost(model, lanes, sigma)
+    state = jax.jit(jax.vmap(trust_region.initial_state))(theta, objective)
+    state = state._replace(point=point, iteration=jnp.ones(FITS, jnp.int32))
     step = jax.vmap(functools.partial(trust_region.iterate, trust_region.Tolerances()))
     cases = {
         "residual": wait(of(residual.residual_value), theta, lanes),
         "residual and Jacobian": wait(of(residual.residual), theta, lanes),
         "residual, Jacobian, normal equations": wait(of(cost.evaluate), theta, lanes, sigma),
-        "one Levenberg-Marquardt step": wait(step, cost.LaneCost(model, lanes, sigma), state),
+        "one Levenberg-Marquardt step": wait(step, objective, state),
     }
     common.close("residual", cases["residual and Jacobian"]().value, cases["residual"]())
     assert bool(jnp.all(cases["one Levenberg-Marquardt step"]().iteration == 2))
