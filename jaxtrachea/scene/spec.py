@@ -20,7 +20,7 @@ from jaxtrachea.config import (
     load_spec,
     quantity,
 )
-from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMaterial
+from jaxtrachea.mechanics.sections.material import LEAST, SECTION_VALUES, SectionMaterial
 from jaxtrachea.scene.declare import Effect
 from jaxtrachea.scene.effects import EFFECTS
 from jaxtrachea.trachea.material import DEEP, VALUES, meaningless
@@ -102,6 +102,15 @@ def _section_keys() -> type[Section]:
 
 class SectionsSection(_section_keys()):
     """[sections]: see `SectionMaterial`; one value for all rings and spans."""
+
+    @model_validator(mode="after")
+    def _large_enough(self) -> "SectionsSection":
+        for name, p in SECTION_VALUES.items():
+            value, least = getattr(self, name), LEAST.get(name, 0.0)
+            if value is not None and value < least:
+                found = f"{value:g} {p.unit}".removesuffix(" 1")
+                raise ValueError(f"{name} is {found}; expected {least:g} or more")
+        return self
 
 
 #: Values of [sections] that have no default of their own.

@@ -289,6 +289,13 @@ def test_material_of_a_file():
         material(trachea={"file": "a.stl"})
     with pytest.raises(ValueError, match="wall.h_C is 4.0 mm"):
         material(wall={"h_C": "4 mm"})
+    for low, says in (
+        ({"c_end": -1}, "c_end is -1; expected 0 or more"),
+        ({"c_K": "-2 mm^2"}, "c_K is -2 mm^2; expected 0 or more"),
+        ({"footprint": 0.5}, "footprint is 0.5; expected 1 or more"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(says)):
+            material(sections=low)
 
 
 def test_cross_sections_are_not_traded():
