@@ -42,7 +42,7 @@ import fitting, jax, numpy as np
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
 from jaxtrachea.fitting.noise import first_sigma
-from jaxtrachea.fitting.result import Settings
+from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.starts import draw_starts
 fitting.SPECIMENS = 256
 p, *_ = fitting.make_study()
