@@ -88,6 +88,27 @@ def programs(model):
     return both, value
 
 
+@pytest.mark.parametrize("share", [0.0, 0.06])
+def test_markers_err_by_a_share_of_the_displacement(share):
+    """Of joints, sideward markers and ring ends alike; forces keep their own noise."""
+    given = Noise(force=0.05, joints=0.2, joints_share=share)
+    lanes = build_study([curve(PLACES[1])], GEOMETRY, SECTIONS, NAMED, noise=given).lanes
+    variance = 0.2**2 + (share * PATH) ** 2
+    for name in ("joint_precision", "joint_side_precision", "end_precision"):
+        kept = getattr(lanes, name)[0, 0].reshape(len(PATH), -1)
+        kept = kept[:, kept[0] > 0]
+        assert kept.shape[1] >= 2
+        np.testing.assert_allclose(kept, np.tile(variance[:, None] ** -0.5, kept.shape[1]))
+    np.testing.assert_allclose(lanes.precision[0, 0], 1 / 0.05)
+    np.testing.assert_allclose(lanes.side_precision[0, 0], 1 / 0.05)
+
+
+@pytest.mark.parametrize(("share", "says"), [(-0.1, "0 or more"), (0.1, "needs joints")])
+def test_a_share_without_meaning(share, says):
+    with pytest.raises(ValueError, match=says):
+        Noise(force=0.05, joints_share=share)
+
+
 def lane_of(study, dtype=np.float64):
     def cast(v):
         return jnp.asarray(v[0] if v.dtype == np.int32 else v[0].astype(dtype))

@@ -222,8 +222,10 @@ def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
     options = options_of(spec)
     curves = measurements.curves
     joints = any(c.joint_displacement is not None for c in curves)
-    given = (spec.noise.force, spec.noise.joints)
-    noise = Noise(*(None if sigma == "estimate" else sigma for sigma in given))
+    force, markers = (
+        None if sigma == "estimate" else sigma for sigma in (spec.noise.force, spec.noise.joints)
+    )
+    noise = Noise(force=force, joints=markers, joints_share=spec.noise.joints_share)
     try:
         return build_study(
             curves,

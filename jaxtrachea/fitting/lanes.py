@@ -30,10 +30,13 @@ class Noise:
     Attributes:
         force: N; a curve's own per-sample sigma comes before it.
         joints: mm.
+        joints_share: of the tool's displacement, which `joints` has beside it (root of the sum of
+            the squares): what a model errs in markers grows with the press.
     """
 
     force: float | None = None
     joints: float | None = None
+    joints_share: float = 0.0
 
     def __post_init__(self):
         """Refuse words and numbers that mean nothing.
@@ -47,6 +50,16 @@ class Noise:
                 raise ValueError(
                     f"{name} is {value:g}; expected a standard deviation of more than 0, or None"
                 )
+        if not 0 <= self.joints_share < np.inf:
+            raise ValueError(f"joints_share is {self.joints_share:g}; expected 0 or more")
+        if self.joints_share > 0 and self.joints is None:
+            raise ValueError("joints_share needs joints, the standard deviation at no displacement")
+
+    def joints_precision(self, displacement: np.ndarray) -> np.ndarray:
+        """1 / sigma of markers at each displacement of the tool, 1/mm; 1 if it is estimated."""
+        if self.joints is None:
+            return np.ones_like(displacement)
+        return 1 / np.hypot(self.joints, self.joints_share * displacement)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,7 +237,7 @@ def _lane(layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown])
             if not p.fixed:
                 lane["index"][t, j] = place[_key(p, curve)]
         if curve.joint_displacement is not None and curve.joint_rings is not None:
-            weight = 1.0 if noise.joints is None else 1 / noise.joints
+            weight = noise.joints_precision(curve.displacement)[:, None]
             seen, at = _seen_joints(curve, geometry, layout.reach), curve.joint_rings
             lane["joints"][t, :n, at] = np.where(seen, curve.joint_displacement, 0).T
             lane["joint_precision"][t, :n, at] = np.where(seen, weight, 0).T
@@ -282,7 +295,7 @@ def _add_vectors(lane: dict[str, Any], layout: _Layout, t: int, curve: Curve) ->
         seen = np.isfinite(curve.side_force)
         lane["side_force"][t, :n] = np.where(seen, curve.side_force, 0)
         lane["side_precision"][t, :n] = np.where(seen, lane["precision"][t, :n], 0)
-    weight = 1.0 if layout.noise.joints is None else 1 / layout.noise.joints
+    weight = layout.noise.joints_precision(curve.displacement)[:, None]
     moved = curve.joint_side_displacement
     if aside and moved is not None and curve.joint_rings is not None:
         seen = np.isfinite(moved) & _away(curve, geometry, layout.reach, curve.joint_rings)

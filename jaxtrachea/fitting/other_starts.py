@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.parameters import SKELETON
 from jaxtrachea.fitting.residual import inputs
@@ -21,6 +22,8 @@ from jaxtrachea.optimisation.programs import program
 
 #: Indentation over skeleton deflection, and its inverse, of the two starts.
 SOFT = 19.0
+#: Lanes whose compliances are computed together.
+BATCH = 16
 #: Skeletons with the same compliances: how many are tried, and the grid they are looked for on
 #: (half width in natural logarithms, points of each axis).
 TWINS, TWIN_REACH, TWIN_POINTS = 3, 9.0, 41
@@ -64,8 +67,8 @@ def soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
 def _compliances(study: Study, lanes, theta) -> Float[np.ndarray, " n"]:
     """Mean compliance of the observed trials, mm/N."""
     observed = (study.lanes.precision[lanes] > 0).any(axis=2)
-    c = [_compliance(study, int(k), row[None])[0] for k, row in zip(lanes, theta, strict=True)]
-    return np.sum(np.array(c) * observed, axis=1) / np.sum(observed, axis=1)
+    c = map_lanes(_felt_compliance, study, theta, batch=BATCH, rows=np.asarray(lanes))
+    return np.sum(c * observed, axis=1) / np.sum(observed, axis=1)
 
 
 def _compliance(study: Study, lane: int, theta) -> Float[np.ndarray, "n T"]:
@@ -89,9 +92,10 @@ def twins(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     if not {"EI_L", "k_M"} <= {p.name for p in study.free}:
         return []
     out = np.repeat(result.theta[lanes][None], TWINS, axis=0)
+    several = positions(study) > 1
     for n, lane in enumerate(lanes):
         place = {p.name: i for i, (p, _, _) in enumerate(study.unknowns[lane])}
-        if not {"EI_L", "k_M"} <= place.keys() or positions(study)[lane] < 2:
+        if not {"EI_L", "k_M"} <= place.keys() or not several[lane]:
             continue
         low, high, best = (v[lane] for v in (study.lanes.lower, study.lanes.upper, result.theta))
         beam = [place["EI_L"], place["k_M"]]

@@ -5,6 +5,7 @@ results.h5 and the population all ask.
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
@@ -114,7 +115,7 @@ class FitResult:
         """Number of lanes."""
         return len(self.status)
 
-    @property
+    @functools.cached_property
     def succeeded(self) -> np.ndarray:
         """Lanes that have an estimate; (lanes,)."""
         return self.status <= FitStatus.UNIDENTIFIABLE
@@ -124,10 +125,15 @@ class FitResult:
         """`sigma` in units of the lanes' precision, as `evaluate` wants it; (lanes, 2)."""
         return self.sigma / precision_unit(self.study)
 
-    @property
+    @functools.cached_property
     def relative(self) -> np.ndarray:
         """Change of each scaled coordinate that makes a relative change of 1; (lanes, P)."""
         return relative_change(self.study, self.theta)
+
+    @functools.cached_property
+    def judged(self) -> "dict[tuple[int, int], Judgement]":
+        """What `judgement` has said without further profiles, by lane and unknown."""
+        return {}
 
     def table(self, profiles: Intervals | None = None) -> Table:
         """One row per unknown: estimate, standard error, 95 % interval and verdict, with units.
@@ -240,6 +246,14 @@ def judgement(result: FitResult, lane: int, i: int, profiles: Intervals | None =
         i: unknown of the lane.
         profiles: further profiles, which come on top.
     """
+    if profiles is not None:
+        return _judged(result, lane, i, profiles)
+    if (lane, i) not in result.judged:  # tables, files and report all ask
+        result.judged[lane, i] = _judged(result, lane, i, None)
+    return result.judged[lane, i]
+
+
+def _judged(result: FitResult, lane: int, i: int, profiles: Intervals | None) -> Judgement:
     low, high, ends = _unbounded(result, lane, i, profiles)
     inside = within_bounds(result, lane, i, low, high)
     if not result.succeeded[lane]:

@@ -107,7 +107,9 @@ def positions(study: Study) -> Int[np.ndarray, " lanes"]:
     lanes, middle = study.lanes, float(study.model.geometry.length) / 2
     observed = (lanes.precision > 0).any(axis=2)
     folded = np.where(observed, np.round(np.abs(lanes.s_c - middle), 6), -1.0)
-    return np.array([len(np.unique(row[row >= 0])) for row in folded])
+    folded = np.sort(folded, axis=1)
+    new = np.diff(folded, axis=1, prepend=-1.0) > 0  # what is not observed comes first
+    return np.sum(new, axis=1)
 
 
 def structure(study: Study) -> Structure:

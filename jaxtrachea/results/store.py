@@ -104,7 +104,9 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
         columns[kind.name] = [used[k, t, : len(c.force)] for k, t, c in placed]
         columns[f"{kind.name}_residual"] = [left[k, t, : len(c.force)] for k, t, c in placed]
     for name, parts in columns.items():
-        group.create_dataset(name, data=np.concatenate(parts), compression="gzip")
+        group.create_dataset(
+            name, data=np.concatenate(parts), compression="gzip", compression_opts=1, shuffle=True
+        )
 
 
 def _side(curve: Curve) -> np.ndarray:

@@ -50,8 +50,10 @@ def main() -> None:
     out = common.Writer("cohort", "scipy", "lmfit")
     study, model, forces = fitting.make_study(SPECIMENS, SPOTS, DEPTHS)
     few = forces[:SAMPLE]
+    errors = Settings(starts=1, scrutiny=False)
     cases = {
-        "jaxtrachea: fit with standard errors": lambda: fit.fit(study, Settings(starts=1)),
+        "jaxtrachea: fit with standard errors": lambda: fit.fit(study, errors),
+        "jaxtrachea: fit, what is in doubt profiled": lambda: fit.fit(study, Settings(starts=1)),
         "scipy least_squares lm, numpy residual and Jacobian": fitting.one_by_one(
             model, few, lambda i: fitting.with_scipy(model.value, model.jacobian)
         ),
@@ -59,7 +61,7 @@ def main() -> None:
             model, few, lambda i: fitting.with_lmfit(model)
         ),
     }
-    lanes = dict(zip(cases, (SPECIMENS, SAMPLE, SAMPLE), strict=True))
+    lanes = dict(zip(cases, (SPECIMENS, SPECIMENS, SAMPLE, SAMPLE), strict=True))
     samples = {name: [] for name in cases}
     for i in range(ROUNDS + 1):
         for name, call in cases.items():

@@ -6,6 +6,7 @@ library's default guess, about a decade away, in the same scaled coordinates, wi
 tolerances. One core each.
 """
 
+import dataclasses
 import time
 
 import common
@@ -271,6 +272,9 @@ def main() -> None:
     first = {}
 
     def ours():
+        return fit.fit(study, dataclasses.replace(settings, scrutiny=False))
+
+    def scrutinised():
         return fit.fit(study, settings)
 
     def solve_only():
@@ -280,6 +284,7 @@ def main() -> None:
     count = {
         "jaxtrachea: fit with standard errors": SPECIMENS,
         "jaxtrachea: Levenberg-Marquardt alone": SPECIMENS,
+        "jaxtrachea: fit, what is in doubt profiled": SPECIMENS,
         "optimistix LevenbergMarquardt, vmap (no standard errors)": 512,
         "scipy least_squares lm, numpy residual and Jacobian": SAMPLE,
         "lmfit leastsq, numpy residual and Jacobian": SAMPLE,
@@ -289,6 +294,7 @@ def main() -> None:
     calls = (
         ours,
         solve_only,
+        scrutinised,
         optimistix_batch(study, 512),
         one_by_one(model, few, lambda i: with_scipy(model.value, model.jacobian)),
         one_by_one(model, few, lambda i: with_lmfit(model)),

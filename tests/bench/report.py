@@ -105,7 +105,7 @@ def fitting_section(rows: list[dict], goals: list[list[str]]) -> str:
         lines.append([*line, misses, first])
     by = {r["case"]: r for r in rows}
     ours = by["jaxtrachea: fit with standard errors"]
-    for case in list(by)[2:]:
+    for case in (name for name in by if not name.startswith("jaxtrachea")):
         goal = "at least 25 times as fast" if case.startswith("scipy least_squares lm, n") else "-"
         value = ratio(by[case], ours)[0]
         word = verdict(value >= 25) if goal != "-" else "-"
@@ -119,7 +119,7 @@ def cohort_section(rows: list[dict], goals: list[list[str]]) -> str:
     serial = [r for r in rows if r["table"] == "cohort"]
     lines = [[r["case"], number(1e6 / microseconds(r)[0]), *map(number, microseconds(r))]
              for r in serial]  # fmt: skip
-    for r in serial[1:]:
+    for r in (r for r in serial if not r["case"].startswith("jaxtrachea")):
         name = f"cohort fits against {r['case']}"
         goals.append([name, "-", quoted(r, serial[0]), "-"])
     (told,) = (r for r in rows if r["table"] == "command")
@@ -246,7 +246,8 @@ Default tolerances of each, 1e-8 for optimistix
 it: compliance of the uniform beam from a spectrum prepared once, hyperbolic root of the cubic,
 Jacobian by the implicit function rule, parts shared between value and Jacobian. "Missed": fits of
 the first 60 whose cost is more than 1e-6 above the lowest any solver found. The first call contains
-the compilation.
+the compilation. What is in doubt: a fit unless told otherwise looks for other minima and profiles
+unknowns whose local error says little (here of 88 % of the specimens); no other does.
 """
 
 
