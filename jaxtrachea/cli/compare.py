@@ -34,8 +34,8 @@ def compare(
     clock = [time.perf_counter()]
     if len(specs) < 2:
         raise Stop("compare: one model has nothing to be compared with; give two or more SPEC")
-    told: set[str] = set()
-    loaded = [load(path, data, refits=True, said=told) for path in specs]
+    printed: set[str] = set()
+    loaded = [load(path, data, refits=True, printed=printed) for path in specs]
     names = _names(specs, [spec.title for spec, _, _ in loaded])
     _same_data(specs, loaded, names)
     clock.append(time.perf_counter())
@@ -43,8 +43,8 @@ def compare(
     with into(out_dir, default) as (folder, stop_if_asked):
         models = _fitted(loaded, names, cross_validation, stop_if_asked)
         clock.append(time.perf_counter())
-        rows, failed, said = _write(folder, specs, loaded, models, clock)
-    _print(rows, said, failed, models, folder.parent)
+        rows, failed, sentences = _write(folder, specs, loaded, models, clock)
+    _print(rows, sentences, failed, models, folder.parent)
     raise typer.Exit(1 if failed or loaded[0][1].bad else 0)
 
 
@@ -105,9 +105,9 @@ def _write(folder: Path, specs, loaded, models, clock):
     from jaxtrachea.inference.comparison import compared
 
     rows, failed = compared(models)
-    said = _sentences(models, rows)
+    sentences = _sentences(models, rows)
     write_csv(folder / "compare.csv", [dataclasses.asdict(row) for row in rows])
-    write_text(folder / "report.md", _report(rows, said, failed, models))
+    write_text(folder / "report.md", _report(rows, sentences, failed, models))
     ends = [*clock, time.perf_counter()]
     timings = {n: ends[i + 1] - ends[i] for i, n in enumerate(("read", "fit", "write"))}
     measured, precision = loaded[0][1], loaded[0][0].fit.precision
@@ -119,7 +119,7 @@ def _write(folder: Path, specs, loaded, models, clock):
     ]
     del made["specification"]
     write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
-    return rows, failed, said
+    return rows, failed, sentences
 
 
 def _sentences(models, rows) -> dict[str, str]:
@@ -127,11 +127,11 @@ def _sentences(models, rows) -> dict[str, str]:
     from jaxtrachea.inference.comparison import sentence
 
     left = _left_out_words(models)
-    said = {}
+    sentences = {}
     for specimen in dict.fromkeys(row.specimen for row in rows):
         own = [row for row in rows if row.specimen == specimen]
-        said[specimen] = sentence(own, left)
-    return said
+        sentences[specimen] = sentence(own, left)
+    return sentences
 
 
 def _left_out_words(models) -> str:
@@ -146,19 +146,19 @@ def _left_out_notes(models) -> list[str]:
     from jaxtrachea.inference.cross_validation import refits_sentence
     from jaxtrachea.inference.together import together_sentence
 
-    said = []
+    notes = []
     if any(model.left_out is not None for model in models):
-        said += [f"{text}." for text in together_sentence(models[0].result.study.together)]
+        notes += [f"{text}." for text in together_sentence(models[0].result.study.together)]
     for model in models:
         if model.left_out is None:
             continue
         refits, unconverged, lost = (int(v.sum()) for v in model.left_out[1:])
         if not refits:
-            said.append(f"Nothing was left out of {model.name}: {_why_nothing(model)}.")
+            notes.append(f"Nothing was left out of {model.name}: {_why_nothing(model)}.")
         elif words := refits_sentence(refits, unconverged, lost):
             none = "; there the left-out column has no number" if lost else ""
-            said.append(f"Left out of {model.name}: {words}{none}.")
-    return said
+            notes.append(f"Left out of {model.name}: {words}{none}.")
+    return notes
 
 
 def _why_nothing(model) -> str:
@@ -187,12 +187,12 @@ def _percent(share: float) -> str:
     return "–" if share != share else f"{100 * share:.2f} %"
 
 
-def _report(rows, said: dict[str, str], failed: int, models) -> str:
+def _report(rows, sentences: dict[str, str], failed: int, models) -> str:
     from jaxtrachea.files.tables import markdown_table
 
     parts = [
         "# Which model",
-        "\n".join(f"- {specimen}: {text}." for specimen, text in said.items()),
+        "\n".join(f"- {specimen}: {text}." for specimen, text in sentences.items()),
         markdown_table(HEAD, _cells(rows)),
         "k: fitted parameters and estimated standard deviations. dAICc: above the best model; "
         "below 2 models cannot be told apart, from 10 on the worse one has next to no support. "
@@ -208,16 +208,16 @@ def _report(rows, said: dict[str, str], failed: int, models) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _print(rows, said, failed: int, models, folder: Path) -> None:
+def _print(rows, sentences, failed: int, models, folder: Path) -> None:
     out = Console()
-    names = [name for name in said if name != "(all)"]
+    names = [name for name in sentences if name != "(all)"]
     if len(names) > MANY:  # what is decided says little more
-        names.sort(key=lambda name: "decisively (" in said[name])
-    shown = names[:MANY] + [name for name in said if name == "(all)"]
+        names.sort(key=lambda name: "decisively (" in sentences[name])
+    shown = names[:MANY] + [name for name in sentences if name == "(all)"]
     for name in shown:
         cells = _cells([row for row in rows if row.specimen == name])
         out.print(table("Models", HEAD, cells))
-        out.print(escape(f"{name}: {said[name]}"), highlight=False, emoji=False)
+        out.print(escape(f"{name}: {sentences[name]}"), highlight=False, emoji=False)
     if len(names) > MANY:
         out.print(f"and {len(names) - MANY} more specimens, see compare.csv")
     for note in _left_out_notes(models):

@@ -8,15 +8,15 @@ from rich.markup import escape
 from jaxtrachea.cli.terminal import Stop, set_up_jax, to_stderr
 
 
-def load(path: Path, data: Path | None, *, refits: bool = False, said: set[str] | None = None):
-    """Specification, measurements and study; what is wrong with curves is said on stderr.
+def load(path: Path, data: Path | None, *, refits: bool = False, printed: set[str] | None = None):
+    """Specification, measurements and study; what is wrong with curves goes to stderr.
 
     Args:
         path: the specification.
         data: folder its paths start from; None: its own.
         refits: single curves will be left out, or unknowns held (see `specification.study_of`).
-        said: what was said before (of another model of the same curves) and is not said again;
-            what is said now is added.
+        printed: lines that were printed before (of another model of the same curves) and are not
+            printed again; those printed now are added.
 
     Raises:
         Stop: nothing can be fitted.
@@ -32,58 +32,58 @@ def load(path: Path, data: Path | None, *, refits: bool = False, said: set[str] 
         set_up_jax()
         if measurements.curves:
             measurements = usable(spec, measurements)
-        said = set() if said is None else said
-        print_bad(measurements, said)
-        print_notes(measurements, said)
+        printed = set() if printed is None else printed
+        print_bad(measurements, printed)
+        print_notes(measurements, printed)
         if not measurements.curves:
             raise Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
         study = study_of(spec, measurements, refits=refits)
-        _say_unused_batch(spec, study, said)
-        return spec, _with_depths(measurements, study.model, said), study
+        _note_unused_batch(spec, study, printed)
+        return spec, _with_depths(measurements, study.model, printed), study
     except SpecError as error:
         raise Stop(str(SpecError.like(error, place=str(path)))) from None
     except DataError as error:
         raise Stop(str(error)) from None
 
 
-def _say_unused_batch(spec, study, said: set[str]) -> None:
+def _note_unused_batch(spec, study, printed: set[str]) -> None:
     """A note where lanes are fitted one at a time and the specification says otherwise."""
     batch = spec.fit.batch
     if batch != "auto" and batch > 1 and study.one_at_a_time:
         note = f"fit.batch = {batch} is not used: sections take one lane at a time on a CPU"
-        _say("note", [note], said)
+        _print("note", [note], printed)
 
 
-def _with_depths(measurements, model, said: set[str]):
+def _with_depths(measurements, model, printed: set[str]):
     """The measurements with a note on curves that go deeper than the model was tested."""
     from jaxtrachea.fitting.tested import deeper_than_tested
 
     note = deeper_than_tested(measurements.curves, model.options, float(model.geometry.radius))
     if note is None:
         return measurements
-    _say("note", [note], said)
+    _print("note", [note], printed)
     return dataclasses.replace(measurements, notes=(*measurements.notes, note))
 
 
-def print_notes(measurements, said: set[str] | None = None) -> None:
+def print_notes(measurements, printed: set[str] | None = None) -> None:
     """Say what a user should know of how files were read, and which names look alike."""
     from jaxtrachea.measurements.names import look_alikes
 
     notes = [*measurements.notes, *look_alikes((*measurements.curves, *measurements.bad))]
-    _say("note", notes, said, more=" notes")
+    _print("note", notes, printed, more=" notes")
 
 
-def print_bad(measurements, said: set[str] | None = None) -> None:
+def print_bad(measurements, printed: set[str] | None = None) -> None:
     """Say which curves cannot be used, and why."""
     bad = [f"{b.specimen} {b.trial}: {b.reason}" for b in measurements.bad]
-    _say("not usable", bad, said)
+    _print("not usable", bad, printed)
 
 
-def _say(what: str, lines: list[str], said: set[str] | None, more: str = "") -> None:
-    """The first twenty lines that were not said before, and how many there are beside them."""
-    said = set() if said is None else said
-    new = [line for line in lines if line not in said]
-    said.update(new)
+def _print(what: str, lines: list[str], printed: set[str] | None, more: str = "") -> None:
+    """The first twenty lines that were not printed before, and how many there are beside them."""
+    printed = set() if printed is None else printed
+    new = [line for line in lines if line not in printed]
+    printed.update(new)
     for line in new[:20]:
         to_stderr(f"[yellow]{what}:[/] {escape(line)}")
     if len(new) > 20:
