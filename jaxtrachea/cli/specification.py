@@ -86,8 +86,14 @@ def _parameter(default: Parameter, section: ParameterSection | None) -> Paramete
     if section is None:
         return default
     try:
-        if section.fixed is True:
+        if section.fixed is True and (default.fixed or default.name in SECTION_VALUES):
             return dataclasses.replace(default, fixed=True)
+        if section.fixed is True:
+            raise InputError(
+                f"true would hold the first guess, {default.value:g} {default.unit}".rstrip(),
+                key="fixed",
+                expected="a number; only values of deforming cross-sections have one, by [wall]",
+            )
         if section.fixed is not None:
             return _fixed(default, section.fixed)
         return _free(default, section)
