@@ -234,9 +234,6 @@ on the mesh, most of them in a loop of twelve rounds (counted by `tests/test_ker
 CPUs runs a computation in order where all its arrays are small (512 bytes), and else from a
 queue, which takes half as long again for so many: contact and skeleton of one pose are
 computations of their own (`jaxtrachea/_in_order.py`). 256 poses together share the kernels.
-The times below were taken before contact and skeleton were computations of their own, and with more
-kernels (700 and 1,030): since then one update takes 0.63 of them on the round tube and 0.87 on the
-mesh (float64, in turns on a loaded machine).
 Slow calls come to all rows, the C loop included: the core is shared.
 """
 COHORT = """\
