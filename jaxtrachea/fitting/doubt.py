@@ -74,6 +74,8 @@ def left_in_doubt(result: FitResult, minima: Minima) -> Bool[np.ndarray, "lanes 
         row, good = np.arange(len(doubt))[:, None], result.succeeded
         votes = doubt[row, shared][good]
         doubt[row, shared] = np.mean(votes, axis=0) >= 0.5 if len(votes) else True
+    if not any(p.name in OF_THE_PRESS for p in study.free):
+        return doubt
     error = result.uncertainty.se / natural_sizes(result)
     for lane, unknowns in enumerate(study.unknowns):
         for i, (p, _, _) in enumerate(unknowns):
