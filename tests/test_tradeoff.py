@@ -118,6 +118,17 @@ def test_every_level_has_its_row_and_lies_within_its_panels():
     assert finest == [1e-2, 1e-2, 2e-3]
 
 
+def test_a_worthless_level_does_not_squeeze_the_others():
+    points = [rung("a", "model", "wild", 2e6, 5e-4), rung("a", "model", "poor", 10.0, 5e-4),
+              rung("a", "model", "full", 0.0, 2e-3, True)]  # fmt: skip
+    axis = draw(points, "scene").axes[0]
+    assert [text.get_text() for text in axis.texts] == ["2e+06"]
+    (dot,) = (line for line in axis.lines if line.get_marker() == "o")
+    left, right = axis.get_xlim()
+    assert 10.0 == dot.get_xdata()[0] < axis.texts[0].get_position()[0] < right
+    assert right / left < 1e8
+
+
 def test_no_text_of_a_picture_lies_on_another():
     points = [rung("b", "algebra", f"level {i}", 10.0**-i, 1e-5 * (i + 1)) for i in range(30)]
     figure = draw([*points, rung("b", "algebra", "best", 0.0, 1e-2, True)], "scene")

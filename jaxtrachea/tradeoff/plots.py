@@ -13,6 +13,8 @@ from jaxtrachea.tradeoff.front import error, front, time, worst
 
 #: An error up to this is drawn as exact, left of all others.
 EXACT = 1e-17
+#: An error above this has its number in place of a dot: it would squeeze all others together.
+WORTHLESS = 10.0
 #: Times that the paper states: skeleton at 10 kHz, surface at 1 kHz; s.
 GOALS = {"100 µs": 1e-4, "1 ms": 1e-3}
 #: Kinds of ladders in the order of their rows, and their colours (Okabe and Ito, for all eyes).
@@ -108,18 +110,19 @@ def _names(axis, rows) -> None:
 
 
 def _errors(axis, errors: np.ndarray, colours, edges) -> None:
-    """Dots; an error of 0 stands at the left as "exact", an infinite one at the right."""
-    known = np.isfinite(errors) & (errors > EXACT)
+    """Dots; an error of 0 stands left as "exact", a `WORTHLESS` one right in words."""
+    known = (errors > EXACT) & (errors <= WORTHLESS)
     low, high = errors[known].min(initial=1e-3), errors[known].max(initial=1.0)
     decades = np.log10(high / low) + 1
     left, right = low * 10 ** (-0.22 * decades), high * 10 ** (0.12 * decades)
     axis.set(xscale="log", xlim=(left / 10 ** (0.12 * decades), right * 10 ** (0.12 * decades)))
-    x = np.where(known, errors, np.where(np.isfinite(errors), left, right))
+    x = np.where(known, errors, np.where(errors <= EXACT, left, right))
     for i, at in enumerate(x):
-        word = None if known[i] else "exact" if np.isfinite(errors[i]) else "infinite"
-        if word is None:
+        if known[i]:
             axis.plot(at, i, "o", ms=5.5, color=colours[i], mec=edges[i], mew=1.3)
         else:
+            word = f"{errors[i]:.0e}" if np.isfinite(errors[i]) else "infinite"
+            word = "exact" if errors[i] <= EXACT else word
             axis.text(at, i, word, fontsize=6, ha="center", va="center", color=colours[i])
     axis.xaxis.set_major_locator(LogLocator(numticks=5))
     axis.xaxis.set_minor_formatter(NullFormatter())
