@@ -131,8 +131,8 @@ class FitResult:
         return relative_change(self.study, self.theta)
 
     @functools.cached_property
-    def judged(self) -> "dict[tuple[int, int], Judgement]":
-        """What `judgement` has said without further profiles, by lane and unknown."""
+    def judgements(self) -> "dict[tuple[int, int], Judgement]":
+        """Kept by `judgement`: those without further profiles, by lane and unknown."""
         return {}
 
     def table(self, profiles: Intervals | None = None) -> Table:
@@ -248,9 +248,9 @@ def judgement(result: FitResult, lane: int, i: int, profiles: Intervals | None =
     """
     if profiles is not None:
         return _judged(result, lane, i, profiles)
-    if (lane, i) not in result.judged:  # tables, files and report all ask
-        result.judged[lane, i] = _judged(result, lane, i, None)
-    return result.judged[lane, i]
+    if (lane, i) not in result.judgements:  # tables, files and report all ask
+        result.judgements[lane, i] = _judged(result, lane, i, None)
+    return result.judgements[lane, i]
 
 
 def _judged(result: FitResult, lane: int, i: int, profiles: Intervals | None) -> Judgement:

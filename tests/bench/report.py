@@ -119,7 +119,8 @@ def fitting_section(rows: list[dict], goals: list[list[str]]) -> str:
         goal = "at least 25 times as fast" if case.startswith("scipy least_squares lm, n") else "-"
         value = ratio(by[case], ours)[0]
         word = verdict(value >= 25) if goal != "-" else "-"
-        goals.append([f"fits against {case}", goal, quoted(by[case], ours), word])
+        name = f"fits with standard errors, nothing profiled, against {case}"
+        goals.append([name, goal, quoted(by[case], ours), word])
     head = ["solver", "fits/s", "median µs per fit", "min", "evaluations median / most"]
     return "\n".join([FITTING, table([*head, "missed", "first call s"], lines)])
 
@@ -130,7 +131,7 @@ def cohort_section(rows: list[dict], goals: list[list[str]]) -> str:
     lines = [[r["case"], number(1e6 / microseconds(r)[0]), *map(number, microseconds(r))]
              for r in serial]  # fmt: skip
     for r in (r for r in serial if not r["case"].startswith("jaxtrachea")):
-        name = f"cohort fits against {r['case']}"
+        name = f"cohort fits with standard errors, nothing profiled, against {r['case']}"
         goals.append([name, "-", quoted(r, serial[0]), "-"])
     (told,) = (r for r in rows if r["table"] == "command")
     seconds = ", ".join(f"{name} {number(v)} s" for name, v in told["seconds"].items())
