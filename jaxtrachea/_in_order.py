@@ -1,20 +1,32 @@
-"""Small parts of a large program, which XLA for CPUs is to run in order.
+"""Small parts of a large program, which XLA for CPUs is to run in order, or as a single kernel.
 
 It runs a computation in order where every array has at most 512 bytes, or where there are at most
 eight kernels. Else it keeps a graph and a queue of what is ready: for hundreds of small kernels
 that takes half as long again as they do. One large array (a surface) is enough for that, unless the
-small part is a computation of its own.
+small part is a computation of its own: `in_order`.
+
+Starting a kernel takes as long as some hundred operations. What XLA makes of its own small loops
+can be asked for: the whole part in one function, with loops and branches, `one_kernel`. That is for
+parts whose arrays are small: one thread works through them, and a product of matrices must be
+written as a sum (`_numerics.product`), since a kernel calls no library.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
+import jaxlib
 from jax.core import Tracer
+from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
 Out = TypeVar("Out")
-#: Name of the operation that marks a call: no work, and reads its first operand alone.
-MARK = "not_inlined"
+#: Names of the operations that mark a call: no work, and read their first operand alone.
+MARK, ONE_KERNEL, HIDDEN = "not_inlined", "one_kernel", "hidden"
+#: Versions of jaxlib, from the first to before the last, whose compiler was seen to do `one_kernel`
+#: right. What it cannot put in one ends the process, so that others compile it as `in_order`.
+TESTED = (0, 10, 2), (0, 11)
 
 
 def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
@@ -41,42 +53,106 @@ def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
     return run
 
 
-def _jvp(primals, tangents):
-    return _not_inlined_p.bind(*primals), tangents[0]
+def one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
+    """The same function, compiled into a single kernel where `in_order` would mark it.
+
+    Args:
+        part: as that of `in_order`; of small arrays, without sorting (also `top_k`), products of
+            matrices, linear algebra and `.at[]` with more than one place.
+    """
+    if _one_kernel_p is None:
+        return in_order(part)
+
+    def run(*arguments):
+        if not any(isinstance(v, Tracer) for v in jax.tree.leaves(arguments)):
+            return part(*arguments)
+        closed, shape = jax.make_jaxpr(part, return_shape=True)(*arguments)
+        own = [i for i, v in enumerate(closed.consts) if isinstance(v, Tracer)]
+        inputs = [*(closed.consts[i] for i in own), *jax.tree.leaves(arguments)]
+        if not fits_one_kernel(closed.jaxpr):
+            return in_order(part)(*arguments)
+
+        def whole(inputs):
+            consts = list(closed.consts)
+            for i, v in zip(own, inputs, strict=False):
+                consts[i] = v
+            found = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, consts))(*inputs[len(own) :])
+            read = [jnp.ravel(jax.lax.stop_gradient(v))[0] for v in inputs]
+            return found, jnp.stack([v.astype(jnp.float32) for v in read])
+
+        # The compiler ends the process over an input that a kernel does not read: constants are
+        # hidden from it, which it would write into the part, and every input is read.
+        leaves, read = jax.jit(whole)([_hidden_p.bind(v, *inputs) for v in inputs])
+        leaves[0] = _one_kernel_p.bind(leaves[0], read, *inputs)
+        return jax.tree.unflatten(jax.tree.structure(shape), leaves)
+
+    return run
 
 
-def _lanes(operands, axes):
-    x, axis = operands[0], axes[0]
-    lanes = [v.shape[i] for v, i in zip(operands, axes, strict=True) if i is not None]
-    return (x if max(lanes) > 1 else _not_inlined_p.bind(*operands)), axis
+#: What the compiler puts into one kernel; besides loops, branches and what works entry by entry.
+FITTING = frozenset(
+    """abs add and argmax argmin atan2 bitcast_convert_type broadcast_in_dim ceil clamp concatenate convert_element_type copy
+    copy_p cos div dynamic_slice dynamic_update_slice eq erf erf_inv exp exp2 expand_dims expm1
+    floor gather ge gt integer_pow iota is_finite le le_to log log1p logistic lt max min mul ne neg
+    nextafter not or pad pow reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem
+    reshape rev round rsqrt select_n sign sin slice sqrt square squeeze stack stop_gradient sub tan tanh
+    transpose unstack xor optimization_barrier while scan cond jit pjit closed_call custom_jvp_call
+    custom_vjp_call one_kernel hidden not_inlined""".split()
+)
+#: Entries of one array up to which one thread is as good as many.
+SMALL = 1 << 16
 
 
-def _mark() -> Any:
-    """The identity of its first operand, which marks the call that this comes from.
+def fits_one_kernel(jaxpr: Jaxpr) -> bool:
+    """Whether all that is computed can be in one kernel, and all arrays are small."""
+    from jax.extend.core import jaxprs_in_params  # not of all versions
 
-    The others, what goes into the call, tell how many lanes there are: the result may have none.
+    shapes = [v.aval.shape for v in (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars)]
+    if not jaxpr.outvars or any(not 0 < math.prod(shape) <= SMALL for shape in shapes):
+        return False
+    return all(
+        eqn.primitive.name in FITTING
+        and all(fits_one_kernel(sub) for sub in jaxprs_in_params(eqn.params))
+        for eqn in jaxpr.eqns
+    )
+
+
+def _mark(name: str, lowering: Callable) -> Any:
+    """The identity of its first operand, with a lowering of its own on CPUs, for one lane.
+
+    The others, what goes into a call, tell how many lanes there are: a result may have none.
+
+    Args:
+        name: of the operation.
+        lowering: of all operands.
 
     Returns:
         None where this JAX does not offer what it takes (0.6).
     """
     try:
-        from jax.experimental.xla_metadata import set_xla_metadata
         from jax.extend.core import Primitive
         from jax.interpreters import ad, batching, mlir
 
-        def mark(x, *_):
-            return set_xla_metadata(x, inlineable="false")
-
-        jax.eval_shape(mark, jax.ShapeDtypeStruct((), "float32"))
-        primitive = Primitive(MARK)
+        one = jax.ShapeDtypeStruct((), "float32")
+        jax.eval_shape(lowering, one, one)
+        primitive = Primitive(name)
         primitive.def_impl(lambda x, *_: x)
         primitive.def_abstract_eval(lambda x, *_: x)
-        ad.primitive_jvps[primitive] = _jvp
+
+        def jvp(primals, tangents):
+            return primitive.bind(*primals), tangents[0]
+
+        def lanes(operands, axes):
+            x, axis = operands[0], axes[0]
+            many = [v.shape[i] for v, i in zip(operands, axes, strict=True) if i is not None]
+            return (x if max(many) > 1 else primitive.bind(*operands)), axis
+
+        ad.primitive_jvps[primitive] = jvp
         ad.primitive_transposes[primitive] = lambda cotangent, x, *inputs: (
             [cotangent if ad.is_undefined_primal(x) else None, *[None] * len(inputs)]
         )
-        batching.primitive_batchers[primitive] = _lanes
-        lowered = mlir.lower_fun(mark, multiple_results=False)
+        batching.primitive_batchers[primitive] = lanes
+        lowered = mlir.lower_fun(lowering, multiple_results=False)
         # Not cacheable: a function of its own would not see where its argument comes from.
         mlir.register_lowering(primitive, lowered, platform="cpu", cacheable=False)
         mlir.register_lowering(primitive, lambda _, x, *inputs: [x])
@@ -85,4 +161,29 @@ def _mark() -> Any:
     return primitive
 
 
-_not_inlined_p = _mark()
+def _tested() -> bool:
+    version = tuple(int(v) for v in jaxlib.__version__.split(".")[:3] if v.isdigit())
+    return TESTED[0] <= version < TESTED[1]
+
+
+def _told(**metadata: str) -> Callable:
+    """Tells the compiler something about the call that its first operand comes from."""
+
+    def lowering(x, *_):
+        from jax.experimental.xla_metadata import set_xla_metadata
+
+        return set_xla_metadata(x, **metadata)
+
+    return lowering
+
+
+def _all_read(x, *rest):
+    return jax.lax.optimization_barrier((x, *rest))[0]
+
+
+_not_inlined_p = _mark(MARK, _told(inlineable="false"))
+_one_kernel_p = _hidden_p = None
+if _tested():
+    told = _told(inlineable="false", xla_cpu_small_call="true")
+    _one_kernel_p = _mark(ONE_KERNEL, lambda x, read, *_: _all_read(told(x), told(read)))
+    _hidden_p = _mark(HIDDEN, lambda x, *_: jax.lax.optimization_barrier(x))

@@ -33,6 +33,26 @@ def total(x: Num[Array, "*rows n"]) -> Num[Array, "*rows"]:
     return _reduced(jnp.sum, jnp.add, x, 0)
 
 
+def product(a: Float[Array, "*rows k"], b: Float[Array, "k *columns"]) -> Float[Array, "..."]:
+    """The product of small matrices (or of a matrix and a vector), written out.
+
+    XLA for CPUs calls a library for `a @ b`: that takes longer than these few operations, and what
+    is one kernel cannot do it (`_in_order.one_kernel`).
+
+    Args:
+        a: of two dimensions or more; k is small.
+        b: of one or two dimensions.
+    """
+    if b.ndim == 1:
+        return sum_of([a[..., i] * b[i] for i in range(b.shape[0])])
+    return sum_of([a[..., i, None] * b[i] for i in range(b.shape[0])])
+
+
+def sum_of(terms: list[Float[Array, "*n"]]) -> Float[Array, "*n"]:
+    """The sum of some arrays, the first and the second first."""
+    return functools.reduce(jnp.add, terms)
+
+
 def largest(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
     """Largest entry along the last axis, NaN where there is one; see `total`.
 

@@ -244,7 +244,7 @@ def _towards(pair: Pair):
     """Unit vector from A's centre (the origin) to B's; z where they coincide."""
     v = mean(pair.b)
     length = jnp.sqrt(total(v * v))
-    ahead = jnp.zeros_like(v).at[2].set(1)
+    ahead = jnp.asarray((0, 0, 1), v.dtype)
     return jnp.where(length > FLOOR, v / jnp.where(length > FLOOR, length, 1), ahead)
 
 

@@ -174,7 +174,8 @@ def touch(
     bounds, directions = gap_bounds(tool, pose, patches)
     # Where two patches are equally near, beside the middle one, roundings do not choose.
     order = jnp.arange(count, dtype=bounds.dtype) / count
-    _, chosen = jax.lax.top_k(-bounds - LEAD * _size(tool, patches) * order, near)
+    rank = bounds + LEAD * _size(tool, patches) * order
+    chosen = _lowest(rank, near)
     shapes = _rows_at(patches.shapes, chosen)
 
     def contact(patch, direction):
@@ -210,7 +211,7 @@ def touch(
         s,
         phi,
         chosen[jnp.argmin(each.distance)],
-        jnp.min(bounds.at[chosen].set(jnp.inf)),
+        jnp.min(jnp.where(jnp.any(jnp.arange(count)[:, None] == chosen, axis=1), jnp.inf, bounds)),
         jax.lax.stop_gradient(jnp.log(jnp.asarray(terms, gap.dtype)) / beta),
         jnp.where(jnp.isfinite(gap), worst, ContactStatus.NON_FINITE).astype(jnp.int8),
     )
@@ -242,6 +243,15 @@ def gap_bounds(
     return jax.vmap(bound)(patches.shapes, patches.centres)
 
 
+def _lowest(values, count):
+    """Places of the lowest values, rising."""
+    found, at = [], jnp.arange(values.shape[0])
+    for _ in range(count):
+        found.append(first_largest(-values))
+        values = jnp.where(at == found[-1], jnp.inf, values)
+    return jnp.stack(found)
+
+
 def _furthest(vertices, direction):
     """The vertex furthest along a direction, of equal ones the first."""
     if vertices.shape[1] == 1:
@@ -259,7 +269,7 @@ def _rows_at(shapes: Shape, chosen) -> Shape:
 def _unit(v):
     """Unit vector; z for a zero one."""
     square = total(v * v)
-    ahead = jnp.zeros_like(v).at[2].set(1)
+    ahead = jnp.asarray((0, 0, 1), v.dtype)
     return jnp.where(square > 0, v, ahead) / jnp.sqrt(jnp.where(square > 0, square, 1))
 
 

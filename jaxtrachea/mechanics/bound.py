@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import ArrayLike, check_fits, real, shaped
+from jaxtrachea._in_order import one_kernel
 from jaxtrachea._packed import Packing
 from jaxtrachea.mechanics.admission import check_alike, check_shapes
 from jaxtrachea.mechanics.press import Options, Press, check_line, press
@@ -52,7 +53,8 @@ class BoundPress:
 
         like = jax.ShapeDtypeStruct((self.size,), self.dtype)
         self._result = Packing(jax.eval_shape(run, like))
-        self._run: Callable = jax.jit(lambda numbers: self._result.pack(run(numbers)))
+        whole = one_kernel(lambda numbers: self._result.pack(run(numbers)))
+        self._run: Callable = jax.jit(whole)
         self(self._given.fill(given))
 
     def pack(

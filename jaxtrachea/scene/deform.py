@@ -5,7 +5,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxtrachea._in_order import in_order
+from jaxtrachea._in_order import one_kernel
+from jaxtrachea._numerics import total
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
@@ -170,14 +171,14 @@ def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.
         return where, local.shares(depth, sag)
 
     radius = scene.radius if radius is None else radius
-    where, share = in_order(lay_out)(s_c, phi_c, radius, tool, depth)
+    where, share = one_kernel(lay_out)(s_c, phi_c, radius, tool, depth)
     return local.fit(where, share[:, None], local.REACH * spacing, depth)
 
 
 def _sag(tool: Shape, pose: Poses, points):
     """Distance of the tool, just touching, from points of the rest surface, mm."""
     if tool.vertices.shape[1] == 1:
-        centre = pose.rotation @ tool.vertices[:, 0] + pose.translation
+        centre = total(pose.rotation * tool.vertices[:, 0]) + pose.translation
         off = points - centre[None]
         return jnp.maximum(jnp.sqrt(jnp.sum(off * off, axis=1)) - tool.radius, 0)
     point = sphere(jnp.zeros_like(tool.radius))

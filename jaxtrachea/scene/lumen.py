@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from jaxtrachea._numerics import product
 from jaxtrachea.contact.line import Centreline, point_at
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.scene.stage import Poses, Scene
@@ -56,7 +57,7 @@ def whereabouts(scene: Scene, path: Poses, seen: Touch) -> Whereabouts:
     gap = jax.lax.stop_gradient(seen.gap)
     wall = 2 * jnp.maximum(scene.radius - scene.geometry.radius, 0)
     room = scene.radius - wall - scene.tool.radius
-    corners = path.rotation @ scene.tool.vertices + path.translation[:, :, None]
+    corners = product(path.rotation, scene.tool.vertices) + path.translation[:, :, None]
     line = scene.tube.line if scene.plan.curved else None
     off_axis = jax.vmap(functools.partial(_off_axis, line))
     square = jax.vmap(off_axis, 2, 1)(corners)

@@ -31,7 +31,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._numerics import solve_spd
+from jaxtrachea._numerics import product, solve_spd
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.mechanics.oblique import Place, place_at
@@ -198,7 +198,7 @@ def _stiffness(scene: Scene, depth, place: Place | None) -> Float[Array, "3"] | 
     frame = local_frame(place.phi_c)
     stretched = STRETCHED * depth
     local = place.law.stiffest(stretched * stretched)
-    C = frame @ place.unit.compliance @ frame.T
+    C = product(frame, product(place.unit.compliance, frame.T))
     one = jnp.eye(3, dtype=C.dtype)
     known = jnp.isfinite(jnp.sum(C) + local) & (local > 0)
     return solve_spd(jnp.where(known, C + one / jnp.where(known, local, 1), one), one[0])
@@ -274,4 +274,4 @@ def _length(v):
 
 def _turned(matrix):
     """The rotation next to a mean of two, by one Newton step of its polar form."""
-    return 1.5 * matrix - 0.5 * matrix @ matrix.T @ matrix
+    return 1.5 * matrix - 0.5 * product(matrix, product(matrix.T, matrix))

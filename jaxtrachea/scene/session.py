@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxtrachea._in_order import one_kernel
 from jaxtrachea._packed import Packing
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.admission import check_alike
@@ -186,10 +187,11 @@ class Session:
 
         _, contact, large = jax.eval_shape(one, self._start, *pose, self._numbers)
         contacts = Packing(contact)
+        whole = one if self.scene.plan.surface is not None else one_kernel(one)
 
         def run(state, _, *given):
             # State and contact as two arrays: in one, much of what both need is computed twice.
-            state, contact, large = one(state, *given)
+            state, contact, large = whole(state, *given)
             return state, contacts.pack(contact), tuple(large.values())
 
         zeros = tuple(jnp.array(np.zeros(v.shape, v.dtype)) for v in large.values())

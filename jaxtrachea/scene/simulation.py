@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._in_order import in_order
+from jaxtrachea._in_order import one_kernel
 from jaxtrachea.mechanics.oblique import Place, press_at
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.approach import Approach, approach
@@ -131,7 +131,7 @@ def follow(
         moved = moved_by(press_at(place, used.displacement, plan.options))
     else:
         solve = vectors if plan.second_plane else one_plane
-        moved = in_order(lambda used: solve(scene, material, used))(used)
+        moved = one_kernel(lambda used: solve(scene, material, used))(used)
     vertices = None
     if plan.surface is not None and isinstance(material, Material):
         vertices = deform(scene, material, used, moved, path, made)

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import real, shaped
 from jaxtrachea._errors import InputError
-from jaxtrachea._in_order import in_order
+from jaxtrachea._in_order import one_kernel
+from jaxtrachea._numerics import product, total
 from jaxtrachea.contact.patches import Patches, Touch, touch
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import STANDARD, Settings
@@ -177,7 +178,7 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
     def one(R, T):
         return touch(tool, Pose(R, T), tube, scene.quality, near=scene.near)
 
-    return jax.vmap(in_order(one))(path.rotation, path.translation)
+    return jax.vmap(one_kernel(one))(path.rotation, path.translation)
 
 
 def contact_point_path(path: Poses, seen: Touch, first, inward, frame):
@@ -202,15 +203,15 @@ def contact_point_path(path: Poses, seen: Touch, first, inward, frame):
     before = jnp.where(earlier < 0, first, earlier)
     pose = Pose(at_row(path.rotation, first), at_row(path.translation, first))
     body = transform(inverse(pose), at_row(seen.tool_point, first)[:, None])[:, 0]
-    points = jax.vmap(lambda R, T: R @ body + T)(path.rotation, path.translation)
+    points = product(path.rotation, body) + path.translation
     way = points - at_row(points, first)[None]
     if frame is not None:
-        way = way @ frame
+        way = product(way, frame)
     gap = at_row(seen.gap, first)
     closing = at_row(seen.gap, before) - gap
     left = jnp.where(closing > 0, -gap / jnp.where(closing > 0, closing, 1), 0)
     step = -at_row(way, before)
-    step = step - jnp.dot(step, inward) * inward
+    step = step - total(step * inward) * inward
     return way + (left * step - gap * inward)[None]
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._in_order import in_order
+from jaxtrachea._in_order import in_order, one_kernel
 from jaxtrachea._numerics import epsilon, total
 
 #: Centres on circles round C, by the number of centres; the outermost circle is the collar.
@@ -245,7 +245,7 @@ def add_correction(
         return start, whole, run.T
 
     # By itself: of vertices that begin anywhere the processor would take one after the other.
-    start, whole, run = in_order(find)(s_c, dent.reach)
+    start, whole, run = one_kernel(find)(s_c, dent.reach)
     here = _columns(dent, run.T)
     rest = points.shape[0] - length
 

@@ -30,7 +30,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea._in_order import in_order
+from jaxtrachea._in_order import in_order, one_kernel
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.surface import phong
 from jaxtrachea.surface.blocks import Blocks, in_blocks, to_blocks, to_vertices
@@ -208,7 +208,7 @@ def weigh(binding: Binding, phi_c: Float[Array, ""]) -> Weights:
         V = (1 - from_V) * (1 - behind) + (1 - from_U) * behind
         return jnp.stack([U, from_U * from_V, V])
 
-    return Weights(in_order(share)(phi_c, to_U, to_V, on), phi_c)
+    return Weights(one_kernel(share)(phi_c, to_U, to_V, on), phi_c)
 
 
 def interpolate(
@@ -260,7 +260,7 @@ def _carry(binding: Binding, weights: Weights, s_c, joints, contact, U, V, slope
     def across(weights, s_c, line, ends):
         return _across(binding, weights, s_c, line, ends)
 
-    line, *ends = in_order(lines)(s_c, joints, contact, U, V, slopes)
+    line, *ends = one_kernel(lines)(s_c, joints, contact, U, V, slopes)
     return in_order(across)(weights, s_c, line, ends)
 
 
