@@ -17,16 +17,16 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-import jaxlib
+import jaxlib.version
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
 Out = TypeVar("Out")
-#: Names of the operations that mark a call: no work, and read their first operand alone.
-MARK, ONE_KERNEL, HIDDEN = "not_inlined", "one_kernel", "hidden"
-#: Versions of jaxlib, from the first to before the last, whose compiler was seen to do `one_kernel`
-#: right. What it cannot put in one ends the process, so that others compile it as `in_order`.
-TESTED = (0, 10, 2), (0, 11)
+#: Names of the operations that mark a call: no work, and what they give is the first operand.
+MARKS = "not_inlined", "one_kernel", "hidden"
+#: Versions of jaxlib whose compiler was seen to do `one_kernel` right (tests/test_in_order.py). A
+#: compiler that cannot put a part into one kernel ends the process: others do as for `in_order`.
+TESTED = ("0.10.2",)
 
 
 def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
@@ -56,11 +56,15 @@ def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
 def one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
     """The same function, compiled into a single kernel where `in_order` would mark it.
 
+    Not where it is differentiated, nor where it does what `FITTING` lacks (products of matrices,
+    linear algebra, sorting with `top_k`, `.at[]`) or has arrays that are not `SMALL`: that is
+    compiled as `in_order`.
+
     Args:
-        part: as that of `in_order`; of small arrays, without sorting (also `top_k`), products of
-            matrices, linear algebra and `.at[]` with more than one place.
+        part: as that of `in_order`.
     """
-    if _one_kernel_p is None:
+    mark, hidden = _one_kernel_p, _hidden_p
+    if mark is None or hidden is None:
         return in_order(part)
 
     def run(*arguments):
@@ -78,12 +82,12 @@ def one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
                 consts[i] = v
             found = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, consts))(*inputs[len(own) :])
             read = [jnp.ravel(jax.lax.stop_gradient(v))[0] for v in inputs]
-            return found, jnp.stack([v.astype(jnp.float32) for v in read])
+            return found, jnp.stack([jnp.asarray(v, jnp.float32) for v in read])
 
         # The compiler ends the process over an input that a kernel does not read: constants are
         # hidden from it, which it would write into the part, and every input is read.
-        leaves, read = jax.jit(whole)([_hidden_p.bind(v, *inputs) for v in inputs])
-        leaves[0] = _one_kernel_p.bind(leaves[0], read, *inputs)
+        leaves, read = jax.jit(whole)([hidden.bind(v, *inputs) for v in inputs])
+        leaves[0] = mark.bind(leaves[0], read, *inputs)
         return jax.tree.unflatten(jax.tree.structure(shape), leaves)
 
     return run
@@ -91,13 +95,14 @@ def one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
 
 #: What the compiler puts into one kernel; besides loops, branches and what works entry by entry.
 FITTING = frozenset(
-    """abs add and argmax argmin atan2 bitcast_convert_type broadcast_in_dim ceil clamp concatenate convert_element_type copy
-    copy_p cos div dynamic_slice dynamic_update_slice eq erf erf_inv exp exp2 expand_dims expm1
-    floor gather ge gt integer_pow iota is_finite le le_to log log1p logistic lt max min mul ne neg
-    nextafter not or pad pow reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem
-    reshape rev round rsqrt select_n sign sin slice sqrt square squeeze stack stop_gradient sub tan tanh
-    transpose unstack xor optimization_barrier while scan cond jit pjit closed_call custom_jvp_call
-    custom_vjp_call one_kernel hidden not_inlined""".split()
+    """abs add and argmax argmin atan2 bitcast_convert_type broadcast_in_dim ceil clamp closed_call
+    concatenate cond convert_element_type copy cos custom_jvp_call custom_vjp_call div
+    dynamic_slice eq erf erf_inv exp exp2 expm1 floor gather ge gt hidden
+    integer_pow iota is_finite jit le le_to log log1p logistic lt max min mul ne neg nextafter
+    not not_inlined one_kernel optimization_barrier or pad pjit pow reduce_and reduce_max
+    reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt scan select_n sign
+    sin slice sqrt square squeeze stack stop_gradient sub tan tanh transpose unstack while
+    xor""".split()
 )
 #: Entries of one array up to which one thread is as good as many.
 SMALL = 1 << 16
@@ -107,7 +112,7 @@ def fits_one_kernel(jaxpr: Jaxpr) -> bool:
     """Whether all that is computed can be in one kernel, and all arrays are small."""
     from jax.extend.core import jaxprs_in_params  # not of all versions
 
-    shapes = [v.aval.shape for v in (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars)]
+    shapes = [jnp.shape(v.aval) for v in (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars)]
     if not jaxpr.outvars or any(not 0 < math.prod(shape) <= SMALL for shape in shapes):
         return False
     return all(
@@ -117,7 +122,7 @@ def fits_one_kernel(jaxpr: Jaxpr) -> bool:
     )
 
 
-def _mark(name: str, lowering: Callable) -> Any:
+def _mark(name: str, lowering: Callable, differentiated: Callable | None = None) -> Any:
     """The identity of its first operand, with a lowering of its own on CPUs, for one lane.
 
     The others, what goes into a call, tell how many lanes there are: a result may have none.
@@ -125,6 +130,7 @@ def _mark(name: str, lowering: Callable) -> Any:
     Args:
         name: of the operation.
         lowering: of all operands.
+        differentiated: what stands in its place where derivatives are taken; itself if None.
 
     Returns:
         None where this JAX does not offer what it takes (0.6).
@@ -140,7 +146,7 @@ def _mark(name: str, lowering: Callable) -> Any:
         primitive.def_abstract_eval(lambda x, *_: x)
 
         def jvp(primals, tangents):
-            return primitive.bind(*primals), tangents[0]
+            return (differentiated or primitive.bind)(*primals), tangents[0]
 
         def lanes(operands, axes):
             x, axis = operands[0], axes[0]
@@ -161,11 +167,6 @@ def _mark(name: str, lowering: Callable) -> Any:
     return primitive
 
 
-def _tested() -> bool:
-    version = tuple(int(v) for v in jaxlib.__version__.split(".")[:3] if v.isdigit())
-    return TESTED[0] <= version < TESTED[1]
-
-
 def _told(**metadata: str) -> Callable:
     """Tells the compiler something about the call that its first operand comes from."""
 
@@ -181,9 +182,13 @@ def _all_read(x, *rest):
     return jax.lax.optimization_barrier((x, *rest))[0]
 
 
-_not_inlined_p = _mark(MARK, _told(inlineable="false"))
+_not_inlined_p = _mark(MARKS[0], _told(inlineable="false"))
 _one_kernel_p = _hidden_p = None
-if _tested():
+if jaxlib.version.__version__ in TESTED:
     told = _told(inlineable="false", xla_cpu_small_call="true")
-    _one_kernel_p = _mark(ONE_KERNEL, lambda x, read, *_: _all_read(told(x), told(read)))
-    _hidden_p = _mark(HIDDEN, lambda x, *_: jax.lax.optimization_barrier(x))
+    _one_kernel_p = _mark(
+        MARKS[1],
+        lambda x, read, *_: _all_read(told(x), told(read)),
+        lambda x, _, *inputs: _not_inlined_p.bind(x, *inputs),
+    )
+    _hidden_p = _mark(MARKS[2], lambda x, *_: jax.lax.optimization_barrier(x), lambda x, *_: x)

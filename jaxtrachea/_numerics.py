@@ -33,24 +33,18 @@ def total(x: Num[Array, "*rows n"]) -> Num[Array, "*rows"]:
     return _reduced(jnp.sum, jnp.add, x, 0)
 
 
-def product(a: Float[Array, "*rows k"], b: Float[Array, "k *columns"]) -> Float[Array, "..."]:
+def product(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
     """The product of small matrices (or of a matrix and a vector), written out.
 
     XLA for CPUs calls a library for `a @ b`: that takes longer than these few operations, and what
     is one kernel cannot do it (`_in_order.one_kernel`).
 
     Args:
-        a: of two dimensions or more; k is small.
-        b: of one or two dimensions.
+        a: of shape (..., k), k small.
+        b: of shape (k,) or (k, n).
     """
-    if b.ndim == 1:
-        return sum_of([a[..., i] * b[i] for i in range(b.shape[0])])
-    return sum_of([a[..., i, None] * b[i] for i in range(b.shape[0])])
-
-
-def sum_of(terms: list[Float[Array, "*n"]]) -> Float[Array, "*n"]:
-    """The sum of some arrays, the first and the second first."""
-    return functools.reduce(jnp.add, terms)
+    columns = [a[..., i] if b.ndim == 1 else a[..., i, None] for i in range(b.shape[0])]
+    return functools.reduce(jnp.add, [v * row for v, row in zip(columns, b, strict=True)])
 
 
 def largest(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:

@@ -13,11 +13,15 @@ import numpy as np
 import pytest
 
 from jaxtrachea import _in_order
-from jaxtrachea._in_order import in_order
+from jaxtrachea._in_order import in_order, one_kernel
 from jaxtrachea._numerics import epsilon
+from jaxtrachea.tradeoff.kernels import count_kernels
 
 DTYPES = ["float32", "float64"]
 NOT_INLINED = 'inlineable="false"'
+#: With the first word: XLA makes calls of its own small loops.
+ONE = f'{NOT_INLINED},xla_cpu_small_call="true"'
+BOTH = pytest.mark.parametrize("mark", [in_order, one_kernel])
 
 
 class Out(NamedTuple):
@@ -41,7 +45,7 @@ def close(got, expected):
     assert jax.tree.structure(got) == jax.tree.structure(expected)
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
         assert (a.dtype, a.shape) == (b.dtype, b.shape)
-        atol = 8 * epsilon(b.dtype) * max(1, np.abs(b).max()) if b.dtype.kind == "f" else 0
+        atol = 8 * epsilon(b.dtype) * np.abs(b).max(initial=1) if b.dtype.kind == "f" else 0
         np.testing.assert_allclose(a, b, rtol=0, atol=atol)
 
 
@@ -133,10 +137,11 @@ def arguments(lanes, dtype):
 @pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("way", list(WAYS))
-def test_it_is_the_part(way, dtype):
+@BOTH
+def test_it_is_the_part(mark, way, dtype):
     """Alone, and one or many lanes, in the same program and one operation after the other."""
     do = WAYS[way]
-    marked = in_order(part)
+    marked = mark(part)
     close(do(marked, *numbers(dtype)), do(part, *numbers(dtype)))
     chosen = list(LANES) if way in ("value", "jacrev") else ["none", "many", "second argument"]
     for lanes in chosen:
@@ -237,10 +242,92 @@ def test_an_older_jax_has_the_part_itself(missing, monkeypatch):
         monkeypatch.setattr("jax.experimental.xla_metadata.set_xla_metadata", without_value)
     else:
         monkeypatch.setitem(sys.modules, "jax.experimental.xla_metadata", None)
-    mark = _in_order._mark()
+    mark = _in_order._mark("without", _in_order._told(inlineable="false"))
     assert mark is None
     monkeypatch.setattr(_in_order, "_not_inlined_p", mark)
     x, y = numbers("float64")
     marked = in_order(part)
     close(jax.jit(marked)(x, y), part(x, y))
     assert NOT_INLINED not in jax.jit(marked).lower(x, y).compile().as_text()
+
+
+def compiled(f, *at) -> str:
+    return str(jax.jit(f).lower(*at).compile().as_text())
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_one_kernel_is_one(dtype):
+    """Sixty rounds of Newton's method for cube roots, each of several kernels by itself."""
+
+    def root(x, a):
+        def step(_, x):
+            ahead = x - (x**3 - a) / (3 * x**2)
+            return jnp.where(jnp.max(jnp.abs(ahead - x)) > 0, ahead, x)
+
+        return jax.lax.fori_loop(0, 60, step, x + a)
+
+    a = jnp.linspace(1, 27, 300, dtype=dtype)
+    marked, one = one_kernel(root), jnp.ones_like(a)
+    np.testing.assert_allclose(jax.jit(marked)(one, a), np.cbrt(a), rtol=8 * epsilon(a.dtype))
+    if _in_order._one_kernel_p is not None:
+        assert count_kernels(compiled(root, one, a))[0] > 60
+        assert count_kernels(compiled(marked, one, a)) == (1, 0)
+    many = compiled(jax.vmap(marked), jnp.stack([one] * 4), jnp.stack([a] * 4))
+    slope = compiled(jax.grad(lambda x: jnp.sum(one_kernel(jnp.sin)(x))), a)
+    assert ONE not in many + slope
+
+
+UNFIT = {
+    "product": lambda x, y: jnp.outer(x, x) @ y,
+    "places": lambda x, y: x.at[jnp.array([0, 2])].set(y[:2]),
+    "sorted": lambda x, y: jnp.sort(x) + jax.lax.top_k(y, 1)[0],
+    "solve": lambda x, y: jnp.linalg.solve(jnp.outer(x, x) + jnp.eye(3), y),
+    "in a branch": lambda x, y: jax.lax.cond(x[0] > 0, lambda: jnp.sort(x), lambda: y),
+    "large": lambda x, y: (x, jnp.zeros(70_000) + y[0]),
+    "empty": lambda x, y: x[:0] + y[:0],
+}
+
+
+@pytest.mark.parametrize("what", list(UNFIT))
+def test_what_one_kernel_cannot_hold_is_compiled_as_before(what):
+    """Sorting, libraries, large arrays and those without entries."""
+    x, y = numbers("float64")
+    part = UNFIT[what]
+    close(jax.jit(one_kernel(part))(x, y), jax.jit(part)(x, y))
+    assert ONE not in compiled(one_kernel(part), x, y)
+
+
+def test_inputs_that_one_kernel_does_not_read():
+    """The compiler would end the process.
+
+    A constant, an argument of which only the shape is used, one that comes out as it is, a truth
+    value, and the same argument twice.
+    """
+    x, y = numbers("float64")
+    turn = jnp.eye(3)
+
+    def part(x, y, turn, n, on, again):
+        return jnp.where(on, jnp.sin(x), 0), jnp.zeros_like(y), n, again, x + turn[0]
+
+    def run(x, y):
+        return one_kernel(part)(x, y, turn, jnp.asarray(7), x[0] > -9, x)
+
+    for f in (run, jax.vmap(run)):
+        at = (x, y) if f is run else (x[None], y[None])
+        sine, nothing, seven, same, moved = (jnp.squeeze(v) for v in jax.jit(f)(*at))
+        np.testing.assert_allclose(sine, np.sin(x), rtol=1e-14)
+        assert not nothing.any()
+        assert seven == 7
+        np.testing.assert_array_equal(same, x)
+        np.testing.assert_array_equal(moved, x + np.array([1.0, 0, 0]))
+
+
+def test_another_compiler_runs_it_in_order(monkeypatch):
+    """With a jaxlib that nobody has tried."""
+    monkeypatch.setattr(_in_order, "_one_kernel_p", None)
+    x, y = numbers("float64")
+    marked = one_kernel(part)
+    close(jax.jit(marked)(x, y), part(x, y))
+    text = compiled(marked, x, y)
+    assert NOT_INLINED in text
+    assert ONE not in text

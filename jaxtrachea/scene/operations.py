@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from jaxtrachea._in_order import MARK
+from jaxtrachea._in_order import MARKS
 
 #: Moves of data, not operations.
 FREE = {"reshape", "broadcast_in_dim", "squeeze", "stack", "transpose", "slice", "concatenate",
@@ -61,7 +61,7 @@ def _equation(equation, out: list[bool]) -> tuple[int, list[bool]]:
     if inner is not None and len(inner.outvars) == len(out):
         cost, reads = _count(inner, out)
         return cost, reads if len(reads) == len(everything) else everything
-    if name == MARK:
+    if name in MARKS:
         return 0, [True] + [False] * (len(everything) - 1)
     if name in FREE:
         return 0, everything

@@ -1,7 +1,8 @@
 """How many kernels a compiled program starts, counted in XLA's text of it.
 
 A kernel is an instruction that runs by itself: on a CPU each takes some time to start, whatever it
-computes. Those in a loop count once for each of its rounds.
+computes. Those in a loop count once for each of its rounds; a call that is compiled as one kernel
+(`_in_order.one_kernel`) counts once, whatever is in it.
 """
 
 import re
@@ -16,6 +17,9 @@ INNER = {
     "call": r"to_apply=%?([\w.\-]+)",
     "conditional": r"(?:true|false)_computation=%?([\w.\-]+)|branch_computations=\{([^}]*)\}",
 }
+
+#: What marks the call that is one kernel.
+ONE = 'xla_cpu_small_call="true"'
 
 #: Opcode and line of every instruction, by the name of the computation.
 Bodies = dict[str, list[tuple[str, str]]]
@@ -58,6 +62,9 @@ def computations(text: str) -> tuple[str, Bodies]:
 def _count(name: str, bodies: Bodies) -> tuple[int, int]:
     count, loops = 0, 0
     for opcode, line in bodies[name]:
+        if opcode == "call" and ONE in line:
+            count += 1
+            continue
         inner = [_count(v, bodies) for v in _inner(opcode, line)]
         loops += (opcode == "while") + sum(n for _, n in inner)
         kernels = [n for n, _ in inner]
