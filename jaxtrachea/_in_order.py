@@ -112,7 +112,8 @@ def fits_one_kernel(jaxpr: Jaxpr) -> bool:
     """Whether all that is computed can be in one kernel, and all arrays are small."""
     from jax.extend.core import jaxprs_in_params  # not of all versions
 
-    shapes = [jnp.shape(v.aval) for v in (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars)]
+    named = (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars)
+    shapes = [v.aval.shape for v in named]  # pyright: ignore[reportAttributeAccessIssue]
     if not jaxpr.outvars or any(not 0 < math.prod(shape) <= SMALL for shape in shapes):
         return False
     return all(
