@@ -1,5 +1,6 @@
 """From forces and skeleton to the deformed surface: global shape, and the dent under the tool."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -175,6 +176,8 @@ def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.
     return local.fit(where, share[:, None], local.REACH * spacing, depth)
 
 
+# Inlined: traced once for all plans of a scene that are compared, as `stage.touch_tube`.
+@partial(jax.jit, inline=True)
 def _sag(tool: Shape, pose: Poses, points):
     """Distance of the tool, just touching, from points of the rest surface, mm."""
     if tool.vertices.shape[1] == 1:

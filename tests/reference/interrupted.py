@@ -52,18 +52,22 @@ def numbers(folder: Path) -> dict[str, bytes]:
     return found
 
 
+def programs_kept(folder: Path) -> dict[str, str]:
+    """What lets processes share compiled programs, in `folder`/cache."""
+    return {
+        "JAX_ENABLE_COMPILATION_CACHE": "true",
+        "JAX_COMPILATION_CACHE_DIR": str(folder / "cache"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+
+
 def start(folder: Path, *arguments, **more) -> subprocess.Popen:
     """`jaxtrachea ARGUMENTS` in a process of its own, programs kept in `folder`/cache."""
     code = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
         "from jaxtrachea.cli.main import main; sys.exit(main())"
     )
-    kept = {
-        "JAX_ENABLE_COMPILATION_CACHE": "true",
-        "JAX_COMPILATION_CACHE_DIR": str(folder / "cache"),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "COLUMNS": "80",
-    }
+    kept = programs_kept(folder) | {"COLUMNS": "80"}
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, arguments)],
         cwd=folder,

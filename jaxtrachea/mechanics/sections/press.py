@@ -5,6 +5,7 @@ positive phi.
 """
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -113,6 +114,25 @@ def press_sections(
     direction = shaped("direction", direction, (2,), dtype=dtype)
     phi_c = shaped("phi_c", phi_c, (), dtype=dtype)
     s_c = shaped("s_c", s_c, (), dtype=dtype, why="; use jax.vmap for many positions")
+    if places is not None:
+        places = shaped("places", places, ("any number of",), dtype=dtype)
+    return _press(geometry, material, s_c, phi_c, displacement, direction, places, midline)
+
+
+# Inlined: the program is as without. But what calls it is traced through derivatives and maps from
+# equations that are known, in all programs for the same shapes, and not through its Python again.
+@functools.partial(jax.jit, static_argnames="midline", inline=True)
+def _press(
+    geometry: Geometry,
+    material: SectionMaterial,
+    s_c: Float[Array, ""],
+    phi_c: Float[Array, ""],
+    displacement: Float[Array, " n"],
+    direction: Float[Array, "2"],
+    places: Float[Array, " k"] | None,
+    midline: bool,
+) -> SectionPress:
+    """`press_sections` of arrays."""
     asked = _admit(geometry, material, s_c, phi_c, direction, midline)
     parts = build(geometry, *asked[:4], midline=midline)
     known = jnp.isfinite(displacement)
@@ -123,8 +143,8 @@ def press_sections(
     observe = jax.vmap(_observe, (0, 0, None))
     found = observe(solved.state, path, parts)
     if places is not None:
-        places = shaped("places", places, ("any number of",), dtype=dtype)
-        nodes, footprint = ends_and_rings(geometry), asked.material.footprint.astype(dtype)
+        nodes = ends_and_rings(geometry)
+        footprint = asked.material.footprint.astype(displacement.dtype)
         along = jax.vmap(_along, (0, None, None, None, None))
         contact = asked.s_c, footprint
         found = found._replace(along=along(solved.state, places, nodes, contact, parts))
