@@ -24,7 +24,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._numerics import first_largest, largest, total
+from jaxtrachea._numerics import WRITTEN_OUT, first_largest, largest, total
 from jaxtrachea.contact.distance import approach, signed_distance
 from jaxtrachea.contact.line import Centreline, skeleton_coordinates
 from jaxtrachea.contact.pose import Pose, transform
@@ -175,7 +175,7 @@ def touch(
     # Where two patches are equally near, beside the middle one, roundings do not choose.
     order = jnp.arange(count, dtype=bounds.dtype) / count
     rank = bounds + LEAD * _size(tool, patches) * order
-    chosen = _lowest(rank, near)
+    chosen, left = _lowest(rank, near)
     shapes = _rows_at(patches.shapes, chosen)
 
     def contact(patch, direction):
@@ -211,7 +211,7 @@ def touch(
         s,
         phi,
         chosen[jnp.argmin(each.distance)],
-        jnp.min(jnp.where(jnp.any(jnp.arange(count)[:, None] == chosen, axis=1), jnp.inf, bounds)),
+        jnp.min(jnp.where(left, bounds, jnp.inf)),
         jax.lax.stop_gradient(jnp.log(jnp.asarray(terms, gap.dtype)) / beta),
         jnp.where(jnp.isfinite(gap), worst, ContactStatus.NON_FINITE).astype(jnp.int8),
     )
@@ -244,12 +244,16 @@ def gap_bounds(
 
 
 def _lowest(values, count):
-    """Places of the lowest values, rising."""
-    found, at = [], jnp.arange(values.shape[0])
-    for _ in range(count):
-        found.append(first_largest(-values))
-        values = jnp.where(at == found[-1], jnp.inf, values)
-    return jnp.stack(found)
+    """Places of the lowest values, rising, and which values are left."""
+    at = jnp.arange(values.shape[0], dtype=jnp.int32)
+    if count > WRITTEN_OUT:
+        found = jax.lax.top_k(-values, count)[1]
+        return found, jnp.all(at[:, None] != found[None], axis=1)
+    found, left = [], jnp.ones(values.shape, bool)
+    for _ in range(count):  # a kernel of its own, which `top_k` is, takes longer
+        found.append(first_largest(jnp.where(left, -values, -jnp.inf)).astype(jnp.int32))
+        left = left & (at != found[-1])
+    return jnp.stack(found), left
 
 
 def _furthest(vertices, direction):
