@@ -42,6 +42,8 @@ class Study:
         curves: for each lane, its curves in trial order.
         unknowns: for each lane, the (parameter, specimen or "", trial or "") of every unknown.
         noise_given: whether sigma of (force, markers) is known.
+        marker_noise: given standard deviation of markers, mm, and share of the tool's displacement
+            that it has beside it (see `Noise`); None: estimated.
         joint: whether shared unknowns are one and the same in all lanes.
         together: names of trials, in groups that are left out together; see
             `inference.together.left_out_together`.
@@ -53,6 +55,7 @@ class Study:
     curves: tuple[tuple[Curve, ...], ...]
     unknowns: tuple[tuple[Unknown, ...], ...]
     noise_given: tuple[bool, bool]
+    marker_noise: tuple[float, float] | None = None
     joint: bool = False
     together: tuple[tuple[str, ...], ...] = ()
 
@@ -220,6 +223,7 @@ def build_study(
         curves=tuple(map(tuple, groups)),
         unknowns=tuple(map(tuple, unknowns)),
         noise_given=(known, noise.joints is not None),
+        marker_noise=None if noise.joints is None else (noise.joints, noise.joints_share),
         joint=joint,
     )
 
