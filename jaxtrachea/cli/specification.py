@@ -228,10 +228,7 @@ def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
     options = options_of(spec)
     curves = measurements.curves
     joints = any(c.joint_displacement is not None for c in curves)
-    force, markers = (
-        None if sigma == "estimate" else sigma for sigma in (spec.noise.force, spec.noise.joints)
-    )
-    noise = Noise(force=force, joints=markers, joints_share=spec.noise.joints_share)
+    noise = _noise(spec)
     try:
         return build_study(
             curves,
@@ -247,6 +244,21 @@ def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
         raise
     except ValueError as error:
         raise SpecError(str(error)) from None
+
+
+def _noise(spec: FitSpec) -> Noise:
+    """The [noise] section.
+
+    Raises:
+        SpecError: with the dotted key.
+    """
+    force, joints = (
+        None if sigma == "estimate" else sigma for sigma in (spec.noise.force, spec.noise.joints)
+    )
+    try:
+        return Noise(force=force, joints=joints, joints_share=spec.noise.joints_share)
+    except InputError as error:
+        raise SpecError.like(error, key=f"noise.{error.key}") from None
 
 
 def settings_of(spec: FitSpec) -> Settings:
