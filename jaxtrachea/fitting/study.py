@@ -20,7 +20,14 @@ from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.lanes import Noise, Unknown, Weighting, group, lanes_of, unknowns_of
 from jaxtrachea.fitting.model import Common, FitModel, columns_of, numbers_of
 from jaxtrachea.fitting.onset import blends, natural_steps, onset_is_sought, within_reach
-from jaxtrachea.fitting.parameters import DEFAULTS, SKELETON, Parameter, defaults_of, in_model
+from jaxtrachea.fitting.parameters import (
+    DEFAULTS,
+    SKELETON,
+    Parameter,
+    defaults_of,
+    held,
+    in_model,
+)
 from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
@@ -366,7 +373,7 @@ def default_parameters(
 
     Raises:
         ValueError: a change names a parameter that the chosen model does not contain, or something
-            that a parameter does not have.
+            that a parameter does not have, or holds a first guess (`fixed` without `value`).
     """
     unknown = [name for name in changes if name not in names]
     if unknown:
@@ -380,4 +387,11 @@ def default_parameters(
                 raise ValueError(
                     f"parameters.{name}: {key!r} is not known; expected one of {', '.join(known)}"
                 )
+        if change.get("fixed") is True and "value" not in change:
+            try:
+                held(defaults[name])
+            except InputError as error:
+                expected = "a value beside it, as in {'fixed': True, 'value': 1.0}"
+                key = f"parameters.{name}: fixed"
+                raise InputError.like(error, key=key, expected=expected) from None
     return tuple(dataclasses.replace(defaults[n], **changes.get(n, {})) for n in names)
