@@ -216,19 +216,14 @@ class ParameterSection(Section):
 
 
 class NoiseSection(Section):
-    """[noise]: standard deviation of each kind of observation, or "estimate"."""
+    """[noise]: standard deviation of each kind of observation, or "estimate".
+
+    What excludes each other is said by `fitting.lanes.Noise`.
+    """
 
     force: ForceNoise = "estimate"
     joints: LengthNoise = "estimate"
     joints_share: Annotated[float, quantity("dimensionless")] = 0.0
-
-    @model_validator(mode="after")
-    def _shared(self) -> "NoiseSection":
-        if self.joints_share < 0:
-            raise ValueError(f"joints_share: is {self.joints_share:g}; expected 0 or more")
-        if self.joints_share > 0 and self.joints == "estimate":
-            raise ValueError("joints_share: only with joints as a length; give joints too")
-        return self
 
 
 class FitSection(Section):

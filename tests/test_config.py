@@ -77,20 +77,10 @@ def test_quantities_come_in_internal_units(tmp_path):
     assert spec.parameters["k_1"].bounds == (1, "2 kN/m")
 
 
-@pytest.mark.parametrize(
-    ("noise", "says"),
-    [
-        ('joints_share = "6 %"', "joints_share: only with joints as a length"),
-        ('joints = "0.1 mm"\njoints_share = -0.1', "joints_share: is -0.1; expected 0 or more"),
-    ],
-)
-def test_a_share_of_the_displacement(tmp_path, noise, says):
+def test_a_share_of_the_displacement(tmp_path):
     file = tmp_path / "fit.toml"
     file.write_text('[data]\nfiles = "x.csv"\n[noise]\njoints = "0.1 mm"\njoints_share = "6 %"\n')
     assert load_fit_spec(file).noise.joints_share == 0.06
-    file.write_text(f'[data]\nfiles = "x.csv"\n[noise]\n{noise}\n')
-    with pytest.raises(SpecError, match=says):
-        load_fit_spec(file)
 
 
 def test_every_problem_is_reported_at_once(tmp_path):

@@ -111,7 +111,9 @@ def test_few_samples_and_weights():
 
 def row(model, AICc, k=3, left=np.nan, fair=None, worth=40.0):
     fair = float(AICc) if fair is None else fair
-    return Row("T", model, k, 40, 1.0, 0.0, 0.0, float(AICc), 0.0, 0.0, 0.0, left, fair, worth)
+    return Row(
+        "T", model, k, 40, 1.0, 0.0, 0.0, float(AICc), 0.0, 0.0, 0.0, left, left, "", fair, worth
+    )
 
 
 @pytest.mark.parametrize(
@@ -222,9 +224,17 @@ def test_leaving_a_position_out_is_a_fit_without_it():
         b = np.linalg.lstsq(X, np.concatenate([c.force for c in kept]), rcond=None)[0]
         missed += [b[0] * DEPTH + b[1] - c.force for c in curves if c.s_c == s]
     want = np.sqrt(np.mean(np.square(missed))) / max(np.abs(c.force).max() for c in curves)
-    got = leave_repeats_out(study, Settings(starts=1)).error
-    np.testing.assert_allclose(got, [want], rtol=1e-6)
+    found = leave_repeats_out(study, Settings(starts=1))
+    np.testing.assert_allclose(found.error, [want], rtol=1e-6)
     assert repeats(study).words == "positions"
+    each = [np.sqrt(np.mean(np.square(missed[i : i + 2]))) for i in (0, 2, 4)]
+    place = (30, 60, 90)[int(np.argmax(each))]
+    assert found.worst[0].place == f"s = {place} mm"
+    np.testing.assert_allclose(
+        found.worst[0].error / found.error[0] * want,
+        max(each) / max(np.abs(c.force).max() for c in curves),
+        rtol=1e-6,
+    )
 
 
 def test_without_a_second_position_trials_are_left_out():
@@ -233,7 +243,8 @@ def test_without_a_second_position_trials_are_left_out():
     plan = repeats(study)
     assert (plan.words, plan.lanes.tolist()) == ("trials", [0, 0, 1, 1, 2, 2])
     assert plan.held.tolist() == [[True, False], [False, True]] * 3
-    got = leave_repeats_out(study, Settings(starts=1)).error
+    found = leave_repeats_out(study, Settings(starts=1))
+    got = found.error
     for lane, (a, b) in enumerate(zip(noisy()[::2], noisy()[1::2], strict=True)):
         missed = []
         for kept, out in ((a, b), (b, a)):
@@ -241,6 +252,9 @@ def test_without_a_second_position_trials_are_left_out():
             missed.append(X @ np.linalg.lstsq(X, kept.force, rcond=None)[0] - out.force)
         peak = max(np.abs(c.force).max() for c in (a, b))
         np.testing.assert_allclose(got[lane], np.sqrt(np.mean(np.square(missed))) / peak, rtol=1e-6)
+        each = np.sqrt(np.mean(np.square(missed), axis=1)) / peak
+        np.testing.assert_allclose(found.worst[lane].error, each.max(), rtol=1e-6)
+        assert found.worst[lane].place == (b, a)[int(np.argmax(each))].trial
 
 
 def test_a_refit_that_does_not_converge_counts_and_is_said(monkeypatch):
@@ -272,6 +286,9 @@ def test_a_refit_that_does_not_converge_counts_and_is_said(monkeypatch):
     rows, _ = compared([Model("A", result, lost), Model("B", result, slow)])
     assert np.isnan(rows[-2].left_out)
     assert np.isfinite(rows[-1].left_out)
+    assert (np.isnan(rows[-2].worst), rows[-2].worst_place) == (True, "")
+    _, name, worst = max((w.error, study.lane_name(k)[0], w) for k, w in enumerate(slow.worst))
+    assert (rows[-1].worst, rows[-1].worst_place) == (worst.error, f"{name}, {worst.place}")
 
 
 def test_why_nothing_was_left_out():
@@ -370,6 +387,7 @@ def test_command_chooses_the_model_behind_the_data(two, monkeypatch, capsys):
     total = sum(float(rows[2 * i + 1]["AICc"]) for i in range(3))
     np.testing.assert_allclose(float(rows[-1]["AICc"]), total, rtol=1e-12)
     assert float(rows[-1]["weight"]) > 0.99
+    assert f"({rows[-1]['worst_place']})" in (two / "o" / "report.md").read_text()
     made = json.loads((two / "o" / "provenance.json").read_text())
     assert [s["model"] for s in made["specifications"]] == ["straight", "cubic"]
     assert list(made["inputs"]) == ["data.csv"]

@@ -54,13 +54,21 @@ def test_geometry_goes_in_and_comes_out_as_numbers():
     assert all(isinstance(v, float | tuple) for v in study.model.tube)
 
 
+HELD = {"fixed": True, "value": 1.0}
+
+
 def test_parameters_by_default_and_by_what_differs():
     """A table left out is that of the options; changes to single parameters keep the others."""
     curves = synthetic.curves(FORCE)
     plain = build_study(curves, synthetic.GEOMETRY)
     assert [p.name for p in plain.free] == ["EI_L", "k_M", "k_1", "k_3"]
-    fixed = build_study(curves, synthetic.GEOMETRY, parameters={"k_M": {"fixed": True}})
+    fixed = build_study(
+        curves, synthetic.GEOMETRY, parameters={"k_M": HELD, "onset": {"fixed": True}}
+    )
     assert [p.name for p in fixed.free] == ["EI_L", "k_1", "k_3"]
+    says = r"parameters\.k_M: fixed: true would hold the first guess, 0.1 N/mm; expected a value"
+    with pytest.raises(ValueError, match=says):
+        build_study(curves, synthetic.GEOMETRY, parameters={"k_M": {"fixed": True}})
     rings = build_study(curves, synthetic.GEOMETRY, Options(local="two-material", shear=True))
     assert [p.name for p in rings.free] == ["EI_L", "GA_L", "k_M", "k_1", "k_3", "k_1_ring"]
     with pytest.raises(ValueError, match=r"parameters\.k_1_ring: not part of this model"):

@@ -170,7 +170,7 @@ def test_three_lines_of_python(study):
     results = jaxtrachea.read_results(study[0])
     curve = jaxtrachea.predict(results, s=61.0, displacement=[1.0, 2.0], specimen="s0003")
     assert np.all((curve.low95 < curve.curve_low95) & (curve.curve_high95 < curve.high95))
-    assert np.isnan(curve.joint_sigma)  # this fit had no markers
+    assert np.isnan(curve.joint_sigma).all()  # this fit had no markers
     # Joints and reactions in equilibrium with each other: R = k_M w (paper 2.3).
     k_M = math.exp(results.theta[3, 1])
     assert np.allclose(curve.reactions, k_M * curve.joints, rtol=1e-12)
@@ -188,6 +188,33 @@ def test_three_lines_of_python(study):
         jaxtrachea.predict(results, s=61.0, displacement=np.nan, specimen="s0003")
     with pytest.raises(ValueError, match="trial 'x'"):
         jaxtrachea.predict(results, s=61.0, displacement=1.0, specimen="s0003", trial="x")
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+@pytest.mark.parametrize("free", [True, False])
+def test_residuals_and_bands_of_unequal_noise(free, tmp_path):
+    """Sizes of residuals are in N and mm, bands of markers as wide as their own noise is."""
+    measured = jaxtrachea.read_measurements(VIRTUAL / "small_strain.h5").curves[:2]
+    weighed = [dataclasses.replace(c, sigma=0.01 * np.arange(1.0, len(c.force) + 1))
+               for c in measured]  # fmt: skip
+    noise = Noise(joints=5e-4, joints_share=0.06)
+    values = {"k_3": 0.0, "EI_L": 300.0, "k_M": 1.0, "GA_L": 9.0}
+    held = {name: {"fixed": True, "value": value} for name, value in values.items()}
+    options = Options(contact="bonded", shear=True)
+    changes = held | {"k_1": {} if free else {"fixed": True, "value": 2.0}}
+    result = fit(build_study(weighed, table_1(), options, changes, noise=noise), TWO)
+    write_hdf5(tmp_path / "r.h5", Findings(result), {})
+    read = jaxtrachea.read_results(tmp_path / "r.h5")
+    off, aside = [], []
+    for curve in measured:
+        D = curve.displacement
+        found = jaxtrachea.predict(read, s=curve.s_c, displacement=D)
+        off.append(found.force - curve.force)
+        aside.append((found.joints[:, curve.joint_rings] - curve.joint_displacement).ravel())
+        np.testing.assert_allclose(found.joint_sigma, np.sqrt(5e-4**2 + (0.06 * D) ** 2))
+    sizes = [np.sqrt(np.mean(np.concatenate(v) ** 2)) for v in (off, aside)]
+    np.testing.assert_allclose(result.rms[0], sizes, rtol=1e-9)
 
 
 def test_a_failed_lane_predicts_nothing(read):

@@ -11,7 +11,7 @@ import synthetic
 from scipy.integrate import quad
 
 from jaxtrachea.fitting.lanes import Noise
-from jaxtrachea.fitting.parameters import in_model
+from jaxtrachea.fitting.parameters import DEFAULTS, in_model
 from jaxtrachea.fitting.residual import residual, residual_value
 from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.measurements.read import Curve
@@ -21,14 +21,15 @@ from jaxtrachea.trachea.material import Material
 pytestmark = pytest.mark.compiling
 
 FREE = {"fixed": False}
+HELD = {n: {"fixed": True, "value": p.value} for n, p in DEFAULTS.items()}
 TRIAL = {"fixed": False, "scope": "trial"}
 BOTH = {"onset": TRIAL, "force_offset": TRIAL}
 SHARED = {"fixed": False, "scope": "shared"}
 #: Options, with markers or without, and what is said of single parameters.
 CASES = {
     "default": (Options(), False, {}),
-    "fixed skeleton": (Options(), False, {n: {"fixed": True} for n in ("EI_L", "k_M")}),
-    "fixed law": (Options(), True, {n: {"fixed": True} for n in ("k_1", "k_3")}),
+    "fixed skeleton": (Options(), False, {n: HELD[n] for n in ("EI_L", "k_M")}),
+    "fixed law": (Options(), True, {n: HELD[n] for n in ("k_1", "k_3")}),
     "shear": (Options(shear=True), False, {}),
     "two materials": (Options(local="two-material"), False, {}),
     "dense": (Options(form="reactions"), False, {}),

@@ -50,7 +50,7 @@ CASES = [
     ),
     (
         [(75.0, 22.0)],
-        FIXED_K_3 | {"EI_L": {"fixed": True}, "onset": {"fixed": False},
+        FIXED_K_3 | {"EI_L": {"fixed": True, "value": 10.0}, "onset": {"fixed": False},
                      "force_offset": {"fixed": False}},
         [{"onset", "force_offset"}],
     ),

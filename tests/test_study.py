@@ -10,7 +10,7 @@ import pytest
 from run_cli import run
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.cli.specification import parameters_of, usable
+from jaxtrachea.cli.specification import parameters_of, study_of, usable
 from jaxtrachea.config import FitSpec, SpecError, TracheaSection, load_fit_spec
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.study import build_study
@@ -231,6 +231,20 @@ def test_parameters_take_quantities_bounds_and_scales(two):
     assert (made["EI_L"].value, made["EI_L"].fixed) == (1e6, True)
     assert not made["onset"].fixed
     assert DEFAULTS["onset"].fixed
+
+
+@pytest.mark.parametrize(
+    ("noise", "says"),
+    [
+        ('joints_share = "6 %"', r"noise\.joints_share needs joints, .*; give joints as a length"),
+        ('joints = "0.1 mm"\njoints_share = -0.1', r"noise\.joints_share is -0\.1; expected 0 or"),
+    ],
+)
+def test_a_share_without_meaning_is_refused_with_its_key(two, noise, says):
+    (two / "spec.toml").write_text(f'[data]\nfiles = "*.csv"\n[noise]\n{noise}\n')
+    spec = load_fit_spec(two / "spec.toml")
+    with pytest.raises(SpecError, match=says):
+        study_of(spec, read_data(spec, two))
 
 
 def test_fixed_is_a_number_or_true_where_a_value_is_known(two):

@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import h5py
 import jax
@@ -201,6 +202,10 @@ def test_refusals(peace, study, monkeypatch, capsys):
     with monkeypatch.context() as patch:
         patch.setattr(jaxtrachea, "__version__", "99")
         refused(*FIT, "--resume", says=["jaxtrachea was 0", "and is 99"])
+    with monkeypatch.context() as patch:
+        patch.setattr(manifest, "source_digest", lambda: "0123")
+        says = ["the source of jaxtrachea was ", " and is 0123; ", "another --out", "--force"]
+        refused(*FIT, "--resume", says=says)
     strip_manifests(study / "out" / ".run")
     (study / "out" / ".run" / "run.json").write_text("{")
     refused(*FIT, "--resume", says=["its run.json cannot be read", "none of its 1 shards says"])
@@ -213,6 +218,25 @@ def strip_manifests(folder):
             arrays = {name: file[name] for name in file.files if name != "journal"}
         np.savez(path, **arrays)
     (folder / "previous-run.json").unlink(missing_ok=True)
+
+
+def test_the_digest_of_the_source_follows_every_file(tmp_path, monkeypatch):
+    """And nothing else: neither the folder that it is installed in nor what is compiled there."""
+    package = Path(jaxtrachea.__file__).parent
+
+    def digest(change=None):
+        shutil.rmtree(tmp_path, ignore_errors=True)
+        shutil.copytree(package, tmp_path, ignore=shutil.ignore_patterns("__pycache__", "*.json"))
+        if change is not None:
+            change()
+        monkeypatch.setattr(jaxtrachea, "__file__", str(tmp_path / "__init__.py"))
+        return manifest.source_digest.__wrapped__()
+
+    as_it_is = manifest.source_digest()
+    assert digest() == as_it_is
+    law = tmp_path / "mechanics" / "force_law.py"
+    assert digest(lambda: law.write_text(law.read_text().replace("1", "2", 1))) != as_it_is
+    assert digest(lambda: law.rename(law.with_name("law.py"))) != as_it_is
 
 
 def test_a_manifest_of_an_earlier_version_is_read():

@@ -21,7 +21,18 @@ CrossOption = Annotated[
 ]
 #: Specimens of a terminal table; the files hold all.
 MANY = 8
-HEAD = ["specimen", "model", "k", "-2 ln L", "dAICc", "deflated", "weight", "BIC", "left out"]
+HEAD = [
+    "specimen",
+    "model",
+    "k",
+    "-2 ln L",
+    "dAICc",
+    "deflated",
+    "weight",
+    "BIC",
+    "left out",
+    "worst",
+]
 
 
 def compare(
@@ -152,7 +163,10 @@ def _left_out_notes(models) -> list[str]:
     for model in models:
         if model.left_out is None:
             continue
-        refits, unconverged, lost = (int(v.sum()) for v in model.left_out[1:])
+        left = model.left_out
+        refits, unconverged, lost = (
+            int(v.sum()) for v in (left.refits, left.unconverged, left.lost)
+        )
         if not refits:
             notes.append(f"Nothing was left out of {model.name}: {_why_nothing(model)}.")
         elif words := refits_sentence(refits, unconverged, lost):
@@ -178,13 +192,18 @@ def _cells(rows) -> list[list[str]]:
 
     return [
         [row.specimen, row.model, str(row.unknowns), number(row.deviance, 6), number(row.delta, 3),
-         number(row.deflated, 3), number(row.weight, 2), number(row.BIC, 6), _percent(row.left_out)]
+         number(row.deflated, 3), number(row.weight, 2), number(row.BIC, 6), _percent(row.left_out),
+         _worst(row)]
         for row in rows
     ]  # fmt: skip
 
 
 def _percent(share: float) -> str:
     return "–" if share != share else f"{100 * share:.2f} %"
+
+
+def _worst(row) -> str:
+    return _percent(row.worst) + (f" ({row.worst_place})" if row.worst_place else "")
 
 
 def _report(rows, sentences: dict[str, str], failed: int, models) -> str:
@@ -199,7 +218,8 @@ def _report(rows, sentences: dict[str, str], failed: int, models) -> str:
         "deflated: the same where the likelihood counts only as many samples as are independent, "
         "by the correlation of neighbouring residuals of the best model; decisive is what stays at "
         "10 or more so. weight: Akaike weight. left out: root mean square error of force of "
-        f"{_left_out_words(models)} that took no part in the fit, over the largest force "
+        f"{_left_out_words(models)} that took no part in the fit, over the largest force; worst: "
+        "the largest of them by itself "
         "(docs/model_choice.md). All numbers: `compare.csv`.",
         *_left_out_notes(models),
     ]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
 from jaxtrachea.fitting.lanes import Noise, Weighting
-from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, defaults_of, in_model, visible
+from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, defaults_of, held, in_model, visible
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study, check_curve
 from jaxtrachea.fitting.unread import along_the_normal
@@ -86,14 +86,8 @@ def _parameter(default: Parameter, section: ParameterSection | None) -> Paramete
     if section is None:
         return default
     try:
-        if section.fixed is True and (default.fixed or default.name in SECTION_VALUES):
-            return dataclasses.replace(default, fixed=True)
         if section.fixed is True:
-            raise InputError(
-                f"true would hold the first guess, {default.value:g} {default.unit}".rstrip(),
-                key="fixed",
-                expected="a number; only values of deforming cross-sections have one, by [wall]",
-            )
+            return held(default)
         if section.fixed is not None:
             return _fixed(default, section.fixed)
         return _free(default, section)
@@ -228,10 +222,7 @@ def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
     options = options_of(spec)
     curves = measurements.curves
     joints = any(c.joint_displacement is not None for c in curves)
-    force, markers = (
-        None if sigma == "estimate" else sigma for sigma in (spec.noise.force, spec.noise.joints)
-    )
-    noise = Noise(force=force, joints=markers, joints_share=spec.noise.joints_share)
+    noise = _noise(spec)
     try:
         return build_study(
             curves,
@@ -247,6 +238,21 @@ def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
         raise
     except ValueError as error:
         raise SpecError(str(error)) from None
+
+
+def _noise(spec: FitSpec) -> Noise:
+    """The [noise] section.
+
+    Raises:
+        SpecError: with the dotted key.
+    """
+    force, joints = (
+        None if sigma == "estimate" else sigma for sigma in (spec.noise.force, spec.noise.joints)
+    )
+    try:
+        return Noise(force=force, joints=joints, joints_share=spec.noise.joints_share)
+    except InputError as error:
+        raise SpecError.like(error, key=f"noise.{error.key}") from None
 
 
 def settings_of(spec: FitSpec) -> Settings:

@@ -33,7 +33,7 @@ def evaluated(study: Study) -> FitResult:
     unit = precision_unit(study)
     finite = np.asarray(np.isfinite(info.squares).all(axis=1))
     with np.errstate(invalid="ignore", divide="ignore"):
-        rms = np.sqrt(info.squares / info.counts) * unit
+        rms = np.sqrt(info.plain / info.counts)
     total = np.sum(info.counts, axis=1)
     both = study.lanes.joints is None or study.noise_given[1]
     half = half_widths(total, noise_given=study.noise_given[0] and both)
@@ -84,6 +84,13 @@ def _information(study: Study, off: Prediction) -> Information:
     def balance(part):
         return np.repeat(study.lanes.balance, part.shape[1] // trials, axis=1)
 
+    def plain(kinds):
+        total = zero
+        for kind in kinds:
+            off_by = np.where(kind.precision > 0, getattr(off, kind.name), 0)
+            total = total + np.sum(off_by**2, axis=tuple(range(1, off_by.ndim)))
+        return total
+
     def spread(part, observed):
         if study.model.loss == "linear":
             return zero
@@ -96,6 +103,7 @@ def _information(study: Study, off: Prediction) -> Information:
         gradient=np.zeros((lanes, 0)),
         squares=both([np.sum(v**2, axis=1) for v in parts]),
         weighted=both([np.sum(v**2 * balance(v) ** 2, axis=1) for v in parts]),
+        plain=both([plain(forces(study.lanes)), plain(markers(study.lanes))]),
         counts=both([np.sum(s, axis=1).astype(float) for s in seen]),
         spread=both([spread(*pair) for pair in zip(parts, seen, strict=True)]),
         psi2=np.ones(lanes),

@@ -149,7 +149,7 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
 
         value = unscale(theta)
         half = u.half_width[:, None] * u.se
-        rms = np.sqrt(info.squares / info.counts)
+        rms = np.sqrt(info.plain / info.counts)
         standard_error = u.se * np.where(log, value, step)
         lower, upper = unscale(theta - half), unscale(theta + half)
     unit = precision_unit(study)
@@ -160,7 +160,7 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
         study=study, theta=theta, value=value, standard_error=standard_error,
         lower=lower, upper=upper, relative_se=u.se / relative,
         at_bound=at_bound, status=status, iterations=solved.iterations, cost=solved.cost,
-        converged_starts=agree, tried=tried, sigma=sigma * unit, rms=rms * unit, samples=samples,
+        converged_starts=agree, tried=tried, sigma=sigma * unit, rms=rms, samples=samples,
         criteria=criteria(study, info, alive),
         uncertainty=u, undetermined=structure.undetermined,
         unexamined=np.zeros(theta.shape, bool), evidence_low=np.full(theta.shape, np.nan),

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea.fitting.cost import assemble, entry_scale, robust
-from jaxtrachea.fitting.lane import Lane, observations
+from jaxtrachea.fitting.lane import Lane, observations, precisions
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import residual
@@ -25,6 +25,7 @@ class Information(NamedTuple):
         squares: sum of squared residuals of force (N^2) and markers (mm^2) in units of the given
             precision; (2,).
         weighted: the same with the squares of the curve weights; (2,).
+        plain: sum of squared residuals in N^2 and mm^2, whatever their precision; (2,).
         counts: observed entries of each; (2,).
         spread: median absolute residual of each, same units, 0 with a linear loss; (2,).
         psi2: mean of psi(z)^2 over observed entries.
@@ -36,6 +37,7 @@ class Information(NamedTuple):
     gradient: Float[Array, " P"]
     squares: Float[Array, "2"]
     weighted: Float[Array, "2"]
+    plain: Float[Array, "2"]
     counts: Float[Array, "2"]
     spread: Float[Array, "2"]
     psi2: Float[Array, ""]
@@ -58,6 +60,7 @@ def information(
     """Information matrices and residual statistics of one lane."""
     r = residual(model, theta, lane)
     seen, forces = observations(lane)
+    precision = precisions(lane)
     scale = entry_scale(lane, sigma)
     z = r.value * scale[None]
     J = r.jacobian * (scale[None] * seen)[:, None]
@@ -89,6 +92,7 @@ def information(
         gradient=assemble(model, gradient, lane),
         squares=by_kind(r.value**2 * seen),
         weighted=by_kind(r.value**2 * seen * b2[:, 0]),
+        plain=by_kind((r.value / jnp.where(precision > 0, precision, 1)) ** 2 * seen),
         counts=by_kind(seen),
         spread=jnp.stack([spread(True), spread(False)]),
         psi2=jnp.sum(psi(z) ** 2 * seen) / total,

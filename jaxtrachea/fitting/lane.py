@@ -125,10 +125,14 @@ def size(lane: Lane) -> int:
 
 def observations(lane: Lane) -> tuple[Float[Array, "*l T m"], int]:
     """Which entries of the residual are observed (1 or 0), and how many of them are forces."""
+    return (precisions(lane) > 0).astype(lane.force.dtype), force_entries(lane)
+
+
+def precisions(lane: Lane) -> Float[Array, "*l T m"]:
+    """Precision of every entry of the residual."""
     rows = lane.force.shape[:-1]
     kinds = forces(lane) + markers(lane)
-    seen = jnp.concatenate([(kind.precision > 0).reshape(*rows, -1) for kind in kinds], axis=-1)
-    return seen.astype(lane.force.dtype), force_entries(lane)
+    return jnp.concatenate([kind.precision.reshape(*rows, -1) for kind in kinds], axis=-1)
 
 
 def weighted(v: Float[Array, "*n"], precision: Float[Array, "*n"]) -> Float[Array, "*n"]:

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from jaxtrachea._arguments import check_record
+from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.lane import FORCES, MARKERS, Lane
 from jaxtrachea.fitting.model import Loss
 from jaxtrachea.fitting.parameters import Parameter
@@ -47,13 +48,16 @@ class Noise:
         check_record(self)
         for name in ("force", "joints"):
             if (value := getattr(self, name)) is not None and value <= 0:
-                raise ValueError(
-                    f"{name} is {value:g}; expected a standard deviation of more than 0, or None"
-                )
-        if not 0 <= self.joints_share < np.inf:
-            raise ValueError(f"joints_share is {self.joints_share:g}; expected 0 or more")
+                expected = "a standard deviation of more than 0, or None"
+                raise InputError(f"is {value:g}", key=name, expected=expected, joint=" ")
+        if self.joints_share < 0:
+            found = f"is {self.joints_share:g}"
+            raise InputError(found, key="joints_share", expected="0 or more", joint=" ")
         if self.joints_share > 0 and self.joints is None:
-            raise ValueError("joints_share needs joints, the standard deviation at no displacement")
+            raise InputError(
+                "needs joints, the standard deviation of markers at no displacement",
+                key="joints_share", cure="give joints as a length", joint=" ",
+            )  # fmt: skip
 
     def joints_precision(self, displacement: np.ndarray) -> np.ndarray:
         """1 / sigma of markers at each displacement of the tool, 1/mm; 1 if it is estimated."""

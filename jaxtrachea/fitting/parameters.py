@@ -95,6 +95,21 @@ class Parameter:
         return math.exp(theta) if self.scale == "log" else theta * self.step
 
 
+def held(p: Parameter) -> Parameter:
+    """A parameter fixed at its own value, where that is more than a first guess.
+
+    Raises:
+        InputError: it is none: neither fixed by default, nor given by the wall of cross-sections.
+    """
+    if p.fixed or p.name in SECTION_VALUES:
+        return dataclasses.replace(p, fixed=True)
+    raise InputError(
+        f"true would hold the first guess, {p.value:g} {p.unit}".rstrip(),
+        key="fixed",
+        expected="a number; only values of deforming cross-sections have one, by [wall]",
+    )
+
+
 def _of(declared: Declaration, fit: Fitted) -> Parameter:
     return Parameter(
         declared.name, declared.unit, declared.dimension, declared.description, fit.value,

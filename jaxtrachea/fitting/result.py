@@ -67,7 +67,8 @@ class FitResult:
         cost: half the weighted sum of squares (or of rho); (lanes,).
         converged_starts: starts that ended in the best minimum; (lanes,).
         tried: starts in all; (lanes,).
-        sigma: standard deviation of force (N) and markers (mm), given or estimated; (lanes, 2).
+        sigma: standard deviation of force (N) and markers (mm), given (the median of the lane's
+            samples) or estimated; (lanes, 2).
         rms: root mean square residual of force (N) and markers (mm); (lanes, 2).
         samples: observed entries; (lanes,).
         criteria: AIC, AICc, BIC of all lanes.

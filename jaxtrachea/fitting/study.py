@@ -20,7 +20,14 @@ from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.lanes import Noise, Unknown, Weighting, group, lanes_of, unknowns_of
 from jaxtrachea.fitting.model import Common, FitModel, columns_of, numbers_of
 from jaxtrachea.fitting.onset import blends, natural_steps, onset_is_sought, within_reach
-from jaxtrachea.fitting.parameters import DEFAULTS, SKELETON, Parameter, defaults_of, in_model
+from jaxtrachea.fitting.parameters import (
+    DEFAULTS,
+    SKELETON,
+    Parameter,
+    defaults_of,
+    held,
+    in_model,
+)
 from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
@@ -42,6 +49,8 @@ class Study:
         curves: for each lane, its curves in trial order.
         unknowns: for each lane, the (parameter, specimen or "", trial or "") of every unknown.
         noise_given: whether sigma of (force, markers) is known.
+        marker_noise: given standard deviation of markers, mm, and share of the tool's displacement
+            that it has beside it (see `Noise`); None: estimated.
         joint: whether shared unknowns are one and the same in all lanes.
         together: names of trials, in groups that are left out together; see
             `inference.together.left_out_together`.
@@ -53,6 +62,7 @@ class Study:
     curves: tuple[tuple[Curve, ...], ...]
     unknowns: tuple[tuple[Unknown, ...], ...]
     noise_given: tuple[bool, bool]
+    marker_noise: tuple[float, float] | None = None
     joint: bool = False
     together: tuple[tuple[str, ...], ...] = ()
 
@@ -220,6 +230,7 @@ def build_study(
         curves=tuple(map(tuple, groups)),
         unknowns=tuple(map(tuple, unknowns)),
         noise_given=(known, noise.joints is not None),
+        marker_noise=None if noise.joints is None else (noise.joints, noise.joints_share),
         joint=joint,
     )
 
@@ -362,7 +373,7 @@ def default_parameters(
 
     Raises:
         ValueError: a change names a parameter that the chosen model does not contain, or something
-            that a parameter does not have.
+            that a parameter does not have, or holds a first guess (`fixed` without `value`).
     """
     unknown = [name for name in changes if name not in names]
     if unknown:
@@ -376,4 +387,11 @@ def default_parameters(
                 raise ValueError(
                     f"parameters.{name}: {key!r} is not known; expected one of {', '.join(known)}"
                 )
+        if change.get("fixed") is True and "value" not in change:
+            try:
+                held(defaults[name])
+            except InputError as error:
+                expected = "a value beside it, as in {'fixed': True, 'value': 1.0}"
+                key = f"parameters.{name}: fixed"
+                raise InputError.like(error, key=key, expected=expected) from None
     return tuple(dataclasses.replace(defaults[n], **changes.get(n, {})) for n in names)

@@ -12,7 +12,7 @@ from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.effective import CORRELATED, effective_samples
-from jaxtrachea.inference.repeats import Missed
+from jaxtrachea.inference.repeats import Missed, Worst
 from jaxtrachea.inference.residuals import rms
 
 #: Difference of AICc up to which models cannot be told apart, and from which on they clearly can
@@ -54,6 +54,9 @@ class Row:
         left_out: rms force residual of what was left out, over the largest force of the lane; of
             all lanes the root mean square; NaN where nothing was, or where a refit of one of them
             predicts nothing.
+        worst: largest of the errors of the single parts that were left out (positions, mostly),
+            likewise.
+        worst_place: which part that is, in words; of several lanes with its specimen.
         deflated: AICc with the deviance of as many samples as are independent, less the smallest of
             the models; see `deflated`.
         effective_samples: that many.
@@ -71,6 +74,8 @@ class Row:
     delta: float
     weight: float
     left_out: float
+    worst: float
+    worst_place: str
     deflated: float
     effective_samples: float
 
@@ -214,6 +219,7 @@ def _rows(
         fair = fair - fair[best]
     weight = weights(AICc)
     independent = total(worth[best], lanes[best])
+    found = [_worst(m, at) for m, at in zip(models, lanes, strict=True)]
     return [
         Row(
             specimen=specimen,
@@ -228,10 +234,12 @@ def _rows(
             delta=float(delta[i]),
             weight=float(weight[i]),
             left_out=_left_out(m, at),
+            worst=worst.error,
+            worst_place=worst.place,
             deflated=float(fair[i]),
             effective_samples=independent,
         )
-        for i, (m, c, at) in enumerate(zip(models, of, lanes, strict=True))
+        for i, (m, c, at, worst) in enumerate(zip(models, of, lanes, found, strict=True))
     ]
 
 
@@ -243,6 +251,19 @@ def _left_out(model: Model, at: np.ndarray) -> float:
     if model.left_out is None or model.left_out.lost[at].any():
         return np.nan
     return float(rms(model.left_out.error[at]))
+
+
+def _worst(model: Model, at: np.ndarray) -> Worst:
+    """The part of some lanes that a model predicts worst without it; NaN as `_left_out`."""
+    missed = model.left_out
+    if missed is None or not missed.worst or missed.lost[at].any():
+        return Worst(np.nan, "")
+    known = [(w, k) for k in at if (w := missed.worst[k]) is not None]
+    if not known:
+        return Worst(np.nan, "")
+    worst, lane = max(known)
+    name = "" if len(at) == 1 else f"{model.result.study.lane_name(int(lane))[0]}, "
+    return worst._replace(place=name + worst.place)
 
 
 def sentence(rows: Sequence[Row], left: str = "positions") -> str:

@@ -15,6 +15,18 @@ from jaxtrachea.inference.together import companions
 from jaxtrachea.measurements.read import Curve
 
 
+class Worst(NamedTuple):
+    """The part of a lane that was predicted worst by a fit without it.
+
+    Attributes:
+        error: root mean square force residual of its curves, over the lane's largest force.
+        place: in words: contact position with its angle, trial or specimen.
+    """
+
+    error: float
+    place: str
+
+
 class Missed(NamedTuple):
     """Errors of what was left out of each lane, and what became of the refits behind them.
 
@@ -25,12 +37,14 @@ class Missed(NamedTuple):
         unconverged: of them, those that did not converge (`FitStatus`) or left the onset or offset
             of a curve left out so, yet predict: their best point counts; (lanes,).
         lost: of them, those without a finite prediction of all that they left out; (lanes,).
+        worst: of each lane; None where `error` is NaN; empty where nothing was left out.
     """
 
     error: Float[np.ndarray, " lanes"]
     refits: Int[np.ndarray, " lanes"]
     unconverged: Int[np.ndarray, " lanes"]
     lost: Int[np.ndarray, " lanes"]
+    worst: tuple[Worst | None, ...] = ()
 
 
 class Repeats(NamedTuple):
@@ -134,9 +148,10 @@ def leave_repeats_out(
         The `Missed` of all lanes.
     """
     count = len(study.curves)
-    lanes, held, _ = repeats(study)
+    lanes, held, kinds = repeats(study)
     if not len(lanes):
-        return Missed(np.full(count, np.nan), *np.zeros((3, count), int))
+        none = np.zeros(count, int)
+        return Missed(np.full(count, np.nan), none, none, none)
     chosen = study.take(lanes)
     result, touched, seen = refitted(chosen, held, settings, progress)
     seen = seen.force
@@ -153,8 +168,25 @@ def leave_repeats_out(
         unconverged=of_lane(~converged & ~lost),
         lost=of_lane(lost),
     )
+    worst: list[Worst | None] = [None] * count
     for lane in np.flatnonzero((missed.refits > 0) & (missed.lost == 0)):
-        rows = lanes == lane
+        rows = np.flatnonzero(lanes == lane)
         peak = np.max(np.abs(study.lanes.force[lane]))
         missed.error[lane] = float(rms(seen[rows][observed[rows]])) / peak
-    return missed
+        each = [float(rms(seen[row][observed[row]])) / peak for row in rows]
+        row = rows[int(np.argmax(each))]
+        curves = [study.curves[lane][t] for t in np.flatnonzero(held[row])]
+        worst[lane] = Worst(max(each), _place(curves, kinds[row]))
+    return missed._replace(worst=tuple(worst))
+
+
+def _place(curves: Sequence[Curve], kind: str) -> str:
+    """What was left out, in words."""
+    if kind != "positions":
+        names = [c.trial if kind == "trials" else c.specimen for c in curves]
+        return ", ".join(dict.fromkeys(names))
+    words = []
+    for c in curves:
+        aside = "" if c.phi_c == 0 else f" at {np.degrees(c.phi_c):.4g} deg"
+        words.append("no position" if c.s_c is None else f"s = {c.s_c:g} mm{aside}")
+    return ", ".join(dict.fromkeys(words))

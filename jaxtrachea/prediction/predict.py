@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.tested import tested_depth
 from jaxtrachea.measurements.vectors import tilt_of
@@ -48,7 +49,7 @@ class CurvePrediction:
         joints_se: from the parameters.
         reactions: of each ring, N; (N, rings).
         reactions_se: from the parameters.
-        joint_sigma: standard deviation of a marker, mm; NaN if the fit had none.
+        joint_sigma: standard deviation of a marker, mm; NaN if the fit had none; (N,).
         status: the worst there is to say.
         message: in words.
         press_status: `PressStatus`; (N,).
@@ -73,7 +74,7 @@ class CurvePrediction:
     joints_se: np.ndarray
     reactions: np.ndarray
     reactions_se: np.ndarray
-    joint_sigma: float
+    joint_sigma: np.ndarray
     status: PredictionStatus
     message: str
     press_status: np.ndarray
@@ -229,7 +230,7 @@ def _on_host(stored: StoredFit, source: Source, where, displacement, part: Predi
         joints_se=show(se.joints),
         reactions=show(_nothing(value) if value.reactions is None else value.reactions),
         reactions_se=show(_nothing(value) if se.reactions is None else se.reactions),
-        joint_sigma=float(source.sigma[1]),
+        joint_sigma=_marker_sigma(stored, source, displacement),
         status=status,
         message=message,
         press_status=presses,
@@ -240,6 +241,14 @@ def _on_host(stored: StoredFit, source: Source, where, displacement, part: Predi
         joint_side=maybe(value.joint_side),
         joint_side_se=maybe(se.joint_side),
     )
+
+
+def _marker_sigma(stored: StoredFit, source: Source, displacement) -> np.ndarray:
+    """Standard deviation of a marker at each displacement, mm; NaN if the fit had none."""
+    given = stored.study.marker_noise
+    if given is None or np.isnan(source.sigma[1]):
+        return np.full(len(displacement), source.sigma[1])
+    return 1 / Noise(joints=given[0], joints_share=given[1]).joints_precision(displacement)
 
 
 def _nothing(value: Response) -> np.ndarray:

@@ -102,7 +102,7 @@ def joint_rows(
         measured: marker displacement, mm, NaN where there was none; (N, rings).
     """
     half = p.half_width
-    noisy = np.hypot(p.joints_se, p.joint_sigma)
+    noisy = np.hypot(p.joints_se, p.joint_sigma[:, None])
     for i in at:
         for ring, x in enumerate(rings):
             marker = np.nan if measured is None else float(measured[i, ring])

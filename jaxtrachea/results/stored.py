@@ -241,6 +241,7 @@ def _read(path: Path, file: Any) -> StoredFit:
         curves=(),
         unknowns=unknowns,
         noise_given=(bool(model["noise_given"][0]), bool(model["noise_given"][1])),
+        marker_noise=_marker_noise(model.get("marker_noise")),
         joint=bool(model["joint"]),
     )
     theta = numeric(file["unknowns"], "theta")
@@ -264,6 +265,14 @@ def _read(path: Path, file: Any) -> StoredFit:
     )
     _check_shapes(stored)
     return stored
+
+
+def _marker_noise(found: Any) -> tuple[float, float] | None:
+    """As `Study.marker_noise`; files of before had none, and no share."""
+    if found is None:
+        return None
+    joints, share = found
+    return float(joints), float(share)
 
 
 def _known_half_width(study: Study, half: np.ndarray) -> np.ndarray:

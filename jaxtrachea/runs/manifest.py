@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -17,6 +18,7 @@ from jaxtrachea.files.provenance import installed
 SCHEMA = "jaxtrachea-run"
 SCHEMA_VERSION = 1
 _PACKAGES = ("jax", "jaxlib", "numpy", "scipy")
+_SOURCE = "the source of jaxtrachea"
 #: Keys on file of the fields that are called otherwise there.
 _RUN_KEYS, _RERUN_KEYS = {"batch": "chunk"}, {"results": "former"}
 
@@ -44,7 +46,8 @@ class Manifest:
         id: name of this run, in all its shards.
         specification: SHA-256.
         inputs: SHA-256 by file, seen from the folder of the data.
-        versions: of what computes.
+        versions: of what computes; of this package also the digest of its source, since numbers
+            move between versions.
         dtype: of the computation.
         device: kind of device.
         lanes: of the whole study.
@@ -69,6 +72,17 @@ class Manifest:
     forced: list[str] = dataclasses.field(default_factory=list)
 
 
+@functools.cache
+def source_digest() -> str:
+    """SHA-256 (16 digits) of the package's Python files, wherever it is installed."""
+    root, digest = Path(jaxtrachea.__file__).parent, hashlib.sha256()
+    for path in sorted(root.rglob("*.py"), key=lambda path: path.relative_to(root).as_posix()):
+        content = path.read_bytes().replace(b"\r\n", b"\n")
+        name = path.relative_to(root).as_posix().encode()
+        digest.update(b"%d %s %d " % (len(name), name, len(content)) + content)
+    return digest.hexdigest()[:16]
+
+
 def describe(
     spec: Path, root: Path, inputs: dict[str, str], dtype: str, device: str, **sizes
 ) -> Manifest:
@@ -86,7 +100,8 @@ def describe(
         id=uuid.uuid4().hex,
         specification=hashlib.sha256(spec.read_bytes()).hexdigest(),
         inputs={os.path.relpath(name, root): digest for name, digest in inputs.items()},
-        versions={"jaxtrachea": jaxtrachea.__version__} | {p: installed(p) for p in _PACKAGES},
+        versions={"jaxtrachea": jaxtrachea.__version__, _SOURCE: source_digest()}
+        | {p: installed(p) for p in _PACKAGES},
         dtype=dtype,
         device=device,
         **sizes,
@@ -106,7 +121,7 @@ def differences(was: Manifest, now: Manifest) -> Iterator[str]:
             yield f"{name} has changed"
     for name, new in now.versions.items():
         if (old := was.versions.get(name)) != new:
-            yield f"{name} was {old} and is {new}"
+            yield f"{name} was {old or 'not recorded'} and is {new}"
     for name in ("dtype", "device", "lanes"):
         if (old := getattr(was, name)) != (new := getattr(now, name)):
             more = [f"--{option}" for option in now.options if option not in was.options]

@@ -1,5 +1,8 @@
 """Rows that are refused, and the status of every row."""
 
+import functools
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -46,7 +49,9 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
 
     A row that does not press needs nothing of the plan, the rings and the tube: off the plan or
     behind the ends of the rings it is computed as no motion, on the midline; off the tube at its
-    end. (What presses there is NaN by then.)
+    end. Refused rows of a line of joints are computed as no motion, too, and their results hidden
+    (`hide`): by 0 times NaN they would reach the derivatives of other rows by the geometry. With
+    friction they are NaN, since what follows goes on from them; deforming cross-sections see to it.
     """
     presses = path if made is None else made.presses
     assert presses is not None
@@ -73,11 +78,31 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
         number = number + (presses.s[0] + phi[0])  # the place that all rows press
     refused[PressStatus.NON_FINITE] = jnp.isnan(number)
     refused[PressStatus.BAD_MATERIAL] = jnp.broadcast_to(bad, presses.s.shape)
-    for rows in refused.values():
-        D = jnp.where(rows[:, None], jnp.nan, D)
+    hidden = functools.reduce(jnp.logical_or, refused.values())
+    D = jnp.where(hidden[:, None], jnp.nan, D)
     idle = (behind if scene.plan.second_plane else True) & ~acting
+    if at_rest(scene):
+        idle = idle | hidden
+        s, mid = (jnp.where(jnp.isnan(v), 0, v) for v in (s, mid))
     used = Presses(s, mid, jnp.where(idle[:, None], jnp.zeros_like(D), D))
     return Presses(presses.s, phi, D), used, inward, refused
+
+
+def at_rest(scene: Scene) -> bool:
+    """Whether refused rows are computed as no motion, see `refuse`."""
+    return not (scene.plan.friction or scene.plan.options.deforms_sections)
+
+
+def hide(scene: Scene, refused: dict[PressStatus, Bool[Array, "*n"]], results: Any) -> Any:
+    """The results, NaN in the rows that were refused; arrays with rows first, of any structure."""
+    if not at_rest(scene):
+        return results
+    hidden = functools.reduce(jnp.logical_or, refused.values())
+
+    def of_rows(v):
+        return jnp.where(hidden.reshape(-1, *[1] * (v.ndim - 1)), jnp.nan, v)
+
+    return jax.tree.map(of_rows, results)
 
 
 def on_the_tube(scene: Scene, s: Float[Array, "*n"], phi: Float[Array, "*n"]):

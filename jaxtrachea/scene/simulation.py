@@ -17,7 +17,7 @@ from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.deform import deform, deform_sections
 from jaxtrachea.scene.programs import cross_sections, moved_by, one_plane, vectors
 from jaxtrachea.scene.ranges import contact_share, depth_share
-from jaxtrachea.scene.refusals import refuse, status_of, without_negative_values
+from jaxtrachea.scene.refusals import hide, refuse, status_of, without_negative_values
 from jaxtrachea.scene.stage import Poses, Presses, Scene, check_kind, check_material, check_path
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
@@ -137,20 +137,22 @@ def follow(
         vertices = deform(scene, material, used, moved, path, made)
     elif plan.surface is not None:
         vertices = deform_sections(scene, used, moved, path, made)
-    share = depth_share(scene, moved.depth, moved.skeleton, inward)
     force, moment, solved = moved.force, None, moved.status
     of_joints = isinstance(material, Material)
     if made is not None and made.pull is not None and isinstance(path, Poses) and of_joints:
         force, moment = force_by_pose(scene, material, path, used, moved, made)
         lost = (solved == PressStatus.OK) & ~jnp.isfinite(jnp.sum(force + moment, axis=1))
         solved = jnp.where(lost, PressStatus.NON_FINITE, solved)
+    results = moved._replace(force=force, status=None), moment, vertices
+    moved, moment, vertices = hide(scene, refused, results)
+    share = depth_share(scene, moved.depth, moved.skeleton, inward)
     asked, ends = plan.joints, plan.ring_ends
     return Simulation(
         s=presses.s,
         phi=presses.phi,
         gap=None if made is None else made.own.gap,
         displacement=presses.displacement,
-        force=force,
+        force=moved.force,
         moment=moment,
         depth=moved.depth,
         skeleton=moved.skeleton,
