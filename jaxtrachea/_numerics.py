@@ -43,8 +43,12 @@ def product(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "...
         a: of shape (..., k), k small.
         b: of shape (k,) or (k, n).
     """
-    columns = [a[..., i] if b.ndim == 1 else a[..., i, None] for i in range(b.shape[0])]
-    return functools.reduce(jnp.add, [v * row for v, row in zip(columns, b, strict=True)])
+    columns = [a[..., i] for i in range(b.shape[0])]
+    if b.ndim == 2:
+        columns = [v[..., None] for v in columns]
+        b = b.reshape(b.shape[0], *[1] * (a.ndim - 1), b.shape[1])
+    terms = [v * row for v, row in zip(columns, b, strict=True)]
+    return functools.reduce(jnp.add, terms)
 
 
 def largest(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrachea._in_order import one_kernel
-from jaxtrachea._numerics import total
+from jaxtrachea._numerics import product
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
@@ -181,7 +181,7 @@ def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.
 def _sag(tool: Shape, pose: Poses, points):
     """Distance of the tool, just touching, from points of the rest surface, mm."""
     if tool.vertices.shape[1] == 1:
-        centre = total(pose.rotation * tool.vertices[:, 0]) + pose.translation
+        centre = product(pose.rotation, tool.vertices[:, 0]) + pose.translation
         off = points - centre[None]
         return jnp.maximum(jnp.sqrt(jnp.sum(off * off, axis=1)) - tool.radius, 0)
     point = sphere(jnp.zeros_like(tool.radius))
