@@ -104,7 +104,7 @@ FITTING = frozenset(
     sin slice sqrt square squeeze stack stop_gradient sub tan tanh transpose unstack while
     xor""".split()
 )
-#: Entries of one array up to which one thread is as good as many.
+#: Entries of one array, also between two operations, up to which one thread is as good as many.
 SMALL = 1 << 16
 
 
@@ -112,8 +112,9 @@ def fits_one_kernel(jaxpr: Jaxpr) -> bool:
     """Whether all that is computed can be in one kernel, and all arrays are small."""
     from jax.extend.core import jaxprs_in_params  # not of all versions
 
-    named = (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars)
-    shapes = [v.aval.shape for v in named]  # pyright: ignore[reportAttributeAccessIssue]
+    made = [v for eqn in jaxpr.eqns for v in eqn.outvars]
+    arrays = (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars, *made)
+    shapes = [v.aval.shape for v in arrays]  # pyright: ignore[reportAttributeAccessIssue]
     if not jaxpr.outvars or any(not 0 < math.prod(shape) <= SMALL for shape in shapes):
         return False
     return all(

@@ -271,7 +271,7 @@ def test_one_kernel_is_one(dtype):
     np.testing.assert_allclose(jax.jit(marked)(one, a), np.cbrt(a), rtol=8 * epsilon(a.dtype))
     if _in_order._one_kernel_p is not None:
         assert count_kernels(compiled(root, one, a))[0] > 60
-        assert count_kernels(compiled(marked, one, a)) == (1, 0)
+        assert count_kernels(compiled(marked, one, a), inside=False) == (1, 0)
     many = compiled(jax.vmap(marked), jnp.stack([one] * 4), jnp.stack([a] * 4))
     slope = compiled(jax.grad(lambda x: jnp.sum(one_kernel(jnp.sin)(x))), a)
     assert ONE not in many + slope

@@ -1,8 +1,7 @@
 """How many kernels a compiled program starts, counted in XLA's text of it.
 
 A kernel is an instruction that runs by itself: on a CPU each takes some time to start, whatever it
-computes. Those in a loop count once for each of its rounds; a call that is compiled as one kernel
-(`_in_order.one_kernel`) counts once, whatever is in it.
+computes. Those in a loop count once for each of its rounds.
 """
 
 import re
@@ -25,19 +24,21 @@ ONE = 'xla_cpu_small_call="true"'
 Bodies = dict[str, list[tuple[str, str]]]
 
 
-def count_kernels(text: str | None) -> tuple[int, int]:
+def count_kernels(text: str | None, *, inside: bool = True) -> tuple[int, int]:
     """Kernels that one call of a compiled program starts, and the loops in it.
 
     Of branches the longest counts.
 
     Args:
         text: `as_text()` of the compiled program.
+        inside: what would be a kernel in a part that is compiled as one (`_in_order.one_kernel`)
+            counts: a measure of the work, since it takes about as long. Else that part counts once.
 
     Raises:
         ValueError: a loop has no fixed number of rounds, so that none is known before it runs (a
             Newton solve that stops where it has converged), or it is no text of a compiled program.
     """
-    return _count(*computations(text or ""))
+    return _count(*computations(text or ""), inside)
 
 
 def computations(text: str) -> tuple[str, Bodies]:
@@ -59,13 +60,13 @@ def computations(text: str) -> tuple[str, Bodies]:
     return entry, bodies
 
 
-def _count(name: str, bodies: Bodies) -> tuple[int, int]:
+def _count(name: str, bodies: Bodies, inside: bool) -> tuple[int, int]:
     count, loops = 0, 0
     for opcode, line in bodies[name]:
-        if opcode == "call" and ONE in line:
+        if opcode == "call" and ONE in line and not inside:
             count += 1
             continue
-        inner = [_count(v, bodies) for v in _inner(opcode, line)]
+        inner = [_count(v, bodies, inside) for v in _inner(opcode, line)]
         loops += (opcode == "while") + sum(n for _, n in inner)
         kernels = [n for n, _ in inner]
         if opcode == "while":

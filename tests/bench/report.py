@@ -235,6 +235,8 @@ on the mesh, most of them in a loop of twelve rounds (counted by `tests/test_ker
 CPUs runs a computation in order where all its arrays are small (512 bytes), and else from a
 queue, which takes half as long again for so many: contact and skeleton of one pose are
 computations of their own (`jaxtrachea/_in_order.py`). 256 poses together share the kernels.
+Since the commit of this table they are one kernel each: two thirds of the time, see
+[measured.md](measured.md).
 Slow calls come to all rows, the C loop included: the core is shared.
 """
 COHORT = """\
