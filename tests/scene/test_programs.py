@@ -20,7 +20,7 @@ from jaxtrachea import (
     press_path,
     simulate,
 )
-from jaxtrachea._in_order import in_order
+from jaxtrachea._in_order import one_kernel
 from jaxtrachea.contact.patches import touch
 from jaxtrachea.contact.pose import Pose
 from jaxtrachea.mechanics.friction import Coulomb
@@ -32,7 +32,7 @@ from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.lumen import in_lumen
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.ranges import contact_share, depth_share
-from jaxtrachea.scene.refusals import refuse, status_of, without_negative_values
+from jaxtrachea.scene.refusals import hide, refuse, status_of, without_negative_values
 from jaxtrachea.scene.stage import Tool, touch_tube
 from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local, regions
@@ -46,12 +46,13 @@ def by_hand(options=Options(), more="joints loads end_U end_V", surface="", **ho
     oblique = ObliqueOptions(options, **how)
 
     def run(scene, m, p):
-        m, led, used, status = admitted(scene, m, p)
+        m, led, used, status, hidden = admitted(scene, m, p)
         at = used.s[0], used.phi[0]
         out = press_oblique(scene.geometry, m, *at, used.displacement, oblique)
-        seen = [led, out.force, out.depth, out.skeleton, *status(out)]
-        seen += [getattr(out, name) for name in more.split()]
-        return (*seen, move_surface(scene, *at, out, surface)) if surface else seen
+        vertices = move_surface(scene, *at, out, surface) if surface else ()
+        named = {name: getattr(out, name) for name in ("force", "depth", "skeleton", *more.split())}
+        named, vertices = hidden((named, vertices))
+        return led, named, vertices, status(out._replace(**named))
 
     return run
 
@@ -65,7 +66,7 @@ def admitted(scene, m, p, made=None):
         share = depth_share(scene, out.depth, out.skeleton, inward)
         return share, status_of(out.status, share, made, refused)
 
-    return m, presses.displacement, used, status
+    return m, presses.displacement, used, status, functools.partial(hide, scene, refused)
 
 
 def move_surface(scene, s, phi, out, kind):
@@ -90,7 +91,7 @@ def move_surface(scene, s, phi, out, kind):
 
 def normal(scene, m, p):
     """A normal press; its scalars as vectors, rows that are none of its kind refused."""
-    m, led, used, status = admitted(scene, m, p)
+    m, led, used, status, hidden = admitted(scene, m, p)
     inward = -used.displacement[:, 1]
     s, options = used.s[0], Options()
     unit = unit_deflection(ligament_beam(scene.geometry, m, options), s, options)
@@ -99,13 +100,14 @@ def normal(scene, m, p):
     F = -out.force  # outward is +y
     y = F, -out.depth, F * unit.w_C
     force, depth, way = (jnp.stack([jnp.zeros(3), v, jnp.zeros(3)], -1) for v in y)
+    force, depth, way = hidden((force, depth, way))
     moved = SimpleNamespace(depth=depth, skeleton=way, status=out.status)
     return led, force, depth, way, status(moved)
 
 
 def friction(scene, m, p):
     law = Coulomb(scene.friction)
-    m, led, used, status = admitted(scene, m, p)
+    m, led, used, status, _ = admitted(scene, m, p)
     at = used.s[0], used.phi[0]
     out = press_path(scene.geometry, m, *at, used.displacement, law, ObliqueOptions(rings="mat"))
     f = out.press
@@ -114,15 +116,13 @@ def friction(scene, m, p):
 
 
 def each(scene, m, p):
-    m, led, used, status = admitted(scene, m, p)
-    return led, presses_of(scene, m, used, status)
-
-
-def presses_of(scene, m, used, status):
+    m, led, used, status, hidden = admitted(scene, m, p)
     out = oblique_presses(scene, m, used)
-    return out.force, out.depth, out.skeleton, out.joints, out.loads, out.end_U, out.end_V, (
-        status(out)
-    )  # fmt: skip
+    seen = hidden({name: getattr(out, name) for name in SEEN})
+    return led, seen, status(out._replace(**seen))
+
+
+SEEN = "force", "depth", "skeleton", "joints", "loads", "end_U", "end_V"
 
 
 def oblique_presses(scene, m, used):
@@ -149,15 +149,15 @@ def tool(scene, m, p):
     presses, pull, (seen, inward) = jax.vjp(pressed, p, has_aux=True)
     inside = in_lumen(scene, p, seen)
     made = Approach(seen, presses, inward, None, None, seen, inside)
-    m, led, used, status = admitted(scene, m, None, made)
+    m, led, used, status, hidden = admitted(scene, m, None, made)
     # As `simulate` does: across the border of a computation XLA finds nothing that is there twice.
-    out = in_order(lambda used: oblique_presses(scene, m, used))(used)
+    out = one_kernel(lambda used: oblique_presses(scene, m, used))(used)
     wrench = force_and_moment(p, pull, inward, used, out)
     # A row is OK only with a force and a moment that are finite.
     finite = jnp.isfinite(jnp.sum(wrench[0] + wrench[1], axis=1))
     solved = jnp.where((out.status == 0) & ~finite, PressStatus.NON_FINITE, out.status)
-    rest = out.depth, out.skeleton, out.joints, out.loads, out.end_U, out.end_V
-    said = status(out._replace(status=solved))
+    rest, wrench = hidden(({name: getattr(out, name) for name in SEEN[1:]}, wrench))
+    said = status(out._replace(status=solved, **rest))
     return seen.gap, seen.s, seen.phi, led, wrench, rest, said, contact_share(scene, seen)
 
 
@@ -264,7 +264,7 @@ def test_refusals_cost_no_more_than_counted_on_paper():
     """The programs by hand share them with `simulate`: these counts see what is added there."""
 
     def refusals(scene, m, p):
-        *_, used, status = admitted(scene, m, p)
+        _, _, used, status, _ = admitted(scene, m, p)
         moved = SimpleNamespace(depth=p.displacement, skeleton=p.displacement)
         moved.status = jnp.zeros(len(p.s), jnp.int8)
         return used, status(moved)
