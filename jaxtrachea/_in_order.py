@@ -9,9 +9,13 @@ Starting a kernel takes as long as some hundred operations. What XLA makes of it
 can be asked for: the whole part in one function, with loops and branches, `one_kernel`. That is for
 parts whose arrays are small: one thread works through them, and a product of matrices must be
 written as a sum (`_numerics.product`), since a kernel calls no library.
+
+With the environment variable `JAXTRACHEA_ONE_KERNEL` set to 0 there are no single kernels: for
+programs that are exported to another version of jaxlib, or should a compiler refuse one.
 """
 
 import math
+import os
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -25,7 +29,8 @@ Out = TypeVar("Out")
 #: Names of the operations that mark a call: no work, and what they give is the first operand.
 MARKS = "not_inlined", "one_kernel", "hidden"
 #: Versions of jaxlib whose compiler was seen to do `one_kernel` right (tests/test_in_order.py). A
-#: compiler that cannot put a part into one kernel ends the process: others do as for `in_order`.
+#: compiler that cannot put a part into one kernel refuses the program or ends the process: with
+#: others it is as `in_order`.
 TESTED = ("0.10.2",)
 
 
@@ -57,8 +62,8 @@ def one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
     """The same function, compiled into a single kernel where `in_order` would mark it.
 
     Not where it is differentiated, nor where it does what `FITTING` lacks (products of matrices,
-    linear algebra, sorting with `top_k`, `.at[]`) or has arrays that are not `SMALL`: that is
-    compiled as `in_order`.
+    linear algebra, sorting with `top_k`, `.at[]`), reduces more than `REDUCED` entries, or has
+    arrays that are not `SMALL` or not of numbers: that is compiled as `in_order`.
 
     Args:
         part: as that of `in_order`.
@@ -106,22 +111,37 @@ FITTING = frozenset(
 )
 #: Entries of one array, also between two operations, up to which one thread is as good as many.
 SMALL = 1 << 16
+#: Entries of which a sum, a maximum ... may be taken. The compiler gives those of 4,096 and more to
+#: a library, also by rows, and then refuses the kernel they are in.
+REDUCED = 2048
 
 
 def fits_one_kernel(jaxpr: Jaxpr) -> bool:
     """Whether all that is computed can be in one kernel, and all arrays are small."""
     from jax.extend.core import jaxprs_in_params  # not of all versions
 
-    made = [v for eqn in jaxpr.eqns for v in eqn.outvars]
-    arrays = (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars, *made)
-    shapes = [v.aval.shape for v in arrays]  # pyright: ignore[reportAttributeAccessIssue]
-    if not jaxpr.outvars or any(not 0 < math.prod(shape) <= SMALL for shape in shapes):
+    results = [v for eqn in jaxpr.eqns for v in eqn.outvars]
+    arrays = (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars, *results)
+    if not jaxpr.outvars or not all(_entries(v) <= SMALL for v in arrays):
         return False
     return all(
         eqn.primitive.name in FITTING
+        and (not _reduces(eqn) or all(_entries(v) <= REDUCED for v in eqn.invars))
         and all(fits_one_kernel(sub) for sub in jaxprs_in_params(eqn.params))
         for eqn in jaxpr.eqns
     )
+
+
+def _reduces(eqn) -> bool:
+    return eqn.primitive.name.startswith(("reduce_", "arg"))
+
+
+def _entries(variable) -> float:
+    """How many numbers an array has; infinite where it has none, or is of something else."""
+    shape, dtype = variable.aval.shape, variable.aval.dtype
+    kinds = jnp.bool_, jnp.integer, jnp.floating
+    numbers = any(jnp.issubdtype(dtype, kind) for kind in kinds)
+    return float(math.prod(shape)) if numbers and math.prod(shape) else math.inf
 
 
 def _mark(name: str, lowering: Callable, differentiated: Callable | None = None) -> Any:
@@ -161,9 +181,13 @@ def _mark(name: str, lowering: Callable, differentiated: Callable | None = None)
         )
         batching.primitive_batchers[primitive] = lanes
         lowered = mlir.lower_fun(lowering, multiple_results=False)
+
+        def lower(context, x, *inputs):
+            on_cpu = tuple(context.module_context.platforms) == ("cpu",)
+            return lowered(context, x, *inputs) if on_cpu else [x]
+
         # Not cacheable: a function of its own would not see where its argument comes from.
-        mlir.register_lowering(primitive, lowered, platform="cpu", cacheable=False)
-        mlir.register_lowering(primitive, lambda _, x, *inputs: [x])
+        mlir.register_lowering(primitive, lower, cacheable=False)
     except (ImportError, AttributeError, TypeError):
         return None
     return primitive
@@ -181,16 +205,17 @@ def _told(**metadata: str) -> Callable:
 
 
 def _all_read(x, *rest):
+    """x, once the rest is computed too."""
     return jax.lax.optimization_barrier((x, *rest))[0]
 
 
 _not_inlined_p = _mark(MARKS[0], _told(inlineable="false"))
 _one_kernel_p = _hidden_p = None
-if jaxlib.version.__version__ in TESTED:
-    told = _told(inlineable="false", xla_cpu_small_call="true")
+if jaxlib.version.__version__ in TESTED and os.environ.get("JAXTRACHEA_ONE_KERNEL") != "0":
+    _small_call = _told(inlineable="false", xla_cpu_small_call="true")
     _one_kernel_p = _mark(
         MARKS[1],
-        lambda x, read, *_: _all_read(told(x), told(read)),
+        lambda x, read, *_: _all_read(_small_call(x), _small_call(read)),
         lambda x, _, *inputs: _not_inlined_p.bind(x, *inputs),
     )
     _hidden_p = _mark(MARKS[2], lambda x, *_: jax.lax.optimization_barrier(x), lambda x, *_: x)

@@ -33,7 +33,7 @@ def total(x: Num[Array, "*rows n"]) -> Num[Array, "*rows"]:
     return _reduced(jnp.sum, jnp.add, x, 0)
 
 
-def product(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
+def product(a: Float[Array, "*rows k"], b: Float[Array, "k ..."]) -> Float[Array, "..."]:
     """The product of small matrices (or of a matrix and a vector), written out.
 
     XLA for CPUs calls a library for `a @ b`: that takes longer than these few operations, and what
@@ -42,7 +42,12 @@ def product(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "...
     Args:
         a: of shape (..., k), k small.
         b: of shape (k,) or (k, n).
+
+    Raises:
+        ValueError: the two differ in k.
     """
+    if a.shape[-1] != b.shape[0]:
+        raise ValueError(f"expected {a.shape[-1]} rows in b, found {b.shape[0]}")
     columns = [a[..., i] for i in range(b.shape[0])]
     if b.ndim == 2:
         columns = [v[..., None] for v in columns]

@@ -49,7 +49,7 @@ def test_it_is_press(bound, s, changes, status):
         for name, a, b in zip(known._fields, found, known, strict=True):
             assert (a.shape, a.dtype) == (b.shape, b.dtype)
             scale = np.abs(b)
-            if b.ndim > 1:  # far joints are sums that cancel: exact to the row's largest entry
+            if b.ndim > 1:  # of rings: far ones are sums that cancel, exact to the row's largest
                 scale = np.max(scale, axis=-1, keepdims=True)
             a, b = (v / np.where(scale > 0, scale, 1) for v in (a, b))
             np.testing.assert_allclose(a, b, rtol=0, atol=100 * np.finfo(dtype).eps, err_msg=name)

@@ -4,6 +4,8 @@ The outside truth is the function without the mark, and for one case the derivat
 the mark does is read in the compiled program: one pose calls the part, several lanes do not.
 """
 
+import os
+import subprocess
 import sys
 from typing import NamedTuple
 
@@ -331,3 +333,51 @@ def test_another_compiler_runs_it_in_order(monkeypatch):
     text = compiled(marked, x, y)
     assert NOT_INLINED in text
     assert ONE not in text
+
+
+def test_without_single_kernels():
+    """The switch in the environment, read when the package is imported."""
+    program = "from jaxtrachea import _in_order as m; assert m._one_kernel_p is None"
+    environment = os.environ | {"JAXTRACHEA_ONE_KERNEL": "0"}
+    subprocess.run([sys.executable, "-c", program], env=environment, check=True)
+
+
+REDUCTIONS = {
+    "sum": jnp.sum,
+    "largest of columns": lambda x: jnp.max(x.reshape(8, -1), axis=0),
+    "sum of rows": lambda x: jnp.sum(x.reshape(-1, 8), axis=1),
+    "place": jnp.argmax,
+    "in a loop": lambda x: jax.lax.fori_loop(0, 3, lambda _, v: v + jnp.min(x), jnp.sin(x[0])),
+}
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("entries", [2048, 4096])
+@pytest.mark.parametrize("what", list(REDUCTIONS))
+def test_reductions_of_many_entries(what, entries, dtype):
+    """The compiler refuses those of 4,096 entries and more in a kernel."""
+    part = REDUCTIONS[what]
+    x = jnp.asarray(np.random.default_rng(3).uniform(0, 1, entries), dtype)
+    marked = one_kernel(part)
+    np.testing.assert_allclose(jax.jit(marked)(x), part(x), rtol=1e2 * epsilon(x.dtype))
+    if _in_order._one_kernel_p is not None:
+        assert (ONE in compiled(marked, x)) == (entries == 2048)
+
+
+def test_what_is_not_numbers_is_not_in_one_kernel():
+    """Keys of random numbers, and complex ones."""
+    x, key = numbers("float64")[0], jax.random.key(3)
+    for extra in (key, jnp.asarray(1 + 2j)):
+        marked = one_kernel(lambda x, extra: (jnp.sin(x), extra))
+        np.testing.assert_allclose(jax.jit(marked)(x, extra)[0], np.sin(x), rtol=1e-14)
+        assert ONE not in compiled(marked, x, extra)
+
+
+@pytest.mark.parametrize("mark", [in_order, one_kernel])
+def test_programs_for_several_devices_have_no_marks(mark):
+    """One text for all of them; for another device alone too."""
+    x, y = numbers("float64")
+    for devices in (("cpu", "cuda"), ("cuda",)):
+        text = jax.export.export(jax.jit(mark(part)), platforms=devices)(x, y).mlir_module()
+        assert "inlineable" not in text
+        assert "small_call" not in text

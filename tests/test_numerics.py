@@ -1,5 +1,6 @@
 """Guarded functions: closed forms, smoothness, derivatives at the awkward points."""
 
+import functools
 import math
 
 import jax
@@ -17,6 +18,7 @@ from jaxtrachea._numerics import (
     largest,
     newton_tolerance,
     positive_part,
+    product,
     quintic_past_fold,
     quintic_ratio,
     rising_root,
@@ -388,3 +390,28 @@ def test_first_largest(n, dtype):
     np.testing.assert_array_equal(found, x.argmax(axis=1))
     for bad in (np.full(n, np.nan), np.where(np.arange(n) == n // 2, np.nan, x[0])):
         assert 0 <= int(first_largest(jnp.asarray(bad, dtype))) < n
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(
+    "shapes", [((3, 4), (4,)), ((2, 3, 4), (4, 5)), ((4,), (4, 2)), ((4,), (4,))]
+)
+def test_product_is_that_of_matrices(shapes, dtype):
+    """Against numpy; derivatives, which are exact, by the product rule; lanes."""
+    rng = np.random.default_rng(2)
+    a, b = (jnp.asarray(rng.normal(size=shape), dtype) for shape in shapes)
+    close = functools.partial(np.testing.assert_allclose, rtol=0, atol=20 * epsilon(a.dtype))
+    close(product(a, b), np.asarray(a) @ np.asarray(b))
+    close(jax.vmap(product, (0, None))(jnp.stack([a, 2 * a]), b)[1], 2 * (a @ b))
+    value, change = jax.jit(lambda a, b: jax.jvp(product, (a, b), (b[0].sum() * a, b)))(a, b)
+    close(value, a @ b)
+    close(change, (1 + b[0].sum()) * np.asarray(a @ b))
+    back = jax.grad(lambda a: jnp.sum(product(a, b)))(a)
+    close(back, np.broadcast_to(b.reshape(4, -1).sum(1), a.shape))
+
+
+def test_product_of_unequal_sizes():
+    a = jnp.arange(12.0).reshape(3, 4)
+    for b in (jnp.ones(3), jnp.ones(5), jnp.ones((3, 2))):
+        with pytest.raises(Exception, match=r"expected 4 rows|k"):
+            product(a, b)

@@ -1,5 +1,6 @@
 """A tube as a row of patches: closed forms, surfaces, borders, derivatives, hostile input."""
 
+import dataclasses
 import functools
 from pathlib import Path
 from types import SimpleNamespace
@@ -455,3 +456,14 @@ def test_misuse_is_told():
         patches_of(surface._replace(vertices=m.vertices.at[0, 0].set(jnp.nan)), BORDERS)
     with pytest.raises(ValueError, match=r"between s = 200 and 210 mm encloses nothing: 35 vert"):
         patches_of(surface, np.r_[BORDERS, 200.0, 210.0])
+
+
+@pytest.mark.parametrize("beta", [None, 50.0])
+def test_a_patch_that_is_no_number_is_told(beta):
+    """Wherever it is: the broad phase cannot know which patch is nearest."""
+    pose = pose_from_vector(jnp.zeros(3), jnp.asarray([73.0, 15.6, 0.0]))
+    sharp = None if beta is None else jnp.asarray(beta)
+    vertices = TUBE.shapes.vertices.at[2].set(jnp.nan)
+    spoilt = dataclasses.replace(TUBE, shapes=dataclasses.replace(TUBE.shapes, vertices=vertices))
+    for tube, status in ((TUBE, ContactStatus.OK), (spoilt, ContactStatus.NON_FINITE)):
+        assert quick(touch)(sphere(5.0), pose, tube, beta=sharp).status == status

@@ -213,7 +213,10 @@ def touch(
         chosen[jnp.argmin(each.distance)],
         jnp.min(jnp.where(left, bounds, jnp.inf)),
         jax.lax.stop_gradient(jnp.log(jnp.asarray(terms, gap.dtype)) / beta),
-        jnp.where(jnp.isfinite(gap), worst, ContactStatus.NON_FINITE).astype(jnp.int8),
+        # Also of patches that are not searched: which one is nearest is then not known.
+        jnp.where(
+            jnp.all(jnp.isfinite(bounds)) & jnp.isfinite(gap), worst, ContactStatus.NON_FINITE
+        ).astype(jnp.int8),
     )
 
 

@@ -27,6 +27,7 @@ from small_scenes import (
 
 from jaxtrachea import (
     EffectOptions,
+    Geometry,
     Poses,
     Presses,
     make_scene,
@@ -302,3 +303,16 @@ def test_the_tool_touches_the_mesh_not_a_cylinder():
     gap = np.asarray(seen.gap)[2:-2]
     np.testing.assert_allclose(gap[::2], 0.2, atol=0.05)  # on the rings, every 10 mm
     np.testing.assert_allclose(gap[1::2], 0.2 + 0.6, atol=0.08)  # between them
+
+
+@pytest.mark.slow
+def test_a_long_tube_of_many_patches():
+    """35 patches of 120 corners each: more than a compiler puts into one kernel."""
+    tube = Geometry.create(360.0, list(np.linspace(10, 350, 35)))
+    at = ball([180, -1, 0], [180, -1, 0], 1, float(tube.radius) + 1.3)
+    scene = make_scene(tube, SPRINGS, at, tool=BALL, mesh=make_tube(tube))
+    out = run(scene, SPRINGS, at)
+    assert out.status.tolist() == [0]
+    np.testing.assert_allclose(out.gap, -1, atol=0.05)  # bound of the smoothing
+    alone = press(tube, SPRINGS, out.s[0], jnp.linalg.norm(out.displacement, axis=1))
+    np.testing.assert_allclose(np.linalg.norm(out.force, axis=1), alone.force, rtol=1e-9)
