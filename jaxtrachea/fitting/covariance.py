@@ -123,7 +123,8 @@ def half_widths(dof: np.ndarray, *, noise_given: bool) -> np.ndarray:
     half = np.full(len(dof), 1.959963984540054)
     if noise_given:
         return half
-    return np.where(dof > 0, stdtrit(np.maximum(dof, 1), 0.975), half)
+    different, which = np.unique(np.maximum(dof, 1), return_inverse=True)
+    return np.where(dof > 0, stdtrit(different, 0.975)[which.reshape(-1)], half)
 
 
 def _conditional_directions(values, vectors, free) -> np.ndarray:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.joint_information import unknown_count
-from jaxtrachea.fitting.lane import forces, markers
+from jaxtrachea.fitting.lane import forces, markers, peaks
 from jaxtrachea.fitting.study import Study
 
 #: Share of the largest datum that its own rounding may be: no residual counts for less.
@@ -63,8 +63,7 @@ def criteria(study: Study, info: Information, alive: Bool[np.ndarray, " lanes"])
             continue
         rows = len(counts)
         if estimated[kind]:
-            flat = [np.abs(v.data * v.precision).reshape(rows, -1) for v in parts]
-            peak = np.max(np.concatenate(flat, axis=1), axis=1, initial=0)
+            peak = peaks([v._replace(data=v.data * v.precision) for v in parts])
             peak = whole(peak, functools.partial(np.max, initial=0))
             S = np.maximum(S, np.maximum(n, 1) * (ROUNDING * peak) ** 2)
             with np.errstate(divide="ignore", invalid="ignore"):

@@ -112,8 +112,7 @@ def barely_determined(study: Study) -> Bool[np.ndarray, " lanes"]:
     With as many equations as unknowns other skeletons may have the same compliances exactly, with
     one more nearly the same, each a sharp minimum of its own.
     """
-    beam = [[p.name in SKELETON for p, _, _ in u] for u in study.unknowns]
-    count = np.array([sum(row) for row in beam])
+    count = np.sum(study.of_unknowns(lambda p: p.name in SKELETON, False), axis=1)
     marked = study.lanes.joint_precision
     seen = np.zeros(len(count), bool) if marked is None else (marked > 0).any(axis=(1, 2, 3))
     return (positions(study) <= count + 1) & (count > 1) & ~seen

@@ -113,6 +113,17 @@ def _present(lane: Lane, kinds) -> list[Observed]:
     return out
 
 
+def peaks(kinds: list[Observed]) -> Float[np.ndarray, " lanes"]:
+    """Largest size of an observation of these kinds, N or mm, of every lane; numpy.
+
+    0 without observations; NaN where one is NaN.
+    """
+    flat = [kind.data.reshape(len(kind.data), -1) for kind in kinds]
+    # Not of the absolute values: these would be another array of all observations.
+    ends = [(v.max(axis=1, initial=0), -v.min(axis=1, initial=0)) for v in flat]
+    return np.max(ends, axis=(0, 1))
+
+
 def force_entries(lane: Lane) -> int:
     """Entries of the residual of a trial that are forces (static); they come first."""
     return lane.force.shape[-1] * len(forces(lane))

@@ -22,8 +22,10 @@ def natural_sizes(result: FitResult) -> Float[np.ndarray, "L P"]:
     sizes = {"onset": depth, "force_offset": force}
     law = [p.name for p in result.study.free if coefficient(p.name)]
     sizes |= {name: force / depth ** power(name) for name in law if power(name) > 1}
-    for lane, unknowns in enumerate(result.study.unknowns):
-        for i, (p, _, _) in enumerate(unknowns):
-            if p.scale == "linear" and p.name in sizes:
-                out[lane, i] = max(out[lane, i], sizes[p.name][lane] / p.step)
+    for column, p in enumerate(result.study.free):
+        if p.scale == "linear" and p.name in sizes:
+            lane, unknown = np.nonzero(result.study.unknown_columns == column)
+            own = sizes[p.name][lane] / p.step
+            before = out[lane, unknown]
+            out[lane, unknown] = np.where(own > before, own, before)  # NaN takes no place
     return out

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxtrachea.fitting.information import Information
-from jaxtrachea.fitting.lane import forces, markers
+from jaxtrachea.fitting.lane import forces, markers, peaks
 from jaxtrachea.fitting.study import Study
 
 
@@ -22,8 +22,7 @@ def first_sigma(study: Study) -> np.ndarray:
     lanes = study.lanes
 
     def peak(kinds):
-        each = [np.abs(v.data).reshape(len(v.data), -1) for v in kinds]
-        of_lane = np.maximum(np.concatenate(each, axis=1).max(axis=1), 1e-300)
+        of_lane = np.maximum(peaks(kinds), 1e-300)
         if not study.joint:
             return of_lane
         return np.full(len(of_lane), np.max(np.nan_to_num(of_lane, nan=1e-300)))

@@ -48,11 +48,10 @@ def relative_change(
 
     With scale `log` 1; for an onset or an offset the size of the press; else the value itself.
     """
-    rows = [[p.scale == "log" for p, _, _ in unknowns] for unknowns in study.unknowns]
-    log = np.array([row + [False] * (study.size - len(row)) for row in rows], bool)
+    log = study.of_unknowns(lambda p: p.scale == "log", False)
     size = sizes_of_press(study)
     linear = np.where(np.isnan(size), np.maximum(np.abs(theta), 1e-3), size)
-    return np.where(log.reshape(theta.shape), 1.0, linear)
+    return np.where(log, 1.0, linear)
 
 
 def around_touch(study: Study, guess, low, high, decades: float):

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.fitting.press_scale import around_touch
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
@@ -39,24 +38,15 @@ def box(study: Study, decades: float) -> Box:
         decades: half the width of the box (scale `linear`: times 10 steps; onset and offset: times
             a tenth of the press, around the change point of the curve).
     """
-    guess = of_unknowns(study, lambda p: p.to_scaled(p.value), 0.0)
+    guess = study.of_unknowns(lambda p: p.to_scaled(p.value), 0.0)
 
     def decade(p):
         return np.log(10) if p.scale == "log" else 10.0
 
-    reach = decades * of_unknowns(study, decade, 0.0)
+    reach = decades * study.of_unknowns(decade, 0.0)
     low = np.maximum(study.lanes.lower, guess - reach)
     high = np.minimum(study.lanes.upper, guess + reach)
     return Box(*around_touch(study, guess, low, high, decades))
-
-
-def of_unknowns(study: Study, number: Callable[[Parameter], float], padding: float):
-    """A number of each unknown's parameter, `padding` where a lane has fewer; (lanes, P)."""
-    known = {p.name: float(number(p)) for p in study.free}
-    rows = np.full(study.lanes.lower.shape, padding)
-    for row, unknowns in zip(rows, study.unknowns, strict=True):
-        row[: len(unknowns)] = [known[p.name] for p, _, _ in unknowns]
-    return rows
 
 
 def draw_starts(study: Study, settings) -> np.ndarray:
@@ -177,5 +167,5 @@ def _number(name: tuple[str, str]) -> int:
 
 def scales(study: Study) -> tuple[np.ndarray, np.ndarray]:
     """Which unknowns have a logarithmic scale, and the step of the others; (lanes, P) each."""
-    log = of_unknowns(study, lambda p: p.scale == "log", 0.0) > 0
-    return log, of_unknowns(study, lambda p: p.step, 1.0)
+    log = study.of_unknowns(lambda p: p.scale == "log", False)
+    return log, study.of_unknowns(lambda p: p.step, 1.0)

@@ -368,10 +368,7 @@ def _points(study: Study) -> Float[np.ndarray, "lanes points P"]:
 
 def _log(study: Study) -> Bool[np.ndarray, "lanes P"]:
     """Which unknowns have a logarithmic scale."""
-    size = study.size
-    return np.array(
-        [[p.scale == "log" for p, _, _ in u] + [True] * (size - len(u)) for u in study.unknowns]
-    )
+    return study.of_unknowns(lambda p: p.scale == "log", True)
 
 
 def _without_curves(study: Study) -> Study:

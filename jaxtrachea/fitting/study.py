@@ -8,12 +8,13 @@ compared with in `residual`.
 """
 
 import dataclasses
+import functools
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Int, Shaped
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.lane import Lane
@@ -93,10 +94,27 @@ class Study:
         """Unknowns per lane, padding included."""
         return self.lanes.lower.shape[1]
 
+    @functools.cached_property
+    def unknown_columns(self) -> Int[np.ndarray, "lanes P"]:
+        """Which of `free` every unknown is; -1 where a lane has fewer unknowns."""
+        number = {p.name: i for i, p in enumerate(self.free)}
+        out = np.full((len(self.unknowns), self.size), -1)
+        there = np.arange(self.size) < np.array([len(lane) for lane in self.unknowns])[:, None]
+        out[there] = [number[p.name] for lane in self.unknowns for p, _, _ in lane]
+        return out
+
+    def of_unknowns(
+        self, number: Callable[[Parameter], object], padding
+    ) -> Shaped[np.ndarray, "lanes P"]:
+        """A number of each unknown's parameter, `padding` where a lane has fewer; of its dtype."""
+        return np.array([*map(number, self.free), padding], type(padding))[self.unknown_columns]
+
     @property
     def shared(self) -> Int[np.ndarray, "lanes k"]:
         """Where the unknowns that all lanes of a joint study share stand in each lane."""
         names = [p.name for p in self.free if p.scope == "shared"] if self.joint else []
+        if not names:
+            return np.zeros((len(self.unknowns), 0), int)
         rows = [{p.name: i for i, (p, _, _) in enumerate(lane)} for lane in self.unknowns]
         return np.array([[row[name] for name in names] for row in rows], int).reshape(
             len(self.unknowns), len(names)

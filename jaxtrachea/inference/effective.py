@@ -22,7 +22,6 @@ from scipy.special import stdtrit
 from jaxtrachea.fitting.joint_information import held_count, unknown_count
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.result import FitResult, interval95, within_bounds
-from jaxtrachea.fitting.starts import of_unknowns
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.residuals import lag_correlation
 from jaxtrachea.status import ProfileEnd
@@ -127,8 +126,8 @@ def _drawn_out(
             unfound[:, lane, i] = [end == ProfileEnd.FAILED for end in ends or ()] or False
     # Of a side whose end was not found nothing is known but the local error.
     local = np.fmin(plain[0], result.lower), np.fmax(plain[1], result.upper)
-    log = of_unknowns(study, lambda p: p.scale == "log", 0.0) > 0
-    step = of_unknowns(study, lambda p: p.step, 1.0)
+    log = study.of_unknowns(lambda p: p.scale == "log", False)
+    step = study.of_unknowns(lambda p: p.step, 1.0)
     sign, growth = np.array([-1.0, 1.0])[:, None, None], growth[:, None]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         ends = np.where(unfound, local, plain)

@@ -11,7 +11,6 @@ from jaxtrachea.files.atomic import hdf5_file
 from jaxtrachea.fitting.covariance import Uncertainty
 from jaxtrachea.fitting.criteria import Criteria
 from jaxtrachea.fitting.result import FitResult, judgement
-from jaxtrachea.fitting.starts import of_unknowns
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.profile import Profiles
@@ -150,8 +149,8 @@ def _same_steps(result: FitResult) -> FitResult:
     Raises:
         ValueError: they were written by a version that took other steps.
     """
-    log = of_unknowns(result.study, lambda p: p.scale == "log", 0.0) > 0
-    step = of_unknowns(result.study, lambda p: p.step, 1.0)
+    log = result.study.of_unknowns(lambda p: p.scale == "log", False)
+    step = result.study.of_unknowns(lambda p: p.step, 1.0)
     meant = np.where(log, np.exp(np.where(log, result.theta, 0.0)), result.theta * step)
     known = np.isfinite(meant) & np.isfinite(result.value) & (result.study.lanes.active > 0)
     known &= result.succeeded[:, None]
