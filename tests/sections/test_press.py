@@ -14,6 +14,9 @@ from jaxtrachea.mechanics.sections import system
 from jaxtrachea.mechanics.sections.contact import place_on
 from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
 from jaxtrachea.mechanics.sections.press import build, press_sections
+from jaxtrachea.mechanics.sections.solve import _flat as flat
+from jaxtrachea.mechanics.sections.solve import _newton as newton_step
+from jaxtrachea.mechanics.sections.solve import _size as size_of_step
 from jaxtrachea.mechanics.sections.solve import solve_path
 from jaxtrachea.mechanics.sections.span import Wall, make_forms, make_span
 from jaxtrachea.status import PressStatus
@@ -307,6 +310,34 @@ def test_spans_at_the_clamps_have_their_share_of_the_softening():
     plain = SectionMaterial(**{k: v for k, v in VALUES.items() if k != "c_end"})
     np.testing.assert_allclose(build(geometry, plain, *place, midline=True).spans.c_W, 0.68)
     assert from_wall(geometry).c_end == 0
+
+
+@pytest.mark.slow
+def test_accepted_states_are_equilibria():
+    """Three more of Newton's steps move no mode: walls soft and stiff, paths fine and coarse."""
+    geometry = Geometry.create(LENGTH, RINGS, radius=RADIUS)
+
+    @jax.jit
+    @jax.vmap
+    def moved(values, path):
+        place = tuple(jnp.asarray(v) for v in (34.0, 0.4, [1.0, 0.3]))
+        parts = build(geometry, SectionMaterial(**values), *place, midline=False)
+        found = solve_path(parts, path)
+
+        def further(state, displacement):
+            z = begin = flat(state)
+            for _ in range(3):
+                z = z - newton_step(z, displacement, parts)[0]
+            return size_of_step(z - begin, parts)
+
+        return found.solved, jax.vmap(further)(found.state, path)
+
+    changes = [{}, {"EI_C": 2.4e3}, {"D_L": 3.5e2}, {"Gt_L": 0.2}, {}, {}]
+    paths = np.array([np.linspace(0.75, 6, 8)] * 4 + [np.linspace(0.1, 0.8, 8), -PATH[:8] / 2])
+    values = {k: jnp.asarray([(VALUES | v)[k] for v in changes]) for k in VALUES}
+    solved, change = moved(values, jnp.asarray(paths))
+    assert solved.all()
+    assert np.max(change / np.abs(paths)) <= 1e-12
 
 
 def test_refusals():

@@ -19,6 +19,8 @@ from jaxtrachea.mechanics.sections.system import State, System
 
 #: Longest substep over the radius, Newton steps of one substep, halvings, and steps in all.
 REACH, STEPS, HALVINGS, IN_ALL = 0.15, 10, 10, 2000
+#: Error of a state that is accepted, over the displacement; epsilon where that is more.
+ERROR = 1e-13
 
 
 class Solved(NamedTuple):
@@ -45,6 +47,8 @@ class _Way(NamedTuple):
             BEFORE, SLOPE, SLOPE_BEFORE.
         z: under correction for the displacement TRIED, flat.
         places: AT and AT_BEFORE of the two states, TRIED, and REACH: the substep allowed; mm.
+        converging: size of the last Newton step of this substep, mm, and the curvature: the size of
+            a step over the square of the one before, 1/mm, when last seen; infinite before.
         steps: of Newton's method, of this substep and of all.
         lost: given up.
         stable: no state so far that is no minimum of the energy.
@@ -53,6 +57,7 @@ class _Way(NamedTuple):
     known: Float[Array, "4 n"]
     z: Float[Array, " n"]
     places: Float[Array, "4"]
+    converging: Float[Array, "2"]
     steps: Int[Array, "2"]
     lost: Bool[Array, ""]
     stable: Bool[Array, ""]
@@ -111,6 +116,22 @@ def _newton(z, displacement, system: System):
     return step, slope, _system.excess_negative(tangent) == 0
 
 
+def _converging(size, scale, way: _Way):
+    """Whether a Newton step of this size was the last that is needed, and `converging` after it.
+
+    The next one would be about the square of it times the curvature: if that is negligible, it need
+    not be made.
+    """
+    last, curvature = way.converging
+    eps = epsilon(size.dtype)
+    # A step of the size of rounding says nothing about the curvature.
+    seen = (way.steps[0] > 0) & (size > 1e3 * eps * scale)
+    curvature = jnp.where(seen, size / last**2, curvature)
+    settled = size <= eps**0.5 * scale
+    settled |= curvature * size**2 <= max(eps, ERROR) * scale
+    return settled, jnp.stack([size, curvature])
+
+
 def _advance(way: _Way, target, system: System) -> _Way:
     """One Newton step, and what follows from it."""
     longest = REACH * system.shape.radius
@@ -120,13 +141,14 @@ def _advance(way: _Way, target, system: System) -> _Way:
     size = _size(step, system)
     finite = jnp.isfinite(jnp.max(jnp.abs(z)))
     scale = jnp.maximum(jnp.abs(tried), jnp.abs(tried - at))
-    settled = finite & (size <= epsilon(size.dtype) ** 0.5 * scale)
+    settled, converging = _converging(size, scale, way)
+    settled &= finite
     count, total = way.steps + 1
     failed = ~finite | (size > 3 * system.shape.radius) | ((count >= STEPS) & ~settled)
     # The first step of all is from rest, whose derivative nothing else tells.
     at_rest = (at == before) & (way.steps[0] == 0)
     known = jnp.where(at_rest, way.known.at[SLOPE].set(slope), way.known)
-    on = way._replace(known=known, z=z, steps=way.steps + 1)
+    on = way._replace(known=known, z=z, converging=converging, steps=way.steps + 1)
     # Settled: slope and stability are those before the last step, which was small.
     quick = jnp.minimum(jnp.where(count <= 5, 2 * reach, reach), longest)
     grown = jnp.stack([z, known[THERE], slope, known[SLOPE]])
@@ -141,6 +163,7 @@ def _advance(way: _Way, target, system: System) -> _Way:
         known=known,
         z=z,
         places=places,
+        converging=converging,
         steps=jnp.stack([jnp.zeros_like(total), total]),
         lost=given_up,
         stable=way.stable & (minimum | ~settled),
@@ -158,6 +181,7 @@ def _follow(system: System, displacement) -> Solved:
         known=jnp.zeros((4, rest.size), rest.dtype),
         z=rest,
         places=jnp.stack([none, none, none, reach]),
+        converging=jnp.stack([none, none + jnp.inf]),
         steps=jnp.zeros(2, jnp.int32),
         lost=no,
         stable=~no,
@@ -167,7 +191,7 @@ def _follow(system: System, displacement) -> Solved:
         # No displacement is the state of rest, and that exactly.
         way = _choose(target == 0, begin._replace(stable=way.stable), way)
         z, places = _predict(way.known, way.places.at[REACH_NOW].set(reach), target)
-        way = _Way(way.known, z, places, jnp.zeros_like(way.steps), no, way.stable)
+        way = way._replace(z=z, places=places, steps=jnp.zeros_like(way.steps), lost=no)
 
         def goes(way):
             return (way.places[AT] != target) & ~way.lost
