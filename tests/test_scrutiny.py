@@ -284,7 +284,7 @@ def joint_study(seed, shared, count, share):
 @pytest.mark.parametrize(
     ("seeds", "shared", "count"),
     [
-        ((2,), ("EI_L",), 2),
+        ((1,), ("EI_L",), 2),
         pytest.param(range(12), ("EI_L",), 2, marks=pytest.mark.slow),
         pytest.param(range(12), ("EI_L",), 1, marks=pytest.mark.slow),
         pytest.param(range(12), ("k_1", "k_3"), 2, marks=pytest.mark.slow),
