@@ -111,9 +111,9 @@ FITTING = frozenset(
 )
 #: Entries of one array, also between two operations, up to which one thread is as good as many.
 SMALL = 1 << 16
-#: Entries of which a sum, a maximum ... may be taken. The compiler gives those of 4,096 and more to
+#: Entries of which a sum, a maximum ... may be taken. The compiler gives those of 4,096 or more to
 #: a library, also by rows, and then refuses the kernel they are in.
-REDUCED = 2048
+REDUCED = 4000
 
 
 def fits_one_kernel(jaxpr: Jaxpr) -> bool:

@@ -285,7 +285,8 @@ def _size(tool: Shape, patches: Patches):
     tool, shapes = jax.lax.stop_gradient((tool, patches.shapes))
 
     def reach(v):
-        return jnp.sqrt(largest(total(((v - middle(v)[:, None]) ** 2).T)))
+        # Axis by axis: sums of fewer entries, which may be in one kernel.
+        return jnp.sqrt(largest(sum((row - total(row) / row.shape[0]) ** 2 for row in v)))
 
     return (
         reach(tool.vertices)
