@@ -286,7 +286,8 @@ def _size(tool: Shape, patches: Patches):
 
     def reach(v):
         # Axis by axis: sums of fewer entries, which may be in one kernel.
-        return jnp.sqrt(largest(sum((row - total(row) / row.shape[0]) ** 2 for row in v)))
+        x, y, z = ((row - total(row) / row.shape[0]) ** 2 for row in v)
+        return jnp.sqrt(largest(x + y + z))
 
     return (
         reach(tool.vertices)
