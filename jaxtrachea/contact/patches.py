@@ -203,6 +203,8 @@ def touch(
     if not search:
         deep = gap < -(tool.radius + jnp.min(shapes.radius))
         worst = jnp.where(deep, jnp.maximum(worst, ContactStatus.NOT_CONVERGED), worst)
+    # Also the patches that are not searched: else which one is nearest is not known.
+    finite = jnp.isfinite(gap) & jnp.all(jnp.isfinite(bounds))
     return Touch(
         gap,
         point,
@@ -213,10 +215,7 @@ def touch(
         chosen[jnp.argmin(each.distance)],
         jnp.min(jnp.where(left, bounds, jnp.inf)),
         jax.lax.stop_gradient(jnp.log(jnp.asarray(terms, gap.dtype)) / beta),
-        # Also of patches that are not searched: which one is nearest is then not known.
-        jnp.where(
-            jnp.all(jnp.isfinite(bounds)) & jnp.isfinite(gap), worst, ContactStatus.NON_FINITE
-        ).astype(jnp.int8),
+        jnp.where(finite, worst, ContactStatus.NON_FINITE).astype(jnp.int8),
     )
 
 
