@@ -12,8 +12,8 @@ DAY = 86_400.0
 NOW = 1.9e9
 
 
-def program(folder, name, size, days):
-    path = folder / f"jit_{name}-{'0a' * 32}-cache"
+def program(folder, name, size, days, kind="cache"):
+    path = folder / f"jit_{name}-{'0a' * 32}-{kind}"
     path.write_bytes(b"x" * size)
     os.utime(path, (NOW - days * DAY,) * 2)
 
@@ -51,6 +51,7 @@ def test_bounds_are_looked_at_once_a_day(tmp_path):
 
 def test_other_files_are_no_programs(tmp_path):
     (tmp_path / "my-cache").write_text("notes")
+    (tmp_path / "what-was-traced").write_text("notes")
     (tmp_path / f"jit_f-{'0' * 64}-cache").mkdir()
     assert list(kept.programs(tmp_path)) == []
 
@@ -67,13 +68,13 @@ def test_command(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(command, "programs_folder", lambda: tmp_path)
     program(tmp_path, "a", 2**20, 1)
-    program(tmp_path, "b", 2**19, 1)
+    program(tmp_path, "b", 2**19, 1, "traced")
     code, out, err = run(monkeypatch, capsys, "cache")
     assert (code, err) == (0, "")
-    assert f"2 programs, 1.5 MiB, in {tmp_path}" in out
+    assert f"1 compiled programs and 1 traces, 1.5 MiB, in {tmp_path}" in out
     code, out, _ = run(monkeypatch, capsys, "cache", "--clear")
     assert code == 0
-    assert f"2 of 2 programs deleted from {tmp_path}" in out
+    assert f"2 of 2 programs and traces deleted from {tmp_path}" in out
     assert names(tmp_path) == []
     monkeypatch.undo()
     assert not jax.config.values["jax_enable_compilation_cache"]  # in all tests

@@ -14,7 +14,8 @@ PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 ORDER = [
     {"_errors"},
     {"units", "status", "_numerics", "_arguments", "_packed", "_in_order"},
-    {"files", "optimisation"},
+    {"files"},
+    {"optimisation"},
     {"config"},
     {"trachea"},
     {"contact"},

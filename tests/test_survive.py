@@ -35,6 +35,7 @@ from jaxtrachea.cli.terminal import set_up_jax
 from jaxtrachea.config import load_fit_spec
 from jaxtrachea.files import lock as run_lock
 from jaxtrachea.files import output
+from jaxtrachea.files.provenance import source_digest
 from jaxtrachea.fitting import fit
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.measurements.data_files import read_data
@@ -230,9 +231,9 @@ def test_the_digest_of_the_source_follows_every_file(tmp_path, monkeypatch):
         if change is not None:
             change()
         monkeypatch.setattr(jaxtrachea, "__file__", str(tmp_path / "__init__.py"))
-        return manifest.source_digest.__wrapped__()
+        return source_digest.__wrapped__()
 
-    as_it_is = manifest.source_digest()
+    as_it_is = source_digest()
     assert digest() == as_it_is
     law = tmp_path / "mechanics" / "force_law.py"
     assert digest(lambda: law.write_text(law.read_text().replace("1", "2", 1))) != as_it_is

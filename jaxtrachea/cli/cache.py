@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from jaxtrachea.cli.terminal import Stop, cache_folder, programs_folder
-from jaxtrachea.files.programs import MOST_BYTES, MOST_DAYS, TIME_MODEL, delete, programs
+from jaxtrachea.files.programs import MOST_BYTES, MOST_DAYS, TIME_MODEL, TRACED, delete, programs
 
 ClearOption = Annotated[bool, typer.Option("--clear", help="Delete all that is kept.")]
 
@@ -24,12 +24,14 @@ def cache(clear: ClearOption = False) -> None:
     kept = list(programs(folder))
     if clear:
         gone = sum(delete(program) for program in kept)
-        text = f"{gone} of {len(kept)} programs deleted from {folder}"
+        text = f"{gone} of {len(kept)} programs and traces deleted from {folder}"
         if os.path.lexists(folder / TIME_MODEL):
             text += f"\n{_cleared(folder / TIME_MODEL)}"
     else:
         size = sum(program.size for program in kept) / 2**20
-        text = f"{len(kept)} programs, {size:.1f} MiB, in {folder}"
+        traced = sum(program.path.name.endswith(TRACED) for program in kept)
+        text = f"{len(kept) - traced} compiled programs and {traced} traces, {size:.1f} MiB, "
+        text += f"in {folder}"
         if folder == cache_folder():
             text += f"\nat most {MOST_BYTES // 2**20} MiB, and none unused for {MOST_DAYS:g} days"
         if os.path.lexists(folder / TIME_MODEL):

@@ -57,6 +57,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     import jax
     import numpy as np
 
+    from jaxtrachea.files.traces import Traced
     from jaxtrachea.scene.results import last_solved, write_meshes, write_simulation
     from jaxtrachea.scene.simulation import simulate as run
     from jaxtrachea.status import PressStatus
@@ -66,7 +67,7 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     staged, choice = _chosen(scene, spec, staged)
     clock.append(time.perf_counter())
     with into(out_dir, _default(scene)) as (folder, stop_if_asked):
-        out = jax.block_until_ready(jax.jit(run)(staged.scene, staged.material, staged.path))
+        out = jax.block_until_ready(Traced(run)(staged.scene, staged.material, staged.path))
         clock.append(time.perf_counter())
         stop_if_asked()
         write_meshes(folder, staged.scene, out)
@@ -96,6 +97,7 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
     import numpy as np
 
     from jaxtrachea.files.pictures import save_each
+    from jaxtrachea.files.traces import Traced
     from jaxtrachea.scene.plots import draw_sweep
     from jaxtrachea.scene.results import write_sweep
     from jaxtrachea.scene.sweep import sweep as run
@@ -110,15 +112,15 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
     points = [v.ravel() for v in np.meshgrid(s, phi, indexing="ij")]
     clock.append(time.perf_counter())
     with into(out_dir, _default(scene, "-sweep")) as (folder, stop_if_asked):
-        compute = jax.jit(run, static_argnames="chunk")
         size, parts, total = want.chunk, [], len(points[0])
+        compute = Traced(run, chunk=size)
         with progress_bar() as bar:
             task = bar.add_task("sweeping", total=total)
             for start in range(0, total, size):
                 stop_if_asked()
                 rows = [v[np.minimum(np.arange(start, start + size), total - 1)] for v in points]
                 depth = np.full(size, want.depth)
-                part = compute(swept, staged.material, *rows, depth, chunk=size)
+                part = compute(swept, staged.material, *rows, depth)
                 parts.append(jax.tree.map(lambda v, left=total - start: np.asarray(v)[:left], part))
                 bar.update(task, completed=min(start + size, total))
         out = jax.tree.map(lambda *v: np.concatenate(v), *parts)

@@ -1,4 +1,4 @@
-"""Compiled programs that are kept for the next start: which there are, and their bounds."""
+"""Programs that are kept for the next start, compiled or traced: which, and their bounds."""
 
 import contextlib
 import re
@@ -13,8 +13,10 @@ MOST_BYTES = 2**30
 MOST_DAYS = 90.0
 #: Time between two looks at the bounds, s.
 BETWEEN = 86_400.0
+#: How the names of traces end (`files.traces`); those that JAX compiled end in "-cache".
+TRACED = "-traced"
 #: Names of programs: that of the function and a digest.
-_NAME = re.compile(r".*-[0-9a-f]{64}-cache", re.DOTALL)
+_NAME = re.compile(rf".*-[0-9a-f]{{64}}(-cache|{TRACED})", re.DOTALL)
 #: File with the times of this machine (`tradeoff.time_model`).
 TIME_MODEL = "time_model.json"
 #: File whose time of change is that of the last look.
@@ -22,7 +24,7 @@ LAST_LOOK = ".trimmed"
 
 
 class Program(NamedTuple):
-    """A file with a compiled program: its size in bytes and when it was last used, s."""
+    """A file with a compiled or traced program: its size, bytes, and when it was last used, s."""
 
     path: Path
     size: int
@@ -35,7 +37,7 @@ def programs(folder: Path) -> Iterator[Program]:
     Args:
         folder: may not exist.
     """
-    for path in folder.glob("*-cache"):
+    for path in folder.glob("*-*-*"):
         if not _NAME.fullmatch(path.name) or not path.is_file():
             continue
         with contextlib.suppress(OSError):  # another process deletes it

@@ -1,11 +1,14 @@
 """What a result comes from: versions, command, digests of every input."""
 
 import datetime
+import functools
 import hashlib
 import platform
 import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+import jaxtrachea
 
 
 def installed(package: str) -> str:
@@ -14,6 +17,17 @@ def installed(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
+
+
+@functools.cache
+def source_digest() -> str:
+    """SHA-256 (16 digits) of the package's Python files, wherever it is installed."""
+    root, digest = Path(jaxtrachea.__file__).parent, hashlib.sha256()
+    for path in sorted(root.rglob("*.py"), key=lambda path: path.relative_to(root).as_posix()):
+        content = path.read_bytes().replace(b"\r\n", b"\n")
+        name = path.relative_to(root).as_posix().encode()
+        digest.update(b"%d %s %d " % (len(name), name, len(content)) + content)
+    return digest.hexdigest()[:16]
 
 
 def provenance(

@@ -11,6 +11,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxtrachea.files.traces import Traced
+
 
 @functools.lru_cache(maxsize=128)
 def program(function: Callable, *static, axes: Any = 0, donate: tuple[int, ...] = ()) -> Any:
@@ -22,8 +24,7 @@ def program(function: Callable, *static, axes: Any = 0, donate: tuple[int, ...] 
         axes: of the other arguments, as `in_axes` of `jax.vmap`; None: no `vmap`.
         donate: of the other arguments, as `donate_argnums` of `jax.jit`.
     """
-    one = functools.partial(function, *static)
-    return jax.jit(one if axes is None else jax.vmap(one, axes), donate_argnums=donate)
+    return Traced(function, *static, axes=axes, donate=donate)
 
 
 def batch_size(total: int, most: int) -> int:

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
 import hashlib
 import json
 import os
@@ -13,7 +12,7 @@ from typing import get_args, get_origin, get_type_hints
 
 import jaxtrachea
 from jaxtrachea.files.atomic import write_whole
-from jaxtrachea.files.provenance import installed
+from jaxtrachea.files.provenance import installed, source_digest
 
 SCHEMA = "jaxtrachea-run"
 SCHEMA_VERSION = 1
@@ -70,17 +69,6 @@ class Manifest:
     options: list[str]
     rerun: Rerun | None = None
     forced: list[str] = dataclasses.field(default_factory=list)
-
-
-@functools.cache
-def source_digest() -> str:
-    """SHA-256 (16 digits) of the package's Python files, wherever it is installed."""
-    root, digest = Path(jaxtrachea.__file__).parent, hashlib.sha256()
-    for path in sorted(root.rglob("*.py"), key=lambda path: path.relative_to(root).as_posix()):
-        content = path.read_bytes().replace(b"\r\n", b"\n")
-        name = path.relative_to(root).as_posix().encode()
-        digest.update(b"%d %s %d " % (len(name), name, len(content)) + content)
-    return digest.hexdigest()[:16]
 
 
 def describe(
