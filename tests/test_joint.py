@@ -136,6 +136,32 @@ def test_elimination_is_the_dense_solution():
         np.testing.assert_allclose(found, dense[np.ix_(f, f)], atol=1e-12)
 
 
+def test_an_unknown_that_is_best_at_infinity_stays_within_reach():
+    """Its column is as good as nothing, yet a Newton step along it promises a fall.
+
+    What is promised within reach is the fall of the quadratic; the shared unknown and the other
+    lane know nothing of it.
+    """
+    tiny, rng = 1e-15, np.random.default_rng(0)
+    J, residual = rng.normal(size=(2, 20, 3)), rng.normal(size=(2, 20))
+    column = J[0, :, 2] - J[0, :, :2] @ np.linalg.lstsq(J[0, :, :2], J[0, :, 2], rcond=None)[0]
+    residual[0] += column / np.linalg.norm(column)
+    J[0, :, 2] = tiny * column
+    g, H = np.einsum("lnp,ln->lp", J, residual), np.einsum("lnp,lnq->lpq", J, J)
+    shared, free = np.zeros((2, 1), int), np.ones((2, 3), bool)
+    found = schur.eliminate(g, H, shared, free, longest=20.0)
+    assert np.abs(found.step).max() <= 20 * (1 + 1e-9)
+    fall = 0.5 * np.sum(residual**2 - (residual + np.einsum("lnp,lp->ln", J, found.step)) ** 2, 1)
+    np.testing.assert_allclose(found.predicted_decrease, fall, rtol=1e-9)
+    without = schur.eliminate(g[:, :2], H[:, :2, :2], shared, free[:, :2])
+    for name in ("gradient", "hessian", "predicted_decrease"):
+        own, other = (getattr(v, name)[0] for v in (found, without))
+        np.testing.assert_allclose(own, other, rtol=1e-9, err_msg=name)
+    alone = schur.eliminate(g[1:], H[1:], shared[1:], free[1:])
+    for name in schur.Reduced._fields:
+        np.testing.assert_array_equal(getattr(found, name)[1], getattr(alone, name)[0])
+
+
 def test_the_step_of_the_trust_region():
     """Inside: Newton's. On the sphere: (H + damping) step = -g with damping >= 0."""
     H, g = np.diag([1.0, 4.0, 0.0]), np.array([3.0, 4.0, 0.0])

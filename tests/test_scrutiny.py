@@ -291,11 +291,18 @@ def joint_study(seed, shared, count, share):
     ],
 )
 def test_a_joint_fit_says_what_it_has_not_looked_at(seeds, shared, count):
-    """No wrong unknown is identifiable; with local errors alone 7 of 8, 30 of 53, 9 of 21 were."""
+    """No wrong unknown is identifiable; with local errors alone 7 of 8, 30 of 53, 9 of 21 were.
+
+    All come to rest, also where an unknown is best at infinity (seed 2 had stalled); but for one
+    that creeps along a valley for 200 iterations, and says so.
+    """
     words = []
     for seed in seeds:
         study, truth = joint_study(seed, shared, count, 0.002)
-        word, _, false = verdicts(fit(study, Settings(starts=4)), truth)
+        result = fit(study, Settings(starts=4))
+        creeps = seed == 10 and shared == ("k_1", "k_3")
+        assert creeps or np.all(result.status <= FitStatus.UNIDENTIFIABLE), seed
+        word, _, false = verdicts(result, truth)
         assert not np.any(false & (word == "identifiable")), seed
         words.append(word)
     assert np.any(np.array(words) == "not shown")

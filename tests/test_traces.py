@@ -1,7 +1,9 @@
 """Functions that are not traced anew at every start: what is kept, and what must not be."""
 
 import functools
+import hashlib
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -14,7 +16,7 @@ import numpy as np
 import pytest
 
 from jaxtrachea.files import traces
-from jaxtrachea.files.traces import Traced
+from jaxtrachea.files.traces import Traced, keep_traces
 
 ROOT = Path(__file__).parents[1]
 #: Names of the functions below each time that one is traced.
@@ -41,13 +43,36 @@ def add(state, x):
     return state + x, jnp.sin(x)
 
 
+def weak(x):
+    TRACES.append("weak")
+    return jnp.where(jnp.sum(x) > 0, 1.0, 2.0)
+
+
+def draw(key):
+    TRACES.append("draw")
+    return jax.random.uniform(key)
+
+
+def start():
+    """As a process starts: nothing is known of sources and settings."""
+    traces._sources.cache_clear()
+    traces._surroundings.cache_clear()
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder for traces, and this module taken for one whose code the digest tells."""
-    monkeypatch.setattr(traces, "_folder", lambda settings: tmp_path)
+    """A folder for traces, and this module taken for one whose code the digest tells.
+
+    Sources that were edited since pytest began do not count.
+    """
     monkeypatch.setattr(traces, "_KNOWN", traces._KNOWN | {__name__.split(".")[0]})
+    monkeypatch.setattr(traces, "_start", np.inf)
     TRACES.clear()
-    return tmp_path
+    start()
+    keep_traces(tmp_path)
+    yield tmp_path
+    keep_traces(None)
+    start()
 
 
 def pair(dtype=np.float64, size=3, power=2):
@@ -126,11 +151,14 @@ def test_what_differs_is_traced_anew(folder, change):
 
 
 def test_surroundings_that_differ_are_traced_anew(folder, monkeypatch):
+    """Settings, the package's switches, sources and versions."""
+
     def run():
+        start()
         Traced(power_sum, 3.0)(pair(), jnp.ones(3))
         return len(TRACES)
 
-    assert run() == 1
+    assert [run(), run()] == [1, 1]
     with jax.default_matmul_precision("highest"):
         assert run() == 2
     with monkeypatch.context() as patch:
@@ -138,37 +166,83 @@ def test_surroundings_that_differ_are_traced_anew(folder, monkeypatch):
         assert run() == 3
     with monkeypatch.context() as patch:
         patch.setattr(traces, "source_digest", lambda: "other sources")
-        patch.setattr(traces, "_sources", traces._sources.__wrapped__)
         assert run() == 4
-    with monkeypatch.context() as patch:
-        patch.setattr(jax, "__version__", "99.0")
-        patch.setattr(traces, "_sources", traces._sources.__wrapped__)
-        assert run() == 5
-    assert run() == 5
+    for name in ("jax", "blackjax"):
+        with monkeypatch.context() as patch:
+            patch.setattr(traces, "installed", lambda n, name=name: "99" if n == name else "1")
+            run()
+    assert len(TRACES) == 6
+    assert run() == 6
 
 
-def test_settings_that_change_meanwhile_are_seen(folder):
-    """Of one object: a `with`, and settings of the whole process."""
-    run = Traced(power_sum, 3.0)
-    run(pair(), jnp.ones(3))
-    with jax.default_matmul_precision("highest"):
-        run(pair(), jnp.ones(3))
-    assert len(TRACES) == 2
-    jax.config.update("jax_softmax_custom_jvp", True)
-    try:
-        run(pair(), jnp.ones(3))
-    finally:
-        jax.config.update("jax_softmax_custom_jvp", False)
-    assert len(TRACES) == 3
-
-
-def test_settings_for_debugging_keep_nothing(folder):
-    with jax.disable_jit():
-        out, _ = Traced(add)(np.zeros(3), np.ones(3))
-    with jax.debug_nans(True), pytest.raises(FloatingPointError):
-        Traced(add)(np.zeros(3), np.full(3, np.inf))
-    np.testing.assert_array_equal(out, np.ones(3))
+def test_sources_that_were_edited_keep_nothing(folder, monkeypatch):
+    """What a process has read is then not what lies on the disk."""
+    monkeypatch.setattr(traces, "_start", 0.0)
+    for _ in range(2):
+        assert Traced(add)(np.zeros(3), np.ones(3))[0].sum() == 3
     assert kept(folder) == []
+
+
+def test_weak_types_are_not_kept(folder):
+    """A trace would make them strong, and what they meet another dtype."""
+    for _ in range(2):
+        out = Traced(weak)(np.ones(3, np.float32))
+        assert out.weak_type
+    assert kept(folder) == []
+
+
+def test_keys_of_random_numbers(folder):
+    """As in draws from the posterior; the same numbers as without traces."""
+    keys = jax.random.split(jax.random.key(0), 3)
+    for _ in range(2):
+        np.testing.assert_array_equal(
+            Traced(draw, axes=0)(keys), [jax.random.uniform(key) for key in keys]
+        )
+    assert TRACES == ["draw"]
+
+
+DEVICES = """
+import threading, jax, numpy as np
+from jaxtrachea.files import traces
+from test_traces import add
+import pathlib, sys
+traces._KNOWN.add("test_traces")
+traces._start = float("inf")
+traces.keep_traces(pathlib.Path(sys.argv[1]))
+run, made = traces.Traced(add, donate=(0,)), traces.Traced._by_trace
+counted = []
+traces.Traced._by_trace = lambda *a: counted.append(1) or made(*a)
+def work(device, x):
+    with jax.default_device(device):
+        state = np.zeros(3)
+        for _ in range(50):
+            state, _ = run(state, x)
+        assert state.devices() == {device}, state.devices()
+        np.testing.assert_array_equal(state, 50 * x)
+threads = [threading.Thread(target=work, args=(d, np.full(3, 1.0 + i)))
+           for i, d in enumerate(jax.devices())]
+failed = []
+threading.excepthook = lambda args: failed.append(args.exc_value)
+for t in threads: t.start()
+for t in threads: t.join()
+assert not failed, failed
+print(len(jax.devices()), len(counted), len(list(pathlib.Path(sys.argv[1]).iterdir())))
+"""
+
+
+def test_threads_on_two_devices(tmp_path):
+    """As shards of a study: one trace, compiled once for each device."""
+    environment = os.environ | {
+        "XLA_FLAGS": os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2",
+        "PYTHONPATH": str(ROOT / "tests"),
+        "JAX_ENABLE_X64": "1",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", DEVICES, str(tmp_path)],
+        capture_output=True, text=True, env=environment, cwd=ROOT,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["2", "2", "1"]
 
 
 def test_code_from_elsewhere_is_not_kept(folder, monkeypatch):
@@ -197,23 +271,35 @@ def test_a_damaged_trace_is_made_anew(folder):
     for damaged in (whole[:-1], b"", whole[:200] + bytes([whole[200] ^ 1]) + whole[201:]):
         path.write_bytes(damaged)
         assert Traced(add)(np.zeros(3), np.ones(3))[0].sum() == 3
-        assert traces._read(path) is not None
+        assert traces._content(path) is not None
     assert len(TRACES) == 4
 
 
-def test_where_nothing_can_be_written(folder, monkeypatch):
+def test_a_trace_that_cannot_be_read_is_no_fault(folder):
+    """Whole, and yet of no use: it is traced as ever."""
+    Traced(add)(np.zeros(3), np.ones(3))
+    (path,) = folder.iterdir()
+    for content in (b"", b"no pickle", pickle.dumps((b"no trace", 0)), b"cno_module\nx\n."):
+        path.write_bytes(hashlib.sha256(content).digest() + content)
+        assert Traced(add)(np.zeros(3), np.ones(3))[0].sum() == 3
+
+
+def test_where_nothing_can_be_written(folder):
     (folder / "file").touch()
-    monkeypatch.setattr(traces, "_folder", lambda settings: folder / "file" / "folder")
+    keep_traces(folder / "file" / "folder")
     assert Traced(add)(np.zeros(3), np.ones(3))[0].sum() == 3
-    monkeypatch.setattr(traces, "_folder", lambda settings: folder / "new" / "folder")
+    keep_traces(folder / "new" / "folder")
     assert Traced(add)(np.zeros(3), np.ones(3))[0].sum() == 3
     assert len(kept(folder / "new" / "folder")) == 1
 
 
-def test_without_a_folder_nothing_is_kept(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize("where", [None, Path("gs://bucket/programs")])
+def test_nowhere(folder, monkeypatch, where):
+    """Neither in no folder nor in one of another machine, which JAX can write."""
+    monkeypatch.chdir(folder)
+    keep_traces(where)
     assert Traced(add)(np.zeros(3), np.ones(3))[0].sum() == 3
-    assert kept(tmp_path) == []
+    assert kept(folder) == []
 
 
 def test_members_of_a_set_are_said_in_order():
@@ -235,7 +321,7 @@ def test_a_function_that_fails_says_so(folder):
 COUNTED = """
 import sys
 from jaxtrachea.cli.main import main
-from jaxtrachea.files.traces import Traced
+from jaxtrachea.files.traces import Traced, keep_traces
 made = Traced._traced
 def count(self, *arguments):
     print("traced", self._name, file=sys.stderr)

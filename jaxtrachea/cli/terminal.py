@@ -96,7 +96,7 @@ def interrupts() -> Iterator[Callable[[], None]]:
 
 
 def set_up_jax() -> None:
-    """The command line computes in float64 and keeps compiled programs for the next start.
+    """The command line computes in float64 and keeps its programs for the next start.
 
     They lie in `cache_folder()`, within the bounds of `files.programs`, or where
     JAX_COMPILATION_CACHE_DIR says, without; JAX_ENABLE_COMPILATION_CACHE=false keeps none.
@@ -104,8 +104,11 @@ def set_up_jax() -> None:
     """
     import jax
 
+    from jaxtrachea.files.traces import keep_traces
+
     jax.config.update("jax_enable_x64", True)
     folder = programs_folder()
+    keep_traces(folder)
     if folder is not None and folder == cache_folder():
         keep_bounds(folder)
         jax.config.update("jax_compilation_cache_dir", str(folder))

@@ -1,11 +1,14 @@
-"""Compiled functions that are not traced anew at every start.
+"""Compiled functions that the next start of a command does not trace anew.
 
 JAX keeps what XLA compiles, but a process must first trace and lower a function to know what to
-look for: of a warm start that is about half the time. Here the lowered function is kept too, beside
-JAX's own files, under a digest of all that a trace depends on: the sources of this package,
-versions, JAX's settings, the function and its static arguments by value, and the arguments' shapes,
-dtypes and static fields. Where that cannot be said for certain (a class from elsewhere, a traced
-argument, several devices), the function is traced as ever.
+look for: of a warm start that is about half the time. Commands keep the lowered function too,
+beside JAX's own files, under a digest of the sources of this package, of versions, of JAX's
+settings, of the function and its static arguments by value, and of the shapes, dtypes and static
+fields of the others. Where that does not tell all (a class from elsewhere, sources that were edited
+since the start), and wherever anything goes wrong, the function is traced as ever.
+
+For commands only: a program that sets constants of a module, or JAX's settings for a while, would
+be given the traces of before.
 """
 
 import contextlib
@@ -14,38 +17,50 @@ import hashlib
 import io
 import os
 import pickle
+import platform
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import equinox
 import jax
-import jaxlib
 import numpy as np
 from jax import export
 from jax.core import Tracer
 
+import jaxtrachea
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.files.programs import TRACED
-from jaxtrachea.files.provenance import source_digest
+from jaxtrachea.files.provenance import installed, source_digest
 
-#: Packages whose code is told by the digest; what is defined elsewhere may change unseen.
-_KNOWN = {"jaxtrachea", "jax", "jaxlib", "numpy", "ml_dtypes", "equinox", "builtins", "copyreg"}
-_KNOWN |= {"functools", "collections", "enum", "operator", "pathlib", "types"}
-#: Settings of JAX that say where and how long files are kept, not what is computed.
-_OF_FILES = ("cache", "_log", "dump")
-#: Settings under which a function is to be traced, or run one operation after the other.
-_TO_DEBUG = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs")
+#: Packages with code of which a trace may be made.
+_VERSIONS = ("jax", "jaxlib", "numpy", "scipy", "ml_dtypes", "equinox", "optax", "blackjax")
+#: Packages of which static arguments may be made: those, and what Python brings.
+_KNOWN = {"jaxtrachea", "builtins", "collections", "copyreg", "enum", "functools", "operator"}
+_KNOWN |= {"pathlib", "types", *_VERSIONS}
+#: Settings of JAX that say where files are kept and what is run where, not what is computed.
+_ELSEWHERE = ("cache", "_log", "dump", "default_device")
+#: Seconds before this process began to read the package in which its sources were not edited.
+_STILL = 5.0
 #: Bytes of the digest that comes before the content of a file.
 _DIGEST = hashlib.sha256().digest_size
 
+_start = time.time()
+_folder: Path | None = None
+
+
+def keep_traces(folder: Path | None) -> None:
+    """Say where this process keeps traces from now on, beside compiled programs; None: nowhere.
+
+    Nor in what is no folder of this machine (gs://bucket), where JAX can keep its own.
+    """
+    global _folder
+    remote = folder is not None and folder.parts[:1] and folder.parts[0].endswith(":")
+    _folder = None if remote else folder
+
 
 class Traced:
-    """`jax.jit(function)`, the trace of which is kept where JAX keeps compiled programs.
-
-    With no such folder (`jax_compilation_cache_dir`), and under JAX's settings for debugging, it is
-    `jax.jit(function)`.
-    """
+    """`jax.jit(function)`; where `keep_traces` says so, its trace is kept for the next start."""
 
     def __init__(
         self,
@@ -65,74 +80,69 @@ class Traced:
             named: static arguments by name.
         """
         self._name, self._donate = function.__name__, donate
-        self._given = (function, static, named, axes, donate)
+        self._identity = (function, static, named, axes, donate)
         one = functools.partial(function, *static, **named)
         self._function = one if axes is None else jax.vmap(one, axes)
         self._plain = jax.jit(self._function, donate_argnums=donate)
-        self._known: dict[Any, Callable] = {}
-        self._settings: dict[str, Any] = {}
+        self._compiled: dict[Any, Callable] = {}
 
     def __call__(self, *arguments: Any) -> Any:
         """What the function returns."""
-        settings = jax.config.values  # here and now, in a `with` too
-        folder = _folder(settings)
-        if folder is None or any(settings[name] for name in _TO_DEBUG):
+        if _folder is None:
             return self._plain(*arguments)
-        if settings != self._settings:
-            self._known, self._settings = {}, settings
         leaves, tree = jax.tree.flatten(arguments)
-        device = settings["jax_default_device"] or jax.local_devices()[0]
+        device = jax.config.values["jax_default_device"] or jax.local_devices()[0]
         try:
             kinds = tuple(_kind(leaf, device) for leaf in leaves)
-            key = folder, device, tree, kinds
-            known = self._known.get(key)
+            key = _folder, device, tree, kinds
+            compiled = self._compiled.get(key)
         except TypeError:  # neither an array nor a number; a field without a hash
             return self._plain(*arguments)
-        if known is None:
-            said = jax.tree.unflatten(tree, kinds)
-            known = self._known[key] = self._kept(folder, arguments, said) or self._plain
-        return known(*arguments)
+        if compiled is None:
+            compiled = self._plain
+            with contextlib.suppress(Exception):  # what is wrong is said by the plain call
+                compiled = self._by_trace(_folder, arguments, kinds, device)
+            self._compiled[key] = compiled
+        return compiled(*arguments)
 
-    def _kept(self, folder: Path, arguments: tuple, kinds: Any) -> Callable | None:
+    def _by_trace(self, folder: Path, arguments: tuple, kinds: tuple, device: Any) -> Callable:
         """The function of arguments like these by a kept trace, which is made if there is none."""
         leaves, tree = jax.tree.flatten(arguments)
-        try:
-            digest = hashlib.sha256(_surroundings(self._settings))
-            digest.update(_said((self._given, kinds)))
-        except (pickle.PicklingError, TypeError, AttributeError):
-            return None
+        digest = hashlib.sha256(_surroundings(device.platform))
+        digest.update(_said((self._identity, jax.tree.unflatten(tree, kinds))))
         path = folder / f"{self._name}-{digest.hexdigest()}{TRACED}"
-        content = _read(path)
+        content = _content(path)
         if content is None:
-            content = self._traced(leaves, tree)
-            if content is None:
-                return None
+            content = self._traced(leaves, tree, device.platform)
             with contextlib.suppress(OSError):  # then the next start traces anew
                 folder.mkdir(parents=True, exist_ok=True)
                 write_whole(path, hashlib.sha256(content).digest() + content)
         trace, made = pickle.loads(content)
-        call, read = export.deserialize(bytearray(trace)).call, jax.tree.structure(made)
+        call, structure = export.deserialize(bytearray(trace)).call, jax.tree.structure(made)
         flat = self._named(lambda *leaves: call(*leaves))
         # Compiled here: what an exported function returns is bound to its device, and `jax.jit`
         # would compile it once more when given that.
         run = jax.jit(flat, donate_argnums=self._donated(arguments)).lower(*leaves).compile()
-        return lambda *arguments: jax.tree.unflatten(read, run(*jax.tree.leaves(arguments)))
+        return lambda *arguments: jax.tree.unflatten(structure, run(*jax.tree.leaves(arguments)))
 
-    def _traced(self, leaves: list, tree: Any) -> bytes | None:
-        """The trace and the structure of what it returns, in bytes; None: it cannot be kept."""
+    def _traced(self, leaves: list, tree: Any, platform: str) -> bytes:
+        """The trace and the structure of what it returns.
+
+        Raises:
+            TypeError: what it returns has weak types, which a trace does not keep.
+        """
         made = []
 
         def flat(*leaves):
-            values, read = jax.tree.flatten(self._function(*jax.tree.unflatten(tree, leaves)))
-            made[:] = [jax.tree.unflatten(read, range(len(values)))]
+            values, structure = jax.tree.flatten(self._function(*jax.tree.unflatten(tree, leaves)))
+            if any(getattr(jax.typeof(v), "weak_type", False) for v in values):
+                raise TypeError(f"{self._name} returns weak types")
+            made[:] = [jax.tree.unflatten(structure, range(len(values)))]
             return values
 
-        try:
-            trace = export.export(jax.jit(self._named(flat)))(*leaves).serialize()
-            _said(made[0])
-            return pickle.dumps((bytes(trace), made[0]), protocol=5)
-        except (ValueError, TypeError, NotImplementedError, AttributeError, pickle.PicklingError):
-            return None  # what is wrong with the function itself is said by the plain call
+        trace = export.export(jax.jit(self._named(flat)), platforms=(platform,))(*leaves)
+        _said(made[0])
+        return pickle.dumps((bytes(trace.serialize()), made[0]), protocol=5)
 
     def _named(self, flat: Callable) -> Callable:
         """The function under the name by which JAX calls its program."""
@@ -146,14 +156,8 @@ class Traced:
         return tuple(i for d in self._donate for i in range(starts[d], starts[d + 1]))
 
 
-def _folder(settings: dict[str, Any]) -> Path | None:
-    """Where JAX keeps compiled programs; None: nowhere."""
-    chosen = settings["jax_compilation_cache_dir"]
-    return Path(chosen) if chosen and settings["jax_enable_compilation_cache"] else None
-
-
 def _kind(leaf: Any, device: Any) -> tuple:
-    """All that a trace sees of an argument.
+    """Shape, dtype and whether its type is weak, of an argument.
 
     Raises:
         TypeError: not an array of that device, or no array.
@@ -161,7 +165,7 @@ def _kind(leaf: Any, device: Any) -> tuple:
     if isinstance(leaf, jax.Array):
         if isinstance(leaf, Tracer) or leaf.devices() != {device}:
             raise TypeError("a trace is kept of arrays of the device in use")
-        return leaf.shape, str(leaf.dtype), leaf.weak_type
+        return leaf.shape, str(leaf.dtype), getattr(leaf, "weak_type", False)
     if isinstance(leaf, np.ndarray | np.generic):
         return leaf.shape, str(leaf.dtype), False
     if isinstance(leaf, bool | int | float | complex):
@@ -180,16 +184,16 @@ class _Pickler(pickle.Pickler):
 
     def persistent_id(self, obj: Any) -> Any:
         """Members of a set in an order of their own: that of a set differs between processes."""
-        if isinstance(obj, set | frozenset):
+        if type(obj) in (set, frozenset):
             return type(obj).__name__, sorted(map(_said, obj))
         return None
 
 
 def _said(value: Any) -> bytes:
-    """The object in bytes, not to be read again: equal bytes, equal object.
+    """The object in bytes, not to be read again; those of an object that is equal may differ.
 
     Raises:
-        PicklingError, TypeError, AttributeError: it cannot be said.
+        PicklingError: it is made of what is defined elsewhere. Others of `pickle`.
     """
     out = io.BytesIO()
     _Pickler(out, protocol=5).dump(value)
@@ -198,23 +202,32 @@ def _said(value: Any) -> bytes:
 
 @functools.cache
 def _sources() -> str:
-    """Digest of this package's sources, and the versions of what they stand on."""
-    packages = (jax, jaxlib, np, equinox)
-    return " ".join([source_digest(), *(f"{p.__name__} {p.__version__}" for p in packages)])
+    """Digest of this package's sources, and the versions of what they stand on.
+
+    Raises:
+        RuntimeError: the sources may not be those that this process has read.
+    """
+    for path in Path(jaxtrachea.__file__).parent.rglob("*.py"):
+        found = path.stat()
+        if max(found.st_mtime, found.st_ctime) > _start - _STILL:
+            raise RuntimeError(f"{path} was edited")
+    versions = [f"{name} {installed(name)}" for name in _VERSIONS]
+    return " ".join([source_digest(), platform.python_version(), *versions])
 
 
-def _surroundings(settings: dict[str, Any]) -> bytes:
-    """What a trace depends on besides the function and its arguments."""
-    of_jax = [
+@functools.cache
+def _surroundings(platform: str) -> bytes:
+    """Sources, versions and settings, of this process; and the kind of device."""
+    settings = [
         (name, repr(value))
-        for name, value in sorted(settings.items())
-        if not any(word in name for word in _OF_FILES)
+        for name, value in sorted(jax.config.values.items())
+        if not any(word in name for word in _ELSEWHERE)
     ]
     ours = [(k, v) for k, v in sorted(os.environ.items()) if k.startswith("JAXTRACHEA_")]
-    return repr((_sources(), of_jax, ours, jax.default_backend())).encode()
+    return repr((_sources(), settings, ours, platform)).encode()
 
 
-def _read(path: Path) -> bytes | None:
+def _content(path: Path) -> bytes | None:
     """What is kept in a file; None: there is none that is whole."""
     try:
         content = path.read_bytes()

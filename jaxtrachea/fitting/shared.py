@@ -36,6 +36,9 @@ _FIRST_RADIUS = 2.0
 _NOT_MINIMISED, _LEFT = 0.01, 0.1
 #: Iterations granted after the shared unknowns have come to rest, or when the cost falls no more.
 _BUDGET = 10
+#: Longest step of a lane's own unknowns, scaled coordinates (log: a factor of 5e8), once no step
+#: lowers the cost or some lanes do not come to rest.
+_LONGEST = 20.0
 
 
 class Evaluated(NamedTuple):
@@ -156,19 +159,26 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
     here = _evaluate_or_refit(task, clip(start), None, np.ones(len(start), bool))
     alive = here.finite
     radius, status, budget, n = _FIRST_RADIUS, FitStatus.MAX_ITERATIONS, _BUDGET, 0
-    fall = np.inf
-    unconverged = np.zeros(len(alive), bool)
+    fall = longest = np.inf
+    stuck, unconverged = False, np.zeros(len(alive), bool)
     while alive.any() and n < task.tolerances.iterations:
         n += 1
         if progress is not None:
             progress(0)
-        reduced, moving, gradient, hessian = _reduce(task, here, alive)
+        reduced, moving, gradient, hessian = _reduce(task, here, alive, longest)
         step, shared = _shared_step(task, here, alive, radius, moving, gradient, hessian)
         resting, unconverged = _at_rest(task, here, alive, reduced, gradient, hessian, moving)
         budget -= resting or fall <= _floor(task, here, alive)
-        if (resting and not unconverged.any()) or budget == 0:
+        if resting and not unconverged.any():
             status = FitStatus.CONVERGED
             break
+        if stuck or budget == 0:
+            if np.isfinite(longest) or not (stuck or unconverged.any()):
+                status = FitStatus.STALLED if stuck else FitStatus.CONVERGED
+                break
+            # An unknown that is best at infinity may have promised what is not to be had.
+            radius, budget, fall, longest, stuck = _FIRST_RADIUS, _BUDGET, np.inf, _LONGEST, False
+            continue
         trial = clip(here.theta + reduced.step + reduced.sensitivity @ step)
         trial[np.arange(len(trial))[:, None], task.shared] = shared
         trial = np.where(alive[:, None], trial, here.theta)
@@ -188,9 +198,8 @@ def _descend(task: _Task, start: Float[np.ndarray, "L P"], progress) -> Solved:
         elif promised <= _rounding(task, here, alive):
             status = FitStatus.CONVERGED
             break
-        elif radius < task.tolerances.step:
-            status = FitStatus.STALLED
-            break
+        else:
+            stuck = bool(radius < task.tolerances.step)
     codes = np.where(unconverged & ~_nearly_flat(task, here), FitStatus.MAX_ITERATIONS, status)
     codes = np.where(alive, codes, FitStatus.INFEASIBLE_START)
     return Solved(here.theta, here.cost, codes, np.full(len(alive), n))
@@ -228,11 +237,11 @@ def _of_shared(task: _Task, theta, alive):
     return at(theta), Bounds(at(lanes.lower), at(lanes.upper))
 
 
-def _reduce(task: _Task, here: Evaluated, alive):
+def _reduce(task: _Task, here: Evaluated, alive, longest: float):
     """Elimination at a point: lanes reduced, which shared unknowns move, and their equations."""
     g = np.where(alive[:, None], here.gradient, 0)
     H = np.where(alive[:, None, None], here.hessian, 0)
-    reduced = eliminate(g, H, task.shared, ~_active_set(here.theta, g, task.study.lanes))
+    reduced = eliminate(g, H, task.shared, ~_active_set(here.theta, g, task.study.lanes), longest)
     gradient, hessian = reduced.gradient.sum(axis=0), reduced.hessian.sum(axis=0)
     theta, box = _of_shared(task, here.theta, alive)
     return reduced, ~_active_set(theta, gradient, box), gradient, hessian

@@ -21,7 +21,8 @@ class Reduced(NamedTuple):
     """Lanes after the elimination of their own unknowns; P unknowns each, k of them shared.
 
     Attributes:
-        step: Newton step of a lane's own unknowns where the shared ones stay; 0 for those; (L, P).
+        step: Newton step of a lane's own unknowns where the shared ones stay, damped where it
+            would be too long; 0 for the shared ones; (L, P).
         sensitivity: how all unknowns of a lane move with each shared one; (L, P, k).
         predicted_decrease: fall of each lane's cost by `step`, to second order; (L,).
         gradient: of each lane's cost by the shared unknowns, its own following; (L, k).
@@ -40,6 +41,7 @@ def eliminate(
     hessian: Float[np.ndarray, "L P P"],
     shared: Int[np.ndarray, "L k"],
     free: Bool[np.ndarray, "L P"],
+    longest: float = np.inf,
 ) -> Reduced:
     """Eliminate every lane's own unknowns; directions that change nothing do not move.
 
@@ -48,13 +50,19 @@ def eliminate(
         hessian: symmetric, not negative.
         shared: where the shared unknowns stand in each lane.
         free: unknowns that move; shared ones are not looked at.
+        longest: step of a lane's own unknowns. Where the data have the best value of one at
+            infinity, a Newton step may have any length, and brings nothing of what it promises.
     """
     select = selector(shared, hessian.shape[1])
     own = free & (select.sum(axis=2) == 0)
     inverse = pseudo_inverse(hessian, own)
     step = -np.einsum("lpq,lq->lp", inverse, gradient)
+    for lane in np.flatnonzero(np.max(np.abs(step), axis=1, initial=0) > longest):
+        inverse[lane] = _damped_inverse(longest, gradient[lane], hessian[lane], own[lane])
+        step[lane] = -inverse[lane] @ gradient[lane]
     sensitivity = select - inverse @ hessian @ select
-    predicted_decrease = -0.5 * np.sum(step * gradient * own, axis=1)
+    curved = np.einsum("lp,lpq,lq->l", step, hessian, step)
+    predicted_decrease = -np.sum(step * gradient * own, axis=1) - 0.5 * curved
     reduced = np.einsum("lpk,lp->lk", sensitivity, gradient)
     return Reduced(step, sensitivity, predicted_decrease, reduced, congruent(hessian, sensitivity))
 
@@ -87,26 +95,40 @@ def pseudo_inverse(
 def trust_region_step(
     radius: float, gradient: Float[np.ndarray, " k"], hessian: Float[np.ndarray, "k k"]
 ) -> Float[np.ndarray, " k"]:
-    """Minimum of the quadratic model in the ball of this radius.
-
-    Damping by bisection of its logarithm, in the coordinates where the matrix is diagonal.
-    """
+    """Minimum of the quadratic model in the ball of this radius."""
     values, vectors = np.linalg.eigh(hessian)
+    along = vectors.T @ gradient
+    return -vectors @ (along / (np.maximum(values, 0) + _damping(radius, along, values)))
+
+
+def _damping(radius: float, along, values) -> float:
+    """What is added to a matrix so that the step has this length, or next to 0 if it is shorter.
+
+    By bisection of its logarithm, in the coordinates where the matrix is diagonal.
+    """
     top = max(values[-1], 1e-300)
     values = np.maximum(values, 0)
-    along = vectors.T @ gradient
 
-    def step(damping):
-        return -along / (values + damping)
+    def length(damping):
+        return scipy.linalg.norm(along / (values + np.exp(damping)))
 
     low, high = np.log(_SINGULAR * top), np.log(top + scipy.linalg.norm(along) / radius)
-    if scipy.linalg.norm(step(np.exp(low))) > radius:
+    if length(low) > radius:
         for _ in range(60):
             middle = 0.5 * (low + high)
-            outside = scipy.linalg.norm(step(np.exp(middle))) > radius
-            low, high = (middle, high) if outside else (low, middle)
+            low, high = (middle, high) if length(middle) > radius else (low, middle)
         low = high
-    return vectors @ step(np.exp(low))
+    return float(np.exp(low))
+
+
+def _damped_inverse(longest: float, gradient, hessian, own):
+    """Inverse of a lane's own block, 0 elsewhere, damped so that its step is as long as may be."""
+    block = np.ix_(own, own)
+    values, vectors = np.linalg.eigh(hessian[block])
+    damping = _damping(longest, vectors.T @ gradient[own], values)
+    inverse = np.zeros_like(hessian)
+    inverse[block] = (vectors / (np.maximum(values, 0) + damping)) @ vectors.T
+    return inverse
 
 
 def eliminate_others(
