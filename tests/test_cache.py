@@ -56,6 +56,12 @@ def test_other_files_are_no_programs(tmp_path):
     assert list(kept.programs(tmp_path)) == []
 
 
+def test_what_a_killed_process_left_goes_too(tmp_path):
+    program(tmp_path, "year", 1, 365, "traced.4711")
+    assert kept.keep_bounds(tmp_path, NOW) == 1
+    assert names(tmp_path) == [kept.LAST_LOOK]
+
+
 def test_a_folder_that_is_not_there(tmp_path):
     assert kept.keep_bounds(tmp_path / "none", NOW) == 0
     assert list(kept.programs(tmp_path / "none")) == []

@@ -15,8 +15,8 @@ MOST_DAYS = 90.0
 BETWEEN = 86_400.0
 #: How the names of traces end (`files.traces`); those that JAX compiled end in "-cache".
 TRACED = "-traced"
-#: Names of programs: that of the function and a digest.
-_NAME = re.compile(rf".*-[0-9a-f]{{64}}(-cache|{TRACED})", re.DOTALL)
+#: Names of programs: that of the function and a digest; and the process, if killed in the midst.
+_NAME = re.compile(rf".*-[0-9a-f]{{64}}(-cache|{TRACED}(\.\d+)?)", re.DOTALL)
 #: File with the times of this machine (`tradeoff.time_model`).
 TIME_MODEL = "time_model.json"
 #: File whose time of change is that of the last look.

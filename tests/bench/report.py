@@ -230,13 +230,12 @@ turns of 1,000. The tool touches the mesh itself (16 patches of up to 128 corner
 capsule, and the angular weights prepared; called through ctypes. coal is called once for each of 16
 capsules. The paper states 10 kHz for the skeleton and 1 kHz with the surface (100 and 1,000 µs).
 
-The contact alone starts some 500 small kernels with a ball on the round tube and 800 with a box
-on the mesh, most of them in a loop of twelve rounds (counted by `tests/test_kernels.py`). XLA for
-CPUs runs a computation in order where all its arrays are small (512 bytes), and else from a
-queue, which takes half as long again for so many: contact and skeleton of one pose are
-computations of their own (`jaxtrachea/_in_order.py`). 256 poses together share the kernels.
-Since the commit of this table they are one kernel each: two thirds of the time, see
-[measured.md](measured.md).
+The contact alone was some 500 small kernels with a ball on the round tube and 800 with a box on
+the mesh, most of them in a loop of twelve rounds. For one pose on a CPU contact and skeleton now
+are one kernel each, as are small parts of the surface (`jaxtrachea/_in_order.py`; counted by
+`tests/test_kernels.py`, gains in [measured.md](measured.md)). 256 poses together share the small
+kernels, and derivatives are made of them: what a gradient takes over its value rose as the value
+became quicker.
 Slow calls come to all rows, the C loop included: the core is shared.
 """
 COHORT = """\

@@ -69,7 +69,5 @@ has rings and stiffness as constants of the program. The C loops are our own, wr
 problem. coal is called from Python for each of 16 capsules and gives no derivatives; ours searches
 two of 16 patches and smooths the gap to be differentiable. Ours fits 500 specimens in one batch,
 the solvers 10 one after the other; estimates differ by that part of a standard error.
-The rows of fits were taken when ours profiled what is in doubt and took time with the square of it;
-the script now asks for standard errors alone, as of the others, and was not run again.
 
 """
