@@ -108,6 +108,16 @@ def test_over_lanes(folder):
     assert TRACES == ["add"]
 
 
+def test_arguments_by_name(folder):
+    """Over lanes as well; another name is another trace."""
+    lanes = np.arange(6.0).reshape(2, 3)
+    for _ in range(2):
+        out, _ = Traced(add, axes=0, donate=(0,))(lanes, x=np.ones((2, 3)))
+        np.testing.assert_array_equal(out, lanes + 1)
+        np.testing.assert_array_equal(Traced(add)(x=lanes, state=np.ones((2, 3)))[0], lanes + 1)
+    assert TRACES == ["add", "add"]
+
+
 def test_outputs_go_in_again_and_compile_nothing(folder):
     """As the state of a solver does, whose memory is given away."""
     compiled = []

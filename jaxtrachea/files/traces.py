@@ -86,34 +86,34 @@ class Traced:
         self._plain = jax.jit(self._function, donate_argnums=donate)
         self._compiled: dict[Any, Callable] = {}
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
         """What the function returns."""
         if _folder is None:
-            return self._plain(*arguments)
-        leaves, tree = jax.tree.flatten(arguments)
+            return self._plain(*arguments, **named)
+        leaves, tree = jax.tree.flatten((arguments, named))
         device = jax.config.values["jax_default_device"] or jax.local_devices()[0]
         try:
             kinds = tuple(_kind(leaf, device) for leaf in leaves)
             key = _folder, device, tree, kinds
             compiled = self._compiled.get(key)
         except TypeError:  # neither an array nor a number; a field without a hash
-            return self._plain(*arguments)
+            return self._plain(*arguments, **named)
         if compiled is None:
             compiled = self._plain
             with contextlib.suppress(Exception):  # what is wrong is said by the plain call
-                compiled = self._by_trace(_folder, arguments, kinds, device)
+                compiled = self._by_trace(_folder, (arguments, named), kinds, device)
             self._compiled[key] = compiled
-        return compiled(*arguments)
+        return compiled(*arguments, **named)
 
-    def _by_trace(self, folder: Path, arguments: tuple, kinds: tuple, device: Any) -> Callable:
+    def _by_trace(self, folder: Path, given: tuple, kinds: tuple, device: Any) -> Callable:
         """The function of arguments like these by a kept trace, which is made if there is none."""
-        leaves, tree = jax.tree.flatten(arguments)
+        leaves, tree = jax.tree.flatten(given)
         digest = hashlib.sha256(_surroundings(device.platform))
         digest.update(_said((self._identity, jax.tree.unflatten(tree, kinds))))
         path = folder / f"{self._name}-{digest.hexdigest()}{TRACED}"
         content = _content(path)
         if content is None:
-            content = self._traced(leaves, tree, device.platform)
+            content = self._traced(leaves, tree, device)
             with contextlib.suppress(OSError):  # then the next start traces anew
                 folder.mkdir(parents=True, exist_ok=True)
                 write_whole(path, hashlib.sha256(content).digest() + content)
@@ -122,10 +122,14 @@ class Traced:
         flat = self._named(lambda *leaves: call(*leaves))
         # Compiled here: what an exported function returns is bound to its device, and `jax.jit`
         # would compile it once more when given that.
-        run = jax.jit(flat, donate_argnums=self._donated(arguments)).lower(*leaves).compile()
-        return lambda *arguments: jax.tree.unflatten(structure, run(*jax.tree.leaves(arguments)))
+        run = jax.jit(flat, donate_argnums=self._donated(given[0])).lower(*leaves).compile()
 
-    def _traced(self, leaves: list, tree: Any, platform: str) -> bytes:
+        def compiled(*arguments, **named):
+            return jax.tree.unflatten(structure, run(*jax.tree.leaves((arguments, named))))
+
+        return compiled
+
+    def _traced(self, leaves: list, tree: Any, device: Any) -> bytes:
         """The trace and the structure of what it returns.
 
         Raises:
@@ -134,13 +138,16 @@ class Traced:
         made = []
 
         def flat(*leaves):
-            values, structure = jax.tree.flatten(self._function(*jax.tree.unflatten(tree, leaves)))
+            arguments, named = jax.tree.unflatten(tree, leaves)
+            values, structure = jax.tree.flatten(self._function(*arguments, **named))
             if any(getattr(jax.typeof(v), "weak_type", False) for v in values):
                 raise TypeError(f"{self._name} returns weak types")
             made[:] = [jax.tree.unflatten(structure, range(len(values)))]
             return values
 
-        trace = export.export(jax.jit(self._named(flat)), platforms=(platform,))(*leaves)
+        # JAX's own name of the backend (cuda, rocm) is not that of its devices (gpu).
+        where = None if device.platform == jax.default_backend() else (device.platform,)
+        trace = export.export(jax.jit(self._named(flat)), platforms=where)(*leaves)
         _said(made[0])
         return pickle.dumps((bytes(trace.serialize()), made[0]), protocol=5)
 
@@ -216,7 +223,7 @@ def _sources() -> str:
 
 
 @functools.cache
-def _surroundings(platform: str) -> bytes:
+def _surroundings(backend: str) -> bytes:
     """Sources, versions and settings, of this process; and the kind of device."""
     settings = [
         (name, repr(value))
@@ -224,7 +231,7 @@ def _surroundings(platform: str) -> bytes:
         if not any(word in name for word in _ELSEWHERE)
     ]
     ours = [(k, v) for k, v in sorted(os.environ.items()) if k.startswith("JAXTRACHEA_")]
-    return repr((_sources(), settings, ours, platform)).encode()
+    return repr((_sources(), settings, ours, backend)).encode()
 
 
 def _content(path: Path) -> bytes | None:
