@@ -118,6 +118,12 @@ def test_arguments_by_name(folder):
     assert TRACES == ["add", "add"]
 
 
+def test_what_is_lowered_is_not_kept(folder):
+    text = Traced(add).lower(np.zeros(3), np.ones(3)).as_text()
+    assert "sine" in text
+    assert kept(folder) == []
+
+
 def test_outputs_go_in_again_and_compile_nothing(folder):
     """As the state of a solver does, whose memory is given away."""
     compiled = []

@@ -105,6 +105,10 @@ class Traced:
             self._compiled[key] = compiled
         return compiled(*arguments, **named)
 
+    def lower(self, *arguments: Any, **named: Any) -> Any:
+        """As of `jax.jit`; nothing is kept."""
+        return self._plain.lower(*arguments, **named)
+
     def _by_trace(self, folder: Path, given: tuple, kinds: tuple, device: Any) -> Callable:
         """The function of arguments like these by a kept trace, which is made if there is none."""
         leaves, tree = jax.tree.flatten(given)
