@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilations import compilations
 
 from jaxtrachea.files import traces
 from jaxtrachea.files.traces import Traced, keep_traces
@@ -55,7 +56,6 @@ def draw(key):
 
 def start():
     """As a process starts: nothing is known of sources and settings."""
-    traces._sources.cache_clear()
     traces._surroundings.cache_clear()
 
 
@@ -126,18 +126,14 @@ def test_what_is_lowered_is_not_kept(folder):
 
 def test_outputs_go_in_again_and_compile_nothing(folder):
     """As the state of a solver does, whose memory is given away."""
-    compiled = []
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda name, duration, **_: compiled.append(name) if "backend_compile" in name else None
-    )
     run, state, x = Traced(add, donate=(0,)), np.zeros(3), np.ones(3)
     state, _ = run(state, x)
-    del compiled[:]
-    for _ in range(3):
-        given = state
-        state, _ = run(given, x)
-        assert given.is_deleted()
-    assert compiled == []
+    with compilations() as seen:
+        for _ in range(3):
+            given = state
+            state, _ = run(given, x)
+            assert given.is_deleted()
+    assert seen == []
     np.testing.assert_array_equal(state, [4.0, 4.0, 4.0])
 
 
@@ -250,7 +246,7 @@ def test_threads_on_two_devices(tmp_path):
     """As shards of a study: one trace, compiled once for each device."""
     environment = os.environ | {
         "XLA_FLAGS": os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2",
-        "PYTHONPATH": str(ROOT / "tests"),
+        "PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), str(ROOT / "tests" / "reference")]),
         "JAX_ENABLE_X64": "1",
     }
     done = subprocess.run(
@@ -337,7 +333,7 @@ def test_a_function_that_fails_says_so(folder):
 COUNTED = """
 import sys
 from jaxtrachea.cli.main import main
-from jaxtrachea.files.traces import Traced, keep_traces
+from jaxtrachea.files.traces import Traced
 made = Traced._traced
 def count(self, *arguments):
     print("traced", self._name, file=sys.stderr)

@@ -29,7 +29,7 @@ def cache(clear: ClearOption = False) -> None:
             text += f"\n{_cleared(folder / TIME_MODEL)}"
     else:
         size = sum(program.size for program in kept) / 2**20
-        traced = sum(program.path.name.endswith(TRACED) for program in kept)
+        traced = sum(TRACED in program.path.name for program in kept)
         text = f"{len(kept) - traced} compiled programs and {traced} traces, {size:.1f} MiB, "
         text += f"in {folder}"
         if folder == cache_folder():

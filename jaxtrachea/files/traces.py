@@ -90,7 +90,8 @@ class Traced:
         if _folder is None:
             return self._plain(*arguments, **named)
         leaves, tree = jax.tree.flatten((arguments, named))
-        device = jax.config.values["jax_default_device"] or jax.local_devices()[0]
+        chosen = jax.config.jax_default_device  # pyright: ignore
+        device = chosen or jax.local_devices()[0]
         try:
             kinds = tuple(_kind(leaf, device) for leaf in leaves)
             key = _folder, device, tree, kinds
@@ -210,7 +211,6 @@ def _said(value: Any) -> bytes:
     return out.getvalue()
 
 
-@functools.cache
 def _sources() -> str:
     """Digest of this package's sources, and the versions of what they stand on.
 
