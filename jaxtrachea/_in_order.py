@@ -23,7 +23,10 @@ import jax
 import jax.numpy as jnp
 import jaxlib.version
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
+from jax.custom_derivatives import SymbolicZero, zero_from_primal
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+
+from jaxtrachea._linear import linear, replaced
 
 Out = TypeVar("Out")
 #: Names of the operations that mark a call: no work, and what they give is the first operand.
@@ -40,74 +43,147 @@ def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
     Many lanes at once (`vmap` over an argument, or what gives the first result), on another device,
     or with a JAX that cannot mark a call, it is compiled into the program around it as if this were
     not here; so too where the first result is not used. Values and derivatives are the same, but
-    for rounding.
+    for rounding. Derivatives are computations of their own too, and begin with the part once more:
+    for small parts that is quicker than to keep in memory what they need of it. Forward and reverse
+    mode, each as often as wanted; `jax.linear_transpose` by itself does not know these calls.
 
     Args:
         part: from arrays to arrays (or trees of them); may close over traced ones.
     """
-
-    def run(*arguments):
-        inputs = jax.tree.leaves(arguments)
-        if _not_inlined_p is None or not any(isinstance(v, Tracer) for v in inputs):
-            return part(*arguments)
-        leaves, tree = jax.tree.flatten(jax.jit(part)(*arguments))
-        if leaves:  # one that is used is enough: what is marked is the call that it comes from
-            leaves[0] = _not_inlined_p.bind(leaves[0], *inputs)
-        return jax.tree.unflatten(tree, leaves)
-
-    return run
+    return _called(part, single=False)
 
 
 def one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
     """The same function, compiled into a single kernel where `in_order` would mark it.
 
-    Not where it is differentiated, nor where it does what `FITTING` lacks (products of matrices,
-    linear algebra, sorting with `top_k`, `.at[]`), reduces more than `REDUCED` entries, or has
-    arrays that are not `SMALL` or not of numbers: that is compiled as `in_order`.
+    Not where it does what `FITTING` lacks (products of matrices, linear algebra, sorting with
+    `top_k`, `.at[]`), reduces more than `REDUCED` entries, or has arrays that are not `SMALL` or
+    not of numbers: that is compiled as `in_order`. So it is with its derivatives, each by itself.
 
     Args:
         part: as that of `in_order`.
     """
-    mark, hidden = _one_kernel_p, _hidden_p
-    if mark is None or hidden is None:
-        return in_order(part)
+    return _called(part, single=True)
+
+
+def _called(part: Callable[..., Out], single: bool) -> Callable[..., Out]:
+    """The part as a call of its own, if it can be as a `single` kernel."""
 
     def run(*arguments):
-        if not any(isinstance(v, Tracer) for v in jax.tree.leaves(arguments)):
+        if _not_inlined_p is None or not _traced(arguments):
             return part(*arguments)
         closed, shape = jax.make_jaxpr(part, return_shape=True)(*arguments)
+        if not closed.jaxpr.outvars:
+            return part(*arguments)
         own = [i for i, v in enumerate(closed.consts) if isinstance(v, Tracer)]
         inputs = [*(closed.consts[i] for i in own), *jax.tree.leaves(arguments)]
-        if not fits_one_kernel(closed.jaxpr):
-            return in_order(part)(*arguments)
 
-        def whole(inputs):
-            consts = list(closed.consts)
-            for i, v in zip(own, inputs, strict=False):
-                consts[i] = v
-            found = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, consts))(*inputs[len(own) :])
-            read = [jnp.ravel(jax.lax.stop_gradient(v))[0] for v in inputs]
-            return found, jnp.stack([jnp.asarray(v, jnp.float32) for v in read])
+        def plain(*inputs):
+            consts = replaced(closed.consts, own, inputs[: len(own)])
+            return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, consts))(*inputs[len(own) :])
 
-        # The compiler ends the process over an input that a kernel does not read: constants are
-        # hidden from it, which it would write into the part, and every input is read.
-        leaves, read = jax.jit(whole)([hidden.bind(v, *inputs) for v in inputs])
-        leaves[0] = mark.bind(leaves[0], read, *inputs)
-        return jax.tree.unflatten(jax.tree.structure(shape), leaves)
+        def changing(moving):
+            variables = [*(closed.jaxpr.constvars[i] for i in own), *closed.jaxpr.invars]
+            return _changing(closed.jaxpr, {variables[i] for i in moving})
+
+        fits = single and _one_kernel_p is not None and fits_one_kernel(closed.jaxpr)
+        found = _differentiable(plain, changing, fits)(*inputs)
+        return jax.tree.unflatten(jax.tree.structure(shape), found)
 
     return run
 
 
+def _inexact(variable) -> bool:
+    return jnp.issubdtype(variable.aval.dtype, jnp.inexact)
+
+
+def _changing(jaxpr: Jaxpr, moving: set) -> list[int]:
+    """Which results change with some of the variables; those of whole numbers do not."""
+    for eqn in jaxpr.eqns:
+        if any(not isinstance(v, Literal) and v in moving for v in eqn.invars):
+            moving = moving | {v for v in eqn.outvars if _inexact(v)}
+    results = enumerate(jaxpr.outvars)
+    return [i for i, v in results if not isinstance(v, Literal) and v in moving]
+
+
+def _differentiable(plain: Callable, changing_with: Callable, single: bool) -> Callable:
+    """`plain` as a call; its derivatives, there and back, are calls too.
+
+    Args:
+        plain: from arrays to a list of arrays; what it closes over is not traced.
+        changing_with: from the places of arrays to those of the results that change with them.
+        single: whether it is a single kernel; so are its derivatives then, if they can be.
+    """
+
+    @jax.custom_jvp
+    def call(*inputs):
+        return (_kernel if single else _in_order)(plain, inputs)
+
+    def derivatives(inputs, tangents):
+        moving = [i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero)]
+        out = call(*inputs)
+        changing = changing_with(moving)
+
+        def along(inputs):
+            def part(*moved):
+                found = plain(*replaced(inputs, moving, moved))
+                return [found[i] for i in changing]
+
+            return part, [inputs[i] for i in moving]
+
+        def push(inputs, tangents):
+            part, at = along(inputs)
+            return jax.jvp(part, at, tangents)[1]
+
+        def pull(inputs, cotangents):
+            part, at = along(inputs)
+            return list(jax.vjp(part, *at)[1](cotangents))
+
+        moved = [tangents[i] for i in moving]
+        push, pull = _called(push, single), _called(pull, single)
+        change = linear(push, pull, inputs, moved) if changing else []
+        return out, replaced(zero_from_primal(out, symbolic_zeros=True), changing, change)
+
+    call.defjvp(derivatives, symbolic_zeros=True)
+    return call
+
+
+def _in_order(plain: Callable, inputs) -> list:
+    leaves = list(jax.jit(plain)(*inputs))
+    # One that is used is enough: what is marked is the call that it comes from.
+    leaves[0] = _not_inlined_p.bind(leaves[0], *inputs)
+    return leaves
+
+
+def _kernel(plain: Callable, inputs) -> list:
+    def whole(*inputs):
+        found = plain(*inputs)
+        read = [jnp.ravel(jax.lax.stop_gradient(v))[0] for v in inputs]
+        return list(found), jnp.stack([jnp.asarray(v, jnp.float32) for v in read])
+
+    # The compiler ends the process over an input that a kernel does not read: constants are
+    # hidden from it, which it would write into the part, and every input is read.
+    assert _hidden_p is not None
+    assert _one_kernel_p is not None
+    leaves, read = jax.jit(whole)(*(_hidden_p.bind(v, *inputs) for v in inputs))
+    leaves[0] = _one_kernel_p.bind(leaves[0], read, *inputs)
+    return leaves
+
+
+def _traced(arguments) -> bool:
+    return any(isinstance(v, Tracer) for v in jax.tree.leaves(arguments))
+
+
 #: What the compiler puts into one kernel; besides loops, branches and what works entry by entry.
 FITTING = frozenset(
-    """abs add and argmax argmin atan2 bitcast_convert_type broadcast_in_dim ceil clamp closed_call
-    concatenate cond convert_element_type copy cos custom_jvp_call custom_vjp_call div
-    dynamic_slice eq erf erf_inv exp exp2 expm1 floor gather ge gt hidden
-    integer_pow iota is_finite jit le le_to log log1p logistic lt max min mul ne neg nextafter
-    not not_inlined one_kernel optimization_barrier or pad pjit pow reduce_and reduce_max
-    reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt scan select_n sign
-    sin slice sqrt square squeeze stack stop_gradient sub tan tanh transpose unstack while
-    xor""".split()
+    """abs add add_any and argmax argmin atan2 bitcast_convert_type broadcast_in_dim ceil clamp
+    closed_call concatenate cond convert_element_type copy cos custom_jvp_call custom_vjp_call
+    div dynamic_slice dynamic_update_slice eq erf erf_inv exp exp2 expm1 floor gather ge gt
+    hidden integer_pow iota is_finite jit le le_to linear log log1p logistic lt max min mul ne
+    neg nextafter not not_inlined one_kernel optimization_barrier or pad pjit pow reduce_and
+    reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt scan
+    select_n sign sin slice split sqrt square squeeze stack stop_gradient sub tan tanh transpose
+    unstack while xor""".split()
 )
 #: Entries of one array, also between two operations, up to which one thread is as good as many.
 SMALL = 1 << 16
@@ -144,22 +220,22 @@ def _entries(variable) -> float:
     return float(math.prod(shape)) if numbers and math.prod(shape) else math.inf
 
 
-def _mark(name: str, lowering: Callable, differentiated: Callable | None = None) -> Any:
+def _mark(name: str, lowering: Callable) -> Any:
     """The identity of its first operand, with a lowering of its own on CPUs, for one lane.
 
-    The others, what goes into a call, tell how many lanes there are: a result may have none.
+    The others, what goes into a call, tell how many lanes there are: a result may have none. It is
+    not differentiated: calls have derivatives of their own.
 
     Args:
         name: of the operation.
         lowering: of all operands.
-        differentiated: what stands in its place where derivatives are taken; itself if None.
 
     Returns:
         None where this JAX does not offer what it takes (0.6).
     """
     try:
         from jax.extend.core import Primitive
-        from jax.interpreters import ad, batching, mlir
+        from jax.interpreters import batching, mlir
 
         one = jax.ShapeDtypeStruct((), "float32")
         jax.eval_shape(lowering, one, one)
@@ -167,18 +243,11 @@ def _mark(name: str, lowering: Callable, differentiated: Callable | None = None)
         primitive.def_impl(lambda x, *_: x)
         primitive.def_abstract_eval(lambda x, *_: x)
 
-        def jvp(primals, tangents):
-            return (differentiated or primitive.bind)(*primals), tangents[0]
-
         def lanes(operands, axes):
             x, axis = operands[0], axes[0]
             many = [v.shape[i] for v, i in zip(operands, axes, strict=True) if i is not None]
             return (x if max(many) > 1 else primitive.bind(*operands)), axis
 
-        ad.primitive_jvps[primitive] = jvp
-        ad.primitive_transposes[primitive] = lambda cotangent, x, *inputs: (
-            [cotangent if ad.is_undefined_primal(x) else None, *[None] * len(inputs)]
-        )
         batching.primitive_batchers[primitive] = lanes
         lowered = mlir.lower_fun(lowering, multiple_results=False)
 
@@ -214,8 +283,6 @@ _one_kernel_p = _hidden_p = None
 if jaxlib.version.__version__ in TESTED and os.environ.get("JAXTRACHEA_ONE_KERNEL") != "0":
     _small_call = _told(inlineable="false", xla_cpu_small_call="true")
     _one_kernel_p = _mark(
-        MARKS[1],
-        lambda x, read, *_: _all_read(_small_call(x), _small_call(read)),
-        lambda x, _, *inputs: _not_inlined_p.bind(x, *inputs),
+        MARKS[1], lambda x, read, *_: _all_read(_small_call(x), _small_call(read))
     )
-    _hidden_p = _mark(MARKS[2], lambda x, *_: jax.lax.optimization_barrier(x), lambda x, *_: x)
+    _hidden_p = _mark(MARKS[2], lambda x, *_: jax.lax.optimization_barrier(x))

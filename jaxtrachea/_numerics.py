@@ -5,7 +5,7 @@ the singular operation, so that derivatives stay finite.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,11 @@ def epsilon(dtype) -> float:
 #: Entries up to which a reduction is written out, and most that one may have: of more, XLA for CPUs
 #: makes a `reduce-window`, which fuses with nothing.
 WRITTEN_OUT, ONE_REDUCTION = 8, 32
+
+
+def added(terms: Iterable[Array]) -> Array:
+    """The sum of at least one array, in order."""
+    return functools.reduce(jnp.add, terms)
 
 
 def total(x: Num[Array, "*rows n"]) -> Num[Array, "*rows"]:
@@ -53,7 +58,7 @@ def product(a: Float[Array, "*rows k"], b: Float[Array, "k ..."]) -> Float[Array
         columns = [v[..., None] for v in columns]
         b = b.reshape(b.shape[0], *[1] * (a.ndim - 1), b.shape[1])
     terms = [v * row for v, row in zip(columns, b, strict=True)]
-    return functools.reduce(jnp.add, terms)
+    return added(terms)
 
 
 def largest(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:

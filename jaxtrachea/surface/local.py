@@ -13,6 +13,7 @@ Points are those of the tube bent straight (`Mesh.straight`), displacements alon
 anterior, lateral); mm. Most vertices are beyond every centre's reach: `Runs` picks the others.
 """
 
+import functools
 import math
 
 import equinox as eqx
@@ -20,10 +21,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._in_order import in_order, one_kernel
-from jaxtrachea._numerics import epsilon, total
+from jaxtrachea._linear import linear
+from jaxtrachea._numerics import added, epsilon, total
 
 #: Centres on circles round C, by the number of centres; the outermost circle is the collar.
 CIRCLES = {1: (), 8: (7,), 16: (6, 9), 32: (6, 10, 15)}
@@ -180,10 +183,18 @@ def fit(
     n = centres.shape[0]
 
     def solve(centres, targets, reach):
-        matrix = _kernel(centres, centres, reach)
-        matrix = matrix + 16 * n * epsilon(matrix.dtype) * jnp.eye(n, dtype=matrix.dtype)
+        ridge = 16 * n * epsilon(targets.dtype)
+        matrix = _kernel(centres, centres, reach) + ridge * jnp.eye(n, dtype=targets.dtype)
         factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
-        return jax.scipy.linalg.cho_solve(factor, targets)
+
+        def meet(weights):
+            columns = [_spread(w, centres, centres, reach) for w in weights.T]
+            return jnp.stack(columns, axis=1) + ridge * weights
+
+        def weigh(_, targets):
+            return jax.scipy.linalg.cho_solve(factor, targets)
+
+        return jax.lax.custom_linear_solve(meet, targets, weigh, symmetric=True)
 
     return Dent(centres, in_order(solve)(centres, targets, reach), reach, way)
 
@@ -195,13 +206,64 @@ def correction(dent: Dent, points: Float[Array, "points 3"]) -> Float[Array, "po
 
 def _columns(dent: Dent, points):
     """Its components at the points, or with a way the share of it."""
-    near = _kernel(dent.centres, points, dent.reach)
     # One at a time: XLA for CPUs takes five times as long for a product with three columns.
-    return [jnp.dot(w, near, precision="highest") for w in dent.weights.T]
+    return [_spread(w, dent.centres, points, dent.reach) for w in dent.weights.T]
+
+
+_dot = functools.partial(jnp.dot, precision="highest")
+
+
+@jax.custom_jvp
+def _spread(weights, centres, points, reach):
+    """Sum of the kernels of all centres at every point; shape (points,)."""
+    return _dot(weights, _kernel(centres, points, reach))
+
+
+@functools.partial(_spread.defjvp, symbolic_zeros=True)
+def _spread_jvp(primals, tangents):
+    """By the slope of psi over q, 20 (1 - q)^3, which has no pole; going back by products."""
+    moving = [i for i, v in enumerate(tangents) if not isinstance(v, SymbolicZero)]
+
+    def push(fixed, tangents):
+        weights, centres, points, reach = fixed
+        moved = dict(zip(moving, tangents, strict=True))
+        q = _distance(centres, points, reach)
+        closing = [q**2 * moved[3] * reach] if 3 in moved else []
+        for k in range(3):
+            way = points[None, :, k] - centres[:, None, k]
+            closing += [way * moved[1][:, None, k]] if 1 in moved else []
+            closing += [-way * moved[2][None, :, k]] if 2 in moved else []
+        change = [_dot(moved[0], _psi(q))] if 0 in moved else []
+        if closing:
+            change.append(_dot(weights, _steepness(q) * added(closing)) / reach**2)
+        return [added(change)]
+
+    def moments(pulls, at):
+        return jnp.stack([_dot(pulls, v) for v in at.T], axis=1)
+
+    def pull(fixed, cotangents):
+        (weights, centres, points, reach), (g,) = fixed, cotangents
+        q = _distance(centres, points, reach)
+        pulls = weights[:, None] * _steepness(q) * (g / reach**2)[None]
+        # From the first centre: differences of small numbers.
+        x, c = (v - centres[:1] for v in (points, centres))
+        by = (
+            lambda: _dot(_psi(q), g),
+            lambda: moments(pulls, x) - jnp.sum(pulls, axis=1)[:, None] * c,
+            lambda: moments(pulls.T, c) - jnp.sum(pulls, axis=0)[:, None] * x,
+            lambda: jnp.sum(pulls * q**2) * reach,
+        )
+        return [by[i]() for i in moving]
+
+    change = linear(push, pull, primals, [tangents[i] for i in moving])
+    return _spread(*primals), change[0]
 
 
 def _together(dent: Dent, columns):
-    return jnp.stack(columns, axis=1) if dent.way is None else columns[0][:, None] * dent.way[None]
+    if dent.way is None:
+        return jnp.stack(columns, axis=1)
+    # As a product of matrices: going back, its parts are such products too, not plain sums.
+    return jnp.einsum("p,c->pc", columns[0], dent.way, precision="highest")
 
 
 def add_correction(
@@ -259,11 +321,22 @@ def add_correction(
 
 def _kernel(points, centres, reach):
     """The kernel psi between points and centres; shape (points, centres)."""
-    square = sum(
-        ((p[:, None] - c[None]) ** 2 for p, c in zip(points.T, centres.T, strict=True)),
-        jnp.zeros((), points.dtype),
-    ) * (1 / (reach * reach))
+    return _psi(_distance(points, centres, reach))
+
+
+def _distance(points, centres, reach):
+    """Between points and centres, in reaches, 1 from there on; shape (points, centres)."""
+    ways = (p[:, None] - c[None] for p, c in zip(points.T, centres.T, strict=True))
+    square = added(v**2 for v in ways) * (1 / (reach * reach))
     inside = square < 1
     away = inside & (square > 0)  # before the root, whose derivative at 0 is not finite
-    q = jnp.where(away, jnp.sqrt(jnp.where(away, square, 1)), 0)
-    return jnp.where(inside, (1 - q) ** 4 * (4 * q + 1), 0)
+    return jnp.where(away, jnp.sqrt(jnp.where(away, square, 1)), jnp.where(inside, 0, 1))
+
+
+def _psi(q):
+    return (1 - q) ** 4 * (4 * q + 1)
+
+
+def _steepness(q):
+    """Minus its slope, over q."""
+    return 20 * (1 - q) ** 3

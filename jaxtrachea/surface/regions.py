@@ -31,7 +31,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea._in_order import in_order, one_kernel
-from jaxtrachea._numerics import epsilon
+from jaxtrachea._linear import linear, replaced
+from jaxtrachea._numerics import added, epsilon, total
 from jaxtrachea.surface import phong
 from jaxtrachea.surface.blocks import Blocks, in_blocks, to_blocks, to_vertices
 from jaxtrachea.trachea.geometry import Geometry
@@ -192,23 +193,100 @@ def weigh(binding: Binding, phi_c: Float[Array, ""]) -> Weights:
     Returns:
         The weights; NaN if C lies behind the ends of the rings.
     """
-    alpha, phi = binding.half_angle, binding.phi
+
+    def share(*given):
+        return jnp.stack(_shares(*given))
+
+    return Weights(one_kernel(share)(binding.phi, phi_c, binding.half_angle), phi_c)
+
+
+@jax.custom_jvp
+def _shares(phi, phi_c, alpha) -> tuple[Array, ...]:
+    """Of U, J and V at the angles phi; see `weigh`."""
     on = jnp.abs(phi_c) <= alpha * (1 + 8 * epsilon(phi.dtype))
     to_U = jnp.maximum(alpha, NARROWEST - phi_c)
     to_V = jnp.maximum(alpha, NARROWEST + phi_c)
+    # One division for all vertices of a region. Hidden by NaN: behind the ends of the rings.
+    hidden = jnp.where(on, 1, jnp.nan).astype(phi.dtype)
+    from_U = jnp.clip((phi + to_U) * (hidden / (phi_c + to_U)), 0, 1)
+    from_V = jnp.clip((to_V - phi) * (hidden / (to_V - phi_c)), 0, 1)
+    behind = jnp.maximum(phi - to_V, -phi - to_U) * (1 / (2 * math.pi - to_U - to_V))
+    behind = jnp.clip(behind, 0, 1)
+    U = (1 - from_U) * (1 - behind) + (1 - from_V) * behind
+    V = (1 - from_V) * (1 - behind) + (1 - from_U) * behind
+    return U, from_U * from_V, V
 
-    def share(phi_c, to_U, to_V, on):
-        # One division for all vertices of a region. Hidden by NaN: behind the ends of the rings.
-        hidden = jnp.where(on, 1, jnp.nan).astype(phi.dtype)
-        from_U = jnp.clip((phi + to_U) * (hidden / (phi_c + to_U)), 0, 1)
-        from_V = jnp.clip((to_V - phi) * (hidden / (to_V - phi_c)), 0, 1)
-        behind = jnp.maximum(phi - to_V, -phi - to_U) * (1 / (2 * math.pi - to_U - to_V))
-        behind = jnp.clip(behind, 0, 1)
-        U = (1 - from_U) * (1 - behind) + (1 - from_V) * behind
-        V = (1 - from_V) * (1 - behind) + (1 - from_U) * behind
-        return jnp.stack([U, from_U * from_V, V])
 
-    return Weights(one_kernel(share)(phi_c, to_U, to_V, on), phi_c)
+@functools.partial(_shares.defjvp, symbolic_zeros=True)
+def _shares_jvp(primals, tangents):
+    """Going back, how all of them change by one angle comes before what that adds up to."""
+    moving = [i for i, v in enumerate(tangents) if not isinstance(v, SymbolicZero)]
+
+    def along(fixed, i, v):
+        return jax.jvp(lambda v: _shares.fun(*replaced(fixed, [i], [v])), (fixed[i],), (v,))[1]
+
+    def push(fixed, tangents):
+        terms = [along(fixed, i, v) for i, v in zip(moving, tangents, strict=True)]
+        return [added(of_one) for of_one in zip(*terms, strict=True)]
+
+    def pull(fixed, cotangents):
+        out = []
+        for i in moving:
+            rises = along(fixed, i, jnp.ones_like(fixed[i]))
+            by_each = added(g * v for g, v in zip(cotangents, rises, strict=True))
+            out.append(by_each if i == 0 else total(total(by_each).ravel()))
+        return out
+
+    change = linear(push, pull, primals, [tangents[i] for i in moving])
+    return _shares(*primals), tuple(change)
+
+
+@jax.custom_jvp
+def _ramps(x: Array, at: Array, slope: Array) -> Array:
+    """Several ramps, slope (x - at), for each place of a row.
+
+    What they add up to, going back, is a matrix product.
+
+    Args:
+        x: shape (rows, width).
+        at: where each ramp is 0; shape (rows, ramps).
+        slope: of each; shape (rows, ramps).
+
+    Returns:
+        Shape (rows, ramps, width).
+    """
+    return (x[:, None] - at[:, :, None]) * slope[:, :, None]
+
+
+@functools.partial(_ramps.defjvp, symbolic_zeros=True)
+def _ramps_jvp(primals, tangents):
+    moving = [i for i, v in enumerate(tangents) if not isinstance(v, SymbolicZero)]
+
+    def push(fixed, tangents):
+        x, at, slope = fixed
+        by = (
+            lambda v: slope[:, :, None] * v[:, None],
+            lambda v: jnp.broadcast_to(-(slope * v)[:, :, None], g_shape),
+            lambda v: (x[:, None] - at[:, :, None]) * v[:, :, None],
+        )
+        return [added(by[i](v) for i, v in zip(moving, tangents, strict=True))]
+
+    def pull(fixed, cotangents):
+        (x, at, slope), (g,) = fixed, cotangents
+        from_first = x - x[:, :1]
+        sides = jnp.stack([jnp.ones_like(x), from_first], axis=1)
+        both = jnp.einsum("rpw,rjw->rpj", g, sides, precision="highest")
+        whole, moment = both[:, :, 0], both[:, :, 1] + (x[:, :1] - at) * both[:, :, 0]
+        by = (
+            lambda: jnp.sum(slope[:, :, None] * g, axis=1),
+            lambda: -slope * whole,
+            lambda: moment,
+        )
+        return [by[i]() for i in moving]
+
+    out = _ramps(*primals)
+    g_shape = out.shape
+    return out, linear(push, pull, primals, [tangents[i] for i in moving])[0]
 
 
 def interpolate(
@@ -317,14 +395,10 @@ def _across(binding: Binding, weights: Weights, s_c, line, ends):
         return jax.lax.dynamic_slice_in_dim(patches, patch, parts)
 
     rows = jax.vmap(read)(binding.patch)
-
-    def side(column):
-        own, *upper = (rows[:, i, column, None] for i in range(parts))
-        for past, other in zip(beyond, upper, strict=True):
-            own = jnp.where(past, other, own)
-        return own
-
-    t = (binding.s - side(0)) * side(1)
+    ways = _ramps(binding.s, rows[:, :, 0], rows[:, :, 1])
+    t = ways[:, 0]
+    for i, past in enumerate(beyond, 1):
+        t = jnp.where(past, ways[:, i], t)
     width = cubic[0].shape[1]
     own = [rows[:, i, 2 : 2 + 4 * width] for i in range(parts)]
     table = jnp.concatenate([*own, rows[:, 0, 2 + 4 * width :]], axis=1)
@@ -345,11 +419,18 @@ def _combine(where, beyond, fraction, table):
             both edges, and beyond them); of U, of the line U by fraction, of V and the line V by
             it; shape (blocks, 12 or 16, components).
 
-    Derivatives are written as matrix products, one for each block: their transposes then are such
-    products too. Of the plain sums the compiler makes, going back, a reduction over the vertices
-    for each column of the table, and computes everything anew in each (CPU; three times slower).
+    Derivatives by `table` are matrix products, one for each block; by the rest, sums over the three
+    components. Of the plain sums the compiler makes, going back, a reduction over the vertices for
+    each column of the table, and computes everything anew in each (CPU; three times slower).
     """
-    U, J, V, t, f = (v[:, None] for v in (*where, fraction))
+    U, J, V, _, f = (v[:, None] for v in (*where, fraction))
+    line, _, (u, along_u, v, along_v) = _lines(where, beyond, table)
+    return U * (u + f * along_u) + J * line + V * (v + f * along_v)
+
+
+def _lines(where, beyond, table):
+    """The line J and its slope in t at the vertices, and what there is of the other two."""
+    t = where[3][:, None]
     rows = [row[:, :, None] for row in table.swapaxes(0, 1)]
     a, b, c, d = rows[:4]
     for i, past in enumerate(beyond):
@@ -357,39 +438,65 @@ def _combine(where, beyond, fraction, table):
             jnp.where(past[:, None], upper, lower)
             for lower, upper in zip((a, b, c, d), rows[4 * i + 4 : 4 * i + 8], strict=True)
         )
-    u, along_u, v, along_v = rows[-4:]
-    line = a + t * (b + t * (c + t * d))
-    return U * (u + f * along_u) + J * line + V * (v + f * along_v)
+    return a + t * (b + t * (c + t * d)), b + t * (2 * c + 3 * t * d), rows[-4:]
 
 
 @functools.partial(_combine.defjvp, symbolic_zeros=True)
 def _combine_jvp(primals, tangents):
     (where, beyond, fraction, table), (d_where, _, d_fraction, d_table) = primals, tangents
+    # By whatever moves: in a scene the rings are at rest, and often the contact is.
+    changes = [*d_where, d_fraction, d_table]
+    moving = [i for i, v in enumerate(changes) if not isinstance(v, SymbolicZero)]
+    product = functools.partial(jnp.einsum, precision="highest")
 
-    def still(v):
-        return isinstance(v, SymbolicZero)
+    def push(fixed, tangents):
+        of_vertex, table, beyond = _parted(fixed)
+        slopes = _slopes(of_vertex, beyond, table)
+        return [
+            added(
+                product("bkc,bkw->bcw", v, _basis(of_vertex, beyond))
+                if i == 5
+                else slopes[i] * v[:, None]
+                for i, v in zip(moving, tangents, strict=True)
+            )
+        ]
 
-    def real(v):
-        return jnp.zeros(v.shape, v.dtype) if still(v) else v
+    def pull(fixed, cotangents):
+        (of_vertex, table, beyond), (g,) = _parted(fixed), cotangents
+        slopes = _slopes(of_vertex, beyond, table)
+        return [
+            product("bkw,bcw->bkc", _basis(of_vertex, beyond), g)
+            if i == 5
+            else added(slopes[i][:, c] * g[:, c] for c in range(g.shape[1]))
+            for i in moving
+        ]
 
-    def basis(where, fraction):
-        U, J, V, t = where
-        zero, rest, sides = jnp.zeros_like(J), J, []
-        for past in beyond:
-            sides.append(jnp.where(past, zero, rest))
-            rest = jnp.where(past, rest, zero)
-        sides.append(rest)
-        line = [w * t**k for w in sides for k in range(4)]
-        return jnp.stack([*line, U, U * fraction, V, V * fraction], axis=1)
+    fixed = [*where, fraction, table, *beyond]
+    return _combine(*primals), linear(push, pull, fixed, [changes[i] for i in moving])[0]
 
-    product = functools.partial(jnp.einsum, "bkc,bkw->bcw", precision="highest")
-    given = where, fraction
-    change = d_where, d_fraction
-    out = _combine(*primals)
-    if all(map(still, jax.tree.leaves(change, is_leaf=still))):
-        return out, product(real(d_table), basis(*given))
-    matrix, d_matrix = jax.jvp(basis, given, jax.tree.map(real, change, is_leaf=still))
-    return out, product(table, d_matrix) + product(real(d_table), matrix)
+
+def _parted(fixed):
+    """U, J, V, t and fraction; table; beyond."""
+    return fixed[:5], fixed[5], fixed[6:]
+
+
+def _slopes(of_vertex, beyond, table):
+    """Of `_combine`, by each of U, J, V, t, fraction; shape (blocks, components, width) each."""
+    U, J, V, _, f = (v[:, None] for v in of_vertex)
+    line, rise, (u, along_u, v, along_v) = _lines(of_vertex, beyond, table)
+    return u + f * along_u, line, v + f * along_v, J * rise, U * along_u + V * along_v
+
+
+def _basis(of_vertex, beyond):
+    """Of `_combine`, by the rows of the table; shape (blocks, rows, width)."""
+    U, J, V, t, fraction = of_vertex
+    zero, rest, sides = jnp.zeros_like(J), J, []
+    for past in beyond:
+        sides.append(jnp.where(past, zero, rest))
+        rest = jnp.where(past, rest, zero)
+    sides.append(rest)
+    line = [w * t**k for w in sides for k in range(4)]
+    return jnp.stack([*line, U, U * fraction, V, V * fraction], axis=1)
 
 
 def _insert(rows, row, below):
