@@ -80,6 +80,7 @@ def test_the_contact_starts_few_kernels(tube):
 
 
 UPDATE = """
+import json
 import jax, jax.numpy as jnp
 jax.config.update("jax_enable_x64", True)
 from jaxtrachea import EffectOptions, Material, Poses, make_scene, simulate, table_1
@@ -98,27 +99,42 @@ def update(place):
     out = simulate(scene, material, Poses(path.rotation, place[None]))
     return out.force[0], out.vertices[0]
 
-print(jax.jit(update).lower(path.translation[0]).compile().as_text())
+def moved(place):
+    force, vertices = update(place)
+    return force[1] + jnp.mean((vertices - scene.mesh.vertices) ** 2)
+
+programs = update, jax.value_and_grad(moved)
+print(json.dumps([jax.jit(f).lower(path.translation[0]).compile().as_text() for f in programs]))
 """
 
 
 @pytest.mark.slow
 def test_the_whole_update_of_one_pose():
-    """Contact, skeleton, surface and dent: no `reduce-window`, small parts as one kernel each."""
+    """Contact, skeleton, surface and dent: no `reduce-window`, small parts as one kernel each.
+
+    So it is with the gradient, in which what goes back is a call of its own.
+    """
     environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     run = subprocess.run(
         [sys.executable, "-c", UPDATE], capture_output=True, text=True, env=environment
     )
     assert run.returncode == 0, run.stderr
-    assert "reduce-window(" not in run.stdout
-    called = [v for v in run.stdout.split("\n") if " call(" in v and 'inlineable="false"' in v]
+    value, gradient = json.loads(run.stdout)
+    assert "reduce-window(" not in value
+    called, back = (
+        [v for v in text.split("\n") if " call(" in v and 'inlineable="false"' in v]
+        for text in (value, gradient)
+    )
     # The contact, the skeleton, shares and lines of the surface, what goes into the dent and where
-    # it reaches; in order: across the surface, and the dent's Cholesky factors.
+    # it reaches; in order: across the surface, and the dent's Cholesky factors. All but where the
+    # dent reaches have derivatives.
     assert len(called) == 8
+    assert len(back) == 8 + 7
     if version("jaxlib") in TESTED:
         assert sum(ONE in v for v in called) == 6
-        # Of the same program without one kernel for a part: 1,163.
-        assert count_kernels(run.stdout, inside=False)[0] <= MARGIN * 45
+        # Of the same programs without one kernel for a part: 1,163, and with the gradient 1,834.
+        assert count_kernels(value, inside=False)[0] <= MARGIN * 45
+        assert count_kernels(gradient, inside=False)[0] <= MARGIN * 182
 
 
 def largest_array(text: str) -> int:

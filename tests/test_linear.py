@@ -15,7 +15,9 @@ from jaxtrachea._linear import linear
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.surface import local, regions
 
-DTYPES = ["float32", "float64"]
+#: Most of the time is compilation.
+SLOW = [pytest.mark.slow, pytest.mark.compiling]
+DTYPES = [pytest.param("float32", marks=SLOW), "float64"]
 
 
 def numbers(dtype, *shapes, seed=3):
@@ -60,7 +62,7 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("large", [1, 10**6])
+@pytest.mark.parametrize("large", [1, pytest.param(10**6, marks=SLOW)])
 @pytest.mark.parametrize("way", list(WAYS))
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_it_is_the_plain_formula(dtype, way, large, monkeypatch):
@@ -120,7 +122,7 @@ def combined(dtype):
 def spread(dtype, on_a_centre=True):
     """Some points within reach, one beyond all and one on a centre, where psi is C2 only."""
     weights, centres, points = numbers(dtype, (5,), (5, 3), (9, 3))
-    points = jnp.concatenate([points, centres[:1] + (not on_a_centre), 50 + centres[1:2]])
+    points = jnp.concatenate([points, centres[:1] + int(not on_a_centre), 50 + centres[1:2]])
     return local._spread, [weights, centres, points, jnp.asarray(2.5, dtype)]
 
 

@@ -25,8 +25,6 @@ from jaxtrachea.scene.stage import Poses
 jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 LANES, FITS = 64, 512
-#: Lanes computed together where memory is to be saved.
-TOGETHER = 8
 WALLS = ("patches of the mesh", "round tube")
 
 
@@ -101,15 +99,15 @@ def pipeline(out: common.Writer) -> None:
             check(cases)
             if lanes > 1:
                 for name in list(cases)[:2]:
-                    cases[f"{name}, {TOGETHER} at a time"] = wait(chunks(programs[name]), *args)
+                    cases[f"{name}, one at a time"] = wait(in_turn(programs[name]), *args)
             found = common.interleaved(cases, rounds=25, target=0.02)
             out.table("pipeline", found, lanes=lanes, dtype=dtype, walls=walls)
             out.write()
 
 
-def chunks(program):
-    """The program for many lanes, a few of them at a time."""
-    return lambda *args: jax.lax.map(lambda x: program(*x), args, batch_size=TOGETHER)
+def in_turn(program):
+    """The program for many lanes, one after the other in one call."""
+    return lambda *args: jax.lax.map(lambda x: program(*x), args)
 
 
 def check(cases) -> None:

@@ -183,11 +183,11 @@ the material. Fit: residual of 4 positions × 50 points, its Jacobian by four pa
 and a whole step (residual, Jacobian, normal equations, one more residual for the curvature, the
 trust region). Times are per lane. In brackets: ratio of the smallest samples.
 
-Many poses together cost more than the same poses a few at a time (`jax.lax.map(..., batch_size=8)`
-over the function that gives value and gradient): the largest array of 64 poses takes 24 MB, in
-fresh memory at every call. With glibc told to keep it (`MALLOC_MMAP_THRESHOLD_`,
-`MALLOC_TRIM_THRESHOLD_`) the gradient of 64 took 589 instead of 986 µs a pose (round tube, float32;
-one trial by hand). A step of the fit has a second residual in it, for the curvature.
+Small parts of a program, and their derivatives, are one kernel each for one pose on a CPU. Many
+poses together (`vmap`) cannot be that, and their arrays are in fresh memory at every call; so going
+back takes the surface of one pose after the other. `jax.lax.map` over the function that gives value
+and gradient (one at a time) does so with everything. A step of the fit has a second residual in it,
+for the curvature.
 """
 COMMANDS = """\
 Whole processes. Cold: the folder of compiled programs is empty; warm: as the cold start left it.
