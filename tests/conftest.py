@@ -1,5 +1,6 @@
 """Strict settings for the whole suite: float64, no silent promotion, shapes checked."""
 
+import functools
 import gc
 import os
 import subprocess
@@ -10,8 +11,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
 
 import jax
+import jaxtyping
 import pytest
-from jaxtyping import install_import_hook
 
 
 def _compile_quickly() -> None:
@@ -42,8 +43,27 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# For the whole session: modules that a test imports later are checked as well.
-install_import_hook("jaxtrachea", "beartype.beartype")
+
+def _check_what_is_annotated() -> None:
+    """Shapes and types of all that is annotated are checked, also in modules imported later.
+
+    The hook decorates every function, one inside of another each time that it is defined: a fifth
+    of the time of joint fits. One without annotations has nothing to check.
+    """
+    decorate = jaxtyping.jaxtyped
+
+    def checked(*given, typechecker):
+        if not given:
+            return functools.partial(checked, typechecker=typechecker)
+        (one,) = given
+        told = isinstance(one, type) or getattr(one, "__annotations__", True)
+        return decorate(one, typechecker=typechecker) if told else one
+
+    jaxtyping.jaxtyped = checked
+    jaxtyping.install_import_hook("jaxtrachea", "beartype.beartype")
+
+
+_check_what_is_annotated()
 
 
 #: Programs compiled since they were last dropped.
