@@ -125,11 +125,16 @@ def point_of(study):
     return jnp.asarray(np.array(guess) + off)
 
 
-#: One press, whatever its place: compiled once.
-single = jax.jit(
+_single = jax.jit(
     lambda m, s, phi, D, along: press_sections(GEOMETRY, m, s, phi, D, along),
     compiler_options=QUICK,
 )
+
+
+def single(values, *at):
+    """One press, whatever its place: compiled once, for plain numbers are made arrays."""
+    material = SectionMaterial(**{name: jnp.asarray(np.array(v)) for name, v in values.items()})
+    return _single(material, *(jnp.asarray(v) for v in at))
 
 
 def shown(study, theta, k):
@@ -141,10 +146,7 @@ def shown(study, theta, k):
         for (p, _, _), v in zip(study.unknowns[0], theta, strict=True)
     }
     onset, offset = values.pop("onset"), values.pop("force_offset")
-    got = single(
-        SectionMaterial(**values), jnp.asarray(c.s_c), jnp.asarray(c.phi_c),
-        jnp.asarray(c.displacement - onset), jnp.asarray(c.direction),
-    )  # fmt: skip
+    got = single(values, c.s_c, c.phi_c, c.displacement - onset, c.direction)
     normal = np.array([0, -np.cos(c.phi_c), -np.sin(c.phi_c)])
     around = np.array([0, -np.sin(c.phi_c), np.cos(c.phi_c)])
     a, b = c.direction
@@ -257,11 +259,10 @@ def test_single_precision(evaluated):
     np.testing.assert_allclose(np.asarray(got.jacobian) / largest, exact / largest, atol=1e-2)
 
 
-def pressed(material, place, path=PATH):
+def pressed(values, place, path=PATH):
     """A curve as `press_sections` shows it, with vectors."""
     s, phi, direction = place
-    at = (jnp.asarray(v) for v in (s, phi, path, direction))
-    got = jax.tree.map(np.asarray, single(material, *at))
+    got = jax.tree.map(np.asarray, single(values, s, phi, path, direction))
     frame = np.array([[0, -np.cos(phi), -np.sin(phi)], [0, -np.sin(phi), np.cos(phi)]])
     F, moved = got.force @ frame.T, got.joints @ frame.T
     a, b = direction
@@ -281,8 +282,7 @@ def test_known_parameters_are_found(tmp_path):
     """From vectors of three presses, to rounding; nothing on a bound, nothing open."""
     start = from_wall(GEOMETRY)
     fields = {f.name: np.median(getattr(start, f.name)) for f in dataclasses.fields(start)}
-    material = SectionMaterial(**(fields | TRUTH))
-    study = study_of([pressed(material, place) for place in PLACES], {})
+    study = study_of([pressed(fields | TRUTH, place) for place in PLACES], {})
     assert {p.name for p in study.free} == set(TRUTH)
     result = fit(study, Settings(starts=1, more_starts=0))
     assert result.status[0] == FitStatus.CONVERGED
