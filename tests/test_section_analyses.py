@@ -182,6 +182,22 @@ def test_joint_fit_is_dense_least_squares():
     np.testing.assert_allclose(np.sum(result.cost), found.cost, rtol=1e-8)
 
 
+@pytest.mark.slow
+def test_population_of_sections_has_the_spread_of_its_specimens():
+    """Hardly any noise: mean and spread are those of the true values, one bed shared or not."""
+    truth, sigma = [31.0, 24.0, 35.0, 28.0], SIGMA / 30
+    parts = [measured(i, sigma, str(i), EI_C=v) for i, v in enumerate(truth)]
+    curves, logs = sum(parts, []), np.log(truth)
+    for table, joint in (({}, False), ({"bed_n": {"scope": "shared"}}, True)):
+        result = fit(study_of(curves, table, sigma, joint=joint), ONE)
+        assert np.all(result.status == FitStatus.CONVERGED)
+        found = population(result)
+        assert [p.name for p in found.parameters][0] == "EI_C"
+        effects = found.effects
+        np.testing.assert_allclose(effects.mean[0], np.mean(logs), atol=2e-3)
+        np.testing.assert_allclose(effects.sd[0], np.std(logs, ddof=1), rtol=0.02)
+
+
 @pytest.fixture(scope="module")
 def known(result):
     return situation(result)
@@ -202,15 +218,19 @@ def test_information_of_a_candidate_is_that_of_differences(known):
 
 
 @pytest.mark.slow
-def test_predicted_error_is_that_of_a_fit_with_the_press_added(known, result):
+def test_predicted_error_is_that_of_a_fit_with_the_press_added():
     """The chosen press, measured without noise: the new standard errors are those predicted."""
+    curves = measured(0)
+    # Beside a specimen of three curves there is room for the one to come: the same programs.
+    room = study_of(curves[:2] + measured(0, specimen="two")).take(np.array([0]))
+    result = fit(room, ONE)
     places = np.array(PLACES)
     at = Candidates(places[:, 0], np.full(3, PATH[-1]), places[:, 1])
-    choice = next_points(known, at, 1)
+    choice = next_points(situation(result), at, 1)
     k = int(choice.chosen[0])
     (s, phi), (force, side) = PLACES[k], shown(result.theta[0])[k]
     more = Curve("one", "next", s, phi, PATH, force, side_force=side if phi else None)
-    after = fit(study_of([*result.study.curves[0], more]), ONE)
+    after = fit(study_of([*curves[:2], more]), ONE)
     np.testing.assert_allclose(after.theta, result.theta, atol=1e-6)
     # Bounds count as a prior in the prediction: no more than a thousandth here.
     np.testing.assert_allclose(choice.error[1], after.uncertainty.se[0], rtol=1e-3)
@@ -457,20 +477,3 @@ def test_what_is_refused_is_refused_before_the_fit(arguments, says, tmp_path, mo
     assert (code, out) == (2, "")
     assert says in " ".join(err.split())
     assert not Path("out").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_population_of_sections_has_the_spread_of_its_specimens():
-    """Hardly any noise: mean and spread are those of the true values, one bed shared or not."""
-    truth, sigma = [31.0, 24.0, 35.0, 28.0], SIGMA / 30
-    parts = [measured(i, sigma, str(i), EI_C=v) for i, v in enumerate(truth)]
-    curves, logs = sum(parts, []), np.log(truth)
-    for table, joint in (({}, False), ({"bed_n": {"scope": "shared"}}, True)):
-        result = fit(study_of(curves, table, sigma, joint=joint), ONE)
-        assert np.all(result.status == FitStatus.CONVERGED)
-        found = population(result)
-        assert [p.name for p in found.parameters][0] == "EI_C"
-        effects = found.effects
-        np.testing.assert_allclose(effects.mean[0], np.mean(logs), atol=2e-3)
-        np.testing.assert_allclose(effects.sd[0], np.std(logs, ddof=1), rtol=0.02)
