@@ -968,7 +968,10 @@ def test_bad_input_ends_with_a_cure(arguments, says, study, tmp_path, monkeypatc
 @pytest.mark.slow
 @pytest.mark.compiling
 def test_virtual_trachea_ten_positions_by_the_command(tmp_path, monkeypatch, capsys):
-    """The command on fits of nine positions predicts the tenth as `--leave-one-out` does."""
+    """The command on fits of nine positions predicts the tenth as `--leave-one-out` does.
+
+    Ten specimens of nine curves in one file: each is a fit of its own.
+    """
     from jaxtrachea.cli.specification import settings_of, study_of
     from jaxtrachea.config import load_fit_spec
     from jaxtrachea.measurements.data_files import read_data
@@ -979,26 +982,32 @@ def test_virtual_trachea_ten_positions_by_the_command(tmp_path, monkeypatch, cap
     study = study_of(spec, measured, refits=True)
     left = leave_one_out(study, settings_of(spec))
     truth = predictions(study.take(left.lane), left.result.theta).force
+    out = [study.curves[lane][trial] for lane, trial in zip(left.lane, left.trial, strict=True)]
+    assert len(out) == 10
+    parts = {"nine": [], "tenth": []}
+    for tenth in out:
+        for c in measured.curves:
+            name = "tenth" if c.trial == tenth.trial else "nine"
+            parts[name].append(dataclasses.replace(c, specimen=f"without {tenth.trial}"))
+    for name, curves in parts.items():
+        write_hdf5(tmp_path / f"{name}.h5", Measurements(tuple(curves), (), ()))
     text = (VIRTUAL / "fit.toml").read_text()
-    for k, (lane, trial) in enumerate(zip(left.lane, left.trial, strict=True)):
-        out = study.curves[lane][trial]
-        others = tuple(c for c in measured.curves if c.trial != out.trial)
-        parts = {"nine": others, "tenth": (out,)}
-        for name, curves in parts.items():
-            write_hdf5(tmp_path / f"{name}{k}.h5", Measurements(curves, (), ()))
-        path = tmp_path / f"fit{k}.toml"
-        path.write_text(text.replace("small_strain.h5", f"nine{k}.h5"))
-        code, _, err = run(monkeypatch, capsys, "fit", path, "--out", tmp_path / f"f{k}")
-        assert code == 0, err
-        code, _, err = run(
-            monkeypatch, capsys, "predict", tmp_path / f"f{k}", "--data", tmp_path / f"tenth{k}.h5",
-            "--out", tmp_path / f"p{k}",
-        )  # fmt: skip
-        assert code == 0, err
-        rows = rows_of(tmp_path / f"p{k}" / "predictions.csv")
-        mine = [float(r["predicted [N]"]) - float(r["force [N]"]) for r in rows]
-        assert np.allclose(mine, truth[k, trial][: len(rows)], rtol=0, atol=1e-9), k
-        assert json.loads((tmp_path / f"f{k}" / "provenance.json").read_text())["inputs"]
+    (tmp_path / "fit.toml").write_text(text.replace("small_strain.h5", "nine.h5"))
+    code, _, err = run(monkeypatch, capsys, "fit", tmp_path / "fit.toml", "--out", tmp_path / "f")
+    assert code == 0, err
+    code, _, err = run(
+        monkeypatch, capsys, "predict", tmp_path / "f", "--data", tmp_path / "tenth.h5",
+        "--out", tmp_path / "p",
+    )  # fmt: skip
+    assert code == 0, err
+    rows = rows_of(tmp_path / "p" / "predictions.csv")
+    for k, (trial, tenth) in enumerate(zip(left.trial, out, strict=True)):
+        own = [r for r in rows if r["specimen"] == f"without {tenth.trial}"]
+        assert {r["trial"] for r in own} == {tenth.trial}
+        assert len(own) > 1
+        mine = [float(r["predicted [N]"]) - float(r["force [N]"]) for r in own]
+        assert np.allclose(mine, truth[k, trial][: len(own)], rtol=0, atol=1e-9), k
+    assert json.loads((tmp_path / "f" / "provenance.json").read_text())["inputs"]
 
 
 @pytest.mark.slow
