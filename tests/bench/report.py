@@ -234,8 +234,7 @@ The contact alone was some 500 small kernels with a ball on the round tube and 8
 the mesh, most of them in a loop of twelve rounds. For one pose on a CPU contact and skeleton now
 are one kernel each, as are small parts of the surface (`jaxtrachea/_in_order.py`; counted by
 `tests/test_kernels.py`, gains in [measured.md](measured.md)). 256 poses together share the small
-kernels, and derivatives are made of them: what a gradient takes over its value rose as the value
-became quicker.
+kernels.
 Slow calls come to all rows, the C loop included: the core is shared.
 """
 COHORT = """\
