@@ -78,13 +78,16 @@ def _called(part: Callable[..., Out], single: bool) -> Callable[..., Out]:
         own = [i for i, v in enumerate(closed.consts) if isinstance(v, Tracer)]
         inputs = [*(closed.consts[i] for i in own), *jax.tree.leaves(arguments)]
 
+        # Without what is traced, which would be kept for as long as the derivatives are.
+        jaxpr, kept = closed.jaxpr, replaced(closed.consts, own, [None] * len(own))
+
         def plain(*inputs):
-            consts = replaced(closed.consts, own, inputs[: len(own)])
-            return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, consts))(*inputs[len(own) :])
+            consts = replaced(kept, own, inputs[: len(own)])
+            return jaxpr_as_fun(ClosedJaxpr(jaxpr, consts))(*inputs[len(own) :])
 
         def changing(moving):
-            variables = [*(closed.jaxpr.constvars[i] for i in own), *closed.jaxpr.invars]
-            return _changing(closed.jaxpr, {variables[i] for i in moving})
+            variables = [*(jaxpr.constvars[i] for i in own), *jaxpr.invars]
+            return _changing(jaxpr, {variables[i] for i in moving})
 
         fits = single and _one_kernel_p is not None and fits_one_kernel(closed.jaxpr)
         found = _differentiable(plain, changing, fits)(*inputs)
@@ -124,24 +127,27 @@ def _differentiable(plain: Callable, changing_with: Callable, single: bool) -> C
         out = call(*inputs)
         changing = changing_with(moving)
 
-        def along(inputs):
+        def along(inputs, shown):
             def part(*moved):
                 found = plain(*replaced(inputs, moving, moved))
-                return [found[i] for i in changing]
+                return [found[i] for i in shown]
 
             return part, [inputs[i] for i in moving]
 
         def push(inputs, tangents):
-            part, at = along(inputs)
-            return jax.jvp(part, at, tangents)[1]
+            part, at = along(inputs, changing)
+            return jax.jvp(part, at, list(tangents))[1]
 
         def pull(inputs, cotangents):
-            part, at = along(inputs)
-            return list(jax.vjp(part, *at)[1](cotangents))
+            given = {i: v for i, v in zip(changing, cotangents, strict=True) if v is not None}
+            part, at = along(inputs, given)
+            return list(jax.vjp(part, *at)[1](list(given.values())))
 
-        moved = [tangents[i] for i in moving]
-        push, pull = _called(push, single), _called(pull, single)
-        change = linear(push, pull, inputs, moved) if changing else []
+        change = []
+        if changing:
+            ways = _called(push, single), _called(pull, single)
+            like = [out[i] for i in changing]
+            change = linear(*ways, inputs, [tangents[i] for i in moving], like)
         return out, replaced(zero_from_primal(out, symbolic_zeros=True), changing, change)
 
     call.defjvp(derivatives, symbolic_zeros=True)
@@ -194,8 +200,6 @@ REDUCED = 4000
 
 def fits_one_kernel(jaxpr: Jaxpr) -> bool:
     """Whether all that is computed can be in one kernel, and all arrays are small."""
-    from jax.extend.core import jaxprs_in_params  # not of all versions
-
     results = [v for eqn in jaxpr.eqns for v in eqn.outvars]
     arrays = (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars, *results)
     if not jaxpr.outvars or not all(_entries(v) <= SMALL for v in arrays):
@@ -203,9 +207,16 @@ def fits_one_kernel(jaxpr: Jaxpr) -> bool:
     return all(
         eqn.primitive.name in FITTING
         and (not _reduces(eqn) or all(_entries(v) <= REDUCED for v in eqn.invars))
-        and all(fits_one_kernel(sub) for sub in jaxprs_in_params(eqn.params))
+        and all(fits_one_kernel(sub) for sub in _inside(eqn))
         for eqn in jaxpr.eqns
     )
+
+
+def _inside(eqn) -> list[Jaxpr]:
+    from jax.extend.core import jaxprs_in_params  # not of all versions
+
+    way = eqn.params.get("way")  # of `linear`
+    return [way.closed.jaxpr] if way else list(jaxprs_in_params(eqn.params))
 
 
 def _reduces(eqn) -> bool:

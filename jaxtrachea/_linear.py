@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray
-from jax.extend.core import Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
@@ -18,52 +18,72 @@ from jaxtyping import Array
 #: memory at every call, and out of the cache.
 LARGE = 2048
 #: From what is fixed and what it is linear in, to results; lists of arrays.
-Linear = Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]]
+Linear = Callable[[Sequence, Sequence], Sequence[Array]]
 
 
 def linear(
-    push: Linear, pull: Linear, fixed: Sequence[Array], tangents: Sequence[Array]
+    push: Linear, pull: Linear, fixed: Sequence, tangents: Sequence, like: Sequence
 ) -> list[Array]:
     """`push(fixed, tangents)`, which is transposed into `pull(fixed, cotangents)`.
 
-    Both are differentiated again as they are written, by `fixed` too, and take lanes (`vmap`).
+    Both are differentiated again as they are written, by `fixed` too, and take lanes (`vmap`). What
+    is not used is not traced: of a gradient `push`, of a derivative forward `pull`.
 
     Args:
         push: linear in its second argument; what it closes over is not traced.
-        pull: from cotangents of what `push` gives to those of `tangents`, of the same shapes.
-        fixed: what both depend on besides.
-        tangents: of floating-point numbers.
+        pull: from cotangents of what `push` gives (None for those that are 0) to those of
+            `tangents`, of the same shapes.
+        fixed: arrays that both depend on besides.
+        tangents: arrays of floating-point numbers.
+        like: arrays of the shapes and dtypes of what `push` gives.
     """
-    return _bind(push, pull, list(fixed), list(tangents))
+    way = _Way(push, [_shown(v) for v in (*fixed, *tangents)], len(fixed))
+    shown = tuple(_shown(v).strip_weak_type() for v in like)
+    return _linear_p.bind(*fixed, *tangents, way=way, pull=pull, shown=shown)
 
 
-def _bind(push: Linear, pull: Linear, fixed: list, tangents: list) -> list:
-    closed = jax.make_jaxpr(lambda fixed, t: list(push(fixed, t)))(fixed, tangents)
-    # Traced once more where it is transposed only.
-    return _linear_p.bind(*fixed, *tangents, closed=closed, pull=pull, split=len(fixed))
+def _shown(v) -> ShapedArray:
+    return v if isinstance(v, ShapedArray) else jax.typeof(v)
 
 
-def _evaluate(*operands, closed, **_):
-    return jaxpr_as_fun(closed)(*operands)
+class _Way:
+    """What `push` does with arrays like these, traced when it is asked for."""
+
+    def __init__(self, push: Linear, given: list, split: int):
+        self.push, self.given, self.split = push, given, split
+
+    @functools.cached_property
+    def closed(self) -> ClosedJaxpr:
+        def flat(*operands):
+            return list(self.push(operands[: self.split], operands[self.split :]))
+
+        given = [jax.ShapeDtypeStruct(v.shape, v.dtype, weak_type=v.weak_type) for v in self.given]
+        return jax.make_jaxpr(flat)(*given)
 
 
-def _pushed(closed) -> Linear:
-    return lambda fixed, tangents: jaxpr_as_fun(closed)(*fixed, *tangents)
+def _evaluate(*operands, way, **_):
+    return jaxpr_as_fun(way.closed)(*operands)
 
 
-def _jvp(primals, changes, *, closed, pull, split):
-    push, fixed, tangents = _pushed(closed), list(primals[:split]), list(primals[split:])
-    moving = [i for i in range(split) if type(changes[i]) is not ad.Zero]
-    out, total = _bind(push, pull, fixed, tangents), []
-    if any(type(v) is not ad.Zero for v in changes[split:]):
-        total.append(_bind(push, pull, fixed, [ad.instantiate_zeros(v) for v in changes[split:]]))
+def _parts(operands, way) -> tuple[list, list]:
+    return list(operands[: way.split]), list(operands[way.split :])
+
+
+def _jvp(primals, changes, *, way, pull, shown):
+    (fixed, tangents), (of_fixed, of_tangents) = _parts(primals, way), _parts(changes, way)
+    moving = [i for i, v in enumerate(of_fixed) if type(v) is not ad.Zero]
+    out, terms = linear(way.push, pull, fixed, tangents, shown), []
+    if any(type(v) is not ad.Zero for v in of_tangents):
+        along = [ad.instantiate_zeros(v) for v in of_tangents]
+        terms.append(linear(way.push, pull, fixed, along, shown))
     if moving:
-        of = functools.partial(replaced, fixed, moving)
-        along = [changes[i] for i in moving]
-        total.append(
-            jax.jvp(lambda v: push(of(v), tangents), ([fixed[i] for i in moving],), (along,))[1]
-        )
-    return out, total[0] if len(total) == 1 else list(map(jnp.add, *total))
+        at, along = ([v[i] for i in moving] for v in (fixed, of_fixed))
+
+        def of(*moved):
+            return list(way.push(replaced(fixed, moving, moved), tangents))
+
+        terms.append(jax.jvp(of, at, along)[1])
+    return out, terms[0] if len(terms) == 1 else list(map(jnp.add, *terms))
 
 
 def replaced(values: Sequence, at: Sequence[int], new: Sequence) -> list:
@@ -74,39 +94,48 @@ def replaced(values: Sequence, at: Sequence[int], new: Sequence) -> list:
     return out
 
 
-def _transpose(cotangents, *operands, closed, pull, split):
-    fixed, tangents = list(operands[:split]), operands[split:]
-    cotangents = [ad.instantiate_zeros(v) for v in cotangents]
-    found = _bind(pull, _pushed(closed), fixed, cotangents)
-    shapes = [[(v.shape, v.dtype) for v in part] for part in (found, (t.aval for t in tangents))]
-    if shapes[0] != shapes[1]:
-        raise TypeError(f"pull gives {shapes[0]}; expected {shapes[1]}, as of the tangents")
-    return [None] * split + found
+def _transpose(cotangents, *operands, way, pull, shown):
+    fixed, tangents = _parts(operands, way)
+    # Those that are 0 stay out: times a slope without bound they would not be.
+    given = [i for i, v in enumerate(cotangents) if type(v) is not ad.Zero]
+    count, like = len(cotangents), [v.aval for v in tangents]
+
+    def back(fixed, some):
+        found = list(pull(fixed, replaced([None] * count, given, some)))
+        shapes = [[v.shape for v in part] for part in (found, like)]
+        if shapes[0] != shapes[1]:
+            raise TypeError(f"pull gives shapes {shapes[0]}; expected {shapes[1]}, as of tangents")
+        return [v.astype(t.dtype) for v, t in zip(found, like, strict=True)]
+
+    def there(fixed, tangents):
+        found = way.push(fixed, tangents)
+        return [found[i] for i in given]
+
+    found = linear(back, there, fixed, [cotangents[i] for i in given], like)
+    return [None] * way.split + found
 
 
-def _lanes(operands, axes, *, closed, pull, split):
-    shared = [a is None for a in axes]
+def _lanes(operands, axes, *, way, pull, shown):
     count = next(v.shape[a] for v, a in zip(operands, axes, strict=True) if a is not None)
-    operands = [
+    in_front = [
         v if a is None else jnp.moveaxis(v, a, 0) for v, a in zip(operands, axes, strict=True)
     ]
-    large = (
-        sum(v.size for v, of_all in zip(operands, shared, strict=True) if not of_all)
-        >= LARGE * count
-    )
+    own = [i for i, a in enumerate(axes) if a is not None]
+    large = sum(in_front[i].size for i in own) >= LARGE * count
+    fixed, tangents = _parts(in_front, way)
     # Of tangents what all lanes share is repeated: going back, what is repeated adds up.
     tangents = [
-        jnp.broadcast_to(v, (count, *v.shape)) if of_all else v
-        for v, of_all in zip(operands[split:], shared[split:], strict=True)
+        jnp.broadcast_to(v, (count, *v.shape)) if a is None else v
+        for v, a in zip(tangents, axes[way.split :], strict=True)
     ]
-    own = [i for i in range(split) if not shared[i]]
+    of_lane = [i for i in own if i < way.split]
 
     def over(f: Linear) -> Linear:
         def many(fixed, tangents):
             def one(lane):
-                return list(f(replaced(fixed, own, lane[0]), lane[1]))
+                return list(f(replaced(fixed, of_lane, lane[0]), lane[1]))
 
-            lanes = [fixed[i] for i in own], list(tangents)
+            lanes = [fixed[i] for i in of_lane], list(tangents)
             if not large:
                 return jax.vmap(one)(lanes)
             return jax.lax.platform_dependent(
@@ -115,16 +144,15 @@ def _lanes(operands, axes, *, closed, pull, split):
 
         return many
 
-    out = _bind(over(_pushed(closed)), over(pull), operands[:split], tangents)
+    like = [ShapedArray((count, *v.shape), v.dtype) for v in shown]
+    out = linear(over(way.push), over(pull), fixed, tangents, like)
     return out, [0] * len(out)
 
 
 _linear_p = Primitive("linear")
 _linear_p.multiple_results = True
 _linear_p.def_impl(_evaluate)
-_linear_p.def_abstract_eval(
-    lambda *_, closed, **__: [ShapedArray(v.shape, v.dtype) for v in closed.out_avals]
-)
+_linear_p.def_abstract_eval(lambda *_, shown, **__: list(shown))
 ad.primitive_jvps[_linear_p] = _jvp
 ad.primitive_transposes[_linear_p] = _transpose
 batching.primitive_batchers[_linear_p] = _lanes

@@ -303,6 +303,32 @@ def test_derivatives_of_one_kernel_are_one_each(dtype):
             assert ONE not in compiled(jax.vmap(f), x[None].repeat(4, 0))
 
 
+@BOTH
+def test_what_is_not_used_has_no_part_in_a_derivative(mark):
+    """The root has a slope without bound at 0, of which 0 times is no number."""
+    marked = mark(lambda x: (2 * x, jnp.sqrt(x)))
+    slope = jax.jit(jax.grad(lambda x: marked(x)[0]))
+    assert slope(0.0) == 2
+    assert jax.jit(jax.vmap(slope))(jnp.zeros(3)).tolist() == [2, 2, 2]
+
+
+@BOTH
+def test_nothing_traced_is_kept(mark):
+    """A part that closes over what is traced, and its derivatives, once and twice."""
+
+    def of(x):
+        return jnp.sum(mark(lambda v: jnp.sin(v) * x)(x * 2))
+
+    x = jnp.arange(3.0)
+    with jax.checking_leaks():
+        got = jax.jit(jax.grad(of))(x), jax.jit(jax.hessian(of))(x)
+    first = 2 * x * np.cos(2 * x) + np.sin(2 * x)
+    np.testing.assert_allclose(got[0], first, rtol=1e-14)
+    np.testing.assert_allclose(
+        got[1], np.diag(4 * np.cos(2 * x) - 4 * x * np.sin(2 * x)), atol=1e-14
+    )
+
+
 UNFIT = {
     "product": lambda x, y: jnp.outer(x, x) @ y,
     "places": lambda x, y: x.at[jnp.array([0, 2])].set(y[:2]),

@@ -599,3 +599,19 @@ def test_global_and_local_make_up_the_tool_displacement():
     _, _, found = dent(16)
     here = points(73.0, 0.4).straight
     np.testing.assert_allclose(at_C + correction(found, here)[0], keys.contact + d, atol=1e-9)
+
+
+@pytest.mark.parametrize("given", ["float32", "float64"])
+def test_targets_of_another_dtype(given):
+    """Promoted to that of the centres, as the numpy solution of the same equations is."""
+    rng = np.random.default_rng(2)
+    centres, points = rng.normal(size=(8, 3)), rng.normal(size=(5, 3))
+    targets = (10 * rng.normal(size=(8, 3))).astype(given)
+    with jax.numpy_dtype_promotion("standard"):
+        dent = jax.jit(local.fit)(jnp.asarray(centres), jnp.asarray(targets), jnp.asarray(3.0))
+        found = local.correction(dent, jnp.asarray(points))
+    q = np.minimum(np.linalg.norm(centres[:, None] - centres, axis=2) / 3, 1)
+    weights = np.linalg.solve((1 - q) ** 4 * (4 * q + 1), targets.astype(float))
+    q = np.minimum(np.linalg.norm(points[:, None] - centres, axis=2) / 3, 1)
+    assert found.dtype == jnp.float64
+    np.testing.assert_allclose(found, (1 - q) ** 4 * (4 * q + 1) @ weights, rtol=1e-9, atol=1e-9)

@@ -183,8 +183,10 @@ def fit(
     n = centres.shape[0]
 
     def solve(centres, targets, reach):
-        ridge = 16 * n * epsilon(targets.dtype)
-        matrix = _kernel(centres, centres, reach) + ridge * jnp.eye(n, dtype=targets.dtype)
+        matrix = _kernel(centres, centres, reach)
+        ridge = 16 * n * epsilon(matrix.dtype)
+        matrix = matrix + ridge * jnp.eye(n, dtype=matrix.dtype)
+        targets = targets.astype(jnp.result_type(targets, matrix))
         factor = jax.scipy.linalg.cho_factor(matrix, lower=True)
 
         def meet(weights):
@@ -255,8 +257,8 @@ def _spread_jvp(primals, tangents):
         )
         return [by[i]() for i in moving]
 
-    change = linear(push, pull, primals, [tangents[i] for i in moving])
-    return _spread(*primals), change[0]
+    out = _spread(*primals)
+    return out, linear(push, pull, primals, [tangents[i] for i in moving], [out])[0]
 
 
 def _together(dent: Dent, columns):

@@ -233,12 +233,13 @@ def _shares_jvp(primals, tangents):
         out = []
         for i in moving:
             rises = along(fixed, i, jnp.ones_like(fixed[i]))
-            by_each = added(g * v for g, v in zip(cotangents, rises, strict=True))
+            pairs = zip(cotangents, rises, strict=True)
+            by_each = added(g * v for g, v in pairs if g is not None)
             out.append(by_each if i == 0 else total(total(by_each).ravel()))
         return out
 
-    change = linear(push, pull, primals, [tangents[i] for i in moving])
-    return _shares(*primals), tuple(change)
+    out = _shares(*primals)
+    return out, tuple(linear(push, pull, primals, [tangents[i] for i in moving], out))
 
 
 @jax.custom_jvp
@@ -266,7 +267,7 @@ def _ramps_jvp(primals, tangents):
         x, at, slope = fixed
         by = (
             lambda v: slope[:, :, None] * v[:, None],
-            lambda v: jnp.broadcast_to(-(slope * v)[:, :, None], g_shape),
+            lambda v: jnp.zeros_like(x)[:, None] - (slope * v)[:, :, None],
             lambda v: (x[:, None] - at[:, :, None]) * v[:, :, None],
         )
         return [added(by[i](v) for i, v in zip(moving, tangents, strict=True))]
@@ -285,8 +286,7 @@ def _ramps_jvp(primals, tangents):
         return [by[i]() for i in moving]
 
     out = _ramps(*primals)
-    g_shape = out.shape
-    return out, linear(push, pull, primals, [tangents[i] for i in moving])[0]
+    return out, linear(push, pull, primals, [tangents[i] for i in moving], [out])[0]
 
 
 def interpolate(
@@ -472,7 +472,8 @@ def _combine_jvp(primals, tangents):
         ]
 
     fixed = [*where, fraction, table, *beyond]
-    return _combine(*primals), linear(push, pull, fixed, [changes[i] for i in moving])[0]
+    out = _combine(*primals)
+    return out, linear(push, pull, fixed, [changes[i] for i in moving], [out])[0]
 
 
 def _parted(fixed):
