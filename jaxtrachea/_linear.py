@@ -57,8 +57,7 @@ class _Way:
         def flat(*operands):
             return list(self.push(operands[: self.split], operands[self.split :]))
 
-        given = [jax.ShapeDtypeStruct(v.shape, v.dtype, weak_type=v.weak_type) for v in self.given]
-        return jax.make_jaxpr(flat)(*given)
+        return jax.make_jaxpr(flat)(*self.given)
 
 
 def _evaluate(*operands, way, **_):
