@@ -45,7 +45,8 @@ def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
     not here; so too where the first result is not used. Values and derivatives are the same, but
     for rounding. Derivatives are computations of their own too, and begin with the part once more:
     for small parts that is quicker than to keep in memory what they need of it. Forward and reverse
-    mode, each as often as wanted; `jax.linear_transpose` by itself does not know these calls.
+    mode, each as often as wanted (with a `custom_vjp` inside, reverse mode once);
+    `jax.linear_transpose` by itself does not know these calls.
 
     Args:
         part: from arrays to arrays (or trees of them); may close over traced ones.
@@ -89,7 +90,7 @@ def _called(part: Callable[..., Out], single: bool) -> Callable[..., Out]:
             variables = [*(jaxpr.constvars[i] for i in own), *jaxpr.invars]
             return _changing(jaxpr, {variables[i] for i in moving})
 
-        fits = single and _one_kernel_p is not None and fits_one_kernel(closed.jaxpr)
+        fits = single and _one_kernel_p is not None and fits_one_kernel(jaxpr)
         found = _differentiable(plain, changing, fits)(*inputs)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 

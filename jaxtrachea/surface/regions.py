@@ -455,7 +455,7 @@ def _combine_jvp(primals, tangents):
         return [
             added(
                 product("bkc,bkw->bcw", v, _basis(of_vertex, beyond))
-                if i == 5
+                if i == len(of_vertex)
                 else slopes[i] * v[:, None]
                 for i, v in zip(moving, tangents, strict=True)
             )
@@ -466,7 +466,7 @@ def _combine_jvp(primals, tangents):
         slopes = _slopes(of_vertex, beyond, table)
         return [
             product("bkw,bcw->bkc", _basis(of_vertex, beyond), g)
-            if i == 5
+            if i == len(of_vertex)
             else added(slopes[i][:, c] * g[:, c] for c in range(g.shape[1]))
             for i in moving
         ]
