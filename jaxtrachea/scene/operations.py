@@ -74,6 +74,8 @@ def _equation(equation, out: list[bool]) -> tuple[int, list[bool]]:
 
 def _inner(parameters: dict):
     """The program that a call contains, or None."""
+    if "way" in parameters:  # of a linear part
+        return parameters["way"].closed.jaxpr
     for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
         if key in parameters:
             return getattr(parameters[key], "jaxpr", parameters[key])

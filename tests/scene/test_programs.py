@@ -142,7 +142,9 @@ def tool(scene, m, p):
         return touch(scene.tool, Pose(R, T), scene.tube, near=near)
 
     def pressed(p):
-        seen = jax.vmap(contact)(p.rotation, p.translation)
+        # As `simulate` does, here and below: across the border of a computation XLA finds nothing
+        # that is there twice.
+        seen = jax.vmap(one_kernel(contact))(p.rotation, p.translation)
         inward = jax.vmap(lambda phi: local_frame(phi)[0])(seen.phi)
         return Presses(seen.s, seen.phi, -seen.gap[:, None] * inward), (seen, inward)
 
@@ -150,7 +152,6 @@ def tool(scene, m, p):
     inside = in_lumen(scene, p, seen)
     made = Approach(seen, presses, inward, None, None, seen, inside)
     m, led, used, status, hidden = admitted(scene, m, None, made)
-    # As `simulate` does: across the border of a computation XLA finds nothing that is there twice.
     out = one_kernel(lambda used: oblique_presses(scene, m, used))(used)
     wrench = force_and_moment(p, pull, inward, used, out)
     # A row is OK only with a force and a moment that are finite.
