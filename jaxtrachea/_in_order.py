@@ -184,13 +184,13 @@ def _traced(arguments) -> bool:
 #: What the compiler puts into one kernel; besides loops, branches and what works entry by entry.
 FITTING = frozenset(
     """abs add add_any and argmax argmin atan2 bitcast_convert_type broadcast_in_dim ceil clamp
-    closed_call concatenate cond convert_element_type copy cos custom_jvp_call custom_vjp_call
-    div dynamic_slice dynamic_update_slice eq erf erf_inv exp exp2 expm1 floor gather ge gt
-    hidden integer_pow iota is_finite jit le le_to linear log log1p logistic lt max min mul ne
-    neg nextafter not not_inlined one_kernel optimization_barrier or pad pjit pow reduce_and
-    reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt scan
-    select_n sign sin slice split sqrt square squeeze stack stop_gradient sub tan tanh transpose
-    unstack while xor""".split()
+    closed_call concatenate cond convert_element_type copy cos cumsum custom_jvp_call
+    custom_vjp_call div dynamic_slice dynamic_update_slice eq erf erf_inv exp exp2 expm1 floor
+    gather ge gt hidden integer_pow iota is_finite jit le le_to linear log log1p logistic lt max
+    min mul ne neg nextafter not not_inlined one_kernel optimization_barrier or pad pjit pow
+    reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round
+    rsqrt scan select_n sign sin slice split sqrt square squeeze stack stop_gradient sub tan
+    tanh transpose unstack while xor""".split()
 )
 #: Entries of one array, also between two operations, up to which one thread is as good as many.
 SMALL = 1 << 16
@@ -203,7 +203,7 @@ def fits_one_kernel(jaxpr: Jaxpr) -> bool:
     """Whether all that is computed can be in one kernel, and all arrays are small."""
     results = [v for eqn in jaxpr.eqns for v in eqn.outvars]
     arrays = (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars, *results)
-    if not jaxpr.outvars or not all(_entries(v) <= SMALL for v in arrays):
+    if not all(_entries(v) <= SMALL for v in arrays):
         return False
     return all(
         eqn.primitive.name in FITTING
@@ -227,7 +227,8 @@ def _reduces(eqn) -> bool:
 def _entries(variable) -> float:
     """How many numbers an array has; infinite where it has none, or is of something else."""
     shape, dtype = variable.aval.shape, variable.aval.dtype
-    kinds = jnp.bool_, jnp.integer, jnp.floating
+    # Of no size: what JAX puts where whole numbers have no derivative; nothing reads it.
+    kinds = jnp.bool_, jnp.integer, jnp.floating, jax.dtypes.float0
     numbers = any(jnp.issubdtype(dtype, kind) for kind in kinds)
     return float(math.prod(shape)) if numbers and math.prod(shape) else math.inf
 

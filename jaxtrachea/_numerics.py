@@ -61,6 +61,27 @@ def product(a: Float[Array, "*rows k"], b: Float[Array, "k ..."]) -> Float[Array
     return added(terms)
 
 
+def picked(values: Float[Array, "*rows n"], index: Int[Array, "*places"]) -> Float[Array, "..."]:
+    """`values[..., index]` of few values, as a sum of choices.
+
+    Going back that is a choice again; of `values[index]` it is a scatter, which no single kernel
+    can do (`_in_order.one_kernel`).
+    """
+    rows, n = values.shape[:-1], values.shape[-1]
+    each = values.reshape(*rows, *[1] * index.ndim, n)
+    place = jnp.arange(n).reshape([1] * (each.ndim - 1) + [n])
+    chosen = index.reshape(*[1] * len(rows), *index.shape, 1) == place
+    return total(jnp.where(chosen, each, 0))
+
+
+def turned(
+    matrices: Float[Array, "*many p p"], frame: Float[Array, "p q"]
+) -> Float[Array, "*many q q"]:
+    """frame^T M frame of each small matrix M, written out as `product` is."""
+    half = product(jnp.matrix_transpose(product(matrices, frame)), frame)
+    return jnp.matrix_transpose(half)
+
+
 def largest(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
     """Largest entry along the last axis, NaN where there is one; see `total`.
 

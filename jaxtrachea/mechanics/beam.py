@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, check_word, real, shaped
+from jaxtrachea._numerics import picked
 from jaxtrachea.mechanics.compliance import (
     Beam,
     Compliance,
@@ -115,7 +116,7 @@ def _reach(beam: Beam, s_c) -> tuple[Int[Array, "2"], Float[Array, "2"], Float[A
     """
     count = jnp.sum(beam.x <= s_c)
     ends = _ends(beam)
-    last = jnp.stack([s_c - ends[count], ends[count + 1] - s_c])
+    last = jnp.stack([s_c - picked(ends, count), picked(ends, count + 1) - s_c])
     return jnp.stack([count, beam.x.shape[0] - count]), last, jnp.stack([s_c, beam.length - s_c])
 
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._arguments import ArrayLike
-from jaxtrachea._numerics import epsilon
+from jaxtrachea._numerics import epsilon, product
 from jaxtrachea.mechanics._matrix2 import apply, solve
 from jaxtrachea.mechanics.equilibrium import press_series
 from jaxtrachea.mechanics.force_law import Law
@@ -144,7 +144,7 @@ def slide(
     solved = jnp.where(sliding, on_cone.solved, jnp.isfinite(jnp.sum(stuck.force)) & ~pulls)
     force = jnp.where(sliding, on_cone.force, jnp.where(solved, stuck.force, 0))
     depth = jnp.where(sliding, on_cone.depth, jnp.where(solved, stuck.depth, 0))
-    moved = jnp.where(sliding & solved, (trial - depth - compliance @ force)[1:], 0)
+    moved = jnp.where(sliding & solved, (trial - depth - product(compliance, force))[1:], 0)
     away = jnp.where(jnp.isfinite(jnp.sum(displacement)), displacement[1:], slip)
     failed = jnp.where(pulls, PressStatus.PULLS, PressStatus.PAST_FOLD)
     failed = jnp.where(stuck.status == PressStatus.OK, failed, stuck.status)
@@ -186,7 +186,7 @@ def _on_cone(sliding, D, compliance, law: Law, mu) -> _OnCone:
     normal, tangential = force[0], jnp.linalg.norm(force[1:])
     tolerance = epsilon(D.dtype) ** 0.5
     size = tolerance * jnp.linalg.norm(force)
-    work = jnp.sum(force[1:] * (still[0] - depth - still[1] @ force)[1:])
+    work = jnp.sum(force[1:] * (still[0] - depth - product(still[1], force))[1:])
     solved = sliding & jnp.isfinite(jnp.sum(force + depth)) & (normal >= 0) & (pressed >= 0)
     solved &= jnp.abs(tangential - still[3] * normal) <= size
     solved &= work >= -size * jnp.linalg.norm(still[0])

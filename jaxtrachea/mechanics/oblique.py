@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, check_record, check_word, last_axis, shaped
+from jaxtrachea._numerics import product, turned
 from jaxtrachea.mechanics import friction as _friction
 from jaxtrachea.mechanics import skeleton, vector_equilibrium
 from jaxtrachea.mechanics.admission import Admitted, admit, hide, status_of
@@ -153,7 +154,7 @@ def press_oblique(
 def press_at(place: Place, displacement: Float[Array, "*n 3"], options: Options) -> ObliquePress:
     """As `press_oblique`, on a place that is known."""
     normal = local_frame(place.phi_c)[0]
-    inward = displacement @ normal
+    inward = product(displacement, normal)
     if options.contact == "bonded":
         moved = displacement - place.onset * jnp.broadcast_to(normal, displacement.shape)
     else:
@@ -168,7 +169,7 @@ def press_at(place: Place, displacement: Float[Array, "*n 3"], options: Options)
     force, depth = (v.reshape(displacement.shape) for v in (solved.force, solved.depth))
     status = solved.status.reshape(displacement.shape[:-1])
     if options.contact == "unilateral":
-        pulls = force @ normal < 0
+        pulls = product(force, normal) < 0
         force, depth = (jnp.where(pulls[..., None], jnp.nan, v) for v in (force, depth))
         status = jnp.where(pulls, PressStatus.PULLS, status)
     refused = place.asked.refused
@@ -220,15 +221,15 @@ def press_path(
     friction = Coulomb(jnp.where(mu < 0, 0, mu), friction.rounding)
     refused = jnp.where(mu < 0, PressStatus.BAD_MATERIAL, asked.refused).astype(jnp.int8)
     frame = local_frame(phi_c)
-    D = displacement @ frame.T
-    D = D.at[:, 0].set(touch(D[:, 0], onset, options.press))
-    C = frame @ unit.compliance @ frame.T
+    D = product(displacement, frame.T)
+    D = jnp.concatenate([touch(D[:, :1], onset, options.press), D[:, 1:]], axis=1)
+    C = turned(unit.compliance, frame.T)
     slid = _friction.slide_path(D, C, law, friction)
     unit, slid = hide(refused, unit, slid)
     status = status_of(refused, slid.status)
-    press = _assemble(unit, slid.force @ frame, slid.depth @ frame, status)
+    press = _assemble(unit, product(slid.force, frame), product(slid.depth, frame), status)
     sliding = slid.sliding & (refused == PressStatus.OK)
-    return ObliquePath(press, slid.slip @ frame[1:], slid.dissipated, sliding)
+    return ObliquePath(press, product(slid.slip, frame[1:]), slid.dissipated, sliding)
 
 
 def place_at(
@@ -257,15 +258,16 @@ def _assemble(unit: Skeleton, force, depth, status) -> ObliquePress:
     """The skeleton's response times the forces; the ring's status where it has one."""
 
     def per_ring(v):
-        return jnp.einsum("...q,ipq->...ip", force, v)
+        rows = product(force.reshape(-1, 3), v.reshape(-1, 3).T)
+        return rows.reshape(*force.shape[:-1], *v.shape[:-1])
 
     behind = unit.status == RingStatus.BEHIND_GAP
     status = jnp.where(behind, PressStatus.BEHIND_GAP, status).astype(jnp.int8)
     return ObliquePress(
         force=force,
         depth=depth,
-        skeleton=force @ unit.compliance.T,
-        slope_C=force @ unit.slope_C.T,
+        skeleton=product(force, unit.compliance.T),
+        slope_C=product(force, unit.slope_C.T),
         joints=per_ring(unit.joints),
         slopes=per_ring(unit.slopes),
         loads=per_ring(unit.loads),

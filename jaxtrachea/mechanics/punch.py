@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtrachea._numerics import epsilon
+from jaxtrachea._numerics import epsilon, picked, product
 from jaxtrachea.mechanics.beam import deflect
 from jaxtrachea.mechanics.compliance import Beam
 from jaxtrachea.mechanics.force_law import ring_weight
@@ -60,7 +60,7 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
         half_width: mm, more than 0.
     """
     ends = jnp.clip(jnp.stack([s_c - half_width, s_c + half_width]), 0, beam.length)
-    marked, ring, marks = _with_marks(beam, ends)
+    marked, passed, marks = _with_marks(beam, ends)
     unit = jax.vmap(lambda s: deflect(marked, s, jnp.ones_like(s)))(ends)
     c_11, c_22 = unit.w_C
     c_12 = unit.w[0, marks[1]]
@@ -71,29 +71,43 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
     share = jnp.where(apart, share, jnp.nan)
 
     def per_ring(v):
-        return share @ v[:, ring]
+        return _without_marks(product(share, v), passed)
 
-    edges = share @ unit.theta[:, marks]
+    edges = product(share, picked(unit.theta, marks))
     return UnitDeflection(
-        w_C=c_12 + share[0] * second, theta_C=share @ edges, w=per_ring(unit.w),
+        w_C=c_12 + share[0] * second, theta_C=product(share, edges), w=per_ring(unit.w),
         theta=per_ring(unit.theta), reaction=per_ring(unit.reaction), edges=edges,
     )  # fmt: skip
 
 
 def _with_marks(beam: Beam, ends) -> tuple[Beam, Array, Array]:
-    """The beam with two more supports, of no stiffness; where the others then stand, and they.
+    """The beam with two more supports, of no stiffness; how many of them stand before each other.
 
-    A mark at a support stands behind it.
+    A mark at a support stands behind it. Third: the places of the two.
     """
     n = beam.x.shape[0]
-    before = jnp.arange(n)
-    ring = before + jnp.sum(ends[None] < beam.x[:, None], axis=1)
+    passed = jnp.sum(ends[None] < beam.x[:, None], axis=1)
     mark = jnp.sum(beam.x[None] <= ends[:, None], axis=1) + jnp.arange(2)
-    x = jnp.zeros(n + 2, beam.x.dtype).at[ring].set(beam.x).at[mark].set(ends)
-    k = jnp.zeros(n + 2, beam.k.dtype).at[ring].set(beam.k)
-    span = jnp.arange(n + 3) - jnp.sum(mark[None] < jnp.arange(n + 3)[:, None], axis=1)
-    GA = None if beam.GA is None else beam.GA[span]
-    return Beam(x, beam.length, beam.EI[span], k, GA), ring, mark
+    place = jnp.arange(n + 3)  # of a support, and of the span before it
+    before = jnp.sum(mark[None] < place[:, None], axis=1)
+
+    def spread(v, before):
+        """Each as far behind as marks stand before it; no gather, which goes back as a scatter."""
+        shifts = [jnp.pad(v, (i, 2 - i)) for i in range(3)]
+        return jnp.select([before == 0, before == 1], shifts[:2], shifts[2])
+
+    first, second = (place[:-1] == at for at in mark)
+    x, k = (spread(v, before[:-1]) for v in (beam.x, beam.k))
+    x = jnp.where(first, ends[0], jnp.where(second, ends[1], x))
+    k = jnp.where(first | second, 0, k)
+    EI, GA = (None if v is None else spread(v, before) for v in (beam.EI, beam.GA))
+    return Beam(x, beam.length, EI, k, GA), passed, mark
+
+
+def _without_marks(v: Float[Array, " supports"], passed) -> Float[Array, " n"]:
+    """Of all supports those that are no marks."""
+    n = passed.shape[0]
+    return jnp.select([passed == 0, passed == 1], [v[:n], v[1 : n + 1]], v[2:])
 
 
 def mean_ring_weight(
@@ -105,4 +119,4 @@ def mean_ring_weight(
     """`ring_weight`, its mean over the width of the punch."""
     points = s_c + half_width * jnp.asarray(_POINTS, s_c.dtype)
     of_points = jax.vmap(ring_weight, (0, None, None))(points, ring_positions, transition)
-    return of_points @ jnp.asarray(_WEIGHTS / 2, s_c.dtype)
+    return jnp.sum(of_points * jnp.asarray(_WEIGHTS / 2, s_c.dtype))

@@ -12,9 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, check_word, shaped
+from jaxtrachea._numerics import turned
 from jaxtrachea.mechanics import axial as _axial
 from jaxtrachea.mechanics import ring as _ring
 from jaxtrachea.mechanics import spatial_beam
+from jaxtrachea.mechanics._matrix2 import mul
 from jaxtrachea.mechanics.admission import admit, hide, status_of
 from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -118,14 +120,11 @@ def respond(
     n = x.shape[0]
     EI = _planes(material.EI_L, material.EI_side, n + 1)
     GA = _planes(_needed(material, "GA_L", "shear"), material.GA_side, n + 1) if shear else None
-    beam = spatial_beam.SpatialBeam(x, geometry.length, EI, frame @ C @ frame.T, GA)
+    beam = spatial_beam.SpatialBeam(x, geometry.length, EI, turned(C, frame.T), GA)
     unit = jax.vmap(spatial_beam.deflect, (None, None, 0), -1)(beam, s_c, jnp.eye(2, dtype=x.dtype))
 
     # To y and z: components on the left, the force's on the right.
-    def turn(v):
-        return frame.T @ v @ frame
-
-    w_C, w, P = turn(unit.w_C), turn(unit.w), turn(unit.reaction)
+    w_C, w, P = (turned(v, frame) for v in (unit.w_C, unit.w, unit.reaction))
     along = None
     if axial:
         EA = jnp.broadcast_to(_needed(material, "EA_L", "axial"), (n + 1,))
@@ -135,12 +134,12 @@ def respond(
     if along is not None:
         u_C, u = along.u_C, along.u
         passed = jnp.where(x <= s_c, along.force_A, along.force_B)
-    U, V = (w, w) if per_load is None else (end @ P for end in per_load)
+    U, V = (w, w) if per_load is None else (jax.vmap(mul)(end, P) for end in per_load)
     return Skeleton(
         compliance=_join(u_C, (w_C + w_C.T) / 2),
-        slope_C=_widen(turn(unit.theta_C)),
+        slope_C=_widen(turned(unit.theta_C, frame)),
         joints=_join(u, w),
-        slopes=_widen(turn(unit.theta)),
+        slopes=_widen(turned(unit.theta, frame)),
         loads=_join(passed, P),
         end_U=_join(u, U),
         end_V=_join(u, V),
@@ -166,7 +165,7 @@ def turned_rings(
 ) -> Float[Array, "rings 2 2"]:
     """Compliance of each ring at phi_c along (inward normal, circumferential), mm/N."""
     frame = local_frame(phi_c)[::2, 1:]
-    return frame @ _rings(geometry, material, phi_c, rings)[0] @ frame.T
+    return turned(_rings(geometry, material, phi_c, rings)[0], frame.T)
 
 
 def _rings(geometry: Geometry, material: Material, phi_c, level: Rings):
@@ -198,7 +197,7 @@ def _rings(geometry: Geometry, material: Material, phi_c, level: Rings):
         C, ends, status = jax.lax.map(one, k_M)
     if level == "arch":
         normal = jnp.stack([jnp.cos(phi_c), jnp.sin(phi_c)])
-        C = jnp.einsum("npq,p,q->n", C, normal, normal)[:, None, None] * eye
+        C = turned(C, normal[:, None]) * eye
     return C, ends, jnp.max(status)
 
 

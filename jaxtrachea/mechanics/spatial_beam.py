@@ -199,14 +199,14 @@ def _reach(sides: _Side, beam: SpatialBeam, s_c) -> _Reach:
     ends = _ends(beam)
     last = jnp.stack([s_c - ends[count_A], ends[count_A + 1] - s_c])
 
-    def one(side, h, count):
-        def at(v):
-            return jax.lax.dynamic_index_in_dim(v, count, keepdims=False)
+    def at(v):
+        # Not vmap: going back that would be a scatter, which a single kernel cannot do.
+        return jnp.stack(
+            [jax.lax.dynamic_index_in_dim(v[i], count[i], keepdims=False) for i in (0, 1)]
+        )
 
-        tip, EI, GA = jax.tree.map(at, (side.after, side.EI, side.GA))
-        return _add_span(tip, h, EI, GA)
-
-    return _Reach(jax.vmap(one)(sides, last, count), last, count)
+    tip, EI, GA = jax.tree.map(at, (sides.after, sides.EI, sides.GA))
+    return _Reach(jax.vmap(_add_span)(tip, last, EI, GA), last, count)
 
 
 def _side(tree, i):

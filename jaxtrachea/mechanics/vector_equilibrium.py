@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._numerics import epsilon, solve_spd
+from jaxtrachea._numerics import epsilon, product, solve_spd
 from jaxtrachea.mechanics.equilibrium import status_of
 from jaxtrachea.mechanics.force_law import Law, fold_depth
 from jaxtrachea.status import PressStatus
@@ -77,7 +77,7 @@ def press_vector_total(
     squared = jnp.sum(displacement * displacement)
     folded = law.softens() & (squared >= fold_depth(law) ** 2)
     force = _force(displacement, law)
-    depth = displacement - compliance @ force
+    depth = displacement - product(compliance, force)
     status = status_of(jnp.max(jnp.abs(displacement)), jnp.sum(depth + force), folded)
     negative = (status == PressStatus.OK) & (jnp.sum(depth * force) < 0)
     status = jnp.where(negative, PressStatus.NEGATIVE_LOCAL, status).astype(jnp.int8)
@@ -111,7 +111,7 @@ def _series(displacement, compliance, law: Law):
         d, e = _secant_motion(direction, compliance, scaled.secant(t * t))
         length = jnp.linalg.norm(d)
         # 1/|d| = a + b kappa, neither formed by a subtraction; a t + b t kappa(t) = 1.
-        a, b = jnp.sum(d * e) / length**3, jnp.sum(d * (compliance @ e)) / length**3
+        a, b = jnp.sum(d * e) / length**3, jnp.sum(d * product(compliance, e)) / length**3
         return scaled.root(jnp.ones_like(a), b, a)
 
     t = jax.lax.fori_loop(0, STEPS, tangent_step, jnp.zeros_like(size))
@@ -137,8 +137,8 @@ def _series_jvp(primals, tangents):
     kappa, stiffening = jax.jvp(law.secant, (squared,), (jnp.ones_like(squared),))
     grown = d_law.secant(squared)
     M = jnp.eye(3, dtype=depth.dtype) + kappa * compliance
-    y, z = solve_spd(M, d_displacement - d_compliance @ force), solve_spd(M, depth)
-    v = compliance @ z
+    y, z = solve_spd(M, d_displacement - product(d_compliance, force)), solve_spd(M, depth)
+    v = product(compliance, z)
     share = 1 / (1 + 2 * stiffening * jnp.sum(depth * v))
     along = 2 * stiffening * share * jnp.sum(depth * y)
     d_depth = y - along * v
