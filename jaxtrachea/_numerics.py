@@ -108,6 +108,23 @@ def first_largest(x: Float[Array, " n"]) -> Int[Array, ""]:
     return jnp.minimum(first, n - 1)
 
 
+def lowest(x: Float[Array, " n"], count: int) -> tuple[Int[Array, " count"], Bool[Array, " n"]]:
+    """Indices of the lowest entries, rising, and which entries are left.
+
+    A few are found one by one: `jax.lax.top_k` is a kernel of its own, which takes longer and
+    cannot be part of another (`_in_order.one_kernel`).
+    """
+    at = jnp.arange(x.shape[0], dtype=jnp.int32)
+    if count > WRITTEN_OUT:
+        found = jax.lax.top_k(-x, count)[1]
+        return found, jnp.all(at[:, None] != found[None], axis=1)
+    found, left = [], jnp.ones(x.shape, bool)
+    for _ in range(count):
+        found.append(first_largest(jnp.where(left, -x, -jnp.inf)).astype(jnp.int32))
+        left = left & (at != found[-1])
+    return jnp.stack(found), left
+
+
 def _reduced(reduce, pair, x, filling):
     """A reduction along the last axis in columns, which the processor takes several at a time.
 

@@ -14,9 +14,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtrachea import _in_order
+from jaxtrachea import (
+    Material,
+    Options,
+    _in_order,
+    press,
+    press_oblique,
+    press_path,
+    table_1,
+)
 from jaxtrachea._in_order import in_order, one_kernel
 from jaxtrachea._numerics import epsilon
+from jaxtrachea.mechanics.friction import Coulomb
+from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.tradeoff.kernels import count_kernels
 
 DTYPES = ["float32", "float64"]
@@ -431,3 +441,58 @@ def test_programs_for_several_devices_have_no_marks(mark):
         text = jax.export.export(jax.jit(mark(part)), platforms=devices)(x, y).mlir_module()
         assert "inlineable" not in text
         assert "small_call" not in text
+
+
+#: Presses as scenes make them: each with what it takes beside the others.
+PRESSES = {
+    "mat": ObliqueOptions(rings="mat", axial=False),
+    "arch": ObliqueOptions(rings="arch"),
+    "arch2, shear, bonded": ObliqueOptions(Options(contact="bonded", shear=True)),
+    "total coupling": ObliqueOptions(Options(coupling="total")),
+}
+SCRAPES = {"friction": ObliqueOptions(rings="arch2")}
+PUNCHES = {
+    "punch": Options(half_width=2.0),
+    "punch, shear, two materials": Options(half_width=2.0, shear=True, local="two-material"),
+}
+
+
+def pressed(name):
+    """The press of this name, by tube, material, place and displacements."""
+
+    def run(geometry, material, s, D):
+        if name in PUNCHES:
+            return press(geometry, material, s, D[:, 1], PUNCHES[name])
+        if name in SCRAPES:
+            return press_path(geometry, material, s, 0.3, D, Coulomb(0.3), SCRAPES[name])
+        return press_oblique(geometry, material, s, 0.3, D, PRESSES[name])
+
+    return run
+
+
+SLOW = pytest.mark.slow, pytest.mark.compiling
+LONG = "mat", "arch", "total coupling", "friction"
+
+
+@pytest.mark.parametrize(
+    "name", ["arch2, shear, bonded", *PUNCHES, *(pytest.param(v, marks=SLOW) for v in LONG)]
+)
+def test_presses_and_their_derivatives_fit_one_kernel(name):
+    """What scenes put into a kernel: with a product or a scatter it would be hundreds."""
+    names = "EI_L k_M k_1 k_3 EA_L EI_C k_t GA_L k_A k_1_ring".split()
+    material = Material(**dict.fromkeys(names, 1.0))
+    given = table_1(), jax.tree.map(jnp.asarray, material), jnp.asarray(70.0), jnp.ones((2, 3))
+
+    def numbers(*given):
+        leaves = jax.tree.leaves(pressed(name)(*given))
+        return [v for v in leaves if jnp.issubdtype(v.dtype, jnp.floating)]
+
+    def push(given, tangents):
+        return jax.jvp(numbers, given, tangents)[1]
+
+    def pull(given, cotangents):
+        return jax.vjp(numbers, *given)[1](cotangents)
+
+    ways = (numbers, *given), (push, given, given), (pull, given, jax.eval_shape(numbers, *given))
+    for f, *arguments in ways:
+        assert _in_order.fits_one_kernel(jax.make_jaxpr(f)(*arguments).jaxpr), f.__name__

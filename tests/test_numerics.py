@@ -16,7 +16,9 @@ from jaxtrachea._numerics import (
     first_largest,
     first_positive_root,
     largest,
+    lowest,
     newton_tolerance,
+    picked,
     positive_part,
     product,
     quintic_past_fold,
@@ -24,6 +26,7 @@ from jaxtrachea._numerics import (
     rising_root,
     solve_spd,
     total,
+    turned,
 )
 
 DTYPES = ["float32", "float64"]
@@ -415,3 +418,42 @@ def test_product_of_unequal_sizes():
     for b in (jnp.ones(3), jnp.ones(5), jnp.ones((3, 2))):
         with pytest.raises(Exception, match=r"expected 4 rows|Type-check error"):
             product(a, b)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("rows", "places"), [((), ()), ((), (2,)), ((3,), (2,)), ((2, 3), (4, 1))])
+def test_picked_is_the_entry(rows, places, dtype):
+    """As by indexing; NaN stays where it is, and the derivative is 1 for what is picked."""
+    rng = np.random.default_rng(3)
+    values, index = rng.normal(size=(*rows, 5)).astype(dtype), rng.integers(1, 5, places)
+    values[..., 0] = np.nan
+    for f in (picked, jax.jit(picked)):
+        found = f(jnp.asarray(values), jnp.asarray(index))
+        assert found.dtype == dtype
+        np.testing.assert_array_equal(found, values[..., index])
+    slope = jax.grad(lambda v: jnp.sum(picked(v, jnp.asarray(index))))(jnp.asarray(values))
+    count = np.bincount(index.ravel(), minlength=5)
+    np.testing.assert_array_equal(slope, np.broadcast_to(count, values.shape))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
+def test_turned_is_the_congruence(shape, dtype):
+    rng = np.random.default_rng(4)
+    matrices, frame = rng.normal(size=(*shape, 3, 3)), rng.normal(size=(3, 2))
+    expected = frame.T @ matrices @ frame
+    found = jax.jit(turned)(jnp.asarray(matrices, dtype), jnp.asarray(frame, dtype))
+    assert found.dtype == dtype
+    atol = 32 * epsilon(found.dtype) * np.abs(expected).max()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("count", [1, 3, 8, 9, 20])
+def test_lowest_are_those_of_a_sort(count):
+    """Of equal ones the first; in lanes too."""
+    x = np.random.default_rng(6).integers(0, 12, (3, 40)).astype(float)
+    places, left = jax.jit(jax.vmap(lambda v: lowest(v, count)))(jnp.asarray(x))
+    expected = np.argsort(x, axis=1, kind="stable")[:, :count]
+    np.testing.assert_array_equal(places, expected)
+    for kept, taken in zip(left, expected, strict=True):
+        np.testing.assert_array_equal(np.flatnonzero(~kept), np.sort(taken))

@@ -24,7 +24,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxtrachea._numerics import WRITTEN_OUT, first_largest, largest, total
+from jaxtrachea._numerics import first_largest, largest, lowest, total
 from jaxtrachea.contact.distance import approach, signed_distance
 from jaxtrachea.contact.line import Centreline, skeleton_coordinates
 from jaxtrachea.contact.pose import Pose, transform
@@ -175,7 +175,7 @@ def touch(
     # Where two patches are equally near, beside the middle one, roundings do not choose.
     order = jnp.arange(count, dtype=bounds.dtype) / count
     rank = bounds + LEAD * _size(tool, patches) * order
-    chosen, left = _lowest(rank, near)
+    chosen, left = lowest(rank, near)
     shapes = _rows_at(patches.shapes, chosen)
 
     def contact(patch, direction):
@@ -243,19 +243,6 @@ def gap_bounds(
         return -(sharp_support(patch, d) + sharp_support(moved, -d)), d
 
     return jax.vmap(bound)(patches.shapes, patches.centres)
-
-
-def _lowest(values, count):
-    """Places of the lowest values, rising, and which values are left."""
-    at = jnp.arange(values.shape[0], dtype=jnp.int32)
-    if count > WRITTEN_OUT:
-        found = jax.lax.top_k(-values, count)[1]
-        return found, jnp.all(at[:, None] != found[None], axis=1)
-    found, left = [], jnp.ones(values.shape, bool)
-    for _ in range(count):  # a kernel of its own, which `top_k` is, takes longer
-        found.append(first_largest(jnp.where(left, -values, -jnp.inf)).astype(jnp.int32))
-        left = left & (at != found[-1])
-    return jnp.stack(found), left
 
 
 def _furthest(vertices, direction):

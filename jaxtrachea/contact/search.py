@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import check_record
-from jaxtrachea._numerics import epsilon, largest, total
+from jaxtrachea._numerics import epsilon, largest, lowest, total
 from jaxtrachea.contact.shapes import heights, log_mean
 
 #: Sharpness times size at which annealing begins: the whole pair is then one smooth bowl.
@@ -342,9 +342,9 @@ def starts(pair: Pair, table, centre, count: int):
     directions, neighbours = coarse_directions(table.shape[0])
     f = table + sharp_table(-pair.b, table.shape[0])
     f = f - LEAD * extent(pair) * jnp.asarray(directions @ np.asarray(PREFERRED), f.dtype)
-    lowest = jnp.all(f[:, None] <= f[neighbours], axis=1)
-    ranked = jnp.where(lowest, f, f + (jnp.max(f) - jnp.min(f)))
-    _, best = jax.lax.top_k(-ranked, count - 1)
+    minimum = jnp.all(f[:, None] <= f[neighbours], axis=1)
+    ranked = jnp.where(minimum, f, f + (jnp.max(f) - jnp.min(f)))
+    best, _ = lowest(ranked, count - 1)
     return jnp.concatenate([jnp.asarray(directions, f.dtype)[best], centre[None]])
 
 
@@ -380,7 +380,7 @@ def _survivors(pair: Pair, d, count: int):
     together = jnp.sum(d[:, None] * d[None], axis=2) > SAME
     again = jnp.any(together & (rank[None] < rank[:, None]), axis=1)
     last = jnp.max(rank) - jnp.min(rank)
-    return jax.lax.top_k(-(rank + jnp.where(again, last, 0)), count)[1]
+    return lowest(rank + jnp.where(again, last, 0), count)[0]
 
 
 def _choose(pair: Pair, d, f):

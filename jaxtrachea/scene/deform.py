@@ -192,4 +192,5 @@ def _sag(tool: Shape, pose: Poses, points):
         there = Pose(jnp.eye(3, dtype=x.dtype), seen)
         return signed_distance(tool, point, there, FOR_POINTS).distance
 
-    return jnp.maximum(jax.vmap(one)(points), 0)
+    # In turn: all at once are arrays too large for one kernel, and many kernels take longer.
+    return jnp.maximum(jax.lax.map(one, points), 0)
