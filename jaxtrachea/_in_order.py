@@ -8,8 +8,8 @@ small part is a computation of its own: `in_order`.
 Starting a kernel takes as long as some hundred operations. What XLA makes of its own small loops
 can be asked for: the whole part in one function, with loops and branches, `one_kernel`. That is for
 parts whose arrays are small: one thread works through them. A kernel calls no library and holds no
-scatter: a product of matrices is written as a sum (`_numerics.product`, `turned`), a choice by place
-as a sum of choices (`picked`), the lowest of many found one by one (`lowest`).
+scatter: a product of matrices is written as a sum (`_numerics.product`, `turned`), a choice by
+place as a sum of choices (`picked`), the lowest of many found one by one (`lowest`).
 
 With the environment variable `JAXTRACHEA_ONE_KERNEL` set to 0 there are no single kernels: for
 programs that are exported to another version of jaxlib, or should a compiler refuse one.
