@@ -100,8 +100,8 @@ def _with_marks(beam: Beam, ends) -> tuple[Beam, Array, Array]:
     x, k = (spread(v, before[:-1]) for v in (beam.x, beam.k))
     x = jnp.where(first, ends[0], jnp.where(second, ends[1], x))
     k = jnp.where(first | second, 0, k)
-    EI, GA = (None if v is None else spread(v, before) for v in (beam.EI, beam.GA))
-    return Beam(x, beam.length, EI, k, GA), passed, mark
+    GA = None if beam.GA is None else spread(beam.GA, before)
+    return Beam(x, beam.length, spread(beam.EI, before), k, GA), passed, mark
 
 
 def _without_marks(v: Float[Array, " supports"], passed) -> Float[Array, " n"]:
