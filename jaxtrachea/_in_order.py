@@ -228,7 +228,7 @@ def _reduces(eqn) -> bool:
 def _entries(variable) -> float:
     """How many numbers an array has; infinite where it has none, or is of something else."""
     shape, dtype = variable.aval.shape, variable.aval.dtype
-    # Of no size: what JAX puts where whole numbers have no derivative; nothing reads it.
+    # float0: what JAX puts where whole numbers have no derivative; nothing reads it.
     kinds = jnp.bool_, jnp.integer, jnp.floating, jax.dtypes.float0
     numbers = any(jnp.issubdtype(dtype, kind) for kind in kinds)
     return float(math.prod(shape)) if numbers and math.prod(shape) else math.inf

@@ -62,7 +62,7 @@ def product(a: Float[Array, "*rows k"], b: Float[Array, "k ..."]) -> Float[Array
 
 
 def picked(values: Float[Array, "*rows n"], index: Int[Array, "*places"]) -> Float[Array, "..."]:
-    """`values[..., index]` of few values, as a sum of choices.
+    """`values[..., index]`, as a sum of choices; 0 where there is no such place.
 
     Going back that is a choice again; of `values[index]` it is a scatter, which no single kernel
     can do (`_in_order.one_kernel`).
@@ -113,9 +113,13 @@ def lowest(x: Float[Array, " n"], count: int) -> tuple[Int[Array, " count"], Boo
 
     A few are found one by one: `jax.lax.top_k` is a kernel of its own, which takes longer and
     cannot be part of another (`_in_order.one_kernel`).
+
+    Args:
+        x: no NaN, and at least `count` entries below infinity: else an index may come twice.
+        count: of indices, 0 or more.
     """
     at = jnp.arange(x.shape[0], dtype=jnp.int32)
-    if count > WRITTEN_OUT:
+    if count == 0 or count > WRITTEN_OUT:
         found = jax.lax.top_k(-x, count)[1]
         return found, jnp.all(at[:, None] != found[None], axis=1)
     found, left = [], jnp.ones(x.shape, bool)

@@ -17,6 +17,7 @@ import pytest
 from jaxtrachea import (
     Material,
     Options,
+    Poses,
     _in_order,
     press,
     press_oblique,
@@ -25,8 +26,10 @@ from jaxtrachea import (
 )
 from jaxtrachea._in_order import in_order, one_kernel
 from jaxtrachea._numerics import epsilon
+from jaxtrachea.contact.shapes import capsule
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliqueOptions
+from jaxtrachea.scene.deform import _sag
 from jaxtrachea.tradeoff.kernels import count_kernels
 
 DTYPES = ["float32", "float64"]
@@ -496,3 +499,27 @@ def test_presses_and_their_derivatives_fit_one_kernel(name):
     ways = (numbers, *given), (push, given, given), (pull, given, jax.eval_shape(numbers, *given))
     for f, *arguments in ways:
         assert _in_order.fits_one_kernel(jax.make_jaxpr(f)(*arguments).jaxpr), f.__name__
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("n", [2, 33, 501])
+def test_running_sums_are_in_one_kernel(n, dtype):
+    """Stretches of the ligament add up from either end: of any number of rings, there and back."""
+    x = jnp.asarray(np.random.default_rng(8).normal(size=n), dtype)
+    f = one_kernel(lambda x: jnp.cumsum(x) + 2 * jnp.cumsum(x[::-1])[::-1])
+    run = jax.jit(f).lower(x).compile()
+    assert (ONE in run.as_text()) == (_in_order._one_kernel_p is not None)
+    v = np.asarray(x, float)
+    atol = 4 * n * epsilon(x.dtype)
+    np.testing.assert_allclose(run(x), v.cumsum() + 2 * v[::-1].cumsum()[::-1], rtol=0, atol=atol)
+    # By hand: entry i is in n - i sums from the front, and twice in i + 1 from the back.
+    i = np.arange(n)
+    np.testing.assert_array_equal(jax.grad(lambda x: jnp.sum(f(x)))(x), n - i + 2 * (i + 1))
+
+
+def test_a_tool_of_few_corners_is_in_the_kernel_that_lays_out_a_dent():
+    """Its distance from the dent's centres, in turn; a sphere's is a formula."""
+    pose = Poses(jnp.eye(3), jnp.asarray([70.0, 15.0, 0.0]))
+    tool = capsule(2.0, 6.0)
+    program = jax.make_jaxpr(lambda points: _sag(tool, pose, points))(jnp.ones((16, 3)))
+    assert _in_order.fits_one_kernel(program.jaxpr)

@@ -81,9 +81,12 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
 
 
 def _with_marks(beam: Beam, ends) -> tuple[Beam, Array, Array]:
-    """The beam with two more supports, of no stiffness; how many of them stand before each other.
+    """The beam with two more supports, the marks, of no stiffness.
 
-    A mark at a support stands behind it. Third: the places of the two.
+    A mark at a support stands behind it.
+
+    Returns:
+        That beam, how many marks stand before each support of `beam`, and the places of the marks.
     """
     n = beam.x.shape[0]
     passed = jnp.sum(ends[None] < beam.x[:, None], axis=1)
@@ -94,7 +97,7 @@ def _with_marks(beam: Beam, ends) -> tuple[Beam, Array, Array]:
     def spread(v, before):
         """Each as far behind as marks stand before it; no gather, which goes back as a scatter."""
         shifts = [jnp.pad(v, (i, 2 - i)) for i in range(3)]
-        return jnp.select([before == 0, before == 1], shifts[:2], shifts[2])
+        return jnp.where(before == 0, shifts[0], jnp.where(before == 1, shifts[1], shifts[2]))
 
     first, second = (place[:-1] == at for at in mark)
     x, k = (spread(v, before[:-1]) for v in (beam.x, beam.k))
@@ -107,7 +110,7 @@ def _with_marks(beam: Beam, ends) -> tuple[Beam, Array, Array]:
 def _without_marks(v: Float[Array, " supports"], passed) -> Float[Array, " n"]:
     """Of all supports those that are no marks."""
     n = passed.shape[0]
-    return jnp.select([passed == 0, passed == 1], [v[:n], v[1 : n + 1]], v[2:])
+    return jnp.where(passed == 0, v[:n], jnp.where(passed == 1, v[1 : n + 1], v[2:]))
 
 
 def mean_ring_weight(

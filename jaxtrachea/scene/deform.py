@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrachea._in_order import one_kernel
-from jaxtrachea._numerics import product
+from jaxtrachea._numerics import WRITTEN_OUT, product
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
@@ -192,5 +192,7 @@ def _sag(tool: Shape, pose: Poses, points):
         there = Pose(jnp.eye(3, dtype=x.dtype), seen)
         return signed_distance(tool, point, there, FOR_POINTS).distance
 
-    # In turn: all at once are arrays too large for one kernel, and many kernels take longer.
+    if tool.vertices.shape[1] > WRITTEN_OUT:
+        return jnp.maximum(jax.vmap(one)(points), 0)
+    # In turn: all at once are arrays too large for one kernel, as those of more corners are anyway.
     return jnp.maximum(jax.lax.map(one, points), 0)

@@ -288,6 +288,8 @@ def test_refusals_cost_no_more_than_counted_on_paper():
 def test_an_unused_effect_adds_none_to_the_compiled_program(name):
     """After XLA's optimisation, by its own count; which folds the two in orders of their own.
 
+    It finds less that is there twice in the program by hand, where a press is no kernel of its own.
+
     Counted are the operations before they become machine code, which is not optimised here.
     """
     scene, path, hand = program(name)
@@ -298,7 +300,7 @@ def test_an_unused_effect_adds_none_to_the_compiled_program(name):
 
     mine, minimal = count(simulate), count(hand)
     assert mine["flops"] <= minimal["flops"]
-    assert mine["transcendentals"] == minimal["transcendentals"]
+    assert mine["transcendentals"] <= minimal["transcendentals"]
 
 
 @pytest.mark.slow
@@ -334,3 +336,6 @@ def test_counting_operations():
 
     assert 140 <= count_operations(loop, x) <= 140 + 14
     assert count_operations(jax.jit(lambda x: (jnp.sin(x), jnp.cos(x))), x) == 40
+    # Going back, a part is a call of its own: it counts with what is in it.
+    wave = one_kernel(lambda x: jnp.sin(jnp.cos(jnp.sin(x))))
+    assert count_operations(jax.grad(lambda x: jnp.sum(wave(x))), x) >= 5 * 20
