@@ -1,5 +1,6 @@
 """The public names of jaxtrachea, each once; `jaxtrachea/__init__.py` loads them on first use."""
 
+from ._in_order import one_kernel as one_kernel
 from .fitting.fit import fit as fit
 from .fitting.lanes import Noise as Noise
 from .fitting.lanes import Weighting as Weighting

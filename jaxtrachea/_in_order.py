@@ -56,14 +56,20 @@ def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
 
 
 def one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
-    """The same function, compiled into a single kernel where `in_order` would mark it.
+    """The same function, compiled into a single kernel: one call at a time, on a CPU.
 
-    Not where it does what `FITTING` lacks (products of matrices, linear algebra, sorting with
-    `top_k`, `.at[]`), reduces more than `REDUCED` entries, or has arrays that are not `SMALL` or
-    not of numbers: that is compiled as `in_order`. So it is with its derivatives, each by itself.
+    For programs of many small operations, whose time goes into starting kernels. It works where
+    the call is traced (under `jit`); a batch (`vmap`), another device or another compiler than
+    those of `TESTED` gets the function as it is. Not where it does what `FITTING` lacks (products
+    of matrices, linear algebra, sorting with `top_k`, `.at[]`), reduces more than `REDUCED`
+    entries, or has arrays that are not `SMALL` or not of numbers: that is compiled as `in_order`.
+    So it is with its derivatives, each by itself. Values and derivatives are the same but for
+    rounding. A derivative begins with the part once more: of a batch it takes somewhat longer than
+    that of the function by itself, so mark what is called one at a time.
 
     Args:
-        part: as that of `in_order`.
+        part: from arrays to arrays (or trees of them) of any dtype; pure, may close over traced
+            ones. Its errors are passed on.
     """
     return _called(part, single=True)
 

@@ -149,6 +149,13 @@ def _at_three_places(out):
     assert all(0 < float(row[1]) < 20.0 * 4 + 0.5 * 4**3 for row in rows)
 
 
+def _too_stiff(out):
+    """The page's tube is stiffer than what was measured: a stiffer muscle is further from it."""
+    value, slope = map(float, out.split())
+    assert value > 0
+    assert slope > 0
+
+
 def _trained(out):
     """The weights that made the observed forces."""
     k_m, slope = map(float, re.match(r"(\S+) N/mm at 50 years, slope (\S+)", out).groups())
@@ -172,9 +179,10 @@ def _sensitivity(out):
 FINDS = {
     ("layer", 0): _press,
     ("layer", 1): _at_three_places,
-    ("layer", 2): _trained,
-    ("layer", 3): _stiffer,
-    ("layer", 5): _sensitivity,
+    ("layer", 2): _too_stiff,
+    ("layer", 3): _trained,
+    ("layer", 4): _stiffer,
+    ("layer", 6): _sensitivity,
     ("measurements", 0): _read,
 }
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxtrachea
 from jaxtrachea import (
     Material,
     Options,
@@ -523,3 +524,32 @@ def test_a_tool_of_few_corners_is_in_the_kernel_that_lays_out_a_dent():
     tool = capsule(2.0, 6.0)
     program = jax.make_jaxpr(lambda points: _sag(tool, pose, points))(jnp.ones((16, 3)))
     assert _in_order.fits_one_kernel(program.jaxpr)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_loss_of_a_press_by_its_public_name(dtype):
+    """As docs/layer.md has it: value and derivatives against the closed form, alone and in lanes.
+
+    The skeleton is all but rigid, so the force is k_1 times the depth.
+    """
+    tube = jax.tree.map(lambda v: jnp.asarray(v, dtype), table_1())
+    stiff = jnp.asarray(1e9, dtype)
+
+    @jaxtrachea.one_kernel
+    def loss(k_1, depth):
+        return press(tube, Material(stiff, stiff, k_1, 0.0), tube.length / 2, depth).force ** 2
+
+    k_1, depth = jnp.asarray([0.5, 2.0], dtype), jnp.asarray([1.0, 3.0], dtype)
+    expected, slope = (k_1 * depth) ** 2, 2 * k_1 * depth**2
+    tolerance = 64 * epsilon(dtype) + 1e-7  # of the skeleton, which is not rigid
+    one, many = jax.jit(jax.value_and_grad(loss)), jax.jit(jax.vmap(jax.value_and_grad(loss)))
+    forward = jax.jit(lambda k, d: jax.jvp(loss, (k, d), (jnp.ones_like(k), jnp.zeros_like(d))))
+    for i in range(2):
+        for way in (one, forward):
+            np.testing.assert_allclose(
+                way(k_1[i], depth[i]), (expected[i], slope[i]), rtol=tolerance
+            )
+    np.testing.assert_allclose(many(k_1, depth), (expected, slope), rtol=tolerance)
+    if _in_order._one_kernel_p is not None:
+        assert compiled(one, k_1[0], depth[0]).count(ONE) > 0
+    assert ONE not in compiled(many, k_1, depth)
