@@ -24,10 +24,11 @@ import jax
 import jax.numpy as jnp
 import jaxlib.version
 from jax.core import Tracer
+from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
-from jaxtrachea._linear import linear, replaced
+from jaxtrachea._linear import linear, over_lanes, replaced
 
 Out = TypeVar("Out")
 #: Names of the operations that mark a call: no work, and what they give is the first operand.
@@ -52,7 +53,7 @@ def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
     Args:
         part: from arrays to arrays (or trees of them); may close over traced ones.
     """
-    return _called(part, single=False)
+    return _called(part, _in_order)
 
 
 def one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
@@ -71,14 +72,30 @@ def one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
         part: from arrays to arrays (or trees of them) of any dtype; pure, may close over traced
             ones. Its errors are passed on.
     """
-    return _called(part, single=True)
+    return _called(part, _kernel)
 
 
-def _called(part: Callable[..., Out], single: bool) -> Callable[..., Out]:
-    """The part as a call of its own, if it can be as a `single` kernel."""
+def in_turn(part: Callable[..., Out]) -> Callable[..., Out]:
+    """The same function; of many lanes (`vmap`), on a CPU, one lane after the other.
+
+    For parts that are a large array and go through it several times: those of many lanes are out of
+    the cache before they are read again. A lane, on a CPU, is then as if there were no other:
+    `in_order` and `one_kernel` inside are what they say. Small arrays (`_linear.LARGE`) and other
+    devices take all lanes together. Values and derivatives are the same but for rounding;
+    derivatives begin with the part once more, and are taken in turn too.
+
+    Args:
+        part: from arrays to arrays (or trees of them); may close over traced ones.
+    """
+    return _called(part, _in_turn)
+
+
+def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
+    """The part as a call of its own: `_in_order`, as a single `_kernel` if it can, `_in_turn`."""
 
     def run(*arguments):
-        if _not_inlined_p is None or not _traced(arguments):
+        marked = how is not _in_turn
+        if (marked and _not_inlined_p is None) or not _traced(arguments):
             return part(*arguments)
         closed, shape = jax.make_jaxpr(part, return_shape=True)(*arguments)
         if not closed.jaxpr.outvars:
@@ -97,8 +114,9 @@ def _called(part: Callable[..., Out], single: bool) -> Callable[..., Out]:
             variables = [*(jaxpr.constvars[i] for i in own), *jaxpr.invars]
             return _changing(jaxpr, {variables[i] for i in moving})
 
-        fits = single and _one_kernel_p is not None and fits_one_kernel(jaxpr)
-        found = _differentiable(plain, changing, fits)(*inputs)
+        fits = _one_kernel_p is not None and fits_one_kernel(jaxpr)
+        known = _in_order if how is _kernel and not fits else how
+        found = _differentiable(plain, changing, known)(*inputs)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 
     return run
@@ -117,18 +135,18 @@ def _changing(jaxpr: Jaxpr, moving: set) -> list[int]:
     return [i for i, v in results if not isinstance(v, Literal) and v in moving]
 
 
-def _differentiable(plain: Callable, changing_with: Callable, single: bool) -> Callable:
+def _differentiable(plain: Callable, changing_with: Callable, how: Callable) -> Callable:
     """`plain` as a call; its derivatives, there and back, are calls too.
 
     Args:
         plain: from arrays to a list of arrays; what it closes over is not traced.
         changing_with: from the places of arrays to those of the results that change with them.
-        single: whether it is a single kernel; so are its derivatives then, if they can be.
+        how: `_in_order`, `_kernel` or `_in_turn`; so are its derivatives then, if they can be.
     """
 
     @jax.custom_jvp
     def call(*inputs):
-        return (_kernel if single else _in_order)(plain, inputs)
+        return how(plain, inputs)
 
     def derivatives(inputs, tangents):
         moving = [i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero)]
@@ -153,7 +171,8 @@ def _differentiable(plain: Callable, changing_with: Callable, single: bool) -> C
 
         change = []
         if changing:
-            ways = _called(push, single), _called(pull, single)
+            # Lanes of a linear part are taken in turn already.
+            ways = (push, pull) if how is _in_turn else (_called(push, how), _called(pull, how))
             like = [out[i] for i in changing]
             change = linear(*ways, inputs, [tangents[i] for i in moving], like)
         return out, replaced(zero_from_primal(out, symbolic_zeros=True), changing, change)
@@ -182,6 +201,26 @@ def _kernel(plain: Callable, inputs) -> list:
     leaves, read = jax.jit(whole)(*(_hidden_p.bind(v, *inputs) for v in inputs))
     leaves[0] = _one_kernel_p.bind(leaves[0], read, *inputs)
     return leaves
+
+
+def _in_turn(plain: Callable, inputs) -> list:
+    @custom_vmap
+    def call(*inputs):
+        return list(plain(*inputs))
+
+    @call.def_vmap
+    def _(count, has_lanes, *inputs):
+        own = [i for i, lanes in enumerate(has_lanes) if lanes]
+
+        def one(f):
+            return lambda lane: list(f(*replaced(inputs, own, lane)))
+
+        # A lane may itself be of many: of those that are taken in turn the next `vmap` is told.
+        out = over_lanes(one(call), one(plain), [inputs[i] for i in own], count, like)
+        return out, [True] * len(out)
+
+    like = jax.eval_shape(call, *inputs)
+    return call(*inputs)
 
 
 def _traced(arguments) -> bool:

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxtrachea._in_order import one_kernel
+from jaxtrachea._in_order import in_turn, one_kernel
 from jaxtrachea._numerics import WRITTEN_OUT, product
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
@@ -45,10 +45,9 @@ def deform(
     together = plan.contact_point == "fixed"
     if together:  # one contact point for all rows: what depends on it alone is computed once
         where = jax.tree.map(lambda v: v[0], where)
-    weights = regions.weigh(binding, where[1]) if together else None
     slides = plan.friction and runs is not None
 
-    def one(moved, where, pose):
+    def one(moved, where, pose, share):
         s_c, phi_c, radius, tool = where
         ends = _ends(scene, material, s_c, moved) if plan.end_motion else regions.Ends()
         keys = regions.clamped(
@@ -56,7 +55,7 @@ def deform(
             moved.slopes, moved.slope_C if moved.slope_edges is None else moved.slope_edges,
             ends=ends,
         )  # fmt: skip
-        share = regions.weigh(binding, phi_c) if weights is None else weights
+        share = regions.weigh(binding, phi_c) if share is None else share
         u = regions.interpolate(binding, share, keys, method=method)
         if runs is None:
             return place(mesh, u)
@@ -73,7 +72,12 @@ def deform(
 
     moved = moved._replace(dissipated=None, status=None)
     led = path if slides and made is not None else None
-    return jax.vmap(one, (0, None if together else 0, 0))(moved, where, led)
+    if presses.s.shape[0] == 1:
+        first = jax.tree.map(lambda v: v[0], (moved, led))
+        where = where if together else jax.tree.map(lambda v: v[0], where)
+        return in_turn(one)(first[0], where, first[1], None)[None]
+    share = regions.weigh(binding, where[1]) if together else None
+    return jax.vmap(in_turn(one), (0, None if together else 0, 0, None))(moved, where, led, share)
 
 
 def _held_at(scene: Scene, s_c):

@@ -76,7 +76,7 @@ def _inner(parameters: dict):
     """The program that a call contains, or None."""
     if "way" in parameters:  # of a linear part
         return parameters["way"].closed.jaxpr
-    for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
+    for key in ("jaxpr", "call_jaxpr", "fun_jaxpr", "call"):
         if key in parameters:
             return getattr(parameters[key], "jaxpr", parameters[key])
     return None

@@ -1,0 +1,128 @@
+"""A part that takes many lanes one after the other: values and derivatives are those of the part.
+
+The outside truth is the function without the mark, and calculus. Whether lanes are taken in turn is
+read in the compiled program: a loop, and no array of the part for all lanes.
+"""
+
+import itertools
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrachea import _linear
+from jaxtrachea._in_order import in_turn, one_kernel
+from jaxtrachea._numerics import epsilon
+
+DTYPES = ["float32", "float64"]
+LANES, POINTS = 5, 3000
+
+
+def wave(x, a):
+    """A large array from few numbers; a tree of results, one of them without a derivative."""
+    along = jnp.linspace(0, 1, POINTS, dtype=x.dtype)
+    heights = jnp.sin(x[:, None] * along[None]) * jnp.sum(a**2)
+    return {"heights": heights, "highest": jnp.argmax(heights)}
+
+
+def total(f):
+    return lambda x, a: jnp.mean(f(x, a)["heights"] ** 2)
+
+
+def numbers(dtype, *shapes):
+    rng = np.random.default_rng(11)
+    return [jnp.asarray(rng.uniform(0.5, 1.5, s), dtype) for s in shapes]
+
+
+def close(got, expected):
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        assert (a.dtype, a.shape) == (b.dtype, b.shape)
+        atol = 64 * epsilon(b.dtype) * np.abs(b).max(initial=1) if b.dtype.kind == "f" else 0
+        np.testing.assert_allclose(a, b, rtol=0, atol=atol)
+
+
+WAYS = {
+    "value": lambda f: f,
+    "forward": lambda f: lambda x, a: jax.jvp(total(f), (x, a), (jnp.cos(x), a))[1],
+    "reverse": lambda f: jax.value_and_grad(total(f), argnums=(0, 1)),
+    "second": lambda f: jax.hessian(total(f), argnums=(0, 1)),
+}
+
+
+@pytest.mark.parametrize("large", [1, _linear.LARGE, 10**9])
+@pytest.mark.parametrize("way", list(WAYS))
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_it_is_the_part(dtype, way, large, monkeypatch):
+    """Alone, with lanes of either argument or of both, within lanes, and a kernel inside."""
+    monkeypatch.setattr(_linear, "LARGE", large)
+    do = WAYS[way]
+    x, a, xs, As = numbers(dtype, (2,), (3,), (LANES, 2), (4, 3))
+    both = jnp.stack([a] * LANES)
+    marks = in_turn(wave), in_turn(one_kernel(wave))
+    for axes, at in {
+        None: (x, a),
+        (0, None): (xs, a),
+        (None, 0): (x, As),
+        (0, 0): (xs, both),
+        (0, (None, 0)): (xs, As),
+    }.items():
+        plain, *marked = (batched(do(f), axes) for f in (wave, *marks))
+        expected = jax.jit(plain)(*at)
+        for f in marked:
+            close(jax.jit(f)(*at), expected)
+
+
+def batched(f, axes):
+    """Over lanes; with an axis of two entries over those of another argument within."""
+    if axes is None:
+        return f
+    if isinstance(axes[1], tuple):
+        return jax.vmap(jax.vmap(f, axes[1]), (0, None))
+    return jax.vmap(f, axes)
+
+
+def test_the_derivative_by_hand():
+    """d/da of the mean of (sin(x t) a^2)^2 is 4 a^3 mean sin^2, of all lanes together too."""
+    x, a = numbers("float64", (LANES, 1), (LANES, 1))
+    sine = np.sin(np.asarray(x) * np.linspace(0, 1, POINTS)[None])
+    expected = 4 * np.asarray(a) ** 3 * np.mean(sine**2, axis=1, keepdims=True)
+    each = jax.vmap(jax.grad(total(in_turn(wave)), argnums=1))
+    whole = jax.grad(lambda a: jnp.sum(jax.vmap(total(in_turn(wave)))(x, a)))
+    for found in (jax.jit(each)(x, a), jax.jit(whole)(a)):
+        np.testing.assert_allclose(found, expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("mode", [jax.jit, lambda f: jax.jit(jax.grad(lambda *v: jnp.sum(f(*v))))])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_large_lanes_are_in_a_loop_on_a_cpu(dtype, mode):
+    """The sum of a large array: of lanes in turn there is never the array of all."""
+    xs, As = numbers(dtype, (LANES, 2), (LANES, 3))
+    found = {}
+    for points, mark in itertools.product((POINTS, 3), (in_turn, lambda f: f)):
+
+        def part(x, a, points=points):
+            along = jnp.linspace(0, 1, points, dtype=x.dtype)
+            return jnp.cumsum(jnp.sin(x[:, None] * along[None]) * jnp.sum(a), axis=1)
+
+        one = mark(part)
+
+        def loss(x, a, one=one):
+            return jnp.sum(jnp.sort(one(x, a), axis=1)[:, -1])
+
+        text = mode(jax.vmap(loss)).lower(xs, As).compile().as_text()
+        loops = re.findall(r" while\(.*known_trip_count.*\"n\":\"" + str(LANES), text)
+        found[points, mark is in_turn] = bool(loops)
+    assert found == {(POINTS, True): True, (POINTS, False): False, (3, True): False,
+                     (3, False): False}  # fmt: skip
+
+
+def test_other_devices_take_all_lanes_together():
+    xs, As = numbers("float64", (LANES, 2), (LANES, 3))
+    f = jax.jit(jax.vmap(total(in_turn(wave))))
+    texts = [
+        jax.export.export(f, platforms=(device,))(xs, As).mlir_module()
+        for device in ("cuda", "cpu")
+    ]
+    assert ["stablehlo.while" in t for t in texts] == [False, True]
