@@ -4,6 +4,7 @@ The outside truth is the function without the mark, and calculus. Whether lanes 
 read in the compiled program: a loop, and no array of the part for all lanes.
 """
 
+import dataclasses
 import itertools
 import re
 
@@ -12,9 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtrachea import _linear
+from jaxtrachea import (
+    Material,
+    Presses,
+    _linear,
+    make_scene,
+    simulate,
+    table_1,
+)
 from jaxtrachea._in_order import in_turn, one_kernel
 from jaxtrachea._numerics import epsilon
+from jaxtrachea.trachea.tube import make_tube
 
 DTYPES = ["float32", "float64"]
 LANES, POINTS = 5, 3000
@@ -126,3 +135,25 @@ def test_other_devices_take_all_lanes_together():
         for device in ("cuda", "cpu")
     ]
     assert ["stablehlo.while" in t for t in texts] == [False, True]
+
+
+def test_surfaces_of_many_poses_keep_no_array_of_all():
+    """Vertices and their cotangents are what 32 poses share the memory for, and little besides."""
+    tube, lanes = table_1(), 32
+    mesh, path = make_tube(tube, around=24, along=60), Presses([75.0], [0.0], [[0.0, -2.0, 0.0]])
+    material = Material(EI_L=1.86, k_M=0.1, k_1=0.3, k_3=0.02)
+    scene = make_scene(tube, material, path, mesh=mesh)
+
+    def moved(k_M, depth):
+        press = Presses([75.0], [0.0], jnp.stack([0 * depth, -depth, 0 * depth])[None])
+        found = simulate(scene, dataclasses.replace(material, k_M=k_M), press)
+        return jnp.mean((found.vertices[0] - mesh.vertices) ** 2)
+
+    at = jnp.linspace(0.1, 0.2, lanes), jnp.linspace(1, 2, lanes)
+    each = jax.grad(moved, argnums=(0, 1))
+    program = jax.jit(jax.vmap(each)).lower(*at).compile()
+    memory = program.memory_analysis().temp_size_in_bytes / (lanes * mesh.vertices.nbytes)
+    assert memory < 3
+    one = jax.jit(each)(*(v[7] for v in at))
+    for got, expected in zip(program(*at), one, strict=True):
+        np.testing.assert_allclose(got[7], expected, rtol=1e-11)
