@@ -101,25 +101,36 @@ def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
         if not closed.jaxpr.outvars:
             return part(*arguments)
         own = [i for i, v in enumerate(closed.consts) if isinstance(v, Tracer)]
-        inputs = [*(closed.consts[i] for i in own), *jax.tree.leaves(arguments)]
+        given = [*(closed.consts[i] for i in own), *jax.tree.leaves(arguments)]
 
         # Without what is traced, which would be kept for as long as the derivatives are.
         jaxpr, kept = closed.jaxpr, replaced(closed.consts, own, [None] * len(own))
+        # What is not read is not asked for: another call would compute it.
+        variables = [*(jaxpr.constvars[i] for i in own), *jaxpr.invars]
+        used = _read(jaxpr)
+        read = [i for i, v in enumerate(variables) if v in used]
+        if not read:
+            return part(*arguments)
 
         def plain(*inputs):
-            consts = replaced(kept, own, inputs[: len(own)])
-            return jaxpr_as_fun(ClosedJaxpr(jaxpr, consts))(*inputs[len(own) :])
+            values = replaced([None] * len(variables), read, inputs)
+            consts = replaced(kept, own, values[: len(own)])
+            return jaxpr_as_fun(ClosedJaxpr(jaxpr, consts))(*values[len(own) :])
 
         def changing(moving):
-            variables = [*(jaxpr.constvars[i] for i in own), *jaxpr.invars]
-            return _changing(jaxpr, {variables[i] for i in moving})
+            return _changing(jaxpr, {variables[read[i]] for i in moving})
 
         fits = _one_kernel_p is not None and fits_one_kernel(jaxpr)
         known = _in_order if how is _kernel and not fits else how
-        found = _differentiable(plain, changing, known)(*inputs)
+        found = _differentiable(plain, changing, known)(*(given[i] for i in read))
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 
     return run
+
+
+def _read(jaxpr: Jaxpr) -> set:
+    used = [*(v for eqn in jaxpr.eqns for v in eqn.invars), *jaxpr.outvars]
+    return {v for v in used if not isinstance(v, Literal)}
 
 
 def _inexact(variable) -> bool:
