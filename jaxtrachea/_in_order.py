@@ -120,15 +120,17 @@ def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
         def changing(moving):
             return _changing(jaxpr, {variables[read[i]] for i in moving})
 
-        fits = _one_kernel_p is not None and fits_one_kernel(jaxpr)
-        known = _in_order if how is _kernel and not fits else how
-        found = _differentiable(plain, changing, known)(*(given[i] for i in read))
+        refused = how is _kernel and (_one_kernel_p is None or not fits_one_kernel(jaxpr))
+        found = _differentiable(plain, changing, _in_order if refused else how)(
+            *(given[i] for i in read)
+        )
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 
     return run
 
 
 def _read(jaxpr: Jaxpr) -> set:
+    """The variables that an operation or a result reads."""
     used = [*(v for eqn in jaxpr.eqns for v in eqn.invars), *jaxpr.outvars]
     return {v for v in used if not isinstance(v, Literal)}
 

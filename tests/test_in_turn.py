@@ -21,7 +21,7 @@ from jaxtrachea import (
     simulate,
     table_1,
 )
-from jaxtrachea._in_order import in_turn, one_kernel
+from jaxtrachea._in_order import in_order, in_turn, one_kernel
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.trachea.tube import make_tube
 
@@ -106,7 +106,7 @@ def test_the_derivative_by_hand():
 @pytest.mark.parametrize("mode", [jax.jit, lambda f: jax.jit(jax.grad(lambda *v: jnp.sum(f(*v))))])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_large_lanes_are_in_a_loop_on_a_cpu(dtype, mode):
-    """The sum of a large array: of lanes in turn there is never the array of all."""
+    """The largest of many running sums, which are no result: only what is marked has a loop."""
     xs, As = numbers(dtype, (LANES, 2), (LANES, 3))
     found = {}
     for points, mark in itertools.product((POINTS, 3), (in_turn, lambda f: f)):
@@ -135,6 +135,19 @@ def test_other_devices_take_all_lanes_together():
         for device in ("cuda", "cpu")
     ]
     assert ["stablehlo.while" in t for t in texts] == [False, True]
+
+
+@pytest.mark.parametrize("mark", [in_order, one_kernel, in_turn])
+def test_what_is_not_read_is_not_computed(mark):
+    """Of two results of a call, where a marked part reads one."""
+    x = jnp.linspace(0, 1, 7)
+
+    def run(x):
+        return mark(lambda pair: 2 * pair[0])(in_order(lambda x: (jnp.sqrt(x), jnp.cos(x)))(x))
+
+    compiled = jax.jit(run).lower(x).compile()
+    np.testing.assert_allclose(compiled(x), 2 * np.sqrt(x), rtol=1e-6)
+    assert "cosine(" not in compiled.as_text()
 
 
 def test_surfaces_of_many_poses_keep_no_array_of_all():

@@ -73,9 +73,10 @@ def deform(
     moved = moved._replace(dissipated=None, status=None)
     led = path if slides and made is not None else None
     if presses.s.shape[0] == 1:
-        first = jax.tree.map(lambda v: v[0], (moved, led))
+        # No lanes of the weights: of many such paths together they would be in memory for all.
         where = where if together else jax.tree.map(lambda v: v[0], where)
-        return in_turn(one)(first[0], where, first[1], None)[None]
+        moved, led = jax.tree.map(lambda v: v[0], (moved, led))
+        return in_turn(one)(moved, where, led, None)[None]
     share = regions.weigh(binding, where[1]) if together else None
     return jax.vmap(in_turn(one), (0, None if together else 0, 0, None))(moved, where, led, share)
 

@@ -20,7 +20,7 @@ from jaxtrachea import (
     press_path,
     simulate,
 )
-from jaxtrachea._in_order import in_turn, one_kernel
+from jaxtrachea._in_order import one_kernel
 from jaxtrachea.contact.patches import touch
 from jaxtrachea.contact.pose import Pose
 from jaxtrachea.mechanics.friction import Coulomb
@@ -91,8 +91,7 @@ def move_surface(scene, s, phi, out, kind):
         return place(mesh, u)
 
     rows = out.skeleton, out.joints, out.end_U, out.end_V, out.slopes, out.slope_C, out.depth
-    # As `simulate` does: XLA counts a row more than once where it is not in a loop.
-    return jax.vmap(in_turn(one))(*rows)
+    return jax.vmap(one)(*rows)
 
 
 def normal(scene, m, p):
