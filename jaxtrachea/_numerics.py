@@ -35,7 +35,7 @@ def total(x: Num[Array, "*rows n"]) -> Num[Array, "*rows"]:
     Args:
         x: n >= 1 entries in each row.
     """
-    return _reduced(jnp.sum, jnp.add, x, 0)
+    return _reduced(jnp.sum, jnp.add, x)
 
 
 def product(a: Float[Array, "*rows k"], b: Float[Array, "k ..."]) -> Float[Array, "..."]:
@@ -88,7 +88,7 @@ def largest(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
     Args:
         x: n >= 1 entries in each row.
     """
-    return _reduced(jnp.max, jnp.maximum, x, -jnp.inf)
+    return _reduced(jnp.max, jnp.maximum, x)
 
 
 def first_largest(x: Float[Array, " n"]) -> Int[Array, ""]:
@@ -104,7 +104,7 @@ def first_largest(x: Float[Array, " n"]) -> Int[Array, ""]:
     if n <= WRITTEN_OUT:
         return jnp.argmax(x)
     at = jnp.arange(n, dtype=jnp.int32)
-    first = _reduced(jnp.min, jnp.minimum, jnp.where(x == largest(x), at, n), n)
+    first = _reduced(jnp.min, jnp.minimum, jnp.where(x == largest(x), at, n))
     return jnp.minimum(first, n - 1)
 
 
@@ -129,23 +129,23 @@ def lowest(x: Float[Array, " n"], count: int) -> tuple[Int[Array, " count"], Boo
     return jnp.stack(found), left
 
 
-def _reduced(reduce, pair, x, filling):
+def _reduced(reduce, pair, x):
     """A reduction along the last axis in columns, which the processor takes several at a time.
 
-    Along a row it takes one entry after the other: their order is part of the result.
+    Along a row it takes one entry after the other: their order is part of the result. Entries that
+    fill no row are paired with the columns' results: rows filled up would be asked for every entry
+    whether it is one, and no longer be taken several at a time.
     """
     while x.shape[-1] > WRITTEN_OUT:
         width = WRITTEN_OUT * -(-x.shape[-1] // (WRITTEN_OUT * ONE_REDUCTION))
-        x = reduce(_in_rows(x, width, filling), axis=-2)
+        rows = x[..., : x.shape[-1] // width * width].reshape(*x.shape[:-1], -1, width)
+        columns = reduce(rows, axis=-2) if rows.shape[-2] > 1 else rows[..., 0, :]
+        left = x.shape[-1] % width
+        if left:
+            ends = pair(columns[..., :left], x[..., -left:])
+            columns = jnp.concatenate([ends, columns[..., left:]], axis=-1)
+        x = columns
     return _in_pairs(pair, x)
-
-
-def _in_rows(x, width: int, filling):
-    """The last axis as rows of this width, filled up."""
-    if x.shape[-1] % width:
-        ends = [(0, 0)] * (x.ndim - 1) + [(0, -x.shape[-1] % width)]
-        x = jnp.pad(x, ends, constant_values=filling)
-    return x.reshape(*x.shape[:-1], -1, width)
 
 
 def _in_pairs(pair, x):

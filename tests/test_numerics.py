@@ -9,6 +9,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 
+from jaxtrachea._in_order import fits_one_kernel
 from jaxtrachea._numerics import (
     cos_sin,
     cubic_ratio,
@@ -360,7 +361,7 @@ def test_cosine_and_sine_have_derivatives():
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 32, 33, 64, 97, 120, 128, 1000, 1500])
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 9, 32, 33, 64, 97, 120, 121, 128, 1000, 1500])
 def test_total_and_largest(n, dtype):
     """Against exact sums, with entries of both signs, in rows, at every way of summing."""
     x = np.random.default_rng(n).normal(size=(2, 3, n)).astype(dtype)
@@ -379,6 +380,15 @@ def test_total_and_largest(n, dtype):
     worst[-1] = -np.inf
     assert np.isneginf(total(jnp.asarray(worst)))
     np.testing.assert_array_equal(largest(jnp.full(n, -3, dtype)), -3)
+
+
+@pytest.mark.parametrize("n", [7, 8, 9, 120, 121, 300])
+@pytest.mark.parametrize("reduced", [total, largest])
+def test_a_reduction_fills_up_no_row(reduced, n):
+    """A loop over filled-up rows asks for each entry whether it is one: 1.8 times a contact."""
+    program = jax.make_jaxpr(reduced)(jnp.zeros(n)).jaxpr
+    assert " pad[" not in str(program)
+    assert fits_one_kernel(program)  # no array is empty
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
