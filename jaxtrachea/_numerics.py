@@ -30,12 +30,12 @@ def added(terms: Iterable[Array]) -> Array:
 def total(x: Num[Array, "*rows n"]) -> Num[Array, "*rows"]:
     """Sum over the last axis, such that XLA for CPUs starts few kernels and vectorises them.
 
-    The order of summation differs from that of `jnp.sum`.
+    The order of summation differs from that of `jnp.sum`, and whole numbers keep their dtype.
 
     Args:
         x: n >= 1 entries in each row.
     """
-    return _reduced(jnp.sum, jnp.add, x)
+    return _reduced(functools.partial(jnp.sum, dtype=x.dtype), jnp.add, x)
 
 
 def product(a: Float[Array, "*rows k"], b: Float[Array, "k ..."]) -> Float[Array, "..."]:

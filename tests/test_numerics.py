@@ -380,6 +380,8 @@ def test_total_and_largest(n, dtype):
     worst[-1] = -np.inf
     assert np.isneginf(total(jnp.asarray(worst)))
     np.testing.assert_array_equal(largest(jnp.full(n, -3, dtype)), -3)
+    ones = total(jnp.ones(n, jnp.int32))
+    assert (ones, ones.dtype) == (n, jnp.int32)
 
 
 @pytest.mark.parametrize("n", [7, 8, 9, 120, 121, 300])
