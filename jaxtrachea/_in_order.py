@@ -244,12 +244,12 @@ def _traced(arguments) -> bool:
 FITTING = frozenset(
     """abs add add_any and argmax argmin atan2 bitcast_convert_type broadcast_in_dim ceil clamp
     closed_call concatenate cond convert_element_type copy cos cumsum custom_jvp_call
-    custom_vjp_call div dynamic_slice dynamic_update_slice eq erf erf_inv exp exp2 expm1 floor
-    gather ge gt hidden integer_pow iota is_finite jit le le_to linear log log1p logistic lt max
-    min mul ne neg nextafter not not_inlined one_kernel optimization_barrier or pad pjit pow
-    reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round
-    rsqrt scan select_n sign sin slice split sqrt square squeeze stack stop_gradient sub tan
-    tanh transpose unstack while xor""".split()
+    custom_vjp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv exp
+    exp2 expm1 floor gather ge gt hidden integer_pow iota is_finite jit le le_to linear log
+    log1p logistic lt max min mul ne neg nextafter not not_inlined one_kernel
+    optimization_barrier or pad pjit pow reduce_and reduce_max reduce_min reduce_or reduce_prod
+    reduce_sum rem reshape rev round rsqrt scan select_n sign sin slice split sqrt square
+    squeeze stack stop_gradient sub tan tanh transpose unstack while xor""".split()
 )
 #: Entries of one array, also between two operations, up to which one thread is as good as many.
 SMALL = 1 << 16

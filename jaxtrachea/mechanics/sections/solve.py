@@ -108,10 +108,11 @@ def _size(step, system: System):
 
 def _newton(z, displacement, system: System):
     """Newton's step from z, the derivative of the solution by the displacement, and stability."""
-    r, tangent = _system.linearise(_state(z, system), displacement, system)
+    state = _state(z, system)
+    r, tangent = _system.linearise(state, displacement, system, differentiable=False)
     along = jax.tree.map(jnp.zeros_like, r)._replace(force=system.direction)
     both = jax.tree.map(lambda x, y: jnp.stack([x, y]), r, along)
-    both = jax.vmap(_system.solve_linear, (None, 0))(tangent, both)
+    both = _system.solve_several(tangent, both, differentiable=False)
     step, slope = jax.vmap(_flat)(both)
     return step, slope, _system.excess_negative(tangent) == 0
 

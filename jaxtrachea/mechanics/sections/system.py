@@ -217,9 +217,9 @@ def residual_of(line: Line, state: State, displacement: Float[Array, ""], system
 
 
 def linearise(
-    state: State, displacement: Float[Array, ""], system: System
+    state: State, displacement: Float[Array, ""], system: System, *, differentiable: bool = True
 ) -> tuple[State, Tangent]:
-    """The residual and its derivative."""
+    """The residual and its derivative; whether derivatives of them are asked for."""
     line = lines(state, system)
     surface = contact_surface(state, line, system)
     r_q, r_F, g = _contact(state, displacement, system, surface)
@@ -237,7 +237,7 @@ def linearise(
     diagonal = diagonal + felt * share[:, :, None] * share[:, None]
     after = jnp.concatenate([share[1:], jnp.zeros_like(share[:1])])
     upper = upper + felt * share[:, :, None] * after[:, None]
-    factors = block.factor(diagonal, upper)
+    factors = block.factor(diagonal, upper, differentiable=differentiable)
     return r, Tangent(factors, share, own, E, B, M, system.give, negative)
 
 
@@ -271,15 +271,28 @@ def stiffness(
 
 def solve_linear(tangent: Tangent, r: State) -> State:
     """J^-1 r."""
+    found = solve_several(tangent, jax.tree.map(lambda v: v[None], r))
+    return jax.tree.map(lambda v: v[0], found)
+
+
+def solve_several(tangent: Tangent, r: State, *, differentiable: bool = True) -> State:
+    """J^-1 r of several r, stacked; whether derivatives are asked for."""
     share, own, E = tangent.share, tangent.own, tangent.stiffness
-    b = tangent.B.T @ (r.force / tangent.give)
-    fixed = r.q_C.ravel() + own * b
-    rhs = r.y.reshape(share.shape) + _spread(share, b - E @ fixed)
-    y = block.solve(tangent.factors, rhs[:, :, None])[:, :, 0]
-    moved = _gather(share, y) + fixed
-    q = moved - own * (E @ moved)
-    force = (r.force - tangent.B @ q) / tangent.give
-    return State(y.reshape(r.y.shape), q.reshape(r.q_C.shape), force)
+
+    def condense(r):
+        b = tangent.B.T @ (r.force / tangent.give)
+        fixed = r.q_C.ravel() + own * b
+        return r.y.reshape(share.shape) + _spread(share, b - E @ fixed), fixed
+
+    def expand(r, y, fixed):
+        moved = _gather(share, y) + fixed
+        q = moved - own * (E @ moved)
+        force = (r.force - tangent.B @ q) / tangent.give
+        return State(y.reshape(r.y.shape), q.reshape(r.q_C.shape), force)
+
+    rhs, fixed = jax.vmap(condense, out_axes=(2, 0))(r)
+    y = block.solve(tangent.factors, rhs, differentiable=differentiable)
+    return jax.vmap(expand, (0, 2, 0))(r, y, fixed)
 
 
 def excess_negative(tangent: Tangent) -> Int[Array, ""]:
