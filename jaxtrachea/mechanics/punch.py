@@ -70,14 +70,20 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
     share = jnp.stack([first, second]) / jnp.where(total > 0, total, 1)
     share = jnp.where(apart, share, jnp.nan)
 
-    def per_ring(v):
-        return _without_marks(product(share, v), passed)
+    def add(found, end):
+        share, moved = end
+        own = jax.tree.map(lambda v: share * _without_marks(v, passed), moved)
+        return jax.tree.map(jnp.add, found, own), None
 
+    # A loop: of a sum XLA for CPUs makes a part of what reads it, and computes it anew for each
+    # of many displacements.
+    moved = unit.w, unit.theta, unit.reaction
+    none = jax.tree.map(lambda v: jnp.zeros_like(v[0, 2:]), moved)
+    w, theta, reaction = jax.lax.scan(add, none, (share, moved))[0]
     edges = product(share, picked(unit.theta, marks))
     return UnitDeflection(
-        w_C=c_12 + share[0] * second, theta_C=product(share, edges), w=per_ring(unit.w),
-        theta=per_ring(unit.theta), reaction=per_ring(unit.reaction), edges=edges,
-    )  # fmt: skip
+        c_12 + share[0] * second, product(share, edges), w, theta, reaction, edges
+    )
 
 
 def _with_marks(beam: Beam, ends) -> tuple[Beam, Array, Array]:
