@@ -8,8 +8,9 @@ small part is a computation of its own: `in_order`.
 Starting a kernel takes as long as some hundred operations. What XLA makes of its own small loops
 can be asked for: the whole part in one function, with loops and branches, `one_kernel`. That is for
 parts whose arrays are small: one thread works through them. A kernel calls no library and holds no
-scatter: a product of matrices is written as a sum (`_numerics.product`, `turned`), a choice by
-place as a sum of choices (`picked`), the lowest of many found one by one (`lowest`).
+scatter: a product of matrices is written as a sum (`_numerics.product`, `turned`; of a part that is
+also called in batches by `_written_out`), a choice by place as a sum of choices (`picked`), the
+lowest of many found one by one (`lowest`).
 
 With the environment variable `JAXTRACHEA_ONE_KERNEL` set to 0 there are no single kernels: for
 programs that are exported to another version of jaxlib, or should a compiler refuse one.
@@ -29,6 +30,7 @@ from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 from jaxtrachea._linear import linear, over_lanes, replaced
+from jaxtrachea._written_out import is_small_product, written_out
 
 Out = TypeVar("Out")
 #: Names of the operations that mark a call: no work, and what they give is the first operand.
@@ -56,7 +58,7 @@ def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
     return _called(part, _in_order)
 
 
-def one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
+def one_kernel(part: Callable[..., Out], *, products: bool = False) -> Callable[..., Out]:
     """The same function, compiled into a single kernel: one call at a time, on a CPU.
 
     For programs of many small operations, whose time goes into starting kernels. It works where
@@ -71,8 +73,10 @@ def one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
     Args:
         part: from arrays to arrays (or trees of them) of any dtype; pure, may close over traced
             ones. Its errors are passed on.
+        products: whether those of small matrices are written out, in a single call; of a batch the
+            library does them, which is quicker there.
     """
-    return _called(part, _kernel)
+    return _called(part, _kernel_of_products if products else _kernel)
 
 
 def in_turn(part: Callable[..., Out]) -> Callable[..., Out]:
@@ -120,7 +124,9 @@ def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
         def changing(moving):
             return _changing(jaxpr, {variables[read[i]] for i in moving})
 
-        refused = how is _kernel and (_one_kernel_p is None or not fits_one_kernel(jaxpr))
+        products = how is _kernel_of_products
+        fits = _one_kernel_p is not None and fits_one_kernel(jaxpr, products=products)
+        refused = (products or how is _kernel) and not fits
         found = _differentiable(plain, changing, _in_order if refused else how)(
             *(given[i] for i in read)
         )
@@ -216,6 +222,24 @@ def _kernel(plain: Callable, inputs) -> list:
     return leaves
 
 
+def _kernel_of_products(plain: Callable, inputs) -> list:
+    @custom_vmap
+    def alone(*inputs):
+        sums = written_out(jax.make_jaxpr(plain)(*inputs))
+        return _kernel(jaxpr_as_fun(sums), inputs)
+
+    @alone.def_vmap
+    def _(count, has_lanes, *inputs):
+        if count == 1:
+            one = [v[0] if lanes else v for v, lanes in zip(inputs, has_lanes, strict=True)]
+            out = [v[None] for v in alone(*one)]
+        else:
+            out = jax.vmap(plain, [0 if lanes else None for lanes in has_lanes])(*inputs)
+        return out, [True] * len(out)
+
+    return alone(*inputs)
+
+
 def _in_turn(plain: Callable, inputs) -> list:
     @custom_vmap
     def call(*inputs):
@@ -258,16 +282,21 @@ SMALL = 1 << 16
 REDUCED = 4000
 
 
-def fits_one_kernel(jaxpr: Jaxpr) -> bool:
-    """Whether all that is computed can be in one kernel, and all arrays are small."""
+def fits_one_kernel(jaxpr: Jaxpr, *, products: bool = False) -> bool:
+    """Whether all that is computed can be in one kernel, and all arrays are small.
+
+    Args:
+        jaxpr: of the computation.
+        products: whether those of matrices will be written out.
+    """
     results = [v for eqn in jaxpr.eqns for v in eqn.outvars]
     arrays = (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars, *results)
     if not all(_entries(v) <= SMALL for v in arrays):
         return False
     return all(
-        eqn.primitive.name in FITTING
+        (eqn.primitive.name in FITTING or (products and is_small_product(eqn)))
         and (not _reduces(eqn) or all(_entries(v) <= REDUCED for v in eqn.invars))
-        and all(fits_one_kernel(sub) for sub in _inside(eqn))
+        and all(fits_one_kernel(sub, products=products) for sub in _inside(eqn))
         for eqn in jaxpr.eqns
     )
 

@@ -13,7 +13,9 @@ PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 #: Rooms from the bottom up; `fit` and `scene` are neighbours, neither knows the other.
 ORDER = [
     {"_errors", "_linear"},
-    {"units", "status", "_numerics", "_arguments", "_packed", "_in_order"},
+    {"units", "status", "_numerics", "_arguments", "_packed"},
+    {"_written_out"},
+    {"_in_order"},
     {"files"},
     {"optimisation"},
     {"config"},

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from sections_linear import E, beam_shares, span_stiffness, wall_matrices
 
+from jaxtrachea._in_order import one_kernel
 from jaxtrachea.mechanics.sections import block
 from jaxtrachea.mechanics.sections.contact import effective_place, place_on
 from jaxtrachea.mechanics.sections.section import Shape, make_grid
@@ -19,7 +20,6 @@ from jaxtrachea.mechanics.sections.span import (
     span_forces,
     span_tangent,
 )
-from jaxtrachea.tradeoff.kernels import count_kernels
 
 WALL = {"Gt_L": 20.0, "Et_L": 1.2, "D_L": 3.5, "c_W": 0.7, "rho": 0.01}
 P = WALL | {"R": 11.7, "alpha": 2.0}
@@ -58,18 +58,20 @@ def random_blocks(n, m, indefinite):
 @pytest.mark.compiling
 @pytest.mark.parametrize("n", [2, 3, 8, 9])
 @pytest.mark.parametrize("indefinite", [False, True])
-@pytest.mark.parametrize(("m", "differentiable"), [(7, True), (7, False), (14, False)])
-def test_block_elimination_is_dense(m, differentiable, indefinite, n):
-    """Also of many lanes, whose products are the library's."""
+@pytest.mark.parametrize(("m", "alone"), [(7, True), (7, False), (14, True), (14, False)])
+def test_block_elimination_is_dense(m, alone, indefinite, n):
+    """As single kernels or not; also of many lanes, whose products are the library's."""
     D, U, dense = random_blocks(n, m, indefinite)
     if not indefinite:
         shift = max(0, 1 - np.linalg.eigvalsh(dense)[0])
         D, dense = D + shift * np.eye(m), dense + shift * np.eye(n * m)
     rhs = np.random.default_rng(0).normal(size=(n, m, 2))
 
-    def both(D, U, rhs):
-        factors = block.factor(D, U, differentiable=differentiable)
-        return block.solve(factors, rhs, differentiable=differentiable), factors.negative
+    def plain(D, U, rhs):
+        factors = block.factor(D, U)
+        return block.solve(factors, rhs), factors.negative
+
+    both = one_kernel(plain, products=True) if alone else plain
 
     one = jax.jit(both)(*map(jnp.asarray, (D, U, rhs)))
     scaled = (jnp.stack([v / 2, v, 4 * v]) for v in (D, U))
@@ -79,25 +81,6 @@ def test_block_elimination_is_dense(m, differentiable, indefinite, n):
     for x, negative in (one, (lanes[0][1], lanes[1][1]), (4 * lanes[0][2], lanes[1][2])):
         assert np.abs(x - wanted).max() <= tolerance
         assert int(negative) == np.sum(np.linalg.eigvalsh(dense) < 0)
-
-
-def test_a_step_of_newton_eliminates_in_single_kernels():
-    """One matrix at a time; lanes, and where derivatives are asked for, by products of matrices."""
-    D, U, _ = random_blocks(4, 7, indefinite=False)
-    given = jnp.asarray(D), jnp.asarray(U), jnp.ones((4, 7, 2))
-
-    def both(D, U, rhs, differentiable=False):
-        factors = block.factor(D, U, differentiable=differentiable)
-        return block.solve(factors, rhs, differentiable=differentiable)
-
-    def compiled(f, *args):
-        return jax.jit(f).lower(*args).compile().as_text()
-
-    own = compiled(both, *given)
-    assert count_kernels(own, inside=False) == (2, 0)
-    assert "dot(" not in own
-    assert "dot(" in compiled(functools.partial(both, differentiable=True), *given)
-    assert "dot(" in compiled(jax.vmap(both), *(jnp.stack([v, v]) for v in given))
 
 
 def test_a_linear_span_is_exact():

@@ -11,11 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
-
-from jaxtrachea._in_order import one_kernel
-from jaxtrachea._numerics import product
 
 #: Largest matrix that `invert` eliminates entry by entry: a node of the midline.
 LEAF = 7
@@ -111,36 +107,13 @@ def _chains(nodes, fill):
     return jnp.stack([nodes[:half], right], 1), nodes[half]
 
 
-@custom_vmap
-def _written_out(a: Float[Array, "s m m"], b: Float[Array, "s m k"]) -> Float[Array, "s m k"]:
-    """Products of stacked matrices, written out; of many lanes by the library: quicker there."""
-    return jax.vmap(product)(a, b)
-
-
-@_written_out.def_vmap
-def _by_library(count, has_lanes, a, b):
-    a, b = (v if lanes else v[None] for v, lanes in zip((a, b), has_lanes, strict=True))
-    return jnp.broadcast_to(a @ b, (count, *b.shape[1:])), True
-
-
-def factor(
-    diagonal: Float[Array, "n m m"], upper: Float[Array, "n m m"], *, differentiable: bool = True
-) -> Factors:
+def factor(diagonal: Float[Array, "n m m"], upper: Float[Array, "n m m"]) -> Factors:
     """Eliminate the first block and the last, then the next of either.
 
     Args:
         diagonal: blocks [i, i], symmetric.
         upper: blocks [i, i + 1]; the last is zero.
-        differentiable: whether derivatives are asked for. Without, small blocks of a single matrix
-            are eliminated in one kernel, on a CPU; reverse mode through it is not defined.
     """
-    if differentiable or diagonal.shape[1] > LEAF:
-        return _factor(jnp.matmul, diagonal, upper)
-    return one_kernel(functools.partial(_factor, _written_out))(diagonal, upper)
-
-
-def _factor(multiply, diagonal, upper) -> Factors:
-    """`factor` with a product of stacked matrices."""
     eye = jnp.eye(diagonal.shape[1], dtype=diagonal.dtype)
     D, centre = _chains(diagonal, eye)
     half = D.shape[0]
@@ -152,42 +125,33 @@ def _factor(multiply, diagonal, upper) -> Factors:
     def step(carry, blocks):
         D, U = blocks
         inverse, negative = jax.vmap(functools.partial(invert, symmetric=True))(D - carry)
-        gain = multiply(inverse, U)
-        return multiply(U.transpose(0, 2, 1), gain), (inverse, gain, negative)
+        gain = inverse @ U
+        return U.transpose(0, 2, 1) @ gain, (inverse, gain, negative)
 
     carry, (inverse, gain, negative) = jax.lax.scan(step, jnp.zeros_like(D[0]), (D, U))
     middle, own = invert(centre - carry[0] - carry[1], symmetric=True)
     return Factors(inverse, gain, middle, jnp.sum(negative) + own)
 
 
-def solve(
-    factors: Factors, rhs: Float[Array, "n m k"], *, differentiable: bool = True
-) -> Float[Array, "n m k"]:
-    """Solution for k right-hand sides; whether derivatives are asked for as in `factor`."""
-    if differentiable or rhs.shape[1] > LEAF:
-        return _solve(jnp.matmul, factors, rhs)
-    return one_kernel(functools.partial(_solve, _written_out))(factors, rhs)
-
-
-def _solve(multiply, factors: Factors, rhs) -> Float[Array, "n m k"]:
-    """`solve` with a product of stacked matrices."""
+def solve(factors: Factors, rhs: Float[Array, "n m k"]) -> Float[Array, "n m k"]:
+    """Solution for k right-hand sides."""
     n = rhs.shape[0]
     sides, centre = _chains(rhs, jnp.zeros_like(rhs[0]))
 
     def down(taken, node):
         gain, r = node
         r = r - taken
-        return multiply(gain.transpose(0, 2, 1), r), r
+        return gain.transpose(0, 2, 1) @ r, r
 
     def back(x, node):
         gain, own = node
-        x = own - multiply(gain, x)
+        x = own - gain @ x
         return x, x
 
     taken, left = jax.lax.scan(down, jnp.zeros_like(sides[0]), (factors.gain, sides))
-    x = multiply(factors.centre[None], (centre - taken[0] - taken[1])[None])
+    x = (factors.centre @ (centre - taken[0] - taken[1]))[None]
     inverse = factors.inverse.reshape(-1, *factors.centre.shape)
-    own = multiply(inverse, left.reshape(-1, *centre.shape)).reshape(left.shape)
+    own = (inverse @ left.reshape(-1, *centre.shape)).reshape(left.shape)
     start = jnp.broadcast_to(x, sides[0].shape)
     sides = jax.lax.scan(back, start, (factors.gain, own), reverse=True)[1]
     right = sides[::-1, 1][: n - n // 2 - 1]

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxtrachea.mechanics.sections.section import (
     A1,
     B1,
+    FRONT,
     STRETCH,
     Grid,
     Line,
@@ -46,6 +47,20 @@ class _Loads(NamedTuple):
     moment: Float[Array, " points"]
 
 
+def _added(x, more, place: int, axis: int = 0):
+    """An array with more added at a place along an axis; no scatter (`_in_order.one_kernel`)."""
+    shape = np.ones(x.ndim, int)
+    shape[axis] = x.shape[axis]
+    here = (np.arange(x.shape[axis]) == place).reshape(shape).astype(x.dtype)
+    return x + here * jnp.expand_dims(more, axis)
+
+
+def _added_behind(x, more, grid: Grid):
+    """An array with more added at the points behind."""
+    halves = jnp.split(more, 1 if grid.midline else 2)
+    return x + jnp.concatenate([jnp.pad(half, (FRONT, 0)) for half in halves])
+
+
 def _bed_stiffness(ring: Ring, grid: Grid, shape: Shape):
     area = grid.weights[grid.back] * (shape.radius + shape.offset) * ring.pitch
     return area * ring.k_n, area * ring.k_t
@@ -67,12 +82,18 @@ def _gradient(line: Line, loads: _Loads, ring: Ring, grid: Grid, shape: Shape):
     """dU/dw with the loads of the slopes as given; (shapes,)."""
     on_turn = -shape.radius * line.stretch * (loads.y * line.c + loads.z * line.s)
     c, s = line.c[grid.back], line.s[grid.back]
-    on_turn = on_turn.at[grid.back].add(shape.offset * (loads.bed_z * c - loads.bed_y * s))
-    total = grid.turn @ on_turn + grid.curve @ loads.moment
+    on_turn = _added_behind(on_turn, shape.offset * (loads.bed_z * c - loads.bed_y * s), grid)
+    # One product, also below: its start takes longer than its sums.
+    total = _by_turn_and_curve(grid) @ jnp.concatenate([on_turn, loads.moment])
     pulled = jnp.sum(grid.behind * (loads.z * line.c - loads.y * line.s))
-    total = total.at[STRETCH].add(pulled + muscle(ring, shape) * line.w[STRETCH])
-    total = total.at[A1].add(jnp.sum(loads.bed_y))
-    return total if grid.midline else total.at[B1].add(jnp.sum(loads.bed_z))
+    total = _added(total, pulled + muscle(ring, shape) * line.w[STRETCH], STRETCH)
+    total = _added(total, jnp.sum(loads.bed_y), A1)
+    return total if grid.midline else _added(total, jnp.sum(loads.bed_z), B1)
+
+
+def _by_turn_and_curve(grid: Grid):
+    """Rotation and its derivative by w; (shapes, 2 points)."""
+    return jnp.concatenate([grid.turn, grid.curve], 1)
 
 
 def _slopes(line: Line, grid: Grid, shape: Shape):
@@ -80,8 +101,8 @@ def _slopes(line: Line, grid: Grid, shape: Shape):
     by_turn = (shape.radius * line.stretch)[None] * grid.turn
     y, z = -by_turn * line.c[None], -by_turn * line.s[None]
     return (
-        y.at[STRETCH].add(-line.s * grid.behind),
-        z.at[STRETCH].add(line.c * grid.behind),
+        _added(y, -line.s * grid.behind, STRETCH),
+        _added(z, line.c * grid.behind, STRETCH),
     )
 
 
@@ -134,11 +155,13 @@ def line_tangent(
     stiff = grid.weights * EI * bend(kappa, ring.c_K)[2] / shape.radius
     squares = _turn_squares(line, loads.y, loads.z, shape)
     c, s = line.c[grid.back], line.s[grid.back]
-    squares = squares.at[grid.back].add(-shape.offset * (loads.bed_y * c + loads.bed_z * s))
-    hessian = _weighted_squares(grid.turn, squares) + _weighted_squares(grid.curve, stiff)
+    by_offset = -shape.offset * (loads.bed_y * c + loads.bed_z * s)
+    squares = _added_behind(squares, by_offset, grid)
+    hessian = _weighted_squares(_by_turn_and_curve(grid), jnp.concatenate([squares, stiff]))
     hessian = hessian + _bed_part(line, ring, grid, shape)
     hessian = _mix_stretch(hessian, line, loads.y, loads.z, grid)
-    hessian = hessian.at[STRETCH, STRETCH].add(muscle(ring, shape))
+    stretched = _added(jnp.zeros_like(line.w), muscle(ring, shape), STRETCH)
+    hessian = _added(hessian, stretched, STRETCH)
     return gradient, _along_closed(hessian, follow)
 
 
@@ -188,8 +211,8 @@ def surface_tangent(
     d_y, d_z = _slopes(line, grid, shape)
     free = on_y @ d_y.T + on_z @ d_z.T
     at_way = axes[:, :1] * way.by_turn_y[None] + axes[:, 1:] * way.by_turn_z[None]
-    free = (free + at_way @ way.turn.T).at[:, A1].add(axes[:, 0])
-    free = free if grid.midline else free.at[:, B1].add(axes[:, 1])
+    free = _added(free + at_way @ way.turn.T, axes[:, 0], A1, 1)
+    free = free if grid.midline else _added(free, axes[:, 1], B1, 1)
     gaps, n = _gaps(line, grid, shape), grid.modes
     mu = small_solve(gaps[:, n:].T, free[:, n:].T)
     slope = free[:, :n] - mu.T @ gaps[:, :n]
@@ -213,12 +236,12 @@ def _bed_part(line: Line, ring: Ring, grid: Grid, shape: Shape):
     lever = shape.offset * grid.turn[:, grid.back]
     y = d_y @ grid.to_y.T - lever * line.s[grid.back][None]
     z = d_z @ grid.to_z.T + lever * line.c[grid.back][None]
-    y = y.at[A1].add(1)
-    z = z if grid.midline else z.at[B1].add(1)
+    y = _added(y, jnp.ones_like(y[0]), A1)
+    z = z if grid.midline else _added(z, jnp.ones_like(z[0]), B1)
     phi = grid.phi[grid.back][None]
     normal, tangential = y * jnp.cos(phi) + z * jnp.sin(phi), z * jnp.cos(phi) - y * jnp.sin(phi)
-    k_n, k_t = _bed_stiffness(ring, grid, shape)
-    return (normal * k_n[None]) @ normal.T + (tangential * k_t[None]) @ tangential.T
+    moved = jnp.concatenate([normal, tangential], 1)
+    return (moved * jnp.concatenate(_bed_stiffness(ring, grid, shape))[None]) @ moved.T
 
 
 def _turn_squares(line: Line, y, z, shape: Shape):
@@ -229,7 +252,7 @@ def _turn_squares(line: Line, y, z, shape: Shape):
 def _mix_stretch(hessian, line: Line, y, z, grid: Grid):
     """Adds the second derivatives by rotation and stretch of the muscle."""
     mixed = grid.turn @ (-grid.behind * (y * line.c + z * line.s))
-    return hessian.at[STRETCH].add(mixed).at[:, STRETCH].add(mixed)
+    return _added(_added(hessian, mixed, STRETCH), mixed, STRETCH, 1)
 
 
 def _weighted_squares(shapes, weights):

@@ -177,8 +177,10 @@ def _pinned(system: System):
 
 def _held_ends(y, system: System):
     """Forces on the ends' rotations, as an array of the shape of y."""
-    pulled = jnp.einsum("epij,epj->epi", system.ends, y[jnp.array([0, -1]), :, 4:])
-    return jnp.zeros_like(y).at[jnp.array([0, -1]), :, 4:].set(pulled)
+    turned = jnp.stack([y[0], y[-1]])[:, :, 4:]
+    pulled = jnp.einsum("epij,epj->epi", system.ends, turned)
+    pulled = jnp.pad(pulled, ((0, 0), (0, 0), (4, 0)))
+    return jnp.concatenate([pulled[:1], jnp.zeros_like(y[1:-1]), pulled[1:]])
 
 
 def _assemble(span, ring, state: State, system: System, g):
@@ -216,28 +218,56 @@ def residual_of(line: Line, state: State, displacement: Float[Array, ""], system
     return State(_assemble(span, ring, state, system, g), r_q, r_F)
 
 
-def linearise(
-    state: State, displacement: Float[Array, ""], system: System, *, differentiable: bool = True
-) -> tuple[State, Tangent]:
-    """The residual and its derivative; whether derivatives of them are asked for."""
-    line = lines(state, system)
-    surface = contact_surface(state, line, system)
-    r_q, r_F, g = _contact(state, displacement, system, surface)
-    span, of_span = jax.vmap(span_tangent)(_pairs(physical(state, system)), system.spans)
+class Elements(NamedTuple):
+    """Rings and spans in a state.
+
+    Attributes:
+        line: of `lines`.
+        span: forces on the unknowns of both ends of each span.
+        of_span: their derivatives.
+        ring: forces on the modes of each ring, N.
+        of_ring: their derivatives, N/mm.
+    """
+
+    line: Line
+    span: Float[Array, "spans parities 14"]
+    of_span: Float[Array, "spans a a"]
+    ring: Float[Array, "rings modes"]
+    of_ring: Float[Array, "rings modes modes"]
+
+
+def elements(line: Line, state: State, system: System) -> Elements:
+    """Forces and stiffness of rings and spans, where the mid-lines are known."""
+    spans = jax.vmap(span_tangent)(_pairs(physical(state, system)), system.spans)
     rings = jax.vmap(line_tangent, (0, 0, None, None))
-    ring, of_ring = rings(of_rings(line), system.rings, system.grid, system.shape)
-    r = State(_assemble(span, ring, state, system, g), r_q, r_F)
+    return Elements(line, *spans, *rings(of_rings(line), system.rings, system.grid, system.shape))
+
+
+def linearise(
+    state: State, displacement: Float[Array, ""], system: System
+) -> tuple[State, Tangent]:
+    """The residual and its derivative."""
+    return assemble(elements(lines(state, system), state, system), state, displacement, system)
+
+
+def assemble(
+    found: Elements, state: State, displacement: Float[Array, ""], system: System
+) -> tuple[State, Tangent]:
+    """`linearise` where rings and spans are known."""
+    surface = contact_surface(state, found.line, system)
+    r_q, r_F, g = _contact(state, displacement, system, surface)
+    r = State(_assemble(found.span, found.ring, state, system, g), r_q, r_F)
     B, own, share = surface.slope, system.place.own.ravel(), _share(system)
     M = (B.T / system.give[None]) @ B - surface.curved
     inverse, negative = block.invert(jnp.eye(own.size, dtype=own.dtype) + own[:, None] * M)
     E = M @ inverse
-    diagonal, upper = stiffness(of_span, of_ring, system)
+    diagonal, upper = stiffness(found.of_span, found.of_ring, system)
     mode = _mode_of(system.scale.shape[1])
     felt = E[mode[:, None], mode[None]][None]
     diagonal = diagonal + felt * share[:, :, None] * share[:, None]
     after = jnp.concatenate([share[1:], jnp.zeros_like(share[:1])])
     upper = upper + felt * share[:, :, None] * after[:, None]
-    factors = block.factor(diagonal, upper, differentiable=differentiable)
+    factors = block.factor(diagonal, upper)
     return r, Tangent(factors, share, own, E, B, M, system.give, negative)
 
 
@@ -275,8 +305,8 @@ def solve_linear(tangent: Tangent, r: State) -> State:
     return jax.tree.map(lambda v: v[0], found)
 
 
-def solve_several(tangent: Tangent, r: State, *, differentiable: bool = True) -> State:
-    """J^-1 r of several r, stacked; whether derivatives are asked for."""
+def solve_several(tangent: Tangent, r: State) -> State:
+    """J^-1 r of several r, stacked."""
     share, own, E = tangent.share, tangent.own, tangent.stiffness
 
     def condense(r):
@@ -291,7 +321,7 @@ def solve_several(tangent: Tangent, r: State, *, differentiable: bool = True) ->
         return State(y.reshape(r.y.shape), q.reshape(r.q_C.shape), force)
 
     rhs, fixed = jax.vmap(condense, out_axes=(2, 0))(r)
-    y = block.solve(tangent.factors, rhs, differentiable=differentiable)
+    y = block.solve(tangent.factors, rhs)
     return jax.vmap(expand, (0, 2, 0))(r, y, fixed)
 
 

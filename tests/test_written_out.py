@@ -1,0 +1,115 @@
+"""Products of matrices written out: against NumPy's, in calls, loops and branches, and in lanes."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from jax.extend.core import jaxpr_as_fun, jaxprs_in_params
+
+from jaxtrachea._in_order import one_kernel
+from jaxtrachea._numerics import epsilon
+from jaxtrachea._written_out import written_out
+from jaxtrachea.tradeoff.kernels import count_kernels
+
+DTYPES = ["float32", "float64"]
+#: Products as `einsum` names them, and the sizes of the two.
+PRODUCTS = {
+    "i,i->": ((5,), (5,)),
+    "ij,j->i": ((3, 20), (20,)),
+    "i,j->ij": ((3,), (4,)),
+    "j,ji->i": ((4,), (4, 3)),
+    "ij,jk->ik": ((3, 4), (4, 2)),
+    "bij,bjk->bik": ((5, 3, 4), (5, 4, 2)),
+    "ibj,kjb->bik": ((3, 5, 4), (2, 4, 5)),
+    "ijk,kjl->il": ((2, 3, 4), (4, 3, 2)),
+    "bcij,bcj->bci": ((2, 3, 4, 5), (2, 3, 5)),
+}
+
+
+def numbers(*shapes, dtype="float64"):
+    rng = np.random.default_rng(3)
+    return [jnp.asarray(rng.normal(size=shape), dtype) for shape in shapes]
+
+
+def names(jaxpr):
+    """Every operation, also in what an operation holds."""
+    inside = [v for eqn in jaxpr.eqns for v in jaxprs_in_params(eqn.params)]
+    return {eqn.primitive.name for eqn in jaxpr.eqns}.union(*map(names, inside))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("what", PRODUCTS)
+def test_a_product_is_that_of_numpy(what, dtype):
+    a, b = numbers(*PRODUCTS[what], dtype=dtype)
+    sums = written_out(jax.make_jaxpr(functools.partial(jnp.einsum, what))(a, b))
+    assert "dot_general" not in names(sums.jaxpr)
+    (got,) = jaxpr_as_fun(sums)(a, b)
+    wanted = np.einsum(what, np.asarray(a, float), np.asarray(b, float))
+    assert got.dtype == dtype
+    np.testing.assert_allclose(got, wanted, rtol=0, atol=40 * epsilon(dtype))
+
+
+@jax.custom_jvp
+def with_a_rule(A, x):
+    return A @ x
+
+
+with_a_rule.defjvp(lambda at, along: (with_a_rule(*at), along[0] @ at[1] + at[0] @ along[1]))
+
+
+def many(A, x):
+    """Products in a loop, a scan, a branch, a call and a function with a rule of its own."""
+    x = lax.fori_loop(0, 3, lambda _, v: A @ v / 2, x)
+    x, rows = lax.scan(lambda v, row: (jnp.tanh(A @ v) + row, row @ A), x, A)
+    x = lax.while_loop(lambda v: jnp.max(jnp.abs(v)) > 1, lambda v: A @ v / 8, x)
+    x = lax.cond(x[0] > 0, lambda v: A @ v, lambda v: A.T @ v, x)
+    return with_a_rule(A, x), jax.jit(jnp.matmul)(rows, A)
+
+
+def test_all_that_holds_a_product_is_rewritten():
+    A, x = numbers((4, 4), (4,))
+    sums = written_out(jax.make_jaxpr(many)(A, x))
+    assert "dot_general" in names(jax.make_jaxpr(many)(A, x).jaxpr)
+    assert "dot_general" not in names(sums.jaxpr)
+    for got, wanted in zip(jaxpr_as_fun(sums)(A, x), many(A, x), strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-13, atol=1e-14)
+
+
+def compiled(f, *inputs):
+    return jax.jit(f).lower(*inputs).compile().as_text()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_single_call_is_one_kernel_and_lanes_are_the_librarys(dtype):
+    """One lane is a single call, too; values and derivatives are those of the function."""
+    A, x = numbers((4, 4), (4,), dtype=dtype)
+    one = one_kernel(many, products=True)
+    lanes = jnp.stack([x, -x, 2 * x])
+    assert count_kernels(compiled(one, A, x), inside=False)[0] == 1
+    single = compiled(jax.vmap(one, (None, 0)), A, lanes[:1])
+    assert count_kernels(single, inside=False)[0] == 1
+    assert "dot(" not in single
+    assert "dot(" in compiled(jax.vmap(one, (None, 0)), A, lanes)
+    assert "dot(" in compiled(one_kernel(many), A, x)
+
+    def slope(f):
+        return jax.jit(lambda A, x, along: jax.jvp(f, (A, x), (jnp.sin(A), along)))
+
+    def close(got, wanted):
+        for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(wanted), strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=500 * epsilon(dtype))
+
+    close(jax.jit(one)(A, x), many(A, x))
+    close(slope(one)(A, x, jnp.cos(x)), slope(many)(A, x, jnp.cos(x)))
+    for f in (jax.vmap, lambda g, axes: jax.vmap(jax.vmap(g, axes), axes)):
+        given = lanes if f is jax.vmap else lanes[None]
+        close(jax.jit(f(one, (None, 0)))(A, given), f(many, (None, 0))(A, given))
+
+
+def test_large_products_stay_with_the_library():
+    A, x = numbers((40, 40), (40,))
+    text = compiled(one_kernel(lambda A, x: jnp.sin(A @ x), products=True), A, x)
+    assert "dot(" in text
