@@ -30,7 +30,7 @@ from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 from jaxtrachea._linear import linear, over_lanes, replaced
-from jaxtrachea._written_out import is_small_product, written_out
+from jaxtrachea._written_out import written_out
 
 Out = TypeVar("Out")
 #: Names of the operations that mark a call: no work, and what they give is the first operand.
@@ -64,8 +64,9 @@ def one_kernel(part: Callable[..., Out], *, products: bool = False) -> Callable[
     For programs of many small operations, whose time goes into starting kernels. It works where
     the call is traced (under `jit`); a batch (`vmap`), another device or another compiler than
     those of `TESTED` gets the function as it is. Not where it does what `FITTING` lacks (products
-    of matrices, linear algebra, sorting with `top_k`, `.at[]`), reduces more than `REDUCED`
-    entries, or has arrays that are not `SMALL` or not of numbers: that is compiled as `in_order`.
+    of matrices, but see `products`; linear algebra, sorting with `top_k`, `.at[]`), reduces more
+    than `REDUCED` entries, or has arrays that are not `SMALL` or not of numbers: that is compiled
+    as `in_order`.
     So it is with its derivatives, each by itself. Values and derivatives are the same but for
     rounding. A derivative begins with the part once more: of a batch it takes somewhat longer than
     that of the function by itself, so mark what is called one at a time.
@@ -73,8 +74,8 @@ def one_kernel(part: Callable[..., Out], *, products: bool = False) -> Callable[
     Args:
         part: from arrays to arrays (or trees of them) of any dtype; pure, may close over traced
             ones. Its errors are passed on.
-        products: whether those of small matrices are written out, in a single call; of a batch the
-            library does them, which is quicker there.
+        products: whether products of matrices of at most 64 terms are written out as sums, so that
+            they can be part of the kernel; a batch has the library's, which are quicker there.
     """
     return _called(part, _kernel_of_products if products else _kernel)
 
@@ -95,7 +96,7 @@ def in_turn(part: Callable[..., Out]) -> Callable[..., Out]:
 
 
 def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
-    """The part as a call of its own: `_in_order`, as a single `_kernel` if it can, `_in_turn`."""
+    """The part as a call of its own: `_in_order`, if it can a single `_kernel`, or `_in_turn`."""
 
     def run(*arguments):
         marked = how is not _in_turn
@@ -124,12 +125,13 @@ def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
         def changing(moving):
             return _changing(jaxpr, {variables[read[i]] for i in moving})
 
-        products = how is _kernel_of_products
-        fits = _one_kernel_p is not None and fits_one_kernel(jaxpr, products=products)
-        refused = (products or how is _kernel) and not fits
-        found = _differentiable(plain, changing, _in_order if refused else how)(
-            *(given[i] for i in read)
-        )
+        inputs = [given[i] for i in read]
+        judged = jaxpr
+        if how is _kernel_of_products:
+            judged = written_out(jax.make_jaxpr(plain)(*inputs)).jaxpr
+        fits = _one_kernel_p is not None and fits_one_kernel(judged)
+        refused = how in (_kernel, _kernel_of_products) and not fits
+        found = _differentiable(plain, changing, _in_order if refused else how)(*inputs)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 
     return run
@@ -160,7 +162,8 @@ def _differentiable(plain: Callable, changing_with: Callable, how: Callable) -> 
     Args:
         plain: from arrays to a list of arrays; what it closes over is not traced.
         changing_with: from the places of arrays to those of the results that change with them.
-        how: `_in_order`, `_kernel` or `_in_turn`; so are its derivatives then, if they can be.
+        how: `_in_order`, `_kernel`, `_kernel_of_products` or `_in_turn`; so are its derivatives
+            then, if they can be.
     """
 
     @jax.custom_jvp
@@ -282,21 +285,16 @@ SMALL = 1 << 16
 REDUCED = 4000
 
 
-def fits_one_kernel(jaxpr: Jaxpr, *, products: bool = False) -> bool:
-    """Whether all that is computed can be in one kernel, and all arrays are small.
-
-    Args:
-        jaxpr: of the computation.
-        products: whether those of matrices will be written out.
-    """
+def fits_one_kernel(jaxpr: Jaxpr) -> bool:
+    """Whether all that is computed can be in one kernel, and all arrays are small."""
     results = [v for eqn in jaxpr.eqns for v in eqn.outvars]
     arrays = (*jaxpr.invars, *jaxpr.constvars, *jaxpr.outvars, *results)
     if not all(_entries(v) <= SMALL for v in arrays):
         return False
     return all(
-        (eqn.primitive.name in FITTING or (products and is_small_product(eqn)))
+        eqn.primitive.name in FITTING
         and (not _reduces(eqn) or all(_entries(v) <= REDUCED for v in eqn.invars))
-        and all(fits_one_kernel(sub, products=products) for sub in _inside(eqn))
+        and all(fits_one_kernel(sub) for sub in _inside(eqn))
         for eqn in jaxpr.eqns
     )
 

@@ -9,37 +9,37 @@ called alone.
 import math
 
 import jax
+import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Literal
-from jaxtyping import Array, Float
+from jaxtyping import Array, Num
 
-from jaxtrachea._numerics import ONE_REDUCTION, added, total
+from jaxtrachea._numerics import added, total
 
+#: Terms of a sum up to which it is written out.
+TERMS = 64
 #: Operations that only call what they hold. Their derivatives are not asked for here.
 CALLS = frozenset("jit pjit closed_call custom_jvp_call custom_vjp_call custom_vmap_call".split())
 
 
 def written_out(closed: ClosedJaxpr) -> ClosedJaxpr:
-    """The same function without `dot_general`; calls are taken apart, loops and branches kept.
+    """The same function with its products of at most `TERMS` terms as sums.
 
-    Args:
-        closed: a function; derivatives of the result are those of the operations, so that rules of
-            its own (`custom_jvp`) are lost.
+    Loops and branches are kept. Calls are taken apart: with them go marks, and rules of derivatives
+    (`custom_jvp`). Operations that hold functions of another kind (`_linear.linear`) stay as they
+    are, with what products are in them.
     """
     return jax.make_jaxpr(lambda *values: _evaluate(closed, values))(*closed.in_avals)
 
 
-def is_small_product(eqn) -> bool:
-    """Whether an operation is a product of matrices that are small enough to be written out."""
+def _is_short_product(eqn) -> bool:
     if eqn.primitive.name != "dot_general":
         return False
     (sum_a, _), _ = eqn.params["dimension_numbers"]
-    return 0 < math.prod(eqn.invars[0].aval.shape[i] for i in sum_a) <= ONE_REDUCTION
+    return 0 < math.prod(eqn.invars[0].aval.shape[i] for i in sum_a) <= TERMS
 
 
-def product_of(
-    a: Float[Array, "..."], b: Float[Array, "..."], dimension_numbers
-) -> Float[Array, "..."]:
-    """`jax.lax.dot_general`, written out."""
+def product_of(a: Num[Array, "..."], b: Num[Array, "..."], dimension_numbers) -> Num[Array, "..."]:
+    """`jax.lax.dot_general` of two arrays of one dtype, written out."""
     (sum_a, sum_b), (both_a, both_b) = dimension_numbers
     own_a = [i for i in range(a.ndim) if i not in (*sum_a, *both_a)]
     own_b = [i for i in range(b.ndim) if i not in (*sum_b, *both_b)]
@@ -62,8 +62,10 @@ def _evaluate(closed: ClosedJaxpr, values):
 
     for eqn in closed.jaxpr.eqns:
         inputs, name = [read(v) for v in eqn.invars], eqn.primitive.name
-        if name == "dot_general":
-            out = [product_of(*inputs, eqn.params["dimension_numbers"])]
+        if _is_short_product(eqn):
+            # The dtype of the result may be wider than that of either.
+            a, b = (jnp.asarray(v, eqn.outvars[0].aval.dtype) for v in inputs)
+            out = [product_of(a, b, eqn.params["dimension_numbers"])]
         elif name in CALLS:
             held = (v for v in eqn.params.values() if isinstance(v, ClosedJaxpr))
             out = _evaluate(next(held), inputs)

@@ -9,7 +9,7 @@ import pytest
 from jax import lax
 from jax.extend.core import jaxpr_as_fun, jaxprs_in_params
 
-from jaxtrachea._in_order import one_kernel
+from jaxtrachea._in_order import in_order, one_kernel
 from jaxtrachea._numerics import epsilon
 from jaxtrachea._written_out import written_out
 from jaxtrachea.tradeoff.kernels import count_kernels
@@ -109,7 +109,33 @@ def test_a_single_call_is_one_kernel_and_lanes_are_the_librarys(dtype):
         close(jax.jit(f(one, (None, 0)))(A, given), f(many, (None, 0))(A, given))
 
 
-def test_large_products_stay_with_the_library():
-    A, x = numbers((40, 40), (40,))
-    text = compiled(one_kernel(lambda A, x: jnp.sin(A @ x), products=True), A, x)
-    assert "dot(" in text
+REFUSED = {
+    "many terms": lambda A, x: jnp.sin(A @ x),
+    "many entries": lambda A, x: jnp.sin(A[:, :20] @ x[:20]),
+    "a marked call": lambda A, x: A[:4, :4] @ jnp.sin(in_order(lambda A: A @ A)(A[:4, :4])),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_does_not_fit_stays_with_the_library(what):
+    """Also of its derivative: the compiler would refuse the program."""
+    (A,), (x,) = numbers((300, 300)), numbers((300,))
+    part = REFUSED[what]
+
+    def slope(f):
+        return lambda A, x: jax.jvp(f, (A, x), (A, x))
+
+    got, wanted = (jax.jit(slope(f))(A, x) for f in (one_kernel(part, products=True), part))
+    for a, b in zip(got, wanted, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
+
+
+def test_the_dtype_is_that_of_the_result():
+    a, b = jnp.arange(4, dtype=jnp.int8) + 60, jnp.arange(4, dtype=jnp.int8) + 90
+
+    def part(a, b):
+        return jnp.matmul(a, b, preferred_element_type=jnp.int32) + jnp.int32(1)
+
+    (got,) = jaxpr_as_fun(written_out(jax.make_jaxpr(part)(a, b)))(a, b)
+    assert got.dtype == jnp.int32
+    assert int(got) == 1 + sum((60 + i) * (90 + i) for i in range(4))

@@ -257,6 +257,24 @@ def test_an_equilibrium_that_is_no_minimum_is_seen():
         assert int(excess(state, parts._replace(give=jnp.asarray([give])))) == wanted
 
 
+@pytest.mark.parametrize(("midline", "kernels"), [(True, 3), (False, 2)])
+def test_single_kernels_of_a_step(midline, kernels):
+    """Closure and solution, on the midline assembly with elimination; of many lanes none."""
+    geometry, material = Geometry.create(30.0, [10.0, 20.0]), SectionMaterial(**VALUES)
+    direction = jnp.asarray([1.0, 0.0])
+    parts = build(
+        geometry, material, jnp.asarray(14.0), jnp.asarray(0.0), direction, midline=midline
+    )
+    z, D = flat(system.at_rest(parts)), jnp.asarray(1.0)
+
+    def marks(step, z):
+        return str(jax.make_jaxpr(step)(z, D, parts)).count("= one_kernel ")
+
+    one = marks(newton_step, z)
+    lanes = marks(jax.vmap(newton_step, (0, None, None)), jnp.stack([z, z]))
+    assert (one, lanes) == (kernels, 0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("midline", [True, False])
 def test_float32(midline):

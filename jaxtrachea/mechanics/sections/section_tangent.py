@@ -51,12 +51,12 @@ def _added(x, more, place: int, axis: int = 0):
     """An array with more added at a place along an axis; no scatter (`_in_order.one_kernel`)."""
     shape = np.ones(x.ndim, int)
     shape[axis] = x.shape[axis]
-    here = (np.arange(x.shape[axis]) == place).reshape(shape).astype(x.dtype)
-    return x + here * jnp.expand_dims(more, axis)
+    here = (np.arange(x.shape[axis]) == place).reshape(shape)
+    return jnp.where(here, x + jnp.expand_dims(more, axis), x)
 
 
 def _added_behind(x, more, grid: Grid):
-    """An array with more added at the points behind."""
+    """An array with more added at the points `grid.back`: last of each half."""
     halves = jnp.split(more, 1 if grid.midline else 2)
     return x + jnp.concatenate([jnp.pad(half, (FRONT, 0)) for half in halves])
 
