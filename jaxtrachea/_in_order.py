@@ -38,7 +38,7 @@ MARKS = "not_inlined", "one_kernel", "hidden"
 #: Versions of jaxlib whose compiler was seen to do `one_kernel` right (tests/test_in_order.py). A
 #: compiler that cannot put a part into one kernel refuses the program or ends the process: with
 #: others it is as `in_order`.
-TESTED = ("0.10.2",)
+TESTED = ("0.10.2", "0.11.2")
 
 
 def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
@@ -108,8 +108,10 @@ def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
         own = [i for i, v in enumerate(closed.consts) if isinstance(v, Tracer)]
         given = [*(closed.consts[i] for i in own), *jax.tree.leaves(arguments)]
 
-        # Without what is traced, which would be kept for as long as the derivatives are.
-        jaxpr, kept = closed.jaxpr, replaced(closed.consts, own, [None] * len(own))
+        # Without what is traced, which would be kept for as long as the derivatives are. From JAX
+        # 0.11 on a `Jaxpr` holds its constants itself.
+        kept = replaced(closed.consts, own, [None] * len(own))
+        jaxpr = ClosedJaxpr(closed.jaxpr, kept).jaxpr
         # What is not read is not asked for: another call would compute it.
         variables = [*(jaxpr.constvars[i] for i in own), *jaxpr.invars]
         used = _read(jaxpr)

@@ -5,6 +5,7 @@ import gc
 import os
 import subprocess
 import sys
+import time
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Also for the commands that tests start: nothing is written beside the tests.
@@ -101,6 +102,14 @@ def _forget_programs():
         jax.clear_caches()
         gc.collect()
         _compiled = 0
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """No slow test begins after `SLOW_TESTS_UNTIL` (seconds since the epoch, set by .ci/run)."""
+    until = os.environ.get("SLOW_TESTS_UNTIL")
+    if until and time.time() > float(until):
+        pytest.skip(f"no time is left for {item.nodeid}")
 
 
 #: Files that take longest begin, so that none runs on alone at the end.

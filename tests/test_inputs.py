@@ -172,8 +172,10 @@ def test_formulas(tmp_path):
         for name in old.namelist():
             data = old.read(name)
             if name.endswith("sheet1.xml"):
-                assert b"<f>E3*2</f><v />" in data or b"<f>E3*2</f><v/>" in data
-                data = re.sub(rb"<f>E3\*2</f><v ?/>", b"<f>E3*2</f><v>0.66</v>", data)
+                # openpyxl writes the empty value in three ways, with lxml and without.
+                empty = rb"<f>E3\*2</f><v(?: ?/>|></v>)"
+                data, count = re.subn(empty, b"<f>E3*2</f><v>0.66</v>", data)
+                assert count == 1
             new.writestr(name, data)
     assert_same(read(put(tmp_path, stored.getvalue(), "stored.xlsx")), read(put(tmp_path, TWO)))
     made.active["A3"] = "=A2"

@@ -14,12 +14,10 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
+from jaxtrachea._compiler import quick_options
 from jaxtrachea.selfcheck.functions import FUNCTIONS
 from jaxtrachea.selfcheck.judge import Outcome, judge, rank
 from jaxtrachea.selfcheck.table import Case, Truth
-
-#: Options of the compiler for a quick look: not the programs that are otherwise run.
-QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 
 
 def _lane(call, constant, v, tangent, cotangent):
@@ -58,7 +56,7 @@ class _Programs:
         self.healthy = healthy
         one, many = (functools.partial(f, call, case.constant) for f in (_alone, _lane))
         first = {n: v[0] for n, v in basis[1].items()}
-        options = QUICK if quick else None
+        options = quick_options() if quick else None
         self.one = jax.jit(one).lower(healthy, first).compile(options)
         self.many = jax.jit(jax.vmap(many)).lower(self.batch(healthy), *basis).compile(options)
 
@@ -136,7 +134,7 @@ def run_table(
         cases: rows of the table.
         truths: by name.
         dtypes: some of `table.DTYPES`.
-        quick: compile without optimisation (`QUICK`).
+        quick: compile without optimisation: not the programs that are otherwise run.
     """
     groups: dict[tuple[str, str], list[Case]] = {}
     for case in cases:

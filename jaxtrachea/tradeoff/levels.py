@@ -4,9 +4,7 @@
 rung of a ladder is a `Levels` with a few of them changed, so that rungs of several ladders combine.
 """
 
-import contextlib
 import dataclasses
-import functools
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -246,20 +244,6 @@ def solve(scene: Scene, material: Material, path: Poses | Presses):
 
     change, out = jax.jacfwd(forces, has_aux=True)(jnp.zeros(len(names), material.k_1.dtype))
     return out, change
-
-
-@functools.cache
-def quick_options() -> dict[str, Any]:
-    """Options to compile what is called a few times only: 0.4 of the time, with as many kernels.
-
-    An option that this XLA does not know is left out.
-    """
-    plain = {"xla_backend_optimization_level": 0}
-    for options in (plain | {"xla_cpu_use_fusion_emitters": False}, plain):
-        with contextlib.suppress(jax.errors.JaxRuntimeError):
-            jax.jit(jnp.negative, compiler_options=options).lower(1.0).compile()
-            return options
-    return {}
 
 
 def parameter_names(material: Material) -> list[str]:

@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxtrachea._compiler import quick_options
 from jaxtrachea.scene.simulation import Simulation
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.tradeoff.choice import Choice
 from jaxtrachea.tradeoff.errors import Errors, compare, relative, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
-from jaxtrachea.tradeoff.levels import Full, Levels, program, quick_options, solve
+from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
 from jaxtrachea.tradeoff.load import Load
 from jaxtrachea.tradeoff.parts import inputs, part_of
 from jaxtrachea.tradeoff.time_model import processor

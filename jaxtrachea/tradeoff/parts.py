@@ -7,12 +7,13 @@ from typing import Literal, NamedTuple
 import jax
 
 from jaxtrachea._arguments import check_word
+from jaxtrachea._compiler import quick_options
 from jaxtrachea.scene.approach import Approach, approach
 from jaxtrachea.scene.deform import deform
 from jaxtrachea.scene.programs import Moved, one_plane, vectors
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.stage import Poses, Presses
-from jaxtrachea.tradeoff.levels import Full, Levels, cast, program, quick_options
+from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
 
 Part = Literal["contact", "skeleton", "surface"]
 #: What each ladder changes; of those not named here the force and the skeleton.

@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea._compiler import quick_options
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.simulation import Simulation, simulate
 from jaxtrachea.scene.stage import Poses, Presses
 from jaxtrachea.tradeoff.errors import Errors, compare
-from jaxtrachea.tradeoff.levels import Full, Levels, cast, program, quick_options
+from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
 from jaxtrachea.tradeoff.price import OPERATIONS, By, Price, started
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.

@@ -48,7 +48,7 @@ def quintic(v):
     falling = [p[0], 0, p[1], 0, 1, -1]  # of d / delta
     while falling[0] == 0:
         falling.pop(0)
-    roots = mp.polyroots(falling, maxsteps=2000, extraprec=2000)
+    roots = mp.polyroots(falling, maxsteps=2000, extraprec=2000, asc=False)
     near = mp.mpf(10) ** -80
     real = [mp.re(r) for r in roots if abs(mp.im(r)) < near * abs(r) and mp.re(r) > 0]
     d = mp.sign(v["D"]) * delta * min(real)
