@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtrachea._numerics import epsilon
+from jaxtrachea._numerics import epsilon, full_precision
 from jaxtrachea.fitting.lane import Lane, data_weight, force_entries, size
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import of_trials, residual, residual_value
@@ -69,6 +69,7 @@ def weights(model: FitModel, value, lane: Lane, sigma: Float[Array, "2"]):
     return balance * balance * rho, balance * jnp.sqrt(slope) * scale
 
 
+@full_precision
 def evaluate(
     model: FitModel,
     theta: Float[Array, " P"],
@@ -173,6 +174,7 @@ class LaneCost(eqx.Module):
         """Residual, cost and normal equations."""
         return evaluate(self.model, theta, self.lane, self.sigma, self.geometry)
 
+    @full_precision
     def ahead(self, point: Point, theta, step) -> Float[Array, " P"]:
         """J^T times the residual's second derivative along the step, by a probe on the way.
 
@@ -189,6 +191,7 @@ class LaneCost(eqx.Module):
         curvature = 2 / PROBE * ((probe - point.value) / PROBE * root - linear)
         return assemble(model, jnp.einsum("tim,tm->ti", point.jacobian, curvature), lane)
 
+    @full_precision
     def cross_gradient(self, point: Point, other: Point) -> Float[Array, " P"]:
         """J^T of one point times the residual of another."""
         _, root = weights(self.model, other.value, self.lane, self.sigma)

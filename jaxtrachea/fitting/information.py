@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.cost import assemble, entry_scale, robust
 from jaxtrachea.fitting.lane import Lane, observations, precisions
 from jaxtrachea.fitting.map_lanes import map_lanes
@@ -54,6 +55,7 @@ class Information(NamedTuple):
         )
 
 
+@full_precision
 def information(
     model: FitModel, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
 ) -> Information:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.lane import Lane, forces, markers, weighted
 from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.mechanics.sections.material import SectionMaterial
@@ -67,6 +68,7 @@ def section_material(
     return SectionMaterial(**{name: values[name] for name in names}), values
 
 
+@full_precision
 def answer(
     model: FitModel,
     free: Float[Array, " Jf"],

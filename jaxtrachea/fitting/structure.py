@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
@@ -263,6 +264,7 @@ def _seen_of_sections(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     return (J / np.where(size > 0, size, 1)).reshape(len(lanes), -1, J.shape[-1])
 
 
+@full_precision
 def _curves_by_unknowns(model: FitModel, theta: Float[Array, " P"], lane: Lane):
     """Derivative of the residual by the unknowns of the lane; (T, m, P)."""
     J = residual(model, theta, lane).jacobian

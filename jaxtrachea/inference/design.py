@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import check_word
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.fitting.information import informations
 from jaxtrachea.fitting.model import FitModel
@@ -265,6 +266,7 @@ def _of_all(study: Study, samples: int, guess: _Guess, candidates: Candidates) -
     return np.concatenate(parts)
 
 
+@full_precision
 def _information(model: FitModel, samples: int, sides: bool, guess: _Guess, place: _Place):
     """Information of one press with noise of 1 N on the unknowns; (P, P).
 

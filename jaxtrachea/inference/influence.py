@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.cost import assemble, entry_scale, robust
 from jaxtrachea.fitting.covariance import SINGULAR
 from jaxtrachea.fitting.lane import Lane, force_entries, observations
@@ -108,6 +109,7 @@ def _invert(A, H, relative, free) -> _Inverses:
     return _Inverses(gauss_newton * scale, full * scale)
 
 
+@full_precision
 def diagnose(
     model: FitModel,
     theta: Float[Array, " P"],

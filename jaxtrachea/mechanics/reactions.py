@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.compliance import Beam, Compliance, Deflection, Split, divide_load
 
 
@@ -48,6 +49,7 @@ def _dense_side(beam: Beam, s, held):
     return Compliance(tip[0, 0], tip[0, 1], tip[1, 1], det), R, theta
 
 
+@full_precision
 def deflect_dense(
     beam: Beam, s_c: Float[Array, ""], force: Float[Array, ""], *, split: Split = "continuous"
 ) -> Deflection:

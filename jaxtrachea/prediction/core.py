@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.model import FitModel
 from jaxtrachea.fitting.residual import material_and_values
 from jaxtrachea.fitting.section_residual import Tool, answer
@@ -147,6 +148,7 @@ def jacobian(model: FitModel, free, value, s_c, displacement, blend=None, aside=
     return jax.vmap(push, out_axes=(None, None, 0))(eye)
 
 
+@full_precision
 def standard_errors(
     slope: Float[Array, "F ..."],
     covariance: Float[Array, "F F"],
@@ -178,6 +180,7 @@ def _unseen(slope: Float[Array, "F N"], slack: Float[Array, "N F"]) -> Float[Arr
     return jnp.where(jnp.any(slack > 0, axis=1), jnp.max(size), 0)
 
 
+@full_precision
 def predicted(
     model: FitModel,
     estimate: Estimate,

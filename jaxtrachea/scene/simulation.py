@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._in_order import one_kernel
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.oblique import Place, press_at
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.approach import Approach, approach
@@ -81,6 +82,7 @@ class Simulation(NamedTuple):
     status: Int[Array, " rows"]
 
 
+@full_precision
 def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simulation:
     """Follow a path through the program of `scene.plan`; pure, to be jitted and differentiated.
 

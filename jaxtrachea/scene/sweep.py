@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, shaped
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.oblique import press_oblique
 from jaxtrachea.mechanics.press import press
 from jaxtrachea.mechanics.ring import on_ring
@@ -41,6 +42,7 @@ class Sweep(NamedTuple):
     status: Int[Array, " points"]
 
 
+@full_precision
 def sweep(
     scene: Scene,
     material: AnyMaterial,

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, shaped
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.admission import hide
 from jaxtrachea.mechanics.ring import on_ring
 from jaxtrachea.mechanics.sections import section, span, system
@@ -122,6 +123,7 @@ def press_sections(
 # Inlined: the program is as without. But what calls it is traced through derivatives and maps from
 # equations that are known, in all programs for the same shapes, and not through its Python again.
 @functools.partial(jax.jit, static_argnames="midline", inline=True)
+@full_precision
 def _press(
     geometry: Geometry,
     material: SectionMaterial,

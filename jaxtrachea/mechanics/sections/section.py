@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtrachea._numerics import cos_sin, epsilon
+from jaxtrachea._numerics import cos_sin, epsilon, full_precision
 
 #: Gauss points on the half of the cartilage and on that of the muscle, and on the way to a point.
 FRONT, BACK, WAY = 12, 8, 10
@@ -225,6 +225,7 @@ def close_ring(
 
 
 @close_ring.defjvp
+@full_precision
 def _close_ring_jvp(primals, tangents):
     lam = close_ring(*primals)
     _, grown, slope = jax.jvp(lambda *given: _gap(lam, *given), primals, tangents, has_aux=True)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._in_order import one_kernel
-from jaxtrachea._numerics import epsilon
+from jaxtrachea._numerics import epsilon, full_precision
 from jaxtrachea.mechanics.sections import system as _system
 from jaxtrachea.mechanics.sections.system import State, System
 
@@ -227,6 +227,7 @@ def solve_path(system: System, displacement: Float[Array, " m"]) -> Solved:
 
 
 @solve_path.defjvp
+@full_precision
 def _solve_path_jvp(primals, tangents):
     system, displacement = primals
     found = solve_path(system, displacement)
