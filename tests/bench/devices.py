@@ -158,9 +158,8 @@ def main() -> None:
             found.setdefault(name, []).append(f"{off:.1e}")
     for name, cells in found.items():
         print(f"| {name} | {' | '.join(cells)} |")
-    print(
-        "| µs, float64 | a call | lanes | a lane | CPU: a call | a lane |\n|---|---|---|---|---|---|"
-    )
+    print("| µs, float64 | a call | lanes | a lane | CPU: a call | a lane |")
+    print("|---|---|---|---|---|---|")
     for name in found:
         row = []
         for at in (device, cpu):
