@@ -75,6 +75,7 @@ LATER = {
     "imported",
     "imported_tool",
     "capsule",
+    "bonded_pull",
     "cross_sections",
     "deep",
     "friction",

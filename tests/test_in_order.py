@@ -326,6 +326,7 @@ def test_what_is_not_used_has_no_part_in_a_derivative(mark):
     assert jax.jit(jax.vmap(slope))(jnp.zeros(3)).tolist() == [2, 2, 2]
 
 
+@pytest.mark.slow  # all that lives is searched, often
 @BOTH
 def test_nothing_traced_is_kept(mark):
     """A part that closes over what is traced, and its derivatives, once and twice."""

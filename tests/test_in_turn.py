@@ -60,9 +60,19 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("large", [1, _linear.LARGE, 10**9])
-@pytest.mark.parametrize("way", list(WAYS))
-@pytest.mark.parametrize("dtype", DTYPES)
+#: Of the default suite those of float64, of the second derivative where all lanes are in turn.
+CASES = [
+    pytest.param(
+        dtype, way, large, marks=[pytest.mark.slow, pytest.mark.compiling] if later else []
+    )
+    for dtype in DTYPES
+    for way in WAYS
+    for large in (1, _linear.LARGE, 10**9)
+    for later in [dtype == "float32" or (way == "second" and large > 1)]
+]
+
+
+@pytest.mark.parametrize(("dtype", "way", "large"), CASES)
 def test_it_is_the_part(dtype, way, large, monkeypatch):
     """Alone, with lanes of either argument or of both, within lanes, and a kernel inside."""
     monkeypatch.setattr(_linear, "LARGE", large)

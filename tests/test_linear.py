@@ -131,7 +131,7 @@ def spread(dtype, on_a_centre=True):
 RULES = {"ramps": ramps, "shares": shares, "combined": combined, "spread": spread}
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", [pytest.param("float32", marks=SLOW), "float64"])
 @pytest.mark.parametrize("rule", list(RULES))
 def test_rules_of_the_surface(rule, dtype):
     """By all arguments, by each and by each two, both ways."""
@@ -155,7 +155,9 @@ def test_rules_of_the_surface(rule, dtype):
             close(got, expected, factor=1024)
 
 
-@pytest.mark.parametrize("rule", list(RULES))
+@pytest.mark.parametrize(
+    "rule", ["ramps", "combined", *(pytest.param(v, marks=SLOW) for v in ("shares", "spread"))]
+)
 def test_rules_of_the_surface_against_differences(rule):
     """Central differences of values and of gradients, along random directions."""
     f, at = spread("float64", on_a_centre=False) if rule == "spread" else RULES[rule]("float64")

@@ -416,12 +416,19 @@ def test_product_is_that_of_matrices(shapes, dtype):
     rng = np.random.default_rng(2)
     a, b = (jnp.asarray(rng.normal(size=shape), dtype) for shape in shapes)
     close = functools.partial(np.testing.assert_allclose, rtol=0, atol=20 * epsilon(a.dtype))
-    close(product(a, b), np.asarray(a) @ np.asarray(b))
-    close(jax.vmap(product, (0, None))(jnp.stack([a, 2 * a]), b)[1], 2 * (a @ b))
-    value, change = jax.jit(lambda a, b: jax.jvp(product, (a, b), (b[0].sum() * a, b)))(a, b)
+    lanes, along = np.stack([a, 2 * a]), float(np.sum(b[0]))
+
+    @jax.jit
+    def found(a, b, lanes):
+        moved = jax.jvp(product, (a, b), (along * a, b))
+        back = jax.grad(lambda a: jnp.sum(product(a, b)))(a)
+        return *moved, back, jax.vmap(product, (0, None))(lanes, b)
+
+    value, change, back, many = found(a, b, lanes)
+    a, b = np.asarray(a), np.asarray(b)
     close(value, a @ b)
-    close(change, (1 + b[0].sum()) * np.asarray(a @ b))
-    back = jax.grad(lambda a: jnp.sum(product(a, b)))(a)
+    close(many[1], 2 * (a @ b))
+    close(change, (1 + along) * (a @ b))
     close(back, np.broadcast_to(b.reshape(4, -1).sum(1), a.shape))
 
 
@@ -440,11 +447,15 @@ def test_picked_is_the_entry(rows, places, n, dtype):
     rng = np.random.default_rng(3)
     values, index = rng.normal(size=(*rows, n)).astype(dtype), rng.integers(1, n, places)
     values[..., 0] = np.nan
-    for f in (picked, jax.jit(picked)):
-        found = f(jnp.asarray(values), jnp.asarray(index))
-        assert found.dtype == dtype
-        np.testing.assert_array_equal(found, values[..., index])
-    slope = jax.grad(lambda v: jnp.sum(picked(v, jnp.asarray(index))))(jnp.asarray(values))
+
+    @jax.jit
+    def both(values, index):
+        slope = jax.grad(lambda v: jnp.sum(picked(v, index)))
+        return picked(values, index), slope(values)
+
+    found, slope = both(jnp.asarray(values), jnp.asarray(index))
+    assert found.dtype == dtype
+    np.testing.assert_array_equal(found, values[..., index])
     count = np.bincount(index.ravel(), minlength=n)
     np.testing.assert_array_equal(slope, np.broadcast_to(count, values.shape))
 
