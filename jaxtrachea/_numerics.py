@@ -114,7 +114,9 @@ def first_largest(x: Float[Array, " n"]) -> Int[Array, ""]:
     """Index of the largest entry, of equal ones the first: as `jnp.argmax`.
 
     XLA for CPUs walks through an `argmax` entry by entry. With a NaN it is some index from 0 to
-    n - 1: which one depends on n.
+    n - 1: which one depends on n. A compiler may compute `x` twice, for the largest and to find it,
+    and round differently: then no entry is equal, and the first within 64 roundings is taken. Where
+    another entry would be a fault and not a little more work, use `jnp.argmax`.
 
     Args:
         x: n >= 1 entries.
@@ -122,16 +124,19 @@ def first_largest(x: Float[Array, " n"]) -> Int[Array, ""]:
     n = x.shape[0]
     if n <= WRITTEN_OUT:
         return jnp.argmax(x)
-    at = jnp.arange(n, dtype=jnp.int32)
-    first = _reduced(jnp.min, jnp.minimum, jnp.where(x == largest(x), at, n))
-    return jnp.minimum(first, n - 1)
+    at, most = jnp.arange(n, dtype=jnp.int32), largest(x)
+    close = x >= most - 64 * epsilon(x.dtype) * jnp.abs(most)
+    first = _reduced(
+        jnp.min, jnp.minimum, jnp.where(x == most, at, jnp.where(close, at + n, 2 * n))
+    )
+    return jnp.minimum(jnp.where(first < n, first, first - n), n - 1)
 
 
 def lowest(x: Float[Array, " n"], count: int) -> tuple[Int[Array, " count"], Bool[Array, " n"]]:
     """Indices of the lowest entries, rising, and which entries are left.
 
     A few are found one by one: `jax.lax.top_k` is a kernel of its own, which takes longer and
-    cannot be part of another (`_in_order.one_kernel`).
+    cannot be part of another (`_in_order.one_kernel`). Not by `first_largest`, which may miss.
 
     Args:
         x: no NaN, and at least `count` entries below infinity: else an index may come twice.
@@ -143,7 +148,7 @@ def lowest(x: Float[Array, " n"], count: int) -> tuple[Int[Array, " count"], Boo
         return found, jnp.all(at[:, None] != found[None], axis=1)
     found, left = [], jnp.ones(x.shape, bool)
     for _ in range(count):
-        found.append(first_largest(jnp.where(left, -x, -jnp.inf)).astype(jnp.int32))
+        found.append(jnp.argmax(jnp.where(left, -x, -jnp.inf)).astype(jnp.int32))
         left = left & (at != found[-1])
     return jnp.stack(found), left
 

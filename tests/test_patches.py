@@ -13,15 +13,20 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from jaxtrachea._compiler import quick_options
 from jaxtrachea.contact.line import skeleton_coordinates
 from jaxtrachea.contact.patches import Patches, gap_bounds, straight_patches, touch
 from jaxtrachea.contact.pose import Pose, pose_from_vector
 from jaxtrachea.contact.shapes import box, capsule, padded, sphere
 from jaxtrachea.contact.walls import TubeSurface, patches_of
+from jaxtrachea.scene.build import stage
+from jaxtrachea.scene.spec import load_scene_spec
+from jaxtrachea.scene.stage import touch_tube
 from jaxtrachea.status import ContactStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.imported import read_mesh
 from jaxtrachea.trachea.tube import make_tube
+from jaxtrachea.tradeoff.levels import full_scene, program
 
 ROOT = Path(__file__).parents[1]
 REAL = ROOT.parent / "shared" / "data" / "meshes" / "hra_vh_male"
@@ -467,3 +472,26 @@ def test_a_patch_that_is_no_number_is_told(beta):
     spoilt = dataclasses.replace(TUBE, shapes=dataclasses.replace(TUBE.shapes, vertices=vertices))
     for tube, status in ((TUBE, ContactStatus.OK), (spoilt, ContactStatus.NON_FINITE)):
         assert quick(touch)(sphere(5.0), pose, tube, beta=sharp).status == status
+
+
+#: Modules of a program that are compiled beside each other; XLA's own number.
+PARTS = {"xla_cpu_parallel_codegen_split_count": 32}
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_ball_over_the_border_of_two_patches_touches_the_border(dtype):
+    """By symmetry; in a batch a compiler once rounded the patches' bounds in two ways.
+
+    Then no patch was the lowest, and the last one, out of reach, was searched in its place: the
+    gap was that of one side, 1.7e-3 mm off, in another scene 0.4 mm, with status OK.
+    """
+    spec = load_scene_spec(ROOT / "configs" / "deep.toml")
+    full = full_scene(spec, stage(spec, ROOT / "configs"))
+    levels = dataclasses.replace(full.levels, dtype=dtype)
+    scene, _, path = program(full, levels)
+    assert np.all(np.asarray(path.translation)[:, 0] == 75)  # between the rings at 70 and 80
+    # As a ladder of `tradeoff` compiles it, whatever the flags of the suite.
+    parts = PARTS if "xla_cpu_use_fusion_emitters" in quick_options() else {}
+    found = jax.jit(touch_tube, compiler_options=quick_options() | parts)(scene, path)
+    np.testing.assert_allclose(found.s, 75.0, atol=1e-3)
+    np.testing.assert_array_equal(found.status, 0)
