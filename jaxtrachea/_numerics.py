@@ -115,8 +115,8 @@ def first_largest(x: Float[Array, " n"]) -> Int[Array, ""]:
 
     XLA for CPUs walks through an `argmax` entry by entry. With a NaN it is some index from 0 to
     n - 1: which one depends on n. A compiler may compute `x` twice, for the largest and to find it,
-    and round differently: then no entry is equal, and the first within 64 roundings is taken. Where
-    another entry would be a fault and not a little more work, use `jnp.argmax`.
+    and round differently: where no entry is equal, the first within 64 roundings of the largest is
+    taken, and without such an entry n - 1. Where that would be a fault, use `jnp.argmax`.
 
     Args:
         x: n >= 1 entries.

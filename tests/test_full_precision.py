@@ -30,6 +30,7 @@ from jaxtrachea.fitting.information import information
 from jaxtrachea.mechanics.reactions import deflect_dense
 from jaxtrachea.mechanics.sections.material import from_wall
 from jaxtrachea.mechanics.sections.press import press_sections
+from jaxtrachea.scene import session
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.tube import make_tube
 
@@ -85,6 +86,14 @@ def simulated(s):
     return found.force, found.vertices, found.joints
 
 
+def stepped(s):
+    path = poses(s)
+    here = path.rotation[0], path.translation[0]
+    state = session._start(scene(), *here)
+    found = session._step(scene(), MATERIAL, state, *here)[1]
+    return found.force, found.vertices, found.joints
+
+
 def swept(s):
     found = sweep(scene(), MATERIAL, s[None], s[None] * 0, s[None] * 0 + 1)
     return found.force, found.compliance
@@ -115,6 +124,7 @@ CASES = [
     pytest.param(sections(1.5), id="sections, off the midline", marks=pytest.mark.slow),
     pytest.param(simulated, id="scene"),
     pytest.param(swept, id="sweep"),
+    pytest.param(stepped, id="session", marks=pytest.mark.slow),
     pytest.param(dense, id="beam"),
     pytest.param(fit, id="fit"),
 ]

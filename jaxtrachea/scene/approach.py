@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.curve import frame_at
@@ -39,6 +40,7 @@ class Approach(NamedTuple):
     pull: Callable[[Presses], tuple[Poses]] | None = None
 
 
+@full_precision
 def approach(scene: Scene, path: Poses) -> Approach:
     """Let the tool touch the tube at rest, and say what it does to the place it touches."""
     if scene.plan.contact_point == "per_step":

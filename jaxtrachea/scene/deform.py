@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrachea._in_order import in_turn, one_kernel
-from jaxtrachea._numerics import WRITTEN_OUT, product
+from jaxtrachea._numerics import WRITTEN_OUT, full_precision, product
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
@@ -23,6 +23,7 @@ from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import place
 
 
+@full_precision
 def deform(
     scene: Scene, material: Material, presses: Presses, moved: Any, path: Any, made: Approach | None
 ):
@@ -87,6 +88,7 @@ def _held_at(scene: Scene, s_c):
     return jnp.stack([s_c - half, s_c + half]) if half > 0 else s_c
 
 
+@full_precision
 def deform_sections(scene: Scene, presses: Presses, moved: Any, path: Any, made: Approach | None):
     """Deformed vertices of a wall of deforming cross-sections; as `deform`.
 

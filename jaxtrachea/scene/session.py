@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxtrachea._in_order import one_kernel
+from jaxtrachea._numerics import full_precision
 from jaxtrachea._packed import Packing
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.admission import check_alike
@@ -315,6 +316,7 @@ def _start(scene: Scene, rotation, translation) -> State:
     return State(started=no, touching=no, side=side, last=nowhere, seat=grasp(scene, nowhere))
 
 
+@full_precision
 def _step(scene: Scene, material: Material, state: State, rotation, translation):
     """The next state, and the result without its axis of rows."""
     path = Poses(rotation[None], translation[None])

@@ -112,6 +112,7 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
     return follow(scene, material, path, approach(scene, path) if isinstance(path, Poses) else None)
 
 
+@full_precision
 def follow(
     scene: Scene,
     material: AnyMaterial,

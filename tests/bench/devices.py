@@ -120,6 +120,8 @@ def apart(a, b) -> float:
         x, y = np.asarray(x, float), np.asarray(y, float)
         if (np.isnan(x) != np.isnan(y)).any():
             return float("nan")
+        if np.isnan(y).all():
+            return float("nan")
         worst = max(worst, float(np.nanmax(np.abs(x - y)) / max(np.nanmax(np.abs(y)), 1e-300)))
     return worst
 
