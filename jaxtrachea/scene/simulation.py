@@ -82,7 +82,6 @@ class Simulation(NamedTuple):
     status: Int[Array, " rows"]
 
 
-@full_precision
 def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simulation:
     """Follow a path through the program of `scene.plan`; pure, to be jitted and differentiated.
 

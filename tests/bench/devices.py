@@ -76,10 +76,8 @@ def cases(dtype: str):
     def sections(phi):
         return lambda s: press_sections(geometry, wall, s, phi, path, midline=phi == 0).force
 
-    tool, tube = (
-        box(numbers([2.0, 1.5, 4.0]), numbers(0.3)),
-        straight_patches(BORDERS, 12.0, dtype=dtype),
-    )
+    tool = box(numbers([2.0, 1.5, 4.0]), numbers(0.3))
+    tube = straight_patches(BORDERS, 12.0, dtype=dtype)
 
     def contact(s):
         pose = pose_from_vector(numbers([0.3, -0.7, 0.5]), jnp.stack([s, s * 0 + 15.5, s * 0 + 1]))
@@ -114,13 +112,11 @@ def places(between, count: int, dtype: str):
 
 
 def apart(a, b) -> float:
-    """Largest difference of an array, of its largest entry; NaN where one has NaN alone."""
+    """Largest difference relative to the largest entry; NaN where one has NaN or both no number."""
     worst = 0.0
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         x, y = np.asarray(x, float), np.asarray(y, float)
-        if (np.isnan(x) != np.isnan(y)).any():
-            return float("nan")
-        if np.isnan(y).all():
+        if (np.isnan(x) != np.isnan(y)).any() or np.isnan(y).all():
             return float("nan")
         worst = max(worst, float(np.nanmax(np.abs(x - y)) / max(np.nanmax(np.abs(y)), 1e-300)))
     return worst
