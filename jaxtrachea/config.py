@@ -102,6 +102,7 @@ class DataSection(Section):
     displacement_sign: Literal[1, -1] = 1
     sheet: str | None = None
     tool_radius: PositiveLength | None = None
+    pressed_ends: bool = True
     together: list[Annotated[list[str], Field(min_length=2)]] | None = None
 
     @model_validator(mode="before")
@@ -110,6 +111,14 @@ class DataSection(Section):
         if isinstance(data, dict) and isinstance(data.get("files"), str):
             return {**data, "files": [data["files"]]}
         return data
+
+    @model_validator(mode="after")
+    def _told(self) -> "DataSection":
+        if not self.pressed_ends and self.tool_radius is None:
+            raise ValueError(
+                "pressed_ends = false needs tool_radius: which rings are under the tool"
+            )
+        return self
 
 
 class EvenRings(Section):

@@ -136,6 +136,10 @@ BAD_SPECS = {
     "role unknown": (DATA + 'columns = { depth = "x" }', ["data: role 'depth'", "displacement"]),
     "pattern broken": (DATA + "specimen = '(?P<specimen'", ["data: specimen pattern", "regular"]),
     "tool negative": (DATA + 'tool_radius = "-1 mm"', ["data.tool_radius", "positive"]),
+    "pressed ends of no tool": (
+        DATA + "pressed_ends = false",
+        ["data: pressed_ends = false needs tool_radius"],
+    ),
     "no such file": ('[data]\nfiles = "god.csv"', ["data.files.0", "'god.csv'", "--data"]),
     "no match": ('[data]\nfiles = "x/*.csv"', ["data.files.0", "no file", "--data"]),
     "no absolute match": ('[data]\nfiles = "/nowhere/*.csv"', ["/nowhere/*.csv", "no file"]),

@@ -318,6 +318,15 @@ def test_lanes():
     for seen in (near.joint_precision, near.joint_side_precision):
         np.testing.assert_array_equal(np.any(seen > 0, axis=(0, 1, 2)), [False, False, True])
     assert np.sum(near.end_precision > 0) == 3 * 4
+    # Under the tool, off the midline: both ends are far round the ring, V 15 mm, U 31 mm.
+    under = curve((20.5, 0.8, (1.0, 0.0)))
+    for given, count in ((True, 3 * 4), (False, 0)):
+        seen = study_of([under], tool_radius=1.0, pressed_ends=given).lanes.end_precision
+        assert np.sum(seen > 0) == count
+    beside = study_of([curve((10.5, 0.5, (1.0, 0.0)))], tool_radius=1.0, pressed_ends=False)
+    assert np.sum(beside.lanes.end_precision > 0) == 3 * 4
+    with pytest.raises(ValueError, match="pressed_ends=False needs tool_radius"):
+        study_of([curve((10.5, 0.5, (1.0, 0.0)))], pressed_ends=False)
     at_end = curve((20.0, 2 * np.pi / 3, (1.0, 0.0)))
     ends = study_of([at_end], tool_radius=1.0).lanes.end_precision
     assert np.sum(ends[..., 0, :] > 0) == np.sum(ends > 0) == 3 * 2

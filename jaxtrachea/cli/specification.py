@@ -232,6 +232,7 @@ def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
             noise=noise,
             weighting=Weighting(spec.fit.balance, spec.fit.loss, spec.fit.loss_scale),
             tool_radius=spec.data.tool_radius,
+            pressed_ends=spec.data.pressed_ends,
             joint=joint,
         )
     except SpecError:

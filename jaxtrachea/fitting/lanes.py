@@ -136,6 +136,7 @@ class _Layout:
         noise: known standard deviations.
         mean_length: samples of a curve in the mean; None: every sample weighs the same.
         reach: markers closer to the contact do not count, mm; below 0: all count.
+        pressed_ends: whether ends of rings within reach along the tube count.
         trials: of a lane, at most.
         samples: of a curve, at most.
         unknowns: of a lane, at most.
@@ -149,6 +150,7 @@ class _Layout:
     noise: Noise
     mean_length: float | None
     reach: float
+    pressed_ends: bool
     trials: int
     samples: int
     unknowns: int
@@ -170,6 +172,7 @@ def lanes_of(
     noise: Noise,
     balance: Balance,
     tool_radius: float | None,
+    pressed_ends: bool,
     vectors: bool = False,
 ) -> Lane:
     """The lanes of a study, stacked along a leading axis.
@@ -182,6 +185,7 @@ def lanes_of(
         noise: known standard deviations.
         balance: see `Weighting`.
         tool_radius: see `study.build_study`.
+        pressed_ends: likewise.
         vectors: see `Lane.phi_c`; whether the model reads what is below it there.
     """
     every = [c for curves in groups for c in curves]
@@ -192,6 +196,7 @@ def lanes_of(
         noise=noise,
         mean_length=float(np.mean(lengths)) if balance == "curve" else None,
         reach=-1.0 if tool_radius is None else tool_radius,
+        pressed_ends=pressed_ends,
         trials=max(map(len, groups)),
         samples=max(lengths),
         unknowns=max(map(len, unknowns)),
@@ -311,6 +316,7 @@ def _add_vectors(lane: dict[str, Any], layout: _Layout, t: int, curve: Curve) ->
         if end is None:
             continue
         around = abs(side * float(geometry.half_angle) - curve.phi_c) * float(geometry.radius)
+        around = around if layout.pressed_ends else 0.0
         far = _away(curve, geometry, layout.reach, curve.end_rings, around)
         for ring, which, moved in zip(curve.end_rings, far, np.moveaxis(end, 1, 0), strict=True):
             seen = np.isfinite(moved) & which
