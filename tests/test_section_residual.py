@@ -321,12 +321,13 @@ def test_lanes():
     # Under the tool, off the midline: both ends are far round the ring, V 15 mm, U 31 mm.
     under = curve((20.5, 0.8, (1.0, 0.0)))
     for given, count in ((True, 3 * 4), (False, 0)):
-        seen = study_of([under], tool_radius=1.0, pressed_ends=given).lanes.end_precision
-        assert np.sum(seen > 0) == count
-    beside = study_of([curve((10.5, 0.5, (1.0, 0.0)))], tool_radius=1.0, pressed_ends=False)
+        seen = study_of([under], tool_radius=1.0, weighting=Weighting(pressed_ends=given))
+        assert np.sum(seen.lanes.end_precision > 0) == count
+    without = Weighting(pressed_ends=False)
+    beside = study_of([curve((10.5, 0.5, (1.0, 0.0)))], tool_radius=1.0, weighting=without)
     assert np.sum(beside.lanes.end_precision > 0) == 3 * 4
     with pytest.raises(ValueError, match="pressed_ends=False needs tool_radius"):
-        study_of([curve((10.5, 0.5, (1.0, 0.0)))], pressed_ends=False)
+        study_of([under], weighting=without)
     at_end = curve((20.0, 2 * np.pi / 3, (1.0, 0.0)))
     ends = study_of([at_end], tool_radius=1.0).lanes.end_precision
     assert np.sum(ends[..., 0, :] > 0) == np.sum(ends > 0) == 3 * 2

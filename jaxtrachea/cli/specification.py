@@ -230,9 +230,10 @@ def _built(spec: FitSpec, measurements: Measurements, joint: bool) -> Study:
             options,
             parameters_of(spec, options, joints=joints),
             noise=noise,
-            weighting=Weighting(spec.fit.balance, spec.fit.loss, spec.fit.loss_scale),
+            weighting=Weighting(
+                spec.fit.balance, spec.fit.loss, spec.fit.loss_scale, spec.data.pressed_ends
+            ),
             tool_radius=spec.data.tool_radius,
-            pressed_ends=spec.data.pressed_ends,
             joint=joint,
         )
     except SpecError:

@@ -183,7 +183,6 @@ def build_study(
     noise: Noise = Noise(),
     weighting: Weighting = Weighting(),
     tool_radius: float | None = None,
-    pressed_ends: bool = True,
     joint: bool = False,
 ) -> Study:
     """Put curves, model and parameters together.
@@ -199,23 +198,21 @@ def build_study(
             the model, `{"k_1": {"value": 2.0}, "EI_L": {"fixed": True}}`; None: the defaults. Of
             another wall than `parameters.defaults_of` takes, the table by `default_parameters`.
         noise: known standard deviations.
-        weighting: balance between curves, and the loss.
+        weighting: balance between curves, the loss, and whether ends of pressed rings count.
         tool_radius: mm; markers closer to the contact are held by the tool and left out. None: all
             are used.
-        pressed_ends: False: ends of rings under the tool, within `tool_radius` along the tube, are
-            left out too, however far round the ring. There a ring moves in more modes than
-            `sections` has: its ends err by 5 to 15 % of D on the virtual specimen.
         joint: one lane per specimen even if parameters are shared; without effect if none is, or
             if there is but one specimen.
 
     Raises:
-        ValueError: a `tool_radius` that is no length, none for `pressed_ends` False, no curve, a
-            marker on a ring that does not exist, a curve without a contact position where one is
-            needed, with specimen and trial named; a parameter that the model does not have.
+        ValueError: a `tool_radius` that is no length, none where `weighting` leaves pressed ends
+            out, no curve, a marker on a ring that does not exist, a curve without a contact
+            position where one is needed, with specimen and trial named; a parameter that the model
+            does not have.
     """
     if tool_radius is not None and not 0 <= tool_radius < np.inf:
         raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
-    if not pressed_ends and tool_radius is None:
+    if not weighting.pressed_ends and tool_radius is None:
         raise ValueError("pressed_ends=False needs tool_radius: which rings are under the tool")
     if isinstance(curves, Measurements):
         _warn_of(curves.bad)
@@ -235,7 +232,7 @@ def build_study(
     unknowns = [unknowns_of(lane, parameters) for lane in groups]
     lanes = lanes_of(
         groups, unknowns, parameters, geometry,
-        noise=noise, balance=weighting.balance, tool_radius=tool_radius, pressed_ends=pressed_ends,
+        noise=noise, weighting=weighting, tool_radius=tool_radius,
         vectors=options.deforms_sections,
     )  # fmt: skip
     if onset_is_sought(parameters, options):
