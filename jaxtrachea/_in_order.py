@@ -80,6 +80,22 @@ def one_kernel(part: Callable[..., Out], *, products: bool = False) -> Callable[
     return _called(part, _kernel_of_products if products else _kernel)
 
 
+def lanes_in_one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
+    """The same function; many lanes together (`vmap`) are a single kernel, on a CPU.
+
+    For parts of many small steps, a sweep over the rings say, where `one_kernel` is for one call:
+    of some hundred lanes each step is still a small kernel. Arrays of all lanes together are to be
+    `SMALL`, sums of `REDUCED` entries, and nothing else than `one_kernel` can do; otherwise, and
+    for one call, the function is as it is. Take derivatives inside the part, one after the other
+    (`jax.jvp`, not under `vmap`, which breaks the lanes into short rows): those taken from outside
+    are calls of their own, which begin with the part once more.
+
+    Args:
+        part: from arrays to arrays (or trees of them); may close over traced ones.
+    """
+    return _called(part, _kernel_of_lanes)
+
+
 def in_turn(part: Callable[..., Out]) -> Callable[..., Out]:
     """The same function; of many lanes (`vmap`), on a CPU, one lane after the other.
 
@@ -240,6 +256,22 @@ def _kernel_of_products(plain: Callable, inputs) -> list:
             out = [v[None] for v in alone(*one)]
         else:
             out = jax.vmap(plain, [0 if lanes else None for lanes in has_lanes])(*inputs)
+        return out, [True] * len(out)
+
+    return alone(*inputs)
+
+
+def _kernel_of_lanes(plain: Callable, inputs, *, lanes: bool = False) -> list:
+    @custom_vmap
+    def alone(*inputs):
+        if lanes and fits_one_kernel(jax.make_jaxpr(plain)(*inputs).jaxpr):
+            return _kernel(plain, inputs)
+        return list(plain(*inputs))
+
+    @alone.def_vmap
+    def _(_, has_lanes, *inputs):
+        mapped = jax.vmap(plain, [0 if own else None for own in has_lanes])
+        out = _kernel_of_lanes(lambda *lanes: list(mapped(*lanes)), inputs, lanes=True)
         return out, [True] * len(out)
 
     return alone(*inputs)

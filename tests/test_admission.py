@@ -167,7 +167,7 @@ def any_words(function, argument):
 #: Called by what checks the word, with its own word; never from outside.
 INNER = {
     "mechanics.compliance.divide_load", "mechanics.reactions.deflect_dense",
-    "mechanics.skeleton.respond", "mechanics.skeleton.read_values", "fitting.lanes.lanes_of",
+    "mechanics.skeleton.respond", "mechanics.skeleton.read_values",
     "mechanics.energy.gradient", "mechanics.skeleton.turned_rings",
 }  # fmt: skip
 

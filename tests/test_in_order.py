@@ -25,7 +25,7 @@ from jaxtrachea import (
     press_path,
     table_1,
 )
-from jaxtrachea._in_order import in_order, one_kernel
+from jaxtrachea._in_order import in_order, lanes_in_one_kernel, one_kernel
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.contact.shapes import capsule
 from jaxtrachea.mechanics.friction import Coulomb
@@ -38,6 +38,7 @@ NOT_INLINED = 'inlineable="false"'
 #: With the first word: XLA makes calls of its own small loops.
 ONE = f'{NOT_INLINED},xla_cpu_small_call="true"'
 BOTH = pytest.mark.parametrize("mark", [in_order, one_kernel])
+ALL = pytest.mark.parametrize("mark", [in_order, one_kernel, lanes_in_one_kernel])
 
 
 class Out(NamedTuple):
@@ -153,7 +154,7 @@ def arguments(lanes, dtype):
 @pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("way", list(WAYS))
-@BOTH
+@ALL
 def test_it_is_the_part(mark, way, dtype):
     """Alone, and one or many lanes, in the same program and one operation after the other."""
     do = WAYS[way]
@@ -293,6 +294,39 @@ def test_one_kernel_is_one(dtype):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
+def test_many_lanes_in_one_kernel_are_one(dtype):
+    """Cube roots again, with their derivative a^(-2/3) / 3 from inside; of one lane not."""
+
+    def root(a):
+        def step(_, x):
+            return x - (x**3 - a) / (3 * x**2)
+
+        return jax.lax.fori_loop(0, 40, step, jnp.ones_like(a))
+
+    def part(a):
+        return jax.jvp(root, (a,), (jnp.ones_like(a),))
+
+    a = jnp.linspace(1, 27, 30, dtype=dtype)
+    marked = lanes_in_one_kernel(part)
+    lanes = {1: a, 2: jnp.stack([a, 2 * a, 3 * a]), 3: jnp.stack([a, 2 * a])[None]}
+    for axes, at in lanes.items():
+        f, plain = marked, part
+        for _ in range(axes - 1):
+            f, plain = jax.vmap(f), jax.vmap(plain)
+        got, slope = jax.jit(f)(at)
+        np.testing.assert_allclose(got, np.cbrt(at), rtol=8 * epsilon(a.dtype))
+        np.testing.assert_allclose(slope, np.cbrt(at) ** -2 / 3, rtol=32 * epsilon(a.dtype))
+        text = compiled(f, at)
+        assert (ONE in text) == (axes > 1 and _in_order._one_kernel_p is not None)
+        if ONE in text:
+            assert count_kernels(compiled(plain, at))[0] > 40
+            assert count_kernels(text, inside=False) == (1, 0)
+    # Of arrays that are not small it is not one.
+    many = jnp.broadcast_to(a, (_in_order.SMALL // 30 + 1, 30))
+    assert ONE not in compiled(jax.vmap(marked), many)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
 def test_derivatives_of_one_kernel_are_one_each(dtype):
     """Sum of y exp(-x^2): there, back, and back of what goes there, against calculus."""
     x, y = numbers(dtype, (100,))
@@ -317,7 +351,7 @@ def test_derivatives_of_one_kernel_are_one_each(dtype):
             assert ONE not in compiled(jax.vmap(f), x[None].repeat(4, 0))
 
 
-@BOTH
+@ALL
 def test_what_is_not_used_has_no_part_in_a_derivative(mark):
     """The root has a slope without bound at 0, of which 0 times is no number."""
     marked = mark(lambda x: (2 * x, jnp.sqrt(x)))

@@ -9,8 +9,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from jaxtrachea._in_order import lanes_in_one_kernel
 from jaxtrachea.fitting import section_residual
 from jaxtrachea.fitting.lane import Lane, weighted
 from jaxtrachea.fitting.model import FitModel, values_of
@@ -129,7 +131,7 @@ def residual_value(
     free, tube = of_trials(model, theta, lane), _tube(model, geometry, theta.dtype)
     if model.options.deforms_sections:
         return section_residual.residual_value(model, free, of_press(lane), tube)
-    skeleton = _skeleton(model, free, _places(lane), tube)
+    skeleton = _skeleton_of_lanes(model, free, _places(lane), tube)
 
     def one(free, skeleton, trial):
         at = _at_contact(model, free, trial.value, trial.s_c, tube)
@@ -213,19 +215,37 @@ def _skeleton_and_derivative(
 ) -> tuple[Skeleton, Skeleton]:
     """`_skeleton` and its derivative by each of `_beam_columns`, an axis after that of the trials.
 
-    A trial reads its own row of `free` alone, so that one tangent serves all trials.
+    A trial reads its own row of `free` alone, so that one tangent serves all trials. Compliances of
+    many lanes are one kernel with their derivatives.
     """
     columns = _beam_columns(model)
     if not columns:
         skeleton = _skeleton(model, free, places, tube)
         return skeleton, jax.tree.map(lambda v: jnp.zeros((v.shape[0], 0, *v.shape[1:])), skeleton)
-    along = jnp.eye(free.shape[1], dtype=free.dtype)[jnp.array(columns)]
+    along = np.eye(free.shape[1], dtype=free.dtype)[list(columns)]
 
-    def push(tangent):
+    def push(tangent, free, places):
         tangents = jnp.broadcast_to(tangent, free.shape)
         return jax.jvp(lambda free: _skeleton(model, free, places, tube), (free,), (tangents,))
 
-    return jax.vmap(push, out_axes=(None, 1))(along)
+    if places.marked or model.options.half_width > 0:
+        return jax.vmap(lambda t: push(t, free, places), out_axes=(None, 1))(along)
+
+    def pushed(free, s_c, value):
+        at = places._replace(s_c=s_c, value=value)
+        found = [push(jnp.asarray(t), free, at) for t in along]
+        return found[0][0], jax.tree.map(lambda *v: jnp.stack(v, 1), *(t for _, t in found))
+
+    return lanes_in_one_kernel(pushed)(free, places.s_c, places.value)
+
+
+def _skeleton_of_lanes(model: FitModel, free, places: _Places, tube: Geometry) -> Skeleton:
+    """`_skeleton`; of many lanes one kernel."""
+
+    def at(free, s_c, value):
+        return _skeleton(model, free, places._replace(s_c=s_c, value=value), tube)
+
+    return lanes_in_one_kernel(at)(free, places.s_c, places.value)
 
 
 class _Contact(NamedTuple):

@@ -36,6 +36,8 @@ from jaxtrachea.mechanics.compliance import (
 from jaxtrachea.mechanics.reactions import deflect_dense
 
 Form = Literal["recursion", "reactions"]
+#: Rings up to which many contact positions are placed among them by one comparison each.
+FEW = 32
 
 
 class _Side(NamedTuple):
@@ -109,15 +111,32 @@ def _ends(beam: Beam):
     return jnp.concatenate([jnp.zeros_like(beam.x[:1]), beam.x, beam.length[None]])
 
 
-def _reach(beam: Beam, s_c) -> tuple[Int[Array, "2"], Float[Array, "2"], Float[Array, "2"]]:
+def _reach(
+    beam: Beam, s_c, *, written_out: bool = False
+) -> tuple[Int[Array, "2"], Float[Array, "2"], Float[Array, "2"]]:
     """Rings on either side of C, distance to the last of them, and to the clamp.
 
     A ring exactly at C belongs to side A.
+
+    Args:
+        beam: the beam.
+        s_c: mm.
+        written_out: a comparison for each ring and no sum over them, which of many lanes no single
+            kernel can make (`_in_order.REDUCED`).
     """
-    count = jnp.sum(beam.x <= s_c)
-    ends = _ends(beam)
-    last = jnp.stack([s_c - picked(ends, count), picked(ends, count + 1) - s_c])
-    return jnp.stack([count, beam.x.shape[0] - count]), last, jnp.stack([s_c, beam.length - s_c])
+    ends, n = _ends(beam), beam.x.shape[0]
+    if written_out:
+        count, before, after = jnp.zeros((), int), ends[0], ends[1]
+        for i in range(1, n + 1):
+            passed = ends[i] <= s_c
+            count = count + passed.astype(count.dtype)
+            before = jnp.where(passed, ends[i], before)
+            after = jnp.where(passed, ends[i + 1], after)
+    else:
+        count = jnp.sum(beam.x <= s_c)
+        before, after = picked(ends, count), picked(ends, count + 1)
+    last = jnp.stack([s_c - before, after - s_c])
+    return jnp.stack([count, n - count]), last, jnp.stack([s_c, beam.length - s_c])
 
 
 def _up_to(side: _Side, count, last) -> _Side:
@@ -178,7 +197,7 @@ def contact_compliance(
     nodes = jax.tree.map(with_clamp, nodes)
 
     def one(s_c):
-        count, last, s = _reach(beam, s_c)
+        count, last, s = _reach(beam, s_c, written_out=beam.x.shape[0] <= FEW)
 
         def at(v):
             return v[jnp.arange(2), count]
