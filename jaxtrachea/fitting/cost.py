@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from jaxtrachea._numerics import epsilon, full_precision
 from jaxtrachea.fitting.lane import Lane, data_weight, force_entries, size
 from jaxtrachea.fitting.model import FitModel
-from jaxtrachea.fitting.residual import residual, residual_value
+from jaxtrachea.fitting.residual import of_trials, residual, residual_value
 from jaxtrachea.trachea.geometry import Geometry
 
 #: Part of a step after which the residual's curvature along it is probed.
@@ -184,11 +184,12 @@ class LaneCost(eqx.Module):
         model, lane = self.model, self.lane
         if model.options.deforms_sections:
             return jnp.zeros_like(theta)
+        along = of_trials(model, step, lane)
         probe = residual_value(model, theta + PROBE * step, lane, self.geometry)
         _, root = weights(model, point.value, lane, self.sigma)
-        pulled = assemble(model, jnp.einsum("tim,tm->ti", point.jacobian, probe * root), lane)
-        along = jnp.sum(point.hessian * step[None], axis=1)
-        return 2 / PROBE * ((pulled - point.gradient) / PROBE - along)
+        linear = jnp.einsum("tim,ti->tm", point.jacobian, along)
+        curvature = 2 / PROBE * ((probe - point.value) / PROBE * root - linear)
+        return assemble(model, jnp.einsum("tim,tm->ti", point.jacobian, curvature), lane)
 
     @full_precision
     def cross_gradient(self, point: Point, other: Point) -> Float[Array, " P"]:
