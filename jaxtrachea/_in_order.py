@@ -85,10 +85,10 @@ def lanes_in_one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
 
     For parts of many small steps, a sweep over the rings say, where `one_kernel` is for one call:
     of some hundred lanes each step is still a small kernel. Arrays of all lanes together are to be
-    `SMALL`, sums of `REDUCED` entries, and nothing else than `one_kernel` can do; otherwise, and
-    for one call, the function is as it is. Take derivatives inside the part, one after the other
-    (`jax.jvp`, not under `vmap`, which breaks the lanes into short rows): those taken from outside
-    are calls of their own, which begin with the part once more.
+    `SMALL`, sums of `REDUCED` entries, and nothing else than `one_kernel` can do; otherwise, with
+    another compiler, and for one call, the function is as it is. Take derivatives inside the part,
+    one after the other (`jax.jvp`, not under `vmap`, which breaks the lanes into short rows): those
+    taken from outside are calls of their own, which begin with the part once more.
 
     Args:
         part: from arrays to arrays (or trees of them); may close over traced ones.
@@ -112,7 +112,7 @@ def in_turn(part: Callable[..., Out]) -> Callable[..., Out]:
 
 
 def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
-    """The part as a call of its own: `_in_order`, if it can a single `_kernel`, or `_in_turn`."""
+    """The part as a call of its own: `_in_order`, if it can a `_kernel`, of lanes, `_in_turn`."""
 
     def run(*arguments):
         marked = how is not _in_turn
@@ -180,8 +180,8 @@ def _differentiable(plain: Callable, changing_with: Callable, how: Callable) -> 
     Args:
         plain: from arrays to a list of arrays; what it closes over is not traced.
         changing_with: from the places of arrays to those of the results that change with them.
-        how: `_in_order`, `_kernel`, `_kernel_of_products` or `_in_turn`; so are its derivatives
-            then, if they can be.
+        how: `_in_order`, `_kernel`, `_kernel_of_products`, `_kernel_of_lanes` or `_in_turn`; so
+            are its derivatives then, if they can be.
     """
 
     @jax.custom_jvp
@@ -264,7 +264,8 @@ def _kernel_of_products(plain: Callable, inputs) -> list:
 def _kernel_of_lanes(plain: Callable, inputs, *, lanes: bool = False) -> list:
     @custom_vmap
     def alone(*inputs):
-        if lanes and fits_one_kernel(jax.make_jaxpr(plain)(*inputs).jaxpr):
+        kernels = lanes and _one_kernel_p is not None
+        if kernels and fits_one_kernel(jax.make_jaxpr(plain)(*inputs).jaxpr):
             return _kernel(plain, inputs)
         return list(plain(*inputs))
 

@@ -432,6 +432,11 @@ def test_another_compiler_runs_it_in_order(monkeypatch):
     text = compiled(marked, x, y)
     assert NOT_INLINED in text
     assert ONE not in text
+    lanes, plain = (jax.vmap(f) for f in (lanes_in_one_kernel(part), part))
+    at = numbers("float64", (4,))
+    for way in (lambda f: f, lambda f: lambda *v: jax.jvp(f, v, v)):
+        close(jax.jit(way(lanes))(*at), way(plain)(*at))
+    assert ONE not in compiled(lanes, *at)
 
 
 def test_without_single_kernels():

@@ -95,11 +95,11 @@ def test_the_fit_of_sections_errs_as_the_page_says(tmp_path, monkeypatch, capsys
         data = {name: values[()] for name, values in file["data"].items()}
     most = largest_errors(data)
     # As on the page and in docs/measured.md.
-    page = {"30 deg": 3.2, "90 deg": 4.55, "0 deg": 1.8, "s = 22": 3.3}
+    page = {"30 deg": 2.76, "90 deg": 3.57, "0 deg": 1.93, "s = 22": 2.41}
     for name, percent in page.items():
         assert 100 * most[name] == pytest.approx(percent, abs=0.1), name
     assert most["side"] < 0.07
-    assert 100 * max(most[n] for n in most if n.endswith("residual")) < 3.7
+    assert 100 * max(most[n] for n in most if n.endswith("residual")) < 4.45
 
 
 def largest_errors(data):

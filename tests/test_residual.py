@@ -10,7 +10,10 @@ import pytest
 import synthetic
 from scipy.integrate import quad
 
-from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea import _in_order
+from jaxtrachea._numerics import epsilon
+from jaxtrachea.fitting.cost import LaneCost
+from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, in_model
 from jaxtrachea.fitting.residual import residual, residual_value
 from jaxtrachea.fitting.study import build_study, default_parameters
@@ -51,9 +54,10 @@ LATER = {"fixed law", "dense", "independent", "total", "several beams", "shear",
 LATER |= {"markers", "onset and offset"}  # parts of "all"
 EACH = [pytest.param(n, marks=pytest.mark.slow if n in LATER else ()) for n in CASES]
 QUICK = {"xla_backend_optimization_level": 0}  # most of the time here is compilation
+ONE_KERNEL = 'inlineable="false",xla_cpu_small_call="true"'
 
 
-def make_study(name):
+def make_study(name, weighting=Weighting()):
     """Study of two specimens, of three curves and two, of unequal length and varying sigma."""
     options, markers, changes = CASES[name]
     rng = np.random.default_rng(5)
@@ -70,7 +74,9 @@ def make_study(name):
     named = ("k_3_ring", *changes)
     parameters = default_parameters(in_model(options, joints=markers, named=named), changes)
     noise = Noise(force=0.3, joints=0.7)
-    return build_study(found, synthetic.GEOMETRY, options, parameters, noise=noise)
+    return build_study(
+        found, synthetic.GEOMETRY, options, parameters, noise=noise, weighting=weighting
+    )
 
 
 def lane_and_point(study, k, dtype=np.float64):
@@ -180,6 +186,51 @@ def test_jacobian_is_that_of_the_value(name):
                 )
             others = np.setdiff1d(np.arange(study.size), index[t])
             assert np.all(truth[t][:, others] == 0)
+
+
+def test_lanes_are_as_each_by_itself(subtests):
+    """Many together are one kernel, on a CPU, where neither markers nor a width are in the way."""
+    for name, kernel in (("default", True), ("bonded", False), ("punch", False)):
+        study = make_study(name)
+        for dtype in (np.float32, np.float64):
+            ones = [lane_and_point(study, k, dtype) for k in range(2)]
+            lanes, theta = jax.tree.map(lambda *v: jnp.stack(v), *ones)
+            each = jax.vmap(functools.partial(residual, study.model))
+            program = jax.jit(each, compiler_options=QUICK).lower(theta, lanes).compile()
+            with subtests.test(name=name, dtype=dtype):
+                whole = kernel and _in_order._one_kernel_p is not None
+                assert (ONE_KERNEL in program.as_text()) == whole
+                for k, alone in enumerate(evaluated(name)):
+                    for got, true in zip(program(theta, lanes), alone[0], strict=True):
+                        if true is not None:
+                            atol = 200 * epsilon(got.dtype) * np.abs(true).max()
+                            np.testing.assert_allclose(got[k], true, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("loss", ["linear", "huber"])
+@pytest.mark.parametrize("name", ["default", "beam of a trial", "bonded"])
+def test_the_pull_ahead_is_the_second_derivative(name, loss):
+    """J^T root(weight) r'' along a short step; with an onset its rounded corner takes no part."""
+    study = make_study(name, Weighting(loss=loss))
+    model = study.model
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def both(theta, step, lane):
+        cost = LaneCost(model, lane, jnp.ones(2))
+        value = functools.partial(residual_value, model, lane=lane)
+        bent = jax.jvp(lambda v: jax.jvp(value, (v,), (step,))[1], (theta,), (step,))[1]
+        slope = 1.0
+        if loss == "huber":
+            slope = 1 / jnp.maximum(jnp.abs(value(theta)) / 1.345, 1)
+        weight = slope * lane.balance[:, None] ** 2
+        true = jnp.einsum("tmp,tm->p", jax.jacfwd(value)(theta), weight * bent)
+        return cost.ahead(cost.evaluate(theta), theta, step), true
+
+    for k in range(len(study.curves)):
+        lane, theta = lane_and_point(study, k)
+        step = 1e-3 * np.random.default_rng(k).normal(size=study.size) * lane.active
+        got, true = both(theta, jnp.asarray(step), lane)
+        np.testing.assert_allclose(got, true, rtol=0, atol=1e-2 * np.abs(true).max())
 
 
 @pytest.mark.slow

@@ -318,7 +318,7 @@ def test_lanes():
     for seen in (near.joint_precision, near.joint_side_precision):
         np.testing.assert_array_equal(np.any(seen > 0, axis=(0, 1, 2)), [False, False, True])
     assert np.sum(near.end_precision > 0) == 3 * 4
-    # Under the tool, off the midline: both ends are far round the ring, V 15 mm, U 31 mm.
+    # Under the tool, off the midline: both ends are far round the ring, V 15 mm, U 34 mm.
     under = curve((20.5, 0.8, (1.0, 0.0)))
     for given, count in ((True, 3 * 4), (False, 0)):
         seen = study_of([under], tool_radius=1.0, weighting=Weighting(pressed_ends=given))

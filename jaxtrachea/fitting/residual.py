@@ -216,7 +216,8 @@ def _skeleton_and_derivative(
     """`_skeleton` and its derivative by each of `_beam_columns`, an axis after that of the trials.
 
     A trial reads its own row of `free` alone, so that one tangent serves all trials. Compliances of
-    many lanes are one kernel with their derivatives.
+    many lanes are one kernel with their derivatives, if it can hold them. With markers, or a tool
+    with a width, it cannot: then all columns go along together.
     """
     columns = _beam_columns(model)
     if not columns:
@@ -240,7 +241,7 @@ def _skeleton_and_derivative(
 
 
 def _skeleton_of_lanes(model: FitModel, free, places: _Places, tube: Geometry) -> Skeleton:
-    """`_skeleton`; of many lanes one kernel."""
+    """`_skeleton`; of many lanes one kernel, if it can hold it."""
 
     def at(free, s_c, value):
         return _skeleton(model, free, places._replace(s_c=s_c, value=value), tube)

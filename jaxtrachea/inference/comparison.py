@@ -106,7 +106,7 @@ def same_data(studies: Sequence[Study], names: Sequence[str]) -> None:
         if study.noise_given != first.noise_given or not _same_noise(study, first):
             raise ValueError(
                 f"{pair} count noise or curves differently; give both the same [noise], "
-                "fit.balance and data.tool_radius"
+                "fit.balance, data.tool_radius and data.pressed_ends"
             )
 
 
