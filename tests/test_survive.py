@@ -349,10 +349,15 @@ def test_sizes_of_shards(peace):
     assert shards.lanes_per_shard(study, 2) == 4096
     long = dataclasses.replace(study, lanes=study.lanes._replace(force=np.zeros((1, 2, 100_000))))
     assert shards.lanes_per_shard(long, 4) == 5
-    each = shards.bytes_per_slot(study)
+    each = study.bytes_per_lane
     assert [shards.slots(study, m) for m in (0.0, 2.1 * each, 65.0 * each, 1e12)] == [
         *(1, 1, 32, 128)
     ]
+    long = dataclasses.replace(study, lanes=study.lanes._replace(force=np.zeros((1, 2, 2000))))
+    expected = 16 if jax.default_backend() == "cpu" else 128
+    assert shards.slots(long, 1e12) == long.batch_size(1000, 128) == expected
+    assert long.batch_size(1000, 4) == 4
+    assert dataclasses.replace(long, joint=True).batch_size(1000, 128) == 128
     assert shards.free_memory() > 1e6
 
 
@@ -370,7 +375,7 @@ def test_memory_of_a_lane_is_what_xla_counts(peace):
     lowered = step.lower(objective, starts, np.ones(count, bool), state)
     used = lowered.compile().memory_analysis()
     total = used.temp_size_in_bytes + used.argument_size_in_bytes
-    assert total / count <= shards.bytes_per_slot(study) <= 3 * total / count
+    assert total / count <= study.bytes_per_lane <= 3 * total / count
 
 
 def test_devices_share_the_work_and_its_end():

@@ -26,7 +26,7 @@ class Settings:
         seed: of the drawn starts.
         more_starts: added to lanes in doubt: no start converged, or one of several alone came
             lowest. With them infeasible starts are drawn anew. 0: neither.
-        batch: lanes computed together.
+        batch: lanes computed together, at most: on a CPU fewer of long curves, which is quicker.
         tolerances: when a lane is done.
         float32: compute in single precision (results are float64 all the same); without it a fit
             warns once where JAX has no double precision (`jax_enable_x64` is off).

@@ -18,6 +18,7 @@ from jaxtyping import Int, Shaped
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lane import size as entries_of_trial
 from jaxtrachea.fitting.lanes import Noise, Unknown, Weighting, group, lanes_of, unknowns_of
 from jaxtrachea.fitting.model import Common, FitModel, columns_of, numbers_of
 from jaxtrachea.fitting.onset import blends, natural_steps, onset_is_sought, within_reach
@@ -35,6 +36,9 @@ from jaxtrachea.mechanics.press import Options
 from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.trachea.geometry import Geometry
 
+#: Of lanes computed together on a CPU, bytes by `Study.bytes_per_lane`, and lanes at least: more
+#: are out of the cache before they are read again (docs/measured.md).
+CACHED, FEWEST = 5 << 20, 16
 #: The table of parameters, or what differs from the defaults of the model, by name.
 Table = Sequence[Parameter] | Mapping[str, Mapping[str, object]]
 
@@ -151,8 +155,34 @@ class Study:
         """
         return self.model.options.deforms_sections and jax.default_backend() == "cpu"
 
+    @property
+    def bytes_per_lane(self) -> int:
+        """Memory that one of the lanes computed together takes, from above.
+
+        Five numbers per residual entry and free column, as XLA counts them for a
+        Levenberg-Marquardt step in float64 (3.7 to 5 in ten studies), and the matrices of the
+        unknowns.
+        """
+        entries = self.lanes.s_c.shape[1] * entries_of_trial(self.lanes)
+        return 8 * (5 * len(self.free) * entries + 8 * self.size**2 + 500)
+
+    @property
+    def lanes_in_cache(self) -> int:
+        """Lanes worth computing together, a power of two: of long curves on a CPU not many.
+
+        More are out of the cache before they are read again. Not of joint studies, nor on other
+        devices.
+        """
+        if self.joint or jax.default_backend() != "cpu":
+            return 1 << 30
+        return 1 << (max(FEWEST, CACHED // self.bytes_per_lane).bit_length() - 1)
+
     def batch_size(self, total: int, most: int) -> int:
-        """Lanes computed together, of `total` and of `most` at most: a size of few."""
+        """Lanes computed together, of `total` and of `most` at most: a size of few.
+
+        Of long curves on a CPU fewer, `lanes_in_cache`.
+        """
+        most = min(most, self.lanes_in_cache)
         return 1 if self.one_at_a_time else batch_size(total, most)
 
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":

@@ -48,26 +48,16 @@ def divide(lanes: int, most: int) -> list[np.ndarray]:
     return np.array_split(np.arange(lanes), -(-lanes // most))
 
 
-def bytes_per_slot(study: Study) -> int:
-    """Memory that one of the lanes computed together takes, from above.
-
-    Five numbers per residual entry and free column, as XLA counts them for a Levenberg-Marquardt
-    step in float64 (3.7 to 5 in ten studies), and the matrices of the unknowns.
-    """
-    entries = study.lanes.s_c.shape[1] * lane.size(study.lanes)
-    return 8 * (5 * len(study.free) * entries + 8 * study.size**2 + 500)
-
-
 def slots(study: Study, free: float, most: int = MOST_SLOTS) -> int:
-    """Lanes that can be computed together, a power of two.
+    """Lanes to compute together, a power of two: what memory and, on a CPU, the cache can hold.
 
     Args:
         study: the study.
         free: memory of the device that is free, bytes.
         most: upper bound.
     """
-    fitting = max(1, int(PART_OF_MEMORY * free) // bytes_per_slot(study))
-    return min(most, 1 << (fitting.bit_length() - 1))
+    fitting = max(1, int(PART_OF_MEMORY * free) // study.bytes_per_lane)
+    return min(most, study.lanes_in_cache, 1 << (fitting.bit_length() - 1))
 
 
 def free_memory() -> float:
