@@ -216,8 +216,8 @@ def _skeleton_and_derivative(
     """`_skeleton` and its derivative by each of `_beam_columns`, an axis after that of the trials.
 
     A trial reads its own row of `free` alone, so that one tangent serves all trials. Compliances of
-    many lanes are one kernel with their derivatives, if it can hold them. With markers, or a tool
-    with a width, it cannot: then all columns go along together.
+    many lanes are one kernel with their derivatives, if it can hold them. With markers, a tool
+    with a width or on another device it cannot: then all columns go along together.
     """
     columns = _beam_columns(model)
     if not columns:
@@ -229,7 +229,7 @@ def _skeleton_and_derivative(
         tangents = jnp.broadcast_to(tangent, free.shape)
         return jax.jvp(lambda free: _skeleton(model, free, places, tube), (free,), (tangents,))
 
-    if places.marked or model.options.half_width > 0:
+    if places.marked or model.options.half_width > 0 or jax.default_backend() != "cpu":
         return jax.vmap(lambda t: push(t, free, places), out_axes=(None, 1))(along)
 
     def pushed(free, s_c, value):
