@@ -112,7 +112,7 @@ def in_turn(part: Callable[..., Out]) -> Callable[..., Out]:
 
 
 def _called(part: Callable[..., Out], how: Callable) -> Callable[..., Out]:
-    """The part as a call of its own: `_in_order`, if it can a `_kernel`, of lanes, `_in_turn`."""
+    """The part as a call of its own, made by `how`; `_in_order` where a kernel cannot hold it."""
 
     def run(*arguments):
         marked = how is not _in_turn

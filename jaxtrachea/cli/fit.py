@@ -98,8 +98,8 @@ def describe(options: FitOptions, loaded, measurements, study, analyses: list[st
     device = jax.local_devices()[0].device_kind
     root = options.spec.parent if options.data is None else options.data
     batch, every = asked.batch, "auto" if study.joint else asked.save_every
-    if study.one_at_a_time:
-        batch = 1
+    if batch != "auto":
+        batch = min(batch, study.most_together)
     return manifest.describe(
         options.spec, root, measurements.sha256(), asked.precision, device,
         lanes=study.lanes.lower.shape[0],

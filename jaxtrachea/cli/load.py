@@ -47,11 +47,13 @@ def load(path: Path, data: Path | None, *, refits: bool = False, printed: set[st
 
 
 def _note_unused_batch(spec, study, printed: set[str]) -> None:
-    """A note where lanes are fitted one at a time and the specification says otherwise."""
-    batch = spec.fit.batch
-    if batch != "auto" and batch > 1 and study.one_at_a_time:
-        note = f"fit.batch = {batch} is not used: sections take one lane at a time on a CPU"
-        _print("note", [note], printed)
+    """A note where fewer lanes are computed together than the specification says."""
+    batch, most = spec.fit.batch, study.most_together
+    if batch != "auto" and batch > most:
+        why = f"of curves as long as these a CPU takes {most} together"
+        if study.one_at_a_time:
+            why = "sections take one lane at a time on a CPU"
+        _print("note", [f"fit.batch = {batch} is not used: {why}"], printed)
 
 
 def _with_depths(measurements, model, printed: set[str]):

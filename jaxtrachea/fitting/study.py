@@ -167,23 +167,21 @@ class Study:
         return 8 * (5 * len(self.free) * entries + 8 * self.size**2 + 500)
 
     @property
-    def lanes_in_cache(self) -> int:
-        """Lanes worth computing together, a power of two: of long curves on a CPU not many.
+    def most_together(self) -> int:
+        """Lanes worth computing together at most, a power of two; on a CPU not many of long curves.
 
-        More are out of the cache before they are read again. Not of joint studies, nor on other
-        devices.
+        More are out of the cache before they are read again. Joint studies and other devices have
+        no such limit; 1 where lanes are fitted `one_at_a_time`.
         """
+        if self.one_at_a_time:
+            return 1
         if self.joint or jax.default_backend() != "cpu":
             return 1 << 30
         return 1 << (max(FEWEST, CACHED // self.bytes_per_lane).bit_length() - 1)
 
     def batch_size(self, total: int, most: int) -> int:
-        """Lanes computed together, of `total` and of `most` at most: a size of few.
-
-        Of long curves on a CPU fewer, `lanes_in_cache`.
-        """
-        most = min(most, self.lanes_in_cache)
-        return 1 if self.one_at_a_time else batch_size(total, most)
+        """Lanes computed together, of `total`, of `most` and `most_together`: a size of few."""
+        return batch_size(total, min(most, self.most_together))
 
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":
         """The same study with these lanes, in this order; a lane may come more than once."""

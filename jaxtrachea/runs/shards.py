@@ -57,7 +57,7 @@ def slots(study: Study, free: float, most: int = MOST_SLOTS) -> int:
         most: upper bound.
     """
     fitting = max(1, int(PART_OF_MEMORY * free) // study.bytes_per_lane)
-    return min(most, study.lanes_in_cache, 1 << (fitting.bit_length() - 1))
+    return min(most, study.most_together, 1 << (fitting.bit_length() - 1))
 
 
 def free_memory() -> float:
