@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from run_cli import run
@@ -34,6 +35,10 @@ WORK = [Work(k, a, b) for k, a, b in (
 )]  # fmt: skip
 SECONDS = [float(TRUTH @ (1, *w)) for w in WORK]
 MODEL = TimeModel(*map(float, TRUTH), worst=0.1, date="2026-11-23")
+
+pytestmark = pytest.mark.skipif(
+    jax.default_backend() != "cpu", reason="times are modelled on a CPU only"
+)
 
 
 def full():

@@ -67,7 +67,7 @@ def free_memory() -> float:
     device = jax.local_devices()[0]
     known = device.memory_stats() or {}
     if "bytes_limit" in known:
-        return known["bytes_limit"] - known.get("bytes_in_use", 0)
+        return float(known["bytes_limit"] - known.get("bytes_in_use", 0))
     with contextlib.suppress(OSError, StopIteration):
         with open("/proc/meminfo", encoding="ascii") as stream:
             line = next(line for line in stream if line.startswith("MemAvailable"))

@@ -1,9 +1,10 @@
 """The same programs on a GPU and on the CPU beside it: values and times, for docs/gpu.md.
 
-    python tests/bench/devices.py [--lanes 16384]
+    python tests/bench/devices.py [--lanes 16384] [--specimens 8192]
 
 Values of 16 lanes, in float32 and float64, of the first device that JAX names against the CPU;
-times of one call and of many lanes on both. Needs no GPU to run: without one it says so and
+times of one call and of many lanes on both; fits a second of a cohort by how many are computed
+together (with JAX_PLATFORMS=cpu those of the CPU). Needs no GPU to run: without one it says so and
 compares the CPU with itself.
 """
 
@@ -30,6 +31,11 @@ from jaxtrachea import (  # noqa: E402
 from jaxtrachea.contact.patches import straight_patches, touch  # noqa: E402
 from jaxtrachea.contact.pose import pose_from_vector  # noqa: E402
 from jaxtrachea.contact.shapes import box, sphere  # noqa: E402
+from jaxtrachea.fitting import fit  # noqa: E402
+from jaxtrachea.fitting.parameters import in_model  # noqa: E402
+from jaxtrachea.fitting.settings import Settings  # noqa: E402
+from jaxtrachea.fitting.study import build_study, default_parameters  # noqa: E402
+from jaxtrachea.measurements.read import Curve  # noqa: E402
 from jaxtrachea.mechanics.sections.material import from_wall  # noqa: E402
 from jaxtrachea.mechanics.sections.press import press_sections  # noqa: E402
 from jaxtrachea.trachea.tube import make_tube  # noqa: E402
@@ -41,6 +47,8 @@ BONDED = {"EA_L": 5.0, "EI_C": 100.0, "k_t": 2.0, "k_A": 1.0, "k_B": 1.0}
 BORDERS = np.r_[0.0, np.arange(10, 151, 10), 160.0]
 #: Lanes of a press of sections and of a surface are larger: so many fewer.
 FEWER = {"sections": 8, "sections, 90°": 8, "scene with its surface": 4}
+#: Specimens fitted together, and whether in single precision.
+ROUNDS = [(128, False), (1024, False), (8192, False), (8192, True)]
 
 
 def cases(dtype: str):
@@ -133,11 +141,45 @@ def seconds(f, s) -> float:
     return float(np.median(found))
 
 
+def cohort(specimens: int):
+    """A study of specimens with four positions of 50 points, noise of 0.5 % of the peak."""
+    rng = np.random.default_rng(11)
+    geometry, depths, spots = table_1("float64"), np.linspace(0.12, 6, 50), [15.0, 40.0, 65.0, 80.0]
+    truths = np.array([100.0, 1.0, 1.0, 0.01]) * np.exp(0.2 * rng.standard_normal((specimens, 4)))
+
+    def forces(truth):
+        material = Material(**dict(zip(("EI_L", "k_M", "k_1", "k_3"), truth, strict=True)))
+        return jnp.stack([press(geometry, material, s, depths).force for s in spots])
+
+    clean = np.asarray(jax.jit(jax.vmap(forces))(truths))
+    noise = 0.005 * clean.max(axis=2, keepdims=True) * rng.standard_normal(clean.shape)
+    curves = [
+        Curve(f"s{i:05d}", f"{s:g}", s, 0.0, depths, force)
+        for i, rows in enumerate(clean + noise)
+        for s, force in zip(spots, rows, strict=True)
+    ]
+    return build_study(
+        curves, geometry, Options(), default_parameters(in_model(Options(), joints=False), {})
+    )
+
+
+def fits(study, settings) -> tuple[str, list[float]]:
+    """Fits a second, the better of two after one that compiles, and medians of the estimates."""
+    found, best = fit.fit(study, settings), float("inf")
+    for _ in range(2):
+        start = time.perf_counter()
+        found = fit.fit(study, settings)
+        best = min(best, time.perf_counter() - start)
+    return f"{found.lanes / best:,.0f}", np.median(found.value, axis=0).tolist()
+
+
 def main() -> None:
-    """Print both tables."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lanes", type=int, default=16384)
-    lanes = parser.parse_args().lanes
+    parser.add_argument("--specimens", type=int, default=8192)
+    told = parser.parse_args()
+    lanes = told.lanes
     device, cpu = jax.devices()[0], jax.devices("cpu")[0]
     print(f"{device.device_kind} against {cpu.device_kind}, jax {jax.__version__}")
     if device == cpu:
@@ -168,6 +210,15 @@ def main() -> None:
                 many = seconds(jax.jit(jax.vmap(f)), places(between, count, "float64"))
             row += [f"{1e6 * one:.3g}", f"{count:,}", f"{1e6 * many / count:.3g}"]
         print(f"| {name} | {' | '.join([*row[:4], *row[5:]])} |", flush=True)
+    print(
+        f"| fits of {told.specimens:,} specimens | batch | a second | medians |\n|---|---|---|---|"
+    )
+    study = cohort(told.specimens)
+    for batch, single in ROUNDS:
+        settings = Settings(starts=1, scrutiny=False, batch=batch, float32=single)
+        speed, medians = fits(study, settings)
+        dtype = "float32" if single else "float64"
+        print(f"| {device.device_kind}, {dtype} | {batch:,} | {speed} | {medians} |", flush=True)
 
 
 if __name__ == "__main__":

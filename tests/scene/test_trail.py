@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from jaxtrachea import Poses, simulate
+from jaxtrachea._numerics import full_precision
 from jaxtrachea.contact.shapes import capsule, sphere
 from jaxtrachea.scene import trail
 from jaxtrachea.scene.build import stage
@@ -87,7 +88,8 @@ def test_a_dent_is_scaled_until_it_touches(name, dtype):
     reaches = np.array([1.3, 0.4, -0.2])
     places = jnp.asarray(np.stack([0 * reaches, height - reaches, 0 * reaches], 1), dtype)
     poses = Poses(jnp.broadcast_to(jnp.eye(3, dtype=dtype), (3, 3, 3)), places)
-    run = jax.jit(jax.vmap(trail.touching, (None, 0, None, None, None)))
+    # As a part of `simulate`, also where products of matrices are in less by default.
+    run = jax.jit(jax.vmap(full_precision(trail.touching), (None, 0, None, None, None)))
     surfaces = run(tool, poses, square, flat, dented)
     assert surfaces.dtype == flat.dtype
     # The capsule's distance is that of its smoothed shape, up to log(2) / beta too small.
