@@ -33,8 +33,9 @@ from jaxtrachea._linear import linear, over_lanes, replaced
 from jaxtrachea._written_out import written_out
 
 Out = TypeVar("Out")
-#: Names of the operations that mark a call: no work, and what they give is the first operand.
-MARKS = "not_inlined", "one_kernel", "hidden"
+#: Names of the operations that mark a call: no work, and what they give is the first operand; the
+#: last one gives as many of the first as the call has results.
+MARKS = "not_inlined", "one_kernel", "hidden", "lanes_alike"
 #: Versions of jaxlib whose compiler was seen to do `one_kernel` right (tests/test_in_order.py). A
 #: compiler that cannot put a part into one kernel refuses the program or ends the process: with
 #: others it is as `in_order`.
@@ -225,7 +226,7 @@ def _in_order(plain: Callable, inputs) -> list:
     leaves = list(jax.jit(plain)(*inputs))
     # One that is used is enough: what is marked is the call that it comes from.
     leaves[0] = _not_inlined_p.bind(leaves[0], *inputs)
-    return leaves
+    return _lanes_alike(leaves, inputs)
 
 
 def _kernel(plain: Callable, inputs) -> list:
@@ -240,7 +241,7 @@ def _kernel(plain: Callable, inputs) -> list:
     assert _one_kernel_p is not None
     leaves, read = jax.jit(whole)(*(_hidden_p.bind(v, *inputs) for v in inputs))
     leaves[0] = _one_kernel_p.bind(leaves[0], read, *inputs)
-    return leaves
+    return _lanes_alike(leaves, inputs)
 
 
 def _kernel_of_products(plain: Callable, inputs) -> list:
@@ -307,8 +308,8 @@ FITTING = frozenset(
     """abs add add_any and argmax argmin atan2 bitcast_convert_type broadcast_in_dim ceil clamp
     closed_call concatenate cond convert_element_type copy cos cumsum custom_jvp_call
     custom_vjp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv exp
-    exp2 expm1 floor gather ge gt hidden integer_pow iota is_finite jit le le_to linear log
-    log1p logistic lt max min mul ne neg nextafter not not_inlined one_kernel
+    exp2 expm1 floor gather ge gt hidden integer_pow iota is_finite jit lanes_alike le le_to linear
+    log log1p logistic lt max min mul ne neg nextafter not not_inlined one_kernel
     optimization_barrier or pad pjit pow reduce_and reduce_max reduce_min reduce_or reduce_prod
     reduce_sum rem reshape rev round rsqrt scan select_n sign sin slice split sqrt square
     squeeze stack stop_gradient sub tan tanh transpose unstack while xor""".split()
@@ -396,6 +397,45 @@ def _mark(name: str, lowering: Callable) -> Any:
     return primitive
 
 
+def _alike_or_none() -> Any:
+    """The identity of its first `results` operands: with lanes in one operand, all have them.
+
+    Returns:
+        None where this JAX does not offer what it takes (0.6).
+    """
+    try:
+        from jax.extend.core import Primitive
+        from jax.interpreters import batching, mlir
+
+        primitive = Primitive(MARKS[3])
+        primitive.multiple_results = True
+        primitive.def_impl(lambda *operands, results: list(operands[:results]))
+        primitive.def_abstract_eval(lambda *operands, results: list(operands[:results]))
+
+        def lanes(operands, axes, *, results):
+            count = next(v.shape[i] for v, i in zip(operands, axes, strict=True) if i is not None)
+            own = [
+                jnp.broadcast_to(v, (count, *v.shape)) if i is None else jnp.moveaxis(v, i, 0)
+                for v, i in zip(operands[:results], axes[:results], strict=True)
+            ]
+            return primitive.bind(*own, *operands[results:], results=results), [0] * results
+
+        batching.primitive_batchers[primitive] = lanes
+        mlir.register_lowering(primitive, lambda _, *operands, results: operands[:results])
+    except (ImportError, AttributeError, TypeError):
+        return None
+    return primitive
+
+
+def _lanes_alike(found: list, inputs) -> list:
+    """The results of a call; of lanes all of them, as their derivatives are.
+
+    A result that is the same in all lanes (it is read from what they share) would have none, but a
+    derivative of lanes: under `jit` JAX takes it for granted that the two are alike.
+    """
+    return found if _alike_p is None else _alike_p.bind(*found, *inputs, results=len(found))
+
+
 def _told(**metadata: str) -> Callable:
     """Tells the compiler something about the call that its first operand comes from."""
 
@@ -412,6 +452,7 @@ def _all_read(x, *rest):
     return jax.lax.optimization_barrier((x, *rest))[0]
 
 
+_alike_p = _alike_or_none()
 _not_inlined_p = _mark(MARKS[0], _told(inlineable="false"))
 _one_kernel_p = _hidden_p = None
 if jaxlib.version.__version__ in TESTED and os.environ.get("JAXTRACHEA_ONE_KERNEL") != "0":

@@ -4,6 +4,7 @@ The outside truth is the function without the mark, and for one case the derivat
 the mark does is read in the compiled program: one pose calls the part, several lanes do not.
 """
 
+import functools
 import os
 import subprocess
 import sys
@@ -25,7 +26,7 @@ from jaxtrachea import (
     press_path,
     table_1,
 )
-from jaxtrachea._in_order import in_order, lanes_in_one_kernel, one_kernel
+from jaxtrachea._in_order import in_order, in_turn, lanes_in_one_kernel, one_kernel
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.contact.shapes import capsule
 from jaxtrachea.mechanics.friction import Coulomb
@@ -174,6 +175,21 @@ def test_it_is_the_part(mark, way, dtype):
             jax.jit(LANES[lanes](lambda x, y, f=f: do(f, x, y)))(*at) for f in (marked, part)
         )
         close(got, expected)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("lanes", ["first argument", "second argument", "of lanes"])
+@pytest.mark.parametrize("mark", [in_order, one_kernel, lanes_in_one_kernel, in_turn])
+def test_derivatives_of_a_program_of_lanes(mark, lanes, dtype):
+    """Taken from outside of `jit`; the first result is the same in all lanes of the second."""
+    at = arguments(lanes, dtype)
+
+    def ways(f):
+        mapped = jax.jit(LANES[lanes](f))
+        slope = jax.grad(functools.partial(total, mapped), argnums=(0, 1))
+        return jax.jvp(mapped, at, at), slope(*at)
+
+    close(ways(mark(part)), ways(part))
 
 
 def test_the_derivative_by_hand():
