@@ -39,7 +39,7 @@ MARKS = "not_inlined", "one_kernel", "hidden", "lanes_alike"
 #: Versions of jaxlib whose compiler was seen to do `one_kernel` right (tests/test_in_order.py). A
 #: compiler that cannot put a part into one kernel refuses the program or ends the process: with
 #: others it is as `in_order`.
-TESTED = ("0.10.2", "0.11.2")
+TESTED = ("0.10.2", "0.11.2", "0.12.0.1")
 
 
 def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
