@@ -33,8 +33,7 @@ from jaxtrachea._linear import linear, over_lanes, replaced
 from jaxtrachea._written_out import written_out
 
 Out = TypeVar("Out")
-#: Names of the operations that mark a call: no work, and what they give is the first operand; the
-#: last one gives as many of the first as the call has results.
+#: Names of the operations that mark a call: no work, and what they give is the first operand.
 MARKS = "not_inlined", "one_kernel", "hidden", "lanes_alike"
 #: Versions of jaxlib whose compiler was seen to do `one_kernel` right (tests/test_in_order.py). A
 #: compiler that cannot put a part into one kernel refuses the program or ends the process: with
@@ -398,7 +397,7 @@ def _mark(name: str, lowering: Callable) -> Any:
 
 
 def _alike_or_none() -> Any:
-    """The identity of its first `results` operands: with lanes in one operand, all have them.
+    """The identity of its first operand, which has lanes if any operand has.
 
     Returns:
         None where this JAX does not offer what it takes (0.6).
@@ -408,20 +407,18 @@ def _alike_or_none() -> Any:
         from jax.interpreters import batching, mlir
 
         primitive = Primitive(MARKS[3])
-        primitive.multiple_results = True
-        primitive.def_impl(lambda *operands, results: list(operands[:results]))
-        primitive.def_abstract_eval(lambda *operands, results: list(operands[:results]))
+        primitive.def_impl(lambda x, *_: x)
+        primitive.def_abstract_eval(lambda x, *_: x)
 
-        def lanes(operands, axes, *, results):
-            count = next(v.shape[i] for v, i in zip(operands, axes, strict=True) if i is not None)
-            own = [
-                jnp.broadcast_to(v, (count, *v.shape)) if i is None else jnp.moveaxis(v, i, 0)
-                for v, i in zip(operands[:results], axes[:results], strict=True)
-            ]
-            return primitive.bind(*own, *operands[results:], results=results), [0] * results
+        def lanes(operands, axes):
+            x, axis = operands[0], axes[0]
+            if axis is None:
+                many = (v.shape[i] for v, i in zip(operands, axes, strict=True) if i is not None)
+                x, axis = jnp.broadcast_to(x, (next(many), *x.shape)), 0
+            return primitive.bind(x, *operands[1:]), axis
 
         batching.primitive_batchers[primitive] = lanes
-        mlir.register_lowering(primitive, lambda _, *operands, results: operands[:results])
+        mlir.register_lowering(primitive, lambda _, x, *rest: [x])
     except (ImportError, AttributeError, TypeError):
         return None
     return primitive
@@ -431,9 +428,12 @@ def _lanes_alike(found: list, inputs) -> list:
     """The results of a call; of lanes all of them, as their derivatives are.
 
     A result that is the same in all lanes (it is read from what they share) would have none, but a
-    derivative of lanes: under `jit` JAX takes it for granted that the two are alike.
+    derivative of lanes: under `jit` JAX takes it for granted that the two are alike. One operation
+    for each, so that one that is not read is not computed.
     """
-    return found if _alike_p is None else _alike_p.bind(*found, *inputs, results=len(found))
+    if _alike_p is None:
+        return found
+    return [_alike_p.bind(v, *inputs) if jnp.issubdtype(v.dtype, jnp.inexact) else v for v in found]
 
 
 def _told(**metadata: str) -> Callable:
