@@ -433,7 +433,7 @@ def _lanes_alike(found: list, inputs) -> list:
     """
     if _alike_p is None:
         return found
-    return [_alike_p.bind(v, *inputs) if jnp.issubdtype(v.dtype, jnp.inexact) else v for v in found]
+    return [_alike_p.bind(v, *inputs) if _inexact(v) else v for v in found]
 
 
 def _told(**metadata: str) -> Callable:
