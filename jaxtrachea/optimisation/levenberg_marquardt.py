@@ -27,8 +27,9 @@ from jaxtrachea.optimisation.trust_region import (
 )
 from jaxtrachea.status import FitStatus
 
-#: Starts computed together at most, and the part of the free memory that they may take.
-MOST_SLOTS, PART_OF_MEMORY = 128, 0.5
+#: Starts computed together at most, on a CPU and on another device (docs/gpu.md), and the part of
+#: the free memory that they may take.
+MOST_SLOTS, MOST_ELSEWHERE, PART_OF_MEMORY = 128, 1024, 0.5
 
 
 class Solved(NamedTuple):
@@ -45,6 +46,11 @@ class Solved(NamedTuple):
     cost: np.ndarray
     status: np.ndarray
     iterations: np.ndarray
+
+
+def most_slots() -> int:
+    """Starts worth computing together at most on the device that JAX names first."""
+    return MOST_SLOTS if jax.default_backend() == "cpu" else MOST_ELSEWHERE
 
 
 def _advance(tolerances, rounds, objective, start, refill, state):

@@ -19,7 +19,7 @@ from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.fitting import lane
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.optimisation.levenberg_marquardt import MOST_SLOTS, PART_OF_MEMORY
+from jaxtrachea.optimisation.levenberg_marquardt import PART_OF_MEMORY, most_slots
 from jaxtrachea.results.arrays import arrays_of, result_of
 from jaxtrachea.runs import manifest as manifests
 from jaxtrachea.runs.manifest import Manifest
@@ -48,16 +48,15 @@ def divide(lanes: int, most: int) -> list[np.ndarray]:
     return np.array_split(np.arange(lanes), -(-lanes // most))
 
 
-def slots(study: Study, free: float, most: int = MOST_SLOTS) -> int:
+def slots(study: Study, free: float) -> int:
     """Lanes to compute together, a power of two: what memory and, on a CPU, the cache can hold.
 
     Args:
         study: the study.
         free: memory of the device that is free, bytes.
-        most: upper bound.
     """
     fitting = max(1, int(PART_OF_MEMORY * free) // study.bytes_per_lane)
-    return min(most, study.most_together, 1 << (fitting.bit_length() - 1))
+    return min(most_slots(), study.most_together, 1 << (fitting.bit_length() - 1))
 
 
 def free_memory() -> float:
