@@ -16,6 +16,9 @@ With the environment variable `JAXTRACHEA_ONE_KERNEL` set to 0 there are no sing
 programs that are exported to another version of jaxlib, or should a compiler refuse one.
 """
 
+import contextlib
+import dataclasses
+import functools
 import math
 import os
 from collections.abc import Callable
@@ -27,14 +30,15 @@ import jaxlib.version
 from jax.core import Tracer
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
 
 from jaxtrachea._linear import linear, over_lanes, replaced
 from jaxtrachea._written_out import written_out
 
 Out = TypeVar("Out")
 #: Names of the operations that mark a call: no work, and what they give is the first operand.
-MARKS = "not_inlined", "one_kernel", "hidden", "lanes_alike"
+MARKS = "not_inlined", "one_kernel", "hidden"
 #: Versions of jaxlib whose compiler was seen to do `one_kernel` right (tests/test_in_order.py). A
 #: compiler that cannot put a part into one kernel refuses the program or ends the process: with
 #: others it is as `in_order`.
@@ -221,18 +225,37 @@ def _differentiable(plain: Callable, changing_with: Callable, how: Callable) -> 
     return call
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Way:
+    """What a part does, and whether it is to be a single kernel."""
+
+    closed: ClosedJaxpr
+    kernel: bool
+
+    def plain(self, *inputs) -> list:
+        return jaxpr_as_fun(self.closed)(*inputs)
+
+
 def _in_order(plain: Callable, inputs) -> list:
-    leaves = list(jax.jit(plain)(*inputs))
-    # One that is used is enough: what is marked is the call that it comes from.
-    leaves[0] = _not_inlined_p.bind(leaves[0], *inputs)
-    return _lanes_alike(leaves, inputs)
+    return _part_p.bind(*inputs, way=_Way(jax.make_jaxpr(plain)(*inputs), kernel=False))
 
 
 def _kernel(plain: Callable, inputs) -> list:
+    return _part_p.bind(*inputs, way=_Way(jax.make_jaxpr(plain)(*inputs), kernel=True))
+
+
+def _marked(*inputs, way: _Way) -> list:
+    """What a part is lowered to on a CPU: a call with a mark on its first result."""
+    plain = way.plain
+    if not way.kernel:
+        leaves = list(jax.jit(plain)(*inputs))
+        # One that is used is enough: what is marked is the call that it comes from.
+        leaves[0] = _not_inlined_p.bind(leaves[0], *inputs)
+        return leaves
+
     def whole(*inputs):
-        found = plain(*inputs)
-        read = [jnp.ravel(jax.lax.stop_gradient(v))[0] for v in inputs]
-        return list(found), jnp.stack([jnp.asarray(v, jnp.float32) for v in read])
+        read = [jnp.ravel(v)[0] for v in inputs]
+        return list(plain(*inputs)), jnp.stack([jnp.asarray(v, jnp.float32) for v in read])
 
     # The compiler ends the process over an input that a kernel does not read: constants are
     # hidden from it, which it would write into the part, and every input is read.
@@ -240,7 +263,7 @@ def _kernel(plain: Callable, inputs) -> list:
     assert _one_kernel_p is not None
     leaves, read = jax.jit(whole)(*(_hidden_p.bind(v, *inputs) for v in inputs))
     leaves[0] = _one_kernel_p.bind(leaves[0], read, *inputs)
-    return _lanes_alike(leaves, inputs)
+    return leaves
 
 
 def _kernel_of_products(plain: Callable, inputs) -> list:
@@ -307,11 +330,11 @@ FITTING = frozenset(
     """abs add add_any and argmax argmin atan2 bitcast_convert_type broadcast_in_dim ceil clamp
     closed_call concatenate cond convert_element_type copy cos cumsum custom_jvp_call
     custom_vjp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv exp
-    exp2 expm1 floor gather ge gt hidden integer_pow iota is_finite jit lanes_alike le le_to linear
-    log log1p logistic lt max min mul ne neg nextafter not not_inlined one_kernel
-    optimization_barrier or pad pjit pow reduce_and reduce_max reduce_min reduce_or reduce_prod
-    reduce_sum rem reshape rev round rsqrt scan select_n sign sin slice split sqrt square
-    squeeze stack stop_gradient sub tan tanh transpose unstack while xor""".split()
+    exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le le_to linear log log1p
+    logistic lt max min mul ne neg nextafter not optimization_barrier or pad part pjit pow
+    reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round
+    rsqrt scan select_n sign sin slice split sqrt square squeeze stack stop_gradient sub tan
+    tanh transpose unstack while xor""".split()
 )
 #: Entries of one array, also between two operations, up to which one thread is as good as many.
 SMALL = 1 << 16
@@ -355,10 +378,7 @@ def _entries(variable) -> float:
 
 
 def _mark(name: str, lowering: Callable) -> Any:
-    """The identity of its first operand, with a lowering of its own on CPUs, for one lane.
-
-    The others, what goes into a call, tell how many lanes there are: a result may have none. It is
-    not differentiated: calls have derivatives of their own.
+    """The identity of its first operand, with a lowering of its own; only in what is lowered.
 
     Args:
         name: of the operation.
@@ -369,7 +389,7 @@ def _mark(name: str, lowering: Callable) -> Any:
     """
     try:
         from jax.extend.core import Primitive
-        from jax.interpreters import batching, mlir
+        from jax.interpreters import mlir
 
         one = jax.ShapeDtypeStruct((), "float32")
         jax.eval_shape(lowering, one, one)
@@ -377,18 +397,7 @@ def _mark(name: str, lowering: Callable) -> Any:
         primitive.def_impl(lambda x, *_: x)
         primitive.def_abstract_eval(lambda x, *_: x)
 
-        def lanes(operands, axes):
-            x, axis = operands[0], axes[0]
-            many = [v.shape[i] for v, i in zip(operands, axes, strict=True) if i is not None]
-            return (x if max(many) > 1 else primitive.bind(*operands)), axis
-
-        batching.primitive_batchers[primitive] = lanes
-        lowered = mlir.lower_fun(lowering, multiple_results=False)
-
-        def lower(context, x, *inputs):
-            on_cpu = tuple(context.module_context.platforms) == ("cpu",)
-            return lowered(context, x, *inputs) if on_cpu else [x]
-
+        lower = mlir.lower_fun(lowering, multiple_results=False)
         # Not cacheable: a function of its own would not see where its argument comes from.
         mlir.register_lowering(primitive, lower, cacheable=False)
     except (ImportError, AttributeError, TypeError):
@@ -396,44 +405,77 @@ def _mark(name: str, lowering: Callable) -> Any:
     return primitive
 
 
-def _alike_or_none() -> Any:
-    """The identity of its first operand, which has lanes if any operand has.
+def _evaluated(*inputs, way: _Way) -> list:
+    return list(jax.jit(way.plain)(*inputs))
 
-    Returns:
-        None where this JAX does not offer what it takes (0.6).
+
+def _lowered(context, *inputs, way: _Way):
+    on_cpu = tuple(context.module_context.platforms) == ("cpu",)
+    if not on_cpu:
+        return mlir.lower_fun(way.plain, multiple_results=True)(context, *inputs)
+    call = functools.partial(_marked, way=way)
+    return mlir.lower_fun(call, multiple_results=True)(context, *inputs)
+
+
+def _lanes(inputs, axes, *, way: _Way):
+    """Of one lane the part itself; many are compiled into the program around them.
+
+    All results have lanes then, also those that are the same in all of them: their derivatives have
+    lanes, and under `jit` JAX takes it for granted that the two are alike.
     """
-    try:
-        from jax.extend.core import Primitive
-        from jax.interpreters import batching, mlir
-
-        primitive = Primitive(MARKS[3])
-        primitive.def_impl(lambda x, *_: x)
-        primitive.def_abstract_eval(lambda x, *_: x)
-
-        def lanes(operands, axes):
-            x, axis = operands[0], axes[0]
-            if axis is None:
-                many = (v.shape[i] for v, i in zip(operands, axes, strict=True) if i is not None)
-                x, axis = jnp.broadcast_to(x, (next(many), *x.shape)), 0
-            return primitive.bind(x, *operands[1:]), axis
-
-        batching.primitive_batchers[primitive] = lanes
-        mlir.register_lowering(primitive, lambda _, x, *rest: [x])
-    except (ImportError, AttributeError, TypeError):
-        return None
-    return primitive
+    count = next(v.shape[i] for v, i in zip(inputs, axes, strict=True) if i is not None)
+    if count == 1:
+        one = [v if i is None else jnp.squeeze(v, i) for v, i in zip(inputs, axes, strict=True)]
+        found = [v[None] for v in _part_p.bind(*one, way=way)]
+    else:
+        found = jax.vmap(way.plain, in_axes=axes)(*inputs)
+    return found, [0] * len(found)
 
 
-def _lanes_alike(found: list, inputs) -> list:
-    """The results of a call; of lanes all of them, as their derivatives are.
+def _jvp(primals, tangents, *, way: _Way):
+    """For JAX before 0.11, which drops the rule of the call in reverse mode of loops."""
+    moving = [i for i, t in enumerate(tangents) if type(t) is not ad.Zero]
 
-    A result that is the same in all lanes (it is read from what they share) would have none, but a
-    derivative of lanes: under `jit` JAX takes it for granted that the two are alike. One operation
-    for each, so that one that is not read is not computed.
-    """
-    if _alike_p is None:
-        return found
-    return [_alike_p.bind(v, *inputs) if _inexact(v) else v for v in found]
+    def of(*moved):
+        return way.plain(*replaced(primals, moving, moved))
+
+    at, along = ([v[i] for i in moving] for v in (primals, tangents))
+    found, changes = jax.jvp(of, at, along)
+    return found, [
+        t if jnp.issubdtype(v.dtype, jnp.inexact) else ad.Zero(jax.typeof(v).to_tangent_aval())
+        for v, t in zip(found, changes, strict=True)
+    ]
+
+
+def _without_unread(used: list[bool], *rest):
+    """Of a part whose results are not all read: the part of those that are, if JAX asks for it."""
+    from jax.interpreters.partial_eval import dce_jaxpr
+
+    eqn = rest[-1]
+    way = eqn.params["way"]
+    if not any(used):
+        return [False] * len(eqn.invars), None
+    jaxpr, reads = dce_jaxpr(way.closed.jaxpr, used)
+    return reads, eqn.replace(
+        invars=[v for v, read in zip(eqn.invars, reads, strict=True) if read],
+        outvars=[v for v, read in zip(eqn.outvars, used, strict=True) if read],
+        params={"way": _Way(ClosedJaxpr(jaxpr, way.closed.consts), way.kernel)},
+    )
+
+
+#: A part as one operation, which JAX does not look into where it takes programs apart: not where it
+#: moves what a loop has in common out of it, say.
+_part_p = Primitive("part")
+_part_p.multiple_results = True
+_part_p.def_impl(_evaluated)
+_part_p.def_abstract_eval(lambda *_, way: way.closed.out_avals)
+ad.primitive_jvps[_part_p] = _jvp
+batching.primitive_batchers[_part_p] = _lanes
+mlir.register_lowering(_part_p, _lowered)
+with contextlib.suppress(ImportError, AttributeError):
+    from jax.interpreters.partial_eval import dce_rules
+
+    dce_rules[_part_p] = _without_unread
 
 
 def _told(**metadata: str) -> Callable:
@@ -452,7 +494,6 @@ def _all_read(x, *rest):
     return jax.lax.optimization_barrier((x, *rest))[0]
 
 
-_alike_p = _alike_or_none()
 _not_inlined_p = _mark(MARKS[0], _told(inlineable="false"))
 _one_kernel_p = _hidden_p = None
 if jaxlib.version.__version__ in TESTED and os.environ.get("JAXTRACHEA_ONE_KERNEL") != "0":
