@@ -227,27 +227,27 @@ def _differentiable(plain: Callable, changing_with: Callable, how: Callable) -> 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Way:
-    """What a part does, and whether it is to be a single kernel."""
+    """What a part does, and how the call is marked; "": compiled into the program around it."""
 
     closed: ClosedJaxpr
-    kernel: bool
+    mark: str
 
     def plain(self, *inputs) -> list:
         return jaxpr_as_fun(self.closed)(*inputs)
 
 
 def _in_order(plain: Callable, inputs) -> list:
-    return _part_p.bind(*inputs, way=_Way(jax.make_jaxpr(plain)(*inputs), kernel=False))
+    return _part_p.bind(*inputs, way=_Way(jax.make_jaxpr(plain)(*inputs), mark=MARKS[0]))
 
 
 def _kernel(plain: Callable, inputs) -> list:
-    return _part_p.bind(*inputs, way=_Way(jax.make_jaxpr(plain)(*inputs), kernel=True))
+    return _part_p.bind(*inputs, way=_Way(jax.make_jaxpr(plain)(*inputs), mark=MARKS[1]))
 
 
 def _marked(*inputs, way: _Way) -> list:
     """What a part is lowered to on a CPU: a call with a mark on its first result."""
     plain = way.plain
-    if not way.kernel:
+    if way.mark == MARKS[0]:
         leaves = list(jax.jit(plain)(*inputs))
         # One that is used is enough: what is marked is the call that it comes from.
         leaves[0] = _not_inlined_p.bind(leaves[0], *inputs)
@@ -411,7 +411,7 @@ def _evaluated(*inputs, way: _Way) -> list:
 
 def _lowered(context, *inputs, way: _Way):
     on_cpu = tuple(context.module_context.platforms) == ("cpu",)
-    if not on_cpu:
+    if not (on_cpu and way.mark):
         return mlir.lower_fun(way.plain, multiple_results=True)(context, *inputs)
     call = functools.partial(_marked, way=way)
     return mlir.lower_fun(call, multiple_results=True)(context, *inputs)
@@ -428,7 +428,8 @@ def _lanes(inputs, axes, *, way: _Way):
         one = [v if i is None else jnp.squeeze(v, i) for v, i in zip(inputs, axes, strict=True)]
         found = [v[None] for v in _part_p.bind(*one, way=way)]
     else:
-        found = jax.vmap(way.plain, in_axes=axes)(*inputs)
+        closed = jax.make_jaxpr(jax.vmap(way.plain, in_axes=axes))(*inputs)
+        found = _part_p.bind(*inputs, way=_Way(closed, mark=""))
     return found, [0] * len(found)
 
 
@@ -459,7 +460,7 @@ def _without_unread(used: list[bool], *rest):
     return reads, eqn.replace(
         invars=[v for v, read in zip(eqn.invars, reads, strict=True) if read],
         outvars=[v for v, read in zip(eqn.outvars, used, strict=True) if read],
-        params={"way": _Way(ClosedJaxpr(jaxpr, way.closed.consts), way.kernel)},
+        params={"way": _Way(ClosedJaxpr(jaxpr, way.closed.consts), way.mark)},
     )
 
 

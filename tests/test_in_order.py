@@ -26,7 +26,7 @@ from jaxtrachea import (
     press_path,
     table_1,
 )
-from jaxtrachea._in_order import in_order, in_turn, lanes_in_one_kernel, one_kernel
+from jaxtrachea._in_order import in_order, lanes_in_one_kernel, one_kernel
 from jaxtrachea._numerics import epsilon
 from jaxtrachea.contact.shapes import capsule
 from jaxtrachea.mechanics.friction import Coulomb
@@ -177,19 +177,63 @@ def test_it_is_the_part(mark, way, dtype):
         close(got, expected)
 
 
+#: Lanes of the second argument alone, of which the first result of `part` knows nothing.
+SHARED = {
+    "in front": (lambda f: jax.vmap(f, (None, 0)), (), (4,)),
+    "of one": (lambda f: jax.vmap(f, (None, 0)), (), (1,)),
+    "inside": (lambda f: jax.vmap(jax.vmap(f, (None, 0)), (0, None)), (2,), (4,)),
+    "outside": (lambda f: jax.vmap(jax.vmap(f, (0, None)), (None, 0)), (2,), (4,)),
+}
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("lanes", ["first argument", "second argument", "of lanes"])
-@pytest.mark.parametrize("mark", [in_order, one_kernel, lanes_in_one_kernel, in_turn])
+@pytest.mark.parametrize("lanes", list(SHARED))
+@BOTH
 def test_derivatives_of_a_program_of_lanes(mark, lanes, dtype):
-    """Taken from outside of `jit`; the first result is the same in all lanes of the second."""
-    at = arguments(lanes, dtype)
+    """Taken from outside of `jit`, where a result is the same in all lanes."""
+    way, first, second = SHARED[lanes]
+    at = numbers(dtype, first)[0], numbers(dtype, second)[1]
 
     def ways(f):
-        mapped = jax.jit(LANES[lanes](f))
+        mapped = jax.jit(way(f))
         slope = jax.grad(functools.partial(total, mapped), argnums=(0, 1))
         return jax.jvp(mapped, at, at), slope(*at)
 
     close(ways(mark(part)), ways(part))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@BOTH
+def test_second_derivatives_of_a_loop(mark, dtype):
+    """By a result that is not the first, twice backwards: JAX takes the loop apart."""
+    x, y = numbers(dtype)
+
+    def slopes(f):
+        def of(x):
+            return jnp.sum(jax.lax.map(lambda v: f(x, v).both[0], jnp.stack([y, 2 * y])) ** 2)
+
+        return jax.jit(jax.jacrev(jax.grad(of)))(x)
+
+    close(slopes(mark(part)), slopes(part))
+
+
+@BOTH
+def test_a_loop_takes_no_part_apart(mark):
+    """What a part computes of constants alone stays in it.
+
+    Out of it, it would be an operand, of those that a kernel need not read: the compiler ended the
+    process over the gradient of a loop over scenes.
+    """
+    marked = mark(lambda x, y: (jnp.sum(jnp.cos(jnp.arange(5.0)) * x) * y, y * x))
+
+    def loss(y):
+        found = jax.lax.map(lambda x: marked(x, y), jnp.linspace(1.0, 2, 3))
+        return sum(jnp.sum(jnp.sin(v)) for v in found)
+
+    lines = compiled(jax.grad(loss), 1.3).split("\n")
+    calls = [v for v in lines if " call(" in v and NOT_INLINED in v]
+    there, back = (v.split(" call(")[1].split(")")[0].split(",") for v in calls)
+    assert (len(there), len(back)) == (2, 4)
 
 
 def test_the_derivative_by_hand():
