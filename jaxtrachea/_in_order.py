@@ -48,11 +48,11 @@ TESTED = ("0.10.2", "0.11.2", "0.12.0.1")
 def in_order(part: Callable[..., Out]) -> Callable[..., Out]:
     """The same function, compiled as a computation of its own: one pose at a time, on a CPU.
 
-    Many lanes at once (`vmap` over an argument, or what gives the first result), on another device,
-    or with a JAX that cannot mark a call, it is compiled into the program around it as if this were
-    not here; so too where the first result is not used. Values and derivatives are the same, but
-    for rounding. Derivatives are computations of their own too, and begin with the part once more:
-    for small parts that is quicker than to keep in memory what they need of it. Forward and reverse
+    Many lanes at once (`vmap` over an argument), on another device, or with a JAX that cannot mark
+    a call, it is compiled into the program around it as if this were not here; all results of a
+    batch have lanes, also one that is the same in all. Values and derivatives are the same, but for
+    rounding. Derivatives are computations of their own too, and begin with the part once more: for
+    small parts that is quicker than to keep in memory what they need of it. Forward and reverse
     mode, each as often as wanted (with a `custom_vjp` inside, reverse mode once);
     `jax.linear_transpose` by itself does not know these calls.
 
@@ -107,7 +107,8 @@ def in_turn(part: Callable[..., Out]) -> Callable[..., Out]:
     the cache before they are read again. A lane, on a CPU, is then as if there were no other:
     `in_order` and `one_kernel` inside are what they say. Small arrays (`_linear.LARGE`) and other
     devices take all lanes together. Values and derivatives are the same but for rounding;
-    derivatives begin with the part once more, and are taken in turn too.
+    derivatives begin with the part once more, and are taken in turn too; twice backwards through a
+    loop only from JAX 0.11 on.
 
     Args:
         part: from arrays to arrays (or trees of them); may close over traced ones.

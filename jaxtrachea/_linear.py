@@ -156,7 +156,7 @@ def over_lanes(one: Callable, of_many: Callable, lanes, count: int, like: Sequen
     if count == 1:
         found = one(jax.tree.map(lambda v: v[0], lanes))
         return jax.tree.map(lambda v: v[None], found)
-    taken = sum(v.size for v in jax.tree.leaves(lanes)) // count
+    taken = sum(v.size for v in jax.tree.leaves(lanes)) // max(count, 1)
     if taken + sum(math.prod(v.shape) for v in like) < LARGE:
         return jax.vmap(of_many)(lanes)
     return jax.lax.platform_dependent(

@@ -17,7 +17,7 @@ from jaxtrachea.measurements.read import (
 )
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.mechanics.sections.material import LEAST, SECTION_VALUES, Wall
-from jaxtrachea.optimisation.levenberg_marquardt import most_slots
+from jaxtrachea.optimisation.levenberg_marquardt import MOST_SLOTS
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.trachea.section import geometry_of
 from jaxtrachea.units import UnitError, parse_quantity
@@ -267,7 +267,7 @@ def settings_of(spec: FitSpec) -> Settings:
         decades=f.start_decades,
         seed=f.seed,
         more_starts=f.more_starts,
-        batch=most_slots() if f.batch == "auto" else f.batch,
+        batch=MOST_SLOTS if f.batch == "auto" else f.batch,
         tolerances=limits,
         float32=f.precision == "float32",
     )

@@ -11,8 +11,6 @@ from typing import Any
 
 import jax
 
-from jaxtrachea._in_order import MARKS
-
 #: Moves of data, not operations.
 FREE = {"reshape", "broadcast_in_dim", "squeeze", "stack", "transpose", "slice", "concatenate",
         "copy", "convert_element_type", "stop_gradient", "iota", "rev", "pad", "split",
@@ -61,8 +59,6 @@ def _equation(equation, out: list[bool]) -> tuple[int, list[bool]]:
     if inner is not None and len(inner.outvars) == len(out):
         cost, reads = _count(inner, out)
         return cost, reads if len(reads) == len(everything) else everything
-    if name in MARKS:
-        return 0, [True] + [False] * (len(everything) - 1)
     if name in FREE:
         return 0, everything
     size = sum(math.prod(v.aval.shape) for v in equation.outvars)
