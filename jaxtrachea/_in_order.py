@@ -80,6 +80,7 @@ def one_kernel(part: Callable[..., Out], *, products: bool = False) -> Callable[
             ones. Its errors are passed on.
         products: whether products of matrices of at most 64 terms are written out as sums, so that
             they can be part of the kernel; a batch has the library's, which are quicker there.
+            Twice backwards through a loop then only from JAX 0.11 on.
     """
     return _called(part, _kernel_of_products if products else _kernel)
 
@@ -92,7 +93,8 @@ def lanes_in_one_kernel(part: Callable[..., Out]) -> Callable[..., Out]:
     `SMALL`, sums of `REDUCED` entries, and nothing else than `one_kernel` can do; otherwise, with
     another compiler, and for one call, the function is as it is. Take derivatives inside the part,
     one after the other (`jax.jvp`, not under `vmap`, which breaks the lanes into short rows): those
-    taken from outside are calls of their own, which begin with the part once more.
+    taken from outside are calls of their own, which begin with the part once more; twice backwards
+    through a loop only from JAX 0.11 on.
 
     Args:
         part: from arrays to arrays (or trees of them); may close over traced ones.
