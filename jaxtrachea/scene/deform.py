@@ -170,16 +170,24 @@ def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.
     """The local correction for one row."""
     count, spacing = scene.plan.dent, scene.footprint
 
+    def centres(s_c, phi_c, radius):
+        return local.centres(s_c, phi_c, radius, spacing, count)
+
+    def evenly(depth):
+        return local.shares(depth, jnp.zeros(count, depth.dtype))
+
     def lay_out(s_c, phi_c, radius, tool, depth):
-        where = local.centres(s_c, phi_c, radius, spacing, count)
-        sag = jnp.zeros_like(where[:, 0])
-        if tool is not None and scene.tool is not None:
-            bent = scene.tube if scene.plan.curved else None
-            sag = _sag(scene.tool, tool, where if bent is None else lay(bent.line, where))
+        where = centres(s_c, phi_c, radius)
+        bent = scene.tube if scene.plan.curved else None
+        sag = _sag(scene.tool, tool, where if bent is None else lay(bent.line, where))
         return where, local.shares(depth, sag)
 
     radius = scene.radius if radius is None else radius
-    where, share = one_kernel(lay_out)(s_c, phi_c, radius, tool, depth)
+    if tool is None or scene.tool is None:
+        # Rows may share the contact point: outside of a part, all of whose results have lanes.
+        where, share = centres(s_c, phi_c, radius), one_kernel(evenly)(depth)
+    else:
+        where, share = one_kernel(lay_out)(s_c, phi_c, radius, tool, depth)
     return local.fit(where, share[:, None], local.REACH * spacing, depth)
 
 
