@@ -6,7 +6,7 @@ the singular operation, so that derivatives stay finite.
 
 import functools
 from collections.abc import Callable, Iterable
-from typing import TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -354,52 +354,93 @@ def newton_tolerance(dtype) -> float:
     return epsilon(dtype) ** 0.6
 
 
-def rising_root(
-    value_and_slope: Callable[[Array], tuple[Array, Array]],
-    least_step: Callable[[Array], Array],
-    start: Float[Array, "*n"],
-    low: Float[Array, "*n"],
-    high: Float[Array, "*n"],
-    sought: Bool[Array, "*n"],
-) -> Float[Array, "*n"]:
-    """Roots of functions that rise from `low` to `high`, by Newton steps kept in the bracket.
+class Rising(NamedTuple):
+    """Functions of one unknown each, which rise within a bracket.
 
-    A step that leaves the bracket goes to its middle instead. Up to 68 steps; callers give the
-    derivatives of the root, none is taken through the loop.
-
-    Args:
+    Attributes:
         value_and_slope: of the functions at x, entry by entry: none knows of its neighbours.
         least_step: at x, the size from which on a step is the last.
-        start: within the bracket.
+        start: of the steps.
         low: where the functions are not positive.
         high: where they are not negative.
-        sought: which roots; the others keep their start.
+        solvable: which functions have a root in their bracket.
     """
 
-    def newton(x, low, high):
-        value, slope = value_and_slope(x)
-        low, high = jnp.where(value < 0, x, low), jnp.where(value < 0, high, x)
-        new = x - value / slope
-        return jnp.where((new >= low) & (new <= high), new, (low + high) / 2), low, high
+    value_and_slope: Callable[[Array], tuple[Array, Array]]
+    least_step: Callable[[Array], Array]
+    start: Float[Array, "*n"]
+    low: Float[Array, "*n"]
+    high: Float[Array, "*n"]
+    solvable: Bool[Array, "*n"]
+
+
+def rising_root(
+    problem: Callable[..., Rising], *arguments: Float[Array, "..."], steps: int
+) -> Array:
+    """Roots of functions that rise, NaN where there is none, by Newton steps.
+
+    First a few that every entry takes, none waited for: most need no others. A loop that keeps to
+    the bracket takes several times as long, and is for those that still moved or left the bracket.
+    Callers give the derivatives of the root, none is taken through the loop.
+
+    Args:
+        problem: of the arguments; that of zeros is as good as any.
+        arguments: broadcast against each other, one of each for an entry.
+        steps: that all take; enough for all but rare entries.
+    """
+    free = problem(*arguments)
+
+    def newton(x):
+        value, slope = free.value_and_slope(x)
+        return x - value / slope
+
+    last = jax.lax.fori_loop(0, steps - 1, lambda _, x: newton(x), free.start)
+    x = newton(last)
+    found = (jnp.abs(x - last) <= free.least_step(last)) & (x >= free.low) & (x <= free.high)
+
+    def in_bracket(state):
+        x, found = state
+        # Not of the arguments as they are: a compiler would take what never changes out of this
+        # loop, and compute it also where all are found.
+        left = (jnp.where(found, 0, v) for v in arguments)
+        return jnp.where(found, x, _root_in_bracket(problem(*left))), jnp.ones_like(found)
+
+    begin = x, found | ~free.solvable
+    x = jax.lax.while_loop(lambda state: ~_all(state[1]), in_bracket, begin)[0]
+    return jnp.where(free.solvable, x, jnp.nan)
+
+
+def _all(x):
+    """Whether all entries are true."""
+    if x.size <= ONE_REDUCTION:
+        return jnp.all(x)
+    return _reduced(jnp.all, jnp.logical_and, x.reshape(-1))
+
+
+def _root_in_bracket(problem: Rising):
+    """Up to 68 Newton steps; a step that leaves the bracket goes to its middle instead."""
+    value_and_slope, least_step, start, low, high, solvable = problem
 
     def moving(x, step):
         return jnp.abs(step) > least_step(x)
 
     def newton_where_moving(state):
         x, low, high, step, count = state
-        (new, low, high), goes = newton(x, low, high), moving(x, step)
+        value, slope = value_and_slope(x)
+        low, high = jnp.where(value < 0, x, low), jnp.where(value < 0, high, x)
+        new = x - value / slope
+        new = jnp.where((new >= low) & (new <= high), new, (low + high) / 2)
         # What has settled stays, whatever the others do: no row knows of its neighbours.
+        goes = moving(x, step)
         return jnp.where(goes, new, x), low, high, jnp.where(goes, new - x, step), count + 1
 
     def unsettled(state):
-        return jnp.any(moving(state[0], state[3])) & (state[4] < 64)
+        x, _, _, step, count = state
+        return ~_all(~moving(x, step)) & (count < 68)
 
-    # Steps that every row takes in the bracket given, none waited for: most rows need no others,
-    # and a round of the loop below takes several times as long.
-    x = jax.lax.fori_loop(0, 3, lambda _, x: newton(x, low, high)[0], start)
-    new, low, high = newton(x, low, high)
-    begin = jnp.where(sought, new, start), low, high, jnp.where(sought, new - x, 0)
-    return jax.lax.while_loop(unsettled, newton_where_moving, (*begin, jnp.zeros((), jnp.int32)))[0]
+    x = jnp.clip(start, low, high)
+    begin = x, low, high, jnp.where(solvable, jnp.inf, 0), jnp.zeros((), jnp.int32)
+    return jax.lax.while_loop(unsettled, newton_where_moving, begin)[0]
 
 
 @jax.custom_jvp
@@ -449,20 +490,27 @@ def _quintic_start(u, v, folds, top):
 
 
 def _quintic_root(u, v):
-    """Root of `quintic_ratio`: 4 to 6 Newton steps, up to 64 within some 1e-6 of the fold."""
+    """Root of `quintic_ratio`: 4 to 6 Newton steps, up to 72 within some 1e-6 of the fold."""
     known = jnp.isfinite(u + v)
-    u, v = jnp.where(known, u, 0), jnp.where(known, v, 0)
+    g = rising_root(_quintic_problem, jnp.where(known, u, 0), jnp.where(known, v, 0), steps=6)
+    return jnp.where(known, g, jnp.nan)
+
+
+def _quintic_problem(u, v) -> Rising:
+    """The equation of `quintic_ratio`."""
     folds, top = _quintic_fold(u, v)
-    past = folds & (_quintic(u, v, top) < 0)
 
     def value_and_slope(g):
         return _quintic(u, v, g), 1 + g * g * (3 * u + 5 * v * (g * g))
 
-    g = rising_root(
-        value_and_slope, lambda g: newton_tolerance(g.dtype) * g, _quintic_start(u, v, folds, top),
-        jnp.zeros_like(u), top, ~past,
-    )  # fmt: skip
-    return jnp.where(past | ~known, jnp.nan, g)
+    return Rising(
+        value_and_slope,
+        least_step=lambda g: newton_tolerance(g.dtype) * g,
+        start=_quintic_start(u, v, folds, top),
+        low=jnp.zeros_like(u),
+        high=top,
+        solvable=~(folds & (_quintic(u, v, top) < 0)),
+    )
 
 
 @quintic_ratio.defjvp

@@ -11,6 +11,7 @@ import pytest
 
 from jaxtrachea._in_order import fits_one_kernel
 from jaxtrachea._numerics import (
+    Rising,
     cos_sin,
     cubic_ratio,
     epsilon,
@@ -307,26 +308,62 @@ def test_first_positive_root(dtype):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_rising_root(dtype):
-    """Tangents from values of arctan, from starts where plain Newton steps diverge (|x| > 1.4)."""
-    y = jnp.asarray([-1.4, -0.3, 0.0, 1.0, 1.5, 0.7], dtype)
-    start = jnp.asarray([20.0, -30.0, 40.0, -40.0, -9.0, 5.0], dtype)
+@pytest.mark.parametrize("lanes", [False, True])
+def test_rising_root(lanes, dtype):
+    """Tangents from values of arctan, from starts where plain Newton steps diverge (|x| > 1.4).
 
-    def value_and_slope(x):
-        return jnp.arctan(x) - y, 1 / (1 + x * x)
+    The last three starts lie beside the root: free steps find them. The one before has no root in
+    its bracket.
+    """
+    y = jnp.asarray([-1.4, -0.3, 0.0, 1.0, 1.5, 0.7, 0.6, 0.0, -0.6], dtype)
+    start = jnp.asarray([20.0, -30.0, 40.0, -40.0, -9.0, 5.0, 0.7, 0.1, -0.6], dtype)
 
-    def least_step(x):
-        return newton_tolerance(dtype) * jnp.abs(x)
+    def problem(y, start):
+        low, solvable = jnp.full_like(y, -50), y != jnp.asarray(0.7, dtype)
+        return Rising(
+            lambda x: (jnp.arctan(x) - y, 1 / (1 + x * x)),
+            lambda x: newton_tolerance(dtype) * jnp.abs(x),
+            start, low, -low, solvable,
+        )  # fmt: skip
 
-    low, sought = jnp.full_like(y, -50), jnp.asarray([True] * 5 + [False])
-    found = jax.jit(rising_root, static_argnums=(0, 1))(
-        value_and_slope, least_step, start, low, -low, sought
-    )
+    solve = functools.partial(rising_root, problem, steps=4)
+    found = jax.jit(jax.vmap(solve) if lanes else solve)(y, start)
     assert found.dtype == jnp.dtype(dtype)
     # An error of one rounding in arctan moves x by 1 + x^2 of it, 35 at most.
     want, rtol = np.tan(np.asarray(y, float)), 50 * np.finfo(dtype).eps
-    np.testing.assert_allclose(found[:5], want[:5], rtol=rtol, atol=rtol)
-    assert found[5] == start[5]
+    np.testing.assert_allclose(np.delete(found, 5), np.delete(want, 5), rtol=rtol, atol=rtol)
+    assert np.isnan(found[5])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_rising_root_beside_another(dtype):
+    """The root of sin(x) = 1/2 in the bracket, from starts that lead to others; pi/2 is its end."""
+
+    def problem(start):
+        end = jnp.full_like(start, jnp.pi / 2)
+        return Rising(
+            lambda x: (jnp.sin(x) - 0.5, jnp.cos(x)),
+            lambda x: newton_tolerance(dtype) * jnp.abs(x),
+            start, -end, end, end > 0,
+        )  # fmt: skip
+
+    start = jnp.asarray([2.5, 0.5, 7.0, -4.0], dtype)
+    found = jax.jit(functools.partial(rising_root, problem, steps=4))(start)
+    np.testing.assert_allclose(found, np.pi / 6, rtol=8 * np.finfo(dtype).eps)
+
+
+def test_roots_in_a_bracket_are_a_loop_apart():
+    """The compiler leaves the search in brackets inside its loop: it runs where one is sought."""
+
+    def problem(y):
+        end = jnp.full_like(y, 9)
+        return Rising(lambda x: (x**3 + x - y, 3 * x * x + 1), jnp.abs, y, -end, end, end > y)
+
+    solve = jax.jit(jax.vmap(functools.partial(rising_root, problem, steps=4)))
+    text = solve.lower(jnp.ones((8, 100))).compile().as_text()
+    entry = text[text.index("\nENTRY") :]
+    # The steps that all take, and the loop with the search inside.
+    assert (entry.count(" while("), text.count(" while(")) == (2, 3)
 
 
 @pytest.mark.parametrize(("dtype", "reach"), [("float32", 1e2), ("float64", 1e4)])

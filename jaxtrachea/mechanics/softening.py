@@ -19,7 +19,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxtrachea._numerics import epsilon, first_positive_root, newton_tolerance, rising_root
+from jaxtrachea._numerics import (
+    Rising,
+    epsilon,
+    first_positive_root,
+    newton_tolerance,
+    rising_root,
+)
 from jaxtrachea.mechanics.force_law import Law, fold_depth
 
 
@@ -91,7 +97,6 @@ def soft_series(
 
 @jax.custom_jvp
 def _solved(displacement, compliance, law: Law, softening: Softening):
-    displacement, compliance = jnp.broadcast_arrays(displacement, compliance)
     return _newton(displacement, compliance, law, softening)
 
 
@@ -117,56 +122,65 @@ def _solved_jvp(primals, tangents):
 
 
 def _newton(displacement, compliance, law: Law, softening: Softening):
-    """Depth, deflection, force and fold by Newton steps for the deflection, in a bracket."""
-    draw = displacement < 0
+    """Depth, deflection, force and fold, by Newton steps for the deflection."""
     known = jnp.isfinite(displacement) & jnp.isfinite(compliance)
     for value in jax.tree.leaves((law, softening)):
         known = known & jnp.isfinite(value)
-    D = jnp.where(known, jnp.abs(displacement), 0)
-    c = jnp.where(known, compliance, 0)
-    e_1, e_2 = (jnp.asarray(e, D.dtype) for e in softening)
-    soft = Softening(jnp.where(draw, -e_1, e_1), jnp.broadcast_to(e_2, D.shape))
-    limit = first_positive_root(jnp.ones_like(D), -2 * soft.e_1, 3 * soft.e_2)
-    low = jnp.maximum(D - fold_depth(law), 0)
-    high = jnp.minimum(D, limit)
+    softening = Softening(*(jnp.asarray(e, displacement.dtype) for e in softening))
+    # Each by itself: what rows share stays one number.
+    D, c = (jnp.where(jnp.isfinite(v), v, 0) for v in (displacement, compliance))
+    u = rising_root(lambda D, c: _equation(D, c, law, softening), D, c, steps=4)
+    folded = jnp.isnan(u) & known
+    depth, u, force = (jnp.where(known, v, jnp.nan) for v in _polished(D, c, law, softening, u))
+    return depth, u, force, folded
+
+
+def _equation(D, c, law: Law, softening: Softening) -> Rising:
+    """g(u) - c F(D - u) = 0, rising between 0 and D where neither part is past its fold."""
+    law_top = fold_depth(law)
+    e_1, e_2 = softening
+    low = jnp.maximum(jnp.maximum(jnp.minimum(D, 0), D - law_top), -_fold(-e_1, e_2))
+    high = jnp.minimum(jnp.minimum(jnp.maximum(D, 0), D + law_top), _fold(e_1, e_2))
 
     def excess(u):
-        return soft.linear(u) - c * law.force(D - u)
-
-    solvable = (low <= high) & (excess(low) <= 0) & (excess(high) >= 0)
+        return softening.linear(u) - c * law.force(D - u)
 
     def excess_and_slope(u):
-        return excess(u), soft.tangent(u) + c * law.tangent(D - u)
+        return excess(u), softening.tangent(u) + c * law.tangent(D - u)
 
     def least_step(u):
         # Not below the rounding of u itself; `_polished` does the rest.
-        return jnp.maximum(
-            newton_tolerance(D.dtype) * jnp.minimum(u, D - u), 4 * epsilon(D.dtype) * D
-        )
+        small = jnp.minimum(jnp.abs(u), jnp.abs(D - u))
+        return jnp.maximum(newton_tolerance(D.dtype) * small, 4 * epsilon(D.dtype) * jnp.abs(D))
 
     linear = c * law.k_1
-    start = jnp.clip(D * (linear / (1 + linear)), low, jnp.maximum(low, high))
-    u = rising_root(excess_and_slope, least_step, start, low, high, solvable & (D > 0))
-    depth, u, force = _polished(D, c, law, soft, u)
-    sign = jnp.where(draw, -1, 1)
-    out = (jnp.where(solvable & known, sign * v, jnp.nan) for v in (depth, u, force))
-    return *out, ~solvable & known
+    return Rising(
+        excess_and_slope,
+        least_step,
+        start=D * (linear / (1 + linear)),
+        low=low,
+        high=high,
+        solvable=(low <= high) & (excess(low) <= 0) & (excess(high) >= 0),
+    )
 
 
-def _polished(D, c, law: Law, soft: Softening, u):
+def _fold(e_1, e_2):
+    """First deflection u > 0 at which the skeleton carries no more, mm; inf where it nowhere is."""
+    return first_positive_root(jnp.ones_like(e_1), -2 * e_1, 3 * e_2)
+
+
+def _polished(D, c, law: Law, softening: Softening, u):
     """The smaller of depth and deflection is a difference: once more from the force of the other.
 
     Newton's step for one is exact to rounding, since its start is right to half the digits.
     """
     depth = D - u
-    by_skeleton = u > depth
-    c_safe = jnp.where(by_skeleton, c, 1)
-    force = jnp.where(by_skeleton, soft.linear(u) / c_safe, law.force(depth))
-    slope = law.tangent(jnp.where(by_skeleton, depth, 0))
-    better_depth = depth - (law.force(depth) - force) / slope
-    better_u = u - (soft.linear(u) - c * force) / soft.tangent(u)
+    by_skeleton = jnp.abs(u) > jnp.abs(depth)
+    bent, pushed = softening.linear(u), law.force(depth)
+    slope = jnp.where(by_skeleton, c * law.tangent(depth), softening.tangent(u))
+    step = (bent - c * pushed) / slope
     return (
-        jnp.where(by_skeleton, better_depth, depth),
-        jnp.where(by_skeleton, u, better_u),
-        force,
+        jnp.where(by_skeleton, depth + step, depth),
+        jnp.where(by_skeleton, u, u - step),
+        jnp.where(by_skeleton, bent * (1 / jnp.where(c > 0, c, 1)), pushed),
     )
