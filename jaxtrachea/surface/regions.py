@@ -242,53 +242,6 @@ def _shares_jvp(primals, tangents):
     return out, tuple(linear(push, pull, primals, [tangents[i] for i in moving], out))
 
 
-@jax.custom_jvp
-def _ramps(x: Array, at: Array, slope: Array) -> Array:
-    """Several ramps, slope (x - at), for each place of a row.
-
-    What they add up to, going back, is a matrix product.
-
-    Args:
-        x: shape (rows, width).
-        at: where each ramp is 0; shape (rows, ramps).
-        slope: of each; shape (rows, ramps).
-
-    Returns:
-        Shape (rows, ramps, width).
-    """
-    return (x[:, None] - at[:, :, None]) * slope[:, :, None]
-
-
-@functools.partial(_ramps.defjvp, symbolic_zeros=True)
-def _ramps_jvp(primals, tangents):
-    moving = [i for i, v in enumerate(tangents) if not isinstance(v, SymbolicZero)]
-
-    def push(fixed, tangents):
-        x, at, slope = fixed
-        by = (
-            lambda v: slope[:, :, None] * v[:, None],
-            lambda v: jnp.zeros_like(x)[:, None] - (slope * v)[:, :, None],
-            lambda v: (x[:, None] - at[:, :, None]) * v[:, :, None],
-        )
-        return [added(by[i](v) for i, v in zip(moving, tangents, strict=True))]
-
-    def pull(fixed, cotangents):
-        (x, at, slope), (g,) = fixed, cotangents
-        from_first = x - x[:, :1]
-        sides = jnp.stack([jnp.ones_like(x), from_first], axis=1)
-        both = jnp.einsum("rpw,rjw->rpj", g, sides, precision="highest")
-        whole, moment = both[:, :, 0], both[:, :, 1] + (x[:, :1] - at) * both[:, :, 0]
-        by = (
-            lambda: jnp.sum(slope[:, :, None] * g, axis=1),
-            lambda: -slope * whole,
-            lambda: moment,
-        )
-        return [by[i]() for i in moving]
-
-    out = _ramps(*primals)
-    return out, linear(push, pull, primals, [tangents[i] for i in moving], [out])[0]
-
-
 def interpolate(
     binding: Binding, weights: Weights, keys: Keys, *, method: Method = "hermite"
 ) -> Float[Array, "vertices 3"]:
@@ -333,13 +286,22 @@ def _carry(binding: Binding, weights: Weights, s_c, joints, contact, U, V, slope
 
     def lines(s_c, joints, contact, U, V, slopes):
         line = _joint_line(binding.nodes, s_c, joints, contact, slopes)
-        return line, _ends(U, s_c), _ends(V, s_c)
+        return jnp.concatenate([*line, *_ends(U, s_c), *_ends(V, s_c)], axis=1)
 
-    def across(weights, s_c, line, ends):
-        return _across(binding, weights, s_c, line, ends)
+    def across(weights, s_c, patches):
+        beyond = tuple(binding.s >= s for s in _each(s_c))
 
-    line, *ends = one_kernel(lines)(s_c, joints, contact, U, V, slopes)
-    return in_order(across)(weights, s_c, line, ends)
+        # Of the patch that C splits, a vertex belongs to the lower or to the upper part. What a
+        # block needs of all parts is read at once.
+        def read(patch):
+            return jax.lax.dynamic_slice_in_dim(patches, patch, 1 + len(beyond))
+
+        rows = jax.vmap(read)(binding.patch)
+        shares = weights.U, weights.J, weights.V
+        return _combine(shares, binding.fraction, binding.s, beyond, rows)
+
+    patches = one_kernel(lines)(s_c, joints, contact, U, V, slopes)
+    return in_order(across)(weights, s_c, patches)
 
 
 def _ends(values, s_c):
@@ -355,8 +317,8 @@ def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None 
     Linear between the nodes; where `slopes` are given (nodes, C), the last components are cubic.
 
     Returns:
-        Where each patch begins, mm, and one over its length; shape (nodes,). The coefficients of
-        1, t, t^2, t^3 in it, t = 0..1; shape (nodes, components) each.
+        Columns, of shape (nodes, ...): where each patch begins, mm; one over its length; the
+        coefficients of 1, t, t^2, t^3 in it, t = 0..1, of each component.
     """
     values, below = joints, []
     for s in _each(s_c):
@@ -374,7 +336,7 @@ def _joint_line(nodes, s_c, joints, contact, slopes: tuple[Array, Array] | None 
         )
     rise = high - low
     cubic = low, leave, 3 * rise - 2 * leave - land, leave + land - 2 * rise
-    return nodes[:-1], 1 / jnp.where(span > 0, span, jnp.inf), cubic
+    return nodes[:-1, None], 1 / jnp.where(span > 0, span, jnp.inf)[:, None], *cubic
 
 
 def _each(v, dimensions: int = 0):
@@ -382,122 +344,132 @@ def _each(v, dimensions: int = 0):
     return [v] if v.ndim == dimensions else [v[i] for i in range(v.shape[0])]
 
 
-def _across(binding: Binding, weights: Weights, s_c, line, ends):
-    """The vertices of each patch; `line` from `_joint_line`, `ends` from `_ends` of U and of V."""
-    beyond = tuple(binding.s >= s for s in _each(s_c))
-    (begin, density, cubic), parts = line, 1 + len(beyond)
-    columns = [begin[:, None], density[:, None], *cubic, *ends[0], *ends[1]]
-    patches = jnp.concatenate(columns, axis=1)
-
-    # Of the patch that C splits, a vertex belongs to the lower or to the upper part. What a block
-    # needs of all parts is read at once.
-    def read(patch):
-        return jax.lax.dynamic_slice_in_dim(patches, patch, parts)
-
-    rows = jax.vmap(read)(binding.patch)
-    ways = _ramps(binding.s, rows[:, :, 0], rows[:, :, 1])
-    t = ways[:, 0]
-    for i, past in enumerate(beyond, 1):
-        t = jnp.where(past, ways[:, i], t)
-    width = cubic[0].shape[1]
-    own = [rows[:, i, 2 : 2 + 4 * width] for i in range(parts)]
-    table = jnp.concatenate([*own, rows[:, 0, 2 + 4 * width :]], axis=1)
-    table = table.reshape(table.shape[0], -1, width)
-    return _combine((weights.U, weights.J, weights.V, t), beyond, binding.fraction, table)
-
-
 @jax.custom_jvp
-def _combine(where, beyond, fraction, table):
-    """Values of the three lines at the vertices, times their weights; linear in `table`.
+def _combine(shares, fraction, s, beyond, rows):
+    """Values of the three lines at the vertices, times their weights.
 
     Args:
-        where: U, J, V and the way t through the patch, or through its part on one side of C; each
-            of shape (blocks, width).
+        shares: U, J and V; shape (blocks, width) each.
+        fraction: way through the whole patch; shape (blocks, width), as all of the vertices.
+        s: of the vertices, mm.
         beyond: whether on the side away from A; of C, or of each edge in order.
-        fraction: way through the whole patch.
-        table: rows: coefficients of 1, t, t^2, t^3 on the side of A, and on the other (between
-            both edges, and beyond them); of U, of the line U by fraction, of V and the line V by
-            it; shape (blocks, 12 or 16, components).
+        rows: of each part of a block's patch, shape (blocks, parts, 2 + 8 components): what
+            `_joint_line` gives; then, the same for all parts, U, U by fraction, V and V by it.
 
-    Derivatives by `table` are matrix products, one for each block; by the rest, sums over the three
-    components. Of the plain sums the compiler makes, going back, a reduction over the vertices for
-    each column of the table, and computes everything anew in each (CPU; three times slower).
+    Derivatives by `rows` are two matrix products for each block, the moments of t on each side of C
+    and those of U and V; by the rest, sums over the three components. Of the plain sums the
+    compiler makes, going back, a reduction over the vertices for each column of the rows, and
+    computes everything anew in each (CPU; three times slower).
     """
-    U, J, V, _, f = (v[:, None] for v in (*where, fraction))
-    line, _, (u, along_u, v, along_v) = _lines(where, beyond, table)
+    U, J, V, f = (v[:, None] for v in (*shares, fraction))
+    line, _, (u, along_u, v, along_v) = _lines(_way(s, beyond, rows), beyond, rows)
     return U * (u + f * along_u) + J * line + V * (v + f * along_v)
 
 
-def _lines(where, beyond, table):
+def _chosen(beyond, parts):
+    """At each vertex what there is of its part of the patch."""
+    return functools.reduce(
+        lambda found, other: jnp.where(other[0], other[1], found),
+        zip(beyond, parts[1:], strict=True), parts[0],
+    )  # fmt: skip
+
+
+def _way(s, beyond, rows):
+    """The way t of the vertices through their part of the patch."""
+    begin, density = (rows[:, :, i, None] for i in (0, 1))
+    return _chosen(beyond, list(((s[:, None] - begin) * density).swapaxes(0, 1)))
+
+
+def _coefficients(row):
+    """Of 1, t, t^2, t^3, U, U by fraction, V, V by fraction; shape (blocks, components) each."""
+    return jnp.split(row[:, 2:], 8, axis=1)
+
+
+def _lines(t, beyond, rows):
     """The line J and its slope in t at the vertices, and what there is of the other two."""
-    t = where[3][:, None]
-    rows = [row[:, :, None] for row in table.swapaxes(0, 1)]
-    a, b, c, d = rows[:4]
-    for i, past in enumerate(beyond):
-        a, b, c, d = (
-            jnp.where(past[:, None], upper, lower)
-            for lower, upper in zip((a, b, c, d), rows[4 * i + 4 : 4 * i + 8], strict=True)
-        )
-    return a + t * (b + t * (c + t * d)), b + t * (2 * c + 3 * t * d), rows[-4:]
+    t, past = t[:, None], [v[:, None] for v in beyond]
+    parts = [[v[:, :, None] for v in _coefficients(rows[:, i])] for i in range(rows.shape[1])]
+    a, b, c, d = [_chosen(past, of_part) for of_part in zip(*parts, strict=True)][:4]
+    return a + t * (b + t * (c + t * d)), b + t * (2 * c + 3 * t * d), parts[0][4:]
 
 
 @functools.partial(_combine.defjvp, symbolic_zeros=True)
 def _combine_jvp(primals, tangents):
-    (where, beyond, fraction, table), (d_where, _, d_fraction, d_table) = primals, tangents
+    (shares, fraction, s, beyond, rows), d = primals, tangents
     # By whatever moves: in a scene the rings are at rest, and often the contact is.
-    changes = [*d_where, d_fraction, d_table]
+    changes = [*d[0], d[1], d[2], d[4]]
     moving = [i for i, v in enumerate(changes) if not isinstance(v, SymbolicZero)]
-    product = functools.partial(jnp.einsum, precision="highest")
 
     def push(fixed, tangents):
-        of_vertex, table, beyond = _parted(fixed)
-        slopes = _slopes(of_vertex, beyond, table)
-        return [
-            added(
-                product("bkc,bkw->bcw", v, _basis(of_vertex, beyond))
-                if i == len(of_vertex)
-                else slopes[i] * v[:, None]
-                for i, v in zip(moving, tangents, strict=True)
+        shares, fraction, s, rows, beyond = _parted(fixed)
+        slopes, by = _slopes(*_parted(fixed)), dict(zip(moving, tangents, strict=True))
+        terms = [slopes[i] * by[i][:, None] for i in by if i < 5]
+        if 5 in by:
+            change = _combine.fun(
+                shares, fraction, s, beyond, rows.at[:, :, 2:].set(by[5][:, :, 2:])
             )
-        ]
+            begin, density = (rows[:, :, i, None] for i in (0, 1))
+            d_begin, d_density = (by[5][:, :, i, None] for i in (0, 1))
+            rates = (s[:, None] - begin) * d_density - density * d_begin
+            rate = _chosen(beyond, list(rates.swapaxes(0, 1)))
+            terms += [change, slopes[5] * rate[:, None]]
+        return [added(terms)]
 
     def pull(fixed, cotangents):
-        (of_vertex, table, beyond), (g,) = _parted(fixed), cotangents
-        slopes = _slopes(of_vertex, beyond, table)
-        return [
-            product("bkw,bcw->bkc", _basis(of_vertex, beyond), g)
-            if i == len(of_vertex)
-            else added(slopes[i][:, c] * g[:, c] for c in range(g.shape[1]))
-            for i in moving
-        ]
+        parted, (g,) = _parted(fixed), cotangents
+        slopes = _slopes(*parted)
 
-    fixed = [*where, fraction, table, *beyond]
+        def by_vertex(i):
+            return added(slopes[i][:, c] * g[:, c] for c in range(g.shape[1]))
+
+        return [by_vertex(i) if i < 5 else _of_rows(*parted, g) for i in moving]
+
+    fixed = [*shares, fraction, s, rows, *beyond]
     out = _combine(*primals)
     return out, linear(push, pull, fixed, [changes[i] for i in moving], [out])[0]
 
 
 def _parted(fixed):
-    """U, J, V, t and fraction; table; beyond."""
-    return fixed[:5], fixed[5], fixed[6:]
+    """Shares, fraction, s, rows; beyond."""
+    return fixed[:3], fixed[3], fixed[4], fixed[5], fixed[6:]
 
 
-def _slopes(of_vertex, beyond, table):
-    """Of `_combine`, by each of U, J, V, t, fraction; shape (blocks, components, width) each."""
-    U, J, V, _, f = (v[:, None] for v in of_vertex)
-    line, rise, (u, along_u, v, along_v) = _lines(of_vertex, beyond, table)
-    return u + f * along_u, line, v + f * along_v, J * rise, U * along_u + V * along_v
+def _slopes(shares, fraction, s, rows, beyond):
+    """Of `_combine`, by U, J, V, fraction, s and t; shape (blocks, components, width) each."""
+    U, J, V, f = (v[:, None] for v in (*shares, fraction))
+    line, rise, (u, along_u, v, along_v) = _lines(_way(s, beyond, rows), beyond, rows)
+    density = _chosen(beyond, list(rows[:, :, 1, None].swapaxes(0, 1)))[:, None]
+    by_t = J * rise
+    return u + f * along_u, line, v + f * along_v, U * along_u + V * along_v, by_t * density, by_t
 
 
-def _basis(of_vertex, beyond):
-    """Of `_combine`, by the rows of the table; shape (blocks, rows, width)."""
-    U, J, V, t, fraction = of_vertex
-    zero, rest, sides = jnp.zeros_like(J), J, []
+def _of_rows(shares, fraction, s, rows, beyond, g):
+    """Cotangent of the rows of `_combine`."""
+    U, J, V, t, f = (v[:, None] for v in (*shares, _way(s, beyond, rows), fraction))
+    # Chosen by place: all rows are one loop then; stacked, each would be its own.
+    place, (blocks, parts) = jnp.arange(8)[None, :, None], rows.shape[:2]
+    power = jnp.where(place > 1, t * t, 1) * jnp.where(place % 2 == 1, t, 1)
+    across = jnp.where(place > 5, V, U) * jnp.where(place % 2 == 1, f, 1)
+    basis = jnp.where(place < 4, J * power, across)
+    own, rest = [], jnp.ones_like(beyond[0])
     for past in beyond:
-        sides.append(jnp.where(past, zero, rest))
-        rest = jnp.where(past, rest, zero)
-    sides.append(rest)
-    line = [w * t**k for w in sides for k in range(4)]
-    return jnp.stack([*line, U, U * fraction, V, V * fraction], axis=1)
+        own.append(rest & ~past)
+        rest = rest & past
+    own = jax.lax.optimization_barrier(jnp.stack([*own, rest], axis=1))
+    sides = jnp.where(own[:, :, None], g[:, None], 0)
+    moments = jnp.einsum("bkw,bpcw->bpkc", basis, sides, precision="highest")
+    line, ends = moments[:, :, :4], added(moments[:, i, 4:] for i in range(parts))
+    # What t does at the rows' own begin and length, by its moments on each side.
+    turned = jnp.stack(_coefficients(rows.reshape(-1, rows.shape[2]))[1:4], axis=1)
+    times = jnp.arange(1, 4, dtype=g.dtype)[None, None, :, None]
+    turned = turned.reshape(blocks, parts, 3, -1) * times
+    whole, moment = (jnp.sum(turned * line[:, :, i : i + 3], axis=(2, 3)) for i in (0, 1))
+    # In a part without length, whose density is 0, there is no vertex.
+    density = rows[:, :, 1]
+    moment = jnp.where(density != 0, moment / jnp.where(density != 0, density, 1), 0)
+    first = jnp.where(jnp.arange(parts)[None, :, None] == 0, ends.reshape(blocks, 1, -1), 0)
+    head = jnp.stack([-density * whole, moment], axis=2)
+    return jnp.concatenate([head, line.reshape(blocks, parts, -1), first], axis=2)
 
 
 def _insert(rows, row, below):
