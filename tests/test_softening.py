@@ -63,6 +63,40 @@ def exact(D, c, k_1, k_3, e_1, e_2):
         return sign * d, sign * u, sign * (k_1 * d + k_3 * d**3), (1 + slope) / (rise + slope)
 
 
+#: D, c, k_1, k_3, e_1, e_2. Newton steps end beside the bracket, or the slope of one part vanishes.
+AWKWARD = [
+    (7.103547096252441, 0.010391807183623314, 3.7435123920440674, 0.3207882344722748,
+     0.3786492645740509, 0.031034469604492188),
+    (5.099063831981425, 0.011181853053177574, 8.871589887372034, 0.33365479430829115,
+     0.5119065690786285, 0.06732756246349501),
+    (7.92747, 0.156729, 0.692956, 0.0449488, 0.220599, 0.0123822),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("rows", [1, 8])
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_awkward_rows(dtype, rows):
+    """Alone and repeated, which compilers round in two ways."""
+    for case in AWKWARD:
+        case = [np.full(rows, v, dtype) for v in case]
+        got = solve(*case)
+        *truth, condition = exact(*(v[0] for v in case))
+        rtol = 4 * np.finfo(dtype).eps * float(condition)
+        for v, expected in zip(got[:3], truth, strict=True):
+            np.testing.assert_allclose(v, float(expected), rtol=rtol)
+
+
+@pytest.mark.parametrize("many", ["k_3", "e_1"])
+def test_one_displacement_and_many_values(many):
+    """What has rows gives the result its shape, whichever it is."""
+    given = {"D": 4.0, "c": 0.5, "k_1": 1.0, "k_3": 0.1, "e_1": 0.05, "e_2": 0.01}
+    rows = [given | {many: v} for v in (0.03, 0.06)]
+    D, c, k_1, k_3, e_1, e_2 = (jnp.asarray(v) for v in (given | {many: [0.03, 0.06]}).values())
+    got = soft_series(D, c, Law(k_1, k_3), Softening(e_1, e_2))
+    for i, row in enumerate(rows):
+        np.testing.assert_allclose(got.force[i], float(exact(*row.values())[2]), rtol=1e-14)
+
+
 @pytest.mark.slow
 @pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)

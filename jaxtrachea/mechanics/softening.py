@@ -126,7 +126,8 @@ def _newton(displacement, compliance, law: Law, softening: Softening):
     known = jnp.isfinite(displacement) & jnp.isfinite(compliance)
     for value in jax.tree.leaves((law, softening)):
         known = known & jnp.isfinite(value)
-    softening = Softening(*(jnp.asarray(e, displacement.dtype) for e in softening))
+    e_1, e_2 = (jnp.asarray(e, displacement.dtype) for e in softening)
+    softening = Softening(*jnp.broadcast_arrays(e_1, e_2))
     # Each by itself: what rows share stays one number.
     D, c = (jnp.where(jnp.isfinite(v), v, 0) for v in (displacement, compliance))
     u = rising_root(lambda D, c: _equation(D, c, law, softening), D, c, steps=4)
@@ -154,14 +155,10 @@ def _equation(D, c, law: Law, softening: Softening) -> Rising:
         return jnp.maximum(newton_tolerance(D.dtype) * small, 4 * epsilon(D.dtype) * jnp.abs(D))
 
     linear = c * law.k_1
-    return Rising(
-        excess_and_slope,
-        least_step,
-        start=D * (linear / (1 + linear)),
-        low=low,
-        high=high,
-        solvable=(low <= high) & (excess(low) <= 0) & (excess(high) >= 0),
-    )
+    start = D * (linear / (1 + linear))
+    solvable = (low <= high) & (excess(low) <= 0) & (excess(high) >= 0)
+    of_row = jnp.broadcast_arrays(start, low, high, solvable)
+    return Rising(excess_and_slope, least_step, *of_row)
 
 
 def _fold(e_1, e_2):
@@ -170,17 +167,17 @@ def _fold(e_1, e_2):
 
 
 def _polished(D, c, law: Law, softening: Softening, u):
-    """The smaller of depth and deflection is a difference: once more from the force of the other.
+    """One Newton step more, taken by the smaller of depth and deflection, which is a difference.
 
-    Newton's step for one is exact to rounding, since its start is right to half the digits.
+    It is exact to rounding, since its start is right to half the digits. By the slope of both parts
+    together: that of one alone vanishes at its fold.
     """
     depth = D - u
     by_skeleton = jnp.abs(u) > jnp.abs(depth)
-    bent, pushed = softening.linear(u), law.force(depth)
-    slope = jnp.where(by_skeleton, c * law.tangent(depth), softening.tangent(u))
-    step = (bent - c * pushed) / slope
-    return (
-        jnp.where(by_skeleton, depth + step, depth),
-        jnp.where(by_skeleton, u, u - step),
-        jnp.where(by_skeleton, bent * (1 / jnp.where(c > 0, c, 1)), pushed),
-    )
+    excess = softening.linear(u) - c * law.force(depth)
+    step = excess / (softening.tangent(u) + c * law.tangent(depth))
+    small = jnp.where(by_skeleton, depth + step, u - step)
+    depth, u = jnp.where(by_skeleton, small, D - small), jnp.where(by_skeleton, D - small, small)
+    by_law = law.force(depth)
+    by_bend = softening.linear(u) * (1 / jnp.where(c > 0, c, 1))
+    return depth, u, jnp.where(by_skeleton, by_bend, by_law)

@@ -354,7 +354,7 @@ def _combine(shares, fraction, s, beyond, rows):
         s: of the vertices, mm.
         beyond: whether on the side away from A; of C, or of each edge in order.
         rows: of each part of a block's patch, shape (blocks, parts, 2 + 8 components): what
-            `_joint_line` gives; then, the same for all parts, U, U by fraction, V and V by it.
+            `_joint_line` gives; then, of the first part alone, U, U by fraction, V and V by it.
 
     Derivatives by `rows` are two matrix products for each block, the moments of t on each side of C
     and those of U and V; by the rest, sums over the three components. Of the plain sums the
@@ -389,7 +389,8 @@ def _lines(t, beyond, rows):
     """The line J and its slope in t at the vertices, and what there is of the other two."""
     t, past = t[:, None], [v[:, None] for v in beyond]
     parts = [[v[:, :, None] for v in _coefficients(rows[:, i])] for i in range(rows.shape[1])]
-    a, b, c, d = [_chosen(past, of_part) for of_part in zip(*parts, strict=True)][:4]
+    lines = zip(*(of_part[:4] for of_part in parts), strict=True)
+    a, b, c, d = (_chosen(past, of_one) for of_one in lines)
     return a + t * (b + t * (c + t * d)), b + t * (2 * c + 3 * t * d), parts[0][4:]
 
 
@@ -401,8 +402,8 @@ def _combine_jvp(primals, tangents):
     moving = [i for i, v in enumerate(changes) if not isinstance(v, SymbolicZero)]
 
     def push(fixed, tangents):
-        shares, fraction, s, rows, beyond = _parted(fixed)
-        slopes, by = _slopes(*_parted(fixed)), dict(zip(moving, tangents, strict=True))
+        shares, fraction, s, rows, beyond = parted = _parted(fixed)
+        slopes, by = _slopes(*parted), dict(zip(moving, tangents, strict=True))
         terms = [slopes[i] * by[i][:, None] for i in by if i < 5]
         if 5 in by:
             change = _combine.fun(
@@ -464,7 +465,7 @@ def _of_rows(shares, fraction, s, rows, beyond, g):
     times = jnp.arange(1, 4, dtype=g.dtype)[None, None, :, None]
     turned = turned.reshape(blocks, parts, 3, -1) * times
     whole, moment = (jnp.sum(turned * line[:, :, i : i + 3], axis=(2, 3)) for i in (0, 1))
-    # In a part without length, whose density is 0, there is no vertex.
+    # In a part without length, whose density is 0, a vertex is at its begin.
     density = rows[:, :, 1]
     moment = jnp.where(density != 0, moment / jnp.where(density != 0, density, 1), 0)
     first = jnp.where(jnp.arange(parts)[None, :, None] == 0, ends.reshape(blocks, 1, -1), 0)
