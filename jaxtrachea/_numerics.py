@@ -429,7 +429,7 @@ def _root_in_bracket(problem: Rising):
         value, slope = value_and_slope(x)
         low, high = jnp.where(value < 0, x, low), jnp.where(value < 0, high, x)
         new, within = x - value / slope, least_step(x)
-        # By rounding a good step may end beside the bracket: a middle in its place is no last step.
+        # By rounding a good step may end beside the bracket; a middle could pass for the last one.
         inside = (new >= low - within) & (new <= high + within)
         new = jnp.where(inside, jnp.clip(new, low, high), (low + high) / 2)
         # What has settled stays, whatever the others do: no row knows of its neighbours.

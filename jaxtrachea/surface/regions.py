@@ -406,9 +406,8 @@ def _combine_jvp(primals, tangents):
         slopes, by = _slopes(*parted), dict(zip(moving, tangents, strict=True))
         terms = [slopes[i] * by[i][:, None] for i in by if i < 5]
         if 5 in by:
-            change = _combine.fun(
-                shares, fraction, s, beyond, rows.at[:, :, 2:].set(by[5][:, :, 2:])
-            )
+            moved = jnp.concatenate([rows[:, :, :2], by[5][:, :, 2:]], axis=2)
+            change = _combine.fun(shares, fraction, s, beyond, moved)
             begin, density = (rows[:, :, i, None] for i in (0, 1))
             d_begin, d_density = (by[5][:, :, i, None] for i in (0, 1))
             rates = (s[:, None] - begin) * d_density - density * d_begin
@@ -461,9 +460,8 @@ def _of_rows(shares, fraction, s, rows, beyond, g):
     moments = jnp.einsum("bkw,bpcw->bpkc", basis, sides, precision="highest")
     line, ends = moments[:, :, :4], added(moments[:, i, 4:] for i in range(parts))
     # What t does at the rows' own begin and length, by its moments on each side.
-    turned = jnp.stack(_coefficients(rows.reshape(-1, rows.shape[2]))[1:4], axis=1)
     times = jnp.arange(1, 4, dtype=g.dtype)[None, None, :, None]
-    turned = turned.reshape(blocks, parts, 3, -1) * times
+    turned = times * rows[:, :, 2:].reshape(blocks, parts, 8, -1)[:, :, 1:4]
     whole, moment = (jnp.sum(turned * line[:, :, i : i + 3], axis=(2, 3)) for i in (0, 1))
     # In a part without length, whose density is 0, a vertex is at its begin.
     density = rows[:, :, 1]
