@@ -137,6 +137,35 @@ def test_the_whole_update_of_one_pose():
         assert count_kernels(gradient, inside=False)[0] <= MARGIN * 182
 
 
+STEP = """
+import json
+import jax
+jax.config.update("jax_enable_x64", True)
+from pathlib import Path
+from jaxtrachea.scene.build import stage
+from jaxtrachea.scene.session import Session
+from jaxtrachea.scene.spec import SceneSpec
+from jaxtrachea.tradeoff.levels import BUILT_IN, full_scene
+
+spec = SceneSpec.model_validate(BUILT_IN)
+full = full_scene(spec, stage(spec, Path()), coupling="series")
+print(json.dumps(Session(full.scene, full.material)._run.as_text()))
+"""
+
+
+@pytest.mark.slow
+def test_a_step_of_a_session_is_one_kernel_but_for_the_surface():
+    """Contact, seat, skeleton, force and what is packed: with the surface 1,042 kernels before."""
+    environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    run = subprocess.run(
+        [sys.executable, "-c", STEP], capture_output=True, text=True, env=environment
+    )
+    assert run.returncode == 0, run.stderr
+    text = json.loads(run.stdout)
+    if version("jaxlib") in TESTED:
+        assert count_kernels(text, inside=False)[0] <= MARGIN * 31
+
+
 def largest_array(text: str) -> int:
     """Bytes of the largest array that an instruction outside of a fusion gives."""
     bodies = computations(text)[1]

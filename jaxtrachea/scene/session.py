@@ -38,7 +38,7 @@ from jaxtrachea.scene.seat import (
     place_of,
     way_of,
 )
-from jaxtrachea.scene.simulation import Simulation, follow
+from jaxtrachea.scene.simulation import Simulation, pressed, surface
 from jaxtrachea.scene.stage import Poses, Scene, check_material, touch_tube
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
@@ -177,23 +177,30 @@ class Session:
         self._start = np.asarray(_packed_start(scene, *pose))
         states = Packing(jax.eval_shape(_start, scene, *pose))
 
+        def now(numbers):
+            at = given.unpack(numbers)
+            return dataclasses.replace(scene, tool=at.tool, footprint=at.footprint), at.material
+
         @jax.jit  # traced once, for the shapes of the result and for the program
         def one(state, rotation, translation, numbers):
-            now = given.unpack(numbers)
-            scene_now = dataclasses.replace(scene, tool=now.tool, footprint=now.footprint)
-            state, result = _step(
-                scene_now, now.material, states.unpack(state), rotation, translation
-            )
-            return states.pack(state), *_apart(result)
+            state, result, rest = _step(*now(numbers), states.unpack(state), rotation, translation)
+            return states.pack(state), *_apart(result), rest
 
-        _, contact, large = jax.eval_shape(one, self._start, *pose, self._numbers)
+        _, contact, large, _ = jax.eval_shape(one, self._start, *pose, self._numbers)
         contacts = Packing(contact)
-        whole = one if self.scene.plan.surface is not None else one_kernel(one)
+        if scene.plan.surface is not None:
+            assert scene.mesh is not None
+            large["vertices"] = jax.ShapeDtypeStruct(scene.mesh.straight.shape, self.dtype)
+
+        def line(*given):
+            # State and contact as two arrays: in one, much of what both need is computed twice.
+            state, contact, large, rest = one(*given)
+            return state, contacts.pack(contact), tuple(large.values()), rest
 
         def run(state, _, *given):
-            # State and contact as two arrays: in one, much of what both need is computed twice.
-            state, contact, large = whole(state, *given)
-            return state, contacts.pack(contact), tuple(large.values())
+            state, contact, large, rest = one_kernel(line)(state, *given)
+            vertices = surface(*now(given[-1]), *rest)
+            return state, contact, large if vertices is None else (*large, vertices[0])
 
         zeros = tuple(jnp.array(np.zeros(v.shape, v.dtype)) for v in large.values())
         # Donated: the new state and the large arrays are written where the old ones were.
@@ -318,7 +325,7 @@ def _start(scene: Scene, rotation, translation) -> State:
 
 @full_precision
 def _step(scene: Scene, material: Material, state: State, rotation, translation):
-    """The next state, and the result without its axis of rows."""
+    """The next state, the result without its axis of rows, and what the surface follows from."""
     path = Poses(rotation[None], translation[None])
     each = approach(scene, path) if scene.plan.contact_point == "per_step" else None
     here = Instant(path, touch_tube(scene, path) if each is None else each.seen)
@@ -326,20 +333,19 @@ def _step(scene: Scene, material: Material, state: State, rotation, translation)
     side = next_side(state.side, at)
     inside = (side == Side.IN_LUMEN)[None]
     if each is None:
-        after, result = _held(scene, material, state, here, inside)
+        after, path, each, place = _held(scene, material, state, here, inside)
     else:
-        result = follow(scene, material, path, each._replace(inside=inside))
-        after = state
+        after, each, place = state, each._replace(inside=inside), None
+    result, ground = pressed(scene, material, path, each, place)
     after = after._replace(side=side)
     result = jax.tree.map(lambda v: v[0], result)
     wrong = jnp.asarray(PressStatus.NON_FINITE, result.status.dtype)
-    return _pick(at.known, after, state), result._replace(
-        status=jnp.where(at.known, result.status, wrong)
-    )
+    result = result._replace(status=jnp.where(at.known, result.status, wrong))
+    return _pick(at.known, after, state), result, (path, ground)
 
 
 def _held(scene: Scene, material: Material, state: State, here: Instant, inside):
-    """A step of a tool that holds its place."""
+    """The next state but for the side; a tool that holds its place as it stands; the place."""
     depth = -here.seen.gap[0]
     hit = (depth > 0) & ~inside[0]
     last = _pick(state.started, state.last, here)
@@ -358,10 +364,9 @@ def _held(scene: Scene, material: Material, state: State, here: Instant, inside)
         way = jnp.where(hit, given_way(scene, way, jnp.where(hit, depth, 1), place), way)
         seat = anchored(scene, seat, way, here.path)
     rest, made = as_approach(scene, seat, way, here, inside)
-    result = follow(scene, material, rest, made, place)
     started = jnp.asarray(True)
     after = State(started=started, touching=touching, side=state.side, last=here, seat=seat)
-    return after, result
+    return after, rest, made, place
 
 
 def _pick(when, a, b):

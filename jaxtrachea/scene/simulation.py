@@ -3,10 +3,10 @@
 The program is put together from the scene's static `Plan`; what is off is not in it.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._in_order import one_kernel
 from jaxtrachea._numerics import full_precision
@@ -111,7 +111,6 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
     return follow(scene, material, path, approach(scene, path) if isinstance(path, Poses) else None)
 
 
-@full_precision
 def follow(
     scene: Scene,
     material: AnyMaterial,
@@ -123,6 +122,35 @@ def follow(
 
     `place`: where all rows press, if it is known already (a step of a session).
     """
+    result, ground = pressed(scene, material, path, made, place)
+    return result._replace(vertices=surface(scene, material, path, ground))
+
+
+class Ground(NamedTuple):
+    """What the surface follows from.
+
+    Attributes:
+        presses: as computed.
+        moved: what they do.
+        made: the tool's way; its `pull` is left out.
+        refused: rows by status.
+    """
+
+    presses: Presses
+    moved: Any
+    made: Approach | None
+    refused: dict[PressStatus, Bool[Array, " rows"]]
+
+
+@full_precision
+def pressed(
+    scene: Scene,
+    material: AnyMaterial,
+    path: Poses | Presses,
+    made: Approach | None,
+    place: Place | None = None,
+) -> tuple[Simulation, Ground]:
+    """All of `follow` but the surface, and what that follows from."""
     plan = scene.plan
     material, bad = without_negative_values(scene, material)
     given = path if isinstance(path, Presses) else None
@@ -134,19 +162,15 @@ def follow(
     else:
         solve = vectors if plan.second_plane else one_plane
         moved = one_kernel(lambda used: solve(scene, material, used))(used)
-    vertices = None
-    if plan.surface is not None and isinstance(material, Material):
-        vertices = deform(scene, material, used, moved, path, made)
-    elif plan.surface is not None:
-        vertices = deform_sections(scene, used, moved, path, made)
     force, moment, solved = moved.force, None, moved.status
     of_joints = isinstance(material, Material)
     if made is not None and made.pull is not None and isinstance(path, Poses) and of_joints:
         force, moment = force_by_pose(scene, material, path, used, moved, made)
         lost = (solved == PressStatus.OK) & ~jnp.isfinite(jnp.sum(force + moment, axis=1))
         solved = jnp.where(lost, PressStatus.NON_FINITE, solved)
-    results = moved._replace(force=force, status=None), moment, vertices
-    moved, moment, vertices = hide(scene, refused, results)
+    way = None if made is None else made._replace(pull=None)
+    ground = Ground(used, moved, way, refused)
+    moved, moment = hide(scene, refused, (moved._replace(force=force, status=None), moment))
     share = depth_share(scene, moved.depth, moved.skeleton, inward)
     asked, ends = plan.joints, plan.ring_ends
     return Simulation(
@@ -165,8 +189,24 @@ def follow(
         slip=moved.slip,
         dissipated=moved.dissipated,
         frame=None if made is None else made.frame,
-        vertices=vertices,
+        vertices=None,
         depth_share=share,
         contact_share=None if made is None else contact_share(scene, made.own),
         status=status_of(solved, share, made, refused),
-    )
+    ), ground
+
+
+@full_precision
+def surface(
+    scene: Scene, material: AnyMaterial, path: Poses | Presses, ground: Ground
+) -> Float[Array, "rows vertices 3"] | None:
+    """Deformed vertices, NaN in the rows that were refused; None: the plan has no surface."""
+    if scene.plan.surface is None:
+        return None
+    presses, moved, made, refused = ground
+    material, _ = without_negative_values(scene, material)
+    if isinstance(material, SectionMaterial):
+        vertices = deform_sections(scene, presses, moved, path, made)
+    else:
+        vertices = deform(scene, material, presses, moved, path, made)
+    return hide(scene, refused, vertices)
