@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from kernels import count_kernels
 
 import jaxtrachea
 from jaxtrachea import (
@@ -32,7 +33,6 @@ from jaxtrachea.contact.shapes import capsule
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.scene.deform import _sag
-from jaxtrachea.tradeoff.kernels import count_kernels
 
 DTYPES = ["float32", "float64"]
 NOT_INLINED = 'inlineable="false"'

@@ -14,9 +14,9 @@ import sys
 from importlib.metadata import version
 
 import pytest
+from kernels import ONE, computations, count_kernels
 
 from jaxtrachea._in_order import TESTED
-from jaxtrachea.tradeoff.kernels import ONE, computations, count_kernels
 
 #: Kernels of a single contact, value and with gradient, jaxlib 0.10.2: of a ball on the round tube,
 #: of a box on patches of 120 corners. Before sums were written out: 697, 716, 1,030 and 1,048. The

@@ -6,6 +6,7 @@ import numpy as np
 import punch_fem
 import pytest
 from jax.test_util import check_grads
+from kernels import computations
 
 from jaxtrachea.mechanics import beam as point
 from jaxtrachea.mechanics.compliance import Beam
@@ -15,7 +16,6 @@ from jaxtrachea.mechanics.punch import mean_ring_weight, punch_deflection
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
-from jaxtrachea.tradeoff.kernels import computations
 
 DTYPES = ["float32", "float64"]
 X, LENGTH, HALF = np.arange(10.0, 151.0, 10.0), 160.0, 2.4

@@ -357,12 +357,12 @@ def test_of_rungs_that_cost_the_same_the_best_is_taken():
     ladder = Ladder("made up", "truncation", rungs | {"finest": {}}, {})
     errors = {1: 0.5, 2: 0.001, 3: 0.01}
     trial = object.__new__(Trial)
-    trial.full, trial.report, trial.saved = full, lambda text: None, lambda levels: 0.25
+    trial.full, trial.report, trial.saved = full, lambda text: None, lambda by, levels: 0.25
     trial.errors = lambda levels: Errors(errors[levels.kept], None, None, None, None, None)
     refused = []
-    assert choosing._within(trial, ladder, 0.1, refused).level == "best"
+    assert choosing._within(trial, "operations", ladder, 0.1, refused).level == "best"
     assert not refused
-    assert choosing._within(trial, ladder, 1e-4, refused) is None
+    assert choosing._within(trial, "operations", ladder, 1e-4, refused) is None
     assert {rung.level for rung in refused} == set(rungs)
 
 
@@ -373,10 +373,13 @@ def test_a_choice_can_be_shown():
     times = {v: both for v in (choice.levels, full.levels)}
     end = measuring.environment(measuring.Settings(), Load())
     row = measuring.choice_row("small", full, choice, times, end)
-    ((*_, error, cost, calls, ratio, share),) = choice_rows([json.loads(json.dumps(row))])
+    ((*_, error, cost, operations, calls, ratio, share),) = choice_rows(
+        [json.loads(json.dumps(row))]
+    )
     assert (calls, ratio) == ("10 / 10", "1.00")
-    assert float(share) == pytest.approx(1 / row["cost"], abs=0.005)
+    assert float(share) == pytest.approx(1 / row["operations"], abs=0.005)
     assert float(error.removesuffix(" %")) <= 10
+    assert cost == operations
     assert float(cost.removesuffix(" %")) < 100
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from jax import lax
 from jax.extend.core import jaxpr_as_fun, jaxprs_in_params
+from kernels import count_kernels
 
 from jaxtrachea import _in_order
 from jaxtrachea._in_order import in_order, one_kernel
 from jaxtrachea._numerics import epsilon
 from jaxtrachea._written_out import written_out
-from jaxtrachea.tradeoff.kernels import count_kernels
 
 DTYPES = ["float32", "float64"]
 #: Products as `einsum` names them, and the sizes of the two.

@@ -1,14 +1,12 @@
-"""The command cache: where compiled programs are kept, and how much they take; the time model."""
+"""The command cache: where compiled programs are kept, and how much they take."""
 
-import os
-from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
 from jaxtrachea.cli.terminal import Stop, cache_folder, programs_folder
-from jaxtrachea.files.programs import MOST_BYTES, MOST_DAYS, TIME_MODEL, TRACED, delete, programs
+from jaxtrachea.files.programs import MOST_BYTES, MOST_DAYS, TRACED, delete, programs
 
 ClearOption = Annotated[bool, typer.Option("--clear", help="Delete all that is kept.")]
 
@@ -25,8 +23,6 @@ def cache(clear: ClearOption = False) -> None:
     if clear:
         gone = sum(delete(program) for program in kept)
         text = f"{gone} of {len(kept)} programs and traces deleted from {folder}"
-        if os.path.lexists(folder / TIME_MODEL):
-            text += f"\n{_cleared(folder / TIME_MODEL)}"
     else:
         size = sum(program.size for program in kept) / 2**20
         traced = sum(TRACED in program.path.name for program in kept)
@@ -34,30 +30,4 @@ def cache(clear: ClearOption = False) -> None:
         text += f"in {folder}"
         if folder == cache_folder():
             text += f"\nat most {MOST_BYTES // 2**20} MiB, and none unused for {MOST_DAYS:g} days"
-        if os.path.lexists(folder / TIME_MODEL):
-            text += f"\n{_of_time(folder)}"
     Console().print(text, markup=False, highlight=False, soft_wrap=True)
-
-
-def _of_time(folder: Path) -> str:
-    """The kept model of time in words; starts no device."""
-    from jaxtrachea.tradeoff.time_model import others_than_here, stored
-
-    found = stored(folder)
-    if found is None:
-        return "model of time: damaged; the next choice measures it anew"
-    where, model = found
-    off = ", ".join(others_than_here(where))
-    anew = f"\nnot for here, the next choice measures it anew: it is of {off}" if off else ""
-    return f"model of time: {model.sentence}{anew}"
-
-
-def _cleared(path: Path) -> str:
-    """Delete the model of time; what became of it."""
-    try:
-        path.unlink()
-    except FileNotFoundError:
-        return "model of time: another process deleted it"
-    except OSError as error:
-        return f"model of time not deleted: {path}: {error.strerror or error}"
-    return "model of time deleted"

@@ -23,13 +23,13 @@ from jaxtrachea.cli.terminal import (
 
 SceneArgument = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
 TimeOption = Annotated[
-    bool, typer.Option("--time", help="Predict the time on this machine; compiles the program.")
+    bool, typer.Option("--time", help="Measure the time on this machine; compiles the programs.")
 ]
 #: Rows of a terminal table; the files hold all.
 MANY = 12
 
 
-def plan(scene: SceneArgument, predict: TimeOption = False) -> None:
+def plan(scene: SceneArgument, timed: TimeOption = False) -> None:
     """Show which effects a scene needs, why, and their cost."""
     from jaxtrachea.scene.cost import shares
     from jaxtrachea.scene.results import plan_rows
@@ -42,8 +42,8 @@ def plan(scene: SceneArgument, predict: TimeOption = False) -> None:
     head = ["effect", "level", "chosen", "operations", "reason"]
     out.print(table("Plan", head, plan_rows(staged.scene.plan, found), ("reason",)))
     out.print(f"{whole:,} operations for {_rows(staged)} rows", highlight=False)
-    if predict:
-        out.print(escape(_predicted(staged)), highlight=False)
+    if timed:
+        out.print(escape(_timed(staged)), highlight=False)
     if choice is not None:
         out.print(escape(choice.sentence), highlight=False)
     if swept is not None:
@@ -162,16 +162,16 @@ def _chosen(path: Path, spec, staged):
     """The scene with the plan within its tolerance, and that choice; as it is without tolerance."""
     if spec.plan is None:
         return staged, None
-    from jaxtrachea.cli.timing import in_place, price_of
     from jaxtrachea.scene.declare import PlanError
     from jaxtrachea.tradeoff.choice import choose
     from jaxtrachea.tradeoff.levels import full_scene
-    from jaxtrachea.tradeoff.time_model import Uncalibrated
+    from jaxtrachea.tradeoff.load import Load
 
     try:
         full = full_scene(spec, staged)
     except PlanError as error:
         raise Stop(f"{path}: effects.{error}") from None
+    wish, load = spec.plan, Load()
     with interrupts() as stop_if_asked, progress_bar() as bar:
         task = bar.add_task("choosing", total=None)
 
@@ -179,49 +179,35 @@ def _chosen(path: Path, spec, staged):
             stop_if_asked()
             bar.update(task, description=f"choosing: {text}", advance=1)
 
-        wish = spec.plan
-        price, why = price_of(wish.cost, report)
         try:
-            try:
-                choice = choose(full, wish.tolerance, report, precision=wish.precision, price=price)
-            except Uncalibrated as error:
-                why = in_place(error)
-                choice = choose(full, wish.tolerance, report, precision=wish.precision)
+            choice = choose(full, wish.tolerance, report, precision=wish.precision, by=wish.cost)
         except PlanError as error:
             raise Stop(f"{path}: {error}") from None
     chosen = {name: getattr(choice, name) for name in ("scene", "material", "path")}
-    notes = (*staged.notes, why) if why else staged.notes
-    return staged._replace(**chosen, notes=notes), choice
+    notes = () if wish.cost == "operations" else load.notes()
+    return staged._replace(**chosen, notes=(*staged.notes, *notes)), choice
 
 
-def _predicted(staged) -> str:
-    """Time of the whole path in one call and of a pose a call, and what they are predicted by."""
-    from jaxtrachea.cli.timing import time_model
-    from jaxtrachea.tradeoff.calibrate import predicted
-    from jaxtrachea.tradeoff.time_model import Uncalibrated
+def _timed(staged) -> str:
+    """Time of the whole path in one call and of a pose a call, measured."""
+    from jaxtrachea.tradeoff.calls import one_pose, quickest, whole_path
+    from jaxtrachea.tradeoff.load import Load
+    from jaxtrachea.tradeoff.price import WORDS
 
+    arguments, load = (staged.scene, staged.material, staged.path), Load()
     with interrupts() as stop_if_asked, progress_bar(transient=True) as bar:
-        task = bar.add_task("time model", total=None)
-
-        def report(text: str) -> None:
+        task, calls = bar.add_task("time", total=None), []
+        for name, compiled in (("path", whole_path), ("pose", one_pose)):
             stop_if_asked()
-            bar.update(task, description=text, advance=1)
-
-        try:
-            model, why = time_model(report)
-        except Uncalibrated as error:
-            return f"no time is predicted: {error}"
-        report("compiling")
-        try:
-            found = predicted(model, (staged.scene, staged.material, staged.path))
-        except Uncalibrated as error:
-            return f"no time is predicted: {error}"
-    words = ("the path in one call", "one pose a call")
+            bar.update(task, description=f"compiling: the {name}", advance=1)
+            calls.append(compiled(arguments))
+        stop_if_asked()
+        bar.update(task, description="timing", advance=1)
+        seconds = quickest(calls)
     each = ", ".join(
-        f"{1e3 * v.seconds:.2g} ms for {what} ({v.kernels:,} kernels)"
-        for v, what in zip(found, words, strict=True) if v is not None
-    )  # fmt: skip
-    return f"time predicted on this machine: {each}\n({model.sentence})" + (why and f"\n{why}")
+        f"{1e3 * v:.2g} ms for {what}" for v, what in zip(seconds, WORDS.values(), strict=True)
+    )
+    return "\n".join((f"time measured on this machine: {each}", *load.notes()))
 
 
 def _for_sweep(path: Path, spec, staged):

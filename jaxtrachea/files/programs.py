@@ -17,8 +17,6 @@ BETWEEN = 86_400.0
 TRACED = "-traced"
 #: Names of programs: that of the function and a digest; and the process, if killed in the midst.
 _NAME = re.compile(rf".*-[0-9a-f]{{64}}(-cache|{TRACED}(\.\d+)?)", re.DOTALL)
-#: File with the times of this machine (`tradeoff.time_model`).
-TIME_MODEL = "time_model.json"
 #: File whose time of change is that of the last look.
 LAST_LOOK = ".trimmed"
 

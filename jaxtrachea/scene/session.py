@@ -6,7 +6,6 @@ made; a step compiles nothing. State and result go in and out as one array each 
 
 import dataclasses
 import time
-from operator import itemgetter
 from typing import NamedTuple
 
 import jax
@@ -15,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxtrachea._in_order import one_kernel
 from jaxtrachea._numerics import full_precision
 from jaxtrachea._packed import Packing
 from jaxtrachea.contact.shapes import Shape
@@ -25,6 +23,7 @@ from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.assemble import with_tool
 from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
+from jaxtrachea.scene.one_row import OneRow
 from jaxtrachea.scene.seat import (
     Instant,
     Seat,
@@ -38,16 +37,13 @@ from jaxtrachea.scene.seat import (
     place_of,
     way_of,
 )
-from jaxtrachea.scene.simulation import Simulation, pressed, surface
+from jaxtrachea.scene.simulation import Simulation, pressed
 from jaxtrachea.scene.stage import Poses, Scene, check_material, touch_tube
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
 
 #: Borders of the histogram of latencies, s: four a decade from 10 us to 1 s.
 EDGES = np.logspace(-5, 0, 21)
-
-#: Arrays of the result that have a number for every ring or vertex.
-LARGE = ("joints", "loads", "end_U", "end_V", "vertices")
 
 
 class State(NamedTuple):
@@ -171,45 +167,23 @@ class Session:
         self._seconds, self._steps = np.zeros(keep), 0
 
     def _compile(self) -> None:
-        """The program of a step, its first state and the memory that it writes into."""
+        """The program of a step, and its first state."""
         scene, given = self.scene, self._given
         pose = np.eye(3, dtype=self.dtype), np.zeros(3, self.dtype)
         self._start = np.asarray(_packed_start(scene, *pose))
         states = Packing(jax.eval_shape(_start, scene, *pose))
 
-        def now(numbers):
-            at = given.unpack(numbers)
+        def now(*args):
+            at = given.unpack(args[-1])
             return dataclasses.replace(scene, tool=at.tool, footprint=at.footprint), at.material
 
-        @jax.jit  # traced once, for the shapes of the result and for the program
-        def one(state, rotation, translation, numbers):
-            state, result, rest = _step(*now(numbers), states.unpack(state), rotation, translation)
-            return states.pack(state), *_apart(result), rest
+        def step(state, rotation, translation, numbers):
+            at = now(numbers)
+            state, *found = _step(*at, states.unpack(state), rotation, translation)
+            return states.pack(state), *found
 
-        _, contact, large, _ = jax.eval_shape(one, self._start, *pose, self._numbers)
-        contacts = Packing(contact)
-        if scene.plan.surface is not None:
-            assert scene.mesh is not None
-            large["vertices"] = jax.ShapeDtypeStruct(scene.mesh.straight.shape, self.dtype)
-
-        def line(*given):
-            # State and contact as two arrays: in one, much of what both need is computed twice.
-            state, contact, large, rest = one(*given)
-            return state, contacts.pack(contact), tuple(large.values()), rest
-
-        def run(state, _, *given):
-            state, contact, large, rest = one_kernel(line)(state, *given)
-            vertices = surface(*now(given[-1]), *rest)
-            return state, contact, large if vertices is None else (*large, vertices[0])
-
-        zeros = tuple(jnp.array(np.zeros(v.shape, v.dtype)) for v in large.values())
-        # Donated: the new state and the large arrays are written where the old ones were.
-        made = jax.jit(run, donate_argnums=(0, 1), keep_unused=True)
-        self._run = made.lower(self._start, zeros, *pose, self._numbers).compile()
-        self._state, self._large, self._contacts = jnp.array(self._start), zeros, contacts
-        names = [n for n in Simulation._fields if getattr(contact, n) is not None]
-        where = {name: at for at, name in enumerate([*names, *large])}
-        self._in_order = itemgetter(*(where.get(n, len(where)) for n in Simulation._fields))
+        self._program = OneRow(scene, now, step, self._start, *pose, self._numbers)
+        self._state = jnp.array(self._start)
 
     def step(self, rotation: ArrayLike, translation: ArrayLike) -> Simulation:
         """Move the tool.
@@ -234,9 +208,7 @@ class Session:
             )
         # Two arrays: to make one of them takes longer than it saves.
         given = turn, place, self._numbers
-        self._state, packed, self._large = self._run(self._state, self._large, *given)
-        contact = self._contacts.leaves(np.asarray(packed))  # waits for all of them
-        result = Simulation._make(self._in_order((*contact, *self._large, None)))
+        self._state, result = self._program(self._state, *given)
         self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin
         self._steps += 1
         return result
@@ -303,13 +275,6 @@ class Session:
             steps=len(taken), median=float(median), p99=float(p99), worst=float(taken.max()),
             edges=edges, counts=counts,
         )  # fmt: skip
-
-
-def _apart(result: Simulation) -> tuple[Simulation, dict[str, Array]]:
-    """The result without what there is for every ring or vertex, and that by name."""
-    found = {name: getattr(result, name) for name in LARGE}
-    large = {name: v for name, v in found.items() if v is not None}
-    return result._replace(**dict.fromkeys(LARGE)), large
 
 
 def _start(scene: Scene, rotation, translation) -> State:

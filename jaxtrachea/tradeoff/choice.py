@@ -2,9 +2,9 @@
 
 Every effect is dropped alone from the full program, the cheapest rung within the tolerance is
 taken, and all of them together are checked. Effects do not add up: while the whole is too far off,
-the effect that errs most per cost saved comes back by one rung. Cost is a `price.Price`:
-operations, so that the choice does not depend on the machine, or the time predicted on this one;
-errors are those of force, joints and surface over the path and two sample paths beside it.
+the effect that errs most per cost saved comes back by one rung. Cost (`price.By`) is operations, so
+that the choice does not depend on the machine, or the time measured on this one; errors are those
+of force, joints and surface over the path and two sample paths beside it.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from jaxtrachea.trachea.material import Material
 from jaxtrachea.tradeoff.errors import Errors
 from jaxtrachea.tradeoff.ladders import QUALITY, Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, program
-from jaxtrachea.tradeoff.price import OPERATIONS, Price
+from jaxtrachea.tradeoff.price import GRAIN, By, words
 from jaxtrachea.tradeoff.trial import Trial
 
 
@@ -58,8 +58,9 @@ class Choice(NamedTuple):
         refused: rungs that are too far off alone.
         returned: rungs that were within the tolerance alone, but not together with the others.
         errors: of the choice against the full program, on all sample paths.
-        cost: of the full program and of the choice: s, or operations for the path, see `price`.
-        price: what was made least.
+        cost: of the full program and of the choice: s, or operations for the path.
+        by: what was made least.
+        operations: share of the full program's.
     """
 
     scene: Scene
@@ -73,7 +74,8 @@ class Choice(NamedTuple):
     returned: tuple[Rung, ...]
     errors: Errors
     cost: tuple[float, float]
-    price: Price = OPERATIONS
+    by: By
+    operations: float
 
     @property
     def sentence(self) -> str:
@@ -82,13 +84,13 @@ class Choice(NamedTuple):
             return f"no program but the full one is within {percent(self.tolerance)}; it is taken"
         return (
             f"within {percent(self.tolerance)}: {changes(self.errors)} off the full program, "
-            f"{self.price.words(self.cost)}"
+            f"{words(self.by, self.cost)}"
         )
 
 
 def choose(
     full: Full | Trial, tolerance: float, report: Callable[[str], None] = lambda text: None,
-    *, precision: Literal["auto", "float64"] = "auto", price: Price = OPERATIONS,
+    *, precision: Literal["auto", "float64"] = "auto", by: By = "operations",
 ) -> Choice:  # fmt: skip
     """Choose the cheapest levels within the tolerance.
 
@@ -97,21 +99,21 @@ def choose(
         tolerance: largest error of force, joints and surface, relative to the largest value.
         report: called with what is tried next; may raise to stop.
         precision: `auto`: float32 where that is within the tolerance.
-        price: what is made least; operations unless told otherwise.
+        by: what is made least; operations unless told otherwise.
 
     Raises:
         PlanError: the path, or a sample path beside it, has no row with a force.
-        Uncalibrated: the price is a time, and a program has loops without a fixed number of
-            rounds, or what its compiler made of it cannot be read.
+        ValueError: another word for `precision` or `by`.
     """
     check_word("precision", precision, Literal["auto", "float64"])
-    trial = full if isinstance(full, Trial) else Trial(full, report, price)
-    trial.price, full = price, trial.full
+    check_word("by", by, By)
+    trial = full if isinstance(full, Trial) else Trial(full, report)
+    full = trial.full
     every = _ladders(full, precision)
     refused: list[Rung] = []
     options: dict[str, list[Rung]] = {}
     for ladder in every:
-        within = _within(trial, ladder, tolerance, refused)
+        within = _within(trial, by, ladder, tolerance, refused)
         if within is not None:
             options[ladder.name] = [within]
     named = {ladder.name: ladder for ladder in every}
@@ -125,7 +127,7 @@ def choose(
             break
         back = max(picked, key=lambda r: r.errors.worst / r.saved)
         returned.append(back)
-        finer = _within(trial, named[back.ladder], tolerance, refused, back)
+        finer = _within(trial, by, named[back.ladder], tolerance, refused, back)
         if finer is None:
             del options[back.ladder]
         else:
@@ -134,12 +136,12 @@ def choose(
     scene = _explained(scene, picked, refused, returned)
     plan = dataclasses.replace(scene.plan, served=_served(trial.reference))
     scene = dataclasses.replace(scene, plan=plan)
-    cost = trial.cost(full.levels), trial.cost(levels)
     return Choice(
         scene=scene, material=material, path=path, levels=levels, changed=changed,
         tolerance=tolerance,
         dropped=tuple(picked), refused=tuple(refused), returned=tuple(returned), errors=errors,
-        cost=cost, price=price,
+        cost=trial.cost(by, levels), by=by,
+        operations=1 - trial.saved("operations", levels),
     )  # fmt: skip
 
 
@@ -169,32 +171,42 @@ def _ladders(full: Full, precision: str) -> list[Ladder]:
 
 
 def _within(
-    trial: Trial, ladder: Ladder, tolerance: float, refused: list[Rung], above: Rung | None = None
-) -> Rung | None:
-    """The cheapest rung within the tolerance alone, of equal ones that which errs least.
+    trial: Trial, by: By, ladder: Ladder, tolerance: float, refused: list[Rung],
+    above: Rung | None = None,
+) -> Rung | None:  # fmt: skip
+    """The rung of the fewest operations within the tolerance alone; of equal ones the best.
 
-    Dearer than `above` if given.
+    With more operations than `above` if given. None: there is none, or it saves no time to speak
+    of.
     """
     names = list(ladder.rungs)[:-1]
     trial.report(ladder.name)
-    saved = {name: trial.saved(ladder.levels(trial.full, name)) for name in names}
-    for worth in sorted(set(saved.values()), reverse=True):
-        if worth <= 0 or (above is not None and worth >= above.saved):
+    levels = {name: ladder.levels(trial.full, name) for name in names}
+    fewer = {name: trial.saved("operations", levels[name]) for name in names}
+    for worth in sorted(set(fewer.values()), reverse=True):
+        if worth <= 0 or (above is not None and worth >= fewer[above.level]):
             continue
         rungs = []
-        for name in (name for name in names if saved[name] == worth):
+        for name in (name for name in names if fewer[name] == worth):
             trial.report(f"{ladder.name} {name}")
-            errors = trial.errors(ladder.levels(trial.full, name))
             rung = Rung(
-                ladder=ladder.name, effect=ladder.effect, level=name, errors=errors, saved=worth
-            )
+                ladder=ladder.name, effect=ladder.effect, level=name,
+                errors=trial.errors(levels[name]), saved=worth,
+            )  # fmt: skip
             rungs.append(rung)
         best = min(rungs, key=lambda rung: rung.errors.worst)
         if best.errors.worst <= tolerance:
-            return best
+            return best if by == "operations" else _timed(trial, by, best, levels[best.level])
         if above is None:
             refused += rungs
     return None
+
+
+def _timed(trial: Trial, by: By, rung: Rung, levels: Levels) -> Rung | None:
+    """The rung with the share of time that it saves; None where that is lost in noise."""
+    trial.report(f"{rung.ladder} {rung.level}: time")
+    saved = trial.saved(by, levels)
+    return rung._replace(saved=saved) if saved >= GRAIN else None
 
 
 def _combined(named: dict[str, Ladder], picked: list[Rung]) -> dict[str, Any]:

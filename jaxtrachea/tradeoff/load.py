@@ -1,12 +1,23 @@
-"""How busy others keep the machine while something is timed."""
+"""What machine something is timed on, and how busy others keep it meanwhile."""
 
 import os
+import platform
 import time
 from pathlib import Path
 
 #: Cores kept busy by others from which on a run says so.
 QUIET = 0.3
 STAT = Path("/proc/stat")
+
+
+def processor() -> str:
+    """Name of the processor where Linux tells it."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            names = [line.split(":", 1)[1].strip() for line in file if "model name" in line]
+    except OSError:
+        names = []
+    return names[0] if names else platform.processor()
 
 
 class Load:
@@ -25,6 +36,15 @@ class Load:
             return None
         wall, busy, own = (b - a for a, b in zip(self._begin, now, strict=True))
         return round(max(busy - own, 0.0) / max(wall, 1e-9), 2)
+
+    def notes(self) -> tuple[str, ...]:
+        """That others were busy, in words; empty where the machine was quiet or is not known."""
+        others = self.others()
+        if others is None or others <= QUIET:
+            return ()
+        return (
+            f"others kept {others:.2g} cores busy while times were measured: they are in doubt",
+        )
 
 
 def _now() -> tuple[float, float, float] | None:

@@ -16,9 +16,8 @@ from jaxtrachea.tradeoff.choice import Choice
 from jaxtrachea.tradeoff.errors import Errors, compare, relative, spread
 from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
-from jaxtrachea.tradeoff.load import Load
+from jaxtrachea.tradeoff.load import Load, processor
 from jaxtrachea.tradeoff.parts import inputs, part_of
-from jaxtrachea.tradeoff.time_model import processor
 from jaxtrachea.tradeoff.timing import Compiled, Settings, compiled, timed, with_part
 
 __all__ = ["Settings", "choice_row", "environment", "measure"]
@@ -156,14 +155,14 @@ def choice_row(
             {"ladder": r.ladder, "level": r.level, "error": _number(r.errors.worst)} for r in rungs
         ]
 
-    measured = "call" if choice.price.by == "step" else "path"
+    measured = "call" if choice.by == "step" else "path"
     return {
-        "scene": name, "tolerance": choice.tolerance, "by": choice.price.by,
+        "scene": name, "tolerance": choice.tolerance, "by": choice.by,
         "dropped": said(choice.dropped), "refused": said(choice.refused),
         "returned": said(choice.returned),
         "errors": {k: _number(v) for k, v in choice.errors._asdict().items()},
         "cost": round(choice.cost[1] / choice.cost[0], 4),
-        "predicted": [_number(v) for v in choice.cost] if choice.price.timed else None,
+        "operations": round(choice.operations, 4),
         "times": {
             which: times[v][measured]["median"]
             for which, v in (("chosen", choice.levels), ("full", full.levels))

@@ -108,7 +108,8 @@ WITHIN = (0.1, float("inf"))
 FRONT_HEAD = ["scene", "within 10 %: a call", "a lane", "all: a call", "a lane",
               "error of the quickest call"]  # fmt: skip
 CHOICE_HEAD = ["scene", "tolerance", "least", "dropped (changes alone)", "came back",
-               "verified error", "cost", "chosen / full [µs]", "ratio", "ratio / cost"]  # fmt: skip
+               "verified error", "time", "operations", "chosen / full [µs]", "ratio",
+               "ratio / operations"]  # fmt: skip
 
 
 def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
@@ -126,8 +127,9 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
             row["scene"], f"{100 * row['tolerance']:g} %", row.get("by", "operations"),
             dropped or "nothing", returned or "-",
             f"{100 * worst:.2g} %", f"{100 * row['cost']:.0f} %",
+            f"{100 * row['operations']:.0f} %",
             f"{_micro(call['chosen'])} / {_micro(call['full'])}", f"{ratio:.2f}",
-            f"{ratio / row['cost']:.2f}",
+            f"{ratio / row['operations']:.2f}",
         ])  # fmt: skip
     return found
 

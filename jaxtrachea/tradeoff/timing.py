@@ -1,6 +1,5 @@
 """Compiled programs of one pose, of batches and of a part, and what a call of each takes."""
 
-import functools
 import time
 from collections.abc import Callable, Hashable, Mapping
 from typing import NamedTuple
@@ -11,6 +10,7 @@ import numpy as np
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.simulation import simulate
+from jaxtrachea.tradeoff.calls import one_pose, whole_path
 from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
 from jaxtrachea.tradeoff.parts import Inputs, Part, part
 
@@ -38,8 +38,8 @@ class Settings(NamedTuple):
 class Compiled(NamedTuple):
     """Programs ready to be called, by what is timed, and the seconds that `call` took to compile.
 
-    `call`: one pose; `gradient`: force and its derivatives; `lane`: a batch; `path`: the whole path
-    in one call; `part` and `part_lane`: the part that a ladder changes.
+    `call`: one pose, see `calls.one_pose`; `gradient`: force and its derivatives; `lane`: a batch;
+    `path`: the whole path in one call; `part` and `part_lane`: the part that a ladder changes.
     """
 
     calls: dict[str, Callable]
@@ -47,7 +47,7 @@ class Compiled(NamedTuple):
 
 
 def compiled(full: Full, levels: Levels, settings: Settings, *, path: bool = False) -> Compiled:
-    """The program of one pose: material and path in, everything out; and those beside it.
+    """The program of one pose, and those beside it.
 
     Args:
         full: the scene at its finest.
@@ -58,7 +58,7 @@ def compiled(full: Full, levels: Levels, settings: Settings, *, path: bool = Fal
     scene, material, whole = program(full, levels)
     row = jax.tree.map(lambda v: v[-1:], whole)
     start = time.perf_counter()
-    calls = {"call": _ready(lambda m, p: simulate(scene, m, p), (material, row))}
+    calls: dict[str, Callable] = {"call": one_pose((scene, material, row))}
     seconds = time.perf_counter() - start
 
     def derivatives(m, p):
@@ -70,7 +70,7 @@ def compiled(full: Full, levels: Levels, settings: Settings, *, path: bool = Fal
     if settings.lanes:
         calls["lane"] = _batch(lambda m, p: simulate(scene, m, p), (material, row), settings.lanes)
     if path:
-        calls["path"] = _ready(lambda m, p: simulate(scene, m, p), (material, whole))
+        calls["path"] = whole_path((scene, material, whole))
     return Compiled(calls, seconds)
 
 
@@ -94,7 +94,7 @@ def with_part(
 
 def _ready(function: Callable, arguments: tuple) -> Callable:
     made = jax.jit(function).lower(*arguments).compile()
-    return functools.partial(made, *arguments)
+    return lambda: jax.block_until_ready(made(*arguments))
 
 
 def _batch(function: Callable, arguments: tuple, lanes: int) -> Callable:
@@ -127,10 +127,10 @@ def timed(programs: Mapping[Hashable, Compiled], settings: Settings) -> dict[Has
 
 def sampled(call: Callable, calls: int) -> list[float]:
     """Seconds of single calls, each waited for; one before them is not counted."""
-    jax.block_until_ready(call())
+    call()
     taken = []
     for _ in range(calls):
         start = time.perf_counter()
-        jax.block_until_ready(call())
+        call()
         taken.append(time.perf_counter() - start)
     return taken

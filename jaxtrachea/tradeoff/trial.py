@@ -12,9 +12,10 @@ from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.simulation import Simulation, simulate
 from jaxtrachea.scene.stage import Poses, Presses
+from jaxtrachea.tradeoff.calls import Call, quickest
 from jaxtrachea.tradeoff.errors import Errors, compare
 from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
-from jaxtrachea.tradeoff.price import OPERATIONS, By, Price, started
+from jaxtrachea.tradeoff.price import By, compiled, operations
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
 BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
@@ -25,25 +26,21 @@ class Trial:
 
     Raises:
         PlanError: the path, or a sample path beside it, has no row with a force.
-        Uncalibrated: `price` is a time, and the kernels of the full program are not known.
     """
 
-    def __init__(
-        self, full: Full, report: Callable[[str], None] = lambda text: None,
-        price: Price = OPERATIONS,
-    ):  # fmt: skip
+    def __init__(self, full: Full, report: Callable[[str], None] = lambda text: None):
         """Run the full program.
 
         Args:
             full: the scene at its finest.
             report: called with what is tried next; may raise to stop.
-            price: kernels are counted as programs are compiled where this asks for them.
         """
-        self.full, self.report, self.price = full, report, price
+        self.full, self.report = full, report
         self.paths = samples(full)
         self.known: dict[Levels, Errors] = {}
-        self.costs: dict[tuple[Price, Levels], float] = {}
-        self.kernels: dict[tuple[By, Levels], int] = {}
+        self.counts: dict[Levels, float] = {}
+        self.times: dict[tuple[By, Levels], tuple[float, float]] = {}
+        self.calls: dict[By, Call] = {}
         report("full program")
         self.reference = self._run(full.levels)
         pressed = [bool(np.nan_to_num(v).any()) for v in np.asarray(self.reference.force)]
@@ -63,30 +60,31 @@ class Trial:
             self.known[levels] = compare(found, self.reference, (self.full.scene, self.full.scene))
         return self.known[levels]
 
-    def cost(self, levels: Levels) -> float:
-        """What these levels cost.
+    def operations(self, levels: Levels) -> float:
+        """Of the whole path, those in float32 counted half."""
+        if levels not in self.counts:
+            self.counts[levels] = operations(program(self.full, levels))
+        return self.counts[levels]
 
-        Raises:
-            Uncalibrated: it is a time, and the kernels of the program are not known.
-        """
-        key = self.price, levels
-        if key not in self.costs:
-            kernels = self._kernels(levels) if self.price.timed else 0
-            self.costs[key] = self.price.of(program(self.full, levels), kernels)
-        return self.costs[key]
+    def cost(self, by: By, levels: Levels) -> tuple[float, float]:
+        """Of the full program and of these levels: s, measured in turns, or operations."""
+        full = self.full.levels
+        if by == "operations":
+            return self.operations(full), self.operations(levels)
+        if by not in self.calls:
+            self.calls[by] = compiled(by, program(self.full, full))
+        if (by, levels) not in self.times:
+            calls = [self.calls[by]]
+            if levels != full:
+                calls.append(compiled(by, program(self.full, levels)))
+            taken = quickest(calls)
+            self.times[by, levels] = taken[0], taken[-1]
+        return self.times[by, levels]
 
-    def _kernels(self, levels: Levels) -> int:
-        """Of a call: of the path, as it is compiled for its errors, or of a pose alone."""
-        key = self.price.by, levels
-        if key not in self.kernels and self.price.by == "path":
-            self.errors(levels)
-        if key not in self.kernels:  # a pose, or compiled when no time was asked for
-            self.kernels[key] = started(_compiled(*self.price.call(program(self.full, levels))))
-        return self.kernels[key]
-
-    def saved(self, levels: Levels) -> float:
+    def saved(self, by: By, levels: Levels) -> float:
         """Share of the full program's cost that they save."""
-        return self.price.saved(self.cost(levels), self.cost(self.full.levels))
+        full, own = self.cost(by, levels)
+        return 1 - own / full
 
     def _run(self, levels: Levels) -> Simulation:
         """The sample paths, one after the other, with a leading axis."""
@@ -94,8 +92,6 @@ class Trial:
         paths = cast(self.paths, levels.dtype)
         each = [jax.tree.map(lambda v, i=i: v[i], paths) for i in range(len(BESIDE))]
         made = _compiled(scene, material, each[0])
-        if self.price.timed and self.price.by == "path":
-            self.kernels["path", levels] = started(made)
         outs = [made(scene, material, path) for path in each]
         return jax.tree.map(lambda *v: np.stack(v), *outs)
 

@@ -60,25 +60,16 @@ def say(text: str) -> None:
     print(f"{time.perf_counter() - START:6.0f} s  {text}", flush=True)
 
 
-def cheapest(name: str, full, model) -> list:
-    """The choices by time; by operations where no time is predicted."""
+def cheapest(name: str, full) -> list:
+    """The choices, by the time of the path and of a pose a call."""
     from jaxtrachea.tradeoff.choice import choose
-    from jaxtrachea.tradeoff.price import OPERATIONS, price
-    from jaxtrachea.tradeoff.time_model import Uncalibrated
     from jaxtrachea.tradeoff.trial import Trial
 
-    def all_of(prices):
-        trial = Trial(full, lambda text: say(f"{name}: choice: {text}"), prices[0])
-        return [choose(trial, v, price=one) for one in prices for v in TOLERANCES]
-
-    try:
-        return all_of([price(by, model) for by in LEAST])
-    except Uncalibrated as error:
-        say(f"{name}: no time is predicted: {error}")
-        return all_of([OPERATIONS])
+    trial = Trial(full, lambda text: say(f"{name}: choice: {text}"))
+    return [choose(trial, v, by=by) for by in LEAST for v in TOLERANCES]
 
 
-def choices(name: str, full, model, settings) -> tuple[list[dict], list]:
+def choices(name: str, full, settings) -> tuple[list[dict], list]:
     """Rows of the table of choices of one scene, and the choices."""
     import jax
 
@@ -87,7 +78,7 @@ def choices(name: str, full, model, settings) -> tuple[list[dict], list]:
     from jaxtrachea.tradeoff.timing import compiled, timed
 
     settings = settings._replace(lanes=0, slopes=False)
-    found = cheapest(name, full, model)
+    found = cheapest(name, full)
     say(f"{name}: choice: timing")
     levels = {full.levels, *(choice.levels for choice in found)}
     programs = {v: compiled(full, v, settings, path=True) for v in levels}
@@ -111,19 +102,19 @@ def together(full, found):
     rungs, seen = {"all at the coarsest": coarsest}, [full.levels.changed(**coarsest)]
     for choice in found:
         if choice.levels not in (*seen, full.levels):
-            rungs[f"{100 * choice.tolerance:g} %, {choice.price.by}"] = choice.changed
+            rungs[f"{100 * choice.tolerance:g} %, {choice.by}"] = choice.changed
             seen.append(choice.levels)
     return Ladder("together", "together", rungs | {"full": {}}, {})
 
 
-def scene(name: str, model, settings) -> list[dict]:
+def scene(name: str, settings) -> list[dict]:
     """Measure one scene; writes its JSON lines and its picture; rows of its choices."""
     from jaxtrachea.cli.tradeoff import measured_curves
     from jaxtrachea.tradeoff.measure import measure
     from jaxtrachea.tradeoff.page import lines
 
     full = full_of(name, "series")
-    rows, found = choices(name, full, model, settings)
+    rows, found = choices(name, full, settings)
     curves, radius, _ = measured_curves(ROOT / DATA[name] if name in DATA else None)
     measured = measure(
         name, full, settings, lambda text: say(f"{name}: {text}"), curves, radius,
@@ -149,7 +140,6 @@ def measure_all(asked) -> None:
     """Everything asked for, a scene at a time."""
     import levels
 
-    from jaxtrachea.tradeoff.calibrate import calibrate
     from jaxtrachea.tradeoff.page import lines, read
     from jaxtrachea.tradeoff.timing import Settings
 
@@ -157,14 +147,12 @@ def measure_all(asked) -> None:
     if not asked.no_levels:
         say("levels of the skeleton")
         (FOLDER / "levels.jsonl").write_text(lines(levels.rows(quick=asked.quick)), "utf-8")
-    model = calibrate(say)
-    say(model.sentence)
     file = FOLDER / "choice.jsonl"
     rows = [row for row in read(file) if row["scene"] in SCENES] if file.exists() else []
     for name in filter(None, asked.scenes.split(",")):
         rungs = 2 if asked.quick else SCENES[name][1]
         settings = Settings(20 if asked.quick else asked.calls, 256, rungs, slopes=False)
-        rows = [row for row in rows if row["scene"] != name] + scene(name, model, settings)
+        rows = [row for row in rows if row["scene"] != name] + scene(name, settings)
         rows.sort(key=lambda row: list(SCENES).index(row["scene"]))
         file.write_text(lines(rows), "utf-8")
 

@@ -1,0 +1,96 @@
+"""A scene's program as it is called: the whole path at once, or pose by pose; what that takes."""
+
+import time
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+
+from jaxtrachea._packed import Packing
+from jaxtrachea.scene.approach import approach
+from jaxtrachea.scene.declare import AnyMaterial
+from jaxtrachea.scene.one_row import OneRow
+from jaxtrachea.scene.session import Session, check_scene
+from jaxtrachea.scene.simulation import pressed, simulate
+from jaxtrachea.scene.stage import Poses, Presses, Scene
+
+#: Turns in which calls are made one after the other, seconds of each in a turn, and of all turns
+#: together after which there is no further one.
+TURNS, BURST, ENOUGH = 12, 0.01, 2.0
+
+Arguments = tuple[Scene, AnyMaterial, Poses | Presses]
+Call = Callable[[], object]
+
+
+def whole_path(arguments: Arguments) -> Call:
+    """The whole path in one call, as `jaxtrachea simulate` makes it; compiles it.
+
+    Args:
+        arguments: scene, material and path.
+
+    Returns:
+        A call that ends when all results are there.
+    """
+    made = jax.jit(simulate).lower(*arguments).compile()
+    return lambda: jax.block_until_ready(made(*arguments))
+
+
+def one_pose(arguments: Arguments) -> Call:
+    """The last pose of the path, once more at each call; compiles the program.
+
+    A step of a `Session` where one takes the scene. Else `simulate` of that row in the same form:
+    numbers go in and out as one array each.
+
+    Args:
+        arguments: scene, material and path.
+
+    Returns:
+        As `whole_path`.
+    """
+    scene, material, path = arguments
+    row = jax.tree.map(lambda v: v[-1:], path)
+    try:
+        check_scene(scene, material)
+    except ValueError:
+        return _alone(scene, material, row)
+    session = Session(scene, material)
+    pose = np.asarray(row.rotation[0]), np.asarray(row.translation[0])
+    return lambda: session.step(*pose)
+
+
+def _alone(scene: Scene, material: AnyMaterial, row: Poses | Presses) -> Call:
+    given = Packing((material, row))
+
+    def now(_, numbers):
+        return scene, given.unpack(numbers)[0]
+
+    def step(state, numbers):
+        material, path = given.unpack(numbers)
+        made = approach(scene, path) if isinstance(path, Poses) else None
+        result, ground = pressed(scene, material, path, made)
+        return state, jax.tree.map(lambda v: v[0], result), (path, ground)
+
+    numbers = jax.device_put(given.fill((material, row)))
+    program = OneRow(scene, now, step, np.zeros(1, given.dtype), numbers)
+    state = [jax.numpy.zeros(1, given.dtype)]
+
+    def call():
+        state[0], result = program(state[0], numbers)
+        return result
+
+    return call
+
+
+def quickest(calls: Sequence[Call]) -> list[float]:
+    """Least seconds of each call, in turns, so that all see the same machine."""
+    best, begin = [np.inf] * len(calls), time.perf_counter()
+    for turn in range(TURNS):
+        if turn > 2 and time.perf_counter() - begin > ENOUGH:
+            break
+        for i, call in enumerate(calls):
+            call()
+            end = time.perf_counter() + BURST
+            while (start := time.perf_counter()) < end:
+                call()
+                best[i] = min(best[i], time.perf_counter() - start)
+    return best
