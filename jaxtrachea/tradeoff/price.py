@@ -4,6 +4,7 @@ from typing import Literal
 
 import jax
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.tradeoff.calls import Arguments, Call, one_pose, whole_path
@@ -11,6 +12,8 @@ from jaxtrachea.tradeoff.calls import Arguments, Call, one_pose, whole_path
 #: What is made least: time of the whole path in one call (`simulate`), of a pose a call
 #: (`Session`), or operations, those in float32 counted half: the same on every machine.
 By = Literal["path", "step", "operations"]
+#: Those that are a time.
+Time = Literal["path", "step"]
 #: What an operation in float32 counts where operations are the cost.
 HALF = 0.5
 #: Share of the time below which what a level saves is not told from noise.
@@ -25,17 +28,23 @@ def operations(arguments: Arguments) -> float:
     return float(count_operations(simulate, *arguments)) * (HALF if half else 1)
 
 
-def compiled(by: By, arguments: Arguments) -> Call:
+def compiled(by: Time, arguments: Arguments) -> Call:
     """The call whose time is the cost; compiles it.
 
     Raises:
-        KeyError: operations, which are no time.
+        ValueError: another word.
     """
+    check_word("by", by, Time)
     return {"path": whole_path, "step": one_pose}[by](arguments)
 
 
 def words(by: By, cost: tuple[float, float]) -> str:
-    """Cost of the full program and of another, in words."""
+    """Cost of the full program and of another, in words.
+
+    Raises:
+        ValueError: another word.
+    """
+    check_word("by", by, By)
     share = f"{100 * cost[1] / cost[0]:.0f} %"
     if by == "operations":
         return f"{share} of its cost"
