@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxtrachea._numerics import (
+from jaxtrachea.mechanics.roots import (
     cubic_ratio,
     first_positive_root,
     quintic_past_fold,

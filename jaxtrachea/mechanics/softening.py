@@ -19,14 +19,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxtrachea._numerics import (
+from jaxtrachea._numerics import epsilon
+from jaxtrachea.mechanics.force_law import Law, fold_depth
+from jaxtrachea.mechanics.roots import (
     Rising,
-    epsilon,
     first_positive_root,
     newton_tolerance,
     rising_root,
 )
-from jaxtrachea.mechanics.force_law import Law, fold_depth
 
 
 class Softening(NamedTuple):

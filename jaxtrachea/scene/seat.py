@@ -207,7 +207,7 @@ def _stiffness(scene: Scene, depth, place: Place | None) -> Float[Array, "3"] | 
 def as_approach(
     scene: Scene, seat: Seat, way: Float[Array, "3"], here: Instant, inside: Bool[Array, "1"]
 ) -> tuple[Poses, Approach]:
-    """One row for `simulation.follow`: the tool as it stands on its seat, and what it does."""
+    """One row for `simulation.pressed`: the tool as it stands on its seat, and what it does."""
     frame, axes = local_frame(seat.phi), _axes(scene, seat.s)
     now = jax.tree.map(lambda v: v[0], here.seen)
     seen = dataclasses.replace(

@@ -108,21 +108,8 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
     if plan.contact != isinstance(path, Poses):
         kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
         raise ValueError(f"path is {type(path).__name__}; expected {kinds[not plan.contact]}")
-    return follow(scene, material, path, approach(scene, path) if isinstance(path, Poses) else None)
-
-
-def follow(
-    scene: Scene,
-    material: AnyMaterial,
-    path: Poses | Presses,
-    made: Approach | None,
-    place: Place | None = None,
-) -> Simulation:
-    """What follows from the presses of `path`, or of the tool's way `made` of it.
-
-    `place`: where all rows press, if it is known already (a step of a session).
-    """
-    result, ground = pressed(scene, material, path, made, place)
+    made = approach(scene, path) if isinstance(path, Poses) else None
+    result, ground = pressed(scene, material, path, made)
     return result._replace(vertices=surface(scene, material, path, ground))
 
 
@@ -150,7 +137,15 @@ def pressed(
     made: Approach | None,
     place: Place | None = None,
 ) -> tuple[Simulation, Ground]:
-    """All of `follow` but the surface, and what that follows from."""
+    """All of `simulate` but the surface, and what that follows from.
+
+    Args:
+        scene: -
+        material: -
+        path: as for `simulate`.
+        made: the tool's way; None: the path is of presses.
+        place: where all rows press, if it is known already (a step of a session).
+    """
     plan = scene.plan
     material, bad = without_negative_values(scene, material)
     given = path if isinstance(path, Presses) else None
