@@ -149,7 +149,7 @@ from jaxtrachea.tradeoff.levels import BUILT_IN, full_scene
 
 spec = SceneSpec.model_validate(BUILT_IN)
 full = full_scene(spec, stage(spec, Path()), coupling="series")
-print(json.dumps(Session(full.scene, full.material)._run.as_text()))
+print(json.dumps(Session(full.scene, full.material)._program._run.as_text()))
 """
 
 

@@ -359,11 +359,12 @@ def test_of_rungs_that_cost_the_same_the_best_is_taken():
     trial = object.__new__(Trial)
     trial.full, trial.report, trial.saved = full, lambda text: None, lambda by, levels: 0.25
     trial.errors = lambda levels: Errors(errors[levels.kept], None, None, None, None, None)
-    refused = []
-    assert choosing._within(trial, "operations", ladder, 0.1, refused).level == "best"
-    assert not refused
-    assert choosing._within(trial, "operations", ladder, 1e-4, refused) is None
-    assert {rung.level for rung in refused} == set(rungs)
+    found = choosing._Found([], [], [])
+    assert choosing._within(trial, "operations", ladder, 0.1, found).level == "best"
+    assert not found.refused
+    assert choosing._within(trial, "operations", ladder, 1e-4, found) is None
+    assert {rung.level for rung in found.refused} == set(rungs)
+    assert not found.idle
 
 
 def test_a_choice_can_be_shown():

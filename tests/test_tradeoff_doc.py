@@ -44,11 +44,10 @@ def test_measurements_are_complete(path):
         assert len(rungs) > 1
 
 
-def test_every_scene_but_deep_has_its_ladders_and_choices():
-    """`deep` is not measured yet, as the page says."""
+def test_every_scene_has_its_ladders_and_choices():
     module = bench()
     names = {path.stem for path in SCENES}
-    assert set(module.SCENES) - {"deep"} <= names <= set(module.SCENES)
+    assert names == set(module.SCENES)
     chosen = [(row["scene"], row["tolerance"]) for row in read(FOLDER / "choice.jsonl")]
     for name in names:
         assert {v for scene, v in chosen if scene == name} >= {0.1, 0.01, 0.001}

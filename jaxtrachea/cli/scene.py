@@ -165,13 +165,13 @@ def _chosen(path: Path, spec, staged):
     from jaxtrachea.scene.declare import PlanError
     from jaxtrachea.tradeoff.choice import choose
     from jaxtrachea.tradeoff.levels import full_scene
-    from jaxtrachea.tradeoff.load import Load
+    from jaxtrachea.tradeoff.load import doubt
 
     try:
         full = full_scene(spec, staged)
     except PlanError as error:
         raise Stop(f"{path}: effects.{error}") from None
-    wish, load = spec.plan, Load()
+    wish = spec.plan
     with interrupts() as stop_if_asked, progress_bar() as bar:
         task = bar.add_task("choosing", total=None)
 
@@ -184,30 +184,28 @@ def _chosen(path: Path, spec, staged):
         except PlanError as error:
             raise Stop(f"{path}: {error}") from None
     chosen = {name: getattr(choice, name) for name in ("scene", "material", "path")}
-    notes = () if wish.cost == "operations" else load.notes()
-    return staged._replace(**chosen, notes=(*staged.notes, *notes)), choice
+    return staged._replace(**chosen, notes=(*staged.notes, *doubt(choice.others))), choice
 
 
 def _timed(staged) -> str:
     """Time of the whole path in one call and of a pose a call, measured."""
     from jaxtrachea.tradeoff.calls import one_pose, quickest, whole_path
-    from jaxtrachea.tradeoff.load import Load
+    from jaxtrachea.tradeoff.load import Load, doubt
     from jaxtrachea.tradeoff.price import WORDS
 
-    arguments, load = (staged.scene, staged.material, staged.path), Load()
+    arguments = staged.scene, staged.material, staged.path
     with interrupts() as stop_if_asked, progress_bar(transient=True) as bar:
-        task, calls = bar.add_task("time", total=None), []
-        for name, compiled in (("path", whole_path), ("pose", one_pose)):
+        task, calls = bar.add_task("time", total=None), {}
+        for by, compiled in (("path", whole_path), ("step", one_pose)):
             stop_if_asked()
-            bar.update(task, description=f"compiling: the {name}", advance=1)
-            calls.append(compiled(arguments))
+            bar.update(task, description=f"compiling: {WORDS[by]}", advance=1)
+            calls[WORDS[by]] = compiled(arguments)
         stop_if_asked()
         bar.update(task, description="timing", advance=1)
-        seconds = quickest(calls)
-    each = ", ".join(
-        f"{1e3 * v:.2g} ms for {what}" for v, what in zip(seconds, WORDS.values(), strict=True)
-    )
-    return "\n".join((f"time measured on this machine: {each}", *load.notes()))
+        load = Load()
+        seconds = dict(zip(calls, quickest(list(calls.values())), strict=True))
+    each = ", ".join(f"{1e3 * v:.2g} ms for {what}" for what, v in seconds.items())
+    return "\n".join((f"time measured on this machine: {each}", *doubt(load.others())))
 
 
 def _for_sweep(path: Path, spec, staged):

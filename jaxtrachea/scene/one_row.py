@@ -23,60 +23,64 @@ LARGE = ("joints", "loads", "end_U", "end_V", "vertices")
 
 
 class OneRow:
-    """A compiled program, and the memory that it writes into."""
+    """A compiled program, and the memory that it writes into.
+
+    Attributes:
+        state: that the next call begins with.
+    """
 
     def __init__(
-        self, scene: Scene, now: Callable[..., tuple], step: Callable[..., tuple], *given: Any
+        self, scene: Scene, now: Callable, step: Callable, state: Array | np.ndarray, *given: Any
     ):
         """Compile.
 
         Args:
             scene: whose plan says whether there is a surface.
             now: from what is given to scene and material.
-            step: from what is given to the next state (an array), the result without its axis of
-                rows and without vertices, and the path and `Ground` of `simulation.surface`.
-            given: arrays as they are given at each call; the first is the state.
+            step: from state and what is given to the next state (one array, as the first), the
+                result without its axis of rows and without vertices, and the path and `Pressed` of
+                `simulation.surface`.
+            state: to begin with.
+            given: arrays as they are given at each call.
         """
+        shown = scene.plan.surface is not None
 
         @jax.jit  # traced once, for the shapes of the result and for the program
-        def one(*given):
-            state, result, rest = step(*given)
-            return state, *_apart(result), rest
+        def one(state, *given):
+            state, result, pressed = step(state, *given)
+            return state, *_apart(result), pressed if shown else None
 
-        _, contact, large, _ = jax.eval_shape(one, *given)
+        _, contact, large, _ = jax.eval_shape(one, state, *given)
         self._contacts = contacts = Packing(contact)
-        if scene.plan.surface is not None:
+        if shown:
             assert scene.mesh is not None
             vertices = scene.mesh.straight
             large["vertices"] = jax.ShapeDtypeStruct(vertices.shape, vertices.dtype)
 
         def line(*given):
             # State and contact as two arrays: in one, much of what both need is computed twice.
-            state, contact, large, rest = one(*given)
-            return state, contacts.pack(contact), tuple(large.values()), rest
+            state, contact, large, pressed = one(*given)
+            return state, contacts.pack(contact), tuple(large.values()), pressed
 
-        def run(state, _, *more):
-            given = state, *more
-            state, contact, large, rest = one_kernel(line)(*given)
-            vertices = surface(*now(*given), *rest)
+        def run(state, _, *given):
+            state, contact, large, pressed = one_kernel(line)(state, *given)
+            vertices = surface(*now(*given), *pressed) if shown else None
             return state, contact, large if vertices is None else (*large, vertices[0])
 
         self._large = tuple(jnp.array(np.zeros(v.shape, v.dtype)) for v in large.values())
         # Donated: the new state and the large arrays are written where the old ones were.
-        made = jax.jit(run, donate_argnums=(0, 1), keep_unused=True)
-        self._run = made.lower(given[0], self._large, *given[1:]).compile()
+        program = jax.jit(run, donate_argnums=(0, 1), keep_unused=True)
+        self._run = program.lower(state, self._large, *given).compile()
+        self.state = jnp.array(state)
         names = [n for n in Simulation._fields if getattr(contact, n) is not None]
-        where = {name: at for at, name in enumerate([*names, *large])}
+        where = {name: i for i, name in enumerate([*names, *large])}
         self._in_order = itemgetter(*(where.get(n, len(where)) for n in Simulation._fields))
 
-    def __call__(self, state: Array, *given: Any) -> tuple[Array, Simulation]:
-        """The next state and the finished result: numpy arrays, and `LARGE` on the device.
-
-        The state and the large arrays of the call before are given up.
-        """
-        state, packed, self._large = self._run(state, self._large, *given)
+    def __call__(self, *given: Any) -> Simulation:
+        """The finished result: numpy arrays, and `LARGE` on the device until the next call."""
+        self.state, packed, self._large = self._run(self.state, self._large, *given)
         contact = self._contacts.leaves(np.asarray(packed))  # waits for all of them
-        return state, Simulation._make(self._in_order((*contact, *self._large, None)))
+        return Simulation._make(self._in_order((*contact, *self._large, None)))
 
 
 def _apart(result: Simulation) -> tuple[Simulation, dict[str, Array]]:

@@ -173,17 +173,15 @@ class Session:
         self._start = np.asarray(_packed_start(scene, *pose))
         states = Packing(jax.eval_shape(_start, scene, *pose))
 
-        def now(*args):
-            at = given.unpack(args[-1])
-            return dataclasses.replace(scene, tool=at.tool, footprint=at.footprint), at.material
+        def now(rotation, translation, numbers):
+            new = given.unpack(numbers)
+            return dataclasses.replace(scene, tool=new.tool, footprint=new.footprint), new.material
 
-        def step(state, rotation, translation, numbers):
-            at = now(numbers)
-            state, *found = _step(*at, states.unpack(state), rotation, translation)
-            return states.pack(state), *found
+        def step(state, *args):
+            state, *result = _step(*now(*args), states.unpack(state), *args[:2])
+            return states.pack(state), *result
 
         self._program = OneRow(scene, now, step, self._start, *pose, self._numbers)
-        self._state = jnp.array(self._start)
 
     def step(self, rotation: ArrayLike, translation: ArrayLike) -> Simulation:
         """Move the tool.
@@ -207,8 +205,7 @@ class Session:
                 f"rotation {turn.shape}, translation {place.shape}; expected (3, 3) and (3,)"
             )
         # Two arrays: to make one of them takes longer than it saves.
-        given = turn, place, self._numbers
-        self._state, result = self._program(self._state, *given)
+        result = self._program(turn, place, self._numbers)
         self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin
         self._steps += 1
         return result
@@ -248,7 +245,7 @@ class Session:
                 not reach (or no tool has).
         """
         self._change(with_tool(self.scene, tool), self.material)
-        self._state = jnp.array(self._start)
+        self._program.state = jnp.array(self._start)
 
     def _change(self, scene: Scene, material: Material) -> None:
         assert scene.tool is not None
@@ -258,7 +255,7 @@ class Session:
 
     def reset(self) -> None:
         """Forget where the tool was, and all latencies."""
-        self._state, self._steps = jnp.array(self._start), 0
+        self._program.state, self._steps = jnp.array(self._start), 0
 
     def latency(self, edges: Float[np.ndarray, " borders"] = EDGES) -> Latency:
         """Of the steps kept.
@@ -301,12 +298,12 @@ def _step(scene: Scene, material: Material, state: State, rotation, translation)
         after, path, each, place = _held(scene, material, state, here, inside)
     else:
         after, each, place = state, each._replace(inside=inside), None
-    result, ground = pressed(scene, material, path, each, place)
+    result, done = pressed(scene, material, path, each, place)
     after = after._replace(side=side)
     result = jax.tree.map(lambda v: v[0], result)
     wrong = jnp.asarray(PressStatus.NON_FINITE, result.status.dtype)
     result = result._replace(status=jnp.where(at.known, result.status, wrong))
-    return _pick(at.known, after, state), result, (path, ground)
+    return _pick(at.known, after, state), result, (path, done)
 
 
 def _held(scene: Scene, material: Material, state: State, here: Instant, inside):

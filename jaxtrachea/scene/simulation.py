@@ -109,12 +109,12 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
         kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
         raise ValueError(f"path is {type(path).__name__}; expected {kinds[not plan.contact]}")
     made = approach(scene, path) if isinstance(path, Poses) else None
-    result, ground = pressed(scene, material, path, made)
-    return result._replace(vertices=surface(scene, material, path, ground))
+    result, done = pressed(scene, material, path, made)
+    return result._replace(vertices=surface(scene, material, path, done))
 
 
-class Ground(NamedTuple):
-    """What the surface follows from.
+class Pressed(NamedTuple):
+    """A path that was pressed: what the surface follows from.
 
     Attributes:
         presses: as computed.
@@ -136,7 +136,7 @@ def pressed(
     path: Poses | Presses,
     made: Approach | None,
     place: Place | None = None,
-) -> tuple[Simulation, Ground]:
+) -> tuple[Simulation, Pressed]:
     """All of `simulate` but the surface, and what that follows from.
 
     Args:
@@ -164,7 +164,7 @@ def pressed(
         lost = (solved == PressStatus.OK) & ~jnp.isfinite(jnp.sum(force + moment, axis=1))
         solved = jnp.where(lost, PressStatus.NON_FINITE, solved)
     way = None if made is None else made._replace(pull=None)
-    ground = Ground(used, moved, way, refused)
+    done = Pressed(used, moved, way, refused)
     moved, moment = hide(scene, refused, (moved._replace(force=force, status=None), moment))
     share = depth_share(scene, moved.depth, moved.skeleton, inward)
     asked, ends = plan.joints, plan.ring_ends
@@ -188,17 +188,17 @@ def pressed(
         depth_share=share,
         contact_share=None if made is None else contact_share(scene, made.own),
         status=status_of(solved, share, made, refused),
-    ), ground
+    ), done
 
 
 @full_precision
 def surface(
-    scene: Scene, material: AnyMaterial, path: Poses | Presses, ground: Ground
+    scene: Scene, material: AnyMaterial, path: Poses | Presses, done: Pressed
 ) -> Float[Array, "rows vertices 3"] | None:
     """Deformed vertices, NaN in the rows that were refused; None: the plan has no surface."""
     if scene.plan.surface is None:
         return None
-    presses, moved, made, refused = ground
+    presses, moved, made, refused = done
     material, _ = without_negative_values(scene, material)
     if isinstance(material, SectionMaterial):
         vertices = deform_sections(scene, presses, moved, path, made)

@@ -57,10 +57,12 @@ class Choice(NamedTuple):
         dropped: effects at a lower level than in the full program.
         refused: rungs that are too far off alone.
         returned: rungs that were within the tolerance alone, but not together with the others.
+        idle: rungs within the tolerance that save no time to speak of, alone or with the others.
         errors: of the choice against the full program, on all sample paths.
         cost: of the full program and of the choice: s, or operations for the path.
         by: what was made least.
-        operations: share of the full program's.
+        operations: share of the full program's; by `step` those of one pose.
+        others: most cores that others kept busy while times were measured.
     """
 
     scene: Scene
@@ -72,14 +74,19 @@ class Choice(NamedTuple):
     dropped: tuple[Rung, ...]
     refused: tuple[Rung, ...]
     returned: tuple[Rung, ...]
+    idle: tuple[Rung, ...]
     errors: Errors
     cost: tuple[float, float]
     by: By
     operations: float
+    others: float
 
     @property
     def sentence(self) -> str:
         """What was found, in a line."""
+        if not self.dropped and self.idle:
+            within = percent(self.tolerance)
+            return f"nothing that is within {within} saves time; the full program is taken"
         if not self.dropped:
             return f"no program but the full one is within {percent(self.tolerance)}; it is taken"
         return (
@@ -110,38 +117,47 @@ def choose(
     trial = full if isinstance(full, Trial) else Trial(full, report)
     full = trial.full
     every = _ladders(full, precision)
-    refused: list[Rung] = []
+    found = _Found([], [], [])
     options: dict[str, list[Rung]] = {}
     for ladder in every:
-        within = _within(trial, by, ladder, tolerance, refused)
+        within = _within(trial, by, ladder, tolerance, found)
         if within is not None:
             options[ladder.name] = [within]
     named = {ladder.name: ladder for ladder in every}
-    returned: list[Rung] = []
     while True:
         picked = [rungs[-1] for rungs in options.values()]
         changed = _combined(named, picked)
         levels = full.levels.changed(**changed)
         errors = trial.errors(levels)
-        if errors.worst <= tolerance or not picked:
+        if not picked:
             break
-        back = max(picked, key=lambda r: r.errors.worst / r.saved)
-        returned.append(back)
-        finer = _within(trial, by, named[back.ladder], tolerance, refused, back)
-        if finer is None:
-            del options[back.ladder]
+        if errors.worst > tolerance:
+            back = max(picked, key=lambda r: r.errors.worst / r.saved)
+            found.returned.append(back)
+            finer = _within(trial, by, named[back.ladder], tolerance, found, back)
+            if finer is None:
+                del options[back.ladder]
+            else:
+                options[back.ladder].append(finer)
+        elif by != "operations" and trial.saved(by, levels) < GRAIN:
+            # What saves time alone need not do so with the others.
+            least = min(picked, key=lambda r: r.saved)
+            found.idle.append(least)
+            del options[least.ladder]
         else:
-            options[back.ladder].append(finer)
+            break
     scene, material, path = program(full, levels)
-    scene = _explained(scene, picked, refused, returned)
+    scene = _explained(scene, picked, found)
     plan = dataclasses.replace(scene.plan, served=_served(trial.reference))
     scene = dataclasses.replace(scene, plan=plan)
     return Choice(
         scene=scene, material=material, path=path, levels=levels, changed=changed,
         tolerance=tolerance,
-        dropped=tuple(picked), refused=tuple(refused), returned=tuple(returned), errors=errors,
+        dropped=tuple(picked), refused=tuple(found.refused), returned=tuple(found.returned),
+        idle=tuple(found.idle), errors=errors,
         cost=trial.cost(by, levels), by=by,
-        operations=1 - trial.saved("operations", levels),
+        operations=trial.share(by, levels),
+        others=trial.others,
     )  # fmt: skip
 
 
@@ -170,14 +186,21 @@ def _ladders(full: Full, precision: str) -> list[Ladder]:
     return found + [v for v in every if v.name == "dtype" and precision == "auto"]
 
 
+class _Found(NamedTuple):
+    """Rungs that were tried and not taken; see `Choice`."""
+
+    refused: list[Rung]
+    returned: list[Rung]
+    idle: list[Rung]
+
+
 def _within(
-    trial: Trial, by: By, ladder: Ladder, tolerance: float, refused: list[Rung],
+    trial: Trial, by: By, ladder: Ladder, tolerance: float, found: _Found,
     above: Rung | None = None,
 ) -> Rung | None:  # fmt: skip
-    """The rung of the fewest operations within the tolerance alone; of equal ones the best.
+    """The rung of the fewest operations that is within the tolerance alone and saves time.
 
-    With more operations than `above` if given. None: there is none, or it saves no time to speak
-    of.
+    Of equal ones that which errs least; with more operations than `above` if given.
     """
     names = list(ladder.rungs)[:-1]
     trial.report(ladder.name)
@@ -196,17 +219,16 @@ def _within(
             rungs.append(rung)
         best = min(rungs, key=lambda rung: rung.errors.worst)
         if best.errors.worst <= tolerance:
-            return best if by == "operations" else _timed(trial, by, best, levels[best.level])
-        if above is None:
-            refused += rungs
+            if by == "operations":
+                return best
+            trial.report(f"{ladder.name} {best.level}: time")
+            saved = trial.saved(by, levels[best.level])
+            if saved >= GRAIN:
+                return best._replace(saved=saved)
+            found.idle.append(best)
+        elif above is None:
+            found.refused.extend(rungs)
     return None
-
-
-def _timed(trial: Trial, by: By, rung: Rung, levels: Levels) -> Rung | None:
-    """The rung with the share of time that it saves; None where that is lost in noise."""
-    trial.report(f"{rung.ladder} {rung.level}: time")
-    saved = trial.saved(by, levels)
-    return rung._replace(saved=saved) if saved >= GRAIN else None
 
 
 def _combined(named: dict[str, Ladder], picked: list[Rung]) -> dict[str, Any]:
@@ -233,15 +255,14 @@ def _served(reference: Simulation) -> Served:
     )
 
 
-def _explained(
-    scene: Scene, picked: list[Rung], refused: list[Rung], returned: list[Rung]
-) -> Scene:
+def _explained(scene: Scene, picked: list[Rung], found: _Found) -> Scene:
     """The scene with the decisions of its plan in words."""
     said: dict[str, list[str]] = {}
     for rungs, form in (
         (picked, "within the tolerance: changes {1}"),
-        (refused, "{0} would change {1}"),
-        (returned, "{0} would change {1}, too much together with the others"),
+        (found.refused, "{0} would change {1}"),
+        (found.returned, "{0} would change {1}, too much together with the others"),
+        (found.idle, "{0} would change {1} and save no time"),
     ):
         for rung in rungs:
             said.setdefault(rung.effect, []).append(form.format(rung.level, changes(rung.errors)))

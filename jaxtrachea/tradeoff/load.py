@@ -37,14 +37,12 @@ class Load:
         wall, busy, own = (b - a for a, b in zip(self._begin, now, strict=True))
         return round(max(busy - own, 0.0) / max(wall, 1e-9), 2)
 
-    def notes(self) -> tuple[str, ...]:
-        """That others were busy, in words; empty where the machine was quiet or is not known."""
-        others = self.others()
-        if others is None or others <= QUIET:
-            return ()
-        return (
-            f"others kept {others:.2g} cores busy while times were measured: they are in doubt",
-        )
+
+def doubt(others: float | None) -> tuple[str, ...]:
+    """That others were busy, in words; empty where the machine was quiet or is not known."""
+    if others is None or others <= QUIET:
+        return ()
+    return (f"others kept {others:.2g} cores busy while times were measured: they are in doubt",)
 
 
 def _now() -> tuple[float, float, float] | None:

@@ -22,8 +22,16 @@ GRAIN = 0.02
 WORDS = {"path": "the whole path in one call", "step": "one pose a call"}
 
 
-def operations(arguments: Arguments) -> float:
-    """Of `simulate` for scene, material and path; those in float32 counted half."""
+def operations(arguments: Arguments, *, step: bool = False) -> float:
+    """Of `simulate` for scene, material and path; those in float32 counted half.
+
+    Args:
+        arguments: scene, material and path.
+        step: of the last row of the path alone.
+    """
+    if step:
+        scene, material, path = arguments
+        arguments = scene, material, jax.tree.map(lambda v: v[-1:], path)
     half = str(jax.tree.leaves(arguments[1])[0].dtype) == "float32"
     return float(count_operations(simulate, *arguments)) * (HALF if half else 1)
 

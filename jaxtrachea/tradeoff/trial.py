@@ -15,6 +15,7 @@ from jaxtrachea.scene.stage import Poses, Presses
 from jaxtrachea.tradeoff.calls import Call, quickest
 from jaxtrachea.tradeoff.errors import Errors, compare
 from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
+from jaxtrachea.tradeoff.load import Load
 from jaxtrachea.tradeoff.price import By, compiled, operations
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
@@ -38,9 +39,11 @@ class Trial:
         self.full, self.report = full, report
         self.paths = samples(full)
         self.known: dict[Levels, Errors] = {}
-        self.counts: dict[Levels, float] = {}
+        self.counts: dict[tuple[bool, Levels], float] = {}
         self.times: dict[tuple[By, Levels], tuple[float, float]] = {}
         self.calls: dict[By, Call] = {}
+        #: Most cores that others kept busy while times were measured.
+        self.others = 0.0
         report("full program")
         self.reference = self._run(full.levels)
         pressed = [bool(np.nan_to_num(v).any()) for v in np.asarray(self.reference.force)]
@@ -62,9 +65,18 @@ class Trial:
 
     def operations(self, levels: Levels) -> float:
         """Of the whole path, those in float32 counted half."""
-        if levels not in self.counts:
-            self.counts[levels] = operations(program(self.full, levels))
-        return self.counts[levels]
+        return self._counted(levels, step=False)
+
+    def share(self, by: By, levels: Levels) -> float:
+        """Of the full program's operations; for `step` of the last row alone."""
+        step = by == "step"
+        return self._counted(levels, step=step) / self._counted(self.full.levels, step=step)
+
+    def _counted(self, levels: Levels, *, step: bool) -> float:
+        if (step, levels) not in self.counts:
+            count = operations(program(self.full, levels), step=step)
+            self.counts[step, levels] = count
+        return self.counts[step, levels]
 
     def cost(self, by: By, levels: Levels) -> tuple[float, float]:
         """Of the full program and of these levels: s, measured in turns, or operations."""
@@ -77,8 +89,10 @@ class Trial:
             calls = [self.calls[by]]
             if levels != full:
                 calls.append(compiled(by, program(self.full, levels)))
-            taken = quickest(calls)
-            self.times[by, levels] = taken[0], taken[-1]
+            load = Load()
+            seconds = quickest(calls)
+            self.others = max(self.others, load.others() or 0.0)
+            self.times[by, levels] = seconds[0], seconds[-1]
         return self.times[by, levels]
 
     def saved(self, by: By, levels: Levels) -> float:
