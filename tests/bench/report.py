@@ -188,6 +188,8 @@ def update_section(rows: list[dict], goals: list[list[str]]) -> str:
 def update_goals(single: dict[str, dict]) -> list[list[str]]:
     """Medians of single calls against the C loop on the round tube, and of the contact alone."""
     goals, loop = [], single["C loop: whole, dent of 16; round tube; float64"]["median"]
+    slow = single["C loop: contact, skeleton, surface; round tube; float64"]
+    most = f"at most 2 times (the C loop's: {number(slow['p99'] / slow['median'])})"
     for walls in ("round tube", "patches of the mesh"):
         for dtype in ("float32", "float64"):
             whole = single[f"whole, dent of 16; {walls}; {dtype}"]["median"]
@@ -198,7 +200,7 @@ def update_goals(single: dict[str, dict]) -> list[list[str]]:
             goals.append([f"contact, skeleton, {walls}, {dtype}", "median below 60 µs", *found])
             spread = alone["p99"] / alone["median"]
             name = f"contact, skeleton, {walls}, {dtype}: 99 % against median"
-            goals.append([name, "at most 2 times", number(spread), verdict(spread <= 2)])
+            goals.append([name, most, number(spread), verdict(spread <= 2)])
     return goals
 
 
