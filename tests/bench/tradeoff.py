@@ -1,7 +1,7 @@
 """Accuracy against time of the repository's scenes, and docs/tradeoff.md from it.
 
 Run: python tests/bench/tradeoff.py. It measures everything on the page: choices, ladders, levels of
-the skeleton (tests/bench/levels.py); 33 to 39 minutes on two cores with nothing else to do.
+the skeleton (tests/bench/levels.py); an hour on two busy cores.
 Options: `--quick` (few calls, two rungs a ladder, no fits), `--scenes A,B` (these only; "": none),
 `--no-levels`, `--page` (write the page and the pictures from the JSON, measure nothing).
 """
