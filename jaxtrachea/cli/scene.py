@@ -189,22 +189,23 @@ def _chosen(path: Path, spec, staged):
 
 def _timed(staged) -> str:
     """Time of the whole path in one call and of a pose a call, measured."""
-    from jaxtrachea.tradeoff.calls import one_pose, quickest, whole_path
+    from jaxtrachea.tradeoff.calls import quickest
     from jaxtrachea.tradeoff.load import Load, doubt
-    from jaxtrachea.tradeoff.price import WORDS
+    from jaxtrachea.tradeoff.price import WORDS, compiled
 
-    arguments = staged.scene, staged.material, staged.path
+    arguments, calls = (staged.scene, staged.material, staged.path), []
     with interrupts() as stop_if_asked, progress_bar(transient=True) as bar:
-        task, calls = bar.add_task("time", total=None), {}
-        for by, compiled in (("path", whole_path), ("step", one_pose)):
+        task = bar.add_task("time", total=None)
+        for by, what in WORDS.items():
             stop_if_asked()
-            bar.update(task, description=f"compiling: {WORDS[by]}", advance=1)
-            calls[WORDS[by]] = compiled(arguments)
+            bar.update(task, description=f"compiling: {what}", advance=1)
+            calls.append(compiled(by, arguments))
         stop_if_asked()
         bar.update(task, description="timing", advance=1)
         load = Load()
-        seconds = dict(zip(calls, quickest(list(calls.values())), strict=True))
-    each = ", ".join(f"{1e3 * v:.2g} ms for {what}" for what, v in seconds.items())
+        seconds = quickest(calls)
+    times = zip(seconds, WORDS.values(), strict=True)
+    each = ", ".join(f"{1e3 * v:.2g} ms for {what}" for v, what in times)
     return "\n".join((f"time measured on this machine: {each}", *doubt(load.others())))
 
 

@@ -30,13 +30,14 @@ class OneRow:
     """
 
     def __init__(
-        self, scene: Scene, now: Callable, step: Callable, state: Array | np.ndarray, *given: Any
-    ):
+        self, scene: Scene, setting: Callable, step: Callable,
+        state: Array | np.ndarray, *given: Any,
+    ):  # fmt: skip
         """Compile.
 
         Args:
             scene: whose plan says whether there is a surface.
-            now: from what is given to scene and material.
+            setting: from what is given to scene and material.
             step: from state and what is given to the next state (one array, as the first), the
                 result without its axis of rows and without vertices, and the path and `Pressed` of
                 `simulation.surface`.
@@ -47,8 +48,8 @@ class OneRow:
 
         @jax.jit  # traced once, for the shapes of the result and for the program
         def one(state, *given):
-            state, result, pressed = step(state, *given)
-            return state, *_apart(result), pressed if shown else None
+            state, result, press = step(state, *given)
+            return state, *_apart(result), press if shown else None
 
         _, contact, large, _ = jax.eval_shape(one, state, *given)
         self._contacts = contacts = Packing(contact)
@@ -59,12 +60,12 @@ class OneRow:
 
         def line(*given):
             # State and contact as two arrays: in one, much of what both need is computed twice.
-            state, contact, large, pressed = one(*given)
-            return state, contacts.pack(contact), tuple(large.values()), pressed
+            state, contact, large, press = one(*given)
+            return state, contacts.pack(contact), tuple(large.values()), press
 
         def run(state, _, *given):
-            state, contact, large, pressed = one_kernel(line)(state, *given)
-            vertices = surface(*now(*given), *pressed) if shown else None
+            state, contact, large, press = one_kernel(line)(state, *given)
+            vertices = surface(*setting(*given), *press) if shown else None
             return state, contact, large if vertices is None else (*large, vertices[0])
 
         self._large = tuple(jnp.array(np.zeros(v.shape, v.dtype)) for v in large.values())

@@ -1,7 +1,7 @@
 """A scene step by step: one position of the tool in, forces and surface out, without a pause.
 
 For loops in real time (haptics, a simulator's frame). Everything is compiled when the session is
-made; a step compiles nothing. State and result go in and out as one array each (`_packed`).
+made; a step compiles nothing. State and result go in and out as one array each (`one_row`).
 """
 
 import dataclasses
@@ -173,15 +173,15 @@ class Session:
         self._start = np.asarray(_packed_start(scene, *pose))
         states = Packing(jax.eval_shape(_start, scene, *pose))
 
-        def now(rotation, translation, numbers):
+        def setting(rotation, translation, numbers):
             new = given.unpack(numbers)
             return dataclasses.replace(scene, tool=new.tool, footprint=new.footprint), new.material
 
         def step(state, *args):
-            state, *result = _step(*now(*args), states.unpack(state), *args[:2])
+            state, *result = _step(*setting(*args), states.unpack(state), *args[:2])
             return states.pack(state), *result
 
-        self._program = OneRow(scene, now, step, self._start, *pose, self._numbers)
+        self._program = OneRow(scene, setting, step, self._start, *pose, self._numbers)
 
     def step(self, rotation: ArrayLike, translation: ArrayLike) -> Simulation:
         """Move the tool.
@@ -298,16 +298,16 @@ def _step(scene: Scene, material: Material, state: State, rotation, translation)
         after, path, each, place = _held(scene, material, state, here, inside)
     else:
         after, each, place = state, each._replace(inside=inside), None
-    result, done = pressed(scene, material, path, each, place)
+    result, press = pressed(scene, material, path, each, place)
     after = after._replace(side=side)
     result = jax.tree.map(lambda v: v[0], result)
     wrong = jnp.asarray(PressStatus.NON_FINITE, result.status.dtype)
     result = result._replace(status=jnp.where(at.known, result.status, wrong))
-    return _pick(at.known, after, state), result, (path, done)
+    return _pick(at.known, after, state), result, (path, press)
 
 
 def _held(scene: Scene, material: Material, state: State, here: Instant, inside):
-    """The next state but for the side; a tool that holds its place as it stands; the place."""
+    """The next state but for the side; pose and way of a tool that holds its place; the place."""
     depth = -here.seen.gap[0]
     hit = (depth > 0) & ~inside[0]
     last = _pick(state.started, state.last, here)

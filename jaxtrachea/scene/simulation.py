@@ -109,8 +109,8 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
         kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
         raise ValueError(f"path is {type(path).__name__}; expected {kinds[not plan.contact]}")
     made = approach(scene, path) if isinstance(path, Poses) else None
-    result, done = pressed(scene, material, path, made)
-    return result._replace(vertices=surface(scene, material, path, done))
+    result, press = pressed(scene, material, path, made)
+    return result._replace(vertices=surface(scene, material, path, press))
 
 
 class Pressed(NamedTuple):
@@ -164,7 +164,7 @@ def pressed(
         lost = (solved == PressStatus.OK) & ~jnp.isfinite(jnp.sum(force + moment, axis=1))
         solved = jnp.where(lost, PressStatus.NON_FINITE, solved)
     way = None if made is None else made._replace(pull=None)
-    done = Pressed(used, moved, way, refused)
+    press = Pressed(used, moved, way, refused)
     moved, moment = hide(scene, refused, (moved._replace(force=force, status=None), moment))
     share = depth_share(scene, moved.depth, moved.skeleton, inward)
     asked, ends = plan.joints, plan.ring_ends
@@ -188,17 +188,17 @@ def pressed(
         depth_share=share,
         contact_share=None if made is None else contact_share(scene, made.own),
         status=status_of(solved, share, made, refused),
-    ), done
+    ), press
 
 
 @full_precision
 def surface(
-    scene: Scene, material: AnyMaterial, path: Poses | Presses, done: Pressed
+    scene: Scene, material: AnyMaterial, path: Poses | Presses, press: Pressed
 ) -> Float[Array, "rows vertices 3"] | None:
     """Deformed vertices, NaN in the rows that were refused; None: the plan has no surface."""
     if scene.plan.surface is None:
         return None
-    presses, moved, made, refused = done
+    presses, moved, made, refused = press
     material, _ = without_negative_values(scene, material)
     if isinstance(material, SectionMaterial):
         vertices = deform_sections(scene, presses, moved, path, made)

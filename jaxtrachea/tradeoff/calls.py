@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,12 @@ TURNS, BURST, ENOUGH = 12, 0.01, 2.0
 
 Arguments = tuple[Scene, AnyMaterial, Poses | Presses]
 Call = Callable[[], object]
+Path = TypeVar("Path", bound=Poses | Presses)
+
+
+def last_row(path: Path) -> Path:
+    """A path of the last row alone."""
+    return jax.tree.map(lambda v: v[-1:], path)
 
 
 def whole_path(arguments: Arguments) -> Call:
@@ -50,11 +57,12 @@ def one_pose(arguments: Arguments) -> Call:
         As `whole_path`.
     """
     scene, material, path = arguments
-    row = jax.tree.map(lambda v: v[-1:], path)
+    row = last_row(path)
     try:
         check_scene(scene, material)
     except ValueError:
         return _alone(scene, material, row)
+    assert isinstance(row, Poses)
     session = Session(scene, material)
     pose = np.asarray(row.rotation[0]), np.asarray(row.translation[0])
     return lambda: session.step(*pose)
@@ -63,17 +71,18 @@ def one_pose(arguments: Arguments) -> Call:
 def _alone(scene: Scene, material: AnyMaterial, row: Poses | Presses) -> Call:
     given = Packing((material, row))
 
-    def now(numbers):
+    def setting(numbers):
         return scene, given.unpack(numbers)[0]
 
     def step(state, numbers):
         material, path = given.unpack(numbers)
         made = approach(scene, path) if isinstance(path, Poses) else None
-        result, done = pressed(scene, material, path, made)
-        return state, jax.tree.map(lambda v: v[0], result), (path, done)
+        result, press = pressed(scene, material, path, made)
+        return state, jax.tree.map(lambda v: v[0], result), (path, press)
 
     numbers = jax.device_put(given.fill((material, row)))
-    program = OneRow(scene, now, step, jnp.zeros(1, given.dtype), numbers)
+    # A row knows nothing of the one before: its state is a number that is handed on.
+    program = OneRow(scene, setting, step, jnp.zeros(1, given.dtype), numbers)
     return lambda: program(numbers)
 
 

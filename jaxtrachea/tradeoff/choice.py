@@ -1,10 +1,11 @@
 """The cheapest program of a scene whose error is within a tolerance.
 
-Every effect is dropped alone from the full program, the cheapest rung within the tolerance is
-taken, and all of them together are checked. Effects do not add up: while the whole is too far off,
-the effect that errs most per cost saved comes back by one rung. Cost (`price.By`) is operations, so
-that the choice does not depend on the machine, or the time measured on this one; errors are those
-of force, joints and surface over the path and two sample paths beside it.
+Every effect is dropped alone from the full program, the rung of the fewest operations within the
+tolerance is taken (where time is the cost, if it saves any), and all of them together are checked.
+Effects do not add up: while the whole is too far off, the effect that errs most per cost saved
+comes back by one rung. Cost (`price.By`) is operations, so that the choice does not depend on the
+machine, or the time measured on this one; errors are those of force, joints and surface over the
+path and two sample paths beside it.
 """
 
 import dataclasses

@@ -13,6 +13,7 @@ from jaxtrachea.scene.deform import deform
 from jaxtrachea.scene.programs import Moved, one_plane, vectors
 from jaxtrachea.scene.simulation import simulate
 from jaxtrachea.scene.stage import Poses, Presses
+from jaxtrachea.tradeoff.calls import last_row
 from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
 
 Part = Literal["contact", "skeleton", "surface"]
@@ -49,7 +50,7 @@ def part_of(ladder: str) -> Part | None:
 def inputs(full: Full) -> Inputs:
     """What the parts of the last row are given."""
     scene, material, path = full.scene, full.material, full.path
-    row = jax.tree.map(lambda v: v[-1:], path)
+    row = last_row(path)
     made, presses = None, row
     if isinstance(row, Poses):
         made = _quickly(approach)(scene, row)

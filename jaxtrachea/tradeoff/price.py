@@ -7,7 +7,7 @@ import jax
 from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.operations import count_operations
 from jaxtrachea.scene.simulation import simulate
-from jaxtrachea.tradeoff.calls import Arguments, Call, one_pose, whole_path
+from jaxtrachea.tradeoff.calls import Arguments, Call, last_row, one_pose, whole_path
 
 #: What is made least: time of the whole path in one call (`simulate`), of a pose a call
 #: (`Session`), or operations, those in float32 counted half: the same on every machine.
@@ -19,7 +19,7 @@ HALF = 0.5
 #: Share of the time below which what a level saves is not told from noise.
 GRAIN = 0.02
 #: A time in words.
-WORDS = {"path": "the whole path in one call", "step": "one pose a call"}
+WORDS: dict[Time, str] = {"path": "the whole path in one call", "step": "one pose a call"}
 
 
 def operations(arguments: Arguments, *, step: bool = False) -> float:
@@ -31,7 +31,7 @@ def operations(arguments: Arguments, *, step: bool = False) -> float:
     """
     if step:
         scene, material, path = arguments
-        arguments = scene, material, jax.tree.map(lambda v: v[-1:], path)
+        arguments = scene, material, last_row(path)
     half = str(jax.tree.leaves(arguments[1])[0].dtype) == "float32"
     return float(count_operations(simulate, *arguments)) * (HALF if half else 1)
 

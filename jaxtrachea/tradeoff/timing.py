@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.simulation import simulate
-from jaxtrachea.tradeoff.calls import one_pose, whole_path
+from jaxtrachea.tradeoff.calls import last_row, one_pose, whole_path
 from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
 from jaxtrachea.tradeoff.parts import Inputs, Part, part
 
@@ -56,9 +56,9 @@ def compiled(full: Full, levels: Levels, settings: Settings, *, path: bool = Fal
         path: the whole path in one call is one of them.
     """
     scene, material, whole = program(full, levels)
-    row = jax.tree.map(lambda v: v[-1:], whole)
+    row = last_row(whole)
     start = time.perf_counter()
-    calls: dict[str, Callable] = {"call": one_pose((scene, material, row))}
+    calls: dict[str, Callable] = {"call": one_pose((scene, material, whole))}
     seconds = time.perf_counter() - start
 
     def derivatives(m, p):

@@ -63,26 +63,22 @@ class Trial:
             self.known[levels] = compare(found, self.reference, (self.full.scene, self.full.scene))
         return self.known[levels]
 
-    def operations(self, levels: Levels) -> float:
-        """Of the whole path, those in float32 counted half."""
-        return self._counted(levels, step=False)
-
     def share(self, by: By, levels: Levels) -> float:
         """Of the full program's operations; for `step` of the last row alone."""
         step = by == "step"
-        return self._counted(levels, step=step) / self._counted(self.full.levels, step=step)
+        return self._operations(levels, step=step) / self._operations(self.full.levels, step=step)
 
-    def _counted(self, levels: Levels, *, step: bool) -> float:
+    def _operations(self, levels: Levels, *, step: bool = False) -> float:
+        """Of the path, or of its last row; those in float32 counted half."""
         if (step, levels) not in self.counts:
-            count = operations(program(self.full, levels), step=step)
-            self.counts[step, levels] = count
+            self.counts[step, levels] = operations(program(self.full, levels), step=step)
         return self.counts[step, levels]
 
     def cost(self, by: By, levels: Levels) -> tuple[float, float]:
         """Of the full program and of these levels: s, measured in turns, or operations."""
         full = self.full.levels
         if by == "operations":
-            return self.operations(full), self.operations(levels)
+            return self._operations(full), self._operations(levels)
         if by not in self.calls:
             self.calls[by] = compiled(by, program(self.full, full))
         if (by, levels) not in self.times:
