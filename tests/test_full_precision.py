@@ -31,6 +31,7 @@ from jaxtrachea.mechanics.reactions import deflect_dense
 from jaxtrachea.mechanics.sections.material import from_wall
 from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.scene import session
+from jaxtrachea.scene.simulation import surface
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.tube import make_tube
 
@@ -90,8 +91,8 @@ def stepped(s):
     path = poses(s)
     here = path.rotation[0], path.translation[0]
     state = session._start(scene(), *here)
-    found = session._step(scene(), MATERIAL, state, *here)[1]
-    return found.force, found.vertices, found.joints
+    _, found, press = session._step(scene(), MATERIAL, state, *here)
+    return found.force, surface(scene(), MATERIAL, *press), found.joints
 
 
 def swept(s):
