@@ -30,6 +30,7 @@ from jaxtrachea.tradeoff.levels import full_scene, kept_rings, program
 from jaxtrachea.tradeoff.load import Load
 from jaxtrachea.tradeoff.page import choice_rows, fronts
 from jaxtrachea.tradeoff.plots import QUESTIONS, draw
+from jaxtrachea.tradeoff.price import Cost
 from jaxtrachea.tradeoff.trial import Trial
 
 
@@ -357,7 +358,8 @@ def test_of_rungs_that_cost_the_same_the_best_is_taken():
     ladder = Ladder("made up", "truncation", rungs | {"finest": {}}, {})
     errors = {1: 0.5, 2: 0.001, 3: 0.01}
     trial = object.__new__(Trial)
-    trial.full, trial.report, trial.saved = full, lambda text: None, lambda by, levels: 0.25
+    trial.full, trial.report = full, lambda text: None
+    trial.cost = lambda by, levels: Cost.exact(1.0, 0.75)
     trial.errors = lambda levels: Errors(errors[levels.kept], None, None, None, None, None)
     found = choosing._Found([], [], [])
     assert choosing._within(trial, "operations", ladder, 0.1, found).level == "best"
@@ -370,15 +372,14 @@ def test_of_rungs_that_cost_the_same_the_best_is_taken():
 def test_a_choice_can_be_shown():
     full = full_scene(*staged())
     choice = choose(full, 0.1, precision="float64")
-    both = {"path": {"median": 1e-5}, "call": {"median": 2e-5}}
-    times = {v: both for v in (choice.levels, full.levels)}
+    again = Cost(1e-5, 0.9, 0.87, 0.94)
     end = measuring.environment(measuring.Settings(), Load())
-    row = measuring.choice_row("small", full, choice, times, end)
-    ((*_, error, cost, operations, calls, ratio, share),) = choice_rows(
+    row = measuring.choice_row("small", choice, again, end)
+    ((*_, error, cost, operations, time, calls, share),) = choice_rows(
         [json.loads(json.dumps(row))]
     )
-    assert (calls, ratio) == ("10 / 10", "1.00")
-    assert float(share) == pytest.approx(1 / row["operations"], abs=0.005)
+    assert (time, calls) == ("90 % (87 to 94)", "9 / 10")
+    assert float(share) == pytest.approx(0.9 / row["operations"], abs=0.005)
     assert float(error.removesuffix(" %")) <= 10
     assert cost == operations
     assert float(cost.removesuffix(" %")) < 100

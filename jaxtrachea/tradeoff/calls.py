@@ -7,6 +7,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxtrachea._packed import Packing
 from jaxtrachea.scene.approach import approach
@@ -17,8 +18,8 @@ from jaxtrachea.scene.simulation import pressed, simulate
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 
 #: Turns in which calls are made one after the other, seconds of each in a turn, and of all turns
-#: together after which there is no further one.
-TURNS, BURST, ENOUGH = 12, 0.01, 2.0
+#: together after which there is no further one. Many short turns: a machine changes its speed.
+TURNS, BURST, ENOUGH = 120, 0.002, 2.0
 
 Arguments = tuple[Scene, AnyMaterial, Poses | Presses]
 Call = Callable[[], object]
@@ -86,18 +87,24 @@ def _alone(scene: Scene, material: AnyMaterial, row: Poses | Presses) -> Call:
     return lambda: program(numbers)
 
 
-def quickest(calls: Sequence[Call]) -> list[float]:
-    """Least seconds of each call, in turns, so that all see the same machine."""
-    best, begin = [np.inf] * len(calls), time.perf_counter()
+def in_turns(calls: Sequence[Call]) -> Float[np.ndarray, "calls turns"]:
+    """Median seconds of each call in every turn; in a turn all see the same machine."""
+    found, begin = [], time.perf_counter()
     for call in calls:
         call()  # the first is slower
     for turn in range(TURNS):
         if turn > 2 and time.perf_counter() - begin > ENOUGH:
             break
-        for i, call in enumerate(calls):
-            end, start = time.perf_counter() + BURST, -np.inf
-            while start < end:
-                start = time.perf_counter()
-                call()
-                best[i] = min(best[i], time.perf_counter() - start)
-    return best
+        found.append([_median(call) for call in calls])
+    return np.array(found).T
+
+
+def _median(call: Call) -> float:
+    """Seconds of a call, of as many as fit into a turn."""
+    taken, start = [], time.perf_counter()
+    end = start + BURST
+    while start < end or not taken:
+        call()
+        taken.append(time.perf_counter() - start)
+        start = time.perf_counter()
+    return float(np.median(taken))

@@ -23,7 +23,7 @@ from jaxtrachea.trachea.material import Material
 from jaxtrachea.tradeoff.errors import Errors
 from jaxtrachea.tradeoff.ladders import QUALITY, Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, program
-from jaxtrachea.tradeoff.price import GRAIN, By, words
+from jaxtrachea.tradeoff.price import GRAIN, By, Cost, words
 from jaxtrachea.tradeoff.trial import Trial
 
 
@@ -60,7 +60,7 @@ class Choice(NamedTuple):
         returned: rungs that were within the tolerance alone, but not together with the others.
         idle: rungs within the tolerance that save no time to speak of, alone or with the others.
         errors: of the choice against the full program, on all sample paths.
-        cost: of the full program and of the choice: s, or operations for the path.
+        cost: of the full program and of the choice against it: s, or operations for the path.
         by: what was made least.
         operations: share of the full program's; by `step` those of one pose.
         others: most cores that others kept busy while times were measured.
@@ -77,7 +77,7 @@ class Choice(NamedTuple):
     returned: tuple[Rung, ...]
     idle: tuple[Rung, ...]
     errors: Errors
-    cost: tuple[float, float]
+    cost: Cost
     by: By
     operations: float
     others: float
@@ -140,7 +140,7 @@ def choose(
                 del options[back.ladder]
             else:
                 options[back.ladder].append(finer)
-        elif by != "operations" and trial.saved(by, levels) < GRAIN:
+        elif by != "operations" and trial.cost(by, levels).saved < GRAIN:
             # What saves time alone need not do so with the others.
             least = min(picked, key=lambda r: r.saved)
             found.idle.append(least)
@@ -206,7 +206,7 @@ def _within(
     names = list(ladder.rungs)[:-1]
     trial.report(ladder.name)
     levels = {name: ladder.levels(trial.full, name) for name in names}
-    fewer = {name: trial.saved("operations", levels[name]) for name in names}
+    fewer = {name: trial.cost("operations", levels[name]).saved for name in names}
     for worth in sorted(set(fewer.values()), reverse=True):
         if worth <= 0 or (above is not None and worth >= fewer[above.level]):
             continue
@@ -223,7 +223,7 @@ def _within(
             if by == "operations":
                 return best
             trial.report(f"{ladder.name} {best.level}: time")
-            saved = trial.saved(by, levels[best.level])
+            saved = trial.cost(by, levels[best.level]).saved
             if saved >= GRAIN:
                 return best._replace(saved=saved)
             found.idle.append(best)

@@ -2,7 +2,7 @@
 
 import datetime
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from jaxtrachea.tradeoff.ladders import Ladder, ladders
 from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
 from jaxtrachea.tradeoff.load import Load, processor
 from jaxtrachea.tradeoff.parts import inputs, part_of
+from jaxtrachea.tradeoff.price import Cost
 from jaxtrachea.tradeoff.timing import Compiled, Settings, compiled, timed, with_part
 
 __all__ = ["Settings", "choice_row", "environment", "measure"]
@@ -137,16 +138,13 @@ def against(full: Full, solved: Solved, curves: Sequence[Any], radius: float) ->
     return {name: _number(relative(*v)) for name, v in both.items() if v[0]}
 
 
-def choice_row(
-    name: str, full: Full, choice: Choice, times: Mapping[Any, dict], end: dict[str, Any]
-) -> dict[str, Any]:
-    """A choice as a line of JSON, with the times of its program and of the full one.
+def choice_row(name: str, choice: Choice, again: Cost, end: dict[str, Any]) -> dict[str, Any]:
+    """A choice as a line of JSON.
 
     Args:
         name: of the scene.
-        full: at its finest.
         choice: -
-        times: of both programs, see `timed`.
+        again: its time, measured once more.
         end: what `environment` gives.
     """
 
@@ -155,22 +153,16 @@ def choice_row(
             {"ladder": r.ladder, "level": r.level, "error": _number(r.errors.worst)} for r in rungs
         ]
 
-    measured = "call" if choice.by == "step" else "path"
+    def short(cost):
+        return {k: float(f"{v:.4g}") for k, v in cost._asdict().items()}
+
     return {
         "scene": name, "tolerance": choice.tolerance, "by": choice.by,
         "dropped": said(choice.dropped), "refused": said(choice.refused),
-        "returned": said(choice.returned),
+        "returned": said(choice.returned), "idle": said(choice.idle),
         "errors": {k: _number(v) for k, v in choice.errors._asdict().items()},
-        "cost": round(choice.cost[1] / choice.cost[0], 4),
-        "operations": round(choice.operations, 4),
-        "times": {
-            which: times[v][measured]["median"]
-            for which, v in (("chosen", choice.levels), ("full", full.levels))
-        },
-        "all": {
-            which: {k: v["median"] for k, v in times[levels].items() if k != "compile"}
-            for which, levels in (("chosen", choice.levels), ("full", full.levels))
-        },
+        "cost": short(choice.cost), "operations": round(choice.operations, 4),
+        "again": short(again),
     } | end  # fmt: skip
 
 

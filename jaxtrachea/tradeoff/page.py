@@ -108,30 +108,34 @@ WITHIN = (0.1, float("inf"))
 FRONT_HEAD = ["scene", "within 10 %: a call", "a lane", "all: a call", "a lane",
               "error of the quickest call"]  # fmt: skip
 CHOICE_HEAD = ["scene", "tolerance", "least", "dropped (changes alone)", "came back",
-               "verified error", "time", "operations", "chosen / full [µs]", "ratio",
-               "ratio / operations"]  # fmt: skip
+               "verified error", "time", "operations", "time again", "chosen / full [µs]",
+               "time again / operations"]  # fmt: skip
 
 
 def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
     """Scene, tolerance, what was made least, what was dropped, verified error, times."""
     found = []
     for row in rows:
-        error, call = row["errors"], row["times"]
+        error, again = row["errors"], row["again"]
         worst = max(v for k in ("force", "joints", "surface") if (v := error[k]) is not None)
         dropped, returned = (
             ", ".join(f"{d['ladder']} {d['level']} ({_percent(d['error'])})" for d in row[k])
             for k in ("dropped", "returned")
         )
-        ratio = call["chosen"] / call["full"]
         found.append([
             row["scene"], f"{100 * row['tolerance']:g} %", row.get("by", "operations"),
             dropped or "nothing", returned or "-",
-            f"{100 * worst:.2g} %", f"{100 * row['cost']:.0f} %",
-            f"{100 * row['operations']:.0f} %",
-            f"{_micro(call['chosen'])} / {_micro(call['full'])}", f"{ratio:.2f}",
-            f"{ratio / row['operations']:.2f}",
+            f"{100 * worst:.2g} %", _range(row["cost"]), f"{100 * row['operations']:.0f} %",
+            _range(again), f"{_micro(again['full'] * again['share'])} / {_micro(again['full'])}",
+            f"{again['share'] / row['operations']:.2f}",
         ])  # fmt: skip
     return found
+
+
+def _range(cost: dict[str, float]) -> str:
+    """Share of the full program's cost, and its interval where it has one."""
+    share, low, high = (f"{100 * cost[k]:.0f}" for k in ("share", "low", "high"))
+    return f"{share} %" if cost["low"] == cost["high"] else f"{share} % ({low} to {high})"
 
 
 def fronts(scenes: dict[str, list[dict[str, Any]]]) -> list[list[str]]:

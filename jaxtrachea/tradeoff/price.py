@@ -1,8 +1,11 @@
 """What a program costs, for the choice by tolerance: seconds measured here, or operations."""
 
-from typing import Literal
+import math
+from typing import Literal, NamedTuple
 
 import jax
+import numpy as np
+from jaxtyping import Float
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.operations import count_operations
@@ -16,10 +19,51 @@ By = Literal["path", "step", "operations"]
 Time = Literal["path", "step"]
 #: What an operation in float32 counts where operations are the cost.
 HALF = 0.5
-#: Share of the time below which what a level saves is not told from noise.
+#: Share of the time below which it is not worth an error to save it.
 GRAIN = 0.02
 #: A time in words.
 WORDS: dict[Time, str] = {"path": "the whole path in one call", "step": "one pose a call"}
+
+
+class Cost(NamedTuple):
+    """Of the full program, and of another against it.
+
+    Attributes:
+        full: s (the median of turns), or operations.
+        share: of it that the other costs: of times the median of the ratios within a turn.
+        low: lower end of the 95 % interval of that median (operations have none: the same).
+        high: upper end.
+    """
+
+    full: float
+    share: float
+    low: float
+    high: float
+
+    @classmethod
+    def exact(cls, full: float, own: float) -> "Cost":
+        """Of two numbers that are known."""
+        return cls(full, own / full, own / full, own / full)
+
+    @classmethod
+    def measured(
+        cls, full: Float[np.ndarray, " turns"], own: Float[np.ndarray, " turns"]
+    ) -> "Cost":
+        """From seconds in the same turns (`calls.in_turns`).
+
+        The interval is that of the order statistics (no distribution assumed), for turns that do
+        not depend on each other; of fewer than 6 it is from the least to the largest.
+        """
+        ratios = np.sort(own / full)
+        n = len(ratios)
+        below = max(round(n / 2 - 0.98 * math.sqrt(n)) - 1, 0)
+        low, high = ratios[below], ratios[n - 1 - below]
+        return cls(float(np.median(full)), float(np.median(ratios)), float(low), float(high))
+
+    @property
+    def saved(self) -> float:
+        """Share of the full program's cost; 0 where noise may be all of it."""
+        return 1 - self.share if self.high < 1 else 0.0
 
 
 def operations(arguments: Arguments, *, step: bool = False) -> float:
@@ -46,15 +90,17 @@ def compiled(by: Time, arguments: Arguments) -> Call:
     return {"path": whole_path, "step": one_pose}[by](arguments)
 
 
-def words(by: By, cost: tuple[float, float]) -> str:
-    """Cost of the full program and of another, in words.
+def words(by: By, cost: Cost) -> str:
+    """What the other program costs, in words.
 
     Raises:
         ValueError: another word.
     """
     check_word("by", by, By)
-    share = f"{100 * cost[1] / cost[0]:.0f} %"
+    share, low, high = (f"{100 * v:.0f}" for v in (cost.share, cost.low, cost.high))
     if by == "operations":
-        return f"{share} of its cost"
-    full, own = (f"{1e3 * v:.2g} ms" for v in cost)
-    return f"{share} of its time (measured here for {WORDS[by]}: {own} of {full})"
+        return f"{share} % of its cost"
+    full, own = (f"{1e3 * v:.2g} ms" for v in (cost.full, cost.full * cost.share))
+    return (
+        f"{share} % of its time ({low} to {high} %, measured here for {WORDS[by]}: {own} of {full})"
+    )

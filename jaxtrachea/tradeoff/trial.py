@@ -12,11 +12,11 @@ from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.simulation import Simulation, simulate
 from jaxtrachea.scene.stage import Poses, Presses
-from jaxtrachea.tradeoff.calls import Call, quickest
+from jaxtrachea.tradeoff.calls import Call, in_turns
 from jaxtrachea.tradeoff.errors import Errors, compare
 from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
 from jaxtrachea.tradeoff.load import Load
-from jaxtrachea.tradeoff.price import By, compiled, operations
+from jaxtrachea.tradeoff.price import By, Cost, compiled, operations
 
 #: Sample paths: how far along the tube, in smallest ring spacings, and how much deeper.
 BESIDE = ((0.0, 0.0), (0.25, 0.1), (-0.25, -0.1))
@@ -40,7 +40,7 @@ class Trial:
         self.paths = samples(full)
         self.known: dict[Levels, Errors] = {}
         self.counts: dict[tuple[bool, Levels], float] = {}
-        self.times: dict[tuple[By, Levels], tuple[float, float]] = {}
+        self.times: dict[tuple[By, Levels], Cost] = {}
         self.calls: dict[By, Call] = {}
         #: Most cores that others kept busy while times were measured.
         self.others = 0.0
@@ -74,11 +74,11 @@ class Trial:
             self.counts[step, levels] = operations(program(self.full, levels), step=step)
         return self.counts[step, levels]
 
-    def cost(self, by: By, levels: Levels) -> tuple[float, float]:
+    def cost(self, by: By, levels: Levels) -> Cost:
         """Of the full program and of these levels: s, measured in turns, or operations."""
         full = self.full.levels
         if by == "operations":
-            return self._operations(full), self._operations(levels)
+            return Cost.exact(self._operations(full), self._operations(levels))
         if by not in self.calls:
             self.calls[by] = compiled(by, program(self.full, full))
         if (by, levels) not in self.times:
@@ -86,15 +86,10 @@ class Trial:
             if levels != full:
                 calls.append(compiled(by, program(self.full, levels)))
             load = Load()
-            seconds = quickest(calls)
+            seconds = in_turns(calls)
             self.others = max(self.others, load.others() or 0.0)
-            self.times[by, levels] = seconds[0], seconds[-1]
+            self.times[by, levels] = Cost.measured(seconds[0], seconds[-1])
         return self.times[by, levels]
-
-    def saved(self, by: By, levels: Levels) -> float:
-        """Share of the full program's cost that they save."""
-        full, own = self.cost(by, levels)
-        return 1 - own / full
 
     def _run(self, levels: Levels) -> Simulation:
         """The sample paths, one after the other, with a leading axis."""

@@ -73,20 +73,25 @@ def choices(name: str, full, settings) -> tuple[list[dict], list]:
     """Rows of the table of choices of one scene, and the choices."""
     import jax
 
+    from jaxtrachea.tradeoff.calls import in_turns
+    from jaxtrachea.tradeoff.levels import program
     from jaxtrachea.tradeoff.load import Load
     from jaxtrachea.tradeoff.measure import choice_row, environment
-    from jaxtrachea.tradeoff.timing import compiled, timed
+    from jaxtrachea.tradeoff.price import Cost, compiled
 
-    settings = settings._replace(lanes=0, slopes=False)
     found = cheapest(name, full)
     say(f"{name}: choice: timing")
-    levels = {full.levels, *(choice.levels for choice in found)}
-    programs = {v: compiled(full, v, settings, path=True) for v in levels}
+    programs = {(full.levels, by): None for by in LEAST}
+    programs |= {(choice.levels, choice.by): None for choice in found}
+    calls = [compiled(by, program(full, levels)) for levels, by in programs]
     load = Load()
-    times = timed(programs, settings)
-    end = environment(settings, load)
-    rows = [choice_row(name, full, choice, times, end) for choice in found]
-    del programs
+    seconds = dict(zip(programs, in_turns(calls), strict=True))
+    end = environment(settings._replace(lanes=0), load)
+    rows = []
+    for choice in found:
+        both = seconds[full.levels, choice.by], seconds[choice.levels, choice.by]
+        rows.append(choice_row(name, choice, Cost.measured(*both), end))
+    del calls
     jax.clear_caches()  # programs of one scene at a time: see measure
     return rows, found
 
