@@ -80,6 +80,11 @@ def test_every_run_has_a_line_of_its_own():
     assert second.startswith("b, c: measured 2026-01-01, cpu:0, old, **load average up to 2.5")
     assert "1000 calls" in second
     assert measured(rows[:1]).startswith("Measured 2026-02-02, cpu:0, new")
+    one = [row | {"scene": "a", "ladder": name} for row, name in ((new, "dent"), (old, "rings"))]
+    assert [line[:15] for line in measured(one).split("\n\n")] == [
+        "dent: measured ",
+        "rings: measured",
+    ]
 
 
 def test_levels_of_the_skeleton_are_there():

@@ -21,7 +21,7 @@ from jaxtrachea.tradeoff.parts import inputs, part_of
 from jaxtrachea.tradeoff.price import Cost
 from jaxtrachea.tradeoff.timing import Compiled, Settings, compiled, timed, with_part
 
-__all__ = ["Settings", "choice_row", "environment", "measure"]
+__all__ = ["Settings", "choice_row", "environment", "measure", "measure_ladders"]
 
 DEFAULT = Settings()
 Report = Callable[[str], None]
@@ -37,11 +37,9 @@ class Solved(NamedTuple):
 
 def measure(
     name: str, full: Full, settings: Settings = DEFAULT, report: Report = lambda text: None,
-    curves: Sequence[Any] = (), radius: float = -1.0, more: Sequence[Ladder] = (),
+    curves: Sequence[Any] = (), radius: float = -1.0,
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Errors and times of every rung, one dict each; then one for each ladder left out.
-
-    Each ladder is measured against its finest rung in float64, all else at its finest level.
+    """Errors and times of every rung of the scene's ladders; then a dict for each left out.
 
     Args:
         name: of the scene.
@@ -50,15 +48,35 @@ def measure(
         report: called with what is done next.
         curves: measured curves of the scene's specimen; or none.
         radius: markers no further from the contact say nothing, mm; negative: all count.
-        more: ladders beside those of the scene.
+    """
+    found, left_out = ladders(full)
+    rows = measure_ladders(name, full, found, settings, report, curves, radius)
+    return rows + [{"scene": name, "ladder": k, "left_out": v} for k, v in left_out.items()]
+
+
+def measure_ladders(
+    name: str, full: Full, asked: Sequence[Ladder], settings: Settings = DEFAULT,
+    report: Report = lambda text: None, curves: Sequence[Any] = (), radius: float = -1.0,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Errors and times of every rung, one dict each.
+
+    Each ladder is measured against its finest rung in float64, all else at its finest level.
+
+    Args:
+        name: of the scene.
+        full: the scene at its finest.
+        asked: the ladders.
+        settings: -
+        report: called with what is done next.
+        curves: as for `measure`.
+        radius: likewise.
     """
     if curves:
         check_curves(full.path, curves)
-    found, left_out = ladders(full)
     solved: dict[Levels, Solved] = {}
     kept: dict[Levels, Compiled] = {}
     rows, given = [], inputs(full)
-    for ladder in (*found, *more):
+    for ladder in asked:
         programs, points = {}, []
         finest, own = ladder.levels(full, list(ladder.rungs)[-1]), part_of(ladder.name)
         for rung in picked(ladder, settings.rungs):
@@ -86,7 +104,7 @@ def measure(
         # hundreds: what is not needed again goes.
         del programs, made
         jax.clear_caches()
-    return rows + [{"scene": name, "ladder": k, "left_out": v} for k, v in left_out.items()]
+    return rows
 
 
 def check_curves(path, curves: Sequence[Any]) -> list[tuple[Any, float]]:

@@ -71,21 +71,25 @@ def scene_text(rows: list[dict[str, Any]], picture: str = "") -> str:
 
 
 def measured(points: list[dict[str, Any]]) -> str:
-    """Where and when, with the load of the machine: a line for each run that differs in these."""
+    """Where and when, with the load of the machine: a line for each run that differs in these.
+
+    Each names its scenes; where all are of one scene, its ladders.
+    """
+    what = "scene" if len({point["scene"] for point in points}) > 1 else "ladder"
     runs: dict[str, list[dict[str, Any]]] = {}
     for point in points:
         where = {name: point[name] for name in WHERE}
         runs.setdefault(json.dumps(where, sort_keys=True), []).append(point)
-    return "\n".join(_measured(run, named=len(runs) > 1) for run in runs.values())
+    return "\n".join(_measured(run, what if len(runs) > 1 else None) for run in runs.values())
 
 
-def _measured(points: list[dict[str, Any]], named: bool) -> str:
+def _measured(points: list[dict[str, Any]], what: str | None) -> str:
     first = points[0]
-    scenes = ", ".join(dict.fromkeys(point["scene"] for point in points))
+    named = ", ".join(dict.fromkeys(point[what] for point in points)) if what else ""
     versions = ", ".join(f"{name} {v}" for name, v in first["versions"].items())
     lanes = f"batches of {first['lanes']}" if first["lanes"] else "no batches"
     return (
-        (f"{scenes}: measured " if named else "Measured ")
+        (f"{named}: measured " if named else "Measured ")
         + f"{first['date']}, {first['device']}, {first['processor']}, {busy(points)}, "
         f"{first['calls']} calls, {lanes}; {versions}.\n"
     )

@@ -3,7 +3,8 @@
 Run: python tests/bench/tradeoff.py. It measures everything on the page: choices, ladders, levels of
 the skeleton (tests/bench/levels.py); an hour on two busy cores.
 Options: `--quick` (few calls, two rungs a ladder, no fits), `--scenes A,B` (these only; "": none),
-`--no-levels`, `--page` (write the page and the pictures from the JSON, measure nothing).
+`--no-levels`, `--only-choices` (choices and the ladder of their plans; others stay as they are),
+`--page` (write the page and the pictures from the JSON, measure nothing).
 """
 
 import argparse
@@ -112,20 +113,25 @@ def together(full, found):
     return Ladder("together", "together", rungs | {"full": {}}, {})
 
 
-def scene(name: str, settings) -> list[dict]:
-    """Measure one scene; writes its JSON lines and its picture; rows of its choices."""
+def scene(name: str, settings, *, only_choices: bool) -> list[dict]:
+    """Measure one scene; writes its JSON lines; rows of its choices."""
     from jaxtrachea.cli.tradeoff import measured_curves
-    from jaxtrachea.tradeoff.measure import measure
-    from jaxtrachea.tradeoff.page import lines
+    from jaxtrachea.tradeoff.measure import measure, measure_ladders
+    from jaxtrachea.tradeoff.page import lines, read
 
-    full = full_of(name, "series")
+    def report(text):
+        say(f"{name}: {text}")
+
+    full, file = full_of(name, "series"), FOLDER / f"{name}.jsonl"
     rows, found = choices(name, full, settings)
     curves, radius, _ = measured_curves(ROOT / DATA[name] if name in DATA else None)
-    measured = measure(
-        name, full, settings, lambda text: say(f"{name}: {text}"), curves, radius,
-        [together(full, found)],
-    )  # fmt: skip
-    (FOLDER / f"{name}.jsonl").write_text(lines(measured), "utf-8")
+    given = settings, report, curves, radius
+    if only_choices:
+        measured = [row for row in read(file) if row["ladder"] != "together"]
+    else:
+        measured = measure(name, full, *given)
+    measured += measure_ladders(name, full, [together(full, found)], *given)
+    file.write_text(lines(measured), "utf-8")
     return rows
 
 
@@ -157,7 +163,9 @@ def measure_all(asked) -> None:
     for name in filter(None, asked.scenes.split(",")):
         rungs = 2 if asked.quick else SCENES[name][1]
         settings = Settings(20 if asked.quick else asked.calls, 256, rungs, slopes=False)
-        rows = [row for row in rows if row["scene"] != name] + scene(name, settings)
+        rows = [row for row in rows if row["scene"] != name] + scene(
+            name, settings, only_choices=asked.only_choices
+        )
         rows.sort(key=lambda row: list(SCENES).index(row["scene"]))
         file.write_text(lines(rows), "utf-8")
 
@@ -167,7 +175,7 @@ def main() -> None:
     import jax
 
     parser = argparse.ArgumentParser(description=__doc__)
-    for option in ("--quick", "--page", "--no-levels"):
+    for option in ("--quick", "--page", "--no-levels", "--only-choices"):
         parser.add_argument(option, action="store_true")
     parser.add_argument("--calls", type=int, default=300)
     parser.add_argument("--scenes", default=",".join(SCENES))
