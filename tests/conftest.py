@@ -104,6 +104,13 @@ def _forget_programs():
         _compiled = 0
 
 
+@pytest.fixture
+def on_the_cpu():
+    """Whatever device JAX names first: for what is made for CPUs alone, single kernels say."""
+    with jax.default_device(jax.devices("cpu")[0]):
+        yield
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     """No slow test begins after `SLOW_TESTS_UNTIL` (seconds since the epoch, set by .ci/run)."""

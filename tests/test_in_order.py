@@ -40,13 +40,7 @@ NOT_INLINED = 'inlineable="false"'
 ONE = f'{NOT_INLINED},xla_cpu_small_call="true"'
 BOTH = pytest.mark.parametrize("mark", [in_order, one_kernel])
 ALL = pytest.mark.parametrize("mark", [in_order, one_kernel, lanes_in_one_kernel])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _on_the_cpu():
-    """Whatever device JAX names first: single kernels are made for CPUs."""
-    with jax.default_device(jax.devices("cpu")[0]):
-        yield
+pytestmark = pytest.mark.usefixtures("on_the_cpu")
 
 
 class Out(NamedTuple):

@@ -113,6 +113,7 @@ def test_the_derivative_by_hand():
         np.testing.assert_allclose(found, expected, rtol=1e-13)
 
 
+@pytest.mark.usefixtures("on_the_cpu")
 @pytest.mark.parametrize("mode", [jax.jit, lambda f: jax.jit(jax.grad(lambda *v: jnp.sum(f(*v))))])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_large_lanes_are_in_a_loop_on_a_cpu(dtype, mode):
@@ -130,8 +131,7 @@ def test_large_lanes_are_in_a_loop_on_a_cpu(dtype, mode):
         def loss(x, a, one=one):
             return jnp.sum(jnp.sort(one(x, a), axis=1)[:, -1])
 
-        with jax.default_device(jax.devices("cpu")[0]):
-            text = mode(jax.vmap(loss)).lower(xs, As).compile().as_text()
+        text = mode(jax.vmap(loss)).lower(xs, As).compile().as_text()
         loops = re.findall(r" while\(.*known_trip_count.*\"n\":\"" + str(LANES), text)
         found[points, mark is in_turn] = bool(loops)
     assert found == {(POINTS, True): True, (POINTS, False): False, (3, True): False,
@@ -161,6 +161,7 @@ def test_what_is_not_read_is_not_computed(mark):
     assert "cosine(" not in compiled.as_text()
 
 
+@pytest.mark.usefixtures("on_the_cpu")
 def test_surfaces_of_many_poses_keep_no_array_of_all():
     """Vertices and their cotangents are what 32 poses share the memory for, and little besides."""
     tube, lanes = table_1(), 32

@@ -170,6 +170,7 @@ def test_compliance_and_law_of_press():
         np.testing.assert_allclose(got.force, 0.1 / (c[i] + local), rtol=1e-12)
 
 
+@pytest.mark.usefixtures("on_the_cpu")
 @pytest.mark.parametrize("skeleton", ["linear", "softening"])
 def test_lanes_find_the_deflections_once(skeleton):
     """What is computed for each displacement and ring is not more than under a point."""

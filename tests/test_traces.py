@@ -248,6 +248,7 @@ def test_threads_on_two_devices(tmp_path):
         "XLA_FLAGS": os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2",
         "PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), str(ROOT / "tests" / "reference")]),
         "JAX_ENABLE_X64": "1",
+        "JAX_PLATFORMS": "cpu",
     }
     done = subprocess.run(
         [sys.executable, "-c", DEVICES, str(tmp_path)],

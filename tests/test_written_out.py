@@ -83,6 +83,7 @@ def compiled(f, *inputs):
     return jax.jit(f).lower(*inputs).compile().as_text()
 
 
+@pytest.mark.usefixtures("on_the_cpu")
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_single_call_is_one_kernel_and_lanes_are_the_librarys(dtype):
     """One lane is a single call, too; values and derivatives are those of the function."""
