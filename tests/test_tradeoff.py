@@ -372,9 +372,9 @@ def test_of_rungs_that_cost_the_same_the_best_is_taken():
 def test_a_choice_can_be_shown():
     full = full_scene(*staged())
     choice = choose(full, 0.1, precision="float64")
-    again = Cost(1e-5, 0.9, 0.87, 0.94)
+    repeat = Cost(1e-5, 0.9, 0.87, 0.94)
     end = measuring.environment(measuring.Settings(), Load())
-    row = measuring.choice_row("small", choice, again, end)
+    row = measuring.choice_row("small", choice, repeat, end)
     ((*_, error, cost, operations, time, calls, share),) = choice_rows(
         [json.loads(json.dumps(row))]
     )

@@ -191,7 +191,7 @@ def _timed(staged) -> str:
     """Time of the whole path in one call and of a pose a call, measured."""
     import numpy as np
 
-    from jaxtrachea.tradeoff.calls import in_turns
+    from jaxtrachea.tradeoff.calls import turn_medians
     from jaxtrachea.tradeoff.load import Load, doubt
     from jaxtrachea.tradeoff.price import WORDS, compiled
 
@@ -205,7 +205,7 @@ def _timed(staged) -> str:
         stop_if_asked()
         bar.update(task, description="timing", advance=1)
         load = Load()
-        seconds = np.median(in_turns(calls), axis=1)
+        seconds = np.median(turn_medians(calls), axis=1)
     times = zip(seconds, WORDS.values(), strict=True)
     each = ", ".join(f"{1e3 * v:.2g} ms for {what}" for v, what in times)
     return "\n".join((f"time measured on this machine: {each}", *doubt(load.others())))

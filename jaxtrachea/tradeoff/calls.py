@@ -20,6 +20,8 @@ from jaxtrachea.scene.stage import Poses, Presses, Scene
 #: Turns in which calls are made one after the other, seconds of each in a turn, and of all turns
 #: together after which there is no further one. Many short turns: a machine changes its speed.
 TURNS, BURST, ENOUGH = 120, 0.002, 2.0
+#: Turns there are at least: as many as a 95 % interval of their median needs.
+FEWEST = 6
 
 Arguments = tuple[Scene, AnyMaterial, Poses | Presses]
 Call = Callable[[], object]
@@ -87,24 +89,24 @@ def _alone(scene: Scene, material: AnyMaterial, row: Poses | Presses) -> Call:
     return lambda: program(numbers)
 
 
-def in_turns(calls: Sequence[Call]) -> Float[np.ndarray, "calls turns"]:
+def turn_medians(calls: Sequence[Call]) -> Float[np.ndarray, "calls turns"]:
     """Median seconds of each call in every turn; in a turn all see the same machine."""
-    found, begin = [], time.perf_counter()
-    for call in calls:
-        call()  # the first is slower
+    medians, begin = [], time.perf_counter()
     for turn in range(TURNS):
-        if turn > 2 and time.perf_counter() - begin > ENOUGH:
+        if turn >= FEWEST and time.perf_counter() - begin > ENOUGH:
             break
-        found.append([_median(call) for call in calls])
-    return np.array(found).T
+        medians.append([_median(call) for call in calls])
+    return np.array(medians).T
 
 
 def _median(call: Call) -> float:
-    """Seconds of a call, of as many as fit into a turn."""
+    """Seconds of a call, of those that begin within a turn; the one before them is not counted."""
+    call()  # after another program: what it reads is out of the cache
     taken, start = [], time.perf_counter()
     end = start + BURST
-    while start < end or not taken:
+    while start < end:
         call()
-        taken.append(time.perf_counter() - start)
-        start = time.perf_counter()
+        stop = time.perf_counter()
+        taken.append(stop - start)
+        start = stop
     return float(np.median(taken))

@@ -1,7 +1,8 @@
 """The cheapest program of a scene whose error is within a tolerance.
 
 Every effect is dropped alone from the full program, the rung of the fewest operations within the
-tolerance is taken (where time is the cost, if it saves any), and all of them together are checked.
+tolerance is taken (where time is the cost, if it surely saves some), and all of them together are
+checked.
 Effects do not add up: while the whole is too far off, the effect that errs most per cost saved
 comes back by one rung. Cost (`price.By`) is operations, so that the choice does not depend on the
 machine, or the time measured on this one; errors are those of force, joints and surface over the
@@ -58,7 +59,7 @@ class Choice(NamedTuple):
         dropped: effects at a lower level than in the full program.
         refused: rungs that are too far off alone.
         returned: rungs that were within the tolerance alone, but not together with the others.
-        idle: rungs within the tolerance that save no time to speak of, alone or with the others.
+        idle: rungs within the tolerance that do not surely save time, alone or with the others.
         errors: of the choice against the full program, on all sample paths.
         cost: of the full program and of the choice against it: s, or operations for the path.
         by: what was made least.
@@ -87,7 +88,7 @@ class Choice(NamedTuple):
         """What was found, in a line."""
         if not self.dropped and self.idle:
             within = percent(self.tolerance)
-            return f"nothing that is within {within} saves time; the full program is taken"
+            return f"nothing that is within {within} surely saves time; the full program is taken"
         if not self.dropped:
             return f"no program but the full one is within {percent(self.tolerance)}; it is taken"
         return (
@@ -263,7 +264,7 @@ def _explained(scene: Scene, picked: list[Rung], found: _Found) -> Scene:
         (picked, "within the tolerance: changes {1}"),
         (found.refused, "{0} would change {1}"),
         (found.returned, "{0} would change {1}, too much together with the others"),
-        (found.idle, "{0} would change {1} and save no time"),
+        (found.idle, "{0} would change {1} and not surely save time"),
     ):
         for rung in rungs:
             said.setdefault(rung.effect, []).append(form.format(rung.level, changes(rung.errors)))

@@ -55,7 +55,7 @@ def measure(
 
 
 def measure_ladders(
-    name: str, full: Full, asked: Sequence[Ladder], settings: Settings = DEFAULT,
+    name: str, full: Full, measured: Sequence[Ladder], settings: Settings = DEFAULT,
     report: Report = lambda text: None, curves: Sequence[Any] = (), radius: float = -1.0,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Errors and times of every rung, one dict each.
@@ -65,7 +65,7 @@ def measure_ladders(
     Args:
         name: of the scene.
         full: the scene at its finest.
-        asked: the ladders.
+        measured: the ladders.
         settings: -
         report: called with what is done next.
         curves: as for `measure`.
@@ -76,7 +76,7 @@ def measure_ladders(
     solved: dict[Levels, Solved] = {}
     kept: dict[Levels, Compiled] = {}
     rows, given = [], inputs(full)
-    for ladder in asked:
+    for ladder in measured:
         programs, points = {}, []
         finest, own = ladder.levels(full, list(ladder.rungs)[-1]), part_of(ladder.name)
         for rung in picked(ladder, settings.rungs):
@@ -156,13 +156,13 @@ def against(full: Full, solved: Solved, curves: Sequence[Any], radius: float) ->
     return {name: _number(relative(*v)) for name, v in both.items() if v[0]}
 
 
-def choice_row(name: str, choice: Choice, again: Cost, end: dict[str, Any]) -> dict[str, Any]:
+def choice_row(name: str, choice: Choice, repeat: Cost, end: dict[str, Any]) -> dict[str, Any]:
     """A choice as a line of JSON.
 
     Args:
         name: of the scene.
         choice: -
-        again: its time, measured once more.
+        repeat: its time, measured once more.
         end: what `environment` gives.
     """
 
@@ -172,7 +172,7 @@ def choice_row(name: str, choice: Choice, again: Cost, end: dict[str, Any]) -> d
         ]
 
     def short(cost):
-        return {k: float(f"{v:.4g}") for k, v in cost._asdict().items()}
+        return {k: _number(v) for k, v in cost._asdict().items()}
 
     return {
         "scene": name, "tolerance": choice.tolerance, "by": choice.by,
@@ -180,7 +180,7 @@ def choice_row(name: str, choice: Choice, again: Cost, end: dict[str, Any]) -> d
         "returned": said(choice.returned), "idle": said(choice.idle),
         "errors": {k: _number(v) for k, v in choice.errors._asdict().items()},
         "cost": short(choice.cost), "operations": round(choice.operations, 4),
-        "again": short(again),
+        "repeat": short(repeat),
     } | end  # fmt: skip
 
 

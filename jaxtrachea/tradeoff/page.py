@@ -75,23 +75,24 @@ def measured(points: list[dict[str, Any]]) -> str:
 
     Each names its scenes; where all are of one scene, its ladders.
     """
-    what = "scene" if len({point["scene"] for point in points}) > 1 else "ladder"
+    column = "scene" if len({point["scene"] for point in points}) > 1 else "ladder"
     runs: dict[str, list[dict[str, Any]]] = {}
     for point in points:
-        where = {name: point[name] for name in WHERE}
+        where = {name: point.get(name) for name in WHERE}
         runs.setdefault(json.dumps(where, sort_keys=True), []).append(point)
-    return "\n".join(_measured(run, what if len(runs) > 1 else None) for run in runs.values())
+    return "\n".join(_measured(run, column if len(runs) > 1 else None) for run in runs.values())
 
 
-def _measured(points: list[dict[str, Any]], what: str | None) -> str:
+def _measured(points: list[dict[str, Any]], column: str | None) -> str:
     first = points[0]
-    named = ", ".join(dict.fromkeys(point[what] for point in points)) if what else ""
+    named = ", ".join(dict.fromkeys(point[column] for point in points)) if column else ""
     versions = ", ".join(f"{name} {v}" for name, v in first["versions"].items())
+    much = f"{first['turns']} turns" if "turns" in first else f"{first['calls']} calls"
     lanes = f"batches of {first['lanes']}" if first["lanes"] else "no batches"
     return (
         (f"{named}: measured " if named else "Measured ")
         + f"{first['date']}, {first['device']}, {first['processor']}, {busy(points)}, "
-        f"{first['calls']} calls, {lanes}; {versions}.\n"
+        f"{much}, {lanes}; {versions}.\n"
     )
 
 
@@ -120,18 +121,19 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
     """Scene, tolerance, what was made least, what was dropped, verified error, times."""
     found = []
     for row in rows:
-        error, again = row["errors"], row["again"]
+        error, repeat = row["errors"], row["repeat"]
         worst = max(v for k in ("force", "joints", "surface") if (v := error[k]) is not None)
         dropped, returned = (
             ", ".join(f"{d['ladder']} {d['level']} ({_percent(d['error'])})" for d in row[k])
             for k in ("dropped", "returned")
         )
         found.append([
-            row["scene"], f"{100 * row['tolerance']:g} %", row.get("by", "operations"),
+            row["scene"], f"{100 * row['tolerance']:g} %", row["by"],
             dropped or "nothing", returned or "-",
             f"{100 * worst:.2g} %", _range(row["cost"]), f"{100 * row['operations']:.0f} %",
-            _range(again), f"{_micro(again['full'] * again['share'])} / {_micro(again['full'])}",
-            f"{again['share'] / row['operations']:.2f}",
+            _range(repeat),
+            f"{_micro(repeat['full'] * repeat['share'])} / {_micro(repeat['full'])}",
+            f"{repeat['share'] / row['operations']:.2f}",
         ])  # fmt: skip
     return found
 

@@ -30,8 +30,9 @@ class Cost(NamedTuple):
 
     Attributes:
         full: s (the median of turns), or operations.
-        share: of it that the other costs: of times the median of the ratios within a turn.
-        low: lower end of the 95 % interval of that median (operations have none: the same).
+        share: cost of the other over that of the full program; of times the median over turns of
+            the ratio within a turn.
+        low: lower end of the 95 % interval of that median; of operations the share itself.
         high: upper end.
     """
 
@@ -49,10 +50,10 @@ class Cost(NamedTuple):
     def measured(
         cls, full: Float[np.ndarray, " turns"], own: Float[np.ndarray, " turns"]
     ) -> "Cost":
-        """From seconds in the same turns (`calls.in_turns`).
+        """From seconds in the same turns, 6 at least (`calls.turn_medians`).
 
         The interval is that of the order statistics (no distribution assumed), for turns that do
-        not depend on each other; of fewer than 6 it is from the least to the largest.
+        not depend on each other.
         """
         ratios = np.sort(own / full)
         n = len(ratios)

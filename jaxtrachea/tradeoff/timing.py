@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.scene.simulation import simulate
-from jaxtrachea.tradeoff.calls import last_row, one_pose, whole_path
+from jaxtrachea.tradeoff.calls import last_row, one_pose
 from jaxtrachea.tradeoff.levels import Full, Levels, program, solve
 from jaxtrachea.tradeoff.parts import Inputs, Part, part
 
@@ -39,21 +39,20 @@ class Compiled(NamedTuple):
     """Programs ready to be called, by what is timed, and the seconds that `call` took to compile.
 
     `call`: one pose, see `calls.one_pose`; `gradient`: force and its derivatives; `lane`: a batch;
-    `path`: the whole path in one call; `part` and `part_lane`: the part that a ladder changes.
+    `part` and `part_lane`: the part that a ladder changes.
     """
 
     calls: dict[str, Callable]
     seconds: float
 
 
-def compiled(full: Full, levels: Levels, settings: Settings, *, path: bool = False) -> Compiled:
+def compiled(full: Full, levels: Levels, settings: Settings) -> Compiled:
     """The program of one pose, and those beside it.
 
     Args:
         full: the scene at its finest.
         levels: of the program.
         settings: which programs.
-        path: the whole path in one call is one of them.
     """
     scene, material, whole = program(full, levels)
     row = last_row(whole)
@@ -69,8 +68,6 @@ def compiled(full: Full, levels: Levels, settings: Settings, *, path: bool = Fal
         calls["gradient"] = _ready(derivatives, (material, row))
     if settings.lanes:
         calls["lane"] = _batch(lambda m, p: simulate(scene, m, p), (material, row), settings.lanes)
-    if path:
-        calls["path"] = whole_path((scene, material, whole))
     return Compiled(calls, seconds)
 
 

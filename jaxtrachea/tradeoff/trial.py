@@ -12,7 +12,7 @@ from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.declare import PlanError
 from jaxtrachea.scene.simulation import Simulation, simulate
 from jaxtrachea.scene.stage import Poses, Presses
-from jaxtrachea.tradeoff.calls import Call, in_turns
+from jaxtrachea.tradeoff.calls import Call, turn_medians
 from jaxtrachea.tradeoff.errors import Errors, compare
 from jaxtrachea.tradeoff.levels import Full, Levels, cast, program
 from jaxtrachea.tradeoff.load import Load
@@ -86,7 +86,7 @@ class Trial:
             if levels != full:
                 calls.append(compiled(by, program(self.full, levels)))
             load = Load()
-            seconds = in_turns(calls)
+            seconds = turn_medians(calls)
             self.others = max(self.others, load.others() or 0.0)
             self.times[by, levels] = Cost.measured(seconds[0], seconds[-1])
         return self.times[by, levels]

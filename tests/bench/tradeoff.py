@@ -74,7 +74,7 @@ def choices(name: str, full, settings) -> tuple[list[dict], list]:
     """Rows of the table of choices of one scene, and the choices."""
     import jax
 
-    from jaxtrachea.tradeoff.calls import in_turns
+    from jaxtrachea.tradeoff.calls import turn_medians
     from jaxtrachea.tradeoff.levels import program
     from jaxtrachea.tradeoff.load import Load
     from jaxtrachea.tradeoff.measure import choice_row, environment
@@ -82,16 +82,18 @@ def choices(name: str, full, settings) -> tuple[list[dict], list]:
 
     found = cheapest(name, full)
     say(f"{name}: choice: timing")
-    programs = {(full.levels, by): None for by in LEAST}
-    programs |= {(choice.levels, choice.by): None for choice in found}
-    calls = [compiled(by, program(full, levels)) for levels, by in programs]
-    load = Load()
-    seconds = dict(zip(programs, in_turns(calls), strict=True))
-    end = environment(settings._replace(lanes=0), load)
     rows = []
-    for choice in found:
-        both = seconds[full.levels, choice.by], seconds[choice.levels, choice.by]
-        rows.append(choice_row(name, choice, Cost.measured(*both), end))
+    for by in LEAST:
+        chosen = [choice for choice in found if choice.by == by]
+        levels = list(dict.fromkeys([full.levels, *(choice.levels for choice in chosen)]))
+        calls = [compiled(by, program(full, v)) for v in levels]
+        load = Load()
+        seconds = dict(zip(levels, turn_medians(calls), strict=True))
+        end = environment(settings._replace(lanes=0), load) | {"turns": len(seconds[full.levels])}
+        for choice in chosen:
+            others = None if end["others"] is None else max(choice.others, end["others"])
+            repeat = Cost.measured(seconds[full.levels], seconds[choice.levels])
+            rows.append(choice_row(name, choice, repeat, end | {"others": others}))
     del calls
     jax.clear_caches()  # programs of one scene at a time: see measure
     return rows, found
@@ -155,7 +157,7 @@ def measure_all(asked) -> None:
     from jaxtrachea.tradeoff.timing import Settings
 
     FOLDER.mkdir(exist_ok=True)
-    if not asked.no_levels:
+    if not (asked.no_levels or asked.only_choices):
         say("levels of the skeleton")
         (FOLDER / "levels.jsonl").write_text(lines(levels.rows(quick=asked.quick)), "utf-8")
     file = FOLDER / "choice.jsonl"
@@ -180,6 +182,9 @@ def main() -> None:
     parser.add_argument("--calls", type=int, default=300)
     parser.add_argument("--scenes", default=",".join(SCENES))
     asked = parser.parse_args()
+    files = [FOLDER / f"{name}.jsonl" for name in filter(None, asked.scenes.split(","))]
+    if asked.only_choices and (asked.page or not all(map(Path.exists, files))):
+        parser.error("--only-choices is for scenes that have been measured, and not with --page")
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     sys.path.insert(0, str(Path(__file__).parent))
     if not asked.page:
