@@ -93,11 +93,17 @@ def at_rest(scene: Scene) -> bool:
     return not (scene.plan.friction or scene.plan.options.deforms_sections)
 
 
-def hide(scene: Scene, refused: dict[PressStatus, Bool[Array, "*n"]], results: Any) -> Any:
-    """The results, NaN in the rows that were refused; arrays with rows first, of any structure."""
-    if not at_rest(scene):
+def hidden_rows(
+    scene: Scene, refused: dict[PressStatus, Bool[Array, "*n"]]
+) -> Bool[Array, "*n"] | None:
+    """Rows that were refused and computed as no motion; None: no row is (`at_rest`)."""
+    return functools.reduce(jnp.logical_or, refused.values()) if at_rest(scene) else None
+
+
+def hide(hidden: Bool[Array, "*n"] | None, results: Any) -> Any:
+    """The results, NaN in the `hidden_rows`; arrays with rows first, of any structure."""
+    if hidden is None:
         return results
-    hidden = functools.reduce(jnp.logical_or, refused.values())
 
     def of_rows(v):
         return jnp.where(hidden.reshape(-1, *[1] * (v.ndim - 1)), jnp.nan, v)

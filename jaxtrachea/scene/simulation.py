@@ -18,7 +18,7 @@ from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.deform import deform, deform_sections
 from jaxtrachea.scene.programs import cross_sections, moved_by, one_plane, vectors
 from jaxtrachea.scene.ranges import contact_share, depth_share
-from jaxtrachea.scene.refusals import hide, refuse, status_of, without_negative_values
+from jaxtrachea.scene.refusals import hidden_rows, hide, refuse, status_of, without_negative_values
 from jaxtrachea.scene.stage import Poses, Presses, Scene, check_kind, check_material, check_path
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
@@ -120,13 +120,13 @@ class Pressed(NamedTuple):
         presses: as computed.
         moved: what they do.
         made: the tool's way; its `pull` is left out.
-        refused: rows by status.
+        hidden: rows that were refused, see `refusals.hidden_rows`.
     """
 
     presses: Presses
     moved: Any
     made: Approach | None
-    refused: dict[PressStatus, Bool[Array, " rows"]]
+    hidden: Bool[Array, " rows"] | None
 
 
 @full_precision
@@ -164,8 +164,9 @@ def pressed(
         lost = (solved == PressStatus.OK) & ~jnp.isfinite(jnp.sum(force + moment, axis=1))
         solved = jnp.where(lost, PressStatus.NON_FINITE, solved)
     way = None if made is None else made._replace(pull=None)
-    press = Pressed(used, moved, way, refused)
-    moved, moment = hide(scene, refused, (moved._replace(force=force, status=None), moment))
+    hidden = hidden_rows(scene, refused)
+    press = Pressed(used, moved, way, hidden)
+    moved, moment = hide(hidden, (moved._replace(force=force, status=None), moment))
     share = depth_share(scene, moved.depth, moved.skeleton, inward)
     asked, ends = plan.joints, plan.ring_ends
     return Simulation(
@@ -198,10 +199,11 @@ def surface(
     """Deformed vertices, NaN in the rows that were refused; None: the plan has no surface."""
     if scene.plan.surface is None:
         return None
-    presses, moved, made, refused = press
-    material, _ = without_negative_values(scene, material)
+    presses, moved, made, hidden = press
+    if scene.plan.end_motion:  # reads the only values of the material that a surface follows from
+        material, _ = without_negative_values(scene, material)
     if isinstance(material, SectionMaterial):
         vertices = deform_sections(scene, presses, moved, path, made)
     else:
         vertices = deform(scene, material, presses, moved, path, made)
-    return hide(scene, refused, vertices)
+    return hide(hidden, vertices)
