@@ -80,6 +80,9 @@ def test_every_run_has_a_line_of_its_own():
     assert second.startswith("b, c: measured 2026-01-01, cpu:0, old, **load average up to 2.5")
     assert "1000 calls" in second
     assert measured(rows[:1]).startswith("Measured 2026-02-02, cpu:0, new")
+    turns = [new | {"scene": "a", "turns": n} for n in (120, 37, 60)]
+    assert "37 to 120 turns, no batches" in measured(turns)
+    assert ", 120 turns, no" in measured(turns[:1])
     one = [row | {"scene": "a", "ladder": name} for row, name in ((new, "dent"), (old, "rings"))]
     assert [line[:15] for line in measured(one).split("\n\n")] == [
         "dent: measured ",

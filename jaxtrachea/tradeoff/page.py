@@ -87,13 +87,20 @@ def _measured(points: list[dict[str, Any]], column: str | None) -> str:
     first = points[0]
     named = ", ".join(dict.fromkeys(point[column] for point in points)) if column else ""
     versions = ", ".join(f"{name} {v}" for name, v in first["versions"].items())
-    much = f"{first['turns']} turns" if "turns" in first else f"{first['calls']} calls"
     lanes = f"batches of {first['lanes']}" if first["lanes"] else "no batches"
     return (
         (f"{named}: measured " if named else "Measured ")
         + f"{first['date']}, {first['device']}, {first['processor']}, {busy(points)}, "
-        f"{much}, {lanes}; {versions}.\n"
+        f"{_much(points)}, {lanes}; {versions}.\n"
     )
+
+
+def _much(points: list[dict[str, Any]]) -> str:
+    """Calls of each program, or turns of them."""
+    if "turns" not in points[0]:
+        return f"{points[0]['calls']} calls"
+    least, most = (f({point["turns"] for point in points}) for f in (min, max))
+    return f"{most} turns" if least == most else f"{least} to {most} turns"
 
 
 def busy(points: list[dict[str, Any]]) -> str:
