@@ -60,6 +60,7 @@ def test_choices_hold_their_tolerance_and_are_no_dearer():
         errors = [row["errors"][k] for k in ("force", "joints", "surface")]
         assert max(v for v in errors if v is not None) <= row["tolerance"]
         assert (row["cost"]["high"] < 1) == bool(row["dropped"])
+        assert (row["repeat"]["share"] < 1) == bool(row["dropped"])  # the page says so
         for rung in row["dropped"]:
             assert rung["error"] <= row["tolerance"]
         for rung in row["refused"]:
@@ -83,6 +84,8 @@ def test_every_run_has_a_line_of_its_own():
     turns = [new | {"scene": "a", "turns": n} for n in (120, 37, 60)]
     assert "37 to 120 turns, no batches" in measured(turns)
     assert ", 120 turns, no" in measured(turns[:1])
+    night = [new | {"scene": "a"}, new | {"scene": "a", "date": "2026-02-03"}]  # choices
+    assert measured(night).startswith("a: measured 2026-02-02")
     one = [row | {"scene": "a", "ladder": name} for row, name in ((new, "dent"), (old, "rings"))]
     assert [line[:15] for line in measured(one).split("\n\n")] == [
         "dent: measured ",

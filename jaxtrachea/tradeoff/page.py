@@ -73,9 +73,10 @@ def scene_text(rows: list[dict[str, Any]], picture: str = "") -> str:
 def measured(points: list[dict[str, Any]]) -> str:
     """Where and when, with the load of the machine: a line for each run that differs in these.
 
-    Each names its scenes; where all are of one scene, its ladders.
+    Each names its scenes; where all are rungs of one scene, its ladders.
     """
-    column = "scene" if len({point["scene"] for point in points}) > 1 else "ladder"
+    rungs = all("ladder" in point for point in points)
+    column = "ladder" if rungs and len({point["scene"] for point in points}) == 1 else "scene"
     runs: dict[str, list[dict[str, Any]]] = {}
     for point in points:
         where = {name: point.get(name) for name in WHERE}
