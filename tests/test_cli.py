@@ -12,7 +12,12 @@ import pytest
 from run_cli import GOOD, run, tree
 
 import jaxtrachea
+from jaxtrachea.cli.terminal import into
+from jaxtrachea.files import lock as run_lock
+from jaxtrachea.files import output
 from jaxtrachea.fitting import fit as fit_module
+from jaxtrachea.runs import folder as run_folder
+from jaxtrachea.runs import manifest
 
 ROOT = Path(__file__).parents[1]
 HEAD = "specimen,trial,s [mm],displacement [mm],force [N]\n"
@@ -333,6 +338,75 @@ def test_interrupt_in_a_real_process(study):
     assert "stopped; nothing was written" in err
     assert "Traceback" not in err
     assert tree(study) == before
+
+
+@pytest.fixture
+def ctrl_c(monkeypatch):
+    """Lets one Ctrl-C come during a call of a function, before what it does or after."""
+
+    def comes(owner, name, when):
+        real = getattr(owner, name)
+
+        def interrupted(*arguments, **options):
+            monkeypatch.setattr(owner, name, real)
+            if when == "before":
+                signal.raise_signal(signal.SIGINT)
+            result = real(*arguments, **options)
+            if when == "after":
+                signal.raise_signal(signal.SIGINT)
+            return result
+
+        monkeypatch.setattr(owner, name, interrupted)
+
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield comes
+    signal.signal(signal.SIGINT, previous)
+
+
+@pytest.mark.parametrize("out", [(), ("--out", "a/b/new"), ("--out", "there")])
+@pytest.mark.parametrize("when", ["before", "after"])
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [
+        (run_folder, "new_directory"), (run_lock, "_sign"), (manifest, "write"),
+        (run_folder, "stage"),
+    ],
+)  # fmt: skip
+def test_interrupt_while_a_fit_makes_its_folders(
+    owner, name, when, out, study, ctrl_c, monkeypatch, capsys
+):
+    (study / "there").mkdir()
+    monkeypatch.chdir(study)
+    monkeypatch.setattr("jaxtrachea.fitting.fit.fit", None)
+    before = tree(study)
+    ctrl_c(owner, name, when)
+    code, _, err = run(monkeypatch, capsys, "fit", "spec.toml", *out)
+    assert code == 130
+    assert "stopped; nothing was written" in err
+    assert tree(study) == before
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_interrupt_while_a_command_makes_its_folder(when, study, ctrl_c, monkeypatch):
+    monkeypatch.chdir(study)
+    before = tree(study)
+    ctrl_c(output, "new_directory", when)
+    with pytest.raises(KeyboardInterrupt), into(None, Path("out/a")):
+        pytest.fail("went on after an interrupt")
+    assert tree(study) == before
+
+
+def test_interrupt_while_files_are_put_into_place(study, ctrl_c, monkeypatch):
+    """All of them are there then: the command has ended."""
+    monkeypatch.chdir(study)
+    with into(None, Path("out/a")) as (folder, stop_if_asked):
+        for name in "bc":
+            (folder / name).write_text(name)
+        ctrl_c(Path, "replace", "after")
+    assert sorted(path.name for path in Path("out/a").iterdir()) == ["b", "c"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with pytest.raises(KeyboardInterrupt):
+        stop_if_asked()
 
 
 def test_interrupt_that_was_swallowed(study, monkeypatch, capsys):

@@ -195,16 +195,18 @@ def running(options: FitOptions, meeting: Meeting, now, study, settings) -> Iter
     from jaxtrachea.runs import checkpoint, manifest
     from jaxtrachea.runs import folder as run_folder
 
-    with _failures_as_messages(options), interrupts() as stop_if_asked:
+    with _failures_as_messages(options), interrupts() as ctrl_c:
+        ctrl_c.hold()
         run = open_run(options, now, study)
         try:
+            ctrl_c.let_through()
             todo, damaged = checkpoint.missing(run, study)
             _say_what_is_there(run, study, todo, damaged)
             watch = processes.Watch(run.checkpoint, meeting)
             with _watched(watch, todo=todo):
 
                 def check() -> None:
-                    stop_if_asked()
+                    ctrl_c.stop_if_asked()
                     watch.check()
 
                 def fit(_, settings, progress):
@@ -221,6 +223,7 @@ def running(options: FitOptions, meeting: Meeting, now, study, settings) -> Iter
                 check()
             run_folder.commit(run)
         except BaseException as error:
+            ctrl_c.hold()
             kept = run_folder.abandon(run, shared=meeting.processes > 1)
             if kept and isinstance(error, KeyboardInterrupt | Lost | OSError):
                 raise _kept(meeting, run, study, error) from None
@@ -308,10 +311,10 @@ def help_out(options: FitOptions, meeting: Meeting, now, study, settings) -> Non
     from jaxtrachea.runs import folder as run_folder
 
     target, timeout = options.folder, meeting.heartbeat_timeout
-    with _failures_as_messages(options), interrupts() as stop_if_asked:
+    with _failures_as_messages(options), interrupts() as ctrl_c:
         end = time.monotonic() + timeout
         while (opened := processes.opened(target / ".run", meeting)) is None:
-            stop_if_asked()
+            ctrl_c.stop_if_asked()
             if (
                 options.resume
                 and (target / "results.h5").exists()
@@ -328,7 +331,7 @@ def help_out(options: FitOptions, meeting: Meeting, now, study, settings) -> Non
             with watch.watching(), progress_bar() as bar:
 
                 def look():
-                    stop_if_asked()
+                    ctrl_c.stop_if_asked()
                     watch.check()
 
                 stages = Stages(bar, look)

@@ -152,8 +152,8 @@ def _staged(path: Path):
 
         if spec.trachea.file is None:
             return spec, stage(spec, path.parent)
-        with interrupts() as stop_if_asked, progress_bar(transient=True) as bar:
-            return spec, stage(spec, path.parent, Stages(bar, stop_if_asked).begin)
+        with interrupts() as ctrl_c, progress_bar(transient=True) as bar:
+            return spec, stage(spec, path.parent, Stages(bar, ctrl_c.stop_if_asked).begin)
     except SpecError as error:
         raise Stop(str(SpecError.like(error, place=str(path)))) from None
 
@@ -172,11 +172,11 @@ def _chosen(path: Path, spec, staged):
     except PlanError as error:
         raise Stop(f"{path}: effects.{error}") from None
     wish = spec.plan
-    with interrupts() as stop_if_asked, progress_bar() as bar:
+    with interrupts() as ctrl_c, progress_bar() as bar:
         task = bar.add_task("choosing", total=None)
 
         def report(text: str) -> None:
-            stop_if_asked()
+            ctrl_c.stop_if_asked()
             bar.update(task, description=f"choosing: {text}", advance=1)
 
         try:
@@ -196,13 +196,13 @@ def _timed(staged) -> str:
     from jaxtrachea.tradeoff.price import WORDS, compiled
 
     arguments, calls = (staged.scene, staged.material, staged.path), []
-    with interrupts() as stop_if_asked, progress_bar(transient=True) as bar:
+    with interrupts() as ctrl_c, progress_bar(transient=True) as bar:
         task = bar.add_task("time", total=None)
         for by, what in WORDS.items():
-            stop_if_asked()
+            ctrl_c.stop_if_asked()
             bar.update(task, description=f"compiling: {what}", advance=1)
             calls.append(compiled(by, arguments))
-        stop_if_asked()
+        ctrl_c.stop_if_asked()
         bar.update(task, description="timing", advance=1)
         load = Load()
         seconds = np.median(turn_medians(calls), axis=1)

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import FrameType
 
 from rich.console import Console
 from rich.markup import escape
@@ -61,22 +62,38 @@ def say_lost(pictures: Mapping[str, str]) -> None:
         to_stderr(f"[yellow]warning:[/] {escape(sentence(name, reason))}")
 
 
-@contextlib.contextmanager
-def interrupts() -> Iterator[Callable[[], None]]:
-    """Remember Ctrl-C, since an exception raised inside a callback of jax is printed and lost.
+class Interrupts:
+    """Ctrl-C while a command is at work: raised where it comes, unless it is held back."""
 
-    Yields:
-        What raises KeyboardInterrupt if one came; to be called between steps of the work.
-    """
-    asked = []
+    def __init__(self) -> None:
+        """None came yet."""
+        self._asked = self._held = False
 
-    def remember(number, frame):
-        asked.append(number)
-        signal.default_int_handler(number, frame)
+    def remember(self, number: int, frame: FrameType | None) -> None:
+        """What SIGINT calls."""
+        self._asked = True
+        if not self._held:
+            signal.default_int_handler(number, frame)
 
-    def stop_if_asked():
-        if asked:
+    def stop_if_asked(self) -> None:
+        """Raise KeyboardInterrupt if one came; to be called between steps of the work."""
+        if self._asked:
             raise KeyboardInterrupt
+
+    def hold(self) -> None:
+        """Only remember them: folders are made, or files put into place, all of them or none."""
+        self._held = True
+
+    def let_through(self) -> None:
+        """Raise them again, and one that came while they were held."""
+        self._held = False
+        self.stop_if_asked()
+
+
+@contextlib.contextmanager
+def interrupts() -> Iterator[Interrupts]:
+    """Remember Ctrl-C, since an exception raised inside a callback of jax is printed and lost."""
+    ctrl_c = Interrupts()
 
     def print_others(lost):
         if not issubclass(lost.exc_type, KeyboardInterrupt):
@@ -84,12 +101,12 @@ def interrupts() -> Iterator[Callable[[], None]]:
 
     usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not usual or threading.current_thread() is not threading.main_thread():
-        yield stop_if_asked
+        yield ctrl_c
         return
     shown, sys.unraisablehook = sys.unraisablehook, print_others
-    signal.signal(signal.SIGINT, remember)
+    signal.signal(signal.SIGINT, ctrl_c.remember)
     try:
-        yield stop_if_asked
+        yield ctrl_c
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.unraisablehook = shown
@@ -207,9 +224,15 @@ def into(out_dir: Path | None, default: Path) -> Iterator[tuple[Path, Callable[[
     from jaxtrachea.files.output import OutputExists, new_output
 
     try:
-        with interrupts() as stop_if_asked, new_output(out_dir, default) as folder:
-            yield folder, stop_if_asked
-            stop_if_asked()
+        with interrupts() as ctrl_c:
+            ctrl_c.hold()
+            with new_output(out_dir, default) as folder:
+                try:
+                    ctrl_c.let_through()
+                    yield folder, ctrl_c.stop_if_asked
+                    ctrl_c.stop_if_asked()
+                finally:
+                    ctrl_c.hold()
     except OutputExists as error:
         raise Stop(str(error)) from None
     except OSError as error:
