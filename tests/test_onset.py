@@ -17,7 +17,7 @@ from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.analysis import Findings
-from jaxtrachea.inference.cross_validation import leave_one_out, without
+from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out, without
 from jaxtrachea.inference.design import Candidates, check, gains, situation
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.inference.labels import verdict_sentence
@@ -240,7 +240,7 @@ def own_misfit(curve, k_1, k_3, start):
 
 def test_a_curve_left_out_fits_its_own_onset(owned):
     """SciPy: others fitted, then the curve's own two numbers with their k_1 and k_3."""
-    left = leave_one_out(owned.study, ONE)
+    left = leave_one_out(owned, ONE)
     assert left.result.succeeded.all()
     assert len(left.trial) == 8
     lane, t = 0, 2
@@ -251,7 +251,7 @@ def test_a_curve_left_out_fits_its_own_onset(owned):
     r = own_misfit(gone, k_1, k_3, value[[2 + t, 6 + t]])
     expected = np.sqrt(np.mean(r**2)) / np.max(np.abs(gone.force))
     np.testing.assert_allclose(left.force[2], expected, rtol=0.01)
-    by_position = leave_repeats_out(owned.study, ONE).error
+    by_position = leave_repeats_out(owned, ONE).error
     assert np.isfinite(by_position).all()
     peak = max(np.max(np.abs(c.force)) for c in owned.study.curves[0])
     each = left.force[:4] * [np.max(np.abs(c.force)) for c in owned.study.curves[0]]
@@ -261,7 +261,7 @@ def test_a_curve_left_out_fits_its_own_onset(owned):
 def test_a_stiffness_of_one_curve_is_still_refused():
     study = own_study(0.05, k_1={"scope": "trial"})
     with pytest.raises(ValueError, match="k_1 belongs to single trials"):
-        leave_one_out(study, ONE)
+        curves_to_leave_out(study)
 
 
 def test_influence_of_a_curve_with_its_own_onset(owned):

@@ -9,6 +9,7 @@ from hardening import TWO, pairs, stored_again, total_study
 from scipy.optimize import least_squares
 
 import jaxtrachea
+from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.model import columns_of
 from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.inference.cross_validation import leave_one_out, with_own_touch
@@ -69,7 +70,7 @@ def test_used_curves_come_back_with_the_corner_of_the_fit(touched):
 
 def left_out_pairs(study, changes, rows, folder):
     """Curves left out: as `leave_one_out` predicts them, and as a stored fit of the others does."""
-    left = leave_one_out(study, TWO)
+    left = leave_one_out(fit(study, TWO), TWO)
     assert left.result.succeeded.all()
     held = np.zeros(study.take(left.lane).lanes.s_c.shape, bool)
     held[np.arange(len(held)), left.trial] = True

@@ -321,7 +321,7 @@ def test_left_out_curve_is_that_of_leave_one_out(tmp_path):
     """Fit without a curve, written, read, predicted: the residual of `leave_one_out` to 1e-9."""
     curves = list(pairs())
     study = total_study(curves)
-    left = leave_one_out(study, TWO)
+    left = leave_one_out(fit(study, TWO), TWO)
     truth = predictions(study.take(left.lane), left.result.theta).force
     for row in (0, 3):
         lane, trial = left.lane[row], left.trial[row]
@@ -745,7 +745,7 @@ def test_virtual_trachea_ten_positions_by_the_command(tmp_path, monkeypatch, cap
     spec = load_fit_spec(VIRTUAL / "fit.toml")
     measured = read_data(spec, VIRTUAL)
     study = study_of(spec, measured, refits=True)
-    left = leave_one_out(study, settings_of(spec))
+    left = leave_one_out(fit(study, settings_of(spec)), settings_of(spec))
     truth = predictions(study.take(left.lane), left.result.theta).force
     out = [study.curves[lane][trial] for lane, trial in zip(left.lane, left.trial, strict=True)]
     assert len(out) == 10

@@ -150,7 +150,7 @@ def test_rows_with_different_keys_make_one_table(tmp_path, result):
 def test_leaving_out_predicts_from_the_other_trial():
     """The trial left out is 2 % stiffer or softer than the one that predicts it; exact data."""
     study = make_study()
-    left_out = leave_one_out(study, Settings(starts=1))
+    left_out = leave_one_out(fit(study, Settings(starts=1)), Settings(starts=1))
     assert curves_to_leave_out(study) == [(0, 0), (0, 1), (1, 0), (1, 1)]
     assert np.allclose(left_out.ratio, [1 / 1.02 - 1, 0.02] * 2, atol=1e-6)
     assert np.all(np.isnan(left_out.joints))

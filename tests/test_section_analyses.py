@@ -367,7 +367,7 @@ def test_leaving_positions_out_is_by_angle_too(result):
     """Of a position pressed at two angles one is left out; against SciPy's fits of the others."""
     curves = result.study.curves[0]
     assert PLACES[0][0] == PLACES[2][0]
-    missed = leave_repeats_out(result.study, ONE)
+    missed = leave_repeats_out(result, ONE)
     assert missed.refits[0] == 3
     assert missed.lost[0] == missed.unconverged[0] == 0
     keep = np.ones((3, 2, len(PATH)), bool)

@@ -10,6 +10,7 @@ from run_cli import run
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import load_fit_spec
+from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
@@ -77,17 +78,18 @@ def test_twins_are_left_out_together():
     study = study_of(curves)
     assert [np.flatnonzero(row).tolist() for row in repeats(study).held] == [[0, 2], [1], [3]] * 2
     want = by_specimen(missed_by_hand(curves, TWINS), curves)
-    got = leave_repeats_out(study, Settings(starts=1)).error
+    got = leave_repeats_out(fit(study, Settings(starts=1)), Settings(starts=1)).error
     np.testing.assert_allclose(got, want, rtol=1e-6)
     alone = by_specimen(missed_by_hand(curves, []), curves)
-    plain = leave_repeats_out(study_of(curves, None), Settings(starts=1)).error
+    study = study_of(curves, None)
+    plain = leave_repeats_out(fit(study, Settings(starts=1)), Settings(starts=1)).error
     np.testing.assert_allclose(plain, alone, rtol=1e-6)
     assert np.all(np.abs(want - alone) > 0.01 * alone)
 
 
 def test_one_curve_left_out_takes_its_twins_along():
     curves = presses()
-    left = leave_one_out(study_of(curves), Settings(starts=1))
+    left = leave_one_out(fit(study_of(curves), Settings(starts=1)), Settings(starts=1))
     assert left.trial.tolist() == [0, 1, 2, 3] * 2
     missed = missed_by_hand(curves, TWINS)
     peak = [np.max(np.abs(c.force)) for c in curves]

@@ -98,7 +98,7 @@ def _fitted(loaded, names, cross_validation: bool, stop_if_asked) -> list:
             result = fit(study, settings, counted(name))
             left = None
             if cross_validation:
-                left = leave_repeats_out(study, settings, counted(f"{name}, left out"))
+                left = leave_repeats_out(result, settings, counted(f"{name}, left out"))
             models.append(Model(name, result, left))
         stages.close()
     return models

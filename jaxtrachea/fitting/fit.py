@@ -38,6 +38,7 @@ def fit(
     settings: Settings = Settings(),
     progress: Callable[[int, int], None] | None = None,
     starts: np.ndarray | None = None,
+    beside: np.ndarray | None = None,
 ) -> FitResult:
     """Fit every lane from every start, keep the best, and find out what may be believed.
 
@@ -51,6 +52,7 @@ def fit(
         settings: how to solve.
         progress: called with (starts finished since the last call, starts in all).
         starts: where to start, scaled coordinates, (lanes * settings.starts, P); None: drawn.
+        beside: one more start of each lane, first of those drawn; (lanes, P), NaN: the guess.
 
     Returns:
         The `FitResult`. It never raises for a lane's sake. Without unknowns (every parameter is
@@ -60,7 +62,7 @@ def fit(
     if study.size == 0:
         return evaluated(study)
     known = structure_of(study, suspicious(study))
-    minima = lowest_minima(study, settings, starts, progress, known)
+    minima = lowest_minima(study, settings, starts, progress, known, beside)
     result = _conclude(study, minima, known)
     late = _unproven(result, known)
     if late.any():
@@ -69,7 +71,8 @@ def fit(
         rows = np.flatnonzero(late & (known.nullity > 0))
         if len(rows) and not study.joint and starts is None:
             part = study.take(rows)
-            again = lowest_minima(part, settings, None, progress, known.take(rows))
+            near = None if beside is None else beside[rows]
+            again = lowest_minima(part, settings, None, progress, known.take(rows), near)
             minima = minima.replaced(rows, again)
         if len(rows):
             result = _conclude(study, minima, known)

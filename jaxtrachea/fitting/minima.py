@@ -14,7 +14,7 @@ from jaxtrachea.fitting.lane import data_weight
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, noise_rounds
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.shared import solve_jointly
-from jaxtrachea.fitting.starts import add_starts, best, draw_starts
+from jaxtrachea.fitting.starts import add_starts, best, draw_starts, with_one_more
 from jaxtrachea.fitting.structure import Structure, reduced
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
@@ -55,12 +55,14 @@ class Minima(NamedTuple):
         return Minima(Solved(*rows[:4]), rows[4], rows[5], rows[6], *joined)
 
 
-def lowest_minima(study: Study, settings: Settings, starts, progress, known: Structure) -> Minima:
+def lowest_minima(
+    study: Study, settings: Settings, starts, progress, known: Structure, beside=None
+) -> Minima:
     """The best of all starts of every lane, with the noise that goes with it."""
     # Given starts are refits from an estimate: there the directions left open may be followed.
     held = study if study.joint or starts is not None else reduced(study, known.pinned)
     sigma = first_sigma(study)
-    solved, agree, tried, *ends = _from_starts(held, settings, starts, sigma, progress)
+    solved, agree, tried, *ends = _from_starts(held, settings, starts, sigma, progress, beside)
     if held is not study:
         solved = _released(study, held, settings, solved, sigma)
     solved, sigma = refit_with_noise(held, settings, solved, sigma)
@@ -96,10 +98,12 @@ def refit_with_noise(study: Study, settings: Settings, solved, sigma, theta=None
     return solved, sigma
 
 
-def _from_starts(study: Study, settings: Settings, starts, sigma, progress):
+def _from_starts(study: Study, settings: Settings, starts, sigma, progress, beside):
     """The best of all starts of every lane, how many agree, how many there were; all ends."""
     drawn = starts is None
     starts = draw_starts(study, settings) if drawn else starts
+    if beside is not None:
+        starts, settings = with_one_more(starts, beside, settings)
     lanes = study.lanes.lower.shape[0]
     if study.joint:
         solved, agree = _solve_jointly(study, settings, starts, sigma, progress)

@@ -98,20 +98,21 @@ def curves_to_leave_out(study: Study) -> list[tuple[int, int]]:
     return pairs
 
 
-def leave_one_out(study: Study, settings: Settings, progress=None) -> LeftOut:
+def leave_one_out(whole: FitResult, settings: Settings, progress=None) -> LeftOut:
     """Fit every lane once without each of its curves, and predict that curve.
 
     Those that are left out together with it (`Study.together`) take no part, either. A curve left
     out fits an onset or an offset of its own, all other unknowns kept.
 
     Args:
-        study: lanes with two curves or more are used.
-        settings: as for `fit`.
+        whole: the fit of all curves; lanes with two curves or more are used.
+        settings: as for `fit`; every refit also starts from the estimate of the whole fit.
         progress: as for `fit`.
 
     Raises:
         ValueError: as `curves_to_leave_out`.
     """
+    study = whole.study
     lane, trial = (np.array(v) for v in zip(*curves_to_leave_out(study), strict=True))
     chosen = study.take(lane)
     lanes = chosen.lanes
@@ -119,7 +120,7 @@ def leave_one_out(study: Study, settings: Settings, progress=None) -> LeftOut:
     held = np.zeros(lanes.s_c.shape, bool)
     for row, (k, t) in enumerate(zip(lane, trial, strict=True)):
         held[row, companions(study.curves[k], study.together)[t]] = True
-    result, touched, seen = refitted(chosen, held, settings, progress)
+    result, touched, seen = refitted(chosen, held, whole.theta[lane], settings, progress)
     force, data = seen.force[rows, trial], lanes.force[rows, trial]
     observed = lanes.precision[rows, trial] > 0
     lost = np.any(observed & ~np.isfinite(force), axis=1)
@@ -206,13 +207,21 @@ def with_own_touch(
 
 
 def refitted(
-    study: Study, held: Bool[np.ndarray, "lanes T"], settings: Settings, progress
+    study: Study,
+    held: Bool[np.ndarray, "lanes T"],
+    estimate: Float[np.ndarray, "lanes P"],
+    settings: Settings,
+    progress,
 ) -> tuple[FitResult, OwnTouch, Prediction]:
     """Every lane fitted without the trials `held`, and what it then says of all its trials.
+
+    Besides the starts of a fit one is the estimate of all data, so that no refit ends in a minimum
+    which that fit has left behind (it followed up its doubts, a refit does not).
 
     Args:
         study: the study, with all its data.
         held: trials left out.
+        estimate: of the lanes with all their data, scaled coordinates; NaN where there is none.
         settings: as for `fit`; no doubt is followed up.
         progress: as for `fit`.
 
@@ -220,6 +229,6 @@ def refitted(
         The fit, onsets and offsets of the trials left out, and residuals of all trials.
     """
     plain = dataclasses.replace(settings, scrutiny=False)
-    result = fit(without(study, held), plain, progress)
+    result = fit(without(study, held), plain, progress, beside=estimate)
     touched = with_own_touch(study, held, result.theta, plain)
     return result, touched, predictions(study, touched.theta)

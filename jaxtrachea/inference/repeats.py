@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.cross_validation import refitted
@@ -131,7 +132,7 @@ def _merged(parts: list[list[int]], twins: list[list[int]]) -> list[list[int]]:
 
 
 def leave_repeats_out(
-    study: Study, settings: Settings, progress: Callable[[int, int], None] | None = None
+    whole: FitResult, settings: Settings, progress: Callable[[int, int], None] | None = None
 ) -> Missed:
     """Fit every lane without each of its `repeats` and predict the curves left out.
 
@@ -140,20 +141,21 @@ def leave_repeats_out(
     model the curves that it does worst on. One that predicts nothing makes its lane NaN.
 
     Args:
-        study: the study.
-        settings: as for `fit`.
+        whole: the fit of all curves.
+        settings: as for `fit`; every refit also starts from the estimate of the whole fit.
         progress: as for `fit`.
 
     Returns:
         The `Missed` of all lanes.
     """
+    study = whole.study
     count = len(study.curves)
     lanes, held, kinds = repeats(study)
     if not len(lanes):
         none = np.zeros(count, int)
         return Missed(np.full(count, np.nan), none, none, none)
     chosen = study.take(lanes)
-    result, touched, seen = refitted(chosen, held, settings, progress)
+    result, touched, seen = refitted(chosen, held, whole.theta[lanes], settings, progress)
     seen = seen.force
     observed = held[:, :, None] & (chosen.lanes.precision > 0)
     lost = np.any(observed & ~np.isfinite(seen), axis=(1, 2))

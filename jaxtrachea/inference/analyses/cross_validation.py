@@ -25,7 +25,7 @@ def _refuse(request: Request) -> None:
 
 
 def _compute(request: Request, findings: Findings, progress: Progress) -> LeftOut:
-    return leave_one_out(request.study, request.settings, progress)
+    return leave_one_out(findings.result, request.settings, progress)
 
 
 def left_out_cells(left_out: LeftOut) -> list[Cells]:
