@@ -51,6 +51,11 @@ def with_specimen(name):
 GERMAN = TABLE.replace(",", ";").replace(".", ",")
 MARKERS = column("joint_3 [mm]", [f"{0.05 * i}" if i % 3 else "" for i in range(32)])
 ENDS = column("end_U_3_y [um]", range(32))
+#: Micrometres from 0 to 1400 by hundreds, 1000 written 1.000, of two curves.
+GROUPED = ["0", *[str(100 * i) for i in range(1, 10)], *[f"1.{i}00" for i in range(6)]]
+THOUSANDS = "specimen;displacement [um];force [N]\n" + "".join(
+    f"{who};{D};{i + 1}.5\n" for who in "AB" for i, D in enumerate(GROUPED)
+)
 NAMELESS = "\n".join(line.split(",", 2)[2] for line in TABLE.split("\n")[:9]) + "\n"
 
 #: Files that pyarrow reads, with options.
@@ -97,10 +102,19 @@ PLAIN = {
     ),
     "name by the file": (NAMELESS, {"format": "tidy"}),
     "sigma": (column("sigma [N]", ["0.1"] * 32), {}),
+    "three decimals, some below 1": (
+        THOUSANDS.replace(";0;", ";0.125;").replace(";100;", ";1.125;"),
+        {},
+    ),
+    "two decimals": (THOUSANDS.replace("00;", "0;"), {}),
+    "three decimals, few whole": (THOUSANDS.replace("00;", ";"), {}),
     "sigma below 0": (column("sigma [N]", ["-0.1"] * 32), {}),
 }
 #: Files that must be read line by line, or are refused so.
 ODD = {
+    "thousands after a point": (THOUSANDS, {}),
+    "thousands after a comma": (THOUSANDS.replace(",", "").replace(".", ","), {}),
+    "thousands, blanks around": (THOUSANDS.replace(";", " ; "), {}),
     "short row": (with_row("A,1,35.5,0.4"), {}),
     "long row": (with_row("A,1,35.5,0.4,1.0,7"), {}),
     "empty cells beyond the header": (with_row("A,1,35.5,0.4,1.0,,"), {}),

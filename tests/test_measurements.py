@@ -99,6 +99,19 @@ def test_first_line_state(tmp_path):
     assert (got.specimen, got.trial, got.s_c) == ("T03", "1", 17.0)
 
 
+@pytest.mark.parametrize("sign", [".", ","])
+def test_a_column_that_may_have_thousands_separators_is_refused(tmp_path, sign):
+    """After 900 comes 1.000: one micrometre, or a millimetre; the other columns tell nothing."""
+    rows = [f"T;{v if v < 1000 else f'1{sign}{v - 1000:03d}'};{v}" for v in range(0, 1500, 100)]
+    text = "specimen;displacement [um];force [mN]\n" + "\n".join(rows)
+    (bad,) = read(put(tmp_path, text)).bad
+    assert bad.kind == "unparsable"
+    assert f"line 12: displacement '1{sign}000', among whole numbers" in bad.message
+    assert "leave thousands separators out" in bad.cure
+    (good,) = read(put(tmp_path, text.replace(sign, ""))).curves
+    assert good.displacement[-1] == 1.4
+
+
 @pytest.mark.parametrize(
     ("text", "options", "message"),
     [

@@ -227,7 +227,12 @@ def test_an_end_that_was_not_found_is_no_proof(result):
             result, evidence_end=end, evidence_low=low, evidence_high=high
         )
         words.append(verdict_of(changed, 4, 2))
+        high[4, 2] = result.value[4, 2]
     assert words == ["identifiable", "not shown"]
+    # Where nothing is known of a side, the local error: no interval of no width.
+    judged = judgement(changed, 4, 2)
+    assert judged.low == low[4, 2]
+    assert judged.high == result.upper[4, 2] > 1.001 * result.value[4, 2]
 
 
 @pytest.mark.slow

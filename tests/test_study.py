@@ -3,6 +3,8 @@
 import csv
 import json
 import re
+from contextlib import nullcontext
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -12,8 +14,8 @@ from run_cli import run
 from jaxtrachea._errors import InputError
 from jaxtrachea.cli.specification import parameters_of, study_of, usable
 from jaxtrachea.config import FitSpec, SpecError, TracheaSection, load_fit_spec
-from jaxtrachea.fitting.parameters import DEFAULTS
-from jaxtrachea.fitting.study import build_study
+from jaxtrachea.fitting.parameters import DEFAULTS, in_model
+from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.design import candidates_of
 from jaxtrachea.measurements.data_files import find_files, read_data
 from jaxtrachea.measurements.read import Curve, DataError, Measurements, write_hdf5
@@ -203,6 +205,62 @@ def test_radius_counts_without_rings():
     assert float(geometry.radius) == 9.0
     assert np.isclose(float(geometry.half_angle), np.radians(100))
     assert geometry.rings == 15
+
+
+def signed(displacement, force):
+    """A press of 2 mm with 1 N/mm, recorded with these signs from this place on."""
+    D = np.linspace(0.1, 2, 20)
+    return Curve("A", "t", 75.0, 0.0, displacement(D), force(D))
+
+
+@pytest.mark.parametrize(
+    ("curve", "changes", "says"),
+    [
+        (signed(np.negative, np.negative), {}, "at or before the onset, 0 mm"),
+        (signed(np.negative, np.negative), {"force_offset": {}}, "at or before the onset"),
+        (signed(np.negative, np.negative), {"onset": {}}, "its largest force pulls"),
+        (signed(lambda D: D - 1.5, np.copy), {"onset": {"value": 0.6, "fixed": True}}, "0.6 mm"),
+        (signed(lambda D: D - 2.0, np.copy), {}, "at or before the onset"),
+        (signed(lambda D: D - 2.0, np.copy), {"onset": {}}, None),
+        (signed(lambda D: D - 1.0, lambda D: np.maximum(D - 1, 0)), {}, None),
+        (signed(np.negative, np.negative), {"onset": {}, "force_offset": {}}, None),
+    ],
+)
+def test_a_curve_that_no_touch_explains_is_refused(curve, changes, says):
+    """Both signs turned pass for a press of positive stiffness, of which a touch shows nothing."""
+    options = Options(coupling="total")
+    with nullcontext() if says is None else pytest.raises(InputError, match=says) as refused:
+        build_study([curve], table_1(), options, changes)
+    if refused is not None:
+        assert "specimen 'A' trial 't'" in str(refused.value)
+        assert "force_sign = -1 and displacement_sign = -1" in str(refused.value)
+        bonded = Options(coupling="total", contact="bonded")
+        assert build_study([curve], table_1(), bonded, changes).lanes.force.size == 20
+
+
+def test_of_a_file_curves_that_no_touch_explains_are_bad(two):
+    """Two of three presses recorded negative cost themselves, not the fit."""
+    curves = [signed(np.copy, np.copy), *[signed(np.negative, np.negative)] * 2]
+    curves = [replace(c, trial=str(i)) for i, c in enumerate(curves)]
+    spec = FitSpec.model_validate({"data": {"files": "*.csv"}})
+    found = usable(spec, Measurements(tuple(curves), (), ()))
+    assert [c.trial for c in found.curves] == ["0"]
+    assert [b.kind for b in found.bad] == ["sign", "sign"]
+    with pytest.raises(SpecError, match="force_sign = -1"):
+        usable(spec, Measurements(tuple(curves[1:]), (), ()))
+
+
+@pytest.mark.parametrize(
+    ("change", "fixed"),
+    [({}, False), ({"scope": "trial"}, False), ({"value": 0.1}, False), ({"fixed": True}, True)],
+)
+def test_what_is_named_is_fitted_unless_fixed(change, fixed):
+    """In Python as in a specification, where `onset = {}` frees it."""
+    names = in_model(Options(), joints=False)
+    table = {p.name: p for p in default_parameters(names, {"onset": change})}
+    assert table["onset"].fixed is fixed
+    assert table["force_offset"].fixed
+    assert not table["k_1"].fixed
 
 
 @pytest.mark.parametrize("count", [1, 2, 16])

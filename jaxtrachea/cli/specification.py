@@ -8,7 +8,7 @@ from jaxtrachea.config import FitSpec, ParameterSection, SpecError
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, defaults_of, held, in_model, visible
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Study, build_study, check_curve
+from jaxtrachea.fitting.study import Study, build_study, check_curve, check_touch
 from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.inference.together import left_out_together
 from jaxtrachea.measurements.read import (
@@ -144,16 +144,21 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
         SpecError: not one curve is left; the message is that of the first.
     """
     geometry, options = geometry_of(spec.trachea), options_of(spec)
+    marked = any(c.joint_displacement is not None for c in measurements.curves)
+    table = parameters_of(spec, options, joints=marked)
     good, bad = [], list(measurements.bad)
     reasons = []
     for curve in measurements.curves:
+        kind = "position"
         try:
             check_curve(curve, geometry, options)
+            kind = "sign"
+            check_touch(curve, options, table)
         except InputError as error:
             reasons.append(f"{curve.source}: {error}")
-            text = str(InputError.like(error, place=""))
-            cure = "correct the file, or the trachea and model sections"
-            bad.append(BadCurve(curve.specimen, curve.trial, curve.source, "position", text, cure))
+            cure = error.remedy or "correct the file, or the trachea and model sections"
+            place = curve.specimen, curve.trial, curve.source
+            bad.append(BadCurve(*place, kind, error.problem, cure))
         else:
             good.append(curve)
     if reasons and not good:

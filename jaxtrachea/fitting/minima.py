@@ -5,6 +5,7 @@ import functools
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import Descent, descend
@@ -14,7 +15,7 @@ from jaxtrachea.fitting.lane import data_weight
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, noise_rounds
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.shared import solve_jointly
-from jaxtrachea.fitting.starts import add_starts, best, draw_starts, with_one_more
+from jaxtrachea.fitting.starts import add_starts, best, draw_starts
 from jaxtrachea.fitting.structure import Structure, reduced
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.optimisation.levenberg_marquardt import Solved, levenberg_marquardt
@@ -103,7 +104,7 @@ def _from_starts(study: Study, settings: Settings, starts, sigma, progress, besi
     drawn = starts is None
     starts = draw_starts(study, settings) if drawn else starts
     if beside is not None:
-        starts, settings = with_one_more(starts, beside, settings)
+        starts, settings = _with_one_more(starts, beside, settings)
     lanes = study.lanes.lower.shape[0]
     if study.joint:
         solved, agree = _solve_jointly(study, settings, starts, sigma, progress)
@@ -119,6 +120,20 @@ def _from_starts(study: Study, settings: Settings, starts, sigma, progress, besi
     tried = np.bincount(rows, minlength=lanes)
     chosen = Solved(*(v[lowest] for v in solved))
     return chosen, agree, tried, rows, solved.theta, solved.cost
+
+
+def _with_one_more(
+    starts: Float[np.ndarray, "starts P"], beside: Float[np.ndarray, "lanes P"], settings: Settings
+) -> tuple[Float[np.ndarray, "more P"], Settings]:
+    """Starts of every lane after one more, `beside`; where it is NaN, the lane's first again.
+
+    Returns:
+        The starts, lane by lane, and settings that say how many there are of each.
+    """
+    each = starts.reshape(len(beside), settings.starts, -1)
+    first = np.where(np.isfinite(beside), beside, each[:, 0])[:, None]
+    more = np.concatenate([first, each], axis=1).reshape(-1, starts.shape[1])
+    return more, dataclasses.replace(settings, starts=settings.starts + 1)
 
 
 def refit_with_sigma(study: Study, settings: Settings, theta, sigma) -> Solved:

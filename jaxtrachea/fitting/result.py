@@ -224,7 +224,8 @@ class Judgement(NamedTuple):
     Attributes:
         verdict: one of `VERDICTS`; "failed" without an estimate.
         low: 95 % interval in the parameter's unit, within its bounds: by profile and other minima
-            where there is such evidence, else local; the bound where open.
+            where there is such evidence, else local; the bound where open. Where an end is
+            `FAILED`, the local one, if it reaches further than what is known.
         high: likewise.
         ends: `ProfileEnd` of the two; None where the interval is local.
         error: relative error that the verdict rests on: the longer side of the interval over that
@@ -316,7 +317,13 @@ def _unbounded(
     if not found:
         return local
     low_end, high_end = (_end([v[2][side] for v in found]) for side in (0, 1))
-    return min(v[0] for v in found), max(v[1] for v in found), (low_end, high_end)
+    low, high = min(v[0] for v in found), max(v[1] for v in found)
+    # Of a side whose end was not found nothing is known but the local error.
+    if low_end == ProfileEnd.FAILED:
+        low = float(np.fmin(low, local[0]))
+    if high_end == ProfileEnd.FAILED:
+        high = float(np.fmax(high, local[1]))
+    return low, high, (low_end, high_end)
 
 
 def _end(ends: list[int]) -> int:

@@ -4,7 +4,6 @@ What is drawn for a lane beyond its first starts depends on the seed and the lan
 on the lanes beside it.
 """
 
-import dataclasses
 import hashlib
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxtrachea.fitting.press_scale import around_touch
-from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
 from jaxtrachea.status import FitStatus
@@ -66,20 +64,6 @@ def draw_starts(study: Study, settings) -> np.ndarray:
     unit = (strata + rng.uniform(size=(others, P))) / max(others, 1)
     drawn = low[:, None] + unit[None] * (high - low)[:, None]
     return np.concatenate([guess[:, None], drawn], axis=1).reshape(-1, P)
-
-
-def with_one_more(
-    starts: Float[np.ndarray, "starts P"], beside: Float[np.ndarray, "lanes P"], settings: Settings
-) -> tuple[Float[np.ndarray, "more P"], Settings]:
-    """Starts of every lane after one more, `beside`; where it is NaN, the lane's first again.
-
-    Returns:
-        The starts, lane by lane, and settings that say how many there are of each.
-    """
-    each = starts.reshape(len(beside), settings.starts, -1)
-    first = np.where(np.isfinite(beside), beside, each[:, 0])[:, None]
-    more = np.concatenate([first, each], axis=1).reshape(-1, starts.shape[1])
-    return more, dataclasses.replace(settings, starts=settings.starts + 1)
 
 
 Solve = Callable[[np.ndarray, np.ndarray], Solved]

@@ -24,6 +24,7 @@ from jaxtrachea.fitting.model import Common, FitModel, columns_of, numbers_of
 from jaxtrachea.fitting.onset import blends, natural_steps, onset_is_sought, within_reach
 from jaxtrachea.fitting.parameters import (
     DEFAULTS,
+    OF_THE_PRESS,
     SKELETON,
     Parameter,
     defaults_of,
@@ -223,8 +224,9 @@ def build_study(
         geometry: the tube at rest (`Geometry.create` takes plain numbers; kept as float64).
         options: what the model includes.
         parameters: the table, in the order of `parameters.in_model`; or changes to the defaults of
-            the model, `{"k_1": {"value": 2.0}, "EI_L": {"fixed": True}}`; None: the defaults. Of
-            another wall than `parameters.defaults_of` takes, the table by `default_parameters`.
+            the model, `{"k_1": {"value": 2.0}, "EI_L": {"fixed": True, "value": 1.9}}`, where what
+            is named is fitted unless it says `fixed`; None: the defaults. Of another wall than
+            `parameters.defaults_of` takes, the table by `default_parameters`.
         noise: known standard deviations.
         weighting: balance between curves, the loss, and whether ends of pressed rings count.
         tool_radius: mm; markers closer to the contact are held by the tool and left out. None: all
@@ -234,9 +236,9 @@ def build_study(
 
     Raises:
         ValueError: a `tool_radius` that is no length, none where `weighting` leaves pressed ends
-            out, no curve, a marker on a ring that does not exist, a curve without a contact
-            position where one is needed, with specimen and trial named; a parameter that the model
-            does not have.
+            out, no curve, one that no touch explains (`check_touch`), a marker on a ring that does
+            not exist, a curve without a contact position where one is needed, with specimen and
+            trial named; a parameter that the model does not have.
     """
     if tool_radius is not None and not 0 <= tool_radius < np.inf:
         raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
@@ -253,7 +255,10 @@ def build_study(
         curves, unread = along_the_normal(curves)
         if unread is not None:
             warnings.warn(unread, stacklevel=2)
-    parameters = natural_steps(_table(parameters, options, curves, geometry), curves)
+    table = _table(parameters, options, curves, geometry)
+    for curve in curves:
+        check_touch(curve, options, table)
+    parameters = natural_steps(table, curves)
     joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1
     groups = group(curves, parameters, joint=joint)
@@ -353,6 +358,41 @@ def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
         raise InputError(found, place=where)
 
 
+def check_touch(curve: Curve, options: Options, parameters: Sequence[Parameter]) -> None:
+    """Refuse a curve whose largest force is one that a tool which only touches cannot have.
+
+    Args:
+        curve: the curve.
+        options: with `unilateral` contact; other curves may pull.
+        parameters: the table: a fitted onset may lie anywhere, a fitted offset shifts all forces.
+
+    Raises:
+        InputError: it pulls, or comes before the onset, both by twice what is left; specimen and
+            trial are named.
+    """
+    if options.contact != "unilateral":
+        return
+    onset, offset = (next(p for p in parameters if p.name == name) for name in OF_THE_PRESS)
+    force = curve.force - (offset.value if offset.fixed else 0)
+    if onset.fixed:
+        pressed = curve.displacement > onset.value
+        if not offset.fixed:
+            lost, kept = float(not pressed.any()), 0.0
+        else:
+            lost, kept = (np.max(np.abs(force[v]), initial=0) for v in (~pressed, pressed))
+        found = f"its largest force is at or before the onset, {onset.value:g} mm"
+    else:
+        lost, kept = (-np.min(force), np.max(force)) if offset.fixed else (0.0, 0.0)
+        found = "its largest force pulls"
+    if lost > 2 * kept:
+        raise InputError(
+            f"{found}, where a tool that only touches (contact = 'unilateral') has none",
+            place=f"specimen {curve.specimen!r} trial {curve.trial!r}",
+            cure="use force_sign = -1 and displacement_sign = -1 where the file counts compression "
+            "negative, contact = 'bonded' where it pulls, or fit the onset",
+        )
+
+
 def _check_normal(curve: Curve, options: Options, where: str) -> None:
     """Refuse a press that a line of joints does not have.
 
@@ -417,12 +457,13 @@ def default_parameters(
 
     Args:
         names: parameters of the model.
-        changes: fields of `Parameter` by name.
+        changes: fields of `Parameter` by name; whatever is named is fitted, unless `fixed` is true.
         defaults: what is changed; see `parameters.defaults_of`.
 
     Raises:
         ValueError: a change names a parameter that the chosen model does not contain, or something
-            that a parameter does not have, or holds a first guess (`fixed` without `value`).
+            that a parameter does not have, or holds a first guess (`fixed` without `value`), or is
+            no mapping.
     """
     unknown = [name for name in changes if name not in names]
     if unknown:
@@ -431,6 +472,11 @@ def default_parameters(
         )
     known = [f.name for f in dataclasses.fields(Parameter) if f.name != "name"]
     for name, change in changes.items():
+        if not isinstance(change, Mapping):
+            raise ValueError(
+                f"parameters.{name}: found {change!r}; expected its fields, as in "
+                "{'fixed': True, 'value': 1.0}, or {} to fit it"
+            )
         for key in change:
             if key not in known:
                 raise ValueError(
@@ -443,4 +489,5 @@ def default_parameters(
                 expected = "a value beside it, as in {'fixed': True, 'value': 1.0}"
                 key = f"parameters.{name}: fixed"
                 raise InputError.like(error, key=key, expected=expected) from None
-    return tuple(dataclasses.replace(defaults[n], **changes.get(n, {})) for n in names)
+    fitted = {name: {"fixed": False, **change} for name, change in changes.items()}
+    return tuple(dataclasses.replace(defaults[n], **fitted.get(n, {})) for n in names)

@@ -24,7 +24,6 @@ from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.result import FitResult, interval95, within_bounds
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.residuals import lag_correlation
-from jaxtrachea.status import ProfileEnd
 
 #: Correlation of neighbouring residuals from which the report doubts plain standard errors.
 CORRELATED = 0.3
@@ -119,19 +118,14 @@ def _drawn_out(
     """Plain intervals with their sides `growth` times as long on the scaled coordinate."""
     study = result.study
     plain = np.full((2, *result.theta.shape), np.nan)
-    unfound = np.zeros(plain.shape, bool)
     for lane, unknowns in enumerate(study.unknowns):
         for i in range(len(unknowns)):
-            *plain[:, lane, i], ends = interval95(result, lane, i, profiles)
-            unfound[:, lane, i] = [end == ProfileEnd.FAILED for end in ends or ()] or False
-    # Of a side whose end was not found nothing is known but the local error.
-    local = np.fmin(plain[0], result.lower), np.fmax(plain[1], result.upper)
+            *plain[:, lane, i], _ = interval95(result, lane, i, profiles)
     log = study.of_unknowns(lambda p: p.scale == "log", False)
     step = study.of_unknowns(lambda p: p.step, 1.0)
     sign, growth = np.array([-1.0, 1.0])[:, None, None], growth[:, None]
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        ends = np.where(unfound, local, plain)
-        side = np.abs(np.where(log, np.log(ends), ends / step) - result.theta)
+        side = np.abs(np.where(log, np.log(plain), plain / step) - result.theta)
         # A side of no length, of an estimate on its bound, has no limit either where none has.
         theta = result.theta + sign * np.where(np.isinf(growth), growth, side * growth)
         wide = np.where(log, np.exp(theta), theta * step)

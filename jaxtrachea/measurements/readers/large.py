@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxtrachea.measurements.readers.lines import Lines, is_comment
+from jaxtrachea.measurements.readers.text import grouped
 
 #: Smallest text that is read so, bytes: below, pyarrow takes as long to import as it saves.
 MIN_BYTES = 2**20
@@ -124,8 +125,8 @@ def read_cells(
     decimal = _decimal_sign(found, end, delimiter)
     if decimal is None or _is_odd(found, end, width == len(names) + len(numbers)):
         return None
-    table = _parsed(memoryview(found.data)[found.begin : end], width, delimiter, decimal, names,
-                    numbers)  # fmt: skip
+    rows = memoryview(found.data)[found.begin : end]
+    table = _parsed(rows, width, delimiter, decimal, names, numbers)
     count = found.data.count(b"\n", found.begin, end) + 1
     if table is None or table.num_rows != count:
         return None
@@ -136,7 +137,11 @@ def read_cells(
             return None
         columns[i] = cells
     for i in numbers:
-        columns[i] = table[str(i)].to_numpy()
+        columns[i] = values = table[str(i)].to_numpy()
+        if _may_be_grouped(values):
+            cells = _parsed(rows, width, delimiter, decimal, [i], [])[str(i)].to_pylist()
+            if grouped([*map(str.strip, cells)]) is not None:
+                return None
     # An empty line is a row of empty cells here, and would be left out. In a column of names it
     # has been found already.
     if not names and all(table[str(i)].null_count for i in numbers):
@@ -147,6 +152,19 @@ def read_cells(
             return None
     first = found.lines.numbers[-1] + 1
     return range(first, first + count), columns
+
+
+def _may_be_grouped(values: np.ndarray) -> bool:
+    """Whether `grouped` may find thousands separators in the cells of a column, by its numbers."""
+    size = np.abs(values[np.isfinite(values)])
+    whole = size == np.floor(size)
+    thousands = 1e3 * size[~whole]
+    return bool(
+        np.any(size[whole] >= 100)
+        and np.all(size < 1000)
+        and np.all(thousands >= 1e3)
+        and np.all(np.abs(thousands - np.round(thousands)) < 1e-6)
+    )
 
 
 def _is_odd(found: Opened, end: int, all_read: bool) -> bool:

@@ -27,6 +27,8 @@ ALIASES = {
 # Columns of time, taken where they have a unit; they tell the duration of holds.
 TIMES = ("time", "elapsed time", "total time", "test time", "running time")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_GROUPS = re.compile(r"[+-]?[1-9]\d{0,2}(?:\.(?:\d{3}\.)*|,(?:\d{3},)*)\d{3}")
+_UNGROUPED = re.compile(r"[+-]?\d{1,3}")
 _DATE = re.compile(r"\d{4}-\d\d-\d\d|\d\d:\d\d:\d\d")
 
 
@@ -240,10 +242,19 @@ def numbers(
 
     A comma counts as the decimal sign where it does not separate the columns, unless another
     cell of the column has a point: then one of the two separates thousands, and both are refused.
+    So is the one sign of a column that goes on after 900 with 1.000 (`grouped`).
 
     Raises:
-        Fault: a cell is no number ("unparsable").
+        Fault: a cell is no number, or may be two ("unparsable").
     """
+    if (i := grouped(cells)) is not None:
+        raise Fault(
+            "unparsable",
+            f"{word} {lines[i]}: {name} {cells[i]!r}, among whole numbers of three digits, may be "
+            "a thousand times as large",
+            "write every number of the column with a decimal sign, or leave thousands separators "
+            "out",
+        )
     if "_" not in "".join(cells):
         try:
             return np.array([*map(float, cells)])
@@ -267,6 +278,23 @@ def numbers(
                 _number_cure(cell),
             ) from None
     return values
+
+
+def grouped(cells: Sequence[str]) -> int | None:
+    """Place of the first number that may have a thousands separator, if all cells agree with that.
+
+    They do where each is a whole number of at most three digits, some of them above 99, or groups
+    of three digits after a sign that none begins with 0.
+    """
+    first, large = None, False
+    for i, cell in enumerate(cells):
+        if _GROUPS.fullmatch(cell):
+            first = i if first is None else first
+        elif not cell or _UNGROUPED.fullmatch(cell):
+            large = large or len(cell.lstrip("+-")) == 3
+        else:
+            return None
+    return first if large else None
 
 
 def _number_cure(cell: str) -> str:
