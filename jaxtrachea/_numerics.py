@@ -80,6 +80,37 @@ def product(a: Float[Array, "*rows k"], b: Float[Array, "k ..."]) -> Float[Array
     return added(terms)
 
 
+@jax.custom_jvp
+def scaled(factor: Float[Array, "..."], v: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Factor * v, of equal ranks; where a factor is no number it says nothing of v's derivative.
+
+    A row without a solution is NaN, and 0 times NaN would be NaN in the derivative by a v that
+    other rows share.
+    """
+    return factor * v
+
+
+@scaled.defjvp
+def _scaled_jvp(primals, tangents):
+    (factor, v), (d_factor, d_v) = primals, tangents
+    return factor * v, d_factor * v + jnp.where(jnp.isfinite(factor), factor, 0) * d_v
+
+
+@jax.custom_jvp
+def product_of_rows(
+    rows: Float[Array, "*rows k"], b: Float[Array, "k q"]
+) -> Float[Array, "*rows q"]:
+    """`product`, of which rows that are no numbers say nothing of b's derivative: see `scaled`."""
+    return product(rows, b)
+
+
+@product_of_rows.defjvp
+def _product_of_rows_jvp(primals, tangents):
+    (rows, b), (d_rows, d_b) = primals, tangents
+    known = jnp.where(jnp.isfinite(rows), rows, 0)
+    return product(rows, b), product(d_rows, b) + product(known, d_b)
+
+
 def picked(values: Float[Array, "*rows n"], index: Int[Array, "*places"]) -> Float[Array, "..."]:
     """`values[..., index]`, as a sum of choices; 0 where there is no such place.
 

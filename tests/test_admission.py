@@ -167,6 +167,7 @@ def any_words(function, argument):
 #: Called by what checks the word, with its own word; never from outside.
 INNER = {
     "mechanics.compliance.divide_load", "mechanics.reactions.deflect_dense",
+    "mechanics.beam.deflect_on",
     "mechanics.skeleton.respond", "mechanics.skeleton.read_values",
     "mechanics.energy.gradient", "mechanics.skeleton.turned_rings",
 }  # fmt: skip
@@ -393,6 +394,88 @@ def test_wrong_lengths_elsewhere():
         with pytest.raises(ValueError, match=f"^{says}"):
             # Traced, what comes before the refusal is not compiled; a scene needs numbers.
             call() if says.startswith("path.") else jax.eval_shape(call)
+
+
+def masked(found):
+    """A loss of the rows with a solution, of all that a press gives."""
+    fine = (found.status == OK) | (found.status == PressStatus.NEGATIVE_LOCAL)
+    numbers = [v.reshape(*fine.shape, -1) for v in (found.force, found.skeleton, found.joints)]
+    rows = sum(jnp.sum(v, axis=-1) for v in numbers)
+    return jnp.sum(jnp.where(fine, rows, 0))
+
+
+def by_press(options):
+    def loss(g, m, at, k_1, depth):
+        def one(at, k_1, D):
+            return press(g, dataclasses.replace(m, k_1=k_1), at, D, options)
+
+        return masked(jax.vmap(one)(at, k_1, jnp.stack([depth / 2, depth], 1)))
+
+    return loss
+
+
+def by_oblique(g, m, at, k_1, depth):
+    def one(at, k_1, D):
+        return press_oblique(g, dataclasses.replace(m, k_1=k_1), at, 0.1, D)
+
+    D = jnp.stack([depth / 2, depth], 1)[..., None] * jnp.array([[[0, -1.0, 0.1]]])
+    return masked(jax.vmap(one)(at, k_1, D))
+
+
+def by_scene(g, m, at, k_1, depth, scene):
+    D = depth[:, None] * jnp.array([[0, -1.0, 0]])
+    return masked(simulate(scene, m, Presses(at, jnp.zeros(2), D)))
+
+
+def on_a_scene(loss):
+    path = Presses([40.0] * 2, [0.0] * 2, [[0, -0.1, 0], [0, -0.2, 0]])
+    effects = EffectOptions(contact_point="per_step", want_surface=False, want_ring_ends=False)
+    scene = make_scene(table_1(), Material(**FULL), path, effects=effects)
+    return functools.partial(loss, scene=scene)
+
+
+#: Place, k_1 and displacement of a row without a solution.
+LOST = {
+    "past its fold": (40.0, 0.8, 80.0),
+    "no displacement": (40.0, 0.8, np.nan),
+    "infinite displacement": (40.0, 0.8, np.inf),
+    "no place": (np.nan, 0.8, 1.0),
+    "off the tube": (-1.0, 0.8, 1.0),
+    "no stiffness": (40.0, np.nan, 1.0),
+    "infinite stiffness": (40.0, np.inf, 1.0),
+    "negative stiffness": (40.0, -1.0, 1.0),
+}
+
+
+@pytest.mark.parametrize(
+    ("loss", "skip"),
+    [
+        (by_press(Options()), ()),
+        (by_press(Options(coupling="total")), ()),
+        (by_oblique, ()),
+        (by_scene, ("no stiffness", "infinite stiffness", "negative stiffness")),
+    ],
+    ids=["press", "press total", "press_oblique", "simulate"],
+)
+def test_a_row_without_a_solution_leaves_shared_derivatives_as_they_are(loss, skip):
+    """Those by tube and material are those of the other rows alone: 0 times NaN is NaN."""
+    g, m = table_1(), Material(**FULL | {"k_3": -0.01})
+    loss = on_a_scene(loss) if loss is by_scene else loss
+
+    @jax.jit
+    @jax.grad
+    def grad(shared, *of_row):
+        return loss(
+            *shared, *(jnp.stack([v, w]) for v, w in zip((40.0, 0.8, 0.5), of_row, strict=True))
+        )
+
+    alone = jax.tree.leaves(grad((g, m), 40.0, 0.8, 0.0))
+    assert any(np.any(v != 0) for v in alone)
+    for name, row in LOST.items():
+        if name not in skip:
+            found = jax.tree.leaves(grad((g, m), *row))
+            for p, q in zip(found, alone, strict=True):
+                np.testing.assert_allclose(p, q, rtol=1e-12, atol=1e-15, err_msg=name)
 
 
 @pytest.mark.slow

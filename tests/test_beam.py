@@ -182,7 +182,7 @@ def test_cantilever_reference_agrees_with_fem():
 def test_cantilever_dense_keeps_few_digits():
     """`reactions` errs by 2e-10 of the largest reaction; R_1, 11 decades down, keeps 3 digits."""
     b = beam_of(10.0 * np.arange(1, 16), 155.0, np.full(16, 1.86), np.full(15, 0.1))
-    _, R, _ = reactions._dense_side(b, b.length, jnp.ones(15, bool))
+    _, _, R, _ = reactions._dense_side(b, b.length, jnp.ones(15, bool))
     error = np.abs(0.1 * R[:, 0] - np.array(CANTILEVER_R))
     assert error.max() < 1e-9 * max(CANTILEVER_R)
     assert 1e-6 < error[0] / abs(CANTILEVER_R[0]) < 0.1
@@ -202,6 +202,74 @@ def test_reactions_same_answer(split, shear):
             p, q = getattr(one, name), getattr(two, name)
             peak = jnp.max(jnp.abs(two.theta if name == "theta_C" else q))
             np.testing.assert_allclose(p, q, atol=2e-9 * float(peak), rtol=0, err_msg=name)
+
+
+@pytest.mark.parametrize("split", ["continuous", "independent"])
+@pytest.mark.parametrize("shear", [False, True])
+def test_derivatives_of_both_forms(split, shear):
+    """Between rings, on a ring (from the right, where they jump), and where a ring gives way."""
+    b = table_1()
+    b = Beam(b.x, b.length, b.EI, b.k.at[4].set(0.0), jnp.full(16, 2.0) if shear else None)
+
+    def moved(b, s, form):
+        found = deflect(b, s, -0.2, split=split, form=form)
+        return found.w_C + found.w[6] + 10 * found.theta[8]
+
+    derivatives = jax.jit(jax.grad(moved, argnums=(0, 1)), static_argnums=2)
+    for s in (44.0, 50.0, 70.0):
+        one, two = (jax.tree.leaves(derivatives(b, s, form)) for form in ("recursion", "reactions"))
+        for p, q in zip(one, two, strict=True):
+            atol = 1e-12 + 1e-7 * float(jnp.max(jnp.abs(p)))
+            np.testing.assert_allclose(q, p, atol=atol, rtol=0)
+
+
+def test_derivative_of_reactions_on_a_ring_against_elements():
+    """Without shear w_C is smooth as C crosses a ring: central differences of the elements."""
+    x, h = np.array([11.0, 26.0, 33.0, 58.0, 70.0, 97.0]), 1e-4
+    b = beam_of(x, 130.0, np.full(7, 1.86), np.full(6, 0.1))
+    grad = jax.jit(jax.grad(lambda s: deflect(b, s, 1.0, form="reactions").w_C))
+    for s in (11.0, 33.0, 70.0):
+        low, high = (
+            float(beam_fem.solve(b.x, b.length, b.EI, b.k, s + d, 1.0).w_C) for d in (-h, h)
+        )
+        np.testing.assert_allclose(grad(s), (high - low) / (2 * h), rtol=1e-5)
+
+
+@pytest.mark.parametrize("form", ["recursion", "reactions"])
+def test_off_the_beam_nothing_is_known(form):
+    """-5 and 165 mm on a beam of 160 mm gave finite numbers; both ends are on it."""
+    b, s = table_1(), np.array([-5.0, -1e-9, 0.0, 80.0, 160.0, 165.0, np.nan])
+    lost = [True, True, False, False, False, True, True]
+    if form == "recursion":
+        found = [contact_compliance(b, s), [contact_compliance(b, v) for v in s]]
+    else:
+        found = [jax.vmap(lambda v: deflect(b, v, 1.0, form=form).reaction[0])(s)]
+    found.append(jax.vmap(lambda v: deflect(b, v, 1.0, form=form).w_C)(s))
+    for values in found:
+        assert np.isnan(values).tolist() == lost
+
+
+def test_a_beam_takes_plain_numbers_and_says_what_does_not_fit():
+    x, EI, k = [10, 20, 40], [2.0] * 4, [1, 1, 1]
+    plain = Beam(x, 70, EI, k)
+    want = Beam(*(jnp.asarray(v, float) for v in (x, 70, EI, k)))
+    np.testing.assert_array_equal(contact_compliance(plain, 30), contact_compliance(want, 30.0))
+    for change, says in {
+        "EI": (2.0, "Beam.EI has no axis .*; expected 4 values .3 supports make 4 spans"),
+        "k": ([1.0, 1.0], "Beam.k has 2 values; expected 3 values .one for each support"),
+        "GA": ([1.0], "Beam.GA has 1 value; expected 4 values"),
+        "length": ([70.0, 80.0], "Beam.length has 2 values; expected no axis"),
+    }.items():
+        wrong = dict(zip(("x", "length", "EI", "k"), (x, 70, EI, k), strict=True)) | {
+            change: says[0]
+        }
+        made = object.__new__(Beam)
+        for name, value in (wrong | {"GA": wrong.get("GA")}).items():
+            object.__setattr__(made, name, None if value is None else jnp.asarray(value, float))
+        with pytest.raises(ValueError, match=says[1]):
+            contact_compliance(made, 30.0)
+        with pytest.raises(ValueError, match=says[1]):
+            deflect(made, 30.0, 1.0)
 
 
 def test_reactions_refuses_ring_load():

@@ -24,9 +24,9 @@ class Admitted(NamedTuple):
     """What a press is computed with.
 
     Attributes:
-        material: with 1 in place of negative values.
+        material: with 1 in place of values that are negative or not finite.
         s_c: contact position, mm; the middle of the tube in place of one where it is refused.
-        refused: `PressStatus`: OK, OFF_TUBE or BAD_MATERIAL.
+        refused: `PressStatus`: OK, OFF_TUBE, NON_FINITE or BAD_MATERIAL.
     """
 
     material: Material
@@ -59,11 +59,25 @@ def admit(
     check_shapes(geometry, material)
     length = geometry.length
     s_c = shaped("s_c", s_c, (), dtype=length.dtype, why="; use jax.vmap for many positions")
-    off = (s_c < reach) | (s_c > length - reach)
+    used = tuple(used)
+    on = (s_c >= reach) & (s_c <= length - reach)
     material, bad = without_negative(material, used)
-    refused = jnp.where(off, PressStatus.OFF_TUBE, PressStatus.OK)
+    material, finite = _finite(material, used)
+    refused = jnp.where(on, PressStatus.OK, PressStatus.OFF_TUBE)
+    refused = jnp.where(finite & ~jnp.isnan(s_c), refused, PressStatus.NON_FINITE)
     refused = jnp.where(bad, PressStatus.BAD_MATERIAL, refused).astype(jnp.int8)
-    return Admitted(material, jnp.where(off, length / 2, s_c), refused)
+    return Admitted(material, jnp.where(on, s_c, length / 2), refused)
+
+
+def _finite(material: Material, used: Iterable[str]) -> tuple[Material, Array]:
+    """The material with 1 in place of infinite values and NaN, and whether there were none."""
+    safe, all_finite = {}, jnp.ones((), bool)
+    for name in used:
+        if (value := getattr(material, name)) is not None:
+            finite = jnp.isfinite(value)
+            safe[name] = jnp.where(finite, value, 1)
+            all_finite = all_finite & jnp.all(finite)
+    return dataclasses.replace(material, **safe), all_finite
 
 
 def check_shapes(geometry: Geometry, material: Material) -> None:

@@ -153,6 +153,22 @@ def _tip(side: _Side, node: _Node) -> _Node:
     return _add_span(node, side.h[-1], side.EI[-1], None if side.GA is None else side.GA[-1])
 
 
+def _check_shapes(beam: Beam) -> None:
+    """Refuse a beam whose spans and supports do not fit each other.
+
+    Raises:
+        ValueError: which, its length and the expected one.
+    """
+    shaped("Beam.x", beam.x, ("any number of",))
+    n = beam.x.shape[0]
+    shaped("Beam.length", beam.length, ())
+    shaped("Beam.k", beam.k, (n,), why=" (one for each support)")
+    why = f" ({n} supports make {n + 1} spans)"
+    shaped("Beam.EI", beam.EI, (n + 1,), why=why)
+    if beam.GA is not None:
+        shaped("Beam.GA", beam.GA, (n + 1,), why=why)
+
+
 def _compliance_at(tips: Compliance, s, split: Split):
     """Deflection of C per unit force from the tips of both sides, `s` away from their clamps."""
     if split == "independent":
@@ -166,10 +182,11 @@ def contact_compliance(
     """Deflection of C per unit normal force at C for every contact position: O(n + m).
 
     The two sweeps over the rings are done once; each position then costs one span step per side.
+    NaN off the beam.
 
     Args:
         beam: the beam and its supports.
-        s_c: contact positions, mm, in [0, length]; scalar or shape (m,).
+        s_c: contact positions, mm, on [0, length]; scalar or shape (m,).
         split: `continuous` (deflection and rotation agree at C; C1 in s_c) or `independent` (paper
             eq. 3; jumps as C crosses a ring).
 
@@ -177,18 +194,20 @@ def contact_compliance(
         Compliance, mm/N, of the shape of `s_c`.
 
     Raises:
-        ValueError: an unknown `split`, or no numbers.
+        ValueError: an unknown `split`, no numbers, or of a wrong number of spans or supports.
     """
     check_word("split", split, Split)
+    _check_shapes(beam)
     s_c = real("s_c", s_c, beam.x.dtype)
     if s_c.ndim > 1:
         raise ValueError(f"s_c has shape {s_c.shape}; expected a scalar or one axis")
     both = _both_sides(beam)
+    on = (s_c >= 0) & (s_c <= beam.length)
     if s_c.ndim == 0:
         count, last, s = _reach(beam, s_c)
         cut = jax.vmap(_up_to)(both, count, last)
         tips = jax.vmap(lambda side: _tip(side, _sweep(side)[0]))(cut)
-        return _compliance_at(tips.g, s, split)
+        return jnp.where(on, _compliance_at(tips.g, s, split), jnp.nan)
     _, nodes, _ = jax.vmap(_sweep)(both)
 
     def with_clamp(v):
@@ -206,7 +225,7 @@ def contact_compliance(
         tips = add_span(jax.tree.map(at, nodes.g), last, at(both.EI), GA)
         return _compliance_at(tips, s, split)
 
-    return jax.vmap(one)(s_c)
+    return jnp.where(on, jax.vmap(one)(s_c), jnp.nan)
 
 
 def deflect(
@@ -222,11 +241,10 @@ def deflect(
 
     Args:
         beam: the beam and its supports.
-        s_c: contact position, mm, in [0, length].
+        s_c: contact position, mm, on [0, length]; elsewhere all is NaN.
         force: N.
         split: how the force divides between AC and BC, see `contact_compliance`.
-        form: `recursion` or the paper's dense `reactions` (same answer, see module docstring;
-            needs k > 0).
+        form: `recursion` or the paper's dense `reactions` (same answer, see module docstring).
         ring_load: further forces on the supports themselves, in the direction of `force`, N; shape
             (n,). With them `reaction` is still the force between ring and beam: w_i = (R_i +
             ring_load_i) / k_i. Use float64 with them: the free motions of the two sides under these
@@ -241,14 +259,29 @@ def deflect(
     """
     check_word("split", split, Split)
     check_word("form", form, Form)
+    _check_shapes(beam)
     dtype = beam.x.dtype
     s_c, force = shaped("s_c", s_c, (), dtype=dtype), shaped("force", force, (), dtype=dtype)
     if ring_load is not None:
         why = " (one for each ring)"
         ring_load = shaped("ring_load", ring_load, beam.x.shape, dtype=dtype, why=why)
-    if form == "reactions":
-        if ring_load is not None:
+        if form == "reactions":
             raise ValueError("ring_load is not part of form='reactions'; use form='recursion'")
+    found = deflect_on(beam, s_c, force, split, form, ring_load)
+    on = (s_c >= 0) & (s_c <= beam.length)
+    return jax.tree.map(lambda v: jnp.where(on, v, jnp.nan), found)
+
+
+def deflect_on(
+    beam: Beam,
+    s_c: Float[Array, ""],
+    force: Float[Array, ""],
+    split: Split = "continuous",
+    form: Form = "recursion",
+    ring_load: Float[Array, " n"] | None = None,
+) -> Deflection:
+    """`deflect`, of arguments that are checked and a place on the beam."""
+    if form == "reactions":
         return deflect_dense(beam, s_c, force, split=split)
     count, last, s = _reach(beam, s_c)
     cut = jax.vmap(_up_to)(_both_sides(beam, ring_load), count, last)

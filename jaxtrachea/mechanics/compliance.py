@@ -3,12 +3,15 @@
 Signs and units as in `jaxtrachea.mechanics.beam`.
 """
 
+from functools import partial
 from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from jaxtrachea._arguments import real
 
 Split = Literal["continuous", "independent"]
 
@@ -25,11 +28,13 @@ class Beam(eqx.Module):
             (Bernoulli-Euler, as in the paper).
     """
 
-    x: Float[Array, " n"]
-    length: Float[Array, ""]
-    EI: Float[Array, " spans"]
-    k: Float[Array, " n"]
-    GA: Float[Array, " spans"] | None = None
+    x: Float[Array, " n"] = eqx.field(converter=partial(real, "Beam.x"))
+    length: Float[Array, ""] = eqx.field(converter=partial(real, "Beam.length"))
+    EI: Float[Array, " spans"] = eqx.field(converter=partial(real, "Beam.EI"))
+    k: Float[Array, " n"] = eqx.field(converter=partial(real, "Beam.k"))
+    GA: Float[Array, " spans"] | None = eqx.field(
+        default=None, converter=lambda v: None if v is None else real("Beam.GA", v)
+    )
 
 
 class Compliance(NamedTuple):

@@ -119,14 +119,16 @@ def press_total(
     Args: as `press_series`.
     """
     folded = (jnp.abs(displacement) >= fold_depth(law)) & law.softens()
-    force = law.force(displacement)
-    depth = displacement - compliance * force
-    negative = depth * displacement < 0
-    status = status_of(displacement, depth + force, folded)
+    known = jnp.isfinite(displacement)
+    moved = jnp.where(known, displacement, 0)
+    force = law.force(moved)
+    depth = moved - compliance * force
+    negative = depth * moved < 0
+    status = status_of(displacement, jnp.where(known, depth + force, jnp.nan), folded)
     status = jnp.where((status == PressStatus.OK) & negative, PressStatus.NEGATIVE_LOCAL, status)
 
     def hide(v):
-        return jnp.where(folded, jnp.nan, v)
+        return jnp.where(folded | ~known, jnp.nan, v)
 
     return Equilibrium(hide(depth), hide(force), status.astype(jnp.int8))
 

@@ -193,12 +193,15 @@ def _series(displacement, compliance, law: Law):
 def _series_jvp(primals, tangents):
     _, compliance, law = primals
     d_displacement, d_compliance, d_law = tangents
-    depth, force = _series(*primals)
-    slope = law.tangent(depth)
-    share = 1 / (1 + compliance * slope)
+    solution = _series(*primals)
+    # Without a solution derivatives are 0: NaN would be those of all rows by what they share.
+    solved = jnp.isfinite(solution[1])
+    depth, force, compliance = (jnp.where(solved, v, 0) for v in (*solution, compliance))
+    slope = jnp.where(solved, law.tangent(depth), 0)
+    share = jnp.where(solved, 1 / (1 + compliance * slope), 0)
     pushed = share * (d_displacement - force * d_compliance)
     grown = depth * d_law.secant(depth * depth)
-    return (depth, force), (pushed - (compliance * share) * grown, slope * pushed + share * grown)
+    return solution, (pushed - (compliance * share) * grown, slope * pushed + share * grown)
 
 
 def from_duffing(m_0, omega_0_squared, beta_0_squared_epsilon) -> Law:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, check_record, check_word, last_axis, shaped
-from jaxtrachea._numerics import product, turned
+from jaxtrachea._numerics import product, product_of_rows, turned
 from jaxtrachea.mechanics import friction as _friction
 from jaxtrachea.mechanics import skeleton, vector_equilibrium
 from jaxtrachea.mechanics.admission import Admitted, admit, hide, status_of
@@ -258,7 +258,7 @@ def _assemble(unit: Skeleton, force, depth, status) -> ObliquePress:
     """The skeleton's response times the forces; the ring's status where it has one."""
 
     def per_ring(v):
-        rows = product(force.reshape(-1, 3), v.reshape(-1, 3).T)
+        rows = product_of_rows(force.reshape(-1, 3), v.reshape(-1, 3).T)
         return rows.reshape(*force.shape[:-1], *v.shape[:-1])
 
     behind = unit.status == RingStatus.BEHIND_GAP
@@ -266,8 +266,8 @@ def _assemble(unit: Skeleton, force, depth, status) -> ObliquePress:
     return ObliquePress(
         force=force,
         depth=depth,
-        skeleton=product(force, unit.compliance.T),
-        slope_C=product(force, unit.slope_C.T),
+        skeleton=product_of_rows(force, unit.compliance.T),
+        slope_C=product_of_rows(force, unit.slope_C.T),
         joints=per_ring(unit.joints),
         slopes=per_ring(unit.slopes),
         loads=per_ring(unit.loads),

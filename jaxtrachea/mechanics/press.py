@@ -6,8 +6,8 @@ from typing import Literal, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._arguments import ArrayLike, check_record, real, shaped
-from jaxtrachea._numerics import centred_hinge, positive_part
+from jaxtrachea._arguments import ArrayLike, check_record, check_word, real, shaped
+from jaxtrachea._numerics import centred_hinge, positive_part, scaled
 from jaxtrachea.mechanics import beam as _beam
 from jaxtrachea.mechanics import equilibrium, force_law, punch
 from jaxtrachea.mechanics.admission import Admitted, admit, hide, status_of
@@ -116,8 +116,9 @@ def check_line(options: Options, what: str) -> None:
     """Refuse a skeleton of deforming cross-sections where a line of joints is pressed.
 
     Raises:
-        ValueError: naming what was called and the cure.
+        ValueError: naming what was called and the cure; or no `Options`.
     """
+    check_word("options", options, Options)
     if options.deforms_sections:
         raise ValueError(
             f"{what} presses a line of joints, not skeleton='sections'; use press_sections"
@@ -232,15 +233,14 @@ def compliance(
     """Deflection of C per unit force at C, mm/N, at one or many contact positions.
 
     Far cheaper than `press` where the joints are not asked for: many positions share one sweep
-    over the rings. NaN where a part of a tool with a width lies off the tube.
+    over the rings. NaN where C, or a part of a tool with a width, lies off the tube.
     """
     check_line(options, "compliance")
     beam = ligament_beam(geometry, material, options)
     if options.form == "recursion" and options.half_width == 0:
         return _beam.contact_compliance(beam, s_c, split=options.split)
     w_C = jnp.vectorize(lambda s: unit_deflection(beam, s, options).w_C)(s_c)
-    if (half := options.half_width) == 0:
-        return w_C
+    half = options.half_width
     return jnp.where((s_c < half) | (s_c > geometry.length - half), jnp.nan, w_C)
 
 
@@ -250,7 +250,7 @@ def unit_deflection(
     """Everything that moves under a unit force at C."""
     if options.half_width > 0:
         return punch.punch_deflection(beam, s_c, options.half_width)
-    unit = _beam.deflect(beam, s_c, jnp.ones_like(s_c), split=options.split, form=options.form)
+    unit = _beam.deflect_on(beam, s_c, jnp.ones_like(s_c), options.split, options.form)
     return punch.UnitDeflection(unit.w_C, unit.theta_C, unit.w, unit.theta, unit.reaction)
 
 
@@ -354,13 +354,13 @@ def _press(
     unit, solved = hide(refused, unit, solved)
 
     def per_ring(factor, v):
-        return factor[..., None] * jnp.broadcast_to(v, (*displacement.shape, *v.shape))
+        return scaled(factor[..., None], jnp.broadcast_to(v, (*displacement.shape, *v.shape)))
 
     load = solved.force if solved.load is None else solved.load
     return Press(
         force=solved.force,
         depth=solved.depth,
-        skeleton=unit.w_C * load,
+        skeleton=scaled(load, jnp.broadcast_to(unit.w_C, load.shape)),
         joints=per_ring(load, unit.w),
         reactions=per_ring(solved.force, unit.reaction),
         compliance=unit.w_C,

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea._numerics import epsilon, picked, product
-from jaxtrachea.mechanics.beam import deflect
+from jaxtrachea.mechanics.beam import deflect_on
 from jaxtrachea.mechanics.compliance import Beam
 from jaxtrachea.mechanics.force_law import ring_weight
 
@@ -61,7 +61,7 @@ def punch_deflection(beam: Beam, s_c: Float[Array, ""], half_width: float) -> Un
     """
     ends = jnp.clip(jnp.stack([s_c - half_width, s_c + half_width]), 0, beam.length)
     marked, passed, marks = _with_marks(beam, ends)
-    unit = jax.vmap(lambda s: deflect(marked, s, jnp.ones_like(s)))(ends)
+    unit = jax.vmap(lambda s: deflect_on(marked, s, jnp.ones_like(s)))(ends)
     c_11, c_22 = unit.w_C
     c_12 = unit.w[0, marks[1]]
     first, second = c_22 - c_12, c_11 - c_12

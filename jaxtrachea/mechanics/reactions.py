@@ -19,15 +19,19 @@ def _influence(beam: Beam, s):
     (n + 1, n + 2) matrix of rotations at the rings and the tip, each integral exact by Simpson's
     rule span by span. Rows of rings beyond the tip are those of a ring at the tip; mask them.
     """
-    ends = jnp.concatenate([jnp.zeros_like(beam.x[:1]), jnp.minimum(beam.x, s), s[None]])
+    # At equality, a contact on a ring, `minimum` and `maximum` would pass on half a derivative.
+    cut = jnp.where(beam.x > s, s, beam.x)
+    ends = jnp.concatenate([jnp.zeros_like(beam.x[:1]), cut, s[None]])
     low, high = ends[:-1], ends[1:]
     points = jnp.stack([low, (low + high) / 2, high])
     at = ends[1:]
-    arm = jnp.maximum(at[:, None, None] - points[None], 0)
+    arm = at[:, None, None] - points[None]
+    arm = jnp.where(arm >= 0, arm, 0)
     m = jnp.concatenate([arm, jnp.ones_like(arm[:1])])
     weight = jnp.array([1, 4, 1], s.dtype)[:, None] * ((high - low) / (6 * beam.EI))[None]
     displacement = jnp.einsum("pts,qts,ts->pq", m, m, weight)
-    before = (at[:, None] >= high[None]).astype(s.dtype)
+    order = jnp.arange(high.shape[0])
+    before = (order[:, None] >= order[None]).astype(s.dtype)
     if beam.GA is not None:
         cut = jnp.concatenate([before, jnp.zeros_like(before[:1])])
         displacement = displacement + jnp.einsum("ps,qs,s->pq", cut, cut, (high - low) / beam.GA)
@@ -35,18 +39,24 @@ def _influence(beam: Beam, s):
 
 
 def _dense_side(beam: Beam, s, held):
-    """Redundants of one cantilever for unit V and M at its tip: (delta + I/k) R = Delta."""
+    """Redundants of one cantilever for unit V and M at its tip.
+
+    (delta + I/k) R = Delta with R = k w: (I + delta k) w = Delta, which k = 0 leaves regular.
+
+    Returns:
+        Compliance of the tip; by ring and unit load w, R = k w and theta.
+    """
     n = beam.x.shape[0]
     displacement, rotation = _influence(beam, s)
     both = held[:, None] & held[None]
     flexibility = jnp.where(both, displacement[:n, :n], 0)
-    flexibility = flexibility + jnp.diag(1 / jnp.where(held, beam.k, 1))
     load = jnp.where(held[:, None], displacement[:n, n:], 0)
-    R = jnp.linalg.solve(flexibility, load)
+    w = jnp.linalg.solve(jnp.eye(n, dtype=load.dtype) + flexibility * beam.k[None], load)
+    R = beam.k[:, None] * w
     tip = displacement[n:, n:] - load.T @ R
     theta = rotation[:n, n:] - jnp.where(held[None], rotation[:n, :n], 0) @ R
     det = tip[0, 0] * tip[1, 1] - tip[0, 1] ** 2
-    return Compliance(tip[0, 0], tip[0, 1], tip[1, 1], det), R, theta
+    return Compliance(tip[0, 0], tip[0, 1], tip[1, 1], det), w, R, theta
 
 
 @full_precision
@@ -69,10 +79,12 @@ def deflect_dense(
     s = jnp.stack([s_c, beam.length - s_c])
     held = jnp.stack([in_A, ~in_A[::-1]])
     stacked = jax.tree.map(lambda v, w: jnp.stack([v, w]), beam, mirrored)
-    g, R, theta = jax.vmap(_dense_side)(stacked, s, held)
+    g, *of_rings = jax.vmap(_dense_side)(stacked, s, held)
     w_C, theta_C, V, M = divide_load(g, s, force, split)
     tip = jnp.stack([V, M], axis=1)
-    R, theta = jnp.einsum("sip,sp->si", R, tip), jnp.einsum("sip,sp->si", theta, tip)
-    R = jnp.where(in_A, R[0], R[1][::-1])
-    theta = jnp.where(in_A, theta[0], -theta[1][::-1])
-    return Deflection(w_C, theta_C, R / beam.k, theta, R, V[0], M[0])
+    w, R, theta = (jnp.einsum("sip,sp->si", v, tip) for v in of_rings)
+
+    def of_both(v, sign):
+        return jnp.where(in_A, v[0], sign * v[1][::-1])
+
+    return Deflection(w_C, theta_C, of_both(w, 1), of_both(theta, -1), of_both(R, 1), V[0], M[0])

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxtrachea._numerics import scaled
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliquePress, press_oblique, press_path
 from jaxtrachea.mechanics.press import (
@@ -81,15 +82,17 @@ def one_plane(scene: Scene, material: Material, presses: Presses) -> Moved:
         unit, solved = jax.vmap(at)(presses.s, inward)
     F = -solved.force  # along y
     load = F if solved.load is None else -solved.load
-    joints, bears = (_anterior(v[:, None] * w) for v, w in ((load, unit.w), (F, unit.reaction)))
+    pairs = (load, unit.w), (F, unit.reaction)
+    joints, bears = (_anterior(scaled(v[:, None], w)) for v, w in pairs)
 
     def slope(v):
         return jnp.stack([v, jnp.zeros_like(v)], -1)
 
-    edges = None if unit.edges is None else slope(load[:, None] * unit.edges)
+    edges = None if unit.edges is None else slope(scaled(load[:, None], unit.edges))
     return Moved(
-        force=_anterior(F), depth=_anterior(-solved.depth), skeleton=_anterior(load * unit.w_C),
-        slope_C=slope(load * unit.theta_C), joints=joints, slopes=slope(load[:, None] * unit.theta),
+        force=_anterior(F), depth=_anterior(-solved.depth),
+        skeleton=_anterior(scaled(load, unit.w_C)), slope_C=slope(scaled(load, unit.theta_C)),
+        joints=joints, slopes=slope(scaled(load[:, None], unit.theta)),
         loads=bears, end_U=joints, end_V=joints, status=solved.status, slope_edges=edges,
     )  # fmt: skip
 
