@@ -217,7 +217,7 @@ BAD = {
         ["trachea.file", "cartilage='c.stl'", "no such file"],
     ),
     "no wall left": (
-        GOOD + PRESS + '[trachea]\nradius = "0.2 mm"\nwall = "0.1 mm"',
+        GOOD + PRESS + '[trachea]\nradius = "0.2 mm"\nwall = "0.1 mm"\nrelief = "0.6 mm"',
         ["trachea: wall 0.1 mm", "positive radius"],
     ),
     "cloud missing": (

@@ -40,7 +40,8 @@ STRANGERS = [("scene", {"fitting", "inference", "results", "prediction", "runs"}
 #: Modules within the larger rooms, from the bottom up.
 WITHIN = {
     "scene": [
-        {"operations", "curve", "sizes", "wall_check", "declare"},
+        {"operations", "curve", "sizes", "declare"},
+        {"wall_check"},
         {"depth", "width"},
         {"wall", "effects"},
         {"plan", "spec"},

@@ -453,7 +453,7 @@ def test_misuse_is_told():
         straight_patches(BORDERS, -1.0)
     with pytest.raises(ValueError, match="overlap"):
         straight_patches(BORDERS, 1.0, overlap=-1.0)
-    with pytest.raises(ValueError, match="rounding, overlap, most"):
+    with pytest.raises(ValueError, match="rounding, overlap, spacing, most"):
         patches_of(surface, BORDERS, rounding=1.0)
     with pytest.raises(ValueError, match="centres, frames: expected both"):
         patches_of(surface._replace(centres=np.zeros((3430, 3))), BORDERS)

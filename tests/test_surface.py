@@ -308,7 +308,7 @@ def test_phong_at_rest_in_float32():
     moving = regions.Keys(keys.s_c, keys.contact, small, keys.U, keys.V)
     for keys in (jax.tree.map(jnp.zeros_like, moving), moving):
         for slope in jax.tree.leaves(of(AT32, jnp.asarray(0.4, "float32"), keys)):
-            assert np.max(np.abs(slope)) < 10 / phong.FADE
+            assert np.max(np.abs(slope)) < 10 / (160 * phong.FADE)
 
 
 def slopes_of(f):

@@ -29,8 +29,6 @@ SIDEWAYS = 0.5
 FEW = 64
 #: Planes straight across, which hold a patch together where no face looks sideways.
 ACROSS = 8
-#: Distance of the samples of a curved centreline, mm.
-SPACING = 1.0
 
 
 class TubeSurface(NamedTuple):
@@ -58,6 +56,7 @@ def patches_of(
     *,
     rounding: float = 0.5,
     overlap: float = 0.5,
+    spacing: float = 1.0,
     most: int = 32,
     dtype=None,
     progress: Callable[[int, int], None] | None = None,
@@ -72,6 +71,7 @@ def patches_of(
         rounding: radius r of the ball over the largest that fits, in (0, 1). More is smoother, and
             needs fewer vertices, but loses more at corners.
         overlap: by how much a patch runs on beyond its borders before it is rounded, mm.
+        spacing: of the samples of a curved centreline, mm, positive.
         most: vertices kept of each core, at least 4.
         dtype: of every array; the default float type of JAX if None.
         progress: called with (patches done since the last call, patches in all).
@@ -82,10 +82,10 @@ def patches_of(
     at = check_borders(borders)
     v, s = np.asarray(surface.vertices, float), np.asarray(surface.s, float)
     faces, centres, frames = np.asarray(surface.faces), surface.centres, surface.frames
-    _check(v, s, (centres, frames), (rounding, overlap, most))
+    _check(v, s, (centres, frames), (rounding, overlap, spacing, most))
     if centres is not None and frames is not None:
         centres, frames = np.asarray(centres, float), np.asarray(frames, float)
-    line = _line(s, centres, frames, at)
+    line = _line(s, centres, frames, at, spacing)
     tube = _Tube(v, s, _edges(faces, s), line)
     hulls = []
     for span in zip(at[:-1], at[1:], strict=True):
@@ -112,7 +112,9 @@ class _Tube(NamedTuple):
     line: tuple
 
 
-def _check(v: np.ndarray, s: np.ndarray, curved: tuple, numbers: tuple[float, float, int]) -> None:
+def _check(
+    v: np.ndarray, s: np.ndarray, curved: tuple, numbers: tuple[float, float, float, int]
+) -> None:
     """Refuse arguments of `patches_of` that mean no tube.
 
     Raises:
@@ -124,11 +126,11 @@ def _check(v: np.ndarray, s: np.ndarray, curved: tuple, numbers: tuple[float, fl
         )
     if (curved[0] is None) != (curved[1] is None):
         raise ValueError("centres, frames: expected both (a curved tube) or neither (a straight)")
-    rounding, overlap, most = numbers
-    if not 0 < rounding < 1 or not overlap >= 0 or most < 4:
+    rounding, overlap, spacing, most = numbers
+    if not 0 < rounding < 1 or not overlap >= 0 or not spacing > 0 or most < 4:
         raise ValueError(
-            "rounding, overlap, most: expected in (0, 1), not below 0 and at least 4, found "
-            f"{rounding:g}, {overlap:g}, {most}"
+            "rounding, overlap, spacing, most: expected in (0, 1), not below 0, positive and at "
+            f"least 4, found {rounding:g}, {overlap:g}, {spacing:g}, {most}"
         )
 
 
@@ -153,14 +155,14 @@ def _between(tube: _Tube, span: tuple[float, float], overlap: float, rounding: f
         ) from error
 
 
-def _line(s, centres, frames, at):
+def _line(s, centres, frames, at, spacing):
     """Even samples of s, point, tangent and anterior of the centreline."""
     if centres is None or frames is None:
         x = at[[0, -1]]
         axes = np.eye(3)[:, None].repeat(2, axis=1)
         return x, x[:, None] * axes[0], axes[0], axes[1]
     known, first = np.unique(s, return_index=True)
-    x = np.linspace(known[0], known[-1], int(np.ptp(known) / SPACING) + 2)
+    x = np.linspace(known[0], known[-1], int(np.ptp(known) / spacing) + 2)
 
     def spread(rows):
         return np.stack([np.interp(x, known, r) for r in rows[first].T], axis=1)

@@ -14,17 +14,16 @@ from jaxtrachea.scene.declare import AnyMaterial, PlanError, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions
 from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.rules import make_plan
-from jaxtrachea.scene.sizes import check_sizes, check_width
+from jaxtrachea.scene.sizes import OUTER, RADIUS, check_sizes, check_width
 from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool, check_material, check_path
 from jaxtrachea.scene.wall import checked_walls, near_patches, round_wall
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh
 
-#: Distance between the circles of the dent's centres: share of the tool's size; mm at least.
+#: Distance between the circles of the dent's centres: share of the tool's size; at least, on Table
+#: 1's tube, mm.
 FOOTPRINT, LEAST = 0.6, 4.0
-#: Wall of Table 1, mm, where nothing else is known of it.
-WALL = 2.6
 #: Of a tool that a program does not fit.
 CURE = "make a scene for this tool (a program for the largest tool serves smaller ones)"
 
@@ -52,13 +51,14 @@ def make_scene(
             cross-sections a straight one only follows: a tool touches a round wall of `radius`.
         radius: of the tube's outside, mm; None: of a `SectionMaterial` that of its mid-line and
             offset; else that of the mesh (of an imported one it is
-            `geometry.radius`); without a mesh `geometry.radius` + 1.3 (half of Table 1's wall).
+            `geometry.radius`); without a mesh as much larger than `geometry.radius` as in Table 1
+            (12.6 of 11.3 mm).
         effects: what is not left to the rules.
         progress: called with (patches of the wall done since the last call, patches in all).
 
     Raises:
         PlanError: a wish that cannot be met.
-        MeshError: patches for the contact that are not where an imported mesh is.
+        MeshError: patches for the contact that are not where the mesh is.
         SizeError: a length that no trachea and no tool has: the unit is wrong, most likely; a
             `half_width` beyond the tool.
         ValueError: a path without rows, or arrays of a wrong length.
@@ -78,18 +78,16 @@ def make_scene(
     check_sizes(geometry, float(outer), shape)
     if isinstance(path, Poses) and shape is None:
         raise PlanError("contact", "the path moves a tool", "there is none", "give a tool")
-    size, tube, near = LEAST, None, 1
+    tube, near = None, 1
     if shape is not None and isinstance(path, Poses):
         if mesh is None or (sections and mesh.frames is None):
             tube = round_wall(geometry, float(outer))
         else:
             tube = checked_walls(geometry, mesh, progress)
         near = near_patches(shape, geometry, tube.centres.shape[0])
-    if shape is not None:
-        size = _footprint(shape)
     mu = None if friction is None else jnp.asarray(friction, dtype)
     binding = None if mesh is None or sections else regions.bind(mesh, geometry)
-    spacing = jnp.asarray(size, dtype)
+    spacing = jnp.asarray(_footprint(shape, float(outer)), dtype)
     scene = Scene(
         geometry=geometry, radius=outer, tube=tube, tool=shape, friction=mu, mesh=mesh,
         binding=binding, footprint=spacing, near=near,
@@ -108,16 +106,19 @@ def _points(mesh: Mesh) -> Points:
     return gather_points(mesh.s, mesh.phi, mesh.distance)
 
 
-def _footprint(tool: Shape) -> float:
-    """Distance between the circles of the dent's centres, mm."""
+def _footprint(tool: Shape | None, outer: float) -> float:
+    """Distance between the circles of the dent's centres, mm, on a tube of this outer radius."""
+    least = LEAST * (outer / OUTER)
+    if tool is None:
+        return least
     extent = np.ptp(np.asarray(tool.vertices), axis=1).min() / 2 + float(tool.radius)
-    return max(FOOTPRINT * extent, LEAST)
+    return max(FOOTPRINT * extent, least)
 
 
 def _outer(geometry: Geometry, mesh: Mesh | None):
     """Radius of the outside, mm: of an imported mesh read with it, of a made one its crests."""
     if mesh is None:
-        return geometry.radius + WALL / 2
+        return geometry.radius + (OUTER - RADIUS) * (geometry.radius / RADIUS)
     return geometry.radius if mesh.frames is not None else jnp.asarray(np.max(mesh.distance))
 
 
@@ -156,7 +157,7 @@ def with_tool(scene: Scene, tool: Shape) -> Scene:
             f"tool lies along up to {near} patches of the wall, and the program searches "
             f"{scene.near}: {CURE}"
         )
-    spacing = jnp.asarray(_footprint(tool), scene.footprint.dtype)
+    spacing = jnp.asarray(_footprint(tool, float(scene.radius)), scene.footprint.dtype)
     if scene.plan.dent and scene.runs is not None and scene.mesh is not None:
         reached = local.runs(scene.mesh.s, spacing).longest
         if any(a > b for a, b in zip(reached, scene.runs.longest, strict=True)):
@@ -170,7 +171,7 @@ def with_mesh(scene: Scene, mesh: Mesh) -> Scene:
     The program stays, but for `curved`, which says what the mesh is.
 
     Raises:
-        MeshError: patches for the contact that are not where an imported mesh is.
+        MeshError: patches for the contact that are not where the mesh is.
     """
     curved = scene.plan.contact and mesh.frames is not None
     plan = dataclasses.replace(scene.plan, curved=curved)

@@ -39,6 +39,7 @@ KEYS = {
     "geometry.length": "trachea.length",
     "geometry.radius": "trachea.radius",
     "half_width": "model.half_width",
+    "relief": "trachea.relief",
 }
 
 
@@ -91,7 +92,9 @@ def stage(spec: SceneSpec, folder: Path, counted: Counted | None = None) -> Stag
     except PlanError as error:
         raise SpecError.like(error, key=f"effects.{error.key}") from None
     except MeshError as error:
-        error.place = Path(spec.trachea.file or "").name
+        if spec.trachea.file is None:
+            raise SpecError.like(error.renamed(KEYS), key="trachea") from None
+        error.place = Path(spec.trachea.file).name
         raise _of_file(error) from None
     except SizeError as error:
         raise SpecError.like(error.renamed(KEYS)) from None
@@ -211,7 +214,7 @@ def _trachea(section: SceneTracheaSection, folder: Path, files: list[Path], coun
 
 def _tube(section: SceneTracheaSection, geometry: Geometry, material: AnyMaterial) -> Mesh:
     """The generated surface; of deforming cross-sections round, at the outside of their wall."""
-    key, size = "trachea", {"wall": section.wall}
+    key, size = "trachea", {"wall": section.wall, "relief": section.relief}
     if isinstance(material, SectionMaterial):
         size = {"wall": 2 * float(material.offset), "relief": 0.0, "flatten": 0.0}
         key = f"trachea: a wall of deforming cross-sections of {size['wall']:g} mm (twice offset)"

@@ -5,6 +5,7 @@ import numpy as np
 from jaxtrachea._errors import InputError
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.tube import WALL
 
 #: Length of a trachea, mm: from a newborn mouse's to more than a horse's (some 800 mm).
 LENGTHS = (2.0, 1000.0)
@@ -12,6 +13,9 @@ LENGTHS = (2.0, 1000.0)
 RADII = (0.2, 100.0)
 #: Longest tool, mm.
 LONGEST_TOOL = 1000.0
+#: Table 1: radius of the rings' line, and of the outside, mm. What fits this tube by its length is
+#: as much longer or shorter for another one as that one is larger or smaller.
+RADIUS, OUTER = 11.3, 11.3 + WALL / 2
 
 
 class SizeError(InputError):

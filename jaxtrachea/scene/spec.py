@@ -43,6 +43,7 @@ class SceneTracheaSection(Section):
     around: int = Field(35, ge=3, le=2000)
     along: int = Field(97, ge=1, le=5000)
     wall: PositiveLength = 2.6
+    relief: Annotated[Length, Field(ge=0)] | None = None
     file: str | None = None
     unit: str | None = None
     part: str | None = None
@@ -53,7 +54,8 @@ class SceneTracheaSection(Section):
     @model_validator(mode="after")
     def _complete(self) -> "SceneTracheaSection":
         given = self.model_fields_set
-        made = {"preset", "length", "radius", "ring_height", "around", "along", "wall"} & given
+        made = {"preset", "length", "radius", "ring_height", "around", "along", "wall", "relief"}
+        made &= given
         read = {"unit", "part", "cartilage", "larynx", "anterior"} & given
         if self.file is not None and made:
             raise ValueError(f"file excludes {', '.join(sorted(made))}; remove one side")
@@ -314,6 +316,10 @@ class SceneSpec(Section):
             raise ValueError(
                 "trachea.wall: the outside of deforming cross-sections lies `offset` outside of "
                 "their mid-line; remove it, and give [wall] h or [sections] offset"
+            )
+        if sections and "relief" in self.trachea.model_fields_set:
+            raise ValueError(
+                "trachea.relief: the outside of deforming cross-sections is round; remove it"
             )
         if self.wall is None and self.sections is not None:
             lacking = [name for name in NEEDED if getattr(self.sections, name) is None]

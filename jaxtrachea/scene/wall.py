@@ -9,6 +9,7 @@ from jaxtrachea.contact.patches import Patches, straight_patches
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.contact.walls import TubeSurface, patches_of
 from jaxtrachea.scene import wall_check
+from jaxtrachea.scene.sizes import OUTER, RADIUS
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh
 
@@ -19,20 +20,26 @@ ROUNDED, CORNERS = 0.15, 128
 #: Longest patch over the usual distance of the rings (at most the radius): beyond the last ring a
 #: tube goes on, and one patch would bridge its bend.
 LONGEST = 1.5
+#: By how much the patches of a round wall run on beyond each border, and the distance of the
+#: samples of a curved centreline: on Table 1's tube, mm.
+OVERLAP, SPACING = 0.5, 1.0
 
 
 def round_wall(geometry: Geometry, radius: float) -> Patches:
     """A straight cylinder, in patches about as long as it is wide: so their rounding is small."""
     length = float(geometry.length)
     borders = np.linspace(0, length, max(round(length / (2 * float(geometry.radius))), 1) + 1)
-    return straight_patches(borders, radius, dtype=geometry.length.dtype)
+    overlap = OVERLAP * (radius / OUTER)
+    return straight_patches(borders, radius, overlap=overlap, dtype=geometry.length.dtype)
 
 
 def checked_walls(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
-    """The wall of a mesh; that of an imported one is checked against its triangles."""
+    """The wall of a mesh, checked against its triangles.
+
+    Raises:
+        MeshError: it is not where they are.
+    """
     tube = patches_of_wall(geometry, mesh, progress)
-    if mesh.frames is None:
-        return tube
     wall_check.check(mesh, geometry, tube)
     doubtful = wall_check.look_beyond(mesh, geometry, tube).doubtful
     return dataclasses.replace(tube, doubtful=jnp.asarray(doubtful)) if doubtful.any() else tube
@@ -59,9 +66,11 @@ def patches_of_wall(geometry: Geometry, mesh: Mesh, progress=None) -> Patches:
     spans = zip(borders[:-1], borders[1:], np.maximum(parts, 1), strict=True)
     borders = np.concatenate([*(np.linspace(a, b, n + 1)[:-1] for a, b, n in spans), borders[-1:]])
     surface = TubeSurface(vertices=vertices, faces=faces, s=s, centres=centres, frames=frames)
+    spacing = SPACING * (float(geometry.radius) / RADIUS)
     return patches_of(
         surface, borders, rounding=ROUNDED, most=CORNERS,
-        overlap=wall_check.overlap_of(geometry), dtype=geometry.length.dtype, progress=progress,
+        overlap=wall_check.overlap_of(geometry), spacing=spacing,
+        dtype=geometry.length.dtype, progress=progress,
     )  # fmt: skip
 
 

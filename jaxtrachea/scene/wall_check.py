@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, KDTree
 
 from jaxtrachea.contact.patches import Patches
+from jaxtrachea.scene.sizes import RADIUS
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh, MeshError, face_vectors
 
@@ -21,7 +22,8 @@ from jaxtrachea.trachea.mesh import Mesh, MeshError, face_vectors
 COUNT = 400
 #: Their radius, and how far they are moved off the wall at most, in and out; shares of the radius.
 BALL, AWAY = 0.3, 0.1
-#: By how much a patch runs on beyond each border, mm; at most this share of the rings' distance.
+#: By how much a patch runs on beyond each border of Table 1's tube, mm; on any at most this share
+#: of the rings' distance.
 OVERLAP, OVERLAP_SHARE = 0.5, 0.15
 #: Least limit of the worst, as a share of the radius: meshes are made of facets.
 LEAST_LIMIT = 0.02
@@ -29,6 +31,8 @@ LEAST_LIMIT = 0.02
 NEAR = 4
 #: Classes of triangles by size, each half of the next; points that are searched together.
 SIZES, CHUNK = 12, 100
+#: Width of a triangle over its length, below which roundings say where its normal points.
+SLIVER = 1e-6
 #: Sine of the least angle between a triangle of the outer wall and the radial direction.
 OUTWARD = 0.3
 #: The median may be this share of the limit of the worst.
@@ -90,8 +94,9 @@ def spacing_of(geometry: Geometry) -> float:
 
 
 def overlap_of(geometry: Geometry) -> float:
-    """By how much a patch runs on beyond each border, mm: for small tubes less."""
-    return min(OVERLAP, OVERLAP_SHARE * spacing_of(geometry))
+    """By how much a patch runs on beyond each border, mm: a share of the radius."""
+    size = float(geometry.radius) / RADIUS
+    return min(OVERLAP * size, OVERLAP_SHARE * spacing_of(geometry))
 
 
 def measure(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = COUNT) -> WallError:
@@ -119,11 +124,16 @@ def check(mesh: Mesh, geometry: Geometry, patches: Patches) -> WallError:
     if seen.worst <= seen.limit and seen.median <= USUAL * seen.limit:
         return seen
     at = float(seen.s[np.abs(seen.error).argmax()])
-    raise MeshError(
+    off = (
         f"a tool would not touch it where it is: the contact gap is off by {seen.median:.2g} mm in "
         f"the median and by {seen.worst:.2g} mm at worst (at s = {at:.3g} mm), expected at most "
-        f"{USUAL * seen.limit:.2g} and {seen.limit:.2g} mm for rings this far apart; is it the "
-        "outer wall, one tube without branches and sharp bends?",
+        f"{USUAL * seen.limit:.2g} and {seen.limit:.2g} mm for rings this far apart"
+    )
+    if mesh.frames is None:
+        cure = "make {} smaller, so that its rings stand out less"
+        raise MeshError(f"the tube: {off}", cure=cure, arguments=("relief",))
+    raise MeshError(
+        f"{off}; is it the outer wall, one tube without branches and sharp bends?",
         cure="give that surface, or {}, where the rings are",
         arguments=("ring_positions",),
     )
@@ -229,17 +239,31 @@ def _distance(corners, points):
 
 def _nearest(corners, points, near):
     """Distance of each point to the closest of the triangles listed for it; inf without any."""
-    import trimesh  # only those who read meshes wait for it
-
     count, found = np.array([len(v) for v in near]), np.full(len(points), np.inf)
     listed = np.flatnonzero(count)
     if not len(listed):
         return found
     point = np.repeat(points, count, axis=0)
-    closest = trimesh.triangles.closest_point(corners[np.concatenate(near).astype(int)], point)
+    away = _away(corners[np.concatenate(near).astype(int)], point)
     first = np.concatenate([[0], np.cumsum(count[listed])[:-1]])
-    found[listed] = np.minimum.reduceat(np.linalg.norm(closest - point, axis=1), first)
+    found[listed] = np.minimum.reduceat(away, first)
     return found
+
+
+def _away(corners, points):
+    """Distance of each point to its triangle; a sliver is no more than its edges."""
+    start, edge = corners, np.roll(corners, -1, axis=1) - corners
+    off = points[:, None] - start
+    square = np.einsum("tei,tei->te", edge, edge)
+    along = np.einsum("tei,tei->te", off, edge) / np.where(square > 0, square, 1)
+    beside = off - np.clip(along, 0, 1)[:, :, None] * edge
+    found = np.sqrt(np.einsum("tei,tei->te", beside, beside)).min(axis=1)
+    normal = np.cross(edge[:, 0], edge[:, 1])
+    size = np.linalg.norm(normal, axis=1)
+    over = np.einsum("tei,ti->te", np.cross(edge, off), normal).min(axis=1) >= 0
+    over &= size > SLIVER * square.max(axis=1)
+    height = np.abs(np.einsum("ti,ti->t", off[:, 0], normal)) / np.where(over, size, 1)
+    return np.where(over, np.minimum(found, height), found)
 
 
 def _sharp_gap(patches: Patches, points):

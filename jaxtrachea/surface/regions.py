@@ -485,8 +485,10 @@ def _phong(binding: Binding, weights: Weights, keys: Keys):
     phi_c = weights.phi_c
     pole = jnp.where(phong.radial(phi_c, keys.contact) > 0, 1, -1).astype(phi_c.dtype)
 
+    fade = jax.lax.stop_gradient(phong.FADE * (binding.nodes[-1] - binding.nodes[0]))
+
     def encode(v):
-        return phong.encode(v, phi_c, pole)
+        return phong.encode(v, phi_c, pole, fade)
 
     joints, U, V = (encode(v.T).T for v in (keys.joints, keys.U, keys.V))
     channels = _carry(binding, weights, keys.s_c, joints, encode(keys.contact), U, V)

@@ -89,7 +89,7 @@ def find_rings(shape: Shape, positions=None, half_angle=None) -> Rings:
     if half_angle is None:
         known = shape.cartilage is not None or positions is None
         half_angle = _half_angle(strength) if known else 2 * math.pi / 3
-    height = 4.0 if len(found) < 2 else 0.4 * float(np.median(np.diff(found)))
+    height = 4.0 / 12.6 * radius if len(found) < 2 else 0.4 * float(np.median(np.diff(found)))
     if shape.cartilage is not None:
         height = float(profile.sum() * step / len(found))
     return Rings(found, half_angle, radius, height, source)

@@ -8,14 +8,17 @@ import numpy as np
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh, vertex_normals
 
+#: Wall of Table 1, and how far a ring stands out of it, mm; of another wall the same share.
+WALL, RELIEF = 2.6, 0.6
+
 
 def make_tube(
     geometry: Geometry,
     *,
     around: int = 35,
     along: int = 97,
-    wall: float = 2.6,
-    relief: float = 0.6,
+    wall: float = WALL,
+    relief: float | None = None,
     flatten: float = 0.15,
     lids: bool = True,
 ) -> Mesh:
@@ -34,7 +37,8 @@ def make_tube(
         around: vertices round the tube, at least 3.
         along: rows of quadrilaterals, at least 1. To be seen, a ring needs about two of them.
         wall: thickness, mm; table 1: 2.6.
-        relief: how far a ring stands out, mm; 0: smooth.
+        relief: how far a ring stands out, mm; 0: smooth; None: the share of the wall that is 0.6 mm
+            of table 1's.
         flatten: by what part of the radius the posterior midline is drawn in; 0: round.
         lids: whether to close the ends; without, a tube open at both ends.
 
@@ -47,6 +51,7 @@ def make_tube(
     length, radius, alpha = (
         float(v) for v in (geometry.length, geometry.radius, geometry.half_angle)
     )
+    relief = RELIEF * (wall / WALL) if relief is None else relief
     outer = radius + wall / 2 - relief
     if around < 3 or along < 1:
         raise ValueError(f"around, along are {around}, {along}; expected at least 3 and 1")

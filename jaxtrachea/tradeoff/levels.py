@@ -95,7 +95,7 @@ class Full(NamedTuple):
         facts: of the scene.
         options: of the user, what was `auto` at its finest.
         given: of the user.
-        made: vertices round and along the mesh; None: not made, or none.
+        made: vertices round and along the mesh, its wall and relief, mm; None: not made, or none.
         load: s of the contacts, mm.
     """
 
@@ -106,7 +106,7 @@ class Full(NamedTuple):
     facts: SceneFacts
     options: EffectOptions
     given: EffectOptions
-    made: tuple[int, int, float] | None
+    made: tuple[int, int, float, float | None] | None
     load: np.ndarray
 
 
@@ -136,7 +136,8 @@ def full_scene(spec: SceneSpec, staged: Staged, *, coupling: str | None = None) 
     scene = dataclasses.replace(scene, plan=plan, quality=FINE)
     made = None
     if spec.trachea.file is None and scene.mesh is not None:
-        made = spec.trachea.around, spec.trachea.along, spec.trachea.wall
+        tube = spec.trachea
+        made = tube.around, tube.along, tube.wall, tube.relief
     return Full(
         scene=scene, material=material, path=path,
         levels=Levels(plan, kept=scene.geometry.rings), facts=facts, options=options, given=given,
@@ -222,10 +223,10 @@ def _half_gap(geometry: Geometry) -> float:
     return float(np.diff(ends).min()) / 2
 
 
-def _mesh(geometry: Geometry, made: tuple[int, int, float], factor: float):
-    around, along, wall = made
+def _mesh(geometry: Geometry, made: tuple[int, int, float, float | None], factor: float):
+    around, along, wall, relief = made
     many = max(round(around * factor), 3), max(round(along * factor), 1)
-    return make_tube(geometry, around=many[0], along=many[1], wall=wall)
+    return make_tube(geometry, around=many[0], along=many[1], wall=wall, relief=relief)
 
 
 def solve(scene: Scene, material: Material, path: Poses | Presses):

@@ -158,6 +158,22 @@ def test_distance_to_triangles_of_very_different_sizes():
     np.testing.assert_allclose(wall_check._distance(corners, points), wanted, rtol=1e-12)
 
 
+def test_distance_to_slivers():
+    """Three corners nearly in line, as of hulls with two corners at one place, are their edges."""
+    rng = np.random.default_rng(0)
+    ends = rng.normal(size=(400, 2, 3))
+    corners = np.concatenate([ends, ends[:, :1]], axis=1)
+    corners[:, 2] += rng.uniform(0, 1, (400, 1)) * (ends[:, 1] - ends[:, 0])
+    corners[:, 2] += 10 ** rng.uniform(-18, -9, (400, 1)) * rng.normal(size=(400, 3))
+    points = 2 * rng.normal(size=(400, 3))
+    way = ends[:, 1] - ends[:, 0]
+    along = np.sum((points - ends[:, 0]) * way, axis=1) / np.sum(way * way, axis=1)
+    foot = ends[:, 0] + np.clip(along, 0, 1)[:, None] * way
+    wanted = np.linalg.norm(points - foot, axis=1)
+    found = wall_check._away(corners, points)
+    np.testing.assert_allclose(found, wanted, atol=1e-7)
+
+
 def test_limit_is_the_sagitta_of_a_bridged_hollow():
     """Rings 10 mm apart, patches of 11 mm: that far apart a circle of 11.3 mm is this deep."""
     exact = 11.3 - np.sqrt(11.3**2 - 5.5**2)
@@ -168,7 +184,7 @@ def test_limit_is_the_sagitta_of_a_bridged_hollow():
     ("radius", "pitch", "share"),
     [
         (11.3, 10, 0.118),
-        (0.7, 0.4, 0.069),
+        (0.7, 0.4, 0.054),
         (0.2, 0.2, 0.125),
         (11.3, 1, 0.02),
         (9.479, 5.617, None),
@@ -180,22 +196,27 @@ def test_the_limit_is_a_small_share_of_the_radius_at_any_size(radius, pitch, sha
     limit = wall_check.limit_of(geometry)
     assert 0.02 <= limit / radius <= 0.15
     if share is None:
-        np.testing.assert_allclose(limit, (pitch + 1) ** 2 / (8 * radius), rtol=1e-12)
+        longer = 2 * 0.5 * radius / 11.3
+        np.testing.assert_allclose(limit, (pitch + longer) ** 2 / (8 * radius), rtol=1e-12)
         assert limit > 0.54
     else:
         np.testing.assert_allclose(limit / radius, share, rtol=0.02)
 
 
 def test_a_small_tube_is_as_near_as_a_large_one():
-    """Table 1 at 1 : 16, R = 0.7 mm: patches ran on by 0.5 mm, most of a ring's distance."""
+    """Table 1 at 1 : 16, R = 0.7 mm: patches ran on by 0.5 mm, most of a ring's distance.
+
+    Roundings choose among equal corners of the patches, of which some are left out.
+    """
     small = {"length": 10.0, "ring_positions": np.asarray(TUBE.ring_positions) / 16}
     small |= {"radius": TUBE.radius / 16, "ring_height": TUBE.ring_height / 16}
     small = dataclasses.replace(TUBE, **{k: jnp.asarray(v) for k, v in small.items()})
     mesh = imported(make_tube(small, wall=2.6 / 16, relief=0.6 / 16))
     off = wall_check.check(mesh, small, walls_.patches_of_wall(small, mesh))
     large = wall_check.check(MESHES[1], TUBE, walls_.patches_of_wall(TUBE, MESHES[1]))
-    longer = (1 + 2 * 0.15) / (1 + 2 * 0.05)  # patches, over the rings' distance; hollows: squared
-    assert off.worst <= longer**2 * large.worst / 16
+    np.testing.assert_allclose(
+        16 * np.array([off.worst, off.median]), [large.worst, large.median], rtol=1e-3
+    )
 
 
 def waist(mesh, at, depth, width):
