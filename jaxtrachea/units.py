@@ -79,6 +79,9 @@ ACCEPTED: dict[str, tuple[str, ...]] = {
     "damping": ("N s/mm", "N s/m"),
 }
 
+#: What numbers without a unit most likely are in, where that is not the first accepted one.
+WRITTEN = {"angle": "deg"}
+
 _LBF = Fraction("4.4482216152605")
 _INCH = Fraction("25.4")
 
@@ -253,7 +256,7 @@ def parse_quantity(text: str | float | int, dimension: str) -> float:
     Raises:
         UnitError: no unit, an unknown one, one of another dimension, or no finite number.
     """
-    example = ACCEPTED.get(dimension, ("",))[0]
+    example = WRITTEN.get(dimension) or ACCEPTED.get(dimension, ("",))[0]
     if not isinstance(text, str):
         if dimension == "dimensionless" and not isinstance(text, bool) and math.isfinite(text):
             return float(text)

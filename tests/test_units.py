@@ -136,6 +136,13 @@ def test_bare_number_is_refused_with_a_cure(text):
         parse_quantity(text, "length")
 
 
+def test_the_example_of_an_angle_is_in_degrees():
+    """Who writes 20 for a rotation means degrees; "20 rad" would be taken and be wrong."""
+    for text in ("20", 20):
+        with pytest.raises(UnitError, match='as in "20 deg"'):
+            parse_quantity(text, "angle")
+
+
 @pytest.mark.parametrize("text", ["", "mm", "9,5 mm", "nan mm", "inf mm", "1e999 mm", "9 mm 3"])
 def test_no_quantity(text):
     with pytest.raises(UnitError):
