@@ -12,8 +12,10 @@ from hypothesis.extra.numpy import arrays
 
 from jaxtrachea.contact.pose import (
     Pose,
+    check_rotations,
     compose,
     inverse,
+    is_rotation,
     pose_from_quaternion,
     pose_from_vector,
     relative,
@@ -228,3 +230,39 @@ def test_rotation_derivatives_are_finite_and_right(angle):
 
 def test_pose_is_a_pytree():
     assert len(jax.tree.leaves(Pose(jnp.eye(3), jnp.zeros(3)))) == 2
+
+
+NO_ROTATIONS = {
+    "twice": (2 * np.eye(3), "is 3, the determinant 8"),
+    "shrunk": (0.9 * np.eye(3), "is 0.19, the determinant 0.729"),
+    "mirrored": (-np.eye(3), "is 0, the determinant -1"),
+    "zero": (np.zeros((3, 3)), "is 1, the determinant 0"),
+    "sheared": (np.eye(3) + np.diag([0.3, 0], 1), "is 0.3, the determinant 1"),
+    "huge": (1e200 * np.eye(3), "is inf"),
+    "one row": (np.diag([1, 1, 1.001]), "is 0.002"),
+}
+
+
+@pytest.mark.parametrize("name", NO_ROTATIONS)
+def test_matrices_that_are_no_rotations_are_refused(name):
+    wrong, found = NO_ROTATIONS[name]
+    assert not is_rotation(wrong)
+    with pytest.raises(ValueError, match=rf"(?s)turn: row 1 .*{found}.*pose_from_vector"):
+        check_rotations("turn", np.stack([np.eye(3), wrong, wrong]))
+
+
+def test_rotations_pass_rounded_to_float32_and_after_many_products():
+    """Whatever is not finite is left to a status."""
+    q = np.random.default_rng(0).normal(size=(200, 4))
+    turns = jax.vmap(lambda q: pose_from_quaternion(q, jnp.zeros(3)).rotation)
+    for dtype in (np.float32, np.float64):
+        R = np.asarray(turns(jnp.asarray(q, dtype)), dtype)
+        product = np.eye(3, dtype=dtype)
+        for one in (*R, *R, *R, *R, *R):
+            product = product @ one
+        assert all(map(is_rotation, (*R, product)))
+        check_rotations("turn", np.stack([*R, product]))
+    missing = np.full((3, 3), np.nan)
+    assert not is_rotation(missing)
+    check_rotations("turn", missing[None])
+    check_rotations("turn", np.eye(3)[None] + np.inf)

@@ -61,7 +61,8 @@ def make_scene(
         MeshError: patches for the contact that are not where the mesh is.
         SizeError: a length that no trachea and no tool has: the unit is wrong, most likely; a
             `half_width` beyond the tool.
-        ValueError: a path without rows, or arrays of a wrong length.
+        ValueError: a path without rows, arrays of a wrong length, or matrices of the path that are
+            no rotations.
     """
     check_path(path)
     check_material(geometry, material)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from jaxtrachea._numerics import full_precision
 from jaxtrachea._packed import Packing
+from jaxtrachea.contact.pose import check_rotations, is_rotation
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.admission import check_alike
 from jaxtrachea.mechanics.sections.material import SectionMaterial
@@ -187,7 +188,7 @@ class Session:
         """Move the tool.
 
         Args:
-            rotation: of the tool; shape (3, 3).
+            rotation: of the tool, orthogonal with determinant 1; shape (3, 3).
             translation: of its origin, mm; shape (3,).
 
         Returns:
@@ -196,7 +197,7 @@ class Session:
             `vertices`) lies on the device until the next step.
 
         Raises:
-            ValueError: another shape.
+            ValueError: another shape, or a matrix that is no rotation; the state stays as it was.
         """
         begin = time.perf_counter()
         turn, place = np.asarray(rotation, self.dtype), np.asarray(translation, self.dtype)
@@ -204,6 +205,8 @@ class Session:
             raise ValueError(
                 f"rotation {turn.shape}, translation {place.shape}; expected (3, 3) and (3,)"
             )
+        if not is_rotation(turn):
+            check_rotations("rotation", turn[None])
         # Two arrays: to make one of them takes longer than it saves.
         result = self._program(turn, place, self._numbers)
         self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin

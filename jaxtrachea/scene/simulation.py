@@ -98,8 +98,8 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
         path: `Poses` if the plan has contact, else `Presses`.
 
     Raises:
-        ValueError: the other kind of path, arrays of a wrong length, or something missing that the
-            plan needs.
+        ValueError: the other kind of path, arrays of a wrong length, something missing that the
+            plan needs, or (outside of `jit`) matrices of the path that are no rotations.
     """
     plan = scene.plan
     check_path(path)

@@ -7,6 +7,8 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import real, shaped
@@ -14,7 +16,7 @@ from jaxtrachea._errors import InputError
 from jaxtrachea._in_order import one_kernel
 from jaxtrachea._numerics import product, total
 from jaxtrachea.contact.patches import Patches, Touch, touch
-from jaxtrachea.contact.pose import Pose, inverse, transform
+from jaxtrachea.contact.pose import Pose, check_rotations, inverse, transform
 from jaxtrachea.contact.search import STANDARD, Settings
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.admission import check_shapes
@@ -51,7 +53,8 @@ class Poses(eqx.Module):
     """A tool's positions in the frame of the mesh (without one: of the tube), in order.
 
     Attributes:
-        rotation: shape (rows, 3, 3).
+        rotation: orthogonal with determinant 1, which `make_scene` and `simulate` check outside of
+            `jit`; shape (rows, 3, 3).
         translation: of the tool's origin, mm; shape (rows, 3).
     """
 
@@ -114,10 +117,12 @@ def check_kind(scene: "Scene", material: AnyMaterial) -> None:
 
 
 def check_path(path: Presses | Poses) -> None:
-    """Refuse a path whose arrays do not belong together.
+    """Refuse a path whose arrays do not belong together, or of matrices that are no rotations.
+
+    Traced matrices are not looked at: that would be operations in every program.
 
     Raises:
-        ValueError: the argument, its length and the expected one.
+        ValueError: the argument, its length and the expected one; or the row.
     """
     if isinstance(path, Presses):
         rows = shaped("path.s", path.s, ("rows",)).shape[0]
@@ -126,7 +131,9 @@ def check_path(path: Presses | Poses) -> None:
     else:
         rows = shaped("path.translation", path.translation, ("rows", 3)).shape[0]
         why = " (rows as path.translation has)"
-        shaped("path.rotation", path.rotation, (rows, 3, 3), why=why)
+        rotation = shaped("path.rotation", path.rotation, (rows, 3, 3), why=why)
+        if not isinstance(rotation, Tracer):
+            check_rotations("path.rotation", np.asarray(rotation))
 
 
 class Scene(eqx.Module):

@@ -225,6 +225,18 @@ def test_a_bad_pose_costs_itself_only(held, bad):
         assert int(step.status) == expected[2]
 
 
+def test_a_matrix_that_is_no_rotation_is_refused(held):
+    """It gave a force, with OK: twice as large a tool. The state stays as it was."""
+    down = [0, OUTER + 4.5, 0] + np.array([75, 0, 0])
+    known = [np.array(held.step(EYE, down).force) for _ in range(2)]
+    held.reset()
+    held.step(EYE, down)
+    for wrong in (2 * EYE, 0.9 * EYE, -EYE, 0 * EYE, EYE + np.diag([0.3, 0], 1)):
+        with pytest.raises(ValueError, match=r"rotation: row 0 .* no rotation.*pose_from_vector"):
+            held.step(wrong, down)
+    np.testing.assert_array_equal(np.array(held.step(EYE, down).force), known[1])
+
+
 def test_a_jump_grasps_anew(held):
     """The old seat was dragged along: 1.7 N along the tube, with OK, until the tool was lifted."""
     jump = np.concatenate([line([75, 0, -0.5], [75, 0, 2.0], step=0.1), [[95, 0, 2.0]]])

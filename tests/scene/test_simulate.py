@@ -316,3 +316,17 @@ def test_a_long_tube_of_many_patches():
     np.testing.assert_allclose(out.gap, -1, atol=0.05)  # bound of the smoothing
     alone = press(tube, SPRINGS, out.s[0], jnp.linalg.norm(out.displacement, axis=1))
     np.testing.assert_allclose(np.linalg.norm(out.force, axis=1), alone.force, rtol=1e-9)
+
+
+def test_a_path_of_matrices_that_are_no_rotations_is_refused():
+    """They gave forces of another tool, with OK; traced ones are not looked at."""
+    path = ball([75, 1, 0], [75, -1, 0], 3)
+    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=BARE)
+    for wrong in (2, 0.9, -1, 0):
+        bad = Poses(path.rotation.at[1].multiply(wrong), path.translation)
+        message = r"path\.rotation: row 1 .* no rotation.*pose_from_vector"
+        with pytest.raises(ValueError, match=message):
+            make_scene(TUBE, SPRINGS, bad, tool=BALL, effects=BARE)
+        with pytest.raises(ValueError, match=message):
+            simulate(scene, SPRINGS, bad)
+    jax.eval_shape(simulate, scene, SPRINGS, bad)
