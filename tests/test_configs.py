@@ -13,6 +13,7 @@ from run_cli import run, tree
 
 from jaxtrachea import table_1
 from jaxtrachea.cli import scene as scenes
+from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.tube import make_tube
 
 pytestmark = pytest.mark.compiling
@@ -134,6 +135,27 @@ def test_sweep_runs(tmp_path, monkeypatch, capsys):
     assert (force > 0).all()
     # A ring that bends gives way most between crown and end (docs/off_midline.md).
     assert (force[:, 1] < 0.9 * force[:, 3]).all()
+
+
+def test_a_sweep_names_the_statuses_of_its_points(tmp_path, monkeypatch, capsys):
+    """Points that are solved, but too deep, counted as without a solution, and nothing said why."""
+    monkeypatch.chdir(tmp_path)
+    shown = "[output]\nsurface = false\npictures = false\n"
+    grid = '[sweep]\ndepth = "30 mm"\nphi_count = 1\ns_count = 2\n'
+    Path("scene.toml").write_text(GOOD + PRESS + shown + grid)
+    code, out, _ = run(monkeypatch, capsys, "sweep", "scene.toml", "--out", "maps")
+    said = " ".join(out.split())
+    assert "2 contact points, 0 without a solution" in said
+    assert f"2 point(s): {PressStatus.TOO_DEEP.message}" in said
+    assert code == 1  # as `simulate` ends with such a row
+    with h5py.File("maps/sweep.h5") as file:
+        assert np.isfinite(file["force"][:]).all()
+    Path("scene.toml").write_text(GOOD.replace('"0.02', '"-0.02') + PRESS + shown + grid)
+    code, out, _ = run(monkeypatch, capsys, "sweep", "scene.toml", "--out", "past")
+    said = " ".join(out.split())
+    assert code == 1
+    assert "2 contact points, 2 without a solution" in said
+    assert f"2 point(s): {PressStatus.PAST_FOLD.message}" in said
 
 
 @pytest.mark.slow

@@ -55,12 +55,10 @@ def plan(scene: SceneArgument, timed: TimeOption = False) -> None:
 def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
     """Move the tool along its path: forces, deformed mesh, pictures."""
     import jax
-    import numpy as np
 
     from jaxtrachea.files.traces import Traced
     from jaxtrachea.scene.results import last_solved, write_meshes, write_simulation
     from jaxtrachea.scene.simulation import simulate as run
-    from jaxtrachea.status import PressStatus
 
     clock = [time.perf_counter()]
     spec, staged = _staged(scene)
@@ -76,11 +74,8 @@ def simulate(scene: SceneArgument, out_dir: OutOption = None) -> None:
         made = _provenance(scene, staged, clock)
         write_simulation(folder / "simulation.h5", staged.scene, staged.path, out, made)
         _write_json(folder, made)
-    status = np.asarray(out.status)
     _print_rows(out)
-    failed = (status > PressStatus.NO_CONTACT).sum()
-    for code in np.unique(status[status > PressStatus.NO_CONTACT]):
-        Console().print(f"{(status == code).sum()} row(s): {PressStatus(int(code)).message}")
+    failed = _print_failures(out.status, "row(s)")
     for note in staged.notes:
         Console().print(escape(note), highlight=False)
     if choice is not None:
@@ -101,7 +96,6 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
     from jaxtrachea.scene.plots import draw_sweep
     from jaxtrachea.scene.results import write_sweep
     from jaxtrachea.scene.sweep import sweep as run
-    from jaxtrachea.status import PressStatus
 
     clock = [time.perf_counter()]
     spec, staged = _staged(scene)
@@ -129,13 +123,14 @@ def sweep(scene: SceneArgument, out_dir: OutOption = None) -> None:
         made = _provenance(scene, staged, clock)
         write_sweep(folder / "sweep.h5", swept, s, phi, want.depth, out, made)
         _write_json(folder, made)
-    failed = int((np.asarray(out.status) > PressStatus.NO_CONTACT).sum())
+    unsolved = int(np.isnan(np.asarray(out.force)).sum())
     console = Console()
     console.print(escape(_levels_of(swept)), highlight=False)
     console.print(
-        f"{total} contact points, {failed} without a solution, "
+        f"{total} contact points, {unsolved} without a solution, "
         f"{clock[2] - clock[1]:.2f} s with compilation", highlight=False,
     )  # fmt: skip
+    failed = _print_failures(out.status, "point(s)")
     console.print(f"written to {escape(str(folder.parent))}", highlight=False, soft_wrap=True)
     raise typer.Exit(1 if failed else 0)
 
@@ -291,6 +286,19 @@ def _write_json(folder: Path, made: dict) -> None:
     from jaxtrachea.files.tables import write_text
 
     write_text(folder / "provenance.json", json.dumps(made, indent=2) + "\n")
+
+
+def _print_failures(status, what: str) -> int:
+    """A line for each status beyond contact and none; the number of all these."""
+    import numpy as np
+
+    from jaxtrachea.status import PressStatus
+
+    failed = np.asarray(status)
+    failed = failed[failed > PressStatus.NO_CONTACT]
+    for code, count in zip(*np.unique(failed, return_counts=True), strict=True):
+        Console().print(f"{count} {what}: {PressStatus(int(code)).message}", highlight=False)
+    return len(failed)
 
 
 def _print_rows(out) -> None:
