@@ -37,8 +37,9 @@ class PressStatus(_Described):
     OFF_TUBE = 8, "the contact, or a part of a tool's width, lies beyond an end of the tube"
     UNSURE = (
         9,
-        "solved, but the contact may be another than found: the tool reaches so deep, or touches "
-        "an imported mesh where its gap is off",
+        "solved, but the contact may be another than found: the tool lies so flat on the wall that "
+        "the search did not end (round it more), reaches so deep (press less), or touches an "
+        "imported mesh where its gap is off",
     )
     BAD_MATERIAL = 10, "a stiffness or the coefficient of friction is negative"
     IN_LUMEN = 11, "the tool lies within the tube and did not come through the wall"
