@@ -46,7 +46,7 @@ WITHIN = {
         {"wall", "effects"},
         {"plan", "spec"},
         {"rules", "stage"},
-        {"lumen", "ranges", "trail", "paths"},
+        {"landing", "lumen", "ranges", "trail", "paths"},
         {"approach"},
         {"facts", "refusals", "deform", "programs"},
         {"configurational"},

@@ -11,8 +11,9 @@ from jaxtrachea._numerics import full_precision
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.curve import frame_at
+from jaxtrachea.scene.landing import Landing, landing
 from jaxtrachea.scene.lumen import in_lumen
-from jaxtrachea.scene.stage import Poses, Presses, Scene, at_row, contact_point_path, touch_tube
+from jaxtrachea.scene.stage import Poses, Presses, Scene, touch_tube
 
 
 class Approach(NamedTuple):
@@ -22,12 +23,13 @@ class Approach(NamedTuple):
         seen: contact of every row with the tube at rest.
         presses: displacements along (tangent, anterior, lateral) at the contact.
         inward: normal of the straight tube at the contact; shape (rows, 3).
-        first: row of first touch, where the tool stays; None: every row is a press of its own.
+        first: row of first touch; None: every row is a press of its own.
         frame: those directions as columns in the frame of the mesh; None: straight tube, identity.
         own: contact of every row of `presses`: `seen`, but in a step of a session.
         inside: whether the tool is in the lumen; shape (rows,).
         pull: from derivatives by the presses to those by the poses of the path; None: the contact
             point is fixed.
+        landing: the first touch, where the tool stays; None: every row is a press of its own.
     """
 
     seen: Touch
@@ -38,6 +40,7 @@ class Approach(NamedTuple):
     own: Touch
     inside: Bool[Array, " rows"]
     pull: Callable[[Presses], tuple[Poses]] | None = None
+    landing: Landing | None = None
 
 
 @full_precision
@@ -77,22 +80,20 @@ def first_touch(
 def on_one_point(
     scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""], inside: Bool[Array, " rows"]
 ) -> Approach:
-    """The path as presses on the place that row `first` touches."""
-    inward, frame = _directions(scene, seen)
-    rows = seen.gap.shape[0]
-    axes = None if frame is None else frame[first]
-    D = contact_point_path(path, seen, first, at_row(inward, first), axes)
+    """The path as presses on the place that the tool touches first, at or before row `first`."""
+    rows, place = seen.gap.shape[0], landing(scene, path, seen, first)
+    D = place.way
     if scene.plan.options.contact == "bonded":
         D = jnp.where((jnp.arange(rows) >= first)[:, None], D, 0)
 
     def spread(v):
-        return jnp.broadcast_to(at_row(v, first), v.shape)
+        return jnp.broadcast_to(v, (rows, *v.shape))
 
-    presses = Presses(spread(seen.s), spread(seen.phi), D)
-    frames = None if frame is None else spread(frame)
     return Approach(
-        seen=seen, presses=presses, inward=spread(inward), first=first, frame=frames, own=seen,
-        inside=inside,
+        seen=seen, presses=Presses(spread(place.s), spread(place.phi), D),
+        inward=spread(local_frame(place.phi)[0]), first=first,
+        frame=None if place.frame is None else spread(place.frame), own=seen, inside=inside,
+        landing=place,
     )  # fmt: skip
 
 
@@ -107,14 +108,11 @@ def _directions(scene: Scene, seen: Touch):
 
 def backed_out(path: Poses, made: Approach) -> Poses:
     """Where the tool stands when it just touches, before it presses."""
+    rows = path.translation.shape[0]
+    if made.landing is not None:
+        rotation, translation = made.landing.rotation, made.landing.translation
+        return Poses(*(jnp.broadcast_to(v, (rows, *v.shape)) for v in (rotation, translation)))
     inward = made.inward
     if made.frame is not None:
         inward = jnp.einsum("rij,rj->ri", made.frame, inward)
-    gap, rotation, translation = made.seen.gap, path.rotation, path.translation
-    if made.first is not None:
-
-        def first(v):
-            return jnp.broadcast_to(at_row(v, made.first), v.shape)
-
-        gap, rotation, translation = first(gap), first(rotation), first(translation)
-    return Poses(rotation, translation + gap[:, None] * inward)
+    return Poses(path.rotation, path.translation + made.seen.gap[:, None] * inward)

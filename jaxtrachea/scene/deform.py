@@ -149,9 +149,9 @@ def _distances(scene: Scene, made: Approach):
     """Distance of the contacts from the centreline, mm; of the first for all if they share it."""
     assert scene.tube is not None
     line, seen = scene.tube.line, made.seen
-    if made.first is None:
+    if made.landing is None:
         return jax.vmap(lambda s, point: distance_from(line, s, point))(seen.s, seen.point)
-    found = distance_from(line, seen.s[made.first], seen.point[made.first])
+    found = distance_from(line, made.landing.s, made.landing.point)
     return jnp.broadcast_to(found, seen.s.shape)
 
 

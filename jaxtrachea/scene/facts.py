@@ -7,11 +7,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea.mechanics.sections.material import SectionMaterial
-from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import first_touch
-from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.declare import AnyMaterial, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions, given_values
+from jaxtrachea.scene.landing import landing
 from jaxtrachea.scene.lumen import in_lumen
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.stage import (
@@ -19,7 +18,6 @@ from jaxtrachea.scene.stage import (
     Poses,
     Presses,
     Scene,
-    contact_point_path,
     touch_tube,
 )
 from jaxtrachea.surface import local
@@ -43,15 +41,15 @@ def facts_of(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Scen
         rows = len(path.translation)
         s, phi, touching, moved = (np.asarray(v)[:rows] for v in seen[:4])
         s, phi, moved = (np.asarray(v, float) for v in (s, phi, moved))
-        at = slice(int(seen[4]), int(seen[4]) + 1)
+        place = np.asarray(seen[6], float)
         gap = np.asarray(seen[5], float)[:rows]
         outside = touching | ~(gap < 0)
         after = outside & (np.arange(rows) >= int(seen[4]))
     else:
         s, phi, moved = (np.asarray(v, float) for v in (path.s, path.phi, path.displacement))
-        touching, at = np.ones(len(s), bool), slice(None)
+        touching, place = np.ones(len(s), bool), np.array([s, phi])
         gap, outside, after = np.zeros(len(s)), touching, touching
-    here = np.broadcast_to(phi[at], s.shape)
+    here = np.broadcast_to(place[1], s.shape)
     across = np.abs(moved[:, 2] * np.cos(here) - moved[:, 1] * np.sin(here))
     inward = -(moved[:, 1] * np.cos(here) + moved[:, 2] * np.sin(here))
     along, way = np.abs(moved[:, 0]), np.sqrt((moved**2).sum(axis=1))
@@ -70,7 +68,7 @@ def facts_of(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Scen
     def keep(v):
         return v if v > COVERED else 0.0
 
-    angles = np.abs(phi[touching])
+    angles = np.abs(np.append(phi[touching], place[1] if touching.any() else 0))
     slip = np.hypot(along, across)[touching].max(initial=0)
     x = np.asarray(scene.geometry.ring_positions, float)
     return SceneFacts(
@@ -86,7 +84,7 @@ def facts_of(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Scen
         known=given_values(material),
         mesh=scene.mesh is not None,
         curved=curved,
-        near=_near(scene, s, phi),
+        near=_near(scene, np.append(s, place[0]), np.append(phi, place[1])),
         way_fixed=reach(inward, after),
         way_per_step=reach(-gap, outside),
         softness=_softness(material, radius),
@@ -132,21 +130,18 @@ def _touched(
     Float[Array, "rows 3"],
     Int[Array, ""],
     Float[Array, " rows"],
+    tuple[Float[Array, ""], Float[Array, ""]],
 ]:
     """Contact of every row and whether it is one with the outside; the way from first touch on.
 
     Returns:
         s, mm; phi, rad; whether the row touches from outside; displacement of the contact point,
-        mm; the row of first touch; gap, mm.
+        mm; the row of first touch; gap, mm; s and phi of the first touch.
     """
     seen = touch_tube(scene, path)
     touching, row = first_touch(seen, in_lumen(scene, path, seen))
-    frame = None
-    if scene.plan.curved and scene.tube is not None:
-        frame = frame_at(scene.tube.line, seen.s[row])
-    inward = local_frame(seen.phi[row])[0]
-    moved = contact_point_path(path, seen, row, inward, frame)
-    return seen.s, seen.phi, touching, moved, row, seen.gap
+    place = landing(scene, path, seen, row)
+    return seen.s, seen.phi, touching, place.way, row, seen.gap, (place.s, place.phi)
 
 
 def _near(scene: Scene, s, phi) -> bool:

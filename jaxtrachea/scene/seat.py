@@ -38,9 +38,10 @@ from jaxtrachea.mechanics.oblique import Place, place_at
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.curve import frame_at
+from jaxtrachea.scene.landing import Landing, landing, turned
 from jaxtrachea.scene.ranges import half_spacing
 from jaxtrachea.scene.refusals import on_the_tube
-from jaxtrachea.scene.stage import Poses, Presses, Scene, contact_point_path
+from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.trachea.material import Material
 
 #: Way along the surface that a seat holds, over the depth.
@@ -106,16 +107,18 @@ def grasp(scene: Scene, here: Instant) -> Seat:
 
 def arrive(scene: Scene, before: Instant, here: Instant) -> Seat:
     """The seat of a first touch: the way along the surface since then counts."""
-    seat = grasp(scene, here)
 
     def join(v, w):
         return jnp.concatenate([v, w])
 
     path = jax.tree.map(join, before.path, here.path)
     seen = jax.tree.map(join, before.seen, here.seen)
-    frame = local_frame(seat.phi)
-    way = contact_point_path(path, seen, jnp.asarray(1), frame[0], _axes(scene, seat.s))[1]
-    return anchored(scene, seat, _times(frame, way), here.path)
+    place = landing(scene, path, seen, jnp.asarray(1))
+    seat = Seat(
+        s=place.s, phi=place.phi, point=place.point, body=place.body, anchor=place.point,
+        rotation=place.rotation, translation=place.translation, status=here.seen.status[0],
+    )  # fmt: skip
+    return anchored(scene, seat, _times(local_frame(seat.phi), place.way[1]), here.path)
 
 
 def left(scene: Scene, seat: Seat, before: Instant, here: Instant) -> Bool[Array, ""]:
@@ -127,9 +130,9 @@ def left(scene: Scene, seat: Seat, before: Instant, here: Instant) -> Bool[Array
 def drawn(scene: Scene, seat: Seat, here: Instant) -> Seat:
     """The seat after its place has followed the tool's contact; its press is the same vector."""
     now = grasp(scene, here)
-    turned = now.phi - seat.phi
-    turned = jnp.arctan2(jnp.sin(turned), jnp.cos(turned))
-    lag = jnp.stack([now.s - seat.s, scene.radius * turned])
+    turn = now.phi - seat.phi
+    turn = jnp.arctan2(jnp.sin(turn), jnp.cos(turn))
+    lag = jnp.stack([now.s - seat.s, scene.radius * turn])
     share = 1 - _limit(_hold(scene, -here.seen.gap[0]), _length(lag))
 
     def mix(old, new):
@@ -137,14 +140,14 @@ def drawn(scene: Scene, seat: Seat, here: Instant) -> Seat:
 
     body = mix(seat.body, now.body)
     path = _one(here.path)
-    phi = seat.phi + share * turned
+    phi = seat.phi + share * turn
     return Seat(
         s=mix(seat.s, now.s),
         phi=jnp.arctan2(jnp.sin(phi), jnp.cos(phi)),
         point=mix(seat.point, now.point),
         body=body,
         anchor=seat.anchor + _at(path, body) - _at(path, seat.body),
-        rotation=_turned(mix(seat.rotation, now.rotation)),
+        rotation=turned(mix(seat.rotation, now.rotation)),
         translation=mix(seat.translation, now.translation),
         status=jnp.where(share > 0, now.status, seat.status),
     )
@@ -214,11 +217,22 @@ def as_approach(
         now, gap=jnp.zeros_like(now.gap), point=seat.point, s=seat.s, phi=seat.phi,
         status=seat.status,
     )  # fmt: skip
+    presses = Presses(seat.s[None], seat.phi[None], _times(frame.T, way)[None])
     made = Approach(
         seen=jax.tree.map(lambda v: v[None], seen),
-        presses=Presses(seat.s[None], seat.phi[None], _times(frame.T, way)[None]),
+        presses=presses,
         inward=frame[:1],
         first=jnp.asarray(0),
+        landing=Landing(
+            s=seat.s,
+            phi=seat.phi,
+            point=seat.point,
+            body=seat.body,
+            rotation=seat.rotation,
+            translation=seat.translation,
+            frame=axes,
+            way=presses.displacement,
+        ),
         frame=None if axes is None else axes[None],
         own=here.seen,
         inside=inside,
@@ -270,8 +284,3 @@ def _limit(most, value):
 
 def _length(v):
     return jnp.sqrt(jnp.sum(v * v))
-
-
-def _turned(matrix):
-    """The rotation next to a mean of two, by one Newton step of its polar form."""
-    return 1.5 * matrix - 0.5 * product(matrix, product(matrix.T, matrix))

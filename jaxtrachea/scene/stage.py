@@ -14,9 +14,8 @@ from jaxtyping import Array, Float
 from jaxtrachea._arguments import real, shaped
 from jaxtrachea._errors import InputError
 from jaxtrachea._in_order import one_kernel
-from jaxtrachea._numerics import product, total
 from jaxtrachea.contact.patches import Patches, Touch, touch
-from jaxtrachea.contact.pose import Pose, check_rotations, inverse, transform
+from jaxtrachea.contact.pose import Pose, check_rotations
 from jaxtrachea.contact.search import STANDARD, Settings
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.admission import check_shapes
@@ -191,40 +190,6 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
         return _touch(tool, Pose(R, T), tube, scene.quality, near=scene.near)
 
     return jax.vmap(one_kernel(one))(path.rotation, path.translation)
-
-
-def contact_point_path(path: Poses, seen: Touch, first, inward, frame):
-    """Displacement of the tool's material point that touches first, from its first touch on.
-
-    Before the row of first touch the tool came in a straight line from the last row that is finite:
-    the part of that step which it still went along the surface counts, so that a finer path changes
-    nothing.
-
-    Args:
-        path: of the tool.
-        seen: its contact with the tube at rest, row by row.
-        first: row of first touch.
-        inward: normal of the straight tube there; shape (3,).
-        frame: of the centreline there, as columns; None: the tube is straight.
-
-    Returns:
-        mm, along (tangent, anterior, lateral); shape (rows, 3).
-    """
-    row = jnp.arange(seen.gap.shape[0])
-    earlier = jnp.max(jnp.where((row < first) & ~jnp.isnan(seen.gap), row, -1))
-    before = jnp.where(earlier < 0, first, earlier)
-    pose = Pose(at_row(path.rotation, first), at_row(path.translation, first))
-    body = transform(inverse(pose), at_row(seen.tool_point, first)[:, None])[:, 0]
-    points = product(path.rotation, body) + path.translation
-    way = points - at_row(points, first)[None]
-    if frame is not None:
-        way = product(way, frame)
-    gap = at_row(seen.gap, first)
-    closing = at_row(seen.gap, before) - gap
-    left = jnp.where(closing > 0, -gap / jnp.where(closing > 0, closing, 1), 0)
-    step = -at_row(way, before)
-    step = step - total(step * inward) * inward
-    return way + (left * step - gap * inward)[None]
 
 
 def at_row(v, row):

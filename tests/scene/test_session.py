@@ -228,6 +228,7 @@ def test_a_bad_pose_costs_itself_only(held, bad):
 def test_a_matrix_that_is_no_rotation_is_refused(held):
     """It gave a force, with OK: twice as large a tool. The state stays as it was."""
     down = [0, OUTER + 4.5, 0] + np.array([75, 0, 0])
+    held.reset()
     known = [np.array(held.step(EYE, down).force) for _ in range(2)]
     held.reset()
     held.step(EYE, down)
