@@ -38,8 +38,8 @@ class PressStatus(_Described):
     UNSURE = (
         9,
         "solved, but the contact may be another than found: the tool lies so flat on the wall that "
-        "the search did not end (round it more), reaches so deep (press less), or touches an "
-        "imported mesh where its gap is off",
+        "the search did not end (round it more), reaches so deep (press less), or touches a mesh "
+        "where its gap is off",
     )
     BAD_MATERIAL = 10, "a stiffness or the coefficient of friction is negative"
     IN_LUMEN = 11, "the tool lies within the tube and did not come through the wall"
