@@ -386,6 +386,16 @@ def test_interrupt_while_a_fit_makes_its_folders(
     assert tree(study) == before
 
 
+def test_interrupt_while_the_files_of_a_fit_move(study, ctrl_c, monkeypatch, capsys):
+    """The last ones are in place, the shards gone: it has ended, and says so."""
+    monkeypatch.chdir(study)
+    ctrl_c(run_folder, "commit", "after")
+    code, _, err = run(monkeypatch, capsys, "fit", "spec.toml", "--out", "new")
+    assert code in (0, 1)
+    assert "nothing was written" not in err
+    assert (study / "new" / "results.h5").is_file()
+
+
 @pytest.mark.parametrize("when", ["before", "after"])
 def test_interrupt_while_a_command_makes_its_folder(when, study, ctrl_c, monkeypatch):
     monkeypatch.chdir(study)

@@ -221,6 +221,7 @@ def running(options: FitOptions, meeting: Meeting, now, study, settings) -> Iter
                 staged, asked = run_folder.stage(run), run.manifest.options
                 yield Run(staged, asked, manifest.as_dict(run.manifest), settings, fit, check)
                 check()
+            ctrl_c.hold()
             run_folder.commit(run)
         except BaseException as error:
             ctrl_c.hold()
