@@ -526,6 +526,16 @@ def test_a_line_of_joints_is_pressed_on_the_midline(study, tmp_path, monkeypatch
     assert not (tmp_path / "a").exists()
 
 
+def test_a_curve_with_its_signs_turned_is_not_compared(read):
+    """As in a fit: compression counted negative is a pull to a tool that only touches."""
+    good = Curve("s0001", "new", 61.0, 0.0, DEPTHS, true_force(61.0))
+    turned = dataclasses.replace(good, trial="turned", force=-good.force)
+    kept, (bad,) = held_out.pressable(read, [good, turned])
+    assert kept == [good]
+    assert (bad.trial, bad.kind) == ("turned", "sign")
+    assert "pulls" in bad.reason
+
+
 def test_command_writes_what_the_page_says(study, tmp_path, monkeypatch, capsys):
     data = [Curve("s0001", "new", 61.0, 0.0, DEPTHS, true_force(61.0)),
             Curve("s0002", "off", 200.0, 0.0, DEPTHS, true_force(61.0)),

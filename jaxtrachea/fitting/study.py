@@ -374,15 +374,13 @@ def check_touch(curve: Curve, options: Options, parameters: Sequence[Parameter])
         return
     onset, offset = (next(p for p in parameters if p.name == name) for name in OF_THE_PRESS)
     force = curve.force - (offset.value if offset.fixed else 0)
-    if onset.fixed:
-        pressed = curve.displacement > onset.value
-        if not offset.fixed:
-            lost, kept = float(not pressed.any()), 0.0
-        else:
-            lost, kept = (np.max(np.abs(force[v]), initial=0) for v in (~pressed, pressed))
-        found = f"its largest force is at or before the onset, {onset.value:g} mm"
-    else:
-        lost, kept = (-np.min(force), np.max(force)) if offset.fixed else (0.0, 0.0)
+    pressed = curve.displacement > (onset.value if onset.fixed else -np.inf)
+    touch = np.where(pressed, np.maximum(force, 0), 0)
+    lost, kept = np.max(np.abs(force - touch)), np.max(touch)
+    if not offset.fixed:
+        lost, kept = float(not pressed.any()), 0.0
+    found = f"its largest force is at or before the onset, {onset.value:g} mm"
+    if pressed[np.argmax(np.abs(force - touch))]:
         found = "its largest force pulls"
     if lost > 2 * kept:
         raise InputError(
