@@ -6,6 +6,7 @@ from typing import Any
 
 from jaxtrachea.tradeoff.front import front, worst
 from jaxtrachea.tradeoff.load import QUIET
+from jaxtrachea.tradeoff.price import HALF
 
 HEAD = ["ladder", "level", "force", "joints", "surface", "contact [mm]", "gradient",
         "part [µs]", "call [µs]", "99 %", "part, lane [µs]", "lane [µs]", "gradient [µs]",
@@ -122,12 +123,15 @@ FRONT_HEAD = ["scene", "within 10 %: a call", "a lane", "all: a call", "a lane",
               "error of the quickest call"]  # fmt: skip
 CHOICE_HEAD = ["scene", "tolerance", "least", "dropped (changes alone)", "came back",
                "verified error", "time", "operations", "time again", "chosen / full [µs]",
-               "time again / operations"]  # fmt: skip
+               "time again / operations", "all counted alike"]  # fmt: skip
 
 
 def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
-    """Scene, tolerance, what was made least, what was dropped, verified error, times."""
-    found = []
+    """Scene, tolerances, what was made least, what was dropped, verified error, times.
+
+    Neighbours that differ by the tolerance alone are one row.
+    """
+    found: list[list[str]] = []
     for row in rows:
         error, repeat = row["errors"], row["repeat"]
         worst = max(v for k in ("force", "joints", "surface") if (v := error[k]) is not None)
@@ -135,14 +139,20 @@ def choice_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
             ", ".join(f"{d['ladder']} {d['level']} ({_percent(d['error'])})" for d in row[k])
             for k in ("dropped", "returned")
         )
-        found.append([
+        halved = any(d["ladder"] == "dtype" for d in row["dropped"])
+        over = repeat["share"] / row["operations"]
+        cells = [
             row["scene"], f"{100 * row['tolerance']:g} %", row["by"],
             dropped or "nothing", returned or "-",
             f"{100 * worst:.2g} %", _range(row["cost"]), f"{100 * row['operations']:.0f} %",
             _range(repeat),
             f"{_micro(repeat['full'] * repeat['share'])} / {_micro(repeat['full'])}",
-            f"{repeat['share'] / row['operations']:.2f}",
-        ])  # fmt: skip
+            f"{over:.2f}", f"{over * (HALF if halved else 1):.2f}",
+        ]  # fmt: skip
+        if found and [found[-1][0], *found[-1][2:]] == [cells[0], *cells[2:]]:
+            found[-1][1] += f", {cells[1]}"
+        else:
+            found.append(cells)
     return found
 
 
