@@ -3,11 +3,11 @@
 import statistics
 
 from page import FOLDER, microseconds, number, quoted, ratio, read, table, verdict
-from report_growth import commands_section, gradient_section, growth_section
+from report_growth import against_section, commands_section, gradient_section, growth_section
 from report_peers import peers_section
 
 SUITES = ("skeleton", "update", "fitting", "cohort", "joint", "startup", "peers", "growth",
-          "gradient")  # fmt: skip
+          "gradient", "against")  # fmt: skip
 OPENSEES = (
     "w_C, reactions",
     "w_C, reactions, beam kept",
@@ -282,6 +282,8 @@ def document() -> str:
         "## Import and compilation\n",
         startup_section(suites["startup"][1]),
         commands_section(suites["startup"][1]),
+        "### Against an earlier commit\n",
+        against_section(*suites["against"], goals),
     ]
     intro = [
         "# Benchmarks\n",

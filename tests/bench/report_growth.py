@@ -145,6 +145,27 @@ def commands_section(rows: list[dict]) -> str:
     return "\n".join([table(["command", "median s", "min s"], lines), after])
 
 
+def against_section(environment: dict, rows: list[dict], goals: list[list[str]]) -> str:
+    """Whole commands beside those of an earlier commit."""
+    lines = []
+    earlier = {r["case"]: r for r in rows if r["table"] == "earlier"}
+    for now in (r for r in rows if r["table"] == "now"):
+        was = earlier[now["case"]]
+        by = {}
+        for what, key in (("wall", "samples"), ("processor", "processor")):
+            a, b = (statistics.median(r[key]) for r in (was, now))
+            by[what] = b / a
+            lines.append([now["case"] if what == "wall" else "", what,
+                          number(a), number(b), f"{b / a:.2f}"])  # fmt: skip
+        for case, what, least in AGAINST_GOALS:
+            if case == now["case"]:
+                words = f"{case}: {what} time against {environment['earlier']}"
+                goals.append([words, f"at most {least:.2g} of it", f"{by[what]:.2f}",
+                              verdict(by[what] <= least)])  # fmt: skip
+    head = ["command", "time", f"{environment['earlier']}, s", "now, s", "now / then"]
+    return "\n".join([AGAINST.format(**environment), table(head, lines)])
+
+
 NAMES = {
     "pipeline": "whole update",
     "fit": "fit",
@@ -154,6 +175,19 @@ DERIVED = "value and gradient (reverse)"
 WITH_GOAL = (
     DERIVED, "value and gradient", "residual and Jacobian", "one Levenberg-Marquardt step",
 )  # fmt: skip
+#: Command, kind of time, and most of the earlier one: of 135 s of a cohort 45, of 350 s of a
+#: selfcheck 120.
+AGAINST_GOALS = (
+    ("jaxtrachea fit, cold", "wall", 0.6),
+    ("jaxtrachea fit, 10,000 specimens", "wall", 45 / 135),
+    ("jaxtrachea selfcheck, cold", "processor", 120 / 350),
+)
+AGAINST = """\
+`python tests/bench/against.py FOLDER`: commands of a checkout of {earlier}, from before these
+benchmarks had goals, and of today in turns, on the same specification and measurements; fits and
+scenes three times, the others once. The model of the fit is that of {earlier} (no width of the
+punch). Each selfcheck runs the table of its commit.
+"""
 GROWTH = """\
 Time against size, and its exponent: least squares of log time against log size over the upper half
 of the sizes, and that of the last step alone. Every size is compiled for itself. Times are the

@@ -1,0 +1,93 @@
+"""Whole commands against an earlier checkout. Run: python tests/bench/against.py FOLDER.
+
+Both on the same specification (that of the earlier one) and the same measurements, in turns, each
+command in a process of its own. Cold: with an empty folder for compiled programs; warm: with what
+the cold start left. The cohort of `cohort.py` is read from the file format that each writes by
+itself: schema 1 then, schema 2 now.
+"""
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import common
+import fitting
+from cohort import DEPTHS, SPECIMENS, SPOTS
+
+from jaxtrachea.measurements.read import Measurements, write_hdf5
+
+NOW = common.FOLDER.parents[1]
+TURNS = 3
+
+
+def run(checkout: Path, words: list[str], cache: Path, place: Path) -> dict[str, float]:
+    """Wall and processor seconds of `jaxtrachea` from this checkout, run in the folder `place`."""
+    where = {"JAX_COMPILATION_CACHE_DIR": str(cache), "PYTHONPATH": str(checkout)}
+    place.mkdir(parents=True)
+    before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxtrachea", *words],
+        capture_output=True, text=True, cwd=place, env=os.environ | where,
+    )  # fmt: skip
+    wall, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert done.returncode in (0, 1), done.stderr  # 1: some lane failed
+    processor = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    print(
+        f"{checkout.name:10} {' '.join(words)[:60]:60} {wall:7.1f} s, processor {processor:.1f} s"
+    )
+    return {"wall": wall, "processor": processor}
+
+
+def cases(earlier: Path, base: Path) -> dict[str, tuple[int, tuple[str, ...], dict]]:
+    """By command: turns, starts, and its words by checkout."""
+    study, *_ = fitting.make_study(SPECIMENS, SPOTS, DEPTHS)
+    curves = tuple(curve for lane in study.curves for curve in lane)
+    cohort = {}
+    for checkout, version in ((earlier, 1), (NOW, 2)):
+        folder = base / f"cohort_{version}"
+        folder.mkdir()
+        write_hdf5(folder / "c.h5", Measurements(curves, (), ()), schema_version=version)
+        (folder / "spec.toml").write_text('[data]\nfiles = ["c.h5"]\n')
+        cohort[checkout] = ["fit", str(folder / "spec.toml"), "--out", "out"]
+    both = (earlier, NOW)
+    fit = ["fit", str(earlier / "fits" / "virtual_trachea" / "fit.toml"), "--out", "out"]
+    simulate = ["simulate", str(earlier / "configs" / "normal.toml"), "--out", "out"]
+    return {
+        "fit": (TURNS, ("cold", "warm"), dict.fromkeys(both, fit)),
+        "simulate": (TURNS, ("cold", "warm"), dict.fromkeys(both, simulate)),
+        "fit, 10,000 specimens": (1, ("",), cohort),
+        "selfcheck": (1, ("cold",), dict.fromkeys(both, ["selfcheck"])),
+    }
+
+
+def main() -> None:
+    """Time all in turns and write the results."""
+    earlier = Path(sys.argv[1]).resolve()
+    out = common.Writer("against")
+    log = ["git", "-C", str(earlier), "log", "-1", "--format=%h"]
+    out.rows[0]["earlier"] = subprocess.check_output(log, text=True).strip()
+    with tempfile.TemporaryDirectory() as name:
+        base = Path(name)
+        for command, (turns, starts, words) in cases(earlier, base).items():
+            found: dict[tuple[str, str], list[dict[str, float]]] = {}
+            for turn in range(turns):
+                for checkout, said in words.items():
+                    which = "now" if checkout == NOW else "earlier"
+                    cache = base / f"{command}_{which}_{turn}"
+                    for start in starts:
+                        place = base / f"{command}_{which}_{turn}_{start}_out"
+                        taken = run(checkout, said, cache, place)
+                        found.setdefault((start, which), []).append(taken)
+            for (start, which), taken in found.items():
+                case = f"jaxtrachea {command}" + f", {start}" * bool(start)
+                wall, processor = ([t[k] for t in taken] for k in ("wall", "processor"))
+                out.add(which, case, wall, processor=[round(s, 2) for s in processor])
+            out.write()
+
+
+if __name__ == "__main__":
+    main()
