@@ -111,8 +111,8 @@ WITHIN = {
     "runs": [{"meet", "manifest"}, {"processes", "shards"}, {"folder"}, {"rerun", "checkpoint"}],
     "tradeoff": [
         {"calls", "errors", "front", "levels", "load"},
-        {"ladders", "page", "parts", "plots", "price"},
-        {"timing", "trial"},
+        {"ladders", "parts", "plots", "price"},
+        {"page", "timing", "trial"},
         {"choice"},
         {"measure"},
     ],
