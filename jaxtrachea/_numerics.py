@@ -97,9 +97,7 @@ def _scaled_jvp(primals, tangents):
 
 
 @jax.custom_jvp
-def product_of_rows(
-    rows: Float[Array, "*rows k"], b: Float[Array, "k q"]
-) -> Float[Array, "*rows q"]:
+def product_of_rows(rows: Float[Array, "*rows k"], b: Float[Array, "k ..."]) -> Float[Array, "..."]:
     """`product`, of which rows that are no numbers say nothing of b's derivative: see `scaled`."""
     return product(rows, b)
 

@@ -9,8 +9,11 @@ import dataclasses
 import functools
 import importlib
 import inspect
+import json
 import math
 import pathlib
+import subprocess
+import sys
 import typing
 
 import equinox as eqx
@@ -26,10 +29,12 @@ from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.mechanics import beam
+from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliqueOptions, press_oblique, press_path
 from jaxtrachea.mechanics.press import Options, press
 from jaxtrachea.mechanics.skeleton import skeleton_response
+from jaxtrachea.mechanics.vector_equilibrium import press_vector_total
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.scene.assemble import make_scene
 from jaxtrachea.scene.effects import EffectOptions
@@ -452,14 +457,19 @@ LOST = {
     [
         (by_press(Options()), ()),
         (by_press(Options(coupling="total")), ()),
-        (by_oblique, ()),
-        (by_scene, ("no stiffness", "infinite stiffness", "negative stiffness")),
+        (by_press(Options(skeleton="softening")), ()),
+        pytest.param(by_oblique, (), marks=pytest.mark.slow),
+        pytest.param(
+            by_scene,
+            ("no stiffness", "infinite stiffness", "negative stiffness"),
+            marks=pytest.mark.slow,
+        ),
     ],
-    ids=["press", "press total", "press_oblique", "simulate"],
+    ids=["press", "press total", "press softening", "press_oblique", "simulate"],
 )
 def test_a_row_without_a_solution_leaves_shared_derivatives_as_they_are(loss, skip):
     """Those by tube and material are those of the other rows alone: 0 times NaN is NaN."""
-    g, m = table_1(), Material(**FULL | {"k_3": -0.01})
+    g, m = table_1(), Material(**FULL | {"k_3": -0.01, "e_1": 0.1, "e_2": 0.002})
     loss = on_a_scene(loss) if loss is by_scene else loss
 
     @jax.jit
@@ -476,6 +486,126 @@ def test_a_row_without_a_solution_leaves_shared_derivatives_as_they_are(loss, sk
             found = jax.tree.leaves(grad((g, m), *row))
             for p, q in zip(found, alone, strict=True):
                 np.testing.assert_allclose(p, q, rtol=1e-12, atol=1e-15, err_msg=name)
+
+
+@pytest.mark.parametrize("options", [{}, {"coupling": "total"}, {"contact": "bonded"}], ids=str)
+@pytest.mark.parametrize("lost", [np.nan, np.inf])
+def test_a_displacement_that_is_no_number_says_nothing_of_the_onset(options, lost):
+    """Nor of the angle of an oblique press: derivatives are those of the other rows alone."""
+    g, m = table_1(), Material(**FULL)
+
+    def straight(onset, D):
+        return press(g, m, 40.0, D, Options(**options), onset=onset).force[0]
+
+    def oblique(phi, onset, D):
+        D = D[:, None] * jnp.array([[0.1, -1.0, 0.2]])
+        found = press_oblique(g, m, 40.0, phi, D, ObliqueOptions(Options(**options)), onset=onset)
+        return jnp.sum(found.force[0])
+
+    for f, at in ((straight, (0.2,)), (oblique, (0.1, 0.2))):
+        grad = jax.jit(jax.grad(f, range(len(at))))
+        found, alone = (grad(*at, jnp.array([1.0, D])) for D in (lost, 2.0))
+        assert all(np.asarray(alone) != 0)
+        np.testing.assert_allclose(found, alone, rtol=1e-12)
+
+
+@pytest.mark.parametrize("lost", [np.nan, np.inf, -1.0])
+def test_a_place_off_the_beam_says_nothing_of_the_beam(lost):
+    """As if it had not been asked for: `contact_compliance` of one and of many, `deflect`."""
+
+    def one_by_one(beam_, s):
+        return jnp.stack([beam.contact_compliance(beam_, v) for v in s])
+
+    def deflected(beam_, s):
+        return jax.vmap(lambda v: beam.deflect(beam_, v, 2.0).w_C)(s)
+
+    for solve in (beam.contact_compliance, one_by_one, deflected):
+
+        def f(beam_, s, solve=solve):
+            return jnp.nansum(solve(beam_, s))
+
+        grad = jax.jit(jax.grad(f))
+        found, alone = (jax.tree.leaves(grad(BEAM, jnp.array(s))) for s in ([2.0, lost], [2.0]))
+        assert all(np.any(v != 0) for v in alone)
+        for p, q in zip(found, alone, strict=True):
+            np.testing.assert_allclose(p, q, rtol=1e-12)
+
+
+def test_a_vector_that_is_no_number_says_nothing_of_the_skeleton():
+    """The printed coupling, row by row."""
+    D = jnp.array([[1.0, 0.2, 0.1], [np.nan, 0, 0]])
+
+    def force(k_1, C, D):
+        solve = jax.vmap(press_vector_total, (0, None, None))
+        found = solve(D, C, Law(k_1, jnp.asarray(0.1)))
+        return jnp.sum(found.force[0]) + jnp.sum(found.depth[0])
+
+    found, alone = (jax.grad(force, (0, 1))(0.8, jnp.eye(3), v) for v in (D, D[:1]))
+    for p, q in zip(found, alone, strict=True):
+        np.testing.assert_allclose(p, q, rtol=1e-13)
+    status = press_vector_total(D[1], jnp.eye(3), Law(jnp.asarray(0.8), jnp.asarray(0.1))).status
+    assert status == PressStatus.NON_FINITE
+
+
+def test_friction_that_is_no_number():
+    """Without limit the tool sticks; negative is a bad material, as a stiffness is."""
+    D = np.linspace(0, 1, 3)[:, None] * np.array([0.1, -1.0, 0.0])
+    for mu, status in ((np.nan, PressStatus.NON_FINITE), (-0.1, BAD), (np.inf, OK)):
+        found = press_path(table_1(), Material(**FULL), 40.0, 0.0, D, Coulomb(mu))
+        assert found.press.status[-1] == status
+        assert np.isfinite(found.press.force[-1]).all() == (status == OK)
+        assert not found.sliding.any()
+
+
+#: Calls with what is no record of the right kind, and what is named.
+NO_RECORDS = {
+    "jt.press(None, m, 40.0, 1.0)": "geometry is None; expected Geometry",
+    "jt.press(g, None, 40.0, 1.0)": "material is None; expected Material",
+    "jt.press(g, {}, 40.0, 1.0)": "material is {}; expected Material",
+    "jt.press(g, g, 40.0, 1.0)": "expected Material",
+    "jt.press_oblique('x', m, 40.0, 0.0, [0, -1, 0])": "geometry is 'x'; expected Geometry",
+    "jt.press_path(None, m, 40.0, 0.0, [[0, -1, 0]], jt.Coulomb(0.5))": "geometry is None",
+    "jt.deflect(None, 40.0, 1.0)": "beam is None; expected Beam",
+    "jt.contact_compliance(None, 40.0)": "beam is None; expected Beam",
+    "jt.deflect(jt.Beam([], 9.0, [1.0], []), 4.0, 1.0)": "Beam.x has no values",
+    "jt.make_scene(None, m, path)": "geometry is None",
+    "jt.make_scene(g, None, path)": "material is None",
+    "jt.make_scene(g, m, None)": "path is None; expected Presses or Poses",
+    "jt.simulate(None, m, path)": "scene is None; expected Scene",
+    "jt.simulate(scene, m, 'x')": "path is 'x'; expected Presses or Poses",
+    "jt.simulate(scene, None, path)": "material is None",
+    "jt.sweep(None, m, [40.0], [0.0], [1.0])": "scene is None; expected Scene",
+    "jt.sweep(scene, None, [40.0], [0.0], [1.0])": "material is None",
+    "jt.sweep(scene, m, [40.0], [0.0], [1.0], chunk=0)": "chunk is 0; expected a whole number",
+    "jt.sweep(scene, m, [40.0], [0.0], [1.0], chunk='x')": "chunk is 'x'; expected a whole number",
+}
+
+
+def test_what_is_no_record_is_named():
+    """As users call, who have no checker of annotations in front of it."""
+    code = """
+import json, sys
+import jaxtrachea as jt
+g, m = jt.table_1(), jt.Material(1.862, 0.1, 0.3, 0.02, EA_L=3.9, EI_C=13.0, k_t=0.4)
+path = jt.Presses([40.0], [0.0], [[0, -1, 0]])
+scene = jt.make_scene(g, m, path, effects=jt.EffectOptions(want_surface=False))
+said = []
+for call in json.load(sys.stdin):
+    try:
+        eval(call)
+    except Exception as error:
+        said.append(f"{type(error).__name__}: {error}")
+    else:
+        said.append("nothing")
+print(json.dumps(said))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], input=json.dumps(list(NO_RECORDS)),
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    for call, said in zip(NO_RECORDS, json.loads(done.stdout), strict=True):
+        assert said.startswith(("ValueError: ", "InputError: ")), (call, said)
+        assert NO_RECORDS[call] in said, (call, said)
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -16,6 +17,7 @@ from jaxtrachea.contact.pose import (
     compose,
     inverse,
     is_rotation,
+    nearest_rotation,
     pose_from_quaternion,
     pose_from_vector,
     relative,
@@ -232,6 +234,32 @@ def test_pose_is_a_pytree():
     assert len(jax.tree.leaves(Pose(jnp.eye(3), jnp.zeros(3)))) == 2
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_nearest_rotation_is_the_polar_factor(dtype):
+    """Of means of two rotations, by scipy; of those half a turn apart the one that is given."""
+    rng = np.random.default_rng(0)
+    axis = rng.normal(size=(60, 3))
+    angle = np.r_[np.linspace(0, 2, 30), np.linspace(2, 2.65, 28), 3.1, np.pi]
+    vector = axis / np.linalg.norm(axis, axis=1, keepdims=True) * angle[:, None]
+    turns = jax.vmap(lambda w: pose_from_vector(w, jnp.zeros(3)).rotation)
+    start = np.asarray(turns(jnp.asarray(rng.normal(size=(60, 3)))))
+    share = np.r_[rng.uniform(size=20), np.full(40, 0.5)][:, None, None]
+    mean = (1 - share) * start + share * (start @ np.asarray(turns(jnp.asarray(vector))))
+    found = jax.jit(jax.vmap(nearest_rotation))(jnp.asarray(mean, dtype), jnp.asarray(start, dtype))
+    assert found.dtype == dtype
+    eps = np.finfo(dtype).eps
+    for i in range(58):
+        known = scipy.linalg.polar(mean[i])[0]
+        error = np.abs(np.asarray(found[i], float) - known).max()
+        assert error < (50 * eps if angle[i] <= 2 else 50 * eps + 4e-6), angle[i]
+    np.testing.assert_array_equal(found[58:], np.asarray(start[58:], dtype))
+    slope = jax.jit(jax.grad(lambda m: nearest_rotation(m, m)[0, 1]))(jnp.asarray(mean[25], dtype))
+    step = 1e-6 * rng.normal(size=(3, 3))
+    ends = [scipy.linalg.polar(mean[25] + sign * step)[0][0, 1] for sign in (1, -1)]
+    near = np.sum(np.asarray(slope, float) * step)
+    np.testing.assert_allclose(near, (ends[0] - ends[1]) / 2, rtol=1e-5 + 50 * eps)
+
+
 NO_ROTATIONS = {
     "twice": (2 * np.eye(3), "is 3, the determinant 8"),
     "shrunk": (0.9 * np.eye(3), "is 0.19, the determinant 0.729"),
@@ -264,5 +292,9 @@ def test_rotations_pass_rounded_to_float32_and_after_many_products():
         check_rotations("turn", np.stack([*R, product]))
     missing = np.full((3, 3), np.nan)
     assert not is_rotation(missing)
+    rough = R[:, None] + 1e-5 * np.random.default_rng(1).normal(size=(200, 50, 3, 3))
+    sure = [m for m in rough.reshape(-1, 3, 3) if is_rotation(m)]
+    assert 10 < len(sure) < 9_000
+    check_rotations("turn", np.stack(sure))  # one by one nothing passes that is refused here
     check_rotations("turn", missing[None])
     check_rotations("turn", np.eye(3)[None] + np.inf)

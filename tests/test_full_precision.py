@@ -121,9 +121,9 @@ def fit(theta):
 
 
 CASES = [
-    pytest.param(sections(0.0), id="sections"),
+    pytest.param(sections(0.0), id="sections", marks=pytest.mark.slow),
     pytest.param(sections(1.5), id="sections, off the midline", marks=pytest.mark.slow),
-    pytest.param(simulated, id="scene"),
+    pytest.param(simulated, id="scene", marks=pytest.mark.slow),
     pytest.param(swept, id="sweep"),
     pytest.param(stepped, id="session", marks=pytest.mark.slow),
     pytest.param(dense, id="beam"),

@@ -6,14 +6,14 @@ derivatives of other rows stay finite.
 """
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._arguments import ArrayLike, check_fits, shaped
+from jaxtrachea._arguments import ArrayLike, check_fits, check_word, shaped
 from jaxtrachea._errors import InputError
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -62,30 +62,32 @@ def admit(
     used = tuple(used)
     on = (s_c >= reach) & (s_c <= length - reach)
     material, bad = without_negative(material, used)
-    material, finite = _finite(material, used)
+    material, lost = _replaced(material, used, lambda value: ~jnp.isfinite(value))
     refused = jnp.where(on, PressStatus.OK, PressStatus.OFF_TUBE)
-    refused = jnp.where(finite & ~jnp.isnan(s_c), refused, PressStatus.NON_FINITE)
+    refused = jnp.where(~lost & ~jnp.isnan(s_c), refused, PressStatus.NON_FINITE)
     refused = jnp.where(bad, PressStatus.BAD_MATERIAL, refused).astype(jnp.int8)
     return Admitted(material, jnp.where(on, s_c, length / 2), refused)
 
 
-def _finite(material: Material, used: Iterable[str]) -> tuple[Material, Array]:
-    """The material with 1 in place of infinite values and NaN, and whether there were none."""
-    safe, all_finite = {}, jnp.ones((), bool)
-    for name in used:
-        if (value := getattr(material, name)) is not None:
-            finite = jnp.isfinite(value)
-            safe[name] = jnp.where(finite, value, 1)
-            all_finite = all_finite & jnp.all(finite)
-    return dataclasses.replace(material, **safe), all_finite
+def float_type(geometry: Geometry) -> jnp.dtype:
+    """The floating dtype of a tube.
+
+    Raises:
+        ValueError: it is none.
+    """
+    check_word("geometry", geometry, Geometry)
+    return geometry.length.dtype
 
 
 def check_shapes(geometry: Geometry, material: Material) -> None:
     """Refuse arrays of a wrong length, and values that mean nothing without one that is missing.
 
     Raises:
-        ValueError: the argument, its length and the expected one; or what it is missing.
+        ValueError: the argument, its length and the expected one; or what it is missing; no tube or
+            no material.
     """
+    check_word("geometry", geometry, Geometry)
+    check_word("material", material, Material)
     for name in ("length", "radius", "half_angle", "ring_height"):
         shaped(f"Geometry.{name}", getattr(geometry, name), (), why="; use jax.vmap for many")
     shaped("Geometry.ring_positions", geometry.ring_positions, ("any number of",))
@@ -133,13 +135,20 @@ def check_alike(material: Material, like: Any, cure: str) -> None:
 
 def without_negative(material: Material, used: Iterable[str]) -> tuple[Material, Array]:
     """The material with 1 in place of negative values, and whether there were any."""
-    safe, bad = {}, jnp.zeros((), bool)
+    return _replaced(material, used, lambda value: value < 0)
+
+
+def _replaced(
+    material: Material, used: Iterable[str], wrong: Callable[[Array], Array]
+) -> tuple[Material, Array]:
+    """The material with 1 in place of values that are `wrong`, and whether there were any."""
+    safe, found = {}, jnp.zeros((), bool)
     for name in used:
         if (value := getattr(material, name)) is not None:
-            negative = value < 0
-            safe[name] = jnp.where(negative, 1, value)
-            bad = bad | jnp.any(negative)
-    return dataclasses.replace(material, **safe), bad
+            bad = wrong(value)
+            safe[name] = jnp.where(bad, 1, value)
+            found = found | jnp.any(bad)
+    return dataclasses.replace(material, **safe), found
 
 
 def hide(refused: Int[Array, ""], *arrays: Any) -> Any:

@@ -157,10 +157,12 @@ def _check_shapes(beam: Beam) -> None:
     """Refuse a beam whose spans and supports do not fit each other.
 
     Raises:
-        ValueError: which, its length and the expected one.
+        ValueError: which, its length and the expected one; no beam, or one without supports.
     """
-    shaped("Beam.x", beam.x, ("any number of",))
-    n = beam.x.shape[0]
+    check_word("beam", beam, Beam)
+    n = shaped("Beam.x", beam.x, ("any number of",)).shape[0]
+    if n == 0:
+        raise ValueError("Beam.x has no values; expected one support or more")
     shaped("Beam.length", beam.length, ())
     shaped("Beam.k", beam.k, (n,), why=" (one for each support)")
     why = f" ({n} supports make {n + 1} spans)"
@@ -203,6 +205,7 @@ def contact_compliance(
         raise ValueError(f"s_c has shape {s_c.shape}; expected a scalar or one axis")
     both = _both_sides(beam)
     on = (s_c >= 0) & (s_c <= beam.length)
+    s_c = jnp.where(on, s_c, beam.length / 2)
     if s_c.ndim == 0:
         count, last, s = _reach(beam, s_c)
         cut = jax.vmap(_up_to)(both, count, last)
@@ -267,8 +270,9 @@ def deflect(
         ring_load = shaped("ring_load", ring_load, beam.x.shape, dtype=dtype, why=why)
         if form == "reactions":
             raise ValueError("ring_load is not part of form='reactions'; use form='recursion'")
-    found = deflect_on(beam, s_c, force, split, form, ring_load)
     on = (s_c >= 0) & (s_c <= beam.length)
+    place = jnp.where(on, s_c, beam.length / 2)
+    found = deflect_on(beam, place, force, split, form, ring_load)
     return jax.tree.map(lambda v: jnp.where(on, v, jnp.nan), found)
 
 

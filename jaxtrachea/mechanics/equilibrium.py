@@ -66,7 +66,9 @@ def press_softening(
     """
     solved = soft_series(displacement, compliance, law, softening)
     status = status_of(displacement, solved.depth + solved.force, solved.folded)
-    load = solved.force / softening.ratio(solved.deflection)
+    found = jnp.isfinite(solved.force)  # of other rows 0 times NaN would reach what all share
+    force, deflection = (jnp.where(found, v, 0) for v in (solved.force, solved.deflection))
+    load = jnp.where(found, force / softening.ratio(deflection), jnp.nan)
     return Equilibrium(solved.depth, solved.force, status, load)
 
 

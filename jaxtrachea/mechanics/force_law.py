@@ -164,7 +164,7 @@ def _horner(coefficients, x):
 
 
 def _scaled(law: Law, displacement, compliance, share):
-    """The equilibrium in d = delta g: delta, and the arguments of `_numerics.*_ratio` for g."""
+    """The equilibrium in d = delta g: delta, and the arguments of `roots.*_ratio` for g."""
     first, *rest = law.coefficients().items()
     stiffening = share + compliance * first[1]
     delta = displacement / stiffening

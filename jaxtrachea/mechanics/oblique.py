@@ -15,7 +15,7 @@ from jaxtrachea._arguments import ArrayLike, check_record, check_word, last_axis
 from jaxtrachea._numerics import product, product_of_rows, turned
 from jaxtrachea.mechanics import friction as _friction
 from jaxtrachea.mechanics import skeleton, vector_equilibrium
-from jaxtrachea.mechanics.admission import Admitted, admit, hide, status_of
+from jaxtrachea.mechanics.admission import Admitted, admit, float_type, hide, status_of
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.press import Options, check_line, local_law, read_values, touch
@@ -140,7 +140,7 @@ def press_oblique(
         onset: inward displacement at first touch, mm; 0 if None.
 
     Returns:
-        The `ObliquePress`; as for `press`, OFF_TUBE and BAD_MATERIAL are NaN throughout.
+        The `ObliquePress`; NaN as for `press`.
 
     Raises:
         ValueError: a missing value of the material, an argument that is no number, or an array of
@@ -154,12 +154,16 @@ def press_oblique(
 def press_at(place: Place, displacement: Float[Array, "*n 3"], options: Options) -> ObliquePress:
     """As `press_oblique`, on a place that is known."""
     normal = local_frame(place.phi_c)[0]
-    inward = product(displacement, normal)
+    # Rows that are no numbers say nothing of place and onset.
+    known = jnp.isfinite(jnp.sum(displacement, axis=-1, keepdims=True))
+    given = jnp.where(known, displacement, 0)
+    inward = product(given, normal)
     if options.contact == "bonded":
-        moved = displacement - place.onset * jnp.broadcast_to(normal, displacement.shape)
+        moved = given - place.onset * jnp.broadcast_to(normal, given.shape)
     else:
         share = touch(inward, place.onset, options) / jnp.where(inward > 0, inward, 1)
-        moved = displacement * share[..., None]
+        moved = given * share[..., None]
+    moved = jnp.where(known, moved, displacement)
     solve = {
         "series": vector_equilibrium.press_vector,
         "total": vector_equilibrium.press_vector_total,
@@ -203,7 +207,8 @@ def press_path(
         onset: -
 
     Returns:
-        The `ObliquePath`; OFF_TUBE and BAD_MATERIAL (also: a negative mu) are NaN throughout.
+        The `ObliquePath`; OFF_TUBE, BAD_MATERIAL (also: a negative mu) and NON_FINITE where it is
+        of the material, the place or mu are NaN throughout.
 
     Raises:
         ValueError: as `press_oblique`; another contact or coupling.
@@ -214,12 +219,13 @@ def press_path(
         raise ValueError(
             "friction needs options.contact='unilateral' and options.coupling='series'"
         )
-    dtype = geometry.length.dtype
+    dtype = float_type(geometry)
     displacement = shaped("displacement", displacement, ("steps", 3), dtype=dtype)
     asked, unit, law, phi_c, onset = place_at(geometry, material, s_c, phi_c, options, onset=onset)
     mu = shaped("friction", friction.mu, (), dtype=dtype)
-    friction = Coulomb(jnp.where(mu < 0, 0, mu), friction.rounding)
-    refused = jnp.where(mu < 0, PressStatus.BAD_MATERIAL, asked.refused).astype(jnp.int8)
+    friction = Coulomb(jnp.where(mu >= 0, mu, 0), friction.rounding)
+    refused = jnp.where(jnp.isnan(mu), PressStatus.NON_FINITE, asked.refused)
+    refused = jnp.where(mu < 0, PressStatus.BAD_MATERIAL, refused).astype(jnp.int8)
     frame = local_frame(phi_c)
     D = product(displacement, frame.T)
     D = jnp.concatenate([touch(D[:, :1], onset, options.press), D[:, 1:]], axis=1)
@@ -243,7 +249,7 @@ def place_at(
 ) -> Place:
     """Checked arguments, and the skeleton and the local law at the contact."""
     check_word("options", options, ObliqueOptions)
-    dtype = geometry.length.dtype
+    dtype = float_type(geometry)
     phi_c = shaped("phi_c", phi_c, (), dtype=dtype)
     onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=dtype)
     rings, levels = options.rings, {"axial": options.axial, "shear": options.press.shear}

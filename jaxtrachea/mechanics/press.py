@@ -10,7 +10,14 @@ from jaxtrachea._arguments import ArrayLike, check_record, check_word, real, sha
 from jaxtrachea._numerics import centred_hinge, positive_part, scaled
 from jaxtrachea.mechanics import beam as _beam
 from jaxtrachea.mechanics import equilibrium, force_law, punch
-from jaxtrachea.mechanics.admission import Admitted, admit, hide, status_of
+from jaxtrachea.mechanics.admission import (
+    Admitted,
+    admit,
+    check_shapes,
+    float_type,
+    hide,
+    status_of,
+)
 from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -219,29 +226,44 @@ def touch(
         options: the kind of contact, and the width of the smooth touch.
         blend: mm; where the onset itself is sought: the touch is smooth from `blend` before it to
             `blend` after it, see `centred_hinge` (slightly negative before it).
+
+    Returns:
+        Of the shape of `displacement`; what is not finite stays, and says nothing of the onset.
     """
     if options.contact == "bonded":
         return displacement - onset
+    known = jnp.isfinite(displacement)
+    moved = jnp.where(known, displacement, 0) - onset
     if blend is not None:
-        return centred_hinge(displacement - onset, blend)
-    return positive_part(displacement - onset, jnp.asarray(options.onset_width, displacement.dtype))
+        touched = centred_hinge(moved, blend)
+    else:
+        width = jnp.asarray(options.onset_width, displacement.dtype)
+        touched = positive_part(moved, width)
+    return jnp.where(known, touched, displacement)
 
 
 def compliance(
-    geometry: Geometry, material: Material, s_c: Float[Array, "*m"], options: Options
+    geometry: Geometry, material: Material, s_c: ArrayLike, options: Options
 ) -> Float[Array, "*m"]:
     """Deflection of C per unit force at C, mm/N, at one or many contact positions.
 
     Far cheaper than `press` where the joints are not asked for: many positions share one sweep
     over the rings. NaN where C, or a part of a tool with a width, lies off the tube.
+
+    Raises:
+        ValueError: as `press`.
     """
     check_line(options, "compliance")
+    check_shapes(geometry, material)
+    s_c = real("s_c", s_c, float_type(geometry))
     beam = ligament_beam(geometry, material, options)
     if options.form == "recursion" and options.half_width == 0:
         return _beam.contact_compliance(beam, s_c, split=options.split)
-    w_C = jnp.vectorize(lambda s: unit_deflection(beam, s, options).w_C)(s_c)
     half = options.half_width
-    return jnp.where((s_c < half) | (s_c > geometry.length - half), jnp.nan, w_C)
+    on = (s_c >= half) & (s_c <= geometry.length - half)
+    place = jnp.where(on, s_c, geometry.length / 2)
+    w_C = jnp.vectorize(lambda s: unit_deflection(beam, s, options).w_C)(place)
+    return jnp.where(on, w_C, jnp.nan)
 
 
 def unit_deflection(
@@ -313,15 +335,16 @@ def press(
 
     Returns:
         The `Press`; rows without a stable solution are NaN with a status, others are untouched.
-        A contact off the tube (OFF_TUBE) and a negative stiffness (BAD_MATERIAL) are NaN
-        throughout; a stiffness of zero is the limit of a small one where that exists.
+        A contact off the tube (OFF_TUBE), a negative stiffness (BAD_MATERIAL) and one or a place
+        that is no number (NON_FINITE) are NaN throughout; a stiffness of zero is the limit of a
+        small one where that exists.
 
     Raises:
         ValueError: an argument that is no number, an array of a length that does not fit the tube,
             a value of the material that the options need, or the skeleton `sections`.
     """
     check_line(options, "press")
-    dtype = geometry.length.dtype
+    dtype = float_type(geometry)
     displacement = real("displacement", displacement, dtype)
     onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=displacement.dtype)
     if blend is not None:

@@ -17,7 +17,7 @@ from jaxtrachea.mechanics import axial as _axial
 from jaxtrachea.mechanics import ring as _ring
 from jaxtrachea.mechanics import spatial_beam
 from jaxtrachea.mechanics._matrix2 import mul
-from jaxtrachea.mechanics.admission import admit, hide, status_of
+from jaxtrachea.mechanics.admission import admit, float_type, hide, status_of
 from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -85,7 +85,7 @@ def skeleton_response(
             an unknown level of `rings`.
     """
     check_word("rings", rings, Rings)
-    phi_c = shaped("phi_c", phi_c, (), dtype=geometry.length.dtype)
+    phi_c = shaped("phi_c", phi_c, (), dtype=float_type(geometry))
     asked = admit(geometry, material, s_c, read_values(rings, axial=axial, shear=shear))
     levels = {"rings": rings, "axial": axial, "shear": shear}
     unit = respond(geometry, asked.material, asked.s_c, phi_c, **levels)

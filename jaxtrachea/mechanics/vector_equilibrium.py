@@ -76,14 +76,17 @@ def press_vector_total(
     """
     squared = jnp.sum(displacement * displacement)
     folded = law.softens() & (squared >= fold_depth(law) ** 2)
-    force = _force(displacement, law)
-    depth = displacement - product(compliance, force)
-    status = status_of(jnp.max(jnp.abs(displacement)), jnp.sum(depth + force), folded)
+    known = jnp.isfinite(squared)
+    moved = jnp.where(known, displacement, 0)
+    force = _force(moved, law)
+    depth = moved - product(compliance, force)
+    result = jnp.where(known, jnp.sum(depth + force), jnp.nan)
+    status = status_of(jnp.max(jnp.abs(displacement)), result, folded)
     negative = (status == PressStatus.OK) & (jnp.sum(depth * force) < 0)
     status = jnp.where(negative, PressStatus.NEGATIVE_LOCAL, status).astype(jnp.int8)
 
     def hide(v):
-        return jnp.where(folded, jnp.nan, v)
+        return jnp.where(folded | ~known, jnp.nan, v)
 
     return VectorEquilibrium(hide(depth), hide(force), status)
 

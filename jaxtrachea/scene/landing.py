@@ -11,9 +11,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._numerics import product, total
+from jaxtrachea._numerics import product, product_of_rows, total
 from jaxtrachea.contact.patches import Touch
-from jaxtrachea.contact.pose import Pose, inverse, transform
+from jaxtrachea.contact.pose import Pose, inverse, nearest_rotation, transform
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.curve import frame_at
 from jaxtrachea.scene.stage import Poses, Scene, at_row
@@ -67,7 +67,7 @@ def landing(scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""]) -> La
         return transform(inverse(pose), at_row(seen.tool_point, row)[:, None])[:, 0]
 
     def points_of(body):
-        return product(path.rotation, body) + path.translation
+        return product_of_rows(path.rotation, body) + path.translation
 
     def inward_at(s, phi):
         frame = _frame(scene, s)
@@ -96,7 +96,7 @@ def landing(scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""]) -> La
     chord = step - total(step * mean) / jnp.maximum(total(inward * mean), LEAST) * inward
     moved = share * chord - gap * inward
     way, frame = points - at_row(points, first)[None] + moved[None], _frame(scene, s)
-    rotation = turned(mix(path.rotation))
+    rotation = nearest_rotation(mix(path.rotation), at_row(path.rotation, first))
     return Landing(
         s=s, phi=phi, point=mix(seen.point), body=body, rotation=rotation,
         translation=at_row(points, first) - moved - product(rotation, body), frame=frame,
@@ -116,8 +116,3 @@ def _frame(scene: Scene, s) -> Float[Array, "3 3"] | None:
     if scene.plan.curved and scene.tube is not None:
         return frame_at(scene.tube.line, s)
     return None
-
-
-def turned(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """The rotation next to a mean of two, by one Newton step of its polar form."""
-    return 1.5 * matrix - 0.5 * product(matrix, product(matrix.T, matrix))

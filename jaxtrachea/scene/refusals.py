@@ -76,6 +76,8 @@ def refuse(scene: Scene, material: AnyMaterial, path: Presses | None, made: Appr
     number = jnp.sum(D, axis=1) + presses.s + phi
     if made is None and scene.plan.contact_point == "fixed":
         number = number + (presses.s[0] + phi[0])  # the place that all rows press
+    if scene.plan.friction and scene.friction is not None:
+        number = number + scene.friction
     refused[PressStatus.NON_FINITE] = jnp.isnan(number)
     refused[PressStatus.BAD_MATERIAL] = jnp.broadcast_to(bad, presses.s.shape)
     hidden = functools.reduce(jnp.logical_or, refused.values())

@@ -33,12 +33,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._numerics import product, solve_spd
 from jaxtrachea.contact.patches import Touch
-from jaxtrachea.contact.pose import Pose, inverse, transform
+from jaxtrachea.contact.pose import Pose, inverse, nearest_rotation, transform
 from jaxtrachea.mechanics.oblique import Place, place_at
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import Approach
 from jaxtrachea.scene.curve import frame_at
-from jaxtrachea.scene.landing import Landing, landing, turned
+from jaxtrachea.scene.landing import Landing, landing
 from jaxtrachea.scene.ranges import half_spacing
 from jaxtrachea.scene.refusals import on_the_tube
 from jaxtrachea.scene.stage import Poses, Presses, Scene
@@ -147,7 +147,7 @@ def drawn(scene: Scene, seat: Seat, here: Instant) -> Seat:
         point=mix(seat.point, now.point),
         body=body,
         anchor=seat.anchor + _at(path, body) - _at(path, seat.body),
-        rotation=turned(mix(seat.rotation, now.rotation)),
+        rotation=nearest_rotation(mix(seat.rotation, now.rotation), now.rotation),
         translation=mix(seat.translation, now.translation),
         status=jnp.where(share > 0, now.status, seat.status),
     )

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea._in_order import one_kernel
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.oblique import Place, press_at
@@ -101,6 +102,7 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
         ValueError: the other kind of path, arrays of a wrong length, something missing that the
             plan needs, or (outside of `jit`) matrices of the path that are no rotations.
     """
+    check_word("scene", scene, Scene)
     plan = scene.plan
     check_path(path)
     check_material(scene.geometry, material)

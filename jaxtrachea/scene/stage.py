@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxtrachea._arguments import real, shaped
+from jaxtrachea._arguments import check_word, real, shaped
 from jaxtrachea._errors import InputError
 from jaxtrachea._in_order import one_kernel
 from jaxtrachea.contact.patches import Patches, Touch, touch
@@ -121,8 +121,9 @@ def check_path(path: Presses | Poses) -> None:
     Traced matrices are not looked at: that would be operations in every program.
 
     Raises:
-        ValueError: the argument, its length and the expected one; or the row.
+        ValueError: the argument, its length and the expected one; or the row; no path.
     """
+    check_word("path", path, Presses | Poses)
     if isinstance(path, Presses):
         rows = shaped("path.s", path.s, ("rows",)).shape[0]
         shaped("path.phi", path.phi, (rows,), why=" (as path.s has)")

@@ -1,13 +1,14 @@
 """Normal presses at many contact points."""
 
 import dataclasses
+import numbers
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._arguments import ArrayLike, shaped
+from jaxtrachea._arguments import ArrayLike, check_word, shaped
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.mechanics.oblique import press_oblique
 from jaxtrachea.mechanics.press import press
@@ -18,7 +19,7 @@ from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.ranges import deep, depth_share, lacking
 from jaxtrachea.scene.refusals import REFUSALS, on_the_tube, status_of
-from jaxtrachea.scene.stage import COVERED, Scene, check_kind
+from jaxtrachea.scene.stage import COVERED, Scene, check_kind, check_material
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
 
@@ -63,12 +64,17 @@ def sweep(
         s: mm.
         phi: rad, within the half-angle of the rings; else BEHIND_GAP where it presses.
         depth: of the tool along the inward normal, mm; 0 and less: NO_CONTACT (see `Options`).
-        chunk: points computed together.
+        chunk: points computed together, at least 1.
 
     Raises:
-        ValueError: arrays of different lengths, or no numbers; the material of another skeleton.
+        ValueError: arrays of different lengths, or no numbers; the material of another skeleton, or
+            of arrays that do not fit the tube; no scene; a `chunk` that is no number of points.
     """
+    check_word("scene", scene, Scene)
     check_kind(scene, material)
+    check_material(scene.geometry, material)
+    if not (isinstance(chunk, numbers.Integral) and chunk > 0):
+        raise ValueError(f"chunk is {chunk!r}; expected a whole number of points, 1 or more")
     dtype = scene.geometry.length.dtype
     s = shaped("s", s, ("points",), dtype=dtype)
     phi, depth = (

@@ -356,6 +356,7 @@ def test_the_place_of_first_touch_does_not_follow_the_step():
         assert off < share * np.linalg.norm(known)
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_rows_that_the_first_touch_lies_between():
     """Forward, reverse and by differences, with a row before the touch and without one."""
     path = poses([78, 19, 2], [81, 14.5, 3.5], 4)
