@@ -64,6 +64,7 @@ def analyse(
     held: np.ndarray,
     *,
     noise_given: bool,
+    least: float | None = None,
     unknowns: int | None = None,
     structural: np.ndarray | None = None,
 ) -> Uncertainty:
@@ -74,6 +75,8 @@ def analyse(
         relative: change of each scaled coordinate that makes a relative change of 1; (lanes, P).
         held: unknowns that are absent or on a bound; (lanes, P).
         noise_given: whether sigma is known, so that residuals do not scale the covariance.
+        least: with a robust loss: mean psi^2 of normal noise of a sigma that is known, which it is
+            taken for at least (`noise.normal_psi2`); None: linear loss.
         unknowns: estimated from the `counts`, if more than those of one lane.
         structural: directions that the structure leaves open, relative coordinates, orthonormal
             rows, the others 0; (lanes, P, P).
@@ -84,7 +87,9 @@ def analyse(
     half = half_widths(dof, noise_given=noise_given)
     usable = np.isfinite(info.bread).all(axis=(1, 2)) & (dof >= 0)
     free = free & usable[:, None]
-    kappa = np.ones(len(dof)) if noise_given else np.asarray(info.psi2) * total / np.maximum(dof, 1)
+    kappa = np.asarray(info.psi2) * total / np.maximum(dof, 1)
+    if noise_given:
+        kappa = np.ones(len(dof)) if least is None else np.maximum(kappa, least)
     dpsi = np.maximum(info.dpsi, 1e-3)
     kappa = kappa / dpsi**2
     unit = relative * free

@@ -16,7 +16,7 @@ from jaxtrachea.fitting.minima import (
     lowest_minima,
     refit_with_noise,
 )
-from jaxtrachea.fitting.noise import next_sigma, precision_unit
+from jaxtrachea.fitting.noise import next_sigma, normal_psi2, precision_unit
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.scrutiny import scrutinise
@@ -144,7 +144,11 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
         unknowns = (unknowns or 0) - held_count(study, held, alive)
     noise_given = study.noise_given[0] and both
     open_ = _open_directions(study, theta, structure)
-    u = analyse(pool, relative, held, noise_given=noise_given, unknowns=unknowns, structural=open_)
+    u = analyse(
+        pool, relative, held,
+        noise_given=noise_given, least=normal_psi2(study.model.loss, study.model.loss_scale),
+        unknowns=unknowns, structural=open_,
+    )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
 
         def unscale(v):

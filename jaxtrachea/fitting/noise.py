@@ -1,9 +1,13 @@
 """Standard deviations of force and markers: given, guessed first, estimated from residuals."""
 
+import jax.numpy as jnp
 import numpy as np
+from scipy.integrate import simpson
 
+from jaxtrachea.fitting.cost import robust
 from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.lane import forces, markers, peaks
+from jaxtrachea.fitting.model import Loss
 from jaxtrachea.fitting.study import Study
 
 
@@ -52,6 +56,15 @@ def next_sigma(
     keep = np.array(study.noise_given)[None] | ~np.isfinite(estimate) | (info.counts == 0)
     floor = 1e-9 * first_sigma(study)
     return np.where(keep, sigma, np.maximum(estimate, floor))
+
+
+def normal_psi2(loss: Loss, scale: float) -> float | None:
+    """Mean of psi(z)^2 of standard normal z, by Simpson's rule; None: the loss is linear."""
+    if loss == "linear":
+        return None
+    z = np.linspace(-8, 8, 1601)
+    psi = z * np.asarray(robust(loss, jnp.asarray(z * z), scale)[1])
+    return float(simpson(psi**2 * np.exp(-(z**2) / 2), x=z) / np.sqrt(2 * np.pi))
 
 
 def precision_unit(study: Study) -> np.ndarray:
