@@ -101,7 +101,7 @@ WITHIN = {
         {"rows", "residuals", "chains", "together", "weakest_direction", "estimate", "design_press",
          "random_effects"},
         {"cross_validation", "bootstrap", "profile", "posterior_start"},
-        {"effective", "labels", "population", "repeats"},
+        {"effective", "labels", "misfit", "population", "repeats"},
         {"analysis", "comparison"},
         {"design", "influence", "posterior"},
         {"analyses"},

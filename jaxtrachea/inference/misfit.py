@@ -1,0 +1,75 @@
+"""Residuals against the noise that was given: how many times as large they are.
+
+Standard errors with a given sigma rest on it. If it is right, the sum of squared residuals in units
+of it is chi^2 with n - P degrees of freedom; much more says that the sigma is too small or that the
+model misses the curves, much less that it is too large.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.special import chdtr, chdtrc
+
+from jaxtrachea.fitting.joint_information import held_count, unknown_count
+from jaxtrachea.fitting.lane import forces
+from jaxtrachea.fitting.predictions import Prediction
+from jaxtrachea.fitting.result import FitResult
+
+#: Ratio, or its inverse, from which it is told; and the probability of such a chi^2 by chance.
+BEYOND, CHANCE = 1.5, 1e-3
+#: Share of n independent samples that the median of absolute residuals is worth (normal noise).
+MEDIAN = 0.37
+
+
+class Misfit(NamedTuple):
+    """Of every lane.
+
+    Attributes:
+        result: the fit.
+        ratio: of the forces' residuals to the sigma given: root of chi^2 / (n - P), with a robust
+            loss 1.4826 times the median of their sizes; NaN where no sigma is given or nothing is
+            left over; (lanes,).
+        told: whether it is beyond `BEYOND`, and not by chance; (lanes,).
+    """
+
+    result: FitResult
+    ratio: Float[np.ndarray, " lanes"]
+    told: Bool[np.ndarray, " lanes"]
+
+
+def misfit(result: FitResult, seen: Prediction) -> Misfit:
+    """Residuals of the forces against the noise given; in a joint fit of all lanes together."""
+    study, lanes = result.study, result.study.lanes
+    none = np.full(result.lanes, np.nan)
+    if not study.noise_given[0]:
+        return Misfit(result, none, np.zeros(result.lanes, bool))
+    sizes = []
+    for kind in forces(lanes):
+        residual = getattr(seen, kind.name)
+        known = np.isfinite(residual) & (kind.precision > 0)
+        z = np.where(known, residual * kind.precision, np.nan)
+        sizes.append(np.abs(z).reshape(result.lanes, -1))
+    size = np.concatenate(sizes, axis=1)
+    count = np.sum(np.isfinite(size), axis=1).astype(float)
+    unknowns = np.sum((lanes.active > 0) & ~result.at_bound, axis=1).astype(float)
+    total, square = np.asarray(result.samples, float), np.nansum(size**2, axis=1)
+    if study.joint:
+        alive, held = result.succeeded, result.at_bound | (lanes.active <= 0)
+        unknowns = np.full(len(count), unknown_count(study, alive) - held_count(study, held, alive))
+        count, total, square = (
+            np.full(len(count), np.sum(v[alive])) for v in (count, total, square)
+        )
+        size = np.broadcast_to(size[alive].reshape(1, -1), (len(count), size[alive].size))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        left = count * (1 - unknowns / total)
+        left = np.where(left > 0.5, left, np.nan)
+        if study.model.loss == "linear":
+            ratio = np.sqrt(square / left)
+        else:
+            middle = [np.nanmedian(v) if np.isfinite(v).any() else np.nan for v in size]
+            ratio, left = np.where(left > 0, 1.4826 * np.array(middle), np.nan), MEDIAN * left
+        statistic = ratio**2 * left
+        chance = np.minimum(chdtrc(left, statistic), chdtr(left, statistic))
+        told = ((ratio > BEYOND) | (ratio < 1 / BEYOND)) & (chance < CHANCE)
+    return Misfit(result, ratio, told)

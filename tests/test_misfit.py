@@ -1,0 +1,96 @@
+"""Residuals against the noise given: against chi^2 of a straight line fitted by numpy."""
+
+import numpy as np
+import pytest
+
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise, Weighting
+from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import build_study
+from jaxtrachea.inference.analyses.misfit import MISFIT
+from jaxtrachea.inference.misfit import misfit
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.trachea.geometry import table_1
+
+SIGMA, D = 0.003, np.linspace(0.1, 2, 60)
+QUICK = Settings(starts=1, scrutiny=False)
+
+
+def lines(count, seed=0):
+    """Forces of 2 N/mm with noise; (count, samples)."""
+    return 2 * D + SIGMA * np.random.default_rng(seed).normal(size=(count, len(D)))
+
+
+def compared(force, sigma, joint=False, **weighting):
+    curves = [Curve(f"s{i}", "t", 75.0, 0.0, D, row) for i, row in enumerate(force)]
+    changes = {"k_3": {"fixed": True, "value": 0.0}}
+    changes |= {"k_1": {"scope": "shared"}} if joint else {}
+    study = build_study(
+        curves, table_1(), Options(coupling="total", onset_width=0.0), changes,
+        noise=Noise(force=sigma), weighting=Weighting(**weighting),
+    )  # fmt: skip
+    result = fit(study, QUICK)
+    return misfit(result, predictions(study, result.theta))
+
+
+@pytest.mark.parametrize("sigma", [SIGMA, SIGMA / 10, SIGMA * 10, SIGMA * 1.2])
+def test_ratio_is_the_root_of_chi_squared_over_its_freedom(sigma):
+    force = lines(3)
+    found = compared(force, sigma)
+    left = [row - D * (D @ row) / (D @ D) for row in force]
+    known = np.sqrt(np.sum(np.square(left), axis=1) / (len(D) - 1)) / sigma
+    np.testing.assert_allclose(found.ratio, known, rtol=1e-6)
+    wrong = sigma in (SIGMA / 10, SIGMA * 10)
+    assert found.told.tolist() == [wrong] * 3
+    sentences = MISFIT.section(found)
+    assert len(sentences) == wrong
+    if wrong:
+        assert f"{np.median(known):.2g} times the noise given" in sentences[0]
+        assert "in 3 of 3 lanes" in sentences[0]
+        assert ("errors and intervals, which rest on it, are too small" in sentences[0]) == (
+            sigma < SIGMA
+        )
+
+
+def test_few_samples_may_do_so_by_chance():
+    """One of a thousand fits is told of, not one of ten; see scipy's chi^2 of 3 - 1 samples."""
+    rng = np.random.default_rng(1)
+    few = np.array([0.5, 1.0, 2.0])
+    force = 2 * few + SIGMA * rng.normal(size=(300, 3))
+    curves = [Curve(f"s{i}", "t", 75.0, 0.0, few, row) for i, row in enumerate(force)]
+    study = build_study(
+        curves, table_1(), Options(coupling="total", onset_width=0.0),
+        {"k_3": {"fixed": True, "value": 0.0}}, noise=Noise(force=SIGMA),
+    )  # fmt: skip
+    result = fit(study, QUICK)
+    found = misfit(result, predictions(study, result.theta))
+    assert np.mean((found.ratio > 1.5) | (found.ratio < 1 / 1.5)) > 0.3
+    assert np.sum(found.told) <= 2
+
+
+def test_outliers_do_not_count_with_a_robust_loss():
+    force = lines(2)
+    force[:, ::10] += 100 * SIGMA
+    assert compared(force, SIGMA).told.all()
+    found = compared(force, SIGMA, loss="huber")
+    assert np.all(np.abs(np.log(found.ratio)) < np.log(1.4))
+    assert not found.told.any()
+    assert compared(force, SIGMA / 10, loss="huber").told.all()
+
+
+def test_lanes_of_a_joint_fit_count_together():
+    force = lines(3)
+    found = compared(force, SIGMA / 3, joint=True)
+    k = np.sum(force @ D) / (3 * D @ D)
+    known = np.sqrt(np.sum((force - k * D) ** 2) / (3 * len(D) - 1)) / (SIGMA / 3)
+    np.testing.assert_allclose(found.ratio, known, rtol=1e-6)
+    assert found.told.all()
+
+
+def test_estimated_noise_is_not_compared():
+    found = compared(lines(2), None)
+    assert np.isnan(found.ratio).all()
+    assert MISFIT.section(found) == []
+    assert list(MISFIT.shown(found, [0])) == []
