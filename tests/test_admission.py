@@ -571,6 +571,13 @@ NO_RECORDS = {
     "jt.make_scene(None, m, path)": "geometry is None",
     "jt.make_scene(g, None, path)": "material is None",
     "jt.make_scene(g, m, None)": "path is None; expected Presses or Poses",
+    "jt.make_scene(g, m, path, tool='x')": "tool is 'x'; expected Tool or Shape or None",
+    "jt.make_scene(g, m, path, mesh='x')": "mesh is 'x'; expected Mesh or None",
+    "jt.make_scene(g, m, path, effects=None)": "effects is None; expected EffectOptions",
+    "jt.Tool('x')": "tool.shape is 'x'; expected Shape or None",
+    "make_tube(g, wall=None)": "wall is None; expected a finite number",
+    "make_tube(g, relief='x')": "relief is 'x'; expected a finite number or None",
+    "make_tube(g, around=3.5)": "around is 3.5; expected a whole number",
     "jt.simulate(None, m, path)": "scene is None; expected Scene",
     "jt.simulate(scene, m, 'x')": "path is 'x'; expected Presses or Poses",
     "jt.simulate(scene, None, path)": "material is None",
@@ -586,6 +593,7 @@ def test_what_is_no_record_is_named():
     code = """
 import json, sys
 import jaxtrachea as jt
+from jaxtrachea.trachea.tube import make_tube
 g, m = jt.table_1(), jt.Material(1.862, 0.1, 0.3, 0.02, EA_L=3.9, EI_C=13.0, k_t=0.4)
 path = jt.Presses([40.0], [0.0], [[0, -1, 0]])
 scene = jt.make_scene(g, m, path, effects=jt.EffectOptions(want_surface=False))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrachea._arguments import check_fits
+from jaxtrachea._arguments import check_fits, check_word
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.mechanics.sections.wall import Points, gather_points
@@ -62,10 +62,13 @@ def make_scene(
         SizeError: a length that no trachea and no tool has: the unit is wrong, most likely; a
             `half_width` beyond the tool.
         ValueError: a path without rows, arrays of a wrong length, or matrices of the path that are
-            no rotations.
+            no rotations; what is no tube, material, path, tool, mesh or no options.
     """
     check_path(path)
     check_material(geometry, material)
+    kinds = {"tool": Tool | Shape | None, "mesh": Mesh | None, "effects": EffectOptions}
+    for name, value in (("tool", tool), ("mesh", mesh), ("effects", effects)):
+        check_word(name, value, kinds[name])
     if not len(path.s if isinstance(path, Presses) else path.translation):
         raise ValueError("path has no rows; expected at least one")
     tool = tool if isinstance(tool, Tool) else Tool(tool)

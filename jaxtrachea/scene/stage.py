@@ -74,12 +74,13 @@ class Tool:
     friction: float | None = None
 
     def __post_init__(self):
-        """Refuse a friction that there is not.
+        """Refuse a friction that there is not, and what is no shape.
 
         Raises:
             ValueError: negative or not finite.
         """
         friction = self.friction
+        check_word("tool.shape", self.shape, Shape | None)
         if friction is not None and not 0 <= float(friction) < math.inf:
             raise ValueError(f"friction is {friction}; expected a finite number, not negative")
 

@@ -5,6 +5,7 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh, vertex_normals
 
@@ -48,6 +49,11 @@ def make_tube(
     Raises:
         ValueError: naming the argument.
     """
+    check_word("geometry", geometry, Geometry)
+    check_word("around", around, int)
+    check_word("along", along, int)
+    check_word("wall", wall, float)
+    check_word("relief", relief, float | None)
     length, radius, alpha = (
         float(v) for v in (geometry.length, geometry.radius, geometry.half_angle)
     )
