@@ -5,6 +5,12 @@ residuals drawn with replacement from the same curve, centred and enlarged by sq
 (Efron and Tibshirani 1993, ch. 9); in blocks of neighbouring samples, wrapped around the end, where
 the noise is correlated along the curve (Kuensch 1989, doi:10.1214/aos/1176347265). All markers of a
 sample are drawn together.
+
+Centred residuals of a curve sum to zero, so that a block has less spread the more of its curve it
+is: the sum of b of n white ones has the variance b (1 - b / n) sigma^2. Residuals drawn in blocks
+b_1, b_2, ... (the last one cut) are enlarged by sqrt((1 - 1 / n) / (1 - sum b_k^2 / n^2)), which
+makes up for it where the derivatives by the unknowns change little within a block; by no more than
+for blocks of half a curve.
 """
 
 import dataclasses
@@ -20,12 +26,15 @@ from jaxtrachea.fitting.lane import Lane, Observed, forces, markers
 from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import Study
 
 Kind = Literal["parametric", "residual"]
 #: Refits handed to the solver at a time; bounds the memory.
 _AT_ONCE = 4096
 #: Replicates below which the ends of a 95 % interval are not read off.
 FEWEST = 40
+#: Blocks to a curve below which errors are rough, which is said.
+FEW_BLOCKS = 10
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,6 +63,22 @@ class Bootstrap:
     upper: Float[np.ndarray, "lanes P"]
     standard_error: Float[np.ndarray, "lanes P"]
 
+    @property
+    def note(self) -> str:
+        """What there is to say of blocks that are few to a curve; "" if there is nothing."""
+        n = _shortest(self.result.study)
+        if self.block == 1 or n >= FEW_BLOCKS * self.block:
+            return ""
+        lost = 1 / enlargement(n, self.block)
+        cure = f"blocks of {n // FEW_BLOCKS} or less" if n >= 2 * FEW_BLOCKS else "longer curves"
+        return (
+            f"Of blocks of {self.block} samples only {n / self.block:.2g} go to the shortest curve "
+            f"({n} samples). So few give errors that are too small, with white residuals about "
+            f"{lost:.2g} of the true ones; the residuals are enlarged by {1 / lost:.3g} for it, "
+            "which holds in the mean and for 3 blocks or more to a curve; with correlated residuals "
+            f"errors may still be too small by a third. Better are {cure}"
+        )
+
 
 def bootstrap(
     result: FitResult,
@@ -77,9 +102,13 @@ def bootstrap(
         progress: called with (refits done since the last call, refits in all).
 
     Raises:
-        ValueError: too few replicates, an impossible block, or a joint study.
+        ValueError: no `FitResult` or `Settings`, too few replicates, an impossible block (longer
+            than the shortest curve), or a joint study.
     """
+    check_word("result", result, FitResult)
+    check_word("settings", settings, Settings)
     _check(count, kind, block)
+    check_block(result.study, block)
     result.study.refuse_joint("the bootstrap")
     seen = predictions(result.study, result.theta)
     batch = result.study.batch_size(max(result.lanes * settings.starts, 16), settings.batch)
@@ -106,6 +135,31 @@ def _check(count, kind, block) -> None:
         raise ValueError(f"count is {count}; expected at least {FEWEST} for a 95 % interval")
     if block < 1 or (block > 1 and kind == "parametric"):
         raise ValueError(f"block is {block}; expected 1, or more with kind 'residual'")
+
+
+def check_block(study: Study, block: int) -> None:
+    """Refuse a block that is longer than a curve.
+
+    Raises:
+        ValueError: naming the samples of the shortest curve, and the cure.
+    """
+    if block > (n := _shortest(study)):
+        raise ValueError(
+            f"block is {block}; expected no more than the {n} samples of the shortest curve, better "
+            f"{FEW_BLOCKS} blocks to a curve or more (block = {max(n // FEW_BLOCKS, 1)})"
+        )
+
+
+def _shortest(study: Study) -> int:
+    """Samples of the shortest curve."""
+    return min(len(curve.force) for curves in study.curves for curve in curves)
+
+
+def enlargement(n: int, block: int) -> float:
+    """What white residuals of a curve of n samples, drawn in blocks, lose against single ones."""
+    lengths = np.diff([*range(0, n, block), n])
+    share = float(np.sum(lengths**2)) / n**2
+    return float(np.sqrt(max(1 - 1 / n, 0.5) / max(1 - share, 0.5)))
 
 
 def _draw(result: FitResult, seen: Prediction, lanes, count, kind, block, seed) -> Lane:
@@ -154,7 +208,8 @@ def _blocks(rng, result: FitResult, seen: Prediction, lane, count, block):
         at = ((starts[:, :, None] + np.arange(block)) % n).reshape(count, -1)[:, :n]
         for kind, _ in kinds:
             r, precision = getattr(seen, kind.name)[lane, t, :n], kind.precision[lane, t, :n]
-            noise[kind.name][:, t, :n] = enlarge * _resample(r, precision, at)
+            own = enlarge * enlargement(n, block)
+            noise[kind.name][:, t, :n] = own * _resample(r, precision, at)
     return noise
 
 

@@ -4,14 +4,22 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from jaxtrachea.config import SpecError
 from jaxtrachea.files.tables import markdown_table, number
 from jaxtrachea.fitting.result import unknown_label
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request, Table
-from jaxtrachea.inference.bootstrap import FEWEST, Bootstrap, bootstrap
+from jaxtrachea.inference.bootstrap import FEWEST, Bootstrap, bootstrap, check_block
 from jaxtrachea.inference.labels import lane_label
 from jaxtrachea.inference.rows import and_more, listed, more_of
 
 BOOTSTRAP_HEAD = ["specimen", "parameter", "value", "std. error", "local", "95 % of replicates"]
+
+
+def _refuse(request: Request) -> None:
+    try:
+        check_block(request.study, request.spec.uncertainty.block)
+    except ValueError as error:
+        raise SpecError(f"uncertainty.block: {error}") from None
 
 
 def _compute(request: Request, findings: Findings, progress: Progress) -> Bootstrap:
@@ -69,12 +77,15 @@ def _section(found: Bootstrap) -> list[str]:
         f"{lost} of {found.usable.size} refits did not converge and are left out; a lane with "
         f"fewer than {FEWEST} others has no interval. All numbers: `results.h5` "
         "(docs/uncertainty.md).",
+        *([f"{found.note}."] if found.note else []),
     ]
 
 
 def _shown(found: Bootstrap, lanes: list[int]) -> Iterator[Table | str]:
     yield "Bootstrap", BOOTSTRAP_HEAD, bootstrap_table(found, lanes)
     yield from and_more(found.result.lanes, len(lanes), "parameters.csv")
+    if found.note:
+        yield found.note
 
 
 BOOTSTRAP = Analysis(
@@ -84,6 +95,7 @@ BOOTSTRAP = Analysis(
     work="resampling",
     key="bootstrap",
     commands=("fit", "design"),
+    refuse=_refuse,
     parameter_cells=_cells,
     datasets=_datasets,
     section=_section,
