@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import synthetic
-from scipy.optimize import least_squares
+from scipy.optimize import brentq, least_squares
 
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import Descent, descend
@@ -17,9 +17,11 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.weakest_direction import describe_weakest
 from jaxtrachea.measurements.read import read_measurements
+from jaxtrachea.mechanics.press import press
 from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
 from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.status import FitStatus
+from jaxtrachea.trachea.material import Material
 
 #: No one reads verdicts here.
 ONE = Settings(starts=1, scrutiny=False)
@@ -251,9 +253,29 @@ def test_one_position_leaves_skeleton_undetermined():
     assert np.all(np.isfinite(result.standard_error[0, 2:]))
     names = [p.name for p, _, _ in study.unknowns[0]]
     words = describe_weakest(names, flat, np.inf, result.uncertainty.structural_null_space[0])
-    shape = re.fullmatch(r"of EI_L and k_M only EI_L k_M\^([\d.]+) is known", words)
+    said = "of EI_L and k_M only one combination is known, near this estimate "
+    shape = re.fullmatch(re.escape(said) + r"EI_L k_M\^([\d.]+)", words)
     assert shape is not None
     assert float(shape[1]) == pytest.approx(-ratio, rel=1e-2)
+
+    # What the curve tells is the compliance; the product is its tangent at this estimate, by
+    # central differences (h^2 = 1e-6 of the derivatives; three digits of the exponent are told).
+    def log_compliance(log_EI, log_k):
+        material = Material(np.exp(log_EI), np.exp(log_k), 1.0, 0.1)
+        pressed = press(synthetic.GEOMETRY, material, 75.0, 1.0, synthetic.OPTIONS)
+        return float(np.log(pressed.compliance))
+
+    def exponent(x, y, h=1e-3):
+        by_EI = log_compliance(x + h, y) - log_compliance(x - h, y)
+        return (log_compliance(x, y + h) - log_compliance(x, y - h)) / by_EI
+
+    x, y = np.log(result.value[0, :2])
+    assert log_compliance(x, y) == pytest.approx(log_compliance(np.log(100.0), 0.0), abs=1e-3)
+    assert float(shape[1]) == pytest.approx(exponent(x, y), rel=5e-3)
+    # A tenth of k_M on the same valley: another product, so that none is known everywhere.
+    level, far = log_compliance(x, y), y - np.log(10.0)
+    other = brentq(lambda v: log_compliance(v, far) - level, x, x + 20)
+    assert abs(exponent(other, far) / float(shape[1]) - 1) > 0.2
 
 
 def test_a_bound_is_hit_and_said(noisy):

@@ -75,7 +75,7 @@ class Bootstrap:
             f"Of blocks of {self.block} samples only {n / self.block:.2g} go to the shortest curve "
             f"({n} samples). So few give errors that are too small, with white residuals about "
             f"{lost:.2g} of the true ones; the residuals are enlarged by {1 / lost:.3g} for it, "
-            "which holds in the mean and for 3 blocks or more to a curve; with correlated residuals "
+            "which holds in the mean and for 3 blocks or more to a curve; with correlated ones "
             f"errors may still be too small by a third. Better are {cure}"
         )
 
@@ -145,8 +145,8 @@ def check_block(study: Study, block: int) -> None:
     """
     if block > (n := _shortest(study)):
         raise ValueError(
-            f"block is {block}; expected no more than the {n} samples of the shortest curve, better "
-            f"{FEW_BLOCKS} blocks to a curve or more (block = {max(n // FEW_BLOCKS, 1)})"
+            f"block is {block}; expected no more than the {n} samples of the shortest curve, "
+            f"better {FEW_BLOCKS} blocks to a curve or more (block = {max(n // FEW_BLOCKS, 1)})"
         )
 
 

@@ -7,7 +7,12 @@ from jaxtrachea.fitting.press_scale import sizes_of_press
 from jaxtrachea.fitting.result import FitResult, unknown_label, verdict_of
 from jaxtrachea.fitting.verdict import VERDICTS
 from jaxtrachea.inference.profile import Profiles
-from jaxtrachea.inference.weakest_direction import describe_weakest
+from jaxtrachea.inference.weakest_direction import (
+    Direction,
+    describe_weakest,
+    next_weakest,
+    undetermined_ways,
+)
 
 #: What reports say in the place of estimates.
 NOTHING_FITTED = "every parameter is fixed: nothing was fitted, the model was evaluated"
@@ -40,8 +45,20 @@ def weakest_sentence(result: FitResult, lane: int) -> str:
     return describe_weakest(
         names, u.weakest_direction[lane], float(u.weakest_se[lane]),
         u.structural_null_space[lane], result.undetermined[lane],
-        press_sizes(result, lane),
+        press_sizes(result, lane), _left(result, lane),
     )  # fmt: skip
+
+
+def _left(result: FitResult, lane: int) -> Direction | None:
+    """Least determined direction of a lane beside those that are said to be open."""
+    u, relative = result.uncertainty, result.relative[lane]
+    if not np.any(u.weakest_direction[lane]):
+        return None
+    covariance = u.covariance[lane] / relative[:, None] / relative
+    rows = u.null_space[lane] / relative
+    rows = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
+    ways = undetermined_ways(u.weakest_direction[lane], u.structural_null_space[lane])
+    return next_weakest(covariance, rows, ways)
 
 
 def press_sizes(result: FitResult, lane: int) -> dict[int, tuple[float, str]]:
