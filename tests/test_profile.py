@@ -17,9 +17,11 @@ from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.profile_search import Sides
+from jaxtrachea.fitting.result import judgement, limiting_bound
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.profile import profile_rows
+from jaxtrachea.inference.labels import verdict_sentence
 from jaxtrachea.inference.profile import choose, profiles
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
@@ -62,6 +64,33 @@ def test_linear_model_has_the_interval_of_the_covariance(noise):
     at = (found.coordinate - result.theta.ravel()[:, None]) / se
     np.testing.assert_allclose(found.statistic, at**2, rtol=1e-5, atol=1e-6)
     assert not found.improved.any()
+
+
+@pytest.mark.parametrize("profiled", [False, True], ids=["local", "profiled"])
+@pytest.mark.parametrize("side", ["lower", "upper"])
+def test_a_bound_of_the_user_within_the_interval_is_named(side, profiled):
+    """Half a standard error beyond the estimate, in the linear model; the other side closes."""
+    free = fit(linear_study(), ONE)
+    sign = 1 if side == "upper" else -1
+    bound = float(free.value[0, 0] + sign * 0.5 * free.standard_error[0, 0])
+    cut = fit(linear_study(k_1={"value": float(free.value[0, 0]), side: bound}), ONE)
+    assert not cut.at_bound[0].any()
+    found = profiles(cut, ONE, points=3) if profiled else None
+    said = f"k_1 is limited by the {side} bound {bound:.6g} N/mm: widen it before measuring more"
+    assert said in verdict_sentence(cut, 0, found)
+    word = "practically non-identifiable" if profiled else "identifiable"
+    assert judgement(cut, 0, 0, found).verdict == word
+    assert "limited" not in verdict_sentence(free, 0)
+
+
+def test_a_default_bound_is_not_named():
+    """The same interval, whose bound nobody has set."""
+    result = fit(linear_study(k_1={"upper": DEFAULTS["k_1"].upper}), ONE)
+    high = result.upper.copy()
+    high[0, 0] = 2 * DEFAULTS["k_1"].upper
+    wide = dataclasses.replace(result, upper=high)
+    assert limiting_bound(wide, 0, 0) is None
+    assert limiting_bound(dataclasses.replace(wide, upper=result.upper), 0, 0) is None
 
 
 @pytest.fixture(scope="module")

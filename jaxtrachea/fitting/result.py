@@ -15,6 +15,7 @@ from jaxtrachea.files.table import Table
 from jaxtrachea.fitting.covariance import Uncertainty
 from jaxtrachea.fitting.criteria import Criteria
 from jaxtrachea.fitting.noise import precision_unit
+from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.verdict import verdict
@@ -277,6 +278,39 @@ def _judged(result: FitResult, lane: int, i: int, profiles: Intervals | None) ->
     error = float(longer) / unit
     word = verdict(error, structural=structural, held=held, ends=ends)
     return Judgement(word, *inside, ends, error)
+
+
+def limiting_bound(
+    result: FitResult, lane: int, i: int, profiles: Intervals | None = None
+) -> tuple[str, float] | None:
+    """The bound, set by the user, that ends the 95 % interval of an unknown on one side.
+
+    Of a profile that stays below its threshold up to the bound, or a local interval that is cut
+    there, while the other side ends by itself. Such an interval is that of the bound: without it
+    the same data may tell as much, or nothing.
+
+    Returns:
+        "lower" or "upper" and the bound, in the parameter's unit; None where there is none, the
+        bound is the parameter's default one, or the estimate lies on it.
+    """
+    if not result.succeeded[lane] or result.undetermined[lane, i] or result.at_bound[lane, i]:
+        return None
+    low, high, ends = _unbounded(result, lane, i, profiles)
+    low_cut, high_cut = within_bounds(result, lane, i, low, high)
+    if ends is None:
+        cut = (bool(low < low_cut), bool(high > high_cut))
+        closed = (bool(low == low_cut), bool(high == high_cut))
+    else:
+        cut = tuple(end == ProfileEnd.OPEN for end in ends)
+        closed = tuple(end in (ProfileEnd.CLOSED, ProfileEnd.BOUND) for end in ends)
+    p, lanes = result.study.unknowns[lane][i][0], result.study.lanes
+    usual = DEFAULTS.get(p.name)
+    # An onset is looked for near its own curve: that end is no bound of the user.
+    if cut[0] and closed[1] and p.to_scaled(p.lower) == lanes.lower[lane, i]:
+        return None if usual is not None and p.lower == usual.lower else ("lower", p.lower)
+    if cut[1] and closed[0] and p.to_scaled(p.upper) == lanes.upper[lane, i]:
+        return None if usual is not None and p.upper == usual.upper else ("upper", p.upper)
+    return None
 
 
 def interval95(

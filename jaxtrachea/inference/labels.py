@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.press_scale import sizes_of_press
-from jaxtrachea.fitting.result import FitResult, unknown_label, verdict_of
+from jaxtrachea.fitting.result import FitResult, limiting_bound, unknown_label, verdict_of
 from jaxtrachea.fitting.verdict import VERDICTS
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.weakest_direction import (
@@ -73,6 +73,20 @@ def press_sizes(result: FitResult, lane: int) -> dict[int, tuple[float, str]]:
     return {i: v for i, v in found.items() if np.isfinite(v[0])}
 
 
+def _limited(result: FitResult, lane: int, profiles: Profiles | None) -> list[str]:
+    """Which unknowns a bound of the user limits on one side; with all the data it would."""
+    said = []
+    for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
+        if (found := limiting_bound(result, lane, i, profiles)) is not None:
+            side, bound = found
+            name = unknown_label(result, lane, i)
+            said.append(
+                f"{name} is limited by the {side} bound {bound:.6g} {p.unit}".rstrip()
+                + ": widen it before measuring more"
+            )
+    return said
+
+
 def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = None) -> str:
     """Which unknowns of a lane have which verdict, and what is least determined."""
     if not succeeded(result, lane):
@@ -84,6 +98,7 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
         word = verdict_of(result, lane, i, profiles)
         groups.setdefault(word, []).append(unknown_label(result, lane, i))
     said = [f"{word}: {', '.join(groups[word])}" for word in VERDICTS if word in groups]
+    said += _limited(result, lane, profiles)
     said.append(weakest_sentence(result, lane))
     if result.study.joint and result.unexamined[lane].any():
         said.append("not shown: only the local error was looked at; --profile looks further")

@@ -92,12 +92,13 @@ def _estimates(findings: Findings) -> list[str]:
         "\n".join(flat),
         *more_of(result, shown, "summary.csv"),
         "Identifiable: relative error up to 10 %; weak: up to 50 %; practically non-identifiable: "
-        "more, or open on a side; structurally non-identifiable: no data from these contact points "
-        "can tell, however exact; not shown: there was cause to doubt the local error, and the "
-        "profile could not be followed to its end. Where there is cause, intervals are those of "
-        "profile likelihood and of all other minima found; else of the local standard error "
-        "(Gauss-Newton). Neither says anything of what the model leaves out. Medians and "
-        "populations are of identifiable and weak estimates.",
+        "more, or open on a side (limited by a bound, where that is said); structurally "
+        "non-identifiable: no data from these contact points can tell, however exact; not shown: "
+        "there was cause to doubt the local error, and the profile could not be followed to its "
+        "end. Where there is cause, intervals are those of profile likelihood and of all other "
+        "minima found; else of the local standard error (Gauss-Newton). Neither says anything of "
+        "what the model leaves out. Medians and populations are of identifiable and weak "
+        "estimates.",
     ]
 
 
