@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import inspect
 import re
 from pathlib import Path
 
@@ -16,6 +17,12 @@ from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.bootstrap import Bootstrap, bootstrap, enlargement
+from jaxtrachea.inference.cross_validation import leave_one_out
+from jaxtrachea.inference.influence import influence
+from jaxtrachea.inference.population import population
+from jaxtrachea.inference.posterior import posterior
+from jaxtrachea.inference.profile import profiles
+from jaxtrachea.inference.repeats import leave_repeats_out
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import table_1
@@ -162,6 +169,30 @@ def test_impossible_settings_are_refused(change, says):
     result = fit(make_study(np.random.default_rng(1).normal(size=(1, 2, 12))), ONE)
     with pytest.raises(ValueError, match=says):
         bootstrap(result, ONE, **change)
+
+
+@pytest.mark.parametrize(
+    ("analysis", "given", "says"),
+    [
+        (bootstrap, ("result", 200), "settings is 200; expected Settings"),
+        (bootstrap, (200,), "result is 200; expected FitResult"),
+        (profiles, ("result", ["k_1"]), r"settings is \['k_1'\]; expected Settings"),
+        (profiles, (None,), "result is None; expected FitResult"),
+        (influence, (ONE,), "result is Settings.*; expected FitResult"),
+        (influence, ("result", ONE), "batch is Settings.*; expected a whole number"),
+        (leave_one_out, ("result", 4), "settings is 4; expected Settings"),
+        (leave_one_out, ("study", ONE), "whole is .*; expected FitResult"),
+        (leave_repeats_out, ("study", ONE), "whole is .*; expected FitResult"),
+        (posterior, ("study",), "result is .*; expected FitResult"),
+        (population, ("study",), "result is .*; expected FitResult"),
+        (population, ("result", 3), "profiles is 3; expected Profiles or None"),
+    ],
+)
+def test_another_record_is_a_clear_error(analysis, given, says):
+    result = fit(make_study(np.random.default_rng(1).normal(size=(1, 2, 12))), ONE)
+    records = {"result": result, "study": result.study}
+    with pytest.raises(ValueError, match=says):
+        inspect.unwrap(analysis)(*(records.get(v, v) if isinstance(v, str) else v for v in given))
 
 
 def columns(heading):

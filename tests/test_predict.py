@@ -507,6 +507,23 @@ def test_presses_in_units_and_ranges():
     )
 
 
+def test_a_range_ends_within_its_end():
+    """Whole steps: the end is a value where one ends on it; without a step 20 lead to it."""
+    for text, values in (
+        ("D=0:1:0.3", [0, 0.3, 0.6, 0.9]),
+        ("D=0:0.9:0.3", [0, 0.3, 0.6, 0.9]),
+        ("D=0:1", np.linspace(0, 1, 21)),
+    ):
+        found = parse_presses(text, needs_position=False)
+        np.testing.assert_allclose(found.displacement, values, atol=1e-12)
+    for text in ("D=two", "D=0:1:-0.3"):
+        with pytest.raises(ValueError, match="whole steps from START, none beyond STOP"):
+            parse_presses(text, needs_position=False)
+    page = (Path(__file__).parents[1] / "docs/predict.md").read_text()
+    assert "0:1:0.3" in page
+    assert "the end is included" not in page
+
+
 def test_presses_aside_in_degrees_or_a_unit():
     """Tan 45 deg is 1; growing phi is positive."""
     found = parse_presses("s=75,D=2,phi=-30,tilt=0.25 rad", needs_position=True)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lane import without_data
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
@@ -110,8 +111,10 @@ def leave_one_out(whole: FitResult, settings: Settings, progress=None) -> LeftOu
         progress: as for `fit`.
 
     Raises:
-        ValueError: as `curves_to_leave_out`.
+        ValueError: no `FitResult` or `Settings`; as `curves_to_leave_out`.
     """
+    check_word("whole", whole, FitResult)
+    check_word("settings", settings, Settings)
     study = whole.study
     lane, trial = (np.array(v) for v in zip(*curves_to_leave_out(study), strict=True))
     chosen = study.take(lane)

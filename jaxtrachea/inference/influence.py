@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.cost import assemble, entry_scale, robust
 from jaxtrachea.fitting.covariance import SINGULAR
@@ -230,7 +231,12 @@ def influence(result: FitResult, batch: int = 128) -> Influence:
     Args:
         result: the fit.
         batch: lanes computed together; of deforming cross-sections no more than `_TOGETHER`.
+
+    Raises:
+        ValueError: no `FitResult`, or `batch` is no whole number.
     """
+    check_word("result", result, FitResult)
+    check_word("batch", batch, int)
     if result.study.model.options.deforms_sections:
         batch = min(batch, _TOGETHER)
     free = np.asarray(result.study.lanes.active) * ~result.at_bound

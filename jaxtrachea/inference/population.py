@@ -15,6 +15,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.fitting.result import DETERMINED, FitResult, Intervals, judgement
 from jaxtrachea.fitting.study import Study
@@ -79,8 +80,11 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
         profiles: further profiles, for the verdicts.
 
     Raises:
-        ValueError: no parameter with the scope `specimen`, or none that three specimens determine.
+        ValueError: no `FitResult` or `Profiles`, no parameter with the scope `specimen`, or none
+            that three specimens determine.
     """
+    check_word("result", result, FitResult)
+    check_word("profiles", profiles, Profiles | None)
     parameters = tuple(p for p in result.study.free if p.scope == "specimen")
     if not parameters:
         raise ValueError("no free parameter has the scope 'specimen'; a population needs one")

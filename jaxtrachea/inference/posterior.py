@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.cost import weights
 from jaxtrachea.fitting.lane import Lane, observations
 from jaxtrachea.fitting.model import FitModel
@@ -216,9 +217,11 @@ def posterior(
         progress: called with (lanes done since the last call, lanes in all).
 
     Raises:
-        ValueError: too few draws or chains, or a skeleton of deforming cross-sections.
+        ValueError: no `FitResult`, too few draws or chains, or a skeleton of deforming
+            cross-sections.
         MissingSampler: blackjax is not installed.
     """
+    check_word("result", result, FitResult)
     if draws < 100 or chains < 2:
         raise ValueError(f"{draws} draws of {chains} chains; expected 100 of 2, or more")
     result.study.refuse_sections("the posterior")

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.profile_search import Sides, find_ends, on_grid
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings, check_precision
@@ -121,8 +122,10 @@ def profiles(
         progress: called with (refits done since the last call, 0 for unknown in all).
 
     Raises:
-        ValueError: as `choose`, or a joint study.
+        ValueError: no `FitResult` or `Settings`, as `choose`, or a joint study.
     """
+    check_word("result", result, FitResult)
+    check_word("settings", settings, Settings)
     result.study.refuse_joint("a profile")
     check_precision(settings)
     lane, unknown = choose(result, names)

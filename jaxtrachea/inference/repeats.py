@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
@@ -147,7 +148,12 @@ def leave_repeats_out(
 
     Returns:
         The `Missed` of all lanes.
+
+    Raises:
+        ValueError: no `FitResult` or `Settings`.
     """
+    check_word("whole", whole, FitResult)
+    check_word("settings", settings, Settings)
     study = whole.study
     count = len(study.curves)
     lanes, held, kinds = repeats(study)

@@ -44,8 +44,9 @@ def parse_presses(text: str, *, needs_position: bool) -> Presses:
 
     Args:
         text: KEY=VALUE, separated by commas; s and D are numbers (mm) with or without a unit, or
-            ranges START:STOP or START:STOP:STEP that include the end; phi, and tilt of the tool
-            from the inward normal towards growing phi, are angles (degrees) with or without one.
+            ranges START:STOP:STEP, in whole steps within STOP, which is a value where a step ends
+            on it, or START:STOP, in 20 steps; phi, and tilt of the tool from the inward normal
+            towards growing phi, are angles (degrees) with or without one.
         needs_position: whether s must be given.
 
     Raises:
@@ -97,7 +98,8 @@ def _lengths(name: str, text: str) -> np.ndarray:
     match = _VALUES.fullmatch(text)
     if match is None:
         raise ValueError(
-            f"{name}={text!r} is neither a length nor a range START:STOP:STEP; write it {EXAMPLE}"
+            f"{name}={text!r} is neither a length nor a range START:STOP:STEP (whole steps from "
+            f"START, none beyond STOP); write it {EXAMPLE}"
         )
     try:
         numbers = [float(v) for v in match["numbers"].split(":")]
@@ -115,7 +117,7 @@ def _lengths(name: str, text: str) -> np.ndarray:
     if step == 0 or (stop - start) / step < 0:
         raise ValueError(
             f"{name}={text!r}: steps of {step:g} mm do not lead from {start:g} to {stop:g} mm; "
-            "give START:STOP:STEP"
+            "give START:STOP:STEP, whole steps from START, none beyond STOP"
         )
     count = (stop - start) / step
     if count > MOST:
