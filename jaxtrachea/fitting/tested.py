@@ -14,6 +14,12 @@ def tested_depth(options: Options, radius: float) -> float:
     return np.inf if options.coupling == "total" else TESTED[options.skeleton] * radius * (1 + 1e-9)
 
 
+def untested(options: Options, radius: float, depth: float) -> str:
+    """Whether a press of `depth` goes deeper than the model was tested, in words; "" if not."""
+    most = tested_depth(options, radius)
+    return f"the model was tested to D = {most:.3g} mm" if depth > most else ""
+
+
 def deeper_than_tested(curves: Sequence[Curve], options: Options, radius: float) -> str | None:
     """A sentence on curves that go deeper than the model was tested; None: there are none."""
     most = tested_depth(options, radius)

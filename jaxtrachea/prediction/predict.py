@@ -17,7 +17,7 @@ from jaxtyping import ArrayLike
 
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.fitting.tested import tested_depth
+from jaxtrachea.fitting.tested import untested
 from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Aside, Estimate, Predicted, Response, predicted
@@ -215,8 +215,9 @@ def _on_host(stored: StoredFit, source: Source, where, displacement, part: Predi
         tilts = stored.tilts[source.lane]
         aside = (angles, phi, "phi"), (tilts, tilt_of(direction), "tilt")
         beyond = _beyond(spans, float(s), displacement, aside)
-        untested = _untested(stored, displacement)
-        message = "; ".join(filter(None, [message, beyond, untested]))
+        model, deepest = stored.study.model, float(np.max(np.abs(displacement)))
+        deep = untested(model.options, float(model.geometry.radius), deepest)
+        message = "; ".join(filter(None, [message, beyond, deep]))
     return CurvePrediction(
         specimen=source.specimen,
         trial=source.trial,
@@ -270,14 +271,6 @@ def _bend(source: Source, off: np.ndarray, value: Response, se: Response, deepes
     worst = np.max(np.abs(off[:, deepest])) / half
     # No solution within the band (past a fold): as bent as can be.
     return float(worst) if np.isfinite(worst) else np.inf
-
-
-def _untested(stored: StoredFit, displacement: np.ndarray) -> str:
-    """Whether a curve goes deeper than the model was tested, in words; "" if it does not."""
-    model = stored.study.model
-    most = tested_depth(model.options, float(model.geometry.radius))
-    deep = np.max(np.abs(displacement)) > most
-    return f"the model was tested to D = {most:.3g} mm" if deep else ""
 
 
 def _beyond(spans: np.ndarray, s: float, displacement: np.ndarray, aside=()) -> str:
