@@ -87,11 +87,8 @@ def analyse(
     half = half_widths(dof, noise_given=noise_given)
     usable = np.isfinite(info.bread).all(axis=(1, 2)) & (dof >= 0)
     free = free & usable[:, None]
-    kappa = np.asarray(info.psi2) * total / np.maximum(dof, 1)
-    if noise_given:
-        kappa = np.ones(len(dof)) if least is None else np.maximum(kappa, least)
-    dpsi = np.maximum(info.dpsi, 1e-3)
-    kappa = kappa / dpsi**2
+    kappa = noise_factor(info, dof, noise_given=noise_given, least=least)
+    dpsi = _mean_slope(info)
     unit = relative * free
     structural = np.zeros_like(info.bread) if structural is None else structural
     bread = _without(_scaled(np.asarray(info.bread), unit), structural, free)
@@ -121,6 +118,28 @@ def analyse(
         conditional_direction=conditional, dispersion=dispersion, covariance=covariance,
         null_space=null_space,
     )  # fmt: skip
+
+
+def noise_factor(
+    info: Information, dof: np.ndarray, *, noise_given: bool, least: float | None = None
+) -> Float[np.ndarray, " lanes"]:
+    """Factor kappa of the sandwich: of the residuals, unless the noise is given, and of the loss.
+
+    Args:
+        info: numpy, leading axis = lanes.
+        dof: observed entries less the unknowns; (lanes,).
+        noise_given: as for `analyse`.
+        least: likewise.
+    """
+    square = np.asarray(info.psi2) * np.sum(info.counts, axis=1) / np.maximum(dof, 1)
+    if noise_given:
+        square = np.ones(len(dof)) if least is None else np.maximum(square, least)
+    return square / _mean_slope(info) ** 2
+
+
+def _mean_slope(info: Information) -> np.ndarray:
+    """Mean of psi' of every lane, not 0."""
+    return np.maximum(info.dpsi, 1e-3)
 
 
 def half_widths(dof: np.ndarray, *, noise_given: bool) -> np.ndarray:

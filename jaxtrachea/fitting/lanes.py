@@ -162,9 +162,15 @@ class _Layout:
     vectors: bool
     curves: Sequence[Curve]
 
-    def curve_weight(self, samples: int) -> float:
-        """Weight of the residuals of a curve of so many samples."""
-        return 1.0 if self.mean_length is None else np.sqrt(self.mean_length / samples)
+
+def mean_length(curves: Sequence[Curve], weighting: Weighting) -> float | None:
+    """Samples of a curve in the mean; None where every sample weighs the same."""
+    return float(np.mean([len(c.force) for c in curves])) if weighting.balance == "curve" else None
+
+
+def curve_weight(mean: float | None, samples: int) -> float:
+    """Weight of the residuals of a curve of so many samples; `mean`: of `mean_length`."""
+    return 1.0 if mean is None else np.sqrt(mean / samples)
 
 
 def lanes_of(
@@ -196,7 +202,7 @@ def lanes_of(
         parameters=parameters,
         geometry=geometry,
         noise=noise,
-        mean_length=float(np.mean(lengths)) if weighting.balance == "curve" else None,
+        mean_length=mean_length(every, weighting),
         reach=-1.0 if tool_radius is None else tool_radius,
         pressed_ends=weighting.pressed_ends,
         trials=max(map(len, groups)),
@@ -243,7 +249,7 @@ def _lane(layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown])
         lane["displacement"][t, :n], lane["force"][t, :n] = curve.displacement, curve.force
         sigma = curve.sigma if curve.sigma is not None else noise.force
         lane["precision"][t, :n] = 1.0 if sigma is None else 1 / np.asarray(sigma)
-        lane["balance"][t] = layout.curve_weight(n)
+        lane["balance"][t] = curve_weight(layout.mean_length, n)
         for j, p in enumerate(parameters):
             if not p.fixed:
                 lane["index"][t, j] = place[_key(p, curve)]

@@ -19,7 +19,15 @@ from jaxtyping import Int, Shaped
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.lane import size as entries_of_trial
-from jaxtrachea.fitting.lanes import Noise, Unknown, Weighting, group, lanes_of, unknowns_of
+from jaxtrachea.fitting.lanes import (
+    Noise,
+    Unknown,
+    Weighting,
+    group,
+    lanes_of,
+    mean_length,
+    unknowns_of,
+)
 from jaxtrachea.fitting.model import Common, FitModel, columns_of, numbers_of
 from jaxtrachea.fitting.onset import blends, natural_steps, onset_is_sought, within_reach
 from jaxtrachea.fitting.parameters import (
@@ -60,6 +68,8 @@ class Study:
         joint: whether shared unknowns are one and the same in all lanes.
         together: names of trials, in groups that are left out together; see
             `inference.together.left_out_together`.
+        mean_length: samples of a curve in the mean where every curve weighs the same; None: every
+            sample does.
     """
 
     model: FitModel
@@ -71,6 +81,7 @@ class Study:
     marker_noise: tuple[float, float] | None = None
     joint: bool = False
     together: tuple[tuple[str, ...], ...] = ()
+    mean_length: float | None = None
 
     def __post_init__(self):
         """Refuse a model of another parameter table.
@@ -286,6 +297,7 @@ def build_study(
         noise_given=(known, noise.joints is not None),
         marker_noise=None if noise.joints is None else (noise.joints, noise.joints_share),
         joint=joint,
+        mean_length=mean_length(curves, weighting),
     )
 
 
