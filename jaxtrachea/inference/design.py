@@ -1,12 +1,16 @@
 """Where to press next: what a further curve would add to the information, at every candidate.
 
 A candidate is a press at s up to a depth, on the midline or, of deforming cross-sections, at an
-angle phi. Its sensitivities come from the residual of the fit itself, so that model, scales and
-scopes are the same; its information adds to that of the data (Fisher information of normal noise;
-Fedorov 1972). It observes the force along the normal, and off the midline the side force where the
-study has one. Relative coordinates: 1 is a change of 100 %. Bounds count as a weak prior, of the
-variance of a uniform distribution between them, so that nothing is infinite where the data so far
-leave a combination undetermined.
+angle phi, on one of the specimens where several are fitted together. Its sensitivities come from
+the residual of the fit itself, so that model, scales and scopes are the same; it observes the force
+along the normal, and off the midline the side force where the study has one. Relative coordinates:
+1 is a change of 100 %.
+
+What is known is what the fit says, and would say with the press: the sandwich A^-1 B A^-1 of
+`fitting.covariance` with the weights of all curves, the new one included. A press adds to A (bread)
+and B (meat); with equal weights B = A, the Fisher information of normal noise (Fedorov 1972).
+Bounds count as a weak prior, of the variance of a uniform distribution between them, so that
+nothing is infinite where the data so far leave a combination undetermined.
 
 Unknowns of single trials (an onset, an offset) are told apart from those that are sought: a new
 press brings its own, about which nothing is known, and the measured curves keep theirs. Both are
@@ -15,31 +19,39 @@ marginalised, so that information, scores and errors are those of the other unkn
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jaxtrachea._arguments import check_word
-from jaxtrachea._numerics import full_precision
 from jaxtrachea.config import FitSpec, SpecError
-from jaxtrachea.fitting.information import informations
-from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.covariance import noise_factor
+from jaxtrachea.fitting.information import Information, informations
+from jaxtrachea.fitting.lanes import curve_weight
+from jaxtrachea.fitting.noise import normal_psi2
 from jaxtrachea.fitting.press_scale import relative_change
-from jaxtrachea.fitting.residual import force_jacobian
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.fitting.tested import untested
 from jaxtrachea.inference.bootstrap import Bootstrap
-from jaxtrachea.inference.design_press import marginal, of_a_new_press
+from jaxtrachea.inference.design_press import (
+    Guess,
+    Place,
+    index_of_presses,
+    marginal,
+    of_a_new_press,
+    press_informations,
+)
 from jaxtrachea.inference.labels import succeeded
-from jaxtrachea.optimisation.programs import program
 
 Criterion = Literal["D", "A", "E"]
-#: Candidates of deforming cross-sections: in all where the user does not say, and at a time.
-_FEW, _TOGETHER = 250, 16
-#: Those of a line of joints, which cost next to nothing.
-_MANY = 10_000
+#: Candidates where the user does not say: of deforming cross-sections, and of a line of joints,
+#: which cost next to nothing.
+_FEW, _MANY = 250, 10_000
+#: Numbers of the matrices that are inverted together.
+_NUMBERS = 1 << 20
 #: Estimates of a lane, out of its bootstrap replicates, that a design is averaged over.
 _DRAWS = 16
 
@@ -51,11 +63,13 @@ class Candidates(NamedTuple):
         s: contact position, mm.
         depth: largest tool displacement, mm.
         phi: contact angle, rad; None: all on the midline.
+        curve: a curve of the lane on whose specimen it is; None: the first.
     """
 
     s: Float[np.ndarray, " C"]
     depth: Float[np.ndarray, " C"]
     phi: Float[np.ndarray, " C"] | None = None
+    curve: Int[np.ndarray, " C"] | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,8 +81,11 @@ class Situation:
         lane: lane of each guess; (G,).
         theta: guess, scaled coordinates; (G, P).
         relative: change of each scaled coordinate that makes a relative change of 1; (G, P).
-        base: information of the data so far and of the bounds on the Q unknowns that are not of
-            single trials, relative coordinates; (G, Q, Q).
+        base: bread of the data so far, with the weights of the curves, and of the bounds, on the Q
+            unknowns that are not of single trials, relative coordinates; (G, Q, Q).
+        meat: likewise; times the factor kappa of the covariance; (G, Q, Q).
+        weight: of the squared residuals of a new curve, as the fit will have it.
+        factor: what a press adds to the meat over what it adds to the bread; (G,).
         sigma: of a force sample, N; (G,).
         samples: of a curve.
         kept: these unknowns; (G, Q).
@@ -83,12 +100,20 @@ class Situation:
     theta: Float[np.ndarray, "G P"]
     relative: Float[np.ndarray, "G P"]
     base: Float[np.ndarray, "G Q Q"]
+    meat: Float[np.ndarray, "G Q Q"]
+    weight: float
+    factor: Float[np.ndarray, " G"]
     sigma: Float[np.ndarray, " G"]
     samples: int
     kept: Int[np.ndarray, "G Q"]
     own: Int[np.ndarray, "G R"]
     prior: Float[np.ndarray, "G P"]
     blend: Float[np.ndarray, " G"] | None
+
+    def with_press(self, added: Float[np.ndarray, "G Q Q"]) -> "Situation":
+        """The situation after a press that adds so much to the bread."""
+        meat = self.meat + self.factor[:, None, None] * added
+        return dataclasses.replace(self, base=self.base + added, meat=meat)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -97,11 +122,10 @@ class Choice:
 
     Attributes:
         chosen: candidate of each step; (n,).
-        score: of every candidate at each step, mean over guesses, larger is better: mean log
-            determinant (D), minus the log of the mean variance (A), log of the smallest eigenvalue
-            (E); (n, C).
-        error: relative standard error of every unknown before and after each step, root mean square
-            over guesses; (n + 1, P).
+        score: of every candidate at each step, mean over guesses, larger is better; see `scores`;
+            (n, C).
+        error: relative standard error of every unknown before and after each step, as the fit has
+            it and a refit would have it, root mean square over guesses; (n + 1, P).
     """
 
     chosen: Int[np.ndarray, " n"]
@@ -114,6 +138,7 @@ def grid(
     depth: tuple[float, float],
     count: int = 10_000,
     phi: Sequence[float] = (0.0,),
+    curve: Sequence[int] = (0,),
 ) -> Candidates:
     """About `count` candidates in a reachable region, five depths at even positions.
 
@@ -122,12 +147,47 @@ def grid(
         depth: least and largest, mm.
         count: of all candidates.
         phi: angles, rad; each at every position and depth.
+        curve: see `Candidates`; all of it on each of these.
     """
     depths = np.linspace(*depth, 5) if depth[1] > depth[0] else np.array([depth[0]])
-    positions = np.linspace(*s, max(count // (len(depths) * len(phi)), 1))
-    turned, at, down = np.meshgrid(phi, positions, depths, indexing="ij")
+    positions = np.linspace(*s, max(count // (len(depths) * len(phi) * len(curve)), 1))
+    of, turned, at, down = np.meshgrid(curve, phi, positions, depths, indexing="ij")
     angles = turned.ravel() if np.any(turned) else None
-    return Candidates(at.ravel(), down.ravel(), angles)
+    curves = of.ravel().astype(int) if np.any(of) else None
+    return Candidates(at.ravel(), down.ravel(), angles, curves)
+
+
+def pressed_curves(study: Study) -> list[int]:
+    """First curve of every specimen that has unknowns of its own; the first alone elsewhere.
+
+    Where every specimen is a lane a press is one on each of them.
+    """
+    if len(study.lanes.s_c) > 1:
+        return [0]
+    columns = [j for j in study.free_columns if study.parameters[j].scope != "trial"]
+    rows = study.lanes.index[0, : len(study.curves[0])][:, columns]
+    return np.sort(np.unique(rows, axis=0, return_index=True)[1]).tolist()
+
+
+def pressed_specimen(study: Study, curve: int = 0) -> str:
+    """Name of the specimen of a press; "(each)" of several lanes, "(any)" where all are alike."""
+    names = {c.specimen for curves in study.curves for c in curves}
+    if len(names) > 1 and len(study.lanes.s_c) > 1:
+        return "(each)"
+    if len(names) > 1 and len(pressed_curves(study)) == 1:
+        return "(any)"
+    return study.curves[0][curve].specimen
+
+
+def extrapolation(study: Study, depth: float) -> str:
+    """What of a press goes deeper than the curves did, or the model was tested; "" if nothing."""
+    reached = [c.displacement for curves in study.curves for c in curves]
+    low, high = float(min(map(np.min, reached))), float(max(map(np.max, reached)))
+    beyond = depth > high + 1e-9
+    known = f"extrapolated from data at D = {low:.3g} to {high:.3g} mm" if beyond else ""
+    model = study.model
+    tested = untested(model.options, float(model.geometry.radius), depth)
+    return "; ".join(filter(None, [known, tested]))
 
 
 def check(study: Study) -> None:
@@ -152,7 +212,7 @@ def situation(
     samples: int | None = None,
     with_data: bool = True,
 ) -> Situation:
-    """What a fit knows, with every curve and sample at its own weight 1 / sigma^2.
+    """What a fit knows, with the weights that it gives to curves and samples.
 
     Args:
         result: the fit; its succeeded lanes are the guesses.
@@ -173,35 +233,59 @@ def situation(
         found = [resampled.theta[k][resampled.usable[k]][:_DRAWS] for k in lanes]
         lane = np.repeat(lanes, [len(rows) for rows in found])
         theta = np.concatenate(found)
-    kept, own, theta = of_a_new_press(study, lane, theta)
-    relative = relative_change(study.take(lane), theta)
-    absent = study.lanes.active[lane] == 0
-    relative = np.where(absent, 1.0, relative)
-    width = (study.lanes.upper - study.lanes.lower)[lane] / relative
-    prior = 12 / np.where(width > 0, width, 1) ** 2
+    sigma = result.whitened_sigma
+    info = informations(study, lane, theta, sigma[lane])
+    at_estimate = info
+    if resampled is not None:
+        at_estimate = informations(study, lanes, result.theta[lanes], sigma[lanes])
+    kappa = _kappa(result, lanes, at_estimate)[np.searchsorted(lanes, lane)]
+    relative, prior = _prior(study, lane, theta)
     base = np.eye(study.size) * prior[:, :, None]
+    meat = base
     if with_data:
-        even = study.lanes._replace(balance=np.ones_like(study.lanes.balance))
-        weighed = dataclasses.replace(study, lanes=even)
-        info = informations(weighed, lane, theta, result.whitened_sigma[lane])
-        base = base + info.bread * relative[:, :, None] * relative[:, None]
+        unit = relative[:, :, None] * relative[:, None]
+        meat = base + kappa[:, None, None] * info.meat * unit
+        base = base + info.bread * unit
+    kept, own, theta = of_a_new_press(study, lane, theta)
+    base, meat = marginal(base, meat, kept)
+    relative, prior = _prior(study, lane, theta)
     n = study.lanes.force.shape[-1] if samples is None else samples
+    weight = float(curve_weight(study.mean_length, n) ** 2)
     blends, counts = study.lanes.blend, [len(c) for c in study.curves]
     blend = None
     if blends is not None:
         blend = np.array([np.median(blends[k, : counts[k]]) for k in lane])
     return Situation(
         study=study, lane=lane, theta=theta, relative=relative,
-        base=marginal(base, kept), sigma=result.sigma[lane, 0], samples=n,
-        kept=kept, own=own, prior=prior, blend=blend,
+        base=base, meat=meat, weight=weight, factor=kappa * weight,
+        sigma=result.sigma[lane, 0], samples=n, kept=kept, own=own, prior=prior, blend=blend,
     )  # fmt: skip
 
 
-def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q Q"]:
-    """Information of a press at every candidate on the unknowns it shares, for every guess.
+def _kappa(result: FitResult, lanes: Int[np.ndarray, " L"], info: Information) -> np.ndarray:
+    """The factor of the covariance of these lanes at their estimates, as the fit has it; (L,)."""
+    study = result.study
+    held = result.at_bound | (study.lanes.active == 0)
+    dof = np.sum(info.counts, axis=1) - np.sum(~held[lanes], axis=1)
+    both = study.lanes.joints is None or study.noise_given[1]
+    least = normal_psi2(study.model.loss, study.model.loss_scale)
+    given = study.noise_given[0] and both
+    return noise_factor(info, dof, noise_given=given, least=least)
 
-    In relative coordinates; what the press has of its own is eliminated. A candidate without
-    equilibrium at some sample tells nothing: zeros.
+
+def _prior(study: Study, lane: Int[np.ndarray, " G"], theta: Float[np.ndarray, "G P"]):
+    """Change that makes a relative change of 1, and information of the bounds, of guesses."""
+    absent = study.lanes.active[lane] == 0
+    relative = np.where(absent, 1.0, relative_change(study.take(lane), theta))
+    width = (study.lanes.upper - study.lanes.lower)[lane] / relative
+    return relative, 12 / np.where(width > 0, width, 1) ** 2
+
+
+def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q Q"]:
+    """What a press at every candidate adds to the bread of what it shares, for every guess.
+
+    Its information times the weight of its curve, in relative coordinates; what the press has of
+    its own is eliminated. A candidate without equilibrium at some sample tells nothing: zeros.
 
     Raises:
         ValueError: angles for a skeleton that is pressed on the midline alone.
@@ -210,12 +294,15 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
     if candidates.phi is not None and not study.model.options.deforms_sections:
         raise ValueError("presses off the midline need the skeleton 'sections'; leave phi out")
     parts = []
+    curve = np.zeros(len(candidates.s), int) if candidates.curve is None else candidates.curve
     for g, k in enumerate(known.lane):
-        lanes = study.lanes
         blend = None if known.blend is None else jnp.asarray(known.blend[g])
-        guess = _Guess(jnp.asarray(known.theta[g]), lanes.value[k, 0], lanes.index[k, 0], blend)
-        matrix = _of_all(study, known.samples, guess, candidates)
-        matrix = np.nan_to_num(matrix / known.sigma[g] ** 2, posinf=0.0, neginf=0.0)
+        guess = Guess(jnp.asarray(known.theta[g]), study.lanes.value[k, 0], blend)
+        index = index_of_presses(study, int(k), curve)
+        place = Place(candidates.s, candidates.depth, candidates.phi, index)
+        matrix = press_informations(study, known.samples, guess, place)
+        matrix = matrix * (known.weight / known.sigma[g] ** 2)
+        matrix = np.nan_to_num(matrix, posinf=0.0, neginf=0.0)
         parts.append(matrix * known.relative[g][:, None] * known.relative[g])
     added = np.stack(parts)
     if known.own.shape[1] == 0:
@@ -226,73 +313,46 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
     rows = np.concatenate([known.kept, known.own], axis=1)
     of_press = np.stack([m[:, r[:, None], r[None]] for m, r in zip(added, rows, strict=True)])
     shared = np.tile(np.arange(known.kept.shape[1]), (len(rows), 1))
-    return marginal(of_press, shared)
+    return marginal(of_press, of_press, shared)[0]
 
 
-class _Guess(NamedTuple):
-    """Unknowns of a guess, and the trial that a press is like.
+def scores(
+    bread: Float[np.ndarray, "G C P P"], meat: Float[np.ndarray, "G C P P"], criterion: Criterion
+) -> Float[np.ndarray, " C"]:
+    """What is to be made large, of the covariance V = bread^-1 meat bread^-1 of the estimates.
 
-    `value` and `index`: its rows, see `Lane`; `blend`: as `force_jacobian`.
+    Minus its mean log determinant over guesses (D), minus the log of its mean variance (A), minus
+    the mean log of its largest eigenvalue (E).
     """
-
-    theta: Float[Array, " P"]
-    value: Any
-    index: Any
-    blend: Float[Array, ""] | None
-
-
-class _Place(NamedTuple):
-    """A candidate, or with a leading axis many; see `Candidates`."""
-
-    s: Any
-    depth: Any
-    phi: Any
+    check_word("criterion", criterion, Criterion)
+    if criterion == "D":
+        logs = 2 * np.linalg.slogdet(bread)[1] - np.linalg.slogdet(meat)[1]
+        return np.mean(logs, axis=0)
+    variance = covariance(bread, meat)
+    if criterion == "A":
+        mean = np.mean(np.diagonal(variance, axis1=-2, axis2=-1), axis=-1)
+        return -np.log(np.mean(mean, axis=0))
+    return -np.mean(np.log(np.linalg.eigvalsh(variance)[..., -1]), axis=0)
 
 
-def _of_all(study: Study, samples: int, guess: _Guess, candidates: Candidates) -> np.ndarray:
-    """`_information` of every candidate; of deforming cross-sections so many at a time; (C, P, P).
+def covariance(bread: np.ndarray, meat: np.ndarray) -> np.ndarray:
+    """The sandwich, of many matrices (..., P, P)."""
+    inverse = np.linalg.inv(bread)
+    return inverse @ meat @ inverse
 
-    Each is a path of its own there, and all together would take the memory.
-    """
-    sides = study.lanes.side_force is not None
-    run = program(_information, study.model, samples, sides, axes=(None, 0))
-    count = len(candidates.s)
-    together = _TOGETHER if study.model.options.deforms_sections else count
+
+def scores_after(
+    known: Situation, added: Float[np.ndarray, "G C Q Q"], criterion: Criterion
+) -> Float[np.ndarray, " C"]:
+    """`scores` after a press at every candidate, so many at a time that they take no memory."""
+    guesses, count, size, _ = added.shape
+    together = max(_NUMBERS // max(guesses * size * size, 1), 1)
     parts = []
     for first in range(0, count, together):
-        row = np.minimum(np.arange(first, first + together), count - 1)
-        place = _Place(*(None if v is None else jnp.asarray(v[row]) for v in candidates))
-        parts.append(np.array(run(guess, place))[: count - first])
+        part = added[:, first : first + together]
+        meat = known.meat[:, None] + known.factor[:, None, None, None] * part
+        parts.append(scores(known.base[:, None] + part, meat, criterion))
     return np.concatenate(parts)
-
-
-@full_precision
-def _information(model: FitModel, samples: int, sides: bool, guess: _Guess, place: _Place):
-    """Information of one press with noise of 1 N on the unknowns; (P, P).
-
-    `sides`: whether it observes the side force.
-    """
-    theta, value, index, blend = guess
-    displacement = place.depth * jnp.arange(1, samples + 1, dtype=theta.dtype) / samples
-    index = index[jnp.array(model.free_columns)]
-    free = jnp.where(index >= 0, theta[jnp.maximum(index, 0)], 0)
-    J = force_jacobian(model, free, value, place.s, displacement, blend, place.phi)
-    J = J if sides else J[:, :samples]
-    at = jnp.where(index >= 0, index, len(theta))
-    zero = jnp.zeros((len(theta), len(theta)), theta.dtype)
-    gram = jnp.einsum("im,jm->ij", J, J)
-    return zero.at[at[:, None], at[None]].add(gram, mode="drop")
-
-
-def scores(information: Float[np.ndarray, "G C P P"], criterion: Criterion):
-    """Mean over guesses of what is to be made large, see `Choice.score`; (C,)."""
-    check_word("criterion", criterion, Criterion)
-    values = np.maximum(np.linalg.eigvalsh(information), 1e-300)
-    if criterion == "D":
-        return np.mean(np.sum(np.log(values), axis=-1), axis=0)
-    if criterion == "A":
-        return -np.log(np.mean(np.mean(1 / values, axis=-1), axis=0))
-    return np.mean(np.log(values[..., 0]), axis=0)
 
 
 def next_points(
@@ -313,18 +373,20 @@ def next_points(
     """
     check_word("criterion", criterion, Criterion)
     added = gains(known, candidates) if added is None else added
-    base, chosen, table = known.base, [], []
-    errors = [_errors(base)]
+    # A press that tells nothing takes nothing away either, where weights let others do so.
+    telling = np.any(np.diagonal(added, axis1=-2, axis2=-1) > 0, axis=(0, 2))
+    telling = np.asarray(telling if np.any(telling) else ~telling, bool)
+    chosen, table, errors = [], [], [_errors(known)]
     for _ in range(count):
-        table.append(scores(base[:, None] + added, criterion))
-        chosen.append(int(np.argmax(table[-1])))
-        base = base + added[:, chosen[-1]]
-        errors.append(_errors(base))
+        table.append(scores_after(known, added, criterion))
+        chosen.append(int(np.argmax(np.where(telling, table[-1], -np.inf))))
+        known = known.with_press(added[:, chosen[-1]])
+        errors.append(_errors(known))
     return Choice(np.array(chosen), np.stack(table), np.stack(errors))
 
 
-def _errors(information) -> np.ndarray:
-    variance = np.diagonal(np.linalg.inv(information), axis1=-2, axis2=-1)
+def _errors(known: Situation) -> np.ndarray:
+    variance = np.diagonal(covariance(known.base, known.meat), axis1=-2, axis2=-1)
     return np.sqrt(np.mean(variance, axis=0))
 
 
@@ -336,7 +398,9 @@ class Map(NamedTuple):
         phi: of all presses, rad.
         condition: after a press at s on top of the data; of the scaled Jacobian, as in a fit; (n,).
         weakest: unit vector of the least determined combination then, relative; (n, P).
-        pairs: condition of a press at s and one at s', without any data; (n, n).
+        pairs: condition of a press at s and one at s', without any data, of the unknowns of the
+            specimen that is pressed; (n, n).
+        curve: a curve of that specimen, see `Candidates`.
     """
 
     s: Float[np.ndarray, " n"]
@@ -344,41 +408,47 @@ class Map(NamedTuple):
     condition: Float[np.ndarray, " n"]
     weakest: Float[np.ndarray, "n P"]
     pairs: Float[np.ndarray, "n n"]
+    curve: int = 0
 
 
 def identifiability(
-    known: Situation, s: Float[np.ndarray, " n"], depth: float, phi: float = 0.0
+    known: Situation, s: Float[np.ndarray, " n"], depth: float, phi: float = 0.0, curve: int = 0
 ) -> Map:
     """Condition and weakest direction of presses to `depth` (mm) at every position (mm).
 
-    At one angle (rad). Conditions are geometric means over the guesses, directions those of the
-    first guess.
+    At one angle (rad), on the specimen of a curve (see `Candidates`). Conditions are geometric
+    means over the guesses, directions those of the first guess.
     """
     angles = np.full(len(s), phi) if phi else None
-    added = gains(known, Candidates(s, np.full(len(s), depth), angles))
+    curves = np.full(len(s), curve) if curve else None
+    added = gains(known, Candidates(s, np.full(len(s), depth), angles, curves))
     values, vectors = np.linalg.eigh(known.base[:, None] + added)
     condition = np.exp(np.mean(0.5 * np.log(values[..., -1] / values[..., 0]), axis=0))
     weakest = vectors[0, :, :, 0]
     largest = np.take_along_axis(weakest, np.argmax(np.abs(weakest), axis=1)[:, None], axis=1)
     total = 0.0
-    for matrix in added:
+    index = known.study.lanes.index
+    for matrix, kept, k in zip(added, known.kept, known.lane, strict=True):
+        read = np.flatnonzero(np.isin(kept, index[k, curve]))
+        matrix = matrix[:, read[:, None], read[None]]
         values = np.linalg.eigvalsh(matrix[:, None] + matrix[None])
         low = np.maximum(values[..., 0], 1e-14 * values[..., -1])
         nothing = values[..., -1] <= 0  # neither press tells anything
         ratio = values[..., -1] / np.where(nothing, 1, low)
         total = total + np.where(nothing, np.inf, 0.5 * np.log(np.where(nothing, 1, ratio)))
-    return Map(s, phi, condition, weakest * np.sign(largest), np.exp(total / len(added)))
+    return Map(s, phi, condition, weakest * np.sign(largest), np.exp(total / len(added)), curve)
 
 
 def candidates_of(spec: FitSpec, study: Study) -> Candidates:
     """The presses of the [design] section; left out: first to last ring, half to full depth.
 
     From ring to ring as far as all of the tool lies on the tube; of deforming cross-sections at
-    every angle that was measured.
+    every angle that was measured; on every specimen that has unknowns of its own.
 
     Raises:
-        SpecError: positions outside the tube or where the tool reaches beyond its ends, angles or
-            depths that the model does not have, or unknowns that a new curve would not share.
+        SpecError: positions outside the tube or where the tool reaches beyond its ends, depths of
+            more than its radius, angles that the model does not have, or unknowns that a new curve
+            would not share.
     """
     try:
         check(study)
@@ -398,13 +468,15 @@ def candidates_of(spec: FitSpec, study: Study) -> Candidates:
     depth = (0.5 * deepest, deepest) if section.depth is None else section.depth
     sections = study.model.options.deforms_sections
     radius = float(study.model.geometry.radius)
-    if sections and depth[1] > radius:
+    # Without a skeleton the specimen need not be a tube.
+    limited = section.depth is not None and study.model.options.coupling == "series"
+    if (sections or limited) and depth[1] > radius:
         raise SpecError(
-            f"design.depth: {depth[1]:g} mm, this model presses no deeper than the radius, "
-            f"{radius:g} mm; give less"
+            f"design.depth: {depth[1]:g} mm, a tube is pressed no deeper than its radius, expected "
+            f"at most {radius:g} mm; give less (trachea.radius is that of the tube)"
         )
     count = (_FEW if sections else _MANY) if section.candidates is None else section.candidates
-    return grid(s, depth, count, _angles(section.phi, study))
+    return grid(s, depth, count, _angles(section.phi, study), pressed_curves(study))
 
 
 def _angles(asked: tuple[float, ...] | None, study: Study) -> list[float]:

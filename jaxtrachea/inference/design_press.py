@@ -1,9 +1,19 @@
-"""Unknowns that a further press shares with the curves at hand, and those that it brings itself."""
+"""A further press: its unknowns, shared with the curves at hand or its own, and its information."""
 
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
+from jaxtrachea._numerics import full_precision
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.residual import force_jacobian
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.optimisation.programs import program
+
+#: Presses of deforming cross-sections that are computed at a time.
+_TOGETHER = 16
 
 
 def of_a_new_press(
@@ -39,17 +49,104 @@ def _as_many(shared: np.ndarray) -> np.ndarray:
 
 
 def marginal(
-    information: Float[np.ndarray, "G *c P P"], kept: Int[np.ndarray, "G Q"]
-) -> Float[np.ndarray, "G *c Q Q"]:
-    """Information (G, ..., P, P) on the unknowns `kept` (G, Q), all others eliminated."""
-    size = information.shape[-1]
+    bread: Float[np.ndarray, "G *c P P"],
+    meat: Float[np.ndarray, "G *c P P"],
+    kept: Int[np.ndarray, "G Q"],
+) -> tuple[Float[np.ndarray, "G *c Q Q"], Float[np.ndarray, "G *c Q Q"]]:
+    """Bread and meat of the unknowns `kept`, all others eliminated: the same covariance of them.
+
+    The bread is the Schur complement A - C^T D^-1 C, the meat T B T^T with T = (1, -C^T D^-1).
+    """
+    size = bread.shape[-1]
     if kept.shape[1] == size:
-        return information
+        return bread, meat
     parts = []
-    for matrix, rows in zip(information, kept, strict=True):
+    for A, B, rows in zip(bread, meat, kept, strict=True):
         others = np.setdiff1d(np.arange(size), rows)
-        cross = matrix[..., others[:, None], rows[None]]
-        inner = np.linalg.solve(matrix[..., others[:, None], others[None]], cross)
-        outer = np.swapaxes(cross, -1, -2) @ inner
-        parts.append(matrix[..., rows[:, None], rows[None]] - outer)
-    return np.stack(parts)
+        order = np.concatenate([rows, others])
+        cross = A[..., others[:, None], rows[None]]
+        inner = np.linalg.solve(A[..., others[:, None], others[None]], cross)
+        inner = np.swapaxes(inner, -1, -2)
+        one = np.broadcast_to(np.eye(len(rows)), (*inner.shape[:-1], len(rows)))
+        T = np.concatenate([one, -inner], axis=-1)
+        outer = T @ B[..., order[:, None], order[None]] @ np.swapaxes(T, -1, -2)
+        parts.append((A[..., rows[:, None], rows[None]] - inner @ cross, outer))
+    return np.stack([A for A, _ in parts]), np.stack([B for _, B in parts])
+
+
+def index_of_presses(study: Study, lane: int, curve: Int[np.ndarray, " C"]):
+    """Which unknowns presses on the specimens of some curves read; (C, J).
+
+    Their own are those of the first trial, as in `of_a_new_press`.
+    """
+    index = np.array(study.lanes.index[lane])[curve]
+    own = [j for j in study.free_columns if study.parameters[j].scope == "trial"]
+    index[:, own] = np.asarray(study.lanes.index[lane, 0])[own]
+    return index
+
+
+class Guess(NamedTuple):
+    """Unknowns of a guess, and what a press has beside them.
+
+    Attributes:
+        theta: scaled coordinates; (P,).
+        value: of all parameters, see `Lane`; (J,).
+        blend: as `force_jacobian`.
+    """
+
+    theta: Float[Array, " P"]
+    value: Any
+    blend: Float[Array, ""] | None
+
+
+class Place(NamedTuple):
+    """A press, or with a leading axis many.
+
+    Attributes:
+        s: contact position, mm.
+        depth: largest tool displacement, mm.
+        phi: contact angle, rad; None: on the midline.
+        index: which unknown every parameter reads, see `Lane`; (J,).
+    """
+
+    s: Any
+    depth: Any
+    phi: Any
+    index: Any
+
+
+def press_informations(
+    study: Study, samples: int, guess: Guess, places: Place
+) -> Float[np.ndarray, "C P P"]:
+    """Information of presses with noise of 1 N; of deforming cross-sections so many at a time.
+
+    Each is a path of its own there, and all together would take the memory.
+    """
+    sides = study.lanes.side_force is not None
+    run = program(_information, study.model, samples, sides, axes=(None, 0))
+    count = len(places.s)
+    together = _TOGETHER if study.model.options.deforms_sections else count
+    parts = []
+    for first in range(0, count, together):
+        row = np.minimum(np.arange(first, first + together), count - 1)
+        place = Place(*(None if v is None else jnp.asarray(v[row]) for v in places))
+        parts.append(np.array(run(guess, place))[: count - first])
+    return np.concatenate(parts)
+
+
+@full_precision
+def _information(model: FitModel, samples: int, sides: bool, guess: Guess, place: Place):
+    """Information of one press with noise of 1 N on the unknowns; (P, P).
+
+    `sides`: whether it observes the side force.
+    """
+    theta, value, blend = guess
+    displacement = place.depth * jnp.arange(1, samples + 1, dtype=theta.dtype) / samples
+    index = place.index[jnp.array(model.free_columns)]
+    free = jnp.where(index >= 0, theta[jnp.maximum(index, 0)], 0)
+    J = force_jacobian(model, free, value, place.s, displacement, blend, place.phi)
+    J = J if sides else J[:, :samples]
+    at = jnp.where(index >= 0, index, len(theta))
+    zero = jnp.zeros((len(theta), len(theta)), theta.dtype)
+    gram = jnp.einsum("im,jm->ij", J, J)
+    return zero.at[at[:, None], at[None]].add(gram, mode="drop")

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxtrachea.config import SpecError
 from jaxtrachea.fitting.result import unknown_label
+from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.analysis import (
     Analysis,
     Cells,
@@ -23,10 +24,13 @@ from jaxtrachea.inference.design import (
     Map,
     Situation,
     candidates_of,
+    extrapolation,
     gains,
     identifiability,
     next_points,
+    pressed_specimen,
     scores,
+    scores_after,
     situation,
 )
 
@@ -40,7 +44,7 @@ class Design:
         at: candidates.
         added: what each would tell.
         choice: those chosen.
-        charts: identifiability along the tube, at every angle.
+        charts: identifiability along the tube, at every angle, on the specimen of the first press.
         unknowns: names of what a new press shares.
     """
 
@@ -69,7 +73,9 @@ def _compute(request: Request, findings: Findings, progress: Progress) -> Design
     choice = next_points(known, at, section.points, section.criterion, added)
     s = np.linspace(at.s.min(), at.s.max(), 121)
     angles = [0.0] if at.phi is None else np.unique(at.phi).tolist()
-    charts = [identifiability(known, s, float(at.depth.max()), phi) for phi in angles]
+    curve = 0 if at.curve is None else int(at.curve[choice.chosen[0]])
+    deepest = float(at.depth.max())
+    charts = [identifiability(known, s, deepest, phi, curve) for phi in angles]
     return Design(known, at, added, choice, charts, names(known, findings.result))
 
 
@@ -80,45 +86,60 @@ def names(known: Situation, result) -> list[str]:
     return [unknown_label(result, lane, int(i)) for i in known.kept[0] if i < count]
 
 
-def choice_rows(choice: Choice, at: Candidates, unknowns: list[str]) -> Iterator[Cells]:
+def choice_rows(found: Design) -> Iterator[dict[str, object]]:
     """One row before any press, then one per press chosen, with the errors expected after it."""
-    for step, error in enumerate(choice.error):
-        k = int(choice.chosen[step - 1])
-        place: Cells = _place(at, k)
+    at, study = found.at, found.known.study
+    names = _specimens(study, at)
+    for step, error in enumerate(found.choice.error):
+        k = int(found.choice.chosen[step - 1])
+        place = _place(at, k, names)
         place = place if step else dict.fromkeys(place, "")
-        pairs = zip(unknowns, error, strict=False)
-        yield {"press": step, **place} | {f"{name} relative se": float(e) for name, e in pairs}
+        pairs = zip(found.unknowns, error, strict=False)
+        errors = {f"{name} relative se": float(e) for name, e in pairs}
+        message = extrapolation(study, float(at.depth[k])) if step else ""
+        yield {"press": step, **place, **errors, "message": message}
 
 
-def _place(at: Candidates, k: int) -> dict[str, object]:
-    """Where a candidate is; its angle only where some candidate has one."""
+def _specimens(study: Study, at: Candidates) -> dict[int, str]:
+    """Name of the specimen that is pressed, by its curve."""
+    curves = [0] if at.curve is None else np.unique(at.curve).tolist()
+    return {curve: pressed_specimen(study, curve) for curve in curves}
+
+
+def _place(at: Candidates, k: int, names: dict[int, str]) -> dict[str, object]:
+    """Where a candidate is, on which specimen; its angle only where some candidate has one."""
     turned = {} if at.phi is None else {"phi_deg": float(np.degrees(at.phi[k]))}
-    return {"s_mm": float(at.s[k]), **turned, "depth_mm": float(at.depth[k])}
+    specimen = names[0 if at.curve is None else int(at.curve[k])]
+    return {"specimen": specimen, "s_mm": float(at.s[k]), **turned, "depth_mm": float(at.depth[k])}
 
 
 def candidate_rows(known: Situation, added: np.ndarray, at: Candidates) -> Iterator[Cells]:
     """One row per candidate: what it would gain by every criterion, as a first further press."""
+    names = _specimens(known.study, at)
     criteria: tuple[Criterion, ...] = ("D", "A", "E")
-    now = {c: float(scores(known.base[:, None], c)[0]) for c in criteria}
-    then = {c: scores(known.base[:, None] + added, c) for c in criteria}
+    before = known.base[:, None], known.meat[:, None]
+    now = {c: float(scores(*before, c)[0]) for c in criteria}
+    then = {c: scores_after(known, added, c) for c in criteria}
     for k in range(len(at.s)):
         gain = {f"gain_{c}": float(then[c][k]) - now[c] for c in criteria}
-        yield _place(at, k) | gain
+        yield _place(at, k, names) | gain
 
 
-def map_rows(charts: list[Map], unknowns: list[str], *, turned: bool) -> Iterator[Cells]:
+def map_rows(design: Design) -> Iterator[Cells]:
     """One row per angle and position: condition, weakest combination, best partner from scratch."""
-    for found in charts:
-        yield from _chart_rows(found, unknowns, turned=turned)
+    for found in design.charts:
+        yield from _chart_rows(design, found)
 
 
-def _chart_rows(found: Map, unknowns: list[str], *, turned: bool) -> Iterator[Cells]:
-    """`map_rows` of one angle, which is named if `turned`."""
+def _chart_rows(design: Design, found: Map) -> Iterator[Cells]:
+    """`map_rows` of one angle, which is named where some candidate has one."""
     partner = np.argmin(found.pairs, axis=1)
-    angle = {"phi_deg": float(np.degrees(found.phi))} if turned else {}
+    angle = {} if design.at.phi is None else {"phi_deg": float(np.degrees(found.phi))}
+    specimen = pressed_specimen(design.known.study, found.curve)
     for i, s in enumerate(found.s):
-        parts = zip(unknowns, found.weakest[i], strict=False)
+        parts = zip(design.unknowns, found.weakest[i], strict=False)
         yield {
+            "specimen": specimen,
             "s_mm": float(s),
             **angle,
             "condition": float(found.condition[i]),
@@ -128,21 +149,24 @@ def _chart_rows(found: Map, unknowns: list[str], *, turned: bool) -> Iterator[Ce
 
 
 def _tables(found: Design):
-    turned = found.at.phi is not None
     return {
-        "next_points.csv": choice_rows(found.choice, found.at, found.unknowns),
+        "next_points.csv": choice_rows(found),
         "candidates.csv": candidate_rows(found.known, found.added, found.at),
-        "identifiability.csv": map_rows(found.charts, found.unknowns, turned=turned),
+        "identifiability.csv": map_rows(found),
     }
 
 
-def _shown(found: Design, lanes: list[int]) -> Iterator[Table]:
-    rows = list(choice_rows(found.choice, found.at, found.unknowns))
+def _shown(found: Design, lanes: list[int]) -> Iterator[Table | str]:
+    rows = list(choice_rows(found))
+    messages = [str(row.pop("message")) for row in rows]
     errors = [k.removesuffix(" relative se") for k in rows[0] if k.endswith(" relative se")]
     turned = [] if found.at.phi is None else ["phi [deg]"]
-    head = ["press", "s [mm]", *turned, "depth [mm]", *errors]
+    head = ["press", "specimen", "s [mm]", *turned, "depth [mm]", *errors]
     cells = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows]
-    yield "Next presses, relative errors expected after each", head, cells
+    yield "Next presses, relative standard errors that fit would report after each", head, cells
+    for step, message in enumerate(messages):
+        if message:
+            yield f"Press {step}: {message}"
 
 
 def draw_design(design: Design):
@@ -170,14 +194,21 @@ def draw_design(design: Design):
     where = f", phi = {_degrees(found.phi)}" if several else ""
     middle.set(xlabel="s [mm]", ylabel="s [mm]", title=f"two presses, no other data{where}")
     angles = np.zeros(len(at.s)) if at.phi is None else at.phi
-    for phi, depth in sorted(set(zip(angles.tolist(), at.depth.tolist(), strict=True))):
-        own = (at.depth == depth) & (angles == phi)
+    curves = np.zeros(len(at.s), int) if at.curve is None else at.curve
+    # Of many specimens those that are pressed.
+    pressed = np.isin(curves, curves[choice.chosen])
+    keys = zip(curves[pressed].tolist(), angles[pressed].tolist(), at.depth[pressed].tolist(),
+               strict=True)  # fmt: skip
+    for curve, phi, depth in sorted(set(keys)):
+        own = (at.depth == depth) & (angles == phi) & (curves == curve)
         label = f"{depth:.3g} mm" + (f", {_degrees(phi)}" if several else "")
+        if at.curve is not None:
+            label += f", {pressed_specimen(design.known.study, curve)}"
         right.plot(at.s[own], choice.score[0, own], lw=1, label=label)
     for k in np.unique(choice.chosen):
         order = ", ".join(str(step + 1) for step in np.flatnonzero(choice.chosen == k))
         right.annotate(order, (at.s[k], choice.score[0, k]), color="tab:red")
-    right.legend(title="depth", fontsize="x-small" if several else None)
+    right.legend(title="depth", fontsize="x-small" if several or at.curve is not None else None)
     right.set(xlabel="s [mm]", ylabel="criterion", title="first press; chosen in order")
     return figure
 
