@@ -1,9 +1,10 @@
-"""Whole commands against an earlier checkout. Run: python tests/bench/against.py FOLDER.
+"""Whole commands against an earlier checkout.
 
+Run: python tests/bench/against.py FOLDER [COMMAND ...].
 Both on the same specification (that of the earlier one) and the same measurements, in turns, each
 command in a process of its own. Cold: with an empty folder for compiled programs; warm: with what
 the cold start left. The cohort of `cohort.py` is read from the file format that each writes by
-itself: schema 1 then, schema 2 now.
+itself: schema 1 then, schema 2 now. COMMAND: fit, simulate, cohort, selfcheck; all unless told otherwise.
 """
 
 import os
@@ -59,20 +60,22 @@ def cases(earlier: Path, base: Path) -> dict[str, tuple[int, tuple[str, ...], di
     return {
         "fit": (TURNS, ("cold", "warm"), dict.fromkeys(both, fit)),
         "simulate": (TURNS, ("cold", "warm"), dict.fromkeys(both, simulate)),
-        "fit, 10,000 specimens": (1, ("",), cohort),
+        "cohort": (1, ("",), cohort),
         "selfcheck": (1, ("cold",), dict.fromkeys(both, ["selfcheck"])),
     }
 
 
 def main() -> None:
     """Time all in turns and write the results."""
-    earlier = Path(sys.argv[1]).resolve()
+    earlier, asked = Path(sys.argv[1]).resolve(), sys.argv[2:]
     out = common.Writer("against")
     log = ["git", "-C", str(earlier), "log", "-1", "--format=%h"]
     out.rows[0]["earlier"] = subprocess.check_output(log, text=True).strip()
-    with tempfile.TemporaryDirectory() as name:
-        base = Path(name)
+    with tempfile.TemporaryDirectory() as folder:
+        base = Path(folder)
         for command, (turns, starts, words) in cases(earlier, base).items():
+            if asked and command not in asked:
+                continue
             found: dict[tuple[str, str], list[dict[str, float]]] = {}
             for turn in range(turns):
                 for checkout, said in words.items():
@@ -83,7 +86,8 @@ def main() -> None:
                         taken = run(checkout, said, cache, place)
                         found.setdefault((start, which), []).append(taken)
             for (start, which), taken in found.items():
-                case = f"jaxtrachea {command}" + f", {start}" * bool(start)
+                name = {"cohort": "fit, 10,000 specimens"}.get(command, command)
+                case = f"jaxtrachea {name}" + f", {start}" * bool(start)
                 wall, processor = ([t[k] for t in taken] for k in ("wall", "processor"))
                 out.add(which, case, wall, processor=[round(s, 2) for s in processor])
             out.write()

@@ -184,8 +184,8 @@ AGAINST_GOALS = (
 )
 AGAINST = """\
 `python tests/bench/against.py FOLDER`: commands of a checkout of {earlier}, from before these
-benchmarks had goals, and of today in turns, on the same specification and measurements; fits and
-scenes three times, the others once. The model of the fit is that of {earlier} (no width of the
+benchmarks had goals, and of today in turns, on the same specification and measurements; fit and
+simulate three times, the others once. The model of the fit is that of {earlier} (no width of the
 punch). Each selfcheck runs the table of its commit.
 """
 GROWTH = """\
