@@ -4,7 +4,8 @@ Run: python tests/bench/against.py FOLDER [COMMAND ...].
 Both on the same specification (that of the earlier one) and the same measurements, in turns, each
 command in a process of its own. Cold: with an empty folder for compiled programs; warm: with what
 the cold start left. The cohort of `cohort.py` is read from the file format that each writes by
-itself: schema 1 then, schema 2 now. COMMAND: fit, simulate, cohort, selfcheck; all unless told otherwise.
+itself: schema 1 then, schema 2 now. COMMAND: fit, simulate, cohort, selfcheck; all unless told
+otherwise.
 """
 
 import os
@@ -22,7 +23,13 @@ from cohort import DEPTHS, SPECIMENS, SPOTS
 from jaxtrachea.measurements.read import Measurements, write_hdf5
 
 NOW = common.FOLDER.parents[1]
-TURNS = 3
+#: Turns and starts of each command.
+COMMANDS = {
+    "fit": (3, ("cold", "warm")),
+    "simulate": (3, ("cold", "warm")),
+    "cohort": (1, ("",)),
+    "selfcheck": (1, ("cold",)),
+}
 
 
 def run(checkout: Path, words: list[str], cache: Path, place: Path) -> dict[str, float]:
@@ -43,26 +50,30 @@ def run(checkout: Path, words: list[str], cache: Path, place: Path) -> dict[str,
     return {"wall": wall, "processor": processor}
 
 
-def cases(earlier: Path, base: Path) -> dict[str, tuple[int, tuple[str, ...], dict]]:
-    """By command: turns, starts, and its words by checkout."""
+def cohort(earlier: Path, base: Path) -> dict[Path, list[str]]:
+    """Words of a fit of 10,000 specimens by checkout, each with its file."""
     study, *_ = fitting.make_study(SPECIMENS, SPOTS, DEPTHS)
     curves = tuple(curve for lane in study.curves for curve in lane)
-    cohort = {}
+    words = {}
     for checkout, version in ((earlier, 1), (NOW, 2)):
         folder = base / f"cohort_{version}"
         folder.mkdir()
         write_hdf5(folder / "c.h5", Measurements(curves, (), ()), schema_version=version)
         (folder / "spec.toml").write_text('[data]\nfiles = ["c.h5"]\n')
-        cohort[checkout] = ["fit", str(folder / "spec.toml"), "--out", "out"]
-    both = (earlier, NOW)
-    fit = ["fit", str(earlier / "fits" / "virtual_trachea" / "fit.toml"), "--out", "out"]
-    simulate = ["simulate", str(earlier / "configs" / "normal.toml"), "--out", "out"]
-    return {
-        "fit": (TURNS, ("cold", "warm"), dict.fromkeys(both, fit)),
-        "simulate": (TURNS, ("cold", "warm"), dict.fromkeys(both, simulate)),
-        "cohort": (1, ("",), cohort),
-        "selfcheck": (1, ("cold",), dict.fromkeys(both, ["selfcheck"])),
+        words[checkout] = ["fit", str(folder / "spec.toml"), "--out", "out"]
+    return words
+
+
+def words_of(command: str, earlier: Path, base: Path) -> dict[Path, list[str]]:
+    """Words of a command by checkout."""
+    if command == "cohort":
+        return cohort(earlier, base)
+    words = {
+        "fit": ["fit", str(earlier / "fits" / "virtual_trachea" / "fit.toml"), "--out", "out"],
+        "simulate": ["simulate", str(earlier / "configs" / "normal.toml"), "--out", "out"],
+        "selfcheck": ["selfcheck"],
     }
+    return dict.fromkeys((earlier, NOW), words[command])
 
 
 def main() -> None:
@@ -73,9 +84,9 @@ def main() -> None:
     out.rows[0]["earlier"] = subprocess.check_output(log, text=True).strip()
     with tempfile.TemporaryDirectory() as folder:
         base = Path(folder)
-        for command, (turns, starts, words) in cases(earlier, base).items():
-            if asked and command not in asked:
-                continue
+        for command in asked or COMMANDS:
+            turns, starts = COMMANDS[command]
+            words = words_of(command, earlier, base)
             found: dict[tuple[str, str], list[dict[str, float]]] = {}
             for turn in range(turns):
                 for checkout, said in words.items():
