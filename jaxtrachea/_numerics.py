@@ -97,6 +97,19 @@ def _scaled_jvp(primals, tangents):
 
 
 @jax.custom_jvp
+def quotient(v: Float[Array, "..."], divisor: Float[Array, "..."]) -> Float[Array, "..."]:
+    """V / divisor, of one shape; where v is no number it says nothing of the divisor: `scaled`."""
+    return v / divisor
+
+
+@quotient.defjvp
+def _quotient_jvp(primals, tangents):
+    (v, divisor), (d_v, d_divisor) = primals, tangents
+    share = jnp.where(jnp.isfinite(v), v, 0) / divisor
+    return v / divisor, (d_v - share * d_divisor) / divisor
+
+
+@jax.custom_jvp
 def product_of_rows(rows: Float[Array, "*rows k"], b: Float[Array, "k ..."]) -> Float[Array, "..."]:
     """`product`, of which rows that are no numbers say nothing of b's derivative: see `scaled`."""
     return product(rows, b)

@@ -174,7 +174,7 @@ INNER = {
     "mechanics.compliance.divide_load", "mechanics.reactions.deflect_dense",
     "mechanics.beam.deflect_on",
     "mechanics.skeleton.respond", "mechanics.skeleton.read_values",
-    "mechanics.energy.gradient", "mechanics.skeleton.turned_rings",
+    "mechanics.energy.gradient", "mechanics.skeleton.turned_rings", "fitting.noise.normal_psi2",
 }  # fmt: skip
 
 

@@ -69,7 +69,7 @@ def make_study(name, weighting=Weighting()):
             moved[1, 2] = np.nan
             seen = {"joint_rings": np.array([1, 6, 9]), "joint_displacement": moved}
         sigma = rng.uniform(0.5, 2.0, n) if i % 2 else None
-        D, F = np.linspace(-0.2, 5.0, n), rng.normal(size=n)
+        D, F = np.linspace(-0.2, 5.0, n), np.abs(rng.normal(size=n))
         found.append(Curve(f"s{i // 3}", f"t{i}", s, 0.0, D, F, sigma=sigma, **seen))
     named = ("k_3_ring", *changes)
     parameters = default_parameters(in_model(options, joints=markers, named=named), changes)

@@ -375,11 +375,17 @@ def test_a_choice_can_be_shown():
     repeat = Cost(1e-5, 0.9, 0.87, 0.94)
     end = measuring.environment(measuring.Settings(), Load())
     row = measuring.choice_row("small", choice, repeat, end)
-    ((*_, error, cost, operations, time, calls, share),) = choice_rows(
-        [json.loads(json.dumps(row))]
-    )
+    recorded = json.loads(json.dumps(row))
+    ((*_, error, cost, operations, time, calls, share, alike),) = choice_rows([recorded])
     assert (time, calls) == ("90 % (87 to 94)", "9 / 10")
     assert float(share) == pytest.approx(0.9 / row["operations"], abs=0.005)
+    assert alike == share  # nothing is float32
+    again = recorded | {"tolerance": 0.01}
+    ((_, both, *_),) = choice_rows([recorded, again])  # equal plans are one row
+    assert both == "10 %, 1 %"
+    half = recorded | {"dropped": [{"ladder": "dtype", "level": "float32", "error": 1e-7}]}
+    ((*_, share, alike),) = choice_rows([half])
+    assert float(alike) == pytest.approx(float(share) / 2, abs=0.006)
     assert float(error.removesuffix(" %")) <= 10
     assert cost == operations
     assert float(cost.removesuffix(" %")) < 100

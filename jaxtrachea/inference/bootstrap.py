@@ -105,6 +105,7 @@ def bootstrap(
         ValueError: no `FitResult` or `Settings`, too few replicates, an impossible block (longer
             than the shortest curve), or a joint study.
     """
+    check_word("kind", kind, Kind)
     check_word("result", result, FitResult)
     check_word("settings", settings, Settings)
     _check(count, kind, block)
@@ -130,7 +131,6 @@ def bootstrap(
 
 
 def _check(count, kind, block) -> None:
-    check_word("kind", kind, Kind)
     if count < FEWEST:
         raise ValueError(f"count is {count}; expected at least {FEWEST} for a 95 % interval")
     if block < 1 or (block > 1 and kind == "parametric"):

@@ -345,6 +345,7 @@ def scores_after(
     known: Situation, added: Float[np.ndarray, "G C Q Q"], criterion: Criterion
 ) -> Float[np.ndarray, " C"]:
     """`scores` after a press at every candidate, so many at a time that they take no memory."""
+    check_word("criterion", criterion, Criterion)
     guesses, count, size, _ = added.shape
     together = max(_NUMBERS // max(guesses * size * size, 1), 1)
     parts = []

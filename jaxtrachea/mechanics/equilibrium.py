@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxtrachea._numerics import quotient
 from jaxtrachea.mechanics.force_law import Law, fold_depth
 from jaxtrachea.mechanics.softening import Softening, soft_series
 from jaxtrachea.status import PressStatus
@@ -66,9 +67,9 @@ def press_softening(
     """
     solved = soft_series(displacement, compliance, law, softening)
     status = status_of(displacement, solved.depth + solved.force, solved.folded)
-    found = jnp.isfinite(solved.force)  # of other rows 0 times NaN would reach what all share
-    force, deflection = (jnp.where(found, v, 0) for v in (solved.force, solved.deflection))
-    load = jnp.where(found, force / softening.ratio(deflection), jnp.nan)
+    # Of a row without a solution 0 times NaN would reach what all share.
+    deflection = jnp.where(jnp.isfinite(solved.force), solved.deflection, 0)
+    load = quotient(solved.force, softening.ratio(deflection))
     return Equilibrium(solved.depth, solved.force, status, load)
 
 

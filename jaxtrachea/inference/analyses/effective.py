@@ -5,11 +5,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.inference.analyses.misfit import MISFIT
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
 from jaxtrachea.inference.effective import CORRELATED, Effective, effective
+from jaxtrachea.inference.misfit import misfit
 
 
-def _compute(request: Request | None, findings: Findings, progress: Progress) -> Effective:
+def _compute(request: Request, findings: Findings, progress: Progress) -> Effective:
     return effective(findings.result, findings.prediction, findings.profiles)
 
 
@@ -81,6 +83,7 @@ EFFECTIVE = Analysis(
 
 
 def widened(result: FitResult) -> Findings:
-    """A fit with this analysis alone, which every table of lanes has."""
+    """A fit with the analyses that every table of lanes has, and no others."""
     plain = Findings(result)
-    return Findings(result, ((EFFECTIVE, _compute(None, plain, lambda done, of: None)),))
+    wide = effective(result, plain.prediction, plain.profiles)
+    return Findings(result, ((EFFECTIVE, wide), (MISFIT, misfit(result, plain.prediction))))

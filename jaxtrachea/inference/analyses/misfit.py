@@ -8,7 +8,7 @@ from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, R
 from jaxtrachea.inference.misfit import Misfit, misfit
 
 
-def _compute(request: Request | None, findings: Findings, progress: Progress) -> Misfit:
+def _compute(request: Request, findings: Findings, progress: Progress) -> Misfit:
     return misfit(findings.result, findings.prediction)
 
 
