@@ -26,8 +26,8 @@ from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import unknown_label, verdict_of
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
+from jaxtrachea.inference.analyses import widened
 from jaxtrachea.inference.analyses.cross_validation import LEFT_OUT, left_out_table
-from jaxtrachea.inference.analyses.effective import widened
 from jaxtrachea.inference.analyses.influence import (
     INFLUENCE,
     REASONS,

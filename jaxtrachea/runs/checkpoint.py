@@ -13,7 +13,7 @@ from jaxtrachea.files.tables import write_csv
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.inference.analyses.effective import widened
+from jaxtrachea.inference.analyses import widened
 from jaxtrachea.results.hdf5 import read_hdf5
 from jaxtrachea.results.rows import summary_rows
 from jaxtrachea.runs.folder import NoRun, RunFolder, digest

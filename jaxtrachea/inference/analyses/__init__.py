@@ -6,7 +6,11 @@ from collections.abc import Callable, Iterable
 
 from jaxtrachea.config import SpecError
 from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.inference.analyses.effective import EFFECTIVE
+from jaxtrachea.inference.analyses.misfit import MISFIT
 from jaxtrachea.inference.analysis import Analysis, Findings, Progress, Request, Unavailable
+from jaxtrachea.inference.effective import effective
+from jaxtrachea.inference.misfit import misfit
 
 
 def in_order(analyses: Iterable[Analysis]) -> tuple[Analysis, ...]:
@@ -99,3 +103,10 @@ def analyse(
             unavailable[analysis.name] = str(error)
         findings = Findings(result, found, unavailable)
     return findings
+
+
+def widened(result: FitResult) -> Findings:
+    """A fit with the analyses that every table of lanes has, and no others."""
+    plain = Findings(result)
+    wide = effective(result, plain.prediction, plain.profiles)
+    return Findings(result, ((EFFECTIVE, wide), (MISFIT, misfit(result, plain.prediction))))

@@ -4,11 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.inference.analyses.misfit import MISFIT
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
 from jaxtrachea.inference.effective import CORRELATED, Effective, effective
-from jaxtrachea.inference.misfit import misfit
 
 
 def _compute(request: Request, findings: Findings, progress: Progress) -> Effective:
@@ -80,10 +77,3 @@ EFFECTIVE = Analysis(
     section=_section,
     shown=_shown,
 )
-
-
-def widened(result: FitResult) -> Findings:
-    """A fit with the analyses that every table of lanes has, and no others."""
-    plain = Findings(result)
-    wide = effective(result, plain.prediction, plain.profiles)
-    return Findings(result, ((EFFECTIVE, wide), (MISFIT, misfit(result, plain.prediction))))
