@@ -116,21 +116,19 @@ def nearest_rotation(
         otherwise: taken where the determinant is below `TURNED_OVER`: the two rotations are nearly
             half a turn apart, and hardly any rotation is nearer to their mean than others.
     """
-    rows = matrix
-    for step in range(5):
-        x, y, z = rows
+    x, y, z = matrix
+    known = total(x * _cross(y, z)) > TURNED_OVER
+    found = jnp.where(known, matrix, otherwise)
+    for _ in range(5):
+        x, y, z = found
         cofactors = jnp.stack([_cross(y, z), _cross(z, x), _cross(x, y)])
-        determinant = total(x * cofactors[0])
-        if step == 0:
-            known = determinant > TURNED_OVER
-        rows = (rows + cofactors / jnp.where(known, determinant, 1)) / 2
-        rows = jnp.where(known, rows, otherwise) if step == 4 else rows
-    return rows
+        found = (found + cofactors / total(x * cofactors[0])) / 2
+    return jnp.where(known, found, otherwise)
 
 
-def _cross(a, b):
+def _cross(v, w):
     """Cross product of two vectors, written out."""
-    (a, b, c), (d, e, f) = a, b
+    (a, b, c), (d, e, f) = v, w
     return jnp.stack([b * f - c * e, c * d - a * f, a * e - b * d])
 
 

@@ -56,11 +56,9 @@ def misfit(result: FitResult, seen: Prediction) -> Misfit:
     total, square = np.asarray(result.samples, float), np.nansum(size**2, axis=1)
     if study.joint:
         alive, held = result.succeeded, result.at_bound | (lanes.active <= 0)
-        unknowns = np.full(len(count), unknown_count(study, alive) - held_count(study, held, alive))
-        count, total, square = (
-            np.full(len(count), np.sum(v[alive])) for v in (count, total, square)
-        )
-        size = np.broadcast_to(size[alive].reshape(1, -1), (len(count), size[alive].size))
+        unknowns = np.array([unknown_count(study, alive) - held_count(study, held, alive)])
+        count, total, square = (np.sum(v[alive], keepdims=True) for v in (count, total, square))
+        size = size[alive].reshape(1, -1)
     with np.errstate(invalid="ignore", divide="ignore"):
         left = count * (1 - unknowns / total)
         left = np.where(left > 0.5, left, np.nan)
@@ -72,4 +70,4 @@ def misfit(result: FitResult, seen: Prediction) -> Misfit:
         statistic = ratio**2 * left
         chance = np.minimum(chdtrc(left, statistic), chdtr(left, statistic))
         told = ((ratio > BEYOND) | (ratio < 1 / BEYOND)) & (chance < CHANCE)
-    return Misfit(result, ratio, told)
+    return Misfit(result, *(np.broadcast_to(v, (result.lanes,)) for v in (ratio, told)))

@@ -66,9 +66,9 @@ def make_scene(
     """
     check_path(path)
     check_material(geometry, material)
-    kinds = {"tool": Tool | Shape | None, "mesh": Mesh | None, "effects": EffectOptions}
-    for name, value in (("tool", tool), ("mesh", mesh), ("effects", effects)):
-        check_word(name, value, kinds[name])
+    check_word("tool", tool, Tool | Shape | None)
+    check_word("mesh", mesh, Mesh | None)
+    check_word("effects", effects, EffectOptions)
     if not len(path.s if isinstance(path, Presses) else path.translation):
         raise ValueError("path has no rows; expected at least one")
     tool = tool if isinstance(tool, Tool) else Tool(tool)

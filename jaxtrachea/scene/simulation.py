@@ -100,7 +100,7 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
 
     Raises:
         ValueError: the other kind of path, arrays of a wrong length, something missing that the
-            plan needs, or (outside of `jit`) matrices of the path that are no rotations.
+            plan needs, or (outside of `jit`) matrices of the path that are no rotations; no scene.
     """
     check_word("scene", scene, Scene)
     plan = scene.plan

@@ -1,7 +1,6 @@
 """Normal presses at many contact points."""
 
 import dataclasses
-import numbers
 from typing import NamedTuple
 
 import jax
@@ -73,8 +72,9 @@ def sweep(
     check_word("scene", scene, Scene)
     check_kind(scene, material)
     check_material(scene.geometry, material)
-    if not (isinstance(chunk, numbers.Integral) and chunk > 0):
-        raise ValueError(f"chunk is {chunk!r}; expected a whole number of points, 1 or more")
+    check_word("chunk", chunk, int)
+    if chunk < 1:
+        raise ValueError(f"chunk is {chunk}; expected a whole number of points, 1 or more")
     dtype = scene.geometry.length.dtype
     s = shaped("s", s, ("points",), dtype=dtype)
     phi, depth = (
