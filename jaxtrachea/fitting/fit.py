@@ -132,7 +132,6 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
     alive = solved.status <= FitStatus.STALLED
     gradient = summed_gradient(study, info, alive) if study.joint else info.gradient
     log, step = scales(study)
-    both = lanes.joints is None or study.noise_given[1]
     at_bound = (theta <= lanes.lower) & (gradient > 0)
     at_bound |= (theta >= lanes.upper) & (gradient < 0)
     present = lanes.active > 0
@@ -142,11 +141,10 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
     if study.joint:
         pool = marginal(study, pool, held, alive)
         unknowns = (unknowns or 0) - held_count(study, held, alive)
-    noise_given = study.noise_given[0] and both
     open_ = _open_directions(study, theta, structure)
     u = analyse(
         pool, relative, held,
-        noise_given=noise_given, least=normal_psi2(study.model.loss, study.model.loss_scale),
+        noise_given=study.noise_known, least=normal_psi2(study.model.loss, study.model.loss_scale),
         unknowns=unknowns, structural=open_,
     )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):

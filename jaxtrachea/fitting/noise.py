@@ -14,8 +14,7 @@ from jaxtrachea.fitting.study import Study
 def noise_rounds(study: Study) -> int:
     """Re-weightings: needed where an estimated sigma changes the estimate, not only its error."""
     both = study.lanes.joints is not None
-    estimated = not (study.noise_given[0] and (study.noise_given[1] or not both))
-    return 4 if estimated and (both or study.model.loss != "linear") else 0
+    return 4 if not study.noise_known and (both or study.model.loss != "linear") else 0
 
 
 def first_sigma(study: Study) -> np.ndarray:

@@ -96,6 +96,11 @@ class Study:
             )
 
     @property
+    def noise_known(self) -> bool:
+        """Whether the sigma of all that is observed is given."""
+        return self.noise_given[0] and (self.lanes.joints is None or self.noise_given[1])
+
+    @property
     def free(self) -> tuple[Parameter, ...]:
         """Parameters that are fitted, in column order."""
         return tuple(p for p in self.parameters if not p.fixed)

@@ -267,10 +267,8 @@ def _kappa(result: FitResult, lanes: Int[np.ndarray, " L"], info: Information) -
     study = result.study
     held = result.at_bound | (study.lanes.active == 0)
     dof = np.sum(info.counts, axis=1) - np.sum(~held[lanes], axis=1)
-    both = study.lanes.joints is None or study.noise_given[1]
     least = normal_psi2(study.model.loss, study.model.loss_scale)
-    given = study.noise_given[0] and both
-    return noise_factor(info, dof, noise_given=given, least=least)
+    return noise_factor(info, dof, noise_given=study.noise_known, least=least)
 
 
 def _prior(study: Study, lane: Int[np.ndarray, " G"], theta: Float[np.ndarray, "G P"]):

@@ -97,11 +97,10 @@ def effective(result: FitResult, seen: Prediction, profiles: Profiles | None = N
         P = unknown_count(study, alive) - held_count(study, held, alive)
         unknowns = np.full(len(n), float(P))
         n, worth = (np.full(len(n), np.nansum(v[alive])) for v in (n, worth))
-    given = study.noise_given[0] and (lanes.joints is None or study.noise_given[1])
     plain = result.uncertainty.half_width
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         left = worth - unknowns
-        if given:
+        if study.noise_known:
             factor, half = np.sqrt(np.maximum(n / worth, 1)), plain
         else:
             factor = np.where(left > 0, np.sqrt(np.maximum((n - unknowns) / left, 1)), np.inf)
