@@ -125,13 +125,13 @@ def test_the_whole_update_of_one_pose():
         [v for v in text.split("\n") if " call(" in v and 'inlineable="false"' in v]
         for text in (value, gradient)
     )
-    # The contact, the skeleton, shares and lines of the surface, what goes into the dent and where
-    # it reaches; in order: across the surface, and the dent's Cholesky factors. All but where the
-    # dent reaches have derivatives.
-    assert len(called) == 8
-    assert len(back) == 8 + 7
+    # The contact, the rotation of first touch, the skeleton, shares and lines of the surface, what
+    # goes into the dent and where it reaches; in order: across the surface, and the dent's Cholesky
+    # factors. All but where the dent reaches have derivatives.
+    assert len(called) == 9
+    assert len(back) == 9 + 8
     if version("jaxlib") in TESTED:
-        assert sum(ONE in v for v in called) == 6
+        assert sum(ONE in v for v in called) == 7
         # Of the same programs without one kernel for a part: 1,163, and with the gradient 1,834.
         assert count_kernels(value, inside=False)[0] <= MARGIN * 45
         assert count_kernels(gradient, inside=False)[0] <= MARGIN * 182

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxtrachea._in_order import one_kernel
 from jaxtrachea._numerics import product, product_of_rows, total
 from jaxtrachea.contact.patches import Touch
 from jaxtrachea.contact.pose import Pose, inverse, nearest_rotation, transform
@@ -96,10 +97,10 @@ def landing(scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""]) -> La
     chord = step - total(step * mean) / jnp.maximum(total(inward * mean), LEAST) * inward
     moved = share * chord - gap * inward
     way, frame = points - at_row(points, first)[None] + moved[None], _frame(scene, s)
-    rotation = nearest_rotation(mix(path.rotation), at_row(path.rotation, first))
+    turned = one_kernel(nearest_rotation)(mix(path.rotation), at_row(path.rotation, first))
     return Landing(
-        s=s, phi=phi, point=mix(seen.point), body=body, rotation=rotation,
-        translation=at_row(points, first) - moved - product(rotation, body), frame=frame,
+        s=s, phi=phi, point=mix(seen.point), body=body, rotation=turned,
+        translation=at_row(points, first) - moved - product(turned, body), frame=frame,
         way=way if frame is None else product(way, frame),
     )  # fmt: skip
 
