@@ -29,6 +29,7 @@ from jax import export
 from jax.core import Tracer
 
 import jaxtrachea
+from jaxtrachea._compiler import quick_options
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.files.programs import TRACED
 from jaxtrachea.files.provenance import installed, source_digest
@@ -67,6 +68,7 @@ class Traced:
         *static: Any,
         axes: Any = None,
         donate: tuple[int, ...] = (),
+        quick: bool = False,
         **named: Any,
     ):
         """Nothing is traced yet.
@@ -76,13 +78,15 @@ class Traced:
             static: its first arguments.
             axes: of the other arguments, as `in_axes` of `jax.vmap`; None: no `vmap`.
             donate: of the other arguments, as `donate_argnums` of `jax.jit`.
+            quick: compiled without optimisation; the trace is the same.
             named: static arguments by name.
         """
         self._name, self._donate = function.__name__, donate
         self._identity = (function, static, named, axes, donate)
         one = functools.partial(function, *static, **named)
         self._function = one if axes is None else jax.vmap(one, axes)
-        self._plain = jax.jit(self._function, donate_argnums=donate)
+        self._options = quick_options() if quick else None
+        self._plain = jax.jit(self._function, donate_argnums=donate, compiler_options=self._options)
         self._compiled: dict[Any, Callable] = {}
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
@@ -126,7 +130,8 @@ class Traced:
         flat = self._named(lambda *leaves: call(*leaves))
         # Compiled here: what an exported function returns is bound to its device, and `jax.jit`
         # would compile it once more when given that.
-        run = jax.jit(flat, donate_argnums=self._donated(given[0])).lower(*leaves).compile()
+        lowered = jax.jit(flat, donate_argnums=self._donated(given[0])).lower(*leaves)
+        run = lowered.compile(self._options)
 
         def compiled(*arguments, **named):
             return jax.tree.unflatten(structure, run(*jax.tree.leaves((arguments, named))))

@@ -106,12 +106,13 @@ def _scrutinised(result, minima: Minima, known: Structure, settings, progress) -
         batch = result.study.batch_size(max(result.lanes * settings.starts, 16), settings.batch)
         full = rows[np.arange(max(len(rows), batch)) % len(rows)]
         part = reduced(result.study.take(full), known.pinned[full])
-        solved, sigma = refit_with_noise(part, settings, None, minima.sigma[full], better[full])
+        one = dataclasses.replace(settings, starts=1)
+        solved, sigma = refit_with_noise(part, one, None, minima.sigma[full], better[full])
         solved = Solved(*(v[: len(rows)] for v in solved))
         sigma = sigma[: len(rows)]
-        one, none = np.ones(len(rows), int), np.zeros(0, int)
+        ones, none = np.ones(len(rows), int), np.zeros(0, int)
         moved = Minima(
-            solved, one, minima.tried[rows], sigma, none, np.zeros((0, part.size)), np.zeros(0)
+            solved, ones, minima.tried[rows], sigma, none, np.zeros((0, part.size)), np.zeros(0)
         )
         minima = minima.replaced(rows, moved)
         result = _conclude(result.study, minima, known)

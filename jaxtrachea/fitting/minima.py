@@ -140,23 +140,27 @@ def refit_with_sigma(study: Study, settings: Settings, theta, sigma) -> Solved:
     """Solved anew from near the minimum, with other noise."""
     if study.joint:
         return _solve_jointly(study, settings, theta, sigma, None, near=True)[0]
-    return _solve(study, settings, np.arange(len(theta)), theta, sigma, None)
+    # In the program of the first solve: one of another size takes longer to compile than to run.
+    together, lanes = len(theta) * settings.starts, np.arange(len(theta))
+    return _solve(study, settings, lanes, theta, sigma, None, together=together)
 
 
 def _solve_more(study, settings, sigma, progress, rows, starts) -> Solved:
     """Further starts of a few lanes; their batch does not depend on how many there are."""
     settings = dataclasses.replace(settings, batch=min(settings.batch, FEW))
-    fewest = study.batch_size(2, settings.batch)  # one alone would be another program
-    filled = np.arange(max(len(rows), min(fewest, 2))) % len(rows)
     alive = None if progress is None else lambda done, of: progress(0, of)
-    solved = _solve(study, settings, rows[filled], starts[filled], sigma, alive)
-    return Solved(*(v[: len(rows)] for v in solved))
+    return _solve(study, settings, rows, starts, sigma, alive, together=max(len(rows), FEW))
 
 
-def _solve(study: Study, settings: Settings, rows, starts, sigma, progress) -> Solved:
-    """Every start of lane `rows`; sigma of each lane."""
+def _solve(
+    study: Study, settings: Settings, rows, starts, sigma, progress, *, together: int | None = None
+) -> Solved:
+    """Every start of lane `rows`; sigma of each lane; `together`: starts that the batch is for."""
     common = _common(study, settings, len(rows), progress)
     if settings.method == "levenberg-marquardt":
+        together = len(rows) if together is None else together
+        common["batch"] = study.batch_size(together, settings.batch)
+        common["quick"] = study.quick(together)
         return levenberg_marquardt(
             LaneCost(study.model, study.lanes, sigma), starts, rows,
             tolerances=settings.tolerances, **common,

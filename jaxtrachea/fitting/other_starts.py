@@ -4,7 +4,6 @@ Where the local law and the skeleton share the softness of a curve otherwise (`s
 where another skeleton has nearly the same compliances at the contacts (`twins`).
 """
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -18,12 +17,11 @@ from jaxtrachea.fitting.starts import box
 from jaxtrachea.fitting.structure import positions
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import coefficient, power
-from jaxtrachea.optimisation.programs import program
 
 #: Indentation over skeleton deflection, and its inverse, of the two starts.
 SOFT = 19.0
-#: Lanes whose compliances are computed together.
-BATCH = 16
+#: Points at which compliances are computed together.
+BATCH = 256
 #: Skeletons with the same compliances: how many are tried, and the grid they are looked for on
 #: (half width in natural logarithms, points of each axis).
 TWINS, TWIN_REACH, TWIN_POINTS = 3, 9.0, 41
@@ -35,9 +33,11 @@ def soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     if not any(p.name in SKELETON for p in study.free) or study.model.options.coupling != "series":
         return []
     guess, low, high = box(study, 0.0)[0][lanes], study.lanes.lower, study.lanes.upper
-    compliance = _compliances(study, lanes, guess)
     data = study.lanes
     seen = data.precision[lanes] > 0
+    compliance = np.mean(
+        _compliance(study, lanes, guess, of=len(lanes)), axis=1, where=seen.any(axis=2)
+    )
     force = np.where(seen, np.abs(data.force[lanes]), 0)
     deepest = np.argmax(force, axis=2)[..., None]
     peak = np.take_along_axis(force, deepest, 2)[..., 0]
@@ -64,17 +64,12 @@ def soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     return out
 
 
-def _compliances(study: Study, lanes, theta) -> Float[np.ndarray, " n"]:
-    """Mean compliance of the observed trials, mm/N."""
-    observed = (study.lanes.precision[lanes] > 0).any(axis=2)
-    c = map_lanes(_felt_compliance, study, theta, batch=BATCH, rows=np.asarray(lanes))
-    return np.sum(c * observed, axis=1) / np.sum(observed, axis=1)
-
-
-def _compliance(study: Study, lane: int, theta) -> Float[np.ndarray, "n T"]:
-    """Compliance at every trial of a lane, mm/N, at many points."""
-    row = jax.tree.map(lambda v: v[lane], study.lanes)
-    return np.asarray(program(_felt_compliance, study.model, axes=(0, None))(theta, row))
+def _compliance(study: Study, rows, theta, *, of: int) -> Float[np.ndarray, "n T"]:
+    """Compliance at every trial of a lane, mm/N, at a point for each of `rows`; `of` many lanes."""
+    return map_lanes(
+        _felt_compliance, study, theta, batch=BATCH, rows=rows, quick=study.quick(of),
+        reads=("s_c", "value", "index"),  # without markers their motion is not asked for
+    )  # fmt: skip
 
 
 def _felt_compliance(model: FitModel, theta, lane: Lane):
@@ -104,7 +99,7 @@ def twins(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
         theta = np.repeat(best[None], len(mesh) + 1, axis=0)
         theta[1:, beam] = mesh
         observed = (study.lanes.precision[lane] > 0).any(axis=1)
-        c = _compliance(study, int(lane), theta)
+        c = _compliance(study, np.full(len(theta), lane), theta, of=len(lanes))
         with np.errstate(divide="ignore", invalid="ignore"):
             change = np.log(c[1:] / c[0])[:, observed]
         misfit = np.sum(change**2, axis=1).reshape(*map(len, axes))

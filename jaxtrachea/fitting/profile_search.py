@@ -54,6 +54,7 @@ class Sides:
         self.first = np.where(np.isfinite(self.first), self.first, 1.0)
         starts = result.lanes * settings.starts
         self.batch = result.study.batch_size(max(starts, 16), settings.batch)
+        self.quick = result.study.quick(starts)
         self.sigma = result.whitened_sigma
         self.cost = self._costs_at_estimate()
 
@@ -105,8 +106,9 @@ class Sides:
         chosen = dataclasses.replace(chosen, lanes=chosen.lanes._replace(active=active))
         objective = LaneCost(chosen.model, chosen.lanes, self.sigma[pad(lanes)])
         solved = levenberg_marquardt(
-            objective, start, tolerances=self.settings.tolerances, batch=self.batch
-        )
+            objective, start, tolerances=self.settings.tolerances, batch=self.batch,
+            quick=self.quick,
+        )  # fmt: skip
         return Solved(*(v[: len(lanes)] for v in solved))
 
     def refit(self, side, distance, start):

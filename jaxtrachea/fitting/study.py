@@ -48,6 +48,8 @@ from jaxtrachea.trachea.geometry import Geometry
 #: Of lanes computed together on a CPU, bytes by `Study.bytes_per_lane`, and lanes at least: more
 #: are out of the cache before they are read again (docs/measured.md).
 CACHED, FEWEST = 5 << 20, 16
+#: Of all lanes that are fitted by a program that was compiled without optimisation, at most.
+QUICK = 24 << 20
 #: The table of parameters, or what differs from the defaults of the model, by name.
 Table = Sequence[Parameter] | Mapping[str, Mapping[str, object]]
 
@@ -199,6 +201,16 @@ class Study:
     def batch_size(self, total: int, most: int) -> int:
         """Lanes computed together, of `total`, of `most` and `most_together`: a size of few."""
         return batch_size(total, min(most, self.most_together))
+
+    def quick(self, count: int) -> bool:
+        """Whether `count` lanes take less time than it takes to optimise their program.
+
+        Of a program without optimisation a lane takes about three times as long
+        (docs/measured.md). Joint studies run theirs again and again.
+        """
+        if self.joint or self.one_at_a_time or jax.default_backend() != "cpu":
+            return False
+        return batch_size(max(count, FEWEST), 1 << 30) * self.bytes_per_lane <= QUICK
 
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":
         """The same study with these lanes, in this order; a lane may come more than once."""

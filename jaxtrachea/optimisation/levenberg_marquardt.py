@@ -91,6 +91,7 @@ def levenberg_marquardt(
     rounds: int = 4,
     progress: Callable[[int], None] | None = None,
     dtype=np.float64,
+    quick: bool = False,
 ) -> Solved:
     """Minimise from every start.
 
@@ -99,19 +100,21 @@ def levenberg_marquardt(
         starts: scaled coordinates; (starts, P).
         rows: lane of each start, int; (starts,); None: one start of each lane.
         tolerances: when a start is done.
-        batch: starts computed together.
+        batch: starts computed together at most; one alone takes a place among a few, unless this
+            is 1, since compiling for another size takes longer.
         rounds: iterations between two looks at which are done.
         progress: called with the number of starts that finished since the last call.
         dtype: of the computation.
+        quick: the program is compiled without optimisation (see `program`).
 
     Returns:
         The `Solved` starts, in order. Failed ones are rows with a status; they touch no other row.
     """
     total, unknowns = starts.shape
     rows = np.arange(total) if rows is None else rows
-    batch = batch_size(total, batch)
+    batch = batch_size(max(total, 2), batch)
     exact, objective, given = objective, cast(objective, dtype), cast(starts, dtype)
-    advance = program(_advance, tolerances, rounds, axes=None, donate=(3,))
+    advance = program(_advance, tolerances, rounds, axes=None, donate=(3,), quick=quick)
     state = _idle(objective, batch, dtype)
     # What the slots of the batch compute with; rewritten only where a start takes its place.
     slots = jax.tree.map(lambda v: np.repeat(v[:1], batch, axis=0), (objective, given))

@@ -15,7 +15,13 @@ from jaxtrachea.files.traces import Traced
 
 
 @functools.lru_cache(maxsize=128)
-def program(function: Callable, *static, axes: Any = 0, donate: tuple[int, ...] = ()) -> Any:
+def program(
+    function: Callable,
+    *static,
+    axes: Any = 0,
+    donate: tuple[int, ...] = (),
+    quick: bool = False,
+) -> Any:
     """`function(*static, ...)`, compiled; the same object for equal arguments.
 
     Args:
@@ -23,8 +29,9 @@ def program(function: Callable, *static, axes: Any = 0, donate: tuple[int, ...] 
         static: its first arguments, compared and hashed by value (`FitModel`, numbers, words).
         axes: of the other arguments, as `in_axes` of `jax.vmap`; None: no `vmap`.
         donate: of the other arguments, as `donate_argnums` of `jax.jit`.
+        quick: compiled without optimisation, in a third of the time: for little work.
     """
-    return Traced(function, *static, axes=axes, donate=donate)
+    return Traced(function, *static, axes=axes, donate=donate, quick=quick)
 
 
 def batch_size(total: int, most: int) -> int:
