@@ -48,8 +48,8 @@ from jaxtrachea.trachea.geometry import Geometry
 #: Of lanes computed together on a CPU, bytes by `Study.bytes_per_lane`, and lanes at least: more
 #: are out of the cache before they are read again (docs/measured.md).
 CACHED, FEWEST = 5 << 20, 16
-#: Of all lanes that are fitted by a program that was compiled without optimisation, at most.
-QUICK = 24 << 20
+#: Lanes that are fitted by a program that was compiled without optimisation, and their bytes, at most.
+QUICK = 64, 24 << 20
 #: The table of parameters, or what differs from the defaults of the model, by name.
 Table = Sequence[Parameter] | Mapping[str, Mapping[str, object]]
 
@@ -210,7 +210,9 @@ class Study:
         """
         if self.joint or self.one_at_a_time or jax.default_backend() != "cpu":
             return False
-        return batch_size(max(count, FEWEST), 1 << 30) * self.bytes_per_lane <= QUICK
+        lanes, most = QUICK
+        together = batch_size(max(count, FEWEST), 1 << 30)
+        return together <= lanes and together * self.bytes_per_lane <= most
 
     def take(self, lanes: Int[np.ndarray, " n"]) -> "Study":
         """The same study with these lanes, in this order; a lane may come more than once."""
