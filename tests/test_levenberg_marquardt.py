@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilations import compilations
 
 from jaxtrachea.optimisation.curvature import Rest, secant_update
 from jaxtrachea.optimisation.levenberg_marquardt import levenberg_marquardt
@@ -86,15 +87,17 @@ BOXES = [
 ]
 
 
-@pytest.mark.parametrize(("count", "batch"), [(1, 16), (1000, 64)])
-def test_minima_of_a_valley_inside_boxes(count, batch):
+@pytest.mark.parametrize(
+    ("count", "batch", "quick"), [(1, 16, False), (1, 16, True), (1000, 64, False)]
+)
+def test_minima_of_a_valley_inside_boxes(count, batch, quick):
     """From `count` starts of each box, in batches with a rest: all end where the algebra says."""
     valley = Valley(*(np.array(column) for column in list(zip(*BOXES, strict=True))[:3]))
     rows = np.tile(np.arange(4), count)
     unit = np.random.default_rng(1).uniform(size=(4 * count, 2))
     starts = valley.lower[rows] + unit * (valley.upper - valley.lower)[rows]
     starts[rows == 3, 1] = 3.0
-    solved = levenberg_marquardt(valley, starts, rows, batch=batch)
+    solved = levenberg_marquardt(valley, starts, rows, batch=batch, quick=quick)
     minimum = np.array([m for *_, m in BOXES])[rows]
     assert np.all(solved.status == FitStatus.CONVERGED)
     # A relative fall of the cost by 1e-10 is left; with a residual of 1 a distance of its root.
@@ -105,6 +108,16 @@ def test_minima_of_a_valley_inside_boxes(count, batch):
     x, y = minimum.T
     truth = 50 * (y - x * x) ** 2 + 0.5 * (1 - x) ** 2
     np.testing.assert_allclose(solved.cost, truth, rtol=1e-9, atol=1e-18)
+
+
+def test_one_start_takes_the_program_of_a_few():
+    valley = Valley(*(np.array(column)[None] for column in BOXES[0][:3]))
+    starts, row = np.array([[-1.2, 1.0], [0.5, 2.0]]), np.zeros(1, int)
+    levenberg_marquardt(valley, starts, np.zeros(2, int), batch=16)
+    with compilations() as seen:
+        solved = levenberg_marquardt(valley, starts[:1], row, batch=16)
+    assert not seen
+    np.testing.assert_allclose(solved.theta, 1.0, atol=1e-8)
 
 
 def test_a_start_that_cannot_be_evaluated_is_a_status():

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from compilations import compilations
 
+from jaxtrachea._compiler import quick_options
 from jaxtrachea.files import traces
 from jaxtrachea.files.traces import Traced, keep_traces
 
@@ -124,6 +125,22 @@ def test_what_is_lowered_is_not_kept(folder):
     assert kept(folder) == []
 
 
+def test_without_optimisation_the_trace_is_the_same(folder):
+    """One file serves both; compiled are two programs."""
+    x = np.linspace(0.1, 2.0, 5)
+    for quick in (False, True):
+        start()
+        run = Traced(add, quick=quick)
+        with compilations() as seen:
+            out = run(np.full(5, 0.5), x)
+        assert len(seen) >= 1
+        np.testing.assert_allclose(out[0], 0.5 + x, rtol=1e-15)
+        np.testing.assert_allclose(out[1], np.sin(x), rtol=1e-14)
+        assert (run._options == quick_options()) is quick
+    assert TRACES == ["add"]
+    assert len(list(folder.iterdir())) == 1
+
+
 def test_outputs_go_in_again_and_compile_nothing(folder):
     """As the state of a solver does, whose memory is given away."""
     run, state, x = Traced(add, donate=(0,)), np.zeros(3), np.ones(3)
@@ -215,6 +232,7 @@ def test_keys_of_random_numbers(folder):
 
 DEVICES = """
 import threading, jax, numpy as np
+from jaxtrachea._compiler import quick_options
 from jaxtrachea.files import traces
 from test_traces import add
 import pathlib, sys

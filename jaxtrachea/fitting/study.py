@@ -48,7 +48,7 @@ from jaxtrachea.trachea.geometry import Geometry
 #: Of lanes computed together on a CPU, bytes by `Study.bytes_per_lane`, and lanes at least: more
 #: are out of the cache before they are read again (docs/measured.md).
 CACHED, FEWEST = 5 << 20, 16
-#: Lanes that are fitted by a program that was compiled without optimisation, and their bytes, at most.
+#: Lanes, and their bytes, up to which a program is compiled without optimisation (docs/measured.md)
 QUICK = 64, 24 << 20
 #: The table of parameters, or what differs from the defaults of the model, by name.
 Table = Sequence[Parameter] | Mapping[str, Mapping[str, object]]
