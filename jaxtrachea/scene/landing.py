@@ -71,7 +71,7 @@ def landing(scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""]) -> La
         return product_of_rows(path.rotation, body) + path.translation
 
     def inward_at(s, phi):
-        frame = _frame(scene, s)
+        frame = axes_at(scene, s)
         inward = local_frame(phi)[0]
         return inward if frame is None else product(frame, inward)
 
@@ -96,7 +96,7 @@ def landing(scene: Scene, path: Poses, seen: Touch, first: Int[Array, ""]) -> La
     step = -step_of(points)
     chord = step - total(step * mean) / jnp.maximum(total(inward * mean), LEAST) * inward
     moved = share * chord - gap * inward
-    way, frame = points - at_row(points, first)[None] + moved[None], _frame(scene, s)
+    way, frame = points - at_row(points, first)[None] + moved[None], axes_at(scene, s)
     turned = one_kernel(nearest_rotation)(mix(path.rotation), at_row(path.rotation, first))
     return Landing(
         s=s, phi=phi, point=mix(seen.point), body=body, rotation=turned,
@@ -112,7 +112,7 @@ def _share(gap, earlier):
     return jnp.where((closing > 0) & (share >= 0) & (share <= 1), share, 0)
 
 
-def _frame(scene: Scene, s) -> Float[Array, "3 3"] | None:
+def axes_at(scene: Scene, s) -> Float[Array, "3 3"] | None:
     """Tangent, anterior and lateral direction as columns; None where the tube is straight."""
     if scene.plan.curved and scene.tube is not None:
         return frame_at(scene.tube.line, s)

@@ -37,8 +37,7 @@ from jaxtrachea.contact.pose import Pose, inverse, nearest_rotation, transform
 from jaxtrachea.mechanics.oblique import Place, place_at
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.approach import Approach
-from jaxtrachea.scene.curve import frame_at
-from jaxtrachea.scene.landing import Landing, landing
+from jaxtrachea.scene.landing import Landing, axes_at, landing
 from jaxtrachea.scene.ranges import half_spacing
 from jaxtrachea.scene.refusals import on_the_tube
 from jaxtrachea.scene.stage import Poses, Presses, Scene
@@ -165,7 +164,7 @@ def place_of(scene: Scene, material: Material, seat: Seat) -> Place | None:
 def way_of(scene: Scene, seat: Seat, path: Poses) -> Float[Array, "3"]:
     """How far the tool has pressed its seat, mm: along (inward, tangent, round the tube)."""
     way = _at(_one(path), seat.body) - seat.anchor
-    axes = _axes(scene, seat.s)
+    axes = axes_at(scene, seat.s)
     return _times(local_frame(seat.phi), way if axes is None else _times(axes.T, way))
 
 
@@ -211,7 +210,7 @@ def as_approach(
     scene: Scene, seat: Seat, way: Float[Array, "3"], here: Instant, inside: Bool[Array, "1"]
 ) -> tuple[Poses, Approach]:
     """One row for `simulation.pressed`: the tool as it stands on its seat, and what it does."""
-    frame, axes = local_frame(seat.phi), _axes(scene, seat.s)
+    frame, axes = local_frame(seat.phi), axes_at(scene, seat.s)
     now = jax.tree.map(lambda v: v[0], here.seen)
     seen = dataclasses.replace(
         now, gap=jnp.zeros_like(now.gap), point=seat.point, s=seat.s, phi=seat.phi,
@@ -251,15 +250,8 @@ def _hold(scene: Scene, depth):
     return jnp.minimum(HOLD * depth, NEAR * half_spacing(scene))
 
 
-def _axes(scene: Scene, s) -> Float[Array, "3 3"] | None:
-    """Tangent, anterior and lateral direction as columns; None where the tube is straight."""
-    if scene.plan.curved and scene.tube is not None:
-        return frame_at(scene.tube.line, s)
-    return None
-
-
 def _to_mesh(scene: Scene, s, vector):
-    axes = _axes(scene, s)
+    axes = axes_at(scene, s)
     return vector if axes is None else _times(axes, vector)
 
 

@@ -118,6 +118,39 @@ def test_without_a_contact_point_no_row_is_a_number(more, at):
 
 
 @pytest.mark.slow
+def test_a_friction_that_is_no_number_says_so():
+    """One that is traced: `Tool` refuses it."""
+    path = presses([-1.0, -4.0, 0.0])
+    effects = dataclasses.replace(BARE, friction="on")
+    scene = make_scene(TUBE, SPRINGS, path, tool=Tool(friction=0.66), effects=effects)
+    assert run(scene, SPRINGS, path).status.tolist()[1:] == [PressStatus.OK] * 2
+    out = run(dataclasses.replace(scene, friction=jnp.asarray(np.nan)), SPRINGS, path)
+    assert out.status.tolist() == [PressStatus.NON_FINITE] * 3
+    assert np.isnan(out.force[1:]).any(axis=1).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at", ["rotation", "translation"])
+def test_a_pose_that_is_no_number_costs_its_own_row(at):
+    """On the way down; the rows before and after are those of a path without it."""
+    path = ball([75, 1, 0], [75, -3, 0], 5)
+    scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=BARE)
+    whole = run(scene, SPRINGS, path)
+    lost = dataclasses.replace(path, **{at: getattr(path, at).at[3].set(np.nan)})
+    out = run(scene, SPRINGS, lost)
+    assert out.status.tolist() == [*whole.status[:3].tolist(), PressStatus.NON_FINITE, 0]
+    assert np.isnan(out.force[3]).any()
+    np.testing.assert_allclose(out.force[4], whole.force[4], rtol=1e-12)
+
+    def last(v):
+        return run(scene, SPRINGS, dataclasses.replace(lost, **{at: v})).force[4, 1]
+
+    slope = jax.grad(last)(getattr(lost, at))
+    assert np.isfinite(slope[jnp.array([0, 1, 2, 4])]).all()
+    assert np.any(slope[4] != 0)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [{}, {"second_plane": "on"}, {"friction": "on"}])
 def test_past_the_zero_of_the_law_every_program_says_pulls(more):
     """F(2 mm) = 0 with k_3 = -k_1 / 4 mm^2, whatever the stiff skeleton; the rows stay apart."""
