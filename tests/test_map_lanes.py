@@ -8,6 +8,7 @@ import pytest
 import synthetic
 from compilations import compilations
 
+from jaxtrachea._compiler import quick_options
 from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.information import informations
 from jaxtrachea.fitting.map_lanes import map_lanes
@@ -26,7 +27,8 @@ def study():
 
 @pytest.fixture
 def compiled():
-    """Programs compiled so far, by XLA's own events."""
+    """Programs compiled so far, by XLA's own events; options are tried once in a process."""
+    quick_options()
     with compilations() as seen:
         yield seen
 

@@ -7,7 +7,6 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.optimisation.programs import cast, program
 
@@ -18,11 +17,9 @@ def map_lanes(
     *arrays: np.ndarray,
     batch: int,
     rows: Int[np.ndarray, " n"] | None = None,
-    reads: tuple[str, ...] = Lane._fields,
     static: tuple = (),
     dtype: Any = np.float64,
     progress: Callable[[int], None] | None = None,
-    quick: bool | None = None,
 ) -> Any:
     """`function(model, *static, array, lane, *arrays)` of many lanes.
 
@@ -33,11 +30,9 @@ def map_lanes(
         batch: lanes computed together, always as many: the last ones are filled up with the last
             lane, and one program serves all.
         rows: lane of each row; None: all lanes in order.
-        reads: fields of the lane that the function reads; it is given None for the others.
         static: arguments between model and arrays, by value.
         dtype: of the computation.
         progress: called with the number of rows done since the last call.
-        quick: the program is compiled without optimisation; None: if there are few rows.
 
     Returns:
         What the function returns, on the host with leading axis n; floating-point arrays in
@@ -45,12 +40,10 @@ def map_lanes(
     """
     count = len(arrays[0])
     rows = np.arange(count) if rows is None else rows
-    quick = study.quick(count) if quick is None else quick
-    run, parts = program(function, study.model, *static, quick=quick), []
-    lanes = study.lanes._replace(**dict.fromkeys(set(Lane._fields) - set(reads)))
+    run, parts = program(function, study.model, *static, quick=study.quick(count)), []
     for first in range(0, count, batch):
         here = np.minimum(np.arange(first, first + batch), count - 1)
-        lane = jax.tree.map(lambda v, at=rows[here]: v[at], lanes)
+        lane = jax.tree.map(lambda v, at=rows[here]: v[at], study.lanes)
         before, *after = cast([v[here] for v in arrays], dtype)
         part = run(before, cast(lane, dtype), *after)
         left = min(count - first, batch)

@@ -4,6 +4,9 @@ Where the local law and the skeleton share the softness of a curve otherwise (`s
 where another skeleton has nearly the same compliances at the contacts (`twins`).
 """
 
+import dataclasses
+
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -14,14 +17,14 @@ from jaxtrachea.fitting.parameters import SKELETON
 from jaxtrachea.fitting.residual import inputs
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.starts import box
-from jaxtrachea.fitting.structure import positions
+from jaxtrachea.fitting.structure import positions, without_curves
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import coefficient, power
 
 #: Indentation over skeleton deflection, and its inverse, of the two starts.
 SOFT = 19.0
-#: Points at which compliances are computed together.
-BATCH = 256
+#: Lanes whose compliances are computed together, and points of each: one program serves any number.
+BATCH, TOGETHER = 16, 32
 #: Skeletons with the same compliances: how many are tried, and the grid they are looked for on
 #: (half width in natural logarithms, points of each axis).
 TWINS, TWIN_REACH, TWIN_POINTS = 3, 9.0, 41
@@ -36,7 +39,7 @@ def soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     data = study.lanes
     seen = data.precision[lanes] > 0
     compliance = np.mean(
-        _compliance(study, lanes, guess, of=len(lanes)), axis=1, where=seen.any(axis=2)
+        _compliance(study, lanes, guess[:, None])[:, 0], axis=1, where=seen.any(axis=2)
     )
     force = np.where(seen, np.abs(data.force[lanes]), 0)
     deepest = np.argmax(force, axis=2)[..., None]
@@ -64,17 +67,22 @@ def soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     return out
 
 
-def _compliance(study: Study, rows, theta, *, of: int) -> Float[np.ndarray, "n T"]:
-    """Compliance at every trial of a lane, mm/N, at a point for each of `rows`; `of` many lanes."""
-    return map_lanes(
-        _felt_compliance, study, theta, batch=BATCH, rows=rows, quick=study.quick(of),
-        reads=("s_c", "value", "index"),  # without markers their motion is not asked for
-    )  # fmt: skip
+def _compliance(study: Study, lanes, theta) -> Float[np.ndarray, "n points T"]:
+    """Compliance at every trial of lanes, mm/N, each at many points; `theta` is (n, points, P)."""
+    count, points, size = theta.shape
+    rows = -(-points // TOGETHER)
+    filled = np.minimum(np.arange(rows * TOGETHER), points - 1)
+    theta = theta[:, filled].reshape(count * rows, TOGETHER, size)
+    bare = without_curves(study)
+    read = bare.lanes._replace(joints=None, joint_precision=None)  # their motion is not asked for
+    bare = dataclasses.replace(bare, lanes=read)
+    c = map_lanes(_felt_compliance, bare, theta, batch=BATCH, rows=np.repeat(lanes, rows))
+    return c.reshape(count, rows * TOGETHER, -1)[:, :points]
 
 
 def _felt_compliance(model: FitModel, theta, lane: Lane):
-    """Compliance at every trial of one lane, mm/N; (T,)."""
-    return inputs(model, theta, lane).compliance
+    """Compliance at every trial of one lane at some points, mm/N; (points, T)."""
+    return jax.vmap(lambda one: inputs(model, one, lane).compliance)(theta)
 
 
 def twins(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
@@ -99,7 +107,7 @@ def twins(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
         theta = np.repeat(best[None], len(mesh) + 1, axis=0)
         theta[1:, beam] = mesh
         observed = (study.lanes.precision[lane] > 0).any(axis=1)
-        c = _compliance(study, np.full(len(theta), lane), theta, of=len(lanes))
+        c = _compliance(study, [lane], theta[None])[0]
         with np.errstate(divide="ignore", invalid="ignore"):
             change = np.log(c[1:] / c[0])[:, observed]
         misfit = np.sum(change**2, axis=1).reshape(*map(len, axes))

@@ -233,7 +233,7 @@ def _seen(study: Study, lanes, theta) -> Float[np.ndarray, "n m P"]:
     """V J of each lane: all combinations of inputs that its curves tell, by the unknowns."""
     if study.model.options.deforms_sections:
         return _seen_of_sections(study, lanes, theta)
-    J = map_lanes(_inputs_by_unknowns, _without_curves(study), theta, rows=lanes, batch=_BATCH)
+    J = map_lanes(_inputs_by_unknowns, without_curves(study), theta, rows=lanes, batch=_BATCH)
     log = _log(study)[lanes]
     J = J * np.where(log, 1.0, np.maximum(np.abs(theta), 1e-3))[:, None, None]
     V = _curve_sees(study)
@@ -373,7 +373,7 @@ def _log(study: Study) -> Bool[np.ndarray, "lanes P"]:
     return study.of_unknowns(lambda p: p.scale == "log", True)
 
 
-def _without_curves(study: Study) -> Study:
+def without_curves(study: Study) -> Study:
     """The study with curves of one sample: what the inputs need and no more."""
     lanes = study.lanes
     one = {name: getattr(lanes, name)[:, :, :1] for name in ("displacement", "force", "precision")}

@@ -30,6 +30,8 @@ from jaxtrachea.status import FitStatus
 #: Starts computed together at most, on a CPU and on another device (docs/gpu.md), and the part of
 #: the free memory that they may take.
 MOST_SLOTS, MOST_ELSEWHERE, PART_OF_MEMORY = 128, 1024, 0.5
+#: Iterations of a batch between two looks at which are done.
+ROUNDS = 4
 
 
 class Solved(NamedTuple):
@@ -88,7 +90,6 @@ def levenberg_marquardt(
     *,
     tolerances: Tolerances = Tolerances(),
     batch: int = 128,
-    rounds: int = 4,
     progress: Callable[[int], None] | None = None,
     dtype=np.float64,
     quick: bool = False,
@@ -102,7 +103,6 @@ def levenberg_marquardt(
         tolerances: when a start is done.
         batch: starts computed together at most; one alone takes a place among a few, unless this
             is 1, since compiling for another size takes longer.
-        rounds: iterations between two looks at which are done.
         progress: called with the number of starts that finished since the last call.
         dtype: of the computation.
         quick: the program is compiled without optimisation (see `program`).
@@ -114,7 +114,7 @@ def levenberg_marquardt(
     rows = np.arange(total) if rows is None else rows
     batch = batch_size(max(total, 2), batch)
     exact, objective, given = objective, cast(objective, dtype), cast(starts, dtype)
-    advance = program(_advance, tolerances, rounds, axes=None, donate=(3,), quick=quick)
+    advance = program(_advance, tolerances, ROUNDS, axes=None, donate=(3,), quick=quick)
     state = _idle(objective, batch, dtype)
     # What the slots of the batch compute with; rewritten only where a start takes its place.
     slots = jax.tree.map(lambda v: np.repeat(v[:1], batch, axis=0), (objective, given))
