@@ -168,7 +168,7 @@ def test_finite_strain(known, monkeypatch):
 def only_shipped(known, shipped, monkeypatch):
     """The 64 fits to seven positions are repeated for what is shipped alone."""
     if known != shipped:
-        monkeypatch.setattr(script, "held_out", lambda _: known["held_out"])
+        monkeypatch.setattr(script, "held_out", lambda *_: known["held_out"])
 
 
 def test_positions_not_fitted():

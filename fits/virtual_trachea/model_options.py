@@ -18,6 +18,7 @@ from jaxtrachea.cli.specification import settings_of, study_of
 from jaxtrachea.config import FitSpec, load_fit_spec
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.inference.cross_validation import leave_one_out, refitted
 from jaxtrachea.inference.labels import peak_force
 from jaxtrachea.inference.residuals import rms
@@ -65,11 +66,13 @@ def small_strain(shear: bool, local: str, half_width: float) -> dict:
     model = {"shear": shear, "local": local, "half_width": half_width}
     spec = changed(load_fit_spec(path), "model", **model)
     study = study_of(spec, read_data(spec, HERE))
-    left_out = leave_one_out(study, settings_of(spec))
+    settings = settings_of(spec)
+    whole = fit(study, settings)
+    left_out = leave_one_out(whole, settings)
     return {
         **model,
-        "held_out": held_out(spec),
-        **record(fit(study, settings_of(spec))),
+        "held_out": held_out(whole, settings),
+        **record(whole),
         "left_out_compliance": float(rms(left_out.ratio)),
         "left_out_joints": float(rms(left_out.joints)),
     }
@@ -82,22 +85,24 @@ def finite_strain(depth: float, skeleton: str) -> dict:
     measured = read_data(spec, HERE)
     secant = [c.force[-1] / c.displacement[-1] for c in measured.curves]
     start = [c.force[1] / c.displacement[1] for c in measured.curves]
+    settings = settings_of(spec)
+    whole = fit(study_of(spec, measured), settings)
     return {
         "depth_mm": depth,
         "skeleton": skeleton,
-        **record(fit(study_of(spec, measured), settings_of(spec))),
+        **record(whole),
         "secant_over_first": float(np.mean(np.divide(secant, start))),
-        "held_out": held_out(spec),
+        "held_out": held_out(whole, settings),
     }
 
 
-def held_out(spec: FitSpec) -> dict:
+def held_out(whole: FitResult, settings: Settings) -> dict:
     """Three positions predicted from the other seven, for every choice of three (twins together).
 
     Force: rms over the curve (of its last sample, where it is straight) over the curve's peak;
     markers at the largest displacement D, over D. Both rms and worst over all choices.
     """
-    study = study_of(spec, read_data(spec, HERE))
+    study = whole.study
     (curves,) = study.curves
     choices = [
         three for three in itertools.combinations(range(len(curves)), 3)
@@ -105,8 +110,8 @@ def held_out(spec: FitSpec) -> dict:
     ]  # fmt: skip
     held = np.zeros((len(choices), len(curves)), bool)
     np.put_along_axis(held, np.array(choices), True, axis=1)
-    lanes = study.take(np.zeros(len(choices), int))
-    _, _, error = refitted(lanes, held, settings_of(spec), None)
+    row = np.zeros(len(choices), int)
+    _, _, error = refitted(study.take(row), held, whole.theta[row], settings, None)
     force, joints = [], []
     for lane, trial in np.argwhere(held):
         curve = curves[trial]
