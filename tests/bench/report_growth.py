@@ -186,8 +186,9 @@ AGAINST = """\
 `python tests/bench/against.py FOLDER`: commands of a checkout of {earlier}, from before these
 benchmarks had goals, and of today in turns, on the same specification and measurements; fit and
 simulate three times, the others once. The model of the fit is that of {earlier} (no width of the
-punch). Today's fit also follows up what is in doubt (other minima, profiles), by programs that a
-cold start compiles. Each selfcheck runs the table of its commit.
+punch). Today's fit also follows up what is in doubt (other minima, profiles); its programs of few
+lanes are compiled without optimisation (docs/measured.md). Each selfcheck runs the table of its
+commit.
 """
 GROWTH = """\
 Time against size, and its exponent: least squares of log time against log size over the upper half
