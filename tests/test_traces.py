@@ -232,7 +232,6 @@ def test_keys_of_random_numbers(folder):
 
 DEVICES = """
 import threading, jax, numpy as np
-from jaxtrachea._compiler import quick_options
 from jaxtrachea.files import traces
 from test_traces import add
 import pathlib, sys
