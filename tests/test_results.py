@@ -62,9 +62,10 @@ def result():
 
 def predicted(result, prediction):
     """Findings of a fit with these residuals."""
-    findings = Findings(result, ((EFFECTIVE, effective(result, prediction)),))
-    vars(findings)["prediction"] = prediction
-    return findings
+    found = effective(result, prediction)
+    result = dataclasses.replace(result)
+    vars(result)["prediction"] = prediction
+    return Findings(result, ((EFFECTIVE, found),))
 
 
 def columns(heading):

@@ -117,7 +117,9 @@ class Traced:
         """The function of arguments like these by a kept trace, which is made if there is none."""
         leaves, tree = jax.tree.flatten(given)
         digest = hashlib.sha256(_surroundings(device.platform))
-        digest.update(_said((self._identity, jax.tree.unflatten(tree, kinds))))
+        # By name: how an object is pickled depends on where the same one was met before.
+        named = [(shape, str(dtype), weak) for shape, dtype, weak in kinds]
+        digest.update(_said((self._identity, jax.tree.unflatten(tree, named))))
         path = folder / f"{self._name}-{digest.hexdigest()}{TRACED}"
         content = _content(path)
         if content is None:
@@ -178,12 +180,12 @@ def _kind(leaf: Any, device: Any) -> tuple:
     Raises:
         TypeError: not an array of that device, or no array.
     """
+    if isinstance(leaf, np.ndarray | np.generic):
+        return leaf.shape, leaf.dtype, False
     if isinstance(leaf, jax.Array):
         if isinstance(leaf, Tracer) or leaf.devices() != {device}:
             raise TypeError("a trace is kept of arrays of the device in use")
-        return leaf.shape, str(leaf.dtype), getattr(leaf, "weak_type", False)
-    if isinstance(leaf, np.ndarray | np.generic):
-        return leaf.shape, str(leaf.dtype), False
+        return leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)
     if isinstance(leaf, bool | int | float | complex):
         return (), type(leaf).__name__, True
     raise TypeError(f"{type(leaf).__name__} is no array")

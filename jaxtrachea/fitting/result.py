@@ -16,6 +16,7 @@ from jaxtrachea.fitting.covariance import Uncertainty
 from jaxtrachea.fitting.criteria import Criteria
 from jaxtrachea.fitting.noise import precision_unit
 from jaxtrachea.fitting.parameters import DEFAULTS
+from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.verdict import verdict
@@ -131,6 +132,11 @@ class FitResult:
     def relative(self) -> np.ndarray:
         """Change of each scaled coordinate that makes a relative change of 1; (lanes, P)."""
         return relative_change(self.study, self.theta)
+
+    @functools.cached_property
+    def prediction(self) -> Prediction:
+        """Model minus data at the estimates."""
+        return predictions(self.study, self.theta)
 
     @functools.cached_property
     def judgements(self) -> "dict[tuple[int, int], Judgement]":

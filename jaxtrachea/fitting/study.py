@@ -406,14 +406,12 @@ def check_touch(curve: Curve, options: Options, parameters: Sequence[Parameter])
     onset, offset = (next(p for p in parameters if p.name == name) for name in OF_THE_PRESS)
     force = curve.force - (offset.value if offset.fixed else 0)
     pressed = curve.displacement > (onset.value if onset.fixed else -np.inf)
-    touch = np.where(pressed, np.maximum(force, 0), 0)
-    lost, kept = np.max(np.abs(force - touch)), np.max(touch)
-    if not offset.fixed:
-        lost, kept = float(not pressed.any()), 0.0
-    found = f"its largest force is at or before the onset, {onset.value:g} mm"
-    if pressed[np.argmax(np.abs(force - touch))]:
-        found = "its largest force pulls"
-    if lost > 2 * kept:
+    lost = np.abs(np.where(pressed, np.minimum(force, 0), force))
+    kept = max(float(np.max(force, where=pressed, initial=0)), 0.0)
+    if np.max(lost) > 2 * kept if offset.fixed else not pressed.any():
+        found = f"its largest force is at or before the onset, {onset.value:g} mm"
+        if pressed[np.argmax(lost)]:
+            found = "its largest force pulls"
         raise InputError(
             f"{found}, where a tool that only touches (contact = 'unilateral') has none",
             place=f"specimen {curve.specimen!r} trial {curve.trial!r}",

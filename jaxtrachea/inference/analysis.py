@@ -6,13 +6,11 @@ users give it: a key in `config.UncertaintySection`, an option in `cli.main`.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, Literal
 
 from jaxtrachea._arguments import check_word
 from jaxtrachea.config import FitSpec, SpecError
-from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
@@ -88,11 +86,6 @@ class Findings:
     def profiles(self) -> Profiles | None:
         """Profiles that were asked for: they add to the evidence for all verdicts."""
         return self.get("profiles")
-
-    @functools.cached_property
-    def prediction(self) -> Prediction:
-        """Residuals at the estimate."""
-        return predictions(self.result.study, self.result.theta)
 
 
 @dataclasses.dataclass(frozen=True)

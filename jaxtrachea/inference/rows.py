@@ -40,8 +40,7 @@ def samples_of(result: FitResult, lane: int, trials: list[int]) -> int:
 
 def over_peak(result: FitResult) -> np.ndarray:
     """Root mean square force residual over the largest force of each lane; (lanes,)."""
-    curves = result.study.curves
-    peak = np.array([max(float(np.max(np.abs(c.force))) for c in of) for of in curves])
+    peak = np.max(np.abs(result.study.lanes.force), axis=(1, 2))
     return np.where(peak > 0, result.rms[:, 0], np.nan) / np.where(peak > 0, peak, 1)
 
 

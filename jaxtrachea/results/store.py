@@ -12,7 +12,6 @@ import h5py
 import numpy as np
 
 from jaxtrachea.fitting.lane import markers
-from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.trachea.geometry import Geometry
@@ -79,7 +78,7 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
     group["direction"] = np.array([c.direction for c in curves], np.float64)
     blend = study.lanes.blend
     group["blend"] = np.array([np.nan if blend is None else blend[k, t] for k, t, _ in placed])
-    seen = predictions(study, result.theta)
+    seen = result.prediction
     residual = [seen.force[k, t, : len(c.force)] for k, t, c in placed]
     columns = {
         "displacement": [c.displacement for c in curves],

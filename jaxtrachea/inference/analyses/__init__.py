@@ -108,5 +108,5 @@ def analyse(
 def widened(result: FitResult) -> Findings:
     """A fit with the analyses that every table of lanes has, and no others."""
     plain = Findings(result)
-    wide = effective(result, plain.prediction, plain.profiles)
-    return Findings(result, ((EFFECTIVE, wide), (MISFIT, misfit(result, plain.prediction))))
+    wide = effective(result, result.prediction, plain.profiles)
+    return Findings(result, ((EFFECTIVE, wide), (MISFIT, misfit(result, result.prediction))))

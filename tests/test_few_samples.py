@@ -1,0 +1,281 @@
+"""Many starts on a few samples of long curves, against SciPy on all of them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import synthetic
+from scipy.optimize import least_squares
+
+from jaxtrachea.fitting import few_samples, minima
+from jaxtrachea.fitting.cost import LaneCost
+from jaxtrachea.fitting.few_samples import same_ends, serves
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.gauss_newton import gauss_newton
+from jaxtrachea.fitting.lanes import Noise, Weighting
+from jaxtrachea.fitting.residual import residual_value
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import build_study
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.optimisation.levenberg_marquardt import Solved
+from jaxtrachea.optimisation.trust_region import Tolerances
+from jaxtrachea.status import FitStatus
+
+LANES, SIGMA = 20, 0.002
+#: Curves of unequal length; the last has fewer samples than are kept.
+LENGTHS = (40, 33, 24, 7)
+
+
+@pytest.fixture(autouse=True)
+def short_curves_are_long(monkeypatch):
+    """Twelve of twenty-four samples instead of 48 of 96."""
+    monkeypatch.setattr(few_samples, "KEPT", 12)
+
+
+def curves(lanes=LANES, seed=5):
+    """Presses of known truths with noise, the samples of each in depths of its own."""
+    truth, rng, out = synthetic.draw(seed, lanes, 1.6), np.random.default_rng(seed), []
+    for j, n in enumerate(LENGTHS):
+        depth = np.linspace(0.1, 6.0, n)
+        force, _ = synthetic.forces(truth, synthetic.S_C[j : j + 1], depth)
+        noisy = force[:, 0] + rng.normal(0, SIGMA, (lanes, n))
+        out += [
+            Curve(f"s{i:02d}", f"t{j}", float(synthetic.S_C[j]), 0.0, depth, noisy[i])
+            for i in range(lanes)
+        ]
+    return truth, out
+
+
+def study_of(curves, noise=Noise(force=SIGMA), **more):
+    table = synthetic.parameters()
+    return build_study(curves, synthetic.GEOMETRY, synthetic.OPTIONS, table, noise=noise, **more)
+
+
+@pytest.fixture(scope="module")
+def study():
+    return study_of(curves()[1])
+
+
+def scipy_minimum(study, lane, start, **options):
+    """SciPy's minimum of one lane on all samples, and half the sum of squares there."""
+    model, data = study.model, jax.tree.map(lambda v: v[lane], study.lanes)
+    value = jax.jit(lambda theta: residual_value(model, theta, data) * data.balance[:, None])
+    found = least_squares(
+        lambda theta: np.asarray(value(theta)).ravel(), start, xtol=1e-15, ftol=1e-15, gtol=1e-15,
+        **options,
+    )  # fmt: skip
+    return found.x, found.cost
+
+
+def steps_of(seen):
+    """Names of what was run, with how many starts, as `minima` calls them."""
+
+    def watch(name, wrapped):
+        def run(study, *more, **named):
+            out = wrapped(study, *more, **named)
+            seen.append((name, len(out.theta), study.lanes.force.shape[-1]))
+            return out
+
+        return run
+
+    return watch
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    seen: list[tuple[str, int, int]] = []
+    watch = steps_of(seen)
+    for name in ("_solve", "gauss_newton"):
+        monkeypatch.setattr(minima, name, watch(name, getattr(minima, name)))
+    return seen
+
+
+def test_estimates_are_of_all_samples(study, seen):
+    """Of eighty starts by twelve samples each; four of a lane go on as one."""
+    result = fit(study, Settings(scrutiny=False))
+    print(seen)
+    assert seen[:2] == [("_solve", 4 * LANES, 12), ("gauss_newton", LANES, max(LENGTHS))]
+    assert (result.converged_starts == 4).all()
+    assert (result.tried == 4).all()
+    for lane in (0, 7, 19):
+        theta, cost = scipy_minimum(study, lane, result.theta[lane])
+        np.testing.assert_allclose(result.cost[lane], cost, rtol=1e-10)
+        assert np.all(np.abs(result.theta[lane] - theta) < 1e-3 * result.uncertainty.se[lane])
+
+
+def test_estimated_noise_and_given_starts(seen):
+    """Refits from given starts go by all samples alone, where plain steps do by those alone."""
+    truth, every = curves()
+    study = study_of(every, noise=Noise())
+    settings = Settings(starts=1, scrutiny=False)
+    many = study.take(np.tile(np.arange(LANES), 4))
+    first = fit(many, settings, starts=np.tile(np.log(truth), (4, 1)))
+    assert seen[0] == ("gauss_newton", 4 * LANES, max(LENGTHS))
+    assert all(samples == max(LENGTHS) for _, _, samples in seen)
+    assert sum(starts for name, starts, _ in seen if name == "_solve") < LANES
+    np.testing.assert_array_equal(first.converged_starts, 1)
+    theta, _ = scipy_minimum(study, 3, first.theta[3])
+    assert np.all(np.abs(first.theta[3] - theta) < 1e-3 * first.uncertainty.se[3])
+    np.testing.assert_allclose(first.theta[LANES + 3], first.theta[3], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "more"),
+    [
+        ({"float32": True}, {}),
+        ({"method": "lbfgs"}, {}),
+        ({"starts": 1}, {}),  # twenty in all: their program is compiled quickly
+        ({}, {"weighting": Weighting(loss="huber")}),
+        ({}, {"joint": True}),
+    ],
+)
+def test_where_they_do_not_serve(study, changes, more, monkeypatch):
+    every = curves()[1]
+    if "joint" in more:
+        table = synthetic.parameters(k_1={"scope": "shared"})
+        study = build_study(every, synthetic.GEOMETRY, synthetic.OPTIONS, table, joint=True)
+    elif more:
+        study = study_of(every, **more)
+    settings = Settings(**changes)
+    assert serves(study_of(every), Settings(), 4 * LANES)
+    assert not serves(study, settings, settings.starts * LANES)
+    monkeypatch.setattr(few_samples, "KEPT", 21)  # of 40 samples
+    assert not serves(study_of(every), Settings(), 4 * LANES)
+
+
+def test_nor_for_a_fitted_onset():
+    every = curves()[1]
+    table = synthetic.parameters(onset={"value": 0.0})
+    study = build_study(every, synthetic.GEOMETRY, synthetic.OPTIONS, table)
+    assert study.lanes.blend is not None
+    assert not serves(study, Settings(), 4 * LANES)
+
+
+def test_the_few_are_observed_samples_in_equal_steps():
+    """Of a curve with gaps, from the first observed to the last; its weight stays."""
+    study = study_of(curves(3)[1], noise=Noise())
+    lanes = study.lanes
+    precision = np.array(lanes.precision)
+    precision[1, 0, [0, 5, 6, 39]] = 0
+    precision[2, 1] = 0
+    gaps = dataclasses.replace(study, lanes=lanes._replace(precision=precision))
+    few = few_samples.few_samples(gaps).lanes
+    assert few.force.shape == (3, len(LENGTHS), 12)
+    for lane in range(3):
+        for t in range(len(LENGTHS)):
+            there = np.flatnonzero(precision[lane, t] > 0)
+            kept = np.flatnonzero(few.precision[lane, t] > 0)
+            count = min(12, len(there))
+            np.testing.assert_array_equal(kept, np.arange(count))
+            at = [
+                int(np.flatnonzero(lanes.displacement[lane, t] == d)[0])
+                for d in few.displacement[lane, t, kept]
+            ]
+            exact = there[np.linspace(0, len(there) - 1, count).astype(int)] if count else []
+            assert np.all(np.abs(np.searchsorted(there, at) - np.searchsorted(there, exact)) <= 1)
+            if count:
+                assert at[0] == there[0]
+                assert at[-1] == there[-1]
+                assert len(set(at)) == count
+                np.testing.assert_array_equal(few.force[lane, t, kept], lanes.force[lane, t, at])
+            weight = few.balance[lane, t] ** 2 * count
+            np.testing.assert_allclose(weight, lanes.balance[lane, t] ** 2 * len(there))
+
+
+def test_markers_are_of_the_same_samples():
+    depth = np.linspace(0.1, 6.0, 40)
+    force, joints = synthetic.forces(synthetic.draw(1, 2, 1.5), synthetic.S_C, depth)
+    rings = np.array([2, 5, 9])
+    every = [
+        dataclasses.replace(c, joint_displacement=joints[i, j][:, rings], joint_rings=rings)
+        for (i, j), c in zip(np.ndindex(2, 4), synthetic.curves(force, displacement=depth),
+                             strict=True)
+    ]  # fmt: skip
+    table = synthetic.parameters(joints=True)
+    study = build_study(every, synthetic.GEOMETRY, synthetic.OPTIONS, table)
+    few, whole = few_samples.few_samples(study).lanes, study.lanes
+    assert few.joints is not None
+    assert whole.joints is not None
+    assert whole.joint_precision is not None
+    at = np.searchsorted(depth, few.displacement[1, 2])
+    np.testing.assert_array_equal(few.joints[1, 2], whole.joints[1, 2, at])
+    np.testing.assert_array_equal(few.joint_precision, whole.joint_precision[:, :, :12])
+
+
+def test_starts_that_ended_apart_stay_apart():
+    """By lane and by place; what did not converge shares its end with none."""
+    rows = np.array([0, 0, 0, 1, 1, 1])
+    theta = np.array([[1.0, 2], [1 + 1e-5, 2], [1.1, 2], [1, 2], [1, 2], [1, 2]])
+    status = np.zeros(6, int)
+    status[5] = FitStatus.MAX_ITERATIONS
+    first, of = same_ends(rows, Solved(theta, np.ones(6), status, np.ones(6, int)))
+    assert len(first) == 4
+    assert of[0] == of[1]
+    assert of[3] == of[4]
+    assert len({of[0], of[2], of[3], of[5]}) == 4
+    np.testing.assert_array_equal(rows[first[of]], rows)
+
+
+def test_plain_steps_keep_to_the_box(study):
+    """A bound below the minimum: SciPy's with the same bound, and a cost that says so."""
+    free = gauss_newton(
+        study, np.arange(LANES), fit(study, Settings(scrutiny=False)).theta,
+        np.ones((LANES, 2)), Tolerances(),
+    )  # fmt: skip
+    assert (free.status == FitStatus.CONVERGED).all()
+    upper = study.lanes.upper.copy()
+    upper[:, 2] = free.theta[:, 2] - 0.05
+    tight = dataclasses.replace(study, lanes=study.lanes._replace(upper=upper))
+    begin = np.minimum(free.theta, upper)
+    bound = gauss_newton(tight, np.arange(LANES), begin, np.ones((LANES, 2)), Tolerances())
+    assert (bound.status == FitStatus.CONVERGED).mean() > 0.8
+    for lane in np.flatnonzero(bound.status == FitStatus.CONVERGED)[:2]:
+        assert bound.theta[lane, 2] == upper[lane, 2]
+        box = study.lanes.lower[lane], upper[lane]
+        start = np.clip(begin[lane], box[0] + 1e-6, box[1] - 1e-6)
+        _, cost = scipy_minimum(study, lane, start, bounds=box)
+        np.testing.assert_allclose(bound.cost[lane], cost, rtol=1e-5)
+        assert bound.cost[lane] <= cost * (1 + 1e-12)
+
+
+def test_what_cannot_be_evaluated_is_for_the_solver(study):
+    """NaN in one lane's data touches no other; a far start is said not to have come."""
+    force = np.array(study.lanes.force)
+    force[4] = np.nan
+    broken = dataclasses.replace(study, lanes=study.lanes._replace(force=force))
+    start = np.log(synthetic.draw(5, LANES, 1.6))
+    sigma = np.ones((LANES, 2))
+    out = gauss_newton(broken, np.arange(LANES), start, sigma, Tolerances())
+    whole = gauss_newton(study, np.arange(LANES), start, sigma, Tolerances())
+    assert out.status[4] == FitStatus.STALLED
+    assert not np.isfinite(out.cost[4])
+    np.testing.assert_array_equal(out.theta[4], start[4])
+    others = np.arange(LANES) != 4
+    np.testing.assert_allclose(out.theta[others], whole.theta[others], rtol=1e-12)
+    few = Tolerances(cost=1e-30)
+    assert (gauss_newton(study, np.arange(2), start[:2], sigma, few).status
+            == FitStatus.STALLED).all()  # fmt: skip
+
+
+def test_infeasible_starts_stay_what_they_are(study):
+    """A lane whose curves nothing explains fails, and no other; it is not fitted to a part."""
+    displacement = np.array(study.lanes.displacement)
+    displacement[2] = np.nan
+    broken = dataclasses.replace(study, lanes=study.lanes._replace(displacement=displacement))
+    result = fit(broken, Settings(scrutiny=False, more_starts=0))
+    assert result.status[2] == FitStatus.INFEASIBLE_START
+    assert (result.status[np.arange(LANES) != 2] == FitStatus.CONVERGED).all()
+
+
+def test_lane_cost_and_steps_agree(study):
+    """The cost that the steps end at is the one that the solver minimises."""
+    start = np.log(synthetic.draw(5, LANES, 1.6))
+    sigma = np.tile([0.5, 1.0], (LANES, 1))
+    noise = jnp.asarray(sigma[6])
+    out = gauss_newton(study, np.arange(LANES), start, sigma, Tolerances())
+    lane = jax.tree.map(lambda v: v[6], study.lanes)
+    at = jnp.asarray(out.theta[6])
+    cost = jax.jit(lambda theta: LaneCost(study.model, lane, noise).evaluate(theta).cost)(at)
+    np.testing.assert_allclose(out.cost[6], cost, rtol=1e-12)
