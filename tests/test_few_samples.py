@@ -3,24 +3,20 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic
 from scipy.optimize import least_squares
 
 from jaxtrachea.fitting import few_samples, minima
-from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.few_samples import same_ends, serves
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.gauss_newton import gauss_newton
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.residual import residual_value
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
-from jaxtrachea.optimisation.trust_region import Tolerances
 from jaxtrachea.status import FitStatus
 
 LANES, SIGMA = 20, 0.002
@@ -58,45 +54,33 @@ def study():
     return study_of(curves()[1])
 
 
-def scipy_minimum(study, lane, start, **options):
+def scipy_minimum(study, lane, start):
     """SciPy's minimum of one lane on all samples, and half the sum of squares there."""
     model, data = study.model, jax.tree.map(lambda v: v[lane], study.lanes)
     value = jax.jit(lambda theta: residual_value(model, theta, data) * data.balance[:, None])
     found = least_squares(
-        lambda theta: np.asarray(value(theta)).ravel(), start, xtol=1e-15, ftol=1e-15, gtol=1e-15,
-        **options,
-    )  # fmt: skip
+        lambda theta: np.asarray(value(theta)).ravel(), start, xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
     return found.x, found.cost
-
-
-def steps_of(seen):
-    """Names of what was run, with how many starts, as `minima` calls them."""
-
-    def watch(name, wrapped):
-        def run(study, *more, **named):
-            out = wrapped(study, *more, **named)
-            seen.append((name, len(out.theta), study.lanes.force.shape[-1]))
-            return out
-
-        return run
-
-    return watch
 
 
 @pytest.fixture
 def seen(monkeypatch):
-    seen: list[tuple[str, int, int]] = []
-    watch = steps_of(seen)
-    for name in ("_solve", "gauss_newton"):
-        monkeypatch.setattr(minima, name, watch(name, getattr(minima, name)))
+    """Starts and samples of a curve of every solve."""
+    seen, solve = [], minima._solve
+
+    def watched(study, settings, rows, *more, **named):
+        seen.append((len(rows), study.lanes.force.shape[-1]))
+        return solve(study, settings, rows, *more, **named)
+
+    monkeypatch.setattr(minima, "_solve", watched)
     return seen
 
 
 def test_estimates_are_of_all_samples(study, seen):
-    """Of eighty starts by twelve samples each; four of a lane go on as one."""
+    """Of eighty starts by twelve samples each; the four of a lane go on as one."""
     result = fit(study, Settings(scrutiny=False))
-    print(seen)
-    assert seen[:2] == [("_solve", 4 * LANES, 12), ("gauss_newton", LANES, max(LENGTHS))]
+    assert seen == [(4 * LANES, 12), (LANES, max(LENGTHS))]
     assert (result.converged_starts == 4).all()
     assert (result.tried == 4).all()
     for lane in (0, 7, 19):
@@ -105,20 +89,12 @@ def test_estimates_are_of_all_samples(study, seen):
         assert np.all(np.abs(result.theta[lane] - theta) < 1e-3 * result.uncertainty.se[lane])
 
 
-def test_estimated_noise_and_given_starts(seen):
-    """Refits from given starts go by all samples alone, where plain steps do by those alone."""
-    truth, every = curves()
-    study = study_of(every, noise=Noise())
-    settings = Settings(starts=1, scrutiny=False)
+def test_given_starts_are_of_all_samples(study, seen):
+    """A refit from an estimate takes the minimum near it."""
     many = study.take(np.tile(np.arange(LANES), 4))
-    first = fit(many, settings, starts=np.tile(np.log(truth), (4, 1)))
-    assert seen[0] == ("gauss_newton", 4 * LANES, max(LENGTHS))
-    assert all(samples == max(LENGTHS) for _, _, samples in seen)
-    assert sum(starts for name, starts, _ in seen if name == "_solve") < LANES
-    np.testing.assert_array_equal(first.converged_starts, 1)
-    theta, _ = scipy_minimum(study, 3, first.theta[3])
-    assert np.all(np.abs(first.theta[3] - theta) < 1e-3 * first.uncertainty.se[3])
-    np.testing.assert_allclose(first.theta[LANES + 3], first.theta[3], atol=1e-9)
+    starts = np.tile(np.log(curves()[0]), (4, 1))
+    fit(many, Settings(starts=1, scrutiny=False), starts=starts)
+    assert seen == [(4 * LANES, max(LENGTHS))]
 
 
 @pytest.mark.parametrize(
@@ -218,47 +194,6 @@ def test_starts_that_ended_apart_stay_apart():
     np.testing.assert_array_equal(rows[first[of]], rows)
 
 
-def test_plain_steps_keep_to_the_box(study):
-    """A bound below the minimum: SciPy's with the same bound, and a cost that says so."""
-    free = gauss_newton(
-        study, np.arange(LANES), fit(study, Settings(scrutiny=False)).theta,
-        np.ones((LANES, 2)), Tolerances(),
-    )  # fmt: skip
-    assert (free.status == FitStatus.CONVERGED).all()
-    upper = study.lanes.upper.copy()
-    upper[:, 2] = free.theta[:, 2] - 0.05
-    tight = dataclasses.replace(study, lanes=study.lanes._replace(upper=upper))
-    begin = np.minimum(free.theta, upper)
-    bound = gauss_newton(tight, np.arange(LANES), begin, np.ones((LANES, 2)), Tolerances())
-    assert (bound.status == FitStatus.CONVERGED).mean() > 0.8
-    for lane in np.flatnonzero(bound.status == FitStatus.CONVERGED)[:2]:
-        assert bound.theta[lane, 2] == upper[lane, 2]
-        box = study.lanes.lower[lane], upper[lane]
-        start = np.clip(begin[lane], box[0] + 1e-6, box[1] - 1e-6)
-        _, cost = scipy_minimum(study, lane, start, bounds=box)
-        np.testing.assert_allclose(bound.cost[lane], cost, rtol=1e-5)
-        assert bound.cost[lane] <= cost * (1 + 1e-12)
-
-
-def test_what_cannot_be_evaluated_is_for_the_solver(study):
-    """NaN in one lane's data touches no other; a far start is said not to have come."""
-    force = np.array(study.lanes.force)
-    force[4] = np.nan
-    broken = dataclasses.replace(study, lanes=study.lanes._replace(force=force))
-    start = np.log(synthetic.draw(5, LANES, 1.6))
-    sigma = np.ones((LANES, 2))
-    out = gauss_newton(broken, np.arange(LANES), start, sigma, Tolerances())
-    whole = gauss_newton(study, np.arange(LANES), start, sigma, Tolerances())
-    assert out.status[4] == FitStatus.STALLED
-    assert not np.isfinite(out.cost[4])
-    np.testing.assert_array_equal(out.theta[4], start[4])
-    others = np.arange(LANES) != 4
-    np.testing.assert_allclose(out.theta[others], whole.theta[others], rtol=1e-12)
-    few = Tolerances(cost=1e-30)
-    assert (gauss_newton(study, np.arange(2), start[:2], sigma, few).status
-            == FitStatus.STALLED).all()  # fmt: skip
-
-
 def test_infeasible_starts_stay_what_they_are(study):
     """A lane whose curves nothing explains fails, and no other; it is not fitted to a part."""
     displacement = np.array(study.lanes.displacement)
@@ -267,15 +202,3 @@ def test_infeasible_starts_stay_what_they_are(study):
     result = fit(broken, Settings(scrutiny=False, more_starts=0))
     assert result.status[2] == FitStatus.INFEASIBLE_START
     assert (result.status[np.arange(LANES) != 2] == FitStatus.CONVERGED).all()
-
-
-def test_lane_cost_and_steps_agree(study):
-    """The cost that the steps end at is the one that the solver minimises."""
-    start = np.log(synthetic.draw(5, LANES, 1.6))
-    sigma = np.tile([0.5, 1.0], (LANES, 1))
-    noise = jnp.asarray(sigma[6])
-    out = gauss_newton(study, np.arange(LANES), start, sigma, Tolerances())
-    lane = jax.tree.map(lambda v: v[6], study.lanes)
-    at = jnp.asarray(out.theta[6])
-    cost = jax.jit(lambda theta: LaneCost(study.model, lane, noise).evaluate(theta).cost)(at)
-    np.testing.assert_allclose(out.cost[6], cost, rtol=1e-12)

@@ -89,7 +89,7 @@ WITHIN = {
         {"descent", "starts"},
         {"information", "predictions", "shared", "structure"},
         {"covariance", "joint_information", "noise"},
-        {"criteria", "gauss_newton", "settings", "verdict"},
+        {"criteria", "settings", "verdict"},
         {"few_samples"},
         {"result"},
         {"minima", "natural_sizes", "other_starts", "profile_search"},

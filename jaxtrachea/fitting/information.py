@@ -103,23 +103,8 @@ def information(
 
 
 def informations(
-    study: Study,
-    lanes: np.ndarray,
-    theta: np.ndarray,
-    sigma: np.ndarray,
-    batch: int = 128,
-    together: int | None = None,
+    study: Study, lanes: np.ndarray, theta: np.ndarray, sigma: np.ndarray, batch: int = 128
 ) -> Information:
-    """`information` of many lanes, on the host; leading axis = order of `lanes`.
-
-    Args:
-        study: the study.
-        lanes: of each row.
-        theta: of each row, scaled coordinates.
-        sigma: of each row.
-        batch: lanes computed together, at most.
-        together: lanes that the program is for; None: as many as rows.
-    """
-    together = len(lanes) if together is None else together
-    batch, quick = study.batch_size(together, batch), study.quick(together)
-    return map_lanes(information, study, theta, sigma, rows=lanes, batch=batch, quick=quick)
+    """`information` of many lanes, on the host; leading axis = order of `lanes`."""
+    batch = study.batch_size(len(lanes), batch)
+    return map_lanes(information, study, theta, sigma, rows=lanes, batch=batch)

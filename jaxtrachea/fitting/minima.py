@@ -10,7 +10,6 @@ from jaxtyping import Float
 from jaxtrachea.fitting.cost import LaneCost
 from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.few_samples import few_samples, same_ends, serves
-from jaxtrachea.fitting.gauss_newton import gauss_newton
 from jaxtrachea.fitting.information import Information, informations
 from jaxtrachea.fitting.joint_information import pooled, unknown_count
 from jaxtrachea.fitting.lane import data_weight
@@ -113,9 +112,7 @@ def _from_starts(study: Study, settings: Settings, starts, sigma, progress, besi
         tried = np.full(lanes, len(starts) // lanes)
         return solved, np.full(lanes, agree), tried, np.arange(lanes), solved.theta, solved.cost
     rows = np.repeat(np.arange(lanes), settings.starts)
-    solve = _solve
-    if serves(study, settings, len(rows)):
-        solve = _by_few_samples if drawn else _from_near
+    solve = _by_few_samples if drawn and serves(study, settings, len(rows)) else _solve
     solved = solve(study, settings, rows, starts, sigma, progress)
     if drawn:
         again = functools.partial(_solve_more, study, settings, sigma, progress)
@@ -147,38 +144,21 @@ def refit_with_sigma(study: Study, settings: Settings, theta, sigma) -> Solved:
         return _solve_jointly(study, settings, theta, sigma, None, near=True)[0]
     # In the program of the first solve: one of another size takes longer to compile than to run.
     together, lanes = len(theta) * settings.starts, np.arange(len(theta))
-    if serves(study, settings, together):
-        return _from_near(study, settings, lanes, theta, sigma, None)
     return _solve(study, settings, lanes, theta, sigma, None, together=together)
 
 
 def _by_few_samples(study: Study, settings: Settings, rows, starts, sigma, progress) -> Solved:
-    """Every drawn start of lane `rows`, first on a few samples of its curves.
+    """Every start of lane `rows`, first on a few samples of its curves.
 
     Those of a lane that come to the same point there go on from it as one, on all samples. A start
     that does not converge on the few begins anew.
     """
     led = _solve(few_samples(study), settings, rows, starts, sigma, progress)
     first, of = same_ends(rows, led)
-    begun = led.status[first] != FitStatus.INFEASIBLE_START
     at = np.where((led.status == FitStatus.CONVERGED)[:, None], led.theta, starts)[first]
-    ends = Solved(*(v[first] for v in led))
-    on = _from_near(study, settings, rows[first[begun]], at[begun], sigma, progress)
-    for all_, new in zip(ends, on, strict=True):
-        all_[begun] = new
+    ends = _solve(study, settings, rows[first], at, sigma, None, together=len(rows))
     ends = Solved(*(v[of] for v in ends))
     return ends._replace(iterations=ends.iterations + led.iterations)
-
-
-def _from_near(study: Study, settings: Settings, rows, theta, sigma, progress) -> Solved:
-    """The minimum near each point of lane `rows`: by plain steps, or else by the solver."""
-    out = gauss_newton(study, rows, theta, sigma, settings.tolerances)
-    left = np.flatnonzero(out.status != FitStatus.CONVERGED)
-    if len(left):
-        more = _solve_more(study, settings, sigma, progress, rows[left], out.theta[left])
-        for all_, new in zip(out, more, strict=True):
-            all_[left] = new
-    return out
 
 
 def _solve_more(study, settings, sigma, progress, rows, starts) -> Solved:

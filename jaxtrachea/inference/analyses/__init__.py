@@ -107,6 +107,5 @@ def analyse(
 
 def widened(result: FitResult) -> Findings:
     """A fit with the analyses that every table of lanes has, and no others."""
-    plain = Findings(result)
-    wide = effective(result, result.prediction, plain.profiles)
+    wide = effective(result, result.prediction)
     return Findings(result, ((EFFECTIVE, wide), (MISFIT, misfit(result, result.prediction))))
