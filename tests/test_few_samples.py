@@ -79,8 +79,8 @@ def seen(monkeypatch):
 
 def test_estimates_are_of_all_samples(study, seen):
     """Of eighty starts by twelve samples each; the four of a lane go on as one."""
-    result = fit(study, Settings(scrutiny=False))
-    assert seen == [(4 * LANES, 12), (LANES, max(LENGTHS))]
+    result = fit(study, Settings())
+    assert seen[:2] == [(4 * LANES, 12), (LANES, max(LENGTHS))]
     assert (result.converged_starts == 4).all()
     assert (result.tried == 4).all()
     for lane in (0, 7, 19):
@@ -93,13 +93,14 @@ def test_given_starts_are_of_all_samples(study, seen):
     """A refit from an estimate takes the minimum near it."""
     many = study.take(np.tile(np.arange(LANES), 4))
     starts = np.tile(np.log(curves()[0]), (4, 1))
-    fit(many, Settings(starts=1, scrutiny=False), starts=starts)
-    assert seen == [(4 * LANES, max(LENGTHS))]
+    fit(many, Settings(starts=1), starts=starts)
+    assert {samples for _, samples in seen} == {max(LENGTHS)}
 
 
 @pytest.mark.parametrize(
     ("changes", "more"),
     [
+        ({"scrutiny": False}, {}),
         ({"float32": True}, {}),
         ({"method": "lbfgs"}, {}),
         ({"starts": 1}, {}),  # twenty in all: their program is compiled quickly
@@ -199,6 +200,6 @@ def test_infeasible_starts_stay_what_they_are(study):
     displacement = np.array(study.lanes.displacement)
     displacement[2] = np.nan
     broken = dataclasses.replace(study, lanes=study.lanes._replace(displacement=displacement))
-    result = fit(broken, Settings(scrutiny=False, more_starts=0))
+    result = fit(broken, Settings(more_starts=0))
     assert result.status[2] == FitStatus.INFEASIBLE_START
     assert (result.status[np.arange(LANES) != 2] == FitStatus.CONVERGED).all()

@@ -21,13 +21,14 @@ def serves(study: Study, settings: Settings, starts: int) -> bool:
     """Whether so many starts take less time by a few samples of each curve first.
 
     Not of short curves, nor where compilation is what takes the time (`Study.quick`). Nor where the
-    few do not tell: the samples next to a fitted onset, the outliers of a robust loss. Joint
-    studies, deforming cross-sections, single precision and other solvers go their own way.
+    few do not tell: the samples next to a fitted onset, the outliers of a robust loss. Nor where
+    nothing looks for other minima afterwards: what is one minimum of the few may be two of all.
+    Joint studies, deforming cross-sections, single precision and other solvers go their own way.
     """
     lanes = study.lanes
     of_kind = settings.method == "levenberg-marquardt" and not settings.float32
     of_kind = of_kind and not study.joint and not study.one_at_a_time
-    tells = study.model.loss == "linear" and lanes.blend is None
+    tells = study.model.loss == "linear" and lanes.blend is None and settings.scrutiny
     return of_kind and tells and lanes.force.shape[-1] >= TIMES * KEPT and not study.quick(starts)
 
 
