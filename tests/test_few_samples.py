@@ -103,7 +103,7 @@ def test_given_starts_are_of_all_samples(study, seen):
         ({"scrutiny": False}, {}),
         ({"float32": True}, {}),
         ({"method": "lbfgs"}, {}),
-        ({"starts": 1}, {}),  # twenty in all: their program is compiled quickly
+        ({"starts": 3}, {}),  # sixty in all
         ({}, {"weighting": Weighting(loss="huber")}),
         ({}, {"joint": True}),
     ],
@@ -161,24 +161,19 @@ def test_the_few_are_observed_samples_in_equal_steps():
             np.testing.assert_allclose(weight, lanes.balance[lane, t] ** 2 * len(there))
 
 
-def test_markers_are_of_the_same_samples():
+def test_nor_with_markers():
+    """They may be seen in a few samples alone."""
     depth = np.linspace(0.1, 6.0, 40)
-    force, joints = synthetic.forces(synthetic.draw(1, 2, 1.5), synthetic.S_C, depth)
+    force, joints = synthetic.forces(synthetic.draw(1, LANES, 1.5), synthetic.S_C, depth)
     rings = np.array([2, 5, 9])
-    every = [
-        dataclasses.replace(c, joint_displacement=joints[i, j][:, rings], joint_rings=rings)
-        for (i, j), c in zip(np.ndindex(2, 4), synthetic.curves(force, displacement=depth),
-                             strict=True)
-    ]  # fmt: skip
-    table = synthetic.parameters(joints=True)
-    study = build_study(every, synthetic.GEOMETRY, synthetic.OPTIONS, table)
-    few, whole = few_samples.few_samples(study).lanes, study.lanes
-    assert few.joints is not None
-    assert whole.joints is not None
-    assert whole.joint_precision is not None
-    at = np.searchsorted(depth, few.displacement[1, 2])
-    np.testing.assert_array_equal(few.joints[1, 2], whole.joints[1, 2, at])
-    np.testing.assert_array_equal(few.joint_precision, whole.joint_precision[:, :, :12])
+    bare = synthetic.curves(force, displacement=depth)
+    places = list(np.ndindex(LANES, 4))
+    marked = [
+        dataclasses.replace(c, joint_displacement=joints[at][:, rings], joint_rings=rings)
+        for at, c in zip(places, bare, strict=True)
+    ]
+    assert serves(study_of(bare), Settings(), 4 * LANES)
+    assert not serves(study_of(marked), Settings(), 4 * LANES)
 
 
 def test_starts_that_ended_apart_stay_apart():
@@ -203,3 +198,21 @@ def test_infeasible_starts_stay_what_they_are(study):
     result = fit(broken, Settings(more_starts=0))
     assert result.status[2] == FitStatus.INFEASIBLE_START
     assert (result.status[np.arange(LANES) != 2] == FitStatus.CONVERGED).all()
+
+
+def test_an_end_that_all_samples_do_not_have_is_left(study, seen, monkeypatch):
+    """Such a start begins anew, on all samples from where it was drawn."""
+    solve = minima._solve
+
+    def lost(study, settings, rows, starts, *more, **named):
+        out = solve(study, settings, rows, starts, *more, **named)
+        if len(rows) == LANES:  # the ends of all lanes
+            out.status[rows == 5] = FitStatus.INFEASIBLE_START
+        return out
+
+    monkeypatch.setattr(minima, "_solve", lost)
+    result = fit(study, Settings())
+    assert (4, max(LENGTHS)) in seen
+    assert result.status[5] == FitStatus.CONVERGED
+    _, cost = scipy_minimum(study, 5, result.theta[5])
+    np.testing.assert_allclose(result.cost[5], cost, rtol=1e-10)

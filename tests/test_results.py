@@ -64,7 +64,7 @@ def predicted(result, prediction):
     """Findings of a fit with these residuals."""
     found = effective(result, prediction)
     result = dataclasses.replace(result)
-    vars(result)["prediction"] = prediction
+    vars(result)["residuals"] = prediction
     return Findings(result, ((EFFECTIVE, found),))
 
 

@@ -117,7 +117,7 @@ class Traced:
         """The function of arguments like these by a kept trace, which is made if there is none."""
         leaves, tree = jax.tree.flatten(given)
         digest = hashlib.sha256(_surroundings(device.platform))
-        # By name: how an object is pickled depends on where the same one was met before.
+        # Words, not dtypes: two that are equal may be one object or two, which pickle tells apart.
         named = [(shape, str(dtype), weak) for shape, dtype, weak in kinds]
         digest.update(_said((self._identity, jax.tree.unflatten(tree, named))))
         path = folder / f"{self._name}-{digest.hexdigest()}{TRACED}"

@@ -31,7 +31,8 @@ class Minima(NamedTuple):
 
     Attributes:
         solved: best outcome of each lane.
-        agree: starts that ended in it; (lanes,).
+        agree: starts that ended in it, or came together on a few samples and went on as one from
+            there; (lanes,).
         tried: starts in all; (lanes,).
         sigma: standard deviations that it was found with; (lanes, 2).
         lane: of every start; (starts,).
@@ -151,35 +152,47 @@ def _by_few_samples(study: Study, settings: Settings, rows, starts, sigma, progr
     """Every start of lane `rows`, first on a few samples of its curves.
 
     Those of a lane that come to the same point there go on from it as one, on all samples. A start
-    that does not converge on the few begins anew.
+    that does not converge on the few begins anew, and so does one that ends on the few where all
+    cannot be evaluated.
     """
     led = _solve(few_samples(study), settings, rows, starts, sigma, progress)
     first, of = same_ends(rows, led)
     at = np.where((led.status == FitStatus.CONVERGED)[:, None], led.theta, starts)[first]
-    ends = _solve(study, settings, rows[first], at, sigma, None, together=len(rows))
+    alive = _only_alive(progress)
+    ends = _solve(study, settings, rows[first], at, sigma, alive, together=len(rows))
     ends = Solved(*(v[of] for v in ends))
+    lost = np.flatnonzero(
+        (ends.status == FitStatus.INFEASIBLE_START) & (led.status == FitStatus.CONVERGED)
+    )
+    if len(lost):
+        anew = _solve(study, settings, rows[lost], starts[lost], sigma, alive, together=len(rows))
+        for all_, new in zip(ends, anew, strict=True):
+            all_[lost] = new
     return ends._replace(iterations=ends.iterations + led.iterations)
 
 
 def _solve_more(study, settings, sigma, progress, rows, starts) -> Solved:
     """Further starts of a few lanes; their batch does not depend on how many there are."""
     settings = dataclasses.replace(settings, batch=min(settings.batch, FEW))
-    alive = None if progress is None else lambda done, of: progress(0, of)
-    return _solve(study, settings, rows, starts, sigma, alive, together=max(len(rows), FEW))
+    together = max(len(rows), FEW)
+    return _solve(study, settings, rows, starts, sigma, _only_alive(progress), together=together)
+
+
+def _only_alive(progress):
+    """Told that the work goes on, and of no start that is done."""
+    return None if progress is None else lambda done, of: progress(0, of)
 
 
 def _solve(
     study: Study, settings: Settings, rows, starts, sigma, progress, *, together: int | None = None
 ) -> Solved:
     """Every start of lane `rows`; sigma of each lane; `together`: starts that the batch is for."""
-    common = _common(study, settings, len(rows), progress)
+    together = len(rows) if together is None else together
+    common = _common(study, settings, together, progress, len(rows))
     if settings.method == "levenberg-marquardt":
-        together = len(rows) if together is None else together
-        common["batch"] = study.batch_size(together, settings.batch)
-        common["quick"] = study.quick(together)
         return levenberg_marquardt(
             LaneCost(study.model, study.lanes, sigma), starts, rows,
-            tolerances=settings.tolerances, **common,
+            tolerances=settings.tolerances, quick=study.quick(together), **common,
         )  # fmt: skip
     descent = Descent(settings.method, settings.tolerances)
     return descend(study, rows, starts, sigma, descent, **common)
@@ -192,20 +205,21 @@ def _solve_jointly(
     if settings.method != "levenberg-marquardt":
         raise ValueError(f"a joint study needs levenberg-marquardt, not {settings.method}")
     lanes = study.lanes.lower.shape[0]
-    common = _common(study, settings, len(starts), progress)
     # One size for all calls, so that it is compiled once.
-    common["batch"] = study.batch_size(lanes * settings.starts, settings.batch)
+    common = _common(study, settings, lanes * settings.starts, progress, len(starts))
     of_starts = np.swapaxes(starts.reshape(lanes, len(starts) // lanes, -1), 0, 1)
     return solve_jointly(
         study, of_starts, sigma, separately=not near, tolerances=settings.tolerances, **common
     )
 
 
-def _common(study: Study, settings: Settings, starts: int, progress) -> dict[str, Any]:
-    """What all solvers are told."""
+def _common(
+    study: Study, settings: Settings, together: int, progress, starts: int
+) -> dict[str, Any]:
+    """What all solvers are told; `together`: starts that the batch is for, of `starts`."""
     report = None if progress is None else lambda done: progress(done, starts)
     dtype = np.float32 if settings.float32 else np.float64
-    batch = study.batch_size(starts, settings.batch)
+    batch = study.batch_size(together, settings.batch)
     return {"batch": batch, "progress": report, "dtype": dtype}
 
 

@@ -67,7 +67,8 @@ class FitResult:
         status: `FitStatus`; (lanes,).
         iterations: of the best start; (lanes,).
         cost: half the weighted sum of squares (or of rho); (lanes,).
-        converged_starts: starts that ended in the best minimum; (lanes,).
+        converged_starts: starts that ended in the best minimum; of many long curves (`few_samples`)
+            those that came together on a few samples went there as one; (lanes,).
         tried: starts in all; (lanes,).
         sigma: standard deviation of force (N) and markers (mm), given (the median of the lane's
             samples) or estimated; (lanes, 2).
@@ -134,8 +135,8 @@ class FitResult:
         return relative_change(self.study, self.theta)
 
     @functools.cached_property
-    def prediction(self) -> Prediction:
-        """Model minus data at the estimates."""
+    def residuals(self) -> Prediction:
+        """Model minus data at the estimates; as large as the data."""
         return predictions(self.study, self.theta)
 
     @functools.cached_property

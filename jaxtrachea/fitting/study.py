@@ -408,7 +408,8 @@ def check_touch(curve: Curve, options: Options, parameters: Sequence[Parameter])
     pressed = curve.displacement > (onset.value if onset.fixed else -np.inf)
     lost = np.abs(np.where(pressed, np.minimum(force, 0), force))
     kept = max(float(np.max(force, where=pressed, initial=0)), 0.0)
-    if np.max(lost) > 2 * kept if offset.fixed else not pressed.any():
+    nothing_left = np.max(lost) > 2 * kept if offset.fixed else not pressed.any()
+    if nothing_left:
         found = f"its largest force is at or before the onset, {onset.value:g} mm"
         if pressed[np.argmax(lost)]:
             found = "its largest force pulls"

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lane import Lane, Observed, forces, markers
-from jaxtrachea.fitting.predictions import Prediction
+from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
@@ -111,7 +111,7 @@ def bootstrap(
     _check(count, kind, block)
     check_block(result.study, block)
     result.study.refuse_joint("the bootstrap")
-    seen = result.prediction
+    seen = predictions(result.study, result.theta)
     batch = result.study.batch_size(max(result.lanes * settings.starts, 16), settings.batch)
     one = dataclasses.replace(settings, starts=1, batch=batch, scrutiny=False)
     thetas, usable = [], []

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from jaxtrachea.fitting.criteria import Criteria
 from jaxtrachea.fitting.lane import forces, markers
+from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.effective import CORRELATED, effective_samples
@@ -177,7 +178,7 @@ def compared(models: Sequence[Model]) -> tuple[list[Row], int]:
 def _worth(model: Model) -> Float[np.ndarray, " lanes"]:
     """Independent samples that those of each lane are worth by the residuals of a model."""
     result = model.result
-    worth = effective_samples(result.prediction)
+    worth = effective_samples(predictions(result.study, result.theta))
     return np.where(np.isnan(worth), np.asarray(result.samples, float), worth)
 
 

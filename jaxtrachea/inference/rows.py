@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxtrachea.fitting.lane import forces, markers
+from jaxtrachea.fitting.lane import forces, markers, peaks
 from jaxtrachea.fitting.result import FitResult
 
 #: Lanes that are listed and drawn one by one; of more, the worst.
@@ -40,7 +40,7 @@ def samples_of(result: FitResult, lane: int, trials: list[int]) -> int:
 
 def over_peak(result: FitResult) -> np.ndarray:
     """Root mean square force residual over the largest force of each lane; (lanes,)."""
-    peak = np.max(np.abs(result.study.lanes.force), axis=(1, 2))
+    peak = peaks(forces(result.study.lanes)[:1])
     return np.where(peak > 0, result.rms[:, 0], np.nan) / np.where(peak > 0, peak, 1)
 
 

@@ -46,7 +46,7 @@ def report_text(
         *_sections(findings, "estimates"),
         "## Quality",
         *_quality(result, failed),
-        f"Largest residual: {worst(result.prediction, result)}.",
+        f"Largest residual: {worst(result.residuals, result)}.",
         *_sections(findings, "quality"),
         *_bounds(result),
         *_sections(findings, "checks"),

@@ -22,7 +22,7 @@ def draw_all(folder: Path, findings: Findings) -> tuple[list[Path], dict[str, st
     Returns:
         The paths; and by file name, why a picture could not be drawn: it costs itself only.
     """
-    result, prediction = findings.result, findings.result.prediction
+    result, prediction = findings.result, findings.result.residuals
     drawings: dict[str, Any] = {
         "fit.png": partial(draw_fit, result, prediction),
         "residuals.png": partial(draw_residuals, result, prediction),

@@ -89,7 +89,7 @@ def _unknown_cells(
 def summary_rows(findings: Findings, bad: Sequence[BadCurve] = ()) -> list[dict[str, object]]:
     """All rows of summary.csv: those of the lanes, then curves that could not be used."""
     rows = list(lane_rows(findings.result, findings.profiles))
-    rows = with_residuals(findings.result, rows, findings.result.prediction)
+    rows = with_residuals(findings.result, rows, findings.result.residuals)
     for (lane, _), row in zip(row_places(findings.result), rows, strict=True):
         for analysis, found in findings.found:
             row.update(analysis.lane_cells(found, lane))

@@ -78,7 +78,7 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
     group["direction"] = np.array([c.direction for c in curves], np.float64)
     blend = study.lanes.blend
     group["blend"] = np.array([np.nan if blend is None else blend[k, t] for k, t, _ in placed])
-    seen = result.prediction
+    seen = result.residuals
     residual = [seen.force[k, t, : len(c.force)] for k, t, c in placed]
     columns = {
         "displacement": [c.displacement for c in curves],

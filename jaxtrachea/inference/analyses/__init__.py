@@ -107,5 +107,5 @@ def analyse(
 
 def widened(result: FitResult) -> Findings:
     """A fit with the analyses that every table of lanes has, and no others."""
-    wide = effective(result, result.prediction)
-    return Findings(result, ((EFFECTIVE, wide), (MISFIT, misfit(result, result.prediction))))
+    wide = effective(result, result.residuals)
+    return Findings(result, ((EFFECTIVE, wide), (MISFIT, misfit(result, result.residuals))))

@@ -9,7 +9,7 @@ from jaxtrachea.inference.effective import CORRELATED, Effective, effective
 
 
 def _compute(request: Request, findings: Findings, progress: Progress) -> Effective:
-    return effective(findings.result, findings.result.prediction, findings.profiles)
+    return effective(findings.result, findings.result.residuals, findings.profiles)
 
 
 def _lane_cells(wide: Effective, lane: int) -> Cells:

@@ -9,7 +9,7 @@ from jaxtrachea.inference.misfit import Misfit, misfit
 
 
 def _compute(request: Request, findings: Findings, progress: Progress) -> Misfit:
-    return misfit(findings.result, findings.result.prediction)
+    return misfit(findings.result, findings.result.residuals)
 
 
 def _lane_cells(compared: Misfit, lane: int) -> Cells:
