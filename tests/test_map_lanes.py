@@ -9,10 +9,12 @@ import synthetic
 from compilations import compilations
 
 from jaxtrachea._compiler import quick_options
+from jaxtrachea.fitting import other_starts
 from jaxtrachea.fitting.descent import Descent, descend
 from jaxtrachea.fitting.information import informations
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.optimisation.trust_region import Tolerances
 
@@ -84,3 +86,22 @@ def test_loops_over_lanes_compile_once(study, compiled, loop):
 @pytest.mark.parametrize(("total", "size"), [(1, 1), (2, 16), (17, 32), (100, 128), (5000, 128)])
 def test_few_sizes(total, size):
     assert batch_size(total, 128) == size
+
+
+@pytest.mark.parametrize(("lanes", "quick"), [(40, True), (65, False)])
+def test_compliances_of_other_skeletons_are_quick_for_few_lanes_only(lanes, quick, monkeypatch):
+    """They are looked for lane by lane: how many there are in all decides, not one lane's rows."""
+    truth = synthetic.draw(3, lanes, 1.5)
+    study = synthetic.study(synthetic.forces(truth)[0])
+    seen = []
+
+    def watched(function, study, theta, *, batch, rows, quick):
+        seen.append((len(theta) <= batch, quick))
+        return np.ones((len(theta), other_starts.TOGETHER, 4))
+
+    monkeypatch.setattr(other_starts, "map_lanes", watched)
+    result = object.__new__(FitResult)  # what is read of one
+    vars(result).update(study=study, theta=np.log(truth), status=np.zeros(lanes, int))
+    other_starts.twins(result, np.arange(2))
+    assert [one for _, one in seen] == [quick] * 2
+    assert quick or all(at_once for at_once, _ in seen)

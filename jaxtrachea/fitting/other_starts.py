@@ -18,13 +18,13 @@ from jaxtrachea.fitting.residual import inputs
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.starts import box
 from jaxtrachea.fitting.structure import positions, without_curves
-from jaxtrachea.fitting.study import Study
 from jaxtrachea.mechanics.force_law import coefficient, power
 
 #: Indentation over skeleton deflection, and its inverse, of the two starts.
 SOFT = 19.0
-#: Lanes whose compliances are computed together, and points of each: one program serves any number.
-BATCH, TOGETHER = 16, 32
+#: Lanes whose compliances are computed together, of few and of many lanes in all, and points of
+#: each: one program serves any number.
+FEW, MANY, TOGETHER = 16, 64, 32
 #: Skeletons with the same compliances: how many are tried, and the grid they are looked for on
 #: (half width in natural logarithms, points of each axis).
 TWINS, TWIN_REACH, TWIN_POINTS = 3, 9.0, 41
@@ -39,7 +39,7 @@ def soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     data = study.lanes
     seen = data.precision[lanes] > 0
     compliance = np.mean(
-        _compliance(study, lanes, guess[:, None])[:, 0], axis=1, where=seen.any(axis=2)
+        _compliance(result, lanes, guess[:, None])[:, 0], axis=1, where=seen.any(axis=2)
     )
     force = np.where(seen, np.abs(data.force[lanes]), 0)
     deepest = np.argmax(force, axis=2)[..., None]
@@ -67,8 +67,12 @@ def soft_starts(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
     return out
 
 
-def _compliance(study: Study, lanes, theta) -> Float[np.ndarray, "n points T"]:
-    """Compliance at every trial of lanes, mm/N, each at many points; `theta` is (n, points, P)."""
+def _compliance(result: FitResult, lanes, theta) -> Float[np.ndarray, "n points T"]:
+    """Compliance at every trial of lanes, mm/N, each at many points; `theta` is (n, points, P).
+
+    The program is as for all lanes of the result: it is called for each one.
+    """
+    study = result.study
     count, points, size = theta.shape
     rows = -(-points // TOGETHER)
     filled = np.minimum(np.arange(rows * TOGETHER), points - 1)
@@ -76,7 +80,11 @@ def _compliance(study: Study, lanes, theta) -> Float[np.ndarray, "n points T"]:
     bare = without_curves(study)
     read = bare.lanes._replace(joints=None, joint_precision=None)  # their motion is not asked for
     bare = dataclasses.replace(bare, lanes=read)
-    c = map_lanes(_felt_compliance, bare, theta, batch=BATCH, rows=np.repeat(lanes, rows))
+    quick = study.quick(result.lanes)
+    c = map_lanes(
+        _felt_compliance, bare, theta, batch=FEW if quick else MANY, rows=np.repeat(lanes, rows),
+        quick=quick,
+    )  # fmt: skip
     return c.reshape(count, rows * TOGETHER, -1)[:, :points]
 
 
@@ -107,7 +115,7 @@ def twins(result: FitResult, lanes) -> list[Float[np.ndarray, "n P"]]:
         theta = np.repeat(best[None], len(mesh) + 1, axis=0)
         theta[1:, beam] = mesh
         observed = (study.lanes.precision[lane] > 0).any(axis=1)
-        c = _compliance(study, [lane], theta[None])[0]
+        c = _compliance(result, [lane], theta[None])[0]
         with np.errstate(divide="ignore", invalid="ignore"):
             change = np.log(c[1:] / c[0])[:, observed]
         misfit = np.sum(change**2, axis=1).reshape(*map(len, axes))
