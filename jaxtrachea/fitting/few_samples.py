@@ -7,14 +7,12 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Study
+from jaxtrachea.fitting.study import QUICK, Study
 from jaxtrachea.optimisation.levenberg_marquardt import Solved
 from jaxtrachea.status import FitStatus
 
 #: Samples kept of a curve, and how many times as many the longest of a study has at least.
 KEPT, TIMES = 48, 2
-#: Starts below which compiling one more program takes longer than all samples.
-FEWEST = 65
 #: Width of the cells, in scaled coordinates, in which starts of a lane have come to the same point.
 SAME = 1e-3
 
@@ -22,14 +20,14 @@ SAME = 1e-3
 def serves(study: Study, settings: Settings, starts: int) -> bool:
     """Whether so many starts take less time by a few samples of each curve first.
 
-    Not of short curves or few starts. Nor where the few may not tell: markers (seen in some samples
-    alone), the samples next to a fitted onset, the outliers of a robust loss. Nor where no doubt is
-    followed up afterwards: what is one minimum of the few may be two of all. Joint studies,
-    deforming cross-sections, single precision, other solvers and other devices than CPUs, where
-    nothing was measured, go their own way.
+    Not of short curves, nor of so few starts that compiling takes longer (`QUICK`). Nor where the
+    few may not tell: markers (seen in some samples alone), the samples next to a fitted onset, the
+    outliers of a robust loss. Nor where no doubt is followed up afterwards: what is one minimum of
+    the few may be two of all. Joint studies, deforming cross-sections, single precision, other
+    solvers and other devices than CPUs, where nothing was measured, go their own way.
     """
     lanes, model = study.lanes, study.model
-    long = lanes.force.shape[-1] >= TIMES * KEPT and starts >= FEWEST
+    long = lanes.force.shape[-1] >= TIMES * KEPT and starts > QUICK[0]
     forces_alone = lanes.joints is None and not model.options.deforms_sections
     tells = forces_alone and lanes.blend is None and model.loss == "linear" and settings.scrutiny
     solver = settings.method == "levenberg-marquardt" and not settings.float32
