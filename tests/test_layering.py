@@ -81,7 +81,7 @@ WITHIN = {
     "fitting": [
         {"parameters", "lane", "tested", "unread"},
         {"model"},
-        {"lanes", "onset"},
+        {"lanes", "onset", "refusals"},
         {"study"},
         {"map_lanes", "press_scale", "section_residual"},
         {"residual"},

@@ -99,6 +99,21 @@ def test_page_names_every_dataset(result, tmp_path):
         write_hdf5(tmp_path / "r.h5", Findings(result), {})
 
 
+def test_columns_that_gzip_makes_smaller_are_packed(tmp_path):
+    """Displacements in even steps and a sigma that is not there; noise of full precision is not."""
+    depth = np.round(np.linspace(0.001, 2, 2000), 3)
+    noisy = depth + np.random.default_rng(0).normal(0, 0.01, depth.shape)
+    study = build_study([Curve("A", "t", None, 0.0, depth, noisy)], table_1(), TOTAL)
+    write_hdf5(tmp_path / "r.h5", Findings(fit(study, Settings(starts=1))), {})
+    with h5py.File(tmp_path / "r.h5") as file:
+        data = file["data"]
+        packed = {name for name in data if data[name].compression == "gzip"}
+        assert {"displacement", "sigma"} <= packed
+        assert packed.isdisjoint({"force", "residual"})
+        np.testing.assert_array_equal(data["displacement"], depth)
+        np.testing.assert_array_equal(data["force"], noisy)
+
+
 def test_trialwise_unknowns_are_named_by_trial(result):
     labels = [unknown_label(result, 0, i) for i in range(4)]
     assert labels == ["k_1", "k_3", "force_offset[a]", "force_offset[b]"]

@@ -24,10 +24,11 @@ from jaxtrachea.fitting.lane import (
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, defaults_of
 from jaxtrachea.fitting.predictions import Prediction
+from jaxtrachea.fitting.refusals import Size, check_curve
 from jaxtrachea.fitting.residual import inputs, residual, residual_value
 from jaxtrachea.fitting.section_residual import section_material
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import build_study, check_curve
+from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.comparison import same_data
 from jaxtrachea.inference.effective import effective_samples
@@ -441,18 +442,18 @@ def test_presses_of_a_line_refuse():
 def test_curves_that_a_model_cannot_press():
     aside = curve((20.0, 0.5, (1.0, 0.0)))
     with pytest.raises(ValueError, match="phi = 28.6 deg.*choose skeleton = 'sections'"):
-        check_curve(aside, GEOMETRY, Options())
+        check_curve(aside, Size.of(GEOMETRY), Options())
     turned = curve((20.0, 0.0, (0.8, 0.6)))
     with pytest.raises(ValueError, match=r"\(0.8, 0.6\).*choose skeleton = 'sections'"):
-        check_curve(turned, GEOMETRY, Options())
-    check_curve(turned, GEOMETRY, SECTIONS)
+        check_curve(turned, Size.of(GEOMETRY), Options())
+    check_curve(turned, Size.of(GEOMETRY), SECTIONS)
     behind = curve((20.0, 2.2, (1.0, 0.0)))
     with pytest.raises(ValueError, match="phi = 126 deg, expected on the cartilage, within 120"):
-        check_curve(behind, GEOMETRY, SECTIONS)
+        check_curve(behind, Size.of(GEOMETRY), SECTIONS)
     with pytest.raises(ValueError, match="end of ring 4 of 3"):
-        check_curve(curve(PLACES[0], end_rings=np.array([3])), GEOMETRY, SECTIONS)
+        check_curve(curve(PLACES[0], end_rings=np.array([3])), Size.of(GEOMETRY), SECTIONS)
     with pytest.raises(ValueError, match="12 mm deep, expected no more than the radius, 11.7 mm"):
-        check_curve(curve(PLACES[0], np.array([0.5, 2.0, 12.0])), GEOMETRY, SECTIONS)
+        check_curve(curve(PLACES[0], np.array([0.5, 2.0, 12.0])), Size.of(GEOMETRY), SECTIONS)
 
 
 def test_lanes_pressed_otherwise_are_of_another_kind():

@@ -7,8 +7,9 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, defaults_of, held, in_model, visible
+from jaxtrachea.fitting.refusals import Size, refusal
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Study, build_study, check_curve, check_touch
+from jaxtrachea.fitting.study import Study, build_study
 from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.inference.together import left_out_together
 from jaxtrachea.measurements.read import (
@@ -148,19 +149,17 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
     table = parameters_of(spec, options, joints=marked)
     good, bad = [], list(measurements.bad)
     reasons = []
+    size = Size.of(geometry)
     for curve in measurements.curves:
-        kind = "position"
-        try:
-            check_curve(curve, geometry, options)
-            kind = "sign"
-            check_touch(curve, options, table)
-        except InputError as error:
-            reasons.append(f"{curve.source}: {error}")
-            cure = error.remedy or "correct the file, or the trachea and model sections"
-            place = curve.specimen, curve.trial, curve.source
-            bad.append(BadCurve(*place, kind, error.problem, cure))
-        else:
+        refused = refusal(curve, size, options, table)
+        if refused is None:
             good.append(curve)
+            continue
+        kind, error = refused
+        reasons.append(f"{curve.source}: {error}")
+        cure = error.remedy or "correct the file, or the trachea and model sections"
+        place = curve.specimen, curve.trial, curve.source
+        bad.append(BadCurve(*place, kind, error.problem, cure))
     if reasons and not good:
         raise SpecError(reasons[0])
     unread = None

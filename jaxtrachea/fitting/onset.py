@@ -24,14 +24,17 @@ def natural_steps(
 
     A power of ten, not above the median over the curves: studies alike share compiled programs.
     """
-    span = np.median([np.ptp(c.displacement) for c in curves])
-    peak = np.median([np.max(np.abs(c.force)) for c in curves])
-    size = {"onset": float(span), "force_offset": float(peak)}
+    sizes = {
+        "onset": lambda: np.median([np.ptp(c.displacement) for c in curves]),
+        "force_offset": lambda: np.median([np.max(np.abs(c.force)) for c in curves]),
+    }
 
     def scaled(p: Parameter) -> Parameter:
-        if p.fixed or p.name not in size or p.step != DEFAULTS[p.name].step or not size[p.name] > 0:
+        if p.fixed or p.name not in sizes or p.step != DEFAULTS[p.name].step:
             return p
-        return dataclasses.replace(p, step=10.0 ** math.floor(math.log10(size[p.name])))
+        size = float(sizes[p.name]())
+        step = 10.0 ** math.floor(math.log10(size)) if size > 0 else p.step
+        return dataclasses.replace(p, step=step)
 
     return tuple(map(scaled, parameters))
 

@@ -32,13 +32,13 @@ from jaxtrachea.fitting.model import Common, FitModel, columns_of, numbers_of
 from jaxtrachea.fitting.onset import blends, natural_steps, onset_is_sought, within_reach
 from jaxtrachea.fitting.parameters import (
     DEFAULTS,
-    OF_THE_PRESS,
     SKELETON,
     Parameter,
     defaults_of,
     held,
     in_model,
 )
+from jaxtrachea.fitting.refusals import Size, refusal
 from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
@@ -266,9 +266,8 @@ def build_study(
 
     Raises:
         ValueError: a `tool_radius` that is no length, none where `weighting` leaves pressed ends
-            out, no curve, one that no touch explains (`check_touch`), a marker on a ring that does
-            not exist, a curve without a contact position where one is needed, with specimen and
-            trial named; a parameter that the model does not have.
+            out, no curve, one that cannot be pressed (`refusals`), with specimen and trial named;
+            a parameter that the model does not have.
     """
     if tool_radius is not None and not 0 <= tool_radius < np.inf:
         raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
@@ -279,15 +278,14 @@ def build_study(
         curves = curves.curves
     if not curves:
         raise ValueError("no usable curve; nothing to fit")
+    table, size = _table(parameters, options, curves, geometry), Size.of(geometry)
     for curve in curves:
-        check_curve(curve, geometry, options)
+        if (refused := refusal(curve, size, options, table)) is not None:
+            raise refused.error
     if not options.deforms_sections:
         curves, unread = along_the_normal(curves)
         if unread is not None:
             warnings.warn(unread, stacklevel=2)
-    table = _table(parameters, options, curves, geometry)
-    for curve in curves:
-        check_touch(curve, options, table)
     parameters = natural_steps(table, curves)
     joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1
@@ -338,132 +336,6 @@ def _table(
     joints = any(c.joint_displacement is not None for c in curves)
     names = in_model(options, joints=joints, named=changes)
     return default_parameters(names, changes, defaults_of(options, geometry))
-
-
-def check_curve(curve: Curve, geometry: Geometry, options: Options) -> None:
-    """Refuse a curve that the model cannot press.
-
-    Raises:
-        InputError: no contact position, one outside the tube, one off the midline or a tool that
-            moves aside where the skeleton is a line of joints, a tool whose width reaches beyond an
-            end of the tube, a marker or an end of a ring that does not exist; specimen and trial
-            are named.
-    """
-    where = f"specimen {curve.specimen!r} trial {curve.trial!r}"
-    length, rings = float(geometry.length), geometry.rings
-    if curve.s_c is None:
-        if options.coupling == "series":
-            raise InputError(
-                "no contact position",
-                place=where,
-                cure="give a column s, or data.s for all curves (coupling = 'total' needs none)",
-            )
-    elif not 0 <= curve.s_c <= length:
-        raise InputError(
-            f"contact at s = {curve.s_c:g} mm, expected on the tube, 0 to {length:g} mm",
-            place=where,
-        )
-    else:
-        _check_width(curve.s_c, length, options, where)
-    if options.deforms_sections:
-        if not abs(curve.phi_c) <= float(geometry.half_angle):
-            raise InputError(
-                f"contact at phi = {np.degrees(curve.phi_c):.3g} deg, expected on the cartilage, "
-                f"within {np.degrees(float(geometry.half_angle)):.3g} deg of the midline",
-                place=where,
-            )
-        if (deepest := float(np.max(np.abs(curve.displacement)))) > float(geometry.radius):
-            raise InputError(
-                f"pressed {deepest:.3g} mm deep, expected no more than the radius, "
-                f"{float(geometry.radius):g} mm",
-                place=where,
-                cure="cut the curve off (displacement_max) or leave it out",
-            )
-    else:
-        _check_normal(curve, options, where)
-    if curve.joint_rings is not None and np.any(curve.joint_rings >= rings):
-        found = f"marker on ring {curve.joint_rings.max() + 1} of {rings}"
-        raise InputError(found, place=where)
-    if curve.end_rings is not None and np.any(curve.end_rings >= rings):
-        found = f"end of ring {curve.end_rings.max() + 1} of {rings}"
-        raise InputError(found, place=where)
-
-
-def check_touch(curve: Curve, options: Options, parameters: Sequence[Parameter]) -> None:
-    """Refuse a curve whose largest force is one that a tool which only touches cannot have.
-
-    Args:
-        curve: the curve.
-        options: with `unilateral` contact; other curves may pull.
-        parameters: the table: a fitted onset may lie anywhere, a fitted offset shifts all forces.
-
-    Raises:
-        InputError: it pulls, or comes before the onset, both by twice what is left; specimen and
-            trial are named.
-    """
-    if options.contact != "unilateral":
-        return
-    onset, offset = (next(p for p in parameters if p.name == name) for name in OF_THE_PRESS)
-    force = curve.force - (offset.value if offset.fixed else 0)
-    pressed = curve.displacement > (onset.value if onset.fixed else -np.inf)
-    lost = np.abs(np.where(pressed, np.minimum(force, 0), force))
-    kept = max(float(np.max(force, where=pressed, initial=0)), 0.0)
-    nothing_left = np.max(lost) > 2 * kept if offset.fixed else not pressed.any()
-    if nothing_left:
-        found = f"its largest force is at or before the onset, {onset.value:g} mm"
-        if pressed[np.argmax(lost)]:
-            found = "its largest force pulls"
-        raise InputError(
-            f"{found}, where a tool that only touches (contact = 'unilateral') has none",
-            place=f"specimen {curve.specimen!r} trial {curve.trial!r}",
-            cure="use force_sign = -1 and displacement_sign = -1 where the file counts compression "
-            "negative, contact = 'bonded' where it pulls, or fit the onset",
-        )
-
-
-def _check_normal(curve: Curve, options: Options, where: str) -> None:
-    """Refuse a press that a line of joints does not have.
-
-    Raises:
-        InputError: naming specimen and trial, and the level that has it.
-    """
-    cure = "choose skeleton = 'sections' and contact = 'bonded', or leave the curve out"
-    if options.coupling == "series" and abs(curve.phi_c) > 1e-6:
-        raise InputError(
-            f"contact at phi = {np.degrees(curve.phi_c):.3g} deg; this model presses on the "
-            "anterior midline (phi = 0) only",
-            place=where,
-            cure=cure,
-        )
-    if abs(curve.direction[1]) > 1e-6:
-        shown = ", ".join(f"{v:.4g}" for v in curve.direction)
-        raise InputError(
-            f"the tool moves in the direction ({shown}); this model presses along the inward "
-            "normal (1, 0) only",
-            place=where,
-            cure=cure,
-        )
-
-
-def _check_width(s_c: float, length: float, options: Options, where: str) -> None:
-    """Refuse a tool of which a part lies off the tube.
-
-    Raises:
-        InputError: naming the curve, the width and the places for it.
-    """
-    low, high = options.places(length)
-    if low <= s_c <= high:
-        return
-    expected = f"s from {low:g} to {high:g} mm"
-    if low > high:
-        expected = f"a tool no wider than the tube is long, {length:g} mm"
-    raise InputError(
-        f"contact at s = {s_c:g} mm, where a tool of half_width {options.half_width:g} mm reaches "
-        "beyond an end of the tube",
-        place=where,
-        expected=expected,
-        cure="leave the curve out, or make half_width smaller (0: the tool touches at a point)",
-    )
 
 
 def _common(unknowns, parameters) -> Common:

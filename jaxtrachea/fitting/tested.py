@@ -23,7 +23,7 @@ def untested(options: Options, radius: float, depth: float) -> str:
 def deeper_than_tested(curves: Sequence[Curve], options: Options, radius: float) -> str | None:
     """A sentence on curves that go deeper than the model was tested; None: there are none."""
     most = tested_depth(options, radius)
-    deep = [d for c in curves if (d := float(np.max(np.abs(c.displacement)))) > most]
+    deep = [d for c in curves if (d := max(c.displacement.max(), -c.displacement.min())) > most]
     if not deep:
         return None
     cure = "cut them off or leave them out where that matters"

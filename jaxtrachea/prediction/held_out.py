@@ -11,8 +11,9 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Weighting
 from jaxtrachea.fitting.onset import onset_is_sought
+from jaxtrachea.fitting.refusals import Size, refusal
 from jaxtrachea.fitting.settings import Settings
-from jaxtrachea.fitting.study import Study, build_study, check_curve, check_touch
+from jaxtrachea.fitting.study import Study, build_study
 from jaxtrachea.fitting.unread import LEFT_OUT
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.optimisation.programs import program
@@ -71,19 +72,16 @@ class Compared:
 def pressable(stored: StoredFit, curves: Sequence[Curve]) -> tuple[list[Curve], list[BadCurve]]:
     """Curves that the model of the fit can press, and the others with the reason."""
     good, bad = [], []
-    model = stored.study.model
+    model, parameters = stored.study.model, stored.study.parameters
+    size = Size.of(model.geometry)
     for curve in curves:
-        kind = "position"
-        try:
-            check_curve(curve, model.geometry, model.options)
-            kind = "sign"
-            check_touch(curve, model.options, stored.study.parameters)
-        except InputError as error:
-            text = str(InputError.like(error, place=""))
-            cure = "correct the file; tube and model are those of the fit"
-            bad.append(BadCurve(curve.specimen, curve.trial, curve.source, kind, text, cure))
-        else:
+        refused = refusal(curve, size, model.options, parameters)
+        if refused is None:
             good.append(curve)
+            continue
+        text = str(InputError.like(refused.error, place=""))
+        cure = "correct the file; tube and model are those of the fit"
+        bad.append(BadCurve(curve.specimen, curve.trial, curve.source, refused.kind, text, cure))
     return good, bad
 
 

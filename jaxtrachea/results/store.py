@@ -5,6 +5,7 @@ Numbers and JSON (as bytes) only; `stored` reads them back.
 
 import dataclasses
 import json
+import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -18,6 +19,8 @@ from jaxtrachea.trachea.geometry import Geometry
 
 #: Arrays of the tube.
 GEOMETRY = tuple(f.name for f in dataclasses.fields(Geometry))
+#: Numbers of a column that are tried, and the part of their size that gzip must leave at most.
+BEGINNING, WORTH = 1 << 14, 0.7
 
 
 def write(
@@ -104,9 +107,19 @@ def _write_data(group: h5py.Group, result: FitResult, files: Mapping[str, str]) 
         columns[kind.name] = [used[k, t, : len(c.force)] for k, t, c in placed]
         columns[f"{kind.name}_residual"] = [left[k, t, : len(c.force)] for k, t, c in placed]
     for name, parts in columns.items():
-        group.create_dataset(
-            name, data=np.concatenate(parts), compression="gzip", compression_opts=1, shuffle=True
-        )
+        values = np.concatenate(parts)
+        group.create_dataset(name, data=values, **_packing(values))
+
+
+def _packing(values: np.ndarray) -> dict[str, Any]:
+    """How a column is stored: by gzip where its beginning gets much smaller by it.
+
+    Of noise every bit is new; 30 million measured numbers took 5 s to get smaller by a fifth.
+    """
+    bytes_of = np.ascontiguousarray(values[:BEGINNING]).view(np.uint8).reshape(-1, values.itemsize)
+    if len(zlib.compress(bytes_of.T.tobytes(), 1)) > WORTH * bytes_of.size:
+        return {}
+    return {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
 def _side(curve: Curve) -> np.ndarray:
