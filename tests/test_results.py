@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from jaxtrachea.files.output import OutputExists, new_directory, new_output
 from jaxtrachea.files.tables import markdown_table, number, write_csv
@@ -28,7 +29,7 @@ from jaxtrachea.inference.residuals import lag_correlation, rms, worst
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.report.fit import report_text
-from jaxtrachea.report.plots import draw_all
+from jaxtrachea.report.plots import _draw_bands, draw_all
 from jaxtrachea.results.hdf5 import write_hdf5
 from jaxtrachea.results.rows import bad_row, lane_rows, parameter_rows
 from jaxtrachea.status import FitStatus
@@ -198,6 +199,26 @@ def test_plots_of_many_lanes_and_of_nothing_finite(result, tmp_path):
         paths, lost = draw_all(tmp_path / name, predicted(result, one))
         assert (len(paths), lost) == (3, {})
         assert all(p.read_bytes()[:4] == b"\x89PNG" for p in paths)
+
+
+def test_bands_of_residuals_along_the_press():
+    """Of normal residuals that grow along the press: quantiles of the normal distribution."""
+    draw = np.random.default_rng(3)
+    depth = np.tile(np.linspace(0, 6, 200), 5000)
+    axis = Figure().subplots()
+    _draw_bands(axis, depth, 0.3 + (1 + depth) * draw.normal(size=len(depth)))
+    wide, narrow = (band.get_paths()[0].vertices for band in axis.collections)
+    at, median = axis.lines[-1].get_data()
+    assert len(at) == 60
+    for band, quantile in ((wide, 1.95996), (narrow, 0.67449)):
+        edges = [np.sort(band[np.isclose(band[:, 0], x), 1])[[0, -1]] for x in at]
+        scaled = (np.array(edges) - 0.3) / (1 + at[:, None])
+        np.testing.assert_allclose(scaled.mean(axis=0), [-quantile, quantile], atol=0.02)
+        np.testing.assert_allclose(scaled, np.tile([-quantile, quantile], (60, 1)), atol=0.2)
+    assert np.mean((median - 0.3) / (1 + at)) == pytest.approx(0, abs=0.01)
+    # Too few samples, and one displacement for all: no band, no error.
+    for few in (np.linspace(0, 1, 30), np.zeros(30)):
+        _draw_bands(Figure().subplots(), few, few)
 
 
 def test_rms_skips_what_is_not_there():

@@ -13,7 +13,10 @@ from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.result import FitResult, unknown_label
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.labels import lane_label
-from jaxtrachea.inference.rows import LINES, ONE_BY_ONE, listed, worst_first
+from jaxtrachea.inference.rows import ONE_BY_ONE, listed, worst_first
+
+#: Residuals that bands are made of at most, intervals of displacement, and samples in one at least.
+BANDED, BINS, FEWEST = 400_000, 60, 20
 
 
 def draw_all(folder: Path, findings: Findings) -> tuple[list[Path], dict[str, str]]:
@@ -123,28 +126,62 @@ def _draw_joints(axis, result, prediction, lane, colours) -> None:
 
 
 def draw_residuals(result: FitResult, prediction: Prediction):
-    """Force residuals, model - data, against displacement, and their distribution."""
+    """Force residuals, model - data, against displacement, and their distribution.
+
+    Of many lanes the worst are lines before what the residuals of all come to along the press.
+    """
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    pooled, lined = [], set(listed(result, LINES))
+    many = result.lanes > ONE_BY_ONE
+    lined = set(listed(result, ONE_BY_ONE // 2 if many else ONE_BY_ONE))
+    pooled, depths = [], []
     for lane in range(result.lanes):
         for t, curve in enumerate(result.study.curves[lane]):
             n = len(curve.force)
             peak = np.max(np.abs(curve.force))
             r = 100 * prediction.force[lane, t, :n] / (peak if peak > 0 else 1)
             pooled.append(r)
+            depths.append(curve.displacement)
             if lane in lined:
                 left.plot(curve.displacement, r, lw=0.7, alpha=0.6)
+    values, depth = np.concatenate(pooled), np.concatenate(depths)
+    seen = np.isfinite(values)
+    values, depth = values[seen], depth[seen]
+    if many:
+        _draw_bands(left, depth, values)
     left.axhline(0, color="k", lw=0.6)
+    shown = of_all(len(lined), result.lanes, "worst lanes")
     left.set(
         xlabel="displacement [mm]",
         ylabel="(model - data) / peak [%]",
-        title="force residuals" + of_all(len(lined), result.lanes, "worst lanes"),
+        title="force residuals" + (f"{shown} (lines), all (bands)" if many else shown),
     )
-    values = np.concatenate(pooled)
-    right.hist(values[np.isfinite(values)], bins=60, color="0.4")
+    right.hist(values, bins=60, color="0.4")
     right.set(xlabel="residual / peak [%]", ylabel="samples")
     return figure
+
+
+def _draw_bands(axis, depth, values) -> None:
+    """Median and the middle 50 and 95 % of residuals along the press."""
+    if len(values) > BANDED:  # as many tell the same
+        drawn = np.random.default_rng(0).integers(len(values), size=BANDED)
+        depth, values = depth[drawn], values[drawn]
+    if not np.ptp(depth) > 0:
+        return
+    edges = np.linspace(depth.min(), depth.max(), BINS + 1)
+    bins = np.clip(np.searchsorted(edges, depth, side="right") - 1, 0, BINS - 1)
+    levels = np.full((BINS, 5), np.nan)
+    for i in range(BINS):
+        if np.sum(bins == i) >= FEWEST:
+            levels[i] = np.percentile(values[bins == i], [2.5, 25, 50, 75, 97.5])
+    middle = (edges[1:] + edges[:-1]) / 2
+    low, lower, median, upper, high = levels.T
+    look = {"color": "0.2", "lw": 0, "zorder": 3}
+    axis.fill_between(middle, low, high, alpha=0.25, label="95 % of samples", **look)
+    axis.fill_between(middle, lower, upper, alpha=0.45, label="50 %", **look)
+    axis.plot(middle, median, color="w", lw=1.4, zorder=4)
+    axis.plot(middle, median, color="k", lw=0.9, zorder=4, label="median")
+    axis.legend(ncols=3, loc="upper left")
 
 
 def draw_correlation(result: FitResult):
