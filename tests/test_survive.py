@@ -398,6 +398,22 @@ def test_devices_share_the_work_and_its_end():
     assert len(done) < 20
 
 
+def test_a_cpu_works_with_all_the_cores_it_may_use(monkeypatch):
+    """Beyond 8 they wait for Python; where the system does not tell, all there are."""
+    cpu = jax.local_devices(backend="cpu")[:1]
+    monkeypatch.setattr(jax, "local_devices", lambda: cpu)
+    for cores, workers in ((1, 1), (3, 3), (64, 8)):
+        monkeypatch.setattr(
+            os, "sched_getaffinity", lambda _, n=cores: set(range(n)), raising=False
+        )
+        assert shards.workers() == cpu * workers
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: 5)
+    assert shards.workers() == cpu * 5
+    monkeypatch.setattr(jax, "local_devices", lambda: ["first", "second"])
+    assert shards.workers() == ["first", "second"]
+
+
 def test_processes_notice_each_other(tmp_path):
     """One that is through is waited for no longer; a silent one and one that failed are lost."""
     meetings = [Meeting(k, 2, "s", 1.0) for k in range(2)]

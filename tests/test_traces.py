@@ -7,6 +7,7 @@ import pickle
 import re
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import equinox as eqx
@@ -19,6 +20,7 @@ from compilations import compilations
 from jaxtrachea._compiler import quick_options
 from jaxtrachea.files import traces
 from jaxtrachea.files.traces import Traced, keep_traces
+from jaxtrachea.optimisation import programs
 
 ROOT = Path(__file__).parents[1]
 #: Names of the functions below each time that one is traced.
@@ -273,6 +275,30 @@ def test_threads_on_two_devices(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["2", "2", "1"]
+
+
+@pytest.mark.parametrize("keeping", [True, False])
+def test_threads_share_what_is_compiled(keeping, folder):
+    """As shards on the cores of a CPU: one object for equal arguments, traced and compiled once."""
+    if not keeping:
+        keep_traces(None)
+    together, found = threading.Barrier(8), []
+
+    def work(i):
+        together.wait()
+        run = programs.program(power_sum, 2.0, axes=None)
+        count = run(pair(), np.full(3, float(i)))["count"]
+        found.append((id(run), float(count)))
+
+    programs._program.cache_clear()
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 8
+    assert len(set(found)) == 1
+    assert TRACES == ["power_sum"]
 
 
 def test_code_from_elsewhere_is_not_kept(folder, monkeypatch):

@@ -18,6 +18,7 @@ import io
 import os
 import pickle
 import platform
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -88,6 +89,7 @@ class Traced:
         self._options = quick_options() if quick else None
         self._plain = jax.jit(self._function, donate_argnums=donate, compiler_options=self._options)
         self._compiled: dict[Any, Callable] = {}
+        self._compiling = threading.Lock()
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """What the function returns."""
@@ -103,11 +105,19 @@ class Traced:
         except TypeError:  # neither an array nor a number; a field without a hash
             return self._plain(*arguments, **named)
         if compiled is None:
-            compiled = self._plain
-            with contextlib.suppress(Exception):  # what is wrong is said by the plain call
-                compiled = self._by_trace(_folder, (arguments, named), kinds, device)
-            self._compiled[key] = compiled
+            compiled = self._compile(key, (arguments, named))
         return compiled(*arguments, **named)
+
+    def _compile(self, key: tuple, given: tuple) -> Callable:
+        """The function of arguments like these, compiled by one thread for all."""
+        folder, device, _, kinds = key
+        with self._compiling:
+            if key not in self._compiled:
+                compiled = self._plain
+                with contextlib.suppress(Exception):  # what is wrong is said by the plain call
+                    compiled = self._by_trace(folder, given, kinds, device)
+                self._compiled[key] = compiled
+            return self._compiled[key]
 
     def lower(self, *arguments: Any, **named: Any) -> Any:
         """As of `jax.jit`; nothing is kept."""

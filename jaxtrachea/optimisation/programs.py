@@ -5,6 +5,7 @@ their programs. JAX keeps apart what differs in shapes and dtypes.
 """
 
 import functools
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -13,8 +14,10 @@ import numpy as np
 
 from jaxtrachea.files.traces import Traced
 
+_program = functools.lru_cache(maxsize=128)(Traced)
+_making_one = threading.Lock()
 
-@functools.lru_cache(maxsize=128)
+
 def program(
     function: Callable,
     *static,
@@ -31,7 +34,8 @@ def program(
         donate: of the other arguments, as `donate_argnums` of `jax.jit`.
         quick: compiled without optimisation, in a third of the time: for little work.
     """
-    return Traced(function, *static, axes=axes, donate=donate, quick=quick)
+    with _making_one:  # threads share what is compiled
+        return _program(function, *static, axes=axes, donate=donate, quick=quick)
 
 
 def batch_size(total: int, most: int) -> int:

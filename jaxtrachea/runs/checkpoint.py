@@ -17,7 +17,7 @@ from jaxtrachea.inference.analyses import widened
 from jaxtrachea.results.hdf5 import read_hdf5
 from jaxtrachea.results.rows import summary_rows
 from jaxtrachea.runs.folder import NoRun, RunFolder, digest
-from jaxtrachea.runs.shards import divide, join, load, replaced, save
+from jaxtrachea.runs.shards import divide, join, load, replaced, save, workers
 
 #: A rerun of failed lanes has so many times more starts.
 MORE_STARTS = 4
@@ -55,7 +55,7 @@ def fit_shards(
     todo: list[int],
     progress: Callable[[int, int], None],
 ) -> None:
-    """Fit shards and save each as soon as it is done, on all devices of this process.
+    """Fit shards and save each as soon as it is done, on all devices (cores) of this process.
 
     Args:
         run: where to.
@@ -75,12 +75,13 @@ def fit_shards(
         result = fit(part.take(lanes), settings, lambda done, of: progress(done, jobs))
         save(run.shard(k), run.manifest, lanes, result)
 
-    _on_devices(one, todo, jax.local_devices())
+    _on_devices(one, todo, workers())
 
 
 def _on_devices(work: Callable[[int], None], items: list[int], devices: list) -> None:
-    """Do the work for every item, one at a time on each device; the first error ends it."""
-    if len(devices) == 1 or len(items) < 2:
+    """Do the work for every item, a thread for each device named; the first error ends it."""
+    devices = devices[: len(items)]
+    if len(devices) < 2:
         for item in items:
             work(item)
         return

@@ -27,6 +27,8 @@ from jaxtrachea.runs.manifest import Manifest
 #: Lanes of a shard at most, and its residual entries times starts at most: about ten seconds of
 #: one core.
 MOST_LANES, MOST_ENTRIES = 4096, 4_000_000
+#: Threads on the cores of a CPU at most: beyond it they wait for Python more than for XLA.
+MOST_THREADS = 8
 #: Key of the manifest in the file of a shard.
 _MANIFEST = "journal"
 
@@ -59,8 +61,23 @@ def slots(study: Study, free: float) -> int:
     return min(most_slots(), study.most_together, 1 << (fitting.bit_length() - 1))
 
 
+def workers() -> list:
+    """The device of each thread that fits shards: every device; of a CPU, as often as it has cores.
+
+    XLA computes so small a batch on one core. Cores are those that this process may use.
+    """
+    import jax
+
+    devices = jax.local_devices()
+    if len(devices) > 1 or devices[0].platform != "cpu":
+        return devices
+    with contextlib.suppress(AttributeError):  # not on every system
+        return devices * min(len(os.sched_getaffinity(0)), MOST_THREADS)
+    return devices * min(os.cpu_count() or 1, MOST_THREADS)
+
+
 def free_memory() -> float:
-    """Bytes free on the first device; of the machine's memory its share where devices share it."""
+    """Bytes free on the first device; of the machine's memory the share of one worker."""
     import jax
 
     device = jax.local_devices()[0]
@@ -70,10 +87,10 @@ def free_memory() -> float:
     with contextlib.suppress(OSError, StopIteration):
         with open("/proc/meminfo", encoding="ascii") as stream:
             line = next(line for line in stream if line.startswith("MemAvailable"))
-        return 1024 * int(line.split()[1]) / jax.local_device_count()
+        return 1024 * int(line.split()[1]) / len(workers())
     with contextlib.suppress(AttributeError, ValueError, OSError):
         pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        return pages / jax.local_device_count()
+        return pages / len(workers())
     return np.inf
 
 
