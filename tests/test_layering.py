@@ -12,7 +12,7 @@ import jaxtrachea
 PACKAGE = pathlib.Path(jaxtrachea.__file__).parent
 #: Rooms from the bottom up; `fit` and `scene` are neighbours, neither knows the other.
 ORDER = [
-    {"_errors", "_linear", "_compiler"},
+    {"_errors", "_linear", "_compiler", "_threads"},
     {"units", "status", "_numerics", "_arguments", "_packed"},
     {"_written_out"},
     {"_in_order"},

@@ -216,9 +216,12 @@ def test_bands_of_residuals_along_the_press():
         np.testing.assert_allclose(scaled.mean(axis=0), [-quantile, quantile], atol=0.02)
         np.testing.assert_allclose(scaled, np.tile([-quantile, quantile], (60, 1)), atol=0.2)
     assert np.mean((median - 0.3) / (1 + at)) == pytest.approx(0, abs=0.01)
-    # Too few samples, and one displacement for all: no band, no error.
-    for few in (np.linspace(0, 1, 30), np.zeros(30)):
-        _draw_bands(Figure().subplots(), few, few)
+    # No sample, and one displacement for all: no band, no error.
+    for few in (np.zeros(0), np.zeros(30)):
+        axis = Figure().subplots()
+        _draw_bands(axis, few, few)
+        assert not axis.collections
+        assert not axis.lines
 
 
 def test_rms_skips_what_is_not_there():

@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -38,6 +39,7 @@ from jaxtrachea.files import output
 from jaxtrachea.files.provenance import source_digest
 from jaxtrachea.fitting import fit
 from jaxtrachea.fitting.cost import LaneCost
+from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.optimisation import levenberg_marquardt
 from jaxtrachea.optimisation.programs import program
@@ -81,8 +83,9 @@ def study(peace, tmp_path, monkeypatch):
 
 
 def stop_at(patch, k, error=KeyboardInterrupt):
-    """Let fits before the k-th through, stop that one; counts them in the list it returns."""
+    """Let fits before the k-th through, one after the other, stop that one; counts them."""
     asked, real = [], fit.fit
+    patch.setattr(checkpoint, "worker_devices", lambda _: jax.local_devices()[:1])
 
     def stopping(study, settings, progress):
         asked.append(study.lanes.lower.shape[0])
@@ -360,7 +363,7 @@ def test_sizes_of_shards(peace):
     assert shards.slots(long, 1e12) == (16 if on_cpu else most)
     assert long.batch_size(1000, 4) == 4
     assert dataclasses.replace(long, joint=True).batch_size(1000, 128) == 128
-    assert shards.free_memory() > 1e6
+    assert shards.free_memory(1) > 1e6
 
 
 @pytest.mark.slow
@@ -383,10 +386,10 @@ def test_memory_of_a_lane_is_what_xla_counts(peace):
 def test_devices_share_the_work_and_its_end():
     """Each item once; an error on one device ends the others after the item they are at."""
     device, done = jax.local_devices()[0], []
-    checkpoint._on_devices(done.append, list(range(20)), [device] * 3)
+    checkpoint._on_devices(lambda k, _: done.append(k), list(range(20)), [device] * 3)
     assert sorted(done) == list(range(20))
 
-    def fail(k):
+    def fail(k, _):
         done.append(k)
         time.sleep(0.01)
         if k == 3:
@@ -406,12 +409,79 @@ def test_a_cpu_works_with_all_the_cores_it_may_use(monkeypatch):
         monkeypatch.setattr(
             os, "sched_getaffinity", lambda _, n=cores: set(range(n)), raising=False
         )
-        assert shards.workers() == cpu * workers
+        assert shards.worker_devices() == cpu * workers
+    assert shards.worker_devices(12) == cpu * 12
     monkeypatch.delattr(os, "sched_getaffinity")
     monkeypatch.setattr(os, "cpu_count", lambda: 5)
-    assert shards.workers() == cpu * 5
-    monkeypatch.setattr(jax, "local_devices", lambda: ["first", "second"])
-    assert shards.workers() == ["first", "second"]
+    assert shards.worker_devices() == cpu * 5
+    two = cpu * 2
+    monkeypatch.setattr(jax, "local_devices", lambda: two)
+    assert shards.worker_devices() == two
+    with pytest.raises(ValueError, match="is for one CPU; here cpu x 2 compute"):
+        shards.worker_devices(3)
+
+
+def test_ctrl_c_ends_all_threads_and_waits_for_them():
+    """Work under way is told and ends before the caller goes on, also when it comes twice."""
+    device, under_way, ended = jax.local_devices()[0], threading.Barrier(3), []
+
+    def work(k, told):
+        under_way.wait()
+        if k == 0:
+            signal.raise_signal(signal.SIGINT)
+        while not told.is_set():
+            time.sleep(0.01)
+        if k == 0:
+            signal.raise_signal(signal.SIGINT)
+        time.sleep(0.5)
+        ended.append(k)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            checkpoint._on_devices(work, list(range(9)), [device] * 3)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert sorted(ended) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_any_number_of_threads_gives_the_same_bits(threads, peace, study, monkeypatch, capsys):
+    seen, real = set(), fit.fit
+
+    def watched(*arguments):
+        seen.add(threading.get_ident())
+        time.sleep(0.2)  # for the other threads to take theirs
+        return real(*arguments)
+
+    monkeypatch.setattr("jaxtrachea.fitting.fit.fit", watched)
+    code, _, err = run(monkeypatch, capsys, *FIT, "--threads", str(threads))
+    assert code == 0, err
+    assert len(seen) == threads
+    assert numbers(study / "out") == numbers(peace / "out")
+
+
+def test_what_a_thread_raises_ends_the_fit_under_way_in_the_others(peace, study, monkeypatch):
+    """At its next step, long before its shard is done."""
+    loaded, asked, left = load_peace(study), threading.Barrier(3), []
+
+    def working(study, settings, progress):
+        if asked.wait() == 0:
+            raise OSError(28, "full")
+        for _ in range(1000):
+            time.sleep(0.01)
+            try:
+                progress(0, 1)
+            except BaseException as error:
+                left.append(type(error).__name__)
+                raise
+
+    monkeypatch.setattr("jaxtrachea.fitting.fit.fit", working)
+    monkeypatch.setattr(checkpoint, "_shards", lambda *_: np.arange(3)[:, None])
+    monkeypatch.setattr(checkpoint, "fitted_lanes", lambda _, study: study)
+    with pytest.raises(OSError, match="full"):
+        checkpoint.fit_shards(None, loaded, Settings(), [0, 1, 2], lambda *_: None, 3)
+    assert left == ["_Ended", "_Ended"]
 
 
 def test_processes_notice_each_other(tmp_path):

@@ -290,7 +290,7 @@ def test_threads_share_what_is_compiled(keeping, folder):
         count = run(pair(), np.full(3, float(i)))["count"]
         found.append((id(run), float(count)))
 
-    programs._program.cache_clear()
+    programs.program.__wrapped__.cache_clear()
     threads = [threading.Thread(target=work, args=(i,)) for i in range(8)]
     for thread in threads:
         thread.start()

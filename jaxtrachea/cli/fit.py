@@ -98,14 +98,20 @@ def describe(options: FitOptions, loaded, measurements, study, analyses: list[st
     device = jax.local_devices()[0].device_kind
     root = options.spec.parent if options.data is None else options.data
     batch, every = asked.batch, "auto" if study.joint else asked.save_every
-    if batch != "auto":
+    if every == "auto":
+        every = shards.lanes_per_shard(study, settings.starts)
+    lanes = study.lanes.lower.shape[0]
+    try:
+        workers = min(len(shards.worker_devices(options.threads)), -(-lanes // every))
+    except ValueError as error:
+        raise Stop(f"--threads {error}; leave it out") from None
+    if batch == "auto":
+        batch = shards.slots(study, shards.free_memory(workers))
+    else:
         batch = min(batch, study.most_together)
     return manifest.describe(
         options.spec, root, measurements.sha256(), asked.precision, device,
-        lanes=study.lanes.lower.shape[0],
-        batch=shards.slots(study, shards.free_memory()) if batch == "auto" else batch,
-        save_every=shards.lanes_per_shard(study, settings.starts) if every == "auto" else every,
-        options=analyses,
+        lanes=lanes, batch=batch, save_every=every, options=analyses,
     )  # fmt: skip
 
 
@@ -211,9 +217,8 @@ def running(options: FitOptions, meeting: Meeting, now, study, settings) -> Iter
 
                 def fit(_, settings, progress):
                     mine = todo[0 :: meeting.processes]
-                    checkpoint.fit_shards(
-                        run, study, checkpoint.settings_for(run, settings), mine, progress
-                    )
+                    settings = checkpoint.settings_for(run, settings)
+                    checkpoint.fit_shards(run, study, settings, mine, progress, options.threads)
                     watch.wait_for_others()
                     return checkpoint.collect(run, study)
 
@@ -339,7 +344,7 @@ def help_out(options: FitOptions, meeting: Meeting, now, study, settings) -> Non
                 progress = stages.begin(f"fitting ({meeting.process} of {meeting.processes})")
                 settings = checkpoint.settings_for(run, settings)
                 mine = opened["todo"][meeting.process :: meeting.processes]
-                checkpoint.fit_shards(run, study, settings, mine, progress)
+                checkpoint.fit_shards(run, study, settings, mine, progress, options.threads)
                 stages.close()
                 watch.done()
                 watch.wait_for(0)

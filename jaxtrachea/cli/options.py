@@ -43,6 +43,12 @@ class FitOptions:
     no_lock: Annotated[
         bool, typer.Option("--no-lock", help="Start where the file system has no locks.")
     ] = False
+    threads: Annotated[
+        int | None,
+        typer.Option(
+            "--threads", min=1, help="Shards fitted side by side on a CPU: its cores, at most 8."
+        ),
+    ] = None
     distributed: Annotated[
         bool, typer.Option("--distributed", help="Several processes, found by the cluster.")
     ] = False

@@ -8,6 +8,7 @@ import contextlib
 import errno
 import io
 import os
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ def write_whole(path: Path, data: bytes) -> None:
     Raises:
         OSError: nothing was written; a file of that name is as it was.
     """
-    beside = path.with_name(f"{path.name}.{os.getpid()}")
+    beside = path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}")
     try:
         with beside.open("wb") as stream:
             stream.write(data)

@@ -16,7 +16,7 @@ BETWEEN = 86_400.0
 #: How the names of traces end (`files.traces`); those that JAX compiled end in "-cache".
 TRACED = "-traced"
 #: Names of programs: that of the function and a digest; and the process, if killed in the midst.
-_NAME = re.compile(rf".*-[0-9a-f]{{64}}(-cache|{TRACED}(\.\d+)?)", re.DOTALL)
+_NAME = re.compile(rf".*-[0-9a-f]{{64}}(-cache|{TRACED}(\.\d+(-\d+)?)?)", re.DOTALL)
 #: File whose time of change is that of the last look.
 LAST_LOOK = ".trimmed"
 

@@ -11,6 +11,7 @@ For commands only: a program that sets constants of a module, or JAX's settings 
 be given the traces of before.
 """
 
+import collections
 import contextlib
 import functools
 import hashlib
@@ -89,7 +90,7 @@ class Traced:
         self._options = quick_options() if quick else None
         self._plain = jax.jit(self._function, donate_argnums=donate, compiler_options=self._options)
         self._compiled: dict[Any, Callable] = {}
-        self._compiling = threading.Lock()
+        self._compiling: dict[Any, threading.Lock] = collections.defaultdict(threading.Lock)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """What the function returns."""
@@ -111,7 +112,7 @@ class Traced:
     def _compile(self, key: tuple, given: tuple) -> Callable:
         """The function of arguments like these, compiled by one thread for all."""
         folder, device, _, kinds = key
-        with self._compiling:
+        with self._compiling[key]:
             if key not in self._compiled:
                 compiled = self._plain
                 with contextlib.suppress(Exception):  # what is wrong is said by the plain call

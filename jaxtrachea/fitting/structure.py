@@ -11,7 +11,6 @@ distant positions may see the same compliance to rounding.
 """
 
 import dataclasses
-import functools
 from typing import NamedTuple
 
 import jax
@@ -20,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxtrachea._numerics import full_precision
+from jaxtrachea._threads import made_once
 from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.map_lanes import map_lanes
 from jaxtrachea.fitting.model import FitModel
@@ -301,7 +301,7 @@ def _nonlinear(x: Inputs) -> list[Array]:
     return [*law, *(x.softening or ())]
 
 
-@functools.lru_cache(maxsize=64)
+@made_once(maxsize=64)
 def _generic(options, higher: tuple[tuple[str, bool], ...]) -> Float[np.ndarray, "r n"]:
     """See `_curve_sees`; of a model with these coefficients above k_1, or zero in their place."""
 

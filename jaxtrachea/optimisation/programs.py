@@ -4,20 +4,17 @@ What is compiled is kept by value of the static arguments: the same functions of
 their programs. JAX keeps apart what differs in shapes and dtypes.
 """
 
-import functools
-import threading
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
 
+from jaxtrachea._threads import made_once
 from jaxtrachea.files.traces import Traced
 
-_program = functools.lru_cache(maxsize=128)(Traced)
-_making_one = threading.Lock()
 
-
+@made_once(maxsize=128)
 def program(
     function: Callable,
     *static,
@@ -34,8 +31,7 @@ def program(
         donate: of the other arguments, as `donate_argnums` of `jax.jit`.
         quick: compiled without optimisation, in a third of the time: for little work.
     """
-    with _making_one:  # threads share what is compiled
-        return _program(function, *static, axes=axes, donate=donate, quick=quick)
+    return Traced(function, *static, axes=axes, donate=donate, quick=quick)
 
 
 def batch_size(total: int, most: int) -> int:

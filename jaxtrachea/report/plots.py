@@ -13,7 +13,7 @@ from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.result import FitResult, unknown_label
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.labels import lane_label
-from jaxtrachea.inference.rows import ONE_BY_ONE, listed, worst_first
+from jaxtrachea.inference.rows import ONE_BY_ONE, worst_first
 
 #: Residuals that bands are made of at most, intervals of displacement, and samples in one at least.
 BANDED, BINS, FEWEST = 400_000, 60, 20
@@ -128,12 +128,15 @@ def _draw_joints(axis, result, prediction, lane, colours) -> None:
 def draw_residuals(result: FitResult, prediction: Prediction):
     """Force residuals, model - data, against displacement, and their distribution.
 
-    Of many lanes the worst are lines before what the residuals of all come to along the press.
+    Of many lanes the worst that did not fail are lines, and those of all are bands over them.
     """
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     many = result.lanes > ONE_BY_ONE
-    lined = set(listed(result, ONE_BY_ONE // 2 if many else ONE_BY_ONE))
+    lined = set(range(result.lanes))
+    if many:
+        order = worst_first(result)
+        lined = set([lane for lane in order if result.succeeded[lane]][: ONE_BY_ONE // 2])
     pooled, depths = [], []
     for lane in range(result.lanes):
         for t, curve in enumerate(result.study.curves[lane]):
@@ -150,11 +153,11 @@ def draw_residuals(result: FitResult, prediction: Prediction):
     if many:
         _draw_bands(left, depth, values)
     left.axhline(0, color="k", lw=0.6)
-    shown = of_all(len(lined), result.lanes, "worst lanes")
+    shown = f" of {result.lanes} lanes (bands), the {len(lined)} worst as lines" if many else ""
     left.set(
         xlabel="displacement [mm]",
         ylabel="(model - data) / peak [%]",
-        title="force residuals" + (f"{shown} (lines), all (bands)" if many else shown),
+        title=f"force residuals{shown}",
     )
     right.hist(values, bins=60, color="0.4")
     right.set(xlabel="residual / peak [%]", ylabel="samples")
@@ -166,7 +169,7 @@ def _draw_bands(axis, depth, values) -> None:
     if len(values) > BANDED:  # as many tell the same
         drawn = np.random.default_rng(0).integers(len(values), size=BANDED)
         depth, values = depth[drawn], values[drawn]
-    if not np.ptp(depth) > 0:
+    if not len(depth) or not np.ptp(depth) > 0:
         return
     edges = np.linspace(depth.min(), depth.max(), BINS + 1)
     bins = np.clip(np.searchsorted(edges, depth, side="right") - 1, 0, BINS - 1)

@@ -1,9 +1,10 @@
 """A fit saved as it goes on: finished shards are read from the folder, missing ones are fitted."""
 
+import contextlib
 import dataclasses
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from pathlib import Path
 
 import jax
@@ -17,10 +18,12 @@ from jaxtrachea.inference.analyses import widened
 from jaxtrachea.results.hdf5 import read_hdf5
 from jaxtrachea.results.rows import summary_rows
 from jaxtrachea.runs.folder import NoRun, RunFolder, digest
-from jaxtrachea.runs.shards import divide, join, load, replaced, save, workers
+from jaxtrachea.runs.shards import divide, join, load, replaced, save, worker_devices
 
 #: A rerun of failed lanes has so many times more starts.
 MORE_STARTS = 4
+#: Seconds between two looks at the threads.
+LOOK = 0.2
 
 
 def fitted_lanes(run: RunFolder, study: Study) -> Study:
@@ -54,6 +57,7 @@ def fit_shards(
     settings: Settings,
     todo: list[int],
     progress: Callable[[int, int], None],
+    threads: int | None = None,
 ) -> None:
     """Fit shards and save each as soon as it is done, on all devices (cores) of this process.
 
@@ -62,47 +66,70 @@ def fit_shards(
         study: the whole study.
         settings: of the run, as `settings_for` gives them.
         todo: shards, as `missing` gives them.
-        progress: as for `fit.fit`; what it raises ends the work.
+        progress: as for `fit.fit`, called by one thread at a time; what it raises ends the work.
+        threads: as for `shards.worker_devices`.
     """
     from jaxtrachea.fitting.fit import fit
 
     part = fitted_lanes(run, study)
     shards = _shards(run, part)
-    jobs = settings.starts * sum(len(shards[k]) for k in todo)
+    jobs, telling = settings.starts * sum(len(shards[k]) for k in todo), threading.Lock()
 
-    def one(k: int) -> None:
-        lanes = shards[k]
-        result = fit(part.take(lanes), settings, lambda done, of: progress(done, jobs))
-        save(run.shard(k), run.manifest, lanes, result)
+    def one(k: int, ended: threading.Event) -> None:
+        def tell(done: int, of: int) -> None:
+            with telling:
+                if ended.is_set():
+                    raise _Ended
+                progress(done, jobs)
 
-    _on_devices(one, todo, workers())
+        result = fit(part.take(shards[k]), settings, tell)
+        save(run.shard(k), run.manifest, shards[k], result)
+
+    _on_devices(one, todo, worker_devices(threads))
 
 
-def _on_devices(work: Callable[[int], None], items: list[int], devices: list) -> None:
-    """Do the work for every item, a thread for each device named; the first error ends it."""
+class _Ended(Exception):
+    """Another thread has failed, or was told to stop."""
+
+
+def _on_devices(
+    work: Callable[[int, threading.Event], None], items: list[int], devices: list
+) -> None:
+    """Do the work for every item, a thread for each device named.
+
+    The first error, or Ctrl-C, ends all: the others are told by the event that the work is given.
+    """
     devices = devices[: len(items)]
+    ended = threading.Event()
     if len(devices) < 2:
         for item in items:
-            work(item)
+            work(item, ended)
         return
-    waiting, failed, lock = iter(items), threading.Event(), threading.Lock()
+    waiting, lock, several = iter(items), threading.Lock(), len(set(devices)) > 1
 
     def on(device) -> None:
-        with jax.default_device(device):
-            while not failed.is_set():
+        # A device that is named has programs of its own: not where there is but one.
+        with jax.default_device(device) if several else contextlib.nullcontext():
+            while not ended.is_set():
                 with lock:
                     item = next(waiting, None)
                 if item is None:
                     return
-                try:
-                    work(item)
-                except BaseException:
-                    failed.set()
-                    raise
+                work(item, ended)
 
     with ThreadPoolExecutor(len(devices)) as pool:
-        for done in [pool.submit(on, device) for device in devices]:
-            done.result()
+        going = {pool.submit(on, device) for device in devices}
+        try:
+            while going:
+                # Not in one wait: on some systems Ctrl-C comes through only between two.
+                done, going = wait(going, timeout=LOOK, return_when=FIRST_EXCEPTION)
+                for worker in done:
+                    worker.result()
+        finally:
+            ended.set()
+            while going:  # whoever is told that all has ended may put the folder away
+                with contextlib.suppress(KeyboardInterrupt):
+                    going = wait(going, timeout=LOOK).not_done
 
 
 def collect(run: RunFolder, study: Study) -> FitResult:

@@ -2,7 +2,7 @@
 
 What a shard gives depends on its own lanes and on the settings alone, and all shards are as large
 as each other (within one lane), so that one compiled program serves them. Hence the result does not
-depend on when a run was stopped, nor on which process or device fitted which shard.
+depend on when a run was stopped, nor on which process, device or thread fitted which shard.
 """
 
 import contextlib
@@ -27,7 +27,8 @@ from jaxtrachea.runs.manifest import Manifest
 #: Lanes of a shard at most, and its residual entries times starts at most: about ten seconds of
 #: one core.
 MOST_LANES, MOST_ENTRIES = 4096, 4_000_000
-#: Threads on the cores of a CPU at most: beyond it they wait for Python more than for XLA.
+#: Threads on the cores of a CPU at most, unless the user says: a fifth of a fit is Python, which
+#: one of them runs at a time.
 MOST_THREADS = 8
 #: Key of the manifest in the file of a shard.
 _MANIFEST = "journal"
@@ -61,23 +62,37 @@ def slots(study: Study, free: float) -> int:
     return min(most_slots(), study.most_together, 1 << (fitting.bit_length() - 1))
 
 
-def workers() -> list:
+def worker_devices(threads: int | None = None) -> list:
     """The device of each thread that fits shards: every device; of a CPU, as often as it has cores.
 
-    XLA computes so small a batch on one core. Cores are those that this process may use.
+    XLA computes so small a batch on one core.
+
+    Args:
+        threads: on a CPU; None: as many as this process may use cores, at most `MOST_THREADS`.
+
+    Raises:
+        ValueError: `threads` where the devices are others, or several.
     """
     import jax
 
     devices = jax.local_devices()
     if len(devices) > 1 or devices[0].platform != "cpu":
+        if threads is not None:
+            raise ValueError(f"is for one CPU; here {devices[0].platform} x {len(devices)} compute")
         return devices
+    if threads is None:
+        threads = min(_usable_cores(), MOST_THREADS)
+    return devices * threads
+
+
+def _usable_cores() -> int:
     with contextlib.suppress(AttributeError):  # not on every system
-        return devices * min(len(os.sched_getaffinity(0)), MOST_THREADS)
-    return devices * min(os.cpu_count() or 1, MOST_THREADS)
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
-def free_memory() -> float:
-    """Bytes free on the first device; of the machine's memory the share of one worker."""
+def free_memory(workers: int) -> float:
+    """Bytes free on the first device; of the machine's memory the share of one of the workers."""
     import jax
 
     device = jax.local_devices()[0]
@@ -87,10 +102,10 @@ def free_memory() -> float:
     with contextlib.suppress(OSError, StopIteration):
         with open("/proc/meminfo", encoding="ascii") as stream:
             line = next(line for line in stream if line.startswith("MemAvailable"))
-        return 1024 * int(line.split()[1]) / len(workers())
+        return 1024 * int(line.split()[1]) / workers
     with contextlib.suppress(AttributeError, ValueError, OSError):
         pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        return pages / len(workers())
+        return pages / workers
     return np.inf
 
 

@@ -1,0 +1,26 @@
+"""What threads share."""
+
+import functools
+import threading
+from collections.abc import Callable
+from typing import Any
+
+
+def made_once(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """`functools.lru_cache` for threads: while one makes a value, the others wait for it.
+
+    Args:
+        maxsize: values kept.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        cached, making = functools.lru_cache(maxsize)(function), threading.Lock()
+
+        @functools.wraps(cached)
+        def waiting(*arguments: Any, **named: Any) -> Any:
+            with making:
+                return cached(*arguments, **named)
+
+        return waiting
+
+    return decorate
