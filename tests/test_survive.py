@@ -429,7 +429,7 @@ def test_ctrl_c_ends_all_threads_and_waits_for_them():
         under_way.wait()
         if k == 0:
             signal.raise_signal(signal.SIGINT)
-        while not told.is_set():
+        while not told.now:
             time.sleep(0.01)
         if k == 0:
             signal.raise_signal(signal.SIGINT)
@@ -479,8 +479,9 @@ def test_what_a_thread_raises_ends_the_fit_under_way_in_the_others(peace, study,
     monkeypatch.setattr("jaxtrachea.fitting.fit.fit", working)
     monkeypatch.setattr(checkpoint, "_shards", lambda *_: np.arange(3)[:, None])
     monkeypatch.setattr(checkpoint, "fitted_lanes", lambda _, study: study)
+    folder = object.__new__(run_folder.RunFolder)
     with pytest.raises(OSError, match="full"):
-        checkpoint.fit_shards(None, loaded, Settings(), [0, 1, 2], lambda *_: None, 3)
+        checkpoint.fit_shards(folder, loaded, Settings(), [0, 1, 2], lambda *_: None, 3)
     assert left == ["_Ended", "_Ended"]
 
 

@@ -3,8 +3,8 @@
 import contextlib
 import dataclasses
 import threading
+import time
 from collections.abc import Callable
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from pathlib import Path
 
 import jax
@@ -23,7 +23,7 @@ from jaxtrachea.runs.shards import divide, join, load, replaced, save, worker_de
 #: A rerun of failed lanes has so many times more starts.
 MORE_STARTS = 4
 #: Seconds between two looks at the threads.
-LOOK = 0.2
+LOOK = 0.02
 
 
 def fitted_lanes(run: RunFolder, study: Study) -> Study:
@@ -75,10 +75,10 @@ def fit_shards(
     shards = _shards(run, part)
     jobs, telling = settings.starts * sum(len(shards[k]) for k in todo), threading.Lock()
 
-    def one(k: int, ended: threading.Event) -> None:
+    def one(k: int, end: _End) -> None:
         def tell(done: int, of: int) -> None:
             with telling:
-                if ended.is_set():
+                if end.now:
                     raise _Ended
                 progress(done, jobs)
 
@@ -92,44 +92,63 @@ class _Ended(Exception):
     """Another thread has failed, or was told to stop."""
 
 
-def _on_devices(
-    work: Callable[[int, threading.Event], None], items: list[int], devices: list
-) -> None:
+class _End:
+    """Whether the threads are to end: a plain field, since Ctrl-C may come inside any lock."""
+
+    now = False
+
+
+def _on_devices(work: Callable[[int, _End], None], items: list[int], devices: list) -> None:
     """Do the work for every item, a thread for each device named.
 
-    The first error, or Ctrl-C, ends all: the others are told by the event that the work is given.
+    The first error, or Ctrl-C, ends all: the others are told by what the work is given.
     """
     devices = devices[: len(items)]
-    ended = threading.Event()
+    end = _End()
     if len(devices) < 2:
         for item in items:
-            work(item, ended)
+            work(item, end)
         return
     waiting, lock, several = iter(items), threading.Lock(), len(set(devices)) > 1
+    failures: list[BaseException] = []
 
     def on(device) -> None:
         # A device that is named has programs of its own: not where there is but one.
-        with jax.default_device(device) if several else contextlib.nullcontext():
-            while not ended.is_set():
-                with lock:
-                    item = next(waiting, None)
-                if item is None:
-                    return
-                work(item, ended)
-
-    with ThreadPoolExecutor(len(devices)) as pool:
-        going = {pool.submit(on, device) for device in devices}
         try:
-            while going:
-                # Not in one wait: on some systems Ctrl-C comes through only between two.
-                done, going = wait(going, timeout=LOOK, return_when=FIRST_EXCEPTION)
-                for worker in done:
-                    worker.result()
-        finally:
-            ended.set()
-            while going:  # whoever is told that all has ended may put the folder away
-                with contextlib.suppress(KeyboardInterrupt):
-                    going = wait(going, timeout=LOOK).not_done
+            with jax.default_device(device) if several else contextlib.nullcontext():
+                while not end.now:
+                    with lock:
+                        item = next(waiting, None)
+                    if item is None:
+                        return
+                    work(item, end)
+        except BaseException as error:
+            failures.append(error)
+            end.now = True
+
+    threads = [threading.Thread(target=on, args=(device,)) for device in devices]
+    try:
+        for thread in threads:
+            thread.start()
+        _wait_for(threads)
+    except BaseException:
+        end.now = True
+        while _at_work(threads):  # whoever is told that all has ended may put the folder away
+            with contextlib.suppress(KeyboardInterrupt):
+                _wait_for(threads)
+        raise
+    if failures:
+        raise failures[0]
+
+
+def _wait_for(threads: list[threading.Thread]) -> None:
+    """Until all have ended; in short sleeps, since some systems hold Ctrl-C back in a long one."""
+    while _at_work(threads):
+        time.sleep(LOOK)
+
+
+def _at_work(threads: list[threading.Thread]) -> bool:
+    return any(thread.is_alive() for thread in threads)
 
 
 def collect(run: RunFolder, study: Study) -> FitResult:
