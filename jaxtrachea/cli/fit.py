@@ -11,7 +11,15 @@ import typer
 from rich.markup import escape
 
 from jaxtrachea.cli.options import FitOptions
-from jaxtrachea.cli.terminal import Kept, Stages, Stop, interrupts, progress_bar, to_stderr
+from jaxtrachea.cli.terminal import (
+    Interrupts,
+    Kept,
+    Stages,
+    Stop,
+    interrupts,
+    progress_bar,
+    to_stderr,
+)
 from jaxtrachea.runs import processes
 from jaxtrachea.runs.processes import Lost, Meeting
 
@@ -104,7 +112,7 @@ def describe(options: FitOptions, loaded, measurements, study, analyses: list[st
     try:
         workers = min(len(shards.worker_devices(options.threads)), -(-lanes // every))
     except ValueError as error:
-        raise Stop(f"--threads {error}; leave it out") from None
+        raise Stop(f"--threads: {error}; leave it out") from None
     if batch == "auto":
         batch = shards.slots(study, shards.free_memory(workers))
     else:
@@ -218,7 +226,8 @@ def running(options: FitOptions, meeting: Meeting, now, study, settings) -> Iter
                 def fit(_, settings, progress):
                     mine = todo[0 :: meeting.processes]
                     settings = checkpoint.settings_for(run, settings)
-                    checkpoint.fit_shards(run, study, settings, mine, progress, options.threads)
+                    with _held_back(ctrl_c, options.threads):
+                        checkpoint.fit_shards(run, study, settings, mine, progress, options.threads)
                     watch.wait_for_others()
                     return checkpoint.collect(run, study)
 
@@ -236,6 +245,24 @@ def running(options: FitOptions, meeting: Meeting, now, study, settings) -> Iter
             raise
         finally:
             run.release()
+
+
+@contextlib.contextmanager
+def _held_back(ctrl_c: Interrupts, threads: int | None) -> Iterator[None]:
+    """Ctrl-C while threads fit shards: they raise it at their next step, and all have ended then.
+
+    One thread is interrupted where it is.
+    """
+    from jaxtrachea.runs import shards
+
+    if len(shards.worker_devices(threads)) < 2:
+        yield
+        return
+    ctrl_c.hold()
+    try:
+        yield
+    finally:
+        ctrl_c.let_through()
 
 
 def _watched(watch: processes.Watch, **content):
@@ -344,7 +371,8 @@ def help_out(options: FitOptions, meeting: Meeting, now, study, settings) -> Non
                 progress = stages.begin(f"fitting ({meeting.process} of {meeting.processes})")
                 settings = checkpoint.settings_for(run, settings)
                 mine = opened["todo"][meeting.process :: meeting.processes]
-                checkpoint.fit_shards(run, study, settings, mine, progress, options.threads)
+                with _held_back(ctrl_c, options.threads):
+                    checkpoint.fit_shards(run, study, settings, mine, progress, options.threads)
                 stages.close()
                 watch.done()
                 watch.wait_for(0)

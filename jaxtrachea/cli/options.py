@@ -46,7 +46,9 @@ class FitOptions:
     threads: Annotated[
         int | None,
         typer.Option(
-            "--threads", min=1, help="Shards fitted side by side on a CPU: its cores, at most 8."
+            "--threads",
+            min=1,
+            help="Shards fitted side by side on a CPU; else its cores, up to 8.",
         ),
     ] = None
     distributed: Annotated[

@@ -11,7 +11,6 @@ For commands only: a program that sets constants of a module, or JAX's settings 
 be given the traces of before.
 """
 
-import collections
 import contextlib
 import functools
 import hashlib
@@ -90,7 +89,7 @@ class Traced:
         self._options = quick_options() if quick else None
         self._plain = jax.jit(self._function, donate_argnums=donate, compiler_options=self._options)
         self._compiled: dict[Any, Callable] = {}
-        self._compiling: dict[Any, threading.Lock] = collections.defaultdict(threading.Lock)
+        self._compiling: dict[Any, threading.Lock] = {}
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """What the function returns."""
@@ -112,7 +111,7 @@ class Traced:
     def _compile(self, key: tuple, given: tuple) -> Callable:
         """The function of arguments like these, compiled by one thread for all."""
         folder, device, _, kinds = key
-        with self._compiling[key]:
+        with self._compiling.setdefault(key, threading.Lock()):
             if key not in self._compiled:
                 compiled = self._plain
                 with contextlib.suppress(Exception):  # what is wrong is said by the plain call

@@ -128,17 +128,18 @@ def _draw_joints(axis, result, prediction, lane, colours) -> None:
 def draw_residuals(result: FitResult, prediction: Prediction):
     """Force residuals, model - data, against displacement, and their distribution.
 
-    Of many lanes the worst that did not fail are lines, and those of all are bands over them.
+    Of many lanes those that failed are left out, the worst of the others are lines, and all of them
+    bands over these.
     """
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     many = result.lanes > ONE_BY_ONE
-    lined = set(range(result.lanes))
-    if many:
-        order = worst_first(result)
-        lined = set([lane for lane in order if result.succeeded[lane]][: ONE_BY_ONE // 2])
+    lanes = list(range(result.lanes))
+    if many and result.succeeded.any():
+        lanes = [lane for lane in worst_first(result) if result.succeeded[lane]]
+    lined = set(lanes[: ONE_BY_ONE // 2] if many else lanes)
     pooled, depths = [], []
-    for lane in range(result.lanes):
+    for lane in lanes:
         for t, curve in enumerate(result.study.curves[lane]):
             n = len(curve.force)
             peak = np.max(np.abs(curve.force))
@@ -153,7 +154,7 @@ def draw_residuals(result: FitResult, prediction: Prediction):
     if many:
         _draw_bands(left, depth, values)
     left.axhline(0, color="k", lw=0.6)
-    shown = f" of {result.lanes} lanes (bands), the {len(lined)} worst as lines" if many else ""
+    shown = f" of {len(lanes)} lanes (bands), the {len(lined)} worst as lines" if many else ""
     left.set(
         xlabel="displacement [mm]",
         ylabel="(model - data) / peak [%]",

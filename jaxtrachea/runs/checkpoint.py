@@ -85,7 +85,7 @@ def fit_shards(
         result = fit(part.take(shards[k]), settings, tell)
         save(run.shard(k), run.manifest, shards[k], result)
 
-    _on_devices(one, todo, worker_devices(threads))
+    _in_threads(one, todo, worker_devices(threads))
 
 
 class _Ended(Exception):
@@ -98,7 +98,7 @@ class _End:
     now = False
 
 
-def _on_devices(work: Callable[[int, _End], None], items: list[int], devices: list) -> None:
+def _in_threads(work: Callable[[int, _End], None], items: list[int], devices: list) -> None:
     """Do the work for every item, a thread for each device named.
 
     The first error, or Ctrl-C, ends all: the others are told by what the work is given.

@@ -63,7 +63,7 @@ def slots(study: Study, free: float) -> int:
 
 
 def worker_devices(threads: int | None = None) -> list:
-    """The device of each thread that fits shards: every device; of a CPU, as often as it has cores.
+    """The device of each thread that fits shards: every device once, one CPU several times.
 
     XLA computes so small a batch on one core.
 
@@ -78,7 +78,8 @@ def worker_devices(threads: int | None = None) -> list:
     devices = jax.local_devices()
     if len(devices) > 1 or devices[0].platform != "cpu":
         if threads is not None:
-            raise ValueError(f"is for one CPU; here {devices[0].platform} x {len(devices)} compute")
+            kinds = f"{len(devices)} of kind {devices[0].platform}"
+            raise ValueError(f"threads are for one CPU; the devices of this process are {kinds}")
         return devices
     if threads is None:
         threads = min(_usable_cores(), MOST_THREADS)
