@@ -402,7 +402,7 @@ def test_devices_share_the_work_and_its_end():
 
 
 def test_a_cpu_works_with_all_the_cores_it_may_use(monkeypatch):
-    """Beyond 8 they wait for Python; where the system does not tell, all there are."""
+    """At most 8 unless the user says; where the system does not tell, all there are."""
     cpu = jax.local_devices(backend="cpu")[:1]
     monkeypatch.setattr(jax, "local_devices", lambda: cpu)
     for cores, workers in ((1, 1), (3, 3), (64, 8)):

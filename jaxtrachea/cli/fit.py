@@ -226,7 +226,7 @@ def running(options: FitOptions, meeting: Meeting, now, study, settings) -> Iter
                 def fit(_, settings, progress):
                     mine = todo[0 :: meeting.processes]
                     settings = checkpoint.settings_for(run, settings)
-                    with _held_back(ctrl_c, options.threads):
+                    with _held_back(ctrl_c, options.threads, mine):
                         checkpoint.fit_shards(run, study, settings, mine, progress, options.threads)
                     watch.wait_for_others()
                     return checkpoint.collect(run, study)
@@ -248,14 +248,14 @@ def running(options: FitOptions, meeting: Meeting, now, study, settings) -> Iter
 
 
 @contextlib.contextmanager
-def _held_back(ctrl_c: Interrupts, threads: int | None) -> Iterator[None]:
+def _held_back(ctrl_c: Interrupts, threads: int | None, todo: list[int]) -> Iterator[None]:
     """Ctrl-C while threads fit shards: they raise it at their next step, and all have ended then.
 
     One thread is interrupted where it is.
     """
     from jaxtrachea.runs import shards
 
-    if len(shards.worker_devices(threads)) < 2:
+    if min(len(shards.worker_devices(threads)), len(todo)) < 2:
         yield
         return
     ctrl_c.hold()
@@ -371,7 +371,7 @@ def help_out(options: FitOptions, meeting: Meeting, now, study, settings) -> Non
                 progress = stages.begin(f"fitting ({meeting.process} of {meeting.processes})")
                 settings = checkpoint.settings_for(run, settings)
                 mine = opened["todo"][meeting.process :: meeting.processes]
-                with _held_back(ctrl_c, options.threads):
+                with _held_back(ctrl_c, options.threads, mine):
                     checkpoint.fit_shards(run, study, settings, mine, progress, options.threads)
                 stages.close()
                 watch.done()

@@ -27,8 +27,7 @@ from jaxtrachea.runs.manifest import Manifest
 #: Lanes of a shard at most, and its residual entries times starts at most: about ten seconds of
 #: one core.
 MOST_LANES, MOST_ENTRIES = 4096, 4_000_000
-#: Threads on the cores of a CPU at most, unless the user says: a fifth of a fit is Python, which
-#: one of them runs at a time.
+#: Threads on the cores of a CPU at most, unless the user says; measured with two.
 MOST_THREADS = 8
 #: Key of the manifest in the file of a shard.
 _MANIFEST = "journal"
