@@ -15,7 +15,7 @@ MOST_DAYS = 90.0
 BETWEEN = 86_400.0
 #: How the names of traces end (`files.traces`); those that JAX compiled end in "-cache".
 TRACED = "-traced"
-#: Names of programs: that of the function and a digest; and process and thread, if killed in the midst.
+#: Names of programs: function and digest; and process and thread, if killed in the midst.
 _NAME = re.compile(rf".*-[0-9a-f]{{64}}(-cache|{TRACED}(\.\d+(-\d+)?)?)", re.DOTALL)
 #: File whose time of change is that of the last look.
 LAST_LOOK = ".trimmed"
