@@ -136,7 +136,7 @@ LONGEST = (
     "test_patches.py",
     "test_measurements.py",
     "test_damaged.py",
-    "test_predict.py",
+    "test_bands.py",
     "test_mesh.py",
     "test_survive.py",
 )
@@ -149,7 +149,8 @@ LONGEST_SLOW = (
     "test_configs.py",
     "test_fits.py",
     "test_coverage.py",
-    "test_predict.py",
+    "test_predict_command.py",
+    "test_bands.py",
     "test_selfcheck.py",
     "test_joint.py",
     "test_sections.py",

@@ -1,0 +1,235 @@
+"""Bands of predictions: they cover, are those of the text book, and end where knowledge does."""
+
+import dataclasses
+import functools
+import math
+import shutil
+from pathlib import Path
+
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import synthetic
+from hardening import TWO, pairs, stored_again, total_study
+from noisy_fits import DEPTHS, NOISE, UNSEEN, noisy_study, true_force
+from scipy.stats import t as student
+
+import jaxtrachea
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.study import build_study
+from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.prediction import held_out
+from jaxtrachea.prediction.core import Estimate, predicted
+from jaxtrachea.prediction.predict import predict_sources
+from jaxtrachea.prediction.sources import source_of
+from jaxtrachea.results.hdf5 import write_hdf5
+from jaxtrachea.status import PredictionStatus
+from jaxtrachea.trachea.geometry import table_1
+
+VIRTUAL = Path(__file__).parents[2] / "fits" / "virtual_trachea"
+
+
+def check_coverage(read, noise):
+    """Curve band: the true curve; with noise: new noisy samples; 93 to 97 % over the depths."""
+    rng, lanes = np.random.default_rng(8), len(read.specimens)
+    sources = [source_of(read, name) for name in read.specimens]
+    for s in UNSEEN:
+        found = predict_sources(read, sources, [s] * lanes, [DEPTHS] * lanes, batch=8)
+        truth = true_force(s)
+        sample = truth + noise * rng.normal(size=(lanes, len(DEPTHS)))
+        inside = np.array([(p.curve_low95 <= truth) & (truth <= p.curve_high95) for p in found])
+        pairs = zip(found, sample, strict=True)
+        new = np.array([(p.low95 <= y) & (y <= p.high95) for p, y in pairs])
+        for covered in (inside, new):
+            assert 0.93 <= np.mean(covered) <= 0.97, np.mean(covered)
+            miss = np.max(np.abs(np.mean(covered, axis=0) - 0.95))
+            assert miss < 4 * math.sqrt(0.95 * 0.05 / lanes), miss
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [NOISE, 0.15])
+def test_bands_cover_in_2000_fits(noise, tmp_path):
+    """Truth from finite elements; parameters known to 1 to 3 % and to 10 to 24 %."""
+    noisy_study(tmp_path, noise, 2000, 70)
+    check_coverage(jaxtrachea.read_results(tmp_path), noise)
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+@pytest.mark.parametrize("free", [True, False])
+def test_residuals_and_bands_of_unequal_noise(free, tmp_path):
+    """Sizes of residuals are in N and mm, bands of markers as wide as their own noise is."""
+    measured = jaxtrachea.read_measurements(VIRTUAL / "small_strain.h5").curves[:2]
+    weighed = [dataclasses.replace(c, sigma=0.01 * np.arange(1.0, len(c.force) + 1))
+               for c in measured]  # fmt: skip
+    noise = Noise(joints=5e-4, joints_share=0.06)
+    values = {"k_3": 0.0, "EI_L": 300.0, "k_M": 1.0, "GA_L": 9.0}
+    held = {name: {"fixed": True, "value": value} for name, value in values.items()}
+    options = Options(contact="bonded", shear=True)
+    changes = held | {"k_1": {} if free else {"fixed": True, "value": 2.0}}
+    result = fit(build_study(weighed, table_1(), options, changes, noise=noise), TWO)
+    write_hdf5(tmp_path / "r.h5", Findings(result), {})
+    read = jaxtrachea.read_results(tmp_path / "r.h5")
+    off, aside = [], []
+    for curve in measured:
+        D = curve.displacement
+        found = jaxtrachea.predict(read, s=curve.s_c, displacement=D)
+        off.append(found.force - curve.force)
+        aside.append((found.joints[:, curve.joint_rings] - curve.joint_displacement).ravel())
+        np.testing.assert_allclose(found.joint_sigma, np.sqrt(5e-4**2 + (0.06 * D) ** 2))
+    sizes = [np.sqrt(np.mean(np.concatenate(v) ** 2)) for v in (off, aside)]
+    np.testing.assert_allclose(result.rms[0], sizes, rtol=1e-9)
+
+
+def force_at(read, source, s):
+    """Force of a source at 3 mm."""
+    return predict_sources(read, [source], [s], [np.array([3.0])])[0].force[0]
+
+
+def slope_at(read, source, s):
+    """Its derivative by the estimates, by central differences; (4,)."""
+    steps = 1e-4 * np.eye(4)
+    ends = [[dataclasses.replace(source, free=source.free + sign * h) for sign in (1, -1)]
+            for h in steps]  # fmt: skip
+    return np.array([force_at(read, a, s) - force_at(read, b, s) for a, b in ends]) / 2e-4
+
+
+def test_standard_errors_are_those_of_the_delta_method(read):
+    source = source_of(read, "s0003")
+    (curve,) = predict_sources(read, [source], [61.0], [np.array([3.0])])
+    J = slope_at(read, source, 61.0)
+    assert np.isclose(curve.se[0], np.sqrt(J @ read.covariance[3] @ J), rtol=1e-6)
+
+
+def test_an_undetermined_direction_makes_bands_infinite_where_it_acts(read):
+    """EI_L against k_M as one position leaves them: the same press stays known, others do not."""
+    source = source_of(read, "s0003")
+    J = slope_at(read, source, 75.0)
+    null_space = np.zeros_like(source.null_space)
+    null_space[0, :2] = np.array([-J[1], J[0]]) / np.hypot(J[0], J[1])
+    lost = dataclasses.replace(source, null_space=null_space)
+    places = [75.0, 31.0]
+    same, other = predict_sources(read, [lost, lost], places, [np.array([3.0])] * 2)
+    assert np.isfinite(same.high95).all()
+    assert same.status == PredictionStatus.OK
+    assert np.isinf(other.high95).all()
+    assert other.status == PredictionStatus.UNDETERMINED
+
+
+def test_a_band_that_the_model_bends_in_is_said(read):
+    """A hundred times the standard errors: the ends of the linear band are off."""
+    source = source_of(read, "s0003")
+    wide = dataclasses.replace(source, covariance=1e4 * source.covariance)
+    (curve,) = predict_sources(read, [wide], [61.0], [np.array([3.0])])
+    assert curve.status == PredictionStatus.BENT
+
+
+def test_without_a_sample_to_spare_the_noise_band_is_infinite(study, tmp_path):
+    """As many samples as unknowns: the residual is 0, which says nothing of the noise."""
+    shutil.copy(study[0] / "results.h5", tmp_path)
+    with h5py.File(tmp_path / "results.h5", "r+") as file:
+        file["uncertainty/half_width"][3] = 1.959963984540054
+    read = jaxtrachea.read_results(tmp_path)
+    curve = jaxtrachea.predict(read, s=61.0, displacement=3.0, specimen="s0003")
+    assert curve.status == PredictionStatus.UNDETERMINED
+    assert np.isinf(curve.high95).all()
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+@pytest.mark.parametrize("given", [None, 0.02])
+def test_linear_model_has_the_bands_of_the_text_book(given, tmp_path):
+    """Least squares on D and D^3 (numpy): s^2 (X^T X)^-1, t or, with given noise, z."""
+    curves = list(pairs())
+    read = stored_again(total_study(curves, noise=Noise(force=given)), tmp_path / "r.h5")
+    D, F = (np.concatenate([getattr(c, n) for c in curves[:2]]) for n in ("displacement", "force"))
+    X = np.stack([D, D**3], axis=1)
+    beta, rss, *_ = np.linalg.lstsq(X, F, rcond=None)
+    s = given or np.sqrt(rss[0] / (len(D) - 2))
+    half = 1.959963984540054 if given else student.ppf(0.975, len(D) - 2)
+    at = np.array([0.5, 3.0])
+    rows = np.stack([at, at**3], axis=1)
+    error = s * np.sqrt(np.sum(rows @ np.linalg.inv(X.T @ X) * rows, axis=1))
+    mine = jaxtrachea.predict(read, s=80.0, displacement=at, specimen="T1")
+    assert np.allclose(mine.force, rows @ beta, rtol=1e-8)
+    assert np.allclose(mine.curve_high95, rows @ beta + half * error, rtol=1e-7)
+    assert np.allclose(mine.low95, rows @ beta - half * np.hypot(s, error), rtol=1e-7)
+    assert "extrapolated" in mine.message
+    assert np.isnan(mine.joints).all()
+    # A sigma of the curve itself counts where the fit's noise was given, not where it is a weight.
+    new = dataclasses.replace(curves[0], trial="c", sigma=np.full(30, 0.5))
+    (found,) = held_out.compare(read, [new])
+    assert np.allclose(found.prediction.sigma, 0.5 if given else s, rtol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_joint_fit_predicts_as_one_dense_lane(tmp_path):
+    """A shared parameter: joint lanes carry the whole covariance, the common error included."""
+    at = []
+    for joint in (True, False):
+        study = total_study(pairs(), {"k_3": {"scope": "shared"}}, joint=joint)
+        read = stored_again(study, tmp_path / f"{joint}.h5")
+        assert read.study.joint == joint
+        at.append(jaxtrachea.predict(read, s=80.0, displacement=[1.0, 2.0], specimen="T2"))
+    assert np.allclose(at[0].force, at[1].force, rtol=1e-7)
+    assert np.allclose(at[0].se, at[1].se, rtol=1e-5)
+    assert np.allclose(at[0].half_width, at[1].half_width)
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_core_in_float32(read):
+    """Jitted and batched as the command uses it in float64, which other tests check."""
+    sources = [source_of(read, f"s{i:04d}") for i in range(3)]
+    rows = [np.stack([getattr(s, n) for s in sources]) for n in Estimate._fields]
+    estimate = Estimate(*(jnp.asarray(v, np.float32) for v in rows))
+    place, depth = np.full(3, 61.0, np.float32), np.tile(np.float32([1.0, 4.0]), (3, 1))
+    program = functools.partial(predicted, read.study.model)
+    batch = jax.jit(jax.vmap(program))(estimate, jnp.asarray(place), jnp.asarray(depth))
+    assert batch.value.force.dtype == batch.se.joints.dtype == np.float32
+    exact = predict_sources(read, sources, [61.0] * 3, [np.array([1.0, 4.0])] * 3)
+    for k, curve in enumerate(exact):
+        assert np.allclose(batch.value.force[k], curve.force, rtol=2e-5)
+        assert np.allclose(batch.se.force[k], curve.se, rtol=2e-3)
+        assert np.allclose(batch.se.joints[k], curve.joints_se, rtol=1e-2, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_a_lane_with_one_place_predicts_that_place(study, tmp_path):
+    """k_M too small to be seen in one press: the press itself is known, one elsewhere is not."""
+    truth = true_force(75.0)
+    rng = np.random.default_rng(3)
+    force = truth + NOISE * rng.normal(size=(1, 1, len(DEPTHS)))
+    curves = synthetic.curves(force, np.array([75.0]), DEPTHS)
+    result = fit(build_study(curves, table_1(), synthetic.OPTIONS, synthetic.parameters()), TWO)
+    write_hdf5(tmp_path / "results.h5", Findings(result), {"inputs": {"a.csv": "0" * 64}})
+    read = jaxtrachea.read_results(tmp_path)
+    source = source_of(read, read.specimens[0])
+    # EI_L on its upper bound: k_M is a direction by itself, whose slope is 1e-8 of the others'.
+    free, null_space = source.free.copy(), np.zeros_like(source.null_space)
+    free[:2], null_space[0, 1] = [np.log(1e7), np.log(1e-4)], 1.0
+    covariance = np.zeros((4, 4))
+    covariance[2, 2] = 1e-4
+    lost = dataclasses.replace(source, free=free, null_space=null_space, covariance=covariance)
+    near, far, deep = predict_sources(
+        read, [lost] * 3, [75.0, 61.0, 75.0], [DEPTHS, DEPTHS, 2 * DEPTHS]
+    )
+    assert np.isfinite(near.high95).all()
+    assert near.status < PredictionStatus.UNDETERMINED
+    assert np.isinf(far.se).any()
+    assert np.isinf(deep.se[DEPTHS > 3.001]).all()
+    # As the fit leaves it: a finite band of its own press, which covers it.
+    (own,) = predict_sources(read, [source], [75.0], [DEPTHS])
+    assert np.isfinite(own.high95).all()
+    inside = (own.low95 <= force[0, 0]) & (force[0, 0] <= own.high95)
+    assert np.mean(inside) >= 0.85
+    bent = dataclasses.replace(source, null_space=0 * null_space, covariance=1e12 * np.eye(4))
+    (worst,) = predict_sources(read, [bent], [75.0], [DEPTHS])
+    assert worst.status == PredictionStatus.BENT
+    assert " inf " not in worst.message

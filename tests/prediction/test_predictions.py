@@ -1,0 +1,238 @@
+"""Predictions of other places, left-out curves and new specimens, and what is said of them."""
+
+import dataclasses
+import math
+import re
+
+import beam_fem
+import numpy as np
+import pytest
+from hardening import TWO, pairs, stored_again, total_study
+from noisy_fits import DEPTHS, LANES, true_force
+from scipy.stats import t as student
+
+import jaxtrachea
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.tested import deeper_than_tested
+from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.cross_validation import leave_one_out
+from jaxtrachea.inference.labels import verdict_sentence
+from jaxtrachea.measurements.read import Curve
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.prediction import held_out
+from jaxtrachea.prediction.predict import predict_sources
+from jaxtrachea.prediction.sources import Source, source_of
+from jaxtrachea.results.hdf5 import write_hdf5
+from jaxtrachea.results.rows import lane_rows
+from jaxtrachea.status import FitStatus, PredictionStatus, PressStatus
+from jaxtrachea.trachea.geometry import table_1
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_three_lines_of_python(study):
+    results = jaxtrachea.read_results(study[0])
+    curve = jaxtrachea.predict(results, s=61.0, displacement=[1.0, 2.0], specimen="s0003")
+    assert np.all((curve.low95 < curve.curve_low95) & (curve.curve_high95 < curve.high95))
+    assert np.isnan(curve.joint_sigma).all()  # this fit had no markers
+    # Joints and reactions in equilibrium with each other: R = k_M w (paper 2.3).
+    k_M = math.exp(results.theta[3, 1])
+    assert np.allclose(curve.reactions, k_M * curve.joints, rtol=1e-12)
+    EI = math.exp(results.theta[3, 0])
+    x = np.asarray(table_1().ring_positions)
+    fem = beam_fem.solve(x, 160.0, [EI] * 16, [k_M] * 15, 61.0, float(curve.force[1]))
+    assert np.allclose(curve.joints[1], [float(w) for w in fem.w], rtol=1e-9, atol=1e-12)
+    with pytest.raises(ValueError, match=f"{LANES} specimens .* give specimen="):
+        jaxtrachea.predict(results, s=61.0, displacement=1.0)
+    with pytest.raises(ValueError, match="expected one of 's0000'"):
+        jaxtrachea.predict(results, s=61.0, displacement=1.0, specimen="x")
+    with pytest.raises(ValueError, match=r"expected 0 to 160 mm"):
+        jaxtrachea.predict(results, s=161.0, displacement=1.0, specimen="s0003")
+    with pytest.raises(ValueError, match="finite"):
+        jaxtrachea.predict(results, s=61.0, displacement=np.nan, specimen="s0003")
+    with pytest.raises(ValueError, match="trial 'x'"):
+        jaxtrachea.predict(results, s=61.0, displacement=1.0, specimen="s0003", trial="x")
+
+
+def test_a_failed_lane_predicts_nothing(read):
+    status = read.status.copy()
+    status[3] = FitStatus.MAX_ITERATIONS
+    failed = dataclasses.replace(read, status=status)
+    source = source_of(failed, "s0003")
+    assert source.status == PredictionStatus.NO_ESTIMATE
+    (curve,) = predict_sources(failed, [source], [61.0], [DEPTHS])
+    assert np.isnan(curve.force).all()
+    assert np.isnan(curve.high95).all()
+    assert FitStatus.MAX_ITERATIONS.message in curve.message
+
+
+def test_an_unknown_on_its_bound_is_said(read):
+    held = np.zeros_like(read.at_bound)
+    held[3, 2] = True
+    source = source_of(dataclasses.replace(read, at_bound=held), "s0003")
+    assert source.status == PredictionStatus.AT_BOUND
+    assert "k_1 held" in source.message
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_left_out_curve_is_that_of_leave_one_out(tmp_path):
+    """Fit without a curve, written, read, predicted: the residual of `leave_one_out` to 1e-9."""
+    curves = list(pairs())
+    study = total_study(curves)
+    left = leave_one_out(fit(study, TWO), TWO)
+    truth = predictions(study.take(left.lane), left.result.theta).force
+    for row in (0, 3):
+        lane, trial = left.lane[row], left.trial[row]
+        out = study.curves[lane][trial]
+        read = stored_again(total_study([c for c in curves if c is not out]), tmp_path / f"{row}")
+        (found,) = held_out.compare(read, [out])
+        assert np.allclose(found.residual, truth[row, trial], rtol=0, atol=1e-9)
+        assert found.in_fit == "no"
+
+
+def only(read, lanes):
+    """The same fit of the first lanes alone."""
+    fields = ("theta", "covariance", "null_space", "at_bound", "status", "sigma", "half_width",
+              "lane_names")  # fmt: skip
+    count = int(np.sum(read.curve_lane < lanes))
+    cut = {name: getattr(read, name)[:lanes] for name in fields}
+    study = dataclasses.replace(read.study, unknowns=read.study.unknowns[:lanes])
+    curves = {name: getattr(read, name)[:count] for name in ("curves", "curve_lane", "blend")}
+    return dataclasses.replace(read, study=study, **cut, **curves)
+
+
+def test_unknown_specimens(read):
+    """Own parameters of several specimens: no; of one, or all shared: yes, and it is said."""
+    new = dataclasses.replace(read.curves[0], specimen="T9")
+    (found,) = held_out.compare(read, [new])
+    assert found.prediction.status == PredictionStatus.UNKNOWN_SPECIMEN
+    assert f"k_1, k_3 belongs to each of {LANES} specimens" in found.prediction.message
+    assert np.isnan(found.prediction.force).all()
+    (known,) = held_out.compare(read, [dataclasses.replace(new, specimen="s0002")])
+    (found,) = held_out.compare(read, [new], as_specimen="s0002")
+    assert "predicted as specimen 's0002'" in found.prediction.message
+    assert np.array_equal(found.prediction.force, known.prediction.force)
+
+    def share(p):
+        return dataclasses.replace(p, scope="specimen" if p.fixed else "shared")
+
+    study = dataclasses.replace(
+        read.study,
+        parameters=tuple(map(share, read.study.parameters)),
+        unknowns=tuple(
+            tuple((share(p), "", "") for p, _, _ in lane) for lane in read.study.unknowns
+        ),
+    )
+    for one in (only(read, 1), dataclasses.replace(read, study=study)):
+        (found,) = held_out.compare(one, [new])
+        assert "a new specimen" in found.prediction.message
+        assert np.isfinite(found.prediction.high95).all()
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_fixed_specification_is_evaluated(tmp_path):
+    """Nothing free: residuals, cost and noise by hand; predicted with a band of noise alone."""
+    curves = list(pairs())
+    fixed = {"k_1": {"value": 1.0, "fixed": True}, "k_3": {"value": 0.1, "fixed": True}}
+    result = fit(total_study(curves, fixed))
+    D, F = curves[0].displacement, np.concatenate([c.force for c in curves[:2]])
+    residual = np.tile(D + 0.1 * D**3, 2) - F
+    sigma = np.sqrt(np.mean(residual**2))
+    assert result.lanes == 2
+    assert np.isclose(result.rms[0, 0], sigma, rtol=1e-12)
+    assert np.isclose(result.sigma[0, 0], sigma, rtol=1e-12)
+    assert np.isclose(result.cost[0], 0.5 * 60)
+    assert result.criteria.unknowns[0] == 1
+    row = next(lane_rows(result))
+    assert "nothing was fitted" in str(row["message"])
+    assert "nothing was fitted" in verdict_sentence(result, 0)
+    write_hdf5(tmp_path / "r.h5", Findings(result), {})
+    read = jaxtrachea.read_results(tmp_path / "r.h5")
+    curve = jaxtrachea.predict(read, s=80.0, displacement=1.0, specimen="T1")
+    assert curve.se == 0
+    assert np.allclose(curve.high95 - 1.1, student.ppf(0.975, 60) * sigma)
+
+
+def test_a_curve_with_its_signs_turned_is_not_compared(read):
+    """As in a fit: compression counted negative is a pull to a tool that only touches."""
+    good = Curve("s0001", "new", 61.0, 0.0, DEPTHS, true_force(61.0))
+    turned = dataclasses.replace(good, trial="turned", force=-good.force)
+    kept, (bad,) = held_out.pressable(read, [good, turned])
+    assert kept == [good]
+    assert (bad.trial, bad.kind) == ("turned", "sign")
+    assert "pulls" in bad.reason
+
+
+def test_a_fit_that_knows_no_position_has_no_range_of_them():
+    """Spans of curves without a position begin at inf and end at -inf."""
+    from jaxtrachea.prediction.predict import _beyond
+
+    nowhere, here = np.array([0.0, 2.0, np.inf, -np.inf]), np.array([0.0, 2.0, 10.0, 20.0])
+    deep = np.array([0.0, 3.0])
+    assert _beyond(nowhere, 15.0, deep[:1]) == ""
+    assert _beyond(nowhere, 15.0, deep) == "extrapolated from data at D = 0 to 2 mm"
+    assert _beyond(here, 30.0, deep[:1]).endswith("s = 10 to 20 mm")
+
+
+def test_an_angle_that_was_not_pressed_is_extrapolated():
+    """Data at 0 to 30 deg along the normal; each angle is asked for by itself."""
+    from jaxtrachea.prediction.predict import _beyond
+
+    spans, angles = np.array([0.0, 2.0, 10.0, 20.0]), np.array([0.0, np.pi / 6])
+    deep = np.array([0.0, 2.0])
+
+    def words(phi, tilt):
+        return _beyond(spans, 15.0, deep, [(angles, phi, "phi"), ((0.0, 0.0), tilt, "tilt")])
+
+    assert words(np.pi / 6, 0.0) == ""
+    assert words(-0.01, 0.0) == "extrapolated from data at phi = 0 to 30 deg"
+    assert words(0.1, 0.1) == "extrapolated from data at tilt = 0 to 0 deg"
+    assert words(1.0, -0.1).endswith("phi = 0 to 30 deg and tilt = 0 to 0 deg")
+
+
+def test_rows_where_the_wall_moves_further_than_the_radius_are_told():
+    from jaxtrachea.prediction.core import Response
+    from jaxtrachea.prediction.predict import _verdict
+
+    source = source_like(PredictionStatus.OK)
+    force = np.array([0.1, 0.2, 0.3])
+    value, se = Response(force, force[:, None], None), Response(force / 9, force[:, None], None)
+    presses = np.array([PressStatus.OK, PressStatus.TOO_DEEP, PressStatus.TOO_DEEP])
+    status, message = _verdict(source, value, se, presses, 0.0)
+    assert status == PredictionStatus.TOO_DEEP
+    assert status.predicts
+    assert "2 samples: solved, but the wall is pressed in" in message
+    assert _verdict(source, value, se, 0 * presses, 0.0)[0] == PredictionStatus.OK
+    # A row without a number is worse.
+    lost = value._replace(force=np.array([0.1, 0.2, np.nan]))
+    presses[2] = PressStatus.PAST_FOLD
+    status, message = _verdict(source, lost, se, presses, 0.0)
+    assert status == PredictionStatus.NO_SOLUTION
+    assert "1 samples: solved, but" in message
+
+
+def source_like(status):
+    none = np.zeros((0, 0))
+    return Source(
+        "a", "", 0, none[0:], none[0:], none, none, np.array(2.0), np.ones(2), (), status, ""
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "depths", "says"),
+    [
+        # A tenth of 12 mm, a half of it; without a skeleton nothing yields but the contact.
+        (Options(), (1.0, 1.2), None),
+        (Options(), (1.3, 0.5), "1 of 2 curves go to 1.3 mm; .*'linear' was tested to 1.2 mm"),
+        (Options(skeleton="softening"), (6.0, 1.0), None),
+        (Options(skeleton="softening"), (7.0, 6.5), "2 of 2 curves go to 7 mm; .* to 6 mm"),
+        (Options(coupling="total"), (20.0, 1.0), None),
+    ],
+)
+def test_curves_deeper_than_a_skeleton_was_tested(options, depths, says):
+    curves = [Curve("a", "", 50.0, 0.0, d * np.linspace(0, 1, 5), np.ones(5)) for d in depths]
+    sentence = deeper_than_tested(curves, options, 12.0)
+    assert sentence is None if says is None else re.search(says, sentence)
