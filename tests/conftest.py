@@ -138,12 +138,14 @@ LONGEST = (
     "test_damaged.py",
     "test_bands.py",
     "test_mesh.py",
-    "test_survive.py",
+    "test_resume.py",
 )
 #: The same for the slow tests, both halves.
 LONGEST_SLOW = (
     "test_scrutiny.py",
-    "test_survive.py",
+    "test_full_disk.py",
+    "test_processes.py",
+    "test_resume.py",
     "test_press_derivatives.py",
     "test_section_analyses.py",
     "test_configs.py",
