@@ -1,6 +1,7 @@
-"""What threads share."""
+"""How many threads are of use, and what they share."""
 
 import functools
+import os
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -24,3 +25,11 @@ def made_once(maxsize: int) -> Callable[[Callable[..., Any]], Callable[..., Any]
         return waiting
 
     return decorate
+
+
+def usable_cores() -> int:
+    """Cores that this process may use; all of the machine where the system does not tell."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on every system
+        return os.cpu_count() or 1

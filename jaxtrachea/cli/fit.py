@@ -95,8 +95,18 @@ def remembered(options: FitOptions) -> list[str]:
         return []
 
 
-def describe(options: FitOptions, loaded, measurements, study, analyses: list[str]):
-    """The manifest of what would be run now."""
+def worker_devices(options: FitOptions) -> list:
+    """The device of each thread that fits shards; `Stop` where `--threads` cannot be."""
+    from jaxtrachea.runs import shards
+
+    try:
+        return shards.worker_devices(options.threads)
+    except ValueError as error:
+        raise Stop(f"--threads: {error}; leave it out") from None
+
+
+def describe(options: FitOptions, loaded, measurements, study, analyses: list[str], devices: list):
+    """The manifest of what would be run now, its shards on these devices."""
     import jax
 
     from jaxtrachea.cli.specification import settings_of
@@ -109,11 +119,8 @@ def describe(options: FitOptions, loaded, measurements, study, analyses: list[st
     if every == "auto":
         every = shards.lanes_per_shard(study, settings.starts)
     lanes = study.lanes.lower.shape[0]
-    try:
-        workers = min(len(shards.worker_devices(options.threads)), -(-lanes // every))
-    except ValueError as error:
-        raise Stop(f"--threads: {error}; leave it out") from None
     if batch == "auto":
+        workers = min(len(devices), -(-lanes // every))
         batch = shards.slots(study, shards.free_memory(workers))
     else:
         batch = min(batch, study.most_together)
@@ -196,7 +203,9 @@ def _finished(options: FitOptions, target: Path, now, study):
 
 
 @contextlib.contextmanager
-def running(options: FitOptions, meeting: Meeting, now, study, settings) -> Iterator[Run]:
+def running(
+    options: FitOptions, meeting: Meeting, now, study, settings, devices: list
+) -> Iterator[Run]:
     """The run, opened, watched over, and put into place at the end; or what is kept is said.
 
     Args:
@@ -205,6 +214,7 @@ def running(options: FitOptions, meeting: Meeting, now, study, settings) -> Iter
         now: manifest of what would be run now.
         study: the study.
         settings: of the solver.
+        devices: as `worker_devices` gives them.
     """
     from jaxtrachea.runs import checkpoint, manifest
     from jaxtrachea.runs import folder as run_folder
@@ -225,9 +235,7 @@ def running(options: FitOptions, meeting: Meeting, now, study, settings) -> Iter
 
                 def fit(_, settings, progress):
                     mine = todo[0 :: meeting.processes]
-                    settings = checkpoint.settings_for(run, settings)
-                    with _held_back(ctrl_c, options.threads, mine):
-                        checkpoint.fit_shards(run, study, settings, mine, progress, options.threads)
+                    _fit_shards(run, study, settings, mine, progress, devices, ctrl_c)
                     watch.wait_for_others()
                     return checkpoint.collect(run, study)
 
@@ -247,22 +255,24 @@ def running(options: FitOptions, meeting: Meeting, now, study, settings) -> Iter
             run.release()
 
 
-@contextlib.contextmanager
-def _held_back(ctrl_c: Interrupts, threads: int | None, todo: list[int]) -> Iterator[None]:
-    """Ctrl-C while threads fit shards: they raise it at their next step, and all have ended then.
+def _fit_shards(
+    run, study, settings, todo: list[int], progress: Progress, devices: list, ctrl_c: Interrupts
+) -> None:
+    """Fit shards and save them; several threads raise Ctrl-C at their next step, and end first.
 
     One thread is interrupted where it is.
     """
-    from jaxtrachea.runs import shards
+    from jaxtrachea.runs import checkpoint
 
-    if min(len(shards.worker_devices(threads)), len(todo)) < 2:
-        yield
-        return
-    ctrl_c.hold()
+    settings = checkpoint.settings_for(run, settings)
+    several = min(len(devices), len(todo)) > 1
+    if several:
+        ctrl_c.hold()
     try:
-        yield
+        checkpoint.fit_shards(run, study, settings, todo, progress, devices)
     finally:
-        ctrl_c.let_through()
+        if several:
+            ctrl_c.let_through()
 
 
 def _watched(watch: processes.Watch, **content):
@@ -338,9 +348,8 @@ def _kept(meeting: Meeting, run, study, error: BaseException) -> Kept:
     )
 
 
-def help_out(options: FitOptions, meeting: Meeting, now, study, settings) -> None:
+def help_out(options: FitOptions, meeting: Meeting, now, study, settings, devices: list) -> None:
     """Fit this process's shards of a run that process 0 has opened, and wait for its end."""
-    from jaxtrachea.runs import checkpoint
     from jaxtrachea.runs import folder as run_folder
 
     target, timeout = options.folder, meeting.heartbeat_timeout
@@ -369,10 +378,8 @@ def help_out(options: FitOptions, meeting: Meeting, now, study, settings) -> Non
 
                 stages = Stages(bar, look)
                 progress = stages.begin(f"fitting ({meeting.process} of {meeting.processes})")
-                settings = checkpoint.settings_for(run, settings)
                 mine = opened["todo"][meeting.process :: meeting.processes]
-                with _held_back(ctrl_c, options.threads, mine):
-                    checkpoint.fit_shards(run, study, settings, mine, progress, options.threads)
+                _fit_shards(run, study, settings, mine, progress, devices, ctrl_c)
                 stages.close()
                 watch.done()
                 watch.wait_for(0)

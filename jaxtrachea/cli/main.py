@@ -124,12 +124,13 @@ def fit(options: FitOptions) -> None:
     loaded, measurements, study = load(spec, options.data, refits=bool(analyses))
     request = Request(loaded, study, settings_of(loaded), analyses)
     refuse(spec, request)
-    now = cli_fit.describe(options, loaded, measurements, study, analyses)
+    devices = cli_fit.worker_devices(options)
+    now = cli_fit.describe(options, loaded, measurements, study, analyses, devices)
     if meeting.process > 0:
-        cli_fit.help_out(options, meeting, now, study, request.settings)
+        cli_fit.help_out(options, meeting, now, study, request.settings, devices)
         raise typer.Exit(0)
     clock.append(time.perf_counter())
-    with cli_fit.running(options, meeting, now, study, request.settings) as under:
+    with cli_fit.running(options, meeting, now, study, request.settings, devices) as under:
         changed = {"settings": under.settings, "options": under.options}
         findings = run(dataclasses.replace(request, **changed), under.stop_if_asked, under.fit)
         clock.append(time.perf_counter())

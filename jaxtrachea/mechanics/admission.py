@@ -56,10 +56,7 @@ def admit(
         ValueError: a value of the material that is neither a scalar nor one for each span or ring,
             or a contact position that is no scalar.
     """
-    check_shapes(geometry, material)
-    length = geometry.length
-    s_c = shaped("s_c", s_c, (), dtype=length.dtype, why="; use jax.vmap for many positions")
-    used = tuple(used)
+    s_c, length, used = check_place(geometry, material, s_c), geometry.length, tuple(used)
     on = (s_c >= reach) & (s_c <= length - reach)
     material, bad = without_negative(material, used)
     material, lost = _replaced(material, used, lambda value: ~jnp.isfinite(value))
@@ -67,6 +64,17 @@ def admit(
     refused = jnp.where(~lost & ~jnp.isnan(s_c), refused, PressStatus.NON_FINITE)
     refused = jnp.where(bad, PressStatus.BAD_MATERIAL, refused).astype(jnp.int8)
     return Admitted(material, jnp.where(on, s_c, length / 2), refused)
+
+
+def check_place(geometry: Geometry, material: Material, s_c: ArrayLike) -> Float[Array, ""]:
+    """The contact position, mm, as an array, where tube, material and position are of their shapes.
+
+    Raises:
+        ValueError: as `check_shapes`, or a contact position that is no scalar.
+    """
+    check_shapes(geometry, material)
+    dtype = geometry.length.dtype
+    return shaped("s_c", s_c, (), dtype=dtype, why="; use jax.vmap for many positions")
 
 
 def float_type(geometry: Geometry) -> jnp.dtype:

@@ -13,6 +13,7 @@ when the ring pushes back against F; theta = dw/ds. Valid for small deflections 
 Units: mm, N, N mm^2 (bending stiffness), N (shear stiffness kappa G A), N/mm (rings), mm/N.
 """
 
+import functools
 from typing import Literal, NamedTuple
 
 import jax
@@ -203,6 +204,12 @@ def contact_compliance(
     s_c = real("s_c", s_c, beam.x.dtype)
     if s_c.ndim > 1:
         raise ValueError(f"s_c has shape {s_c.shape}; expected a scalar or one axis")
+    return _contact_compliance(beam, s_c, split)
+
+
+@functools.partial(jax.jit, static_argnames="split", inline=True)
+def _contact_compliance(beam: Beam, s_c: Float[Array, "*m"], split: Split) -> Float[Array, "*m"]:
+    """`contact_compliance`, of arguments that are checked."""
     both = _both_sides(beam)
     on = (s_c >= 0) & (s_c <= beam.length)
     s_c = jnp.where(on, s_c, beam.length / 2)
@@ -270,6 +277,19 @@ def deflect(
         ring_load = shaped("ring_load", ring_load, beam.x.shape, dtype=dtype, why=why)
         if form == "reactions":
             raise ValueError("ring_load is not part of form='reactions'; use form='recursion'")
+    return _deflect(beam, s_c, force, split, form, ring_load)
+
+
+@functools.partial(jax.jit, static_argnames=("split", "form"), inline=True)
+def _deflect(
+    beam: Beam,
+    s_c: Float[Array, ""],
+    force: Float[Array, ""],
+    split: Split,
+    form: Form,
+    ring_load: Float[Array, " n"] | None,
+) -> Deflection:
+    """`deflect`, of arguments that are checked."""
     on = (s_c >= 0) & (s_c <= beam.length)
     place = jnp.where(on, s_c, beam.length / 2)
     found = deflect_on(beam, place, force, split, form, ring_load)

@@ -5,6 +5,7 @@ the frame of the tube: x along s towards the larynx, y anterior, z to the side o
 """
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,14 @@ from jaxtrachea._arguments import ArrayLike, check_record, check_word, last_axis
 from jaxtrachea._numerics import product, product_of_rows, turned
 from jaxtrachea.mechanics import friction as _friction
 from jaxtrachea.mechanics import skeleton, vector_equilibrium
-from jaxtrachea.mechanics.admission import Admitted, admit, float_type, hide, status_of
+from jaxtrachea.mechanics.admission import (
+    Admitted,
+    admit,
+    check_place,
+    float_type,
+    hide,
+    status_of,
+)
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.press import Options, check_line, local_law, read_values, touch
@@ -146,8 +154,23 @@ def press_oblique(
         ValueError: a missing value of the material, an argument that is no number, or an array of
             a wrong length.
     """
+    where = _checked(geometry, material, s_c, phi_c, options, onset)
+    displacement = last_axis("displacement", displacement, 3, float_type(geometry))
+    return _press_oblique(geometry, material, *where, displacement, options)
+
+
+@functools.partial(jax.jit, static_argnames="options", inline=True)
+def _press_oblique(
+    geometry: Geometry,
+    material: Material,
+    s_c: Float[Array, ""],
+    phi_c: Float[Array, ""],
+    onset: Float[Array, ""],
+    displacement: Float[Array, "*n 3"],
+    options: ObliqueOptions,
+) -> ObliquePress:
+    """`press_oblique`, of arguments that are checked."""
     place = place_at(geometry, material, s_c, phi_c, options, onset=onset)
-    displacement = last_axis("displacement", displacement, 3, place.phi_c.dtype)
     return press_at(place, displacement, options.press)
 
 
@@ -221,8 +244,26 @@ def press_path(
         )
     dtype = float_type(geometry)
     displacement = shaped("displacement", displacement, ("steps", 3), dtype=dtype)
-    asked, unit, law, phi_c, onset = place_at(geometry, material, s_c, phi_c, options, onset=onset)
+    where = _checked(geometry, material, s_c, phi_c, options, onset)
     mu = shaped("friction", friction.mu, (), dtype=dtype)
+    friction = Coulomb(mu, friction.rounding)
+    return _press_path(geometry, material, *where, displacement, friction, options)
+
+
+@functools.partial(jax.jit, static_argnames="options", inline=True)
+def _press_path(
+    geometry: Geometry,
+    material: Material,
+    s_c: Float[Array, ""],
+    phi_c: Float[Array, ""],
+    onset: Float[Array, ""],
+    displacement: Float[Array, "steps 3"],
+    friction: Coulomb,
+    options: ObliqueOptions,
+) -> ObliquePath:
+    """`press_path`, of arguments that are checked."""
+    asked, unit, law, phi_c, onset = place_at(geometry, material, s_c, phi_c, options, onset=onset)
+    mu = jnp.asarray(friction.mu)
     friction = Coulomb(jnp.where(mu >= 0, mu, 0), friction.rounding)
     refused = jnp.where(jnp.isnan(mu), PressStatus.NON_FINITE, asked.refused)
     refused = jnp.where(mu < 0, PressStatus.BAD_MATERIAL, refused).astype(jnp.int8)
@@ -248,16 +289,29 @@ def place_at(
     onset: ArrayLike | None = None,
 ) -> Place:
     """Checked arguments, and the skeleton and the local law at the contact."""
-    check_word("options", options, ObliqueOptions)
-    dtype = float_type(geometry)
-    phi_c = shaped("phi_c", phi_c, (), dtype=dtype)
-    onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=dtype)
+    s_c, phi_c, onset = _checked(geometry, material, s_c, phi_c, options, onset)
     rings, levels = options.rings, {"axial": options.axial, "shear": options.press.shear}
     used = (*read_values(options.press), *skeleton.read_values(rings, **levels))
     asked = admit(geometry, material, s_c, dict.fromkeys(used))
     unit = skeleton.respond(geometry, asked.material, asked.s_c, phi_c, rings=rings, **levels)
     law = local_law(geometry, asked.material, asked.s_c, options.press)
     return Place(asked=asked, unit=unit, law=law, phi_c=phi_c, onset=onset)
+
+
+def _checked(
+    geometry: Geometry,
+    material: Material,
+    s_c: ArrayLike,
+    phi_c: ArrayLike,
+    options: ObliqueOptions,
+    onset: ArrayLike | None,
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Contact position, angle and displacement at first touch as arrays."""
+    check_word("options", options, ObliqueOptions)
+    dtype = float_type(geometry)
+    phi_c = shaped("phi_c", phi_c, (), dtype=dtype)
+    onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=dtype)
+    return check_place(geometry, material, s_c), phi_c, onset
 
 
 def _assemble(unit: Skeleton, force, depth, status) -> ObliquePress:

@@ -1,8 +1,10 @@
 """The forward model: the only place that knows the order of the rooms."""
 
 import dataclasses
+import functools
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -11,8 +13,8 @@ from jaxtrachea._numerics import centred_hinge, positive_part, scaled
 from jaxtrachea.mechanics import beam as _beam
 from jaxtrachea.mechanics import equilibrium, force_law, punch
 from jaxtrachea.mechanics.admission import (
-    Admitted,
     admit,
+    check_place,
     check_shapes,
     float_type,
     hide,
@@ -255,7 +257,14 @@ def compliance(
     """
     check_line(options, "compliance")
     check_shapes(geometry, material)
-    s_c = real("s_c", s_c, float_type(geometry))
+    return _compliance(geometry, material, real("s_c", s_c, float_type(geometry)), options)
+
+
+@functools.partial(jax.jit, static_argnames="options", inline=True)
+def _compliance(
+    geometry: Geometry, material: Material, s_c: Float[Array, "*m"], options: Options
+) -> Float[Array, "*m"]:
+    """`compliance`, of arguments that are checked."""
     beam = ligament_beam(geometry, material, options)
     if options.form == "recursion" and options.half_width == 0:
         return _beam.contact_compliance(beam, s_c, split=options.split)
@@ -344,13 +353,12 @@ def press(
             a value of the material that the options need, or the skeleton `sections`.
     """
     check_line(options, "press")
-    dtype = float_type(geometry)
-    displacement = real("displacement", displacement, dtype)
+    displacement = real("displacement", displacement, float_type(geometry))
     onset = shaped("onset", 0.0 if onset is None else onset, (), dtype=displacement.dtype)
     if blend is not None:
         blend = shaped("blend", blend, (), dtype=displacement.dtype)
-    asked = admit(geometry, material, s_c, read_values(options), reach=options.half_width)
-    return _press(geometry, asked, displacement, options, onset, blend)
+    s_c = check_place(geometry, material, s_c)
+    return _press(geometry, material, s_c, displacement, options, onset, blend)
 
 
 def read_values(options: Options) -> tuple[str, ...]:
@@ -360,16 +368,20 @@ def read_values(options: Options) -> tuple[str, ...]:
     return names + (("k_1_ring",) if options.local == "two-material" else ())
 
 
+@functools.partial(jax.jit, static_argnames="options", inline=True)
 def _press(
     geometry: Geometry,
-    asked: Admitted,
+    material: Material,
+    s_c: Float[Array, ""],
     displacement: Float[Array, "*n"],
     options: Options,
     onset: Float[Array, ""],
     blend: Float[Array, ""] | None = None,
 ) -> Press:
     """`press`, of arguments that are checked."""
-    material, s_c, refused = asked
+    material, s_c, refused = admit(
+        geometry, material, s_c, read_values(options), reach=options.half_width
+    )
     unit = unit_deflection(ligament_beam(geometry, material, options), s_c, options)
     law = local_law(geometry, material, s_c, options)
     softening = softening_of(material, options)

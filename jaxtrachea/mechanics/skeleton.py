@@ -5,6 +5,7 @@ positive phi. The ligament beam runs through C parallel to the axis, J_i = (s_i,
 two planes and stretches; at phi_c each ring answers with its own compliance.
 """
 
+import functools
 from typing import Literal, NamedTuple
 
 import jax
@@ -17,7 +18,7 @@ from jaxtrachea.mechanics import axial as _axial
 from jaxtrachea.mechanics import ring as _ring
 from jaxtrachea.mechanics import spatial_beam
 from jaxtrachea.mechanics._matrix2 import mul
-from jaxtrachea.mechanics.admission import admit, float_type, hide, status_of
+from jaxtrachea.mechanics.admission import admit, check_place, float_type, hide, status_of
 from jaxtrachea.status import PressStatus, RingStatus
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
@@ -86,6 +87,22 @@ def skeleton_response(
     """
     check_word("rings", rings, Rings)
     phi_c = shaped("phi_c", phi_c, (), dtype=float_type(geometry))
+    s_c = check_place(geometry, material, s_c)
+    return _response(geometry, material, s_c, phi_c, rings=rings, axial=axial, shear=shear)
+
+
+@functools.partial(jax.jit, static_argnames=("rings", "axial", "shear"), inline=True)
+def _response(
+    geometry: Geometry,
+    material: Material,
+    s_c: Float[Array, ""],
+    phi_c: Float[Array, ""],
+    *,
+    rings: Rings,
+    axial: bool,
+    shear: bool,
+) -> Skeleton:
+    """`skeleton_response`, of arguments that are checked."""
     asked = admit(geometry, material, s_c, read_values(rings, axial=axial, shear=shear))
     levels = {"rings": rings, "axial": axial, "shear": shear}
     unit = respond(geometry, asked.material, asked.s_c, phi_c, **levels)

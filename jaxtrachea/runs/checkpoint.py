@@ -18,7 +18,7 @@ from jaxtrachea.inference.analyses import widened
 from jaxtrachea.results.hdf5 import read_hdf5
 from jaxtrachea.results.rows import summary_rows
 from jaxtrachea.runs.folder import NoRun, RunFolder, digest
-from jaxtrachea.runs.shards import divide, join, load, replaced, save, worker_devices
+from jaxtrachea.runs.shards import divide, join, load, replaced, save
 
 #: A rerun of failed lanes has so many times more starts.
 MORE_STARTS = 4
@@ -57,9 +57,9 @@ def fit_shards(
     settings: Settings,
     todo: list[int],
     progress: Callable[[int, int], None],
-    threads: int | None = None,
+    devices: list,
 ) -> None:
-    """Fit shards and save each as soon as it is done, on all devices (cores) of this process.
+    """Fit shards and save each as soon as it is done, a thread for each device.
 
     Args:
         run: where to.
@@ -67,7 +67,7 @@ def fit_shards(
         settings: of the run, as `settings_for` gives them.
         todo: shards, as `missing` gives them.
         progress: as for `fit.fit`, called by one thread at a time; what it raises ends the work.
-        threads: as for `shards.worker_devices`.
+        devices: of the threads, as `shards.worker_devices` gives them.
     """
     from jaxtrachea.fitting.fit import fit
 
@@ -85,7 +85,7 @@ def fit_shards(
         result = fit(part.take(shards[k]), settings, tell)
         save(run.shard(k), run.manifest, shards[k], result)
 
-    _in_threads(one, todo, worker_devices(threads))
+    _in_threads(one, todo, devices)
 
 
 class _Ended(Exception):

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxtrachea._threads import usable_cores
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.fitting import lane
 from jaxtrachea.fitting.result import FitResult
@@ -81,14 +82,8 @@ def worker_devices(threads: int | None = None) -> list:
             raise ValueError(f"threads are for one CPU; the devices of this process are {kinds}")
         return devices
     if threads is None:
-        threads = min(_usable_cores(), MOST_THREADS)
+        threads = min(usable_cores(), MOST_THREADS)
     return devices * threads
-
-
-def _usable_cores() -> int:
-    with contextlib.suppress(AttributeError):  # not on every system
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def free_memory(workers: int) -> float:

@@ -21,11 +21,6 @@ from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.trachea.material import Material
 
-#: Inlined: traced once for all plans of a scene that are compared, as `stage.touch_tube`.
-_press_oblique, _press_path = (
-    jax.jit(press, static_argnames="options", inline=True) for press in (press_oblique, press_path)
-)
-
 
 class Moved(NamedTuple):
     """Force and skeleton, whichever program found them; fields as in `Simulation`.
@@ -109,17 +104,17 @@ def vectors(scene: Scene, material: Material, presses: Presses) -> Moved:
     if plan.friction:
         if scene.friction is None:
             raise ValueError("scene.friction is None; the plan has friction")
-        path = _press_path(
+        path = press_path(
             *fixed, presses.s[0], presses.phi[0], presses.displacement, Coulomb(scene.friction),
             plan.oblique,
         )  # fmt: skip
         return moved_by(path.press)._replace(slip=path.slip, dissipated=path.dissipated)
     if plan.contact_point == "fixed":
         at = presses.s[0], presses.phi[0], presses.displacement
-        return moved_by(_press_oblique(*fixed, *at, plan.oblique))
+        return moved_by(press_oblique(*fixed, *at, plan.oblique))
 
     def one(s, phi, D):
-        return _press_oblique(*fixed, s, phi, D, plan.oblique)
+        return press_oblique(*fixed, s, phi, D, plan.oblique)
 
     return moved_by(jax.vmap(one)(presses.s, presses.phi, presses.displacement))
 

@@ -3,8 +3,10 @@
 The program is put together from the scene's static `Plan`; what is off is not in it.
 """
 
+import functools
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -110,6 +112,12 @@ def simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simu
     if plan.contact != isinstance(path, Poses):
         kinds = ("Poses (the plan has contact)", "Presses (the plan has no contact)")
         raise ValueError(f"path is {type(path).__name__}; expected {kinds[not plan.contact]}")
+    return _simulate(scene, material, path)
+
+
+@functools.partial(jax.jit, inline=True)
+def _simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Simulation:
+    """`simulate`, of arguments that are checked."""
     made = approach(scene, path) if isinstance(path, Poses) else None
     result, press = pressed(scene, material, path, made)
     return result._replace(vertices=surface(scene, material, path, press))

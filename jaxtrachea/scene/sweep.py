@@ -1,6 +1,7 @@
 """Normal presses at many contact points."""
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
@@ -42,7 +43,6 @@ class Sweep(NamedTuple):
     status: Int[Array, " points"]
 
 
-@full_precision
 def sweep(
     scene: Scene,
     material: AnyMaterial,
@@ -81,7 +81,20 @@ def sweep(
         shaped(name, value, s.shape, dtype=dtype, why=" (as s has)")
         for name, value in (("phi", phi), ("depth", depth))
     )
+    return _sweep(scene, material, s, phi, depth, chunk)
 
+
+@functools.partial(jax.jit, static_argnames="chunk", inline=True)
+@full_precision
+def _sweep(
+    scene: Scene,
+    material: AnyMaterial,
+    s: Float[Array, " points"],
+    phi: Float[Array, " points"],
+    depth: Float[Array, " points"],
+    chunk: int,
+) -> Sweep:
+    """`sweep`, of arguments that are checked."""
     unlike = set(lacking(scene, material)) - {"axial"}
     straight_in = scene.plan.has("skeleton") or scene.plan.has("width")
     flat = straight_in and not scene.plan.second_plane

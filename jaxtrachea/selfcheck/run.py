@@ -7,7 +7,6 @@ for a batch; they are compiled beside each other, which takes nearly all of the 
 import functools
 import itertools
 import math
-import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
@@ -15,6 +14,7 @@ import jax
 import numpy as np
 
 from jaxtrachea._compiler import quick_options
+from jaxtrachea._threads import usable_cores
 from jaxtrachea.selfcheck.functions import FUNCTIONS
 from jaxtrachea.selfcheck.judge import Outcome, judge, rank
 from jaxtrachea.selfcheck.table import Case, Truth
@@ -141,7 +141,7 @@ def run_table(
         for dtype in dtypes:
             if dtype in case.dtypes:
                 groups.setdefault((case.function, dtype), []).append(case)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         made = {
             key: pool.submit(_Programs, rows[0], key[1], quick=quick)
             for key, rows in groups.items()
