@@ -25,6 +25,8 @@ SIAM J. Appl. Math. 14 (1966), doi:10.1137/0114053.
 Results are in the frame of A, lengths in mm (any one unit: the search is scale-free).
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -121,6 +123,19 @@ def signed_distance(
             f"table: expected shape ({settings.directions},), found {table.shape}; "
             "use direction_table with the same settings"
         )
+    return _signed_distance(a, b, pose, settings, beta, table)
+
+
+@functools.partial(jax.jit, static_argnames="settings", inline=True)
+def _signed_distance(
+    a: Shape,
+    b: Shape,
+    pose: Pose,
+    settings: Settings,
+    beta: Float[Array, ""] | None,
+    table: Float[Array, " directions"] | None,
+) -> Contact:
+    """`signed_distance`, of arguments that are checked."""
     scaled = _scaled(a, b, pose, settings, beta)
     pair, size = jax.lax.stop_gradient((scaled.pair, scaled.size))
     if table is None:
@@ -157,6 +172,19 @@ def track(
     Returns:
         The `Contact`, as `signed_distance`.
     """
+    return _track(a, b, pose, direction, settings, beta)
+
+
+@functools.partial(jax.jit, static_argnames="settings", inline=True)
+def _track(
+    a: Shape,
+    b: Shape,
+    pose: Pose,
+    direction: Float[Array, "3"],
+    settings: Settings,
+    beta: Float[Array, ""] | None,
+) -> Contact:
+    """`track`, as one program."""
     scaled = _scaled(a, b, pose, settings, beta)
     d, pair = jax.lax.stop_gradient((direction, scaled.pair))
     d = d / largest(jnp.abs(d))

@@ -17,6 +17,8 @@ bound of theirs, from -h_A(d) - h_B(-d) <= distance, which holds for every unit 
 in mm.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -170,6 +172,21 @@ def touch(
     count = patches.centres.shape[0]
     if not 1 <= near <= count:
         raise ValueError(f"near: expected 1 to {count} (the number of patches), found {near}")
+    return _touch(tool, pose, patches, settings, near, beta, search)
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "near", "search"), inline=True)
+def _touch(
+    tool: Shape,
+    pose: Pose,
+    patches: Patches,
+    settings: Settings,
+    near: int,
+    beta: Float[Array, ""] | None,
+    search: bool,
+) -> Touch:
+    """`touch`, of arguments that are checked."""
+    count = patches.centres.shape[0]
     beta = settings.sharpness / _size(tool, patches) if beta is None else beta
     bounds, directions = gap_bounds(tool, pose, patches)
     # Where two patches are equally near, beside the middle one, roundings do not choose.

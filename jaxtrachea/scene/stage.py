@@ -171,11 +171,6 @@ class Scene(eqx.Module):
     points: Points | None = None
 
 
-#: Inlined: the same program, but traced once for the same shapes. The plans of a scene that are
-#: compared by their operations share it.
-_touch = jax.jit(touch, static_argnames=("settings", "near"), inline=True)
-
-
 def touch_tube(scene: Scene, path: Poses) -> Touch:
     """Contact of the tool with the tube at rest, row by row, batched.
 
@@ -189,7 +184,7 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
     tool, tube = scene.tool, scene.tube
 
     def one(R, T):
-        return _touch(tool, Pose(R, T), tube, scene.quality, near=scene.near)
+        return touch(tool, Pose(R, T), tube, scene.quality, near=scene.near)
 
     return jax.vmap(one_kernel(one))(path.rotation, path.translation)
 
