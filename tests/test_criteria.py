@@ -518,5 +518,5 @@ def test_the_batch_that_is_recorded_is_the_one_used(tmp_path):
             "[fit]\nbatch = 64\n"
         )
         options = FitOptions(spec=path)
-        now = describe(options, *load(path, None), analyses=[])
+        now = describe(options, *load(path, None), analyses=[], devices=[])
         assert as_dict(now)["chunk"] == batch

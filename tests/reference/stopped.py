@@ -11,7 +11,7 @@ from jaxtrachea.config import load_fit_spec
 from jaxtrachea.fitting import fit
 from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.results.hdf5 import read_hdf5
-from jaxtrachea.runs import checkpoint, shards
+from jaxtrachea.runs import shards
 
 FIT = ("fit", "spec.toml", "--out", "out")
 
@@ -19,7 +19,7 @@ FIT = ("fit", "spec.toml", "--out", "out")
 def stop_at(patch, k, error=KeyboardInterrupt):
     """Let fits before the k-th through, one after the other, stop that one; counts them."""
     asked, real = [], fit.fit
-    patch.setattr(checkpoint, "worker_devices", lambda _: jax.local_devices()[:1])
+    patch.setattr(shards, "worker_devices", lambda _: jax.local_devices()[:1])
 
     def stopping(study, settings, progress):
         asked.append(study.lanes.lower.shape[0])

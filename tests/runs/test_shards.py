@@ -191,5 +191,7 @@ def test_what_a_thread_raises_ends_the_fit_under_way_in_the_others(peace, study,
     monkeypatch.setattr(checkpoint, "fitted_lanes", lambda _, study: study)
     folder = object.__new__(run_folder.RunFolder)
     with pytest.raises(OSError, match="full"):
-        checkpoint.fit_shards(folder, loaded, Settings(), [0, 1, 2], lambda *_: None, 3)
+        checkpoint.fit_shards(
+            folder, loaded, Settings(), [0, 1, 2], lambda *_: None, shards.worker_devices(3)
+        )
     assert left == ["_Ended", "_Ended"]
