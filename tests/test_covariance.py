@@ -13,6 +13,8 @@ from jaxtrachea.fitting.lanes import Weighting
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, normal_psi2
 
 N, UNKNOWNS, BEND = 40, 2, 1.345
+ESTIMATED = {"noise_given": (False, False), "noise_known": np.zeros(1, bool)}
+GIVEN = {"noise_given": (True, False), "noise_known": np.ones(1, bool)}
 
 
 def told(z):
@@ -22,9 +24,9 @@ def told(z):
     of_forces = np.array([[1.0, 0.0]])
     return X, Information(
         bread=gram, meat=gram, gradient=zero, squares=np.sum(z**2) * of_forces,
-        weighted=np.sum(z**2) * of_forces, plain=np.sum(z**2) * of_forces, counts=N * of_forces,
+        plain=np.sum(z**2) * of_forces, counts=N * of_forces,
         spread=np.median(np.abs(z)) * of_forces,
-        psi2=np.array([np.mean(np.clip(z, -BEND, BEND) ** 2)]),
+        psi2=np.mean(np.clip(z, -BEND, BEND) ** 2) * of_forces,
         dpsi=np.array([np.mean(np.abs(z) < BEND)]),
     )  # fmt: skip
 
@@ -33,7 +35,7 @@ def test_covariance_of_a_robust_fit():
     """Huber (1981), sec. 7.6: n / (n - p) mean(psi^2) / mean(psi')^2 (X^T X)^-1."""
     z = np.random.default_rng(5).standard_t(3, N)
     X, info = told(z)
-    found = analyse(info, np.ones((1, 2)), np.zeros((1, 2), bool), noise_given=False)
+    found = analyse(info, np.ones((1, 2)), np.zeros((1, 2), bool), **ESTIMATED)
     psi, slope = np.clip(z, -BEND, BEND), np.abs(z) < BEND
     assert 0.5 < np.mean(slope) < 0.95
     factor = N / (N - UNKNOWNS) * np.mean(psi**2) / np.mean(slope) ** 2
@@ -62,11 +64,11 @@ def test_given_noise_of_a_robust_fit(loss):
     dpsi = (
         np.asarray(robust(loss, jnp.asarray((r + 1e-6) ** 2), BEND)[1]) * (r + 1e-6) - psi
     ) / 1e-6
-    info = info._replace(psi2=np.mean(psi**2)[None], dpsi=np.mean(dpsi)[None])
-    found = analyse(info, np.ones((1, 2)), np.zeros((1, 2), bool), noise_given=True, least=kept)
+    info = info._replace(psi2=np.array([[np.mean(psi**2), 0.0]]), dpsi=np.mean(dpsi)[None])
+    found = analyse(info, np.ones((1, 2)), np.zeros((1, 2), bool), **GIVEN, least=kept)
     np.testing.assert_allclose(found.se[0], spread, rtol=0.05)
-    few = info._replace(psi2=np.zeros(1))  # as many unknowns as samples: no residual is left
-    found = analyse(few, np.ones((1, 2)), np.zeros((1, 2), bool), noise_given=True, least=kept)
+    few = info._replace(psi2=np.zeros((1, 2)))  # as many unknowns as samples: no residual is left
+    found = analyse(few, np.ones((1, 2)), np.zeros((1, 2), bool), **GIVEN, least=kept)
     np.testing.assert_allclose(found.se[0], spread, rtol=0.05)
 
 

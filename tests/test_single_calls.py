@@ -102,5 +102,5 @@ def test_derivatives_and_batches_of_a_press_are_compiled_once(derivative):
     with compilations() as again:
         second = whole(at)
     assert again == (["jit(scan)"] if derivative is jax.jacrev else [])
-    np.testing.assert_allclose(first, jax.jit(whole)(at), rtol=1e-12)
+    np.testing.assert_allclose(first, jax.jit(whole)(at), rtol=1e-12, atol=1e-15)
     np.testing.assert_array_equal(first, second)

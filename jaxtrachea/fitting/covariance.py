@@ -9,7 +9,7 @@ s^2 (J^T J)^-1.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.special import stdtrit
 
 from jaxtrachea.fitting.information import Information
@@ -63,7 +63,8 @@ def analyse(
     relative: np.ndarray,
     held: np.ndarray,
     *,
-    noise_given: bool,
+    noise_given: tuple[bool, bool],
+    noise_known: Bool[np.ndarray, " lanes"],
     least: float | None = None,
     unknowns: int | None = None,
     structural: np.ndarray | None = None,
@@ -74,7 +75,9 @@ def analyse(
         info: numpy, leading axis = lanes.
         relative: change of each scaled coordinate that makes a relative change of 1; (lanes, P).
         held: unknowns that are absent or on a bound; (lanes, P).
-        noise_given: whether sigma is known, so that residuals do not scale the covariance.
+        noise_given: whether sigma of (force, markers) is known, so that their residuals do not
+            scale the covariance.
+        noise_known: lanes of which that holds for all that they observe; (lanes,).
         least: with a robust loss: mean psi^2 of normal noise of a sigma that is known, which it is
             taken for at least (`noise.normal_psi2`); None: linear loss.
         unknowns: estimated from the `counts`, if more than those of one lane.
@@ -84,7 +87,7 @@ def analyse(
     free = ~held
     total = np.sum(info.counts, axis=1)
     dof = total - (np.sum(free, axis=1) if unknowns is None else unknowns)
-    half = half_widths(dof, noise_given=noise_given)
+    half = half_widths(dof, noise_known=noise_known)
     usable = np.isfinite(info.bread).all(axis=(1, 2)) & (dof >= 0)
     free = free & usable[:, None]
     kappa = noise_factor(info, dof, noise_given=noise_given, least=least)
@@ -121,9 +124,16 @@ def analyse(
 
 
 def noise_factor(
-    info: Information, dof: np.ndarray, *, noise_given: bool, least: float | None = None
+    info: Information,
+    dof: np.ndarray,
+    *,
+    noise_given: tuple[bool, bool],
+    least: float | None = None,
 ) -> Float[np.ndarray, " lanes"]:
-    """Factor kappa of the sandwich: of the residuals, unless the noise is given, and of the loss.
+    """Factor kappa of the sandwich: of the residuals, unless their noise is given, and of the loss.
+
+    Forces and markers count by their numbers, each in units of its own sigma: residuals of a kind
+    whose sigma is given say nothing of the noise of the other.
 
     Args:
         info: numpy, leading axis = lanes.
@@ -131,10 +141,11 @@ def noise_factor(
         noise_given: as for `analyse`.
         least: likewise.
     """
-    square = np.asarray(info.psi2) * np.sum(info.counts, axis=1) / np.maximum(dof, 1)
-    if noise_given:
-        square = np.ones(len(dof)) if least is None else np.maximum(square, least)
-    return square / _mean_slope(info) ** 2
+    total = np.sum(info.counts, axis=1)
+    squares = np.asarray(info.psi2) * (total / np.maximum(dof, 1))[:, None]
+    given = np.ones_like(squares) if least is None else np.maximum(squares, least)
+    squares = np.where(np.array(noise_given), given, squares)
+    return np.sum(squares * info.counts, axis=1) / np.maximum(total, 1) / _mean_slope(info) ** 2
 
 
 def _mean_slope(info: Information) -> np.ndarray:
@@ -142,13 +153,14 @@ def _mean_slope(info: Information) -> np.ndarray:
     return np.maximum(info.dpsi, 1e-3)
 
 
-def half_widths(dof: np.ndarray, *, noise_given: bool) -> np.ndarray:
-    """Of 95 % intervals in standard errors: normal with given noise, else Student's t; (lanes,)."""
+def half_widths(
+    dof: np.ndarray, *, noise_known: Bool[np.ndarray, " lanes"]
+) -> Float[np.ndarray, " lanes"]:
+    """Of 95 % intervals in standard errors: normal with known noise, else Student's t; (lanes,)."""
     half = np.full(len(dof), 1.959963984540054)
-    if noise_given:
-        return half
     different, which = np.unique(np.maximum(dof, 1), return_inverse=True)
-    return np.where(dof > 0, stdtrit(different, 0.975)[which.reshape(-1)], half)
+    of_t = stdtrit(different, 0.975)[which.reshape(-1)]
+    return np.where((dof > 0) & ~noise_known, of_t, half)
 
 
 def _conditional_directions(values, vectors, free) -> np.ndarray:

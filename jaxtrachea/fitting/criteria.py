@@ -42,8 +42,9 @@ def criteria(study: Study, info: Information, alive: Bool[np.ndarray, " lanes"])
     """Criteria of all lanes; in a joint study those of the whole study, the same in every lane.
 
     With a given standard deviation the deviance is sum(z^2 + ln(2 pi sigma^2)), with an estimated
-    one n (ln(2 pi S / n) + 1), forces and markers each with their own. S is the sum of squares that
-    the fit minimises, curve weights included; they average to one.
+    one n (ln(2 pi S / n) + 1), forces and markers each with their own. S is the sum of squares
+    without curve weights: with them it would be no likelihood. Where curves of unequal length weigh
+    the same the estimate is not quite its maximum.
 
     Args:
         study: what was fitted.
@@ -55,7 +56,7 @@ def criteria(study: Study, info: Information, alive: Bool[np.ndarray, " lanes"])
     def whole(v, combine=np.sum):
         return np.broadcast_to(combine(v[alive], axis=0), v.shape) if study.joint else v
 
-    counts, squares = whole(np.asarray(info.counts, float)), whole(np.asarray(info.weighted))
+    counts, squares = whole(np.asarray(info.counts, float)), whole(np.asarray(info.squares))
     deviance = np.zeros(len(counts))
     for kind, parts in enumerate((forces(lanes), markers(lanes))):
         n, S = counts[:, kind], squares[:, kind]

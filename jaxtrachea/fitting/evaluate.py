@@ -35,8 +35,7 @@ def evaluated(study: Study) -> FitResult:
     with np.errstate(invalid="ignore", divide="ignore"):
         rms = np.sqrt(info.plain / info.counts)
     total = np.sum(info.counts, axis=1)
-    both = study.lanes.joints is None or study.noise_given[1]
-    half = half_widths(total, noise_given=study.noise_given[0] and both)
+    half = half_widths(total, noise_known=study.noise_known)
     none = np.zeros((lanes, 0))
     counts = {"iterations": np.zeros(lanes, int), "tried": np.ones(lanes, int)}
     return FitResult(
@@ -81,9 +80,6 @@ def _information(study: Study, off: Prediction) -> Information:
     def both(values):
         return np.stack([*values, *[zero] * (2 - len(values))], axis=1)
 
-    def balance(part):
-        return np.repeat(study.lanes.balance, part.shape[1] // trials, axis=1)
-
     def plain(kinds):
         total = zero
         for kind in kinds:
@@ -102,11 +98,10 @@ def _information(study: Study, off: Prediction) -> Information:
         meat=np.zeros((lanes, 0, 0)),
         gradient=np.zeros((lanes, 0)),
         squares=both([np.sum(v**2, axis=1) for v in parts]),
-        weighted=both([np.sum(v**2 * balance(v) ** 2, axis=1) for v in parts]),
         plain=both([plain(forces(study.lanes)), plain(markers(study.lanes))]),
         counts=both([np.sum(s, axis=1).astype(float) for s in seen]),
         spread=both([spread(*pair) for pair in zip(parts, seen, strict=True)]),
-        psi2=np.ones(lanes),
+        psi2=np.ones((lanes, 2)),
         dpsi=np.ones(lanes),
     )
     return Information(**arrays)

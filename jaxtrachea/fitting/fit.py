@@ -145,8 +145,9 @@ def _conclude(study: Study, minima: Minima, structure: Structure) -> FitResult:
     open_ = _open_directions(study, theta, structure)
     u = analyse(
         pool, relative, held,
-        noise_given=study.noise_known, least=normal_psi2(study.model.loss, study.model.loss_scale),
-        unknowns=unknowns, structural=open_,
+        noise_given=study.noise_given, noise_known=study.noise_known,
+        least=normal_psi2(study.model.loss, study.model.loss_scale), unknowns=unknowns,
+        structural=open_,
     )  # fmt: skip
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
 

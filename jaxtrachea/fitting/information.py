@@ -25,11 +25,10 @@ class Information(NamedTuple):
         gradient: of the cost; (P,).
         squares: sum of squared residuals of force (N^2) and markers (mm^2) in units of the given
             precision; (2,).
-        weighted: the same with the squares of the curve weights; (2,).
         plain: sum of squared residuals in N^2 and mm^2, whatever their precision; (2,).
         counts: observed entries of each; (2,).
         spread: median absolute residual of each, same units, 0 with a linear loss; (2,).
-        psi2: mean of psi(z)^2 over observed entries.
+        psi2: mean of psi(z)^2 over observed entries of each; (2,).
         dpsi: mean of psi'(z).
     """
 
@@ -37,11 +36,10 @@ class Information(NamedTuple):
     meat: Float[Array, "P P"]
     gradient: Float[Array, " P"]
     squares: Float[Array, "2"]
-    weighted: Float[Array, "2"]
     plain: Float[Array, "2"]
     counts: Float[Array, "2"]
     spread: Float[Array, "2"]
-    psi2: Float[Array, ""]
+    psi2: Float[Array, "2"]
     dpsi: Float[Array, ""]
 
     def rescaled(self, ratio: np.ndarray) -> "Information":
@@ -51,7 +49,7 @@ class Information(NamedTuple):
             bread=self.bread * square[:, None, None],
             meat=self.meat * square[:, None, None],
             gradient=self.gradient * square[:, None],
-            psi2=self.psi2 * square,
+            psi2=self.psi2 * square[:, None],
         )
 
 
@@ -93,11 +91,10 @@ def information(
         meat=assemble(model, b2 * b2 * gram, lane),
         gradient=assemble(model, gradient, lane),
         squares=by_kind(r.value**2 * seen),
-        weighted=by_kind(r.value**2 * seen * b2[:, 0]),
         plain=by_kind((r.value / jnp.where(precision > 0, precision, 1)) ** 2 * seen),
         counts=by_kind(seen),
         spread=jnp.stack([spread(True), spread(False)]),
-        psi2=jnp.sum(psi(z) ** 2 * seen) / total,
+        psi2=by_kind(psi(z) ** 2 * seen) / jnp.maximum(by_kind(seen), 1),
         dpsi=jnp.sum(dpsi * seen) / total,
     )
 

@@ -31,10 +31,9 @@ def pooled(
         alive: lanes that count.
     """
     squares, counts = info.squares[alive].sum(axis=0), info.counts[alive].sum(axis=0)
-    of_lane = info.counts[alive].sum(axis=1)
 
-    def mean(v):
-        return np.sum(v[alive] * of_lane) / max(np.sum(of_lane), 1)
+    def mean(v, weight):
+        return np.sum(v[alive] * weight, axis=0) / np.maximum(np.sum(weight, axis=0), 1)
 
     spread = np.zeros(2)
     if study.model.loss != "linear":
@@ -48,7 +47,8 @@ def pooled(
 
     return info._replace(
         squares=every(squares), counts=every(counts), spread=every(spread),
-        psi2=every(mean(info.psi2)), dpsi=every(mean(info.dpsi)),
+        psi2=every(mean(info.psi2, info.counts[alive])),
+        dpsi=every(mean(info.dpsi, info.counts[alive].sum(axis=1))),
     )  # fmt: skip
 
 

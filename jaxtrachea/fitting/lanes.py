@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea._errors import InputError
@@ -138,7 +139,6 @@ class _Layout:
         parameters: the table.
         geometry: the tube.
         noise: known standard deviations.
-        mean_length: samples of a curve in the mean; None: every sample weighs the same.
         reach: markers closer to the contact do not count, mm; below 0: all count.
         pressed_ends: whether ends of rings within reach along the tube count.
         trials: of a lane, at most.
@@ -152,7 +152,6 @@ class _Layout:
     parameters: Sequence[Parameter]
     geometry: Geometry
     noise: Noise
-    mean_length: float | None
     reach: float
     pressed_ends: bool
     trials: int
@@ -163,14 +162,22 @@ class _Layout:
     curves: Sequence[Curve]
 
 
-def mean_length(curves: Sequence[Curve], weighting: Weighting) -> float | None:
-    """Samples of a curve in the mean; None where every sample weighs the same."""
-    return float(np.mean([len(c.force) for c in curves])) if weighting.balance == "curve" else None
+def mean_lengths(groups: Sequence[Sequence[Curve]], *, joint: bool) -> Float[np.ndarray, " lanes"]:
+    """Samples of a curve in the mean of each lane; of lanes that are fitted jointly, of all."""
+    lengths = [[len(c.force) for c in curves] for curves in groups]
+    if joint:
+        return np.full(len(groups), np.mean(np.concatenate(lengths)))
+    return np.array([np.mean(lane) for lane in lengths])
 
 
-def curve_weight(mean: float | None, samples: int) -> float:
-    """Weight of the residuals of a curve of so many samples; `mean`: of `mean_length`."""
-    return 1.0 if mean is None else np.sqrt(mean / samples)
+def curve_weights(
+    groups: Sequence[Sequence[Curve]], trials: int, *, joint: bool
+) -> Float[np.ndarray, "lanes trials"]:
+    """Weights of the residuals of curves such that every curve of a lane weighs the same."""
+    weights, means = np.ones((len(groups), trials)), mean_lengths(groups, joint=joint)
+    for row, curves, mean in zip(weights, groups, means, strict=True):
+        row[: len(curves)] = np.sqrt(mean / [len(c.force) for c in curves])
+    return weights
 
 
 def lanes_of(
@@ -192,7 +199,7 @@ def lanes_of(
         parameters: the table.
         geometry: the tube.
         noise: known standard deviations.
-        weighting: balance between curves, and whether ends of pressed rings count.
+        weighting: whether ends of pressed rings count; `curve_weights` are put in afterwards.
         tool_radius: see `study.build_study`.
         vectors: see `Lane.phi_c`; whether the model reads what is below it there.
     """
@@ -202,7 +209,6 @@ def lanes_of(
         parameters=parameters,
         geometry=geometry,
         noise=noise,
-        mean_length=mean_length(every, weighting),
         reach=-1.0 if tool_radius is None else tool_radius,
         pressed_ends=weighting.pressed_ends,
         trials=max(map(len, groups)),
@@ -249,7 +255,6 @@ def _lane(layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown])
         lane["displacement"][t, :n], lane["force"][t, :n] = curve.displacement, curve.force
         sigma = curve.sigma if curve.sigma is not None else noise.force
         lane["precision"][t, :n] = 1.0 if sigma is None else 1 / np.asarray(sigma)
-        lane["balance"][t] = curve_weight(layout.mean_length, n)
         for j, p in enumerate(parameters):
             if not p.fixed:
                 lane["index"][t, j] = place[_key(p, curve)]

@@ -14,7 +14,7 @@ from jaxtrachea.fitting.study import Study
 def noise_rounds(study: Study) -> int:
     """Re-weightings: needed where an estimated sigma changes the estimate, not only its error."""
     both = study.lanes.joints is not None
-    return 4 if not study.noise_known and (both or study.model.loss != "linear") else 0
+    return 4 if not study.noise_known.all() and (both or study.model.loss != "linear") else 0
 
 
 def first_sigma(study: Study) -> np.ndarray:

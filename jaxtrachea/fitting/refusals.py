@@ -38,7 +38,7 @@ class Refusal(NamedTuple):
     """Why a curve cannot be pressed.
 
     Attributes:
-        kind: `position` or `sign`.
+        kind: `position`, `sign` or `sigma`.
         error: reason and cure; specimen and trial are its place.
     """
 
@@ -46,15 +46,46 @@ class Refusal(NamedTuple):
     error: InputError
 
 
+def sigma_is_needed(curves: Sequence[Curve], force: float | None) -> bool:
+    """Whether every curve needs a sigma of its own: some have one, and no noise is given for all.
+
+    Args:
+        curves: all that are fitted.
+        force: `Noise.force`, N.
+    """
+    return force is None and any(c.sigma is not None for c in curves)
+
+
 def refusal(
-    curve: Curve, size: Size, options: Options, parameters: Sequence[Parameter]
+    curve: Curve,
+    size: Size,
+    options: Options,
+    parameters: Sequence[Parameter],
+    *,
+    own_sigma: bool = False,
 ) -> Refusal | None:
-    """Why the model cannot press a curve (`check_curve`, `check_touch`); None: it can."""
+    """Why the model cannot press or weigh a curve; None: it can.
+
+    Args:
+        curve: the curve.
+        size: of the tube.
+        options: of the model.
+        parameters: the table.
+        own_sigma: see `sigma_is_needed`.
+    """
     kind = "position"
     try:
         check_curve(curve, size, options)
         kind = "sign"
         check_touch(curve, options, parameters)
+        kind = "sigma"
+        if own_sigma and curve.sigma is None:
+            raise InputError(
+                "no sigma, where other curves have one: known and unknown noise do not add up",
+                place=f"specimen {curve.specimen!r} trial {curve.trial!r}",
+                cure="give noise.force, for curves without a column sigma, or leave sigma out of "
+                "all files",
+            )
     except InputError as error:
         return Refusal(kind, error)
     return None

@@ -14,18 +14,19 @@ from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Int, Shaped
+from jaxtyping import Bool, Int, Shaped
 
 from jaxtrachea._errors import InputError
-from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lane import Lane, markers
 from jaxtrachea.fitting.lane import size as entries_of_trial
 from jaxtrachea.fitting.lanes import (
+    Balance,
     Noise,
     Unknown,
     Weighting,
+    curve_weights,
     group,
     lanes_of,
-    mean_length,
     unknowns_of,
 )
 from jaxtrachea.fitting.model import Common, FitModel, columns_of, numbers_of
@@ -38,7 +39,7 @@ from jaxtrachea.fitting.parameters import (
     held,
     in_model,
 )
-from jaxtrachea.fitting.refusals import Size, refusal
+from jaxtrachea.fitting.refusals import Size, refusal, sigma_is_needed
 from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
@@ -70,8 +71,7 @@ class Study:
         joint: whether shared unknowns are one and the same in all lanes.
         together: names of trials, in groups that are left out together; see
             `inference.together.left_out_together`.
-        mean_length: samples of a curve in the mean where every curve weighs the same; None: every
-            sample does.
+        balance: what weighs the same, see `Weighting`.
     """
 
     model: FitModel
@@ -83,7 +83,7 @@ class Study:
     marker_noise: tuple[float, float] | None = None
     joint: bool = False
     together: tuple[tuple[str, ...], ...] = ()
-    mean_length: float | None = None
+    balance: Balance = "sample"
 
     def __post_init__(self):
         """Refuse a model of another parameter table.
@@ -97,10 +97,14 @@ class Study:
                 f"{of_table}; replace both together"
             )
 
-    @property
-    def noise_known(self) -> bool:
-        """Whether the sigma of all that is observed is given."""
-        return self.noise_given[0] and (self.lanes.joints is None or self.noise_given[1])
+    @functools.cached_property
+    def noise_known(self) -> Bool[np.ndarray, " lanes"]:
+        """Whether the sigma of all that a lane observes is given; jointly fitted: any lane."""
+        known = np.full(len(self.unknowns), self.noise_given[0])
+        if not self.noise_given[1]:
+            for kind in markers(self.lanes):
+                known &= ~(kind.precision.reshape(len(known), -1) > 0).any(axis=1)
+        return np.full(len(known), known.all()) if self.joint else known
 
     @property
     def free(self) -> tuple[Parameter, ...]:
@@ -257,7 +261,8 @@ def build_study(
             the model, `{"k_1": {"value": 2.0}, "EI_L": {"fixed": True, "value": 1.9}}`, where what
             is named is fitted unless it says `fixed`; None: the defaults. Of another wall than
             `parameters.defaults_of` takes, the table by `default_parameters`.
-        noise: known standard deviations.
+        noise: known standard deviations; `force` is needed where some curves have a sigma of their
+            own and others have none.
         weighting: balance between curves, the loss, and whether ends of pressed rings count.
         tool_radius: mm; markers closer to the contact are held by the tool and left out. None: all
             are used.
@@ -279,8 +284,9 @@ def build_study(
     if not curves:
         raise ValueError("no usable curve; nothing to fit")
     table, size = _table(parameters, options, curves, geometry), Size.of(geometry)
+    own_sigma = sigma_is_needed(curves, noise.force)
     for curve in curves:
-        if (refused := refusal(curve, size, options, table)) is not None:
+        if (refused := refusal(curve, size, options, table, own_sigma=own_sigma)) is not None:
             raise refused.error
     if not options.deforms_sections:
         curves, unread = along_the_normal(curves)
@@ -296,6 +302,9 @@ def build_study(
         noise=noise, weighting=weighting, tool_radius=tool_radius,
         vectors=options.deforms_sections,
     )  # fmt: skip
+    if weighting.balance == "curve":
+        weights = curve_weights(groups, lanes.s_c.shape[1], joint=joint)
+        lanes = lanes._replace(balance=weights)
     if onset_is_sought(parameters, options):
         lanes = lanes._replace(blend=blends(lanes, groups, noise.force, parameters, options))
         lanes = within_reach(lanes, parameters)
@@ -314,7 +323,7 @@ def build_study(
         noise_given=(known, noise.joints is not None),
         marker_noise=None if noise.joints is None else (noise.joints, noise.joints_share),
         joint=joint,
-        mean_length=mean_length(curves, weighting),
+        balance=weighting.balance,
     )
 
 

@@ -141,9 +141,7 @@ def _same_noise(a: Study, b: Study) -> bool:
         lanes = study.lanes
         weighted = (np.ravel(kind.precision) for kind in forces(lanes) + markers(lanes))
         curves = sum(map(len, study.curves))
-        balance = np.ravel(lanes.balance * np.any(lanes.precision > 0, axis=2))
-        parts = [*weighted, balance]
-        return curves, [np.sort(v[v > 0]) for v in parts]
+        return (curves, study.balance), [np.sort(v[v > 0]) for v in weighted]
 
     (count, ours), (other, theirs) = known(a), known(b)
     same = (len(x) == len(y) and np.allclose(x, y) for x, y in zip(ours, theirs, strict=True))

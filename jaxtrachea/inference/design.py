@@ -29,7 +29,7 @@ from jaxtrachea._arguments import check_word
 from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.fitting.covariance import noise_factor
 from jaxtrachea.fitting.information import Information, informations
-from jaxtrachea.fitting.lanes import curve_weight
+from jaxtrachea.fitting.lanes import mean_lengths
 from jaxtrachea.fitting.noise import normal_psi2
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
@@ -101,7 +101,7 @@ class Situation:
     relative: Float[np.ndarray, "G P"]
     base: Float[np.ndarray, "G Q Q"]
     meat: Float[np.ndarray, "G Q Q"]
-    weight: float
+    weight: Float[np.ndarray, " G"]
     factor: Float[np.ndarray, " G"]
     sigma: Float[np.ndarray, " G"]
     samples: int
@@ -250,7 +250,9 @@ def situation(
     base, meat = marginal(base, meat, kept)
     relative, prior = _prior(study, lane, theta)
     n = study.lanes.force.shape[-1] if samples is None else samples
-    weight = float(curve_weight(study.mean_length, n) ** 2)
+    weight = np.ones(len(lane))
+    if study.balance == "curve":
+        weight = mean_lengths(study.curves, joint=False)[lane] / n
     blends, counts = study.lanes.blend, [len(c) for c in study.curves]
     blend = None
     if blends is not None:
@@ -268,7 +270,7 @@ def _kappa(result: FitResult, lanes: Int[np.ndarray, " L"], info: Information) -
     held = result.at_bound | (study.lanes.active == 0)
     dof = np.sum(info.counts, axis=1) - np.sum(~held[lanes], axis=1)
     least = normal_psi2(study.model.loss, study.model.loss_scale)
-    return noise_factor(info, dof, noise_given=study.noise_known, least=least)
+    return noise_factor(info, dof, noise_given=study.noise_given, least=least)
 
 
 def _prior(study: Study, lane: Int[np.ndarray, " G"], theta: Float[np.ndarray, "G P"]):
@@ -299,7 +301,7 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
         index = index_of_presses(study, int(k), curve)
         place = Place(candidates.s, candidates.depth, candidates.phi, index)
         matrix = press_informations(study, known.samples, guess, place)
-        matrix = matrix * (known.weight / known.sigma[g] ** 2)
+        matrix = matrix * (known.weight[g] / known.sigma[g] ** 2)
         matrix = np.nan_to_num(matrix, posinf=0.0, neginf=0.0)
         parts.append(matrix * known.relative[g][:, None] * known.relative[g])
     added = np.stack(parts)

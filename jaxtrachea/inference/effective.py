@@ -100,11 +100,10 @@ def effective(result: FitResult, seen: Prediction, profiles: Profiles | None = N
     plain = result.uncertainty.half_width
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         left = worth - unknowns
-        if study.noise_known:
-            factor, half = np.sqrt(np.maximum(n / worth, 1)), plain
-        else:
-            factor = np.where(left > 0, np.sqrt(np.maximum((n - unknowns) / left, 1)), np.inf)
-            half = np.where(left > 0, stdtrit(np.maximum(left, 1e-2), 0.975), plain)
+        factor = np.where(left > 0, np.sqrt(np.maximum((n - unknowns) / left, 1)), np.inf)
+        half = np.where(left > 0, stdtrit(np.maximum(left, 1e-2), 0.975), plain)
+        factor = np.where(study.noise_known, np.sqrt(np.maximum(n / worth, 1)), factor)
+        half = np.where(study.noise_known, plain, half)
         factor = np.where(np.isnan(worth), np.nan, factor)
         growth = np.maximum(half * factor / plain, 1)
     lower, upper = _drawn_out(result, growth, profiles)

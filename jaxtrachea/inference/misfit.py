@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy.special import chdtr, chdtrc
 
 from jaxtrachea.fitting.joint_information import held_count, unknown_count
-from jaxtrachea.fitting.lane import forces
+from jaxtrachea.fitting.lane import Observed, forces, markers
 from jaxtrachea.fitting.predictions import Prediction
 from jaxtrachea.fitting.result import FitResult
 
@@ -23,29 +23,41 @@ MEDIAN = 0.37
 
 
 class Misfit(NamedTuple):
-    """Of every lane.
+    """Of every lane; forces, markers.
 
     Attributes:
         result: the fit.
-        ratio: of the forces' residuals to the sigma given: root of chi^2 / (n - P), with a robust
-            loss 1.4826 times the median of their sizes; NaN where no sigma is given or nothing is
-            left over; (lanes,).
-        told: whether it is beyond `BEYOND`, and not by chance; (lanes,).
+        ratio: of the residuals to the sigma given: root of chi^2 / (n - P), with a robust loss
+            1.4826 times the median of their sizes; NaN where no sigma is given or nothing is left
+            over; (lanes, 2).
+        told: whether it is beyond `BEYOND`, and not by chance; of markers only where residuals are
+            larger: what a model may miss in them is given on purpose; (lanes, 2).
     """
 
     result: FitResult
-    ratio: Float[np.ndarray, " lanes"]
-    told: Bool[np.ndarray, " lanes"]
+    ratio: Float[np.ndarray, "lanes 2"]
+    told: Bool[np.ndarray, "lanes 2"]
 
 
 def misfit(result: FitResult, seen: Prediction) -> Misfit:
-    """Residuals of the forces against the noise given; in a joint fit of all lanes together."""
+    """Residuals against the noise given; in a joint fit of all lanes together."""
     study, lanes = result.study, result.study.lanes
-    none = np.full(result.lanes, np.nan)
-    if not study.noise_given[0]:
-        return Misfit(result, none, np.zeros(result.lanes, bool))
+    shape = (result.lanes, 2)
+    ratio, told = np.full(shape, np.nan), np.zeros(shape, bool)
+    for k, (kinds, given) in enumerate(
+        zip((forces(lanes), markers(lanes)), study.noise_given, strict=True)
+    ):
+        if given and kinds:
+            ratio[:, k], told[:, k] = _against_noise(result, seen, kinds)
+    told[:, 1] &= ratio[:, 1] > 1
+    return Misfit(result, ratio, told)
+
+
+def _against_noise(result: FitResult, seen: Prediction, kinds: list[Observed]):
+    """Ratio of some kinds of residuals to their sigma, and whether it is told; (lanes,) each."""
+    study, lanes = result.study, result.study.lanes
     sizes = []
-    for kind in forces(lanes):
+    for kind in kinds:
         residual = getattr(seen, kind.name)
         known = np.isfinite(residual) & (kind.precision > 0)
         z = np.where(known, residual * kind.precision, np.nan)
@@ -70,4 +82,4 @@ def misfit(result: FitResult, seen: Prediction) -> Misfit:
         statistic = ratio**2 * left
         chance = np.minimum(chdtrc(left, statistic), chdtr(left, statistic))
         told = ((ratio > BEYOND) | (ratio < 1 / BEYOND)) & (chance < CHANCE)
-    return Misfit(result, *(np.broadcast_to(v, (result.lanes,)) for v in (ratio, told)))
+    return (np.broadcast_to(v, (result.lanes,)) for v in (ratio, told))

@@ -289,6 +289,7 @@ def place_at(
     onset: ArrayLike | None = None,
 ) -> Place:
     """Checked arguments, and the skeleton and the local law at the contact."""
+    check_word("options", options, ObliqueOptions)
     s_c, phi_c, onset = _checked(geometry, material, s_c, phi_c, options, onset)
     rings, levels = options.rings, {"axial": options.axial, "shear": options.press.shear}
     used = (*read_values(options.press), *skeleton.read_values(rings, **levels))

@@ -138,10 +138,7 @@ def _in_fit(used: Curve | None, curve: Curve) -> str:
 
 
 def _sigma(stored: StoredFit, curve: Curve, source: Source) -> np.ndarray:
-    """Noise of the samples of a curve, N: its own where that of the fit was given, else the fit's.
-
-    In a fit whose noise was estimated, a sigma of single curves was a weight, not a noise.
-    """
+    """Noise of a curve's samples, N: its own where that of the fit was given, else the fit's."""
     if curve.sigma is not None and stored.study.noise_given[0]:
         return np.asarray(curve.sigma)
     return np.full(len(curve.force), source.sigma[0])
@@ -191,7 +188,7 @@ def measured_corners(
         return [np.nan] * len(curves)
     given = study.noise_given[0]
     alone = [
-        _apart(c, i, s if given and c.sigma is None else c.sigma)
+        _apart(c, i, s if given else None)
         for i, (c, s) in enumerate(zip(curves, sigmas, strict=True))
     ]
     own_study = build_study(alone, study.model.geometry, study.model.options, study.parameters)

@@ -13,27 +13,30 @@ def _compute(request: Request, findings: Findings, progress: Progress) -> Misfit
 
 
 def _lane_cells(compared: Misfit, lane: int) -> Cells:
-    return {"residual_over_noise": float(compared.ratio[lane])}
+    force, marker = map(float, compared.ratio[lane])
+    return {"residual_over_noise": force, "marker_residual_over_noise": marker}
 
 
 def _sentences(compared: Misfit) -> list[str]:
     """Residuals larger than the noise given, and smaller ones."""
     every, said = compared.result.lanes, []
-    for beyond, cause in (
-        (compared.ratio > 1, "the noise given is too small, or the model misses the curves: "
-         "standard errors and intervals, which rest on it, are too small"),
-        (compared.ratio < 1, "the noise given is too large: standard errors and intervals, which "
-         "rest on it, are too large"),
-    ):  # fmt: skip
-        lanes = np.flatnonzero(compared.told & beyond)
-        if len(lanes):
-            ratio = float(np.median(compared.ratio[lanes]))
-            where = f" in {len(lanes)} of {every} lanes" if every > 1 else ""
-            said.append(
-                f"Force residuals are {ratio:.2g} times the noise given (root of chi^2 / (n - P))"
-                f"{where}: {cause} by about this factor. Leave `noise.force` out to take it from "
-                "the residuals."
-            )
+    for k, (kind, key) in enumerate((("Force", "noise.force"), ("Marker", "noise.joints"))):
+        ratio, told = compared.ratio[:, k], compared.told[:, k]
+        for beyond, cause in (
+            (ratio > 1, "the noise given is too small, or the model misses the curves: standard "
+             "errors and intervals, which rest on it, are too small"),
+            (ratio < 1, "the noise given is too large: standard errors and intervals, which rest "
+             "on it, are too large"),
+        ):  # fmt: skip
+            lanes = np.flatnonzero(told & beyond)
+            if len(lanes):
+                median = float(np.median(ratio[lanes]))
+                where = f" in {len(lanes)} of {every} lanes" if every > 1 else ""
+                said.append(
+                    f"{kind} residuals are {median:.2g} times the noise given (root of chi^2 / "
+                    f"(n - P)){where}: {cause} by about this factor. Leave `{key}` out to take it "
+                    "from the residuals."
+                )
     return said
 
 

@@ -1,0 +1,129 @@
+"""Noise given for one kind and estimated for the other, or given for some curves: closed forms."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.stats
+import synthetic
+from run_cli import run
+
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import build_study
+from jaxtrachea.inference.misfit import misfit
+
+QUICK = Settings(starts=1, scrutiny=False)
+TRUTH = np.array([[100.0, 1.0, 1.0, 0.01]])
+FORCE, MARKER = 0.02, 0.005
+RINGS = np.arange(15)
+
+
+def marked(specimen, seed=0, markers=True):
+    """Curves of one specimen with noise, their forces and markers as the truth has them."""
+    force, joints = synthetic.forces(TRUTH)
+    draw = np.random.default_rng(seed)
+    curves = []
+    for t, curve in enumerate(synthetic.curves(force)):
+        seen = joints[0, t] + MARKER * draw.normal(size=joints[0, t].shape)
+        noisy = curve.force + FORCE * draw.normal(size=curve.force.shape)
+        curves.append(dataclasses.replace(curve, specimen=specimen, force=noisy))
+        if markers:
+            given = {"joint_rings": RINGS, "joint_displacement": seen}
+            curves[-1] = dataclasses.replace(curves[-1], **given)
+    return curves
+
+
+def fitted(curves, noise):
+    table = synthetic.parameters(joints=any(c.joint_rings is not None for c in curves))
+    study = build_study(curves, synthetic.GEOMETRY, synthetic.OPTIONS, table, noise=noise)
+    return fit(study, QUICK)
+
+
+def slopes(values):
+    """Derivatives of forces and markers by log parameters, central differences; (P, n) each."""
+    rows = []
+    for i in range(4):
+        up, down = values.copy(), values.copy()
+        up[i], down[i] = values[i] * np.exp(1e-4), values[i] * np.exp(-1e-4)
+        high, low = synthetic.forces([up]), synthetic.forces([down])
+        rows.append([((a - b) / 2e-4).ravel() for a, b in zip(high, low, strict=True)])
+    return (np.array(v) for v in zip(*rows, strict=True))
+
+
+@pytest.mark.parametrize("given", [0.05, MARKER])
+def test_errors_are_of_each_kinds_own_noise(given):
+    """(J_f^T J_f / s^2 + J_m^T J_m / sigma^2)^-1, s from forces alone.
+
+    Residuals of markers with a cautious sigma (0.05 mm) counted for forces too: errors were a
+    quarter of these, smaller than without markers.
+    """
+    result = fitted(marked("A"), Noise(joints=given))
+    force, marker = slopes(result.value[0])
+    s = result.sigma[0, 0]
+    assert abs(s / FORCE - 1) < 0.15
+    want = np.linalg.inv(force @ force.T / s**2 + marker @ marker.T / given**2)
+    got = result.standard_error[0] / result.value[0]
+    np.testing.assert_allclose(got, np.sqrt(np.diag(want)), rtol=2e-3)
+
+
+def test_a_specimen_is_as_by_itself():
+    """Beside another with markers of unknown noise, errors were a fifth, and Student's t."""
+    noise, alone = Noise(force=0.1), marked("B", markers=False)
+    by_itself, both = fitted(alone, noise), fitted(marked("A") + alone, noise)
+    np.testing.assert_allclose(both.standard_error[1], by_itself.standard_error[0], rtol=1e-6)
+    half = both.uncertainty.half_width
+    assert half[1] == pytest.approx(scipy.stats.norm.ppf(0.975))
+    assert half[0] > half[1]
+
+
+def test_criteria_are_of_the_likelihood_whatever_the_lengths_of_others():
+    """Long curves of another specimen multiplied a deviance, to a false "decisively"."""
+    short = [
+        dataclasses.replace(c, displacement=c.displacement[::n], force=c.force[::n])
+        for c, n in zip(marked("B", markers=False), (10, 10, 5, 5), strict=True)
+    ]
+    noise, long = Noise(force=FORCE), marked("A", seed=1, markers=False)
+    by_itself, both = fitted(short, noise), fitted(short + long, noise)
+    for name in ("deviance", "AIC", "AICc", "BIC"):
+        of_both, of_one = (getattr(r.criteria, name)[0] for r in (both, by_itself))
+        assert of_both == pytest.approx(of_one, rel=1e-9)
+    modelled, _ = synthetic.forces(by_itself.value)
+    off = [c.force - m[:: 50 // len(c.force)] for c, m in zip(short, modelled[0], strict=True)]
+    logs = scipy.stats.norm.logpdf(np.concatenate(off), scale=FORCE)
+    assert by_itself.criteria.deviance[0] == pytest.approx(-2 * np.sum(logs), rel=1e-6)
+
+
+def test_markers_beyond_their_noise_are_told():
+    """A cautious sigma is not: it says what the model may miss."""
+    for given, told in ((MARKER / 10, True), (MARKER, False), (10 * MARKER, False)):
+        result = fitted(marked("A"), Noise(force=FORCE, joints=given))
+        found = misfit(result, result.residuals)
+        assert found.told[0].tolist() == [False, told]
+        assert found.ratio[0, 1] == pytest.approx(MARKER / given, rel=0.1)
+
+
+def test_some_curves_with_a_sigma_and_others_without_are_refused():
+    """1 / N and a pure number were summed: bands of 1.9 N where 0.04 are right."""
+    curves = marked("A", markers=False) + marked("B", markers=False)
+    own = np.full(50, FORCE)
+    mixed = [dataclasses.replace(c, sigma=own) if c.specimen == "A" else c for c in curves]
+    with pytest.raises(ValueError, match="specimen 'B' trial 't0': no sigma, where other curves"):
+        fitted(mixed, Noise())
+    result = fitted(mixed, Noise(force=2 * FORCE))
+    np.testing.assert_allclose(result.sigma[:, 0], [FORCE, 2 * FORCE])
+
+
+def test_a_file_without_sigma_beside_one_with_costs_its_own_rows(tmp_path, monkeypatch, capsys):
+    lines = [f"{d},{0.4 * d + 0.002 * (-1) ** i}" for i, d in enumerate(np.linspace(0.1, 3, 20))]
+    with_sigma = "specimen,trial,s [mm],displacement [mm],force [N],sigma [N]\n"
+    (tmp_path / "a.csv").write_text(with_sigma + "".join(f"A,t,75,{x},0.002\n" for x in lines))
+    without = with_sigma.replace(",sigma [N]", "")
+    (tmp_path / "b.csv").write_text(without + "".join(f"B,t,75,{x}\n" for x in lines))
+    (tmp_path / "fit.toml").write_text('[data]\nfiles = "*.csv"\n[model]\ncoupling = "total"\n')
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(monkeypatch, capsys, "check", "fit.toml")
+    assert code == 1
+    assert "1 bad curves" in out
+    assert "no sigma, where other curves have one" in " ".join((out + err).split())
