@@ -39,9 +39,11 @@ def swept():
     return lambda x: jt.sweep(scene, MATERIAL, [40.0 + x], [0.0], [1.0])
 
 
-def beside(x):
-    return pose_from_vector(jnp.array([0.1, 0.2, 0.3]), jnp.array([8.0 + x, 1.0, 1.0]))
-
+#: Of the ball beside the box, by x.
+POSES = {
+    x: pose_from_vector(jnp.array([0.1, 0.2, 0.3]), jnp.array([8.0 + x, 1.0, 1.0]))
+    for x in (0.0, 0.5)
+}
 
 CALLS = {
     "press": lambda: lambda x: jt.press(TUBE, MATERIAL, 40.0 + x, [0.5, 1.0]),
@@ -53,8 +55,8 @@ CALLS = {
     "compliance": lambda: lambda x: compliance(TUBE, MATERIAL, [40.0 + x], jt.Options()),
     "deflect": lambda: lambda x: jt.deflect(BEAM, 30.0 + x, 1.0),
     "contact_compliance": lambda: lambda x: jt.contact_compliance(BEAM, [30.0 + x]),
-    "signed_distance": lambda: lambda x: signed_distance(BOX, BALL, beside(x)),
-    "track": lambda: lambda x: track(BOX, BALL, beside(x), jnp.array([1.0, 0.0, 0.0])),
+    "signed_distance": lambda: lambda x: signed_distance(BOX, BALL, POSES[x]),
+    "track": lambda: lambda x: track(BOX, BALL, POSES[x], jnp.array([1.0, 0.0, 0.0])),
     "simulate": lambda: simulated(None),
     "simulate, surface": lambda: simulated(make_tube(TUBE, around=9, along=40)),
     "sweep": swept,
@@ -81,7 +83,7 @@ def test_a_call_without_jit_is_one_program(name):
     call = CALLS[name]()
     with compilations() as first:
         call(0.0)
-    assert len(first) <= 12, first  # conversions of plain numbers and the poses of a box
+    assert len(first) <= 6, first  # with the conversions of plain numbers
     with compilations() as again:
         found = call(0.5)
     assert again == []
