@@ -155,7 +155,8 @@ def touch(
         settings: accuracy and work of each signed distance.
         near: number of patches searched, those with the lowest bounds. Two are enough for tools
             about as long as a patch; `Touch.complete` says so.
-        beta: sharpness, 1/mm; default `settings.sharpness` over the size of tool and largest patch.
+        beta: sharpness, 1/mm; default `settings.sharpness` over the half-extents of the largest
+            patch and of the tool, which counts for no more than the patch.
         search: over all directions, as `signed_distance`. Without, each patch starts from the
             direction of the broad phase, as `track`: several times faster and the same until the
             tool's core reaches into the core of a patch (penetration beyond both radii). Deeper,
@@ -284,7 +285,10 @@ def _unit(v):
 
 
 def _size(tool: Shape, patches: Patches):
-    """Half-extents of tool and largest patch together, mm; not differentiable."""
+    """Half-extents of the largest patch and of a tool up to as large, mm; not differentiable.
+
+    A larger tool is met on no more of its length than a patch: it does not blur the contact more.
+    """
     tool, shapes = jax.lax.stop_gradient((tool, patches.shapes))
 
     def reach(v):
@@ -292,8 +296,5 @@ def _size(tool: Shape, patches: Patches):
         x, y, z = ((row - total(row) / row.shape[0]) ** 2 for row in v)
         return jnp.sqrt(largest(x + y + z))
 
-    return (
-        reach(tool.vertices)
-        + tool.radius
-        + jnp.max(jax.vmap(reach)(shapes.vertices) + shapes.radius)
-    )
+    patch = jnp.max(jax.vmap(reach)(shapes.vertices) + shapes.radius)
+    return patch + jnp.minimum(reach(tool.vertices) + tool.radius, patch)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrachea._arguments import check_fits, check_word
+from jaxtrachea.contact.search import STANDARD
 from jaxtrachea.contact.shapes import Shape
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.mechanics.sections.wall import Points, gather_points
@@ -16,7 +17,7 @@ from jaxtrachea.scene.facts import facts_of
 from jaxtrachea.scene.rules import make_plan
 from jaxtrachea.scene.sizes import OUTER, RADIUS, check_sizes, check_width
 from jaxtrachea.scene.stage import Poses, Presses, Scene, Tool, check_material, check_path
-from jaxtrachea.scene.wall import checked_walls, near_patches, round_wall
+from jaxtrachea.scene.wall import checked_walls, contact_settings, near_patches, round_wall
 from jaxtrachea.surface import local, regions
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.mesh import Mesh
@@ -82,19 +83,20 @@ def make_scene(
     check_sizes(geometry, float(outer), shape)
     if isinstance(path, Poses) and shape is None:
         raise PlanError("contact", "the path moves a tool", "there is none", "give a tool")
-    tube, near = None, 1
+    tube, near, quality = None, 1, STANDARD
     if shape is not None and isinstance(path, Poses):
         if mesh is None or (sections and mesh.frames is None):
             tube = round_wall(geometry, float(outer))
         else:
             tube = checked_walls(geometry, mesh, progress)
         near = near_patches(shape, geometry, tube.centres.shape[0])
+        quality = contact_settings(shape, geometry)
     mu = None if friction is None else jnp.asarray(friction, dtype)
     binding = None if mesh is None or sections else regions.bind(mesh, geometry)
     spacing = jnp.asarray(_footprint(shape, float(outer)), dtype)
     scene = Scene(
         geometry=geometry, radius=outer, tube=tube, tool=shape, friction=mu, mesh=mesh,
-        binding=binding, footprint=spacing, near=near,
+        binding=binding, footprint=spacing, near=near, quality=quality,
         plan=make_plan(SceneFacts(mesh=False), EffectOptions(want_surface=False)),  # not read
     )  # fmt: skip
     plan = make_plan(facts_of(scene, material, path), effects)
@@ -161,6 +163,9 @@ def with_tool(scene: Scene, tool: Shape) -> Scene:
             f"tool lies along up to {near} patches of the wall, and the program searches "
             f"{scene.near}: {CURE}"
         )
+    steps = scene.quality.warm_steps
+    if contact_settings(tool, geometry).warm_steps > steps:
+        raise ValueError(f"tool is so long that a contact takes more than {steps} steps: {CURE}")
     spacing = jnp.asarray(_footprint(tool, float(scene.radius)), scene.footprint.dtype)
     if scene.plan.dent and scene.runs is not None and scene.mesh is not None:
         reached = local.runs(scene.mesh.s, spacing).longest
