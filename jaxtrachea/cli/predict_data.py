@@ -1,5 +1,6 @@
 """What `jaxtrachea predict --data` compares with: a specification or files of measured curves."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -82,6 +83,15 @@ def _as_written(reading) -> dict[str, object]:
     }
 
 
+#: What a tube is compared by, and in words.
+_OF_TUBE = {
+    "length": lambda g: f"{float(g.length):g} mm with {g.rings} rings",
+    "ring_positions": lambda g: f"{float(g.length):g} mm with {g.rings} rings",
+    "radius": lambda g: f"radius {float(g.radius):g} mm",
+    "half_angle": lambda g: f"half_angle {math.degrees(float(g.half_angle)):g} deg",
+}
+
+
 def _same_model(stored, path: Path, spec) -> None:
     """Refuse a specification whose tube or model is not that of the fit; only [data] is used."""
     import numpy as np
@@ -91,14 +101,12 @@ def _same_model(stored, path: Path, spec) -> None:
 
     if "trachea" in spec.model_fields_set:
         mine, its = stored.study.model.geometry, geometry_of(spec.trachea)
-        same = float(mine.length) == float(its.length)
-        same = same and np.array_equal(mine.ring_positions, its.ring_positions)
-        if not same:
-            raise Stop(
-                f"{path}: trachea: {float(its.length):g} mm with {its.rings} rings, but the fit's "
-                f"is {float(mine.length):g} mm with {mine.rings}; predictions are made with the "
-                "fit's: leave the section out, or correct it"
-            )
+        for name, words in _OF_TUBE.items():
+            if not np.array_equal(getattr(mine, name), getattr(its, name)):
+                raise Stop(
+                    f"{path}: trachea: {words(its)}, but the fit's is {words(mine)}; predictions "
+                    "are made with the fit's: leave the section out, or correct it"
+                )
     if "model" in spec.model_fields_set and Options(**spec.model.model_dump()) != (
         stored.study.model.options
     ):

@@ -229,6 +229,10 @@ def test_pictures_say_what_they_leave_out_and_cost_themselves_only(read, tmp_pat
     assert prediction_plots.draw_predictions(tmp_path, many[:2]) == {}
 
 
+#: Those of Table 1, as a specification has them.
+TABLE_1_RINGS = str([f"{10 * k} mm" for k in range(1, 16)]).replace("'", '"')
+
+
 def many_pairs(curves):
     return [(curve, None) for curve in curves]
 
@@ -250,6 +254,7 @@ def many_pairs(curves):
         (["RESULTS", "--data", "off.csv"], "no usable curve"),
         (["RESULTS", "--data", "off.csv", "--as", "x"], "specimen 'x' is not in this fit"),
         (["RESULTS", "--data", "tube.toml"], "120 mm with 2 rings, but the fit's is 160 mm"),
+        (["RESULTS", "--data", "round.toml"], "radius 9 mm, but the fit's is radius 11.3 mm"),
         (["RESULTS", "--data", "model.toml"], "model: not that of the fit"),
         (
             ["RESULTS", "--at", "s=75,D=1,specimen=s0001", "--out", "full"],
@@ -264,6 +269,8 @@ def test_bad_input_ends_with_a_cure(arguments, says, study, tmp_path, monkeypatc
     shutil.copy(study[0] / "results.h5", tmp_path)
     tube = '[trachea]\nlength = "120 mm"\nrings = ["30 mm", "60 mm"]\n'
     (tmp_path / "tube.toml").write_text(f'[data]\nfiles = "off.csv"\n{tube}')
+    wide = tube.replace("120", "160").replace('["30 mm", "60 mm"]', TABLE_1_RINGS)
+    (tmp_path / "round.toml").write_text(f'[data]\nfiles = "off.csv"\n{wide}radius = "9 mm"\n')
     (tmp_path / "model.toml").write_text('[data]\nfiles = "off.csv"\n[model]\nshear = true\n')
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").touch()
