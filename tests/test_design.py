@@ -314,6 +314,54 @@ def test_depths_beyond_the_tube_are_refused_and_beyond_the_data_told():
     assert extrapolation(study, 6.1).startswith("extrapolated from data at D = 0.1 to 6 mm; the")
 
 
+def late_study(onset, late=10.0):
+    """Records of 5 mm that touch `late` mm from their zero, 2 mm after they begin."""
+    D = late - 2.0 + np.linspace(0, 5.0, 51)
+    pressed = synthetic.forces(CLEAR[None], BEFORE, np.maximum(D - late, 0))[0]
+    changes = {n: {"value": float(v)} for n, v in zip(synthetic.NAMES, CLEAR, strict=True)}
+    table = synthetic.parameters(**changes, onset=onset)
+    curves = synthetic.curves(pressed, BEFORE, D)
+    return build_study(
+        curves, synthetic.GEOMETRY, synthetic.OPTIONS, table, noise=Noise(force=SIGMA)
+    )
+
+
+@pytest.mark.parametrize("onset", [{"fixed": True, "value": 10.0}, {}])
+def test_depths_of_presses_are_from_first_touch(onset):
+    """Records from 8 to 13 mm that touch at 10 mm: presses of 3 mm; 13 mm were taken for them."""
+    study = late_study(onset)
+    spec = FitSpec.model_validate({"data": {"files": "a.csv"}})
+    result = fit(study, ONE)
+    known = situation(result)
+    # The corner is rounded over the noise, some 0.05 mm.
+    near = {"atol": 1e-12 if onset else 0.01}
+    np.testing.assert_allclose(result.first_touch, 10.0, **near)
+    for at in (candidates_of(spec, study), candidates_of(spec, study, known.reach)):
+        # A change point is a start, an estimate of exact data the truth.
+        np.testing.assert_allclose([at.depth.min(), at.depth.max()], [1.5, 3.0], atol=0.05)
+    np.testing.assert_allclose(known.reach, [0.0, 3.0], **near)
+    np.testing.assert_allclose(known.approach, 2.0, **near)
+    assert "extrapolated" not in extrapolation(study, 2.9, known.reach)
+    says = "extrapolated from data at D = 0 to 3 mm from first touch; the model was tested to "
+    assert extrapolation(study, 3.1, known.reach) == f"{says}D = 1.13 mm from first touch"
+
+
+def test_where_a_record_has_its_zero_tells_nothing():
+    """A press as deep tells the same whatever the displacement at first touch; it told nothing."""
+    candidates = Candidates(np.array([51.0, 75.0]), np.array([3.0, 3.0]))
+    here, late = (
+        gains(situation(fit(late_study({"fixed": True, "value": v}, v), ONE)), candidates)
+        for v in (0.0, 10.0)
+    )
+    np.testing.assert_allclose(late, here, rtol=1e-6, atol=1e-6 * np.max(here))
+    # Of a press from 2 mm before the touch to 3 mm, by central differences of the law and beam.
+    h, D = 1e-5, np.maximum(-2.0 + 5.0 * np.arange(1, 52) / 51, 0)
+    theta = np.log(CLEAR)
+    J = np.stack([(pressed(theta + e, 51.0, D) - pressed(theta - e, 51.0, D)) / (2 * h)
+                  for e in h * np.eye(4)])  # fmt: skip
+    np.testing.assert_allclose(late[0, 0], J @ J.T / SIGMA**2, rtol=1e-4)
+
+
 def test_what_cannot_be_designed_is_said(result):
     force = simulated(BEFORE, 1, 1)
     table = synthetic.parameters(**{n: {"scope": "trial"} for n in synthetic.NAMES})

@@ -285,10 +285,12 @@ def test_a_new_press_brings_its_own_onset(owned):
     """Information of a press by differences of the sharp hinge, its onset and offset eliminated."""
     known = situation(owned)
     assert known.base.shape[-2:] == (2, 2)
-    got = gains(known, Candidates(np.array([50.0]), np.array([4.0])))[0, 0]
     value, sigma = owned.value[0], owned.sigma[0, 0]
+    touch = np.median(value[2:6])
+    # Records begin at 0, before the touch; the depth is from there on.
+    got = gains(known, Candidates(np.array([50.0]), np.array([4.0 - touch])))[0, 0]
     D = 4.0 * np.arange(1, 81) / 80
-    h = np.maximum(D - np.median(value[2:6]), 0)
+    h = np.maximum(D - touch, 0)
     slope = -(value[0] + 3 * value[1] * h * h) * (h > 0)
     J = np.stack([value[0] * h, value[1] * h**3, slope, np.ones(80)]) / sigma
     full = J @ J.T

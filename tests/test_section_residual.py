@@ -454,6 +454,10 @@ def test_curves_that_a_model_cannot_press():
         check_curve(curve(PLACES[0], end_rings=np.array([3])), Size.of(GEOMETRY), SECTIONS)
     with pytest.raises(ValueError, match="12 mm deep, expected no more than the radius, 11.7 mm"):
         check_curve(curve(PLACES[0], np.array([0.5, 2.0, 12.0])), Size.of(GEOMETRY), SECTIONS)
+    # From first touch, where that is known.
+    check_curve(curve(PLACES[0], np.array([10.5, 12.0])), Size.of(GEOMETRY), SECTIONS, 10.0)
+    with pytest.raises(ValueError, match="pressed 12 mm deep"):
+        check_curve(curve(PLACES[0], np.array([10.5, 22.0])), Size.of(GEOMETRY), SECTIONS, 10.0)
 
 
 def test_lanes_pressed_otherwise_are_of_another_kind():

@@ -39,7 +39,7 @@ def load(path: Path, data: Path | None, *, refits: bool = False, printed: set[st
             raise Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
         study = study_of(spec, measurements, refits=refits)
         _note_unused_batch(spec, study, printed)
-        return spec, _with_depths(measurements, study.model, printed), study
+        return spec, _with_depths(measurements, study, printed), study
     except SpecError as error:
         raise Stop(str(SpecError.like(error, place=str(path)))) from None
     except DataError as error:
@@ -56,11 +56,24 @@ def _note_unused_batch(spec, study, printed: set[str]) -> None:
         _print("note", [f"fit.batch = {batch} is not used: {why}"], printed)
 
 
-def _with_depths(measurements, model, printed: set[str]):
-    """The measurements with a note on curves that go deeper than the model was tested."""
+def _with_depths(measurements, study, printed: set[str]):
+    """The measurements with a note on curves that go deeper than the model was tested.
+
+    Nothing is fitted yet: a sought onset is taken where its curve shows it.
+    """
+    from jaxtrachea.fitting.onset import counted_from
     from jaxtrachea.fitting.tested import deeper_than_tested
 
-    note = deeper_than_tested(measurements.curves, model.options, float(model.geometry.radius))
+    model = study.model
+    curves = [c for lane in study.curves for c in lane]
+    touch = [
+        float(d)
+        for row, lane in zip(study.first_touch, study.curves, strict=True)
+        for d in row[: len(lane)]
+    ]
+    note = deeper_than_tested(
+        curves, model.options, float(model.geometry.radius), touch, counted_from(study.parameters)
+    )
     if note is None:
         return measurements
     _print("note", [note], printed)

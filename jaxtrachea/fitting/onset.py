@@ -57,27 +57,56 @@ def touches(lanes: Lane, parameters: Sequence[Parameter]) -> FirstTouch:
     return FirstTouch(*(v.reshape(shape) for v in found))
 
 
-def blends(
+def first_touches(
     lanes: Lane,
+    parameters: Sequence[Parameter],
+    value: Float[np.ndarray, "lanes P"] | None = None,
+) -> Float[np.ndarray, "lanes T"]:
+    """Displacement at first touch of every trial, mm, from which depths are counted.
+
+    The number at which it is held, or its estimate.
+
+    Args:
+        lanes: all data.
+        parameters: the table.
+        value: estimates in the parameters' units; None: the first guess in their place.
+    """
+    column = next(j for j, p in enumerate(parameters) if p.name == "onset")
+    known, index = np.asarray(lanes.value)[:, :, column], np.asarray(lanes.index)[:, :, column]
+    if value is None or not value.size:
+        return known
+    found = np.take_along_axis(value, np.maximum(index, 0), axis=1)
+    return np.where(index >= 0, found, known)
+
+
+def counted_from(parameters: Sequence[Parameter]) -> str:
+    """What a depth in a message is counted from, in words; "" where records begin at first touch.
+
+    That is where the onset is held at 0.
+    """
+    onset = next(p for p in parameters if p.name == "onset")
+    return "" if onset.fixed and onset.value == 0 else " from first touch"
+
+
+def blends(
+    touch: FirstTouch,
     curves: Sequence[Sequence[Curve]],
     sigma_force: float | None,
-    parameters: Sequence[Parameter],
     options: Options,
 ) -> Float[np.ndarray, "lanes T"]:
     """Width of the rounded corner of every trial, mm.
 
     Args:
-        lanes: all data.
+        touch: from `touches`.
         curves: of each lane.
         sigma_force: given standard deviation, N; a curve's own comes before it; None: estimated.
-        parameters: the table.
         options: `onset_width` is the least width.
     """
-    given = np.full(lanes.s_c.shape, np.nan)
+    given = np.full(touch.onset.shape, np.nan)
     for row, lane in zip(given, curves, strict=True):
         sigma = [sigma_force if c.sigma is None else np.median(c.sigma) for c in lane]
         row[: len(lane)] = [np.nan if v is None else v for v in sigma]
-    return blend_widths(touches(lanes, parameters), given, options.onset_width)
+    return blend_widths(touch, given, options.onset_width)
 
 
 def where_sought(

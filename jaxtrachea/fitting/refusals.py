@@ -75,7 +75,8 @@ def refusal(
     """
     kind = "position"
     try:
-        check_curve(curve, size, options)
+        onset = next(p.value for p in parameters if p.name == "onset")
+        check_curve(curve, size, options, onset)
         kind = "sign"
         check_touch(curve, options, parameters)
         kind = "sigma"
@@ -91,8 +92,14 @@ def refusal(
     return None
 
 
-def check_curve(curve: Curve, size: Size, options: Options) -> None:
+def check_curve(curve: Curve, size: Size, options: Options, onset: float = 0.0) -> None:
     """Refuse a curve that the model cannot press.
+
+    Args:
+        curve: the curve.
+        size: of the tube.
+        options: of the model.
+        onset: displacement at first touch, mm: held there, or the first guess.
 
     Raises:
         InputError: no contact position, one outside the tube, one off the midline or a tool that
@@ -123,7 +130,7 @@ def check_curve(curve: Curve, size: Size, options: Options) -> None:
                 f"within {np.degrees(size.half_angle):.3g} deg of the midline",
                 place=where,
             )
-        if (deepest := float(np.max(np.abs(curve.displacement)))) > size.radius:
+        if (deepest := float(np.max(np.abs(curve.displacement - onset)))) > size.radius:
             raise InputError(
                 f"pressed {deepest:.3g} mm deep, expected no more than the radius, "
                 f"{size.radius:g} mm",

@@ -15,6 +15,7 @@ from jaxtrachea.files.table import Table
 from jaxtrachea.fitting.covariance import Uncertainty
 from jaxtrachea.fitting.criteria import Criteria
 from jaxtrachea.fitting.noise import precision_unit
+from jaxtrachea.fitting.onset import first_touches
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import Prediction, predictions
 from jaxtrachea.fitting.press_scale import relative_change
@@ -133,6 +134,11 @@ class FitResult:
     def relative(self) -> np.ndarray:
         """Change of each scaled coordinate that makes a relative change of 1; (lanes, P)."""
         return relative_change(self.study, self.theta)
+
+    @functools.cached_property
+    def first_touch(self) -> np.ndarray:
+        """Displacement at first touch of every trial, mm, estimated or held; (lanes, T)."""
+        return first_touches(self.study.lanes, self.study.parameters, self.value)
 
     @functools.cached_property
     def residuals(self) -> Prediction:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.lane import Lane, markers
@@ -30,7 +30,14 @@ from jaxtrachea.fitting.lanes import (
     unknowns_of,
 )
 from jaxtrachea.fitting.model import Common, FitModel, columns_of, numbers_of
-from jaxtrachea.fitting.onset import blends, natural_steps, onset_is_sought, within_reach
+from jaxtrachea.fitting.onset import (
+    blends,
+    first_touches,
+    natural_steps,
+    onset_is_sought,
+    touches,
+    within_reach,
+)
 from jaxtrachea.fitting.parameters import (
     DEFAULTS,
     SKELETON,
@@ -72,6 +79,8 @@ class Study:
         together: names of trials, in groups that are left out together; see
             `inference.together.left_out_together`.
         balance: what weighs the same, see `Weighting`.
+        change_points: displacement at which each curve shows its first touch, mm, NaN where it
+            shows none; (lanes, T); None where no onset is sought.
     """
 
     model: FitModel
@@ -84,6 +93,7 @@ class Study:
     joint: bool = False
     together: tuple[tuple[str, ...], ...] = ()
     balance: Balance = "sample"
+    change_points: Float[np.ndarray, "lanes T"] | None = None
 
     def __post_init__(self):
         """Refuse a model of another parameter table.
@@ -120,6 +130,15 @@ class Study:
     def size(self) -> int:
         """Unknowns per lane, padding included."""
         return self.lanes.lower.shape[1]
+
+    @property
+    def first_touch(self) -> Float[np.ndarray, "lanes T"]:
+        """Displacement at first touch of every trial before a fit, mm: held, or as curves show it.
+
+        The first guess where they do not; `FitResult.first_touch` has the estimates.
+        """
+        known, seen = first_touches(self.lanes, self.parameters), self.change_points
+        return known if seen is None else np.where(np.isnan(seen), known, seen)
 
     @functools.cached_property
     def unknown_columns(self) -> Int[np.ndarray, "lanes P"]:
@@ -225,6 +244,7 @@ class Study:
             lanes=jax.tree.map(lambda v: v[lanes], self.lanes),
             curves=tuple(self.curves[k] for k in lanes),
             unknowns=tuple(self.unknowns[k] for k in lanes),
+            change_points=None if self.change_points is None else self.change_points[lanes],
         )
 
     def lane_name(self, lane: int) -> tuple[str, str]:
@@ -305,9 +325,11 @@ def build_study(
     if weighting.balance == "curve":
         weights = curve_weights(groups, lanes.s_c.shape[1], joint=joint)
         lanes = lanes._replace(balance=weights)
+    change_points = None
     if onset_is_sought(parameters, options):
-        lanes = lanes._replace(blend=blends(lanes, groups, noise.force, parameters, options))
-        lanes = within_reach(lanes, parameters)
+        touch = touches(lanes, parameters)
+        lanes = lanes._replace(blend=blends(touch, groups, noise.force, options))
+        lanes, change_points = within_reach(lanes, parameters), touch.onset
     known = noise.force is not None or all(c.sigma is not None for c in curves)
     model = FitModel(
         tube=numbers_of(geometry), options=options, columns=columns_of(parameters),
@@ -324,6 +346,7 @@ def build_study(
         marker_noise=None if noise.joints is None else (noise.joints, noise.joints_share),
         joint=joint,
         balance=weighting.balance,
+        change_points=change_points,
     )
 
 

@@ -31,10 +31,11 @@ from jaxtrachea.fitting.covariance import noise_factor
 from jaxtrachea.fitting.information import Information, informations
 from jaxtrachea.fitting.lanes import mean_lengths
 from jaxtrachea.fitting.noise import normal_psi2
+from jaxtrachea.fitting.onset import counted_from
 from jaxtrachea.fitting.press_scale import relative_change
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.fitting.tested import untested
+from jaxtrachea.fitting.tested import depths, untested
 from jaxtrachea.inference.bootstrap import Bootstrap
 from jaxtrachea.inference.design_press import (
     Guess,
@@ -61,7 +62,7 @@ class Candidates(NamedTuple):
 
     Attributes:
         s: contact position, mm.
-        depth: largest tool displacement, mm.
+        depth: largest tool displacement from first touch, mm.
         phi: contact angle, rad; None: all on the midline.
         curve: a curve of the lane on whose specimen it is; None: the first.
     """
@@ -93,6 +94,8 @@ class Situation:
             the median of all trials there; (G, R).
         prior: information of the bounds on all unknowns, relative coordinates; (G, P).
         blend: rounded corner of a new curve, mm, see `Lane`; (G,); None where no onset is fitted.
+        approach: how long before first touch the record of a new press begins, mm, by lane.
+        reach: least and largest depth of the curves so far, see `reached`.
     """
 
     study: Study
@@ -109,6 +112,8 @@ class Situation:
     own: Int[np.ndarray, "G R"]
     prior: Float[np.ndarray, "G P"]
     blend: Float[np.ndarray, " G"] | None
+    approach: Float[np.ndarray, " lanes"]
+    reach: tuple[float, float]
 
     def with_press(self, added: Float[np.ndarray, "G Q Q"]) -> "Situation":
         """The situation after a press that adds so much to the bread."""
@@ -179,14 +184,37 @@ def pressed_specimen(study: Study, curve: int = 0) -> str:
     return study.curves[0][curve].specimen
 
 
-def extrapolation(study: Study, depth: float) -> str:
-    """What of a press goes deeper than the curves did, or the model was tested; "" if nothing."""
-    reached = [c.displacement for curves in study.curves for c in curves]
-    low, high = float(min(map(np.min, reached))), float(max(map(np.max, reached)))
+def reached(study: Study, touch: Float[np.ndarray, "lanes T"] | None = None) -> tuple[float, float]:
+    """Least and largest depth of the curves, mm from first touch.
+
+    Args:
+        study: the study.
+        touch: as `FitResult.first_touch`; None: as `Study.first_touch` has it before a fit.
+    """
+    options = study.model.options
+    touch = study.first_touch if touch is None else touch
+    pressed = [
+        depths(c.displacement, at, options)
+        for row, curves in zip(touch, study.curves, strict=True)
+        for at, c in zip(row[: len(curves)].tolist(), curves, strict=True)
+        if np.isfinite(at)  # a lane without an estimate
+    ]
+    return float(min(map(np.min, pressed))), float(max(map(np.max, pressed)))
+
+
+def extrapolation(study: Study, depth: float, reach: tuple[float, float] | None = None) -> str:
+    """What of a press goes deeper than the curves did, or the model was tested; "" if nothing.
+
+    Args:
+        study: the study.
+        depth: mm from first touch.
+        reach: of the curves, as `reached` has it of the fit; None: as before a fit.
+    """
+    low, high = reached(study) if reach is None else reach
+    counted, model = counted_from(study.parameters), study.model
     beyond = depth > high + 1e-9
-    known = f"extrapolated from data at D = {low:.3g} to {high:.3g} mm" if beyond else ""
-    model = study.model
-    tested = untested(model.options, float(model.geometry.radius), depth)
+    known = f"extrapolated from data at D = {low:.3g} to {high:.3g} mm{counted}" if beyond else ""
+    tested = untested(model.options, float(model.geometry.radius), depth, counted)
     return "; ".join(filter(None, [known, tested]))
 
 
@@ -261,7 +289,18 @@ def situation(
         study=study, lane=lane, theta=theta, relative=relative,
         base=base, meat=meat, weight=weight, factor=kappa * weight,
         sigma=result.sigma[lane, 0], samples=n, kept=kept, own=own, prior=prior, blend=blend,
+        approach=_approaches(result), reach=reached(study, result.first_touch),
     )  # fmt: skip
+
+
+def _approaches(result: FitResult) -> Float[np.ndarray, " lanes"]:
+    """How long before first touch the records of each lane begin, median of its curves, mm."""
+    rows = zip(result.first_touch, result.study.curves, strict=True)
+    before = (
+        [max(at - c.displacement.min(), 0.0) for at, c in zip(row.tolist(), curves, strict=False)]
+        for row, curves in rows
+    )
+    return np.array([np.median(lane) for lane in before])
 
 
 def _kappa(result: FitResult, lanes: Int[np.ndarray, " L"], info: Information) -> np.ndarray:
@@ -297,7 +336,8 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
     curve = np.zeros(len(candidates.s), int) if candidates.curve is None else candidates.curve
     for g, k in enumerate(known.lane):
         blend = None if known.blend is None else jnp.asarray(known.blend[g])
-        guess = Guess(jnp.asarray(known.theta[g]), study.lanes.value[k, 0], blend)
+        theta, approach = jnp.asarray(known.theta[g]), jnp.asarray(known.approach[k])
+        guess = Guess(theta, study.lanes.value[k, 0], blend, approach)
         index = index_of_presses(study, int(k), curve)
         place = Place(candidates.s, candidates.depth, candidates.phi, index)
         matrix = press_informations(study, known.samples, guess, place)
@@ -440,11 +480,18 @@ def identifiability(
     return Map(s, phi, condition, weakest * np.sign(largest), np.exp(total / len(added)), curve)
 
 
-def candidates_of(spec: FitSpec, study: Study) -> Candidates:
+def candidates_of(
+    spec: FitSpec, study: Study, reach: tuple[float, float] | None = None
+) -> Candidates:
     """The presses of the [design] section; left out: first to last ring, half to full depth.
 
     From ring to ring as far as all of the tool lies on the tube; of deforming cross-sections at
     every angle that was measured; on every specimen that has unknowns of its own.
+
+    Args:
+        spec: the specification.
+        study: the study.
+        reach: as in `extrapolation`.
 
     Raises:
         SpecError: positions outside the tube or where the tool reaches beyond its ends, depths of
@@ -456,7 +503,7 @@ def candidates_of(spec: FitSpec, study: Study) -> Candidates:
     except ValueError as error:
         raise SpecError(f"parameters: {error}") from None
     section, length = spec.design, float(study.model.geometry.length)
-    deepest = float(np.max(study.lanes.displacement))
+    deepest = (reached(study) if reach is None else reach)[1]
     rings = study.model.geometry.ring_positions
     low, high = study.model.options.places(length)
     s = (max(float(rings[0]), low), min(float(rings[-1]), high)) if section.s is None else section.s

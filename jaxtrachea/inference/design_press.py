@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._numerics import full_precision
-from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.model import FitModel, values_of
 from jaxtrachea.fitting.residual import force_jacobian
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.optimisation.programs import program
@@ -92,11 +92,13 @@ class Guess(NamedTuple):
         theta: scaled coordinates; (P,).
         value: of all parameters, see `Lane`; (J,).
         blend: as `force_jacobian`.
+        approach: how long before first touch the record begins, mm.
     """
 
     theta: Float[Array, " P"]
     value: Any
     blend: Float[Array, ""] | None
+    approach: Float[Array, ""]
 
 
 class Place(NamedTuple):
@@ -104,7 +106,7 @@ class Place(NamedTuple):
 
     Attributes:
         s: contact position, mm.
-        depth: largest tool displacement, mm.
+        depth: largest tool displacement from first touch, mm.
         phi: contact angle, rad; None: on the midline.
         index: which unknown every parameter reads, see `Lane`; (J,).
     """
@@ -140,10 +142,12 @@ def _information(model: FitModel, samples: int, sides: bool, guess: Guess, place
 
     `sides`: whether it observes the side force.
     """
-    theta, value, blend = guess
-    displacement = place.depth * jnp.arange(1, samples + 1, dtype=theta.dtype) / samples
+    theta, value, blend, approach = guess
     index = place.index[jnp.array(model.free_columns)]
     free = jnp.where(index >= 0, theta[jnp.maximum(index, 0)], 0)
+    share = jnp.arange(1, samples + 1, dtype=theta.dtype) / samples
+    touch = values_of(model, free, value)["onset"]
+    displacement = touch + share * place.depth - (1 - share) * approach
     J = force_jacobian(model, free, value, place.s, displacement, blend, place.phi)
     J = J if sides else J[:, :samples]
     at = jnp.where(index >= 0, index, len(theta))

@@ -16,12 +16,13 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.onset import counted_from
 from jaxtrachea.fitting.result import FitResult
-from jaxtrachea.fitting.tested import untested
+from jaxtrachea.fitting.tested import depths, untested
 from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Aside, Estimate, Predicted, Response, predicted
-from jaxtrachea.prediction.sources import Source, slack_of, source_of
+from jaxtrachea.prediction.sources import Source, onset_of, slack_of, source_of
 from jaxtrachea.results.stored import StoredFit, from_result
 from jaxtrachea.status import PredictionStatus, PressStatus
 
@@ -214,9 +215,11 @@ def _on_host(stored: StoredFit, source: Source, where, displacement, part: Predi
         spans, angles = stored.spans[source.lane], stored.angles[source.lane]
         tilts = stored.tilts[source.lane]
         aside = (angles, phi, "phi"), (tilts, tilt_of(direction), "tilt")
-        beyond = _beyond(spans, float(s), displacement, aside)
-        model, deepest = stored.study.model, float(np.max(np.abs(displacement)))
-        deep = untested(model.options, float(model.geometry.radius), deepest)
+        model, counted = stored.study.model, counted_from(stored.study.parameters)
+        depth = depths(displacement, onset_of(stored, source), model.options)
+        beyond = _beyond(spans, float(s), depth, aside, counted)
+        deepest = float(np.max(np.abs(depth)))
+        deep = untested(model.options, float(model.geometry.radius), deepest, counted)
         message = "; ".join(filter(None, [message, beyond, deep]))
     return CurvePrediction(
         specimen=source.specimen,
@@ -273,19 +276,20 @@ def _bend(source: Source, off: np.ndarray, value: Response, se: Response, deepes
     return float(worst) if np.isfinite(worst) else np.inf
 
 
-def _beyond(spans: np.ndarray, s: float, displacement: np.ndarray, aside=()) -> str:
+def _beyond(spans: np.ndarray, s: float, depth: np.ndarray, aside=(), counted: str = "") -> str:
     """What of a curve lies outside the data of its lane, in words; "" if nothing does.
 
     Args:
-        spans: of displacement and position, mm; (4,).
+        spans: of depth and position, mm; (4,).
         s: mm.
-        displacement: mm; (N,).
+        depth: mm from first touch; (N,).
         aside: of each angle: the range of the data, rad, that of the curve, and its name.
+        counted: see `counted_from`.
     """
     low, high, first, last = spans
     words = []
-    if displacement.max() > high + 1e-9 or displacement.min() < min(low, 0.0) - 1e-9:
-        words.append(f"D = {low:.3g} to {high:.3g} mm")
+    if depth.max() > high + 1e-9 or depth.min() < min(low, 0.0) - 1e-9:
+        words.append(f"D = {low:.3g} to {high:.3g} mm{counted}")
     known = first <= last  # else no curve of the lane says where it was pressed
     if known and (s < first - 1e-9 or s > last + 1e-9):
         words.append(f"s = {first:.4g} to {last:.4g} mm")

@@ -178,6 +178,14 @@ def _taken(stored: StoredFit, specimen, trial, lane: int, index, own, note: str)
     )
 
 
+def onset_of(stored: StoredFit, source: Source) -> float:
+    """Displacement of a curve at first touch, mm, as it is predicted."""
+    for p, scaled in zip(stored.study.free, source.free, strict=True):
+        if p.name == "onset":
+            return p.from_scaled(float(scaled))
+    return float(source.value[[p.name for p in stored.study.parameters].index("onset")])
+
+
 def _none(stored: StoredFit, specimen, trial, status: PredictionStatus, message: str) -> Source:
     """No parameters, and why; arrays of the usual shapes, so that one program serves all."""
     F, J = len(stored.study.free), len(stored.study.parameters)
@@ -210,20 +218,27 @@ def slack_of(
     """
     free = stored.study.free
     out = np.zeros((len(displacement), len(free)))
-    curves = [c for c, k in zip(stored.curves, stored.curve_lane, strict=True) if k == source.lane]
+    own = np.flatnonzero(stored.curve_lane == source.lane)
+    curves = [stored.curves[i] for i in own]
 
     def place(c):
         return [np.nan if c.s_c is None else c.s_c, c.phi_c, *c.direction]
 
     s, phi, direction = where
     at = [s, phi, *direction]
-    here = [c for c in curves if np.allclose(place(c), at, rtol=0, atol=1e-9, equal_nan=True)]
+
+    def is_here(c):
+        return np.allclose(place(c), at, rtol=0, atol=1e-9, equal_nan=True)
+
+    here = [i for i in own if is_here(stored.curves[i])]
     if not here or not source.null_space.any():
         return out
     # Of a scaled coordinate; an onset's steps are as large as the presses.
     size = [1.0 if p.scale == "log" or p.name in OF_MEASUREMENT else max(abs(v), 1e-3)
             for p, v in zip(free, source.free, strict=True)]  # fmt: skip
     samples = sum(len(c.force) for c in curves)
-    low, high = (f([f(c.displacement) for c in here]) for f in (np.min, np.max))
-    out[(displacement >= low - 1e-9) & (displacement <= high + 1e-9)] = size
+    reached = [stored.curves[i].displacement - stored.first_touch[i] for i in here]
+    low, high = (f([f(d) for d in reached]) for f in (np.min, np.max))
+    depth = displacement - onset_of(stored, source)
+    out[(depth >= low - 1e-9) & (depth <= high + 1e-9)] = size
     return SINGULAR * np.sqrt(samples) * out

@@ -17,6 +17,7 @@ from jaxtrachea.fitting.model import FitModel, columns_of, numbers_of
 from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.fitting.tested import depths
 from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.read import Curve, DataError
 from jaxtrachea.measurements.readers.hdf5_values import attribute, numeric
@@ -91,11 +92,33 @@ class StoredFit:
         return tuple(dict.fromkeys(c.specimen for c in self.curves))
 
     @functools.cached_property
+    def first_touch(self) -> np.ndarray:
+        """Displacement of each curve at first touch, mm: held, or estimated; (curves,)."""
+        onset = next(p for p in self.study.parameters if p.name == "onset")
+        if onset.fixed:
+            return np.full(len(self.curves), onset.value)
+        places = [
+            {(s, t): i for i, (p, s, t) in enumerate(lane) if p.name == "onset"}
+            for lane in self.study.unknowns
+        ]
+
+        def touch(curve: Curve, lane: int) -> float:
+            specimen = "" if onset.scope == "shared" else curve.specimen
+            i = places[lane].get((specimen, curve.trial if onset.scope == "trial" else ""))
+            return np.nan if i is None else onset.from_scaled(float(self.theta[lane, i]))
+
+        rows = zip(self.curves, self.curve_lane.tolist(), strict=True)
+        return np.array([touch(*row) for row in rows])
+
+    @functools.cached_property
     def spans(self) -> np.ndarray:
-        """Range of displacement and of contact position of the data of each lane, mm; (L, 4)."""
+        """Range of depth from first touch and of contact position of each lane, mm; (L, 4)."""
         out = np.tile([np.inf, -np.inf] * 2, (len(self.status), 1))
-        for curve, lane in zip(self.curves, self.curve_lane, strict=True):
-            D, s = curve.displacement, np.nan if curve.s_c is None else curve.s_c
+        options = self.study.model.options
+        rows = zip(self.curves, self.curve_lane, self.first_touch.tolist(), strict=True)
+        for curve, lane, touch in rows:
+            D = depths(curve.displacement, touch, options)
+            s = np.nan if curve.s_c is None else curve.s_c
             ends = [np.min(D), -np.max(D), s, -s]
             out[lane] = np.fmin(out[lane] * [1, -1, 1, -1], ends) * [1, -1, 1, -1]
         return out

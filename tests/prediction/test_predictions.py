@@ -8,13 +8,17 @@ import beam_fem
 import numpy as np
 import pytest
 from hardening import TWO, pairs, stored_again, total_study
-from noisy_fits import DEPTHS, LANES, true_force
+from noisy_fits import DEPTHS, LANES, TRUTH, true_force
 from scipy.stats import t as student
+from synthetic import NAMES
 
 import jaxtrachea
 from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.predictions import predictions
-from jaxtrachea.fitting.tested import deeper_than_tested
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import build_study
+from jaxtrachea.fitting.tested import deeper_than_tested, depths
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import leave_one_out
 from jaxtrachea.inference.labels import verdict_sentence
@@ -219,6 +223,64 @@ def source_like(status):
     return Source(
         "a", "", 0, none[0:], none[0:], none, none, np.array(2.0), np.ones(2), (), status, ""
     )
+
+
+def late_study(onset, offset, late=(10.0, 10.3), zero=0.0):
+    """Two records from 2 mm before their touch at `late` mm to 3 mm; all but the press is held."""
+    curves = []
+    for i, (s, at) in enumerate(zip((61.0, 75.0), late, strict=True)):
+        D = at + np.linspace(-2.0, 1.0, 61)
+        force = zero + true_force(s, np.maximum(D - at, 0))
+        curves.append(Curve("T1", f"t{i}", s, 0.0, D, force))
+    held = {n: {"fixed": True, "value": float(v)} for n, v in zip(NAMES, TRUTH, strict=True)}
+    table = held | {"onset": onset, "force_offset": offset}
+    return build_study(curves, table_1(), Options(), table, noise=Noise(force=0.01))
+
+
+@pytest.mark.parametrize("onset", [{"fixed": True, "value": 10.0}, {}])
+def test_extrapolated_and_tested_are_depths_from_first_touch(onset, tmp_path):
+    """Presses of 1 mm, recorded from 8 to 11 mm; what was said was held against these 11 mm."""
+    late = (10.0, 10.0 if onset else 10.3)
+    result = fit(late_study(onset, {}, late), Settings(starts=1, scrutiny=False))
+    write_hdf5(tmp_path / "r.h5", Findings(result), {})
+    beyond = "extrapolated from data at D = 0 to 1 mm from first touch"
+    for results in (result, jaxtrachea.read_results(tmp_path / "r.h5")):
+
+        def said(trial, depth, results=results):
+            k = int(trial[1])
+            at = {"s": (61.0, 75.0)[k], "displacement": [0.0, depth + late[k]]}
+            return jaxtrachea.predict(results, **at, trial=trial).message
+
+        for trial in ("t0", "t1"):
+            assert "extrapolated" not in said(trial, 0.99)
+            assert "tested" not in said(trial, 0.99)
+            assert beyond in said(trial, 1.02)
+            assert "tested" not in said(trial, 1.02)
+            assert "the model was tested to D = 1.13 mm from first touch" in said(trial, 1.2)
+    if not onset:  # a new press begins at its touch
+        new = jaxtrachea.predict(result, s=61.0, displacement=11.0)
+        assert beyond in new.message
+        assert "the model was tested to D = 1.13 mm from first touch" in new.message
+
+
+def test_change_points_serve_before_a_fit_and_numbers_that_are_held_as_they_are():
+    for onset, offset in (({}, {}), ({"fixed": True, "value": 10.2}, {})):
+        study = late_study(onset, offset)
+        found = study.first_touch
+        expected = [10.2, 10.2] if onset else [10.0, 10.3]
+        np.testing.assert_allclose(found.ravel(), expected, atol=0 if onset else 0.03)
+    bonded = dataclasses.replace(Options(), contact="bonded")
+    np.testing.assert_array_equal(depths(np.array([1.0, 3.0]), 2.0, bonded), [-1, 1])
+    np.testing.assert_array_equal(depths(np.array([1.0, 3.0]), 2.0, Options()), [0, 1])
+
+
+def test_curves_are_as_deep_as_they_press():
+    """Records to 13 mm that touch at 10.0 and 12.2 mm: one goes 3 mm deep, one 0.8."""
+    curves = [Curve("a", "", 50.0, 0.0, np.linspace(8, 13, 5), np.ones(5))] * 2
+    says = deeper_than_tested(curves, Options(), 12.0, [10.0, 12.2], " from first touch")
+    assert says is not None
+    assert says.startswith("1 of 2 curves go to 3 mm from first touch; skeleton = 'linear' was")
+    assert deeper_than_tested(curves, Options(skeleton="softening"), 12.0, [10.0, 12.2]) is None
 
 
 @pytest.mark.parametrize(

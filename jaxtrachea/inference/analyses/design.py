@@ -64,11 +64,11 @@ def _refuse(request: Request) -> None:
 
 def _compute(request: Request, findings: Findings, progress: Progress) -> Design:
     section = request.spec.design
-    at = candidates_of(request.spec, request.study)
     try:
         known = situation(findings.result, findings.get("bootstrap"))
     except ValueError as error:
         raise Unavailable(str(error)) from None
+    at = candidates_of(request.spec, request.study, known.reach)
     added = gains(known, at)
     choice = next_points(known, at, section.points, section.criterion, added)
     s = np.linspace(at.s.min(), at.s.max(), 121)
@@ -96,7 +96,7 @@ def choice_rows(found: Design) -> Iterator[dict[str, object]]:
         place = place if step else dict.fromkeys(place, "")
         pairs = zip(found.unknowns, error, strict=False)
         errors = {f"{name} relative se": float(e) for name, e in pairs}
-        message = extrapolation(study, float(at.depth[k])) if step else ""
+        message = extrapolation(study, float(at.depth[k]), found.known.reach) if step else ""
         yield {"press": step, **place, **errors, "message": message}
 
 
