@@ -343,12 +343,14 @@ def predict(
     Args:
         results: from `read_results` or `fit`.
         s: contact position, mm, on the tube.
-        displacement: of the tool from first touch, mm; one number or a vector.
+        displacement: of the tool, mm; one number or a vector. From first touch; with `trial` as
+            that trial records it.
         specimen: whose parameters; may be left out where the fit has one specimen only, or shares
             all parameters.
-        trial: of the fit, whose own parameters (onset, say) count, with the rounded corner of its
-            onset; None: onset and force offset of single trials are 0, the corner is sharp
-            (`onset_width` of the model).
+        trial: of the fit, whose own parameters count: displacement and force are as it records
+            them, with its onset and force offset (of any scope, or held) and the rounded corner of
+            its onset; None: a new press, both are 0 and certain, whatever the fit has or holds, and
+            the corner is sharp (`onset_width` of the model).
         phi: contact angle from the anterior midline, rad; with direction: of a skeleton of
             deforming cross-sections.
         direction: of the tool's displacement along the inward normal and the circumference.

@@ -8,7 +8,8 @@ from jaxtrachea.fitting.covariance import SINGULAR
 from jaxtrachea.results.stored import StoredFit
 from jaxtrachea.status import FitStatus, PredictionStatus
 
-#: Parameters of a measurement, not of the specimen: zero where no measurement is meant.
+#: Parameters of a measurement, not of the specimen: zero where no measurement is meant, whatever
+#: their scope, and where they are held as well.
 OF_MEASUREMENT = ("onset", "force_offset")
 
 
@@ -64,11 +65,14 @@ def source_of(
     Args:
         stored: the fit.
         specimen: of the curve.
-        trial: of the fit whose own parameters count; None: a new curve.
+        trial: of the fit whose own parameters count, and whose displacement and force; None: a new
+            curve.
         as_specimen: of the fit, in the place of one that it does not know.
-        measured: the curve has samples that its own parameters can be fitted to; else onset and
-            force offset are 0, and no others can be its own.
+        measured: the curve has samples that its own parameters can be fitted to, recorded as those
+            of the fit; else, of a new curve, displacement counts from first touch and force without
+            offset, and no others can be its own.
     """
+    new = trial is None and not measured
     used, note = _whose(stored, specimen, as_specimen)
     if used is None:
         return _none(stored, specimen, trial, PredictionStatus.UNKNOWN_SPECIMEN, note)
@@ -82,14 +86,36 @@ def source_of(
     status = FitStatus(int(stored.status[lane]))
     if not status.succeeded:
         return _none(stored, specimen, trial, PredictionStatus.NO_ESTIMATE, status.message)
-    index, own = _columns(stored, lane, used, trial)
+    index, own = _columns(stored, lane, used, trial, OF_MEASUREMENT if new else ())
     lacking = [stored.study.free[f].name for f in own]
     lacking = [name for name in lacking if name not in OF_MEASUREMENT]
     if lacking and not measured:
         text = f"{', '.join(lacking)} belongs to single trials; name one of the fit with trial="
         return _none(stored, specimen, trial, PredictionStatus.NO_ESTIMATE, text)
+    note = "; ".join(filter(None, [note, "" if measured else _counted(stored, trial)]))
     taken = _taken(stored, specimen, trial or "", lane, index, own, note)
-    return dataclasses.replace(taken, blend=_corner(stored, used, trial))
+    taken = dataclasses.replace(taken, blend=_corner(stored, used, trial))
+    return _from_first_touch(stored, taken) if new else taken
+
+
+def _counted(stored: StoredFit, trial: str | None) -> str:
+    """What displacement and force are counted from, in words; "" where records have no zero."""
+    zeros = [p for p in stored.study.parameters if p.name in OF_MEASUREMENT]
+    if all(p.fixed and p.value == 0 for p in zeros):
+        return ""
+    if trial is None:
+        return "D from first touch, force without offset"
+    return f"D and force as trial {trial!r} records them"
+
+
+def _from_first_touch(stored: StoredFit, source: Source) -> Source:
+    """The source with no onset and no offset: a press that nobody records."""
+    study = stored.study
+    value = [0.0 if p.name in OF_MEASUREMENT else v
+             for p, v in zip(study.parameters, source.value, strict=True)]  # fmt: skip
+    free = [-np.inf if p.name in OF_MEASUREMENT and p.scale == "log" else v
+            for p, v in zip(study.free, source.free, strict=True)]  # fmt: skip
+    return dataclasses.replace(source, value=np.array(value), free=np.array(free))
 
 
 def _corner(stored: StoredFit, specimen: str, trial: str | None) -> float:
@@ -128,8 +154,11 @@ def _lane(stored: StoredFit, specimen: str, trial: str | None) -> int | None:
     return (good or lanes)[0]
 
 
-def _columns(stored: StoredFit, lane: int, specimen: str, trial: str | None):
-    """Unknown that every free column reads, -1 for those that the fit does not have; and these."""
+def _columns(stored: StoredFit, lane: int, specimen: str, trial: str | None, without):
+    """Unknown that every free column reads, -1 for those that the fit does not have; and these.
+
+    `without`: names of columns that count as such.
+    """
     place = {(p.name, s, t): i for i, (p, s, t) in enumerate(stored.study.unknowns[lane])}
     index, own = [], []
     for f, p in enumerate(stored.study.free):
@@ -138,7 +167,8 @@ def _columns(stored: StoredFit, lane: int, specimen: str, trial: str | None):
             "" if p.scope == "shared" else specimen,
             (trial or "") if p.scope == "trial" else "",
         )
-        index.append(place.get(key, -1) if p.scope != "trial" or trial else -1)
+        lacks = p.name in without or (p.scope == "trial" and not trial)
+        index.append(-1 if lacks else place.get(key, -1))
         if index[-1] < 0:
             own.append(f)
     return np.array(index, int), tuple(own)

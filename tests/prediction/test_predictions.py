@@ -263,6 +263,70 @@ def test_extrapolated_and_tested_are_depths_from_first_touch(onset, tmp_path):
         assert "the model was tested to D = 1.13 mm from first touch" in new.message
 
 
+def recorded_study(scope):
+    """Two records of the law 1.2 D + 0.1 D^3 that touch at 0.5 mm under a load cell at 0.3 N."""
+    D = np.linspace(0, 3, 61)
+    force = 0.3 + law(np.maximum(D - 0.5, 0))
+    curves = [Curve("T1", name, None, 0.0, D, force) for name in ("a", "b")]
+    zeros = {"onset": 0.5, "force_offset": 0.3}
+    if scope == "fixed":
+        more = {n: {"fixed": True, "value": v} for n, v in zeros.items()}
+    else:
+        more = {n: {"fixed": False, "scope": scope} for n in zeros}
+    return total_study(curves, more, noise=Noise(force=0.01))
+
+
+def law(d):
+    return 1.2 * d + 0.1 * d**3
+
+
+def law_error(scope, D):
+    """Standard error of the law at depths D from 61 samples each of two records, by numpy."""
+    d = np.maximum(np.linspace(0, 3, 61) - 0.5, 0)
+    own = np.stack([-(1.2 + 0.3 * d**2) * (d > 0), np.ones(61)])
+    rows = np.tile([d, d**3], 2)
+    if scope in ("specimen", "shared"):
+        rows = np.concatenate([rows, np.tile(own, 2)])
+    if scope == "trial":
+        rows = np.concatenate([rows, np.kron(np.eye(2), own)])
+    covariance = np.linalg.inv(rows @ rows.T / 0.01**2)[:2, :2]
+    x = np.stack([D, D**3])
+    return np.sqrt(np.einsum("in,ij,jn->n", x, covariance, x))
+
+
+@pytest.mark.parametrize("scope", ["fixed", "specimen", "shared", "trial"])
+def test_a_new_press_counts_from_first_touch_whatever_the_fit_has(scope, tmp_path):
+    """Closed form. A zero that is held, or of a specimen, was taken for that of the new press."""
+    read = stored_again(recorded_study(scope), tmp_path / "r.h5")
+    D = np.array([0.5, 1.0, 2.0])
+    # Where the onset is sought the corner is rounded, over the noise: less than it is known to.
+    near = 1e-9 if scope == "fixed" else 0.1 * law_error(scope, D).min()
+    new = jaxtrachea.predict(read, s=80.0, displacement=D)
+    np.testing.assert_allclose(new.force, law(D), rtol=0, atol=near)
+    np.testing.assert_allclose(new.se, law_error(scope, D), rtol=0.02)
+    assert new.status == PredictionStatus.OK
+    assert "D from first touch, force without offset" in new.message
+    named = jaxtrachea.predict(read, s=80.0, displacement=D + 0.5, trial="b")
+    np.testing.assert_allclose(named.force, 0.3 + law(D), rtol=0, atol=2 * near)
+    assert "D and force as trial 'b' records them" in named.message
+    # A measured curve is recorded as those of the fit were, or has its own zeros fitted to it.
+    again = dataclasses.replace(read.curves[0], trial="c")
+    (found,) = held_out.compare(read, [again])
+    np.testing.assert_allclose(found.prediction.force[1:], again.force[1:], rtol=0, atol=0.01)
+    assert np.all(np.abs(found.residual[again.displacement > 0.6]) < 2 * near + 1e-9)
+
+
+def test_a_zero_on_a_logarithmic_scale_is_none_for_a_new_press(tmp_path):
+    """No number has the logarithm of 0; a new press began at 1 mm."""
+    curves = recorded_study("fixed").curves[0]
+    own = {"fixed": False, "scope": "trial", "scale": "log", "lower": 0.01, "upper": 2.0}
+    more = {"onset": own | {"value": 0.4}, "force_offset": {"fixed": True, "value": 0.3}}
+    read = stored_again(total_study(curves, more, noise=Noise(force=0.01)), tmp_path / "r.h5")
+    new = jaxtrachea.predict(read, s=80.0, displacement=[1.0, 2.0])
+    np.testing.assert_allclose(new.force, law(np.array([1.0, 2.0])), rtol=2e-3)
+    assert np.all(np.isfinite(new.se) & (new.se > 0) & (new.se < 0.01))
+
+
 def test_change_points_serve_before_a_fit_and_numbers_that_are_held_as_they_are():
     for onset, offset in (({}, {}), ({"fixed": True, "value": 10.2}, {})):
         study = late_study(onset, offset)
