@@ -14,7 +14,7 @@ _KEYS = {"s": "s", "D": "D", "d": "D", "displacement": "D", "phi": "phi", "tilt"
          "specimen": "specimen", "trial": "trial"}  # fmt: skip
 _START = re.compile(r",(?=\s*\w+\s*=)")
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_VALUES = re.compile(rf"(?P<numbers>{_NUMBER}(?:\s*:\s*{_NUMBER}){{0,2}})\s*(?P<unit>.*)")
+_VALUE = re.compile(rf"\s*(?P<number>{_NUMBER})\s*(?P<unit>.*?)\s*")
 EXAMPLE = "as in s=75,D=0:6:0.5 or 's=7.5 cm,D=2 mm,specimen=T01'"
 
 
@@ -45,7 +45,8 @@ def parse_presses(text: str, *, needs_position: bool) -> Presses:
     Args:
         text: KEY=VALUE, separated by commas; s and D are numbers (mm) with or without a unit, or
             ranges START:STOP:STEP, in whole steps within STOP, which is a value where a step ends
-            on it, or START:STOP, in 20 steps; phi, and tilt of the tool from the inward normal
+            on it, or START:STOP, in 20 steps, with a unit at each number (0 needs none) or one at
+            the end for all; phi, and tilt of the tool from the inward normal
             towards growing phi, are angles (degrees) with or without one.
         needs_position: whether s must be given.
 
@@ -95,15 +96,23 @@ def _angle(name: str, text: str) -> float:
 
 def _lengths(name: str, text: str) -> np.ndarray:
     """A number or a range, mm."""
-    match = _VALUES.fullmatch(text)
-    if match is None:
+    parts = [_VALUE.fullmatch(part) for part in text.split(":")]
+    read = [(float(part["number"]), part["unit"]) for part in parts if part is not None]
+    if len(read) < len(parts) or len(parts) > 3:
         raise ValueError(
             f"{name}={text!r} is neither a length nor a range START:STOP:STEP (whole steps from "
             f"START, none beyond STOP); write it {EXAMPLE}"
         )
+    *before, last = (unit for _, unit in read)
+    if not any(before):
+        read = [(number, last) for number, _ in read]
+    elif any(number != 0 and not unit for number, unit in read):
+        raise ValueError(
+            f"{name}={text!r}: some numbers have a unit and others none; give each its own, as in "
+            "0:2 mm:100 um, or one at the end for all, as in 0:2:0.1 mm"
+        )
     try:
-        numbers = [float(v) for v in match["numbers"].split(":")]
-        values = [convert(v, match["unit"] or "mm", "length") for v in numbers]
+        values = [convert(number, unit or "mm", "length") for number, unit in read]
     except UnitError as error:
         raise ValueError(f"{name}={text!r}: {error}") from None
     if not np.isfinite(values).all():

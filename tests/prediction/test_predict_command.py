@@ -98,6 +98,13 @@ def test_fixed_specification_on_the_command_line(tmp_path, monkeypatch, capsys):
         ("s=75,D=0:1e9:1e-3", "more than 100000"),
         ("s=0:160:0.1,D=0:6:0.01", "more than 100000"),
         ("s=75,D=1e999", "finite"),
+        ("s=75,D=0:1 cm:0.25", "some numbers have a unit and others none"),
+        ("s=75,D=0 mm:1:0.25", "some numbers have a unit and others none"),
+        ("s=75,D=1:2 mm:0.5 mm", "some numbers have a unit and others none"),
+        ("s=75,D=0:1 N:1 mm", "'N' does not measure length"),
+        ("s=75,D=0:1:2:3", "neither a length nor a range"),
+        ("s=75,D=0::1", "neither a length nor a range"),
+        ("s=75,D=0 mm:", "neither a length nor a range"),
         ("s=75,D=2,q=1", "'q=1' is not understood"),
         ("s=75,D=2,phi=north", "phi:"),
         ("s=75,D=2,phi=1_0", "phi:"),
@@ -118,6 +125,27 @@ def test_presses_in_units_and_ranges():
     assert (found.specimen, found.trial) == ("a,b", "x")
     assert np.allclose(
         parse_presses("D=1:-0.5:-0.5", needs_position=False).displacement, [1, 0.5, 0, -0.5]
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("0 mm:2 mm:0.5 mm", [0, 0.5, 1, 1.5, 2]),
+        ("0:2 mm:500 um", [0, 0.5, 1, 1.5, 2]),
+        ("1 mm : 0.3 cm : 1mm", [1, 2, 3]),
+        ("1 cm:0:-5 mm", [10, 5, 0]),
+        ("0:1:0.25 cm", [0, 2.5, 5, 7.5, 10]),
+        ("1:2 um", 1e-3 + np.arange(21) * 5e-5),
+        ("100 um:2 mm", 0.1 + np.arange(21) * 0.095),
+    ],
+)
+def test_each_number_of_a_range_may_have_a_unit(text, expected):
+    """One at the end holds for all of them."""
+    found = parse_presses(f"D={text}", needs_position=False)
+    np.testing.assert_allclose(found.displacement, expected, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        parse_presses(f"s={text},D=1", needs_position=True).s, expected, rtol=1e-12, atol=1e-15
     )
 
 
