@@ -182,6 +182,101 @@ def test_lifting_off():
     np.testing.assert_allclose(got.force[5], [0.5, 0.05, 0], atol=1e-15)
 
 
+def from_the_air(rows):
+    """Down on the surface in `rows` steps, along it, off it and down again; the kinks are steps.
+
+    Touches at (0, 0.6, -0.3), where 0.6 of the first way is behind, and at (0, 3.4, 0.8).
+    """
+    corners = np.array([[-1.2, 0, 0], [0.8, 1.0, -0.5], [0.8, 3, 0.4], [-0.8, 3, 1.2]])
+    corners = np.array([*corners, [0.8, 3.8, 0.4]])
+    return np.concatenate(
+        [np.linspace(a, b, rows + 1)[1:] for a, b in zip(corners, corners[1:], strict=False)]
+    )
+
+
+TOUCHES = np.array([[0, 0.6, -0.3], [0, 3.4, 0.8]])
+
+
+@pytest.mark.parametrize("rows", [1, 4])
+def test_a_step_from_the_air_counts_from_where_it_touches(rows):
+    """Against SciPy, told the points of both touches; one step down is as good as many."""
+    D = np.concatenate([[[-1.2, 0, 0]], from_the_air(rows)])
+    got = path(D, COUPLED, 0.7, 0.3, MU)
+    down = np.flatnonzero((D[1:, 0] > 0) & (D[:-1, 0] <= 0)) + 1
+    up = np.flatnonzero((D[1:, 0] <= 0) & (D[:-1, 0] > 0)) + 1, len(D)
+    for begin, end, point in zip(down, (up[0][0], up[1]), TOUCHES, strict=True):
+        force, slip = reference(D[begin:end] - point, COUPLED, 0.7, 0.3, MU)
+        np.testing.assert_allclose(got.force[begin:end], force, atol=1e-9)
+        np.testing.assert_allclose(got.slip[begin:end], slip + point[1:], atol=1e-9)
+    assert np.any(got.sliding)
+    np.testing.assert_array_equal(np.asarray(got.force)[D[:, 0] <= 0], 0)
+    work = np.sum(got.dissipated)
+    assert 0 < work
+    np.testing.assert_allclose(got.slip[0], 0, atol=0)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_what_sticks_is_stretched_from_where_it_touched(dtype):
+    """Mu = 1e3, an uncoupled skeleton: F = k (D - D_touch) in closed form, after two touches."""
+    C = np.diag([1.0, 2.0, 3.0])
+    D = np.concatenate([[[-1.2, 0, 0]], from_the_air(1)])
+    got = path(D, C, mu=1e3, dtype=dtype)
+    k = 1 / (np.diag(C) + 2)
+    tolerance = 50 * np.finfo(dtype).eps
+    for rows, point in zip((np.array([1, 2]), np.array([4])), TOUCHES, strict=True):
+        np.testing.assert_allclose(got.force[rows], k * (D[rows] - point), atol=tolerance)
+        np.testing.assert_allclose(got.slip[rows], [point[1:]] * len(rows), atol=tolerance)
+    np.testing.assert_allclose(got.dissipated, 0, atol=tolerance)
+
+
+def test_steps_that_are_lost_in_the_air_move_nothing():
+    """One that is no number, and one that folds as it touches: as if they were not there."""
+    good = from_the_air(2)
+    for at, lost in ((1, [np.nan, 9, 9]), (1, [50.0, 9, 9]), (0, [-0.5, np.nan, 0])):
+        D = np.insert(good, at, lost, axis=0)
+        got, wanted = (path(v, COUPLED, 0.5, -0.01) for v in (D, good))
+        np.testing.assert_allclose(np.delete(got.force, at, 0), wanted.force, rtol=1e-12)
+        np.testing.assert_allclose(np.delete(got.slip, at, 0), wanted.slip, rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_gradients_through_touches(dtype):
+    """Forward = reverse = central differences; of a path that never touches all are 0."""
+    D = np.concatenate([[[-1.2, 0.1, 0]], from_the_air(1)])
+
+    def f(D, k_1, mu, height):
+        start = jnp.zeros(2, D.dtype)
+        law = Law(k_1, jnp.full_like(k_1, 0.3))
+        got = slide_path(D, jnp.asarray(COUPLED, D.dtype), law, Coulomb(mu), start, height)
+        return jnp.concatenate([got.force.ravel(), got.slip.ravel(), got.dissipated])
+
+    rng = np.random.default_rng(3)
+    quick = functools.partial(jax.jit, compiler_options=QUICK)
+    both = quick(lambda *v: (jax.jacfwd(f, (0, 1, 2, 3))(*v), jax.jacrev(f, (0, 1, 2, 3))(*v)))
+    value = quick(f)
+    for point in ((D, 0.7, MU, 0.2), (D[1:], 0.7, MU, 0.9)):
+        forward, reverse = both(*(jnp.asarray(v, dtype) for v in point))
+        for i, v in enumerate(point):
+            way = rng.normal(size=np.shape(v))
+            size = np.max(np.abs(forward[i]))
+            tolerance = 2e4 * np.finfo(dtype).eps * size
+            np.testing.assert_allclose(forward[i], reverse[i], atol=tolerance)
+            ends = (
+                [jnp.asarray(p + e * way if i == j else p, float) for j, p in enumerate(point)]
+                for e in (1e-6, -1e-6)
+            )
+            up, down = (value(*p) for p in ends)
+            along = np.tensordot(forward[i], way, np.ndim(v))
+            atol = max(tolerance, 1e-6 * max(size, 1))
+            np.testing.assert_allclose(along, (up - down) / 2e-6, atol=atol)
+    away = np.concatenate([-np.ones((len(D), 1)), D[:, 1:]], 1)
+    slopes = both(*(jnp.asarray(v, dtype) for v in (away, 0.7, MU, 0.2)))[1]
+    assert all(np.all(np.isfinite(slope)) for slope in slopes)
+    for slope in slopes[1:]:
+        np.testing.assert_array_equal(slope, 0)
+
+
 def test_bad_step_is_flagged_and_left_behind():
     """NaN and a folded step: flagged, and the steps after them start from the slip before."""
     D = sideways(np.array([0.2, 2.0, 2.1, 2.2]))

@@ -259,6 +259,31 @@ def test_path():
         run(jnp.asarray(D), Coulomb(jnp.asarray(0.3)), STUCK)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [1, 5])
+def test_a_path_sticks_where_it_touches(rows):
+    """Straight from rest with an onset, mu = 1e3: the press of `press_oblique`, in any steps."""
+    D = (np.array([1.0, -1.6, -0.9]) * np.linspace(0, 1, rows + 1)[1:, None]).astype(float)
+    at = table_1(), material(), 63.0, 0.4, jnp.asarray(D)
+    options = ObliqueOptions()
+
+    @functools.partial(jax.jit, compiler_options=QUICK)
+    def run(onset):
+        path = press_path(*at, Coulomb(jnp.asarray(1e3)), options, onset=onset)
+        return path, press_oblique(*at, options, onset=onset)
+
+    got, wanted = run(0.7)
+    inward = D @ turned(0.4)[0]
+    assert rows == 1 or 0 < np.sum(inward < 0.7) < rows - 1
+    np.testing.assert_allclose(got.press.force, wanted.force, atol=1e-12)
+    np.testing.assert_array_equal(got.press.status, wanted.status)
+    np.testing.assert_allclose(got.dissipated, 0, atol=1e-15)
+    start = D[-1] * 0.7 / inward[-1]
+    along = start - (start @ turned(0.4)[0]) * turned(0.4)[0]
+    for slip in np.asarray(got.slip)[inward > 0.7]:
+        np.testing.assert_allclose(slip, along, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("name", "keywords"),
     [

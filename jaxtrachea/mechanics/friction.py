@@ -9,6 +9,9 @@ Backward Euler over one step with g' = lambda F_t makes the slip a compliance la
 the tangent plane only: sticking is `press_vector`, sliding has one unknown more, and a condition
 that is nearly linear in it. Local law and skeleton are the elasticity that regularises Coulomb's
 law: force and slip are continuous in everything, with a kink where sticking turns into sliding.
+
+A step that comes from the air is straight, and touches where its normal component is 0: the way
+along the surface before that is no slip of the contact and stretches nothing.
 """
 
 import math
@@ -59,7 +62,8 @@ class Slide(NamedTuple):
     Attributes:
         depth: local indentation, mm; (3,).
         force: contact force, N; (3,).
-        slip: way slid since first touch, mm; (2,). Out of contact it goes with the tool.
+        slip: way slid since first touch, mm; (2,). Out of contact it goes with the tool, so that it
+            is where the tool touches next.
         dissipated: work lost to friction in this step, N mm; not negative.
         sliding: whether this step slides.
         status: a `PressStatus` as int8.
@@ -79,8 +83,12 @@ def slide_path(
     law: Law,
     friction: Coulomb,
     slip: Float[Array, "2"] | None = None,
+    height: Float[Array, ""] | None = None,
 ) -> Slide:
     """Follow a tool along a path; the slip is carried from step to step.
+
+    Out of contact the tool takes the slip with it, up to where it touches: the point at which the
+    straight line between two steps has the normal component 0.
 
     Args:
         displacement: of the tool, (inward normal, tangent, tangent), mm, in order. Contact is where
@@ -88,19 +96,30 @@ def slide_path(
         compliance: skeleton at the contact in the same frame, mm/N, symmetric.
         law: local law; k_1 > 0.
         friction: between tool and surface.
-        slip: at the start, mm; None: 0 (first touch where the path begins).
+        slip: at the start, mm; None: 0.
+        height: of the tool above the surface at the start, mm, not negative; None: 0 (it just
+            touches, or is in contact). Above it, the tool stands over `slip`.
 
     Returns:
         A `Slide` with a leading axis of steps. A step without a solution is NaN with its status and
-        leaves the slip as it was.
+        leaves slip and height as they were.
     """
     start = jnp.zeros_like(displacement[0, 1:]) if slip is None else slip
+    above = jnp.zeros_like(displacement[0, 0]) if height is None else height
 
-    def step(slip, D):
-        out = slide(D, compliance, law, friction, slip)
-        return out.slip, out
+    def step(state, D):
+        slip, above = state
+        known = jnp.isfinite(jnp.sum(D))
+        given = jnp.where(known, D, 0)  # before what is derived from it
+        pressing = given[0] > 0
+        share = jnp.where(pressing, above / jnp.where(pressing, above + given[0], 1), 0)
+        out = slide(D, compliance, law, friction, slip + share * (given[1:] - slip))
+        solved = known & ((out.status == PressStatus.OK) | ~pressing)
+        slip = jnp.where(solved, out.slip, slip)
+        above = jnp.where(solved, jnp.where(pressing, 0, -given[0]), above)
+        return (slip, above), out._replace(slip=slip)
 
-    return jax.lax.scan(step, start, displacement)[1]
+    return jax.lax.scan(step, (start, above), displacement)[1]
 
 
 def slide(

@@ -217,7 +217,9 @@ def press_path(
 ) -> ObliquePath:
     """Lead the tool along a path; it sticks and slides by Coulomb's law (unilateral, `series`).
 
-    The contact keeps its place (s_c, phi_c): for slips small against the ring distance.
+    The contact keeps its place (s_c, phi_c): for slips small against the ring distance. From rest
+    and from step to step the tool goes in straight lines. What it does along the surface before it
+    touches, at `onset`, is no slip and no force, then and after it has lifted off.
 
     Args:
         geometry: as for `press_oblique`, like all that is not named here.
@@ -269,9 +271,11 @@ def _press_path(
     refused = jnp.where(mu < 0, PressStatus.BAD_MATERIAL, refused).astype(jnp.int8)
     frame = local_frame(phi_c)
     D = product(displacement, frame.T)
-    D = jnp.concatenate([touch(D[:, :1], onset, options.press), D[:, 1:]], axis=1)
-    C = turned(unit.compliance, frame.T)
-    slid = _friction.slide_path(D, C, law, friction)
+    inward = D[:, :1]
+    inward = jnp.where(inward < onset, inward - onset, touch(inward, onset, options.press))
+    D, C = jnp.concatenate([inward, D[:, 1:]], axis=1), turned(unit.compliance, frame.T)
+    height = jnp.where(onset >= 0, onset, 0)
+    slid = _friction.slide_path(D, C, law, friction, height=height)
     unit, slid = hide(refused, unit, slid)
     status = status_of(refused, slid.status)
     press = _assemble(unit, product(slid.force, frame), product(slid.depth, frame), status)

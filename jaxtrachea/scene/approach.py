@@ -83,8 +83,10 @@ def on_one_point(
     """The path as presses on the place that the tool touches first, at or before row `first`."""
     rows, place = seen.gap.shape[0], landing(scene, path, seen, first)
     D = place.way
-    if scene.plan.options.contact == "bonded":
-        D = jnp.where((jnp.arange(rows) >= first)[:, None], D, 0)
+    if scene.plan.friction or scene.plan.options.contact == "bonded":
+        # What goes on from row to row begins at first touch, where the way is 0. A pose that is no
+        # number stays none.
+        D = jnp.where((jnp.arange(rows) >= first)[:, None] | jnp.isnan(D), D, 0)
 
     def spread(v):
         return jnp.broadcast_to(v, (rows, *v.shape))

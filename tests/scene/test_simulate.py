@@ -129,6 +129,45 @@ def test_a_friction_that_is_no_number_says_so():
     assert np.isnan(out.force[1:]).any(axis=1).all()
 
 
+def slanting(rows, mu, friction="on"):
+    """A ball led down and along the tube, which touches within the first of 4 rows."""
+    path = ball([78, 0.9, 0], [81, -3.1, 0.5], rows)
+    effects = dataclasses.replace(BARE, friction=friction, contact_point="fixed")
+    return make_scene(TUBE, MATERIAL, path, tool=Tool(BALL, mu), effects=effects), path
+
+
+def test_a_tool_that_sticks_for_good_is_one_without_friction():
+    """The way before the first touch stretches nothing, in however few rows; mu = 1e3."""
+    (scene, path), (stuck, _) = slanting(4, 1e3), slanting(4, 1e3, "off")
+    out, wanted = (run(v, MATERIAL, path) for v in (scene, stuck))
+    assert out.status.tolist() == [PressStatus.NO_CONTACT, 0, 0, 0]
+    np.testing.assert_allclose(out.force, wanted.force, atol=1e-12)
+    np.testing.assert_array_equal(out.slip, 0)
+    np.testing.assert_array_equal(out.displacement[0], 0)
+    np.testing.assert_allclose(out.dissipated, 0, atol=1e-15)
+    lost = dataclasses.replace(path, translation=path.translation.at[0].set(np.nan))
+    assert run(scene, MATERIAL, lost).status[0] == PressStatus.NON_FINITE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mu", [0.66, 10.0])
+def test_few_rows_slide_as_many_do(mu):
+    """A straight path: 4 rows end as 31 and 121 do.
+
+    The work is that of each row's force at its end: off by the first power of the step.
+    """
+    ends = {}
+    for rows in (4, 31, 121):
+        scene, path = slanting(rows, mu)
+        out = run(scene, MATERIAL, path)
+        ends[rows] = np.asarray(out.force[-1]), np.asarray(out.slip[-1]), np.sum(out.dissipated)
+    force, slip, work = ends[121]
+    for rows, tolerance in ((4, 2e-4), (31, 2e-5)):
+        np.testing.assert_allclose(ends[rows][0], force, atol=tolerance * np.linalg.norm(force))
+        np.testing.assert_allclose(ends[rows][1], slip, atol=tolerance)
+    assert abs(ends[31][2] - work) <= abs(ends[4][2] - work) / 8
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("at", ["rotation", "translation"])
 def test_a_pose_that_is_no_number_costs_its_own_row(at):
