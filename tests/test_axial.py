@@ -10,7 +10,7 @@ from jaxtrachea.mechanics.axial import stretch
 DTYPES = ["float32", "float64"]
 X, LENGTH = np.array([10.0, 25.0, 40.0, 70.0]), 100.0
 POSITIONS = [0.0, 1e-3, 7.0, 25.0, 55.0, 70.0, 99.0, 100.0]
-SPRINGS = [(None, None), (2.0, None), (None, 0.05), (0.3, 1e4)]
+SPRINGS = [(None, None), (2.0, None), (None, 0.05), (0.3, 1e4), (0.0, 0.4), (0.4, 0.0)]
 jitted = jax.jit(stretch)
 
 
@@ -31,19 +31,20 @@ def fem(EA, s_c, force, k_A, k_B):
     u = np.zeros(nodes.size)
     u[free] = np.linalg.solve(K[np.ix_(free, free)], f[free])
     at_A = k_A * u[0] if k_A is not None else -(K[0] @ u - f[0])
-    return u[nodes == s_c][0], u[np.searchsorted(nodes, X)], at_A
+    return u[nodes == s_c][0], u[np.searchsorted(nodes, X)], at_A, u[[0, -1]]
 
 
 @pytest.mark.parametrize("springs", SPRINGS)
 @pytest.mark.parametrize("s_c", POSITIONS)
 def test_against_bar_fem(s_c, springs):
     EA = np.array([4.0, 0.5, 8.0, 2.0, 1.0])
-    u_C, u, force_A = fem(EA, s_c, 0.7, *springs)
+    u_C, u, force_A, of_ends = fem(EA, s_c, 0.7, *springs)
     end = {n: jnp.asarray(v) for n, v in zip(("k_A", "k_B"), springs, strict=True) if v is not None}
     got = jitted(*map(jnp.asarray, (X, LENGTH, EA, s_c, 0.7)), **end)
     scale = 1e-12 * (abs(u_C) + np.max(np.abs(u)))
     np.testing.assert_allclose(got.u_C, u_C, atol=scale)
     np.testing.assert_allclose(got.u, u, atol=scale)
+    np.testing.assert_allclose([got.u_A, got.u_B], of_ends, atol=scale)
     if springs[0] is not None or s_c > 0:
         np.testing.assert_allclose(got.force_A, abs(force_A), rtol=1e-9, atol=1e-14)
     np.testing.assert_allclose(got.force_A + got.force_B, 0.7, rtol=1e-14)
@@ -67,6 +68,44 @@ def test_paper_formulas(dtype):
     # Linear from C to each fixed end.
     expected = np.where(X <= 30, X / 30, (100 - X) / 70) * float(got.u_C)
     np.testing.assert_allclose(got.u, expected, rtol=rtol)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("s_c", [4.0, 33.0])
+@pytest.mark.parametrize("end", ["k_A", "k_B"])
+def test_an_end_that_is_free_or_held(end, s_c, dtype):
+    """Free: all that lies beyond C moves as C does. Held: not at all, as without a spring.
+
+    The derivative at k = 0 by hand: with f = u_C = F (1 / k' + l / EA), l the way from C to the
+    other end on its spring k', a weak spring takes k f of the force, so f falls by k f^2 / F and
+    its end by the stretch on the way there, k f (s_c / EA), more.
+    """
+    F, EA, other = 0.5, 3.9, 2.0
+    at = s_c if end == "k_A" else LENGTH - s_c
+    name, rest = ("u_A", "k_B") if end == "k_A" else ("u_B", "k_A")
+
+    def cast(v):
+        return jnp.asarray(v, dtype)
+
+    def run(k):
+        place = cast(at), cast(F)
+        springs = {end: k, rest: cast(other)}
+        return stretch(cast(X), cast(LENGTH), cast(np.full(5, EA)), *place, **springs)
+
+    (free, slope), held = jax.jvp(run, (cast(0.0),), (cast(1.0),)), run(cast(np.inf))
+    f, rtol = F * (1 / other + (LENGTH - s_c) / EA), 20 * np.finfo(dtype).eps
+    np.testing.assert_allclose(free.u_C, f, rtol=rtol)
+    beyond = X <= at if end == "k_A" else X >= at
+    assert np.any(beyond) == (s_c > 10)
+    for v in (*np.asarray(free.u)[beyond], getattr(free, name)):
+        np.testing.assert_allclose(v, f, rtol=rtol)
+    np.testing.assert_allclose(slope.u_C, -(f**2) / F, rtol=4 * rtol)
+    by_end = -(f**2) / F - f * s_c / EA
+    np.testing.assert_allclose(getattr(slope, name), by_end, rtol=4 * rtol)
+    assert getattr(held, name) == 0
+    np.testing.assert_allclose(getattr(run(cast(1e-7)), name), f, rtol=1e-4)
+    pulled = jax.grad(lambda k: getattr(run(k), name))(cast(0.0))
+    np.testing.assert_allclose(pulled, by_end, rtol=4 * rtol)
 
 
 def test_contact_on_a_ring_and_vmap():

@@ -30,6 +30,7 @@ from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.optimisation import trust_region
 from jaxtrachea.optimisation.trust_region import Tolerances
+from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import table_1
 
 ONE = Settings(
@@ -207,3 +208,52 @@ def test_each_end_moves_on_its_own_spring():
     front = np.abs(np.asarray(MESH.phi)) < 0.2
     end_A, end_B = (moved[front & (np.abs(at - s) < 1e-9)].mean() for s in (0.0, length))
     np.testing.assert_allclose([end_A, end_B], [F_A / 0.2, (F - F_A) / 1.5], rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("free", ["k_A", "k_B"])
+def test_a_free_end_moves_as_the_contact_does(free, dtype):
+    """All vertices were NaN there, with status OK. The limit of weak springs, and its derivative.
+
+    Between the free end and C nothing stretches: the surface there moves by what C does,
+    F (1 / k' + l / EA), l the way from C to the other end, which a spring k' holds.
+    """
+
+    def cast(v):
+        def one(a):
+            floating = jnp.issubdtype(jnp.asarray(a).dtype, jnp.floating)
+            return jnp.asarray(a, dtype) if floating else a
+
+        return jax.tree.map(one, v)
+
+    other = {"k_A": "k_B", "k_B": "k_A"}[free]
+    material = dataclasses.replace(MATERIAL, **{other: 0.5, free: 0.0})
+    path = presses([-2, -4, 0], s=45.0, rows=2)
+    effects = EffectOptions(rings="mat", contact="bonded", dent="off", want_joints=False)
+    scene = make_scene(TUBE, material, path, mesh=MESH, effects=effects)
+    scene, material, path = cast(scene), cast(material), cast(path)
+
+    def moved(k):
+        out = simulate(scene, dataclasses.replace(material, **{free: k}), path)
+        return (out.vertices[-1] - scene.mesh.vertices)[:, 0], out
+
+    run = jax.jit(lambda k: jax.jvp(moved, (k,), (jnp.ones_like(k),)))
+    (u, out), (slope, _) = run(cast(0.0))
+    assert out.status[-1] == PressStatus.OK
+    assert u.dtype == dtype
+    way = 160.0 - 45.0 if free == "k_A" else 45.0
+    wanted = float(out.force[-1, 0]) * (1 / 0.5 + way / 3.9)
+    s, front = np.asarray(MESH.s), np.abs(np.asarray(MESH.phi)) < 0.2
+    beyond = front & ((s < 45) if free == "k_A" else (s > 45))
+    assert s[beyond].min() == 0 or s[beyond].max() == 160
+    eps = np.finfo(dtype).eps
+    # Vertices are read as places up to 160 mm away.
+    np.testing.assert_allclose(u[beyond], wanted, atol=4 * eps * 160 + 1e3 * eps * abs(wanted))
+    h = 1e-6 if dtype == "float64" else 1e-3
+    weak = [run(cast(k))[0][0] for k in (h, 2 * h)]
+    ahead = (4 * weak[0] - weak[1] - 3 * u) / (2 * h)  # one-sided, of second order
+    size = np.max(np.abs(slope))
+    assert np.all(np.isfinite(slope))
+    rtol = 1e-5 if dtype == "float64" else 0.01
+    np.testing.assert_allclose(slope, ahead, atol=rtol * size)

@@ -15,12 +15,16 @@ class Axial(NamedTuple):
     Attributes:
         u_C: axial displacement of C, mm.
         u: axial displacement at each ring, linear from C to each end, mm; shape (n,).
+        u_A: axial displacement of end A on its spring, mm.
+        u_B: that of end B.
         force_A: tension carried by side AC, N (equal at every joint of that side).
         force_B: compression carried by side BC, N; force_A + force_B is the load.
     """
 
     u_C: Float[Array, ""]
     u: Float[Array, " n"]
+    u_A: Float[Array, ""]
+    u_B: Float[Array, ""]
     force_A: Float[Array, ""]
     force_B: Float[Array, ""]
 
@@ -63,7 +67,10 @@ def stretch(
     from_B = (B.give + B.hold * beyond_ring) * (c_A / both)
     u = jnp.where(x <= s_c, from_A, from_B) * force
     force_A, force_B = A.hold * c_B / both * force, B.hold * c_A / both * force
-    return Axial(c_A * (c_B / both) * force, u, force_A, force_B)
+    return Axial(
+        u_C=c_A * (c_B / both) * force, u=u, u_A=A.give * (c_B / both) * force,
+        u_B=B.give * (c_A / both) * force, force_A=force_A, force_B=force_B,
+    )  # fmt: skip
 
 
 class _End(NamedTuple):

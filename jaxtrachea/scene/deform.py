@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrachea._in_order import in_turn, one_kernel
-from jaxtrachea._numerics import WRITTEN_OUT, full_precision, product
+from jaxtrachea._numerics import WRITTEN_OUT, full_precision, product, scaled
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
 from jaxtrachea.contact.shapes import Shape, sphere
+from jaxtrachea.mechanics.axial import stretch
 from jaxtrachea.mechanics.sections.wall import Points, around, wall_motion
 from jaxtrachea.scene import trail
 from jaxtrachea.scene.approach import Approach, backed_out
@@ -156,14 +157,24 @@ def _distances(scene: Scene, made: Approach):
 
 
 def _ends(scene: Scene, material: Material, s_c, moved) -> regions.Ends:
-    """Motion of both clamps on their axial springs."""
-    passed, F = moved.loads[:, 0], moved.force[0]
-    A = jnp.where(scene.geometry.ring_positions[0] <= s_c, passed[0], F - passed[-1])
+    """Motion of both clamps on their axial springs; None: held.
 
-    def along(f, k):
-        return None if k is None else jnp.zeros_like(moved.force).at[0].set(f / k)
+    As the ligament stretches under the axial force, not that force over a spring: a free end has
+    neither, and moves as all on its side of C.
+    """
+    if material.EA_L is None:
+        raise ValueError("Material.EA_L is None; the plan has an end motion")
+    x, length = scene.geometry.ring_positions, scene.geometry.length
+    EA = jnp.broadcast_to(material.EA_L, (x.shape[0] + 1,))
+    k_A, k_B = material.k_A, material.k_B
+    unit = stretch(x, length, EA, s_c, jnp.ones_like(s_c), k_A=k_A, k_B=k_B)
 
-    return regions.Ends(along(A, material.k_A), along(F - A, material.k_B))
+    def along(k, u):
+        if k is None:
+            return None
+        return jnp.zeros_like(moved.force).at[0].set(scaled(moved.force[0], u))
+
+    return regions.Ends(along(k_A, unit.u_A), along(k_B, unit.u_B))
 
 
 def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.Dent:
