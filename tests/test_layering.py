@@ -40,7 +40,7 @@ STRANGERS = [("scene", {"fitting", "inference", "results", "prediction", "runs"}
 #: Modules within the larger rooms, from the bottom up.
 WITHIN = {
     "scene": [
-        {"operations", "curve", "sizes", "declare"},
+        {"operations", "curve", "sizes", "declare", "needs"},
         {"wall_check"},
         {"depth", "width"},
         {"wall", "effects"},

@@ -99,7 +99,8 @@ def make_scene(
         binding=binding, footprint=spacing, near=near, quality=quality,
         plan=make_plan(SceneFacts(mesh=False), EffectOptions(want_surface=False)),  # not read
     )  # fmt: skip
-    plan = make_plan(facts_of(scene, material, path), effects)
+    facts = facts_of(scene, material, path, bonded=effects.contact == "bonded")
+    plan = make_plan(facts, effects)
     check_width(geometry, shape, plan.options.half_width)
     if plan.surface is None or mesh is None:
         return dataclasses.replace(scene, mesh=None, binding=None, plan=plan)

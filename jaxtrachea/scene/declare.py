@@ -35,11 +35,12 @@ class SceneFacts:
 
     Attributes:
         poses: the path is given as motions of the tool, not as presses at contact points.
-        angle: largest |phi| of a contact.
+        angle: largest |phi| of a contact; this and the next four are those of rows that need more
+            for it (`needs`), 0 where none does.
         several_points: the contacts of the path lie in more than one place.
-        along: largest axial motion of the tool while it touches, against its whole motion.
+        along: largest axial motion of the tool while it presses, against its whole motion.
         across: the same round the tube.
-        slip: largest motion of the tool along the surface while it touches, mm.
+        slip: largest motion of the tool along the surface while it presses, mm.
         spacing: smallest distance of two rings, mm.
         friction: whether the tool has a coefficient of friction.
         known: optional values of the material that are there; `SECTIONS` alone: of a

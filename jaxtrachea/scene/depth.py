@@ -109,9 +109,9 @@ def _sections(case: Case) -> Verdict:
     facts, options, levels = case.facts, case.options, case.levels
     why, cure = "the material is that of deforming cross-sections", "use 'sections', or 'auto'"
     refused = {"linear": (why, cure), "softening": (why, cure)}
-    if case.led and facts.along > SMALL_SHARE:
+    if case.led and facts.along > 0:
         why = "the tool moves along the tube, which deforming cross-sections do not follow"
-        raise PlanError("skeleton", "'sections'", why, "press across the tube")
+        raise PlanError("skeleton", "'sections'", why, "press across it: one x in all rows")
     if facts.poses and levels["contact_point"] == "per_step":
         why = "the tool wanders, and its force along the surface is not known on cross-sections"
         cure = "set contact_point 'fixed', shorten the path, or give it as presses (s, phi)"
@@ -126,7 +126,3 @@ def _sections(case: Case) -> Verdict:
         raise PlanError("skeleton", "'sections'", str(error), cure) from None
     why = "the material is that of deforming cross-sections"
     return Verdict("sections", why, refused, doubt=_untested("sections", reached(case)))
-
-
-#: Share of the tool's motion along the tube below which there is none.
-SMALL_SHARE = 1e-6

@@ -22,9 +22,6 @@ from jaxtrachea.trachea.material import DEEP
 
 Switch = Literal["auto", "on", "off"]
 
-#: Angle (rad) and share of the motion below which something counts as not there.
-SMALL = 1e-6
-
 
 def _contact_point(case: Case) -> Verdict:
     facts = case.facts
@@ -54,7 +51,7 @@ def _friction(case: Case) -> Verdict:
         )
     elif options.contact != "unilateral" or options.coupling != "series":
         cannot = "it needs contact 'unilateral' and coupling 'series'"
-    moves = facts.slip > SMALL
+    moves = facts.slip > 0
     reason = "the tool moves along the surface"
     if not moves:
         reason = "no motion along the surface"
@@ -65,9 +62,9 @@ def _friction(case: Case) -> Verdict:
 
 def _second_plane(case: Case) -> Verdict:
     facts, options, must = case.facts, case.options, ""
-    if facts.angle > SMALL:
+    if facts.angle > 0:
         must = f"the contact lies up to {math.degrees(facts.angle):.3g} deg off the midline"
-    elif case.led and (facts.along > SMALL or facts.across > SMALL):
+    elif case.led and (facts.along > 0 or facts.across > 0):
         must = "the tool's motion is oblique"
     elif case.levels["friction"] == "on":
         must = "friction works in the tangent plane"
@@ -94,7 +91,7 @@ def _rings(case: Case) -> Verdict:
         reason = "EI_C and k_t are given: a ring bends, on the midline and off it"
         return Verdict("arch2", reason)
     reason = "EI_C and k_t are not given: a ring is its spring k_M (paper 2.3)"
-    if case.facts.angle > SMALL:
+    if case.facts.angle > 0:
         reason = "off the midline a ring would bend, but EI_C and k_t are not given"
     why = "EI_C or k_t is not given", "give both, or use 'mat'"
     if SECTIONS in case.facts.known:
@@ -103,7 +100,7 @@ def _rings(case: Case) -> Verdict:
 
 
 def _axial(case: Case) -> Verdict:
-    needed = case.led and case.facts.along > SMALL
+    needed = case.led and case.facts.along > 0
     cannot = "" if EFFECTS["axial"].given(case.facts.known) else "EA_L is not given"
     reason = "the tool moves along the tube" if needed else "no motion along the tube"
     if needed and cannot:

@@ -12,14 +12,17 @@ from jaxtrachea.scene.declare import AnyMaterial, SceneFacts
 from jaxtrachea.scene.effects import EffectOptions, given_values
 from jaxtrachea.scene.landing import landing
 from jaxtrachea.scene.lumen import in_lumen
-from jaxtrachea.scene.rules import make_plan
-from jaxtrachea.scene.stage import (
-    COVERED,
-    Poses,
-    Presses,
-    Scene,
-    touch_tube,
+from jaxtrachea.scene.needs import (
+    PLANNED,
+    axial,
+    elsewhere,
+    lateral,
+    motion_of,
+    off_midline,
+    slides,
 )
+from jaxtrachea.scene.rules import make_plan
+from jaxtrachea.scene.stage import Poses, Presses, Scene, touch_tube
 from jaxtrachea.surface import local
 from jaxtrachea.trachea.material import DEEP
 
@@ -27,13 +30,18 @@ from jaxtrachea.trachea.material import DEEP
 LEAST, MOST = 64, 4096
 
 
-def facts_of(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> SceneFacts:
+def facts_of(
+    scene: Scene, material: AnyMaterial, path: Poses | Presses, *, bonded: bool = False
+) -> SceneFacts:
     """What the rules need to know of a scene and its path; rows in the lumen touch nothing.
+
+    What one row needs (`needs`) the path does, so that its plan serves it.
 
     Args:
         scene: its plan is not read.
         material: read only for which optional values are there.
         path: what the plan is made for.
+        bonded: the tool sticks to the wall: it draws, too.
     """
     curved = scene.mesh is not None and scene.mesh.frames is not None
     if isinstance(path, Poses):
@@ -45,40 +53,38 @@ def facts_of(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Scen
         gap = np.asarray(seen[5], float)[:rows]
         outside = touching | ~(gap < 0)
         after = outside & (np.arange(rows) >= int(seen[4]))
+        moved = np.where(after[:, None], moved, 0) if bonded else moved
     else:
         s, phi, moved = (np.asarray(v, float) for v in (path.s, path.phi, path.displacement))
         touching, place = np.ones(len(s), bool), np.array([s, phi])
         gap, outside, after = np.zeros(len(s)), touching, touching
     here = np.broadcast_to(place[1], s.shape)
-    across = np.abs(moved[:, 2] * np.cos(here) - moved[:, 1] * np.sin(here))
     inward = -(moved[:, 1] * np.cos(here) + moved[:, 2] * np.sin(here))
-    along, way = np.abs(moved[:, 0]), np.sqrt((moved**2).sum(axis=1))
-    whole = max(way[touching].max(initial=0), 1e-9)  # not what the tool goes before it touches
+    # Rows that press one place, and those that press each its own; not what goes before.
+    held = touching | (outside & ((moved != 0).any(axis=1) if bonded else inward > 0))
+    own = outside if bonded else touching
+    motion = motion_of(s[held], here[held], moved[held], np)
+    whole = max(_largest(motion.length), 1e-9)
 
     sections = isinstance(material, SectionMaterial)
     radius = float(scene.geometry.radius if sections else scene.radius)
-
-    def share(v):
-        return float(v.max(initial=0) / whole)
 
     def reach(way, drawn):
         least, most = np.fmin.reduce(way[drawn], initial=0), np.fmax.reduce(way[outside], initial=0)
         return float(least) / radius, float(most) / radius
 
-    def keep(v):
-        return v if v > COVERED else 0.0
+    def largest(v, needed):
+        return _largest(v[needed])
 
-    angles = np.abs(np.append(phi[touching], place[1] if touching.any() else 0))
-    slip = np.hypot(along, across)[touching].max(initial=0)
+    angles = np.concatenate([phi[own], np.ravel(here[held])])
     x = np.asarray(scene.geometry.ring_positions, float)
     return SceneFacts(
         poses=isinstance(path, Poses),
-        angle=keep(float(angles.max(initial=0))),
-        several_points=bool(np.ptp(s[touching]) + np.ptp(phi[touching]) > COVERED * whole)
-        if touching.any() else False,
-        along=keep(share(along[touching])),
-        across=keep(share(across[touching])),
-        slip=float(slip) if slip > COVERED * whole else 0.0,
+        angle=largest(abs(angles), off_midline(angles, PLANNED)),
+        several_points=bool(elsewhere(motion._replace(phi=phi[held]), PLANNED).any()),
+        along=largest(motion.along, axial(motion, PLANNED)) / whole,
+        across=largest(motion.across, lateral(motion, PLANNED)) / whole,
+        slip=largest(motion.slip, slides(motion, PLANNED)),
         spacing=float(np.diff(x).min()) if len(x) > 1 else float(scene.geometry.length),
         friction=scene.friction is not None,
         known=given_values(material),
@@ -89,6 +95,11 @@ def facts_of(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Scen
         way_per_step=reach(-gap, outside),
         softness=_softness(material, radius),
     )  # fmt: skip
+
+
+def _largest(v) -> float:
+    """The largest of numbers that are not negative; those that are none do not count."""
+    return float(np.fmax.reduce(v, initial=0))
 
 
 def _softness(material: AnyMaterial, radius: float) -> tuple[float, float]:

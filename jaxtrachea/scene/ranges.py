@@ -14,8 +14,18 @@ from jaxtrachea.contact.patches import Touch
 from jaxtrachea.scene.declare import AnyMaterial
 from jaxtrachea.scene.depth import SHALLOW, departure
 from jaxtrachea.scene.effects import EFFECTS, given_values
+from jaxtrachea.scene.needs import (
+    COVERED,
+    Motion,
+    axial,
+    elsewhere,
+    lateral,
+    motion_of,
+    off_midline,
+    slides,
+)
 from jaxtrachea.scene.plan import Served
-from jaxtrachea.scene.stage import COVERED, Presses, Scene
+from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.surface import local
 
 #: Largest inward motion of the wall, against the tube's radius. Ring and ligament are linear: a
@@ -56,20 +66,20 @@ def unserved(
     """
     plan = scene.plan
     presses = jax.lax.stop_gradient(presses)
-    D = presses.displacement
+    motion = motion_of(presses.s, presses.phi, presses.displacement)
     less, found = lacking(scene, material), []
     given = not plan.contact
     if not plan.second_plane:
-        found.append(_off_plane(presses))
+        found.append(off_midline(presses.phi) | axial(motion) | lateral(motion))
     elif plan.options.deforms_sections:
-        found.append(jnp.abs(D[:, 0]) > COVERED * _length(D) + COVERED)
+        found.append(axial(motion))
     elif "axial" in less and (given or plan.contact_point == "fixed"):
-        found.append(jnp.abs(D[:, 0]) > COVERED * _length(D) + COVERED)
+        found.append(axial(motion))
     if plan.contact_point == "fixed":
-        found += _elsewhere(scene, presses) if given else _wandering(scene, presses)
+        found += [elsewhere(motion)] if given else _wandering(scene, motion)
         if _frictionless(scene):
-            slides = pressing & (_along(presses) > COVERED * _length(D) + COVERED)
-            found.append(jnp.cumsum(slides) > 0)  # what slid leaves its trace in later rows
+            # What slid leaves its trace in later rows.
+            found.append(jnp.cumsum(pressing & slides(motion)) > 0)
     if plan.served is not None:
         found.append(_beyond(plan.served, presses))
     if "skeleton" in less:
@@ -108,22 +118,6 @@ def _inward(presses: Presses):
     return -jnp.cos(phi) * D[:, 1] - jnp.sin(phi) * D[:, 2]
 
 
-def _off_plane(presses: Presses):
-    """Rows that are no normal presses on the midline."""
-    D = jnp.abs(presses.displacement)
-    oblique = jnp.maximum(D[:, 0], D[:, 2]) > COVERED * D[:, 1] + COVERED
-    return ~(jnp.abs(presses.phi) <= COVERED) | oblique
-
-
-def _elsewhere(scene: Scene, presses: Presses):
-    """Rows at another contact point than the first."""
-
-    def far(v):
-        return jnp.abs(v - v[0]) > COVERED  # NaN is no place: not to be asked here
-
-    return [far(presses.s) | far(presses.phi)]
-
-
 def _near_surface(scene: Scene, presses: Presses):
     """Rows whose dent would reach a vertex."""
     if scene.mesh is None:
@@ -134,11 +128,11 @@ def _near_surface(scene: Scene, presses: Presses):
     return jnp.min(away, axis=1) < (local.REACH * scene.footprint) ** 2
 
 
-def _wandering(scene: Scene, presses: Presses):
+def _wandering(scene: Scene, motion: Motion):
     """Rows of a tool that has left its contact point: as `rules` has it, by half a ring spacing."""
     if "contact_point" in scene.plan.ignored or scene.plan.options.contact == "bonded":
         return []
-    return [_along(presses) > half_spacing(scene)]
+    return [motion.slip > half_spacing(scene) + COVERED]
 
 
 def half_spacing(scene: Scene):
@@ -154,17 +148,6 @@ def _frictionless(scene: Scene) -> bool:
     fits = plan.options.contact == "unilateral" and plan.options.coupling == "series"
     left_out = scene.friction is not None and not plan.friction
     return left_out and fits and "friction" not in plan.ignored
-
-
-def _along(presses: Presses):
-    """Way along the surface at the contact, mm."""
-    c, s = jnp.cos(presses.phi), jnp.sin(presses.phi)
-    D = presses.displacement
-    return jnp.sqrt(D[:, 0] ** 2 + (c * D[:, 2] - s * D[:, 1]) ** 2)
-
-
-def _length(D):
-    return jnp.sqrt(jnp.sum(D * D, axis=-1))
 
 
 def depth_share(scene: Scene, depth, skeleton, inward):

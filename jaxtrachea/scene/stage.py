@@ -28,11 +28,6 @@ from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import DEEP
 from jaxtrachea.trachea.mesh import Mesh
 
-#: What counts as a normal press on the midline and as one contact point: rad, mm, and share of the
-#: motion. Patches of a mesh with a mirror plane are not its mirror images to the last corner: a
-#: tool in the plane touches up to 2e-5 rad beside it.
-COVERED = 1e-4
-
 
 class Presses(eqx.Module):
     """Presses at known contact points.

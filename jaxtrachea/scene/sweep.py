@@ -17,9 +17,10 @@ from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.scene.declare import AnyMaterial
+from jaxtrachea.scene.needs import off_midline
 from jaxtrachea.scene.ranges import deep, depth_share, lacking
 from jaxtrachea.scene.refusals import REFUSALS, on_the_tube, status_of
-from jaxtrachea.scene.stage import COVERED, Scene, check_kind, check_material
+from jaxtrachea.scene.stage import Scene, check_kind, check_material
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.material import Material
 
@@ -116,7 +117,7 @@ def _sweep(
         if unlike or flat:
             off = acting
             if flat and not unlike:
-                off = acting & (jnp.abs(phi_at) > COVERED)
+                off = acting & off_midline(phi_at)
             elif unlike == {"skeleton"}:
                 off = acting & deep(scene, material, d)
             refused = {code: refused.get(code, False) | (found.status == code) for code in REFUSALS}

@@ -128,7 +128,8 @@ def full_scene(spec: SceneSpec, staged: Staged, *, coupling: str | None = None) 
     if isinstance(material, SectionMaterial):
         why = "nothing of deforming cross-sections is traded for time"
         raise PlanError("skeleton", "'sections'", why, "leave [plan] out, or give [material]")
-    facts, given = facts_of(scene, material, path), effects_of(spec)
+    given = effects_of(spec)
+    facts = facts_of(scene, material, path, bonded=given.contact == "bonded")
     options, finest = _finest(given, scene, material, path)
     if coupling is not None:
         options = dataclasses.replace(options, coupling=coupling)
