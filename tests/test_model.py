@@ -10,7 +10,7 @@ import pytest
 from jaxtrachea.mechanics import beam, equilibrium, force_law
 from jaxtrachea.mechanics.press import Options, ligament_beam, local_law, press, touch
 from jaxtrachea.status import PressStatus
-from jaxtrachea.trachea.geometry import table_1
+from jaxtrachea.trachea.geometry import Geometry, table_1
 from jaxtrachea.trachea.material import Material
 
 DTYPES = ["float32", "float64"]
@@ -111,10 +111,21 @@ def test_two_material():
     np.testing.assert_allclose(plain[:2], (0.9, 0.02), rtol=1e-14)
 
 
+@pytest.mark.parametrize("x", [np.arange(2.0, 93, 10), np.arange(8.0, 99, 10)])
+def test_two_material_goes_over_within_half_the_closest_spacing(x):
+    """Also where the first or last ring is nearer to an end: 3 of 5 mm off, w = (1 - 0.6^2)^3."""
+    g, w = Geometry.create(100.0, x), (1 - 0.36) ** 3
+    law = local_law(g, material(**MORE), jnp.asarray(x[4] + 3), Options(local="two-material"))
+    np.testing.assert_allclose(1 / law.k_1, w / 0.9 + (1 - w) / 0.3, rtol=1e-12)
+    for end in (0.0, 100.0):  # 2 mm off a ring, where the tube ends
+        law = local_law(g, material(**MORE), jnp.asarray(end), Options(local="two-material"))
+        off = np.abs(x - end).min()
+        w_end = (1 - min(off / 5, 1) ** 2) ** 3
+        np.testing.assert_allclose(1 / law.k_1, w_end / 0.9 + (1 - w_end) / 0.3, rtol=1e-12)
+
+
 def test_two_material_single_ring_has_a_transition():
     """With one ring the transition is measured to the ends: finite, not the infinity of no pair."""
-    from jaxtrachea.trachea.geometry import Geometry
-
     g = Geometry.create(100.0, [30.0])
     law = local_law(g, material(**MORE), jnp.asarray(95.0), Options(local="two-material"))
     np.testing.assert_allclose(law[:2], (0.3, 0.02))

@@ -42,7 +42,8 @@ class Options:
             or draw, odd law).
         onset_width: width of the smooth first touch, mm; no force before touch, none changed after.
         transition: distance from a ring's centre at which the ligament's own local law is reached,
-            mm; None: half the smallest distance between two rings.
+            mm; None: half the smallest distance between two rings, of one ring that to the nearer
+            end of the tube.
         half_width: of a flat punch along s, mm, which holds the ligament level over twice that and
             whose local law is the mean over it (pi/4 of the radius of a cylinder's end; needs
             `recursion` and `continuous`). All of it has to lie on the tube, else OFF_TUBE. 0: the
@@ -190,13 +191,20 @@ def local_law(
     if options.transition is not None:
         transition = jnp.asarray(options.transition, x.dtype)
     else:
-        ends = jnp.concatenate([-x[:1], x, 2 * geometry.length - x[-1:]])
-        transition = jnp.min(jnp.diff(ends)) / 2
+        transition = default_transition(geometry)
     if options.half_width > 0:
         weight = punch.mean_ring_weight(s_c, x, transition, options.half_width)
     else:
         weight = force_law.ring_weight(s_c, x, transition)
     return force_law.blend(ligament, force_law.of_ring(material), weight)
+
+
+def default_transition(geometry: Geometry) -> Float[Array, ""]:
+    """`Options.transition` where it is None, mm."""
+    x = geometry.ring_positions
+    if x.shape[0] == 1:
+        return jnp.minimum(x[0], geometry.length - x[0])
+    return jnp.min(jnp.diff(x)) / 2
 
 
 def softening_of(material: Material, options: Options) -> Softening | None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxtrachea._arguments import check_record
 from jaxtrachea.contact.search import FINE
+from jaxtrachea.mechanics.press import default_transition
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.assemble import with_geometry, with_mesh
 from jaxtrachea.scene.build import Staged, effects_of
@@ -167,7 +168,7 @@ def program(full: Full, levels: Levels) -> tuple[Scene, Material, Poses | Presse
     scene, rings = full.scene, full.levels.kept
     plan = dataclasses.replace(levels.plan, ignored=EVERY)
     if plan.options.transition is None and levels.kept < rings:
-        wide = dataclasses.replace(plan.options, transition=_half_gap(scene.geometry))
+        wide = dataclasses.replace(plan.options, transition=float(default_transition(scene.geometry)))
         plan = dataclasses.replace(plan, options=wide)
     work = {"sharpness": levels.sharpness, "warm_steps": levels.steps}
     scene = dataclasses.replace(scene, plan=plan, quality=dataclasses.replace(FINE, **work))
@@ -215,13 +216,6 @@ def _load(scene: Scene, path: Poses | Presses) -> np.ndarray:
     seen = jax.jit(touch_tube)(scene, path)
     s, gap = np.asarray(seen.s), np.asarray(seen.gap)
     return s[gap < 0] if (gap < 0).any() else s
-
-
-def _half_gap(geometry: Geometry) -> float:
-    """Where the ligament's own law is reached, by default: as in `model.local_law`."""
-    x = np.asarray(geometry.ring_positions)
-    ends = np.r_[-x[:1], x, 2 * float(geometry.length) - x[-1:]]
-    return float(np.diff(ends).min()) / 2
 
 
 def _mesh(geometry: Geometry, made: tuple[int, int, float, float | None], factor: float):
