@@ -168,7 +168,8 @@ def program(full: Full, levels: Levels) -> tuple[Scene, Material, Poses | Presse
     scene, rings = full.scene, full.levels.kept
     plan = dataclasses.replace(levels.plan, ignored=EVERY)
     if plan.options.transition is None and levels.kept < rings:
-        wide = dataclasses.replace(plan.options, transition=float(default_transition(scene.geometry)))
+        transition = float(default_transition(scene.geometry))
+        wide = dataclasses.replace(plan.options, transition=transition)
         plan = dataclasses.replace(plan, options=wide)
     work = {"sharpness": levels.sharpness, "warm_steps": levels.steps}
     scene = dataclasses.replace(scene, plan=plan, quality=dataclasses.replace(FINE, **work))

@@ -75,8 +75,7 @@ def led(places):
     return Poses(np.tile(np.eye(3), (len(places), 1, 1)), np.asarray(places, float))
 
 
-#: Beside a press of 12 mm: 0.001 mm along or round the tube; half a spacing of the rings to the last
-#: digit.
+#: Beside a press of 12 mm: 0.001 mm along or round the tube; half a spacing to the last digit.
 DOWN = np.linspace(18, 5.6, 25)
 JITTER = 1e-3 * (np.arange(25) % 3 == 2)
 LED = {
