@@ -99,8 +99,15 @@ def overlap_of(geometry: Geometry) -> float:
     return min(OVERLAP * size, OVERLAP_SHARE * spacing_of(geometry))
 
 
+def checked_span(geometry: Geometry) -> tuple[float, float]:
+    """Where the wall is checked, mm: from the first to the last ring; a radius about a lone one."""
+    rings = np.asarray(geometry.ring_positions, float)
+    reach = float(geometry.radius) if len(rings) == 1 else 0.0
+    return float(rings[0]) - reach, float(rings[-1]) + reach
+
+
 def measure(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = COUNT) -> WallError:
-    """Gaps of balls beside the wall, from the first to the last ring.
+    """Gaps of balls beside the wall, along the rings (`checked_span`).
 
     Args:
         mesh: the surface.
@@ -191,7 +198,7 @@ def look_beyond(mesh: Mesh, geometry: Geometry, patches: Patches, count: int = C
 
 
 def _balls(mesh, geometry, count, beyond=False):
-    """Centres beside the outer wall between the rings, or else beyond them; s; their radius."""
+    """Centres beside the outer wall along the rings, or else beyond them; s; their radius."""
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
     vector = face_vectors(vertices, faces)
     area = np.linalg.norm(vector, axis=1)
@@ -200,13 +207,14 @@ def _balls(mesh, geometry, count, beyond=False):
     out = np.stack([0 * phi, np.cos(phi), np.sin(phi)], axis=1)
     if mesh.frames is not None:
         out = np.einsum("vij,vj->vi", np.asarray(mesh.frames, float), out)
-    rings = np.asarray(geometry.ring_positions, float)
+    first, last = checked_span(geometry)
     at = s[faces]
     weight = area * (np.einsum("fi,fi->f", normal, out[faces[:, 0]]) > OUTWARD)
-    between = (at.min(axis=1) >= rings[0]) & (at.max(axis=1) <= rings[-1])
+    between = (at.min(axis=1) >= first) & (at.max(axis=1) <= last)
     weight *= ~between if beyond else between
     if not weight.sum() > 0:
-        raise MeshError("no triangle between the rings faces outwards; expected an outer wall")
+        where = f"from s = {first:.3g} to {last:.3g} mm, along its rings,"
+        raise MeshError(f"no triangle {where} faces outwards; expected an outer wall")
     rng = np.random.default_rng(0)
     face = rng.choice(len(faces), count, p=weight / weight.sum())
     share = rng.dirichlet([1, 1, 1], count)

@@ -280,3 +280,23 @@ def test_a_missing_mesh_names_its_source(tmp_path):
     says = r"trachea.file: there is no file 'meshes/trachea.glb' .* doi:10.48539/HBM969.WCCJ.636"
     with pytest.raises(SpecError, match=says):
         read_scene(load_scene_spec(tmp_path / "scene.toml"), tmp_path)
+
+
+@pytest.mark.parametrize("at", [8.0, 20.0])
+def test_a_wall_with_one_ring_is_checked_about_it(at):
+    """Between the first and the last ring there was no triangle: a tube of one was refused."""
+    geometry = Geometry.create(40.0, [at], radius=11.3)
+    mesh = make_tube(geometry)
+    walls = walls_.patches_of_wall(geometry, mesh)
+    seen = wall_check.check(mesh, geometry, walls)
+    assert len(seen.error) == wall_check.COUNT
+    assert seen.s.min() > at - 11.3
+    assert seen.s.max() < at + 11.3
+    assert np.ptp(seen.s) > 15
+    beyond = wall_check.look_beyond(mesh, geometry, walls)
+    assert not beyond.doubtful.any()
+    # A wall that is not there is refused as with many rings.
+    vertices = jnp.asarray(np.asarray(mesh.vertices) * [1, 0.8, 0.8])
+    shrunk = dataclasses.replace(mesh, vertices=vertices)
+    with pytest.raises(MeshError, match="a tool would not touch it where it is"):
+        wall_check.check(shrunk, geometry, walls)
