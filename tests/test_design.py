@@ -141,6 +141,7 @@ def test_ten_thousand_candidates(known):
         known, lane=known.lane[:1], theta=known.theta[:1], base=known.base[:1],
         relative=known.relative[:1], sigma=known.sigma[:1], kept=known.kept[:1],
         own=known.own[:1], prior=known.prior[:1], meat=known.meat[:1], factor=known.factor[:1],
+        weight=known.weight[:1],
     )  # fmt: skip
     candidates = grid((10.0, 150.0), (2.0, 6.0), 10_000)
     assert len(candidates.s) == 10_000
