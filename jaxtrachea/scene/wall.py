@@ -94,4 +94,4 @@ def contact_settings(tool: Shape, geometry: Geometry) -> Settings:
 
 def _longest(tool: Shape) -> float:
     """Length of a tool along one of its axes, mm."""
-    return np.ptp(np.asarray(tool.vertices), axis=1).max() + 2 * float(tool.radius)
+    return float(np.ptp(np.asarray(tool.vertices), axis=1).max()) + 2 * float(tool.radius)
