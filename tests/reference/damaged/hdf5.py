@@ -11,7 +11,7 @@ from damaged.case import OTHER, Case, flipped
 from jaxtrachea.measurements.read import Curve, Measurements, write_hdf5
 
 TRIAL = "specimens/T01/1"
-BESIDE = '[data]\nfiles = ["data.h5", "good.csv"]\n'
+BESIDE = '[data]\nfiles = ["data.h5", "good.csv"]\n[noise]\nforce = "0.01 N"\n'
 
 
 @functools.lru_cache(maxsize=2)
