@@ -86,9 +86,10 @@ def _as_written(reading) -> dict[str, object]:
 #: What a tube is compared by, and in words.
 _OF_TUBE = {
     "length": lambda g: f"{float(g.length):g} mm with {g.rings} rings",
-    "ring_positions": lambda g: f"{float(g.length):g} mm with {g.rings} rings",
+    "ring_positions": lambda g: f"rings at {', '.join(f'{x:g}' for x in g.ring_positions)} mm",
     "radius": lambda g: f"radius {float(g.radius):g} mm",
     "half_angle": lambda g: f"half_angle {math.degrees(float(g.half_angle)):g} deg",
+    "ring_height": lambda g: f"ring_height {float(g.ring_height):g} mm",
 }
 
 

@@ -7,7 +7,7 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, defaults_of, held, in_model, visible
-from jaxtrachea.fitting.refusals import Size, refusal, sigma_is_needed
+from jaxtrachea.fitting.refusals import Size, refusal
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study
 from jaxtrachea.fitting.unread import along_the_normal
@@ -149,9 +149,9 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
     table = parameters_of(spec, options, joints=marked)
     good, bad = [], list(measurements.bad)
     reasons = []
-    size, own_sigma = Size.of(geometry), sigma_is_needed(measurements.curves, _noise(spec).force)
+    size = Size.of(geometry)
     for curve in measurements.curves:
-        refused = refusal(curve, size, options, table, own_sigma=own_sigma)
+        refused = refusal(curve, size, options, table)
         if refused is None:
             good.append(curve)
             continue

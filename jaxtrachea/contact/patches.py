@@ -173,7 +173,7 @@ def touch(
     count = patches.centres.shape[0]
     if not 1 <= near <= count:
         raise ValueError(f"near: expected 1 to {count} (the number of patches), found {near}")
-    return _touch(tool, pose, patches, settings, near, beta, search)
+    return _touch(tool, pose, patches, settings, int(near), beta, bool(search))
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "near", "search"), inline=True)

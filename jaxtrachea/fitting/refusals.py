@@ -38,7 +38,7 @@ class Refusal(NamedTuple):
     """Why a curve cannot be pressed.
 
     Attributes:
-        kind: `position`, `sign` or `sigma`.
+        kind: `position` or `sign`.
         error: reason and cure; specimen and trial are its place.
     """
 
@@ -46,47 +46,38 @@ class Refusal(NamedTuple):
     error: InputError
 
 
-def sigma_is_needed(curves: Sequence[Curve], force: float | None) -> bool:
-    """Whether every curve needs a sigma of its own: some have one, and no noise is given for all.
+def check_noise(curves: Sequence[Curve], force: float | None) -> None:
+    """Refuse curves of which some have a sigma and others none, where no noise is given for those.
 
     Args:
         curves: all that are fitted.
         force: `Noise.force`, N.
+
+    Raises:
+        InputError: known and unknown noise do not add up; a curve without is named.
     """
-    return force is None and any(c.sigma is not None for c in curves)
+    without = [c for c in curves if c.sigma is None]
+    if force is None and 0 < len(without) < len(curves):
+        first = without[0]
+        raise InputError(
+            f"no sigma, as {len(without)} of {len(curves)} curves, where the others have one: "
+            "known and unknown noise do not add up",
+            place=f"specimen {first.specimen!r} trial {first.trial!r}",
+            cure="give noise.force, for curves without a column sigma, or leave sigma out of all "
+            "files",
+        )
 
 
 def refusal(
-    curve: Curve,
-    size: Size,
-    options: Options,
-    parameters: Sequence[Parameter],
-    *,
-    own_sigma: bool = False,
+    curve: Curve, size: Size, options: Options, parameters: Sequence[Parameter]
 ) -> Refusal | None:
-    """Why the model cannot press or weigh a curve; None: it can.
-
-    Args:
-        curve: the curve.
-        size: of the tube.
-        options: of the model.
-        parameters: the table.
-        own_sigma: see `sigma_is_needed`.
-    """
+    """Why the model cannot press a curve (`check_curve`, `check_touch`); None: it can."""
     kind = "position"
     try:
         onset = next(p.value for p in parameters if p.name == "onset")
         check_curve(curve, size, options, onset)
         kind = "sign"
         check_touch(curve, options, parameters)
-        kind = "sigma"
-        if own_sigma and curve.sigma is None:
-            raise InputError(
-                "no sigma, where other curves have one: known and unknown noise do not add up",
-                place=f"specimen {curve.specimen!r} trial {curve.trial!r}",
-                cure="give noise.force, for curves without a column sigma, or leave sigma out of "
-                "all files",
-            )
     except InputError as error:
         return Refusal(kind, error)
     return None

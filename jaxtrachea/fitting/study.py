@@ -46,7 +46,7 @@ from jaxtrachea.fitting.parameters import (
     held,
     in_model,
 )
-from jaxtrachea.fitting.refusals import Size, refusal, sigma_is_needed
+from jaxtrachea.fitting.refusals import Size, check_noise, refusal
 from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
@@ -92,7 +92,7 @@ class Study:
     marker_noise: tuple[float, float] | None = None
     joint: bool = False
     together: tuple[tuple[str, ...], ...] = ()
-    balance: Balance = "sample"
+    balance: Balance = "curve"
     change_points: Float[np.ndarray, "lanes T"] | None = None
 
     def __post_init__(self):
@@ -304,10 +304,10 @@ def build_study(
     if not curves:
         raise ValueError("no usable curve; nothing to fit")
     table, size = _table(parameters, options, curves, geometry), Size.of(geometry)
-    own_sigma = sigma_is_needed(curves, noise.force)
     for curve in curves:
-        if (refused := refusal(curve, size, options, table, own_sigma=own_sigma)) is not None:
+        if (refused := refusal(curve, size, options, table)) is not None:
             raise refused.error
+    check_noise(curves, noise.force)
     if not options.deforms_sections:
         curves, unread = along_the_normal(curves)
         if unread is not None:

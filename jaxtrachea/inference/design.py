@@ -513,12 +513,14 @@ def candidates_of(
             f"design.s: {s[0]:g} to {s[1]:g} mm, tube spans 0 to {length:g} mm"
             f"{tool if low > 0 else ''}; give places on it"
         )
-    depth = (0.5 * deepest, deepest) if section.depth is None else section.depth
     sections = study.model.options.deforms_sections
     radius = float(study.model.geometry.radius)
+    if sections:
+        deepest = min(deepest, radius)
+    depth = (0.5 * deepest, deepest) if section.depth is None else section.depth
     # Without a skeleton the specimen need not be a tube.
-    limited = section.depth is not None and study.model.options.coupling == "series"
-    if (sections or limited) and depth[1] > radius:
+    limited = sections or study.model.options.coupling == "series"
+    if section.depth is not None and limited and depth[1] > radius:
         raise SpecError(
             f"design.depth: {depth[1]:g} mm, a tube is pressed no deeper than its radius, expected "
             f"at most {radius:g} mm; give less (trachea.radius is that of the tube)"

@@ -86,6 +86,7 @@ def skeleton_response(
             an unknown level of `rings`.
     """
     check_word("rings", rings, Rings)
+    axial, shear = bool(axial), bool(shear)
     phi_c = shaped("phi_c", phi_c, (), dtype=float_type(geometry))
     s_c = check_place(geometry, material, s_c)
     return _response(geometry, material, s_c, phi_c, rings=rings, axial=axial, shear=shear)

@@ -48,6 +48,7 @@ def write(
             "loss": study.model.loss,
             "loss_scale": study.model.loss_scale,
             "noise_given": study.noise_given,
+            "balance": study.balance,
             "marker_noise": study.marker_noise,
             "joint": study.joint,
             "reading": dict(reading),

@@ -266,6 +266,7 @@ def _read(path: Path, file: Any) -> StoredFit:
         noise_given=(bool(model["noise_given"][0]), bool(model["noise_given"][1])),
         marker_noise=_marker_noise(model.get("marker_noise")),
         joint=bool(model["joint"]),
+        balance="sample" if model.get("balance") == "sample" else "curve",  # before: not stored
     )
     theta = numeric(file["unknowns"], "theta")
     curves, lane, files = _read_data(file["data"])

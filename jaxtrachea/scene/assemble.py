@@ -164,9 +164,9 @@ def with_tool(scene: Scene, tool: Shape) -> Scene:
             f"tool lies along up to {near} patches of the wall, and the program searches "
             f"{scene.near}: {CURE}"
         )
-    steps = scene.quality.warm_steps
-    if contact_settings(tool, geometry).warm_steps > steps:
-        raise ValueError(f"tool is so long that a contact takes more than {steps} steps: {CURE}")
+    steps, needed = (contact_settings(t, geometry).warm_steps for t in (before, tool))
+    if needed > max(steps, scene.quality.warm_steps):
+        raise ValueError(f"tool is so long that a contact takes {needed} steps: {CURE}")
     spacing = jnp.asarray(_footprint(tool, float(scene.radius)), scene.footprint.dtype)
     if scene.plan.dent and scene.runs is not None and scene.mesh is not None:
         reached = local.runs(scene.mesh.s, spacing).longest

@@ -1,5 +1,7 @@
 """Tools much larger than a patch of the wall: gaps by formula, whatever their length."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -90,3 +92,11 @@ def test_a_longer_tool_is_another_program():
     scene, _ = scene_of(capsule(40.0, 4.0), 4.0)
     with pytest.raises(ValueError, match="tool"):
         with_tool(scene, capsule(60.0, 4.0))
+
+
+def test_a_tool_of_a_plan_of_few_steps_may_change():
+    """A tolerance leaves steps out; only a longer tool needs more than the one before."""
+    scene, _ = scene_of(sphere(5.0), 5.0)
+    few = dataclasses.replace(scene.quality, warm_steps=4)
+    scene = dataclasses.replace(scene, quality=few)
+    assert float(with_tool(scene, sphere(4.0)).tool.radius) == 4.0
