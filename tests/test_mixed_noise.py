@@ -121,10 +121,11 @@ def test_a_file_without_sigma_beside_one_with_is_named(tmp_path, monkeypatch, ca
     (tmp_path / "a.csv").write_text(with_sigma + "".join(f"A,t,75,{x},0.002\n" for x in lines))
     without = with_sigma.replace(",sigma [N]", "")
     (tmp_path / "b.csv").write_text(without + "".join(f"B,t,75,{x}\n" for x in lines))
-    (tmp_path / "fit.toml").write_text('[data]\nfiles = "*.csv"\n[model]\ncoupling = "total"\n')
+    spec = '[data]\nfiles = "*.csv"\n[model]\ncoupling = "total"\n'
+    (tmp_path / "fit.toml").write_text(spec)
     monkeypatch.chdir(tmp_path)
     code, _, err = run(monkeypatch, capsys, "check", "fit.toml")
     assert code == 2
     assert "specimen 'B' trial 't': no sigma, as 1 of 2 curves" in " ".join(err.split())
-    (tmp_path / "fit.toml").open("a").write('[noise]\nforce = "0.01 N"\n')
+    (tmp_path / "fit.toml").write_text(spec + '[noise]\nforce = "0.01 N"\n')
     assert run(monkeypatch, capsys, "check", "fit.toml")[0] == 0
