@@ -381,7 +381,7 @@ def test_noise_of_a_joint_fit_is_of_all_forces(monkeypatch):
     monkeypatch.setattr(joint_information, "map_lanes", lambda *_, **__: row)
     one, two, P = np.ones(2), np.ones((2, 2)), study.size
     none = np.zeros((2, P, P))
-    info = Information(none, none, np.zeros((2, P)), *[two] * 5, one, one)
+    info = Information(none, none, np.zeros((2, P)), *[two] * 5, one)
     found = joint_information.pooled(study, info, np.zeros((2, P)), one > 0)
     np.testing.assert_array_equal(found.spread, [[2.0, 5.0]] * 2)
 

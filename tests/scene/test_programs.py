@@ -232,7 +232,8 @@ def test_an_unused_effect_adds_no_operation(name):
 QUESTIONS = {
     "does it press? sine, cosine, two signs, product and sum with D, two comparisons": 10,
     "is it on the tube? two comparisons, two logical": 4,
-    "is it normal, on the midline? four sizes, a limit (three), two comparisons, two logical": 11,
+    "which way does it go? sine, cosine, across (four), along, length of the way (six)": 13,
+    "is it normal, on the midline? two limits of two, four comparisons, two logical": 10,
     "is it elsewhere than the first? two differences with size and limit, one logical": 7,
     "does it press off the plan?": 1,
     "is it behind the ends of the rings? size, limit, two for NaN, four logical": 8,
