@@ -32,8 +32,8 @@ class Noise:
     Attributes:
         force: N; a curve's own per-sample sigma comes before it.
         joints: mm.
-        joints_share: of the tool's displacement, which `joints` has beside it (root of the sum of
-            the squares): what a model errs in markers grows with the press.
+        joints_share: of the tool's displacement from first touch, which `joints` has beside it
+            (root of the sum of the squares): what a model errs in markers grows with the press.
     """
 
     force: float | None = None
@@ -61,7 +61,7 @@ class Noise:
             )  # fmt: skip
 
     def joints_precision(self, displacement: np.ndarray) -> np.ndarray:
-        """1 / sigma of markers at each displacement of the tool, 1/mm; 1 if it is estimated."""
+        """1 / sigma of markers at each depth of the tool, 1/mm; 1 if it is estimated."""
         if self.joints is None:
             return np.ones_like(displacement)
         return 1 / np.hypot(self.joints, self.joints_share * displacement)
@@ -178,6 +178,19 @@ def curve_weights(
     for row, curves, mean in zip(weights, groups, means, strict=True):
         row[: len(curves)] = np.sqrt(mean / [len(c.force) for c in curves])
     return weights
+
+
+def weighed_by_depth(lanes: Lane, noise: Noise, depth: Float[np.ndarray, "lanes T N"]) -> Lane:
+    """The lanes with markers weighed by depths from first touch, mm, not by the records' zeros."""
+    if noise.joints_share == 0:
+        return lanes
+    recorded = noise.joints_precision(np.asarray(lanes.displacement))
+    ratio = noise.joints_precision(depth) / recorded
+    changed = {}
+    for _, name in MARKERS:
+        if (weight := getattr(lanes, name)) is not None:
+            changed[name] = weight * ratio.reshape(*ratio.shape, *[1] * (weight.ndim - ratio.ndim))
+    return lanes._replace(**changed)
 
 
 def lanes_of(

@@ -28,6 +28,7 @@ from jaxtrachea.fitting.lanes import (
     group,
     lanes_of,
     unknowns_of,
+    weighed_by_depth,
 )
 from jaxtrachea.fitting.model import Common, FitModel, columns_of, numbers_of
 from jaxtrachea.fitting.onset import (
@@ -47,6 +48,7 @@ from jaxtrachea.fitting.parameters import (
     in_model,
 )
 from jaxtrachea.fitting.refusals import Size, check_noise, refusal
+from jaxtrachea.fitting.tested import depths
 from jaxtrachea.fitting.unread import along_the_normal
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
@@ -137,8 +139,7 @@ class Study:
 
         The first guess where they do not; `FitResult.first_touch` has the estimates.
         """
-        known, seen = first_touches(self.lanes, self.parameters), self.change_points
-        return known if seen is None else np.where(np.isnan(seen), known, seen)
+        return _first_touch(self.lanes, self.parameters, self.change_points)
 
     @functools.cached_property
     def unknown_columns(self) -> Int[np.ndarray, "lanes P"]:
@@ -327,9 +328,12 @@ def build_study(
         lanes = lanes._replace(balance=weights)
     change_points = None
     if onset_is_sought(parameters, options):
-        touch = touches(lanes, parameters)
-        lanes = lanes._replace(blend=blends(touch, groups, noise.force, options))
-        lanes, change_points = within_reach(lanes, parameters), touch.onset
+        corners = touches(lanes, parameters)
+        lanes = lanes._replace(blend=blends(corners, groups, noise.force, options))
+        lanes, change_points = within_reach(lanes, parameters), corners.onset
+    touch = _first_touch(lanes, parameters, change_points)
+    depth = depths(np.asarray(lanes.displacement), touch[..., None], options)
+    lanes = weighed_by_depth(lanes, noise, depth)
     known = noise.force is not None or all(c.sigma is not None for c in curves)
     model = FitModel(
         tube=numbers_of(geometry), options=options, columns=columns_of(parameters),
@@ -348,6 +352,12 @@ def build_study(
         balance=weighting.balance,
         change_points=change_points,
     )
+
+
+def _first_touch(lanes: Lane, parameters: Sequence[Parameter], seen: np.ndarray | None):
+    """As `Study.first_touch`; `seen`: its `change_points`."""
+    known = first_touches(lanes, parameters)
+    return known if seen is None else np.where(np.isnan(seen), known, seen)
 
 
 def _warn_of(bad: Sequence[BadCurve]) -> None:

@@ -16,8 +16,8 @@ def tested_depth(options: Options, radius: float) -> float:
 
 
 def depths(
-    displacement: Float[np.ndarray, " N"], touch: float, options: Options
-) -> Float[np.ndarray, " N"]:
+    displacement: Float[np.ndarray, "*n"], touch: float | np.ndarray, options: Options
+) -> Float[np.ndarray, "*n"]:
     """How deep the tool presses, mm from first touch; before it a tool that only touches does not.
 
     Args:

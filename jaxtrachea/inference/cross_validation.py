@@ -133,7 +133,8 @@ def leave_one_out(whole: FitResult, settings: Settings, progress=None) -> LeftOu
         peak = np.asarray(rms(force)) / np.max(np.abs(data), axis=1)
     joints = np.full(len(lane), np.nan)
     if seen.joints is not None:
-        D = np.abs(lanes.displacement[rows, trial])
+        D = lanes.displacement[rows, trial] - whole.first_touch[lane, trial][:, None]
+        D = np.where(observed, np.abs(D), 0)
         moved = D > 0.5 * np.max(D, axis=1, keepdims=True)
         share = seen.joints[rows, trial] / np.where(moved, D, np.nan)[:, :, None]
         joints = np.asarray(rms(share.reshape(len(lane), -1)))

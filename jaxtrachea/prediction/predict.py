@@ -252,7 +252,8 @@ def _marker_sigma(stored: StoredFit, source: Source, displacement) -> np.ndarray
     given = stored.study.marker_noise
     if given is None or np.isnan(source.sigma[1]):
         return np.full(len(displacement), source.sigma[1])
-    return 1 / Noise(joints=given[0], joints_share=given[1]).joints_precision(displacement)
+    depth = depths(displacement, onset_of(stored, source), stored.study.model.options)
+    return 1 / Noise(joints=given[0], joints_share=given[1]).joints_precision(depth)
 
 
 def _nothing(value: Response) -> np.ndarray:
