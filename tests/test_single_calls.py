@@ -77,7 +77,13 @@ def compilations():
     under_way.clear()
 
 
-@pytest.mark.parametrize("name", CALLS)
+#: Those that take longest to compile, of kinds that others are of too.
+LONG = ("press_path", "skeleton_response", "simulate")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in CALLS]
+)
 def test_a_call_without_jit_is_one_program(name):
     """A first call of `press_oblique` compiled 361 programs, every other one 3."""
     call = CALLS[name]()

@@ -37,7 +37,7 @@ def scene_of(tool, radius, gaps=GAPS, x=75.0):
     ("tool", "radius"),
     [
         (capsule(10.0, 4.0), 4.0),
-        (capsule(150.0, 4.0), 4.0),
+        pytest.param(capsule(150.0, 4.0), 4.0, marks=pytest.mark.slow),
         (capsule(490.0, 4.0), 4.0),
         (sphere(200.0), 200.0),
     ],
@@ -62,6 +62,7 @@ def _arguments(tool, radius):
     return scene, MATERIAL, path
 
 
+@pytest.mark.slow
 def test_shafts_in_all_directions_are_solved():
     """Against the distance of the axis' points to that of the tube, where the middle touches."""
     rng = np.random.default_rng(3)
