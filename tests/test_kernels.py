@@ -163,8 +163,7 @@ def test_a_step_of_a_session_is_one_kernel_but_for_the_surface():
     assert run.returncode == 0, run.stderr
     text = json.loads(run.stdout)
     if version("jaxlib") in TESTED:
-        # 31 until contacts of large tools and the slip from first touch were mended.
-        assert count_kernels(text, inside=False)[0] <= MARGIN * 36
+        assert count_kernels(text, inside=False)[0] <= MARGIN * 31
 
 
 def largest_array(text: str) -> int:

@@ -167,7 +167,12 @@ def _ends(scene: Scene, material: Material, s_c, moved) -> regions.Ends:
     x, length = scene.geometry.ring_positions, scene.geometry.length
     EA = jnp.broadcast_to(material.EA_L, (x.shape[0] + 1,))
     k_A, k_B = material.k_A, material.k_B
-    unit = stretch(x, length, EA, s_c, jnp.ones_like(s_c), k_A=k_A, k_B=k_B)
+
+    @one_kernel
+    def stretched(s_c):
+        return stretch(x, length, EA, s_c, jnp.ones_like(s_c), k_A=k_A, k_B=k_B)
+
+    unit = stretched(s_c)
 
     def along(k, u):
         if k is None:
