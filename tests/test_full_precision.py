@@ -92,7 +92,7 @@ def stepped(s):
     here = path.rotation[0], path.translation[0]
     state = session._start(scene(), *here)
     _, found, press = session._step(scene(), MATERIAL, state, *here)
-    return found.force, surface(scene(), MATERIAL, *press), found.joints
+    return found.force, surface(scene(), *press), found.joints
 
 
 def swept(s):

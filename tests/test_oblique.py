@@ -95,7 +95,8 @@ def frame_fem(s_c, phi, force, v):
     u[free] = np.linalg.solve(K[np.ix_(free, free)], f[free])
     joints = np.stack([u[i : i + 3] for i in at])
     slopes = np.stack([u[i + 3 : i + 5] for i in at])
-    return u[at_C : at_C + 3], u[at_C + 3 : at_C + 5], joints, slopes, joints[:, 1:] @ spring.T
+    ends = np.stack([u[:3], u[-5:-2]])
+    return u[at_C : at_C + 3], u[at_C + 3 : at_C + 5], joints, slopes, joints[:, 1:] @ spring.T, ends
 
 
 @pytest.mark.slow
@@ -104,17 +105,18 @@ def frame_fem(s_c, phi, force, v):
 def test_against_frame(s, phi, more):
     """All parts of the skeleton at the solved force, and the local law in series with it."""
     got = pressed(s, phi, **more)
-    for F, d, C_moved, slope_C, joints, slopes, loads, D in zip(
-        got.force, got.depth, got.skeleton, got.slope_C, got.joints, got.slopes, got.loads, MOVES,
-        strict=True,
+    for F, d, C_moved, slope_C, joints, slopes, loads, clamps, D in zip(
+        got.force, got.depth, got.skeleton, got.slope_C, got.joints, got.slopes, got.loads,
+        got.clamps, MOVES, strict=True,
     ):  # fmt: skip
-        w_C, theta_C, w, theta, P = frame_fem(s, phi, F, VALUES | more)
+        w_C, theta_C, w, theta, P, ends = frame_fem(s, phi, F, VALUES | more)
         scale = 1e-11 * (1e-3 + np.max(np.abs(w_C)))
         np.testing.assert_allclose(C_moved, w_C, atol=scale)
         np.testing.assert_allclose(slope_C, theta_C, atol=scale)
         np.testing.assert_allclose(joints, w, atol=scale)
         np.testing.assert_allclose(slopes, theta, atol=scale)
         np.testing.assert_allclose(loads[:, 1:], P, atol=scale)
+        np.testing.assert_allclose(clamps, ends, atol=scale)
         np.testing.assert_allclose(d + C_moved, D, atol=1e-12)
         np.testing.assert_allclose(F, (0.3 + 0.02 * np.sum(d * d)) * d, atol=1e-13)
 

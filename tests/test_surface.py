@@ -46,7 +46,7 @@ def random_keys(seed=0, s_c=73.0, dtype="float64", size=1.0, rings=15):
     return regions.clamped(
         jnp.asarray(s_c, dtype), draw(3), draw(rings, 3), draw(rings, 3, by=2),
         draw(rings, 3, by=-3), draw(rings, 2, by=0.1), draw(2, by=0.1),
-        ends=regions.Ends(draw(1, 3)[0], draw(1, 3, by=-1)[0]),
+        clamps=jnp.stack([draw(1, 3)[0], draw(1, 3, by=-1)[0]]),
     )  # fmt: skip
 
 
@@ -102,7 +102,7 @@ def test_translation_is_exact(method, dtype):
     still = jnp.zeros((15, 2), dtype)
     keys = regions.clamped(
         jnp.asarray(73, dtype), shift, *[rows * shift[None]] * 3, still, still[0],
-        ends=regions.Ends(shift, shift),
+        clamps=jnp.stack([shift, shift]),
     )  # fmt: skip
     geometry = table_1(dtype)
     at = bind(make_tube(geometry), geometry)

@@ -49,6 +49,7 @@ class ObliquePress(NamedTuple):
     loads: Float[Array, "*n rings 3"]
     end_U: Float[Array, "*n rings 3"]
     end_V: Float[Array, "*n rings 3"]
+    clamps: Float[Array, "*n 2 3"]
     status: Int[Array, "*n"]
 
 
@@ -338,5 +339,6 @@ def _assemble(unit: Skeleton, force, depth, status) -> ObliquePress:
         loads=per_ring(unit.loads),
         end_U=per_ring(unit.end_U),
         end_V=per_ring(unit.end_V),
+        clamps=per_ring(unit.clamps),
         status=status,
     )

@@ -38,6 +38,7 @@ class Skeleton(NamedTuple):
             passes the joint on its way to the clamp; the rings take none of it.
         end_U: displacement of each ring's end at phi = -alpha, mm/N.
         end_V: that at phi = +alpha.
+        clamps: displacement of the ends A and B of the tube on their axial springs, mm/N.
         status: a `RingStatus` as int8.
     """
 
@@ -48,6 +49,7 @@ class Skeleton(NamedTuple):
     loads: Float[Array, "rings 3 3"]
     end_U: Float[Array, "rings 3 3"]
     end_V: Float[Array, "rings 3 3"]
+    clamps: Float[Array, "2 3 3"]
     status: Int[Array, ""]
 
 
@@ -149,8 +151,9 @@ def respond(
         ends = {"k_A": material.k_A, "k_B": material.k_B}
         along = _axial.stretch(x, geometry.length, EA, s_c, jnp.ones_like(s_c), **ends)
     u_C, u, passed = jnp.zeros_like(s_c), jnp.zeros_like(x), jnp.zeros_like(x)
+    u_clamps = jnp.zeros_like(x, shape=2)
     if along is not None:
-        u_C, u = along.u_C, along.u
+        u_C, u, u_clamps = along.u_C, along.u, jnp.stack([along.u_A, along.u_B])
         passed = jnp.where(x <= s_c, along.force_A, along.force_B)
     U, V = (w, w) if per_load is None else (jax.vmap(mul)(end, P) for end in per_load)
     return Skeleton(
@@ -161,6 +164,7 @@ def respond(
         loads=_join(passed, P),
         end_U=_join(u, U),
         end_V=_join(u, V),
+        clamps=_join(u_clamps, jnp.zeros_like(u_clamps, shape=(2, 2, 2))),
         status=status,
     )
 

@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrachea._in_order import in_turn, one_kernel
-from jaxtrachea._numerics import WRITTEN_OUT, full_precision, product, scaled
+from jaxtrachea._numerics import WRITTEN_OUT, full_precision, product
 from jaxtrachea.contact.distance import signed_distance
 from jaxtrachea.contact.pose import Pose, inverse, transform
 from jaxtrachea.contact.search import FOR_POINTS
 from jaxtrachea.contact.shapes import Shape, sphere
-from jaxtrachea.mechanics.axial import stretch
 from jaxtrachea.mechanics.sections.wall import Points, around, wall_motion
 from jaxtrachea.scene import trail
 from jaxtrachea.scene.approach import Approach, backed_out
@@ -20,19 +19,15 @@ from jaxtrachea.scene.curve import distance_from, lay
 from jaxtrachea.scene.stage import Poses, Presses, Scene
 from jaxtrachea.status import PressStatus
 from jaxtrachea.surface import local, regions
-from jaxtrachea.trachea.material import Material
 from jaxtrachea.trachea.mesh import place
 
 
 @full_precision
-def deform(
-    scene: Scene, material: Material, presses: Presses, moved: Any, path: Any, made: Approach | None
-):
+def deform(scene: Scene, presses: Presses, moved: Any, path: Any, made: Approach | None):
     """Deformed vertices, row by row; shape (rows, vertices, 3), in the frame of the mesh.
 
     Args:
         scene: with a surface in its plan.
-        material: -
         presses: -
         moved: what the skeleton does, row by row; fields as in `simulation.Simulation`.
         path: of the tool; read only if `made` is there.
@@ -51,11 +46,10 @@ def deform(
 
     def one(moved, where, pose, share):
         s_c, phi_c, radius, tool = where
-        ends = _ends(scene, material, s_c, moved) if plan.end_motion else regions.Ends()
         keys = regions.clamped(
             _held_at(scene, s_c), moved.skeleton, moved.joints, moved.end_U, moved.end_V,
             moved.slopes, moved.slope_C if moved.slope_edges is None else moved.slope_edges,
-            ends=ends,
+            clamps=moved.clamps,
         )  # fmt: skip
         share = regions.weigh(binding, phi_c) if share is None else share
         u = regions.interpolate(binding, share, keys, method=method)
@@ -154,32 +148,6 @@ def _distances(scene: Scene, made: Approach):
         return jax.vmap(lambda s, point: distance_from(line, s, point))(seen.s, seen.point)
     found = distance_from(line, made.landing.s, made.landing.point)
     return jnp.broadcast_to(found, seen.s.shape)
-
-
-def _ends(scene: Scene, material: Material, s_c, moved) -> regions.Ends:
-    """Motion of both clamps on their axial springs; None: held.
-
-    As the ligament stretches under the axial force, not that force over a spring: a free end has
-    neither, and moves as all on its side of C.
-    """
-    if material.EA_L is None:
-        raise ValueError("Material.EA_L is None; the plan has an end motion")
-    x, length = scene.geometry.ring_positions, scene.geometry.length
-    EA = jnp.broadcast_to(material.EA_L, (x.shape[0] + 1,))
-    k_A, k_B = material.k_A, material.k_B
-
-    @one_kernel
-    def stretched(s_c):
-        return stretch(x, length, EA, s_c, jnp.ones_like(s_c), k_A=k_A, k_B=k_B)
-
-    unit = stretched(s_c)
-
-    def along(k, u):
-        if k is None:
-            return None
-        return jnp.zeros_like(moved.force).at[0].set(scaled(moved.force[0], u))
-
-    return regions.Ends(along(k_A, unit.u_A), along(k_B, unit.u_B))
 
 
 def _dent(scene: Scene, s_c, phi_c, radius, tool: Poses | None, depth) -> local.Dent:

@@ -65,7 +65,7 @@ class OneRow:
 
         def run(state, _, *given):
             state, contact, large, press = one_kernel(line)(state, *given)
-            vertices = surface(*setting(*given), *press) if shown else None
+            vertices = surface(setting(*given)[0], *press) if shown else None
             return state, contact, large if vertices is None else (*large, vertices[0])
 
         self._large = tuple(jnp.array(np.zeros(v.shape, v.dtype)) for v in large.values())

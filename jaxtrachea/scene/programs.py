@@ -18,6 +18,7 @@ from jaxtrachea.mechanics.press import (
 from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.mechanics.skeleton import local_frame
+from jaxtrachea.scene.plan import Plan
 from jaxtrachea.scene.stage import Presses, Scene
 from jaxtrachea.trachea.material import Material
 
@@ -27,8 +28,9 @@ class Moved(NamedTuple):
 
     Slopes are those of the ligament at the contact and at the rings; these and the loads are None
     where there is no ligament. Of a tool with a width, `slope_C` is the mean of those at its edges,
-    each weighed by its force, and `slope_edges` are they; else None. `along`: modes of the sections
-    that a surface asks for, and of that at the contact.
+    each weighed by its force, and `slope_edges` are they; else None. `clamps`: how the ends A and B
+    move, None where they do not. `along`: modes of the sections that a surface asks for, and of
+    that at the contact.
     """
 
     force: Any
@@ -44,12 +46,14 @@ class Moved(NamedTuple):
     slip: Any = None
     dissipated: Any = None
     slope_edges: Any = None
+    clamps: Any = None
     along: Any = None
 
 
-def moved_by(press: ObliquePress) -> Moved:
+def moved_by(press: ObliquePress, plan: Plan) -> Moved:
     """The same of a press as vectors."""
-    return Moved(**press._asdict())
+    moved = Moved(**press._asdict())
+    return moved if plan.end_motion else moved._replace(clamps=None)
 
 
 def one_plane(scene: Scene, material: Material, presses: Presses) -> Moved:
@@ -108,15 +112,15 @@ def vectors(scene: Scene, material: Material, presses: Presses) -> Moved:
             *fixed, presses.s[0], presses.phi[0], presses.displacement, Coulomb(scene.friction),
             plan.oblique,
         )  # fmt: skip
-        return moved_by(path.press)._replace(slip=path.slip, dissipated=path.dissipated)
+        return moved_by(path.press, plan)._replace(slip=path.slip, dissipated=path.dissipated)
     if plan.contact_point == "fixed":
         at = presses.s[0], presses.phi[0], presses.displacement
-        return moved_by(press_oblique(*fixed, *at, plan.oblique))
+        return moved_by(press_oblique(*fixed, *at, plan.oblique), plan)
 
     def one(s, phi, D):
         return press_oblique(*fixed, s, phi, D, plan.oblique)
 
-    return moved_by(jax.vmap(one)(presses.s, presses.phi, presses.displacement))
+    return moved_by(jax.vmap(one)(presses.s, presses.phi, presses.displacement), plan)
 
 
 def cross_sections(scene: Scene, material: SectionMaterial, presses: Presses) -> Moved:

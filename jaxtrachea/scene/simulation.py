@@ -120,7 +120,7 @@ def _simulate(scene: Scene, material: AnyMaterial, path: Poses | Presses) -> Sim
     """`simulate`, of arguments that are checked."""
     made = approach(scene, path) if isinstance(path, Poses) else None
     result, press = pressed(scene, material, path, made)
-    return result._replace(vertices=surface(scene, material, path, press))
+    return result._replace(vertices=surface(scene, path, press))
 
 
 class Pressed(NamedTuple):
@@ -163,7 +163,7 @@ def pressed(
     if isinstance(material, SectionMaterial):
         moved = cross_sections(scene, material, used)
     elif place is not None:
-        moved = moved_by(press_at(place, used.displacement, plan.options))
+        moved = moved_by(press_at(place, used.displacement, plan.options), plan)
     else:
         solve = vectors if plan.second_plane else one_plane
         moved = one_kernel(lambda used: solve(scene, material, used))(used)
@@ -204,16 +204,11 @@ def pressed(
 
 @full_precision
 def surface(
-    scene: Scene, material: AnyMaterial, path: Poses | Presses, press: Pressed
+    scene: Scene, path: Poses | Presses, press: Pressed
 ) -> Float[Array, "rows vertices 3"] | None:
     """Deformed vertices, NaN in the rows that were refused; None: the plan has no surface."""
     if scene.plan.surface is None:
         return None
     presses, moved, made, hidden = press
-    if scene.plan.end_motion:  # reads the only values of the material that a surface follows from
-        material, _ = without_negative_values(scene, material)
-    if isinstance(material, SectionMaterial):
-        vertices = deform_sections(scene, presses, moved, path, made)
-    else:
-        vertices = deform(scene, material, presses, moved, path, made)
-    return hide(hidden, vertices)
+    lay = deform_sections if scene.plan.surface == "sections" else deform
+    return hide(hidden, lay(scene, presses, moved, path, made))

@@ -19,7 +19,7 @@ mesh, `weigh` once for an angle of contact.
 
 import functools
 import math
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -105,13 +105,6 @@ class Keys(eqx.Module):
     contact_slope: Float[Array, "*edges 2"] | None = None
 
 
-class Ends(NamedTuple):
-    """Displacement of the ends A and B of the tube as a whole, mm; None: held."""
-
-    A: Float[Array, "3"] | None = None
-    B: Float[Array, "3"] | None = None
-
-
 def clamped(
     s_c: Float[Array, "*edges"],
     contact: Float[Array, "3"],
@@ -121,7 +114,7 @@ def clamped(
     slopes: Float[Array, "rings 2"] | None = None,
     contact_slope: Float[Array, "*edges 2"] | None = None,
     *,
-    ends: Ends = Ends(),
+    clamps: Float[Array, "2 3"] | None = None,
 ) -> Keys:
     """Keys of a tube whose ends do not turn.
 
@@ -133,10 +126,10 @@ def clamped(
         V: of the ring ends at +alpha.
         slopes: d/ds of (y, z) at the joints.
         contact_slope: the same at C, or at each edge.
-        ends: how A and B move.
+        clamps: displacement of the ends A and B of the tube as a whole, mm; None: held.
     """
     held = jnp.zeros_like(contact)
-    first, last = (held if end is None else end for end in ends)
+    first, last = (held, held) if clamps is None else clamps
 
     def between(a, rows, b):
         return jnp.concatenate([a[None], rows, b[None]])

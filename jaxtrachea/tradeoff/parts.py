@@ -1,6 +1,7 @@
 """The part of a scene's program that a ladder changes, as a program of its own."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
@@ -82,9 +83,9 @@ def part(name: Part, full: Full, levels: Levels, given: Inputs) -> tuple[Callabl
         return None if made is None else (lambda p: approach(scene, p), (path,))
     if scene.plan.surface is None:
         return None
-    return lambda m, p, v, at, how: deform(scene, m, p, v, at, how), (
-        material, presses, moved, path, made,
-    )  # fmt: skip
+    if not scene.plan.end_motion:  # of the finest scene, where the ends may move
+        moved = moved._replace(clamps=None)
+    return functools.partial(deform, scene), (presses, moved, path, made)
 
 
 def _skeleton(scene, material, presses) -> Moved:
