@@ -95,8 +95,8 @@ def frame_fem(s_c, phi, force, v):
     u[free] = np.linalg.solve(K[np.ix_(free, free)], f[free])
     joints = np.stack([u[i : i + 3] for i in at])
     slopes = np.stack([u[i + 3 : i + 5] for i in at])
-    ends = np.stack([u[:3], u[-5:-2]])
-    return u[at_C : at_C + 3], u[at_C + 3 : at_C + 5], joints, slopes, joints[:, 1:] @ spring.T, ends
+    ends, loads = np.stack([u[:3], u[-5:-2]]), joints[:, 1:] @ spring.T
+    return u[at_C : at_C + 3], u[at_C + 3 : at_C + 5], joints, slopes, loads, ends
 
 
 @pytest.mark.slow
