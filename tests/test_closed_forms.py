@@ -24,7 +24,7 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.starts import draw_starts
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference import bootstrap
-from jaxtrachea.inference.design import situation
+from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options

@@ -17,19 +17,17 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses import left_out
 from jaxtrachea.inference.analysis import Request
-from jaxtrachea.inference.design import (
+from jaxtrachea.inference.design.candidates import (
     Candidates,
     candidates_of,
     extrapolation,
-    gains,
     grid,
-    identifiability,
-    next_points,
     pressed_curves,
     pressed_specimen,
-    scores,
-    situation,
 )
+from jaxtrachea.inference.design.choice import gains, next_points, scores
+from jaxtrachea.inference.design.identifiability import identifiability
+from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.status import FitStatus
 

@@ -24,7 +24,7 @@ from jaxtrachea.inference.analyses.population import POPULATION, population_rows
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.bootstrap import bootstrap
 from jaxtrachea.inference.cross_validation import curves_to_leave_out
-from jaxtrachea.inference.design import check
+from jaxtrachea.inference.design.candidates import check
 from jaxtrachea.inference.population import population, wanted
 from jaxtrachea.inference.profile import profiles
 from jaxtrachea.measurements.read import Curve

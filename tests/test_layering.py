@@ -99,7 +99,7 @@ WITHIN = {
     ],
     "optimisation": [{"curvature", "programs", "schur"}, {"trust_region"}, {"levenberg_marquardt"}],
     "inference": [
-        {"rows", "residuals", "chains", "together", "weakest_direction", "estimate", "design_press",
+        {"rows", "residuals", "chains", "together", "weakest_direction", "estimate",
          "random_effects"},
         {"cross_validation", "bootstrap", "profile", "posterior_start"},
         {"effective", "labels", "misfit", "population", "repeats"},
@@ -107,6 +107,7 @@ WITHIN = {
         {"design", "influence", "posterior"},
         {"analyses"},
     ],
+    "inference/design": [{"press", "candidates"}, {"situation"}, {"choice"}, {"identifiability"}],
     "results": [{"arrays", "store"}, {"rows", "stored"}, {"hdf5"}],
     "prediction": [{"core", "sources"}, {"predict"}, {"held_out"}, {"plots", "report", "tables"}],
     "runs": [{"meet", "manifest"}, {"processes", "shards"}, {"folder"}, {"rerun", "checkpoint"}],

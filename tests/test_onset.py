@@ -18,7 +18,9 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out, without
-from jaxtrachea.inference.design import Candidates, check, gains, situation
+from jaxtrachea.inference.design.candidates import Candidates, check
+from jaxtrachea.inference.design.choice import gains
+from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.inference.labels import verdict_sentence
 from jaxtrachea.inference.repeats import leave_repeats_out

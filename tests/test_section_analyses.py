@@ -19,14 +19,10 @@ from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses import influence as analysis
-from jaxtrachea.inference.design import (
-    Candidates,
-    candidates_of,
-    gains,
-    identifiability,
-    next_points,
-    situation,
-)
+from jaxtrachea.inference.design.candidates import Candidates, candidates_of
+from jaxtrachea.inference.design.choice import gains, next_points
+from jaxtrachea.inference.design.identifiability import identifiability
+from jaxtrachea.inference.design.situation import situation
 from jaxtrachea.inference.influence import _external, influence
 from jaxtrachea.inference.population import population
 from jaxtrachea.inference.profile import profiles

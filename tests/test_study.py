@@ -17,7 +17,7 @@ from jaxtrachea.cli.specification import parameters_of, study_of, usable
 from jaxtrachea.config import FitSpec, SpecError, TracheaSection, load_fit_spec
 from jaxtrachea.fitting.parameters import DEFAULTS, in_model
 from jaxtrachea.fitting.study import build_study, default_parameters
-from jaxtrachea.inference.design import candidates_of
+from jaxtrachea.inference.design.candidates import candidates_of
 from jaxtrachea.measurements.data_files import find_files, read_data
 from jaxtrachea.measurements.read import Curve, DataError, Measurements, write_hdf5
 from jaxtrachea.mechanics.press import Options

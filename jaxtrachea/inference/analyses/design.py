@@ -17,22 +17,22 @@ from jaxtrachea.inference.analysis import (
     Table,
     Unavailable,
 )
-from jaxtrachea.inference.design import (
+from jaxtrachea.inference.design.candidates import (
     Candidates,
-    Choice,
-    Criterion,
-    Map,
-    Situation,
     candidates_of,
     extrapolation,
-    gains,
-    identifiability,
-    next_points,
     pressed_specimen,
+)
+from jaxtrachea.inference.design.choice import (
+    Choice,
+    Criterion,
+    gains,
+    next_points,
     scores,
     scores_after,
-    situation,
 )
+from jaxtrachea.inference.design.identifiability import Map, identifiability
+from jaxtrachea.inference.design.situation import Situation, situation
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
