@@ -299,20 +299,8 @@ def build_study(
         raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
     if not weighting.pressed_ends and tool_radius is None:
         raise ValueError("pressed_ends=False needs tool_radius: which rings are under the tool")
-    if isinstance(curves, Measurements):
-        _warn_of(curves.bad)
-        curves = curves.curves
-    if not curves:
-        raise ValueError("no usable curve; nothing to fit")
-    table, size = _table(parameters, options, curves, geometry), Size.of(geometry)
-    for curve in curves:
-        if (refused := refusal(curve, size, options, table)) is not None:
-            raise refused.error
+    curves, table = _admitted(curves, geometry, options, parameters)
     check_noise(curves, noise.force)
-    if not options.deforms_sections:
-        curves, unread = along_the_normal(curves)
-        if unread is not None:
-            warnings.warn(unread, stacklevel=2)
     parameters = natural_steps(table, curves)
     joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1
@@ -326,14 +314,7 @@ def build_study(
     if weighting.balance == "curve":
         weights = curve_weights(groups, lanes.s_c.shape[1], joint=joint)
         lanes = lanes._replace(balance=weights)
-    change_points = None
-    if onset_is_sought(parameters, options):
-        corners = touches(lanes, parameters)
-        lanes = lanes._replace(blend=blends(corners, groups, noise.force, options))
-        lanes, change_points = within_reach(lanes, parameters), corners.onset
-    touch = _first_touch(lanes, parameters, change_points)
-    depth = depths(np.asarray(lanes.displacement), touch[..., None], options)
-    lanes = weighed_by_depth(lanes, noise, depth)
+    lanes, change_points = _from_touch(lanes, groups, parameters, options, noise)
     known = noise.force is not None or all(c.sigma is not None for c in curves)
     model = FitModel(
         tube=numbers_of(geometry), options=options, columns=columns_of(parameters),
@@ -354,6 +335,51 @@ def build_study(
     )
 
 
+def _admitted(
+    curves: Measurements | Sequence[Curve],
+    geometry: Geometry,
+    options: Options,
+    parameters: Table | None,
+) -> tuple[Sequence[Curve], Sequence[Parameter]]:
+    """The curves as the model reads them, every one of which it can press, and the table."""
+    if isinstance(curves, Measurements):
+        _warn_of(curves.bad)
+        curves = curves.curves
+    if not curves:
+        raise ValueError("no usable curve; nothing to fit")
+    table, size = _table(parameters, options, curves, geometry), Size.of(geometry)
+    for curve in curves:
+        if (refused := refusal(curve, size, options, table)) is not None:
+            raise refused.error
+    if not options.deforms_sections:
+        curves, unread = along_the_normal(curves)
+        if unread is not None:
+            warnings.warn(unread, stacklevel=3)
+    return curves, table
+
+
+def _from_touch(
+    lanes: Lane,
+    groups: Sequence[Sequence[Curve]],
+    parameters: Sequence[Parameter],
+    options: Options,
+    noise: Noise,
+) -> tuple[Lane, np.ndarray | None]:
+    """What follows from first touch: its rounded corner, its bounds, weights of markers by depth.
+
+    Returns:
+        The lanes, and the change points of the curves (None: no first touch is sought).
+    """
+    seen = None
+    if onset_is_sought(parameters, options):
+        corners = touches(lanes, parameters)
+        lanes = lanes._replace(blend=blends(corners, groups, noise.force, options))
+        lanes, seen = within_reach(lanes, parameters), corners.onset
+    touch = _first_touch(lanes, parameters, seen)
+    depth = depths(np.asarray(lanes.displacement), touch[..., None], options)
+    return weighed_by_depth(lanes, noise, depth), seen
+
+
 def _first_touch(lanes: Lane, parameters: Sequence[Parameter], seen: np.ndarray | None):
     """As `Study.first_touch`; `seen`: its `change_points`."""
     known = first_touches(lanes, parameters)
@@ -365,7 +391,7 @@ def _warn_of(bad: Sequence[BadCurve]) -> None:
     if bad:
         first = f"{bad[0].specimen} {bad[0].trial}: {bad[0].reason}"
         more = f", and {len(bad) - 1} more" if len(bad) > 1 else ""
-        warnings.warn(f"curves left out: {first}{more}", stacklevel=3)
+        warnings.warn(f"curves left out: {first}{more}", stacklevel=4)
 
 
 def _table(
