@@ -92,6 +92,7 @@ def test_resampled_residuals_have_the_variance_of_the_noise():
     np.testing.assert_allclose(np.var(noise, axis=(0, 2)), expected, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_influence_of_a_curved_model_is_that_of_refits():
     """k_1 in series with the skeleton beside a fixed k_3: residuals change the curvature."""
     changes = {"k_3": {"lower": 0.0, "value": 0.3, "fixed": True}}

@@ -273,6 +273,7 @@ def pressed_by_elements():
     return curves, noise
 
 
+@pytest.mark.slow
 def test_refits_end_in_the_minimum_of_the_whole_fit():
     """From the first guess alone the fit without s = 12 mm ends at k_1 = 1e6 N/mm, 36 % off."""
     curves, noise = pressed_by_elements()

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
+from late import late
 from run_cli import run, tree
 
 from jaxtrachea.cli.run import refuse
@@ -81,6 +82,7 @@ def test_predicted_errors_come_true(known):
     assert np.exp(np.mean(np.log(realised / np.std(without.theta, axis=0)))) < 0.9
 
 
+@pytest.mark.slow
 def test_before_any_measurement_an_unknown_may_be_anywhere_between_its_bounds(result):
     """Errors without data: the standard deviation of points even between the bounds."""
     before, lanes = situation(result, with_data=False), result.study.lanes
@@ -204,7 +206,7 @@ def sandwich_errors(theta, presses, balance):
     return np.sqrt(np.diag(inverse @ meat @ inverse))
 
 
-@pytest.mark.parametrize("balance", ["curve", "sample"])
+@pytest.mark.parametrize("balance", ["sample", *late("curve")])
 def test_expected_errors_are_those_of_the_refit(balance):
     """Curves of 15 to 120 samples: errors before and after two presses, and those of a refit.
 
@@ -225,7 +227,10 @@ def test_expected_errors_are_those_of_the_refit(balance):
     np.testing.assert_allclose(choice.error[1], again.relative_se[0], rtol=1e-3)
 
 
-@pytest.mark.parametrize(("loss", "given"), [("linear", False), ("huber", False), ("huber", True)])
+@pytest.mark.parametrize(
+    ("loss", "given"),
+    [("linear", False), pytest.param("huber", False, marks=pytest.mark.slow), ("huber", True)],
+)
 def test_errors_before_any_press_are_those_of_the_fit(loss, given):
     """Also where the noise is estimated, and with a robust loss."""
     noise = None if given else np.random.default_rng(5)
@@ -259,6 +264,7 @@ def log_volume(result):
     return -np.linalg.slogdet(result.uncertainty.covariance[0])[1]
 
 
+@pytest.mark.slow
 def test_a_joint_fit_presses_the_specimen_that_tells_most():
     """Gains of a press on each specimen are those of refits with it; the first was always taken."""
     study = joint_study(k_1="specimen")
@@ -325,7 +331,7 @@ def late_study(onset, late=10.0):
     )
 
 
-@pytest.mark.parametrize("onset", [{"fixed": True, "value": 10.0}, {}])
+@pytest.mark.parametrize("onset", [{}, *late({"fixed": True, "value": 10.0})])
 def test_depths_of_presses_are_from_first_touch(onset):
     """Records from 8 to 13 mm that touch at 10 mm: presses of 3 mm; 13 mm were taken for them."""
     study = late_study(onset)

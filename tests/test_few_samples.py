@@ -77,6 +77,7 @@ def seen(monkeypatch):
     return seen
 
 
+@pytest.mark.slow
 def test_estimates_are_of_all_samples(study, seen):
     """Of eighty starts by twelve samples each; the four of a lane go on as one."""
     result = fit(study, Settings())

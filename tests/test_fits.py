@@ -57,6 +57,7 @@ def folder(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_run_writes_every_file_and_the_plots_decode(folder):
     names = {p.name for p in folder.iterdir()}
     assert names == {

@@ -124,10 +124,10 @@ CASES = [
     pytest.param(sections(0.0), id="sections", marks=pytest.mark.slow),
     pytest.param(sections(1.5), id="sections, off the midline", marks=pytest.mark.slow),
     pytest.param(simulated, id="scene", marks=pytest.mark.slow),
-    pytest.param(swept, id="sweep"),
+    pytest.param(swept, id="sweep", marks=pytest.mark.slow),
     pytest.param(stepped, id="session", marks=pytest.mark.slow),
     pytest.param(dense, id="beam"),
-    pytest.param(fit, id="fit"),
+    pytest.param(fit, id="fit", marks=pytest.mark.slow),
 ]
 
 

@@ -576,12 +576,10 @@ def pressed(name):
 
 
 SLOW = pytest.mark.slow, pytest.mark.compiling
-LONG = "mat", "arch", "total coupling", "friction"
+LONG = "arch2, shear, bonded", "mat", "arch", "total coupling", "friction"
 
 
-@pytest.mark.parametrize(
-    "name", ["arch2, shear, bonded", *PUNCHES, *(pytest.param(v, marks=SLOW) for v in LONG)]
-)
+@pytest.mark.parametrize("name", [*PUNCHES, *(pytest.param(v, marks=SLOW) for v in LONG)])
 def test_presses_and_their_derivatives_fit_one_kernel(name):
     """What scenes put into a kernel: with a product or a scatter it would be hundreds."""
     names = "EI_L k_M k_1 k_3 EA_L EI_C k_t GA_L k_A k_1_ring".split()

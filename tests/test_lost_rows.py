@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from admitted import BEAM, FULL
+from late import late
 
 from jaxtrachea.mechanics import beam
 from jaxtrachea.mechanics.force_law import Law
@@ -116,8 +117,10 @@ def test_a_row_without_a_solution_leaves_shared_derivatives_as_they_are(loss, sk
                 np.testing.assert_allclose(p, q, rtol=1e-12, atol=1e-15, err_msg=name)
 
 
-@pytest.mark.parametrize("options", [{}, {"coupling": "total"}, {"contact": "bonded"}], ids=str)
-@pytest.mark.parametrize("lost", [np.nan, np.inf])
+@pytest.mark.parametrize(
+    "options", [{}, *late({"coupling": "total"}, {"contact": "bonded"})], ids=str
+)
+@pytest.mark.parametrize("lost", [np.nan, *late(np.inf)])
 def test_a_displacement_that_is_no_number_says_nothing_of_the_onset(options, lost):
     """Nor of the angle of an oblique press: derivatives are those of the other rows alone."""
     g, m = table_1(), Material(**FULL)
@@ -159,6 +162,7 @@ def test_a_place_off_the_beam_says_nothing_of_the_beam(lost):
             np.testing.assert_allclose(p, q, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_vector_that_is_no_number_says_nothing_of_the_skeleton():
     """The printed coupling, row by row."""
     D = jnp.array([[1.0, 0.2, 0.1], [np.nan, 0, 0]])

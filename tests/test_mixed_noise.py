@@ -70,6 +70,7 @@ def test_errors_are_of_each_kinds_own_noise(given):
     np.testing.assert_allclose(got, np.sqrt(np.diag(want)), rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_specimen_is_as_by_itself():
     """Beside another with markers of unknown noise, errors were a fifth, and Student's t."""
     noise, alone = Noise(force=0.1), marked("B", markers=False)

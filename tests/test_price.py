@@ -213,8 +213,8 @@ SHOWN = SCENE | {"output": {"surface": True}}
 
 
 @pytest.mark.parametrize(("record", "dtype"), [
-    (SCENE, "float64"), (SCENE, "float32"),
-    pytest.param(SHOWN, "float64", marks=pytest.mark.compiling),
+    (SCENE, "float64"), pytest.param(SCENE, "float32", marks=pytest.mark.slow),
+    pytest.param(SHOWN, "float64", marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_what_is_timed_of_a_press_is_what_simulate_gives(record, dtype):
     whole = full(record)
@@ -249,6 +249,7 @@ def test_what_is_timed_of_a_tool_is_its_step(friction):
         assert found.status == expected.status
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cost", ["path", "operations"])
 def test_plan_says_what_was_made_least(cost, tmp_path, monkeypatch, capsys):
     path = tmp_path / "scene.toml"

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import synthetic
+from late import late
 from scipy.integrate import quad
 
 from jaxtrachea import _in_order
@@ -188,6 +189,7 @@ def test_jacobian_is_that_of_the_value(name):
             assert np.all(truth[t][:, others] == 0)
 
 
+@pytest.mark.slow
 def test_lanes_are_as_each_by_itself(subtests):
     """Many together are one kernel, on a CPU, where neither markers nor a width are in the way."""
     on_cpu = jax.default_backend() == "cpu"
@@ -208,8 +210,8 @@ def test_lanes_are_as_each_by_itself(subtests):
                             np.testing.assert_allclose(got[k], true, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("loss", ["linear", "huber"])
-@pytest.mark.parametrize("name", ["default", "beam of a trial", "bonded"])
+@pytest.mark.parametrize("loss", ["linear", *late("huber")])
+@pytest.mark.parametrize("name", ["default", *late("beam of a trial", "bonded")])
 def test_the_pull_ahead_is_the_second_derivative(name, loss):
     """J^T root(weight) r'' along a short step; with an onset its rounded corner takes no part."""
     study = make_study(name, Weighting(loss=loss))

@@ -78,7 +78,7 @@ def compilations():
 
 
 #: Those that take longest to compile, of kinds that others are of too.
-LONG = ("press_path", "skeleton_response", "simulate")
+LONG = ("press_path", "skeleton_response", "simulate", "sweep")
 
 
 @pytest.mark.parametrize(

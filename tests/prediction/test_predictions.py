@@ -8,6 +8,7 @@ import beam_fem
 import numpy as np
 import pytest
 from hardening import TWO, pairs, stored_again, total_study
+from late import late
 from noisy_fits import DEPTHS, LANES, TRUTH, true_force
 from scipy.stats import t as student
 from synthetic import NAMES
@@ -237,7 +238,7 @@ def late_study(onset, offset, late=(10.0, 10.3), zero=0.0):
     return build_study(curves, table_1(), Options(), table, noise=Noise(force=0.01))
 
 
-@pytest.mark.parametrize("onset", [{"fixed": True, "value": 10.0}, {}])
+@pytest.mark.parametrize("onset", [{}, *late({"fixed": True, "value": 10.0})])
 def test_extrapolated_and_tested_are_depths_from_first_touch(onset, tmp_path):
     """Presses of 1 mm, recorded from 8 to 11 mm; what was said was held against these 11 mm."""
     late = (10.0, 10.0 if onset else 10.3)
@@ -294,7 +295,10 @@ def law_error(scope, D):
     return np.sqrt(np.einsum("in,ij,jn->n", x, covariance, x))
 
 
-@pytest.mark.parametrize("scope", ["fixed", "specimen", "shared", "trial"])
+@pytest.mark.parametrize(
+    "scope",
+    ["specimen", *late("fixed", "shared", "trial")],
+)
 def test_a_new_press_counts_from_first_touch_whatever_the_fit_has(scope, tmp_path):
     """Closed form. A zero that is held, or of a specimen, was taken for that of the new press."""
     read = stored_again(recorded_study(scope), tmp_path / "r.h5")
@@ -316,6 +320,7 @@ def test_a_new_press_counts_from_first_touch_whatever_the_fit_has(scope, tmp_pat
     assert np.all(np.abs(found.residual[again.displacement > 0.6]) < 2 * near + 1e-9)
 
 
+@pytest.mark.slow
 def test_a_zero_on_a_logarithmic_scale_is_none_for_a_new_press(tmp_path):
     """No number has the logarithm of 0; a new press began at 1 mm."""
     curves = recorded_study("fixed").curves[0]

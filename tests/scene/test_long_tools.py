@@ -38,7 +38,7 @@ def scene_of(tool, radius, gaps=GAPS, x=75.0):
     [
         (capsule(10.0, 4.0), 4.0),
         pytest.param(capsule(150.0, 4.0), 4.0, marks=pytest.mark.slow),
-        (capsule(490.0, 4.0), 4.0),
+        pytest.param(capsule(490.0, 4.0), 4.0, marks=pytest.mark.slow),
         (sphere(200.0), 200.0),
     ],
 )
@@ -88,6 +88,7 @@ def test_shafts_in_all_directions_are_solved():
     np.testing.assert_allclose(found.gap, gap[fair], atol=0.12)
 
 
+@pytest.mark.slow
 def test_a_longer_tool_is_another_program():
     """One with fewer steps would leave some of its contacts unsolved."""
     scene, _ = scene_of(capsule(40.0, 4.0), 4.0)

@@ -268,6 +268,7 @@ def per_row(function, scene, path):
     )
 
 
+@pytest.mark.slow
 def test_refusals_cost_no_more_than_counted_on_paper():
     """The programs by hand share them with `simulate`: these counts see what is added there."""
 

@@ -354,6 +354,7 @@ def test_only_motion_inwards_counts_as_depth(through):
     assert status.tolist() == [OK, OK, OK, PressStatus.TOO_DEEP]
 
 
+@pytest.mark.slow
 def test_the_face_that_closes_a_tube_is_as_thick_as_the_tube_is_large(through):
     """It was 1 mm at any size: for R = 0.2 mm all of a tube of 2 mm."""
     small = dataclasses.replace(TUBE, length=jnp.asarray(2.0))

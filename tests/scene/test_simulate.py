@@ -136,6 +136,7 @@ def slanting(rows, mu, friction="on"):
     return make_scene(TUBE, MATERIAL, path, tool=Tool(BALL, mu), effects=effects), path
 
 
+@pytest.mark.slow
 def test_a_tool_that_sticks_for_good_is_one_without_friction():
     """The way before the first touch stretches nothing, in however few rows; mu = 1e3."""
     (scene, path), (stuck, _) = slanting(4, 1e3), slanting(4, 1e3, "off")

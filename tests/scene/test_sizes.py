@@ -111,6 +111,7 @@ def mouse(**keys):
     return stage(SceneSpec.model_validate(MOUSE | {"trachea": MOUSE["trachea"] | keys}), Path())
 
 
+@pytest.mark.slow
 def test_a_mouse_has_a_tube():
     """Rings of 0.6 mm on a wall of 0.1 mm left radii of 0.04 to 0.65 mm, contacts 0.46 mm off."""
     staged = mouse()

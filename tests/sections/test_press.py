@@ -258,9 +258,8 @@ def test_an_equilibrium_that_is_no_minimum_is_seen():
         assert int(excess(state, parts._replace(give=jnp.asarray([give])))) == wanted
 
 
-@pytest.mark.parametrize(
-    ("midline", "kernels"), [(True, 3), pytest.param(False, 2, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("midline", "kernels"), [(True, 3), (False, 2)])
 def test_single_kernels_of_a_step(midline, kernels):
     """Closure and solution, on the midline assembly with elimination; of many lanes none."""
     if _in_order._one_kernel_p is None:
