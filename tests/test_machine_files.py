@@ -75,6 +75,56 @@ def test_bad_machine_file_costs_only_itself(tmp_path, change, kind, message):
     assert message in bad.message
 
 
+#: Two presses of one specimen at 35 and 75 mm, named by columns; the file names the specimen.
+TABLE = """\
+trial,s [mm],phi [deg],displacement [mm],force [N]
+1,35,0,0.0,0.0
+1,35,0,0.5,0.5
+2,75,40,0.0,0.00
+2,75,40,0.5,0.05
+"""
+
+
+def both(path, **options):
+    found = read(path, **options).curves
+    return [(c.specimen, c.trial, c.s_c, round(np.degrees(c.phi_c)), c.force[-1]) for c in found]
+
+
+@pytest.mark.parametrize("above", ["", "# by hand\n", "sep=,\n", '"sep=,"\n'])
+def test_columns_of_trial_and_position_make_a_table_without_specimens_tidy(tmp_path, above):
+    """They were left unread: one curve of all rows, wherever `data.s` put it."""
+    path = put(tmp_path, above + TABLE, "T7.csv")
+    assert both(path) == [("T7", "1", 35.0, 0, 0.5), ("T7", "2", 75.0, 40, 0.05)]
+    assert both(path) == both(path, format="tidy")
+    refused = "s is 35 mm in the file but 50 mm in the options"
+    assert refused in read(path, s="50 mm").bad[0].message
+
+
+def test_columns_of_other_names_too(tmp_path):
+    text = TABLE.replace("trial,s [mm],phi [deg]", "Versuch,pos [mm],angle [deg]")
+    columns = {"trial": "Versuch", "s": "pos", "phi": "angle"}
+    path = put(tmp_path, text, "T7.csv")
+    assert both(path, columns=columns) == [("T7", "1", 35.0, 0, 0.5), ("T7", "2", 75.0, 40, 0.05)]
+    bad = only_bad(read(path, format="machine", columns=columns))
+    assert "'Versuch' (trial), 'pos' (s), 'angle' (phi), which a machine file" in bad.message
+
+
+def test_columns_of_trial_and_position_below_other_lines_are_refused(tmp_path):
+    path = put(tmp_path, "Compression test,\n" + TABLE, "T7.csv")
+    bad = only_bad(read(path))
+    assert "line 2 is the header of a table with 'trial' (trial), 's' (s), 'phi'" in bad.message
+    (got,) = read(path, format="machine").curves
+    assert (got.trial, got.s_c, got.phi_c) == ("1", None, 0.0)
+
+
+def test_a_way_that_its_file_calls_s_is_no_position(tmp_path):
+    text = TABLE.replace("trial,s [mm],phi [deg],displacement [mm]", "no,s [mm],angle,way [mm]")
+    text = text.replace("1,35,0,0.0", "1,34,0,0.0").replace("0.00\n", "0.60\n").replace("0.05", "0.7")
+    (got,) = read(put(tmp_path, text), columns={"displacement": "s"}).curves
+    np.testing.assert_array_equal(got.displacement, [34, 35, 75, 75])
+    assert got.s_c is None
+
+
 def test_empty_machine_file(tmp_path):
     assert only_bad(read(put(tmp_path, ""))).kind == "empty"
 

@@ -200,7 +200,7 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[Records, list[str]]:
         return records, []
     text = Text(path, split_lines(path, data))
     del data
-    reader = asked or _recognise(text.lines, READERS)
+    reader = asked or _recognise(text.lines, READERS, options)
     if reader.read_text is not None:
         return reader.read_text(text, options), []
     assert reader.read is not None
@@ -213,7 +213,7 @@ def _read_large(
     """What a large text holds; None if it is not large, or must be read line by line."""
     if len(data) < MIN_BYTES:
         return None
-    reader = asked or _recognise(first_lines(data), READERS)
+    reader = asked or _recognise(first_lines(data), READERS, options)
     return reader.read_large and reader.read_large(path, data, options)
 
 
@@ -228,7 +228,8 @@ def _read_workbook(
     text, sheets = read_sheet(path, options.sheet)
     others = listed([name for name in sheets if name != text.sheet])
     hint = f", or choose another sheet with data.sheet ({others})" if others else ""
-    reader = asked or _recognise(text.lines, [r for r in READERS if r.read_text is not None])
+    of_text = [r for r in READERS if r.read_text is not None]
+    reader = asked or _recognise(text.lines, of_text, options)
     assert reader.read_text is not None
     try:
         records = reader.read_text(text, options)
@@ -244,9 +245,9 @@ def _read_workbook(
     return records, [note] if others else []
 
 
-def _recognise(lines: Lines, readers: Sequence[Reader]) -> Reader:
+def _recognise(lines: Lines, readers: Sequence[Reader], options: ReadOptions) -> Reader:
     """Format of a text by its lines; the last reader takes any."""
-    return next(reader for reader in readers if reader.is_text(lines))
+    return next(reader for reader in readers if reader.is_text(lines, options))
 
 
 def _recognise_hdf5(path: Path) -> Reader:

@@ -258,7 +258,7 @@ def _column(
 AFMFORMATS = Reader(
     "afmformats",
     read=read,
-    is_text=lambda lines: any("BEGIN METADATA" in line.text for line in lines[:10]),
+    is_text=lambda lines, options: any("BEGIN METADATA" in line.text for line in lines[:10]),
     is_hdf5=lambda file: "schema" not in file.attrs and any(name.isdecimal() for name in file),
     layout="groups 0, 1, ... of afmformats",
 )

@@ -24,6 +24,8 @@ from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.text import (
     ALIASES,
     Table,
+    columns_of_tidy,
+    find_roles,
     guess_delimiter,
     read_columns,
     role_values,
@@ -273,8 +275,11 @@ def _constant(
     return float(column.mean())
 
 
-def _is_tidy(lines: Lines) -> bool:
-    """Whether the first line is a JSON object, or names a column of specimens."""
+def _is_tidy(lines: Lines, options: ReadOptions) -> bool:
+    """Whether the first line is a JSON object, or names a column that machine files have not.
+
+    That of specimens; or, beside displacement and force, that of trials or of positions.
+    """
     first = next((text for text in lines.texts if not is_comment(text)), None)
     if first is None:
         return False
@@ -284,8 +289,14 @@ def _is_tidy(lines: Lines) -> bool:
         cells = split_cells(first, guess_delimiter(first))
     except Fault:
         return False
-    names = {column_unit(cell)[0].lower() for cell in cells}
-    return bool(names & set(ALIASES["specimen"]))
+    names = [column_unit(cell)[0] for cell in cells]
+    if {*map(str.lower, names)} & {*ALIASES["specimen"]}:
+        return True
+    try:
+        roles = find_roles(names, options)
+    except Fault:
+        return False
+    return {"displacement", "force"} <= roles.keys() and bool(columns_of_tidy(roles))
 
 
 TIDY = Reader("tidy", read_text=read, read_large=read_large, is_text=_is_tidy)

@@ -59,7 +59,8 @@ class Lines(Sequence[Line]):
 
     def without_comments(self) -> "Lines":
         """Those that are no comments."""
-        if not any(map(contains, self.texts, repeat("#"))):
+        begins = not self.texts or not is_comment(self.texts[0])
+        if begins and not any(map(contains, self.texts, repeat("#"))):
             return self
         return self.where([not is_comment(text) for text in self.texts])
 
@@ -165,9 +166,14 @@ def split_lines(path: Path, data: bytes) -> Lines:
 
 
 def is_comment(text: str) -> bool:
-    """Whether a line is a ``#`` comment; ``#N/A`` and the like are cells of a spreadsheet."""
+    """Whether a line is a ``#`` comment, or ``sep=;``, which a spreadsheet puts above a table.
+
+    ``#N/A`` and the like are its cells.
+    """
     text = text.lstrip()
-    return text.startswith("#") and not text.upper().startswith(CELL_ERRORS)
+    if text.startswith("#"):
+        return not text.upper().startswith(CELL_ERRORS)
+    return text[:5].lstrip('"').lower().startswith("sep=")
 
 
 def _bytes(path: Path) -> bytes:

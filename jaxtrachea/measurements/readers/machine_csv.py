@@ -9,6 +9,7 @@ from jaxtrachea.measurements.readers.lines import Lines, Text
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.text import (
     Table,
+    columns_of_tidy,
     find_roles,
     read_columns,
     require_roles,
@@ -90,14 +91,7 @@ def _table(text: Text, options: ReadOptions) -> tuple[Table, dict[str, int]]:
                 # An ambiguous header is still the header; any other line is part of the preamble.
                 reason = fault if fault.kind == "ambiguous" else reason
                 continue
-            if "specimen" in roles and options.format == "auto":
-                raise Fault(
-                    "ambiguous",
-                    f"{text.word} {line.number} is the header of a table with a column for the"
-                    " specimen, but other lines stand above it",
-                    'remove them or begin them with #, or set format = "machine" to name the'
-                    " specimen after the file",
-                )
+            _refuse_columns_of_tidy(f"{text.word} {line.number}", roles, names, options)
             at, units = _units_row(lines, at, delimiter, units)
             numbers, columns = read_columns(lines[at + 1 :], len(names), delimiter, text.word)
             table = Table(
@@ -120,6 +114,35 @@ def _table(text: Text, options: ReadOptions) -> tuple[Table, dict[str, int]]:
     )
 
 
+def _refuse_columns_of_tidy(
+    line: str, roles: dict[str, int], names: list[str], options: ReadOptions
+) -> None:
+    """Refuse a column that a machine file is not read for: specimen, trial or position of rows.
+
+    Raises:
+        Fault: there is one, and nobody has said that it does not count: not by the format, or by
+            naming the column in spite of it.
+    """
+    found = columns_of_tidy(roles)
+    if options.format == "machine":
+        found = [role for role in found if role in options.columns]
+    if not found:
+        return
+    quoted = ", ".join(f"{names[roles[role]]!r} ({role})" for role in found)
+    if options.format == "machine":
+        raise Fault(
+            "ambiguous",
+            f"{line} has {quoted}, which a machine file is not read for",
+            f'set format = "tidy", or leave out columns.{found[0]}: the name of the file tells it',
+        )
+    raise Fault(
+        "ambiguous",
+        f"{line} is the header of a table with {quoted}, but other lines stand above it",
+        'remove them or begin them with #, or set format = "machine": one curve, of which the name '
+        "of the file tells specimen, trial and position",
+    )
+
+
 def _units_row(
     lines: Lines, at: int, delimiter: str, units: list[str | None]
 ) -> tuple[int, list[str | None]]:
@@ -137,4 +160,4 @@ def _units_row(
     return at + 1, [b or None for b in bare]
 
 
-MACHINE = Reader("machine", read_text=read, is_text=lambda lines: True)
+MACHINE = Reader("machine", read_text=read, is_text=lambda lines, options: True)

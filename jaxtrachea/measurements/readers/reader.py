@@ -21,7 +21,7 @@ class Reader(NamedTuple):
             something is odd, and `read_text` must read it or say what is wrong.
         is_file: whether a file that begins with these bytes is of this format; `read` then gets
             it. Text, HDF5 and workbooks need no such sign.
-        is_text: whether lines are of this format.
+        is_text: whether lines are of this format, with the columns that the options name.
         is_hdf5: whether an open HDF5 file is of this format.
         layout: by what an HDF5 file of this format is known, for messages; empty: there are none.
     """
@@ -31,6 +31,6 @@ class Reader(NamedTuple):
     read_text: Callable[[Text, ReadOptions], Records] | None = None
     read_large: Callable[[Path, bytes, ReadOptions], Records | None] | None = None
     is_file: Callable[[bytes], bool] = lambda head: False
-    is_text: Callable[[Lines], bool] = lambda lines: False
+    is_text: Callable[[Lines, ReadOptions], bool] = lambda lines, options: False
     is_hdf5: Callable[[Any], bool] = lambda file: False
     layout: str = ""

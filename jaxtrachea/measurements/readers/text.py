@@ -24,6 +24,8 @@ ALIASES = {
     "side_force": ("side_force", "side force"),
     "sigma": ("sigma", "force_sigma", "force_noise"),
 }
+# Roles that a tidy table tells in every row, and the name of a machine file if at all.
+OF_TIDY = ("specimen", "trial", "s", "phi")
 # Columns of time, taken where they have a unit; they tell the duration of holds.
 TIMES = ("time", "elapsed time", "total time", "test time", "running time")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
@@ -197,6 +199,15 @@ def require_roles(roles: dict[str, int], names: Sequence[str]) -> None:
     for role in ("displacement", "force"):
         if role not in roles:
             raise _no_column(role, role, names)
+
+
+def columns_of_tidy(roles: dict[str, int]) -> list[str]:
+    """Roles of which every row of a tidy table tells, and which a file of one trial has not.
+
+    Without a column that has another role as well: a way that its file calls `s`.
+    """
+    others = {i for role, i in roles.items() if role not in OF_TIDY}
+    return [role for role in OF_TIDY if role in roles and roles[role] not in others]
 
 
 def resolve_unit(role: str, found: str | None, options: ReadOptions, place: str) -> str:
