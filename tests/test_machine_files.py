@@ -119,7 +119,9 @@ def test_columns_of_trial_and_position_below_other_lines_are_refused(tmp_path):
 
 def test_a_way_that_its_file_calls_s_is_no_position(tmp_path):
     text = TABLE.replace("trial,s [mm],phi [deg],displacement [mm]", "no,s [mm],angle,way [mm]")
-    text = text.replace("1,35,0,0.0", "1,34,0,0.0").replace("0.00\n", "0.60\n").replace("0.05", "0.7")
+    text = (
+        text.replace("1,35,0,0.0", "1,34,0,0.0").replace("0.00\n", "0.60\n").replace("0.05", "0.7")
+    )
     (got,) = read(put(tmp_path, text), columns={"displacement": "s"}).curves
     np.testing.assert_array_equal(got.displacement, [34, 35, 75, 75])
     assert got.s_c is None

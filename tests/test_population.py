@@ -5,7 +5,16 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import chi2, multivariate_normal, t
 
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.settings import Settings
+from jaxtrachea.fitting.study import build_study
+from jaxtrachea.inference.analyses.population import POPULATION
+from jaxtrachea.inference.population import population
 from jaxtrachea.inference.random_effects import Common, random_effects
+from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.mechanics.press import Options
+from jaxtrachea.trachea.geometry import table_1
 
 
 def draw(rng, m, tau, middle):
@@ -124,3 +133,48 @@ def test_coverage_of_mean_and_spread():
     assert np.all(np.abs(square - 1) < 0.12)
     assert np.all(inside > 0.82)
     assert np.all(gain < 1)
+
+
+def test_what_the_data_hardly_determine_takes_part():
+    """k_3 about 0.5 +- 0.2 with errors of 0.27: those beyond 50 % left out, the mean was 0.6."""
+    rng, sigma = np.random.default_rng(5), 0.1
+    D = np.linspace(0, 1.1, 16)
+    truth = rng.normal(0.5, 0.2, 100)
+    curves = [
+        Curve(f"s{i:03d}", "1", 75.0, 0.0, D, D + k * D**3 + rng.normal(0, sigma, 16))
+        for i, k in enumerate(truth)
+    ]
+    table = {"k_1": {"fixed": True, "value": 1.0}, "k_3": {"lower": -20.0, "upper": 100.0}}
+    study = build_study(
+        curves, table_1(), Options(coupling="total"), table, noise=Noise(force=sigma)
+    )
+    result = fit(study, Settings(starts=1))
+    se = sigma / np.sqrt(np.sum(D**6))
+    np.testing.assert_allclose(result.standard_error[:, 0], se, rtol=1e-6)
+    found = population(result)
+    (mean,), (error,), (sd,) = found.effects.mean, found.effects.mean_se, found.effects.sd
+    step = found.parameters[0].step
+    assert (found.known.sum(), found.left_out[0], found.at_bound[0]) == (100, 0, 0)
+    # Errors are alike: the plain mean, and the variance of the estimates less that of the errors.
+    np.testing.assert_allclose(mean * step, result.value[:, 0].mean(), rtol=1e-9)
+    spread = np.sqrt(result.value[:, 0].var(ddof=1) - se**2)
+    np.testing.assert_allclose(sd * step, spread, rtol=1e-4)
+    assert abs(mean * step - truth.mean()) < 2.5 * error * step
+    assert abs(spread - truth.std(ddof=1)) < 0.06
+
+
+def test_estimates_on_a_bound_are_told():
+    """Their likelihood has no width there: of ten values of 0.1 +- 0.2 those below 0 are at 0."""
+    D = np.linspace(0, 1.1, 16)
+    curves = [
+        Curve(f"s{i}", "1", 75.0, 0.0, D, D + k * D**3)
+        for i, k in enumerate(np.linspace(-0.35, 0.55, 10))
+    ]
+    table = {"k_1": {"fixed": True, "value": 1.0}, "k_3": {}}
+    study = build_study(
+        curves, table_1(), Options(coupling="total"), table, noise=Noise(force=0.001)
+    )
+    found = population(fit(study, Settings(starts=1)))
+    assert (found.left_out[0], found.at_bound[0], found.known.sum()) == (4, 4, 6)
+    told = "\n".join(POPULATION.section(found))
+    assert "Estimates on a bound took no part (k_3 4 of 10)" in told

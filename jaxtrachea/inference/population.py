@@ -24,6 +24,8 @@ from jaxtrachea.inference.random_effects import FEWEST, Common, Effects, random_
 
 #: Specimens from which a spread is estimated unasked.
 ENOUGH = 5
+#: Verdicts on estimates that have an error to be weighed by.
+WEIGHED = (*DETERMINED, "practically non-identifiable")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -33,7 +35,7 @@ class Population:
     Attributes:
         result: the fit.
         parameters: of scope `specimen`, q of them.
-        known: estimates that took part: those that are identifiable or weak; (lanes, q).
+        known: estimates that took part: those with an error to be weighed by; (lanes, q).
         place: unknown of each lane and parameter, -1: none; (lanes, q).
         effects: in scaled coordinates.
     """
@@ -48,6 +50,12 @@ class Population:
     def left_out(self) -> Int[np.ndarray, " q"]:
         """Specimens that have the parameter and whose estimate took no part; (q,)."""
         return np.sum((self.place >= 0) & ~self.known, axis=0)
+
+    @property
+    def at_bound(self) -> Int[np.ndarray, " q"]:
+        """Of `left_out` those on a bound, without which the mean is too far from it; (q,)."""
+        held = self.result.at_bound[np.arange(len(self.place))[:, None], self.place]
+        return np.sum((self.place >= 0) & ~self.known & held, axis=0)
 
     def shrunk_cells(self, lane: int, i: int) -> dict[str, object]:
         """Columns `shrunk` and `shrunk_se` of parameters.csv for an unknown; none if not of it."""
@@ -70,10 +78,11 @@ def wanted(asked: bool | None, study: Study) -> bool:
 def population(result: FitResult, profiles: Profiles | None = None) -> Population:
     """Mean and spread of all parameters that belong to specimens.
 
-    Estimates take part that are identifiable or weak, weighed by the larger of their local error
-    and that of their interval; what has another verdict has no error to be weighed by. Weak ones
-    left out as well would bias the mean: an error is relative, and small values have large ones.
-    Parameters that fewer than three specimens determine are left out.
+    All estimates take part that have an error, weighed by the larger of their local error and that
+    of their interval, if it has two ends; also those whose data do not determine them: left out,
+    they would bias mean and spread, as an error is relative and small values have large ones. On a
+    bound, structurally non-identifiable or not shown an estimate has none. Parameters that fewer
+    than three specimens determine (identifiable or weak) are left out.
 
     Args:
         result: the fit.
@@ -81,7 +90,7 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
 
     Raises:
         ValueError: no `FitResult` or `Profiles`, no parameter with the scope `specimen`, or none
-            that three specimens determine.
+            that three specimens determine; several specimens in a lane.
     """
     check_word("result", result, FitResult)
     check_word("profiles", profiles, Profiles | None)
@@ -91,17 +100,23 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
     names = [p.name for p in parameters]
     place = np.full((result.lanes, len(names)), -1)
     separate = {c.specimen for lane in result.study.curves for c in lane}
+    if len(separate) != result.lanes:
+        raise ValueError(
+            f"{len(separate)} specimens are fitted in {result.lanes} lanes; a population needs a "
+            "lane for each (a joint fit with profiles, a bootstrap or a posterior has one for all: "
+            "leave these out)"
+        )
     for lane, unknowns in enumerate(result.study.unknowns):
-        if len(separate) == result.lanes:
-            for i, (p, _, _) in enumerate(unknowns):
-                if p.name in names:
-                    place[lane, names.index(p.name)] = i
+        for i, (p, _, _) in enumerate(unknowns):
+            if p.name in names:
+                place[lane, names.index(p.name)] = i
     row = np.arange(result.lanes)[:, None]
     se = result.uncertainty.se[row, place]
-    error = (relative_errors(result, profiles) * result.relative)[row, place]
+    error, determined = weighing_errors(result, profiles)
+    error = (error * result.relative)[row, place]
     known = (place >= 0) & np.isfinite(se) & np.isfinite(error)
     se = np.where(known, np.maximum(se, error), se)
-    enough = known.sum(axis=0) >= FEWEST
+    enough = (known & determined[row, place]).sum(axis=0) >= FEWEST
     if not enough.any():
         raise ValueError(f"no parameter is determined in {FEWEST} specimens of their own")
     place, known, se = place[:, enough], known[:, enough], se[:, enough]
@@ -145,14 +160,17 @@ def _not_negative(rest: Float[np.ndarray, "m q q"], of: Float[np.ndarray, "m q q
     return both * (vectors @ np.swapaxes(vectors, 1, 2))
 
 
-def relative_errors(
+def weighing_errors(
     result: FitResult, profiles: Intervals | None = None
-) -> Float[np.ndarray, "L P"]:
-    """Relative error of what is determined: of identifiable and weak unknowns; NaN elsewhere."""
+) -> tuple[Float[np.ndarray, "L P"], Bool[np.ndarray, "L P"]]:
+    """Relative error of each unknown, NaN where it has none, and whether it is determined."""
     out = np.full(result.theta.shape, np.nan)
+    determined = np.zeros(result.theta.shape, bool)
     for lane, unknowns in enumerate(result.study.unknowns):
         for i in range(len(unknowns)):
             judged = judgement(result, lane, i, profiles)
-            if judged.verdict in DETERMINED:
-                out[lane, i] = judged.error
-    return out
+            determined[lane, i] = judged.verdict in DETERMINED
+            if judged.verdict in WEIGHED:
+                local = float(result.relative_se[lane, i])
+                out[lane, i] = judged.error if np.isfinite(judged.error) else local
+    return out, determined

@@ -47,6 +47,7 @@ def population_rows(of: Population) -> Iterator[Cells]:
             "unit": p.unit,
             "specimens": count,
             "left_out": int(of.left_out[j]),
+            "at_bound": int(of.at_bound[j]),
             "mean": p.from_scaled(mean),
             "mean_se": slope * float(e.mean_se[j]),
             "mean_low95": p.from_scaled(mean - half),
@@ -85,11 +86,24 @@ def _section(found: Population) -> list[str]:
     return [
         "## Population",
         markdown_table(POPULATION_HEAD, population_table(found)),
-        "The specimens as a sample, those whose estimate is identifiable or weak: their errors are "
-        "taken out of the spread between them. Spread: one standard deviation, with scale `log` as "
+        "The specimens as a sample, all whose estimate has an error: their errors are taken out of "
+        "the spread between them. Spread: one standard deviation, with scale `log` as "
         "a factor, and the mean is then the geometric one. Estimates drawn towards the mean by "
         "what they are uncertain: `shrunk` in `parameters.csv`; all numbers: `population.csv` "
         "(docs/joint.md).",
+        *_biased(found),
+    ]
+
+
+def _biased(found: Population) -> list[str]:
+    """Parameters with estimates on a bound, which have no error and take no part."""
+    rows = zip(found.parameters, found.at_bound, found.known.sum(axis=0), strict=True)
+    counts = [f"{p.name} {n} of {n + seen}" for p, n, seen in rows if n]
+    if not counts:
+        return []
+    return [
+        f"**Estimates on a bound took no part ({', '.join(counts)}): the mean is too far from the "
+        "bound, the spread too small.**"
     ]
 
 
