@@ -298,3 +298,10 @@ def test_rotations_pass_rounded_to_float32_and_after_many_products():
     check_rotations("turn", np.stack(sure))  # one by one nothing passes that is refused here
     check_rotations("turn", missing[None])
     check_rotations("turn", np.eye(3)[None] + np.inf)
+
+
+def test_a_capsule_is_of_the_type_of_its_length():
+    for length, expected in ((np.float32(2), "float32"), (2.0, "float64"), (2, "float64")):
+        found = capsule(length, 1.0)
+        assert {v.dtype for v in (found.vertices, found.radius)} == {jnp.dtype(expected)}
+    assert capsule(2.0, 1.0, jnp.float32).vertices.dtype == jnp.float32

@@ -384,3 +384,14 @@ def test_gradients(D, dtype):
         along = np.tensordot(ahead, direction, np.ndim(v))
         close = max(1e4 * np.finfo(dtype).eps, 3e-7) * size
         np.testing.assert_allclose(along, (up - down) / (2 * step), atol=close, rtol=0)
+
+
+@pytest.mark.parametrize("rings", ["mat", "arch", "arch2"])
+def test_numbers_of_python_are_of_the_tubes_type(rings):
+    """Level `mat` made numbers of the material float64, which ended in a fault of a loop."""
+    numbers = Material(EI_L=1.862, k_M=0.1, k_1=0.3, k_3=0.02, EI_C=100.0, k_t=2.0)
+    options = ObliqueOptions(rings=rings, axial=False)
+    found = jax.eval_shape(
+        lambda: press_oblique(table_1(jnp.float32), numbers, 75.0, 0.3, [0.0, -1.0, -0.3], options)
+    )
+    assert {v.dtype for v in found[:-1]} == {jnp.dtype("float32")}

@@ -1,5 +1,7 @@
 """A tool with a width: against finite elements of the beam with two equal deflections imposed."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,10 +9,10 @@ import punch_fem
 import pytest
 from jax.test_util import check_grads
 from kernels import computations
+from scipy.integrate import quad
 
 from jaxtrachea.mechanics import beam as point
 from jaxtrachea.mechanics.compliance import Beam
-from jaxtrachea.mechanics.force_law import ring_weight
 from jaxtrachea.mechanics.press import Options, compliance, local_law, press
 from jaxtrachea.mechanics.punch import mean_ring_weight, punch_deflection
 from jaxtrachea.status import PressStatus
@@ -18,6 +20,7 @@ from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
 
 DTYPES = ["float32", "float64"]
+QUICK = {"xla_backend_optimization_level": 0}
 X, LENGTH, HALF = np.arange(10.0, 151.0, 10.0), 160.0, 2.4
 EI, GA, K = np.linspace(900.0, 1800.0, 16), np.linspace(7.0, 11.0, 16), np.linspace(0.1, 0.3, 15)
 
@@ -143,14 +146,36 @@ def test_no_notch():
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_mean_ring_weight(dtype):
-    x, transition = jnp.asarray(X, dtype), jnp.asarray(5.0, dtype)
-    for s in (10.0, 12.3, 15.0, 18.0):
-        points = jnp.linspace(s - HALF, s + HALF, 20001).astype(dtype)
-        mean = jnp.mean(jax.vmap(lambda p: ring_weight(p, x, transition))(points))
-        got = mean_ring_weight(jnp.asarray(s, dtype), x, transition, HALF)
-        assert got.dtype == jnp.dtype(dtype)
-        np.testing.assert_allclose(got, mean, atol=2e-4)
+@pytest.mark.parametrize(
+    ("transition", "atol"), [(0.5, 1e-12), (2.0, 1e-12), (5.0, 1e-12), (8.0, 1e-12), (25.0, 2e-4)]
+)
+def test_mean_ring_weight(transition, atol, dtype):
+    """By quadrature from kink to kink; a narrow ring under a wide tool slipped between 8 points.
+
+    Its derivative is the difference of both edges over the width, by definition.
+    """
+
+    def weight(s):
+        t = np.clip((s - X) / transition, -1, 1)
+        return 1 - np.prod(1 - (1 - t * t) ** 3)
+
+    kinks = np.concatenate([X - transition, X, X + transition])
+    for half in (HALF, 5.0, 20.0):
+
+        def mean(s, half=half):
+            x, T = jnp.asarray(X, dtype), jnp.asarray(transition, dtype)
+            return mean_ring_weight(s, x, T, half)
+
+        value_and_grad = jax.jit(jax.value_and_grad(mean), compiler_options=QUICK)
+        for s in (80.0, 79.5, 81.0, 72.3, 30.0):
+            ends = [s - half, *sorted(k for k in kinks if abs(k - s) < half), s + half]
+            exact = sum(quad(weight, a, b, epsabs=1e-14)[0] for a, b in itertools.pairwise(ends))
+            got, slope = value_and_grad(jnp.asarray(s, dtype))
+            assert got.dtype == jnp.dtype(dtype)
+            bound = {"float32": 3e-6, "float64": 0}[dtype] + atol
+            np.testing.assert_allclose(got, exact / (2 * half), rtol=0, atol=bound)
+            steep = (weight(s + half) - weight(s - half)) / (2 * half)
+            np.testing.assert_allclose(slope, steep, rtol=0, atol=10 * bound / min(transition, 1))
 
 
 @pytest.mark.slow

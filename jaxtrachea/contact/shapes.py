@@ -161,7 +161,9 @@ def capsule(half_length: ArrayLike, radius: ArrayLike, dtype=None) -> Shape:
         radius: mm, not negative.
         dtype: of the shape; default that of `half_length`.
     """
-    end = jnp.asarray(half_length, dtype) * jnp.array([-1.0, 1.0], dtype)
+    half = jnp.asarray(half_length, dtype)
+    half = jnp.asarray(half, jnp.result_type(half, float) if dtype is None else dtype)
+    end = jnp.stack([-half, half])
     zero = jnp.zeros_like(end)
     return _shape(jnp.stack([zero, zero, end]), radius)
 

@@ -251,8 +251,13 @@ def ring_weight(
         ring_positions: mm; shape (n,).
         transition: distance from a ring's centre at which the ligament's law is reached, mm.
     """
-    t = jnp.clip((s_c - ring_positions) / transition, -1, 1)
-    return 1 - jnp.prod(1 - (1 - t * t) ** 3)
+    return 1 - jnp.prod(1 - on_one_ring(s_c - ring_positions, transition))
+
+
+def on_one_ring(distance: Float[Array, "*m"], transition: Float[Array, ""]) -> Float[Array, "*m"]:
+    """(1 - t_i^2)^3 of `ring_weight`, at a distance from the centre of one ring, mm."""
+    t = jnp.clip(distance / transition, -1, 1)
+    return (1 - t * t) ** 3
 
 
 def of_ligament(material: Material) -> Law:

@@ -19,10 +19,12 @@ from jaxtyping import Array, Float
 from jaxtrachea._numerics import epsilon, picked, product
 from jaxtrachea.mechanics.beam import deflect_on
 from jaxtrachea.mechanics.compliance import Beam
-from jaxtrachea.mechanics.force_law import ring_weight
+from jaxtrachea.mechanics.force_law import on_one_ring
 
 #: Points of Gauss and Legendre in [-1, 1] and their weights, for means over the width.
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+#: Rings on one side that may reach a point; where more do, those in between leave nothing to them.
+_REACHING = 8
 
 
 class UnitDeflection(NamedTuple):
@@ -125,7 +127,24 @@ def mean_ring_weight(
     transition: Float[Array, ""],
     half_width: float,
 ) -> Float[Array, ""]:
-    """`ring_weight`, its mean over the width of the punch."""
-    points = s_c + half_width * jnp.asarray(_POINTS, s_c.dtype)
-    of_points = jax.vmap(ring_weight, (0, None, None))(points, ring_positions, transition)
-    return jnp.sum(of_points * jnp.asarray(_WEIGHTS / 2, s_c.dtype))
+    """`ring_weight`, its mean over the width of the punch.
+
+    The sum over rings of w_i = `on_one_ring` times 1 - w_j of all rings before it, each integrated
+    where it is not 0, from kink to kink: exact where no more than two rings reach a point, else
+    (`transition` above the ring distance) to some 1e-4.
+    """
+    x, n = ring_positions, ring_positions.shape[0]
+    low, high = x - transition, x + transition
+    kink = jnp.concatenate([low[:1], high[:-1]])  # where the ring before ends
+    edges = jnp.stack([low, jnp.clip(kink, low, high), high])
+    edges = jnp.clip(edges, s_c - half_width, s_c + half_width)
+    middle, half = (edges[1:] + edges[:-1]) / 2, (edges[1:] - edges[:-1]) / 2
+    points, weights = (jnp.asarray(v, s_c.dtype)[:, None, None] for v in (_POINTS, _WEIGHTS))
+    at = middle[None] + half[None] * points
+    share = on_one_ring(at - x[None, None], transition)
+    for back in range(1, min(n, _REACHING + 1)):
+        other = on_one_ring(at[..., back:] - x[None, None, :-back], transition)
+        before = [(0, 0), (0, 0), (back, 0)]
+        share = share * jnp.pad(1 - other, before, constant_values=1)
+    of_ring = jnp.sum(jnp.sum(weights * share, axis=0) * half, axis=0)
+    return jnp.sum(of_ring) / (2 * half_width)

@@ -193,7 +193,7 @@ def turned_rings(
 def _rings(geometry: Geometry, material: Material, phi_c, level: Rings):
     """Compliance at phi_c (n, 2, 2), motion of the ends U and V per load (or None), and status."""
     k_M = jnp.broadcast_to(material.k_M, geometry.ring_positions.shape)
-    eye = jnp.eye(2, dtype=k_M.dtype)[None]
+    eye = jnp.eye(2, dtype=geometry.radius.dtype)[None]
     if level == "mat":
         on, _ = _ring.on_ring(geometry.half_angle, phi_c)
         off = jnp.where(jnp.isnan(phi_c), RingStatus.NON_FINITE, RingStatus.BEHIND_GAP)
