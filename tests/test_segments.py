@@ -5,6 +5,7 @@ import dataclasses
 import load_hold
 import numpy as np
 import pytest
+from measured_files import put, read
 
 from jaxtrachea.measurements import segments
 from jaxtrachea.measurements.checks import finish
@@ -271,3 +272,14 @@ def test_k_1_of_the_records_by_the_fit():
     rows = {row[0]: row for row in load_hold.summary()}
     assert rows["now, with time"][3] < 1.25 * rows["true loading"][3]
     assert rows["all samples"][3] > 20 * rows["true loading"][3]
+
+
+@pytest.mark.parametrize(("sign", "told"), [(-1, True), (1, False)])
+def test_a_record_that_only_draws_is_told(tmp_path, sign, told):
+    """Both counted the other way: with onset and offset fitted it was a press of another k."""
+    D = np.linspace(0, 1, 21)
+    rows = "".join(f"{sign * d:.2f},{sign * (d + d**3) + 0.002:.5f}\n" for d in D)
+    path = put(tmp_path, "displacement [mm],force [N]\n" + rows)
+    (got,) = read(path).curves
+    said = [r for r in got.usage.remarks if "displacement_sign = -1 and force_sign = -1" in r]
+    assert len(said) == told

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from jaxtrachea.measurements.curve import Fault, RawCurve, ReadOptions
-from jaxtrachea.measurements.plausible import doubt
+from jaxtrachea.measurements.plausible import doubt, drawn
 from jaxtrachea.measurements.segments import JITTER, NoLoading, Segments, segment
 from jaxtrachea.measurements.usage import CHOOSING, Usage, lasting, usage
 
@@ -18,13 +18,12 @@ def usage_of(
     found: Segments | None,
     options: ReadOptions,
 ) -> Usage:
-    """What of the record is used, with a word on sizes that are hard to believe."""
+    """What of the record is used, with a word on sizes and signs that are hard to believe."""
     unit = "samples" if raw.time is None else "s"
     seen = usage(displacement, keep, found, options.loading, unit)
-    doubtful = doubt(displacement[keep], force[keep])
-    if doubtful is None:
-        return seen
-    return dataclasses.replace(seen, remarks=(*seen.remarks, doubtful))
+    taken = displacement[keep], force[keep]
+    doubts = [said for said in (doubt(*taken), drawn(*taken)) if said is not None]
+    return dataclasses.replace(seen, remarks=(*seen.remarks, *doubts)) if doubts else seen
 
 
 def segments_of(

@@ -5,6 +5,8 @@ import numpy as np
 #: Plausible extent of displacement (mm), of force (N), and stiffness (N/mm) of a press: from thin
 #: airways of small animals to silicone cylinders of 50 mm, with room to spare.
 DISPLACEMENT, FORCE, STIFFNESS = (0.05, 100.0), (1e-3, 1000.0), (1e-3, 200.0)
+#: What a record that only draws may rise above 0, as a share of its depth below: noise.
+DRAWN = 0.1
 #: Units that are taken for mm and N by mistake, in mm and N.
 LENGTHS = {"um": 1e-3, "cm": 10.0, "m": 1000.0}
 FORCES = {"mN": 1e-3, "gf": 9.80665e-3, "kN": 1000.0}
@@ -23,6 +25,20 @@ def doubt(displacement: np.ndarray, force: np.ndarray) -> str | None:
         One sentence, or None.
     """
     return doubt_of(float(np.ptp(displacement)), float(np.ptp(force)))
+
+
+def drawn(displacement: np.ndarray, force: np.ndarray) -> str | None:
+    """What a record says in which a tool draws from the beginning; one sentence, or None.
+
+    A press whose file counts both the other way looks the same, and where first touch and the zero
+    of the force are fitted it could be one of these, too.
+    """
+    if any(v.size < 2 or v.max() > -DRAWN * v.min() for v in (displacement, force)):
+        return None
+    return (
+        f"displacement and force go down to {displacement.min():.4g} mm and {force.min():.4g} N: a "
+        "tool that draws; if it presses, set displacement_sign = -1 and force_sign = -1"
+    )
 
 
 def doubt_of(extent: float, peak: float) -> str | None:
