@@ -52,7 +52,8 @@ class SectionMaterial(eqx.Module):
         EI_C: bending stiffness in front, N mm^2 for each ring with its pitch of wall; a ring.
         EI_M: likewise of the muscle behind; a ring.
         Et_M: modulus times thickness of the muscle around the tube, N/mm; a ring.
-        bed_n: bed behind the muscle, along the normal, N/mm^3; a ring.
+        bed_n: bed behind the muscle, along the normal, per area of the outer surface, N/mm^3; a
+            ring.
         bed_t: likewise along the circumference; a ring.
         Gt_L: shear modulus times thickness of the wall between rings, N/mm; a span. Large values
             stand for a wall without membrane shear.
@@ -83,11 +84,13 @@ class SectionMaterial(eqx.Module):
         _fixed(0.65), each="ring",
     )  # fmt: skip
     bed_n: Float[Array, "..."] = _field(
-        "bed_n", "N/mm^3", "cubic_stiffness", "bed behind the muscle, along the normal",
+        "bed_n", "N/mm^3", "cubic_stiffness",
+        "bed behind the muscle, on its outer surface, along the normal",
         Fitted(0.02, 1e-8, 1e3), each="ring",
     )  # fmt: skip
     bed_t: Float[Array, "..."] = _field(
-        "bed_t", "N/mm^3", "cubic_stiffness", "bed behind the muscle, along the circumference",
+        "bed_t", "N/mm^3", "cubic_stiffness",
+        "bed behind the muscle, on its outer surface, along the circumference",
         Fitted(0.002, 1e-8, 1e3), each="ring",
     )  # fmt: skip
     Gt_L: Float[Array, "..."] = _field(
