@@ -135,6 +135,7 @@ def test_criteria_are_their_definitions_and_greedy_takes_the_best(known):
     assert candidates.depth[next_points(known, candidates).chosen[0]] == 6.0
 
 
+@pytest.mark.slow
 def test_ten_thousand_candidates(known):
     """More than are computed at a time; the error of every unknown falls."""
     one = dataclasses.replace(
@@ -206,7 +207,8 @@ def sandwich_errors(theta, presses, balance):
     return np.sqrt(np.diag(inverse @ meat @ inverse))
 
 
-@pytest.mark.parametrize("balance", ["sample", *late("curve")])
+@pytest.mark.slow
+@pytest.mark.parametrize("balance", ["curve", "sample"])
 def test_expected_errors_are_those_of_the_refit(balance):
     """Curves of 15 to 120 samples: errors before and after two presses, and those of a refit.
 
@@ -351,6 +353,7 @@ def test_depths_of_presses_are_from_first_touch(onset):
     assert extrapolation(study, 3.1, known.reach) == f"{says}D = 1.13 mm from first touch"
 
 
+@pytest.mark.slow
 def test_where_a_record_has_its_zero_tells_nothing():
     """A press as deep tells the same whatever the displacement at first touch; it told nothing."""
     candidates = Candidates(np.array([51.0, 75.0]), np.array([3.0, 3.0]))

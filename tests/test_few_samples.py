@@ -90,6 +90,7 @@ def test_estimates_are_of_all_samples(study, seen):
         assert np.all(np.abs(result.theta[lane] - theta) < 1e-3 * result.uncertainty.se[lane])
 
 
+@pytest.mark.slow
 def test_given_starts_are_of_all_samples(study, seen):
     """A refit from an estimate takes the minimum near it."""
     many = study.take(np.tile(np.arange(LANES), 4))
@@ -191,6 +192,7 @@ def test_starts_that_ended_apart_stay_apart():
     np.testing.assert_array_equal(rows[first[of]], rows)
 
 
+@pytest.mark.slow
 def test_infeasible_starts_stay_what_they_are(study):
     """A lane whose curves nothing explains fails, and no other; it is not fitted to a part."""
     displacement = np.array(study.lanes.displacement)

@@ -126,8 +126,8 @@ CASES = [
     pytest.param(simulated, id="scene", marks=pytest.mark.slow),
     pytest.param(swept, id="sweep", marks=pytest.mark.slow),
     pytest.param(stepped, id="session", marks=pytest.mark.slow),
-    pytest.param(dense, id="beam"),
-    pytest.param(fit, id="fit", marks=pytest.mark.slow),
+    pytest.param(dense, id="beam", marks=pytest.mark.slow),
+    pytest.param(fit, id="fit"),
 ]
 
 

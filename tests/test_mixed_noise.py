@@ -81,6 +81,7 @@ def test_a_specimen_is_as_by_itself():
     assert half[0] > half[1]
 
 
+@pytest.mark.slow
 def test_criteria_are_of_the_likelihood_whatever_the_lengths_of_others():
     """Long curves of another specimen multiplied a deviance, to a false "decisively"."""
     short = [

@@ -479,7 +479,8 @@ def test_a_patch_that_is_no_number_is_told(beta):
 PARTS = {"xla_cpu_parallel_codegen_split_count": 32}
 
 
-@pytest.mark.parametrize("dtype", ["float64", *late("float32")])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_a_ball_over_the_border_of_two_patches_touches_the_border(dtype):
     """By symmetry; in a batch a compiler once rounded the patches' bounds in two ways.
 

@@ -238,7 +238,8 @@ def late_study(onset, offset, late=(10.0, 10.3), zero=0.0):
     return build_study(curves, table_1(), Options(), table, noise=Noise(force=0.01))
 
 
-@pytest.mark.parametrize("onset", [{}, *late({"fixed": True, "value": 10.0})])
+@pytest.mark.slow
+@pytest.mark.parametrize("onset", [{}, {"fixed": True, "value": 10.0}])
 def test_extrapolated_and_tested_are_depths_from_first_touch(onset, tmp_path):
     """Presses of 1 mm, recorded from 8 to 11 mm; what was said was held against these 11 mm."""
     late = (10.0, 10.0 if onset else 10.3)

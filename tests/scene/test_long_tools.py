@@ -39,7 +39,7 @@ def scene_of(tool, radius, gaps=GAPS, x=75.0):
         (capsule(10.0, 4.0), 4.0),
         pytest.param(capsule(150.0, 4.0), 4.0, marks=pytest.mark.slow),
         pytest.param(capsule(490.0, 4.0), 4.0, marks=pytest.mark.slow),
-        (sphere(200.0), 200.0),
+        pytest.param(sphere(200.0), 200.0, marks=pytest.mark.slow),
     ],
 )
 def test_gaps_do_not_grow_with_the_tool(tool, radius):

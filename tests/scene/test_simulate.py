@@ -405,6 +405,7 @@ def test_a_path_of_matrices_that_are_no_rotations_is_refused():
     jax.eval_shape(simulate, scene, SPRINGS, bad)
 
 
+@pytest.mark.slow
 def test_the_place_of_first_touch_does_not_follow_the_step():
     """It was that of the first row in the tube: with 4 rows s was off by 0.95 mm, force by 2.4 %.
 
