@@ -35,6 +35,8 @@ def drawn(displacement: np.ndarray, force: np.ndarray) -> str | None:
     """
     if any(v.size < 2 or v.max() > -DRAWN * v.min() for v in (displacement, force)):
         return None
+    if displacement[-1] > displacement[0]:  # it ends at 0, where it may have been tared
+        return None
     return (
         f"displacement and force go down to {displacement.min():.4g} mm and {force.min():.4g} N: a "
         "tool that draws; if it presses, set displacement_sign = -1 and force_sign = -1"
