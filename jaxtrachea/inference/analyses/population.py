@@ -91,7 +91,6 @@ def _section(found: Population) -> list[str]:
         "a factor, and the mean is then the geometric one. Estimates drawn towards the mean by "
         "what they are uncertain: `shrunk` in `parameters.csv`; all numbers: `population.csv` "
         "(docs/joint.md).",
-        *_biased(found),
     ]
 
 
@@ -102,8 +101,8 @@ def _biased(found: Population) -> list[str]:
     if not counts:
         return []
     return [
-        f"**Estimates on a bound took no part ({', '.join(counts)}): the mean is too far from the "
-        "bound, the spread too small.**"
+        f"**Population: estimates on a bound took no part ({', '.join(counts)}): the mean is too "
+        "far from the bound, the spread too small.**"
     ]
 
 
@@ -120,5 +119,6 @@ POPULATION = Analysis(
     parameter_cells=Population.shrunk_cells,
     place="estimates",
     section=_section,
+    warning=_biased,
     shown=_shown,
 )
