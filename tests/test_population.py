@@ -163,6 +163,24 @@ def test_what_the_data_hardly_determine_takes_part():
     assert abs(spread - truth.std(ddof=1)) < 0.06
 
 
+@pytest.mark.parametrize("scale", ["log", "linear"])
+def test_logarithms_of_what_is_hardly_determined_are_told(scale):
+    """k_1 of 0.03 to 0.08 with errors of 0.026: 0.052 and less of them have errors above half."""
+    rng, D = np.random.default_rng(2), np.linspace(0, 1.1, 16)
+    sigma = 0.026 * np.sqrt(np.sum(D**2))
+    curves = [
+        Curve(f"s{i:02d}", "1", 75.0, 0.0, D, k * D + rng.normal(0, sigma, 16))
+        for i, k in enumerate(np.linspace(0.03, 0.2, 40))
+    ]
+    table = {"k_1": {"scale": scale}, "k_3": {"fixed": True, "value": 0.0}}
+    options, noise = Options(coupling="total"), Noise(force=sigma)
+    found = population(fit(build_study(curves, table_1(), options, table, noise=noise)))
+    below = np.sum(found.known & (0.026 > 0.5 * found.result.value[:, :1]))
+    assert (found.undetermined[0], below > 4) == (below, True)
+    told = [text for text in POPULATION.warning(found) if "errors above half the value" in text]
+    assert len(told) == (scale == "log")
+
+
 def test_estimates_on_a_bound_are_told():
     """Their likelihood has no width there: of ten values of 0.1 +- 0.2 those below 0 are at 0."""
     D = np.linspace(0, 1.1, 16)

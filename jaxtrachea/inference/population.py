@@ -19,6 +19,7 @@ from jaxtrachea._arguments import check_word
 from jaxtrachea.fitting.parameters import Parameter
 from jaxtrachea.fitting.result import DETERMINED, FitResult, Intervals, judgement
 from jaxtrachea.fitting.study import Study
+from jaxtrachea.fitting.verdict import WEAK
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.random_effects import FEWEST, Common, Effects, random_effects
 
@@ -56,6 +57,12 @@ class Population:
         """Of `left_out` those on a bound, without which the mean is too far from it; (q,)."""
         held = self.result.at_bound[np.arange(len(self.place))[:, None], self.place]
         return np.sum((self.place >= 0) & ~self.known & held, axis=0)
+
+    @property
+    def undetermined(self) -> Int[np.ndarray, " q"]:
+        """Of those that took part, estimates with an error above half their value; (q,)."""
+        error = self.result.relative_se[np.arange(len(self.place))[:, None], self.place]
+        return np.sum(self.known & ~(error <= WEAK), axis=0)
 
     def shrunk_cells(self, lane: int, i: int) -> dict[str, object]:
         """Columns `shrunk` and `shrunk_se` of parameters.csv for an unknown; none if not of it."""

@@ -17,6 +17,8 @@ from jaxtrachea.inference.analysis import (
 )
 from jaxtrachea.inference.population import Population, population, wanted
 
+#: Share of estimates with errors above half their value from which logarithms are no good scale.
+UNSURE = 0.1
 POPULATION_HEAD = ["parameter", "n", "left out", "mean", "95 % interval", "spread", "95 % interval"]
 
 
@@ -95,15 +97,27 @@ def _section(found: Population) -> list[str]:
 
 
 def _biased(found: Population) -> list[str]:
-    """Parameters with estimates on a bound, which have no error and take no part."""
-    rows = zip(found.parameters, found.at_bound, found.known.sum(axis=0), strict=True)
-    counts = [f"{p.name} {n} of {n + seen}" for p, n, seen in rows if n]
-    if not counts:
-        return []
-    return [
-        f"**Population: estimates on a bound took no part ({', '.join(counts)}): the mean is too "
-        "far from the bound, the spread too small.**"
-    ]
+    """What the mean is biased by: estimates on a bound, logarithms of what is hardly determined."""
+    held, unsure = [], []
+    each = zip(found.parameters, found.at_bound, found.undetermined, strict=True)
+    for (p, on_bound, open_), count in zip(each, found.known.sum(axis=0), strict=True):
+        if on_bound:
+            held.append(f"{p.name} {on_bound} of {on_bound + count}")
+        if p.scale == "log" and open_ > UNSURE * count:
+            unsure.append(f"{p.name} {open_} of {count}")
+    texts = []
+    if held:
+        texts.append(
+            f"**Population: estimates on a bound took no part ({', '.join(held)}): the mean is too "
+            "far from the bound, the spread too small.**"
+        )
+    if unsure:
+        texts.append(
+            f"**Population: errors above half the value ({', '.join(unsure)}): with scale = 'log' "
+            "the small ones count too little, the mean is too large; fit it with scale = "
+            "'linear'.**"
+        )
+    return texts
 
 
 def _shown(found: Population, lanes: list[int]) -> Iterator[Table]:
