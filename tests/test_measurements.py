@@ -47,6 +47,22 @@ def test_tidy_values_by_hand(tmp_path):
     assert found.sha256() == {str(path): hashlib.sha256(TIDY.encode()).hexdigest()}
 
 
+def test_columns_that_are_not_read_are_told(tmp_path):
+    """`sgima` left the noise to a guess and `angle` the press on the midline, without a word."""
+    says = "columns without a role are not read: {}; data.columns gives them one"
+    head = "specimen,s [mm],angle [deg],displacement [mm],force [N],sgima [N],time [s]"
+    text = head + ",note\nA,40,20,0,0,0.1,0,x\nA,40,20,1,2,0.1,1,\n"
+    path = put(tmp_path, text)
+    assert read(path).notes == (says.format("'angle', 'sgima', 'note'"),)
+    found = read(path, columns={"phi": "angle", "sigma": "sgima"})
+    assert found.notes == (says.format("'note'"),)
+    assert found.curves[0].phi_c == pytest.approx(np.radians(20))
+    many = "displacement [mm],force [N],s [mm]," + ",".join(f"c{i}" for i in range(12))
+    (note,) = read(put(tmp_path, f"{many}\n0,0,40{',' * 12}\n1,2,40{',' * 12}\n")).notes
+    assert "'c9' and 2 more;" in note
+    assert read(put(tmp_path, TIDY)).notes == ()
+
+
 @pytest.mark.parametrize(
     ("change", "encoding"),
     [

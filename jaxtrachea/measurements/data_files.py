@@ -118,7 +118,7 @@ def read_data(spec: FitSpec, root: Path) -> Measurements:
     parts = [_read_one(path, options) for path in files]
     curves = [curve for part in parts for curve in part.curves]
     bad = [curve for part in parts for curve in part.bad]
-    notes = [note for part in parts for note in part.notes]
+    notes = dict.fromkeys(note for part in parts for note in part.notes)
     _refuse_twice(parts)
     return Measurements(tuple(curves), tuple(bad), tuple(files), tuple(notes))
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, ReadOptions
+from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, RawCurve, ReadOptions
 from jaxtrachea.measurements.readers import READERS, hdf5, reader_of
 from jaxtrachea.measurements.readers.large import MIN_BYTES, first_lines
 from jaxtrachea.measurements.readers.lines import (
@@ -40,6 +40,8 @@ __all__ = [
 
 #: What another sheet of the same workbook may mend.
 _OF_THE_SHEET = ("empty", "column_missing")
+#: Names of columns in a sentence.
+_COLUMNS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +109,7 @@ def read_measurements(
     for path in files:
         _check_file(path)
         records, said = _read_file(path, options)
-        notes.extend(said)
+        notes.extend([*said, *_unread(records)])
         for record in records:
             key = (record.specimen, record.trial)
             if key in seen:
@@ -151,6 +153,16 @@ def write_hdf5(
             a (specimen, trial) comes twice.
     """
     hdf5.write(Path(path), measurements.curves, dict(attrs or {}), overwrite, schema_version)
+
+
+def _unread(records: Records) -> list[str]:
+    """That columns of a tidy table are not read, without the file: said once of many."""
+    names = dict.fromkeys(n for r in records if isinstance(r, RawCurve) for n in r.unread)
+    if not names:
+        return []
+    shown = ", ".join(repr(name) for name in [*names][:_COLUMNS])
+    more = f" and {len(names) - _COLUMNS} more" if len(names) > _COLUMNS else ""
+    return [f"columns without a role are not read: {shown}{more}; data.columns gives them one"]
 
 
 def _check_file(path: Path) -> None:

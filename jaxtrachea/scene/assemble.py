@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -47,7 +48,8 @@ def make_scene(
         material: read only for which optional values are there; a `SectionMaterial` makes a scene
             of deforming cross-sections.
         path: what the plan is made for; other paths may follow if they need no more.
-        tool: with its friction, or its shape alone; a shape is needed for `Poses`.
+        tool: with its friction, or its shape alone, in any dtype: the scene has that of
+            `geometry`; a shape is needed for `Poses`.
         mesh: the surface; without one `effects.want_surface` must be false. Of deforming
             cross-sections a straight one only follows: a tool touches a round wall of `radius`.
         radius: of the tube's outside, mm; None: of a `SectionMaterial` that of its mid-line and
@@ -73,8 +75,9 @@ def make_scene(
     if not len(path.s if isinstance(path, Presses) else path.translation):
         raise ValueError("path has no rows; expected at least one")
     tool = tool if isinstance(tool, Tool) else Tool(tool)
-    shape, friction = tool.shape, tool.friction
     dtype = geometry.length.dtype
+    shape = jax.tree.map(lambda v: jnp.asarray(v, dtype), tool.shape)
+    friction = tool.friction
     sections = isinstance(material, SectionMaterial)
     if radius is None and isinstance(material, SectionMaterial):
         outer = geometry.radius + material.offset

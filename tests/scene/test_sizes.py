@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_scenes import BALL, SPRINGS, TUBE, ball, bend, on_arc, poses
@@ -153,3 +154,15 @@ def test_a_wall_that_a_tool_would_not_touch_is_refused():
 def test_a_relief_that_cannot_be(change, says):
     with pytest.raises(ValueError, match=says):
         SceneSpec.model_validate(MOUSE | change)
+
+
+@pytest.mark.parametrize(("tube", "tool"), [("float32", "float64"), ("float64", "float32")])
+def test_a_tool_of_another_dtype_takes_that_of_the_tube(tube, tool):
+    """A float64 tool made a float32 scene's results float64, on a mesh's wall a loop's fault."""
+    path = ball([75, 0.5, 0], [75, -2.5, 0], 3)
+    skeleton, material, path = jax.tree.map(lambda v: jnp.asarray(v, tube), (TUBE, SPRINGS, path))
+    mesh = make_tube(skeleton, around=9, along=40)
+    scene = make_scene(skeleton, material, path, tool=sphere(5.0, tool), mesh=mesh)
+    found = jax.eval_shape(simulate, scene, material, path)
+    kinds = {v.dtype for v in jax.tree.leaves(found) if jnp.issubdtype(v.dtype, jnp.floating)}
+    assert kinds == {jnp.dtype(tube)}

@@ -241,9 +241,17 @@ def _curve(
             phi=_constant("phi", values, state, table, picked),
             time=time_values(table, roles, picked, options),
             direction=state.get("direction", (1.0, 0.0)),
+            unread=_unread(table, roles, options),
         )
     except Fault as fault:
         return bad(*key, source, fault)
+
+
+def _unread(table: Table, roles: dict[str, int], options: ReadOptions) -> tuple[str, ...]:
+    """Names of the columns that have no role."""
+    time = None if "time" in roles else time_column(table.names, table.units, roles, options)
+    read = {*roles.values()} if time is None else {*roles.values(), time[0]}
+    return tuple(name for i, name in enumerate(table.names) if name and i not in read)
 
 
 def _constant(
