@@ -10,6 +10,7 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
 
 from jaxtrachea.contact.pose import (
     Pose,
@@ -147,6 +148,32 @@ def test_hull_drops_what_is_inside():
     flat = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0], [1, 1, 0]]
     assert hull(flat).vertices.shape == (3, 4)
     assert hull([[1, 2, 3]], 2.0).vertices.shape == (3, 1)
+
+
+def test_hull_of_a_box_with_many_points_on_its_faces():
+    """Roundings lift points out of faces; each counted in the smooth support, 0.07 mm here."""
+    line = np.linspace(-1, 1, 9)
+    grid = np.stack(np.meshgrid(line, line, line), -1).reshape(-1, 3)
+    faces = grid[np.abs(grid).max(axis=1) == 1] * [5, 3, 10]
+    turn = Rotation.from_euler("xyz", [0.3, 0.4, 0.5]).as_matrix()
+    found = hull((faces @ turn.T).astype(np.float32))
+    corners = np.asarray(box([5.0, 3.0, 10.0]).vertices).T @ turn.T
+    assert found.vertices.shape == (3, 8)
+    apart = np.linalg.norm(corners[:, None] - np.asarray(found.vertices).T[None], axis=2)
+    assert apart.min(axis=0).max() < 1e-5
+    assert apart.min(axis=1).max() < 1e-5
+
+
+@pytest.mark.parametrize("thickness", [1e-9, 1e-6, 1e-3, 0.1])
+def test_hull_of_a_thin_plate_keeps_its_edges(thickness):
+    draw = np.random.default_rng(5)
+    line = np.linspace(0, 10, 5)
+    plate = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
+    plate = np.concatenate([plate, thickness * draw.normal(size=(25, 1))], axis=1)
+    kept = np.asarray(hull(plate).vertices).T
+    turn = np.linspace(0, 2 * np.pi, 100)
+    d = np.stack([np.cos(turn), np.sin(turn), 0 * turn])
+    np.testing.assert_allclose((kept @ d).max(axis=0), (plate @ d).max(axis=0), atol=1e-3)
 
 
 def test_padded_is_the_same_sharp_shape():

@@ -31,6 +31,10 @@ from jaxtrachea._numerics import largest, total
 
 #: Numbers, arrays and nested lists of them.
 ArrayLike = _ArrayLike | Sequence
+#: Of a hull's extent, what a point must stand out of the faces round it to be a corner.
+FLAT = 1e-5
+#: Thickness over length of a hull from which on that is looked for: thin plates would lose sides.
+THIN = 0.01
 
 
 class Shape(eqx.Module):
@@ -122,24 +126,35 @@ def cloud(points: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
 def hull(points: ArrayLike, radius: ArrayLike = 0.0, dtype=None) -> Shape:
     """The hull of points, keeping only its extreme points (the cost of a contact grows with n).
 
-    Works on numbers, not on traced values. Flat and collinear clouds keep all distinct points.
+    Faces that are flat to `FLAT` of the extent keep their corners alone: each point that roundings
+    lift out of one would count in the smooth support function, which then bulges there. Works on
+    numbers, not on traced values. Flat and collinear clouds keep all distinct points.
 
     Args: as `cloud`.
 
     Raises:
         ValueError: as `cloud`.
     """
-    from scipy.spatial import ConvexHull, QhullError
-
     given = np.asarray(points, float)
     if given.ndim != 2 or given.shape[1] != 3:
         raise ValueError(f"points: expected shape (n, 3) with n >= 1, found {given.shape}")
-    given = np.unique(given, axis=0)
-    try:
-        given = given[np.sort(ConvexHull(given).vertices)]
-    except (QhullError, ValueError):  # fewer than four points, or all in one plane
-        pass
-    return cloud(given, radius, dtype)
+    return cloud(_corners(np.unique(given, axis=0)), radius, dtype)
+
+
+def _corners(points: np.ndarray) -> np.ndarray:
+    """Those of points that their hull needs; all, where it is flat or is none."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    if not np.isfinite(points).all():
+        return points
+    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    flat = FLAT * np.ptp(points, axis=0).max()
+    for options in ("Qt",) if extents[-1] < THIN * extents[0] else (f"Qt C-{flat:.3g}", "Qt"):
+        try:
+            return points[np.sort(ConvexHull(points, qhull_options=options).vertices)]
+        except (QhullError, ValueError):  # fewer than four points, or all in one plane
+            continue
+    return points
 
 
 def sphere(radius: ArrayLike, dtype=None) -> Shape:

@@ -27,6 +27,8 @@ PROBES = 2000
 SIDEWAYS = 0.5
 #: Planes that tell which points are shallow.
 FEW = 64
+#: What a vertex of a core adds to it at least, over the radius of the largest ball that fits.
+LEAST = 1e-5
 #: Planes straight across, which hold a patch together where no face looks sideways.
 ACROSS = 8
 
@@ -214,7 +216,7 @@ def _patch(inside, ends, own, station, rounding, most):
     core = HalfspaceIntersection(planes, middle).intersections
     core = core[ConvexHull(core).vertices]
     d = coarse_directions(PROBES)[0]
-    kept = core[_extreme(core @ d.T, most)]
+    kept = core[_extreme(core @ d.T, most, LEAST * largest)]
     if len(own) > PROBES:  # those that stand out
         own = own[ConvexHull(own).vertices]
     lost = (own @ d.T - (kept @ d.T).max(axis=0)).max() - r
@@ -250,13 +252,17 @@ def _sides(points, t):
     return np.concatenate([faces[np.abs(faces[:, :3] @ t) < SIDEWAYS], straight])
 
 
-def _extreme(heights, most):
-    """Of the rows (vertices by directions) up to `most` that keep the maxima best, one by one."""
+def _extreme(heights, most, least):
+    """Of the rows (vertices by directions) up to `most` that keep the maxima best, one by one.
+
+    No more where each adds at most `least` to a maximum: of the corners that roundings make where
+    faces lie in one plane each would count in the softmax, which then bulges there.
+    """
     full, chosen = heights.max(axis=0), []
     reached = np.full_like(full, -np.inf)
     while len(chosen) < min(most, len(heights)):
         worst = np.argmax(full - reached)
-        if full[worst] - reached[worst] <= 0:
+        if full[worst] - reached[worst] <= least:
             break
         chosen.append(int(heights[:, worst].argmax()))
         reached = np.maximum(reached, heights[chosen[-1]])
