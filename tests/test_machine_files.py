@@ -127,6 +127,75 @@ def test_a_way_that_its_file_calls_s_is_no_position(tmp_path):
     assert got.s_c is None
 
 
+PATTERN = r"(?P<specimen>T\d+)_s(?P<s>\d+)_p(?P<phi>\d+)"
+
+
+@pytest.mark.parametrize(
+    ("columns", "cells", "options", "found"),
+    [
+        ("trial,", "1,", {}, (35.0, 40)),
+        ("phi [deg],", "40,", {}, (35.0, 40)),
+        ("s [mm],", "35,", {}, (35.0, 40)),
+        ("specimen,", "T7,", {}, (35.0, 40)),
+        ("phi [deg],", "0,", {}, "phi is 0 rad in the table but 0.698132 rad in the name of the"),
+        ("s [mm],", "75,", {}, "s is 75 mm in the table but 35 mm in the name of the file"),
+        ("trial,", "1,", {"s": "75 mm"}, "s is 35 mm in the file but 75 mm in the options"),
+        ("", "", {"format": "tidy"}, (35.0, 40)),
+        ("", "", {}, (35.0, 40)),
+    ],
+)
+def test_positions_of_a_file_name_hold_for_tables_too(tmp_path, columns, cells, options, found):
+    """They were dropped where the table was tidy: a press at 40 degrees was one on the midline."""
+    text = f"{columns}displacement [mm],force [N]\n{cells}0,0\n{cells}1,2\n"
+    path = put(tmp_path, text, "T7_s35_p40.csv")
+    got = read(path, specimen=PATTERN, units={"s": "mm", "phi": "deg"}, **options)
+    if isinstance(found, str):
+        assert found in only_bad(got).message
+    else:
+        (curve,) = got.curves
+        assert (curve.specimen, curve.s_c, round(np.degrees(curve.phi_c))) == ("T7", *found)
+
+
+def test_a_first_line_and_a_file_name_must_agree(tmp_path):
+    text = '{"s": "75 mm"}\ntrial,displacement [mm],force [N]\n1,0,0\n1,1,2\n'
+    path = put(tmp_path, text, "T7_s35.csv")
+    pattern = r"(?P<specimen>T\d+)_s(?P<s>\d+)"
+    bad = only_bad(read(path, specimen=pattern, units={"s": "mm"}))
+    assert "s is 75 mm in the table but 35 mm in the name" in bad.message
+    (got,) = read(
+        put(tmp_path, text.replace("75", "35"), "T7_s35.csv"), specimen=pattern, units={"s": "mm"}
+    ).curves
+    assert got.s_c == 35
+
+
+def test_a_time_called_s(tmp_path):
+    """In the unit of a time it is no position; without a unit the cure says what to do."""
+    text = "s [s],displacement [mm],force [N]\n0,0,0\n1,1,2\n"
+    (got,) = read(put(tmp_path, text, "T7.csv")).curves
+    assert (got.specimen, got.s_c) == ("T7", None)
+    (got,) = read(put(tmp_path, text, "T7.csv"), columns={"time": "s"}).curves
+    np.testing.assert_array_equal(got.time, [0, 1])
+    with pytest.raises(DataError, match='no unit; .*no position, rename it, or set format = "mac'):
+        read(put(tmp_path, text.replace("s [s]", "s"), "T7.csv"))
+
+
+def test_a_row_of_units_in_a_table_of_trials(tmp_path):
+    text = "trial,s,displacement,force\n,mm,(mm),(N)\n1,35,0,0\n1,35,1,2\n2,40,0,0\n2,40,2,3\n"
+    found = both(put(tmp_path, text, "T7.csv"))
+    assert found == [("T7", "1", 35.0, 0, 2.0), ("T7", "2", 40.0, 0, 3.0)]
+
+
+def test_a_column_that_the_options_name_and_the_table_has_not(tmp_path):
+    text = "displacement [mm],force [N]\n0,0\n1,2\n"
+    bad = only_bad(read(put(tmp_path, text, "T7.csv"), columns={"s": "pos"}))
+    assert "no column 'pos' for the s; the columns are 'displacement', 'force'" in bad.message
+
+
+def test_a_specimen_called_sep(tmp_path):
+    text = "# by hand\nspecimen,displacement [mm],force [N]\nsep=1,0,0\nsep=1,1,2\n"
+    assert read(put(tmp_path, text)).curves[0].specimen == "sep=1"
+
+
 def test_empty_machine_file(tmp_path):
     assert only_bad(read(put(tmp_path, ""))).kind == "empty"
 

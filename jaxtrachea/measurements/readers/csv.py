@@ -14,6 +14,7 @@ from jaxtrachea.measurements.curve import (
     BadCurve,
     DataError,
     Fault,
+    FileIdentity,
     RawCurve,
     ReadOptions,
     identify_file,
@@ -91,7 +92,7 @@ def read_large(path: Path, data: bytes, options: ReadOptions) -> list[RawCurve |
         names = {roles[role] for role in ("specimen", "trial") if role in roles}
         numbers = {roles[role] for role in units} | ({time[0]} if time else set())
         width = len(header.names)
-        if names & numbers:
+        if names & numbers or header.below > 1:
             return None
         cells = large.read_cells(found, width, header.delimiter, [*names], [*numbers])
         if cells is None:
@@ -112,15 +113,24 @@ def _curves(
             place=table.text.place,
             cure="remove one",
         )
-    groups = _group(table, roles, state, options)
+    named = _named(table.text, {*roles, *state}, options)
+    groups = _group(table, roles, state, named)
     return [
-        _curve(table, roles, units, state, key, picked, options) for key, picked in groups.items()
+        _curve(table, roles, units, state, named, key, picked, options)
+        for key, picked in groups.items()
     ]
+
+
+def _named(text: Text, told: set[str], options: ReadOptions) -> FileIdentity | None:
+    """What the name of the file tells; None if all is told in it."""
+    pattern = options.name_pattern
+    positions = pattern is not None and {"s", "phi"} & pattern.groupindex.keys()
+    return identify_file(text.path, options) if positions or "specimen" not in told else None
 
 
 def _table(text: Text, lines: Lines, header: Header) -> Table:
     width = len(header.names)
-    numbers, columns = read_columns(lines[1:], width, header.delimiter, text.word)
+    numbers, columns = read_columns(lines[header.below :], width, header.delimiter, text.word)
     if not numbers:
         raise DataError(
             f"no rows below the header in {text.word} {header.line}",
@@ -148,10 +158,10 @@ def _filled(
 
 
 def _group(
-    table: Table, roles: dict[str, int], state: dict, options: ReadOptions
+    table: Table, roles: dict[str, int], state: dict, named: FileIdentity | None
 ) -> dict[tuple[str, str], slice]:
     """Rows of each (specimen, trial); a curve must be one block, or it is there twice."""
-    name = None if "specimen" in {**roles, **state} else identify_file(table.text.path, options)
+    name = None if "specimen" in {**roles, **state} else named
     fixed = {
         "specimen": name.specimen if name else "",
         "trial": (name and name.trial) or "1",
@@ -219,6 +229,7 @@ def _curve(
     roles: dict[str, int],
     units: dict[str, str],
     state: dict,
+    named: FileIdentity | None,
     key: tuple[str, str],
     picked: slice,
     options: ReadOptions,
@@ -237,14 +248,29 @@ def _curve(
             values,
             rows=rows,
             row_word=table.text.word,
-            s=_constant("s", values, state, table, picked),
-            phi=_constant("phi", values, state, table, picked),
+            s=_agreed("s", _constant("s", values, state, table, picked), named),
+            phi=_agreed("phi", _constant("phi", values, state, table, picked), named),
             time=time_values(table, roles, picked, options),
             direction=state.get("direction", (1.0, 0.0)),
             unread=_unread(table, roles, options),
         )
     except Fault as fault:
         return bad(*key, source, fault)
+
+
+def _agreed(role: str, own: float | None, named: FileIdentity | None) -> float | None:
+    """Position of a curve by the table and by the name of its file, which must be one."""
+    of_name = None if named is None else getattr(named, role)
+    if own is None or of_name is None:
+        return own if of_name is None else of_name
+    if abs(own - of_name) > STEADY[role]:
+        unit = "mm" if role == "s" else "rad"
+        raise Fault(
+            "position",
+            f"{role} is {own:g} {unit} in the table but {of_name:g} {unit} in the name of the file",
+            f"correct one, or leave {role} out of the specimen pattern",
+        )
+    return own
 
 
 def _unread(table: Table, roles: dict[str, int], options: ReadOptions) -> tuple[str, ...]:
@@ -297,14 +323,14 @@ def _is_tidy(lines: Lines, options: ReadOptions) -> bool:
         cells = split_cells(first, guess_delimiter(first))
     except Fault:
         return False
-    names = [column_unit(cell)[0] for cell in cells]
+    names, units = zip(*map(column_unit, cells), strict=True)
     if {*map(str.lower, names)} & {*ALIASES["specimen"]}:
         return True
     try:
         roles = find_roles(names, options)
     except Fault:
         return False
-    return {"displacement", "force"} <= roles.keys() and bool(columns_of_tidy(roles))
+    return {"displacement", "force"} <= roles.keys() and bool(columns_of_tidy(roles, units))
 
 
 TIDY = Reader("tidy", read_text=read, read_large=read_large, is_text=_is_tidy)

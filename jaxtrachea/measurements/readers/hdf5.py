@@ -142,7 +142,7 @@ def _trial(group: Any, key: tuple[str, str], source: str, options: ReadOptions) 
 
 def _markers(
     group: Any, stored: frozenset[str], source: str, options: ReadOptions
-) -> dict[str, np.ndarray]:
+) -> dict[str, Any]:
     """Markers on the rings; what is stored without its ring numbers is missing them."""
     names = ("joint_displacement", "joint_side_displacement")
     if stored.isdisjoint((*names, "joint_ring_number")):
@@ -156,7 +156,7 @@ def _markers(
 
 def _vectors(
     group: Any, stored: frozenset[str], source: str, options: ReadOptions
-) -> dict[str, np.ndarray]:
+) -> dict[str, Any]:
     """Side force, and the ends of the rings with their numbers."""
     found = {}
     if "side_force" in stored:

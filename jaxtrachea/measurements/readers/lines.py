@@ -1,6 +1,7 @@
 """Lines of a text file, packed or not: bounded reading, encoding, line ends."""
 
 import gzip
+import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ BLOCK = 2**20
 GZIP = b"\x1f\x8b"
 #: What spreadsheets write in place of a number; a line that starts so is no comment.
 CELL_ERRORS = ("#N/A", "#NV", "#REF!", "#VALUE!", "#DIV/0!", "#NUM!", "#NAME?", "#NULL!")
+_SEPARATOR = re.compile(r'\s*"?sep=.?"?\s*', re.IGNORECASE)
 
 
 class Line(NamedTuple):
@@ -166,14 +168,14 @@ def split_lines(path: Path, data: bytes) -> Lines:
 
 
 def is_comment(text: str) -> bool:
-    """Whether a line is a ``#`` comment, or ``sep=;``, which a spreadsheet puts above a table.
+    """Whether a line is a ``#`` comment, or only ``sep=;``, which a spreadsheet puts above a table.
 
     ``#N/A`` and the like are its cells.
     """
     text = text.lstrip()
     if text.startswith("#"):
         return not text.upper().startswith(CELL_ERRORS)
-    return text[:5].lstrip('"').lower().startswith("sep=")
+    return _SEPARATOR.fullmatch(text) is not None
 
 
 def _bytes(path: Path) -> bytes:

@@ -1,11 +1,13 @@
 """Machine CSV: some lines about the test, then a table; one trial per file, named by the file."""
 
+import dataclasses
+
 import numpy as np
 
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.columns import curve_of_columns
 from jaxtrachea.measurements.curve import BadCurve, Fault, RawCurve, ReadOptions, identify_file
-from jaxtrachea.measurements.readers.lines import Lines, Text
+from jaxtrachea.measurements.readers.lines import Text
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.text import (
     Table,
@@ -17,9 +19,10 @@ from jaxtrachea.measurements.readers.text import (
     role_values,
     split_cells,
     time_values,
+    units_row,
 )
 from jaxtrachea.measurements.roles import SAMPLED, is_ring_role
-from jaxtrachea.units import column_unit, is_unit
+from jaxtrachea.units import column_unit
 
 # A header further down than this is no header.
 MAX_PREAMBLE = 500
@@ -78,6 +81,7 @@ def _table(text: Text, options: ReadOptions) -> tuple[Table, dict[str, int]]:
         for delimiter in "\t;,":
             if delimiter not in line.text:
                 continue
+            names: list[str] = []
             try:
                 cells = split_cells(line.text, delimiter)
                 while cells and cells[-1] == "":
@@ -88,11 +92,15 @@ def _table(text: Text, options: ReadOptions) -> tuple[Table, dict[str, int]]:
                 roles = find_roles(names, options)
                 require_roles(roles, names)
             except Fault as fault:
-                # An ambiguous header is still the header; any other line is part of the preamble.
-                reason = fault if fault.kind == "ambiguous" else reason
+                # An ambiguous header is still the header, and so is one without a column that the
+                # options name; any other line is part of the preamble.
+                if fault.kind == "ambiguous" or _names_both(names, options):
+                    reason = fault
                 continue
-            _refuse_columns_of_tidy(f"{text.word} {line.number}", roles, names, options)
-            at, units = _units_row(lines, at, delimiter, units)
+            at, units = units_row(lines, at, delimiter, units)
+            found = columns_of_tidy(roles, units)
+            quoted = {role: repr(names[roles[role]]) for role in found}
+            _refuse_columns_of_tidy(f"{text.word} {line.number}", quoted, options)
             numbers, columns = read_columns(lines[at + 1 :], len(names), delimiter, text.word)
             table = Table(
                 text=text,
@@ -114,50 +122,48 @@ def _table(text: Text, options: ReadOptions) -> tuple[Table, dict[str, int]]:
     )
 
 
-def _refuse_columns_of_tidy(
-    line: str, roles: dict[str, int], names: list[str], options: ReadOptions
-) -> None:
-    """Refuse a column that a machine file is not read for: specimen, trial or position of rows.
+def _names_both(names: list[str], options: ReadOptions) -> bool:
+    """Whether columns are those of displacement and force, whatever else the options name."""
+    both = ("displacement", "force")
+    columns = {role: name for role, name in options.columns.items() if role in both}
+    try:
+        return {*both} <= find_roles(names, dataclasses.replace(options, columns=columns)).keys()
+    except Fault:
+        return False
+
+
+def _refuse_columns_of_tidy(line: str, quoted: dict[str, str], options: ReadOptions) -> None:
+    """Refuse columns that a machine file is not read for: specimen, trial or position of rows.
+
+    With `format = "machine"` those that the options name; else all: other lines stand above, by
+    which the file is no tidy table.
+
+    Args:
+        line: of the header.
+        quoted: their names, by role.
+        options: as the file is read.
 
     Raises:
-        Fault: there is one, and nobody has said that it does not count: not by the format, or by
-            naming the column in spite of it.
+        Fault: there is one.
     """
-    found = columns_of_tidy(roles)
-    if options.format == "machine":
-        found = [role for role in found if role in options.columns]
+    asked = options.format == "machine"
+    found = {role: name for role, name in quoted.items() if not asked or role in options.columns}
     if not found:
         return
-    quoted = ", ".join(f"{names[roles[role]]!r} ({role})" for role in found)
-    if options.format == "machine":
+    shown = ", ".join(f"{name} ({role})" for role, name in found.items())
+    if asked:
+        cure = f"leave out columns.{next(iter(found))}: the name of the file tells it"
         raise Fault(
             "ambiguous",
-            f"{line} has {quoted}, which a machine file is not read for",
-            f'set format = "tidy", or leave out columns.{found[0]}: the name of the file tells it',
+            f"{line} has {shown}, which a machine file is not read for",
+            f'set format = "tidy", or {cure}',
         )
     raise Fault(
         "ambiguous",
-        f"{line} is the header of a table with {quoted}, but other lines stand above it",
+        f"{line} is the header of a table with {shown}, but other lines stand above it",
         'remove them or begin them with #, or set format = "machine": one curve, of which the name '
         "of the file tells specimen, trial and position",
     )
-
-
-def _units_row(
-    lines: Lines, at: int, delimiter: str, units: list[str | None]
-) -> tuple[int, list[str | None]]:
-    """Some machines put the units in a row of their own below the names: ``(s),(mm),(N)``."""
-    if at + 1 >= len(lines) or any(units):
-        return at, units
-    cells = split_cells(lines[at + 1].text, delimiter)
-    bare = [cell.strip("()[] ") for cell in cells]
-    if len(cells) != len(units) or not any(bare):
-        return at, units
-    bracketed = all(cell[:1] in ("(", "[") for cell in cells if cell)
-    # A number is no units row, although "1" alone would pass for a dimensionless unit.
-    if not bracketed and not all(not b or (is_unit(b) and not b[0].isdigit()) for b in bare):
-        return at, units
-    return at + 1, [b or None for b in bare]
 
 
 MACHINE = Reader("machine", read_text=read, is_text=lambda lines, options: True)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtrachea.measurements.curve import DataError, Fault, ReadOptions
 from jaxtrachea.measurements.readers.lines import Lines, Text
 from jaxtrachea.measurements.roles import general_role, ring_role_of, role_dimension
-from jaxtrachea.units import UnitError, column_unit, convert, unit_factor
+from jaxtrachea.units import UnitError, column_unit, convert, is_unit, unit_factor
 
 # Column names understood without `ReadOptions.columns`, in lower case.
 ALIASES = {
@@ -24,7 +24,7 @@ ALIASES = {
     "side_force": ("side_force", "side force"),
     "sigma": ("sigma", "force_sigma", "force_noise"),
 }
-# Roles that a tidy table tells in every row, and the name of a machine file if at all.
+# Roles that a tidy table gives in every row; of a machine file its name gives them, if at all.
 OF_TIDY = ("specimen", "trial", "s", "phi")
 # Columns of time, taken where they have a unit; they tell the duration of holds.
 TIMES = ("time", "elapsed time", "total time", "test time", "running time")
@@ -201,13 +201,59 @@ def require_roles(roles: dict[str, int], names: Sequence[str]) -> None:
             raise _no_column(role, role, names)
 
 
-def columns_of_tidy(roles: dict[str, int]) -> list[str]:
+def columns_of_tidy(roles: dict[str, int], units: Sequence[str | None]) -> list[str]:
     """Roles of which every row of a tidy table tells, and which a file of one trial has not.
 
-    Without a column that has another role as well: a way that its file calls `s`.
+    Without a column that has another role as well, as a way that its file calls `s`, and without
+    one in the unit of something else, as a time.
     """
     others = {i for role, i in roles.items() if role not in OF_TIDY}
-    return [role for role in OF_TIDY if role in roles and roles[role] not in others]
+    return [
+        role
+        for role in OF_TIDY
+        if role in roles and roles[role] not in others and _may_be(role, units[roles[role]])
+    ]
+
+
+def _may_be(role: str, unit: str | None) -> bool:
+    """Whether a column in this unit may have the role; without a unit, and names, always."""
+    if unit is None or role in ("specimen", "trial"):
+        return True
+    try:
+        unit_factor(unit, role_dimension(role))
+    except UnitError:
+        return False
+    return True
+
+
+def units_row(
+    lines: Lines, at: int, delimiter: str, units: list[str | None]
+) -> tuple[int, list[str | None]]:
+    """Some machines put the units in a row of their own below the names: ``(s),(mm),(N)``.
+
+    Args:
+        lines: without comments.
+        at: place of the header.
+        delimiter: what separates cells.
+        units: that the header gives, None for each column without.
+
+    Returns:
+        Place of the last line of the header, and the units.
+
+    Raises:
+        Fault: quotes do not match.
+    """
+    if at + 1 >= len(lines) or any(units):
+        return at, units
+    cells = split_cells(lines[at + 1].text, delimiter)
+    bare = [cell.strip("()[] ") for cell in cells]
+    if len(cells) != len(units) or not any(bare):
+        return at, units
+    bracketed = all(cell[:1] in ("(", "[") for cell in cells if cell)
+    # A number is no units row, although "1" alone would pass for a dimensionless unit.
+    if not bracketed and not all(not b or (is_unit(b) and not b[0].isdigit()) for b in bare):
+        return at, units
+    return at + 1, [b or None for b in bare]
 
 
 def resolve_unit(role: str, found: str | None, options: ReadOptions, place: str) -> str:

@@ -3,7 +3,7 @@
 import json
 from typing import NamedTuple
 
-from jaxtrachea.measurements.curve import DataError, ReadOptions
+from jaxtrachea.measurements.curve import DataError, Fault, ReadOptions
 from jaxtrachea.measurements.readers.lines import Lines, Text
 from jaxtrachea.measurements.readers.text import (
     find_roles,
@@ -11,6 +11,7 @@ from jaxtrachea.measurements.readers.text import (
     require_roles,
     resolve_unit,
     split_cells,
+    units_row,
 )
 from jaxtrachea.measurements.roles import SAMPLED, is_ring_role, role_dimension
 from jaxtrachea.units import column_unit, parse_quantity
@@ -26,12 +27,14 @@ class Header(NamedTuple):
         units: of the columns, None where the header gives none.
         line: its number.
         delimiter: what separates cells.
+        below: place of the first row of the table.
     """
 
     names: list[str]
     units: list[str | None]
     line: int
     delimiter: str
+    below: int
 
 
 def read_state(lines: Lines, word: str) -> tuple[dict, Lines]:
@@ -87,7 +90,7 @@ def _two_numbers(value: object, line: str) -> tuple[float, ...]:
 
 
 def read_header(text: Text, lines: Lines) -> Header:
-    """The names of the columns and their units, from the first line.
+    """The names of the columns and their units, from the first line or a row of units below it.
 
     Raises:
         DataError: there is no line, or a column comes twice.
@@ -117,7 +120,8 @@ def read_header(text: Text, lines: Lines) -> Header:
             place=text.place,
             cure="rename one",
         )
-    return Header(list(names), list(units), lines[0].number, delimiter)
+    last, units = units_row(lines, 0, delimiter, list(units))
+    return Header(list(names), units, lines[0].number, delimiter, last + 1)
 
 
 def roles_and_units(header: Header, options: ReadOptions) -> tuple[dict[str, int], dict[str, str]]:
@@ -130,8 +134,19 @@ def roles_and_units(header: Header, options: ReadOptions) -> tuple[dict[str, int
     roles = find_roles(header.names, options)
     require_roles(roles, header.names)
     units = {
-        role: resolve_unit(role, header.units[i], options, f"column {header.names[i]!r}")
+        role: _unit(role, header.units[i], options, f"column {header.names[i]!r}")
         for role, i in roles.items()
         if role in NUMERIC or is_ring_role(role)
     }
     return roles, units
+
+
+def _unit(role: str, found: str | None, options: ReadOptions, place: str) -> str:
+    """`resolve_unit`; of a position with the cure for a column that is none."""
+    try:
+        return resolve_unit(role, found, options, place)
+    except Fault as fault:
+        if role not in ("s", "phi"):
+            raise
+        cure = f'{fault.cure}; if it is no position, rename it, or set format = "machine"'
+        raise Fault(fault.kind, fault.message, cure) from None
