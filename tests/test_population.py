@@ -35,6 +35,7 @@ def test_balanced_one_way_layout():
     s2, mean = y.var(ddof=1), y.mean()
     np.testing.assert_allclose(e.sd[0] ** 2, s2 - c, rtol=1e-9)
     np.testing.assert_allclose([e.mean[0], e.mean_se[0]], [mean, np.sqrt(s2 / m)], rtol=1e-9)
+    np.testing.assert_allclose(e.dof, m - 1, rtol=1e-9)
     se = s2 * np.sqrt(2 / (m - 1)) / (2 * e.sd[0])
     np.testing.assert_allclose(e.sd_se[0], se, rtol=1e-9)
     ends = np.sqrt(s2 * (m - 1) / chi2.ppf([0.975, 0.025], m - 1) - c)
@@ -102,11 +103,24 @@ def test_errors_that_all_have_in_common():
         e = random_effects(
             y[:, None], (se**2)[:, None, None], None, Common(follow, np.array([[0.09]]))
         )
-        mean = abs(e.mean[0]) < t.ppf(0.975, m - 1) * e.mean_se[0]
+        mean = abs(e.mean[0]) < t.ppf(0.975, e.dof[0]) * e.mean_se[0]
         inside = np.mean(np.abs(e.shrunk[:, 0] - theta) < 1.96 * e.shrunk_sd[:, 0])
         rows.append([mean, e.sd_low[0] <= tau <= e.sd_high[0], inside])
     # 95 % of 200: standard error 1.5 %. As independent errors they leave 50 % for the mean.
     assert np.all(np.abs(np.mean(rows, axis=0) - 0.95) < 0.05)
+
+
+@pytest.mark.parametrize(("good", "others", "error"), [(3, 20, 50.0), (3, 20, 5.0), (4, 10, 10.0)])
+def test_specimens_that_say_nothing_are_no_degrees_of_freedom(good, others, error):
+    """With t of m - 1 intervals of the mean held 81 to 85 %, of the spread 78 to 85 %."""
+    rng, rows = np.random.default_rng(7), []
+    se = np.array([0.1] * good + [error] * others)
+    for _ in range(300):
+        y = rng.normal(size=len(se)) + se * rng.normal(size=len(se))
+        e = random_effects(y[:, None], (se**2)[:, None, None])
+        mean = abs(e.mean[0]) < t.ppf(0.975, e.dof[0]) * e.mean_se[0]
+        rows.append([mean, e.sd_low[0] <= 1 <= e.sd_high[0]])
+    assert np.all(np.abs(np.mean(rows, axis=0) - 0.95) < 0.05)  # standard error 1.3 %
 
 
 def coverage(count, m):
@@ -116,7 +130,7 @@ def coverage(count, m):
     for _ in range(count):
         theta, y, C = draw(rng, m, tau, middle)
         e = random_effects(y, C)
-        mean = np.abs(e.mean - middle) < t.ppf(0.975, m - 1) * e.mean_se
+        mean = np.abs(e.mean - middle) < t.ppf(0.975, e.dof) * e.mean_se
         spread = (e.sd_low <= tau) & (tau <= e.sd_high)
         inside = np.mean(np.abs(e.shrunk - theta) < 1.96 * e.shrunk_sd, axis=0)
         gain = np.mean((e.shrunk - theta) ** 2, 0) / np.mean((y - theta) ** 2, 0)

@@ -23,6 +23,7 @@ class Effects(NamedTuple):
     Attributes:
         mean: of the population; (q,).
         mean_se: its standard error, tau taken as known; (q,).
+        dof: degrees of freedom of `mean_se`, at most m - 1; (q,).
         sd: between specimens, tau; (q,).
         sd_se: its standard error (delta method on tau^2); NaN at tau = 0; (q,).
         sd_low: 95 % interval of tau; (q,).
@@ -33,6 +34,7 @@ class Effects(NamedTuple):
 
     mean: Float[np.ndarray, " q"]
     mean_se: Float[np.ndarray, " q"]
+    dof: Float[np.ndarray, " q"]
     sd: Float[np.ndarray, " q"]
     sd_se: Float[np.ndarray, " q"]
     sd_low: Float[np.ndarray, " q"]
@@ -91,7 +93,9 @@ def random_effects(
     """Mean and spread behind estimates of unequal precision.
 
     The interval of tau is exact where all specimens are known equally well (chi^2 of m - 1 degrees
-    of freedom for tau^2 + C, less C); else C stands for what gives tau^2 its information.
+    of freedom for tau^2 + C, less C); else C stands for what gives tau^2 its information, and the
+    degrees of freedom are those of the mean's variance, as estimated: 2 V^2 / var(V) by the delta
+    method (Satterthwaite 1946, doi:10.2307/3002019). Specimens of which little is known add none.
 
     Args:
         estimate: of each specimen.
@@ -125,11 +129,20 @@ def random_effects(
     sd = np.sqrt(tau2)
     with np.errstate(divide="ignore", invalid="ignore"):
         sd_se = np.where(free, 0.5 * np.sqrt(variance) / sd, np.nan)
-    low, high = _interval(tau2, variance, count - 1)
+    dof = _freedom(here, count)
+    low, high = _interval(tau2, variance, dof)
     follow = np.zeros((*estimate.shape, 0)) if common is None else known[:, :, None] * common.follow
     shared = np.zeros((0, 0)) if common is None else common.covariance
     shrunk, shrunk_sd, mean_se = _posterior(tau2, here, estimate, follow, shared)
-    return Effects(here.mean, mean_se, sd, sd_se, low, high, shrunk, shrunk_sd)
+    return Effects(here.mean, mean_se, dof, sd, sd_se, low, high, shrunk, shrunk_sd)
+
+
+def _freedom(here: _Restricted, count) -> np.ndarray:
+    """Degrees of freedom of the mean's variance; see `random_effects`."""
+    Q = here.mean_covariance
+    slope = np.sum((Q @ here.weight) ** 2, axis=0)  # of Q_jj by tau_k^2
+    error = np.einsum("jk,kl,jl->j", slope, np.linalg.inv(here.information), slope)
+    return np.clip(2 * np.diagonal(Q) ** 2 / error, 1, count - 1)
 
 
 def _maximum(tau2, estimate, covariance, floor) -> tuple[np.ndarray, _Restricted]:

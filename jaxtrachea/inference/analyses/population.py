@@ -34,11 +34,11 @@ def _compute(request: Request, findings: Findings, progress: Progress) -> Popula
 
 
 def population_rows(of: Population) -> Iterator[Cells]:
-    """One row per parameter for population.csv; intervals with Student's t, m - 1."""
+    """One row per parameter for population.csv; intervals with Student's t."""
     e = of.effects
     for j, p in enumerate(of.parameters):
         count = int(of.known[:, j].sum())
-        half = float(stdtrit(count - 1, 0.975) * e.mean_se[j])
+        half = float(stdtrit(e.dof[j], 0.975) * e.mean_se[j])
         log = p.scale == "log"
         ends = np.array([e.sd[j], e.sd_low[j], e.sd_high[j]])
         spread, low, high = map(float, np.exp(ends) if log else ends * p.step)
@@ -52,6 +52,7 @@ def population_rows(of: Population) -> Iterator[Cells]:
             "at_bound": int(of.at_bound[j]),
             "mean": p.from_scaled(mean),
             "mean_se": slope * float(e.mean_se[j]),
+            "mean_dof": float(e.dof[j]),
             "mean_low95": p.from_scaled(mean - half),
             "mean_high95": p.from_scaled(mean + half),
             "spread_is": "factor" if log else p.unit,
