@@ -31,11 +31,12 @@ def drawn(displacement: np.ndarray, force: np.ndarray) -> str | None:
     """What a record says in which a tool draws from the beginning; one sentence, or None.
 
     A press whose file counts both the other way looks the same, and where first touch and the zero
-    of the force are fitted it could be one of these, too.
+    of the force are fitted it could be one of these, too. Not seen where a zero is off by more than
+    `DRAWN` of the depth.
     """
     if any(v.size < 2 or v.max() > -DRAWN * v.min() for v in (displacement, force)):
         return None
-    if displacement[-1] > displacement[0]:  # it ends at 0, where it may have been tared
+    if displacement[-1] > displacement[0]:  # it rises, to a zero where it may have been tared
         return None
     return (
         f"displacement and force go down to {displacement.min():.4g} mm and {force.min():.4g} N: a "
