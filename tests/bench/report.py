@@ -175,7 +175,7 @@ def update_section(rows: list[dict], goals: list[list[str]]) -> str:
         for case, r in single.items()
     ]
     head = ["case", "5 % µs", "median µs", "99 % µs", "worst µs", "calls above 1 ms"]
-    goals += update_goals(single)
+    goals += update_goals(single, {r["case"]: r for r in rows if r.get("table") == "in turns"})
     many = [
         [r["case"], *map(number, microseconds(r)), f"{1e6 / microseconds(r)[0]:,.0f}"]
         for r in rows
@@ -185,17 +185,18 @@ def update_section(rows: list[dict], goals: list[list[str]]) -> str:
     return "\n".join([UPDATE, table(head, lines), table(head_many, many)])
 
 
-def update_goals(single: dict[str, dict]) -> list[list[str]]:
-    """Medians of single calls against the C loop on the round tube, and of the contact alone."""
-    goals, loop = [], single["C loop: whole, dent of 16; round tube; float64"]["median"]
+def update_goals(single: dict[str, dict], turns: dict[str, dict]) -> list[list[str]]:
+    """Whole updates against the C loop on the round tube, in turns; medians of contacts alone."""
+    goals, loop = [], turns["C loop: whole, dent of 16; round tube; float64"]
     slow = single["C loop: contact, skeleton, surface; round tube; float64"]
     most = f"at most 2 times (the C loop's: {number(slow['p99'] / slow['median'])})"
     for walls in ("round tube", "patches of the mesh"):
         for dtype in ("float32", "float64"):
-            whole = single[f"whole, dent of 16; {walls}; {dtype}"]["median"]
+            whole = turns[f"whole, dent of 16; {walls}; {dtype}"]
             alone = single[f"contact, skeleton; {walls}; {dtype}"]
-            name, speed = f"whole update, {walls}, {dtype}, against the C loop", loop / whole
-            goals.append([name, "at least 0.65 of its speed", number(speed), verdict(speed > 0.65)])
+            name, speed = f"whole update, {walls}, {dtype}, against the C loop", ratio(loop, whole)
+            met = verdict(speed[0] > 0.65)
+            goals.append([name, "at least 0.65 of its speed", quoted(loop, whole), met])
             found = f"{number(1e6 * alone['median'])} µs", verdict(alone["median"] < 60e-6)
             goals.append([f"contact, skeleton, {walls}, {dtype}", "median below 60 µs", *found])
             spread = alone["p99"] / alone["median"]
@@ -237,7 +238,8 @@ the mesh, most of them in a loop of twelve rounds. For one pose on a CPU contact
 are one kernel each, as are small parts of the surface (`jaxtrachea/_in_order.py`; counted by
 `tests/test_kernels.py`, gains in [measured.md](measured.md)). 256 poses together share the small
 kernels.
-Slow calls come to all rows, the C loop included: the core is shared.
+Slow calls come to all rows, the C loop included: the core is shared, and its speed may change
+between two blocks of calls. Goals against the C loop are of calls in turns.
 """
 COHORT = """\
 The same model, truths and start with five positions of 200 points: 10,000 specimens in one batch of

@@ -241,6 +241,8 @@ def main():
                 differs(name, call(ball), run(place))
                 cases[f"C loop: {name}; {dtype}"] = lambda c=call, p=ball: c(p)
     latency(out, cases)
+    whole = {name: call for name, call in cases.items() if "whole, dent of 16" in name}
+    out.table("in turns", common.interleaved(whole, rounds=200, target=0.004))
     throughput(out)
     out.write()
 
