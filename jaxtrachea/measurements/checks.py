@@ -117,14 +117,21 @@ def _check_finite(raw: RawCurve) -> None:
         )
 
 
-def position(name: str, own: float | None, common: float | None, unit: str) -> float | None:
-    """Position of the curve from the file and from the options, which must agree.
+def position(
+    name: str,
+    own: float | None,
+    common: float | None,
+    unit: str,
+    places: tuple[str, str] = ("file", "options"),
+) -> float | None:
+    """Position of the curve from two places, as the file and the options, which must agree.
 
     Args:
         name: "s" or "phi".
-        own: from the file, mm or rad.
-        common: from the options, mm or rad.
+        own: from the first place, mm or rad.
+        common: from the second, mm or rad.
         unit: for messages.
+        places: the same.
 
     Raises:
         Fault: they differ, or one is not finite or absurd ("position").
@@ -137,8 +144,8 @@ def position(name: str, own: float | None, common: float | None, unit: str) -> f
     if abs(own - common) > STEADY[name]:
         raise Fault(
             "position",
-            f"{name} is {own:g} {unit} in the file but {common:g} {unit} in the options",
-            f"remove {name} from the options if the files give it",
+            f"{name} is {own:g} {unit} in the {places[0]} but {common:g} {unit} in the {places[1]}",
+            f"remove {name} from the {places[1]} if the {places[0]} is right",
         )
     return own
 

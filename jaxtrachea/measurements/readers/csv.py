@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxtrachea.files.tables import unquoted
-from jaxtrachea.measurements.checks import STEADY, bad
+from jaxtrachea.measurements.checks import STEADY, bad, position
 from jaxtrachea.measurements.columns import curve_of_columns
 from jaxtrachea.measurements.curve import (
     BadCurve,
@@ -259,18 +259,9 @@ def _curve(
 
 
 def _agreed(role: str, own: float | None, named: FileIdentity | None) -> float | None:
-    """Position of a curve by the table and by the name of its file, which must be one."""
-    of_name = None if named is None else getattr(named, role)
-    if own is None or of_name is None:
-        return own if of_name is None else of_name
-    if abs(own - of_name) > STEADY[role]:
-        unit = "mm" if role == "s" else "rad"
-        raise Fault(
-            "position",
-            f"{role} is {own:g} {unit} in the table but {of_name:g} {unit} in the name of the file",
-            f"correct one, or leave {role} out of the specimen pattern",
-        )
-    return own
+    """Position of a curve by the table and by the name of its file."""
+    of_name, unit = getattr(named, role, None), "mm" if role == "s" else "rad"
+    return position(role, own, of_name, unit, ("table", "name of the file"))
 
 
 def _unread(table: Table, roles: dict[str, int], options: ReadOptions) -> tuple[str, ...]:
