@@ -10,10 +10,10 @@ from run_cli import run
 
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
+from jaxtrachea.fitting.misfit import misfit
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.cross_validation import leave_one_out
-from jaxtrachea.inference.misfit import misfit
 from jaxtrachea.prediction.predict import predict
 
 QUICK = Settings(starts=1, scrutiny=False)

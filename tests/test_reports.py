@@ -19,6 +19,7 @@ from jaxtrachea.cli.terminal_table import wide_table
 from jaxtrachea.files.html import page
 from jaxtrachea.files.pictures import plain, save_each, without_lost
 from jaxtrachea.files.tables import quoted, unquoted, write_csv
+from jaxtrachea.fitting.effective import share_independent
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
@@ -36,7 +37,6 @@ from jaxtrachea.inference.analyses.influence import (
 )
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import LeftOut
-from jaxtrachea.inference.effective import effective, share_independent
 from jaxtrachea.inference.influence import influence
 from jaxtrachea.inference.labels import peak_force
 from jaxtrachea.inference.rows import worst_first
@@ -256,7 +256,7 @@ def test_one_lane_of_several_specimens_has_a_row_for_each(dense):
         assert row["k_3 [N/mm^3]"] == dense.value[0, k]
         assert row["k_3 verdict"] == verdict_of(dense, 0, k)
         assert row["k_1 [N/mm]"] == dense.value[0, 0]
-        assert row["k_1 low95"] == dense.lower[0, 0]
+        assert row["k_1 low95"] == judgement(dense, 0, 0).low <= dense.lower[0, 0]
     assert rows[0]["more"] == "force_offset[A/1], force_offset[A/2]: see parameters.csv"
     assert "more" not in rows[1]
     assert "force_offset [N]" in rows[1]
@@ -285,6 +285,15 @@ def test_influence_says_why_there_is_no_number(dense):
     assert "Influence of curves" in shown_text
 
 
+def ends_of(result):
+    """Lower and upper ends of all intervals; (lanes, P) each."""
+    found = [[judgement(result, k, i) for i in range(result.study.size)]
+             for k in range(result.lanes)]  # fmt: skip
+    return (
+        np.array([[getattr(j, name) for j in row] for row in found]) for name in ("low", "high")
+    )
+
+
 def autoregressive(shape, r, seed):
     """AR(1) noise of unit variance."""
     noise = np.random.default_rng(seed).normal(size=shape)
@@ -308,14 +317,15 @@ def test_widened_intervals_cover(given):
     ]
     level = Noise(force=0.05 if given else None)
     result = fit(build_study(curves, table_1(), BONDED, table(), noise=level), ONE)
-    wide = effective(result, predictions(result.study, result.theta))
+    wide = result.effective
+    low, high = ends_of(result)
     truth = np.array([1.3, 0.4])
 
     def inside(low, high):
         return np.mean((low <= truth) & (truth <= high), axis=0)
 
     plain_share = inside(result.lower, result.upper)
-    share = inside(wide.lower, wide.upper)
+    share = inside(low, high)
     assert np.all(plain_share < 0.75), plain_share
     assert np.all((share > 0.90) & (share < 0.98)), share
     # Residuals of a fit are a little less correlated than the noise.
@@ -335,16 +345,27 @@ def test_fewer_independent_samples_than_unknowns_leave_no_limit():
     depth = np.linspace(0, 1, 40)
     bent = Curve("T", "a", None, 0.0, depth, depth + 0.2 * np.sin(3 * depth))
     result = fit(build_study([bent], table_1(), BONDED, table()), ONE)
-    wide = effective(result, predictions(result.study, result.theta))
+    wide = result.effective
     assert wide.samples[0] < 2
-    assert np.isinf(wide.factor[0])
+    assert wide.misses[0]
     # No limit but the bounds.
-    assert wide.lower[0].tolist() == [p.lower for p in result.study.free]
-    assert wide.upper[0].tolist() == [p.upper for p in result.study.free]
+    low, high = ends_of(result)
+    assert low[0].tolist() == [p.lower for p in result.study.free]
+    assert high[0].tolist() == [p.upper for p in result.study.free]
+    words = {verdict_of(result, 0, i) for i in range(2)}
+    assert words == {"inconclusive: the model misses the curve"}
+    rows = list(parameter_rows(widened(result)))
+    assert np.isnan([[row["se"], row["relative_se"]] for row in rows]).all()
+    assert [row["low95_independent"] for row in rows] == result.lower[0].tolist()
     text = report_text("T", widened(result), [])
-    assert "95 % widened" in text
-    assert "no more independent samples than unknowns" in text
-    assert "correlated in 1 of 1 lanes" in " ".join(shown(overview(widened(result))).split())
+    said = " ".join(shown(overview(widened(result))).split())
+    # The line through the curve is above it at first, and again at the end.
+    place = "Most missed: T a from"
+    for where in (text, said):
+        assert "The model misses the curves in 1 of 1 lanes" in where
+        assert place in where
+    assert "1 of 1 lanes solved, 0 with every unknown determined" in text
+    assert summary_rows(widened(result))[0]["determined"] == 0
 
 
 @pytest.mark.slow
@@ -373,7 +394,7 @@ def test_the_command_with_names_of_mathematics(tmp_path, monkeypatch, capsys):
     assert len(read_csv(Path("o/left_out.csv"))) == 6
     parameters = read_csv(Path("o/parameters.csv"))
     assert {row["specimen"] for row in parameters} == {"$a$ $b$", r"$\frac{$", "=1+1"}
-    assert all(float(row["low95_widened"]) <= float(row["value"]) for row in parameters)
+    assert all(float(row["low95"]) <= float(row["low95_independent"]) for row in parameters)
 
 
 def test_of_many_curves_left_out_report_and_terminal_show_the_worst_first(dense):

@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 
 from jaxtrachea.files.output import OutputExists, new_directory, new_output
 from jaxtrachea.files.tables import markdown_table, number, write_csv
+from jaxtrachea.fitting.effective import effective, lag_correlation
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS
-from jaxtrachea.fitting.predictions import Prediction, predictions
+from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import unknown_label
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
@@ -23,9 +24,8 @@ from jaxtrachea.inference.analyses.cross_validation import left_out_rows
 from jaxtrachea.inference.analyses.effective import EFFECTIVE
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.cross_validation import curves_to_leave_out, leave_one_out
-from jaxtrachea.inference.effective import effective
 from jaxtrachea.inference.labels import weakest_sentence
-from jaxtrachea.inference.residuals import lag_correlation, rms, worst
+from jaxtrachea.inference.residuals import rms, worst
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.report.fit import report_text
@@ -91,7 +91,7 @@ def test_page_names_every_dataset(result, tmp_path):
     with h5py.File(tmp_path / "r.h5") as file:
         file.visititems(lambda name, item: found.__setitem__(name, getattr(item, "shape", None)))
         assert json.loads(file.attrs["provenance"]) == {"a": 1}
-        assert (file.attrs["schema"], file.attrs["schema_version"]) == ("jaxtrachea-results", 2)
+        assert (file.attrs["schema"], file.attrs["schema_version"]) == ("jaxtrachea-results", 3)
         assert json.loads(file["unknowns"].attrs["units"])["k_3"] == "N/mm^3"
     shapes = {name: shape for name, shape in found.items() if shape is not None}
     assert sorted(shapes) == sorted(columns("## results.h5"))
@@ -269,8 +269,8 @@ def test_correlated_residuals_are_found():
     for i in range(1, force.shape[-1]):
         force[..., i] = truth[:, None] * force[..., i - 1] + step[..., i]
     force[:, :, ::50] = np.nan
-    np.testing.assert_allclose(lag_correlation(Prediction(force, None)), truth, atol=0.03)
-    assert np.isnan(lag_correlation(Prediction(force[:, :1, 1:9], None))).all()
+    np.testing.assert_allclose(lag_correlation(force), truth, atol=0.03)
+    assert np.isnan(lag_correlation(force[:, :1, 1:9])).all()
 
 
 def test_report_doubts_what_it_should(result):

@@ -20,7 +20,6 @@ from jaxtrachea.fitting.result import judgement, verdict_of
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study, default_parameters
 from jaxtrachea.inference.analysis import Findings
-from jaxtrachea.inference.effective import effective
 from jaxtrachea.inference.population import population
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
@@ -171,24 +170,29 @@ def test_widened_intervals_hold_the_plain_ones(result):
     given = dataclasses.replace(result, evidence_low=low, evidence_high=high, evidence_end=end)
     slow = np.sin(np.arange(result.study.lanes.force.shape[2]))
     seen = Prediction(np.where(result.study.lanes.precision > 0, slow, np.nan), None)
-    wide = effective(given, seen)
+    given.__dict__["residuals"] = seen
+    wide = given.effective
     bounds = [(p.lower, p.upper) for p in given.study.free]
     for k in range(given.lanes):
         for i, (least, most) in enumerate(bounds):
             judged = judgement(given, k, i)
-            assert least <= wide.lower[k, i] <= judged.low <= given.value[k, i] * (1 + 1e-12)
-            assert given.value[k, i] * (1 - 1e-12) <= judged.high <= wide.upper[k, i] <= most
+            low, high = judged.independent
+            assert least <= judged.low <= low <= given.value[k, i] * (1 + 1e-12)
+            assert given.value[k, i] * (1 - 1e-12) <= high <= judged.high <= most
             if judged.ends is not None and judged.ends[1] == ProfileEnd.OPEN:
-                assert judged.high == wide.upper[k, i] == most
+                assert judged.high == high == most
     left = wide.samples[5] - 4
     ratio = stdtrit(left, 0.975) * wide.factor[5] / given.uncertainty.half_width[5]
     assert ratio > 1.5
-    found = np.log([wide.lower[5, 2] / value, wide.upper[5, 2] / value])
+    judged = judgement(given, 5, 2)
+    found = np.log([judged.low / value, judged.high / value])
     np.testing.assert_allclose(found, ratio * sides, rtol=1e-9)
+    assert judged.verdict == "weak"  # plain it would be identifiable or weak by 0.4 / 1.96
     # Where an end was not found, the local error is left.
     assert result.study.free[3].scale == "linear"
     local = np.array([result.lower[5, 3], result.upper[5, 3]]) - result.value[5, 3]
-    found = np.array([wide.lower[5, 3], wide.upper[5, 3]]) - result.value[5, 3]
+    judged = judgement(given, 5, 3)
+    found = np.array([judged.low, judged.high]) - result.value[5, 3]
     np.testing.assert_allclose(found, ratio * local, rtol=1e-9)
 
 
@@ -216,7 +220,7 @@ def test_population_and_medians_take_what_is_identifiable(result):
 @pytest.mark.slow
 @pytest.mark.compiling
 def test_an_end_that_was_not_found_is_no_proof(result):
-    """A narrow interval of which an end failed: not shown, in place of identifiable."""
+    """A narrow interval of which an end failed: inconclusive, in place of identifiable."""
     end, low, high = (v.copy() for v in (
         result.evidence_end, result.evidence_low, result.evidence_high))  # fmt: skip
     low[4, 2], high[4, 2] = result.value[4, 2] * np.array([0.99, 1.01])
@@ -228,7 +232,7 @@ def test_an_end_that_was_not_found_is_no_proof(result):
         )
         words.append(verdict_of(changed, 4, 2))
         high[4, 2] = result.value[4, 2]
-    assert words == ["identifiable", "not shown"]
+    assert words == ["identifiable", "inconclusive"]
     # Where nothing is known of a side, the local error: no interval of no width.
     judged = judgement(changed, 4, 2)
     assert judged.low == low[4, 2]
@@ -310,4 +314,4 @@ def test_a_joint_fit_says_what_it_has_not_looked_at(seeds, shared, count):
         word, _, false = verdicts(result, truth)
         assert not np.any(false & (word == "identifiable")), seed
         words.append(word)
-    assert np.any(np.array(words) == "not shown")
+    assert np.any(np.array(words) == "inconclusive")

@@ -12,6 +12,7 @@ import pytest
 from jaxtrachea.cli.specification import options_of, parameters_of
 from jaxtrachea.config import SpecError, load_fit_spec
 from jaxtrachea.fitting import joint_information, shared, structure
+from jaxtrachea.fitting.effective import effective_samples
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.lane import (
@@ -31,7 +32,6 @@ from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analysis import Findings
 from jaxtrachea.inference.comparison import same_data
-from jaxtrachea.inference.effective import effective_samples
 from jaxtrachea.inference.posterior import posterior
 from jaxtrachea.inference.repeats import repeats
 from jaxtrachea.measurements.read import Curve

@@ -38,11 +38,14 @@ CLOSED, BOUND, OPEN, FAILED = ProfileEnd
         (0.2, {"ends": (CLOSED, BOUND)}, "weak"),
         (0.05, {"ends": (CLOSED, OPEN)}, "practically non-identifiable"),
         (0.05, {"ends": (OPEN, FAILED)}, "practically non-identifiable"),
-        (0.05, {"ends": (FAILED, CLOSED)}, "not shown"),
-        (0.3, {"ends": (CLOSED, FAILED)}, "not shown"),
+        (0.05, {"ends": (FAILED, CLOSED)}, "inconclusive"),
+        (0.3, {"ends": (CLOSED, FAILED)}, "inconclusive"),
         (0.7, {"ends": (CLOSED, FAILED)}, "practically non-identifiable"),
-        (0.05, {"unseen": True}, "not shown"),
+        (0.05, {"unseen": True}, "inconclusive"),
         (0.7, {"unseen": True}, "practically non-identifiable"),
+        (0.01, {"misses": True}, "inconclusive: the model misses the curve"),
+        (np.nan, {"misses": True, "held": True}, "inconclusive: the model misses the curve"),
+        (0.01, {"misses": True, "structural": True}, "structurally non-identifiable"),
     ],
 )
 def test_words(error, more, word):

@@ -1,7 +1,8 @@
 """What a fit gives: estimates, errors, and of every unknown its verdict and its interval.
 
 Verdict and interval are decided here and nowhere else (`judgement`): terminal, report, tables,
-results.h5 and the population all ask.
+results.h5, the population and designs all ask. The interval is that of as many samples as are
+independent (`effective`); the one of independent residuals stands beside it.
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtrachea.files.table import Table
 from jaxtrachea.fitting.covariance import Uncertainty
 from jaxtrachea.fitting.criteria import Criteria
+from jaxtrachea.fitting.effective import Effective, effective
 from jaxtrachea.fitting.noise import precision_unit
 from jaxtrachea.fitting.onset import first_touches
 from jaxtrachea.fitting.parameters import DEFAULTS
@@ -59,11 +61,13 @@ class FitResult:
         study: what was fitted.
         theta: estimate in scaled coordinates; (lanes, P).
         value: estimate in the parameter's unit; (lanes, P).
-        standard_error: in the parameter's unit (delta method); (lanes, P).
-        lower: 95 % interval, transformed from scaled coordinates; (lanes, P).
+        standard_error: of independent residuals, in the parameter's unit (delta method); times
+            `effective.factor` it is that of the tables; (lanes, P).
+        lower: 95 % interval of independent residuals, transformed from scaled coordinates;
+            (lanes, P).
         upper: (lanes, P).
-        relative_se: standard error over the value (scale `log`: of the logarithm; onset and offset:
-            over range and largest force of the press); (lanes, P).
+        relative_se: `standard_error` over the value (scale `log`: of the logarithm; onset and
+            offset: over range and largest force of the press); (lanes, P).
         at_bound: (lanes, P).
         status: `FitStatus`; (lanes,).
         iterations: of the best start; (lanes,).
@@ -146,6 +150,11 @@ class FitResult:
         return predictions(self.study, self.theta)
 
     @functools.cached_property
+    def effective(self) -> Effective:
+        """Independent samples that those of each lane are worth, and what intervals grow by."""
+        return effective(self, self.residuals)
+
+    @functools.cached_property
     def judgements(self) -> "dict[tuple[int, int], Judgement]":
         """Kept by `judgement`: those without further profiles, by lane and unknown."""
         return {}
@@ -167,7 +176,8 @@ class FitResult:
 
         `parameter` and `unit` say what each unknown is; statuses and verdicts are words. Lanes with
         fewer unknowns than others are filled up with NaN and "". Where an unknown lies on its bound
-        (`at_bound`) its standard error is NaN, and so is its interval without a profile.
+        (`at_bound`) its standard error is NaN, and so is its interval without a profile. Errors and
+        intervals are those of the tables (`judgement`).
 
         Args:
             profiles: further intervals, as for `table`.
@@ -202,7 +212,7 @@ class FitResult:
             "parameter": (both, labels),
             "unit": (both, units),
             "value": (both, self.value),
-            "standard_error": (both, self.standard_error),
+            "standard_error": (both, [[end(j, "standard_error") for j in row] for row in judged]),
             "low95": (both, [[end(j, "low") for j in row] for row in judged]),
             "high95": (both, [[end(j, "high") for j in row] for row in judged]),
             "verdict": (both, [[word(j) for j in row] for row in judged]),
@@ -233,17 +243,22 @@ DETERMINED = ("identifiable", "weak")
 
 
 class Judgement(NamedTuple):
-    """What is known of one unknown of one lane.
+    """Verdict, interval and error of one unknown of one lane.
 
     Attributes:
         verdict: one of `VERDICTS`; "failed" without an estimate.
         low: 95 % interval in the parameter's unit, within its bounds: by profile and other minima
-            where there is such evidence, else local; the bound where open. Where an end is
-            `FAILED`, the local one, if it reaches further than what is known.
+            where there is such evidence, else local, each side as many times as long on the scaled
+            coordinate as correlated residuals make it (`Effective.growth`); the bound where open.
+            Where an end is `FAILED`, the local one, if it reaches further than what is known.
         high: likewise.
         ends: `ProfileEnd` of the two; None where the interval is local.
         error: relative error that the verdict rests on: the longer side of the interval over that
-            of one standard error, or the local one.
+            of one standard error, or the local one, with its growth.
+        standard_error: in the parameter's unit, with its growth; NaN where the data do not
+            determine the unknown: on a bound, open on a side, or where the model misses the curve.
+        relative_se: likewise, relative as `FitResult.relative_se`.
+        independent: low and high of independent residuals.
     """
 
     verdict: str
@@ -251,6 +266,9 @@ class Judgement(NamedTuple):
     high: float
     ends: tuple[int, int] | None
     error: float
+    standard_error: float
+    relative_se: float
+    independent: tuple[float, float]
 
 
 def judgement(result: FitResult, lane: int, i: int, profiles: Intervals | None = None) -> Judgement:
@@ -270,27 +288,60 @@ def judgement(result: FitResult, lane: int, i: int, profiles: Intervals | None =
 
 
 def _judged(result: FitResult, lane: int, i: int, profiles: Intervals | None) -> Judgement:
-    low, high, ends = _unbounded(result, lane, i, profiles)
-    inside = within_bounds(result, lane, i, low, high)
+    plain_low, plain_high, ends = _unbounded(result, lane, i, profiles)
+    independent = within_bounds(result, lane, i, plain_low, plain_high)
     if not result.succeeded[lane]:
-        return Judgement("failed", *inside, None, np.nan)
-    p = result.study.unknowns[lane][i][0]
+        return Judgement("failed", *independent, None, np.nan, np.nan, np.nan, independent)
     structural, held = bool(result.undetermined[lane, i]), bool(result.at_bound[lane, i])
-    if ends is None:
-        word = verdict(
-            float(result.relative_se[lane, i]), structural=structural, held=held,
-            unseen=bool(result.unexamined[lane, i]),
-        )  # fmt: skip
-        return Judgement(word, *inside, None, float(result.relative_se[lane, i]))
-    value, unit = float(result.value[lane, i]), float(result.uncertainty.half_width[lane])
+    growth, misses = float(result.effective.growth[lane]), bool(result.effective.misses[lane])
+    error = float(result.relative_se[lane, i])
+    if ends is not None:
+        error = _longer_side(result, lane, i, plain_low, plain_high)
+        error /= float(result.uncertainty.half_width[lane])
+    error *= growth
+    word = verdict(
+        error, structural=structural, held=held, ends=ends, misses=misses,
+        unseen=ends is None and bool(result.unexamined[lane, i]),
+    )  # fmt: skip
+    low, high = _grown(result, lane, i, plain_low, plain_high, growth)
+    open_ = ends is not None and ProfileEnd.OPEN in ends
+    factor = np.nan if structural or open_ or misses else float(result.effective.factor[lane])
+    return Judgement(
+        word, *within_bounds(result, lane, i, low, high), ends, error,
+        _finite(factor * float(result.standard_error[lane, i])),
+        _finite(factor * float(result.relative_se[lane, i])), independent,
+    )  # fmt: skip
+
+
+def _finite(value: float) -> float:
+    return value if np.isfinite(value) else np.nan
+
+
+def _longer_side(result: FitResult, lane: int, i: int, low: float, high: float) -> float:
+    """The longer side of an interval as a relative change of the estimate."""
+    p, value = result.study.unknowns[lane][i][0], float(result.value[lane, i])
     with np.errstate(divide="ignore", invalid="ignore"):
         if p.scale == "log":
-            longer = max(np.log(high / value), np.log(value / low) if low > 0 else np.inf)
+            return float(max(np.log(high / value), np.log(value / low) if low > 0 else np.inf))
+        return float(max(high - value, value - low) / (p.step * result.relative[lane, i]))
+
+
+def _grown(
+    result: FitResult, lane: int, i: int, low: float, high: float, growth: float
+) -> tuple[float, float]:
+    """An interval with both sides `growth` times as long on the scaled coordinate; NaN stays."""
+    if growth == 1 or np.isnan(low):
+        return low, high
+    p, value = result.study.unknowns[lane][i][0], float(result.value[lane, i])
+    log = p.scale == "log"
+    if np.isinf(growth):  # a side of no length, of an estimate on its bound, has no limit either
+        return 0.0 if log else -np.inf, np.inf
+    with np.errstate(divide="ignore", over="ignore"):
+        if log:
+            grown = value * (np.array([low, high]) / value) ** growth
         else:
-            longer = max(high - value, value - low) / (p.step * result.relative[lane, i])
-    error = float(longer) / unit
-    word = verdict(error, structural=structural, held=held, ends=ends)
-    return Judgement(word, *inside, ends, error)
+            grown = value + growth * (np.array([low, high]) - value)
+    return min(low, float(grown[0])), max(high, float(grown[1]))
 
 
 def limiting_bound(
@@ -308,7 +359,10 @@ def limiting_bound(
     """
     if not result.succeeded[lane] or result.undetermined[lane, i] or result.at_bound[lane, i]:
         return None
+    if result.effective.misses[lane]:
+        return None
     low, high, ends = _unbounded(result, lane, i, profiles)
+    low, high = _grown(result, lane, i, low, high, float(result.effective.growth[lane]))
     low_cut, high_cut = within_bounds(result, lane, i, low, high)
     if ends is None:
         cut = (bool(low < low_cut), bool(high > high_cut))
@@ -324,14 +378,6 @@ def limiting_bound(
     if cut[1] and closed[0] and p.to_scaled(p.upper) == lanes.upper[lane, i]:
         return None if usual is not None and p.upper == usual.upper else ("upper", p.upper)
     return None
-
-
-def interval95(
-    result: FitResult, lane: int, i: int, profiles: Intervals | None = None
-) -> tuple[float, float, tuple[int, int] | None]:
-    """`low`, `high`, `ends` of `judgement` without its verdict, which asks for the whole fit."""
-    low, high, ends = _unbounded(result, lane, i, profiles)
-    return *within_bounds(result, lane, i, low, high), ends
 
 
 def within_bounds(
@@ -449,9 +495,9 @@ def estimate_rows(
             "parameter": p.name,
             "unit": p.unit,
             "value": float(result.value[lane, i]),
-            "se": float(result.standard_error[lane, i]),
+            "se": judged.standard_error,
             "low95": judged.low,
             "high95": judged.high,
-            "relative_se": float(result.relative_se[lane, i]),
+            "relative_se": judged.relative_se,
             "verdict": judged.verdict,
         }

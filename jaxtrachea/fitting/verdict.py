@@ -13,7 +13,8 @@ VERDICTS = (
     "practically non-identifiable",
     "structurally non-identifiable",
     "at bound",
-    "not shown",
+    "inconclusive",
+    "inconclusive: the model misses the curve",
 )
 
 
@@ -24,13 +25,15 @@ def verdict(
     held: bool = False,
     ends: tuple[int, int] | None = None,
     unseen: bool = False,
+    misses: bool = False,
 ) -> str:
     """One of `VERDICTS` for a parameter.
 
     Structurally non-identifiable: the model itself, at these contact points, does not let it be
     told, whatever the noise. Practically: it would, but with this noise the relative error exceeds
     50 %, or the interval is open on a side (terms of Raue et al. 2009,
-    doi:10.1093/bioinformatics/btp358). Not shown: it could not be found out.
+    doi:10.1093/bioinformatics/btp358). Inconclusive: it could not be found out, or the residuals
+    are those of another model.
 
     Args:
         relative_error: of the estimate: the longer side of its 95 % interval over that of one
@@ -39,9 +42,12 @@ def verdict(
         held: the estimate is on its bound.
         ends: `ProfileEnd` of the interval's sides; None: the error is local.
         unseen: there was cause to look further than the local error, and it was not done.
+        misses: the model misses the curve (`effective.Effective.misses`).
     """
     if structural:
         return VERDICTS[3]
+    if misses:
+        return VERDICTS[6]
     if held:
         return "at bound"
     if ends is not None and ProfileEnd.OPEN in ends:
@@ -49,5 +55,5 @@ def verdict(
     if not relative_error <= WEAK:
         return VERDICTS[2]
     if unseen or (ends is not None and ProfileEnd.FAILED in ends):
-        return "not shown"
+        return "inconclusive"
     return "identifiable" if relative_error <= IDENTIFIABLE else "weak"

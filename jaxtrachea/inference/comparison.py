@@ -7,11 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.fitting.criteria import Criteria
+from jaxtrachea.fitting.effective import CORRELATED, MIN_FREEDOM, effective_samples
 from jaxtrachea.fitting.lane import forces, markers
-from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
-from jaxtrachea.inference.effective import CORRELATED, effective_samples
 from jaxtrachea.inference.repeats import Missed, Worst
 from jaxtrachea.inference.residuals import rms
 
@@ -176,7 +175,7 @@ def compared(models: Sequence[Model]) -> tuple[list[Row], int]:
 def _worth(model: Model) -> Float[np.ndarray, " lanes"]:
     """Independent samples that those of each lane are worth by the residuals of a model."""
     result = model.result
-    worth = effective_samples(predictions(result.study, result.theta))
+    worth = effective_samples(result.residuals)
     return np.where(np.isnan(worth), np.asarray(result.samples, float), worth)
 
 
@@ -268,7 +267,8 @@ def sentence(rows: Sequence[Row], left: str = "positions") -> str:
     """Which model a specimen (or all) prefers, and whether that is decisive.
 
     Decisive is a difference of AICc of `DECISIVE` or more that remains so for as many samples as
-    are independent, and that no prediction of what was left out contradicts.
+    are independent, that no prediction of what was left out contradicts, and where the best model
+    follows the curves.
 
     Args:
         rows: of one specimen, one per model.
@@ -295,13 +295,15 @@ def sentence(rows: Sequence[Row], left: str = "positions") -> str:
     )
     weak = correlated and not rival.deflated >= DECISIVE
     against = known and predicts != best.model
-    if gap >= DECISIVE and not weak and not against:
+    misses = best.effective_samples < best.unknowns + MIN_FREEDOM
+    if gap >= DECISIVE and not (weak or against or misses):
         more = f"; {fair}" if correlated else ""
         more += f"; and it predicts {left} left out best" if known else ""
         return f"the data prefer {best.model} decisively ({said}{more})"
     doubts = [
         (gap < DECISIVE, f"the difference is below {DECISIVE:g}"),
         (weak, fair),
+        (misses, "even this model misses the curves"),
         (against, f"{predicts} predicts {left} left out better"),
     ]
     why = "; ".join(text for doubt, text in doubts if doubt)

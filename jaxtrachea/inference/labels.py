@@ -4,7 +4,13 @@ import numpy as np
 
 from jaxtrachea.fitting.parameters import OF_THE_PRESS
 from jaxtrachea.fitting.press_scale import sizes_of_press
-from jaxtrachea.fitting.result import FitResult, limiting_bound, unknown_label, verdict_of
+from jaxtrachea.fitting.result import (
+    DETERMINED,
+    FitResult,
+    limiting_bound,
+    unknown_label,
+    verdict_of,
+)
 from jaxtrachea.fitting.verdict import VERDICTS
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.inference.weakest_direction import (
@@ -29,6 +35,26 @@ def succeeded(result: FitResult, lane: int) -> bool:
     return bool(result.succeeded[lane])
 
 
+def outcome(result: FitResult, profiles: Profiles | None = None) -> str:
+    """How many lanes are solved, and in how many of these every unknown is determined."""
+    solved = [lane for lane in range(result.lanes) if succeeded(result, lane)]
+    said = f"{len(solved)} of {result.lanes} lanes solved"
+    if not result.study.free:
+        return said
+    determined = sum(determined_unknowns(result, k, profiles) == _count(result, k) for k in solved)
+    return f"{said}, {determined} with every unknown determined"
+
+
+def determined_unknowns(result: FitResult, lane: int, profiles: Profiles | None = None) -> int:
+    """Unknowns of a lane that are identifiable or weak."""
+    words = (verdict_of(result, lane, i, profiles) for i in range(_count(result, lane)))
+    return sum(word in DETERMINED for word in words)
+
+
+def _count(result: FitResult, lane: int) -> int:
+    return len(result.study.unknowns[lane])
+
+
 def peak_force(result: FitResult, lane: int) -> float:
     """Largest measured force of a lane, N."""
     return max(float(np.max(np.abs(c.force))) for c in result.study.curves[lane])
@@ -41,9 +67,9 @@ def weakest_sentence(result: FitResult, lane: int) -> str:
     if not result.study.free:
         return NOTHING_FITTED
     names = [unknown_label(result, lane, i) for i in range(len(result.study.unknowns[lane]))]
-    u = result.uncertainty
+    u, factor = result.uncertainty, float(result.effective.factor[lane])
     return describe_weakest(
-        names, u.weakest_direction[lane], float(u.weakest_se[lane]),
+        names, u.weakest_direction[lane], factor * float(u.weakest_se[lane]),
         u.structural_null_space[lane], result.undetermined[lane],
         press_sizes(result, lane), _left(result, lane),
     )  # fmt: skip
@@ -54,7 +80,8 @@ def _left(result: FitResult, lane: int) -> Direction | None:
     u, relative = result.uncertainty, result.relative[lane]
     if not np.any(u.weakest_direction[lane]):
         return None
-    covariance = u.covariance[lane] / relative[:, None] / relative
+    factor = float(result.effective.factor[lane])
+    covariance = factor**2 * u.covariance[lane] / relative[:, None] / relative
     rows = u.null_space[lane] / relative
     rows = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
     ways = undetermined_ways(u.weakest_direction[lane], u.structural_null_space[lane])
@@ -87,6 +114,12 @@ def _limited(result: FitResult, lane: int, profiles: Profiles | None) -> list[st
     return said
 
 
+def _listed(verdict: str, names: list[str]) -> str:
+    """``weak: EI_L, k_M``; the reason of a verdict stands in brackets."""
+    word, _, reason = verdict.partition(": ")
+    return f"{word}{f' ({reason})' if reason else ''}: {', '.join(names)}"
+
+
 def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = None) -> str:
     """Which unknowns of a lane have which verdict, and what is least determined."""
     if not succeeded(result, lane):
@@ -97,11 +130,12 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
     for i in range(len(result.study.unknowns[lane])):
         word = verdict_of(result, lane, i, profiles)
         groups.setdefault(word, []).append(unknown_label(result, lane, i))
-    said = [f"{word}: {', '.join(groups[word])}" for word in VERDICTS if word in groups]
+    said = [_listed(word, groups[word]) for word in VERDICTS if word in groups]
     said += _limited(result, lane, profiles)
-    said.append(weakest_sentence(result, lane))
+    if not result.effective.misses[lane]:
+        said.append(weakest_sentence(result, lane))
     if result.study.joint and result.unexamined[lane].any():
-        said.append("not shown: only the local error was looked at; --profile looks further")
+        said.append("inconclusive: only the local error was looked at; --profile looks further")
     if result.minima[lane] > 1:
         said.append("fits that end elsewhere are as good within the noise")
     return "; ".join(said)

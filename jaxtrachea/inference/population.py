@@ -61,7 +61,8 @@ class Population:
     @property
     def undetermined(self) -> Int[np.ndarray, " q"]:
         """Of those that took part, estimates with an error above half their value; (q,)."""
-        error = self.result.relative_se[np.arange(len(self.place))[:, None], self.place]
+        error = self.result.relative_se * self.result.effective.growth[:, None]
+        error = error[np.arange(len(self.place))[:, None], self.place]
         return np.sum(self.known & ~(error <= WEAK), axis=0)
 
     def shrunk_cells(self, lane: int, i: int) -> dict[str, object]:
@@ -88,7 +89,7 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
     All estimates take part that have an error, weighed by the larger of their local error and that
     of their interval, if it has two ends; also those whose data do not determine them: left out,
     they would bias mean and spread, as an error is relative and small values have large ones. On a
-    bound, structurally non-identifiable or not shown an estimate has none. Parameters that fewer
+    bound, structurally non-identifiable or inconclusive an estimate has none. Parameters that fewer
     than three specimens determine (identifiable or weak) are left out.
 
     Args:

@@ -1,4 +1,4 @@
-"""What residuals say as a whole: their size, their largest, and whether neighbours are alike."""
+"""Residuals as a whole: their size, their largest, and where along a press the model misses."""
 
 import numpy as np
 
@@ -13,20 +13,6 @@ def rms(values: np.ndarray) -> np.ndarray | np.floating:
         return np.sqrt(np.where(known, values**2, 0).sum(axis=-1) / known.sum(axis=-1))
 
 
-def lag_correlation(prediction: Prediction) -> np.ndarray:
-    """Correlation of neighbouring force residuals along the curves of each lane; (lanes,).
-
-    About 0 for independent noise, near 1 where the model misses the shape of the curves; NaN with
-    fewer than 10 pairs. Not centred: a residual of one sign is correlated, too.
-    """
-    r = np.nan_to_num(prediction.force)
-    pair = np.isfinite(prediction.force[..., 1:]) & np.isfinite(prediction.force[..., :-1])
-    both = np.sum(r[..., 1:] * r[..., :-1] * pair, axis=(1, 2))
-    ends = 0.5 * np.sum((r[..., 1:] ** 2 + r[..., :-1] ** 2) * pair, axis=(1, 2))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(np.sum(pair, axis=(1, 2)) >= 10, both / ends, np.nan)
-
-
 def worst(prediction: Prediction, result: FitResult) -> str:
     """The largest force residual in words."""
     size = np.where(np.isfinite(prediction.force), np.abs(prediction.force), -1)
@@ -39,4 +25,33 @@ def worst(prediction: Prediction, result: FitResult) -> str:
     return (
         f"{value:+.3g} N at {curve.displacement[sample]:.3g} mm in {curve.specimen} "
         f"{curve.trial}, where {curve.force[sample]:.4g} N were measured"
+    )
+
+
+#: Neighbouring residuals whose mean decides on which side of the record the model runs.
+_WINDOW = 5
+
+
+def where_missed(result: FitResult, lane: int) -> str:
+    """The curve that the model misses most, and from where to where along the press.
+
+    The stretch is the one of residuals of one sign with the largest sum.
+    """
+    residual, curves = result.residuals.force[lane], result.study.curves[lane]
+    curve, row = max(zip(curves, residual, strict=False), key=lambda pair: float(rms(pair[1])))
+    known = np.flatnonzero(np.isfinite(row))
+    order = known[np.argsort(curve.displacement[known], kind="stable")]
+    depth, r = curve.displacement[order], row[order]
+    width = min(_WINDOW, len(r))
+    smooth = np.convolve(r, np.full(width, 1 / width), "same")
+    edges = np.flatnonzero(np.diff(np.sign(smooth))) + 1
+    runs = np.split(np.arange(len(r)), edges)
+    run = max(runs, key=lambda places: abs(float(np.sum(smooth[places]))))
+    largest = run[np.argmax(np.abs(r[run]))]
+    peak = float(np.max(np.abs(curve.force)))
+    side = "above" if smooth[run].sum() > 0 else "below"
+    return (
+        f"{curve.specimen} {curve.trial} from {depth[run[0]]:.3g} to {depth[run[-1]]:.3g} mm, "
+        f"where the model runs {side} the record by up to {abs(r[largest]):.2g} N "
+        f"({100 * abs(r[largest]) / peak:.2g} % of the peak)"
     )

@@ -7,8 +7,13 @@ import numpy as np
 from jaxtrachea.files.tables import markdown_table
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import Findings
-from jaxtrachea.inference.effective import CORRELATED
-from jaxtrachea.inference.labels import NOTHING_FITTED, lane_label, succeeded, verdict_sentence
+from jaxtrachea.inference.labels import (
+    NOTHING_FITTED,
+    lane_label,
+    outcome,
+    succeeded,
+    verdict_sentence,
+)
 from jaxtrachea.inference.residuals import worst
 from jaxtrachea.inference.rows import ONE_BY_ONE, listed, more_of
 from jaxtrachea.measurements.curve import BAD_HEAD, BadCurve
@@ -16,7 +21,6 @@ from jaxtrachea.report.tables import (
     ESTIMATE_HEAD,
     QUALITY_HEAD,
     SPREAD_HEAD,
-    WIDENED_HEAD,
     estimate_rows,
     quality_rows,
     spread_rows,
@@ -38,10 +42,10 @@ def report_text(
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
     parts = [
         f"# {title or 'Fit'}",
-        f"{result.lanes} lanes, {result.lanes - len(failed)} succeeded, {len(failed)} failed; "
-        f"{len(bad)} curves could not be used. A lane is what was fitted by itself: a specimen "
-        "or a curve. How to read this report: docs/report.md. All numbers: `results.h5`; one row "
-        "per lane: `summary.csv`; one row per estimate: `parameters.csv` (docs/results.md).",
+        f"{outcome(result, findings.profiles)}; {len(bad)} curves could not be used. A lane is "
+        "what was fitted by itself: a specimen or a curve. How to read this report: "
+        "docs/report.md. All numbers: `results.h5`; one row per lane: `summary.csv`; one row per "
+        "estimate: `parameters.csv` (docs/results.md).",
         *_estimates(findings),
         *_sections(findings, "estimates"),
         "## Quality",
@@ -69,12 +73,10 @@ def _sections(findings: Findings, place: str) -> list[str]:
 
 def _estimates(findings: Findings) -> list[str]:
     """Values with their errors, and what the data leave open."""
-    result, profiles, wide = findings.result, findings.profiles, findings.get("effective")
+    result, profiles = findings.result, findings.profiles
     shown = listed(result)
-    widened = wide if wide and np.any(wide.correlation > CORRELATED) else None
-    head = ESTIMATE_HEAD if widened is None else WIDENED_HEAD
-    rows = estimate_rows(result, shown, profiles, widened)
-    tables = [markdown_table(head, rows), *more_of(result, shown, "parameters.csv")]
+    rows = estimate_rows(result, shown, profiles)
+    tables = [markdown_table(ESTIMATE_HEAD, rows), *more_of(result, shown, "parameters.csv")]
     if result.lanes > len(shown):
         tables = [markdown_table(SPREAD_HEAD, spread_rows(result, profiles)), *tables]
     if not result.study.free:
@@ -93,12 +95,14 @@ def _estimates(findings: Findings) -> list[str]:
         *more_of(result, shown, "summary.csv"),
         "Identifiable: relative error up to 10 %; weak: up to 50 %; practically non-identifiable: "
         "more, or open on a side (limited by a bound, where that is said); structurally "
-        "non-identifiable: no data from these contact points can tell, however exact; not shown: "
-        "there was cause to doubt the local error, and the profile could not be followed to its "
-        "end. Where there is cause, intervals are those of profile likelihood and of all other "
-        "minima found; else of the local standard error (Gauss-Newton). Neither says anything of "
-        "what the model leaves out. Medians and populations are of identifiable and weak "
-        "estimates.",
+        "non-identifiable: no data from these contact points can tell, however exact; "
+        "inconclusive: the local error is in doubt and the profile could not be followed to its "
+        "end, or the model misses the curve. Where there is cause, intervals are those of profile "
+        "likelihood and of all other minima found; else of the local standard error "
+        "(Gauss-Newton). Both are "
+        "for as many samples as are independent. Neither says anything of what the model leaves "
+        "out where the curves do not show it. Medians and populations are of identifiable and "
+        "weak estimates.",
     ]
 
 

@@ -2,11 +2,8 @@
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from jaxtrachea.inference.analysis import Findings, Table
-from jaxtrachea.inference.effective import CORRELATED
-from jaxtrachea.inference.labels import lane_label, succeeded, verdict_sentence
+from jaxtrachea.inference.labels import lane_label, outcome, verdict_sentence
 from jaxtrachea.inference.rows import and_more, listed
 from jaxtrachea.measurements.usage_tables import sentences
 from jaxtrachea.report import tables
@@ -20,15 +17,13 @@ def overview(findings: Findings) -> Iterator[Table | str]:
     """
     result, profiles = findings.result, findings.profiles
     lanes = listed(result)
-    cut, wide = result.lanes > len(lanes), findings.get("effective")
+    cut = result.lanes > len(lanes)
     if not result.study.free:
         yield f"{result.lanes} lanes: {verdict_sentence(result, 0)}"
     elif cut:
         yield "Estimates over lanes", tables.SPREAD_HEAD, tables.spread_rows(result, profiles)
     else:
-        widened = wide if wide and np.any(wide.correlation > CORRELATED) else None
-        head = tables.ESTIMATE_HEAD if widened is None else tables.WIDENED_HEAD
-        yield "Estimates", head, tables.estimate_rows(result, lanes, profiles, widened)
+        yield "Estimates", tables.ESTIMATE_HEAD, tables.estimate_rows(result, lanes, profiles)
     for analysis, found in findings.at("quality"):
         yield from analysis.shown(found, lanes)
     for analysis, found in findings.found:
@@ -43,7 +38,6 @@ def overview(findings: Findings) -> Iterator[Table | str]:
     for lane in lanes if result.study.free and not cut else ():
         yield f"{lane_label(result, lane)}: {verdict_sentence(result, lane, profiles)}"
     if cut and result.study.free:
-        good = sum(succeeded(result, lane) for lane in range(result.lanes))
-        yield f"{good} of {result.lanes} lanes succeeded"
+        yield outcome(result, profiles)
     for sentence in sentences([c for curves in result.study.curves for c in curves]):
         yield f"{sentence} (curves.csv)"

@@ -13,16 +13,12 @@ from jaxtrachea.fitting.result import (
     judgement,
     said_before,
     unknown_label,
-    verdict_of,
 )
-from jaxtrachea.inference.effective import Effective
 from jaxtrachea.inference.labels import lane_label, peak_force, succeeded
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.status import FitStatus
 
 ESTIMATE_HEAD = ["specimen", "parameter", "value", "std. error", "95 % interval", "verdict"]
-#: Likewise, with intervals for correlated residuals.
-WIDENED_HEAD = [*ESTIMATE_HEAD[:-1], "95 % widened", ESTIMATE_HEAD[-1]]
 SPREAD_HEAD = ["parameter", "determined", "median", "quartiles", "error", "identifiable"]
 QUALITY_HEAD = [
     "specimen",
@@ -41,9 +37,8 @@ def estimate_rows(
     result: FitResult,
     lanes: Sequence[int],
     profiles: Profiles | None = None,
-    wide: Effective | None = None,
 ) -> list[list[str]]:
-    """Lane, parameter, value, standard error, 95 % interval, if given widened, verdict."""
+    """Lane, parameter, value, standard error, 95 % interval, verdict."""
     rows = []
     for lane in lanes:
         for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
@@ -55,18 +50,12 @@ def estimate_rows(
                     lane_label(result, lane) if is_own(result, lane, i) else "(all)",
                     f"{unknown_label(result, lane, i)} [{p.unit}]",
                     number(result.value[lane, i]),
-                    number(result.standard_error[lane, i], 2),
+                    number(judged.standard_error, 2),
                     interval(judged.low, judged.high, log=p.scale == "log"),
-                    *([] if wide is None else [_widened(wide, lane, i, log=p.scale == "log")]),
                     judged.verdict,
                 ]
             )
     return rows
-
-
-def _widened(wide: Effective, lane: int, i: int, *, log: bool) -> str:
-    """The interval as it is with the samples that correlated ones are worth."""
-    return interval(float(wide.lower[lane, i]), float(wide.upper[lane, i]), log=log)
 
 
 def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[list[str]]:
@@ -81,12 +70,12 @@ def spread_rows(result: FitResult, profiles: Profiles | None = None) -> list[lis
         for i, (p, _, _) in enumerate(result.study.unknowns[lane]):
             if said_before(result, good, lane, i):
                 continue
-            verdict = verdict_of(result, lane, i, profiles)
+            judged = judgement(result, lane, i, profiles)
             press = p.name in OF_THE_PRESS and p.scale == "linear"
-            error = result.standard_error if press else result.relative_se
+            error = judged.standard_error if press else judged.relative_se
             if press:
                 units[f"{p.name} [{p.unit}]"] = p.unit
-            entry = (float(result.value[lane, i]), float(error[lane, i]), verdict)
+            entry = (float(result.value[lane, i]), error, judged.verdict)
             columns.setdefault(f"{p.name} [{p.unit}]", []).append(entry)
     rows = []
     for name, entries in columns.items():

@@ -20,7 +20,7 @@ from jaxtrachea.results.stored import SCHEMA, VERSION, NoResults
 from jaxtrachea.status import FitStatus
 
 #: Schema versions that are read; 1 has no covariance, which then follows from the standard errors.
-VERSIONS = (1, VERSION)
+VERSIONS = (1, 2, VERSION)
 #: Fields of `Uncertainty` in the group of that name; the others stand with lanes and unknowns.
 MORE = (
     "se", "weakest_se", "structural_null_space", "half_width", "conditional_direction",
@@ -53,6 +53,8 @@ def write_hdf5(
         for name in MORE:
             data = getattr(result.uncertainty, name)
             group.create_dataset(STORED_AS.get(name, name), data=data, compression="gzip")
+        for name in ("factor", "quantile"):
+            group[f"effective_{name}"] = getattr(result.effective, name)
         for analysis, found in findings.found:
             if analysis.datasets is not None:
                 analysis.datasets(file.create_group(analysis.name), found)

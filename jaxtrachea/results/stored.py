@@ -1,4 +1,4 @@
-"""A finished fit read back from its results.h5 (schema 2), so that it predicts by itself.
+"""A finished fit read back from its results.h5 (schema 3), so that it predicts by itself.
 
 Through the audited door for files that nobody vouches for (`readers.safe_hdf5`).
 """
@@ -30,12 +30,13 @@ from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
 
 SCHEMA = "jaxtrachea-results"
-VERSION = 2
+VERSION = 3
 #: Groups and datasets that are read; nothing else of the file is.
 READ = (
     "/model", "/data", "/lanes/status", "/lanes/sigma", "/lanes/rms", "/unknowns/theta",
     "/unknowns/at_bound",
     "/uncertainty/covariance", "/uncertainty/silent", "/uncertainty/half_width",
+    "/uncertainty/effective_factor", "/uncertainty/effective_quantile",
 )  # fmt: skip
 #: 97.5 % quantile of the normal distribution, as `covariance.analyse` uses it.
 NORMAL = 1.959963984540054
@@ -55,14 +56,15 @@ class StoredFit:
         reading: how the data were read, as in the [data] section.
         lane_names: specimen and trial of each lane, "(all)" where it spans several.
         theta: estimates; (L, P).
-        covariance: of the estimates; 0 for what is held, without the null space; (L, P, P).
+        covariance: of the estimates, for as many samples as are independent; 0 for what is held,
+            without the null space; (L, P, P).
         null_space: rows: directions that change no residual, scaled coordinates; (L, P, P).
         at_bound: (L, P).
         status: `FitStatus`; (L,).
         sigma: standard deviation of force, N, and markers, mm, given or estimated; NaN without
             samples of the kind; (L, 2).
         half_width: of a 95 % interval in standard errors; inf where the noise could not be
-            estimated; (L,).
+            estimated, or the model misses the curves; (L,).
         curves: the data as used; `source` is the file's name and the place in it.
         curve_lane: lane of each curve; (curves,).
         blend: rounded corner at the onset of each curve, mm, see `Lane`; NaN where no onset was
@@ -156,7 +158,7 @@ class StoredFit:
 
 def from_result(result: FitResult) -> StoredFit:
     """A fit of this process as one that was read back: what predictions need."""
-    study, u = result.study, result.uncertainty
+    study, u, wide = result.study, result.uncertainty, result.effective
     placed = [(k, t, c) for k, lane in enumerate(study.curves) for t, c in enumerate(lane)]
     blend = study.lanes.blend
     return StoredFit(
@@ -165,12 +167,12 @@ def from_result(result: FitResult) -> StoredFit:
         reading={},
         lane_names=tuple(study.lane_name(lane) for lane in range(result.lanes)),
         theta=result.theta,
-        covariance=u.covariance,
+        covariance=_grown(u.covariance, wide.factor),
         null_space=u.null_space,
         at_bound=result.at_bound,
         status=result.status,
         sigma=np.where(np.isnan(result.rms), np.nan, result.sigma),
-        half_width=_known_half_width(study, u.half_width),
+        half_width=_known_half_width(study, u.half_width, wide.quantile),
         curves=tuple(c for _, _, c in placed),
         curve_lane=np.array([k for k, _, _ in placed]),
         blend=np.array([np.nan if blend is None else blend[k, t] for k, t, _ in placed]),
@@ -230,9 +232,10 @@ def _check_schema(path: Path, schema: object, version: object) -> None:
             f"{path}: schema is {schema!r}, expected {SCHEMA!r}; name the results of a fit "
             "(its folder, or results.h5 in it)"
         )
-    if version == 1:
+    if version in (1, 2):
+        lost = "model, covariance and data" if version == 1 else "what correlated residuals cost"
         raise NoResults(
-            f"{path}: schema version 1 does not keep model, covariance and data; fit again with "
+            f"{path}: schema version {version} does not keep {lost}; fit again with "
             "this version: jaxtrachea fit SPEC"
         )
     if version != VERSION:
@@ -276,12 +279,19 @@ def _read(path: Path, file: Any) -> StoredFit:
         reading=model["reading"],
         lane_names=tuple((s, t) for s, t in model["lanes"]),
         theta=theta,
-        covariance=numeric(file["uncertainty"], "covariance"),
+        covariance=_grown(
+            numeric(file["uncertainty"], "covariance"),
+            numeric(file["uncertainty"], "effective_factor"),
+        ),
         null_space=numeric(file["uncertainty"], STORED_AS["null_space"]),
         at_bound=numeric(file["unknowns"], "at_bound") > 0,
         status=numeric(file["lanes"], "status").astype(int),
         sigma=_sigma(file["lanes"]),
-        half_width=_known_half_width(study, numeric(file["uncertainty"], "half_width")),
+        half_width=_known_half_width(
+            study,
+            numeric(file["uncertainty"], "half_width"),
+            numeric(file["uncertainty"], "effective_quantile"),
+        ),
         curves=curves,
         curve_lane=lane,
         blend=numeric(file["data"], "blend"),
@@ -299,12 +309,17 @@ def _marker_noise(found: Any) -> tuple[float, float] | None:
     return float(joints), float(share)
 
 
-def _known_half_width(study: Study, half: np.ndarray) -> np.ndarray:
-    """Infinite where noise that should be estimated has no sample left to be estimated from.
+def _known_half_width(study: Study, half: np.ndarray, quantile: np.ndarray) -> np.ndarray:
+    """The quantile; infinite where noise is to be estimated and no sample is left to do it from.
 
     `covariance.analyse` puts the normal quantile there, which Student's t never reaches.
     """
-    return np.where((half == NORMAL) & ~np.array(study.noise_given[0]), np.inf, half)
+    return np.where((half == NORMAL) & ~np.array(study.noise_given[0]), np.inf, quantile)
+
+
+def _grown(covariance: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """Covariance for as many samples as are independent; as it is where none is left."""
+    return covariance * np.where(np.isfinite(factor), factor, 1.0)[:, None, None] ** 2
 
 
 def _sigma(lanes: Any) -> np.ndarray:

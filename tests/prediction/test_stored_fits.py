@@ -48,7 +48,7 @@ def cut(folder):
 
 def newer(folder):
     with h5py.File(folder / "results.h5", "r+") as file:
-        file.attrs["schema_version"] = 3
+        file.attrs["schema_version"] = 4
 
 
 def other(folder):

@@ -5,12 +5,11 @@ import pkgutil
 from collections.abc import Callable, Iterable
 
 from jaxtrachea.config import SpecError
+from jaxtrachea.fitting.misfit import misfit
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analyses.effective import EFFECTIVE
 from jaxtrachea.inference.analyses.misfit import MISFIT
 from jaxtrachea.inference.analysis import Analysis, Findings, Progress, Request, Unavailable
-from jaxtrachea.inference.effective import effective
-from jaxtrachea.inference.misfit import misfit
 
 
 def in_order(analyses: Iterable[Analysis]) -> tuple[Analysis, ...]:
@@ -107,5 +106,6 @@ def analyse(
 
 def widened(result: FitResult) -> Findings:
     """A fit with the analyses that every table of lanes has, and no others."""
-    wide = effective(result, result.residuals)
-    return Findings(result, ((EFFECTIVE, wide), (MISFIT, misfit(result, result.residuals))))
+    return Findings(
+        result, ((EFFECTIVE, Findings(result)), (MISFIT, misfit(result, result.residuals)))
+    )

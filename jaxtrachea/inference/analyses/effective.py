@@ -1,69 +1,93 @@
-"""Correlated residuals: what they cost, in tables and report. Done in every fit."""
+"""Correlated residuals: what intervals grow by, in tables and report. Done in every fit."""
 
 from collections.abc import Iterator
 
 import numpy as np
 
+from jaxtrachea.fitting.effective import CORRELATED, Effective
+from jaxtrachea.fitting.result import judgement
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
-from jaxtrachea.inference.effective import CORRELATED, Effective, effective
+from jaxtrachea.inference.labels import determined_unknowns, lane_label
+from jaxtrachea.inference.residuals import where_missed
+from jaxtrachea.inference.rows import worst_first
+
+#: Lanes whose missed stretch is named in report and terminal.
+NAMED = 5
 
 
-def _compute(request: Request, findings: Findings, progress: Progress) -> Effective:
-    return effective(findings.result, findings.result.residuals, findings.profiles)
+def _compute(request: Request, findings: Findings, progress: Progress) -> Findings:
+    """The fit with the profiles that its intervals rest on; the numbers are the result's own."""
+    return findings
 
 
-def _lane_cells(wide: Effective, lane: int) -> Cells:
+def _lane_cells(found: Findings, lane: int) -> Cells:
+    result, wide = found.result, found.result.effective
+    misses = bool(wide.misses[lane]) and bool(result.succeeded[lane])
+    free = bool(result.study.free)
     return {
         "residual_correlation": float(wide.correlation[lane]),
         "effective_samples": float(wide.samples[lane]),
+        "interval_growth": float(wide.growth[lane]),
+        "determined": determined_unknowns(result, lane, found.profiles) if free else "",
+        "missed": where_missed(result, lane) if misses else "",
     }
 
 
-def _cells(wide: Effective, lane: int, i: int) -> Cells:
-    """The interval as it is with the samples that correlated ones are worth."""
+def _cells(found: Findings, lane: int, i: int) -> Cells:
+    """Error and interval as they would be with independent residuals."""
+    low, high = judgement(found.result, lane, i, found.profiles).independent
     return {
-        "low95_widened": float(wide.lower[lane, i]),
-        "high95_widened": float(wide.upper[lane, i]),
+        "se_independent": float(found.result.standard_error[lane, i]),
+        "low95_independent": low,
+        "high95_independent": high,
     }
 
 
-def _section(wide: Effective) -> list[str]:
-    """What correlation of neighbours says against the standard errors."""
-    lanes, every = np.flatnonzero(wide.correlation > CORRELATED), wide.result.lanes
-    if not len(lanes):
-        return []
-    if not wide.result.study.free:
-        return [
-            f"Neighbouring force residuals are correlated in {len(lanes)} of {every} lanes: "
-            "the model misses the shape of these curves, or the noise is not independent from "
-            "sample to sample."
-        ]
-    r = float(np.median(wide.correlation[lanes]))
-    worth = float(np.median(wide.samples[lanes] / np.maximum(wide.result.samples[lanes], 1)))
-    few = int(np.sum(np.isinf(wide.factor[lanes])))
-    factor = float(np.median(wide.factor[lanes]))
-    return [
-        f"Neighbouring force residuals are correlated in {len(lanes)} of {every} lanes "
-        f"(median correlation {r:.2f}): the model misses the shape of these curves, or the "
-        "noise is not independent from sample to sample. The standard errors assume that it "
-        f"is; there 100 samples are worth {100 * worth:.2g} independent ones, and they are too "
-        + (f"small, by a factor of about {factor:.2g} if it is noise" if np.isfinite(factor)
-           else "small by a factor that these samples do not tell")
-        + ". Intervals for so many samples: `95 % widened`, and `low95_widened`, "
-        "`high95_widened` in `parameters.csv` (docs/uncertainty.md)."
-        + (f" {few} lanes have no more independent samples than unknowns, and no limits."
-           if few else "")
-    ]  # fmt: skip
+def _correlated(wide: Effective) -> np.ndarray:
+    return np.flatnonzero((wide.correlation > CORRELATED) & ~wide.misses)
 
 
-def _shown(wide: Effective, lanes: list[int]) -> Iterator[str]:
-    doubted = int(np.sum(wide.correlation > CORRELATED))
-    if doubted and wide.result.study.free:
-        yield (
-            f"Neighbouring residuals are correlated in {doubted} of {wide.result.lanes} lanes: "
-            "standard errors are too small there; wider intervals: low95_widened, high95_widened "
-            "in parameters.csv"
+def _sentences(found: Findings) -> Iterator[str]:
+    """Lanes whose intervals grow, and those of which nothing can be said."""
+    result = found.result
+    wide, every = result.effective, result.lanes
+    lanes = _correlated(wide)
+    if not result.study.free:
+        lanes = np.flatnonzero(wide.correlation > CORRELATED)
+    if len(lanes):
+        said = (
+            f"Neighbouring force residuals are correlated in {len(lanes)} of {every} lanes (median "
+            f"correlation {np.median(wide.correlation[lanes]):.2f}): the noise changes slowly, or "
+            "the model misses the shape of these curves"
         )
+        if result.study.free:
+            worth = np.median(wide.samples[lanes] / np.maximum(result.samples[lanes], 1))
+            said += (
+                f". There 100 samples are worth {100 * worth:.2g} independent ones, and the "
+                f"intervals are {np.median(wide.growth[lanes]):.2g} times as long for it"
+            )
+        yield said
+    missed = [k for k in worst_first(result) if wide.misses[k] and result.succeeded[k]]
+    if missed and result.study.free:
+        named = "; ".join(f"{lane_label(result, k)}: {where_missed(result, k)}"
+                          if every > 1 else where_missed(result, k)
+                          for k in missed[:NAMED])  # fmt: skip
+        more = f"; and {len(missed) - NAMED} more, see summary.csv" if len(missed) > NAMED else ""
+        yield (
+            f"The model misses the curves in {len(missed)} of {every} lanes: their samples are "
+            "worth less than one independent sample beyond the unknowns, and no verdict is given. "
+            f"Most missed: {named}{more}"
+        )
+
+
+def _section(found: Findings) -> list[str]:
+    said = [f"{sentence}." for sentence in _sentences(found)]
+    if said and found.result.study.free:
+        said[-1] += (
+            " Errors and intervals of independent residuals: `se_independent`, "
+            "`low95_independent`, `high95_independent` in `parameters.csv` (docs/uncertainty.md)."
+        )
+    return [" ".join(said)] if said else []
 
 
 EFFECTIVE = Analysis(
@@ -75,5 +99,5 @@ EFFECTIVE = Analysis(
     parameter_cells=_cells,
     place="quality",
     section=_section,
-    shown=_shown,
+    shown=lambda found, lanes: _sentences(found),
 )

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from jaxtrachea.fitting.misfit import Misfit, misfit
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
-from jaxtrachea.inference.misfit import Misfit, misfit
 
 
 def _compute(request: Request, findings: Findings, progress: Progress) -> Misfit:

@@ -15,7 +15,6 @@ from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.bootstrap import Bootstrap
 from jaxtrachea.inference.design.candidates import check, reached
 from jaxtrachea.inference.design.press import marginal, of_a_new_press
-from jaxtrachea.inference.labels import succeeded
 
 #: Estimates of a lane, out of its bootstrap replicates, that a design is averaged over.
 _DRAWS = 16
@@ -79,19 +78,25 @@ def situation(
     """What a fit knows, with the weights that it gives to curves and samples.
 
     Args:
-        result: the fit; its succeeded lanes are the guesses.
+        result: the fit; the guesses are the succeeded lanes whose curves the model follows.
         resampled: if given, up to 16 replicates of each lane are the guesses.
         samples: of the next curve; None: as the longest measured.
         with_data: False: as before any measurement, with the bounds alone.
 
     Raises:
-        ValueError: no lane succeeded, or as `check`.
+        ValueError: no lane succeeded, the model misses the curves of all, or as `check`.
     """
     study = result.study
     check(study)
-    lanes = np.array([k for k in range(result.lanes) if succeeded(result, k)], int)
+    lanes = np.flatnonzero(result.succeeded)
     if len(lanes) == 0:
         raise ValueError("no lane has an estimate; nothing to design from")
+    lanes = lanes[~result.effective.misses[lanes]]
+    if len(lanes) == 0:
+        raise ValueError(
+            "the model misses the curves, so that its estimates tell nothing of the next press; "
+            "mend the fit first (docs/report.md)"
+        )
     lane, theta = lanes, result.theta[lanes]
     if resampled is not None:
         found = [resampled.theta[k][resampled.usable[k]][:_DRAWS] for k in lanes]
@@ -140,12 +145,13 @@ def _approaches(result: FitResult) -> Float[np.ndarray, " lanes"]:
 
 
 def _kappa(result: FitResult, lanes: Int[np.ndarray, " L"], info: Information) -> np.ndarray:
-    """The factor of the covariance of these lanes at their estimates, as the fit has it; (L,)."""
+    """Factor of the covariance of these lanes at their estimates, of correlated samples; (L,)."""
     study = result.study
     held = result.at_bound | (study.lanes.active == 0)
     dof = np.sum(info.counts, axis=1) - np.sum(~held[lanes], axis=1)
     least = normal_psi2(study.model.loss, study.model.loss_scale)
-    return noise_factor(info, dof, noise_given=study.noise_given, least=least)
+    kappa = noise_factor(info, dof, noise_given=study.noise_given, least=least)
+    return kappa * result.effective.factor[lanes] ** 2
 
 
 def _prior(study: Study, lane: Int[np.ndarray, " G"], theta: Float[np.ndarray, "G P"]):

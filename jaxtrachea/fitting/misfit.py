@@ -5,7 +5,7 @@ of it is chi^2 with n - P degrees of freedom; much more says that the sigma is t
 model misses the curves, much less that it is too large.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,7 +14,9 @@ from scipy.special import chdtr, chdtrc
 from jaxtrachea.fitting.joint_information import held_count, unknown_count
 from jaxtrachea.fitting.lane import Observed, forces, markers
 from jaxtrachea.fitting.predictions import Prediction
-from jaxtrachea.fitting.result import FitResult
+
+if TYPE_CHECKING:
+    from jaxtrachea.fitting.result import FitResult
 
 #: Ratio, or its inverse, from which it is told; and the probability of such a chi^2 by chance.
 BEYOND, CHANCE = 1.5, 1e-3
@@ -34,12 +36,17 @@ class Misfit(NamedTuple):
             larger: what a model may miss in them is given on purpose; (lanes, 2).
     """
 
-    result: FitResult
+    result: "FitResult"
     ratio: Float[np.ndarray, "lanes 2"]
     told: Bool[np.ndarray, "lanes 2"]
 
+    @property
+    def growth(self) -> Float[np.ndarray, " lanes"]:
+        """Growth of standard errors for residuals beyond the noise given; 1 or more; (lanes,)."""
+        return np.max(np.where(self.told & (self.ratio > 1), self.ratio, 1.0), axis=1)
 
-def misfit(result: FitResult, seen: Prediction) -> Misfit:
+
+def misfit(result: "FitResult", seen: Prediction) -> Misfit:
     """Residuals against the noise given; in a joint fit of all lanes together."""
     study, lanes = result.study, result.study.lanes
     shape = (result.lanes, 2)
@@ -53,7 +60,7 @@ def misfit(result: FitResult, seen: Prediction) -> Misfit:
     return Misfit(result, ratio, told)
 
 
-def _against_noise(result: FitResult, seen: Prediction, kinds: list[Observed]):
+def _against_noise(result: "FitResult", seen: Prediction, kinds: list[Observed]):
     """Ratio of some kinds of residuals to their sigma, and whether it is told; (lanes,) each."""
     study, lanes = result.study, result.study.lanes
     sizes = []

@@ -1,0 +1,132 @@
+"""Independent samples that correlated residuals are worth, and by what intervals grow for it.
+
+With a correlation r of neighbours, falling by r from sample to sample (AR(1)), n samples tell a
+mean as well as n (1 - r) / (1 + r) independent ones (Bayley and Hammersley 1946,
+doi:10.2307/2983560; Thiebaux and Zwiers 1984, doi:10.1175/1520-0450(1984)023<0800:TIAEOE>2.0.CO;2).
+The same holds for the unknowns of smooth curves, whose derivatives change little between
+neighbours: noise that changes slowly is averaged by no number of samples. With P unknowns and
+estimated noise, variances grow by (n - P) / (n_eff - P), and Student's t has n_eff - P degrees of
+freedom. With given noise they grow by n / n_eff, and by chi^2 / (n - P) where the residuals are
+larger than that noise (`misfit`).
+
+r is that of the residuals. The fit has made it smaller than that of the noise, by about
+(1 + 4 r) / n and more with many unknowns. An error of the model is correlated as well: the interval
+then says what noise of that size and slowness would do. Where less than one independent sample is
+left over the unknowns, nothing is said at all (`Effective.misses`).
+"""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.special import stdtrit
+
+from jaxtrachea.fitting.joint_information import held_count, unknown_count
+from jaxtrachea.fitting.misfit import misfit
+from jaxtrachea.fitting.predictions import Prediction
+
+if TYPE_CHECKING:
+    from jaxtrachea.fitting.result import FitResult
+
+#: Correlation of neighbouring residuals from which reports speak of it.
+CORRELATED = 0.3
+#: Pairs of neighbours from which a correlation is taken.
+MIN_PAIRS = 10
+#: Independent samples that must be left over the unknowns for an interval.
+MIN_FREEDOM = 1.0
+
+
+class Effective(NamedTuple):
+    """Worth of the samples of every lane; all lanes of a joint fit count together.
+
+    Attributes:
+        correlation: of neighbouring force residuals; NaN with fewer than `MIN_PAIRS`; (lanes,).
+        samples: independent samples that all observed ones are worth; NaN likewise; (lanes,).
+        factor: growth of standard errors, 1 or more; inf where `misses`; (lanes,).
+        quantile: half of a 95 % interval in standard errors (Student's t); inf likewise; (lanes,).
+        growth: of the length of 95 % intervals against those of independent residuals; inf
+            likewise; (lanes,).
+        misses: less than one independent sample is left over the unknowns: the model misses the
+            curve; (lanes,).
+    """
+
+    correlation: Float[np.ndarray, " lanes"]
+    samples: Float[np.ndarray, " lanes"]
+    factor: Float[np.ndarray, " lanes"]
+    quantile: Float[np.ndarray, " lanes"]
+    growth: Float[np.ndarray, " lanes"]
+    misses: Bool[np.ndarray, " lanes"]
+
+
+def lag_correlation(residual: Float[np.ndarray, "lanes trials samples"]) -> np.ndarray:
+    """Correlation of neighbouring residuals along the curves of each lane; (lanes,).
+
+    About 0 for independent noise, near 1 where the model misses the shape of the curves; NaN with
+    fewer than `MIN_PAIRS` pairs. Not centred: a residual of one sign is correlated, too.
+    """
+    r = np.nan_to_num(residual)
+    pair = np.isfinite(residual[..., 1:]) & np.isfinite(residual[..., :-1])
+    both = np.sum(r[..., 1:] * r[..., :-1] * pair, axis=(1, 2))
+    ends = 0.5 * np.sum((r[..., 1:] ** 2 + r[..., :-1] ** 2) * pair, axis=(1, 2))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(np.sum(pair, axis=(1, 2)) >= MIN_PAIRS, both / ends, np.nan)
+
+
+def share_independent(correlation: Float[np.ndarray, "*l"]) -> Float[np.ndarray, "*l"]:
+    """n_eff / n of AR(1) noise; 1 for negative correlations."""
+    r = np.clip(correlation, 0, 1)
+    return (1 - r) / (1 + r)
+
+
+def effective_samples(seen: Prediction) -> Float[np.ndarray, " lanes"]:
+    """Independent samples that the forces, and the markers of each ring, are worth; (lanes,)."""
+    kinds = [seen.force]
+    for more in (seen.side_force, seen.joints, seen.joint_side, seen.ends):
+        if more is not None:
+            lanes, trials, samples = more.shape[:3]
+            rows = np.moveaxis(more.reshape(lanes, trials, samples, -1), -1, 2)
+            kinds.append(rows.reshape(lanes, -1, samples))
+    total = np.zeros(len(seen.force))
+    of_forces = share_independent(lag_correlation(seen.force))
+    for residual in kinds:
+        count = np.sum(np.isfinite(residual), axis=(1, 2))
+        share = share_independent(lag_correlation(residual))
+        # Too few neighbours of one kind, or no residual at all: taken for as alike as the forces.
+        share = np.where(np.isnan(share), of_forces, share)
+        total += np.where(count > 0, count * share, 0)
+    return total
+
+
+def effective(result: "FitResult", seen: Prediction) -> Effective:
+    """Worth of the samples of all lanes by their residuals.
+
+    Args:
+        result: the fit.
+        seen: its residuals.
+    """
+    study, lanes = result.study, result.study.lanes
+    n, worth = np.asarray(result.samples, float), effective_samples(seen)
+    held = result.at_bound | ~(lanes.active > 0)
+    unknowns = np.sum(~held, axis=1).astype(float)
+    if study.joint:
+        alive = result.succeeded
+        P = unknown_count(study, alive) - held_count(study, held, alive)
+        unknowns = np.full(len(n), float(P))
+        n, worth = (np.full(len(n), np.nansum(v[alive])) for v in (n, worth))
+    plain = result.uncertainty.half_width
+    excess = misfit(result, seen).growth
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        left = worth - unknowns
+        # A given noise that covers the residuals limits what they can hide.
+        misses = (left < MIN_FREEDOM) & (worth < n) & (~study.noise_known | (excess > 1))
+        factor = np.sqrt(np.maximum((n - unknowns) / left, 1))
+        quantile = stdtrit(np.maximum(left, MIN_FREEDOM), 0.975)
+        factor = np.where(study.noise_known, excess * np.sqrt(np.maximum(n / worth, 1)), factor)
+        quantile = np.where(study.noise_known, plain, quantile)
+    # Residuals too few for a correlation are taken for independent.
+    few = np.isnan(worth)
+    factor, quantile = np.where(few, excess, factor), np.where(few, plain, quantile)
+    factor, quantile = (np.where(misses, np.inf, v) for v in (factor, quantile))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        growth = np.where(misses, np.inf, np.maximum(factor * quantile / plain, 1))
+    return Effective(lag_correlation(seen.force), worth, factor, quantile, growth, misses)
