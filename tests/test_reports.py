@@ -24,7 +24,7 @@ from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import predictions
-from jaxtrachea.fitting.result import unknown_label, verdict_of
+from jaxtrachea.fitting.result import judgement, unknown_label, verdict_of
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses import widened
@@ -45,7 +45,7 @@ from jaxtrachea.mechanics.press import Options
 from jaxtrachea.report.fit import report_text
 from jaxtrachea.report.overview import overview
 from jaxtrachea.report.plots import STYLE, draw_all
-from jaxtrachea.results.rows import lane_rows, summary_rows
+from jaxtrachea.results.rows import lane_rows, parameter_rows, summary_rows
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import table_1
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from jaxtrachea.files.output import OutputExists, new_directory, new_output
 from jaxtrachea.files.tables import markdown_table, number, write_csv
-from jaxtrachea.fitting.effective import effective, lag_correlation
+from jaxtrachea.fitting.effective import lag_correlation
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.predictions import predictions
@@ -63,10 +63,9 @@ def result():
 
 def predicted(result, prediction):
     """Findings of a fit with these residuals."""
-    found = effective(result, prediction)
     result = dataclasses.replace(result)
     vars(result)["residuals"] = prediction
-    return Findings(result, ((EFFECTIVE, found),))
+    return Findings(result, ((EFFECTIVE, Findings(result)),))
 
 
 def columns(heading):
@@ -279,7 +278,7 @@ def test_report_doubts_what_it_should(result):
     bend = dataclasses.replace(seen, force=np.tile(np.linspace(1, 2, shape[-1]), (*shape[:2], 1)))
     noise = dataclasses.replace(seen, force=np.tile([1.0, -1.0], (*shape[:2], shape[-1] // 2)))
     text = report_text("T", predicted(result, bend), [])
-    assert "correlated in 2 of 2 lanes" in text
+    assert "misses the curves in 2 of 2 lanes" in text
     assert "on its bound" not in text
     held = dataclasses.replace(result, at_bound=np.eye(2, result.at_bound.shape[1], dtype=bool))
     text = report_text("T", predicted(held, noise), [])
