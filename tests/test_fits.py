@@ -108,9 +108,12 @@ def test_files_agree_with_each_other(folder):
             assert units[row["parameter"]] == row["unit"]
             label = f"{row['parameter']} [{row['unit']}]"
             assert float(row["value"]) == unknowns["value"][0, i] == float(summary[label])
-            for ours, theirs in (("se", "standard_error"), ("low95",) * 2, ("high95",) * 2):
-                values = [float(row[ours]), unknowns[theirs][0, i]]
-                values.append(float(summary[f"{row['parameter']} {ours}"]))
+            assert row["se"] == summary[f"{row['parameter']} se"]
+            plain = [float(row["se_independent"]), unknowns["standard_error"][0, i]]
+            assert np.array_equal(plain[:1], plain[1:], equal_nan=True)
+            for end in ("low95", "high95"):
+                values = [float(row[end]), unknowns[end][0, i]]
+                values.append(float(summary[f"{row['parameter']} {end}"]))
                 assert np.array_equal(values, [values[0]] * 3, equal_nan=True)
         assert json.loads(file.attrs["provenance"]) == json.loads(
             (folder / "provenance.json").read_text()

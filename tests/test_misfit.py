@@ -5,8 +5,6 @@ import pytest
 
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise, Weighting
-from jaxtrachea.fitting.misfit import misfit
-from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.analyses.misfit import MISFIT
@@ -31,8 +29,7 @@ def compared(force, sigma, joint=False, **weighting):
         curves, table_1(), Options(coupling="total", onset_width=0.0), changes,
         noise=Noise(force=sigma), weighting=Weighting(**weighting),
     )  # fmt: skip
-    result = fit(study, QUICK)
-    return misfit(result, predictions(study, result.theta))
+    return fit(study, QUICK).misfit
 
 
 @pytest.mark.parametrize("sigma", [SIGMA, SIGMA / 10, SIGMA * 10, SIGMA * 1.2])
@@ -65,7 +62,7 @@ def test_few_samples_may_do_so_by_chance():
         {"k_3": {"fixed": True, "value": 0.0}}, noise=Noise(force=SIGMA),
     )  # fmt: skip
     result = fit(study, QUICK)
-    found = misfit(result, predictions(study, result.theta))
+    found = result.misfit
     assert np.mean((found.ratio[:, 0] > 1.5) | (found.ratio[:, 0] < 1 / 1.5)) > 0.3
     assert np.sum(found.told) <= 2
 

@@ -10,7 +10,6 @@ from run_cli import run
 
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.lanes import Noise
-from jaxtrachea.fitting.misfit import misfit
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import build_study
 from jaxtrachea.inference.cross_validation import leave_one_out
@@ -103,7 +102,7 @@ def test_markers_beyond_their_noise_are_told():
     """A cautious sigma is not: it says what the model may miss."""
     for given, told in ((MARKER / 10, True), (MARKER, False), (10 * MARKER, False)):
         result = fitted(marked("A"), Noise(force=FORCE, joints=given))
-        found = misfit(result, result.residuals)
+        found = result.misfit
         assert found.told[0].tolist() == [False, told]
         assert found.ratio[0, 1] == pytest.approx(MARKER / given, rel=0.1)
 

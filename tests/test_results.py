@@ -134,7 +134,9 @@ def test_failed_lane_keeps_its_row_and_is_called_failed(result):
     assert bad["k_1 verdict"] == "failed"
     assert weakest_sentence(failed, 1) == "no estimate"
     text = report_text("T", Findings(failed), [BAD])
-    assert "2 lanes, 1 succeeded, 1 failed; 1 curves could not be used" in text
+    assert (
+        "1 of 2 lanes solved, 0 with every unknown determined; 1 curves could not be used" in text
+    )
     assert "| T9 | 1 | non_finite | line 3: force is nan | leave it out |" in text
     assert "max iterations" in text
 
@@ -142,7 +144,10 @@ def test_failed_lane_keeps_its_row_and_is_called_failed(result):
 def flat(result, direction, error):
     change = {"weakest_direction": np.array([direction]), "weakest_se": np.array([error])}
     local = result.uncertainty._replace(**change)
-    return weakest_sentence(dataclasses.replace(result, uncertainty=local), 0)
+    changed = dataclasses.replace(result, uncertainty=local)
+    ones = np.ones(result.lanes)
+    vars(changed)["effective"] = result.effective._replace(factor=ones, growth=ones)
+    return weakest_sentence(changed, 0)
 
 
 def test_flat_combination_in_words(result):

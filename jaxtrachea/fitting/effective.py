@@ -7,7 +7,8 @@ The same holds for the unknowns of smooth curves, whose derivatives change littl
 neighbours: noise that changes slowly is averaged by no number of samples. With P unknowns and
 estimated noise, variances grow by (n - P) / (n_eff - P), and Student's t has n_eff - P degrees of
 freedom. With given noise they grow by n / n_eff, and by chi^2 / (n - P) where the residuals are
-larger than that noise (`misfit`).
+larger than that noise (`misfit`). A correlation that independent noise often has by chance is
+taken for none.
 
 r is that of the residuals. The fit has made it smaller than that of the noise, by about
 (1 + 4 r) / n and more with many unknowns. An error of the model is correlated as well: the interval
@@ -15,23 +16,22 @@ then says what noise of that size and slowness would do. Where less than one ind
 left over the unknowns, nothing is said at all (`Effective.misses`).
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.special import stdtrit
 
 from jaxtrachea.fitting.joint_information import held_count, unknown_count
-from jaxtrachea.fitting.misfit import misfit
+from jaxtrachea.fitting.misfit import Residuals, misfit
 from jaxtrachea.fitting.predictions import Prediction
-
-if TYPE_CHECKING:
-    from jaxtrachea.fitting.result import FitResult
 
 #: Correlation of neighbouring residuals from which reports speak of it.
 CORRELATED = 0.3
 #: Pairs of neighbours from which a correlation is taken.
 MIN_PAIRS = 10
+#: Times 1 / sqrt(pairs): correlation that independent noise exceeds in 5 % of all records.
+CHANCE = 1.645
 #: Independent samples that must be left over the unknowns for an interval.
 MIN_FREEDOM = 1.0
 
@@ -72,9 +72,18 @@ def lag_correlation(residual: Float[np.ndarray, "lanes trials samples"]) -> np.n
         return np.where(np.sum(pair, axis=(1, 2)) >= MIN_PAIRS, both / ends, np.nan)
 
 
-def share_independent(correlation: Float[np.ndarray, "*l"]) -> Float[np.ndarray, "*l"]:
-    """n_eff / n of AR(1) noise; 1 for negative correlations."""
-    r = np.clip(correlation, 0, 1)
+def share_independent(
+    correlation: Float[np.ndarray, "*l"], pairs: Int[np.ndarray, "*l"]
+) -> Float[np.ndarray, "*l"]:
+    """n_eff / n of AR(1) noise; 1 where independent noise has so large a correlation by chance.
+
+    Args:
+        correlation: of neighbours.
+        pairs: that it is of.
+    """
+    with np.errstate(divide="ignore"):
+        by_chance = correlation < CHANCE / np.sqrt(pairs)
+    r = np.where(by_chance, 0.0, np.clip(correlation, 0, 1))
     return (1 - r) / (1 + r)
 
 
@@ -87,34 +96,39 @@ def effective_samples(seen: Prediction) -> Float[np.ndarray, " lanes"]:
             rows = np.moveaxis(more.reshape(lanes, trials, samples, -1), -1, 2)
             kinds.append(rows.reshape(lanes, -1, samples))
     total = np.zeros(len(seen.force))
-    of_forces = share_independent(lag_correlation(seen.force))
+    of_forces = _share(seen.force)
     for residual in kinds:
         count = np.sum(np.isfinite(residual), axis=(1, 2))
-        share = share_independent(lag_correlation(residual))
+        share = _share(residual)
         # Too few neighbours of one kind, or no residual at all: taken for as alike as the forces.
         share = np.where(np.isnan(share), of_forces, share)
         total += np.where(count > 0, count * share, 0)
     return total
 
 
-def effective(result: "FitResult", seen: Prediction) -> Effective:
+def _share(residual: Float[np.ndarray, "lanes trials samples"]) -> Float[np.ndarray, " lanes"]:
+    known = np.isfinite(residual)
+    pairs = np.sum(known[..., 1:] & known[..., :-1], axis=(1, 2))
+    return share_independent(lag_correlation(residual), pairs)
+
+
+def effective(of: Residuals, plain: Float[np.ndarray, " lanes"]) -> Effective:
     """Worth of the samples of all lanes by their residuals.
 
     Args:
-        result: the fit.
-        seen: its residuals.
+        of: residuals of the fit.
+        plain: half of a 95 % interval in standard errors, of independent residuals; (lanes,).
     """
-    study, lanes = result.study, result.study.lanes
-    n, worth = np.asarray(result.samples, float), effective_samples(seen)
-    held = result.at_bound | ~(lanes.active > 0)
+    study, lanes = of.study, of.study.lanes
+    n, worth = np.asarray(of.samples, float), effective_samples(of.seen)
+    held = of.at_bound | ~(lanes.active > 0)
     unknowns = np.sum(~held, axis=1).astype(float)
     if study.joint:
-        alive = result.succeeded
+        alive = of.succeeded
         P = unknown_count(study, alive) - held_count(study, held, alive)
         unknowns = np.full(len(n), float(P))
         n, worth = (np.full(len(n), np.nansum(v[alive])) for v in (n, worth))
-    plain = result.uncertainty.half_width
-    excess = misfit(result, seen).growth
+    excess = misfit(of).growth
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         left = worth - unknowns
         # A given noise that covers the residuals limits what they can hide.
@@ -129,4 +143,4 @@ def effective(result: "FitResult", seen: Prediction) -> Effective:
     factor, quantile = (np.where(misses, np.inf, v) for v in (factor, quantile))
     with np.errstate(invalid="ignore", divide="ignore"):
         growth = np.where(misses, np.inf, np.maximum(factor * quantile / plain, 1))
-    return Effective(lag_correlation(seen.force), worth, factor, quantile, growth, misses)
+    return Effective(lag_correlation(of.seen.force), worth, factor, quantile, growth, misses)

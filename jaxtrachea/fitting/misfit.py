@@ -5,18 +5,16 @@ of it is chi^2 with n - P degrees of freedom; much more says that the sigma is t
 model misses the curves, much less that it is too large.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.special import chdtr, chdtrc
 
 from jaxtrachea.fitting.joint_information import held_count, unknown_count
 from jaxtrachea.fitting.lane import Observed, forces, markers
 from jaxtrachea.fitting.predictions import Prediction
-
-if TYPE_CHECKING:
-    from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.study import Study
 
 #: Ratio, or its inverse, from which it is told; and the probability of such a chi^2 by chance.
 BEYOND, CHANCE = 1.5, 1e-3
@@ -24,11 +22,28 @@ BEYOND, CHANCE = 1.5, 1e-3
 MEDIAN = 0.37
 
 
+class Residuals(NamedTuple):
+    """Residuals of a fit, and what they are counted by.
+
+    Attributes:
+        study: the data and the model.
+        seen: model minus data.
+        samples: observed entries; (lanes,).
+        at_bound: unknowns on a bound; (lanes, P).
+        succeeded: lanes with an estimate; (lanes,).
+    """
+
+    study: Study
+    seen: Prediction
+    samples: Int[np.ndarray, " lanes"]
+    at_bound: Bool[np.ndarray, "lanes P"]
+    succeeded: Bool[np.ndarray, " lanes"]
+
+
 class Misfit(NamedTuple):
     """Of every lane; forces, markers.
 
     Attributes:
-        result: the fit.
         ratio: of the residuals to the sigma given: root of chi^2 / (n - P), with a robust loss
             1.4826 times the median of their sizes; NaN where no sigma is given or nothing is left
             over; (lanes, 2).
@@ -36,7 +51,6 @@ class Misfit(NamedTuple):
             larger: what a model may miss in them is given on purpose; (lanes, 2).
     """
 
-    result: "FitResult"
     ratio: Float[np.ndarray, "lanes 2"]
     told: Bool[np.ndarray, "lanes 2"]
 
@@ -46,35 +60,35 @@ class Misfit(NamedTuple):
         return np.max(np.where(self.told & (self.ratio > 1), self.ratio, 1.0), axis=1)
 
 
-def misfit(result: "FitResult", seen: Prediction) -> Misfit:
+def misfit(of: Residuals) -> Misfit:
     """Residuals against the noise given; in a joint fit of all lanes together."""
-    study, lanes = result.study, result.study.lanes
-    shape = (result.lanes, 2)
+    study, lanes = of.study, of.study.lanes
+    shape = (len(of.samples), 2)
     ratio, told = np.full(shape, np.nan), np.zeros(shape, bool)
     for k, (kinds, given) in enumerate(
         zip((forces(lanes), markers(lanes)), study.noise_given, strict=True)
     ):
         if given and kinds:
-            ratio[:, k], told[:, k] = _against_noise(result, seen, kinds)
+            ratio[:, k], told[:, k] = _against_noise(of, kinds)
     told[:, 1] &= ratio[:, 1] > 1
-    return Misfit(result, ratio, told)
+    return Misfit(ratio, told)
 
 
-def _against_noise(result: "FitResult", seen: Prediction, kinds: list[Observed]):
+def _against_noise(of: Residuals, kinds: list[Observed]):
     """Ratio of some kinds of residuals to their sigma, and whether it is told; (lanes,) each."""
-    study, lanes = result.study, result.study.lanes
+    study, lanes = of.study, of.study.lanes
     sizes = []
     for kind in kinds:
-        residual = getattr(seen, kind.name)
+        residual = getattr(of.seen, kind.name)
         known = np.isfinite(residual) & (kind.precision > 0)
         z = np.where(known, residual * kind.precision, np.nan)
-        sizes.append(np.abs(z).reshape(result.lanes, -1))
+        sizes.append(np.abs(z).reshape(len(of.samples), -1))
     size = np.concatenate(sizes, axis=1)
     count = np.sum(np.isfinite(size), axis=1).astype(float)
-    unknowns = np.sum((lanes.active > 0) & ~result.at_bound, axis=1).astype(float)
-    total, square = np.asarray(result.samples, float), np.nansum(size**2, axis=1)
+    unknowns = np.sum((lanes.active > 0) & ~of.at_bound, axis=1).astype(float)
+    total, square = np.asarray(of.samples, float), np.nansum(size**2, axis=1)
     if study.joint:
-        alive, held = result.succeeded, result.at_bound | (lanes.active <= 0)
+        alive, held = of.succeeded, of.at_bound | (lanes.active <= 0)
         unknowns = np.array([unknown_count(study, alive) - held_count(study, held, alive)])
         count, total, square = (np.sum(v[alive], keepdims=True) for v in (count, total, square))
         size = size[alive].reshape(1, -1)
@@ -89,4 +103,4 @@ def _against_noise(result: "FitResult", seen: Prediction, kinds: list[Observed])
         statistic = ratio**2 * left
         chance = np.minimum(chdtrc(left, statistic), chdtr(left, statistic))
         told = ((ratio > BEYOND) | (ratio < 1 / BEYOND)) & (chance < CHANCE)
-    return (np.broadcast_to(v, (result.lanes,)) for v in (ratio, told))
+    return (np.broadcast_to(v, (len(of.samples),)) for v in (ratio, told))

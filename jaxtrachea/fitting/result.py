@@ -16,6 +16,7 @@ from jaxtrachea.files.table import Table
 from jaxtrachea.fitting.covariance import Uncertainty
 from jaxtrachea.fitting.criteria import Criteria
 from jaxtrachea.fitting.effective import Effective, effective
+from jaxtrachea.fitting.misfit import Misfit, Residuals, misfit
 from jaxtrachea.fitting.noise import precision_unit
 from jaxtrachea.fitting.onset import first_touches
 from jaxtrachea.fitting.parameters import DEFAULTS
@@ -152,7 +153,17 @@ class FitResult:
     @functools.cached_property
     def effective(self) -> Effective:
         """Independent samples that those of each lane are worth, and what intervals grow by."""
-        return effective(self, self.residuals)
+        return effective(self._counted, self.uncertainty.half_width)
+
+    @functools.cached_property
+    def misfit(self) -> Misfit:
+        """Residuals of each lane against the noise that was given."""
+        return misfit(self._counted)
+
+    @property
+    def _counted(self) -> Residuals:
+        """The residuals with what they are counted by."""
+        return Residuals(self.study, self.residuals, self.samples, self.at_bound, self.succeeded)
 
     @functools.cached_property
     def judgements(self) -> "dict[tuple[int, int], Judgement]":

@@ -77,7 +77,7 @@ def _unknown_cells(
         judged = judgement(result, lane, i, profiles)
         cells |= {
             f"{p.name} [{p.unit}]": float(result.value[lane, i]),
-            f"{p.name} se": float(result.standard_error[lane, i]),
+            f"{p.name} se": judged.standard_error,
             f"{p.name} low95": judged.low,
             f"{p.name} high95": judged.high,
             f"{p.name} verdict": judged.verdict,

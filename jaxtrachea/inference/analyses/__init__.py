@@ -5,7 +5,6 @@ import pkgutil
 from collections.abc import Callable, Iterable
 
 from jaxtrachea.config import SpecError
-from jaxtrachea.fitting.misfit import misfit
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analyses.effective import EFFECTIVE
 from jaxtrachea.inference.analyses.misfit import MISFIT
@@ -106,6 +105,4 @@ def analyse(
 
 def widened(result: FitResult) -> Findings:
     """A fit with the analyses that every table of lanes has, and no others."""
-    return Findings(
-        result, ((EFFECTIVE, Findings(result)), (MISFIT, misfit(result, result.residuals)))
-    )
+    return Findings(result, ((EFFECTIVE, Findings(result)), (MISFIT, result.misfit)))

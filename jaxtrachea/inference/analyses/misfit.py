@@ -4,12 +4,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxtrachea.fitting.misfit import Misfit, misfit
+from jaxtrachea.fitting.misfit import Misfit
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
 
 
 def _compute(request: Request, findings: Findings, progress: Progress) -> Misfit:
-    return misfit(findings.result, findings.result.residuals)
+    return findings.result.misfit
 
 
 def _lane_cells(compared: Misfit, lane: int) -> Cells:
@@ -19,7 +19,7 @@ def _lane_cells(compared: Misfit, lane: int) -> Cells:
 
 def _sentences(compared: Misfit) -> list[str]:
     """Residuals larger than the noise given, and smaller ones."""
-    every, said = compared.result.lanes, []
+    every, said = len(compared.ratio), []
     for k, (kind, key) in enumerate((("Force", "noise.force"), ("Marker", "noise.joints"))):
         ratio, told = compared.ratio[:, k], compared.told[:, k]
         for beyond, cause in (
