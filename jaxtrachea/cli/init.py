@@ -1,6 +1,7 @@
 """The command init, and check on data files: what was read, what is missing, a specification."""
 
 import dataclasses
+import re
 import shlex
 import tomllib
 from pathlib import Path
@@ -45,7 +46,7 @@ def init(options: InitOptions) -> None:
     _write(options, text)
     out = Console()
     out.print(summary(sources.measurements.curves), highlight=False)
-    print_missing(blocked, f"write it into {options.out}, or say it to init (--help)")
+    print_missing(blocked, f"write it into {options.out}")
     written = f"written to {options.out}; next: jaxtrachea fit {shlex.quote(str(options.out))}"
     out.print(written, markup=False, highlight=False, soft_wrap=True)
     raise typer.Exit(1 if blocked or sources.measurements.bad else 0)
@@ -65,7 +66,7 @@ def conclude(options: CheckOptions, sources: Sources, out: Console) -> None:
         typer.Exit: always; code 1 where something is missing or some curve cannot be used.
     """
     blocked = missing(sources)
-    print_missing(blocked, "say it to init, as below")
+    print_missing(blocked, "write it into the specification that init writes")
     if not blocked:
         out.print("Nothing is missing to fit these curves on the tube of Table 1.")
     command = f"jaxtrachea init {shlex.join(map(str, options.paths))}{options.words}"
@@ -104,12 +105,11 @@ def missing(sources: Sources) -> dict[str, str]:
     spec = FitSpec(data=DataSection(files=["-"], **sources.keys))
     try:
         kept = usable(spec, dataclasses.replace(measurements, curves=tuple(placed)))
-        refused = [bad.message for bad in kept.bad[len(measurements.bad) :]]
-        if refused:
-            blocked["trachea"] = _tube(f"{refused[0]} ({len(refused)} of {len(placed)} curves)")
-            return blocked
     except SpecError as error:
-        return {**blocked, "trachea": _tube(str(error))}
+        return blocked | _refused(str(error))
+    if refused := kept.bad[len(measurements.bad) :]:
+        others = f" (and {len(refused) - 1} more)" if len(refused) > 1 else ""
+        return blocked | _refused(f"{refused[0].reason}{others}")
     try:
         study_of(spec, kept)
     except SpecError as error:
@@ -117,8 +117,11 @@ def missing(sources: Sources) -> dict[str, str]:
     return blocked
 
 
-def _tube(reason: str) -> str:
-    return f"a tube on which all curves lie: on that of Table 1, {reason}"
+def _refused(reason: str) -> dict[str, str]:
+    """Curves that the default tube or model cannot press, by the section to be written."""
+    if re.search(r"on the tube|on ring|end of ring|beyond", reason):
+        return {"trachea": f"a tube that holds all curves; Table 1's does not: {reason}"}
+    return {"model": f"a model that takes all curves; the default does not: {reason}"}
 
 
 def _read(options: CheckOptions | InitOptions) -> Sources:

@@ -17,6 +17,8 @@ EXPECTED = "expected files of measured curves (CSV, TSV, text, xlsx, HDF5, afmfo
 #: How the words of readers, which name keys of a specification, are said as options.
 _AS_OPTION = (
     (re.compile(r"name (it|the one meant) in (?:data\.)?columns\.(\w+)"), r"say --column \2=NAME"),
+    (re.compile(r"name the columns in (?=columns)"), "say "),
+    (re.compile(r"units\.(\w+) (?=says)"), r"--unit \1 "),
     (re.compile(r"(?:data\.)?columns\.(\w+)"), r"--column \1=NAME"),
     (re.compile(r"(?:data\.)?units\.(\w+)"), r"--unit \1=UNIT"),
     (re.compile(r"data\.columns\b"), "--column ROLE=NAME"),
@@ -102,13 +104,12 @@ def read_sources(options: CheckOptions | InitOptions) -> Sources:
         f"--column {role}=NAME"
         for role, name in found.columns.items()
     ]
+    for role, names in found.open.items():
+        listed = " or ".join(map(repr, names))
+        raise Stop(f"{files[0]}: which column is the {role}, {listed}? Say --column {role}=NAME")
     if found.columns:
         keys["columns"] = {**keys.get("columns", {}), **found.columns}
         heads = _heads(files, keys)
-    elif found.open:
-        role, names = next(iter(found.open.items()))
-        listed = ", ".join(map(repr, names))
-        raise Stop(f"{files[0]}: which column is the {role}? Say --column {role}=NAME ({listed})")
     measurements, turned = _read(files, keys), []
     if not measurements.curves and {bad.kind for bad in measurements.bad} == {"sign"}:
         measurements, turned = _turned(files, keys, measurements)

@@ -36,7 +36,7 @@ def specification_text(sources: Sources, out: Path, blocked: Mapping[str, str]) 
     Args:
         sources: the files as read.
         out: where the specification will stand; its paths start from there.
-        blocked: why it cannot be fitted as it is, by section ("data", "trachea", "noise").
+        blocked: why it cannot be fitted as it is, by the section that the cure goes into.
 
     Returns:
         Text that `config.load_fit_spec` reads.
@@ -51,6 +51,7 @@ def specification_text(sources: Sources, out: Path, blocked: Mapping[str, str]) 
         *_trachea(blocked.get("trachea")),
         "",
         "[model]",
+        *_marked(blocked.get("model")),
         *_defaults("ModelSection", _MODEL),
         "",
         "[parameters]",
@@ -97,11 +98,11 @@ def _title(sources: Sources) -> str:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """The path from a folder on, with slashes; absolute where there is none (another drive)."""
-    try:
-        return Path(os.path.relpath(path.absolute(), folder.absolute())).as_posix()
-    except ValueError:
-        return path.absolute().as_posix()
+    """The path from a folder on, with slashes; absolute where they share no more than the root."""
+    path, folder = path.parent.resolve() / path.name, folder.resolve()
+    if path.parts[:2] != folder.parts[:2]:
+        return path.as_posix()
+    return Path(os.path.relpath(path, folder)).as_posix()
 
 
 def _data(sources: Sources, out: Path, blocked: str | None) -> Iterator[str]:
