@@ -29,7 +29,7 @@ class FileOptions:
     ] = None
     specimen: Annotated[
         str | None,
-        _option("specimen", "Names and s from file names, as '{specimen}_s{s}_{trial}'."),
+        _option("specimen", "Names from file names, as '{specimen}_A{trial}'."),
     ] = None
     sheet: Annotated[str | None, _option("sheet", "Sheet of a workbook.")] = None
     format: Annotated[
@@ -76,7 +76,7 @@ class CheckOptions(FileOptions):
 
     paths: Annotated[
         list[Path],
-        typer.Argument(metavar="SPEC|FILE...", help="Fit specification (TOML), or data files."),
+        typer.Argument(metavar="SPEC|FILE", help="Fit specification (TOML), or data files."),
     ]
     data: DataOption = None
 
@@ -87,7 +87,7 @@ class InitOptions(FileOptions):
 
     paths: Annotated[
         list[Path],
-        typer.Argument(metavar="FILE...", help="Files of measured curves, or a folder of them."),
+        typer.Argument(metavar="FILE", help="Files of measured curves, or a folder of them."),
     ]
     out: Annotated[Path, typer.Option("--out", help="The specification to write.")] = Path(
         "fit.toml"

@@ -19,6 +19,8 @@ from jaxtrachea.cli.written_spec import specification_text, summary
 
 #: Rows of a table of columns, and tables of columns; a file has more in itself.
 MANY, TABLES = 40, 3
+#: Options that take the position from names of files.
+OF_NAMES = r"--specimen '(?P<specimen>.+)_(?P<trial>s(?P<s>\d+))' --unit s=mm"
 #: What roles are called.
 ROLES = {
     "displacement": "displacement of the tool",
@@ -47,7 +49,8 @@ def init(options: InitOptions) -> None:
     out = Console()
     out.print(summary(sources.measurements.curves), highlight=False)
     print_missing(blocked, f"write it into {options.out}")
-    written = f"written to {options.out}; next: jaxtrachea fit {shlex.quote(str(options.out))}"
+    written = f"written to {options.out}; {'complete it, then' if blocked else 'next'}: "
+    written += f"jaxtrachea fit {shlex.quote(str(options.out))}"
     out.print(written, markup=False, highlight=False, soft_wrap=True)
     raise typer.Exit(1 if blocked or sources.measurements.bad else 0)
 
@@ -97,8 +100,7 @@ def missing(sources: Sources) -> dict[str, str]:
     if without := len(measurements.curves) - len(placed):
         blocked["data"] = (
             f"the position s along the tube, of {without} of {len(measurements.curves)} curves "
-            "(--s '40 mm' for all, a column s, or in the names of files: --specimen "
-            "'{specimen}_s{s}' --unit s=mm)"
+            f"(--s '40 mm' for all, a column s, or of names as T01_s40.csv {OF_NAMES})"
         )
     if not placed:
         return blocked
@@ -107,9 +109,10 @@ def missing(sources: Sources) -> dict[str, str]:
         kept = usable(spec, dataclasses.replace(measurements, curves=tuple(placed)))
     except SpecError as error:
         return blocked | _refused(str(error))
-    if refused := kept.bad[len(measurements.bad) :]:
+    refused = [bad.reason for bad in kept.bad[len(measurements.bad) :]]
+    if refused:
         others = f" (and {len(refused) - 1} more)" if len(refused) > 1 else ""
-        return blocked | _refused(f"{refused[0].reason}{others}")
+        return blocked | _refused(f"{refused[0]}{others}")
     try:
         study_of(spec, kept)
     except SpecError as error:

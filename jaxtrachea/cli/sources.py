@@ -110,13 +110,12 @@ def read_sources(options: CheckOptions | InitOptions) -> Sources:
     if found.columns:
         keys["columns"] = {**keys.get("columns", {}), **found.columns}
         heads = _heads(files, keys)
-    measurements, turned = _read(files, keys), []
-    if not measurements.curves and {bad.kind for bad in measurements.bad} == {"sign"}:
-        measurements, turned = _turned(files, keys, measurements)
-        notes += [
-            f"the {role} falls where the tool presses: it is turned; if not so, say --{role}-sign 1"
-            for role in turned
-        ]
+    measurements, turned = _turned(files, keys, _read(files, keys))
+    notes += [
+        f"the {role} counts negative where the tool presses: it is turned; if not so, say "
+        f"--{role}-sign 1"
+        for role in turned
+    ]
     notes += _units_apart(heads)
     if not measurements.curves:
         reasons = [as_options(bad.reason) for bad in measurements.bad]
@@ -233,27 +232,36 @@ def _read(files: Sequence[Path], keys: dict[str, Any]):
 
 
 def _turned(files: Sequence[Path], keys: dict[str, Any], before) -> tuple[Any, list[str]]:
-    """Curves whose force falls as they press, with the sign that makes both grow from zero.
+    """Curves that count a press the other way, with the signs that make both grow from zero.
+
+    Where no curve can be used for its sign, or force and displacement are negative in all.
 
     Returns:
-        The measurements and the role that was turned, which `keys` then says; those of before
-        where neither sign does, or both do.
+        The measurements and the roles that were turned, which `keys` then says; those of before
+        where no sign or several make presses of all.
     """
-    import numpy as np
-
-    fitting = {}
-    for role in ("force", "displacement"):
-        key = f"{role}_sign"
-        read = None if key in keys else _read(files, {**keys, key: -1})
-        if read is not None and read.curves and all(
-            np.mean(values) > 0 for c in read.curves for values in (c.force, c.displacement)
-        ):  # fmt: skip
-            fitting[role] = read
+    roles = ("force", "displacement")
+    drawn = all(_mean(c, role) < 0 for c in before.curves for role in roles)
+    faults = {bad.kind for bad in before.bad}
+    if not drawn or (not before.curves and not faults <= {"sign", "non_monotone"}):
+        return before, []
+    fitting = []
+    for turned in (["force"], ["displacement"], [*roles]):
+        signs = {f"{role}_sign": -1 for role in turned}
+        if signs.keys() & keys.keys():
+            continue
+        read = _read(files, keys | signs)
+        if read.curves and all(_mean(c, role) > 0 for c in read.curves for role in roles):
+            fitting.append((read, turned, signs))
     if len(fitting) != 1:
         return before, []
-    ((role, read),) = fitting.items()
-    keys[f"{role}_sign"] = -1
-    return read, [role]
+    read, turned, signs = fitting[0]
+    keys.update(signs)
+    return read, turned
+
+
+def _mean(curve: Any, role: str) -> float:
+    return float(getattr(curve, role).mean())
 
 
 def _units_apart(heads: dict[Path, Any]) -> list[str]:

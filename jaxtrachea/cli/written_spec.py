@@ -122,7 +122,7 @@ def _data(sources: Sources, out: Path, blocked: str | None) -> Iterator[str]:
         turned = key.endswith("_sign") and f"{key[:-5]}" in sources.turned
         yield f"{key} = {_value(value)}" + (
             f"   # guessed by the unit: {', '.join(sorted(sources.guessed))}" if guessed else
-            "   # found: it falls where the tool presses" if turned else ""
+            "   # the file counts a press negative" if turned else ""
         )  # fmt: skip
     if blocked is not None:
         yield from _marked(blocked)
