@@ -264,7 +264,7 @@ def test_output_that_exists_is_refused_before_fitting(study, monkeypatch, capsys
     [
         (["fit"], ["Missing argument"]),
         (["fit", "nowhere.toml"], ["nowhere.toml: No such file", "TOML fit specification"]),
-        (["check", "."], ["Is a directory"]),
+        (["fit", "."], ["Is a directory"]),
         (["fit", "spec.toml", "--outt", "x"], ["No such option"]),
         (["fitt"], ["No such command"]),
         (["check", "spec.toml", "--data", "nowhere"], ["data.files.0", "nowhere"]),
@@ -457,7 +457,7 @@ def test_real_process_says_what_is_wrong(study):
 def test_version_and_help(monkeypatch, capsys):
     code, out, _ = run(monkeypatch, capsys, "--version")
     assert (code, out.strip()) == (0, jaxtrachea.__version__)
-    for arguments in (["--help"], ["fit", "--help"], ["check", "--help"], ["design", "--help"]):
+    for arguments in (["--help"], *([c, "--help"] for c in ("fit", "check", "init", "design"))):
         code, out, _ = run(monkeypatch, capsys, *arguments)
         assert code == 0
         assert "Usage: jaxtrachea" in out
@@ -470,8 +470,8 @@ def test_help_lists_the_commands_in_the_order_of_use(monkeypatch, capsys):
     assert code == 0
     lines = out.partition("Commands:\n")[2].rstrip().splitlines()
     assert [line.split()[0] for line in lines] == [
-        "check", "fit", "predict", "design", "compare", "convert", "plan", "simulate", "sweep",
-        "tradeoff", "selfcheck", "cache",
+        "check", "init", "fit", "predict", "design", "compare", "convert", "plan", "simulate",
+        "sweep", "tradeoff", "selfcheck", "cache",
     ]  # fmt: skip
 
 

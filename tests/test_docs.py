@@ -30,6 +30,9 @@ PATH = ["install", "fit", "report", "simulate", "layer"]
 #: Commands that are shown without a placeholder, and the test that runs each.
 RUN_BY = {
     "--version": "test_cli.py",
+    "init my.csv": "test_init.py",
+    "fit fit.toml": "test_init.py",
+    "check my.csv": "test_init.py",
     "check fits/virtual_trachea/fit.toml": "test_docs.py",
     "fit fits/virtual_trachea/fit.toml": "test_fits.py",
     "fit fits/virtual_trachea/off_midline.toml": "test_off_midline.py",

@@ -67,8 +67,8 @@ WITHIN = {
         {"checks"},
         {"together"},
         {"readers"},
-        {"read"},
-        {"data_files", "usage_tables"},
+        {"heads", "read"},
+        {"data_files", "guess", "usage_tables"},
     ],
     "mechanics/sections": [
         {"section", "block", "material"},
@@ -120,8 +120,9 @@ WITHIN = {
     ],
     "report": [{"plots", "tables"}, {"fit"}, {"overview"}],
     "cli": [{"terminal_table", "specification", "options"}, {"terminal"},
-            {"fit", "load", "predict_data", "run", "scene", "selfcheck"},
-            {"compare", "cache", "convert", "predict", "tradeoff"}, {"main"}],
+            {"file_options", "fit", "load", "predict_data", "run", "scene", "selfcheck"},
+            {"sources"}, {"written_spec"},
+            {"compare", "cache", "convert", "init", "predict", "tradeoff"}, {"main"}],
 }  # fmt: skip
 #: Rooms that only read or write: they may be told of, but not tell, the physics.
 HEAVY = ["matplotlib", "trimesh", "typer", "rich", "pydantic", "h5py"]

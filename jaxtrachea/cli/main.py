@@ -22,14 +22,26 @@ from jaxtrachea.cli import cache as cli_cache
 from jaxtrachea.cli import compare as cli_compare
 from jaxtrachea.cli import convert as cli_convert
 from jaxtrachea.cli import fit as cli_fit
+from jaxtrachea.cli import init as cli_init
 from jaxtrachea.cli import predict as cli_predict
 from jaxtrachea.cli import scene as cli_scene
 from jaxtrachea.cli import selfcheck as cli_selfcheck
 from jaxtrachea.cli import tradeoff as cli_tradeoff
+from jaxtrachea.cli.file_options import CheckOptions
 from jaxtrachea.cli.load import load
 from jaxtrachea.cli.options import DataOption, FitOptions, OutOption, SpecArgument, with_fields
 from jaxtrachea.cli.run import poor, refuse, run, show, write, write_tables
-from jaxtrachea.cli.terminal import Kept, Stop, complain, into, say_lost, table, to_stderr
+from jaxtrachea.cli.sources import specification_in
+from jaxtrachea.cli.terminal import (
+    Kept,
+    Stop,
+    complain,
+    into,
+    quiet_compiler,
+    say_lost,
+    table,
+    to_stderr,
+)
 
 app = typer.Typer(
     add_completion=False,
@@ -38,8 +50,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help=(
         "Mechanics of the trachea: identify stiffnesses from force-displacement curves "
-        "(check, fit, predict, design, compare, convert); simulate a tool on a trachea (plan, "
-        "simulate, sweep)."
+        "(check, init, fit, predict, design, compare, convert); simulate a tool on a trachea "
+        "(plan, simulate, sweep)."
     ),
 )
 #: Rows of a terminal table; the files hold all.
@@ -48,6 +60,7 @@ MANY = 40
 
 def main() -> None:
     """Entry point: every expected error becomes one message on stderr and an exit code."""
+    quiet_compiler()
     try:
         code = app(prog_name="jaxtrachea", standalone_mode=False)
     except Stop as stop:
@@ -90,15 +103,17 @@ def _options(
 
 
 @app.command()
-def check(spec: SpecArgument, data: DataOption = None) -> None:
-    """Read the curves and show what a fit would use; fit nothing."""
-    _, measurements, study = load(spec, data)
+@with_fields(CheckOptions)
+def check(options: CheckOptions) -> None:
+    """Read a specification or data files, show what a fit would use."""
     out = Console()
-    curves = measurements.curves
-    out.print(_curve_table(curves))
-    if len(curves) > MANY:
-        out.print(f"... and {len(curves) - MANY} more")
-    _print_usage(out, curves)
+    if (spec := specification_in(options)) is None:
+        sources = cli_init.read_and_show(options, out)
+        _print_curves(out, sources.measurements.curves)
+        cli_init.conclude(options, sources, out)
+        return
+    _, measurements, study = load(spec, options.data)
+    _print_curves(out, measurements.curves)
     if study.free:
         out.print(_parameter_table(study.parameters, study.model.options))
     fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in study.parameters if p.fixed)
@@ -107,6 +122,9 @@ def check(spec: SpecArgument, data: DataOption = None) -> None:
     joint = ", fitted jointly" if study.joint else ""
     out.print(f"{lanes} lane(s){joint} of up to {study.size} unknowns, {bad} bad curves")
     raise typer.Exit(1 if bad else 0)
+
+
+app.command()(cli_init.init)
 
 
 @app.command()
@@ -172,6 +190,14 @@ for _command in (
     cli_tradeoff.tradeoff, cli_selfcheck.selfcheck, cli_cache.cache,
 ):  # fmt: skip
     app.command()(_command)
+
+
+def _print_curves(out: Console, curves) -> None:
+    """The first curves, one a row, and what is used of them."""
+    out.print(_curve_table(curves))
+    if len(curves) > MANY:
+        out.print(f"... and {len(curves) - MANY} more")
+    _print_usage(out, curves)
 
 
 def _print_usage(out: Console, curves) -> None:

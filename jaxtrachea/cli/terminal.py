@@ -28,7 +28,7 @@ from jaxtrachea.files.programs import keep_bounds
 
 __all__ = [
     "Kept", "Stages", "Stop", "cache_folder", "complain", "interrupts", "into", "programs_folder",
-    "progress_bar", "say_lost", "set_up_jax", "table", "to_stderr",
+    "progress_bar", "quiet_compiler", "say_lost", "set_up_jax", "table", "to_stderr",
 ]  # fmt: skip
 
 
@@ -110,6 +110,15 @@ def interrupts() -> Iterator[Interrupts]:
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.unraisablehook = shown
+
+
+def quiet_compiler() -> None:
+    """Keep what XLA logs off the terminal, such as "Very slow compile?" after two minutes.
+
+    XLA logs this at the level of errors, and reads the level as jax is imported; what really fails
+    is raised besides. TF_CPP_MIN_LOG_LEVEL and JAX_LOGGING_LEVEL of the user come first.
+    """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
 def set_up_jax() -> None:

@@ -1,0 +1,209 @@
+"""The columns of a data file: their names, units and roles, before and beside the curves."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxtrachea.measurements.curve import Fault, ReadOptions
+from jaxtrachea.measurements.readers import READERS
+from jaxtrachea.measurements.readers.afmformats import AFMFORMATS, SI_UNITS
+from jaxtrachea.measurements.readers.hdf5_values import names_in, unit_of
+from jaxtrachea.measurements.readers.lines import (
+    GZIP,
+    Lines,
+    first_bytes,
+    first_unpacked,
+    split_lines,
+)
+from jaxtrachea.measurements.readers.machine_csv import MAX_PREAMBLE
+from jaxtrachea.measurements.readers.ragged import limits_of
+from jaxtrachea.measurements.readers.recognise import kind_of
+from jaxtrachea.measurements.readers.safe_hdf5 import opened
+from jaxtrachea.measurements.readers.text import find_roles, split_cells, time_column, units_row
+from jaxtrachea.measurements.readers.workbook import read_sheet
+from jaxtrachea.units import column_unit
+
+#: Bytes of a text in which its header is looked for.
+HEAD_BYTES = 2**18
+#: Specimens of an HDF5 file of version 1 whose datasets are named, and trials of each.
+_GROUPS = 8
+#: Roles of datasets by their names in the project's own HDF5 files, where they differ.
+_STORED = {"s_c": "s", "phi_c": "phi", "joint_displacement": "joint", "end_U": "end",
+           "end_V": "end", "joint_side_displacement": "joint", "joint_ring_number": "joint",
+           "end_ring_number": "end"}  # fmt: skip
+_OF_AFM = {"force": "force", "height (measured)": "displacement", "tip position": "displacement",
+           "segment": "segment"}  # fmt: skip
+_NUMBER = re.compile(r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?")
+
+
+class Column(NamedTuple):
+    """A column of a table, or a dataset of an HDF5 file.
+
+    Attributes:
+        name: without its unit.
+        unit: as the file writes it; None: the file gives none.
+        role: what it is read as (`roles.ROLES`, or that of a ring); "": it is not read.
+    """
+
+    name: str
+    unit: str | None
+    role: str = ""
+
+
+class Head(NamedTuple):
+    """What a file says of its columns.
+
+    Attributes:
+        format: name of the reader, as `data.format` takes it.
+        columns: in the order of the file; empty where no header was found.
+        ambiguous: why no role is certain, in a sentence; "" if they are.
+    """
+
+    format: str
+    columns: tuple[Column, ...]
+    ambiguous: str = ""
+
+    @property
+    def is_table(self) -> bool:
+        """Whether `data.columns` may name its columns freely."""
+        return self.format in ("tidy", "machine")
+
+
+def head_of(path: Path, options: ReadOptions) -> Head:
+    """The columns of a file; its rows are not read.
+
+    Args:
+        path: an existing file.
+        options: columns that are named, format, sheet.
+
+    Returns:
+        The head; of a table whose header is not found one without columns.
+
+    Raises:
+        DataError: it cannot be read, is damaged, hostile, or no data file at all.
+    """
+    kind = "hdf5" if path.suffix.lower() in (".h5", ".hdf5") else kind_of(path)
+    if kind == "hdf5":
+        with opened(path, limits=limits_of) as file:
+            return _stored(file)
+    if kind == "xlsx":
+        lines = read_sheet(path, options.sheet)[0].lines
+    else:
+        lines = split_lines(path, _beginning(path))
+    if options.format == "auto":
+        found = next(r for r in READERS if r.is_text(lines, options)).name
+    else:
+        found = options.format
+    if found == AFMFORMATS.name:
+        return Head(found, tuple(_of_tab(lines)))
+    return _of_table(found, lines.without_comments(), options)
+
+
+def _beginning(path: Path) -> bytes:
+    """The first whole lines of a text, packed or not."""
+    packed = first_bytes(path, 2) == GZIP
+    data = (first_unpacked if packed else first_bytes)(path, HEAD_BYTES)
+    return data if len(data) < HEAD_BYTES else data[: data.rfind(b"\n") + 1]
+
+
+def _of_table(found: str, lines: Lines, options: ReadOptions) -> Head:
+    """The header of a table: the first line above a row of as many cells, with numbers."""
+    for at in range(min(len(lines), MAX_PREAMBLE)):
+        for delimiter in "\t;,":
+            cells = _cells(lines, at, delimiter)
+            if len(cells) < 2 or any(map(_NUMBER.fullmatch, cells)):
+                continue
+            names, units = map(list, zip(*map(column_unit, cells), strict=True))
+            try:
+                last, units = units_row(lines, at, delimiter, units)
+            except Fault:
+                continue
+            below = _cells(lines, last + 1, delimiter)
+            numbers = sum(1 for cell in below if _NUMBER.fullmatch(cell))
+            if numbers >= 2 and len(below) <= len(cells):
+                return _with_roles(found, names, units, options)
+    return Head(found, ())
+
+
+def _with_roles(
+    found: str, names: list[str], units: list[str | None], options: ReadOptions
+) -> Head:
+    roles, ambiguous = {}, ""
+    try:
+        roles = find_roles(names, options)
+        if "time" not in roles and (time := time_column(names, units, roles, options)):
+            roles["time"] = time[0]
+    except Fault as fault:
+        ambiguous = f"{fault.message}; {fault.cure}"
+    by_column = {i: role for role, i in roles.items()}
+    columns = zip(names, units, strict=True)
+    return Head(
+        found, tuple(Column(n, u, by_column.get(i, "")) for i, (n, u) in enumerate(columns) if n),
+        ambiguous,
+    )  # fmt: skip
+
+
+def _cells(lines: Lines, at: int, delimiter: str) -> list[str]:
+    """Cells of a line without empty ones at its end; none if there is no such line."""
+    if at >= len(lines) or delimiter not in lines.texts[at]:
+        return []
+    try:
+        cells = split_cells(lines.texts[at], delimiter)
+    except Fault:
+        return []
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _of_tab(lines: Lines) -> Iterator[Column]:
+    """Columns of a tab file of afmformats: the first comment below the metadata names them."""
+    texts = [line.text.lstrip().removeprefix("#").strip() for line in lines]
+    if "END METADATA" not in texts:
+        return
+    names = next(filter(None, texts[texts.index("END METADATA") + 1 :]), "").split("\t")
+    for cell in names:
+        # Version 0.13.3 hangs the first row on the last name.
+        known = [name for name in SI_UNITS if cell.startswith(name)]
+        name = max(known, key=len) if known else cell
+        yield Column(name, SI_UNITS.get(name) or None, _OF_AFM.get(name, ""))
+        if name != cell:
+            return
+
+
+def _stored(file: Any) -> Head:
+    """Datasets of an HDF5 file, each name once."""
+    if "schema" not in file.attrs:
+        numbered = sorted(name for name in file if name.isdecimal())
+        groups = [file[name] for name in numbered[:1]]
+        columns = {name: _unit(g, name) for g in groups if hasattr(g, "items") for name in g}
+        roles = _OF_AFM
+        if "tip position" in columns:
+            roles = {**_OF_AFM, "height (measured)": ""}
+        return Head("afmformats", _columns(columns, roles))
+    columns: dict[str, str | None] = {}
+    for group in _own_groups(file):
+        columns |= {name: _unit(group, name) for name in sorted(names_in(group))}
+    return Head("hdf5", _columns(columns, {name: _STORED.get(name, name) for name in columns}))
+
+
+def _unit(group: Any, name: str) -> str | None:
+    """Unit of a dataset; None where its attribute is damaged, which reading tells."""
+    try:
+        return unit_of(group, name) or None
+    except Fault:
+        return None
+
+
+def _columns(units: dict[str, str | None], roles: dict[str, str]) -> tuple[Column, ...]:
+    return tuple(Column(name, unit, roles.get(name, "")) for name, unit in units.items())
+
+
+def _own_groups(file: Any) -> Iterator[Any]:
+    """Groups of the project's own schema that hold datasets."""
+    if "curves" in file:
+        yield from (file[name] for name in ("curves", "samples") if name in file)
+        return
+    for specimen in [*file["specimens"].values()][:_GROUPS]:
+        yield from (trial for trial in [*specimen.values()][:_GROUPS])
