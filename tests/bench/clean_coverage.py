@@ -110,6 +110,7 @@ def main() -> None:
     row = {
         "kind": "row",
         "table": "clean_coverage",
+        "case": f"{asked.specimens} specimens",
         "specimens": asked.specimens,
         "tables": len(chunks),
         "unknowns": len(PARAMETERS) * asked.specimens,

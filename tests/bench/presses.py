@@ -240,17 +240,22 @@ def agree(package: Path, specimens: Sequence[Specimen]) -> float:
 def keep(suite: str, label: str, package: Path, rows: Sequence[dict]) -> None:
     """Write rows under a label into results/SUITE.jsonl; those of other labels stay.
 
-    The first row says where, when and of which commit they were measured, as `common.Writer` does.
+    Other cases of the label stay, too, if they are of the same commit. The first row of a label
+    says where, when and of which commit it was measured, as `common.Writer` does.
     """
     environment = common.Writer(suite).rows[0] | {
         "commit": common.commit(package),
         "cores_used": len(common.ALL_CORES),
     }
     path = common.RESULTS / f"{suite}.jsonl"
-    old = map(json.loads, path.read_text().splitlines()) if path.exists() else ()
-    kept = [row for row in old if row["label"] != label]
-    kept += [{"label": label} | row for row in (environment, *rows)]
-    path.write_text("".join(json.dumps(row) + "\n" for row in kept))
+    old = list(map(json.loads, path.read_text().splitlines())) if path.exists() else []
+    others = [row for row in old if row["label"] != label]
+    ours = [row for row in old if row["label"] == label]
+    same = any(row.get("commit") == environment["commit"] for row in ours)
+    new = {row["case"] for row in rows}
+    kept = [row for row in ours if same and row["kind"] == "row" and row["case"] not in new]
+    labelled = [{"label": label} | row for row in (environment, *kept, *rows)]
+    path.write_text("".join(json.dumps(row) + "\n" for row in others + labelled))
 
 
 def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

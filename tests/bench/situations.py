@@ -169,7 +169,7 @@ SITUATIONS = {
     "preload": Situation(preload, r"preload|under load|already (loaded|in contact)|onset"),
     "offset": Situation(offset, r"offset|\bzero\b|load cell"),
     "slope": Situation(slope, r"slope|baseline"),
-    "slope, no air": Situation(slope_alone, r"slope|baseline", page=r"slope|baseline"),
+    "slope without air": Situation(slope_alone, r"slope|baseline", page=r"slope|baseline"),
     "clipped": Situation(clipped, r"\bflat|saturat|clip"),
     "break": Situation(breaking, r"\bfalls\b|break|broke|drops\b|\bslip|buckl"),
     "drift": Situation(drift, r"drift", page=r"\bdrift"),
@@ -277,7 +277,7 @@ def main() -> None:
                 for position in specimen.positions
                 for record in situation.records(Press(specimen, position, rng))
             ]
-            folder = (asked.keep or Path(base)) / name.replace(" ", "_").replace(",", "")
+            folder = (asked.keep or Path(base)) / name.replace(" ", "_")
             run = presses.fit(asked.package, folder, records)
             common_kinds = common_kinds or usual(run)
             share, examples = named(
