@@ -28,7 +28,7 @@ def of_specimens(run: Run) -> dict[str, set[str]]:
     for table, columns in (("summary", ("message", "remarks")), ("curves", ("remarks",))):
         for row in run.tables.get(table, ()):
             for column in columns:
-                found[row["specimen"]].update(parts(row[column]))
+                found[row["specimen"]].add(row[column])
     for row in run.tables.get("parameters", ()):
         found[row["specimen"]].add(f"verdict: {row['verdict']}")
     for line in lines(run):
@@ -38,7 +38,7 @@ def of_specimens(run: Run) -> dict[str, set[str]]:
 
 
 def parts(cell: str) -> list[str]:
-    """Sentences of a cell of a table."""
+    """Sentences of a cell of a table, or of a line."""
     return [part.strip() for part in cell.split("; ") if part.strip()]
 
 
@@ -54,11 +54,17 @@ def of_all(run: Run) -> list[str]:
 
 
 def usual(run: Run) -> set[str]:
-    """Kinds of sentences that clean specimens get: all that name none, and those of most."""
+    """Kinds of sentences that most clean specimens get, or that name none ("N of M": of most)."""
     by_name = of_specimens(run)
-    count = Counter(k for found in by_name.values() for k in set(map(kind, found)))
+    count = Counter(
+        k for found in by_name.values() for k in {kind(p) for text in found for p in parts(text)}
+    )
     common = {k for k, n in count.items() if 2 * n > len(by_name)}
-    return common | set(map(kind, of_all(run)))
+    rare = {
+        line for line in of_all(run) for a, b in SHARE.findall(line)[:1] if 2 * int(a) <= int(b)
+    }
+    every = {line for line in of_all(run) if line not in rare}
+    return common | {kind(part) for line in every for part in parts(line)}
 
 
 def named(run: Run, pattern: str, names: Sequence[str], known: Iterable[str]) -> tuple:
@@ -69,7 +75,8 @@ def named(run: Run, pattern: str, names: Sequence[str], known: Iterable[str]) ->
     asked, known = re.compile(pattern, re.IGNORECASE), set(known)
 
     def hits(found):
-        return sorted(s for s in found if asked.search(s) and kind(s) not in known)
+        new = ("; ".join(part for part in parts(s) if kind(part) not in known) for s in found)
+        return sorted(s for s in new if asked.search(s))
 
     by_name = of_specimens(run)
     told = {name: hits(by_name.get(name, ())) for name in names}
