@@ -48,18 +48,22 @@ def versions(*names: str) -> dict[str, str]:
     return found
 
 
-def commit() -> str:
-    """Last that changed the package; "+" where its files differ from it, "unknown" without git."""
+def commit(root: Path = FOLDER.parents[1]) -> str:
+    """Last that changed the package in the checkout `root`; "+" where its files differ from it.
+
+    "unknown" without git.
+    """
     package = ["--", "jaxtrachea"]
     try:
-        last = _git("log", "-1", "--format=%h", *package)
-        return last + "+" * bool(_git("status", "--porcelain", *package)) if last else "unknown"
+        last = _git(root, "log", "-1", "--format=%h", *package)
+        dirty = bool(_git(root, "status", "--porcelain", *package))
+        return last + "+" * dirty if last else "unknown"
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
 
 
-def _git(*words: str) -> str:
-    command = ["git", "-C", str(FOLDER.parents[1]), *words]
+def _git(root: Path, *words: str) -> str:
+    command = ["git", "-C", str(root), *words]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 

@@ -1,0 +1,119 @@
+"""Times of two checkouts in turns: the shipped fit, and a table of many specimens.
+
+    python tests/bench/turns.py BEFORE AFTER [--rounds 7] [--specimens 2000] [--label NAME]
+
+Each sample is the command `fit` in a fresh process with the programs that a first one kept (a
+cache folder for each checkout, emptied at the end). Samples are taken in turns, and the first of a
+pair alternates (A B, B A, ...). Given are wall seconds and processor seconds (user and system, of
+all cores), which a busy machine moves less, medians, and the ratio of medians, after over before.
+The specimens are those of situations.py, clean, four positions of 60 samples.
+`--specimens 0` leaves them out. Rows go to results/turns.jsonl under NAME, others stay there.
+"""
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import common
+import numpy as np
+import presses
+import situations
+
+SHIPPED = "fits/virtual_trachea/fit.toml"
+
+
+def write_cohort(folder: Path, count: int) -> Path:
+    """The specification of a table of `count` clean specimens, written into a folder."""
+    rng = np.random.default_rng(1)
+    records = [
+        record
+        for specimen in situations.make_specimens(count, 1)
+        for position in specimen.positions
+        for record in situations.clean(situations.Press(specimen, position, rng))
+    ]
+    presses.write_csv(folder / "d.csv", records)
+    (folder / "spec.toml").write_text('[data]\nfiles = "d.csv"\n')
+    return folder / "spec.toml"
+
+
+def timed(package: Path, spec: Path, base: Path, cache: Path) -> tuple[float, float]:
+    """Wall and processor seconds of one `fit`.
+
+    Raises:
+        RuntimeError: it ended with a code that is neither 0 nor 1 (some specimen failed).
+    """
+    with tempfile.TemporaryDirectory(dir=base) as out, open(base / "messages", "w+") as messages:
+        command = [sys.executable, "-m", "jaxtrachea", "fit", str(spec), "--out", f"{out}/out"]
+        begin = time.perf_counter()
+        process = subprocess.Popen(
+            command, cwd=out, env=presses.environment(package, cache), stdout=messages,
+            stderr=messages,
+        )  # fmt: skip
+        _, status, usage = os.wait4(process.pid, 0)
+        wall = time.perf_counter() - begin
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode not in (0, 1):
+            messages.seek(0)
+            raise RuntimeError(f"{package}: exit code {process.returncode}\n{messages.read()}")
+    return wall, usage.ru_utime + usage.ru_stime
+
+
+def compare(case: str, specs: dict[str, Path], packages: dict[str, Path], base: Path, rounds: int):
+    """A row of all samples of a case, and its ratios; the first run of each keeps its programs."""
+    samples = {name: [] for name in packages}
+    order = list(packages)
+    for i in range(rounds + 1):
+        for name in order:
+            found = timed(packages[name], specs[name], base, base / f"cache_{name}")
+            if i:
+                samples[name].append(found)
+            print(
+                f"{case} {name} {i}: {found[0]:.2f} s wall, {found[1]:.2f} s processor", flush=True
+            )
+        order.reverse()
+    row = {"kind": "row", "table": "turns", "case": case, "load": os.getloadavg()[0]}
+    for j, clock in enumerate(("wall", "processor")):
+        taken = {name: [round(v[j], 3) for v in values] for name, values in samples.items()}
+        median = {name: statistics.median(values) for name, values in taken.items()}
+        row[clock] = taken | {"ratio": round(median["after"] / median["before"], 4)}
+    return row
+
+
+def main() -> None:
+    """Both cases, and a table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("before", type=Path)
+    parser.add_argument("after", type=Path)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--specimens", type=int, default=2000)
+    parser.add_argument("--label", default="", help="left out: nothing is written")
+    asked = parser.parse_args()
+    packages = {"before": asked.before.resolve(), "after": asked.after.resolve()}
+    with tempfile.TemporaryDirectory() as name:
+        base = Path(name)
+        cases = {"shipped fit": {name: path / SHIPPED for name, path in packages.items()}}
+        if asked.specimens:
+            spec = write_cohort(base, asked.specimens)
+            cases[f"{asked.specimens} specimens"] = dict.fromkeys(packages, spec)
+        rows = [compare(case, specs, packages, base, asked.rounds) for case, specs in cases.items()]
+    lines = []
+    for row in rows:
+        row["commits"] = {name: common.commit(path) for name, path in packages.items()}
+        for clock in ("wall", "processor"):
+            median = {name: statistics.median(row[clock][name]) for name in packages}
+            cells = [f"{median[name]:.2f} s" for name in packages]
+            lines.append([row["case"], clock, *cells, f"{row[clock]['ratio']:.3f}"])
+    print(presses.markdown(["case", "time", "before", "after", "ratio of medians"], lines))
+    if asked.label:
+        presses.keep("turns", asked.label, asked.after, rows)
+
+
+if __name__ == "__main__":
+    main()
