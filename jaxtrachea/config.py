@@ -67,6 +67,18 @@ def _value_or_true(value: Any) -> Any:
     return _number_or_quantity(value)
 
 
+def _quantity_or_table(value: Any) -> Any:
+    """Read by `measurements.curve.ReadOptions`."""
+    texts = value.values() if isinstance(value, dict) else [value]
+    if not all(isinstance(text, str) for text in texts):
+        raise ValueError(
+            "expected a quantity with its unit, or a table of files with one each, as in "
+            '{ "a.csv" = "0.05 mm/N", "*" = "0 mm/N" }'
+        )
+    return value
+
+
+Compliance = Annotated[str | dict[str, str], BeforeValidator(_quantity_or_table)]
 Length = Annotated[float, quantity("length")]
 PositiveLength = Annotated[float, quantity("length", positive=True)]
 Stress = Annotated[float, quantity("stress", positive=True)]
@@ -100,6 +112,7 @@ class DataSection(Section):
     loading: Literal["last", "first", "loading", "all", "require-monotone"] = "last"
     force_sign: Literal[1, -1] = 1
     displacement_sign: Literal[1, -1] = 1
+    machine_compliance: Compliance | None = None
     sheet: str | None = None
     tool_radius: PositiveLength | None = None
     pressed_ends: bool = True

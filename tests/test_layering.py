@@ -61,6 +61,7 @@ WITHIN = {
         {"holds"},
         {"parts"},
         {"segments"},
+        {"record_faults"},
         {"usage"},
         {"curve"},
         {"loading", "names", "vectors", "columns", "tidy_writer"},

@@ -5,7 +5,13 @@ import math
 import numpy as np
 
 from jaxtrachea.measurements.curve import BadCurve, Curve, Fault, RawCurve, ReadOptions
-from jaxtrachea.measurements.loading import check_one_loading, segments_of, selection, usage_of
+from jaxtrachea.measurements.loading import (
+    check_one_loading,
+    faults_of,
+    segments_of,
+    selection,
+    usage_of,
+)
 from jaxtrachea.measurements.vectors import (
     check_vector_shapes,
     check_vector_sizes,
@@ -23,8 +29,8 @@ UPSIDE_DOWN = -0.5
 def finish(raw: RawCurve, options: ReadOptions) -> Curve | BadCurve:
     """Turn what a reader found into a usable curve, or into the reason why it is none.
 
-    Order: shapes, finite numbers, position, direction, signs, plausible size, segments,
-    displacement window, number of points, monotone displacement (where required), signal.
+    Order: shapes, finite numbers, position, direction, signs, plausible size, compliance of the
+    machine, segments, faults of the record, displacement window, number of points, monotone displacement (where required), signal.
 
     Args:
         raw: the curve as read, in mm, N, rad.
@@ -59,8 +65,10 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
     displacement = options.displacement_sign * raw.displacement
     force = options.force_sign * raw.force
     _check_scale(raw, displacement, force, options)
+    displacement = without_machine(displacement, force, options.compliance_mm_N)
     found = segments_of(raw, displacement, force, options)
-    keep = selection(displacement, found, options)
+    faulty = faults_of(displacement, force, found, options)
+    keep = selection(displacement, found, options) & ~(faulty.broken | faulty.saturated)
     _check_amount(keep, displacement, options)
     if options.loading == "require-monotone":
         check_one_loading(raw, displacement, keep, found)
@@ -74,11 +82,36 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
         force=np.ascontiguousarray(force[keep], dtype=np.float64),
         sigma=None if raw.sigma is None else raw.sigma[keep].astype(np.float64),
         source=raw.source,
-        usage=usage_of(raw, displacement, force, keep, found, options),
+        usage=usage_of(raw, displacement, force, keep, found, options, faulty),
         direction=direction,
         time=None if raw.time is None else raw.time[keep].astype(np.float64),
         **vectors_of(raw, keep, options),
     )
+
+
+def without_machine(displacement: np.ndarray, force: np.ndarray, compliance: float) -> np.ndarray:
+    """Displacement of the tool where it touches: that recorded less what the rig gives way.
+
+    Args:
+        displacement: (N,) mm, at the crosshead.
+        force: (N,) N, with the sign of the displacement.
+        compliance: of the rig, mm/N.
+
+    Raises:
+        Fault: the rig alone would give way by more than was recorded.
+    """
+    if compliance == 0:
+        return displacement
+    low, high = int(np.argmin(force)), int(np.argmax(force))
+    way, rise = float(displacement[high] - displacement[low]), float(force[high] - force[low])
+    if 0 < way <= compliance * rise:  # one that falls has a sign to be set right first
+        raise Fault(
+            "absurd_scale",
+            f"machine_compliance is {compliance:g} mm/N, but force and displacement grow by "
+            f"{rise:.4g} N and {way:.4g} mm, {way / rise:.4g} mm/N in all",
+            "measure it against a rigid stop, and check its unit",
+        )
+    return displacement - compliance * force
 
 
 def _check_shapes(raw: RawCurve) -> None:

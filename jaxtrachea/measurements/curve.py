@@ -1,5 +1,7 @@
 """What a reader hands over: curves, what could not be used, and the errors in between."""
 
+import dataclasses
+import fnmatch
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -191,6 +193,10 @@ class ReadOptions:
             `side_force` too.
         displacement_sign: -1 if the file counts inward displacement of the tool negative; it turns
             neither the markers nor the ends of the rings nor the direction.
+        machine_compliance: of the rig (frame, load cell, grips), ``"0.05 mm/N"``: this times the
+            force is taken off the displacement, both with their signs. Or a table of names of
+            files, or patterns, to such quantities (the first that fits counts; a file that none
+            fits is an error), for `read_measurements`.
         sheet: which sheet of a workbook holds the table; None: the first that is not hidden.
         min_points: fewest samples of a curve.
         max_displacement: largest plausible displacement, mm.
@@ -212,6 +218,7 @@ class ReadOptions:
     loading: str = "last"
     force_sign: int = 1
     displacement_sign: int = 1
+    machine_compliance: str | Mapping[str, str] | None = None
     sheet: str | None = None
     min_points: int = 2
     max_displacement: float = 1000.0
@@ -245,6 +252,12 @@ class ReadOptions:
             if not (getattr(self, name) > 0 and math.isfinite(getattr(self, name))):
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
         _ = self.s_mm, self.phi_rad, self.name_pattern
+        given = self.machine_compliance
+        table = {"": given} if given is None or isinstance(given, str) else given
+        if not table:
+            raise ValueError("machine_compliance names no file; remove it, or give a quantity")
+        for name, value in table.items():
+            _compliance(f"machine_compliance{name and f'.{name!r}'}", value)
 
     @property
     def s_mm(self) -> float | None:
@@ -255,6 +268,36 @@ class ReadOptions:
     def phi_rad(self) -> float | None:
         """Common contact angle, rad."""
         return None if self.phi is None else _named("phi", parse_quantity, self.phi, "angle")
+
+    @property
+    def compliance_mm_N(self) -> float:
+        """Compliance of the rig, mm/N; of a table of files see `of_file`.
+
+        Raises:
+            ValueError: `machine_compliance` is a table.
+        """
+        given = self.machine_compliance
+        if isinstance(given, Mapping):
+            raise ValueError("machine_compliance is a table of files; take of_file(path) first")
+        return _compliance("machine_compliance", given)
+
+    def of_file(self, path: Path) -> "ReadOptions":
+        """The options with the compliance of one file.
+
+        Raises:
+            DataError: `machine_compliance` is a table that does not name the file.
+        """
+        table = self.machine_compliance
+        if table is None or isinstance(table, str):
+            return self
+        for pattern, value in table.items():
+            if fits(pattern, path):
+                return dataclasses.replace(self, machine_compliance=value)
+        raise DataError(
+            f"machine_compliance names {', '.join(map(repr, table))}, not this file",
+            place=str(path),
+            cure=f"add {path.name!r}, or '*' for all other files",
+        )
 
     @property
     def name_pattern(self) -> re.Pattern | None:
@@ -279,6 +322,21 @@ class ReadOptions:
                 ' "{specimen}_A{trial}" or with a group (?P<specimen>...)'
             )
         return pattern
+
+
+def fits(pattern: str, path: Path) -> bool:
+    """Whether a file has this name, or one of this pattern, with or without its folders."""
+    return fnmatch.fnmatchcase(path.name, pattern) or path.match(pattern)
+
+
+def _compliance(key: str, value: str | None) -> float:
+    """A compliance of 0 or more, mm/N."""
+    if value is None:
+        return 0.0
+    number = _named(key, parse_quantity, value, "compliance")
+    if not 0 <= number < math.inf:
+        raise ValueError(f"{key} is {value!r}; expected a finite compliance, 0 or more")
+    return number
 
 
 def _named(key: str, convert: Callable, *arguments: object) -> Any:
