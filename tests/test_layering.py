@@ -69,7 +69,9 @@ WITHIN = {
         {"together"},
         {"readers"},
         {"read"},
-        {"data_files", "usage_tables"},
+        {"data_files", "differences"},
+        {"repeats", "uneven_noise"},
+        {"usage_tables"},
     ],
     "mechanics/sections": [
         {"section", "block", "material"},
@@ -81,7 +83,7 @@ WITHIN = {
     ],
     "fitting": [
         {"parameters", "lane", "tested", "unread"},
-        {"model"},
+        {"model", "curve_noise"},
         {"lanes", "onset", "refusals"},
         {"study"},
         {"map_lanes", "press_scale", "section_residual"},

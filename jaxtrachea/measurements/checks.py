@@ -30,7 +30,8 @@ def finish(raw: RawCurve, options: ReadOptions) -> Curve | BadCurve:
     """Turn what a reader found into a usable curve, or into the reason why it is none.
 
     Order: shapes, finite numbers, position, direction, signs, plausible size, compliance of the
-    machine, segments, faults of the record, displacement window, number of points, monotone displacement (where required), signal.
+    machine, segments, faults of the record, displacement window, number of points, monotone
+    displacement (where required), signal.
 
     Args:
         raw: the curve as read, in mm, N, rad.
@@ -85,6 +86,7 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
         usage=usage_of(raw, displacement, force, keep, found, options, faulty),
         direction=direction,
         time=None if raw.time is None else raw.time[keep].astype(np.float64),
+        conditions=raw.conditions,
         **vectors_of(raw, keep, options),
     )
 

@@ -1,5 +1,6 @@
 """What a reader hands over: curves, what could not be used, and the errors in between."""
 
+import contextlib
 import dataclasses
 import fnmatch
 import math
@@ -16,6 +17,8 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.measurements.roles import RING_ROLES, ROLES, is_role, role_dimension
 from jaxtrachea.measurements.usage import Usage
 from jaxtrachea.units import UnitError, parse_quantity, unit_factor
+
+_LEADING = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)")
 
 
 class DataError(InputError):
@@ -71,6 +74,8 @@ class Curve:
             None.
         end_V: (N, K, 2) mm, likewise at the end V, phi = +alpha, or None.
         time: (N,) s of each sample, never falling but with ``loading = "all"``, or None.
+        conditions: names and numbers that a file gives for the whole curve and that nothing reads
+            (speed, temperature, cycle), as they stand there.
     """
 
     specimen: str
@@ -91,6 +96,7 @@ class Curve:
     end_U: Float64[np.ndarray, "n k 2"] | None = None
     end_V: Float64[np.ndarray, "n k 2"] | None = None
     time: Float64[np.ndarray, " n"] | None = None
+    conditions: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -160,6 +166,7 @@ class RawCurve:
     end_U: np.ndarray | None = None
     end_V: np.ndarray | None = None
     unread: tuple[str, ...] = ()
+    conditions: tuple[tuple[str, float], ...] = ()
 
 
 #: "loading" means "first".
@@ -354,12 +361,16 @@ def _one_of(name: str, value: object, allowed: tuple) -> None:
 
 @dataclass(frozen=True)
 class FileIdentity:
-    """What the name of a file says about its curves: s in mm, phi in rad, None if not said."""
+    """What the name of a file says about its curves: s in mm, phi in rad, None if not said.
+
+    `conditions`: further names of the pattern whose text begins with a number.
+    """
 
     specimen: str
     trial: str | None
     s: float | None
     phi: float | None
+    conditions: tuple[tuple[str, float], ...] = ()
 
 
 def identify_file(path: Path, options: ReadOptions) -> FileIdentity:
@@ -395,4 +406,18 @@ def identify_file(path: Path, options: ReadOptions) -> FileIdentity:
                     place=str(path),
                     cure="give its unit in units",
                 ) from None
-    return FileIdentity(found["specimen"], found.get("trial"), position["s"], position["phi"])
+    others = {k: v for k, v in found.items() if k not in ("specimen", "trial", *position)}
+    place = (position["s"], position["phi"])
+    return FileIdentity(found["specimen"], found.get("trial"), *place, numbers_of(others))
+
+
+def numbers_of(texts: Mapping[str, object]) -> tuple[tuple[str, float], ...]:
+    """The entries that are finite numbers, or texts that begin with one."""
+    found = []
+    for name, value in texts.items():
+        match = _LEADING.match(value) if isinstance(value, str) else None
+        number = match[1] if match else value
+        if isinstance(number, str | int | float) and not isinstance(number, bool):
+            with contextlib.suppress(ValueError, OverflowError):
+                found.append((name, float(number)))
+    return tuple((name, value) for name, value in found if math.isfinite(value))

@@ -119,7 +119,9 @@ def _break(part: _Loading, found: Segments) -> tuple[int | None, str]:
                 continue
             low = float(piece[i : min(stop - start, j + travel.size // 10 + 2)].min())
             fall = float(piece[i]) - low
-            noises = f", {fall / part.sigma:.2g} times its noise" if part.sigma > 1e-9 * peak else ""
+            noises = (
+                f", {fall / part.sigma:.0f} times its noise" if part.sigma > 1e-9 * peak else ""
+            )
             return start + i, (
                 f"the force falls by {100 * fall / peak:.2g} % of its peak{noises}, at "
                 f"{found.direction * travel[start + i]:.3g} mm while the tool goes on (a break, "
@@ -189,7 +191,10 @@ def _same_tops(part: _Loading, span: float, low: float, high: float) -> float | 
     first, last = part.travel[same].min(), part.travel[same].max()
     reach = float(last - first)
     beyond = part.travel >= first
-    if count < 0.5 * np.count_nonzero(beyond) or part.travel.max() - last > 0.2 * reach + 0.01 * span:
+    if (
+        count < 0.5 * np.count_nonzero(beyond)
+        or part.travel.max() - last > 0.2 * reach + 0.01 * span
+    ):
         return None
     if reach < ADVANCES * (count - 1) * span / (part.travel.size - 1):
         return None
@@ -213,9 +218,7 @@ def _noisy_top(part: _Loading, span: float, low: float, high: float) -> float | 
     rise, rise_error = moments.slopes(start, middle, part.sigma)
     enough = np.minimum(middle - start, travel.size - middle) >= FLAT_NOISY
     bends = rise - flat > FLAT_SIGMAS * np.hypot(flat_error, rise_error)
-    level = (rise > 0.5 * (high - low) / span) & (
-        np.abs(flat) + 2 * flat_error < FLAT_SLOPE * rise
-    )
+    level = (rise > 0.5 * (high - low) / span) & (np.abs(flat) + 2 * flat_error < FLAT_SLOPE * rise)
     found = np.flatnonzero(enough & bends & level)
     if not found.size:
         return None
@@ -331,16 +334,15 @@ def suspicious(
     fall = np.maximum.reduceat(np.maximum.accumulate(raised) - raised, starts)
     falls = fall > FALL
     if falls.any():
-        falls &= fall > 0.6 * FALL_SIGMAS * _rough_noise(share, edges)
+        falls &= fall > 0.6 * FALL_SIGMAS * rough_noise(share, edges)
     flat = np.add.reduceat((share >= 1 - 1e-6).astype(np.int64), starts) >= FLAT
     return (sizes > FLAT) & (falls | flat | _ends_flat(share, edges))
 
 
-def _rough_noise(share: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Noise of each of many records by the roots of their second differences, which few jumps
-    hardly change."""
-    second = np.zeros(share.shape)
-    second[1:-1] = np.sqrt(np.abs(share[2:] - 2 * share[1:-1] + share[:-2]))
+def rough_noise(force: Float64[np.ndarray, " s"], edges: np.ndarray) -> Float64[np.ndarray, " c"]:
+    """Noise of each of many records; few jumps hardly change the roots of second differences."""
+    second = np.zeros(force.shape)
+    second[1:-1] = np.sqrt(np.abs(force[2:] - 2 * force[1:-1] + force[:-2]))
     second[edges[:-1]] = 0.0  # reaches into another record
     second[edges[1:] - 1] = 0.0
     inside = np.maximum(np.diff(edges) - 2, 1)

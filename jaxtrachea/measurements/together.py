@@ -243,5 +243,6 @@ def _curve(
         ),
         direction=direction,
         time=None if raw.time is None else raw.time.copy(),
+        conditions=raw.conditions,
         **(vectors_of(raw, np.ones(size, bool), options) if some else {}),
     )

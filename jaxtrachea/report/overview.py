@@ -45,5 +45,6 @@ def overview(findings: Findings) -> Iterator[Table | str]:
     if cut and result.study.free:
         good = sum(succeeded(result, lane) for lane in range(result.lanes))
         yield f"{good} of {result.lanes} lanes succeeded"
-    for sentence in sentences([c for curves in result.study.curves for c in curves]):
+    curves = [c for lane in result.study.curves for c in lane]
+    for sentence in sentences(curves, weighed=result.study.weighs_noise):
         yield f"{sentence} (curves.csv)"
