@@ -12,6 +12,7 @@ from jaxtrachea.measurements.loading import (
     selection,
     usage_of,
 )
+from jaxtrachea.measurements.machine import without_machine
 from jaxtrachea.measurements.vectors import (
     check_vector_shapes,
     check_vector_sizes,
@@ -89,31 +90,6 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
         conditions=raw.conditions,
         **vectors_of(raw, keep, options),
     )
-
-
-def without_machine(displacement: np.ndarray, force: np.ndarray, compliance: float) -> np.ndarray:
-    """Displacement of the tool where it touches: that recorded less what the rig gives way.
-
-    Args:
-        displacement: (N,) mm, at the crosshead.
-        force: (N,) N, with the sign of the displacement.
-        compliance: of the rig, mm/N.
-
-    Raises:
-        Fault: the rig alone would give way by more than was recorded.
-    """
-    if compliance == 0:
-        return displacement
-    low, high = int(np.argmin(force)), int(np.argmax(force))
-    way, rise = float(displacement[high] - displacement[low]), float(force[high] - force[low])
-    if 0 < way <= compliance * rise:  # one that falls has a sign to be set right first
-        raise Fault(
-            "absurd_scale",
-            f"machine_compliance is {compliance:g} mm/N, but force and displacement grow by "
-            f"{rise:.4g} N and {way:.4g} mm, {way / rise:.4g} mm/N in all",
-            "measure it against a rigid stop, and check its unit",
-        )
-    return displacement - compliance * force
 
 
 def _check_shapes(raw: RawCurve) -> None:

@@ -7,13 +7,13 @@ from pathlib import Path
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, SpecError
+from jaxtrachea.measurements.machine import check_machine_files
 from jaxtrachea.measurements.names import appearance
 from jaxtrachea.measurements.read import (
     BadCurve,
     DataError,
     Measurements,
     ReadOptions,
-    check_machine_files,
     read_measurements,
 )
 from jaxtrachea.measurements.readers import reader_of

@@ -17,8 +17,8 @@ from jaxtrachea.measurements.curve import (
     DataError,
     RawCurve,
     ReadOptions,
-    fits,
 )
+from jaxtrachea.measurements.machine import check_machine_files
 from jaxtrachea.measurements.readers import READERS, hdf5, reader_of
 from jaxtrachea.measurements.readers.large import MIN_BYTES, first_lines
 from jaxtrachea.measurements.readers.lines import (
@@ -134,24 +134,6 @@ def read_measurements(
             else:
                 curves.append(done)
     return Measurements(tuple(curves), tuple(bad), files, tuple(notes))
-
-
-def check_machine_files(files: Sequence[Path], options: ReadOptions) -> None:
-    """Hold the table `machine_compliance`, if it is one, against the files.
-
-    Raises:
-        DataError: it leaves a file out, or a name in it fits none.
-    """
-    if not isinstance(options.machine_compliance, Mapping):
-        return
-    for path in files:
-        options.of_file(path)
-    for name in options.machine_compliance:
-        if not any(fits(name, path) for path in files):
-            raise DataError(
-                f"machine_compliance names {name!r}, which none of the {len(files)} files fits",
-                cure="correct the name, or remove it",
-            )
 
 
 def write_hdf5(

@@ -6,8 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.measurements.curve import Curve
-from jaxtrachea.measurements.record_faults import rough_noise
-from jaxtrachea.measurements.turning import noise
+from jaxtrachea.measurements.turning import noise, rough_noise
 
 #: Factor between the noise of curves of a specimen from which it is said, samples of a curve from
 #: which its noise is known well enough, and the share of its force that the larger noise has.

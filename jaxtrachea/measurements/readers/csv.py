@@ -14,11 +14,10 @@ from jaxtrachea.measurements.curve import (
     BadCurve,
     DataError,
     Fault,
-    FileIdentity,
     RawCurve,
     ReadOptions,
-    identify_file,
 )
+from jaxtrachea.measurements.file_names import FileIdentity, identify_file
 from jaxtrachea.measurements.readers import large
 from jaxtrachea.measurements.readers.conditions import conditions_of, unread_columns
 from jaxtrachea.measurements.readers.lines import Lines, Text, is_comment

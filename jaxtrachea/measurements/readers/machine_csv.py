@@ -7,7 +7,8 @@ import numpy as np
 
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.columns import curve_of_columns
-from jaxtrachea.measurements.curve import BadCurve, Fault, RawCurve, ReadOptions, identify_file
+from jaxtrachea.measurements.curve import BadCurve, Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.file_names import identify_file
 from jaxtrachea.measurements.readers.lines import Text
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.text import (

@@ -3,7 +3,8 @@
 import json
 from typing import NamedTuple
 
-from jaxtrachea.measurements.curve import DataError, Fault, ReadOptions, numbers_of
+from jaxtrachea.measurements.curve import DataError, Fault, ReadOptions
+from jaxtrachea.measurements.file_names import numbers_of
 from jaxtrachea.measurements.readers.lines import Lines, Text
 from jaxtrachea.measurements.readers.text import (
     find_roles,
