@@ -23,17 +23,17 @@ from jaxtrachea.files.toml import SpecError as SpecError
 from jaxtrachea.units import UnitError, parse_quantity
 
 
-def quantity(dimension: str, *, positive: bool = False, word: str | None = None):
+def quantity(dimension: str, *, positive: bool = False, words: tuple[str, ...] = ()):
     """A field read as a quantity with its unit ("9 mm"), kept as a float in internal units.
 
     Args:
         dimension: of the quantity.
         positive: refuse zero and below.
-        word: a text allowed instead of a quantity.
+        words: texts allowed instead of a quantity.
     """
 
     def read(value: Any) -> Any:
-        if word is not None and value == word:
+        if value in words:
             return value
         if isinstance(value, bool) or not isinstance(value, str | int | float):
             raise ValueError(f"expected a {dimension.replace('_', ' ')} with its unit")
@@ -41,7 +41,7 @@ def quantity(dimension: str, *, positive: bool = False, word: str | None = None)
             with np.errstate(over="ignore"):  # infinity is refused with the key's name
                 number = parse_quantity(value, dimension)
         except UnitError as error:
-            raise ValueError(f"{error}{'' if word is None else f', or {word!r}'}") from None
+            raise ValueError(", or ".join([str(error), *map(repr, words)])) from None
         if positive and number <= 0:
             raise ValueError(f"expected a positive {dimension}")
         return number
@@ -67,14 +67,30 @@ def _value_or_true(value: Any) -> Any:
     return _number_or_quantity(value)
 
 
+def _quantity_or_table(value: Any) -> Any:
+    """Read by `measurements.curve.ReadOptions`."""
+    texts = value.values() if isinstance(value, dict) else [value]
+    if not all(isinstance(text, str) for text in texts):
+        raise ValueError(
+            "expected a quantity with its unit, or a table of files with one each, as in "
+            '{ "a.csv" = "0.05 mm/N", "*" = "0 mm/N" }'
+        )
+    return value
+
+
+Compliance = Annotated[str | dict[str, str], BeforeValidator(_quantity_or_table)]
 Length = Annotated[float, quantity("length")]
 PositiveLength = Annotated[float, quantity("length", positive=True)]
 Stress = Annotated[float, quantity("stress", positive=True)]
 Bed = Annotated[float, quantity("foundation_stiffness", positive=True)]
 Angle = Annotated[float, quantity("angle")]
 Estimate = Literal["estimate"]
-ForceNoise = Annotated[Estimate | float, quantity("force", positive=True, word="estimate")]
-LengthNoise = Annotated[Estimate | float, quantity("length", positive=True, word="estimate")]
+PerCurve = Literal["estimate per curve"]
+ForceNoise = Annotated[
+    Estimate | PerCurve | float,
+    quantity("force", positive=True, words=("estimate", "estimate per curve")),
+]
+LengthNoise = Annotated[Estimate | float, quantity("length", positive=True, words=("estimate",))]
 Number = Annotated[Any, BeforeValidator(_number_or_quantity)]
 NumberOrTrue = Annotated[Any, BeforeValidator(_value_or_true)]
 
@@ -100,6 +116,7 @@ class DataSection(Section):
     loading: Literal["last", "first", "loading", "all", "require-monotone"] = "last"
     force_sign: Literal[1, -1] = 1
     displacement_sign: Literal[1, -1] = 1
+    machine_compliance: Compliance | None = None
     sheet: str | None = None
     tool_radius: PositiveLength | None = None
     pressed_ends: bool = True

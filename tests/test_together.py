@@ -61,10 +61,12 @@ PLAIN = {
     "doubtful in m": raw(1e-3 * RAMP, RAMP),
     "of a cantilever": raw(1e-6 * RAMP + 1, 1e-9 * RAMP),
     "force 1e-300": raw(force=1e-300 * RAMP),
-    "much correlated the wrong way": raw(force=np.where(np.arange(30) % 2, 1.0, -1.0)),
 }
 #: Records that are cut, or bad, or nearly so.
 ODD = {
+    "much correlated the wrong way": raw(force=np.where(np.arange(30) % 2, 1.0, -1.0)),
+    "clipped": raw(force=np.minimum(RAMP, 3.3)),
+    "broken": raw(force=np.where(RAMP > 4, RAMP - 2, RAMP)),
     "hold and unloading": raw(HOLDS),
     "hold with time": raw(RAMP, time=with_(np.arange(30.0), slice(20, None), 90 + RAMP[:10])),
     "slow ends": raw(FAST),

@@ -7,6 +7,7 @@ heavy is imported inside the commands.
 
 import contextlib
 import dataclasses
+import itertools
 import math
 import sys
 import time
@@ -106,14 +107,18 @@ def _options(
 @with_fields(CheckOptions)
 def check(options: CheckOptions) -> None:
     """Read a specification or data files, show what a fit would use."""
+    from jaxtrachea.report.understood import understood
+
     out = Console()
     if (spec := specification_in(options)) is None:
         sources = cli_init.read_and_show(options, out)
         _print_curves(out, sources.measurements.curves)
         cli_init.conclude(options, sources, out)
         return
-    _, measurements, study = load(spec, options.data)
-    _print_curves(out, measurements.curves)
+    loaded, measurements, study = load(spec, options.data)
+    _print_curves(out, measurements.curves, study.weighs_noise)
+    for line in understood(loaded, study):
+        out.print(escape(line), highlight=False)
     if study.free:
         out.print(_parameter_table(study.parameters, study.model.options))
     fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in study.parameters if p.fixed)
@@ -134,6 +139,7 @@ def fit(options: FitOptions) -> None:
     from jaxtrachea.cli.specification import settings_of
     from jaxtrachea.inference.analysis import Request
     from jaxtrachea.report.overview import overview
+    from jaxtrachea.report.understood import understood
 
     clock = [time.perf_counter()]
     spec, meeting = options.spec, cli_fit.meet(options)
@@ -155,7 +161,8 @@ def fit(options: FitOptions) -> None:
         for name, reason in findings.unavailable.items():
             to_stderr(f"[yellow]no {name}:[/] {escape(reason)}")
         write(under.folder, spec, loaded, measurements, findings, clock, under.manifest)
-    show(overview(findings), under.folder.parent)
+    lines = understood(loaded, findings.result.study)
+    show(itertools.chain(lines, overview(findings)), under.folder.parent)
     failed = not findings.result.succeeded.all()
     raise typer.Exit(1 if failed or measurements.bad or poor(findings) else 0)
 
@@ -192,15 +199,15 @@ for _command in (
     app.command()(_command)
 
 
-def _print_curves(out: Console, curves) -> None:
+def _print_curves(out: Console, curves, weighed: bool = False) -> None:
     """The first curves, one a row, and what is used of them."""
     out.print(_curve_table(curves))
     if len(curves) > MANY:
         out.print(f"... and {len(curves) - MANY} more")
-    _print_usage(out, curves)
+    _print_usage(out, curves, weighed)
 
 
-def _print_usage(out: Console, curves) -> None:
+def _print_usage(out: Console, curves, weighed: bool) -> None:
     """What is used of the curves that are not used whole, and what is doubtful about them."""
     from jaxtrachea.measurements.usage_tables import sentences, usage_lines
 
@@ -209,7 +216,7 @@ def _print_usage(out: Console, curves) -> None:
         out.print(escape(line), highlight=False)
     if len(told) > MANY:
         out.print(f"... and {len(told) - MANY} more curves not used whole; a fit lists all")
-    for sentence in sentences(curves):
+    for sentence in sentences(curves, weighed=weighed):
         out.print(escape(f"{sentence[:1].upper()}{sentence[1:]}."), highlight=False)
 
 

@@ -50,6 +50,7 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.measurements.usage_tables import usage_rows, usage_section
     from jaxtrachea.report.fit import report_text
     from jaxtrachea.report.plots import draw_all
+    from jaxtrachea.report.understood import understood
     from jaxtrachea.results.hdf5 import write_hdf5
     from jaxtrachea.results.rows import parameter_rows, summary_rows
 
@@ -60,8 +61,11 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     drawn, lost = draw_all(folder, findings)
     say_lost(lost)
     title = loaded.title or spec.stem
-    used = usage_section(measurements.curves, measurements.notes)
-    text = without_lost(report_text(title, findings, measurements.bad, used), lost)
+    used = usage_section(
+        measurements.curves, measurements.notes, weighed=findings.result.study.weighs_noise
+    )
+    lines = understood(loaded, findings.result.study)
+    text = without_lost(report_text(title, findings, measurements.bad, used, lines), lost)
     write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]
     phases = ("read", "fit", "write")

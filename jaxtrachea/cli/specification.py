@@ -253,10 +253,12 @@ def _noise(spec: FitSpec) -> Noise:
         SpecError: with the dotted key.
     """
     force, joints = (
-        None if sigma == "estimate" else sigma for sigma in (spec.noise.force, spec.noise.joints)
+        None if isinstance(sigma, str) else sigma for sigma in (spec.noise.force, spec.noise.joints)
     )
+    by_curve = spec.noise.force == "estimate per curve"
+    share = spec.noise.joints_share
     try:
-        return Noise(force=force, joints=joints, joints_share=spec.noise.joints_share)
+        return Noise(force=force, joints=joints, joints_share=share, force_by_curve=by_curve)
     except InputError as error:
         raise SpecError.like(error, key=f"noise.{error.key}") from None
 

@@ -63,16 +63,17 @@ def criteria(study: Study, info: Information, alive: Bool[np.ndarray, " lanes"])
         if not parts:
             continue
         rows = len(counts)
+        seen = np.concatenate([v.precision.reshape(rows, -1) for v in parts], axis=1)
+        logs = whole(np.log(seen, where=seen > 0, out=np.zeros(seen.shape)).sum(axis=1))
         if estimated[kind]:
             peak = peaks([v._replace(data=v.data * v.precision) for v in parts])
             peak = whole(peak, functools.partial(np.max, initial=0))
             S = np.maximum(S, np.maximum(n, 1) * (ROUNDING * peak) ** 2)
             with np.errstate(divide="ignore", invalid="ignore"):
-                deviance += np.where(n > 0, n * (np.log(2 * np.pi * S / n) + 1), 0)
+                own = n * (np.log(2 * np.pi * S / n) + 1) - 2 * logs
+                deviance += np.where(n > 0, own, 0)
         else:
-            seen = np.concatenate([v.precision.reshape(rows, -1) for v in parts], axis=1)
-            logs = np.log(seen, where=seen > 0, out=np.zeros(seen.shape)).sum(axis=1)
-            deviance += S + n * np.log(2 * np.pi) - 2 * whole(logs)
+            deviance += S + n * np.log(2 * np.pi) - 2 * logs
     if study.model.loss != "linear":
         deviance = np.full(len(counts), np.nan)
     own = np.sum(lanes.active, axis=1)

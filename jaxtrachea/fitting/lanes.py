@@ -34,11 +34,14 @@ class Noise:
         joints: mm.
         joints_share: of the tool's displacement from first touch, which `joints` has beside it
             (root of the sum of the squares): what a model errs in markers grows with the press.
+        force_by_curve: weigh the forces of each curve by its own noise, found from neighbouring
+            samples (`measurements.uneven_noise.noise_to_weigh`); how large it is, is estimated.
     """
 
     force: float | None = None
     joints: float | None = None
     joints_share: float = 0.0
+    force_by_curve: bool = False
 
     def __post_init__(self):
         """Refuse words and numbers that mean nothing.
@@ -59,6 +62,11 @@ class Noise:
                 "needs joints, the standard deviation of markers at no displacement",
                 key="joints_share", cure="give joints as a length", joint=" ",
             )  # fmt: skip
+
+        if self.force_by_curve and self.force is not None:
+            expected = "None, with force_by_curve"
+            found = f"is {self.force:g}"
+            raise InputError(found, key="force", expected=expected, joint=" ")
 
     def joints_precision(self, displacement: np.ndarray) -> np.ndarray:
         """1 / sigma of markers at each depth of the tool, 1/mm; 1 if it is estimated."""

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxtrachea._errors import InputError
+from jaxtrachea.fitting.curve_noise import weighed_by_curve
 from jaxtrachea.fitting.lane import Lane, markers
 from jaxtrachea.fitting.lane import size as entries_of_trial
 from jaxtrachea.fitting.lanes import (
@@ -117,6 +118,12 @@ class Study:
             for kind in markers(self.lanes):
                 known &= ~(kind.precision.reshape(len(known), -1) > 0).any(axis=1)
         return np.full(len(known), known.all()) if self.joint else known
+
+    @property
+    def weighs_noise(self) -> bool:
+        """Whether forces count by noise of their own, given or found."""
+        seen = self.lanes.precision[self.lanes.precision > 0]
+        return bool(np.ptp(seen) > 0)
 
     @property
     def free(self) -> tuple[Parameter, ...]:
@@ -314,6 +321,8 @@ def build_study(
     if weighting.balance == "curve":
         weights = curve_weights(groups, lanes.s_c.shape[1], joint=joint)
         lanes = lanes._replace(balance=weights)
+    if noise.force_by_curve:
+        lanes = weighed_by_curve(lanes, groups, joint=joint)
     lanes, change_points = _from_touch(lanes, groups, parameters, options, noise)
     known = noise.force is not None or all(c.sigma is not None for c in curves)
     model = FitModel(

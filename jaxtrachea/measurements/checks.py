@@ -5,7 +5,14 @@ import math
 import numpy as np
 
 from jaxtrachea.measurements.curve import BadCurve, Curve, Fault, RawCurve, ReadOptions
-from jaxtrachea.measurements.loading import check_one_loading, segments_of, selection, usage_of
+from jaxtrachea.measurements.loading import (
+    check_one_loading,
+    faults_of,
+    segments_of,
+    selection,
+    usage_of,
+)
+from jaxtrachea.measurements.machine import without_machine
 from jaxtrachea.measurements.vectors import (
     check_vector_shapes,
     check_vector_sizes,
@@ -23,8 +30,9 @@ UPSIDE_DOWN = -0.5
 def finish(raw: RawCurve, options: ReadOptions) -> Curve | BadCurve:
     """Turn what a reader found into a usable curve, or into the reason why it is none.
 
-    Order: shapes, finite numbers, position, direction, signs, plausible size, segments,
-    displacement window, number of points, monotone displacement (where required), signal.
+    Order: shapes, finite numbers, position, direction, signs, plausible size, compliance of the
+    machine, segments, faults of the record, displacement window, number of points, monotone
+    displacement (where required), signal.
 
     Args:
         raw: the curve as read, in mm, N, rad.
@@ -59,8 +67,10 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
     displacement = options.displacement_sign * raw.displacement
     force = options.force_sign * raw.force
     _check_scale(raw, displacement, force, options)
+    displacement = without_machine(displacement, force, options.compliance_mm_N)
     found = segments_of(raw, displacement, force, options)
-    keep = selection(displacement, found, options)
+    faulty = faults_of(displacement, force, found, options)
+    keep = selection(displacement, found, options) & ~(faulty.broken | faulty.saturated)
     _check_amount(keep, displacement, options)
     if options.loading == "require-monotone":
         check_one_loading(raw, displacement, keep, found)
@@ -74,9 +84,10 @@ def _finish(raw: RawCurve, options: ReadOptions) -> Curve:
         force=np.ascontiguousarray(force[keep], dtype=np.float64),
         sigma=None if raw.sigma is None else raw.sigma[keep].astype(np.float64),
         source=raw.source,
-        usage=usage_of(raw, displacement, force, keep, found, options),
+        usage=usage_of(raw, displacement, force, keep, found, options, faulty),
         direction=direction,
         time=None if raw.time is None else raw.time[keep].astype(np.float64),
+        conditions=raw.conditions,
         **vectors_of(raw, keep, options),
     )
 

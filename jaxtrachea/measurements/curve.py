@@ -1,5 +1,7 @@
 """What a reader hands over: curves, what could not be used, and the errors in between."""
 
+import dataclasses
+import fnmatch
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -69,6 +71,8 @@ class Curve:
             None.
         end_V: (N, K, 2) mm, likewise at the end V, phi = +alpha, or None.
         time: (N,) s of each sample, never falling but with ``loading = "all"``, or None.
+        conditions: names and numbers that a file gives for the whole curve and that nothing reads
+            (speed, temperature, cycle), as they stand there.
     """
 
     specimen: str
@@ -89,6 +93,7 @@ class Curve:
     end_U: Float64[np.ndarray, "n k 2"] | None = None
     end_V: Float64[np.ndarray, "n k 2"] | None = None
     time: Float64[np.ndarray, " n"] | None = None
+    conditions: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -158,6 +163,7 @@ class RawCurve:
     end_U: np.ndarray | None = None
     end_V: np.ndarray | None = None
     unread: tuple[str, ...] = ()
+    conditions: tuple[tuple[str, float], ...] = ()
 
 
 #: "loading" means "first".
@@ -191,6 +197,10 @@ class ReadOptions:
             `side_force` too.
         displacement_sign: -1 if the file counts inward displacement of the tool negative; it turns
             neither the markers nor the ends of the rings nor the direction.
+        machine_compliance: of the rig (frame, load cell, grips), ``"0.05 mm/N"``: this times the
+            force is taken off the displacement, both with their signs. Or a table of names of
+            files, or patterns, to such quantities (the first that fits counts; a file that none
+            fits is an error), for `read_measurements`.
         sheet: which sheet of a workbook holds the table; None: the first that is not hidden.
         min_points: fewest samples of a curve.
         max_displacement: largest plausible displacement, mm.
@@ -212,6 +222,7 @@ class ReadOptions:
     loading: str = "last"
     force_sign: int = 1
     displacement_sign: int = 1
+    machine_compliance: str | Mapping[str, str] | None = None
     sheet: str | None = None
     min_points: int = 2
     max_displacement: float = 1000.0
@@ -245,6 +256,12 @@ class ReadOptions:
             if not (getattr(self, name) > 0 and math.isfinite(getattr(self, name))):
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
         _ = self.s_mm, self.phi_rad, self.name_pattern
+        given = self.machine_compliance
+        table = {"": given} if given is None or isinstance(given, str) else given
+        if not table:
+            raise ValueError("machine_compliance names no file; remove it, or give a quantity")
+        for name, value in table.items():
+            _compliance(f"machine_compliance{name and f'.{name!r}'}", value)
 
     @property
     def s_mm(self) -> float | None:
@@ -255,6 +272,36 @@ class ReadOptions:
     def phi_rad(self) -> float | None:
         """Common contact angle, rad."""
         return None if self.phi is None else _named("phi", parse_quantity, self.phi, "angle")
+
+    @property
+    def compliance_mm_N(self) -> float:
+        """Compliance of the rig, mm/N; of a table of files see `of_file`.
+
+        Raises:
+            ValueError: `machine_compliance` is a table.
+        """
+        given = self.machine_compliance
+        if isinstance(given, Mapping):
+            raise ValueError("machine_compliance is a table of files; take of_file(path) first")
+        return _compliance("machine_compliance", given)
+
+    def of_file(self, path: Path) -> "ReadOptions":
+        """The options with the compliance of one file.
+
+        Raises:
+            DataError: `machine_compliance` is a table that does not name the file.
+        """
+        table = self.machine_compliance
+        if table is None or isinstance(table, str):
+            return self
+        for pattern, value in table.items():
+            if fits(pattern, path):
+                return dataclasses.replace(self, machine_compliance=value)
+        raise DataError(
+            f"machine_compliance names {', '.join(map(repr, table))}, not this file",
+            place=str(path),
+            cure=f"add {path.name!r}, or '*' for all other files",
+        )
 
     @property
     def name_pattern(self) -> re.Pattern | None:
@@ -281,6 +328,21 @@ class ReadOptions:
         return pattern
 
 
+def fits(pattern: str, path: Path) -> bool:
+    """Whether a file has this name, or one of this pattern, with or without its folders."""
+    return fnmatch.fnmatchcase(path.name, pattern) or path.match(pattern)
+
+
+def _compliance(key: str, value: str | None) -> float:
+    """A compliance of 0 or more, mm/N."""
+    if value is None:
+        return 0.0
+    number = _named(key, parse_quantity, value, "compliance")
+    if not 0 <= number < math.inf:
+        raise ValueError(f"{key} is {value!r}; expected a finite compliance, 0 or more")
+    return number
+
+
 def _named(key: str, convert: Callable, *arguments: object) -> Any:
     """`convert(*arguments)`, with the key before what it refuses."""
     try:
@@ -292,49 +354,3 @@ def _named(key: str, convert: Callable, *arguments: object) -> Any:
 def _one_of(name: str, value: object, allowed: tuple) -> None:
     if value not in allowed:
         raise ValueError(f"{name} must be one of {', '.join(map(str, allowed))}, got {value!r}")
-
-
-@dataclass(frozen=True)
-class FileIdentity:
-    """What the name of a file says about its curves: s in mm, phi in rad, None if not said."""
-
-    specimen: str
-    trial: str | None
-    s: float | None
-    phi: float | None
-
-
-def identify_file(path: Path, options: ReadOptions) -> FileIdentity:
-    """Specimen, trial and position from a file name by `ReadOptions.specimen`.
-
-    Without a pattern the specimen is the file name without its suffix (``.csv`` or ``.csv.gz``).
-
-    Raises:
-        DataError: the pattern does not fit, or s or phi is no number or has no unit.
-    """
-    pattern = options.name_pattern
-    if pattern is None:
-        name = path.with_suffix("") if path.suffix.lower() == ".gz" else path
-        return FileIdentity(name.stem, None, None, None)
-    match = pattern.search(path.name)
-    if match is None:
-        raise DataError(
-            f"the file name does not fit the specimen pattern {options.specimen!r}",
-            place=str(path),
-            cure="correct the pattern or leave the file out",
-        )
-    found = match.groupdict()
-    position: dict[str, float | None] = {"s": None, "phi": None}
-    for role in position:
-        if found.get(role) is not None:
-            try:
-                position[role] = parse_quantity(
-                    f"{found[role]} {options.units.get(role, '')}", role_dimension(role)
-                )
-            except ValueError as error:
-                raise DataError(
-                    f"{role} in the file name: {error}",
-                    place=str(path),
-                    cure="give its unit in units",
-                ) from None
-    return FileIdentity(found["specimen"], found.get("trial"), position["s"], position["phi"])

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, SpecError
+from jaxtrachea.measurements.machine import check_machine_files
 from jaxtrachea.measurements.names import appearance
 from jaxtrachea.measurements.read import (
     BadCurve,
@@ -113,6 +114,10 @@ def read_data(spec: FitSpec, root: Path) -> Measurements:
             raise SpecError(f"data.specimen: {error}") from None
     if options.sheet is not None and not any(map(is_workbook, files)):
         raise SpecError("data.sheet: none of the files is a workbook (xlsx); remove it")
+    try:
+        check_machine_files(files, options)
+    except DataError as error:
+        raise SpecError(f"data: {error}") from None
     if len(files) == 1:
         return read_measurements(files, options)
     parts = [_read_one(path, options) for path in files]
@@ -126,7 +131,7 @@ def read_data(spec: FitSpec, root: Path) -> Measurements:
 def _read_one(path: Path, options: ReadOptions) -> Measurements:
     """One file of several; what spoils it becomes its only row."""
     try:
-        return read_measurements([path], options)
+        return read_measurements([path], options.of_file(path))
     except DataError as error:
         bad = BadCurve(
             path.stem,

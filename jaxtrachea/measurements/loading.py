@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxtrachea.measurements.curve import Fault, RawCurve, ReadOptions
 from jaxtrachea.measurements.plausible import doubt, drawn
+from jaxtrachea.measurements.record_faults import Faults, faults
 from jaxtrachea.measurements.segments import JITTER, NoLoading, Segments, segment
 from jaxtrachea.measurements.usage import CHOOSING, Usage, lasting, usage
 
@@ -17,10 +18,11 @@ def usage_of(
     keep: np.ndarray,
     found: Segments | None,
     options: ReadOptions,
+    faulty: Faults,
 ) -> Usage:
-    """What of the record is used, with a word on sizes and signs that are hard to believe."""
+    """What of the record is used, with a word on faults, and on sizes and signs hard to believe."""
     unit = "samples" if raw.time is None else "s"
-    seen = usage(displacement, keep, found, options.loading, unit)
+    seen = usage(displacement, keep, found, options.loading, unit, faulty)
     taken = displacement[keep], force[keep]
     doubts = [said for said in (doubt(*taken), drawn(*taken)) if said is not None]
     return dataclasses.replace(seen, remarks=(*seen.remarks, *doubts)) if doubts else seen
@@ -73,6 +75,24 @@ def selection(displacement: np.ndarray, found: Segments | None, options: ReadOpt
     if options.displacement_max is not None:
         keep = keep & (displacement <= options.displacement_max)
     return keep
+
+
+def faults_of(
+    displacement: np.ndarray, force: np.ndarray, found: Segments | None, options: ReadOptions
+) -> Faults:
+    """What is wrong with the record, of which the loading is looked at for a break or a flat top.
+
+    With ``loading = "all"`` every sample is used all the same, and this is said.
+    """
+    if found is None:
+        none = np.zeros(displacement.shape, bool)
+        return Faults(none, none)
+    within = selection(displacement, None, options)
+    seen = faults(displacement, force, found.keep & within, found)
+    if options.loading != "all" or not (seen.broken.any() or seen.saturated.any()):
+        return seen
+    remarks = (*seen.remarks, "every sample is used all the same, as loading = 'all' says")
+    return Faults(np.zeros_like(within), np.zeros_like(within), remarks)
 
 
 def check_one_loading(

@@ -11,7 +11,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, RawCurve, ReadOptions
+from jaxtrachea.measurements.curve import (
+    BadCurve,
+    Curve,
+    DataError,
+    RawCurve,
+    ReadOptions,
+)
+from jaxtrachea.measurements.machine import check_machine_files
 from jaxtrachea.measurements.readers import READERS, hdf5, reader_of
 from jaxtrachea.measurements.readers.large import MIN_BYTES, first_lines
 from jaxtrachea.measurements.readers.lines import (
@@ -88,7 +95,8 @@ def read_measurements(
     Raises:
         DataError: a file is missing, unreadable, hostile or of no known format, its table is
             malformed, a (specimen, trial) comes twice, or the specimen pattern backtracks for
-            seconds on the name of a file.
+            seconds on the name of a file; `options.machine_compliance` leaves out a file, or names
+            one that is not there.
         InputError: `options.format` names no format.
     """
     options = options or ReadOptions()
@@ -105,6 +113,7 @@ def read_measurements(
     notes: list[str] = []
     if options.name_pattern is not None:
         ensure_quick(options.name_pattern, [path.name for path in files])
+    check_machine_files(files, options)
     seen: dict[tuple[str, str], str] = {}
     for path in files:
         _check_file(path)
@@ -119,7 +128,7 @@ def read_measurements(
                     cure="rename one, or give a specimen pattern that tells files apart",
                 )
             seen[key] = record.source
-        for done in finish_all(records, options):
+        for done in finish_all(records, options.of_file(path)):
             if isinstance(done, BadCurve):
                 bad.append(done)
             else:

@@ -52,6 +52,7 @@ class Segments:
         full: number of full ones.
         chosen: which of the full ones is meant, counted from 1.
         last_share: height of the last loading as a share of the largest.
+        cycles: foot and peak of the full loadings.
         hold: at the peak, or None.
         steps: holds on the way up.
         stepwise: whether holds are part of the loading.
@@ -68,6 +69,7 @@ class Segments:
     full: int = 1
     chosen: int = 1
     last_share: float = 1.0
+    cycles: tuple[tuple[int, int], ...] = ()
     hold: Hold | None = None
     steps: tuple[Hold, ...] = ()
     stepwise: bool = False
@@ -192,6 +194,7 @@ def _of_many(
         full=len(full),
         chosen=int(np.searchsorted(full, pick)) + 1,
         last_share=float(heights[-1] / heights.max()),
+        cycles=tuple(found[k] for k in full.tolist()),
     )
     legs = tuple(legs_of(travel, corners, tolerance))
     return _held(whole, rise, legs, begin)

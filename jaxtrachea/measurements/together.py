@@ -16,6 +16,7 @@ from jaxtrachea.measurements.curve import BadCurve, Curve, Fault, RawCurve, Read
 from jaxtrachea.measurements.holds import rises_evenly
 from jaxtrachea.measurements.parts import Segment
 from jaxtrachea.measurements.plausible import doubt_of
+from jaxtrachea.measurements.record_faults import suspicious
 from jaxtrachea.measurements.usage import Usage
 from jaxtrachea.measurements.vectors import (
     FURTHER_FIELDS,
@@ -45,6 +46,8 @@ def finish_all(
         For each record what `finish` makes of it.
     """
     done: list[Curve | BadCurve | None] = [None] * len(records)
+    if options.compliance_mm_N > 0:  # noise of the force is one of the displacement then
+        return [r if isinstance(r, BadCurve) else finish(r, options) for r in records]
     common = (options.s_mm, options.phi_rad)
     for picked in _blocks(records):
         raws = [record for i in picked if isinstance(record := records[i], RawCurve)]
@@ -125,6 +128,7 @@ def _measured(raws: Sequence[RawCurve], options: ReadOptions) -> _Block:
         plain &= _rises(displacement, edges) & rises_evenly(displacement, edges)
         plain &= _along(displacement, force, edges) >= UPSIDE_DOWN + _MARGIN
         plain &= _noise_is_sound(raws, edges) & _time_is_even(raws, edges)
+        plain &= ~suspicious(force, edges)
     lists = (low.tolist(), high.tolist(), peak.tolist())
     return _Block(displacement, force, edges.tolist(), plain, *lists)
 
@@ -239,5 +243,6 @@ def _curve(
         ),
         direction=direction,
         time=None if raw.time is None else raw.time.copy(),
+        conditions=raw.conditions,
         **(vectors_of(raw, np.ones(size, bool), options) if some else {}),
     )

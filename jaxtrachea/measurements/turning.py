@@ -38,6 +38,25 @@ def noise(values: Float64[np.ndarray, " n"], lag: int = 1) -> float:
     return min(estimates)
 
 
+def white_noise(force: Float64[np.ndarray, " n"]) -> float:
+    """Standard deviation of the noise of a record, N, of few samples by second differences."""
+    if force.size >= 16:
+        return noise(force)
+    change = np.abs(np.diff(force, 2))
+    return float(np.median(change)) / (0.6745 * 6**0.5) if change.size > 2 else 0.0
+
+
+def rough_noise(force: Float64[np.ndarray, " s"], edges: np.ndarray) -> Float64[np.ndarray, " c"]:
+    """Noise of each of many records; few jumps hardly change the roots of second differences."""
+    second = np.zeros(force.shape)
+    second[1:-1] = np.sqrt(np.abs(force[2:] - 2 * force[1:-1] + force[:-2]))
+    second[edges[:-1]] = 0.0  # reaches into another record
+    second[edges[1:] - 1] = 0.0
+    inside = np.maximum(np.diff(edges) - 2, 1)
+    # The mean root of a normal variable's size is 0.822 for a standard deviation of 1.
+    return (np.add.reduceat(second, edges[:-1]) / inside / 0.8222) ** 2 / 6**0.5
+
+
 def turning_points(values: Float64[np.ndarray, " n"], tolerance: float) -> list[int]:
     """Samples where a record turns back by more than a tolerance, with its first and last extreme.
 

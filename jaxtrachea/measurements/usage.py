@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jaxtrachea.measurements.holds import Hold
+from jaxtrachea.measurements.record_faults import Faults
 from jaxtrachea.measurements.segments import FULL, Segment, Segments
 
 #: Loading rules that choose a loading.
@@ -19,6 +20,8 @@ CAUSES = {
     "hold": "holds",
     "turning back": "turning back",
     "after": "after the loading",
+    "break": "after a break",
+    "saturation": "saturated",
     "window": "displacement window",
 }
 
@@ -57,7 +60,12 @@ class Usage:
 
 
 def usage(
-    displacement: np.ndarray, keep: np.ndarray, found: Segments | None, loading: str, unit: str
+    displacement: np.ndarray,
+    keep: np.ndarray,
+    found: Segments | None,
+    loading: str,
+    unit: str,
+    faulty: Faults,
 ) -> Usage:
     """What is used of a record.
 
@@ -67,6 +75,7 @@ def usage(
         found: segments of the record; None: it only unloads.
         loading: the loading rule.
         unit: of the duration of holds, ``"s"`` or ``"samples"``.
+        faulty: samples left out after a break or on a flat top, and what is said of the record.
 
     Returns:
         Counts, segments, causes and remarks.
@@ -74,6 +83,8 @@ def usage(
     used = int(np.count_nonzero(keep))
     chosen = found is not None and loading in CHOOSING
     left_out = dict(found.left_out) if found is not None and chosen else {}
+    causes = {"break": faulty.broken, "saturation": faulty.saturated}
+    left_out |= {cause: int(which.sum()) for cause, which in causes.items() if which.any()}
     window = keep.size - sum(left_out.values()) - used
     if window > 0:
         left_out["window"] = window
@@ -87,7 +98,7 @@ def usage(
         high=float(displacement.max()),
         parts=() if found is None else found.parts,
         left_out=left_out,
-        remarks=remarks,
+        remarks=(*remarks, *faulty.remarks),
     )
 
 

@@ -5,6 +5,8 @@ from collections.abc import Iterator, Sequence
 from hashlib import sha256
 
 from jaxtrachea.measurements.read import Curve
+from jaxtrachea.measurements.repeats import repeat_sentences
+from jaxtrachea.measurements.uneven_noise import uneven_noise
 from jaxtrachea.measurements.usage import CAUSES
 
 #: Share of left-out samples from which a fit says so.
@@ -74,9 +76,20 @@ def usage_lines(curves: Sequence[Curve]) -> list[str]:
     return lines
 
 
-def sentences(curves: Sequence[Curve]) -> list[str]:
-    """What a fit says of its curves: those cut, remarks by kind, and the same curve twice."""
-    return [*_cut(curves), *_remarked(curves), *same_curves(curves)]
+def sentences(curves: Sequence[Curve], *, weighed: bool = False) -> list[str]:
+    """What a fit says of its curves: those cut, remarks by kind, trials that differ, twins.
+
+    Args:
+        curves: as they are used.
+        weighed: whether each counts by its own noise, so that noise that differs is no matter.
+    """
+    return [
+        *_cut(curves),
+        *_remarked(curves),
+        *repeat_sentences(curves),
+        *(() if weighed else uneven_noise(curves)),
+        *same_curves(curves),
+    ]
 
 
 def _cut(curves: Sequence[Curve]) -> Iterator[str]:
@@ -97,7 +110,14 @@ def _cut(curves: Sequence[Curve]) -> Iterator[str]:
 def _remarked(curves: Sequence[Curve]) -> Iterator[str]:
     """Holds and sizes, which touch what the estimates mean."""
     seen = [(c, remark) for c in curves if c.usage is not None for remark in c.usage.remarks]
-    topics = {"hold": "holds", "hard to believe": "sizes that are hard to believe"}
+    topics = {
+        "hold": "holds",
+        "hard to believe": "sizes that are hard to believe",
+        "the loading ends there": "the force falls while the tool goes on",
+        "are no forces": "a flat top",
+        "has drifted": "a zero that has drifted",
+        "than the first, at": "cycles that differ",
+    }
     for word, topic in topics.items():
         hits = [(c, remark) for c, remark in seen if word in remark]
         if hits:
@@ -127,14 +147,19 @@ def _listed(curves: Sequence[Curve]) -> str:
     return ", ".join(names[:_NAMES]) + more
 
 
-def usage_section(curves: Sequence[Curve], notes: Sequence[str] = ()) -> list[str]:
+def usage_section(
+    curves: Sequence[Curve], notes: Sequence[str] = (), *, weighed: bool = False
+) -> list[str]:
     """The section of the report, if there is anything to say.
 
     Args:
         curves: as they are used.
         notes: what else should be known of how they were read, a sentence each.
+        weighed: see `sentences`.
     """
-    said = [f"{sentence[:1].upper()}{sentence[1:]}" for sentence in sentences(curves)]
+    said = [
+        f"{sentence[:1].upper()}{sentence[1:]}" for sentence in sentences(curves, weighed=weighed)
+    ]
     said += notes  # which may begin with the name of a file
     if not said:
         return []

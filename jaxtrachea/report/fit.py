@@ -28,7 +28,11 @@ from jaxtrachea.report.tables import (
 
 
 def report_text(
-    title: str, findings: Findings, bad: Sequence[BadCurve], data: Sequence[str] = ()
+    title: str,
+    findings: Findings,
+    bad: Sequence[BadCurve],
+    data: Sequence[str] = (),
+    understood: Sequence[str] = (),
 ) -> str:
     """The whole report.md.
 
@@ -37,6 +41,7 @@ def report_text(
         findings: the fit, and what its analyses have found.
         bad: curves that could not be used.
         data: paragraphs on what is used of the data.
+        understood: lines on tube, model and onset (`understood.understood`).
     """
     result = findings.result
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
@@ -46,6 +51,7 @@ def report_text(
         "what was fitted by itself: a specimen or a curve. How to read this report: "
         "docs/report.md. All numbers: `results.h5`; one row per lane: `summary.csv`; one row per "
         "estimate: `parameters.csv` (docs/results.md).",
+        *(["\n".join(f"- {line}." for line in understood)] if understood else []),
         *_estimates(findings),
         *_sections(findings, "estimates"),
         "## Quality",

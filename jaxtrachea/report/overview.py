@@ -39,5 +39,6 @@ def overview(findings: Findings) -> Iterator[Table | str]:
         yield f"{lane_label(result, lane)}: {verdict_sentence(result, lane, profiles)}"
     if cut and result.study.free:
         yield outcome(result, profiles)
-    for sentence in sentences([c for curves in result.study.curves for c in curves]):
+    curves = [c for lane in result.study.curves for c in lane]
+    for sentence in sentences(curves, weighed=result.study.weighs_noise):
         yield f"{sentence} (curves.csv)"

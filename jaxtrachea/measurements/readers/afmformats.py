@@ -24,11 +24,10 @@ from jaxtrachea.measurements.curve import (
     BadCurve,
     DataError,
     Fault,
-    FileIdentity,
     RawCurve,
     ReadOptions,
-    identify_file,
 )
+from jaxtrachea.measurements.file_names import FileIdentity, identify_file
 from jaxtrachea.measurements.readers.hdf5_values import attribute, numeric, unit_of
 from jaxtrachea.measurements.readers.lines import Lines, read_lines
 from jaxtrachea.measurements.readers.reader import Reader

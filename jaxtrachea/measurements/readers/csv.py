@@ -14,12 +14,12 @@ from jaxtrachea.measurements.curve import (
     BadCurve,
     DataError,
     Fault,
-    FileIdentity,
     RawCurve,
     ReadOptions,
-    identify_file,
 )
+from jaxtrachea.measurements.file_names import FileIdentity, identify_file
 from jaxtrachea.measurements.readers import large
+from jaxtrachea.measurements.readers.conditions import conditions_of, unread_columns
 from jaxtrachea.measurements.readers.lines import Lines, Text, is_comment
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.text import (
@@ -97,7 +97,12 @@ def read_large(path: Path, data: bytes, options: ReadOptions) -> list[RawCurve |
         cells = large.read_cells(found, width, header.delimiter, [*names], [*numbers])
         if cells is None:
             return None
-        return _curves(_filled(text, header, *cells), roles, units, state, options)
+        numbers_of_rows, columns = cells
+        for i in {*range(width)} - names - numbers:
+            if (values := large.read_optional(found, width, header.delimiter, i)) is not None:
+                columns[i] = values
+        table = _filled(text, header, numbers_of_rows, columns)
+        return _curves(table, roles, units, state, options)
     except (Fault, DataError):
         return None
 
@@ -124,8 +129,8 @@ def _curves(
 def _named(text: Text, told: set[str], options: ReadOptions) -> FileIdentity | None:
     """What the name of the file tells; None if all is told in it."""
     pattern = options.name_pattern
-    positions = pattern is not None and {"s", "phi"} & pattern.groupindex.keys()
-    return identify_file(text.path, options) if positions or "specimen" not in told else None
+    more = pattern is not None and pattern.groupindex.keys() - {"specimen", "trial"}
+    return identify_file(text.path, options) if more or "specimen" not in told else None
 
 
 def _table(text: Text, lines: Lines, header: Header) -> Table:
@@ -237,6 +242,7 @@ def _curve(
     lines = table.lines[picked]
     rows = np.arange(lines.start, lines.stop) if isinstance(lines, range) else np.array(lines)
     source = f"{table.text.place}:{rows[0]}-{rows[-1]}"
+    unread = unread_columns(table, roles, options)
     try:
         values = {
             role: role_values(table, role, roles[role], picked, unit)
@@ -252,7 +258,12 @@ def _curve(
             phi=_agreed("phi", _constant("phi", values, state, table, picked), named),
             time=time_values(table, roles, picked, options),
             direction=state.get("direction", (1.0, 0.0)),
-            unread=_unread(table, roles, options),
+            unread=tuple(table.names[i] for i in unread),
+            conditions=(
+                *state.get("conditions", ()),
+                *(named.conditions if named else ()),
+                *conditions_of(table, unread, picked),
+            ),
         )
     except Fault as fault:
         return bad(*key, source, fault)
@@ -262,13 +273,6 @@ def _agreed(role: str, own: float | None, named: FileIdentity | None) -> float |
     """Position of a curve by the table and by the name of its file."""
     of_name, unit = getattr(named, role, None), "mm" if role == "s" else "rad"
     return position(role, own, of_name, unit, ("table", "name of the file"))
-
-
-def _unread(table: Table, roles: dict[str, int], options: ReadOptions) -> tuple[str, ...]:
-    """Names of the columns that have no role."""
-    time = None if "time" in roles else time_column(table.names, table.units, roles, options)
-    read = {*roles.values()} if time is None else {*roles.values(), time[0]}
-    return tuple(name for i, name in enumerate(table.names) if name and i not in read)
 
 
 def _constant(

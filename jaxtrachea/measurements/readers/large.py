@@ -154,6 +154,16 @@ def read_cells(
     return range(first, first + count), columns
 
 
+def read_optional(found: Opened, width: int, delimiter: str, column: int) -> np.ndarray | None:
+    """A column that nothing needs, where its cells are numbers throughout; None: they are not."""
+    end = len(found.data.rstrip(b"\n"))
+    decimal = _decimal_sign(found, end, delimiter)
+    rows = memoryview(found.data)[found.begin : end]
+    table = None if decimal is None else _parsed(rows, width, delimiter, decimal, [], [column])
+    values = None if table is None else table[str(column)].to_numpy()
+    return values if values is not None and np.isfinite(values).all() else None
+
+
 def _may_be_grouped(values: np.ndarray) -> bool:
     """Whether `grouped` may find thousands separators in the cells of a column, by its numbers."""
     size = np.abs(values[np.isfinite(values)])

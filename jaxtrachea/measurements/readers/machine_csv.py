@@ -1,12 +1,14 @@
 """Machine CSV: some lines about the test, then a table; one trial per file, named by the file."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.columns import curve_of_columns
-from jaxtrachea.measurements.curve import BadCurve, Fault, RawCurve, ReadOptions, identify_file
+from jaxtrachea.measurements.curve import BadCurve, Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.file_names import identify_file
 from jaxtrachea.measurements.readers.lines import Text
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.text import (
@@ -54,8 +56,9 @@ def read(text: Text, options: ReadOptions) -> list[RawCurve | BadCurve]:
             source = f"{text.place}:{rows[0]}-{rows[-1]}"
         values = _values(table, roles, options)
         time = time_values(table, roles, slice(None), options)
-        place = {"rows": rows, "row_word": text.word, "s": who.s, "phi": who.phi}
-        return [curve_of_columns((who.specimen, trial), source, values, time=time, **place)]
+        place: dict[str, Any] = {"rows": rows, "row_word": text.word, "s": who.s, "phi": who.phi}
+        place |= {"time": time, "conditions": who.conditions}
+        return [curve_of_columns((who.specimen, trial), source, values, **place)]
     except Fault as fault:
         return [bad(who.specimen, trial, source, fault)]
 

@@ -4,6 +4,7 @@ import json
 from typing import NamedTuple
 
 from jaxtrachea.measurements.curve import DataError, Fault, ReadOptions
+from jaxtrachea.measurements.file_names import numbers_of
 from jaxtrachea.measurements.readers.lines import Lines, Text
 from jaxtrachea.measurements.readers.text import (
     find_roles,
@@ -60,6 +61,8 @@ def read_state(lines: Lines, word: str) -> tuple[dict, Lines]:
             cure="correct it",
         ) from None
     known: dict = {key: str(state[key]) for key in ("specimen", "trial") if key in state}
+    read = ("specimen", "trial", "s", "phi", "direction")
+    known["conditions"] = numbers_of({k: v for k, v in state.items() if k not in read})
     for key in ("s", "phi"):
         if key in state:
             if not isinstance(state[key], str | int | float):
