@@ -42,7 +42,11 @@ class PressStatus(_Described):
         "where its gap is off",
     )
     BAD_MATERIAL = 10, "a stiffness or the coefficient of friction is negative"
-    IN_LUMEN = 11, "the tool lies within the tube and did not come through the wall"
+    IN_LUMEN = (
+        11,
+        "the tool lies within the tube and did not come through the wall, or has not been clear of "
+        "the wall since: lift it off, or lead it out over an end",
+    )
     TOO_DEEP = 12, "solved, but the wall is pressed in by more than the tube's radius"
 
 

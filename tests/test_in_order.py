@@ -28,7 +28,7 @@ from jaxtrachea import (
     table_1,
 )
 from jaxtrachea._in_order import in_order, lanes_in_one_kernel, one_kernel
-from jaxtrachea._numerics import epsilon
+from jaxtrachea._numerics import epsilon, largest
 from jaxtrachea.contact.shapes import capsule
 from jaxtrachea.mechanics.friction import Coulomb
 from jaxtrachea.mechanics.oblique import ObliqueOptions
@@ -510,6 +510,7 @@ def test_without_single_kernels():
 REDUCTIONS = {
     "sum": jnp.sum,
     "largest of columns": lambda x: jnp.max(x.reshape(8, -1), axis=0),
+    "largest": largest,
     "sum of rows": lambda x: jnp.sum(x.reshape(-1, 8), axis=1),
     "place": jnp.argmax,
     "in a loop": lambda x: jax.lax.fori_loop(0, 3, lambda _, v: v + jnp.min(x), jnp.sin(x[0])),

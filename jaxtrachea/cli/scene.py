@@ -25,8 +25,8 @@ SceneArgument = Annotated[Path, typer.Argument(help="Scene file (TOML).")]
 TimeOption = Annotated[
     bool, typer.Option("--time", help="Measure the time on this machine; compiles the programs.")
 ]
-#: Rows of a terminal table; the files hold all.
-MANY = 12
+#: Rows of a terminal table at most; the files hold all.
+MANY = 40
 
 
 def plan(scene: SceneArgument, timed: TimeOption = False) -> None:
@@ -302,6 +302,7 @@ def _print_failures(status, what: str) -> int:
 
 
 def _print_rows(out) -> None:
+    """A table of the rows: of more than `MANY` some, evenly, which its title says."""
     import numpy as np
 
     from jaxtrachea.status import PressStatus
@@ -309,19 +310,23 @@ def _print_rows(out) -> None:
     count = len(out.s)
     pick = np.unique(np.linspace(0, count - 1, min(count, MANY)).round().astype(int))
 
-    def vector(v):
-        return " ".join(f"{x:.3g}" for x in np.asarray(v).round(9) + 0.0)
+    def number(x):
+        return f"{np.round(x, 9) + 0.0:.3g}"
 
     def share(v):
         return "–" if np.isnan(v) else f"{100 * v:.0f} %"
 
     rows = [
-        [str(i + 1), f"{out.s[i]:.4g}", f"{np.degrees(out.phi[i]):.3g}",
-         "–" if out.gap is None else f"{out.gap[i]:.3g}", vector(out.force[i]),
-         vector(out.skeleton[i]), share(out.depth_share[i]),
-         PressStatus(int(out.status[i])).name.lower()]
+        [str(i + 1), f"{out.s[i]:.4g}", number(np.degrees(out.phi[i])),
+         "–" if out.gap is None else number(out.gap[i]), *map(number, np.asarray(out.force[i])),
+         PressStatus(int(out.status[i])).name.lower(), share(out.depth_share[i]),
+         *map(number, np.asarray(out.skeleton[i]))]
         for i in pick
     ]  # fmt: skip
-    head = ["row", "s [mm]", "phi [deg]", "gap [mm]", "force [N]", "skeleton [mm]", "depth/radius"]
-    head.append("status")
-    Console().print(table(f"{count} rows", head, rows))
+    head = ["row", "s [mm]", "phi [deg]", "gap [mm]"]
+    head += [f"force {axis} [N]" for axis in "xyz"] + ["status", "depth/radius"]
+    head += [f"skeleton {axis} [mm]" for axis in "xyz"]
+    title = f"{count} rows"
+    if len(pick) < count:
+        title = f"{len(pick)} of {count} rows; all are in simulation.h5"
+    Console().print(table(title, head, rows, ("status",)))

@@ -15,6 +15,7 @@ import optax
 from jaxtyping import Array, Float
 
 from jaxtrachea._arguments import check_record
+from jaxtrachea._numerics import largest
 from jaxtrachea.fitting.cost import entry_scale, evaluate, robust, rounding_cost
 from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.fitting.map_lanes import map_lanes
@@ -146,9 +147,12 @@ def _descend(model, descent: Descent, start, lane, sigma):
         blocks >= tolerances.iterations, FitStatus.MAX_ITERATIONS, FitStatus.CONVERGED
     )
     point = evaluate(model, theta, lane, sigma)
-    left = jnp.max(promise(theta, point, lane))
+    left = largest(promise(theta, point, lane))
     steep = left > NEARLY_FLAT * jnp.sqrt(2 * point.cost)
     steep &= (status == FitStatus.CONVERGED) & (value > rounding_cost(model, lane, sigma))
     status = jnp.where(steep, FitStatus.STALLED, status)
     bad = jnp.where(blocks == 0, FitStatus.INFEASIBLE_START, FitStatus.NON_FINITE)
-    return theta, value, jnp.where(jnp.isfinite(value), status, bad), block * blocks
+    # A column of the Jacobian that is no number promises nothing: `promise` takes it for absent.
+    finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(point.gradient))
+    finite &= jnp.all(jnp.isfinite(point.hessian))
+    return theta, value, jnp.where(finite, status, bad), block * blocks

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._numerics import epsilon, product, solve_spd
+from jaxtrachea._numerics import epsilon, largest, product, solve_spd
 from jaxtrachea.mechanics.equilibrium import status_of
 from jaxtrachea.mechanics.force_law import Law, fold_depth
 from jaxtrachea.status import PressStatus
@@ -60,7 +60,7 @@ def press_vector(
     depth, force = _series(displacement, compliance, law)
     given = jnp.sum(displacement) + jnp.sum(compliance) + sum(law.coefficients().values())
     folded = law.softens() & jnp.isfinite(given) & ~jnp.isfinite(jnp.sum(depth))
-    status = status_of(jnp.max(jnp.abs(displacement)), jnp.sum(depth + force), folded)
+    status = status_of(largest(jnp.abs(displacement)), jnp.sum(depth + force), folded)
     return VectorEquilibrium(depth, force, status)
 
 
@@ -81,7 +81,7 @@ def press_vector_total(
     force = _force(moved, law)
     depth = moved - product(compliance, force)
     result = jnp.where(known, jnp.sum(depth + force), jnp.nan)
-    status = status_of(jnp.max(jnp.abs(displacement)), result, folded)
+    status = status_of(largest(jnp.abs(displacement)), result, folded)
     negative = (status == PressStatus.OK) & (jnp.sum(depth * force) < 0)
     status = jnp.where(negative, PressStatus.NEGATIVE_LOCAL, status).astype(jnp.int8)
 
@@ -105,7 +105,7 @@ def _secant_motion(direction, compliance, kappa):
 @jax.custom_jvp
 def _series(displacement, compliance, law: Law):
     """Local indentation and force of `press_vector`; NaN past the fold."""
-    size = jnp.max(jnp.abs(displacement))
+    size = largest(jnp.abs(displacement))
     still = size == 0
     direction = jnp.where(still, 1, displacement / jnp.where(still, 1, size))
     scaled = law.in_unit(size)

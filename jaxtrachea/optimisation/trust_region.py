@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._numerics import epsilon, solve_spd
+from jaxtrachea._numerics import epsilon, largest, solve_spd
 from jaxtrachea.optimisation import curvature
 from jaxtrachea.optimisation.curvature import Rest
 from jaxtrachea.status import FitStatus
@@ -289,7 +289,7 @@ def _status(tolerances, old_cost, new, objective, fresh, finite, step, actual):
 
     cost, g = new.point.cost, new.point.gradient
     free = ~active_set(new.theta, g, objective)
-    steepest = jnp.max(promise(new.theta, new.point, objective))
+    steepest = largest(promise(new.theta, new.point, objective))
     flat = steepest <= small(tolerances.gradient) * jnp.sqrt(2 * cost)
     exact = cost <= objective.rounding()
     tiny = small(tolerances.cost) * old_cost

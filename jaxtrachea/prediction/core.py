@@ -177,7 +177,8 @@ def _unseen(slope: Float[Array, "F N"], slack: Float[Array, "N F"]) -> Float[Arr
     has but one.
     """
     size = jnp.linalg.norm(slope.T * slack, axis=1)
-    return jnp.where(jnp.any(slack > 0, axis=1), jnp.max(size), 0)
+    known = jnp.where(jnp.isfinite(size), size, 0)  # a sample without a solution has no slope
+    return jnp.where(jnp.any(slack > 0, axis=1), jnp.max(known), 0)
 
 
 @full_precision

@@ -47,7 +47,7 @@ def _is_variable(atom) -> bool:
 def _equation(equation, out: list[bool]) -> tuple[int, list[bool]]:
     name, parameters = equation.primitive.name, equation.params
     everything = [True] * len(equation.invars)
-    inner = _inner(parameters)
+    inner = None if name == "reduce" else _inner(parameters)  # how two entries become one
     if name == "cond":
         return max(_count(b.jaxpr, out)[0] for b in parameters["branches"]), everything
     if name == "scan":

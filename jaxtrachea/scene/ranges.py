@@ -125,7 +125,7 @@ def _near_surface(scene: Scene, presses: Presses):
     y, z = scene.radius * jnp.cos(presses.phi), scene.radius * jnp.sin(presses.phi)
     at = jnp.stack([presses.s, y, z], axis=1)
     away = jnp.sum((scene.mesh.straight[None] - at[:, None]) ** 2, axis=2)
-    return jnp.min(away, axis=1) < (local.REACH * scene.footprint) ** 2
+    return jnp.any(away < (local.REACH * scene.footprint) ** 2, axis=1)
 
 
 def _wandering(scene: Scene, motion: Motion):

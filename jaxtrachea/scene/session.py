@@ -23,6 +23,7 @@ from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.assemble import with_tool
 from jaxtrachea.scene.declare import AnyMaterial
+from jaxtrachea.scene.held_force import HeldForce, next_force, no_force
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.one_row import OneRow
 from jaxtrachea.scene.seat import (
@@ -140,6 +141,8 @@ class Session:
         scene: with the tool as it is now.
         material: as it is now.
         dtype: of poses.
+        force_or_last: contact force for a device, N, finite after every step: that of the last step
+            that had one, with the status of the last step (`held_force.HeldForce`).
     """
 
     def __init__(self, scene: Scene, material: AnyMaterial, *, keep: int = 10_000):
@@ -166,6 +169,7 @@ class Session:
         self._numbers = jax.device_put(self._given.fill(given))
         self._compile()
         self._seconds, self._steps = np.zeros(keep), 0
+        self.force_or_last: HeldForce = no_force(self.dtype)
 
     def _compile(self) -> None:
         """The program of a step, and its first state."""
@@ -209,6 +213,7 @@ class Session:
             check_rotations("rotation", turn[None])
         # Two arrays: to make one of them takes longer than it saves.
         result = self._program(turn, place, self._numbers)
+        self.force_or_last = next_force(self.force_or_last, result)
         self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin
         self._steps += 1
         return result
@@ -249,6 +254,7 @@ class Session:
         """
         self._change(with_tool(self.scene, tool), self.material)
         self._program.state = jnp.array(self._start)
+        self.force_or_last = no_force(self.dtype)
 
     def _change(self, scene: Scene, material: Material) -> None:
         assert scene.tool is not None
@@ -257,8 +263,9 @@ class Session:
         self.scene, self.material = scene, material
 
     def reset(self) -> None:
-        """Forget where the tool was, and all latencies."""
+        """Forget where the tool was, the force that was held, and all latencies."""
         self._program.state, self._steps = jnp.array(self._start), 0
+        self.force_or_last = no_force(self.dtype)
 
     def latency(self, edges: Float[np.ndarray, " borders"] = EDGES) -> Latency:
         """Of the steps kept.

@@ -73,9 +73,13 @@ def touching(
         sunk: vertices moved with the skeleton, in the frame of the tool's pose, mm.
         dented: the same with the dent.
     """
+    # A vertex that is no number is no candidate: `top_k` orders NaN by its sign, a maximum may
+    # keep it or not.
+    near = jnp.where(jnp.isfinite(near), near, jnp.inf)
     _, chosen = jax.lax.top_k(-near, min(CANDIDATES, near.shape[0]))
     start, way = sunk[chosen], (dented - sunk)[chosen]
     square = jnp.sum(way * way, axis=1)
+    square = jnp.where(jnp.isfinite(square), square, 0)
     peak = jnp.max(square)
     counts = (square >= LEAST_SHARE**2 * peak) & (square > 0)
     back = inverse(Pose(pose.rotation, pose.translation))

@@ -418,6 +418,9 @@ WAYS = {
     "lost in the air": ((19, np.nan, 18, 16), [NO, LOST, NO, OK]),
     "lost in touch": ((19, 16, np.nan, 15), [NO, OK, LOST, OK]),
     "lost in the lumen": ((0, np.nan, 8, 0), [LUMEN, LOST, LUMEN, LUMEN]),
+    "from the lumen into a press: not before it was clear": (
+        (0, 16, 15, 18, 16), [LUMEN, LUMEN, LUMEN, NO, OK],
+    ),
     "never touching, lost": ((19, np.nan, 20), [NO, LOST, NO]),
 }
 

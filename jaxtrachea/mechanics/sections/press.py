@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, shaped
-from jaxtrachea._numerics import full_precision
+from jaxtrachea._numerics import full_precision, largest
 from jaxtrachea.mechanics.admission import hide
 from jaxtrachea.mechanics.ring import on_ring
 from jaxtrachea.mechanics.sections import section, span, system
@@ -272,8 +272,8 @@ def _imbalance(line: section.Line, state: State, displacement, parts: System):
     """Largest residual of the nodes over the force."""
     line, state, displacement, parts = jax.lax.stop_gradient((line, state, displacement, parts))
     r = system.residual_of(line, state, displacement, parts)
-    pushed = jnp.max(jnp.abs(state.force))
-    return jnp.max(jnp.abs(r.y)) / jnp.where(pushed > 0, pushed, 1)
+    pushed = largest(jnp.abs(state.force))
+    return largest(jnp.abs(r.y).ravel()) / jnp.where(pushed > 0, pushed, 1)
 
 
 def _observe(state: State, displacement, parts: System) -> SectionPress:

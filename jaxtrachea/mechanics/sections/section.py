@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxtrachea._numerics import cos_sin, epsilon, full_precision
+from jaxtrachea._numerics import cos_sin, epsilon, full_precision, largest
 
 #: Gauss points on the half of the cartilage and on that of the muscle, and on the way to a point.
 FRONT, BACK, WAY = 12, 8, 10
@@ -210,7 +210,7 @@ def close_ring(
         lam, _, count = state
         gap, slope = _gap(lam, turn, stretch, grid)
         change = small_solve(slope, gap)
-        return lam - change, jnp.max(jnp.abs(change)), count + 1
+        return lam - change, largest(jnp.abs(change)), count + 1
 
     # A step of a tenth of the square root of eps leaves an error of less than eps.
     small = 0.1 * epsilon(turn.dtype) ** 0.5

@@ -102,7 +102,7 @@ def _predict(known, places, target):
 
 
 def _size(step, system: System):
-    """Largest change of a mode, mm."""
+    """Largest change of a mode, mm; a NaN may be lost (`_numerics.largest`), which z keeps."""
     step = _state(step, system)
     return jnp.maximum(jnp.max(jnp.abs(step.y[:, :, :4])), jnp.max(jnp.abs(step.q_C)))
 
@@ -146,7 +146,7 @@ def _advance(way: _Way, target, system: System) -> _Way:
     step, slope, minimum = _newton(way.z, tried, system)
     z = way.z - step
     size = _size(step, system)
-    finite = jnp.isfinite(jnp.max(jnp.abs(z)))
+    finite = jnp.all(jnp.isfinite(z))
     scale = jnp.maximum(jnp.abs(tried), jnp.abs(tried - at))
     settled, converging = _converging(size, scale, way)
     settled &= finite
