@@ -116,7 +116,7 @@ def _fixed(default: Parameter, given: str | float | int) -> Parameter:
     if default.name in SECTION_VALUES and value < (least := LEAST.get(default.name, 0.0)):
         found = f"{value:g} {default.unit}".strip()
         raise InputError(found, key="fixed", expected=f"{least:g} or more")
-    return dataclasses.replace(default, value=value, fixed=True)
+    return dataclasses.replace(default, value=value, fixed=True, auto=False)
 
 
 def _free(default: Parameter, section: ParameterSection) -> Parameter:
@@ -132,8 +132,9 @@ def _free(default: Parameter, section: ParameterSection) -> Parameter:
         value = min(max(default.value, lower), upper)
     scope = section.scope or default.scope
     return dataclasses.replace(
-        default, value=value, lower=lower, upper=upper, scale=scale, scope=scope, fixed=False
-    )
+        default, value=value, lower=lower, upper=upper, scale=scale, scope=scope, fixed=False,
+        auto=False,
+    )  # fmt: skip
 
 
 def usable(spec: FitSpec, measurements: Measurements) -> Measurements:

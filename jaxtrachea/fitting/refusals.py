@@ -152,9 +152,9 @@ def check_touch(curve: Curve, options: Options, parameters: Sequence[Parameter])
     """
     if options.contact != "unilateral":
         return
-    onset, offset = (next(p for p in parameters if p.name == name) for name in OF_THE_PRESS)
+    onset, offset = (next(p for p in parameters if p.name == name) for name in OF_THE_PRESS[:2])
     force = curve.force - (offset.value if offset.fixed else 0)
-    begin = onset.value if onset.fixed else -np.inf
+    begin = onset.value if onset.fixed and not onset.auto else -np.inf
     if curve.displacement.min() > begin and force.max() >= -force.min():
         return  # as most are: pressed from the first sample on, and it pushes
     pressed = curve.displacement > begin

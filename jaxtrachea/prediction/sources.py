@@ -10,7 +10,7 @@ from jaxtrachea.status import FitStatus, PredictionStatus
 
 #: Parameters of a measurement, not of the specimen: zero where no measurement is meant, whatever
 #: their scope, and where they are held as well.
-OF_MEASUREMENT = ("onset", "force_offset")
+OF_MEASUREMENT = ("onset", "force_offset", "force_slope")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
