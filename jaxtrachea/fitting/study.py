@@ -16,7 +16,6 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxtrachea._arguments import check_word
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.lane import Lane, markers
 from jaxtrachea.fitting.lane import size as entries_of_trial
@@ -51,7 +50,7 @@ from jaxtrachea.fitting.parameters import (
 from jaxtrachea.fitting.refusals import Size, check_noise, refusal
 from jaxtrachea.fitting.tested import depths
 from jaxtrachea.fitting.unread import along_the_normal
-from jaxtrachea.fitting.zeros import Baseline, Resolved, resolved, starts_of
+from jaxtrachea.fitting.zeros import Resolved, resolved, starts_of
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.optimisation.programs import batch_size
@@ -274,7 +273,6 @@ def build_study(
     weighting: Weighting = Weighting(),
     tool_radius: float | None = None,
     joint: bool = False,
-    baseline: Baseline = "auto",
 ) -> Study:
     """Put curves, model and parameters together.
 
@@ -289,7 +287,9 @@ def build_study(
             the model, `{"k_1": {"value": 2.0}, "EI_L": {"fixed": True, "value": 1.9}}`, where what
             is named is fitted unless it says `fixed`; None: the defaults. Of another wall than
             `parameters.defaults_of` takes, the table by `default_parameters`. Rows that are `auto`
-            (onset and force offset by default) are fitted to those curves whose records show them.
+            (onset and force offset by default, with them a line of the force before first touch,
+            `force_slope`) are fitted to those curves whose records show them. `{"force_slope": {}}`
+            fits that line to every curve, `{"force_slope": {"fixed": True, "value": 0}}` to none.
         noise: known standard deviations; `force` is needed where some curves have a sigma of their
             own and others have none.
         weighting: balance between curves, the loss, and whether ends of pressed rings count.
@@ -297,23 +297,20 @@ def build_study(
             are used.
         joint: one lane per specimen even if parameters are shared; without effect if none is, or
             if there is but one specimen.
-        baseline: of the force before first touch: `slope` fits a line to it in every curve,
-            `auto` where the record shows one, `none` nowhere.
 
     Raises:
         ValueError: a `tool_radius` that is no length, none where `weighting` leaves pressed ends
             out, no curve, one that cannot be pressed (`refusals`), with specimen and trial named;
-            a parameter that the model does not have; `baseline="slope"` and a curve without 5
-            samples before first touch.
+            a parameter that the model does not have; a `force_slope` that is free, and a curve
+            without 5 samples before first touch.
     """
-    check_word("baseline", baseline, Baseline)
     if tool_radius is not None and not 0 <= tool_radius < np.inf:
         raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
     if not weighting.pressed_ends and tool_radius is None:
         raise ValueError("pressed_ends=False needs tool_radius: which rings are under the tool")
     curves, table = _admitted(curves, geometry, options, parameters)
     check_noise(curves, noise.force)
-    own = resolved(table, curves, options, noise.force, baseline)
+    own = resolved(table, curves, options, noise.force)
     parameters = natural_steps(own.parameters, curves, own.taken)
     joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1

@@ -8,7 +8,6 @@ record could show: nothing is taken there.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -19,10 +18,6 @@ from jaxtrachea.fitting.parameters import DEFAULTS, OF_THE_PRESS, Parameter
 from jaxtrachea.measurements.curve import Curve
 from jaxtrachea.measurements.record_zeros import CLEAR, LINE, Zeros, record_zeros
 from jaxtrachea.mechanics.press import Options
-
-#: What becomes of a sloping line of the force before first touch: taken where it is clear, taken of
-#: every curve, or left.
-Baseline = Literal["auto", "slope", "none"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,7 +40,6 @@ def resolved(
     curves: Sequence[Curve],
     options: Options,
     sigma: float | None = None,
-    baseline: Baseline = "auto",
 ) -> Resolved:
     """The table with its `auto` rows decided.
 
@@ -54,16 +48,15 @@ def resolved(
         curves: of the study.
         options: of the model.
         sigma: given standard deviation of a force sample, N; a curve's own comes before it.
-        baseline: see `Baseline`.
 
     Raises:
         InputError: a line is asked for and a curve has too few samples before first touch.
     """
-    table = _with_line(parameters, options, baseline)
+    table = _with_line(parameters, options)
     wanted = any(p.name == "force_slope" and not p.fixed for p in table)
     looked = options.contact == "unilateral" and any(p.auto and p.fixed for p in table)
     if not (wanted or looked):
-        return Resolved(tuple(parameters), {}, None)
+        return Resolved(_without_idle_line(table), {}, None)
     zeros = zeros_of(curves, sigma)
     if wanted:
         for curve, reason in zip(curves, without_line(curves, zeros), strict=True):
@@ -71,6 +64,9 @@ def resolved(
                 raise InputError.like(reason, place=_place(curve))
     others = any(not p.fixed and not p.auto for p in table)
     shown = {"onset": zeros.onset, "force_offset": zeros.force_offset}
+    onset = next((p for p in table if p.name == "onset"), None)
+    if onset is not None and onset.fixed and not onset.auto:  # then what looks like one is another
+        shown["force_offset"] = zeros.force_offset | (zeros.onset & (zeros.air == 0))
     shown["force_slope"] = _sloping(curves, zeros)
     shown["force_offset"] = shown["force_offset"] | shown["force_slope"]
     taken: dict[tuple[str, str], set[str]] = {(c.specimen, c.trial): set() for c in curves}
@@ -81,9 +77,7 @@ def resolved(
             for k in np.flatnonzero(shown[p.name]):
                 taken[curves[k].specimen, curves[k].trial].add(p.name)
         out.append(p)
-    unused = ("force_slope",) if len(table) > len(parameters) else ()
-    out = [p for p in out if not (p.fixed and p.name in unused)]
-    return Resolved(tuple(out), taken, zeros)
+    return Resolved(_without_idle_line(out), taken, zeros)
 
 
 def zeros_of(curves: Sequence[Curve], sigma: float | None = None) -> Zeros:
@@ -120,21 +114,21 @@ def _place(curve: Curve) -> str:
     return f"specimen {curve.specimen!r} trial {curve.trial!r}"
 
 
-def _with_line(
-    parameters: Sequence[Parameter], options: Options, baseline: Baseline
-) -> tuple[Parameter, ...]:
-    """The table with a row for the line, where one may be taken."""
+def _with_line(parameters: Sequence[Parameter], options: Options) -> tuple[Parameter, ...]:
+    """The table with a row for the line, where one may be taken: not of a known force offset."""
     table = tuple(parameters)
     named = any(p.name == "force_slope" for p in table)
     offset = next((p for p in table if p.name == "force_offset"), None)
-    if named or options.contact != "unilateral" or baseline == "none" or offset is None:
+    if named or options.contact != "unilateral" or offset is None:
         return table
-    if baseline == "auto" and offset.fixed and not offset.auto:
-        return table  # a force that is known without contact
-    line = DEFAULTS["force_slope"]
-    if baseline == "slope":
-        line = dataclasses.replace(line, fixed=False, auto=False)
-    return (*table, line)
+    return (*table, DEFAULTS["force_slope"]) if offset.auto or not offset.fixed else table
+
+
+def _without_idle_line(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+    """The table without a line that is held at 0: such a model has none."""
+    return tuple(
+        p for p in parameters if not (p.name == "force_slope" and p.fixed and p.value == 0)
+    )
 
 
 def _sloping(curves: Sequence[Curve], zeros: Zeros) -> np.ndarray:

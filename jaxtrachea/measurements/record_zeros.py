@@ -5,7 +5,8 @@ it. Most are decided in closed form: a beginning that runs through the origin, o
 with a sharp end. The others are fitted with and without an onset and an offset (`press_shape`), so
 that a soft beginning is not taken for air: what is taken must lower the sum of squares by
 `EVIDENCE` times the variance of the noise. Without air a preload and an offset of the load cell
-look alike; such a record takes both, an onset and an offset.
+look alike; unless the shape of the record tells them apart, it is taken for preloaded: an onset
+before the record.
 """
 
 from collections.abc import Sequence
@@ -118,7 +119,7 @@ class _Records(NamedTuple):
 
 
 class _Taken(NamedTuple):
-    """Which zeros C records take, and where, in shares of the record; and which were fitted for it."""
+    """Which zeros C records take, and where, in shares of the record; `fitted`: whose by fits."""
 
     onset: Bool[np.ndarray, " C"]
     offset: Bool[np.ndarray, " C"]
@@ -172,8 +173,8 @@ def _noise(D, F) -> Float[np.ndarray, " C"]:
     size = np.sort(np.where(known, size, np.inf), axis=1)
     count = known.sum(axis=1)
     rows = np.arange(len(size))
-    middle = 0.5 * (size[rows, np.maximum(count - 1, 0) // 2] + size[rows, count // 2 * (count > 1)])
-    return np.where(count > 0, 1.4826 * middle, 0.0)
+    low, high = np.maximum(count - 1, 0) // 2, count // 2 * (count > 1)
+    return np.where(count > 0, 1.4826 * 0.5 * (size[rows, low] + size[rows, high]), 0.0)
 
 
 class _Air(NamedTuple):
@@ -209,15 +210,10 @@ def _decided(records: _Records, usable) -> _Taken:
     x, y, weight = records
     count = len(x)
     taken = _nothing(count)
-    begin, rise = _line_of_first(records, 4)
-    loaded = usable & (np.abs(x[:, 0]) < 1e-3) & (y[:, 0] * weight[:, 0] > _OBVIOUS)
-    loaded &= (begin > 0) & (np.min(np.diff(y[:, :3], axis=1) * weight[:, :2], axis=1) > _OBVIOUS)
-    taken.onset[loaded] = taken.offset[loaded] = True
-    taken.touch[loaded] = (x[:, 0] - np.maximum(begin, 0) / np.maximum(rise, 1e-3))[loaded]
     corner = _sharp_corner(records)
-    air = usable & ~loaded & np.isfinite(corner)
+    air = usable & np.isfinite(corner)
     taken.onset[air], taken.touch[air] = True, corner[air]
-    rest = np.flatnonzero(usable & ~loaded & ~air & ~_through_origin(records))
+    rest = np.flatnonzero(usable & ~air & ~_through_origin(records))
     for first in range(0, len(rest), _FITTED_TOGETHER):
         rows = rest[first : first + _FITTED_TOGETHER]
         for whole, part in zip(taken, _by_fits(records.take(rows)), strict=True):
@@ -330,9 +326,10 @@ def _told_apart(records: _Records, bare, rss) -> _Taken:
     single = np.maximum(by_onset, by_offset)
     least = EVIDENCE * (1 + _FEW / n)
     taken = (single > least) | (by_both > least + TOLD_APART)
-    together = (by_both - single > least) | (np.abs(by_onset - by_offset) < TOLD_APART)
-    onset = taken & (together | (by_onset > by_offset))
-    offset = taken & (together | (by_onset <= by_offset))
+    together = by_both - single > least
+    alike = (y[:, 0] > 0) & (by_offset - by_onset < TOLD_APART)  # a tool that touches cannot pull
+    onset = taken & (together | (by_onset > by_offset) | alike)
+    offset = taken & (together | ~onset)
     best = np.where(together[:, None], both, np.where(onset[:, None], moved, raised))
     touch, level = np.where(onset, best[:, 4], 0), np.where(offset, best[:, 5], 0)
     return _Taken(onset, offset, touch, level, onset | offset)

@@ -169,7 +169,8 @@ def _columns(stored: StoredFit, lane: int, specimen: str, trial: str | None, wit
         )
         lacks = p.name in without or (p.scope == "trial" and not trial)
         index.append(-1 if lacks else place.get(key, -1))
-        if index[-1] < 0:
+        held = p.auto and trial is not None  # that trial's record shows none
+        if index[-1] < 0 and not held:
             own.append(f)
     return np.array(index, int), tuple(own)
 
