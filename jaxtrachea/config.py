@@ -121,6 +121,7 @@ class DataSection(Section):
     tool_radius: PositiveLength | None = None
     pressed_ends: bool = True
     together: list[Annotated[list[str], Field(min_length=2)]] | None = None
+    baseline: Literal["auto", "slope", "none"] = "auto"
 
     @model_validator(mode="before")
     @classmethod

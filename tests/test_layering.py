@@ -57,8 +57,8 @@ WITHIN = {
         {"cost", "plots"},
     ],
     "measurements": [
-        {"presses", "turning", "plausible", "first_touch", "roles"},
-        {"holds"},
+        {"presses", "turning", "plausible", "first_touch", "roles", "press_shape"},
+        {"holds", "record_zeros"},
         {"parts"},
         {"segments"},
         {"returns"},
@@ -86,9 +86,10 @@ WITHIN = {
     "fitting": [
         {"parameters", "lane", "tested", "unread"},
         {"model", "curve_noise"},
-        {"lanes", "onset", "refusals"},
+        {"lanes", "refusals"},
+        {"onset", "zeros"},
         {"study"},
-        {"map_lanes", "press_scale", "section_residual"},
+        {"map_lanes", "zeros_told", "press_scale", "section_residual"},
         {"residual"},
         {"cost"},
         {"descent", "starts"},

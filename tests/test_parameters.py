@@ -74,7 +74,7 @@ def test_tables_follow():
     np.testing.assert_array_equal([getattr(by_place, n) for n in needed], [1, 2, 3, 4])
     assert all(getattr(by_place, n) is None for n in optional)
     assert SKELETON == ("EI_L", "GA_L", "k_M")
-    assert OF_THE_PRESS == ("onset", "force_offset")
+    assert OF_THE_PRESS == ("onset", "force_offset", "force_slope")
     assert set(MaterialSection.model_fields) == set(VALUES)
     assert list(SECTION_VALUES) == [f.name for f in dataclasses.fields(SectionMaterial)]
     assert set(VALUES) & set(SECTION_VALUES) == {"EI_C"}

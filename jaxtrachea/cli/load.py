@@ -39,6 +39,7 @@ def load(path: Path, data: Path | None, *, refits: bool = False, printed: set[st
             raise Stop(f"{path}: no usable curve; nothing was fitted, nothing was written")
         study = study_of(spec, measurements, refits=refits)
         _note_unused_batch(spec, study, printed)
+        measurements = _with_zeros(measurements, study, printed)
         return spec, _with_depths(measurements, study, printed), study
     except SpecError as error:
         raise Stop(str(SpecError.like(error, place=str(path)))) from None
@@ -54,6 +55,15 @@ def _note_unused_batch(spec, study, printed: set[str]) -> None:
         if study.one_at_a_time:
             why = "sections take one lane at a time on a CPU"
         _print("note", [f"fit.batch = {batch} is not used: {why}"], printed)
+
+
+def _with_zeros(measurements, study, printed: set[str]):
+    """The measurements with notes on what curves take from their own records."""
+    from jaxtrachea.fitting.zeros_told import sentences
+
+    said = sentences(study)
+    _print("note", said, printed)
+    return dataclasses.replace(measurements, notes=(*measurements.notes, *said))
 
 
 def _with_depths(measurements, study, printed: set[str]):

@@ -47,6 +47,7 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.files.pictures import without_lost
     from jaxtrachea.files.provenance import provenance
     from jaxtrachea.files.tables import write_csv, write_text
+    from jaxtrachea.fitting.zeros_told import cells
     from jaxtrachea.measurements.usage_tables import usage_rows, usage_section
     from jaxtrachea.report.fit import report_text
     from jaxtrachea.report.plots import draw_all
@@ -56,7 +57,10 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
 
     write_csv(folder / "summary.csv", summary_rows(findings, measurements.bad))
     write_csv(folder / "parameters.csv", list(parameter_rows(findings)))
-    write_csv(folder / "curves.csv", list(usage_rows(measurements.curves)))
+    zeros = cells(findings.result.study)
+    rows = [row | zeros.get((row["specimen"], row["trial"]), {})
+            for row in usage_rows(measurements.curves)]  # fmt: skip
+    write_csv(folder / "curves.csv", rows)
     write_tables(folder, findings)
     drawn, lost = draw_all(folder, findings)
     say_lost(lost)

@@ -7,10 +7,11 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.config import FitSpec, ParameterSection, SpecError
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.parameters import DEFAULTS, Parameter, defaults_of, held, in_model, visible
-from jaxtrachea.fitting.refusals import Size, refusal
+from jaxtrachea.fitting.refusals import Refusal, Size, refusal
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study
 from jaxtrachea.fitting.unread import along_the_normal
+from jaxtrachea.fitting.zeros import without_line, zeros_of
 from jaxtrachea.inference.together import left_out_together
 from jaxtrachea.measurements.read import (
     BadCurve,
@@ -46,8 +47,26 @@ def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Par
             if name in OF_THE_ARCH:
                 reason = f"of a ring that bends; {OF_THE_ARCH[name]}"
             raise SpecError(f"parameters.{name}: {reason}; expected one of {', '.join(known)}")
-    names = in_model(options, joints=joints, named=spec.parameters)
-    return tuple(_parameter(defaults[n], spec.parameters.get(n)) for n in names)
+    sections = spec.parameters | _baseline(spec)
+    names = in_model(options, joints=joints, named=sections)
+    return tuple(_parameter(defaults[n], sections.get(n)) for n in names)
+
+
+def _baseline(spec: FitSpec) -> Mapping[str, ParameterSection]:
+    """The parameter that `data.baseline` stands for.
+
+    Raises:
+        SpecError: it is named beside it.
+    """
+    if spec.data.baseline == "auto":
+        return {}
+    if "force_slope" in spec.parameters:
+        raise SpecError(
+            f"data.baseline = {spec.data.baseline!r} says what becomes of the line that "
+            "parameters.force_slope describes; leave one of them out"
+        )
+    none = spec.data.baseline == "none"
+    return {"force_slope": ParameterSection(fixed=0.0) if none else ParameterSection()}
 
 
 def _defaults(spec: FitSpec, options: Options) -> Mapping[str, Parameter]:
@@ -116,7 +135,7 @@ def _fixed(default: Parameter, given: str | float | int) -> Parameter:
     if default.name in SECTION_VALUES and value < (least := LEAST.get(default.name, 0.0)):
         found = f"{value:g} {default.unit}".strip()
         raise InputError(found, key="fixed", expected=f"{least:g} or more")
-    return dataclasses.replace(default, value=value, fixed=True)
+    return dataclasses.replace(default, value=value, fixed=True, auto=False)
 
 
 def _free(default: Parameter, section: ParameterSection) -> Parameter:
@@ -132,8 +151,9 @@ def _free(default: Parameter, section: ParameterSection) -> Parameter:
         value = min(max(default.value, lower), upper)
     scope = section.scope or default.scope
     return dataclasses.replace(
-        default, value=value, lower=lower, upper=upper, scale=scale, scope=scope, fixed=False
-    )
+        default, value=value, lower=lower, upper=upper, scale=scale, scope=scope, fixed=False,
+        auto=False,
+    )  # fmt: skip
 
 
 def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
@@ -149,9 +169,10 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
     table = parameters_of(spec, options, joints=marked)
     good, bad = [], list(measurements.bad)
     reasons = []
-    size = Size.of(geometry)
-    for curve in measurements.curves:
+    size, lines = Size.of(geometry), _lines(spec, measurements, options, table)
+    for curve, no_line in zip(measurements.curves, lines, strict=True):
         refused = refusal(curve, size, options, table)
+        refused = refused or (no_line and Refusal("baseline", no_line))
         if refused is None:
             good.append(curve)
             continue
@@ -167,6 +188,23 @@ def usable(spec: FitSpec, measurements: Measurements) -> Measurements:
         good, unread = along_the_normal(good)
     notes = measurements.notes if unread is None else (*measurements.notes, unread)
     return dataclasses.replace(measurements, curves=tuple(good), bad=tuple(bad), notes=notes)
+
+
+def _lines(spec: FitSpec, measurements: Measurements, options: Options, table):
+    """Why each curve has no line below its force, where all are to have one; else None each.
+
+    Raises:
+        SpecError: the contact is bonded, so that no record begins before it.
+    """
+    if spec.data.baseline == "slope" and options.contact != "unilateral":
+        raise SpecError(
+            "data.baseline: 'slope' needs samples before first touch, which contact = 'bonded' "
+            "does not have; leave it out"
+        )
+    if not any(p.name == "force_slope" and not p.fixed for p in table):
+        return [None] * len(measurements.curves)
+    noise = None if spec.noise.force == "estimate" else spec.noise.force
+    return without_line(measurements.curves, zeros_of(measurements.curves, noise))
 
 
 #: Unknowns up to which a study with shared parameters is refitted as one dense lane.

@@ -5,7 +5,7 @@ program fits any number of them at once.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
 import jax
@@ -23,6 +23,8 @@ from jaxtrachea.trachea.geometry import Geometry
 Balance = Literal["curve", "sample"]
 #: An unknown: its parameter, and the specimen and the trial that it belongs to, "" for all.
 Unknown = tuple[Parameter, str, str]
+#: Names of the `Parameter.auto` that a curve takes, by specimen and trial.
+Taken = Mapping[tuple[str, str], Collection[str]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,14 +126,28 @@ def group(
     return list(lanes.values())
 
 
-def unknowns_of(lane: Sequence[Curve], parameters: Sequence[Parameter]) -> list[Unknown]:
-    """Distinct unknowns of a lane, in parameter order."""
+def unknowns_of(
+    lane: Sequence[Curve], parameters: Sequence[Parameter], taken: Taken | None = None
+) -> list[Unknown]:
+    """Distinct unknowns of a lane, in parameter order.
+
+    Args:
+        lane: its curves.
+        parameters: the table.
+        taken: what each curve takes of the free parameters that are `auto`; None: all.
+    """
     names: dict[Unknown, None] = {}
     for p in parameters:
         if not p.fixed:
             for curve in lane:
-                names.setdefault(_key(p, curve))
+                if takes(p, curve, taken):
+                    names.setdefault(_key(p, curve))
     return list(names)
+
+
+def takes(p: Parameter, curve: Curve, taken: Taken | None) -> bool:
+    """Whether a curve has an unknown for a free parameter."""
+    return taken is None or not p.auto or p.name in taken[curve.specimen, curve.trial]
 
 
 def _key(p: Parameter, curve: Curve) -> Unknown:
@@ -278,7 +294,7 @@ def _lane(layout: _Layout, curves: Sequence[Curve], unknowns: Sequence[Unknown])
         lane["precision"][t, :n] = 1.0 if sigma is None else 1 / np.asarray(sigma)
         for j, p in enumerate(parameters):
             if not p.fixed:
-                lane["index"][t, j] = place[_key(p, curve)]
+                lane["index"][t, j] = place.get(_key(p, curve), -1)
         if curve.joint_displacement is not None and curve.joint_rings is not None:
             weight = noise.joints_precision(curve.displacement)[:, None]
             seen, at = _seen_joints(curve, geometry, layout.reach), curve.joint_rings

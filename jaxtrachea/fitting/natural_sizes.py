@@ -20,7 +20,7 @@ def natural_sizes(result: FitResult) -> Float[np.ndarray, "L P"]:
     depth = np.abs(lanes.displacement - result.first_touch[..., None])
     depth = np.where(seen, depth, 0).max(axis=(1, 2))
     depth = np.where(depth > 0, depth, 1)
-    sizes = {"onset": depth, "force_offset": force}
+    sizes = {"onset": depth, "force_offset": force, "force_slope": force / depth}
     law = [p.name for p in result.study.free if coefficient(p.name)]
     sizes |= {name: force / depth ** power(name) for name in law if power(name) > 1}
     for column, p in enumerate(result.study.free):

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.fitting.lane import Lane
+from jaxtrachea.fitting.lanes import Taken, takes
 from jaxtrachea.fitting.parameters import DEFAULTS, OF_THE_PRESS, Parameter
 from jaxtrachea.measurements.first_touch import FirstTouch, blend_widths, first_touch
 from jaxtrachea.measurements.read import Curve
@@ -18,21 +19,23 @@ from jaxtrachea.mechanics.press import Options
 
 
 def natural_steps(
-    parameters: Sequence[Parameter], curves: Sequence[Curve]
+    parameters: Sequence[Parameter], curves: Sequence[Curve], taken: Taken | None = None
 ) -> tuple[Parameter, ...]:
-    """The table with the steps of a free onset and offset as large as the presses of the study.
+    """The table with the steps of a free onset, offset and slope as large as the presses.
 
-    A power of ten, not above the median over the curves: studies alike share compiled programs.
+    A power of ten, not above the median over the curves that have one: studies alike share compiled
+    programs.
     """
-    sizes = {
-        "onset": lambda: np.median([np.ptp(c.displacement) for c in curves]),
-        "force_offset": lambda: np.median([np.max(np.abs(c.force)) for c in curves]),
-    }
 
     def scaled(p: Parameter) -> Parameter:
-        if p.fixed or p.name not in sizes or p.step != DEFAULTS[p.name].step:
+        if p.fixed or p.name not in OF_THE_PRESS or p.step != DEFAULTS[p.name].step:
             return p
-        size = float(sizes[p.name]())
+        own = [c for c in curves if takes(p, c, taken)]
+        span, peak = (
+            np.median([np.ptp(c.displacement) for c in own]),
+            np.median([np.max(np.abs(c.force)) for c in own]),
+        )
+        size = float({"onset": span, "force_offset": peak}.get(p.name, peak / max(span, 1e-300)))
         step = 10.0 ** math.floor(math.log10(size)) if size > 0 else p.step
         return dataclasses.replace(p, step=step)
 
@@ -45,16 +48,31 @@ def onset_is_sought(parameters: Sequence[Parameter], options: Options) -> bool:
     return free and options.contact == "unilateral"
 
 
-def touches(lanes: Lane, parameters: Sequence[Parameter]) -> FirstTouch:
-    """Change point of every trial of every lane, see `first_touch`; (lanes, T) each."""
+def touches(
+    lanes: Lane,
+    parameters: Sequence[Parameter],
+    slope: Float[np.ndarray, "lanes T"] | None = None,
+) -> FirstTouch:
+    """Change point of every trial of every lane, see `first_touch`; (lanes, T) each.
+
+    `slope`: of the force without contact, which is taken off, N/mm; NaN: 0.
+    """
     shape, samples = lanes.s_c.shape, lanes.force.shape[-1]
     displacement, force, precision = (
         np.reshape(v, (-1, samples)) for v in (lanes.displacement, lanes.force, lanes.precision)
     )
-    known = next(p for p in parameters if p.name == "force_offset")
-    offset = np.full(len(force), known.value) if known.fixed else None
-    found = first_touch(displacement, force, precision > 0, offset)
-    return FirstTouch(*(v.reshape(shape) for v in found))
+    if slope is not None:
+        force = force - np.nan_to_num(slope).reshape(-1, 1) * displacement
+    column = next(j for j, p in enumerate(parameters) if p.name == "force_offset")
+    own = np.asarray(lanes.index)[:, :, column].reshape(-1) >= 0
+    out = [np.full(len(force), np.nan) for _ in FirstTouch._fields]
+    for rows, known in ((np.flatnonzero(own), None), (np.flatnonzero(~own), parameters[column])):
+        if len(rows):
+            offset = None if known is None else np.full(len(rows), known.value)
+            found = first_touch(displacement[rows], force[rows], precision[rows] > 0, offset)
+            for whole, part in zip(out, found, strict=True):
+                whole[rows] = part
+    return FirstTouch(*(v.reshape(shape) for v in out))
 
 
 def first_touches(

@@ -19,7 +19,7 @@ class Parameter:
     """One parameter of a fit.
 
     Attributes:
-        name: as in `Material`, or `onset` / `force_offset`.
+        name: as in `Material`, or `onset`, `force_offset`, `force_slope`.
         unit: of every number here.
         dimension: for `units.parse_quantity`.
         description: what the user reads in tables.
@@ -31,6 +31,8 @@ class Parameter:
         step: natural size of a change with scale `linear`, in `unit`.
         scope: one value for the whole study, per specimen, or per trial (curve).
         fixed: not fitted.
+        auto: fixed, but `build_study` fits it to those curves whose own record shows that it is not
+            `value` (and `fixed` is then false); other curves keep `value`, which is 0.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Parameter:
     step: float = 1.0
     scope: Scope = "specimen"
     fixed: bool = False
+    auto: bool = False
 
     def __post_init__(self):
         """Check that value, bounds and scale agree.
@@ -102,7 +105,7 @@ def held(p: Parameter) -> Parameter:
         InputError: it is none: neither fixed by default, nor given by the wall of cross-sections.
     """
     if p.fixed or p.name in SECTION_VALUES:
-        return dataclasses.replace(p, fixed=True)
+        return dataclasses.replace(p, fixed=True, auto=False)
     raise InputError(
         f"true would hold the first guess, {p.value:g} {p.unit}".rstrip(),
         key="fixed",
@@ -113,7 +116,7 @@ def held(p: Parameter) -> Parameter:
 def _of(declared: Declaration, fit: Fitted) -> Parameter:
     return Parameter(
         declared.name, declared.unit, declared.dimension, declared.description, fit.value,
-        fit.lower, fit.upper, fit.scale, fit.step, fit.scope, fit.fixed,
+        fit.lower, fit.upper, fit.scale, fit.step, fit.scope, fit.fixed, fit.auto,
     )  # fmt: skip
 
 
@@ -138,14 +141,14 @@ def visible(options: Options, *, joints: bool) -> list[str]:
     local law alone.
     """
     if options.deforms_sections:
-        return [name for name in DEFAULTS if name in SECTION_VALUES or name in OF_PRESS]
+        press = [name for name in OF_PRESS if name != "force_slope"]
+        return [name for name in DEFAULTS if name in SECTION_VALUES or name in press]
     has = {"": True, "shear": options.shear, "two-material": options.local == "two-material",
            "softening": options.skeleton == "softening"}  # fmt: skip
-    blind = options.coupling == "total" and not joints
-    return [
-        name for name in DEFAULTS
-        if has.get(DECLARED[name].needs, False) and not (blind and name in SKELETON)
-    ]  # fmt: skip
+    unseen = SKELETON if options.coupling == "total" and not joints else ()
+    if options.contact == "bonded":  # no record of it has air, where alone a line shows
+        unseen = (*unseen, "force_slope")
+    return [n for n in DEFAULTS if has.get(DECLARED[n].needs, False) and n not in unseen]
 
 
 def in_model(options: Options, *, joints: bool, named: Collection[str] = ()) -> list[str]:

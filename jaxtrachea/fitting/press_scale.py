@@ -35,8 +35,10 @@ def sizes_of_press(study: Study) -> Float[np.ndarray, "lanes P"]:
     span = np.max(pick(lanes.displacement, -np.inf), axis=2)
     span = span - np.min(pick(lanes.displacement, np.inf), axis=2)
     peak = np.max(pick(np.abs(lanes.force), -np.inf), axis=2)
+    slope = peak / np.where(span > 0, span, np.nan)
+    sizes_of = {"onset": span, "force_offset": peak, "force_slope": slope}
     for name, column, step in columns:
-        size = _of_unknowns(study, column, (span if name == "onset" else peak) / step)
+        size = _of_unknowns(study, column, sizes_of[name] / step)
         out = np.where(size > 0, size, out)
     return out
 
@@ -70,13 +72,18 @@ def around_touch(study: Study, guess, low, high, decades: float):
     columns = _columns(study)
     if not columns or study.model.options.contact != "unilateral":
         return guess, low, high
-    found = touches(study.lanes, study.parameters)
+    shown = study.record_zeros
+    found = touches(study.lanes, study.parameters, None if shown is None else shown[..., 2])
     for name, column, step in columns:
         parameter = study.parameters[column]
         if parameter.scale == "log":
             continue
-        at = _of_unknowns(study, column, _estimate(found, name) / step, middle=True)
-        size = found.span if name == "onset" else found.peak
+        estimate = _estimate(found, name)
+        if shown is not None:
+            own = shown[..., OF_THE_PRESS.index(name)]
+            estimate = np.where(np.isnan(own), estimate, own)
+        at = _of_unknowns(study, column, estimate / step, middle=True)
+        size = {"onset": found.span, "force_offset": found.peak}.get(name, found.peak / found.span)
         reach = decades * _REACH * _of_unknowns(study, column, size / step)
         known = np.isfinite(at) & np.isfinite(reach)
         start = at if parameter.value == DEFAULTS[name].value else guess
@@ -100,6 +107,8 @@ def _columns(study: Study) -> list[tuple[str, int, float]]:
 
 
 def _estimate(found: FirstTouch, name: str) -> Float[np.ndarray, "lanes T"]:
+    if name == "force_slope":
+        return np.zeros_like(found.onset)
     return found.onset if name == "onset" else found.force_offset
 
 

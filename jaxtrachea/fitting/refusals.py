@@ -152,10 +152,12 @@ def check_touch(curve: Curve, options: Options, parameters: Sequence[Parameter])
     """
     if options.contact != "unilateral":
         return
-    onset, offset = (next(p for p in parameters if p.name == name) for name in OF_THE_PRESS)
+    onset, offset = (next(p for p in parameters if p.name == name) for name in OF_THE_PRESS[:2])
     force = curve.force - (offset.value if offset.fixed else 0)
-    begin = onset.value if onset.fixed else -np.inf
-    if curve.displacement.min() > begin and force.max() >= -force.min():
+    pushes = force.max() >= -force.min()
+    # Where first touch is may follow from the record; not where both signs may be the other way.
+    begin = onset.value if onset.fixed and not (onset.auto and pushes) else -np.inf
+    if curve.displacement.min() > begin and pushes:
         return  # as most are: pressed from the first sample on, and it pushes
     pressed = curve.displacement > begin
     lost = np.abs(np.where(pressed, np.minimum(force, 0), force))

@@ -65,6 +65,8 @@ class Inputs(NamedTuple):
         onset: mm; (T,).
         force_offset: N; (T,).
         softening: of the skeleton; (T,). None where it is linear.
+        force_slope: of the force without contact, N/mm; (T,). None where the model has no such
+            line.
     """
 
     compliance: Float[Array, " T"]
@@ -73,6 +75,7 @@ class Inputs(NamedTuple):
     onset: Float[Array, " T"]
     force_offset: Float[Array, " T"]
     softening: Softening | None
+    force_slope: Float[Array, " T"] | None = None
 
 
 def inputs(
@@ -141,7 +144,10 @@ def residual_value(
         )  # fmt: skip
         load = solved.force if solved.load is None else solved.load
         joints = None if skeleton.joints is None else _times(load, skeleton.joints)
-        return _whitened(solved.force + at.force_offset, joints, trial)
+        without = at.force_offset
+        if at.force_slope is not None:
+            without = without + at.force_slope * trial.displacement
+        return _whitened(solved.force + without, joints, trial)
 
     return jax.vmap(one)(free, skeleton, of_press(lane))
 
@@ -256,13 +262,15 @@ class _Contact(NamedTuple):
     onset: Float[Array, ""]
     force_offset: Float[Array, ""]
     softening: Softening | None
+    force_slope: Float[Array, ""] | None
 
 
 def _at_contact(model: FitModel, free, value, s_c, tube: Geometry) -> _Contact:
     material, values = material_and_values(model, free, value)
     law = local_law(tube, material, s_c, model.options)
     softening = softening_of(material, model.options)
-    return _Contact(law, values["onset"], values["force_offset"], softening)
+    zeros = values["onset"], values["force_offset"]
+    return _Contact(law, *zeros, softening, values.get("force_slope"))
 
 
 def _felt(model: FitModel, skeleton: Skeleton):
@@ -298,8 +306,8 @@ class _Pressed(NamedTuple):
         d_force: (Jf, N).
         load: what the joints follow, N; the force unless the skeleton softens; (N,).
         d_load: (Jf, N).
-        offset: N; scalar.
-        d_offset: (Jf,).
+        offset: force without contact, N; scalar, or (N,) where it is a line.
+        d_offset: (Jf, 1), or (Jf, N).
         d_joints: of the motion of every ring under a unit force; (Jf, rings); None without rings.
         corner: second derivative of the force by the onset's column, as far as it comes from the
             rounded corner; None where no onset is fitted; (N,).
@@ -309,8 +317,8 @@ class _Pressed(NamedTuple):
     d_force: Float[Array, "Jf N"]
     load: Float[Array, " N"]
     d_load: Float[Array, "Jf N"]
-    offset: Float[Array, ""]
-    d_offset: Float[Array, " Jf"]
+    offset: Float[Array, "*n"]
+    d_offset: Float[Array, "Jf _"]
     d_joints: Float[Array, "Jf rings"] | None
     corner: Float[Array, " N"] | None
 
@@ -374,13 +382,17 @@ def _press(model: FitModel, tube, free, skeleton, by_beam, trial: Lane | _Tool) 
     if blend is not None and any(p.name == "onset" for p in model.free):
         curved = jax.jvp(slope, (contact.onset,), (jnp.ones_like(contact.onset),))[1]
         corner = of_force["displacement"] * curved * jnp.sum(d_contact.onset**2)
+    offset, d_offset = contact.force_offset, d_contact.force_offset[:, None]
+    if contact.force_slope is not None:
+        offset = offset + contact.force_slope * D
+        d_offset = d_offset + d_contact.force_slope[:, None] * D
     return _Pressed(
         force=solved.force,
         d_force=d_force,
         load=load,
         d_load=d_load,
-        offset=contact.force_offset,
-        d_offset=d_contact.force_offset,
+        offset=offset,
+        d_offset=d_offset,
         d_joints=d_skeleton.joints,
         corner=corner,
     )
@@ -402,7 +414,7 @@ def _of_trial_with_jacobian(model: FitModel, tube, free, skeleton, by_beam, tria
     bend = None
     if pressed.corner is not None and joints is None:
         bend = _masked(pressed.corner, None, trial)
-    jacobian = jax.vmap(row)(pressed.d_force + pressed.d_offset[:, None], d_joints)
+    jacobian = jax.vmap(row)(pressed.d_force + pressed.d_offset, d_joints)
     return value, jacobian, bend
 
 
@@ -439,7 +451,7 @@ def force_jacobian(
     skeleton, by_beam = jax.tree.map(lambda v: v[0], of_lane)
     tool = _Tool(value, s_c, displacement, blend)
     pressed = _press(model, tube, free, skeleton, by_beam, tool)
-    return pressed.d_force + pressed.d_offset[:, None]
+    return pressed.d_force + pressed.d_offset
 
 
 def _fields(softening: Softening | None) -> dict[str, Array]:

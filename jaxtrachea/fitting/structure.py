@@ -98,7 +98,7 @@ def suspicious(study: Study) -> Bool[np.ndarray, " lanes"]:
     needed = beam
     if not _hardens(study):  # a slope of each curve, in place of its shape
         needed += sum(coefficient(name) == "k_1" for name in names)
-        if {"onset", "force_offset"} <= names:
+        if {"onset", "force_offset"} <= names or "force_slope" in names:
             return np.ones(len(places), bool)
     return places < needed
 
@@ -282,6 +282,7 @@ def _inputs_by_unknowns(model: FitModel, theta: Float[Array, " P"], lane: Lane):
         felt = model.options.coupling == "series"
         k_1, *more = _nonlinear(x)
         rows = [jnp.log(c) if felt else jnp.zeros_like(c), jnp.log(k_1), *more]
+        rows += [] if x.force_slope is None else [x.force_slope]
         rows = jnp.stack([*rows, x.onset, x.force_offset], axis=1)
         if x.joints is None:
             return rows
@@ -302,19 +303,24 @@ def _nonlinear(x: Inputs) -> list[Array]:
 
 
 @made_once(maxsize=64)
-def _generic(options, higher: tuple[tuple[str, bool], ...]) -> Float[np.ndarray, "r n"]:
-    """See `_curve_sees`; of a model with these coefficients above k_1, or zero in their place."""
+def _generic(options, higher: tuple[tuple[str, bool], ...], line: bool) -> Float[np.ndarray, "r n"]:
+    """See `_curve_sees`; of a model with these coefficients above k_1, or zero in their place.
+
+    `line`: whether it has a slope of the force without contact; its curves then begin in the air.
+    """
 
     def curve(v):
         parts = {name: 1.0 * there + v[2 + i] for i, (name, there) in enumerate(higher)}
         bent = [0.1 * parts.pop(name) for name in Softening._fields if name in parts]
         law = Law(**{"k_1": jnp.exp(v[1]), **parts})
-        depths, c = jnp.asarray(_GENERIC_DEPTHS), jnp.exp(v[0])
+        air = [-0.6, -0.4, -0.2] if line else []
+        depths, c = jnp.asarray([*air, *_GENERIC_DEPTHS]), jnp.exp(v[0])
         softening = Softening(*bent) if bent else None
-        return respond(depths, v[-2], c, law, options, softening=softening).force + v[-1]
+        force = respond(depths, v[-2], c, law, options, softening=softening).force + v[-1]
+        return force + v[-3] * depths if line else force
 
-    J = np.asarray(jax.jit(jax.jacfwd(curve))(jnp.zeros(4 + len(higher))))
-    there = np.array([True, True, *(part for _, part in higher), True, True])
+    J = np.asarray(jax.jit(jax.jacfwd(curve))(jnp.zeros(4 + len(higher) + line)))
+    there = np.array([True, True, *(part for _, part in higher), *[True] * (2 + line)])
     _, values, vectors = np.linalg.svd(J[:, there], full_matrices=False)
     rows = values > 1e-6 * values[0]
     seen = np.zeros((rows.sum(), len(there)))
@@ -323,8 +329,12 @@ def _generic(options, higher: tuple[tuple[str, bool], ...]) -> Float[np.ndarray,
 
 
 def _curve_sees(study: Study) -> Float[np.ndarray, "r n"]:
-    """Combinations of (log c, log k_1, k_3, ..., e_1, e_2, onset, offset) one curve tells; rows."""
-    return _generic(study.model.options, tuple(_higher(study).items()))
+    """Combinations of (log c, log k_1, k_3, ..., e_1, e_2, onset, offset) one curve tells; rows.
+
+    Before the onset the slope of the force without contact, where the model has one.
+    """
+    line = any(p.name == "force_slope" for p in study.parameters)
+    return _generic(study.model.options, tuple(_higher(study).items()), line)
 
 
 def _higher(study: Study) -> dict[str, bool]:

@@ -51,6 +51,7 @@ from jaxtrachea.fitting.parameters import (
 from jaxtrachea.fitting.refusals import Size, check_noise, refusal
 from jaxtrachea.fitting.tested import depths
 from jaxtrachea.fitting.unread import along_the_normal
+from jaxtrachea.fitting.zeros import Resolved, resolved, starts_of
 from jaxtrachea.measurements.read import BadCurve, Curve, Measurements
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.optimisation.programs import batch_size
@@ -84,6 +85,8 @@ class Study:
         balance: what weighs the same, see `Weighting`.
         change_points: displacement at which each curve shows its first touch, mm, NaN where it
             shows none; (lanes, T); None where no onset is sought.
+        record_zeros: onset, force offset and slope that curves take from their own records, as
+            these show them, mm, N, N/mm; NaN where they take none; None: no curve takes any.
     """
 
     model: FitModel
@@ -97,6 +100,7 @@ class Study:
     together: tuple[tuple[str, ...], ...] = ()
     balance: Balance = "curve"
     change_points: Float[np.ndarray, "lanes T"] | None = None
+    record_zeros: Float[np.ndarray, "lanes T 3"] | None = None
 
     def __post_init__(self):
         """Refuse a model of another parameter table.
@@ -253,6 +257,7 @@ class Study:
             curves=tuple(self.curves[k] for k in lanes),
             unknowns=tuple(self.unknowns[k] for k in lanes),
             change_points=None if self.change_points is None else self.change_points[lanes],
+            record_zeros=None if self.record_zeros is None else self.record_zeros[lanes],
         )
 
     def lane_name(self, lane: int) -> tuple[str, str]:
@@ -288,7 +293,10 @@ def build_study(
         parameters: the table, in the order of `parameters.in_model`; or changes to the defaults of
             the model, `{"k_1": {"value": 2.0}, "EI_L": {"fixed": True, "value": 1.9}}`, where what
             is named is fitted unless it says `fixed`; None: the defaults. Of another wall than
-            `parameters.defaults_of` takes, the table by `default_parameters`.
+            `parameters.defaults_of` takes, the table by `default_parameters`. Rows that are `auto`
+            (onset and force offset by default, with them a line of the force before first touch,
+            `force_slope`) are fitted to those curves whose records show them. `{"force_slope": {}}`
+            fits that line to every curve, `{"force_slope": {"fixed": True, "value": 0}}` to none.
         noise: known standard deviations; `force` is needed where some curves have a sigma of their
             own and others have none.
         weighting: balance between curves, the loss, and whether ends of pressed rings count.
@@ -300,7 +308,8 @@ def build_study(
     Raises:
         ValueError: a `tool_radius` that is no length, none where `weighting` leaves pressed ends
             out, no curve, one that cannot be pressed (`refusals`), with specimen and trial named;
-            a parameter that the model does not have.
+            a parameter that the model does not have; a `force_slope` that is free, and a curve
+            without 5 samples before first touch.
     """
     if tool_radius is not None and not 0 <= tool_radius < np.inf:
         raise ValueError(f"tool_radius is {tool_radius}; expected a length in mm, 0 or more")
@@ -308,11 +317,12 @@ def build_study(
         raise ValueError("pressed_ends=False needs tool_radius: which rings are under the tool")
     curves, table = _admitted(curves, geometry, options, parameters)
     check_noise(curves, noise.force)
-    parameters = natural_steps(table, curves)
+    own = resolved(table, curves, options, noise.force)
+    parameters = natural_steps(own.parameters, curves, own.taken)
     joint = joint and any(p.scope == "shared" for p in parameters if not p.fixed)
     joint = joint and len({c.specimen for c in curves}) > 1
     groups = group(curves, parameters, joint=joint)
-    unknowns = [unknowns_of(lane, parameters) for lane in groups]
+    unknowns = [unknowns_of(lane, parameters, own.taken) for lane in groups]
     lanes = lanes_of(
         groups, unknowns, parameters, geometry,
         noise=noise, weighting=weighting, tool_radius=tool_radius,
@@ -323,12 +333,13 @@ def build_study(
         lanes = lanes._replace(balance=weights)
     if noise.force_by_curve:
         lanes = weighed_by_curve(lanes, groups, joint=joint)
-    lanes, change_points = _from_touch(lanes, groups, parameters, options, noise)
+    found = starts_of(own, groups, curves, lanes.s_c.shape[1])
+    lanes, change_points = _from_touch(lanes, groups, parameters, options, noise, found)
     known = noise.force is not None or all(c.sigma is not None for c in curves)
     model = FitModel(
         tube=numbers_of(geometry), options=options, columns=columns_of(parameters),
         loss=weighting.loss, loss_scale=float(weighting.loss_scale),
-        common=_common(unknowns, parameters),
+        common=_common(unknowns, parameters, own),
     )  # fmt: skip
     return Study(
         model=model,
@@ -341,6 +352,7 @@ def build_study(
         joint=joint,
         balance=weighting.balance,
         change_points=change_points,
+        record_zeros=found,
     )
 
 
@@ -373,17 +385,29 @@ def _from_touch(
     parameters: Sequence[Parameter],
     options: Options,
     noise: Noise,
+    found: np.ndarray | None,
 ) -> tuple[Lane, np.ndarray | None]:
     """What follows from first touch: its rounded corner, its bounds, weights of markers by depth.
+
+    Curves that take no onset have a sharp corner, at 0. `found`: see `Study.record_zeros`; onsets
+    in it that lie among the samples are replaced by the change points.
 
     Returns:
         The lanes, and the change points of the curves (None: no first touch is sought).
     """
     seen = None
     if onset_is_sought(parameters, options):
-        corners = touches(lanes, parameters)
-        lanes = lanes._replace(blend=blends(corners, groups, noise.force, options))
-        lanes, seen = within_reach(lanes, parameters), corners.onset
+        corners = touches(lanes, parameters, None if found is None else found[..., 2])
+        column = next(j for j, p in enumerate(parameters) if p.name == "onset")
+        own = lanes.index[:, :, column] >= 0
+        width = np.where(own, blends(corners, groups, noise.force, options), 0.0)
+        lanes = within_reach(lanes._replace(blend=width), parameters)
+        seen = np.where(own, corners.onset, np.nan)
+        if found is not None and parameters[column].auto:
+            first = np.min(np.where(lanes.precision > 0, lanes.displacement, np.inf), axis=2)
+            before = found[..., 0] <= first
+            seen = np.where(before, found[..., 0], seen)
+            found[..., 0] = np.where(np.isnan(found[..., 0]), np.nan, seen)
     touch = _first_touch(lanes, parameters, seen)
     depth = depths(np.asarray(lanes.displacement), touch[..., None], options)
     return weighed_by_depth(lanes, noise, depth), seen
@@ -415,11 +439,12 @@ def _table(
     return default_parameters(names, changes, defaults_of(options, geometry))
 
 
-def _common(unknowns, parameters) -> Common:
+def _common(unknowns, parameters, own: Resolved) -> Common:
     """See `FitModel.common`."""
     free = [p.name for p in parameters if not p.fixed]
+    auto = {p.name for p in parameters if not p.fixed and p.auto}
     names = [[p.name for p, _, _ in lane] for lane in unknowns]
-    if all(lane == free for lane in names):
+    if all(lane == free for lane in names) and all(auto <= v for v in map(set, own.taken.values())):
         return "all"
     beams = ([name for name in lane if name in SKELETON] for lane in names)
     return "beam" if all(len(b) == len(set(b)) for b in beams) else "nothing"
@@ -466,5 +491,5 @@ def default_parameters(
                 expected = "a value beside it, as in {'fixed': True, 'value': 1.0}"
                 key = f"parameters.{name}: fixed"
                 raise InputError.like(error, key=key, expected=expected) from None
-    fitted = {name: {"fixed": False, **change} for name, change in changes.items()}
+    fitted = {name: {"fixed": False, "auto": False, **v} for name, v in changes.items()}
     return tuple(dataclasses.replace(defaults[n], **fitted.get(n, {})) for n in names)

@@ -119,6 +119,8 @@ def respond(
         onset=values["onset"], blend=blend,
     )  # fmt: skip
     force = solved.force + values["force_offset"]
+    if "force_slope" in values:
+        force = force + values["force_slope"] * displacement
     return Response(force, solved.joints, solved.reactions), solved.status
 
 

@@ -9,12 +9,15 @@ import numpy as np
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.fit import fit
-from jaxtrachea.fitting.lanes import Weighting
+from jaxtrachea.fitting.lanes import Taken, Weighting, takes
+from jaxtrachea.fitting.model import columns_of
 from jaxtrachea.fitting.onset import onset_is_sought
+from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.refusals import Size, refusal
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study
 from jaxtrachea.fitting.unread import LEFT_OUT
+from jaxtrachea.fitting.zeros import resolved
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Aside, force_and_slope
@@ -102,6 +105,7 @@ def compare(
     if not curves:
         return []
     used = {(c.specimen, c.trial): c for c in stored.curves}
+    stored, taken = _with_zeros(stored, curves)
     sources, words = [], []
     for curve in curves:
         word = _in_fit(used.get((curve.specimen, curve.trial)), curve)
@@ -109,7 +113,8 @@ def compare(
         source = source_of(
             stored, curve.specimen, trial, as_specimen=as_specimen, measured=True
         )  # fmt: skip
-        sources.append(dataclasses.replace(source, trial=curve.trial))
+        own = tuple(f for f in source.own if takes(stored.study.free[f], curve, taken))
+        sources.append(dataclasses.replace(source, trial=curve.trial, own=own))
         words.append(word)
     sigmas = [_sigma(stored, c, source) for c, source in zip(curves, sources, strict=True)]
     rounded = zip(sources, measured_corners(stored, curves, sigmas), words, strict=True)
@@ -125,6 +130,28 @@ def compare(
     depths = [c.displacement for c in curves]
     found = predict_sources(stored, sources, s, depths, sigmas, aside=aside)
     return [Compared(*row) for row in zip(curves, found, words, strict=True)]
+
+
+def _with_zeros(stored: StoredFit, curves: Sequence[Curve]) -> tuple[StoredFit, Taken]:
+    """The fit with columns for all zeros that are `auto` and that a curve's own record shows.
+
+    Also such as no curve of the fit takes; and which of them each curve takes.
+    """
+    study = stored.study
+    held = [dataclasses.replace(p, fixed=True) if p.auto else p for p in study.parameters]
+    if not any(p.auto for p in held):
+        return stored, {}
+    if stored.reading.get("baseline") == "none":
+        held.append(dataclasses.replace(DEFAULTS["force_slope"], auto=False))
+    own = resolved(held, curves, study.model.options)
+    shown = {p.name for p in own.parameters if p.auto and not p.fixed}
+    known = {p.name for p in study.parameters}
+    table = [dataclasses.replace(p, fixed=p.fixed and p.name not in shown)
+             for p in study.parameters]  # fmt: skip
+    table += [p for p in own.parameters if p.name not in known]
+    model = dataclasses.replace(study.model, columns=columns_of(table))
+    study = dataclasses.replace(study, parameters=tuple(table), model=model)
+    return dataclasses.replace(stored, study=study), own.taken
 
 
 def _in_fit(used: Curve | None, curve: Curve) -> str:

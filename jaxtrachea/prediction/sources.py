@@ -10,7 +10,7 @@ from jaxtrachea.status import FitStatus, PredictionStatus
 
 #: Parameters of a measurement, not of the specimen: zero where no measurement is meant, whatever
 #: their scope, and where they are held as well.
-OF_MEASUREMENT = ("onset", "force_offset")
+OF_MEASUREMENT = ("onset", "force_offset", "force_slope")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -169,7 +169,8 @@ def _columns(stored: StoredFit, lane: int, specimen: str, trial: str | None, wit
         )
         lacks = p.name in without or (p.scope == "trial" and not trial)
         index.append(-1 if lacks else place.get(key, -1))
-        if index[-1] < 0:
+        held = p.auto and trial is not None  # that trial's record shows none
+        if index[-1] < 0 and not held:
             own.append(f)
     return np.array(index, int), tuple(own)
 

@@ -107,7 +107,8 @@ class StoredFit:
         def touch(curve: Curve, lane: int) -> float:
             specimen = "" if onset.scope == "shared" else curve.specimen
             i = places[lane].get((specimen, curve.trial if onset.scope == "trial" else ""))
-            return np.nan if i is None else onset.from_scaled(float(self.theta[lane, i]))
+            held = onset.value if onset.auto else np.nan
+            return held if i is None else onset.from_scaled(float(self.theta[lane, i]))
 
         rows = zip(self.curves, self.curve_lane.tolist(), strict=True)
         return np.array([touch(*row) for row in rows])

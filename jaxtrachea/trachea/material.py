@@ -36,6 +36,7 @@ class Fitted:
         step: natural size of a change with scale `linear`.
         scope: one value for the whole study, per specimen, or per trial (curve).
         fixed: not fitted unless named.
+        auto: fixed, but where a curve's own record shows that it is another.
         if_named: not even part of the model unless named.
     """
 
@@ -46,6 +47,7 @@ class Fitted:
     step: float = 1.0
     scope: Scope = "specimen"
     fixed: bool = False
+    auto: bool = False
     if_named: bool = False
 
     def __post_init__(self):
@@ -254,11 +256,16 @@ class Material(eqx.Module):
 _OF_THE_PRESS = (
     Declaration(
         "onset", "mm", "length", "displacement at first touch", part="press", signed=True,
-        fit=Fitted(0.0, -100.0, 100.0, "linear", scope="trial", fixed=True),
+        fit=Fitted(0.0, -100.0, 100.0, "linear", scope="trial", fixed=True, auto=True),
     ),
     Declaration(
         "force_offset", "N", "force", "zero offset of the load cell", part="press", signed=True,
-        fit=Fitted(0.0, -1e4, 1e4, "linear", 0.1, "trial", fixed=True),
+        fit=Fitted(0.0, -1e4, 1e4, "linear", 0.1, "trial", fixed=True, auto=True),
+    ),
+    Declaration(
+        "force_slope", "N/mm", "stiffness", "slope of the force without contact", part="press",
+        signed=True,
+        fit=Fitted(0.0, -1e4, 1e4, "linear", 0.01, "trial", fixed=True, auto=True, if_named=True),
     ),
 )  # fmt: skip
 #: Values of a material by name, in the order of every table.

@@ -67,7 +67,7 @@ def gains(known: Situation, candidates: Candidates) -> Float[np.ndarray, "G C Q 
         matrix = np.nan_to_num(matrix, posinf=0.0, neginf=0.0)
         parts.append(matrix * known.relative[g][:, None] * known.relative[g])
     added = np.stack(parts)
-    if known.own.shape[1] == 0:
+    if known.kept.shape[1] == added.shape[-1]:
         return added
     # What a press brings of its own is known no better than its bounds say.
     for matrix, own, prior in zip(added, known.own, known.prior, strict=True):

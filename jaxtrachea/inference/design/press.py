@@ -33,13 +33,23 @@ def of_a_new_press(
             theta,
         )
     theta = theta.copy()
-    columns = [j for j in study.free_columns if study.parameters[j].scope == "trial"]
+    columns = own_columns(study)
     own = np.asarray(study.lanes.index)[lane, 0][:, columns]
     for g, k in enumerate(lane):
         for i, j in zip(own[g], columns, strict=True):
             every = study.lanes.index[k, : len(study.curves[k]), j]
             theta[g, i] = np.median(theta[g, every])
     return np.stack([np.flatnonzero(row) for row in _as_many(shared)]), own, theta
+
+
+def own_columns(study: Study) -> list[int]:
+    """Columns of which a new press has an unknown of its own.
+
+    Those of single trials; a press that is yet to be made begins at its touch with force 0 unless
+    all the measured ones have unknowns for that (`Parameter.auto`).
+    """
+    trial = (j for j in study.free_columns if study.parameters[j].scope == "trial")
+    return [j for j in trial if not study.parameters[j].auto]
 
 
 def _as_many(shared: np.ndarray) -> np.ndarray:
@@ -80,7 +90,9 @@ def index_of_presses(study: Study, lane: int, curve: Int[np.ndarray, " C"]):
     Their own are those of the first trial, as in `of_a_new_press`.
     """
     index = np.array(study.lanes.index[lane])[curve]
-    own = [j for j in study.free_columns if study.parameters[j].scope == "trial"]
+    trial = [j for j in study.free_columns if study.parameters[j].scope == "trial"]
+    index[:, trial] = -1
+    own = own_columns(study)
     index[:, own] = np.asarray(study.lanes.index[lane, 0])[own]
     return index
 

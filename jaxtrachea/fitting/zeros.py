@@ -1,0 +1,173 @@
+"""Which curves have an onset, a force offset or a line of their own, by their own records.
+
+A parameter that is `auto` is held at 0 unless the record of a curve shows that it is not
+(`measurements.record_zeros`): then that curve alone has an unknown for it. A study in which no
+record shows one has the same model as one that holds them. Bonded contact has no first touch that a
+record could show: nothing is taken there.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxtrachea._errors import InputError
+from jaxtrachea.fitting.lanes import Taken
+from jaxtrachea.fitting.parameters import DEFAULTS, OF_THE_PRESS, Parameter
+from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.measurements.record_zeros import CLEAR, LINE, Zeros, record_zeros
+from jaxtrachea.mechanics.press import Options
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Resolved:
+    """A parameter table of which every row is free or fixed, and what single curves take.
+
+    Attributes:
+        parameters: the table; free where at least one curve takes it.
+        taken: of the free ones that are `auto`, by specimen and trial.
+        zeros: what the records show, in the order of the curves; None: nobody looked.
+    """
+
+    parameters: tuple[Parameter, ...]
+    taken: Taken
+    zeros: Zeros | None
+
+
+def resolved(
+    parameters: Sequence[Parameter],
+    curves: Sequence[Curve],
+    options: Options,
+    sigma: float | None = None,
+) -> Resolved:
+    """The table with its `auto` rows decided.
+
+    Args:
+        parameters: the table.
+        curves: of the study.
+        options: of the model.
+        sigma: given standard deviation of a force sample, N; a curve's own comes before it.
+
+    Raises:
+        InputError: a line is asked for and a curve has too few samples before first touch.
+    """
+    table = _with_line(parameters, options)
+    wanted = any(p.name == "force_slope" and not p.fixed for p in table)
+    looked = options.contact == "unilateral" and any(p.auto and p.fixed for p in table)
+    if not (wanted or looked):
+        return Resolved(_without_idle_line(table), {}, None)
+    zeros = zeros_of(curves, sigma)
+    if wanted:
+        for curve, reason in zip(curves, without_line(curves, zeros), strict=True):
+            if reason is not None:
+                raise InputError.like(reason, place=_place(curve))
+    others = any(not p.fixed and not p.auto for p in table)
+    shown = {"onset": zeros.onset, "force_offset": zeros.force_offset}
+    onset = next((p for p in table if p.name == "onset"), None)
+    if onset is not None and onset.fixed and not onset.auto:  # then what looks like one is another
+        shown["force_offset"] = zeros.force_offset | (zeros.onset & (zeros.air == 0))
+    shown["force_slope"] = _sloping(curves, zeros)
+    shown["force_offset"] = shown["force_offset"] | shown["force_slope"]
+    taken: dict[tuple[str, str], set[str]] = {(c.specimen, c.trial): set() for c in curves}
+    out = []
+    for p in table:
+        if p.auto and p.fixed and others and p.name in shown and shown[p.name].any():
+            p = dataclasses.replace(p, fixed=False)
+            for k in np.flatnonzero(shown[p.name]):
+                taken[curves[k].specimen, curves[k].trial].add(p.name)
+        out.append(p)
+    return Resolved(_without_idle_line(out), taken, zeros)
+
+
+def zeros_of(curves: Sequence[Curve], sigma: float | None = None) -> Zeros:
+    """What the records of curves show.
+
+    Args:
+        curves: the curves.
+        sigma: as for `resolved`.
+    """
+    given = [sigma if c.sigma is None else float(np.median(c.sigma)) for c in curves]
+    return record_zeros(
+        [c.displacement for c in curves],
+        [c.force for c in curves],
+        np.array([np.nan if s is None else s for s in given]),
+    )
+
+
+def without_line(curves: Sequence[Curve], zeros: Zeros) -> list[InputError | None]:
+    """Why no line can be fitted to the force before first touch of each curve; None: it can."""
+    cure = (
+        "record more of the approach, leave the curve out, or take baseline = 'auto', which fits a "
+        "line where the record shows one"
+    )
+    return [
+        None if n >= LINE else InputError(
+            f"no line can be fitted to the force before first touch: {n} samples lie before it",
+            expected=f"{LINE} or more", cure=cure, place=_place(curve),
+        )
+        for curve, n in zip(curves, zeros.air.tolist(), strict=True)
+    ]  # fmt: skip
+
+
+def _place(curve: Curve) -> str:
+    return f"specimen {curve.specimen!r} trial {curve.trial!r}"
+
+
+def _with_line(parameters: Sequence[Parameter], options: Options) -> tuple[Parameter, ...]:
+    """The table with a row for the line, where one may be taken: not of a known force offset."""
+    table = tuple(parameters)
+    named = any(p.name == "force_slope" for p in table)
+    offset = next((p for p in table if p.name == "force_offset"), None)
+    if named or options.contact != "unilateral" or offset is None:
+        return table
+    return (*table, DEFAULTS["force_slope"]) if offset.auto or not offset.fixed else table
+
+
+def _without_idle_line(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+    """The table without a line that is held at 0: such a model has none."""
+    return tuple(
+        p for p in parameters if not (p.name == "force_slope" and p.fixed and p.value == 0)
+    )
+
+
+def _sloping(curves: Sequence[Curve], zeros: Zeros) -> np.ndarray:
+    """Curves with a line: of specimens in which it is clear of one curve, or of all together.
+
+    A line is of the rig. Where it is clear once, curves that are too noisy to show it have it too.
+    """
+    able = zeros.air >= LINE
+    error = np.where(able, zeros.slope_error, 1.0)
+    z = np.where(able, np.nan_to_num(zeros.slope) / error, 0.0)
+    names = np.unique([c.specimen for c in curves], return_inverse=True)[1].reshape(-1)
+    count = np.maximum(np.bincount(names, able), 1)
+    together = np.abs(np.bincount(names, z)) / np.sqrt(count) > CLEAR
+    alone = np.bincount(names, zeros.force_slope) > 0
+    return able & (together | alone)[names]
+
+
+def starts_of(
+    resolved: Resolved, groups: Sequence[Sequence[Curve]], curves: Sequence[Curve], trials: int
+) -> Float[np.ndarray, "lanes T 3"] | None:
+    """Onset, offset and slope that every curve shows; NaN where it does not take it; None: nobody.
+
+    Args:
+        resolved: from `resolved`.
+        groups: curves of each lane.
+        curves: in the order of `resolved`.
+        trials: T.
+    """
+    zeros, free = resolved.zeros, {p.name for p in resolved.parameters if not p.fixed}
+    auto = {p.name for p in resolved.parameters if p.auto and not p.fixed}
+    if zeros is None or not free & {*auto, "force_slope"}:
+        return None
+    out = np.full((len(groups), trials, len(OF_THE_PRESS)), np.nan)
+    row = {(c.specimen, c.trial): k for k, c in enumerate(curves)}
+    shown = zeros.touch, zeros.offset, np.nan_to_num(zeros.slope)
+    for lane, group in enumerate(groups):
+        for t, curve in enumerate(group):
+            key = curve.specimen, curve.trial
+            for i, name in enumerate(OF_THE_PRESS):
+                if name in resolved.taken[key] or (name == "force_slope" and name in free - auto):
+                    out[lane, t, i] = shown[i][row[key]]
+    return out

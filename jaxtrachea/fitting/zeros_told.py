@@ -1,0 +1,159 @@
+"""Sentences on what curves take from their own records: onset, force offset and line."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxtrachea.fitting.parameters import OF_THE_PRESS
+from jaxtrachea.fitting.study import Study
+from jaxtrachea.fitting.zeros import zeros_of
+from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.measurements.record_zeros import Zeros
+
+#: Curves named in a sentence; curves.csv holds all.
+_NAMES = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """What the record of a curve shows and what it takes of it; NaN: not taken.
+
+    Attributes:
+        curve: the curve.
+        onset: displacement at first touch, mm.
+        force_offset: force without contact at displacement 0, N.
+        force_slope: of the force without contact, N/mm.
+    """
+
+    curve: Curve
+    onset: float
+    force_offset: float
+    force_slope: float
+
+    @property
+    def loaded(self) -> bool:
+        """Whether it begins under load, so that preload and offset look alike."""
+        return self.onset <= float(self.curve.displacement.min())
+
+    @property
+    def name(self) -> str:
+        """Specimen and trial."""
+        return f"{self.curve.specimen} {self.curve.trial}"
+
+
+def shown(study: Study) -> list[Shown]:
+    """Curves that take something from their records, in the order of the lanes."""
+    if study.record_zeros is None:
+        return []
+    rows = zip(study.curves, study.record_zeros, strict=True)
+    every = [
+        Shown(c, *map(float, v)) for lane, row in rows for c, v in zip(lane, row, strict=False)
+    ]
+    return [s for s in every if not np.isnan([s.onset, s.force_offset, s.force_slope]).all()]
+
+
+def sentences(study: Study) -> list[str]:
+    """What the curves of a study take from their records, and what was held against a record."""
+    every, count = shown(study), sum(map(len, study.curves))
+    air = [s for s in every if not s.loaded]
+    touched = [s for s in air if not np.isnan(s.onset)]
+    out = _listed(
+        touched, count, "onset", lambda s: f"{s.onset:.3g} mm",
+        lambda s: f", from its record (no force over its first {_share(s):.0f} %)",
+    )  # fmt: skip
+    offset = [s for s in air if not np.isnan(s.force_offset) and np.isnan(s.force_slope)]
+    out += _listed(
+        offset, count, "force_offset", lambda s: f"{s.force_offset:.3g} N",
+        lambda s: ", from its record",
+    )  # fmt: skip
+    sloping = [s for s in air if not np.isnan(s.force_slope)]
+    out += _listed(
+        sloping, count, "force_slope", lambda s: f"{s.force_slope:.3g} N/mm",
+        lambda s: ", from its record",
+    )  # fmt: skip
+    if sloping:
+        out[-1] += (
+            ": a line is fitted to the force before first touch and taken off the whole record; "
+            "data.baseline = 'none' leaves it"
+        )
+    return [*out, *_under_load([s for s in every if s.loaded], count), *_held(study)]
+
+
+def _share(s: Shown) -> float:
+    D = s.curve.displacement
+    return 100 * max(s.onset - float(D.min()), 0.0) / float(np.ptp(D))
+
+
+def _listed(some: Sequence[Shown], count: int, what: str, value, more) -> list[str]:
+    """One sentence a curve of few, one for all of many."""
+    if len(some) <= _NAMES:
+        return [f"{what} of {s.name}: {value(s)}{more(s)}" for s in some]
+    first = ", ".join(f"{s.name} {value(s)}" for s in some[:_NAMES])
+    rest = len(some) - _NAMES
+    return [
+        f"{what} of {len(some)} of {count} curves, from their records: {first} and {rest} more "
+        "(curves.csv)"
+    ]
+
+
+def _under_load(some: Sequence[Shown], count: int) -> list[str]:
+    """What is said of records that begin under load."""
+    if not some:
+        return []
+    zeros = zeros_of([s.curve for s in some[:_NAMES]])
+    rows = zip(some, zeros.first, zeros.noise, strict=False)
+    first = ", ".join(
+        f"{s.name} with {F:.3g} N, {abs(F) / noise:.0f} times its noise" for s, F, noise in rows
+    )
+    rest = f" and {len(some) - _NAMES} more (curves.csv)" if len(some) > _NAMES else ""
+    several = len(some) > 1
+    begin = f"{len(some)} of {count} curves begin" if several else "a curve begins"
+    said = f"{begin} under load: {first}{rest}"
+    return [
+        f"{said}; the onset is fitted, it lies before the record; without samples before first "
+        "touch an offset of the load cell looks alike: where the displacement was zeroed at first "
+        "touch, set parameters.onset = { fixed = 0 }, and the force offset is fitted in its place"
+    ]
+
+
+def _held(study: Study) -> list[str]:
+    """Zeros that the specification holds at 0 where records show another."""
+    if study.model.options.contact != "unilateral":
+        return []
+    held = [
+        p.name for p in study.parameters
+        if p.name in OF_THE_PRESS and p.fixed and not p.auto and p.value == 0
+    ]  # fmt: skip
+    if not held:
+        return []
+    curves = [c for lane in study.curves for c in lane]
+    zeros = zeros_of(curves)
+    return [text for name in held for text in _against(name, curves, zeros)]
+
+
+def _against(name: str, curves: Sequence[Curve], zeros: Zeros) -> list[str]:
+    against = np.flatnonzero(getattr(zeros, name) & (zeros.air > 1))
+    if not len(against):
+        return []
+    k = int(against[0])
+    value, unit = (zeros.touch, "mm") if name == "onset" else (zeros.offset, "N")
+    if name == "force_slope":
+        value, unit = zeros.slope, "N/mm"
+    others = f" and of {len(against) - 1} more curves" if len(against) > 1 else ""
+    return [
+        f"{name} is held at 0, where the record of {curves[k].specimen} {curves[k].trial} shows "
+        f"{value[k]:.3g} {unit}{others}: leave parameters.{name} out"
+    ]
+
+
+def cells(study: Study) -> dict[tuple[str, str], dict[str, object]]:
+    """Cells of curves.csv on what each curve takes from its record, by specimen and trial."""
+    return {
+        (s.curve.specimen, s.curve.trial): {
+            f"{name}_from_record": value
+            for name in OF_THE_PRESS
+            if not np.isnan(value := getattr(s, name))
+        }
+        for s in shown(study)
+    }

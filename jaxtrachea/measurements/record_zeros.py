@@ -1,0 +1,365 @@
+"""Where records have their zeros: first touch, force without contact, a line below the force.
+
+Every record decides for itself whether a press that touches at displacement 0 with force 0 explains
+it. Most are decided in closed form: a beginning that runs through the origin, one under load, air
+with a sharp end. The others are fitted with and without an onset and an offset (`press_shape`), so
+that a soft beginning is not taken for air: what is taken must lower the sum of squares by
+`EVIDENCE` times the variance of the noise. Without air a preload and an offset of the load cell
+look alike; unless the shape of the record tells them apart, it is taken for preloaded: an onset
+before the record.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxtrachea.measurements import press_shape
+
+#: Fall of the sum of squares, in variances of the noise, that an onset or an offset must bring, and
+#: that must lie between the two for a record to tell which of them it is.
+EVIDENCE, TOLD_APART = 16.0, 9.0
+#: Standard deviations by which a force before the touch, or its slope, must differ from 0.
+CLEAR = 4.0
+#: Samples before the touch at least for a line.
+LINE = 5
+#: Standard deviations from which no fit is needed to see it.
+_OBVIOUS = 6.0
+#: Samples of a record at least, and means of neighbouring samples that it becomes at most.
+_FEWEST, _MEANS = 6, 48
+#: Noise at least, share of the largest force: no model of a press is meant to be closer.
+_LEAST_NOISE = 5e-4
+#: Part of the air before the corner that is left out of its mean and line.
+_MARGIN = 0.15
+#: Part of the record, and samples at least, that must run through the origin.
+_BEGINNING, _FIRST = 0.4, 8
+#: Shapes that fits start from: log k_1, log k_3, log c, in shares of the record.
+_SHAPES = ((0.2, -2.0, -2.0), (-3.0, 2.0, -0.7))
+_SHAPE = ("k_1", "k_3", "c", "q")
+#: Fall of the sum of squares that the linearised press must promise for a record to be fitted on,
+#: and samples by which a short record's evidence must be the larger.
+_HINT, _FEW = 12.0, 6
+#: Records looked at, and fitted, together.
+_TOGETHER, _FITTED_TOGETHER = 1 << 14, 512
+
+
+class Zeros(NamedTuple):
+    """What C records take, and what they show; mm, N.
+
+    Attributes:
+        onset: whether first touch is elsewhere than at displacement 0.
+        force_offset: whether the force without contact is not 0.
+        force_slope: whether the force before the touch lies on a sloping line.
+        touch: displacement at first touch; of a record that begins under load, a guess before it.
+        offset: force without contact at displacement 0; 0 where it is not taken.
+        slope: of the force before the touch, N/mm; NaN with fewer than `LINE` samples there.
+        slope_error: its standard error.
+        air: samples before first touch.
+        first: force of the first sample.
+        noise: standard deviation of a sample.
+    """
+
+    onset: Bool[np.ndarray, " C"]
+    force_offset: Bool[np.ndarray, " C"]
+    force_slope: Bool[np.ndarray, " C"]
+    touch: Float[np.ndarray, " C"]
+    offset: Float[np.ndarray, " C"]
+    slope: Float[np.ndarray, " C"]
+    slope_error: Float[np.ndarray, " C"]
+    air: Int[np.ndarray, " C"]
+    first: Float[np.ndarray, " C"]
+    noise: Float[np.ndarray, " C"]
+
+
+def record_zeros(
+    displacement: Sequence[np.ndarray],
+    force: Sequence[np.ndarray],
+    sigma: Float[np.ndarray, " C"] | None = None,
+) -> Zeros:
+    """What every record takes; nothing where it has fewer than 6 samples.
+
+    Args:
+        displacement: of each record, mm; (N,).
+        force: likewise, N.
+        sigma: standard deviation of a force sample, N; NaN or None: by neighbouring samples.
+    """
+    count = len(displacement)
+    given = np.full(count, np.nan) if sigma is None else np.asarray(sigma, float)
+    taken, zero, unknown = np.zeros(count, bool), np.zeros(count), np.full(count, np.nan)
+    out = Zeros(
+        onset=taken, force_offset=taken.copy(), force_slope=taken.copy(),
+        touch=zero, offset=zero.copy(), slope=unknown, slope_error=unknown.copy(),
+        air=np.zeros(count, int), first=unknown.copy(), noise=unknown.copy(),
+    )  # fmt: skip
+    lengths = np.array([len(d) for d in displacement], int)
+    for length in np.unique(lengths):
+        every = np.flatnonzero(lengths == length)
+        for begin in range(0, len(every) if length >= _FEWEST else 0, _TOGETHER):
+            rows = every[begin : begin + _TOGETHER]
+            D, F = (np.stack([v[i] for i in rows]) for v in (displacement, force))
+            part = _of_equal_length(D, F, given[rows])
+            for whole, values in zip(out, part, strict=True):
+                whole[rows] = values
+    return out
+
+
+class _Records(NamedTuple):
+    """Means of neighbouring samples, in shares of the range of displacement and the largest force.
+
+    `weight`: 1 / standard deviation of each mean.
+    """
+
+    x: Float[np.ndarray, "C n"]
+    y: Float[np.ndarray, "C n"]
+    weight: Float[np.ndarray, "C n"]
+
+    def take(self, rows) -> "_Records":
+        return _Records(*(v[rows] for v in self))
+
+
+class _Taken(NamedTuple):
+    """Which zeros C records take, and where, in shares of the record; `fitted`: whose by fits."""
+
+    onset: Bool[np.ndarray, " C"]
+    offset: Bool[np.ndarray, " C"]
+    touch: Float[np.ndarray, " C"]
+    level: Float[np.ndarray, " C"]
+    fitted: Bool[np.ndarray, " C"]
+
+
+def _of_equal_length(D, F, given) -> Zeros:
+    order = np.argsort(D, axis=1, kind="stable")
+    D, F = np.take_along_axis(D, order, 1), np.take_along_axis(F, order, 1)
+    span, peak = D[:, -1] - D[:, 0], np.max(np.abs(F), axis=1)
+    usable = (span > 0) & (peak > 0)
+    span, peak = np.where(usable, span, 1.0), np.where(usable, peak, 1.0)
+    noise = np.where(np.isnan(given), _noise(D, F), given)
+    noise = np.maximum(noise, _LEAST_NOISE * peak)
+    ends = np.linspace(0, D.shape[1], min(D.shape[1], _MEANS) + 1).astype(int)
+    held = np.diff(ends)
+    x, y = (np.add.reduceat(v, ends[:-1], axis=1) / held for v in (D, F))
+    weight = np.sqrt(held) * (peak / noise)[:, None]
+    taken = _decided(_Records(x / span[:, None], y / peak[:, None], weight), usable)
+    touch, level = taken.touch * span, taken.level * peak
+    air = _air(D, F, noise, touch)
+    clear = (air.count >= 2) & (np.abs(air.mean) > CLEAR * air.mean_error)
+    offset = taken.offset | clear & ~taken.fitted
+    sloping = (np.abs(air.slope) > CLEAR * air.slope_error) & ~taken.fitted
+    level = np.where(sloping, air.at_zero, np.where(air.count >= 2, air.mean, level))
+    offset = (offset | sloping) & usable
+    return Zeros(
+        onset=taken.onset, force_offset=offset, force_slope=sloping & usable,
+        touch=touch, offset=np.where(offset, level, 0.0), slope=air.slope,
+        slope_error=air.slope_error, air=air.count, first=F[:, 0], noise=noise,
+    )  # fmt: skip
+
+
+def _noise(D, F) -> Float[np.ndarray, " C"]:
+    """Standard deviation of samples about the cubic through two neighbours on each side, robust."""
+    n = D.shape[1]
+    x, r = D[:, 2:-2], F[:, 2:-2].copy()
+    others = [slice(i, n - 4 + i) for i in (0, 1, 3, 4)]
+    gain = np.ones_like(r)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for j in others:
+            part = np.ones_like(r)
+            for k in others:
+                if k != j:
+                    part = part * (x - D[:, k]) / (D[:, j] - D[:, k])
+            r, gain = r - part * F[:, j], gain + part * part
+        size = np.abs(r) / np.sqrt(gain)
+    known = np.isfinite(size)  # neighbours at one place say nothing
+    size = np.sort(np.where(known, size, np.inf), axis=1)
+    count = known.sum(axis=1)
+    rows = np.arange(len(size))
+    low, high = np.maximum(count - 1, 0) // 2, count // 2 * (count > 1)
+    return np.where(count > 0, 1.4826 * 0.5 * (size[rows, low] + size[rows, high]), 0.0)
+
+
+class _Air(NamedTuple):
+    """Force before first touch: samples, mean and line; errors inf with too few."""
+
+    count: Int[np.ndarray, " C"]
+    mean: Float[np.ndarray, " C"]
+    mean_error: Float[np.ndarray, " C"]
+    slope: Float[np.ndarray, " C"]
+    slope_error: Float[np.ndarray, " C"]
+    at_zero: Float[np.ndarray, " C"]
+
+
+def _air(D, F, noise, touch) -> _Air:
+    end = touch - _MARGIN * np.maximum(touch - D[:, 0], 0)
+    there = (D < end[:, None]) & (np.arange(D.shape[1]) < D.shape[1] - 3)
+    count = there.sum(axis=1)
+    n = np.maximum(count, 1)
+    mean = np.sum(F, axis=1, where=there) / n
+    middle = np.sum(D, axis=1, where=there) / n
+    u = np.where(there, D - middle[:, None], 0)
+    square = np.sum(u * u, axis=1)
+    enough = (count >= LINE) & (square > 0)
+    slope = np.sum(u * F, axis=1) / np.where(enough, square, 1)
+    line = np.where(enough, slope, np.nan)
+    error = np.where(enough, noise / np.sqrt(np.where(enough, square, 1)), np.nan)
+    mean_error = np.where(count > 0, noise / np.sqrt(n), np.inf)
+    return _Air(count, mean, mean_error, line, error, mean - slope * middle)
+
+
+def _decided(records: _Records, usable) -> _Taken:
+    """What every record takes: in closed form where that suffices, else by fits."""
+    x, y, weight = records
+    count = len(x)
+    taken = _nothing(count)
+    corner = _sharp_corner(records)
+    air = usable & np.isfinite(corner)
+    taken.onset[air], taken.touch[air] = True, corner[air]
+    rest = np.flatnonzero(usable & ~air & ~_through_origin(records))
+    for first in range(0, len(rest), _FITTED_TOGETHER):
+        rows = rest[first : first + _FITTED_TOGETHER]
+        for whole, part in zip(taken, _by_fits(records.take(rows)), strict=True):
+            whole[rows] = part
+    return taken
+
+
+def _nothing(count: int) -> _Taken:
+    none, zero = np.zeros(count, bool), np.zeros(count)
+    return _Taken(none, none.copy(), zero, zero.copy(), none.copy())
+
+
+def _line_of_first(records: _Records, count: int):
+    """Force at the first displacement and slope, of a line through the first means."""
+    x, y = records.x[:, :count], records.y[:, :count]
+    u = x - x.mean(axis=1, keepdims=True)
+    slope = np.sum(u * y, axis=1) / np.maximum(np.sum(u * u, axis=1), 1e-300)
+    return y.mean(axis=1) + slope * u[:, 0], slope
+
+
+def _through_origin(records: _Records) -> Bool[np.ndarray, " C"]:
+    """Records whose first part is a parabola that rises from (0, 0), within the noise."""
+    x, y, weight = records
+    part = (x - x[:, :1] <= _BEGINNING) | (np.arange(x.shape[1]) < _FIRST)
+    w = np.where(part, weight, 0)
+    A = (x[..., None] ** np.arange(3)) * w[..., None]
+    gram = np.swapaxes(A, 1, 2) @ A + 1e-12 * np.eye(3)
+    covariance = np.linalg.inv(gram)
+    found = (covariance @ (np.swapaxes(A, 1, 2) @ (y * w)[..., None]))[..., 0]
+    r = y * w - (A @ found[..., None])[..., 0]
+    spread = np.maximum(np.sum(r * r, axis=1) / np.maximum(part.sum(axis=1) - 3, 1), 1)
+    error = np.sqrt(np.einsum("cii->ci", covariance) * spread[:, None])
+    level, slope = found[:, 0], found[:, 1]
+    near = (np.abs(level) < 2.5 * error[:, 0]) & (slope > _OBVIOUS * error[:, 1])
+    return near & (spread < 2.0) & (np.abs(x[:, 0]) < 0.05)
+
+
+def _sharp_corner(records: _Records) -> Float[np.ndarray, " C"]:
+    """End of the air where it is beyond doubt; else NaN.
+
+    A press that touches at 0 grows from there no faster than with the cube of the displacement
+    (k_1 = 0, and a skeleton only slows it). Its force at x* then says how much it must have risen
+    between the first and the second half of what looks like air.
+    """
+    x, y, weight = records
+    count, n = x.shape
+    start = np.mean(y[:, :3], axis=1, keepdims=True)
+    above = (y - start) * weight > 4
+    first = np.where(above.all(axis=1), 0, n - np.argmax(~above[:, ::-1], axis=1))
+    place = np.arange(n)
+    early, late = place < first[:, None] // 2, place < first[:, None]
+    late = late & ~early
+    few = (first < 4) | (first > n - 3)
+    u = np.maximum(x, 0) ** 3
+    ends = np.where(place >= first[:, None], u, np.inf)
+
+    def mean(v, part):
+        return np.sum(v, axis=1, where=part) / np.maximum(part.sum(axis=1), 1)
+
+    low = mean(y, early)
+    grown = np.max((y - low[:, None]) / np.where(ends > 0, ends, np.inf), axis=1)
+    expected = grown * (mean(u, late) - mean(u, early))
+    spread = np.sqrt(1 / np.maximum(early.sum(1), 1) + 1 / np.maximum(late.sum(1), 1))
+    missing = (expected - (mean(y, late) - low)) * np.median(weight, axis=1) / spread
+    rows = np.arange(count)
+    at = np.minimum(first, n - 2)
+    # Where the line through the first two samples of contact meets the force before it.
+    rise = (y[rows, at + 1] - y[rows, at]) / np.maximum(x[rows, at + 1] - x[rows, at], 1e-9)
+    back = x[rows, at] - (y[rows, at] - low) / np.maximum(rise, 1e-9)
+    corner = np.clip(back, x[rows, np.maximum(at - 1, 0)], x[rows, at])
+    return np.where(few | ~(missing > _OBVIOUS), np.nan, corner)
+
+
+def _by_fits(records: _Records) -> _Taken:
+    """What the least squares of a press with and without onset and offset say."""
+    count = len(records.x)
+    out = _nothing(count)
+    hard, soft = _starts(count, (0.0, 0.0))
+    bare, rss = _best(records, _SHAPE, hard)
+    n = records.x.shape[1]
+    poor = np.flatnonzero(rss > n)
+    if len(poor):
+        found, less = _best(records.take(poor), _SHAPE, bare[poor], soft[poor])
+        bare[poor], rss[poor] = found, less
+    hint = press_shape.fall(*records, bare, _columns((*_SHAPE, "onset", "force_offset")))
+    rows = np.flatnonzero((hint > _HINT) | (rss > _HINT + 2 * n))
+    if len(rows):
+        found = _told_apart(records.take(rows), bare[rows], rss[rows])
+        for whole, part in zip(out, found, strict=True):
+            whole[rows] = part
+    return out
+
+
+def _told_apart(records: _Records, bare, rss) -> _Taken:
+    """An onset, an offset or both, where they bring enough beside the best press without."""
+    x, y, _ = records
+    count, n = x.shape
+    touch = _change_points(records)
+    level, rise = _line_of_first(records, max(3, n // 8))
+    before = np.clip(x[:, 0] - np.maximum(level, 0) / np.maximum(rise, 0.05), -0.9, 0.5)
+    at_touch, at_before, at_level = bare.copy(), bare.copy(), bare.copy()
+    at_touch[:, 4], at_before[:, 4], at_level[:, 5] = touch, before, y[:, 0]
+    starts = bare, at_touch, at_before, *_starts(count, (touch, 0.0))
+    moved, rss_moved = _best(records, (*_SHAPE, "onset"), *starts)
+    raised, rss_raised = _best(records, (*_SHAPE, "force_offset"), bare, at_level)
+    starts = moved, raised, *_starts(count, (touch, level))
+    both, rss_both = _best(records, (*_SHAPE, "onset", "force_offset"), *starts)
+    unit = np.maximum(rss_both / max(n - 6, 1), 1)
+    by_onset, by_offset, by_both = ((rss - v) / unit for v in (rss_moved, rss_raised, rss_both))
+    single = np.maximum(by_onset, by_offset)
+    least = EVIDENCE * (1 + _FEW / n)
+    taken = (single > least) | (by_both > least + TOLD_APART)
+    together = by_both - single > least
+    alike = (y[:, 0] > 0) & (by_offset - by_onset < TOLD_APART)  # a tool that touches cannot pull
+    onset = taken & (together | (by_onset > by_offset) | alike)
+    offset = taken & (together | ~onset)
+    best = np.where(together[:, None], both, np.where(onset[:, None], moved, raised))
+    touch, level = np.where(onset, best[:, 4], 0), np.where(offset, best[:, 5], 0)
+    return _Taken(onset, offset, touch, level, onset | offset)
+
+
+def _columns(names) -> np.ndarray:
+    return np.array([name in names for name in press_shape.NAMES])
+
+
+def _starts(count: int, *zeros):
+    """Both shapes, with each of these onsets and offsets."""
+    for onset, offset in zeros:
+        for shape in _SHAPES:
+            start = np.zeros((count, len(press_shape.NAMES)))
+            start[:, :3], start[:, 4], start[:, 5] = shape, onset, offset
+            yield start
+
+
+def _best(records: _Records, names, *starts):
+    """Parameters and sum of squares of the best of several starts."""
+    found = [press_shape.fitted(*records, start, _columns(names)) for start in starts]
+    rss = np.stack([f.rss for f in found])
+    rows, best = np.arange(len(records.x)), np.argmin(rss, axis=0)
+    return np.stack([f.parameters for f in found])[best, rows], rss[best, rows]
+
+
+def _change_points(records: _Records) -> Float[np.ndarray, " C"]:
+    """Displacement from which on the force is above the noise for good."""
+    start = np.minimum(np.mean(records.y[:, :3], axis=1, keepdims=True), records.y[:, :1] + 0.02)
+    above = (records.y - start) * records.weight > 3
+    n = above.shape[1]
+    first = np.where(above.all(axis=1), 0, n - np.argmax(~above[:, ::-1], axis=1))
+    return records.x[np.arange(len(above)), np.clip(first - 1, 0, n - 4)]
