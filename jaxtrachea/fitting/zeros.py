@@ -138,7 +138,7 @@ def _sloping(curves: Sequence[Curve], zeros: Zeros) -> np.ndarray:
 
     A line is of the rig. Where it is clear once, curves that are too noisy to show it have it too.
     """
-    able = zeros.air >= LINE
+    able = (zeros.air >= LINE) & np.isfinite(zeros.slope)
     error = np.where(able, zeros.slope_error, 1.0)
     z = np.where(able, np.nan_to_num(zeros.slope) / error, 0.0)
     names = np.unique([c.specimen for c in curves], return_inverse=True)[1].reshape(-1)

@@ -34,6 +34,8 @@ _OBVIOUS = 6.0
 _FEWEST, _MEANS = 6, 48
 #: Standard deviations by which the force may rise within the air, and noise at least for that.
 _RISING, _ROUNDING = 6.0, 1e-5
+#: Share of the record that a line needs, and of the mean stiffness that it has at most.
+_LONG, _FLAT = 0.04, 0.2
 #: Noise at least, share of the largest force: no model of a press is meant to be closer.
 _LEAST_NOISE = 5e-4
 #: Part of the air before the corner that is left out of its mean and line.
@@ -59,7 +61,8 @@ class Zeros(NamedTuple):
         force_slope: whether the force before the touch lies on a sloping line.
         touch: displacement at first touch; of a record that begins under load, a guess before it.
         offset: force without contact at displacement 0; 0 where it is not taken.
-        slope: of the force before the touch, N/mm; NaN with fewer than `LINE` samples there.
+        slope: of the force before the touch, N/mm; NaN where they are fewer than `LINE`, lie
+            close together, or rise as a press does.
         slope_error: its standard error.
         air: samples before first touch.
         first: force of the first sample.
@@ -152,21 +155,23 @@ def _of_equal_length(D, F, given) -> Zeros:
     weight = np.sqrt(held) * (peak / noise)[:, None]
     taken = _decided(_Records(x / span[:, None], y / peak[:, None], weight), usable)
     touch, level = taken.touch * span, taken.level * peak
-    air = _air(D, F, noise, touch)
+    air = _air(D, F, noise, touch, peak / span)
     rises = air.rise > _RISING * np.maximum(measured, _ROUNDING * peak)
     rises |= taken.missed & (touch > D[:, 0]) & (air.count < LINE)
+    rises |= (touch <= D[:, 0]) & (F[:, 0] < _SHOWN * noise)  # nor a load where there is none
     rises &= taken.onset
-    for v in (taken.onset, taken.offset, touch, level):  # no air where the force rises in it
+    for v in (taken.onset, taken.offset, touch, level):  # no air where the force rises
         v[rises] = 0
-    air = _air(D, F, noise, touch)
+    air = _air(D, F, noise, touch, peak / span)
     clear = (air.count >= 2) & (np.abs(air.mean) > CLEAR * air.mean_error)
     offset = taken.offset | clear & ~taken.fitted
-    sloping = (np.abs(air.slope) > CLEAR * air.slope_error) & ~taken.fitted
+    sloping = (np.abs(air.slope) > CLEAR * air.slope_error) & ~taken.fitted & air.fit_for_line
     level = np.where(sloping, air.at_zero, np.where(air.count >= 2, air.mean, level))
     offset = (offset | sloping) & usable
     return Zeros(
         onset=taken.onset, force_offset=offset, force_slope=sloping & usable,
-        touch=touch, offset=np.where(offset, level, 0.0), slope=air.slope,
+        touch=touch, offset=np.where(offset, level, 0.0),
+        slope=np.where(air.fit_for_line, air.slope, np.nan),
         slope_error=air.slope_error, air=air.count, first=F[:, 0], noise=noise,
     )  # fmt: skip
 
@@ -196,7 +201,8 @@ def _noise(D, F) -> Float[np.ndarray, " C"]:
 class _Air(NamedTuple):
     """Force before first touch: samples, mean and line; errors inf or NaN with too few.
 
-    `rise`: from the first half to the second, over what a unit of noise gives.
+    `rise`: from the first half to the second, over what a unit of noise gives. `fit_for_line`: long
+    enough for a line through the whole record, and so flat that it is none of the press itself.
     """
 
     count: Int[np.ndarray, " C"]
@@ -206,9 +212,10 @@ class _Air(NamedTuple):
     slope_error: Float[np.ndarray, " C"]
     at_zero: Float[np.ndarray, " C"]
     rise: Float[np.ndarray, " C"]
+    fit_for_line: Bool[np.ndarray, " C"]
 
 
-def _air(D, F, noise, touch) -> _Air:
+def _air(D, F, noise, touch, stiffness) -> _Air:
     end = touch - _MARGIN * np.maximum(touch - D[:, 0], 0)
     there = (D < end[:, None]) & (np.arange(D.shape[1]) < D.shape[1] - 3)
     count = there.sum(axis=1)
@@ -227,7 +234,8 @@ def _air(D, F, noise, touch) -> _Air:
     rise = np.sum(F, axis=1, where=there & ~early) / np.maximum(b, 1)
     rise = rise - np.sum(F, axis=1, where=early) / np.maximum(a, 1)
     rise = np.where(count >= LINE, rise / np.sqrt(1 / np.maximum(a, 1) + 1 / np.maximum(b, 1)), 0)
-    return _Air(count, mean, mean_error, line, error, mean - slope * middle, rise)
+    able = (end - D[:, 0] > _LONG * (D[:, -1] - D[:, 0])) & (np.abs(slope) < _FLAT * stiffness)
+    return _Air(count, mean, mean_error, line, error, mean - slope * middle, rise, able)
 
 
 def _decided(records: _Records, usable) -> _Taken:
