@@ -120,7 +120,7 @@ def check(options: CheckOptions) -> None:
     for line in understood(loaded, study):
         out.print(escape(line), highlight=False)
     if study.free:
-        out.print(_parameter_table(study.parameters, study.model.options))
+        out.print(_parameter_table(study))
     fixed = ", ".join(f"{p.name} = {p.value:g} {p.unit}" for p in study.parameters if p.fixed)
     out.print(f"Fixed: {fixed or 'none'}", highlight=False)
     lanes, bad = len(study.curves), len(measurements.bad)
@@ -241,12 +241,17 @@ def _curve_table(curves):
     return table(f"{len(curves)} usable curves", head, rows, ("vectors",))
 
 
-def _parameter_table(parameters, options):
+def _parameter_table(study):
+    """Free parameters; of those that are `auto`, how many curves have one."""
     from jaxtrachea.fitting.onset import where_sought
 
     head = ["free parameter", "what", "initial", "bounds", "scale", "scope"]
+    own = study.lanes.index >= 0
+    curves = sum(map(len, study.curves))
     rows = [
-        [f"{p.name} [{p.unit}]", p.description, *where_sought(p, parameters, options),
-         p.scale, p.scope] for p in parameters if not p.fixed
+        [f"{p.name} [{p.unit}]", p.description,
+         *where_sought(p, study.parameters, study.model.options), p.scale,
+         f"{p.scope}, {own[:, :, j].sum()} of {curves}" if p.auto else p.scope]
+        for j, p in enumerate(study.parameters) if not p.fixed
     ]  # fmt: skip
     return table("Free parameters", head, rows)

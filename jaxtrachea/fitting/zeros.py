@@ -52,6 +52,8 @@ def resolved(
     Raises:
         InputError: a line is asked for and a curve has too few samples before first touch.
     """
+    # A row that is free already, as in the table of another study, is so for every curve.
+    parameters = [p if p.fixed else dataclasses.replace(p, auto=False) for p in parameters]
     table = _with_line(parameters, options)
     wanted = any(p.name == "force_slope" and not p.fixed for p in table)
     looked = options.contact == "unilateral" and any(p.auto and p.fixed for p in table)
@@ -68,7 +70,7 @@ def resolved(
     if onset is not None and onset.fixed and not onset.auto:  # then what looks like one is another
         shown["force_offset"] = zeros.force_offset | (zeros.onset & (zeros.air == 0))
     shown["force_slope"] = _sloping(curves, zeros)
-    shown["force_offset"] = shown["force_offset"] | shown["force_slope"]
+    shown["force_offset"] = shown["force_offset"] | (wanted | shown["force_slope"])
     taken: dict[tuple[str, str], set[str]] = {(c.specimen, c.trial): set() for c in curves}
     out = []
     for p in table:
@@ -115,13 +117,13 @@ def _place(curve: Curve) -> str:
 
 
 def _with_line(parameters: Sequence[Parameter], options: Options) -> tuple[Parameter, ...]:
-    """The table with a row for the line, where one may be taken: not of a known force offset."""
+    """The table with a row for the line, where one may be taken: where the force offset may."""
     table = tuple(parameters)
     named = any(p.name == "force_slope" for p in table)
     offset = next((p for p in table if p.name == "force_offset"), None)
     if named or options.contact != "unilateral" or offset is None:
         return table
-    return (*table, DEFAULTS["force_slope"]) if offset.auto or not offset.fixed else table
+    return (*table, DEFAULTS["force_slope"]) if offset.auto else table
 
 
 def _without_idle_line(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
@@ -136,7 +138,7 @@ def _sloping(curves: Sequence[Curve], zeros: Zeros) -> np.ndarray:
 
     A line is of the rig. Where it is clear once, curves that are too noisy to show it have it too.
     """
-    able = zeros.air >= LINE
+    able = (zeros.air >= LINE) & np.isfinite(zeros.slope)
     error = np.where(able, zeros.slope_error, 1.0)
     z = np.where(able, np.nan_to_num(zeros.slope) / error, 0.0)
     names = np.unique([c.specimen for c in curves], return_inverse=True)[1].reshape(-1)

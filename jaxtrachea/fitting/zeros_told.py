@@ -140,7 +140,7 @@ def _against(name: str, curves: Sequence[Curve], zeros: Zeros) -> list[str]:
     value, unit = (zeros.touch, "mm") if name == "onset" else (zeros.offset, "N")
     if name == "force_slope":
         value, unit = zeros.slope, "N/mm"
-    others = f" and of {len(against) - 1} more curves" if len(against) > 1 else ""
+    others = f" (and so do {len(against) - 1} others)" if len(against) > 1 else ""
     return [
         f"{name} is held at 0, where the record of {curves[k].specimen} {curves[k].trial} shows "
         f"{value[k]:.3g} {unit}{others}: leave parameters.{name} out"

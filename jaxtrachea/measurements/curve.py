@@ -107,7 +107,7 @@ class BadCurve:
         kind: short code: "empty", "too_few_points", "unparsable", "ragged", "column_missing",
             "ambiguous", "unit_missing", "unit_unknown", "shape", "non_finite", "bad_sigma",
             "position", "direction", "absurd_scale", "time", "non_monotone", "no_signal", "sign",
-            "metadata_missing", "unreadable".
+            "metadata_missing", "unreadable", "baseline".
         message: one line: file, place, what was found and what expected.
         cure: one line.
     """

@@ -24,10 +24,18 @@ EVIDENCE, TOLD_APART = 16.0, 9.0
 CLEAR = 4.0
 #: Samples before the touch at least for a line.
 LINE = 5
+#: Mean square residual, in variances of the noise, from which fits say nothing of a short air.
+_MISSED = 3.0
+#: Standard deviations of the force where a record begins that preload and offset need.
+_SHOWN = 2.5
 #: Standard deviations from which no fit is needed to see it.
 _OBVIOUS = 6.0
 #: Samples of a record at least, and means of neighbouring samples that it becomes at most.
 _FEWEST, _MEANS = 6, 48
+#: Standard deviations by which the force may rise within the air, and noise at least for that.
+_RISING, _ROUNDING = 6.0, 1e-5
+#: Share of the record that a line needs, and of the mean stiffness that it has at most.
+_LONG, _FLAT = 0.04, 0.2
 #: Noise at least, share of the largest force: no model of a press is meant to be closer.
 _LEAST_NOISE = 5e-4
 #: Part of the air before the corner that is left out of its mean and line.
@@ -53,7 +61,8 @@ class Zeros(NamedTuple):
         force_slope: whether the force before the touch lies on a sloping line.
         touch: displacement at first touch; of a record that begins under load, a guess before it.
         offset: force without contact at displacement 0; 0 where it is not taken.
-        slope: of the force before the touch, N/mm; NaN with fewer than `LINE` samples there.
+        slope: of the force before the touch, N/mm; NaN where they are fewer than `LINE`, lie
+            close together, or rise as a press does.
         slope_error: its standard error.
         air: samples before first touch.
         first: force of the first sample.
@@ -119,13 +128,17 @@ class _Records(NamedTuple):
 
 
 class _Taken(NamedTuple):
-    """Which zeros C records take, and where, in shares of the record; `fitted`: whose by fits."""
+    """Which zeros C records take, and where, in shares of the record; `fitted`: whose by fits.
+
+    `missed`: of which no fit comes close to the record.
+    """
 
     onset: Bool[np.ndarray, " C"]
     offset: Bool[np.ndarray, " C"]
     touch: Float[np.ndarray, " C"]
     level: Float[np.ndarray, " C"]
     fitted: Bool[np.ndarray, " C"]
+    missed: Bool[np.ndarray, " C"]
 
 
 def _of_equal_length(D, F, given) -> Zeros:
@@ -134,23 +147,31 @@ def _of_equal_length(D, F, given) -> Zeros:
     span, peak = D[:, -1] - D[:, 0], np.max(np.abs(F), axis=1)
     usable = (span > 0) & (peak > 0)
     span, peak = np.where(usable, span, 1.0), np.where(usable, peak, 1.0)
-    noise = np.where(np.isnan(given), _noise(D, F), given)
-    noise = np.maximum(noise, _LEAST_NOISE * peak)
+    measured = np.where(np.isnan(given), _noise(D, F), given)
+    noise = np.maximum(measured, _LEAST_NOISE * peak)
     ends = np.linspace(0, D.shape[1], min(D.shape[1], _MEANS) + 1).astype(int)
     held = np.diff(ends)
     x, y = (np.add.reduceat(v, ends[:-1], axis=1) / held for v in (D, F))
     weight = np.sqrt(held) * (peak / noise)[:, None]
     taken = _decided(_Records(x / span[:, None], y / peak[:, None], weight), usable)
     touch, level = taken.touch * span, taken.level * peak
-    air = _air(D, F, noise, touch)
+    air = _air(D, F, noise, touch, peak / span)
+    rises = air.rise > _RISING * np.maximum(measured, _ROUNDING * peak)
+    rises |= taken.missed & (touch > D[:, 0]) & (air.count < LINE)
+    rises |= (touch <= D[:, 0]) & (F[:, 0] < _SHOWN * noise)  # nor a load where there is none
+    rises &= taken.onset
+    for v in (taken.onset, taken.offset, touch, level):  # no air where the force rises
+        v[rises] = 0
+    air = _air(D, F, noise, touch, peak / span)
     clear = (air.count >= 2) & (np.abs(air.mean) > CLEAR * air.mean_error)
     offset = taken.offset | clear & ~taken.fitted
-    sloping = (np.abs(air.slope) > CLEAR * air.slope_error) & ~taken.fitted
+    sloping = (np.abs(air.slope) > CLEAR * air.slope_error) & ~taken.fitted & air.fit_for_line
     level = np.where(sloping, air.at_zero, np.where(air.count >= 2, air.mean, level))
     offset = (offset | sloping) & usable
     return Zeros(
         onset=taken.onset, force_offset=offset, force_slope=sloping & usable,
-        touch=touch, offset=np.where(offset, level, 0.0), slope=air.slope,
+        touch=touch, offset=np.where(offset, level, 0.0),
+        slope=np.where(air.fit_for_line, air.slope, np.nan),
         slope_error=air.slope_error, air=air.count, first=F[:, 0], noise=noise,
     )  # fmt: skip
 
@@ -178,7 +199,11 @@ def _noise(D, F) -> Float[np.ndarray, " C"]:
 
 
 class _Air(NamedTuple):
-    """Force before first touch: samples, mean and line; errors inf with too few."""
+    """Force before first touch: samples, mean and line; errors inf or NaN with too few.
+
+    `rise`: from the first half to the second, over what a unit of noise gives. `fit_for_line`: long
+    enough for a line through the whole record, and so flat that it is none of the press itself.
+    """
 
     count: Int[np.ndarray, " C"]
     mean: Float[np.ndarray, " C"]
@@ -186,9 +211,11 @@ class _Air(NamedTuple):
     slope: Float[np.ndarray, " C"]
     slope_error: Float[np.ndarray, " C"]
     at_zero: Float[np.ndarray, " C"]
+    rise: Float[np.ndarray, " C"]
+    fit_for_line: Bool[np.ndarray, " C"]
 
 
-def _air(D, F, noise, touch) -> _Air:
+def _air(D, F, noise, touch, stiffness) -> _Air:
     end = touch - _MARGIN * np.maximum(touch - D[:, 0], 0)
     there = (D < end[:, None]) & (np.arange(D.shape[1]) < D.shape[1] - 3)
     count = there.sum(axis=1)
@@ -202,7 +229,13 @@ def _air(D, F, noise, touch) -> _Air:
     line = np.where(enough, slope, np.nan)
     error = np.where(enough, noise / np.sqrt(np.where(enough, square, 1)), np.nan)
     mean_error = np.where(count > 0, noise / np.sqrt(n), np.inf)
-    return _Air(count, mean, mean_error, line, error, mean - slope * middle)
+    early = there & (np.cumsum(there, axis=1) <= count[:, None] // 2)
+    a, b = early.sum(axis=1), count - early.sum(axis=1)
+    rise = np.sum(F, axis=1, where=there & ~early) / np.maximum(b, 1)
+    rise = rise - np.sum(F, axis=1, where=early) / np.maximum(a, 1)
+    rise = np.where(count >= LINE, rise / np.sqrt(1 / np.maximum(a, 1) + 1 / np.maximum(b, 1)), 0)
+    able = (end - D[:, 0] > _LONG * (D[:, -1] - D[:, 0])) & (np.abs(slope) < _FLAT * stiffness)
+    return _Air(count, mean, mean_error, line, error, mean - slope * middle, rise, able)
 
 
 def _decided(records: _Records, usable) -> _Taken:
@@ -223,7 +256,7 @@ def _decided(records: _Records, usable) -> _Taken:
 
 def _nothing(count: int) -> _Taken:
     none, zero = np.zeros(count, bool), np.zeros(count)
-    return _Taken(none, none.copy(), zero, zero.copy(), none.copy())
+    return _Taken(none, none.copy(), zero, zero.copy(), none.copy(), none.copy())
 
 
 def _line_of_first(records: _Records, count: int):
@@ -309,7 +342,7 @@ def _by_fits(records: _Records) -> _Taken:
 
 def _told_apart(records: _Records, bare, rss) -> _Taken:
     """An onset, an offset or both, where they bring enough beside the best press without."""
-    x, y, _ = records
+    x, y, weight = records
     count, n = x.shape
     touch = _change_points(records)
     level, rise = _line_of_first(records, max(3, n // 8))
@@ -327,12 +360,16 @@ def _told_apart(records: _Records, bare, rss) -> _Taken:
     least = EVIDENCE * (1 + _FEW / n)
     taken = (single > least) | (by_both > least + TOLD_APART)
     together = by_both - single > least
+    # Nothing before the record without a force where it begins.
+    shown = np.abs(level - rise * x[:, 0]) * weight[:, 0] > _SHOWN
+    taken &= shown | (np.where(together, both[:, 4], moved[:, 4]) > x[:, 0])
     alike = (y[:, 0] > 0) & (by_offset - by_onset < TOLD_APART)  # a tool that touches cannot pull
     onset = taken & (together | (by_onset > by_offset) | alike)
     offset = taken & (together | ~onset)
     best = np.where(together[:, None], both, np.where(onset[:, None], moved, raised))
     touch, level = np.where(onset, best[:, 4], 0), np.where(offset, best[:, 5], 0)
-    return _Taken(onset, offset, touch, level, onset | offset)
+    missed = rss_both > _MISSED * max(n - 6, 1)
+    return _Taken(onset, offset, touch, level, onset | offset, missed)
 
 
 def _columns(names) -> np.ndarray:

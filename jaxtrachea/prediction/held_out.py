@@ -242,7 +242,9 @@ def _own_study(stored: StoredFit, own, members) -> Study:
     known = np.stack([_values(stored, source) for source, _, _ in members])
     # The values serve where starts are sought; what is kept has that of its curve, below.
     table = [
-        p if p.name in names else dataclasses.replace(p, fixed=True, value=float(value))
+        dataclasses.replace(p, auto=False)
+        if p.name in names
+        else dataclasses.replace(p, fixed=True, auto=False, value=float(value))
         for p, value in zip(study.parameters, np.median(known, axis=0), strict=True)
     ]
     curves = [_apart(c, i, s) for i, (_, c, s) in enumerate(members)]

@@ -1,0 +1,92 @@
+"""First touch, force offset and line that records show, against records of a beam of its own."""
+
+import numpy as np
+import pytest
+from records import clean, force, recorded
+
+from jaxtrachea.measurements import press_shape
+from jaxtrachea.measurements.record_zeros import record_zeros
+
+
+def test_shape_is_the_series_law_and_differentiates():
+    """Against Newton steps on the law; the derivatives against differences."""
+    x = np.linspace(0, 1, 41)[None]
+    span, peak, k_1, k_3, c = 5.0, 4.0, 2.0, 3.0, 0.9
+    logs = np.log([k_1 * span / peak, k_3 * span**3 / peak, c * peak / span])
+    theta = np.array([[*logs, 0.0, 0.0, 0.0, 0.0]])
+    got, _ = press_shape._shape(x, theta, None)
+    np.testing.assert_allclose(peak * got[0], force(span * x[0], c, k_1, k_3), atol=1e-10)
+    theta = np.array([[0.1, 1.0, -1.0, 0.1, 0.11, 0.05, -0.02]])
+    _, J = press_shape._shape(x, theta, np.arange(7))
+    for i, step in enumerate(1e-6 * np.eye(7)):
+        up, down = (press_shape._shape(x, theta + s, None)[0] for s in (step, -step))
+        np.testing.assert_allclose(J[..., i], (up - down) / 2e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("samples", [10, 20, 60])
+@pytest.mark.parametrize("soft", [False, True])
+def test_records_from_first_touch_on_take_nothing(samples, soft):
+    """At most 2 % of them, noise 0.2 to 5 % of the peak; seeds of no threshold's choice."""
+    rng, wrong, count = np.random.default_rng(1000 + samples + soft), 0, 0
+    for first in (0.0, 0.15):
+        zeros = record_zeros(*clean(rng, 100, samples, soft=soft, first=first))
+        wrong += np.sum(zeros.onset | zeros.force_offset | zeros.force_slope)
+        count += 100
+    assert wrong <= 0.02 * count
+    exact = record_zeros(*clean(rng, 20, samples, soft=soft, noise=(1e-12, 1e-11)))
+    assert not (exact.onset | exact.force_offset).any()
+
+
+@pytest.mark.parametrize(
+    ("fault", "onset", "offset"),
+    [
+        ({"air": 0.6}, 0.6, 0.0),
+        ({"air": 0.1}, 0.1, 0.0),
+        ({"preload": 0.15}, None, 0.0),
+        ({"offset": 0.05}, None, 0.0),  # taken for a preload: the record cannot tell
+        ({"offset": -0.05}, 0.0, -0.05),  # no preload pulls
+        ({"offset": 0.05, "k_1": 0.1, "k_3": 2.0}, 0.0, 0.05),  # here it can
+        ({"air": 0.6, "offset": 0.05}, 0.6, 0.05),
+        ({"air": 0.6, "k_1": 0.3, "k_3": 5.0}, 0.6, 0.0),
+    ],
+)
+def test_faults_are_shown(fault, onset, offset):
+    """Nine of ten records at least; where first touch is by a tenth of a millimetre."""
+    _, D, F = recorded(np.random.default_rng(2000), 8, **fault)
+    zeros = record_zeros(D, F)
+    assert np.mean(zeros.onset == (onset != 0)) >= 0.9
+    assert np.mean(zeros.force_offset == (offset != 0)) >= 0.75
+    if onset is None:
+        assert (zeros.touch < 0).all()
+    else:
+        np.testing.assert_allclose(np.median(zeros.touch), onset, atol=0.12)
+    np.testing.assert_allclose(np.median(zeros.offset), offset, atol=0.01)
+
+
+def test_lines_are_shown_where_there_is_air():
+    """-0.05 N/mm over 6 samples is 5 standard errors; without air nobody can tell."""
+    rng = np.random.default_rng(2001)
+    zeros = record_zeros(*recorded(rng, 10, air=0.6, slope=-0.05)[1:])
+    assert zeros.force_slope.mean() > 0.3
+    np.testing.assert_allclose(np.median(zeros.slope), -0.05, atol=0.01)
+    assert np.median(zeros.slope_error) == pytest.approx(0.012, rel=0.3)
+    zeros = record_zeros(*recorded(rng, 10, slope=-0.05)[1:])
+    assert not zeros.force_slope.any()
+    assert np.isnan(zeros.slope).all()
+
+
+def test_records_that_no_press_explains_are_left_alone():
+    """Hardening with the seventh power is no air: its force rises from the beginning, if little."""
+    rng = np.random.default_rng(2002)
+    D = [np.linspace(0, 20, 400)] * 20
+    F = [d + 400 * (d / 20) ** 7 + 0.02 * rng.normal(size=400) for d in D]
+    assert not record_zeros(D, F).onset.any()
+
+
+def test_few_samples_and_given_noise():
+    """Fewer than 6 samples say nothing; a given noise counts in place of a measured one."""
+    D = [np.linspace(0, 1, 5)]
+    assert not record_zeros(D, [np.array([1.0, 2, 3, 4, 5])]).onset.any()
+    _, D, F = recorded(np.random.default_rng(3), 1, preload=0.05)
+    assert record_zeros(D, F).onset.all()
+    assert not record_zeros(D, F, np.full(len(D), 0.1)).onset.any()
