@@ -10,6 +10,7 @@ from jaxtrachea.inference.labels import lane_label, succeeded, verdict_sentence
 from jaxtrachea.inference.rows import and_more, listed
 from jaxtrachea.measurements.usage_tables import sentences
 from jaxtrachea.report import tables
+from jaxtrachea.trials.repeats import trial_sentences
 
 
 def overview(findings: Findings) -> Iterator[Table | str]:
@@ -46,5 +47,6 @@ def overview(findings: Findings) -> Iterator[Table | str]:
         good = sum(succeeded(result, lane) for lane in range(result.lanes))
         yield f"{good} of {result.lanes} lanes succeeded"
     curves = [c for lane in result.study.curves for c in lane]
-    for sentence in sentences(curves, weighed=result.study.weighs_noise):
+    more = trial_sentences(curves, weighed=result.study.weighs_noise)
+    for sentence in [*sentences(curves), *more]:
         yield f"{sentence} (curves.csv)"

@@ -1,6 +1,6 @@
 """Trials at one position that differ by more than their noise: many positions at once.
 
-They are compared over the displacements that all have (`trial_fits`). Trials with air before the
+They are compared over the displacements that all have (`polynomials`). Trials with air before the
 touch are moved to where they are most alike.
 """
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.measurements.curve import Curve
-from jaxtrachea.measurements.trial_fits import Stack, compare
+from jaxtrachea.trials.polynomials import Stack, compare
 
 #: Halves of what may be air, as shares of the travel, and the share of its force that a trial gains
 #: in air from one to the other at most; share of the force from which trials from air are compared;
@@ -40,7 +40,7 @@ class Difference(NamedTuple):
 
 
 def differing_trials(curves: Sequence[Curve]) -> list[Difference]:
-    """Positions whose trials differ by more than `trial_fits.DIFFERS` and more than their noise.
+    """Positions whose trials differ by more than `polynomials.DIFFERS` and more than their noise.
 
     Args:
         curves: of any number of specimens and positions; those alone at theirs are passed over.
