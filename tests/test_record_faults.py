@@ -8,9 +8,9 @@ from jaxtrachea.fitting.curve_noise import weighed_by_curve
 from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.measurements.curve import Curve, RawCurve, ReadOptions
 from jaxtrachea.measurements.read import DataError, read_measurements
-from jaxtrachea.measurements.repeats import repeat_sentences
 from jaxtrachea.measurements.together import finish_all
-from jaxtrachea.measurements.uneven_noise import uneven_noise
+from jaxtrachea.trials.repeats import repeat_sentences
+from jaxtrachea.trials.uneven_noise import uneven_noise
 
 D = np.linspace(0, 2, 200)
 UP_DOWN = np.r_[D, D[::-1]]

@@ -210,13 +210,14 @@ def _print_curves(out: Console, curves, weighed: bool = False) -> None:
 def _print_usage(out: Console, curves, weighed: bool) -> None:
     """What is used of the curves that are not used whole, and what is doubtful about them."""
     from jaxtrachea.measurements.usage_tables import sentences, usage_lines
+    from jaxtrachea.trials.repeats import trial_sentences
 
     told = [c for c in curves if usage_lines([c])]
     for line in usage_lines(told[:MANY]):
         out.print(escape(line), highlight=False)
     if len(told) > MANY:
         out.print(f"... and {len(told) - MANY} more curves not used whole; a fit lists all")
-    for sentence in sentences(curves, weighed=weighed):
+    for sentence in [*sentences(curves), *trial_sentences(curves, weighed=weighed)]:
         out.print(escape(f"{sentence[:1].upper()}{sentence[1:]}."), highlight=False)
 
 

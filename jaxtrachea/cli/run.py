@@ -54,6 +54,7 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.report.understood import understood
     from jaxtrachea.results.hdf5 import write_hdf5
     from jaxtrachea.results.rows import parameter_rows, summary_rows
+    from jaxtrachea.trials.repeats import trial_sentences
 
     write_csv(folder / "summary.csv", summary_rows(findings, measurements.bad))
     write_csv(folder / "parameters.csv", list(parameter_rows(findings)))
@@ -65,9 +66,9 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     drawn, lost = draw_all(folder, findings)
     say_lost(lost)
     title = loaded.title or spec.stem
-    used = usage_section(
-        measurements.curves, measurements.notes, weighed=findings.result.study.weighs_noise
-    )
+    curves = measurements.curves
+    more = trial_sentences(curves, weighed=findings.result.study.weighs_noise)
+    used = usage_section(curves, measurements.notes, more)
     lines = understood(loaded, findings.result.study)
     text = without_lost(report_text(title, findings, measurements.bad, used, lines), lost)
     write_text(folder / "report.md", text)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.lane import FORCES, Lane
 from jaxtrachea.measurements.read import Curve
-from jaxtrachea.measurements.uneven_noise import noise_to_weigh
+from jaxtrachea.trials.uneven_noise import noise_to_weigh
 
 
 def weighed_by_curve(lanes: Lane, groups: Sequence[Sequence[Curve]], *, joint: bool) -> Lane:

@@ -37,7 +37,7 @@ class Noise:
         joints_share: of the tool's displacement from first touch, which `joints` has beside it
             (root of the sum of the squares): what a model errs in markers grows with the press.
         force_by_curve: weigh the forces of each curve by its own noise, found from neighbouring
-            samples (`measurements.uneven_noise.noise_to_weigh`); how large it is, is estimated.
+            samples (`trials.uneven_noise.noise_to_weigh`); how large it is, is estimated.
     """
 
     force: float | None = None

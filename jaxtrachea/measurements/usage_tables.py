@@ -5,8 +5,6 @@ from collections.abc import Iterator, Sequence
 from hashlib import sha256
 
 from jaxtrachea.measurements.read import Curve
-from jaxtrachea.measurements.repeats import repeat_sentences
-from jaxtrachea.measurements.uneven_noise import uneven_noise
 from jaxtrachea.measurements.usage import CAUSES
 
 #: Share of left-out samples from which a fit says so.
@@ -76,20 +74,9 @@ def usage_lines(curves: Sequence[Curve]) -> list[str]:
     return lines
 
 
-def sentences(curves: Sequence[Curve], *, weighed: bool = False) -> list[str]:
-    """What a fit says of its curves: those cut, remarks by kind, trials that differ, twins.
-
-    Args:
-        curves: as they are used.
-        weighed: whether each counts by its own noise, so that noise that differs is no matter.
-    """
-    return [
-        *_cut(curves),
-        *_remarked(curves),
-        *repeat_sentences(curves),
-        *(() if weighed else uneven_noise(curves)),
-        *same_curves(curves),
-    ]
+def sentences(curves: Sequence[Curve]) -> list[str]:
+    """What a fit says of its curves: those cut, remarks by kind, and the same curve twice."""
+    return [*_cut(curves), *_remarked(curves), *same_curves(curves)]
 
 
 def _cut(curves: Sequence[Curve]) -> Iterator[str]:
@@ -148,18 +135,16 @@ def _listed(curves: Sequence[Curve]) -> str:
 
 
 def usage_section(
-    curves: Sequence[Curve], notes: Sequence[str] = (), *, weighed: bool = False
+    curves: Sequence[Curve], notes: Sequence[str] = (), more: Sequence[str] = ()
 ) -> list[str]:
     """The section of the report, if there is anything to say.
 
     Args:
         curves: as they are used.
         notes: what else should be known of how they were read, a sentence each.
-        weighed: see `sentences`.
+        more: further sentences on the curves.
     """
-    said = [
-        f"{sentence[:1].upper()}{sentence[1:]}" for sentence in sentences(curves, weighed=weighed)
-    ]
+    said = [f"{text[:1].upper()}{text[1:]}" for text in (*sentences(curves), *more)]
     said += notes  # which may begin with the name of a file
     if not said:
         return []

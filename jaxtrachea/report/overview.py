@@ -7,6 +7,7 @@ from jaxtrachea.inference.labels import lane_label, outcome, verdict_sentence
 from jaxtrachea.inference.rows import and_more, listed
 from jaxtrachea.measurements.usage_tables import sentences
 from jaxtrachea.report import tables
+from jaxtrachea.trials.repeats import trial_sentences
 
 
 def overview(findings: Findings) -> Iterator[Table | str]:
@@ -40,5 +41,6 @@ def overview(findings: Findings) -> Iterator[Table | str]:
     if cut and result.study.free:
         yield outcome(result, profiles)
     curves = [c for lane in result.study.curves for c in lane]
-    for sentence in sentences(curves, weighed=result.study.weighs_noise):
+    more = trial_sentences(curves, weighed=result.study.weighs_noise)
+    for sentence in [*sentences(curves), *more]:
         yield f"{sentence} (curves.csv)"

@@ -74,7 +74,8 @@ def positions_elsewhere(geometry: Geometry, curves: Sequence[Curve]) -> list[str
     steps, usual = np.diff(s) / pitch, float(np.median(np.diff(x))) if x.size > 1 else np.inf
     on_grid = s.size > 2 and np.all(np.abs(steps - np.round(steps)) < _ON_GRID)
     halves = 2 * pitch / usual
-    if on_grid and pitch > 0.25 * usual and abs(halves - round(halves)) > _ON_GRID:
+    near = 0.25 * usual < pitch < 2 * usual  # wider steps are chosen for the length of the tube
+    if on_grid and near and abs(halves - round(halves)) > _ON_GRID:
         found.append(f"positions are {pitch:.4g} mm apart, its rings {usual:.4g} mm")
     if found:
         found[-1] += ": give [trachea] length and rings, or preset = 'table-1' if this is the tube"

@@ -1,6 +1,6 @@
 """Trials at one position that differ by more than their noise: many positions at once.
 
-They are compared over the displacements that all have (`trial_fits`). Trials with air before the
+They are compared over the displacements that all have (`polynomials`). Trials with air before the
 touch are moved to where they are most alike.
 """
 
@@ -11,12 +11,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxtrachea.measurements.curve import Curve
-from jaxtrachea.measurements.trial_fits import Stack, compare
+from jaxtrachea.trials.polynomials import Stack, compare
 
 #: Halves of what may be air, as shares of the travel, and the share of its force that a trial gains
 #: in air from one to the other at most; share of the force from which trials from air are compared;
 #: rounds of moving them.
 _AIR, _RISES, _LEVEL, _MOVES = 0.05, 0.01, 0.06, 4
+#: Samples of a trial in air from which its touch is known well enough to say that trials differ.
+_FEWEST = 40
 #: Samples that are looked at together.
 _BLOCK = 2**18
 
@@ -38,7 +40,7 @@ class Difference(NamedTuple):
 
 
 def differing_trials(curves: Sequence[Curve]) -> list[Difference]:
-    """Positions whose trials differ by more than `trial_fits.DIFFERS` and more than their noise.
+    """Positions whose trials differ by more than `polynomials.DIFFERS` and more than their noise.
 
     Args:
         curves: of any number of specimens and positions; those alone at theirs are passed over.
@@ -59,12 +61,14 @@ def differing_trials(curves: Sequence[Curve]) -> list[Difference]:
             continue
         odd = [block[k] for k in which.tolist()]
         raw = compare(stack := Stack.of(odd))
-        moved = compare(_from_touch(stack, raw.noise * raw.peak))
+        stack, in_air = _from_touch(stack, raw.noise * raw.peak)
+        moved = compare(stack)
+        few = np.array([min(c.force.size for c in g) < _FEWEST for g in odd])
         # What a factor explains better than a shift is no air of another length.
         scaled = raw.scaled < np.maximum(moved.apart, 1)
         for k in range(len(odd)):
             seen = raw if scaled[k] else moved
-            if seen.differs[k]:
+            if seen.differs[k] and not (in_air[k] and few[k]):
                 numbers = float(seen.share[k]), float(seen.noise[k]), seen.force[k]
                 found.append(Difference(tuple(odd[k]), *numbers))
     return sorted(found, key=lambda d: -d.share)
@@ -83,7 +87,7 @@ def _blocks(groups: Sequence[list[Curve]]) -> Iterator[list[list[Curve]]]:
         yield picked
 
 
-def _from_touch(stack: Stack, noise: np.ndarray) -> Stack:
+def _from_touch(stack: Stack, noise: np.ndarray) -> tuple[Stack, np.ndarray]:
     """Trials that begin in air, moved to where they are most alike; others stay as they are.
 
     A trial begins in air, or as softly, where its force hardly grows over the first tenth of its
@@ -92,6 +96,9 @@ def _from_touch(stack: Stack, noise: np.ndarray) -> Stack:
     Args:
         stack: the trials.
         noise: (G,) N, of a sample.
+
+    Returns:
+        The trials, and which groups have some in air.
     """
     starts, first = stack.starts, stack.first
     low = np.minimum.reduceat(stack.displacement, starts)
@@ -108,7 +115,7 @@ def _from_touch(stack: Stack, noise: np.ndarray) -> Stack:
     air = (rise < _RISES * top + 2 * error) & stack.by_trial(surely)
     in_air = np.logical_or.reduceat(air, first)
     if not in_air.any():
-        return stack
+        return stack, in_air
     lowest = np.minimum.reduceat(top, first)
     level = stack.by_trial(np.minimum(np.maximum(_LEVEL * lowest, 5 * noise), 0.3 * lowest))
     below = np.where(force < stack.by_sample(level), stack.displacement, -np.inf)
@@ -130,7 +137,7 @@ def _from_touch(stack: Stack, noise: np.ndarray) -> Stack:
         found = compare(moved)
         shift = np.clip(shift + np.where(air, found.shift, 0), begin - reach, begin + reach)
         offset = offset + np.where(air, found.offset, 0)
-    return moved
+    return moved, in_air
 
 
 def _mean(stack: Stack, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from jaxtrachea.measurements.curve import Curve
-from jaxtrachea.measurements.differences import Difference, differing_trials
+from jaxtrachea.trials.differences import Difference, differing_trials
+from jaxtrachea.trials.uneven_noise import uneven_noise
 
 #: Correlation of force and a condition, within positions, from which they go along.
 ALONG = 0.9
@@ -16,6 +17,16 @@ _NUMBER = re.compile(r"\d+")
 _NUMBER_OF_TRIAL = "the number of the trial"
 #: Conditions that vary by less, as a share of their size, are one.
 _SAME = 0.01
+
+
+def trial_sentences(curves: Sequence[Curve], *, weighed: bool = False) -> list[str]:
+    """What a fit says of its curves against each other.
+
+    Args:
+        curves: as they are used.
+        weighed: whether each counts by its own noise, so that noise that differs is no matter.
+    """
+    return [*repeat_sentences(curves), *(() if weighed else uneven_noise(curves))]
 
 
 def repeat_sentences(curves: Sequence[Curve]) -> Iterator[str]:
