@@ -419,7 +419,8 @@ WAYS = {
     "lost in touch": ((19, 16, np.nan, 15), [NO, OK, LOST, OK]),
     "lost in the lumen": ((0, np.nan, 8, 0), [LUMEN, LOST, LUMEN, LUMEN]),
     "from the lumen into a press: not before it was clear": (
-        (0, 16, 15, 18, 16), [LUMEN, LUMEN, LUMEN, NO, OK],
+        (0, 16, 15, 18, 16),
+        [LUMEN, LUMEN, LUMEN, NO, OK],
     ),
     "never touching, lost": ((19, np.nan, 20), [NO, LOST, NO]),
 }
