@@ -335,7 +335,7 @@ FITTING = frozenset(
     custom_vjp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv exp
     exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le le_to linear log log1p
     logistic lt max min mul ne neg nextafter not optimization_barrier or pad part pjit pow
-    reduce reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round
+    reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round
     rsqrt scan select_n sign sin slice split sqrt square squeeze stack stop_gradient sub tan
     tanh transpose unstack while xor""".split()
 )
@@ -368,7 +368,7 @@ def _inside(eqn) -> list[Jaxpr]:
 
 
 def _reduces(eqn) -> bool:
-    return eqn.primitive.name.startswith(("reduce", "arg"))
+    return eqn.primitive.name.startswith(("reduce_", "arg"))
 
 
 def _entries(variable) -> float:

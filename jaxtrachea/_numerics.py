@@ -11,6 +11,7 @@ from typing import TypeVar, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int, Num
 
 Function = TypeVar("Function", bound=Callable)
@@ -40,6 +41,8 @@ def full_precision(function: Function) -> Function:
 #: Entries up to which a reduction is written out, and most that one may have: of more, XLA for CPUs
 #: makes a `reduce-window`, which fuses with nothing.
 WRITTEN_OUT, ONE_REDUCTION = 8, 32
+#: Entries up to which a maximum keeps a NaN, see `_greatest`.
+BY_MAXIMUM = 4000
 
 
 def added(terms: Iterable[Array]) -> Array:
@@ -152,31 +155,44 @@ def largest(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
     Args:
         x: n >= 1 entries in each row.
     """
-    return _reduced(_greatest, jnp.maximum, x)
+    return _reduced(lambda x, axis: _greatest(x), jnp.maximum, x)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
-def _greatest(x, axis):
-    """`jnp.max` that keeps a NaN, of any number of entries.
+@jax.custom_jvp
+def _greatest(x):
+    """`jnp.max` along the last axis but one that keeps a NaN, of any number of entries and lanes.
 
     XLA for CPUs gives a maximum or minimum of 4,096 entries and more, those of all rows and lanes
-    together, to a library that drops a NaN (jaxlib 0.10.2). A comparison it keeps to itself.
+    together, to a library that drops a NaN (jaxlib 0.10.2). A comparison it keeps to itself, but
+    puts into no single kernel (`_in_order.one_kernel`): so lanes are told of (`custom_vmap`).
     """
+    return _greatest_in_lanes(x)
+
+
+@_greatest.defjvp
+def _greatest_jvp(primals, tangents):
+    """As of `jnp.max`: equal entries share it."""
+    (x,), (dx,) = primals, tangents
+    top = _greatest(x)
+    found = x == jnp.expand_dims(top, -2)
+    count = jnp.sum(found, axis=-2, dtype=x.dtype)
+    return top, jnp.sum(jnp.where(found, dx, 0), axis=-2) / count
+
+
+@custom_vmap
+def _greatest_in_lanes(x):
+    if x.size <= BY_MAXIMUM:
+        return jnp.max(x, axis=-2)
 
     def greater(a, b):
         return jnp.where((a >= b) | (a != a), a, b)
 
-    return jax.lax.reduce(x, np.asarray(-np.inf, x.dtype), greater, (axis % x.ndim,))
+    return jax.lax.reduce(x, np.asarray(-np.inf, x.dtype), greater, (x.ndim - 2,))
 
 
-@_greatest.defjvp
-def _greatest_jvp(axis, primals, tangents):
-    """As of `jnp.max`: equal entries share it."""
-    (x,), (dx,) = primals, tangents
-    top = _greatest(x, axis)
-    found = x == jnp.expand_dims(top, axis)
-    count = jnp.sum(found, axis=axis, dtype=x.dtype)
-    return top, jnp.sum(jnp.where(found, dx, 0), axis=axis) / count
+@_greatest_in_lanes.def_vmap
+def _(_, __, x):
+    return _greatest_in_lanes(x), True
 
 
 def every(x: Bool[Array, "*n"]) -> Bool[Array, ""]:

@@ -52,7 +52,7 @@ WITHIN = {
         {"facts", "refusals", "deform", "programs"},
         {"configurational"},
         {"assemble", "simulation", "sweep", "seat"},
-        {"one_row"},
+        {"held_force", "one_row"},
         {"session"},
         {"build", "results"},
         {"cost", "plots"},

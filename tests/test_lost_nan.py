@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtrachea._in_order import one_kernel
+from jaxtrachea._in_order import fits_one_kernel, one_kernel
 from jaxtrachea._numerics import largest
 from jaxtrachea.contact.shapes import sphere
 from jaxtrachea.fitting import descent
@@ -48,13 +48,15 @@ def test_the_largest_of_many_is_no_number(shape, dtype):
         np.testing.assert_array_equal(found(bad), bad.max(axis=-1))
 
 
-@pytest.mark.parametrize("entries", [20, 4000])
-def test_the_largest_in_one_kernel(entries):
-    x = np.random.default_rng(2).normal(size=entries)
-    found = jax.jit(one_kernel(lambda x: largest(2 * x)))
-    assert float(found(x)) == 2 * x.max()
-    x[entries // 2] = np.nan
-    assert np.isnan(found(x))
+@pytest.mark.parametrize("lanes", [1, 200])
+def test_the_largest_in_one_kernel(lanes):
+    """Alone it is part of the kernel, and lanes of it, taken twice, keep a NaN as well."""
+    x = np.random.default_rng(2).normal(size=(lanes, 3, 20))
+    found = jax.jit(jax.vmap(jax.vmap(one_kernel(lambda x: largest(2 * x)))))
+    np.testing.assert_array_equal(found(x), 2 * x.max(axis=-1))
+    x[lanes // 2, 1, 4] = np.nan
+    np.testing.assert_array_equal(found(x), 2 * x.max(axis=-1))
+    assert fits_one_kernel(jax.make_jaxpr(largest)(x[0, 0]).jaxpr)
 
 
 def test_the_derivative_of_the_largest():

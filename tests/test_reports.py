@@ -5,6 +5,7 @@ import dataclasses
 import io
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib as mpl
 import numpy as np
@@ -14,6 +15,7 @@ from rich.console import Console
 from rich.progress import Progress
 from run_cli import run
 
+from jaxtrachea.cli.scene import _print_rows
 from jaxtrachea.cli.terminal import Stages, progress_bar
 from jaxtrachea.cli.terminal_table import wide_table
 from jaxtrachea.files.html import page
@@ -455,3 +457,26 @@ def test_counts_of_the_progress_bar_never_pass_the_total():
     stages.close()
     assert [bar.columns[2].render(t).plain for t in bar.tasks] == ["60/60", "12/12", ""]
     assert all(task.finished for task in bar.tasks)
+
+
+def test_rows_of_a_simulation_on_the_terminal(capsys, monkeypatch):
+    """Each row has one line in each part; of many the title says how many are left out."""
+    monkeypatch.setenv("COLUMNS", "80")
+    for count, title in ((14, "14 rows"), (55, "40 of 55 rows; all are in simulation.h5")):
+        ones = np.ones((count, 3))
+        _print_rows(
+            SimpleNamespace(
+                s=np.full(count, 80.0), phi=np.full(count, -1e-17), gap=np.full(count, -0.265),
+                force=ones * [0.0741, -0.191, 0], skeleton=ones * [1.14, -2.37, 0],
+                depth_share=np.full(count, 0.24), status=np.zeros(count, int),
+            )
+        )  # fmt: skip
+        lines = [line.split() for line in capsys.readouterr().out.split("\n")]
+        assert " ".join(lines[0]) == title
+        body = [line for line in lines if line and not any(v.startswith("rows") for v in line)]
+        numbered = [line[0] for line in body if line[0].isdecimal()]
+        shown = [str(i + 1) for i in range(count)] if count == 14 else None
+        assert len(numbered) == 2 * min(count, 40)
+        assert shown is None or numbered == 2 * shown
+        assert ["1", "80", "0", "-0.265", "0.0741", "-0.191", "0", "ok", "24", "%"] in lines
+        assert ["1", "1.14", "-2.37", "0"] in lines

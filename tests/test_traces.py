@@ -121,6 +121,19 @@ def test_arguments_by_name(folder):
     assert TRACES == ["add", "add"]
 
 
+def test_what_is_compiled_ahead_is_not_traced_again(folder):
+    """As `plan` does for `simulate`; without a folder nothing is done."""
+    given = np.zeros(3), np.ones(3)
+    assert Traced(add).compile(*given) is None
+    start()
+    np.testing.assert_array_equal(Traced(add)(*given)[0], 1)
+    assert TRACES == ["add"]
+    assert len(kept(folder)) == 1
+    keep_traces(None)
+    assert Traced(add).compile(*given) is None
+    assert TRACES == ["add"]
+
+
 def test_what_is_lowered_is_not_kept(folder):
     text = Traced(add).lower(np.zeros(3), np.ones(3)).as_text()
     assert "sine" in text

@@ -31,17 +31,27 @@ MANY = 40
 
 def plan(scene: SceneArgument, timed: TimeOption = False) -> None:
     """Show which effects a scene needs, why, and their cost."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    from jaxtrachea.files.traces import Traced
     from jaxtrachea.scene.cost import shares
     from jaxtrachea.scene.results import plan_rows
+    from jaxtrachea.scene.simulation import simulate as run
 
     spec, staged = _staged(scene)
     swept = None if spec.sweep is None else _for_sweep(scene, spec, staged)[0]
     staged, choice = _chosen(scene, spec, staged)
-    whole, found = shares(staged)
     out = Console()
     head = ["effect", "level", "chosen", "operations", "reason"]
-    out.print(table("Plan", head, plan_rows(staged.scene.plan, found), ("reason",)))
-    out.print(f"{whole:,} operations for {_rows(staged)} rows", highlight=False)
+    with ThreadPoolExecutor(1) as beside:
+        # The program that `simulate` will load is compiled while the operations are counted.
+        kept = beside.submit(Traced(run).compile, staged.scene, staged.material, staged.path)
+        whole, found = shares(staged)
+        out.print(table("Plan", head, plan_rows(staged.scene.plan, found), ("reason",)))
+        out.print(f"{whole:,} operations for {_rows(staged)} rows", highlight=False)
+        with progress_bar(transient=True) as bar:
+            bar.add_task("compiling for simulate", total=None)
+            kept.result()
     if timed:
         out.print(escape(_timed(staged)), highlight=False)
     if choice is not None:

@@ -93,8 +93,19 @@ class Traced:
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """What the function returns."""
+        return self._program(arguments, named)(*arguments, **named)
+
+    def compile(self, *arguments: Any, **named: Any) -> None:
+        """Trace and compile for arguments like these, and keep both; nothing is computed.
+
+        Where nothing is kept, nothing is done.
+        """
+        self._program(arguments, named)
+
+    def _program(self, arguments: tuple, named: dict) -> Callable:
+        """The function of arguments like these, compiled where its trace is kept."""
         if _folder is None:
-            return self._plain(*arguments, **named)
+            return self._plain
         leaves, tree = jax.tree.flatten((arguments, named))
         chosen = jax.config.jax_default_device  # pyright: ignore
         device = chosen or jax.local_devices()[0]
@@ -103,10 +114,8 @@ class Traced:
             key = _folder, device, tree, kinds
             compiled = self._compiled.get(key)
         except TypeError:  # neither an array nor a number; a field without a hash
-            return self._plain(*arguments, **named)
-        if compiled is None:
-            compiled = self._compile(key, (arguments, named))
-        return compiled(*arguments, **named)
+            return self._plain
+        return self._compile(key, (arguments, named)) if compiled is None else compiled
 
     def _compile(self, key: tuple, given: tuple) -> Callable:
         """The function of arguments like these, compiled by one thread for all."""

@@ -1,4 +1,4 @@
-"""The force of a session that is safe to send to a device: always finite, and said how old it is."""
+"""The force of a session for a device: always finite, and it says how old it is."""
 
 import math
 from typing import NamedTuple
@@ -16,7 +16,7 @@ class HeldForce(NamedTuple):
     Attributes:
         force: on the tube, N, in the frame of the poses; shape (3,). Always finite: zeros before
             the first step that had a force. What the tool feels is its opposite.
-        status: of the last step, which says why a force is held.
+        status: of the last step, which says why a force is held; before any NO_CONTACT.
         held: steps since the one that the force is of; 0: it is of the last step.
     """
 
@@ -25,20 +25,35 @@ class HeldForce(NamedTuple):
     held: int
 
 
-def no_force(dtype) -> HeldForce:
-    """Before the first step: zeros."""
-    return HeldForce(np.zeros(3, dtype), PressStatus.NO_CONTACT, 0)
+class LastForce(NamedTuple):
+    """What each step leaves for `held_force`, as it is: a step has microseconds.
 
-
-def next_force(before: HeldForce, step: Simulation) -> HeldForce:
-    """After one more step: its force, or where that is no number the force of before.
-
-    Args:
-        before: after the step before.
-        step: result of a step, without the axis of rows.
+    Attributes:
+        force: of the last step that had one, in the frame of its contact.
+        frame: of that contact; None: that of the poses.
+        status: of the last step.
+        held: see `HeldForce`.
     """
-    status = PressStatus(int(step.status))
-    force = np.asarray(step.force if step.frame is None else step.frame @ step.force)
-    if math.isfinite(sum(force.tolist())):
-        return HeldForce(force, status, 0)
-    return HeldForce(before.force, status, before.held + 1)
+
+    force: np.ndarray
+    frame: np.ndarray | None
+    status: int | np.ndarray
+    held: int
+
+
+def no_force(dtype) -> LastForce:
+    """Before the first step: zeros."""
+    return LastForce(np.zeros(3, dtype), None, PressStatus.NO_CONTACT, 0)
+
+
+def next_force(before: LastForce, step: Simulation) -> LastForce:
+    """After one more step, whose result has numpy arrays and no axis of rows."""
+    if math.isfinite(sum(step.force.tolist())):
+        return LastForce(step.force, step.frame, step.status, 0)  # pyright: ignore
+    return before._replace(status=step.status, held=before.held + 1)
+
+
+def held_force(last: LastForce) -> HeldForce:
+    """For a device."""
+    force = last.force if last.frame is None else last.frame @ last.force
+    return HeldForce(np.array(force), PressStatus(int(last.status)), last.held)

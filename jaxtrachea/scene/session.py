@@ -23,7 +23,7 @@ from jaxtrachea.mechanics.sections.material import SectionMaterial
 from jaxtrachea.scene.approach import approach
 from jaxtrachea.scene.assemble import with_tool
 from jaxtrachea.scene.declare import AnyMaterial
-from jaxtrachea.scene.held_force import HeldForce, next_force, no_force
+from jaxtrachea.scene.held_force import HeldForce, held_force, next_force, no_force
 from jaxtrachea.scene.lumen import Side, next_side, whereabouts
 from jaxtrachea.scene.one_row import OneRow
 from jaxtrachea.scene.seat import (
@@ -141,8 +141,6 @@ class Session:
         scene: with the tool as it is now.
         material: as it is now.
         dtype: of poses.
-        force_or_last: contact force for a device, N, finite after every step: that of the last step
-            that had one, with the status of the last step (`held_force.HeldForce`).
     """
 
     def __init__(self, scene: Scene, material: AnyMaterial, *, keep: int = 10_000):
@@ -169,7 +167,7 @@ class Session:
         self._numbers = jax.device_put(self._given.fill(given))
         self._compile()
         self._seconds, self._steps = np.zeros(keep), 0
-        self.force_or_last: HeldForce = no_force(self.dtype)
+        self._last_force = no_force(self.dtype)
 
     def _compile(self) -> None:
         """The program of a step, and its first state."""
@@ -213,10 +211,20 @@ class Session:
             check_rotations("rotation", turn[None])
         # Two arrays: to make one of them takes longer than it saves.
         result = self._program(turn, place, self._numbers)
-        self.force_or_last = next_force(self.force_or_last, result)
+        self._last_force = next_force(self._last_force, result)
         self._seconds[self._steps % len(self._seconds)] = time.perf_counter() - begin
         self._steps += 1
         return result
+
+    @property
+    def force_or_last(self) -> HeldForce:
+        """Contact force to send to a device: finite, of the last step that had one.
+
+        N, on the tube, in the frame of the poses, with the status of the last step and the steps
+        for which the force has been held; zeros before the first force, and after `reset` and
+        `set_tool`. It is held without limit: let it decay where `held` grows.
+        """
+        return held_force(self._last_force)
 
     def set_material(self, material: Material) -> None:
         """Go on with other values of the material; nothing is compiled.
@@ -254,7 +262,7 @@ class Session:
         """
         self._change(with_tool(self.scene, tool), self.material)
         self._program.state = jnp.array(self._start)
-        self.force_or_last = no_force(self.dtype)
+        self._last_force = no_force(self.dtype)
 
     def _change(self, scene: Scene, material: Material) -> None:
         assert scene.tool is not None
@@ -265,7 +273,7 @@ class Session:
     def reset(self) -> None:
         """Forget where the tool was, the force that was held, and all latencies."""
         self._program.state, self._steps = jnp.array(self._start), 0
-        self.force_or_last = no_force(self.dtype)
+        self._last_force = no_force(self.dtype)
 
     def latency(self, edges: Float[np.ndarray, " borders"] = EDGES) -> Latency:
         """Of the steps kept.

@@ -176,10 +176,15 @@ def touch_tube(scene: Scene, path: Poses) -> Touch:
     """
     if scene.tool is None or scene.tube is None:
         raise ValueError("scene.tool is None; contact needs a tool")
-    tool, tube = scene.tool, scene.tube
+    return _touch_rows(scene.tool, scene.tube, path, scene.quality, scene.near)
+
+
+@partial(jax.jit, static_argnames=("quality", "near"), inline=True)
+def _touch_rows(tool: Shape, tube: Patches, path: Poses, quality: Settings, near: int) -> Touch:
+    """`touch_tube`: of other plans of a scene too it is traced once."""
 
     def one(R, T):
-        return touch(tool, Pose(R, T), tube, scene.quality, near=scene.near)
+        return touch(tool, Pose(R, T), tube, quality, near=near)
 
     return jax.vmap(one_kernel(one))(path.rotation, path.translation)
 
