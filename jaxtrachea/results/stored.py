@@ -94,21 +94,45 @@ class StoredFit:
     @functools.cached_property
     def first_touch(self) -> np.ndarray:
         """Displacement of each curve at first touch, mm: held, or estimated; (curves,)."""
-        onset = next(p for p in self.study.parameters if p.name == "onset")
-        if onset.fixed:
-            return np.full(len(self.curves), onset.value)
+        return self._of_curves("onset")
+
+    @functools.cached_property
+    def _places(self) -> dict[tuple[str, str], int]:
+        return {(c.specimen, c.trial): i for i, c in enumerate(self.curves)}
+
+    @functools.cached_property
+    def force_offset(self) -> np.ndarray:
+        """Force that each curve shows without contact, N: held, or estimated; (curves,)."""
+        return self._of_curves("force_offset")
+
+    def _of_curves(self, name: str) -> np.ndarray:
+        """A parameter as each curve has it: held, or estimated; (curves,)."""
+        named = next(p for p in self.study.parameters if p.name == name)
+        if named.fixed:
+            return np.full(len(self.curves), named.value)
         places = [
-            {(s, t): i for i, (p, s, t) in enumerate(lane) if p.name == "onset"}
+            {(s, t): i for i, (p, s, t) in enumerate(lane) if p.name == name}
             for lane in self.study.unknowns
         ]
 
-        def touch(curve: Curve, lane: int) -> float:
-            specimen = "" if onset.scope == "shared" else curve.specimen
-            i = places[lane].get((specimen, curve.trial if onset.scope == "trial" else ""))
-            return np.nan if i is None else onset.from_scaled(float(self.theta[lane, i]))
+        def value(curve: Curve, lane: int) -> float:
+            specimen = "" if named.scope == "shared" else curve.specimen
+            i = places[lane].get((specimen, curve.trial if named.scope == "trial" else ""))
+            return np.nan if i is None else named.from_scaled(float(self.theta[lane, i]))
 
         rows = zip(self.curves, self.curve_lane.tolist(), strict=True)
-        return np.array([touch(*row) for row in rows])
+        return np.array([value(*row) for row in rows])
+
+    @functools.cached_property
+    def found(self) -> dict[int, Any]:
+        """What predictions have found out of lanes, kept for the next."""
+        return {}
+
+    def above_touch(self, curve: Curve) -> tuple[np.ndarray, np.ndarray]:
+        """Depth of a curve of the fit from first touch, mm, and its force without offset, N."""
+        i = self._places[curve.specimen, curve.trial]
+        depth = depths(curve.displacement, self.first_touch[i], self.study.model.options)
+        return depth, np.asarray(curve.force) - self.force_offset[i]
 
     @functools.cached_property
     def spans(self) -> np.ndarray:

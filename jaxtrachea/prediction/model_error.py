@@ -1,0 +1,300 @@
+"""Error of the model between positions: what leaving each pressed position out leaves.
+
+A fit knows its noise and its parameters; neither says how far the model misses a place that was
+not pressed. Each position of a lane is left out in turn and predicted by the others, to first
+order in the unknowns (exact for a model linear in them: Cook and Weisberg 1982, Residuals and
+Influence in Regression, ch. 3): with z and X the weighted residual and Jacobian of the position
+and A the normal matrix of the others,
+
+    e = z + X A^-1 X^T z.
+
+Unknowns that the position alone reads (its onset, its offset) are fitted to it. The error is a
+smooth bias of a whole curve, not noise: it is compared with the force as e = F (a + b x + c x^2),
+x the depth over the deepest, and what scatters about that is noise and does not count. What the
+uncertainty of the parameters explains is taken off, since bands have it apart. The mean square of
+n positions, as a share of the force, has n - 1 degrees of freedom.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.special import stdtrit
+
+from jaxtrachea._numerics import full_precision
+from jaxtrachea.fitting.cost import weights
+from jaxtrachea.fitting.lane import Lane, forces, markers, precisions
+from jaxtrachea.fitting.lanes import Noise, Weighting
+from jaxtrachea.fitting.map_lanes import map_lanes
+from jaxtrachea.fitting.model import FitModel
+from jaxtrachea.fitting.predictions import Prediction
+from jaxtrachea.fitting.residual import residual
+from jaxtrachea.fitting.study import Study, build_study
+from jaxtrachea.inference.effective import effective_samples
+from jaxtrachea.inference.together import companions
+from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.results.stored import StoredFit
+
+#: Positions from which the error between them is known well enough for a band.
+MIN_POSITIONS = 4
+#: Positions closer than this are one, mm.
+SAME_PLACE = 1e-6
+#: Powers of the depth that a smooth error has beside the force.
+SHAPES = 3
+#: Eigenvalues of the scaled normal matrix, over the largest, that determine nothing.
+_SINGULAR = 1e-10
+#: Slope along such a direction, over the largest of the position, from which it counts.
+_ACTS = 1e-4
+
+
+class ModelError(NamedTuple):
+    """Of one lane.
+
+    Attributes:
+        share: standard deviation of the model's error between positions, share of the force; NaN
+            where too few positions tell it.
+        positions: that could be left out.
+        quantile: of a 95 % interval with `positions` - 1 degrees of freedom; NaN likewise.
+        growth: by which standard errors from the parameters grow, since neighbouring residuals are
+            alike; inf where the samples are worth no more than the unknowns. Then `share` is all
+            that is known of the band, with what the parameters err.
+        pressed: contact positions of the fit, mm; (n,).
+    """
+
+    @property
+    def known(self) -> bool:
+        """Whether there are positions enough to know it."""
+        return bool(np.isfinite(self.share))
+
+    share: float
+    positions: int
+    quantile: float
+    growth: float
+    pressed: np.ndarray
+
+    @property
+    def message(self) -> str:
+        """Why a band between positions is as wide as it is, in words."""
+        if not self.known:
+            few = f"{self.positions} of {MIN_POSITIONS} positions that could be left out"
+            return f"{few}: the model's error between positions is unknown"
+        return (
+            f"with the model's error between positions, {100 * self.share:.2g} % of the force "
+            f"({self.positions} left out in turn)"
+        )
+
+    @property
+    def growth_message(self) -> str:
+        """Why standard errors are larger than perfect residuals would have them; "" if not."""
+        if np.isinf(self.growth):
+            return "neighbouring residuals are so alike that they determine nothing"
+        if self.growth < 1.05:
+            return ""
+        return f"standard errors times {self.growth:.2g}, as neighbouring residuals are alike"
+
+    def at_pressed(self, s: float) -> bool:
+        """Whether the fit has pressed at s, mm: there is nothing between positions."""
+        return bool(np.isnan(s) or np.any(np.abs(self.pressed - s) <= SAME_PLACE))
+
+
+@full_precision
+def weighted_rows(
+    model: FitModel, theta: Float[Array, " P"], lane: Lane, sigma: Float[Array, "2"]
+) -> tuple[Float[Array, "T m"], Float[Array, "T Jf m"], Float[Array, "T m"]]:
+    """Residual and Jacobian of every trial, weighted as the fit does it, and these weights.
+
+    Weights are of residuals in N and mm, 0 of what was not observed.
+    """
+    r = residual(model, theta, lane)
+    _, root = weights(model, r.value, lane, sigma)
+    return r.value * root, r.jacobian * root[:, None], root * precisions(lane)
+
+
+def model_errors(stored: StoredFit, lanes: list[int]) -> dict[int, ModelError]:
+    """Error between positions of some lanes of a fit, each computed once."""
+    kept: dict[int, ModelError] = stored.found
+    missing = [lane for lane in dict.fromkeys(lanes) if lane >= 0 and lane not in kept]
+    if missing:
+        study, theta, sigma, rows = _rebuilt(stored, missing)
+        value, jacobian, root = map_lanes(
+            weighted_rows, study, theta, sigma, batch=study.batch_size(len(rows), 256)
+        )
+        growth = _growth(stored, rows, study, value, root)
+        for k, lane in enumerate(rows):
+            X = _over_unknowns(study, k, jacobian[k], stored.at_bound[lane])
+            left = _LeftOut(value[k], X, root[k], study.lanes.force.shape[-1], growth[k])
+            kept[lane] = _of_lane(stored, study.curves[k], left)
+    return {lane: kept[lane] for lane in lanes if lane >= 0}
+
+
+def _rebuilt(
+    stored: StoredFit, chosen: list[int]
+) -> tuple[Study, Float[np.ndarray, "n P"], Float[np.ndarray, "n 2"], list[int]]:
+    """Lanes of the fit with their data, estimates, whitened sigma, and which lanes they are."""
+    study, given = stored.study, stored.study.noise_given
+    if study.curves:
+        rows, built = chosen, study.take(np.array(chosen))
+    else:
+        pairs = zip(stored.curves, stored.curve_lane.tolist(), strict=True)
+        own = [(c, lane) for c, lane in pairs if lane in set(chosen)]
+        known = given[0] and any(c.sigma is None for c, _ in own)
+        joints, share = study.marker_noise or (None, 0.0)
+        built = build_study(
+            [c for c, _ in own], study.model.geometry, study.model.options, study.parameters,
+            noise=Noise(float(stored.sigma[own[0][1], 0]) if known else None, joints, share),
+            weighting=Weighting(study.balance, study.model.loss, study.model.loss_scale),
+            tool_radius=stored.tool_radius, joint=study.joint,
+        )  # fmt: skip
+        lane_of = {(c.specimen, c.trial): lane for c, lane in own}
+        rows = [lane_of[lane[0].specimen, lane[0].trial] for lane in built.curves]
+    steps = [1.0 if p.scale == "log" else q.step / p.step
+             for p, q in zip(built.parameters, study.parameters, strict=True)]  # fmt: skip
+    column = {p.name: step for p, step in zip(built.parameters, steps, strict=True)}
+    theta = stored.theta[rows][:, : built.size] * built.of_unknowns(lambda p: column[p.name], 1.0)
+    sigma = np.where(given, 1.0, stored.sigma[rows])
+    return built, theta, np.where(np.isfinite(sigma), sigma, 1.0), rows
+
+
+def _over_unknowns(
+    study: Study, lane: int, jacobian: Float[np.ndarray, "T Jf m"], at_bound: np.ndarray
+) -> Float[np.ndarray, "T P m"]:
+    """Jacobian by the lane's unknowns; 0 for what is held, or shared with other lanes."""
+    index = np.asarray(study.lanes.index)[lane][:, study.free_columns]
+    out = np.zeros((len(jacobian), study.size, jacobian.shape[-1]))
+    for t, columns in enumerate(index):
+        for j, i in enumerate(columns):
+            if i >= 0:
+                out[t, i] += jacobian[t, j]
+    held = np.zeros(study.size, bool)
+    held[: len(at_bound)] = at_bound[: study.size]
+    held[study.shared[lane]] = True
+    out[:, held] = 0
+    return out
+
+
+def _growth(stored: StoredFit, rows: list[int], study: Study, value, root) -> np.ndarray:
+    """By which standard errors grow, since neighbouring residuals are alike; (lanes,).
+
+    See `inference.effective`: the samples are worth fewer independent ones.
+    """
+    lanes, first = study.lanes, 0
+    residuals = _over(value, root)
+    found = {}
+    for kind in forces(lanes) + markers(lanes):
+        after = first + lanes.force.shape[-1] * kind.places
+        found[kind.name] = residuals[..., first:after].reshape(kind.data.shape)
+        first = after
+    seen = Prediction(**({"joints": None} | found))
+    worth = effective_samples(seen)
+    samples = sum(np.sum(np.isfinite(v), axis=tuple(range(1, v.ndim))) for v in found.values())
+    unknowns = np.sum((lanes.active > 0) & ~stored.at_bound[rows][:, : study.size], axis=1)
+    return widening(samples, worth, unknowns, study.noise_known, stored.half_width[rows])
+
+
+def _over(v: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Without the weight; NaN where it is 0: not observed."""
+    return np.where(weight > 0, v / np.where(weight > 0, weight, 1), np.nan)
+
+
+def widening(samples, worth, unknowns, noise_known, half_width) -> np.ndarray:
+    """Growth of half-widths where `samples` are `worth` fewer; as `inference.effective` has it."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        left = worth - unknowns
+        factor = np.sqrt(np.maximum((samples - unknowns) / left, 1))
+        half = stdtrit(np.maximum(left, 1e-2), 0.975)
+        growth = np.where(left > 0, factor * half / half_width, np.inf)
+        growth = np.where(noise_known, np.sqrt(np.maximum(samples / worth, 1)), growth)
+        return np.where(np.isnan(worth), 1.0, np.maximum(growth, 1))
+
+
+class _LeftOut(NamedTuple):
+    """One lane, weighted as the fit has it.
+
+    Attributes:
+        z: residual; (T, m).
+        X: its derivative by the unknowns, 0 for what is held; (T, P, m).
+        root: weight of each residual, 1/N and 1/mm; (T, m).
+        samples: entries that are normal forces; they come first.
+        growth: of standard errors, see `ModelError`.
+    """
+
+    z: Float[np.ndarray, "T m"]
+    X: Float[np.ndarray, "T P m"]
+    root: Float[np.ndarray, "T m"]
+    samples: int
+    growth: float
+
+    def predicted(self, out: list[int]):
+        """Force errors of the trials `out`, N, and their variance by the parameters, N^2.
+
+        None where the others do not determine what the prediction needs.
+        """
+        reads = np.any(self.X != 0, axis=2)
+        others = np.setdiff1d(np.arange(len(self.z)), out)
+        kept = np.any(reads[others], axis=0)
+        own = np.any(reads[out], axis=0) & ~kept
+        X, z = self.X[:, kept], self.z
+        A = np.einsum("tim,tjm->ij", X[others], X[others])
+        all_of = A + np.einsum("tim,tjm->ij", X[out], X[out])
+        size = 1 / np.sqrt(np.diagonal(all_of))
+        values, vectors = np.linalg.eigh(A * size * size[:, None])
+        V = vectors * size[:, None]
+        sees = values > _SINGULAR * max(values[-1], 1e-300) if len(values) else values > 0
+        rows = X[out][:, :, : self.samples]
+        lost = np.einsum("tim,ik->tkm", rows, V[:, ~sees])
+        if np.any(np.abs(lost) > _ACTS * np.max(np.abs(rows * size[:, None]), initial=0)):
+            return None
+        half = V[:, sees] / np.sqrt(values[sees])
+        step = half @ (half.T @ np.einsum("tim,tm->i", X[out], z[out]))
+        e = z[out][:, : self.samples] + np.einsum("tim,i->tm", rows, step)
+        variance = np.sum(np.einsum("tim,ik->tkm", rows, half) ** 2, axis=1)
+        if own.any():
+            B = np.moveaxis(self.X[out][:, own, : self.samples], 1, 2).reshape(e.size, -1)
+            e = (e.ravel() - B @ np.linalg.lstsq(B, e.ravel(), rcond=None)[0]).reshape(e.shape)
+        root = self.root[out][:, : self.samples]
+        return _over(e, root), _over(variance, root**2)
+
+
+def _of_lane(stored: StoredFit, curves: tuple[Curve, ...], left: _LeftOut) -> ModelError:
+    """Every position of a lane left out in turn."""
+    together = stored.study.together or tuple(map(tuple, stored.reading.get("together") or ()))
+    places: dict[object, list[int]] = {}
+    for t, (curve, group) in enumerate(zip(curves, companions(curves, together), strict=True)):
+        s = np.nan if curve.s_c is None else round(curve.s_c / SAME_PLACE)
+        places.setdefault((curve.specimen, s, curve.phi_c, *curve.direction), []).extend(group)
+    pressed = np.array([c.s_c for c in curves if c.s_c is not None], float)
+    squares = []
+    for out in places.values():
+        out = sorted(set(out))
+        found = left.predicted(out) if len(out) < len(curves) else None
+        if found is not None:
+            squares.append(_square(stored, [curves[t] for t in out], *found))
+    squares = [v for v in squares if np.isfinite(v)]
+    n = len(squares)
+    share, quantile = np.nan, np.nan
+    if n >= MIN_POSITIONS:
+        share, quantile = float(np.sqrt(max(np.mean(squares), 0))), float(stdtrit(n - 1, 0.975))
+    return ModelError(share, n, quantile, left.growth, pressed)
+
+
+def _square(stored: StoredFit, curves, error, variance) -> float:
+    """Mean square of the smooth error of curves of one position, over that of their force.
+
+    Less what noise in the parameters explains, so that it may be negative.
+    """
+    smooth = force = 0.0
+    for curve, e, v in zip(curves, error, variance, strict=True):
+        depth, F = stored.above_touch(curve)
+        e, v = e[: len(F)], v[: len(F)]
+        seen = (depth > 0) & np.isfinite(e) & (F != 0)
+        if not seen.any():
+            continue
+        e, v, F, x = e[seen], v[seen], F[seen], depth[seen] / np.max(depth[seen])
+        k = min(SHAPES, max(len(np.unique(x)) - 1, 1))
+        basis = F[:, None] * x[:, None] ** np.arange(k)
+        fitted = basis @ np.linalg.lstsq(basis, e, rcond=None)[0]
+        noise = np.sum((e - fitted) ** 2) / max(len(e) - k, 1)
+        smooth += np.sum(fitted**2) - k * noise
+        smooth -= np.sum(v)
+        force += np.sum(F**2)
+    return smooth / force if force > 0 else np.nan
