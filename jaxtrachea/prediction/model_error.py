@@ -143,7 +143,7 @@ def _rebuilt(
             [c for c, _ in own], study.model.geometry, study.model.options, study.parameters,
             noise=Noise(float(stored.sigma[own[0][1], 0]) if known else None, joints, share),
             weighting=Weighting(study.balance, study.model.loss, study.model.loss_scale),
-            tool_radius=stored.tool_radius, joint=study.joint,
+            joint=study.joint,
         )  # fmt: skip
         lane_of = {(c.specimen, c.trial): lane for c, lane in own}
         rows = [lane_of[lane[0].specimen, lane[0].trial] for lane in built.curves]

@@ -348,13 +348,14 @@ def _json(group: Any) -> Any:
 
 
 def _read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str]]:
-    """Curves without markers, the lane of each, and SHA-256 by file name."""
+    """Curves with what of them the fit has used, the lane of each, and SHA-256 by file name."""
     names = _json(group)
     samples = numeric(group, "samples").astype(int)
     ends = np.cumsum(samples)
     column = {c: numeric(group, c) for c in ("displacement", "force", "sigma", "s_c", "phi_c")}
     known = "direction" in group
     direction = numeric(group, "direction") if known else np.tile([1.0, 0.0], (len(samples), 1))
+    observed = _observed(group)
     curves = []
     texts = zip(names["specimen"], names["trial"], names["source"], strict=True)
     for i, (specimen, trial, source) in enumerate(texts):
@@ -371,9 +372,33 @@ def _read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str
                 sigma=None if np.isnan(sigma).all() else sigma,
                 source=source,
                 direction=(float(direction[i][0]), float(direction[i][1])),
+                **{name: v if v.ndim == 1 else v[part] for name, v in observed.items()},
             )
         )
     return tuple(curves), numeric(group, "lane").astype(int), names["files"]
+
+
+def _observed(group: Any) -> dict[str, np.ndarray]:
+    """Fields of curves beside the force, samples end to end; NaN where the fit has not used them.
+
+    Rings are numbered, with no axis of samples.
+    """
+    out = {}
+    if "joints" in group:
+        used = np.isfinite(numeric(group, "joint_residual"))
+        out["joint_displacement"] = np.where(used, numeric(group, "joints"), np.nan)
+    if "side_force" in group:
+        out["side_force"] = numeric(group, "side_force")
+    if "joint_side" in group:
+        out["joint_side_displacement"] = numeric(group, "joint_side")
+        out.setdefault("joint_displacement", np.full_like(out["joint_side_displacement"], np.nan))
+    if "joint_displacement" in out:
+        out["joint_rings"] = np.arange(out["joint_displacement"].shape[1])
+    if "ends" in group:
+        ends = numeric(group, "ends")
+        out["end_U"], out["end_V"] = ends[:, :, 0], ends[:, :, 1]
+        out["end_rings"] = np.arange(ends.shape[1])
+    return out
 
 
 def _check_shapes(stored: StoredFit) -> None:
