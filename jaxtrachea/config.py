@@ -23,17 +23,20 @@ from jaxtrachea.files.toml import SpecError as SpecError
 from jaxtrachea.units import UnitError, parse_quantity
 
 
-def quantity(dimension: str, *, positive: bool = False, word: str | None = None):
+def quantity(
+    dimension: str, *, positive: bool = False, word: str | None = None, or_word: str | None = None
+):
     """A field read as a quantity with its unit ("9 mm"), kept as a float in internal units.
 
     Args:
         dimension: of the quantity.
         positive: refuse zero and below.
         word: a text allowed instead of a quantity.
+        or_word: another.
     """
 
     def read(value: Any) -> Any:
-        if word is not None and value == word:
+        if value is not None and value in (word, or_word):
             return value
         if isinstance(value, bool) or not isinstance(value, str | int | float):
             raise ValueError(f"expected a {dimension.replace('_', ' ')} with its unit")
@@ -41,7 +44,7 @@ def quantity(dimension: str, *, positive: bool = False, word: str | None = None)
             with np.errstate(over="ignore"):  # infinity is refused with the key's name
                 number = parse_quantity(value, dimension)
         except UnitError as error:
-            raise ValueError(f"{error}{'' if word is None else f', or {word!r}'}") from None
+            raise ValueError(f"{error}{''.join(f', or {w!r}' for w in (word, or_word) if w)}") from None
         if positive and number <= 0:
             raise ValueError(f"expected a positive {dimension}")
         return number
@@ -74,6 +77,10 @@ Bed = Annotated[float, quantity("foundation_stiffness", positive=True)]
 Angle = Annotated[float, quantity("angle")]
 Estimate = Literal["estimate"]
 ForceNoise = Annotated[Estimate | float, quantity("force", positive=True, word="estimate")]
+ShareNoise = Annotated[
+    Literal["auto", "estimate"] | float,
+    quantity("dimensionless", word="estimate", or_word="auto"),
+]
 LengthNoise = Annotated[Estimate | float, quantity("length", positive=True, word="estimate")]
 Number = Annotated[Any, BeforeValidator(_number_or_quantity)]
 NumberOrTrue = Annotated[Any, BeforeValidator(_value_or_true)]
@@ -231,6 +238,7 @@ class NoiseSection(Section):
     """
 
     force: ForceNoise = "estimate"
+    force_share: ShareNoise = "auto"
     joints: LengthNoise = "estimate"
     joints_share: Annotated[float, quantity("dimensionless")] = 0.0
 

@@ -93,7 +93,7 @@ WITHIN = {
         {"few_samples"},
         {"result"},
         {"minima", "natural_sizes", "other_starts", "profile_search"},
-        {"doubt", "evaluate"},
+        {"doubt", "evaluate", "force_share"},
         {"scrutiny"},
         {"fit"},
     ],

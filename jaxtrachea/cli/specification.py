@@ -255,8 +255,9 @@ def _noise(spec: FitSpec) -> Noise:
     force, joints = (
         None if sigma == "estimate" else sigma for sigma in (spec.noise.force, spec.noise.joints)
     )
+    share = None if spec.noise.force_share == "auto" else spec.noise.force_share
     try:
-        return Noise(force=force, joints=joints, joints_share=spec.noise.joints_share)
+        return Noise(force, joints, spec.noise.joints_share, share)
     except InputError as error:
         raise SpecError.like(error, key=f"noise.{error.key}") from None
 

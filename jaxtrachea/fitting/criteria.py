@@ -42,7 +42,8 @@ def criteria(study: Study, info: Information, alive: Bool[np.ndarray, " lanes"])
     """Criteria of all lanes; in a joint study those of the whole study, the same in every lane.
 
     With a given standard deviation the deviance is sum(z^2 + ln(2 pi sigma^2)), with an estimated
-    one n (ln(2 pi S / n) + 1), forces and markers each with their own. S is the sum of squares
+    one n (ln(2 pi S / n) + 1), forces and markers each with their own, where forces have a share of
+    the force as sigma of each sample in units of that of none. S is the sum of squares
     without curve weights: with them it would be no likelihood. Where curves of unequal length weigh
     the same the estimate is not quite its maximum.
 
@@ -63,22 +64,25 @@ def criteria(study: Study, info: Information, alive: Bool[np.ndarray, " lanes"])
         if not parts:
             continue
         rows = len(counts)
+        seen = np.concatenate([v.precision.reshape(rows, -1) for v in parts], axis=1)
+        logs = whole(np.log(seen, where=seen > 0, out=np.zeros(seen.shape)).sum(axis=1))
         if estimated[kind]:
             peak = peaks([v._replace(data=v.data * v.precision) for v in parts])
             peak = whole(peak, functools.partial(np.max, initial=0))
             S = np.maximum(S, np.maximum(n, 1) * (ROUNDING * peak) ** 2)
             with np.errstate(divide="ignore", invalid="ignore"):
-                deviance += np.where(n > 0, n * (np.log(2 * np.pi * S / n) + 1), 0)
+                spread = n * (np.log(2 * np.pi * S / n) + 1)
+            deviance += np.where(n > 0, spread - 2 * logs, 0)
         else:
-            seen = np.concatenate([v.precision.reshape(rows, -1) for v in parts], axis=1)
-            logs = np.log(seen, where=seen > 0, out=np.zeros(seen.shape)).sum(axis=1)
-            deviance += S + n * np.log(2 * np.pi) - 2 * whole(logs)
+            deviance += S + n * np.log(2 * np.pi) - 2 * logs
     if study.model.loss != "linear":
         deviance = np.full(len(counts), np.nan)
     own = np.sum(lanes.active, axis=1)
     if study.joint:
         own = np.full(len(own), unknown_count(study, alive))
     k = own + np.sum((counts > 0) * np.array(estimated), axis=1)
+    if study.shares is not None and study.force_share == "estimate":
+        k = k + whole(study.shares.share > 0, np.any)
     return penalised(deviance, k.astype(int), np.sum(counts, axis=1))
 
 

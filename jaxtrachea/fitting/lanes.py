@@ -32,6 +32,10 @@ class Noise:
     Attributes:
         force: N; a curve's own per-sample sigma comes before it.
         joints: mm.
+        force_share: of the force, which sigma has beside it (root of the sum of the squares): what
+            a model misses in a deep press grows with the force. A number, "estimate" (from the
+            residuals), or None: estimated where curves go deeper than a tenth of the radius and
+            sigma is estimated, else none.
         joints_share: of the tool's displacement from first touch, which `joints` has beside it
             (root of the sum of the squares): what a model errs in markers grows with the press.
     """
@@ -39,6 +43,7 @@ class Noise:
     force: float | None = None
     joints: float | None = None
     joints_share: float = 0.0
+    force_share: float | Literal["estimate"] | None = None
 
     def __post_init__(self):
         """Refuse words and numbers that mean nothing.
@@ -47,6 +52,10 @@ class Noise:
             ValueError: naming the field, what was found and what is expected.
         """
         check_record(self)
+        if isinstance(self.force_share, float) and not 0 <= self.force_share < 1:
+            found = f"is {self.force_share:g}"
+            expected = 'a share of 0 to 1, as 0.01 or "1 %", "estimate", or None'
+            raise InputError(found, key="force_share", expected=expected, joint=" ")
         for name in ("force", "joints"):
             if (value := getattr(self, name)) is not None and value <= 0:
                 expected = "a standard deviation of more than 0, or None"

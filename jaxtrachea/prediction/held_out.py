@@ -153,7 +153,10 @@ def _in_fit(used: Curve | None, curve: Curve) -> str:
 
 
 def _sigma(stored: StoredFit, curve: Curve, source: Source) -> np.ndarray:
-    """Noise of a curve's samples, N: its own where that of the fit was given, else the fit's."""
+    """Noise of a curve's samples, N: its own where that of the fit was given, else the fit's.
+
+    Without the share of the force that it may have beside it.
+    """
     if curve.sigma is not None and stored.study.noise_given[0]:
         return np.asarray(curve.sigma)
     return np.full(len(curve.force), source.sigma[0])

@@ -10,9 +10,10 @@ and A the normal matrix of the others,
 
 Unknowns that the position alone reads (its onset, its offset) are fitted to it. The error is a
 smooth bias of a whole curve, not noise: it is compared with the force as e = F (a + b x + c x^2),
-x the depth over the deepest, and what scatters about that is noise and does not count. What the
-uncertainty of the parameters explains is taken off, since bands have it apart. The mean square of
-n positions, as a share of the force, has n - 1 degrees of freedom.
+x the depth over the deepest, and what scatters about that is noise and does not count. What noise
+in the parameters explains is taken off, since bands have it apart. The square of the share at a
+depth is half that of all depths, half that of this one, the mean of n positions; it counts with
+n - 1 degrees of freedom.
 """
 
 from typing import NamedTuple
@@ -23,6 +24,7 @@ from scipy.special import stdtrit
 
 from jaxtrachea._numerics import full_precision
 from jaxtrachea.fitting.cost import weights
+from jaxtrachea.fitting.force_share import Levels, offsets, with_levels
 from jaxtrachea.fitting.lane import Lane, forces, markers, precisions
 from jaxtrachea.fitting.lanes import Noise, Weighting
 from jaxtrachea.fitting.map_lanes import map_lanes
@@ -39,6 +41,8 @@ from jaxtrachea.results.stored import StoredFit
 MIN_POSITIONS = 4
 #: Positions closer than this are one, mm.
 SAME_PLACE = 1e-6
+#: Depths at which the error is kept.
+POINTS = 33
 #: Powers of the depth that a smooth error has beside the force.
 SHAPES = 3
 #: Eigenvalues of the scaled normal matrix, over the largest, that determine nothing.
@@ -51,8 +55,9 @@ class ModelError(NamedTuple):
     """Of one lane.
 
     Attributes:
-        share: standard deviation of the model's error between positions, share of the force; NaN
-            where too few positions tell it.
+        depth: from first touch, mm; (points,).
+        share: standard deviation of the model's error between positions at these depths, share of
+            the force; NaN where too few positions tell it; (points,).
         positions: that could be left out.
         quantile: of a 95 % interval with `positions` - 1 degrees of freedom; NaN likewise.
         growth: by which standard errors from the parameters grow, since neighbouring residuals are
@@ -64,9 +69,10 @@ class ModelError(NamedTuple):
     @property
     def known(self) -> bool:
         """Whether there are positions enough to know it."""
-        return bool(np.isfinite(self.share))
+        return bool(np.isfinite(self.share).all())
 
-    share: float
+    depth: Float[np.ndarray, " points"]
+    share: Float[np.ndarray, " points"]
     positions: int
     quantile: float
     growth: float
@@ -78,10 +84,16 @@ class ModelError(NamedTuple):
         if not self.known:
             few = f"{self.positions} of {MIN_POSITIONS} positions that could be left out"
             return f"{few}: the model's error between positions is unknown"
+        low, high = 100 * np.min(self.share), 100 * np.max(self.share)
+        size = f"{low:.2g}" if high < 1.1 * low or high == 0 else f"{low:.2g} to {high:.2g}"
         return (
-            f"with the model's error between positions, {100 * self.share:.2g} % of the force "
+            f"with the model's error between positions, {size} % of the force "
             f"({self.positions} left out in turn)"
         )
+
+    def share_at(self, depth: np.ndarray) -> np.ndarray:
+        """The share at depths from first touch, mm; that of the deepest beyond."""
+        return np.interp(depth, self.depth, self.share)
 
     @property
     def growth_message(self) -> str:
@@ -152,6 +164,10 @@ def _rebuilt(
     column = {p.name: step for p, step in zip(built.parameters, steps, strict=True)}
     theta = stored.theta[rows][:, : built.size] * built.of_unknowns(lambda p: column[p.name], 1.0)
     sigma = np.where(given, 1.0, stored.sigma[rows])
+    share = stored.force_share[rows]
+    if built.shares is None and share.any():
+        force = np.asarray(built.lanes.force) - offsets(built, theta)[..., None]
+        built = with_levels(built, Levels(sigma[:, 0], share), force)
     return built, theta, np.where(np.isfinite(sigma), sigma, 1.0), rows
 
 
@@ -263,38 +279,49 @@ def _of_lane(stored: StoredFit, curves: tuple[Curve, ...], left: _LeftOut) -> Mo
         s = np.nan if curve.s_c is None else round(curve.s_c / SAME_PLACE)
         places.setdefault((curve.specimen, s, curve.phi_c, *curve.direction), []).extend(group)
     pressed = np.array([c.s_c for c in curves if c.s_c is not None], float)
+    deepest = max(float(np.max(stored.above_touch(c)[0], initial=0)) for c in curves)
+    grid = np.linspace(0, deepest, POINTS)
     squares = []
     for out in places.values():
         out = sorted(set(out))
         found = left.predicted(out) if len(out) < len(curves) else None
         if found is not None:
-            squares.append(_square(stored, [curves[t] for t in out], *found))
-    squares = [v for v in squares if np.isfinite(v)]
+            squares.append(_squares(stored, [curves[t] for t in out], *found, grid))
+    squares = [v for v in squares if np.isfinite(v).all()]
     n = len(squares)
-    share, quantile = np.nan, np.nan
-    if n >= MIN_POSITIONS:
-        share, quantile = float(np.sqrt(max(np.mean(squares), 0))), float(stdtrit(n - 1, 0.975))
-    return ModelError(share, n, quantile, left.growth, pressed)
+    if n < MIN_POSITIONS or deepest <= 0:
+        return ModelError(grid, np.full(POINTS, np.nan), n, np.nan, left.growth, pressed)
+    by_depth = np.mean(squares, axis=0)
+    sampled = np.concatenate([stored.above_touch(c)[0] for c in curves])
+    pooled = np.mean(np.interp(sampled[sampled > 0], grid, by_depth))
+    # Few positions tell the square at one depth badly, all depths together none of its growth.
+    share = np.sqrt(np.maximum((pooled + np.maximum(by_depth, 0)) / 2, 0))
+    return ModelError(grid, share, n, float(stdtrit(n - 1, 0.975)), left.growth, pressed)
 
 
-def _square(stored: StoredFit, curves, error, variance) -> float:
-    """Mean square of the smooth error of curves of one position, over that of their force.
+def _squares(stored: StoredFit, curves, error, variance, grid) -> Float[np.ndarray, " points"]:
+    """Square of the smooth error of one position over the force, at the depths `grid`.
 
-    Less what noise in the parameters explains, so that it may be negative.
+    Less what the noise of the curve and in the parameters explains, so that it may be negative.
+    The mean over curves of the position; NaN where none has a force.
     """
-    smooth = force = 0.0
+    out = []
     for curve, e, v in zip(curves, error, variance, strict=True):
         depth, F = stored.above_touch(curve)
         e, v = e[: len(F)], v[: len(F)]
         seen = (depth > 0) & np.isfinite(e) & (F != 0)
         if not seen.any():
             continue
-        e, v, F, x = e[seen], v[seen], F[seen], depth[seen] / np.max(depth[seen])
-        k = min(SHAPES, max(len(np.unique(x)) - 1, 1))
-        basis = F[:, None] * x[:, None] ** np.arange(k)
-        fitted = basis @ np.linalg.lstsq(basis, e, rcond=None)[0]
-        noise = np.sum((e - fitted) ** 2) / max(len(e) - k, 1)
-        smooth += np.sum(fitted**2) - k * noise
-        smooth -= np.sum(v)
-        force += np.sum(F**2)
-    return smooth / force if force > 0 else np.nan
+        e, v, F, depth = e[seen], v[seen], F[seen], depth[seen]
+        size = np.max(depth)
+        k = min(SHAPES, max(len(np.unique(depth)) - 1, 1))
+        powers = np.arange(k)
+        basis = F[:, None] * (depth / size)[:, None] ** powers
+        at = np.clip(grid / size, np.min(depth) / size, 1)[:, None] ** powers
+        inverse = np.linalg.pinv(basis)
+        left = np.sum((e - basis @ (inverse @ e)) ** 2) / max(len(e) - k, 1)
+        noise = left * np.sum((at @ inverse) ** 2, axis=1)
+        order = np.argsort(depth)
+        known = np.interp(grid, depth[order], (v / F**2)[order])
+        out.append((at @ (inverse @ e)) ** 2 - noise - known)
+    return np.mean(out, axis=0) if out else np.full(len(grid), np.nan)

@@ -64,8 +64,9 @@ class CurvePrediction:
         side_se: its standard error from the parameters.
         joint_side: of each ring along the circumference, mm; (N, rings).
         joint_side_se: from the parameters.
-        model_se: standard deviation of the error of the model between the positions of the fit, N;
-            (N,); 0 at one of them, and where too few tell it.
+        model_se: standard deviation of the error of the model between the positions of the fit,
+            beyond what the widened `se` has of it, N; (N,); 0 at one of them, and where too few
+            tell it.
         model_quantile: of a 95 % interval in `model_se`.
     """
 
@@ -211,10 +212,20 @@ def _widened(source: Source, error: ModelError | None) -> Source:
 def _between_positions(
     stored: StoredFit, source: Source, error: ModelError | None, found: CurvePrediction
 ) -> CurvePrediction:
-    """The prediction with the error of the model, where the fit has not pressed."""
+    """The prediction with the share of the force in its noise, or the model's error in its place.
+
+    That where the fit has not pressed.
+    """
+    if not found.status.predicts:
+        return found
     options = stored.study.model.options
     placeless = options.coupling == "total" and options.local == "uniform"
-    if error is None or placeless or error.at_pressed(found.s) or not found.status.predicts:
+    between = error is not None and not placeless and not error.at_pressed(found.s)
+    force = np.abs(found.force - value_of(stored, source, "force_offset"))
+    share = float(stored.force_share[source.lane])
+    if not between or not error.known:
+        found = dataclasses.replace(found, sigma=np.hypot(found.sigma, share * force))
+    if not between:
         return found
     message = "; ".join(filter(None, [found.message, error.message]))
     if not error.known:
@@ -223,11 +234,17 @@ def _between_positions(
         if status != found.status:
             message = f"{status.message}{head}; {error.message}"
         return dataclasses.replace(found, status=status, message=message)
-    force = np.abs(found.force - value_of(stored, source, "force_offset"))
+    # The noise's share is the model's error where it was pressed, and what alike residuals widen
+    # the parameters' errors by comes of the same misfit: neither counts twice.
+    depth = depths(found.displacement, onset_of(stored, source), options)
+    beyond = (np.maximum(error.share_at(np.abs(depth)), share) * np.nan_to_num(force)) ** 2
+    if np.isfinite(error.growth):
+        ratio = found.half_width / error.quantile
+        beyond = beyond - (1 - 1 / error.growth**2) * (ratio * found.se) ** 2
     return dataclasses.replace(
         found,
         message=message,
-        model_se=error.share * np.nan_to_num(force),
+        model_se=np.sqrt(np.maximum(np.nan_to_num(beyond), 0)),
         model_quantile=error.quantile,
     )
 

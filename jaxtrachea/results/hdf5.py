@@ -71,6 +71,7 @@ def _write_lanes(group: h5py.Group, result: FitResult) -> None:
         group.create_dataset(name, data=getattr(result.criteria, name))
     for name in ("sigma", "rms"):
         group.create_dataset(name, data=getattr(result, name)).attrs["unit"] = "N, mm"
+    group.create_dataset("force_share", data=result.force_share)
     group.create_dataset("condition", data=result.uncertainty.condition)
 
 

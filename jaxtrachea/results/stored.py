@@ -33,7 +33,8 @@ SCHEMA = "jaxtrachea-results"
 VERSION = 2
 #: Groups and datasets that are read; nothing else of the file is.
 READ = (
-    "/model", "/data", "/lanes/status", "/lanes/sigma", "/lanes/rms", "/unknowns/theta",
+    "/model", "/data", "/lanes/status", "/lanes/sigma", "/lanes/rms", "/lanes/force_share",
+    "/unknowns/theta",
     "/unknowns/at_bound",
     "/uncertainty/covariance", "/uncertainty/silent", "/uncertainty/half_width",
 )  # fmt: skip
@@ -61,6 +62,7 @@ class StoredFit:
         status: `FitStatus`; (L,).
         sigma: standard deviation of force, N, and markers, mm, given or estimated; NaN without
             samples of the kind; (L, 2).
+        force_share: share of the force that its noise has beside `sigma`, see `Noise`; (L,).
         half_width: of a 95 % interval in standard errors; inf where the noise could not be
             estimated; (L,).
         curves: the data as used; `source` is the file's name and the place in it.
@@ -80,6 +82,7 @@ class StoredFit:
     at_bound: np.ndarray
     status: np.ndarray
     sigma: np.ndarray
+    force_share: np.ndarray
     half_width: np.ndarray
     curves: tuple[Curve, ...]
     curve_lane: np.ndarray
@@ -194,6 +197,7 @@ def from_result(result: FitResult) -> StoredFit:
         at_bound=result.at_bound,
         status=result.status,
         sigma=np.where(np.isnan(result.rms), np.nan, result.sigma),
+        force_share=result.force_share,
         half_width=_known_half_width(study, u.half_width),
         curves=tuple(c for _, _, c in placed),
         curve_lane=np.array([k for k, _, _ in placed]),
@@ -305,6 +309,7 @@ def _read(path: Path, file: Any) -> StoredFit:
         at_bound=numeric(file["unknowns"], "at_bound") > 0,
         status=numeric(file["lanes"], "status").astype(int),
         sigma=_sigma(file["lanes"]),
+        force_share=_force_share(file["lanes"]),
         half_width=_known_half_width(study, numeric(file["uncertainty"], "half_width")),
         curves=curves,
         curve_lane=lane,
@@ -336,6 +341,13 @@ def _sigma(lanes: Any) -> np.ndarray:
     sigma = numeric(lanes, "sigma")
     rms = numeric(lanes, "rms")
     return np.where(np.isnan(rms), np.nan, sigma) if rms.shape == sigma.shape else sigma
+
+
+def _force_share(lanes: Any) -> np.ndarray:
+    """As `FitResult.force_share`; files of before had none."""
+    if "force_share" in lanes:
+        return numeric(lanes, "force_share")
+    return np.zeros(len(numeric(lanes, "status")))
 
 
 def _json(group: Any) -> Any:
@@ -410,7 +422,7 @@ def _check_shapes(stored: StoredFit) -> None:
     L, P = len(stored.study.unknowns), stored.theta.shape[-1]
     shapes = {
         "theta": (L, P), "covariance": (L, P, P), "null_space": (L, P, P), "at_bound": (L, P),
-        "status": (L,), "sigma": (L, 2), "half_width": (L,), "curve_lane": (len(stored.curves),),
+        "status": (L,), "sigma": (L, 2), "force_share": (L,), "half_width": (L,), "curve_lane": (len(stored.curves),),
         "blend": (len(stored.curves),),
     }  # fmt: skip
     for name, shape in shapes.items():
