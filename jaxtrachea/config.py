@@ -44,7 +44,9 @@ def quantity(
             with np.errstate(over="ignore"):  # infinity is refused with the key's name
                 number = parse_quantity(value, dimension)
         except UnitError as error:
-            raise ValueError(f"{error}{''.join(f', or {w!r}' for w in (word, or_word) if w)}") from None
+            raise ValueError(
+                f"{error}{''.join(f', or {w!r}' for w in (word, or_word) if w)}"
+            ) from None
         if positive and number <= 0:
             raise ValueError(f"expected a positive {dimension}")
         return number

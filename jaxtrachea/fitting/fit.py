@@ -85,20 +85,28 @@ class _Found(NamedTuple):
 def _with_force_share(found: _Found, settings: Settings, progress) -> _Found:
     """The fit in turns with sigma and share of its forces, until these stay.
 
-    A fit whose residuals show no share is returned as it is.
+    Lanes whose residuals show no share are left as they are.
     """
-    levels = None
     alive = None if progress is None else lambda done, of: progress(0, of)
+    result, minima, known = found
+    levels = None
     for _ in range(TURNS):
         before = levels
-        levels, force = next_levels(found.result)
-        if before is None and not levels.share.any():
-            return found
-        study = with_levels(found.result.study, levels, force)
-        found = _lowest(study, settings, alive, None, found.result.theta)
-        if before is not None and not changed(before, levels):
+        levels, force = next_levels(result)
+        rows = changed(before, levels)
+        if result.study.joint and len(rows):
+            rows = np.arange(result.lanes)
+        if not len(rows):
+            if before is None:  # refits need not look again
+                none = dataclasses.replace(result.study, force_share=None)
+                result = dataclasses.replace(result, study=none)
             break
-    return found
+        study = with_levels(result.study, levels, force)
+        part = study if len(rows) == result.lanes else study.take(rows)
+        again = _lowest(part, settings, alive, None, result.theta[rows])
+        minima = minima.without_ends(rows).replaced(rows, again.minima)
+        result = _conclude(study, minima, known)
+    return _Found(result, minima, known)
 
 
 def _lowest(study: Study, settings: Settings, progress, starts, beside) -> _Found:

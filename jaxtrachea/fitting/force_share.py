@@ -9,10 +9,10 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from jaxtrachea.fitting.noise import first_sigma
 from jaxtrachea.fitting.parameters import Parameter
-from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Shares, Study
 
@@ -40,14 +40,20 @@ def with_levels(study: Study, levels: Levels, force: Float[np.ndarray, "lanes T 
     given = study.noise_given[0]
     share = levels.share[:, None, None] * np.abs(force)
     # In units of an estimated sigma; of given ones beside each.
-    grown = share * plain if given else share / levels.sigma[:, None, None]
+    sigma = np.where(levels.share > 0, levels.sigma, first_sigma(_plain(study))[:, 0])
+    grown = share * plain if given else share / sigma[:, None, None]
     precision = plain / np.hypot(1, grown)
     lanes = study.lanes
     changed = {"precision": precision}
     if lanes.side_precision is not None:
         changed["side_precision"] = np.where(lanes.side_precision > 0, precision, 0)
-    shares = Shares(levels.share, None if given else levels.sigma, plain)
+    shares = Shares(levels.share, None if given else sigma, plain)
     return dataclasses.replace(study, lanes=lanes._replace(**changed), shares=shares)
+
+
+def _plain(study: Study) -> Study:
+    """The study as if nothing were found yet."""
+    return dataclasses.replace(study, shares=None)
 
 
 def next_levels(result: FitResult) -> tuple[Levels, Float[np.ndarray, "lanes T N"]]:
@@ -56,7 +62,7 @@ def next_levels(result: FitResult) -> tuple[Levels, Float[np.ndarray, "lanes T N
     A share that is given is kept; one that gains less than `WORTH` is 0.
     """
     study = result.study
-    residual = predictions(study, result.theta).force
+    residual = result.residuals.force
     force = np.asarray(study.lanes.force) - offsets(study, result.theta)[..., None]
     force = np.where(np.isfinite(residual), force + residual, force)
     plain = study.lanes.precision if study.shares is None else study.shares.plain
@@ -128,7 +134,10 @@ def _chosen(cost: np.ndarray) -> int:
     return best if cost[0] - cost[best] > WORTH else 0
 
 
-def changed(before: Levels, after: Levels) -> bool:
-    """Whether another fit is worth its time."""
+def changed(before: Levels | None, after: Levels) -> Int[np.ndarray, " n"]:
+    """Lanes that another fit is worth its time for; of none that never had a share."""
+    if before is None:
+        return np.flatnonzero(after.share > 0)
     pairs = zip(before, after, strict=True)
-    return any(np.any(np.abs(b - a) > STEADY * np.maximum(a, b)) for a, b in pairs)
+    moved = [np.abs(b - a) > STEADY * np.maximum(a, b) for a, b in pairs]
+    return np.flatnonzero(np.any(moved, axis=0) & ((before.share > 0) | (after.share > 0)))

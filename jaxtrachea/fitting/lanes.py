@@ -34,8 +34,8 @@ class Noise:
         joints: mm.
         force_share: of the force, which sigma has beside it (root of the sum of the squares): what
             a model misses in a deep press grows with the force. A number, "estimate" (from the
-            residuals), or None: estimated where curves go deeper than a tenth of the radius and
-            sigma is estimated, else none.
+            residuals), or None: estimated where curves go deeper than a tenth of the radius, sigma
+            is estimated and there is a skeleton, else none.
         joints_share: of the tool's displacement from first touch, which `joints` has beside it
             (root of the sum of the squares): what a model errs in markers grows with the press.
     """

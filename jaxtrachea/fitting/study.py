@@ -366,9 +366,14 @@ def _force_share(
     change_points: np.ndarray | None,
     model: FitModel,
 ) -> float | Literal["estimate"] | None:
-    """The share that is asked for, or estimated by itself: of deep presses, sigma estimated."""
+    """The share that is asked for, or estimated by itself: of deep presses, sigma estimated.
+
+    Without a skeleton (coupling `total`) no press is too deep for it.
+    """
     if noise.force_share is not None:
         return noise.force_share or None
+    if model.options.coupling == "total":
+        return None
     touch = _first_touch(lanes, parameters, change_points)[..., None]
     depth = depths(np.asarray(lanes.displacement), touch, model.options)
     deepest = np.max(np.where(lanes.precision > 0, np.abs(depth), 0))

@@ -42,7 +42,6 @@ from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 
-
 #: Points and weights on -1 to 1: forces are smooth over the way of a press.
 _GAUSS = np.polynomial.legendre.leggauss(12)
 

@@ -70,9 +70,7 @@ def press_softening(
         known = known & jnp.isfinite(value)
     # Of a row without a solution 0 times NaN would reach what all share: hidden at the end.
     D, e_1, e_2, c = (jnp.where(known, v, 0) for v in (displacement, e_1, e_2, compliance))
-    whole = law._replace(
-        **{name: jnp.where(known, k, 1) for name, k in law.coefficients().items()}
-    )
+    whole = law._replace(**{name: jnp.where(known, k, 1) for name, k in law.coefficients().items()})
     softening = Softening(e_1, e_2)
     past = softening.past_peak(D)
     depth, load, folded = whole.series(jnp.where(past, 0, D), c)

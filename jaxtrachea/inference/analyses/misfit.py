@@ -14,12 +14,37 @@ def _compute(request: Request, findings: Findings, progress: Progress) -> Misfit
 
 def _lane_cells(compared: Misfit, lane: int) -> Cells:
     force, marker = map(float, compared.ratio[lane])
-    return {"residual_over_noise": force, "marker_residual_over_noise": marker}
+    share = float(compared.result.force_share[lane])
+    return {
+        "residual_over_noise": force,
+        "marker_residual_over_noise": marker,
+        "force_share": share,
+    }
+
+
+def _share(compared: Misfit) -> list[str]:
+    """That the noise of forces grows with the force."""
+    result = compared.result
+    lanes = np.flatnonzero(result.force_share > 0)
+    if not len(lanes):
+        return []
+    share, sigma = np.median(result.force_share[lanes]), np.median(result.sigma[lanes, 0])
+    median = f" in {len(lanes)} of {result.lanes} lanes (medians)" if result.lanes > 1 else ""
+    cause = (
+        "found in the residuals: what the model misses grows with the force, and with one sigma "
+        "for all depths the deep samples would outvote the shallow ones"
+        if result.study.force_share == "estimate"
+        else "as `noise.force_share` says"
+    )
+    return [
+        f"The noise of a force sample is {sigma:.2g} N and {100 * share:.2g} % of the force"
+        f"{median}, {cause}."
+    ]
 
 
 def _sentences(compared: Misfit) -> list[str]:
-    """Residuals larger than the noise given, and smaller ones."""
-    every, said = compared.result.lanes, []
+    """The share of the force in the noise; residuals larger than the noise given, and smaller."""
+    every, said = compared.result.lanes, _share(compared)
     for k, (kind, key) in enumerate((("Force", "noise.force"), ("Marker", "noise.joints"))):
         ratio, told = compared.ratio[:, k], compared.told[:, k]
         for beyond, cause in (
