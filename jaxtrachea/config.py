@@ -90,6 +90,10 @@ ForceNoise = Annotated[
     Estimate | PerCurve | float,
     quantity("force", positive=True, words=("estimate", "estimate per curve")),
 ]
+ShareNoise = Annotated[
+    Literal["auto", "estimate"] | float,
+    quantity("dimensionless", words=("estimate", "auto")),
+]
 LengthNoise = Annotated[Estimate | float, quantity("length", positive=True, words=("estimate",))]
 Number = Annotated[Any, BeforeValidator(_number_or_quantity)]
 NumberOrTrue = Annotated[Any, BeforeValidator(_value_or_true)]
@@ -249,6 +253,7 @@ class NoiseSection(Section):
     """
 
     force: ForceNoise = "estimate"
+    force_share: ShareNoise = "auto"
     joints: LengthNoise = "estimate"
     joints_share: Annotated[float, quantity("dimensionless")] = 0.0
 

@@ -83,14 +83,19 @@ class PredictionStatus(_Described):
 
     OK = 0, "predicted"
     AT_BOUND = 1, "predicted, but the bands leave out the uncertainty of an unknown on its bound"
-    BENT = 2, "predicted, but the model bends within the bands: the linear bands are off"
-    UNDETERMINED = 3, "predicted, but the data of the fit do not limit it: infinite bands"
-    TOO_DEEP = 4, "predicted, but where the wall moves further than the tube's radius"
-    NO_SOLUTION = 5, "no stable solution at some displacements"
-    NO_OWN = 6, "the curve's own parameters could not be fitted to it"
-    NO_ESTIMATE = 7, "the fit has no estimate for it"
-    UNKNOWN_SPECIMEN = 8, "the fit does not know this specimen"
-    BAD_DATA = 9, "the measurements could not be used"
+    FEW_POSITIONS = (
+        2,
+        "predicted, but the bands know noise and parameters alone and are not of 95 %: too few "
+        "positions tell the model's error between them",
+    )
+    BENT = 3, "predicted, but the model bends within the bands: the linear bands are off"
+    UNDETERMINED = 4, "predicted, but the data of the fit do not limit it: infinite bands"
+    TOO_DEEP = 5, "predicted, but where the wall moves further than the tube's radius"
+    NO_SOLUTION = 6, "no stable solution at some displacements"
+    NO_OWN = 7, "the curve's own parameters could not be fitted to it"
+    NO_ESTIMATE = 8, "the fit has no estimate for it"
+    UNKNOWN_SPECIMEN = 9, "the fit does not know this specimen"
+    BAD_DATA = 10, "the measurements could not be used"
 
     @property
     def predicts(self) -> bool:

@@ -97,7 +97,7 @@ WITHIN = {
         {"effective", "few_samples"},
         {"result"},
         {"minima", "natural_sizes", "other_starts", "profile_search"},
-        {"doubt", "evaluate"},
+        {"doubt", "evaluate", "force_share"},
         {"scrutiny"},
         {"fit"},
     ],
@@ -114,7 +114,8 @@ WITHIN = {
     "inference/design": [{"press", "candidates"}, {"situation"}, {"choice"}, {"identifiability"}],
     "results": [{"arrays", "store"}, {"rows", "stored"}, {"hdf5"}],
     "trials": [{"polynomials", "uneven_noise"}, {"differences"}, {"repeats"}],
-    "prediction": [{"core", "sources"}, {"predict"}, {"held_out"}, {"plots", "report", "tables"}],
+    "prediction": [{"core", "model_error", "sources"}, {"predict"}, {"held_out"},
+                   {"plots", "report", "tables"}],
     "runs": [{"meet", "manifest"}, {"processes", "shards"}, {"folder"}, {"rerun", "checkpoint"}],
     "tradeoff": [
         {"calls", "errors", "front", "levels", "load"},

@@ -1,4 +1,4 @@
-"""A skeleton that softens in series with the local law: roots in 40 digits, derivatives, folds."""
+"""A tube that softens in a deep press: forces in 40 digits, derivatives, the peak of the law."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jax.test_util import check_grads
 from jaxtrachea.mechanics.equilibrium import press_series, press_softening, sensitivity
 from jaxtrachea.mechanics.force_law import Law
 from jaxtrachea.mechanics.press import Options, press
-from jaxtrachea.mechanics.softening import Softening, soft_series
+from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import table_1
 from jaxtrachea.trachea.material import Material
@@ -22,11 +22,11 @@ NAMES = ("displacement", "compliance", "k_1", "k_3", "e_1", "e_2")
 @jax.jit
 @jax.vmap
 def solve(D, c, k_1, k_3, e_1, e_2):
-    return soft_series(D, c, Law(k_1, k_3), Softening(e_1, e_2))
+    return press_softening(D, c, Law(k_1, k_3), Softening(e_1, e_2))
 
 
 def random_cases(n, dtype, seed=0):
-    """D, c, k_1, k_3, e_1, e_2 over many decades; draws and presses, with and without a fold."""
+    """D, c, k_1, k_3, e_1, e_2 over many decades; draws and presses, with and without a peak."""
     rng = np.random.default_rng(seed)
     k_3 = 10 ** rng.uniform(-4, 2, n) * (rng.random(n) < 0.7)
     rows = (
@@ -37,53 +37,26 @@ def random_cases(n, dtype, seed=0):
 
 
 def exact(D, c, k_1, k_3, e_1, e_2):
-    """Depth, deflection and force by bisection in 40 digits, and the condition of the problem.
+    """Depth, load and force by bisection in 40 digits, and the condition of the ratio.
 
-    None where the skeleton carries less than its part at the peak of its law, or at D.
+    None past the peak of D r(D), found on 4000 points of the way: independent of the closed form.
     """
     with mp.workdps(40):
         D, c, k_1, k_3, e_1, e_2 = (mp.mpf(float(v)) for v in (D, c, k_1, k_3, e_1, e_2))
         sign = -1 if D < 0 else 1
         D, e_1 = abs(D), sign * e_1
-        slopes = mp.polyroots([1, -2 * e_1, 3 * e_2], asc=True) if e_2 else [1 / (2 * e_1)]
-        peaks = [mp.re(r) for r in slopes if abs(mp.im(r)) < 1e-25 and mp.re(r) > 0]
-
-        def excess(u):
-            d = D - u
-            return u * (1 - e_1 * u + e_2 * u**2) - c * (k_1 * d + k_3 * d**3)
-
-        low, high = mp.mpf(0), min([D, *peaks])
-        if excess(high) < 0:
+        way = np.linspace(0, float(D), 4001)
+        carried = way * (1 - float(e_1) * way + float(e_2) * way**2)
+        if np.any(np.diff(carried) < 0):
             return None
+        low, high = mp.mpf(0), D
         for _ in range(140):
             middle = (low + high) / 2
-            low, high = (middle, high) if excess(middle) < 0 else (low, middle)
-        d, u = D - low, low
-        slope, rise = c * (k_1 + 3 * k_3 * d**2), 1 - 2 * e_1 * u + 3 * e_2 * u**2
-        return sign * d, sign * u, sign * (k_1 * d + k_3 * d**3), (1 + slope) / (rise + slope)
-
-
-#: D, c, k_1, k_3, e_1, e_2. Newton steps end beside the bracket, or the slope of one part vanishes.
-AWKWARD = [
-    (7.103547096252441, 0.010391807183623314, 3.7435123920440674, 0.3207882344722748,
-     0.3786492645740509, 0.031034469604492188),
-    (5.099063831981425, 0.011181853053177574, 8.871589887372034, 0.33365479430829115,
-     0.5119065690786285, 0.06732756246349501),
-    (7.92747, 0.156729, 0.692956, 0.0449488, 0.220599, 0.0123822),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("rows", [1, 8])
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_awkward_rows(dtype, rows):
-    """Alone and repeated, which compilers round in two ways."""
-    for case in AWKWARD:
-        case = [np.full(rows, v, dtype) for v in case]
-        got = solve(*case)
-        *truth, condition = exact(*(v[0] for v in case))
-        rtol = 4 * np.finfo(dtype).eps * float(condition)
-        for v, expected in zip(got[:3], truth, strict=True):
-            np.testing.assert_allclose(v, float(expected), rtol=rtol)
+            less = middle + c * (k_1 * middle + k_3 * middle**3) < D
+            low, high = (middle, high) if less else (low, middle)
+        ratio, load = 1 - e_1 * D + e_2 * D**2, k_1 * low + k_3 * low**3
+        terms = 1 + abs(e_1) * D + e_2 * D**2
+        return sign * low, sign * load, sign * load * ratio, terms / ratio
 
 
 @pytest.mark.parametrize("many", ["k_3", "e_1"])
@@ -92,7 +65,7 @@ def test_one_displacement_and_many_values(many):
     given = {"D": 4.0, "c": 0.5, "k_1": 1.0, "k_3": 0.1, "e_1": 0.05, "e_2": 0.01}
     rows = [given | {many: v} for v in (0.03, 0.06)]
     D, c, k_1, k_3, e_1, e_2 = (jnp.asarray(v) for v in (given | {many: [0.03, 0.06]}).values())
-    got = soft_series(D, c, Law(k_1, k_3), Softening(e_1, e_2))
+    got = press_softening(D, c, Law(k_1, k_3), Softening(e_1, e_2))
     for i, row in enumerate(rows):
         np.testing.assert_allclose(got.force[i], float(exact(*row.values())[2]), rtol=1e-14)
 
@@ -101,7 +74,7 @@ def test_one_displacement_and_many_values(many):
 @pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_roots(dtype):
-    """All three to a few roundings relative to themselves, however unequal; folds are told."""
+    """All three to a few roundings relative to themselves, however unequal; peaks are told."""
     cases = random_cases(400, dtype)
     got = solve(*cases)
     eps, folded = np.finfo(dtype).eps, 0
@@ -109,25 +82,25 @@ def test_roots(dtype):
         truth = exact(*row)
         if truth is None:
             folded += 1
-            assert got.folded[i]
-            assert all(np.isnan(v[i]) for v in got[:3])
+            assert got.status[i] == PressStatus.PAST_FOLD
+            assert all(np.isnan(v[i]) for v in (got.depth, got.load, got.force))
             continue
-        assert not got.folded[i]
-        for value, true in zip(got[:3], truth[:3], strict=True):
+        assert got.status[i] == PressStatus.OK
+        for value, true in zip((got.depth, got.load, got.force), truth[:3], strict=True):
             error = abs(mp.mpf(float(value[i])) - true) / abs(true)
             assert error < 8 * eps * max(1, truth[3]), (i, row)
-    assert 5 < folded < 50
+    assert 5 < folded < 100
 
 
 def test_a_row_knows_nothing_of_its_neighbours():
     """Bit for bit among others; to rounding by itself, which is a program of its own."""
     cases, others = (random_cases(40, "float64", seed=seed) for seed in (1, 2))
     rows, keeps = [0, 17, 33], np.isin(np.arange(40), [0, 17, 33])
-    together = np.array(solve(*cases)[:3])[:, rows]
+    together = np.array(solve(*cases)[:2])[:, rows]
     mixed = solve(*(np.where(keeps, v, w) for v, w in zip(cases, others, strict=True)))
-    np.testing.assert_array_equal(np.array(mixed[:3])[:, rows], together)
+    np.testing.assert_array_equal(np.array(mixed[:2])[:, rows], together)
     for i, found in zip(rows, together.T, strict=True):
-        alone = np.array(solve(*(v[i : i + 1] for v in cases))[:3])[:, 0]
+        alone = np.array(solve(*(v[i : i + 1] for v in cases))[:2])[:, 0]
         np.testing.assert_allclose(alone, found, rtol=4 * np.finfo(float).eps)
 
 
@@ -171,7 +144,7 @@ def test_derivatives(D):
 @pytest.mark.slow
 @pytest.mark.compiling
 def test_past_the_fold():
-    """Softening to a peak of the skeleton at u = 1/(2 e_1): no row beyond it, gradients finite."""
+    """Softening to a peak at D = 1/(2 e_1): no row beyond it, gradients finite."""
     law, softening = Law(jnp.asarray(1e6), jnp.asarray(0.0)), Softening(0.25, 0.0)
     D = jnp.array([1.9, 1.99, 2.01, 5.0, -5.0])
     got = press_softening(D, jnp.asarray(1.0), law, softening)
@@ -231,7 +204,7 @@ def test_not_finite_is_no_fold(name, bad, dtype):
 @pytest.mark.compiling
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_press(dtype):
-    """In `press` the joints follow the deflection of C; work along a path is the stored energy."""
+    """In `press` the joints follow the deflection of C, the rings and the tool the softer force."""
     material = Material(
         *(jnp.asarray(v, dtype) for v in (40.0, 0.1, 0.6, 0.02)),
         e_1=jnp.asarray(0.11, dtype), e_2=jnp.asarray(0.006, dtype),
@@ -248,11 +221,10 @@ def test_press(dtype):
     np.testing.assert_allclose(got.joints, joints, rtol=rtol, atol=1e-9)
     reactions = np.outer(got.force, linear.reactions / linear.force)
     np.testing.assert_allclose(got.reactions, reactions, rtol=rtol, atol=1e-9)
-    F, d, u = (np.asarray(v, np.float64) for v in (got.force, got.depth, got.skeleton))
-    work = np.sum((F[1:] + F[:-1]) / 2 * np.diff(np.asarray(D, np.float64)))
-    skeleton = u**2 / 2 - 0.11 * u**3 / 3 + 0.006 * u**4 / 4
-    stored = 0.6 * d**2 / 2 + 0.02 * d**4 / 4 + skeleton / float(got.compliance)
-    np.testing.assert_allclose(work, stored[-1], rtol=2e-6)
+    F, d, D_ = (np.asarray(v, np.float64) for v in (got.force, got.depth, D))
+    np.testing.assert_allclose(
+        F, (0.6 * d + 0.02 * d**3) * (1 - 0.11 * D_ + 0.006 * D_**2), rtol=rtol, atol=1e-9
+    )
     one = jax.vmap(lambda D: press(geometry, material, 75.0, D, options).force)(D[::500])
     np.testing.assert_allclose(one, got.force[::500], rtol=rtol)
 

@@ -57,6 +57,7 @@ def record(result: FitResult) -> dict:
         },
         "rms_over_peak": float(result.rms[0, 0]) / peak_force(result, 0),
         "rms_joints_mm": float(result.rms[0, 1]),
+        "force_share": float(result.force_share[0]),
     }
 
 
@@ -99,8 +100,9 @@ def finite_strain(depth: float, skeleton: str) -> dict:
 def held_out(whole: FitResult, settings: Settings) -> dict:
     """Three positions predicted from the other seven, for every choice of three (twins together).
 
-    Force: rms over the curve (of its last sample, where it is straight) over the curve's peak;
-    markers at the largest displacement D, over D. Both rms and worst over all choices.
+    Force: rms over the curve (of its last sample, where it is straight) over the curve's peak, and
+    of the first sample over its force; markers at the largest displacement D, over D. All rms over
+    all choices, of the first also the worst curve.
     """
     study = whole.study
     (curves,) = study.curves
@@ -112,11 +114,12 @@ def held_out(whole: FitResult, settings: Settings) -> dict:
     np.put_along_axis(held, np.array(choices), True, axis=1)
     row = np.zeros(len(choices), int)
     _, _, error = refitted(study.take(row), held, whole.theta[row], settings, None)
-    force, joints = [], []
+    force, first, joints = [], [], []
     for lane, trial in np.argwhere(held):
         curve = curves[trial]
         last = len(curve.force) - 1
         off = error.force[lane, trial, 1 : last + 1] / np.max(np.abs(curve.force))
+        first.append(error.force[lane, trial, 1] / curve.force[1])
         force.append(abs(off[-1]) if last < 3 else np.sqrt(np.mean(off**2)))
         off = error.joints[lane, trial, last] / curve.displacement[-1]
         joints.extend(off[np.isfinite(off)])
@@ -124,6 +127,7 @@ def held_out(whole: FitResult, settings: Settings) -> dict:
         "choices": len(choices),
         "force": float(np.sqrt(np.mean(np.square(force)))),
         "force_worst": float(np.max(force)),
+        "first": float(np.sqrt(np.mean(np.square(first)))),
         "joints": float(np.sqrt(np.mean(np.square(joints)))),
     }
 
@@ -156,7 +160,9 @@ def document(expected: dict) -> str:
             *(_estimate(o["parameters"].get(n)) for n in [*names, "e_1", "e_2"]),
             f"{100 * o['rms_over_peak']:.2f} %",
             f"{o['rms_joints_mm']:.3f}",
+            f"{100 * o['force_share']:.2f} %",
             *_of_three(o),
+            f"{100 * o['held_out']['first']:.2f} %",
         ]
         for o in expected["finite_strain"]
     ]
@@ -169,8 +175,9 @@ def document(expected: dict) -> str:
         "e_2",
         "fit F",
         "fit w",
+        "share",
     ]
-    finite_head += three
+    finite_head += [*three, "at first"]
     text = (HERE / "virtual_trachea.md.in").read_text(encoding="utf-8")
     return text.replace("@OPTIONS@", _table(head, rows)).replace(
         "@FINITE@", _table(finite_head, finite)

@@ -294,9 +294,13 @@ def _noise(spec: FitSpec) -> Noise:
         None if isinstance(sigma, str) else sigma for sigma in (spec.noise.force, spec.noise.joints)
     )
     by_curve = spec.noise.force == "estimate per curve"
-    share = spec.noise.joints_share
+    of_joints = spec.noise.joints_share
+    share = None if spec.noise.force_share == "auto" else spec.noise.force_share
     try:
-        return Noise(force=force, joints=joints, joints_share=share, force_by_curve=by_curve)
+        return Noise(
+            force=force, joints=joints, joints_share=of_joints, force_share=share,
+            force_by_curve=by_curve,
+        )  # fmt: skip
     except InputError as error:
         raise SpecError.like(error, key=f"noise.{error.key}") from None
 

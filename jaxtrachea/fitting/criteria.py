@@ -42,7 +42,8 @@ def criteria(study: Study, info: Information, alive: Bool[np.ndarray, " lanes"])
     """Criteria of all lanes; in a joint study those of the whole study, the same in every lane.
 
     With a given standard deviation the deviance is sum(z^2 + ln(2 pi sigma^2)), with an estimated
-    one n (ln(2 pi S / n) + 1), forces and markers each with their own. S is the sum of squares
+    one n (ln(2 pi S / n) + 1), forces and markers each with their own, where forces have a share of
+    the force as sigma of each sample in units of that of none. S is the sum of squares
     without curve weights: with them it would be no likelihood. Where curves of unequal length weigh
     the same the estimate is not quite its maximum.
 
@@ -80,6 +81,8 @@ def criteria(study: Study, info: Information, alive: Bool[np.ndarray, " lanes"])
     if study.joint:
         own = np.full(len(own), unknown_count(study, alive))
     k = own + np.sum((counts > 0) * np.array(estimated), axis=1)
+    if study.shares is not None and study.force_share == "estimate":
+        k = k + whole(study.shares.share > 0, np.any)
     return penalised(deviance, k.astype(int), np.sum(counts, axis=1))
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from jaxtrachea.fitting.covariance import Uncertainty, analyse
 from jaxtrachea.fitting.criteria import criteria
 from jaxtrachea.fitting.doubt import doubtful, left_in_doubt
 from jaxtrachea.fitting.evaluate import evaluated
+from jaxtrachea.fitting.force_share import TURNS, changed, next_levels, with_levels
 from jaxtrachea.fitting.joint_information import held_count, marginal, summed_gradient
 from jaxtrachea.fitting.minima import (
     Minima,
@@ -45,7 +47,9 @@ def fit(
     Failed lanes are rows with a status. Where the structure leaves a combination of unknowns open
     (`structure`), one of them is held, so that there is no valley to follow; where an estimate
     gives cause for doubt, other minima are looked for and unknowns are profiled (`scrutiny`). A
-    lane that gives no cause costs nothing more.
+    lane that gives no cause costs nothing more. Where the noise of forces has a share of the force
+    to be found (`Noise.force_share`), the fit is made in turns with it; the study of the result
+    keeps what was found, and refits from it do, too.
 
     Args:
         study: from `study.build_study`.
@@ -61,6 +65,52 @@ def fit(
     check_precision(settings)
     if study.size == 0:
         return evaluated(study)
+    found = _lowest(study, settings, progress, starts, beside)
+    if study.force_share is not None and study.shares is None:
+        found = _with_force_share(found, settings, progress)
+    result, minima, known = found
+    if not settings.scrutiny or study.joint:
+        return dataclasses.replace(result, unexamined=left_in_doubt(result, minima))
+    return _scrutinised(result, minima, known, settings, progress)
+
+
+class _Found(NamedTuple):
+    """A fit before its doubts are followed up."""
+
+    result: FitResult
+    minima: Minima
+    known: Structure
+
+
+def _with_force_share(found: _Found, settings: Settings, progress) -> _Found:
+    """The fit in turns with sigma and share of its forces, until these stay.
+
+    Lanes whose residuals show no share are left as they are.
+    """
+    alive = None if progress is None else lambda done, of: progress(0, of)
+    result, minima, known = found
+    levels = None
+    for _ in range(TURNS):
+        before = levels
+        levels, force = next_levels(result)
+        rows = changed(before, levels)
+        if result.study.joint and len(rows):
+            rows = np.arange(result.lanes)
+        if not len(rows):
+            if before is None:  # refits need not look again
+                none = dataclasses.replace(result.study, force_share=None)
+                result = dataclasses.replace(result, study=none)
+            break
+        study = with_levels(result.study, levels, force)
+        part = study if len(rows) == result.lanes else study.take(rows)
+        again = _lowest(part, settings, alive, None, result.theta[rows])
+        minima = minima.without_ends(rows).replaced(rows, again.minima)
+        result = _conclude(study, minima, known)
+    return _Found(result, minima, known)
+
+
+def _lowest(study: Study, settings: Settings, progress, starts, beside) -> _Found:
+    """The lowest minimum of every lane and its errors."""
     known = structure_of(study, suspicious(study))
     minima = lowest_minima(study, settings, starts, progress, known, beside)
     result = _conclude(study, minima, known)
@@ -76,9 +126,7 @@ def fit(
             minima = minima.replaced(rows, again)
         if len(rows):
             result = _conclude(study, minima, known)
-    if not settings.scrutiny or study.joint:
-        return dataclasses.replace(result, unexamined=left_in_doubt(result, minima))
-    return _scrutinised(result, minima, known, settings, progress)
+    return _Found(result, minima, known)
 
 
 def _unproven(result: FitResult, known: Structure) -> np.ndarray:

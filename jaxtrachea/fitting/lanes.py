@@ -34,6 +34,10 @@ class Noise:
     Attributes:
         force: N; a curve's own per-sample sigma comes before it.
         joints: mm.
+        force_share: of the force, which sigma has beside it (root of the sum of the squares): what
+            a model misses in a deep press grows with the force. A number, "estimate" (from the
+            residuals), or None: estimated where curves go deeper than a tenth of the radius, sigma
+            is estimated and there is a skeleton, else none.
         joints_share: of the tool's displacement from first touch, which `joints` has beside it
             (root of the sum of the squares): what a model errs in markers grows with the press.
         force_by_curve: weigh the forces of each curve by its own noise, found from neighbouring
@@ -43,6 +47,7 @@ class Noise:
     force: float | None = None
     joints: float | None = None
     joints_share: float = 0.0
+    force_share: float | Literal["estimate"] | None = None
     force_by_curve: bool = False
 
     def __post_init__(self):
@@ -52,6 +57,10 @@ class Noise:
             ValueError: naming the field, what was found and what is expected.
         """
         check_record(self)
+        if isinstance(self.force_share, float) and not 0 <= self.force_share < 1:
+            found = f"is {self.force_share:g}"
+            expected = 'a share of 0 to 1, as 0.01 or "1 %", "estimate", or None'
+            raise InputError(found, key="force_share", expected=expected, joint=" ")
         for name in ("force", "joints"):
             if (value := getattr(self, name)) is not None and value <= 0:
                 expected = "a standard deviation of more than 0, or None"

@@ -48,6 +48,11 @@ class Minima(NamedTuple):
     end: np.ndarray
     cost: np.ndarray
 
+    def without_ends(self, lanes: np.ndarray) -> "Minima":
+        """Without where starts of these lanes ended, which is worth nothing with another noise."""
+        kept = ~np.isin(self.lane, lanes)
+        return self._replace(lane=self.lane[kept], end=self.end[kept], cost=self.cost[kept])
+
     def replaced(self, lanes: np.ndarray, by: "Minima") -> "Minima":
         """With the rows `lanes` from `by`; where their own starts ended is not forgotten."""
         rows = [np.array(v) for v in (*self.solved, self.agree, self.tried, self.sigma)]

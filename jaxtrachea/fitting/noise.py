@@ -20,7 +20,8 @@ def noise_rounds(study: Study) -> int:
 def first_sigma(study: Study) -> np.ndarray:
     """Standard deviations to begin with: 1 where given, else 2 % of the peak; (lanes, 2).
 
-    Of the lane's peak, or that of the study if it is fitted jointly.
+    Of the lane's peak, or that of the study if it is fitted jointly; that of `Study.shares` where
+    forces have a share.
     """
     lanes = study.lanes
 
@@ -30,7 +31,12 @@ def first_sigma(study: Study) -> np.ndarray:
             return of_lane
         return np.full(len(of_lane), np.max(np.nan_to_num(of_lane, nan=1e-300)))
 
-    force = np.ones(len(lanes.s_c)) if study.noise_given[0] else 0.02 * peak(forces(lanes))
+    if study.noise_given[0]:
+        force = np.ones(len(lanes.s_c))
+    elif study.shares is not None and study.shares.sigma is not None:
+        force = study.shares.sigma
+    else:
+        force = 0.02 * peak(forces(lanes))
     joints = np.ones(len(lanes.s_c))
     if lanes.joints is not None and not study.noise_given[1]:
         joints = 0.02 * peak(markers(lanes))
@@ -76,4 +82,6 @@ def precision_unit(study: Study) -> np.ndarray:
         return np.array([1 / np.median(row[row > 0]) if np.any(row > 0) else 1.0 for row in flat])
 
     lanes, (force, joints) = study.lanes, study.noise_given
+    if study.shares is not None:
+        lanes = lanes._replace(precision=study.shares.plain, side_force=None)
     return np.stack([typical(forces(lanes), force), typical(markers(lanes), joints)], 1)

@@ -131,6 +131,12 @@ class FitResult:
         return self.status <= FitStatus.UNIDENTIFIABLE
 
     @property
+    def force_share(self) -> np.ndarray:
+        """Share of the force that its noise has beside `sigma`, see `Noise`; (lanes,)."""
+        shares = self.study.shares
+        return np.zeros(self.lanes) if shares is None else shares.share
+
+    @property
     def whitened_sigma(self) -> np.ndarray:
         """`sigma` in units of the lanes' precision, as `evaluate` wants it; (lanes, 2)."""
         return self.sigma / precision_unit(self.study)

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -62,8 +63,24 @@ from jaxtrachea.trachea.geometry import Geometry
 CACHED, FEWEST = 5 << 20, 16
 #: Lanes, and their bytes, up to which a program is compiled without optimisation (docs/measured.md)
 QUICK = 64, 24 << 20
+#: Depth over the radius of the tube beyond which the noise of forces is looked for a share.
+DEEP = 0.1
 #: The table of parameters, or what differs from the defaults of the model, by name.
 Table = Sequence[Parameter] | Mapping[str, Mapping[str, object]]
+
+
+class Shares(NamedTuple):
+    """Noise of forces that has a share of the force, as found; of every lane.
+
+    Attributes:
+        share: of the force; (lanes,).
+        sigma: of a sample without force, N; (lanes,); None where it is given.
+        plain: precision of the forces without the share; (lanes, T, N).
+    """
+
+    share: Float[np.ndarray, " lanes"]
+    sigma: Float[np.ndarray, " lanes"] | None
+    plain: Float[np.ndarray, "lanes T N"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,6 +104,8 @@ class Study:
             shows none; (lanes, T); None where no onset is sought.
         record_zeros: onset, force offset and slope that curves take from their own records, as
             these show them, mm, N, N/mm; NaN where they take none; None: no curve takes any.
+        force_share: of the noise of forces, see `Noise`; None: it has none.
+        shares: what the weights of the lanes have of it; None: nothing yet.
     """
 
     model: FitModel
@@ -101,6 +120,8 @@ class Study:
     balance: Balance = "curve"
     change_points: Float[np.ndarray, "lanes T"] | None = None
     record_zeros: Float[np.ndarray, "lanes T 3"] | None = None
+    force_share: float | Literal["estimate"] | None = None
+    shares: Shares | None = None
 
     def __post_init__(self):
         """Refuse a model of another parameter table.
@@ -258,6 +279,7 @@ class Study:
             unknowns=tuple(self.unknowns[k] for k in lanes),
             change_points=None if self.change_points is None else self.change_points[lanes],
             record_zeros=None if self.record_zeros is None else self.record_zeros[lanes],
+            shares=jax.tree.map(lambda v: v[lanes], self.shares),
         )
 
     def lane_name(self, lane: int) -> tuple[str, str]:
@@ -353,7 +375,30 @@ def build_study(
         balance=weighting.balance,
         change_points=change_points,
         record_zeros=found,
+        force_share=_force_share(noise, known, lanes, parameters, change_points, model),
     )
+
+
+def _force_share(
+    noise: Noise,
+    known: bool,
+    lanes: Lane,
+    parameters: Sequence[Parameter],
+    change_points: np.ndarray | None,
+    model: FitModel,
+) -> float | Literal["estimate"] | None:
+    """The share that is asked for, or estimated by itself: of deep presses, sigma estimated.
+
+    Without a skeleton (coupling `total`) no press is too deep for it.
+    """
+    if noise.force_share is not None:
+        return noise.force_share or None
+    if model.options.coupling == "total":
+        return None
+    touch = _first_touch(lanes, parameters, change_points)[..., None]
+    depth = depths(np.asarray(lanes.displacement), touch, model.options)
+    deepest = np.max(np.where(lanes.precision > 0, np.abs(depth), 0))
+    return None if known or deepest <= DEEP * float(model.geometry.radius) else "estimate"
 
 
 def _admitted(

@@ -17,10 +17,9 @@ d/ds G(s, s) is twice the derivative by one of them): a normal force on an incli
 load on ring i and C_i its compliance: the bending stiffness of the ligament turns with the frame
 (least complementary energy). In `total` coupling the skeleton takes no part: E = W(p(delta); s).
 
-A skeleton that softens (`mechanics.softening`; in one plane, deflection u, c F = g(u)) stores
-G(u) / c, G the integral of g: its part of dE/ds is -G(u) / c^2 dc/ds = -L w' times
-`Softening.energy_ratio`, with L = u / c, the load under which a linear skeleton would deflect by u,
-and w' the slope under that load.
+A tube that softens (`mechanics.softening`, in one plane) stores the integral of r(x) F_0(x; s)
+over the way x of the tool, F_0 the force of small strain: no maximum of anything. dE/ds is that of
+the integral, by Gauss points.
 
 With shear C(s) has a kink where a ring stands (dE/ds jumps there); with the `split` "independent" a
 jump, which no derivative has.
@@ -34,12 +33,17 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxtrachea.mechanics import press, skeleton
 from jaxtrachea.mechanics.skeleton import Rings, local_frame
+from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
+
+#: Points and weights on -1 to 1: forces are smooth over the way of a press.
+_GAUSS = np.polynomial.legendre.leggauss(12)
 
 
 class StraightPress(NamedTuple):
@@ -113,6 +117,13 @@ def gradient(
     def local(s):
         return press.local_law(geometry, material, s, options).energy(squared)
 
+    softening = press.softening_of(material, options)
+    if softening is not None:
+
+        def stored(s):
+            return _stored_softening(geometry, material, s, moved, softening, options)
+
+        return Gradient(inward=normal * rising, s=jax.grad(stored)(solved.s), phi=zero)
     by_s, by_phi = zero, zero
     if not total:
         by_s = _by_position(
@@ -135,16 +146,10 @@ def _by_position(
     axial: bool,
     one_plane: bool,
 ):
-    """-F . (dC/ds) F / 2, N; F the load, times the energy ratio, where the skeleton softens."""
-    F, stored = solved.force, None
-    softening = press.softening_of(material, options)
-    if softening is not None:
-        moved = press.touch(solved.inward, jnp.zeros_like(solved.inward), options)
-        u = moved + solved.depth[1]  # The normal of the midline is -y.
-        F, stored = F / softening.ratio(u), softening.energy_ratio(u)
+    """-F . (dC/ds) F / 2, N."""
+    F = solved.force
     if not options.shear and options.split == "continuous":
-        by_load = -jnp.sum(F[1:] * solved.slope_C)
-        return by_load if stored is None else stored * by_load
+        return -jnp.sum(F[1:] * solved.slope_C)
 
     # With shear the slope is another on either side of the force.
     def yielding(s):
@@ -154,8 +159,19 @@ def _by_position(
         C = skeleton.respond(geometry, material, s, solved.phi, **levels).compliance
         return jnp.sum(F * (C @ F))
 
-    by_load = -jax.grad(yielding)(solved.s) / 2
-    return by_load if stored is None else stored * by_load
+    return -jax.grad(yielding)(solved.s) / 2
+
+
+def _stored_softening(
+    geometry: Geometry, material: Material, s, moved, softening: Softening, options: press.Options
+):
+    """Integral of the force of a tube that softens over the way `moved`, N mm, on the midline."""
+    nodes, weights = (jnp.asarray(v, moved.dtype) for v in _GAUSS)
+    way = moved * (1 + nodes) / 2
+    c = press.compliance(geometry, material, s, options)
+    law = press.local_law(geometry, material, s, options)
+    force = softening.ratio(way) * law.series(way, c).force
+    return jnp.sum(weights * force) * moved / 2
 
 
 def _by_angle(geometry: Geometry, material: Material, solved: StraightPress, rings: Rings):

@@ -9,9 +9,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxtrachea._numerics import quotient
 from jaxtrachea.mechanics.force_law import Law, fold_depth
-from jaxtrachea.mechanics.softening import Softening, soft_series
+from jaxtrachea.mechanics.softening import Softening
 from jaxtrachea.status import PressStatus
 
 
@@ -22,8 +21,8 @@ class Equilibrium(NamedTuple):
         depth: local indentation d, mm.
         force: contact force, N. NaN where `status` says there is no stable solution.
         status: a `PressStatus` as int8.
-        load: force under which a linear skeleton would deflect as much, N: what the joints follow.
-            None where the skeleton is linear: the force.
+        load: force of small strain, N: what the skeleton and its joints follow. None where nothing
+            softens: the force.
     """
 
     depth: Float[Array, "*n"]
@@ -57,20 +56,32 @@ def press_softening(
     law: Law,
     softening: Softening,
 ) -> Equilibrium:
-    """Series coupling with a skeleton that softens, see `mechanics.softening`.
+    """Series coupling of a tube that softens, see `mechanics.softening`.
 
     Args:
         displacement: D after first touch, mm; any shape.
         compliance: c of the skeleton at small strain, mm/N, not negative.
         law: local law; k_1 > 0.
-        softening: of the skeleton.
+        softening: of the press.
     """
-    solved = soft_series(displacement, compliance, law, softening)
-    status = status_of(displacement, solved.depth + solved.force, solved.folded)
-    # Of a row without a solution 0 times NaN would reach what all share.
-    deflection = jnp.where(jnp.isfinite(solved.force), solved.deflection, 0)
-    load = quotient(solved.force, softening.ratio(deflection))
-    return Equilibrium(solved.depth, solved.force, status, load)
+    e_1, e_2 = (jnp.asarray(e, displacement.dtype) for e in softening)
+    known = jnp.isfinite(displacement) & jnp.isfinite(e_1) & jnp.isfinite(e_2)
+    for value in (compliance, *law.coefficients().values()):
+        known = known & jnp.isfinite(value)
+    # Of a row without a solution 0 times NaN would reach what all share: hidden at the end.
+    D, e_1, e_2, c = (jnp.where(known, v, 0) for v in (displacement, e_1, e_2, compliance))
+    whole = law._replace(**{name: jnp.where(known, k, 1) for name, k in law.coefficients().items()})
+    softening = Softening(e_1, e_2)
+    past = softening.past_peak(D)
+    depth, load, folded = whole.series(jnp.where(past, 0, D), c)
+    folded = (folded | past) & known
+
+    def hide(v):
+        return jnp.where(known & ~folded, v, jnp.nan)
+
+    depth, load, force = hide(depth), hide(load), hide(softening.ratio(D) * load)
+    status = status_of(displacement, jnp.where(known, depth + force, jnp.nan), folded)
+    return Equilibrium(depth, force, status, load)
 
 
 def sensitivity(
@@ -97,18 +108,15 @@ def sensitivity(
         by |= {name: share * v for name, v in powered.items()}
         return by, by
     load = solved.load
-    u = compliance * load
-    rise = softening.tangent(u)
-    share = 1 / (rise + compliance * slope)
-    yielding = {"e_1": share * u * load, "e_2": -share * u * u * load}
-    # The deflection is compliance times load: what is in `shed` is the bend of the skeleton alone.
-    shed = load * (softening.e_1 - 2 * softening.e_2 * u)
-    of_load = {"displacement": share * slope, "compliance": share * load * (shed - slope)}
-    of_load |= {name: share * v for name, v in powered.items()} | yielding
-    of_force = {name: rise * of_load[name] for name in ("displacement", *powered)}
-    of_force["compliance"] = -slope * share * solved.force
-    of_force |= {name: -compliance * slope * v for name, v in yielding.items()}
-    return of_force, of_load
+    D = depth + compliance * load
+    ratio, share = softening.ratio(D), 1 / (1 + compliance * slope)
+    of_load = {"displacement": slope * share, "compliance": -slope * load * share}
+    of_load |= {name: share * v for name, v in powered.items()}
+    of_force = {name: ratio * v for name, v in of_load.items()}
+    of_force["displacement"] += softening.slope(D) * load
+    of_force |= {"e_1": -D * load, "e_2": D * D * load}
+    zero = jnp.zeros_like(load)
+    return of_force, of_load | {"e_1": zero, "e_2": zero}
 
 
 def press_total(

@@ -22,9 +22,12 @@ from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Aside, force_and_slope
 from jaxtrachea.prediction.predict import CurvePrediction, predict_sources
-from jaxtrachea.prediction.sources import Source, source_of
+from jaxtrachea.prediction.sources import Source, source_of, value_of
 from jaxtrachea.results.stored import StoredFit
 from jaxtrachea.status import FitStatus, PredictionStatus
+
+#: Standard deviations of the noise from which a force counts in the share that a band holds.
+NOISE_LEVELS = 2.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -36,11 +39,13 @@ class Compared:
         prediction: at its displacements.
         in_fit: "yes" if the fit has used these samples; "changed" if it has used others under the
             same name; else "no".
+        offset: force without contact, N, as it is predicted.
     """
 
     curve: Curve
     prediction: CurvePrediction
     in_fit: str
+    offset: float = 0.0
 
     @property
     def residual(self) -> np.ndarray:
@@ -54,6 +59,15 @@ class Compared:
         if predicted is None or measured is None:
             return np.full(len(self.curve.force), np.nan)
         return predicted - measured
+
+    @property
+    def with_force(self) -> np.ndarray:
+        """Which samples have a force above the noise: the others are 0 in model and record; (N,).
+
+        By the prediction, so that no sample is chosen for what its noise makes of it.
+        """
+        p = self.prediction
+        return np.abs(p.force - self.offset) > NOISE_LEVELS * p.sigma
 
     @property
     def covered(self) -> np.ndarray:
@@ -129,7 +143,8 @@ def compare(
         aside = [(c.phi_c, (c.direction[0], c.direction[1])) for c in curves]
     depths = [c.displacement for c in curves]
     found = predict_sources(stored, sources, s, depths, sigmas, aside=aside)
-    return [Compared(*row) for row in zip(curves, found, words, strict=True)]
+    offsets = [value_of(stored, source, "force_offset") for source in sources]
+    return [Compared(*row) for row in zip(curves, found, words, offsets, strict=True)]
 
 
 def _with_zeros(stored: StoredFit, curves: Sequence[Curve]) -> tuple[StoredFit, Taken]:
@@ -165,7 +180,10 @@ def _in_fit(used: Curve | None, curve: Curve) -> str:
 
 
 def _sigma(stored: StoredFit, curve: Curve, source: Source) -> np.ndarray:
-    """Noise of a curve's samples, N: its own where that of the fit was given, else the fit's."""
+    """Noise of a curve's samples, N: its own where that of the fit was given, else the fit's.
+
+    Without the share of the force that it may have beside it.
+    """
     if curve.sigma is not None and stored.study.noise_given[0]:
         return np.asarray(curve.sigma)
     return np.full(len(curve.force), source.sigma[0])

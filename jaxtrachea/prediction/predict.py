@@ -1,7 +1,9 @@
 """Force, joints and reactions that a finished fit predicts, with 95 % bands.
 
 Two bands: of the curve itself (covariance of the parameters, through the exact Jacobian: the delta
-method) and of a new sample (with the noise). The delta method is linear. It stops being valid where
+method; between the positions of the fit with the error of the model there, `model_error`) and of a
+new sample (with the noise). The covariance is widened by what alike residuals are worth less. The
+delta method is linear. It stops being valid where
 the band is so wide that the model bends within it, where an unknown is held on its bound (its own
 uncertainty is left out) and where the data leave a combination of unknowns undetermined (the band
 is then infinite wherever that combination acts): each has a `PredictionStatus`.
@@ -22,7 +24,8 @@ from jaxtrachea.fitting.tested import depths, untested
 from jaxtrachea.measurements.vectors import tilt_of
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Aside, Estimate, Predicted, Response, predicted
-from jaxtrachea.prediction.sources import Source, onset_of, slack_of, source_of
+from jaxtrachea.prediction.model_error import ModelError, model_errors
+from jaxtrachea.prediction.sources import Source, onset_of, slack_of, source_of, value_of
 from jaxtrachea.results.stored import StoredFit, from_result
 from jaxtrachea.status import PredictionStatus, PressStatus
 
@@ -34,8 +37,8 @@ BENT = 0.5
 class CurvePrediction:
     """What a fit predicts for one curve of N displacements; numpy, float64.
 
-    Bands are 95 %: `curve_*` of the curve itself, from the covariance of the parameters; the others
-    of a new sample, with the noise.
+    Bands are 95 %: `curve_*` of the curve itself, from the covariance of the parameters and the
+    error of the model; the others of a new sample, with the noise.
 
     Attributes:
         specimen: name.
@@ -43,7 +46,7 @@ class CurvePrediction:
         s: contact position, mm; NaN if the model needs none.
         displacement: mm; (N,).
         force: N; NaN where there is none.
-        se: standard error of the force from the parameters, N.
+        se: standard error of the force from the parameters, widened (`model_error`), N.
         half_width: of the intervals, in standard errors.
         sigma: standard deviation of a force sample, N; (N,).
         joints: deflection at each ring, mm; (N, rings), NaN where the skeleton is not in the model.
@@ -61,6 +64,10 @@ class CurvePrediction:
         side_se: its standard error from the parameters.
         joint_side: of each ring along the circumference, mm; (N, rings).
         joint_side_se: from the parameters.
+        model_se: standard deviation of the error of the model between the positions of the fit,
+            beyond what the widened `se` has of it, N; (N,); 0 at one of them, and where too few
+            tell it.
+        model_quantile: of a 95 % interval in `model_se`.
     """
 
     specimen: str
@@ -85,6 +92,13 @@ class CurvePrediction:
     side_se: np.ndarray | None = None
     joint_side: np.ndarray | None = None
     joint_side_se: np.ndarray | None = None
+    model_se: np.ndarray | float = 0.0
+    model_quantile: float = 0.0
+
+    def _half(self, sigma: np.ndarray | float) -> np.ndarray:
+        """Half of a band with noise of a standard deviation, N; (N,)."""
+        known = self.half_width * np.hypot(self.se, sigma)
+        return np.hypot(known, self.model_quantile * self.model_se)
 
     @property
     def side_half(self) -> np.ndarray:
@@ -100,22 +114,22 @@ class CurvePrediction:
     @property
     def curve_low95(self) -> np.ndarray:
         """Lower end of the band of the curve itself, N."""
-        return self.force - self.half_width * self.se
+        return self.force - self._half(0.0)
 
     @property
     def curve_high95(self) -> np.ndarray:
         """Upper end of the band of the curve itself, N."""
-        return self.force + self.half_width * self.se
+        return self.force + self._half(0.0)
 
     @property
     def low95(self) -> np.ndarray:
         """Lower end of the band of a new sample, N."""
-        return self.force - self.half_width * np.hypot(self.se, self.sigma)
+        return self.force - self._half(self.sigma)
 
     @property
     def high95(self) -> np.ndarray:
         """Upper end of the band of a new sample, N."""
-        return self.force + self.half_width * np.hypot(self.se, self.sigma)
+        return self.force + self._half(self.sigma)
 
 
 def predict_sources(
@@ -141,6 +155,8 @@ def predict_sources(
     """
     turned = [(0.0, (1.0, 0.0))] * len(s) if aside is None else list(aside)
     run = program(predicted, stored.study.model)
+    errors = model_errors(stored, [source.lane for source in sources])
+    sources = [_widened(source, errors.get(source.lane)) for source in sources]
     most = _rounded(max(map(len, displacements)), 32)
     padded = np.stack([np.pad(d, (0, most - len(d)), mode="edge") for d in displacements])
     places = np.where(np.isnan(s), float(stored.study.model.geometry.length) / 2, s)
@@ -176,8 +192,61 @@ def predict_sources(
                 own = jax.tree.map(lambda v, row=row: v[row], part)
                 sigma = None if sigmas is None else sigmas[k]
                 where = (s[k], *turned[k])
-                out[k] = _on_host(stored, sources[k], where, displacements[k], own, sigma)
+                found = _on_host(stored, sources[k], where, displacements[k], own, sigma)
+                out[k] = _between_positions(stored, sources[k], errors.get(sources[k].lane), found)
     return [out[k] for k in range(len(sources))]
+
+
+def _widened(source: Source, error: ModelError | None) -> Source:
+    """The source with the covariance that alike residuals leave."""
+    if error is None or error.growth == 1:
+        return source
+    message = "; ".join(filter(None, [source.message, error.growth_message]))
+    if np.isfinite(error.growth):
+        covariance = source.covariance * error.growth**2
+        return dataclasses.replace(source, covariance=covariance, message=message)
+    half = source.half_width if error.known else np.asarray(np.inf)
+    return dataclasses.replace(source, half_width=half, message=message)
+
+
+def _between_positions(
+    stored: StoredFit, source: Source, error: ModelError | None, found: CurvePrediction
+) -> CurvePrediction:
+    """The prediction with the share of the force in its noise, or the model's error in its place.
+
+    That where the fit has not pressed.
+    """
+    if not found.status.predicts:
+        return found
+    options = stored.study.model.options
+    placeless = options.coupling == "total" and options.local == "uniform"
+    between = error is not None and not placeless and not error.at_pressed(found.s)
+    force = np.abs(found.force - value_of(stored, source, "force_offset"))
+    share = float(stored.force_share[source.lane])
+    if not between or not error.known:
+        found = dataclasses.replace(found, sigma=np.hypot(found.sigma, share * force))
+    if not between:
+        return found
+    message = "; ".join(filter(None, [found.message, error.message]))
+    if not error.known:
+        status = max(found.status, PredictionStatus.FEW_POSITIONS)
+        head = found.message.removeprefix(found.status.message)
+        if status != found.status:
+            message = f"{status.message}{head}; {error.message}"
+        return dataclasses.replace(found, status=status, message=message)
+    # The noise's share is the model's error where it was pressed, and what alike residuals widen
+    # the parameters' errors by comes of the same misfit: neither counts twice.
+    depth = depths(found.displacement, onset_of(stored, source), options)
+    beyond = (np.maximum(error.share_at(np.abs(depth)), share) * np.nan_to_num(force)) ** 2
+    if np.isfinite(error.growth):
+        ratio = found.half_width / error.quantile
+        beyond = beyond - (1 - 1 / error.growth**2) * (ratio * found.se) ** 2
+    return dataclasses.replace(
+        found,
+        message=message,
+        model_se=np.sqrt(np.maximum(np.nan_to_num(beyond), 0)),
+        model_quantile=error.quantile,
+    )
 
 
 def _rounded(count: int, least: int) -> int:

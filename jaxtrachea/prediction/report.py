@@ -19,7 +19,10 @@ AT_HEAD = ["specimen", "trial", "s [mm]", "D [mm]", "force [N]", "95 % of the cu
            "95 % with noise", "outcome"]  # fmt: skip
 BANDS = (
     "Bands are 95 %: of the curve itself (covariance of the parameters, linear: the delta method), "
-    "and of a new sample (with the noise as well). They say nothing of what the model leaves out. "
+    "and of a new sample (with the noise as well). The covariance is widened where neighbouring "
+    "residuals are alike. Between the positions of the fit both have the error of the model there, "
+    "as leaving each position out in turn leaves it; where too few positions tell it (few "
+    "positions) the bands are not of 95 %. "
     "Where an unknown lies on its bound they leave out its uncertainty; where the data do not "
     "determine what a prediction needs they are infinite; where the model bends within the band "
     "they are off, and the outcome says so (docs/predict.md)."
@@ -153,7 +156,7 @@ def report_data(
         parts += ["## Contact positions, worst first", _table(ERROR_HEAD, positions, "errors.csv")]
     parts += [
         "rms and worst: predicted minus measured force over the largest measured force; in band: "
-        "share of samples in the 95 % band with noise. " + BANDS,
+        "share of samples with force (above twice the noise) in the 95 % band with noise. " + BANDS,
     ]
     parts += ["![curves](curves.png)", "![measured against predicted](measured_predicted.png)"]
     if bad:

@@ -211,10 +211,15 @@ def _taken(stored: StoredFit, specimen, trial, lane: int, index, own, note: str)
 
 def onset_of(stored: StoredFit, source: Source) -> float:
     """Displacement of a curve at first touch, mm, as it is predicted."""
+    return value_of(stored, source, "onset")
+
+
+def value_of(stored: StoredFit, source: Source, name: str) -> float:
+    """A parameter of a curve as it is predicted, in its unit."""
     for p, scaled in zip(stored.study.free, source.free, strict=True):
-        if p.name == "onset":
+        if p.name == name:
             return p.from_scaled(float(scaled))
-    return float(source.value[[p.name for p in stored.study.parameters].index("onset")])
+    return float(source.value[[p.name for p in stored.study.parameters].index(name)])
 
 
 def _none(stored: StoredFit, specimen, trial, status: PredictionStatus, message: str) -> Source:

@@ -75,6 +75,7 @@ def band_rows(p: CurvePrediction) -> Iterator[Row]:
         "low95 [N]": p.low95,
         "high95 [N]": p.high95,
         "sigma [N]": p.sigma,
+        "model_se [N]": np.zeros_like(p.force) + p.model_se,
     }
     for i in range(len(p.displacement)):
         cells: Row = {name: _cell(float(v[i])) for name, v in columns.items()}
@@ -162,7 +163,9 @@ def _errors(of: str, group: Sequence[Compared], tool_radius, rings) -> Row:
         rms = float(np.sqrt(np.mean(residual[known] ** 2)))
         k = int(np.argmax(np.where(known, np.abs(residual), -1)))
         worst, at = float(residual[k]), float(depth[k])
-        covered = float(np.mean(np.concatenate([c.covered for c in group])[known]))
+        counts = known & np.concatenate([c.with_force for c in group])
+        if counts.any():
+            covered = float(np.mean(np.concatenate([c.covered for c in group])[counts]))
     status = max(c.prediction.status for c in group)
     used = sum(c.in_fit == "yes" for c in group)
     return {

@@ -53,8 +53,7 @@ def write_hdf5(
         for name in MORE:
             data = getattr(result.uncertainty, name)
             group.create_dataset(STORED_AS.get(name, name), data=data, compression="gzip")
-        for name in ("factor", "quantile"):
-            group[f"effective_{name}"] = getattr(result.effective, name)
+        group["interval_growth"] = result.effective.growth
         for analysis, found in findings.found:
             if analysis.datasets is not None:
                 analysis.datasets(file.create_group(analysis.name), found)
@@ -73,6 +72,7 @@ def _write_lanes(group: h5py.Group, result: FitResult) -> None:
         group.create_dataset(name, data=getattr(result.criteria, name))
     for name in ("sigma", "rms"):
         group.create_dataset(name, data=getattr(result, name)).attrs["unit"] = "N, mm"
+    group.create_dataset("force_share", data=result.force_share)
     group.create_dataset("condition", data=result.uncertainty.condition)
 
 

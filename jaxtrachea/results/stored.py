@@ -33,10 +33,11 @@ SCHEMA = "jaxtrachea-results"
 VERSION = 3
 #: Groups and datasets that are read; nothing else of the file is.
 READ = (
-    "/model", "/data", "/lanes/status", "/lanes/sigma", "/lanes/rms", "/unknowns/theta",
+    "/model", "/data", "/lanes/status", "/lanes/sigma", "/lanes/rms", "/lanes/force_share",
+    "/unknowns/theta",
     "/unknowns/at_bound",
     "/uncertainty/covariance", "/uncertainty/silent", "/uncertainty/half_width",
-    "/uncertainty/effective_factor", "/uncertainty/effective_quantile",
+    "/uncertainty/interval_growth",
 )  # fmt: skip
 #: 97.5 % quantile of the normal distribution, as `covariance.analyse` uses it.
 NORMAL = 1.959963984540054
@@ -56,15 +57,18 @@ class StoredFit:
         reading: how the data were read, as in the [data] section.
         lane_names: specimen and trial of each lane, "(all)" where it spans several.
         theta: estimates; (L, P).
-        covariance: of the estimates, for as many samples as are independent; 0 for what is held,
-            without the null space; (L, P, P).
+        covariance: of the estimates, of independent residuals; 0 for what is held, without the null
+            space; (L, P, P).
         null_space: rows: directions that change no residual, scaled coordinates; (L, P, P).
         at_bound: (L, P).
         status: `FitStatus`; (L,).
         sigma: standard deviation of force, N, and markers, mm, given or estimated; NaN without
             samples of the kind; (L, 2).
+        force_share: share of the force that its noise has beside `sigma`, see `Noise`; (L,).
         half_width: of a 95 % interval in standard errors; inf where the noise could not be
-            estimated, or the model misses the curves; (L,).
+            estimated; (L,).
+        growth: of intervals for correlated residuals, inf where the model misses the curves, see
+            `Effective`; (L,).
         curves: the data as used; `source` is the file's name and the place in it.
         curve_lane: lane of each curve; (curves,).
         blend: rounded corner at the onset of each curve, mm, see `Lane`; NaN where no onset was
@@ -82,7 +86,9 @@ class StoredFit:
     at_bound: np.ndarray
     status: np.ndarray
     sigma: np.ndarray
+    force_share: np.ndarray
     half_width: np.ndarray
+    growth: np.ndarray
     curves: tuple[Curve, ...]
     curve_lane: np.ndarray
     blend: np.ndarray
@@ -96,22 +102,46 @@ class StoredFit:
     @functools.cached_property
     def first_touch(self) -> np.ndarray:
         """Displacement of each curve at first touch, mm: held, or estimated; (curves,)."""
-        onset = next(p for p in self.study.parameters if p.name == "onset")
-        if onset.fixed:
-            return np.full(len(self.curves), onset.value)
+        return self._of_curves("onset")
+
+    @functools.cached_property
+    def _places(self) -> dict[tuple[str, str], int]:
+        return {(c.specimen, c.trial): i for i, c in enumerate(self.curves)}
+
+    @functools.cached_property
+    def force_offset(self) -> np.ndarray:
+        """Force that each curve shows without contact, N: held, or estimated; (curves,)."""
+        return self._of_curves("force_offset")
+
+    def _of_curves(self, name: str) -> np.ndarray:
+        """A parameter as each curve has it: held, or estimated; (curves,)."""
+        named = next(p for p in self.study.parameters if p.name == name)
+        if named.fixed:
+            return np.full(len(self.curves), named.value)
         places = [
-            {(s, t): i for i, (p, s, t) in enumerate(lane) if p.name == "onset"}
+            {(s, t): i for i, (p, s, t) in enumerate(lane) if p.name == name}
             for lane in self.study.unknowns
         ]
 
-        def touch(curve: Curve, lane: int) -> float:
-            specimen = "" if onset.scope == "shared" else curve.specimen
-            i = places[lane].get((specimen, curve.trial if onset.scope == "trial" else ""))
-            held = onset.value if onset.auto else np.nan
-            return held if i is None else onset.from_scaled(float(self.theta[lane, i]))
+        def value(curve: Curve, lane: int) -> float:
+            specimen = "" if named.scope == "shared" else curve.specimen
+            i = places[lane].get((specimen, curve.trial if named.scope == "trial" else ""))
+            held = named.value if named.auto else np.nan
+            return held if i is None else named.from_scaled(float(self.theta[lane, i]))
 
         rows = zip(self.curves, self.curve_lane.tolist(), strict=True)
-        return np.array([touch(*row) for row in rows])
+        return np.array([value(*row) for row in rows])
+
+    @functools.cached_property
+    def found(self) -> dict[int, Any]:
+        """What predictions have found out of lanes, kept for the next."""
+        return {}
+
+    def above_touch(self, curve: Curve) -> tuple[np.ndarray, np.ndarray]:
+        """Depth of a curve of the fit from first touch, mm, and its force without offset, N."""
+        i = self._places[curve.specimen, curve.trial]
+        depth = depths(curve.displacement, self.first_touch[i], self.study.model.options)
+        return depth, np.asarray(curve.force) - self.force_offset[i]
 
     @functools.cached_property
     def spans(self) -> np.ndarray:
@@ -159,7 +189,7 @@ class StoredFit:
 
 def from_result(result: FitResult) -> StoredFit:
     """A fit of this process as one that was read back: what predictions need."""
-    study, u, wide = result.study, result.uncertainty, result.effective
+    study, u = result.study, result.uncertainty
     placed = [(k, t, c) for k, lane in enumerate(study.curves) for t, c in enumerate(lane)]
     blend = study.lanes.blend
     return StoredFit(
@@ -168,12 +198,14 @@ def from_result(result: FitResult) -> StoredFit:
         reading={},
         lane_names=tuple(study.lane_name(lane) for lane in range(result.lanes)),
         theta=result.theta,
-        covariance=_grown(u.covariance, wide.factor),
+        covariance=u.covariance,
         null_space=u.null_space,
         at_bound=result.at_bound,
         status=result.status,
         sigma=np.where(np.isnan(result.rms), np.nan, result.sigma),
-        half_width=_known_half_width(study, u.half_width, wide.quantile),
+        force_share=result.force_share,
+        half_width=_known_half_width(study, u.half_width),
+        growth=result.effective.growth,
         curves=tuple(c for _, _, c in placed),
         curve_lane=np.array([k for k, _, _ in placed]),
         blend=np.array([np.nan if blend is None else blend[k, t] for k, t, _ in placed]),
@@ -280,19 +312,14 @@ def _read(path: Path, file: Any) -> StoredFit:
         reading=model["reading"],
         lane_names=tuple((s, t) for s, t in model["lanes"]),
         theta=theta,
-        covariance=_grown(
-            numeric(file["uncertainty"], "covariance"),
-            numeric(file["uncertainty"], "effective_factor"),
-        ),
+        covariance=numeric(file["uncertainty"], "covariance"),
         null_space=numeric(file["uncertainty"], STORED_AS["null_space"]),
         at_bound=numeric(file["unknowns"], "at_bound") > 0,
         status=numeric(file["lanes"], "status").astype(int),
         sigma=_sigma(file["lanes"]),
-        half_width=_known_half_width(
-            study,
-            numeric(file["uncertainty"], "half_width"),
-            numeric(file["uncertainty"], "effective_quantile"),
-        ),
+        force_share=_force_share(file["lanes"]),
+        half_width=_known_half_width(study, numeric(file["uncertainty"], "half_width")),
+        growth=numeric(file["uncertainty"], "interval_growth"),
         curves=curves,
         curve_lane=lane,
         blend=numeric(file["data"], "blend"),
@@ -310,17 +337,12 @@ def _marker_noise(found: Any) -> tuple[float, float] | None:
     return float(joints), float(share)
 
 
-def _known_half_width(study: Study, half: np.ndarray, quantile: np.ndarray) -> np.ndarray:
-    """The quantile; infinite where noise is to be estimated and no sample is left to do it from.
+def _known_half_width(study: Study, half: np.ndarray) -> np.ndarray:
+    """The half width; infinite where noise is to be estimated and no sample is left to do it from.
 
     `covariance.analyse` puts the normal quantile there, which Student's t never reaches.
     """
-    return np.where((half == NORMAL) & ~np.array(study.noise_given[0]), np.inf, quantile)
-
-
-def _grown(covariance: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """Covariance for as many samples as are independent; as it is where none is left."""
-    return covariance * np.where(np.isfinite(factor), factor, 1.0)[:, None, None] ** 2
+    return np.where((half == NORMAL) & ~np.array(study.noise_given[0]), np.inf, half)
 
 
 def _sigma(lanes: Any) -> np.ndarray:
@@ -328,6 +350,13 @@ def _sigma(lanes: Any) -> np.ndarray:
     sigma = numeric(lanes, "sigma")
     rms = numeric(lanes, "rms")
     return np.where(np.isnan(rms), np.nan, sigma) if rms.shape == sigma.shape else sigma
+
+
+def _force_share(lanes: Any) -> np.ndarray:
+    """As `FitResult.force_share`; files of before had none."""
+    if "force_share" in lanes:
+        return numeric(lanes, "force_share")
+    return np.zeros(len(numeric(lanes, "status")))
 
 
 def _json(group: Any) -> Any:
@@ -340,13 +369,14 @@ def _json(group: Any) -> Any:
 
 
 def _read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str]]:
-    """Curves without markers, the lane of each, and SHA-256 by file name."""
+    """Curves with what of them the fit has used, the lane of each, and SHA-256 by file name."""
     names = _json(group)
     samples = numeric(group, "samples").astype(int)
     ends = np.cumsum(samples)
     column = {c: numeric(group, c) for c in ("displacement", "force", "sigma", "s_c", "phi_c")}
     known = "direction" in group
     direction = numeric(group, "direction") if known else np.tile([1.0, 0.0], (len(samples), 1))
+    observed = _observed(group)
     curves = []
     texts = zip(names["specimen"], names["trial"], names["source"], strict=True)
     for i, (specimen, trial, source) in enumerate(texts):
@@ -363,9 +393,33 @@ def _read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str
                 sigma=None if np.isnan(sigma).all() else sigma,
                 source=source,
                 direction=(float(direction[i][0]), float(direction[i][1])),
+                **{name: v if v.ndim == 1 else v[part] for name, v in observed.items()},
             )
         )
     return tuple(curves), numeric(group, "lane").astype(int), names["files"]
+
+
+def _observed(group: Any) -> dict[str, np.ndarray]:
+    """Fields of curves beside the force, samples end to end; NaN where the fit has not used them.
+
+    Rings are numbered, with no axis of samples.
+    """
+    out = {}
+    if "joints" in group:
+        used = np.isfinite(numeric(group, "joint_residual"))
+        out["joint_displacement"] = np.where(used, numeric(group, "joints"), np.nan)
+    if "side_force" in group:
+        out["side_force"] = numeric(group, "side_force")
+    if "joint_side" in group:
+        out["joint_side_displacement"] = numeric(group, "joint_side")
+        out.setdefault("joint_displacement", np.full_like(out["joint_side_displacement"], np.nan))
+    if "joint_displacement" in out:
+        out["joint_rings"] = np.arange(out["joint_displacement"].shape[1])
+    if "ends" in group:
+        ends = numeric(group, "ends")
+        out["end_U"], out["end_V"] = ends[:, :, 0], ends[:, :, 1]
+        out["end_rings"] = np.arange(ends.shape[1])
+    return out
 
 
 def _check_shapes(stored: StoredFit) -> None:
@@ -377,8 +431,8 @@ def _check_shapes(stored: StoredFit) -> None:
     L, P = len(stored.study.unknowns), stored.theta.shape[-1]
     shapes = {
         "theta": (L, P), "covariance": (L, P, P), "null_space": (L, P, P), "at_bound": (L, P),
-        "status": (L,), "sigma": (L, 2), "half_width": (L,), "curve_lane": (len(stored.curves),),
-        "blend": (len(stored.curves),),
+        "status": (L,), "sigma": (L, 2), "force_share": (L,), "half_width": (L,),
+        "growth": (L,), "curve_lane": (len(stored.curves),), "blend": (len(stored.curves),),
     }  # fmt: skip
     for name, shape in shapes.items():
         if getattr(stored, name).shape != shape:

@@ -195,14 +195,14 @@ class Material(eqx.Module):
     )  # fmt: skip
     e_1: Float[Array, ""] | None = _field(
         Declaration(
-            "e_1", "1/mm", "inverse_length", "softening of the skeleton, linear in its deflection",
+            "e_1", "1/mm", "inverse_length", "softening of a press, linear in the way of the tool",
             part="finite strain", needs="softening", absent="a linear skeleton", signed=True,
             fit=Fitted(0.05, 0.0, 10.0, "linear", 0.01),
         )
     )  # fmt: skip
     e_2: Float[Array, ""] | None = _field(
         Declaration(
-            "e_2", "1/mm^2", "inverse_area", "softening of the skeleton, quadratic part",
+            "e_2", "1/mm^2", "inverse_area", "softening of a press, quadratic part",
             part="finite strain", needs="softening", absent="a linear skeleton", signed=True,
             fit=Fitted(0.002, 0.0, 10.0, "linear", 0.001),
         )

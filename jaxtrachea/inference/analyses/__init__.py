@@ -105,4 +105,4 @@ def analyse(
 
 def widened(result: FitResult) -> Findings:
     """A fit with the analyses that every table of lanes has, and no others."""
-    return Findings(result, ((EFFECTIVE, Findings(result)), (MISFIT, result.misfit)))
+    return Findings(result, ((EFFECTIVE, Findings(result)), (MISFIT, result)))

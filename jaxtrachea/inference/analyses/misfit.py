@@ -4,27 +4,51 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxtrachea.fitting.misfit import Misfit
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.analysis import Analysis, Cells, Findings, Progress, Request
 
 
-def _compute(request: Request, findings: Findings, progress: Progress) -> Misfit:
-    return findings.result.misfit
+def _compute(request: Request, findings: Findings, progress: Progress) -> FitResult:
+    return findings.result
 
 
-def _lane_cells(compared: Misfit, lane: int) -> Cells:
-    force, marker = map(float, compared.ratio[lane])
-    return {"residual_over_noise": force, "marker_residual_over_noise": marker}
+def _lane_cells(result: FitResult, lane: int) -> Cells:
+    force, marker = map(float, result.misfit.ratio[lane])
+    share = float(result.force_share[lane])
+    return {
+        "residual_over_noise": force,
+        "marker_residual_over_noise": marker,
+        "force_share": share,
+    }
 
 
-def _sentences(compared: Misfit) -> list[str]:
-    """Residuals larger than the noise given, and smaller ones."""
-    every, said = len(compared.ratio), []
+def _share(result: FitResult) -> list[str]:
+    """That the noise of forces grows with the force."""
+    lanes = np.flatnonzero(result.force_share > 0)
+    if not len(lanes):
+        return []
+    share, sigma = np.median(result.force_share[lanes]), np.median(result.sigma[lanes, 0])
+    median = f" in {len(lanes)} of {result.lanes} lanes (medians)" if result.lanes > 1 else ""
+    cause = (
+        "found in the residuals: what the model misses grows with the force, and with one sigma "
+        "for all depths the deep samples would outvote the shallow ones"
+        if result.study.force_share == "estimate"
+        else "as `noise.force_share` says"
+    )
+    return [
+        f"The noise of a force sample is {sigma:.2g} N and {100 * share:.2g} % of the force"
+        f"{median}, {cause}."
+    ]
+
+
+def _sentences(result: FitResult) -> list[str]:
+    """The share of the force in the noise; residuals larger than the noise given, and smaller."""
+    compared, every, said = result.misfit, result.lanes, _share(result)
     for k, (kind, key) in enumerate((("Force", "noise.force"), ("Marker", "noise.joints"))):
         ratio, told = compared.ratio[:, k], compared.told[:, k]
         for beyond, cause in (
             (ratio > 1, "the noise given is too small, or the model misses the curves: standard "
-             "errors and intervals, which rest on it, are too small"),
+             "errors and intervals have grown"),
             (ratio < 1, "the noise given is too large: standard errors and intervals, which rest "
              "on it, are too large"),
         ):  # fmt: skip
@@ -40,8 +64,8 @@ def _sentences(compared: Misfit) -> list[str]:
     return said
 
 
-def _shown(compared: Misfit, lanes: list[int]) -> Iterator[str]:
-    yield from (sentence.replace("`", "") for sentence in _sentences(compared))
+def _shown(result: FitResult, lanes: list[int]) -> Iterator[str]:
+    yield from (sentence.replace("`", "") for sentence in _sentences(result))
 
 
 MISFIT = Analysis(

@@ -1,0 +1,143 @@
+"""Noise of a force sample with a share of the force: sqrt(sigma^2 + (share F)^2).
+
+What a model misses in a deep press grows with the force; one sigma for all depths lets the deep
+samples outvote the shallow ones. The share is given, or estimated with sigma from the residuals
+of a fit by maximum likelihood, in turns with the fit. F is the force that the fit predicts.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxtrachea.fitting.noise import first_sigma
+from jaxtrachea.fitting.parameters import Parameter
+from jaxtrachea.fitting.result import FitResult
+from jaxtrachea.fitting.study import Shares, Study
+
+#: Gain in -2 ln L from which a share is taken; of noise without one 1 in 700 gains as much.
+WORTH = 9.0
+#: Fits in turns with the estimate, at most, and the relative change of sigma and share that ends.
+TURNS, STEADY = 8, 0.02
+#: Least sigma over the largest force, so that no sample of hardly any force counts alone.
+LEAST = 2e-4
+#: Shares over sigma, times the largest force, that are tried.
+_RATIOS = np.geomspace(1e-2, 1 / LEAST, 121)
+
+
+class Levels(NamedTuple):
+    """Of every lane: sigma of a sample without force, N, and share; (lanes,)."""
+
+    sigma: Float[np.ndarray, " lanes"]
+    share: Float[np.ndarray, " lanes"]
+
+
+def with_levels(study: Study, levels: Levels, force: Float[np.ndarray, "lanes T N"]) -> Study:
+    """The study with forces weighed by sigma and share; `force` without offset, N."""
+    before = study.shares
+    plain = study.lanes.precision if before is None else before.plain
+    given = study.noise_given[0]
+    share = levels.share[:, None, None] * np.abs(force)
+    # In units of an estimated sigma; of given ones beside each.
+    sigma = np.where(levels.share > 0, levels.sigma, first_sigma(_plain(study))[:, 0])
+    grown = share * plain if given else share / sigma[:, None, None]
+    precision = plain / np.hypot(1, grown)
+    lanes = study.lanes
+    changed = {"precision": precision}
+    if lanes.side_precision is not None:
+        changed["side_precision"] = np.where(lanes.side_precision > 0, precision, 0)
+    shares = Shares(levels.share, None if given else sigma, plain)
+    return dataclasses.replace(study, lanes=lanes._replace(**changed), shares=shares)
+
+
+def _plain(study: Study) -> Study:
+    """The study as if nothing were found yet."""
+    return dataclasses.replace(study, shares=None)
+
+
+def next_levels(result: FitResult) -> tuple[Levels, Float[np.ndarray, "lanes T N"]]:
+    """Sigma and share by the residuals of a fit, and the forces that it predicts without offset.
+
+    A share that is given is kept; one that gains less than `WORTH` is 0.
+    """
+    study = result.study
+    residual = result.residuals.force
+    force = np.asarray(study.lanes.force) - offsets(study, result.theta)[..., None]
+    force = np.where(np.isfinite(residual), force + residual, force)
+    plain = study.lanes.precision if study.shares is None else study.shares.plain
+    rows = range(result.lanes)
+    groups = [list(rows)] if study.joint else [[k] for k in rows]
+    sigma, share = np.ones(result.lanes), np.zeros(result.lanes)
+    for group in groups:
+        group = [k for k in group if result.succeeded[k]]
+        r, F, p = (np.concatenate([v[k].ravel() for k in group] or [np.zeros(0)])
+                   for v in (residual, force, plain))  # fmt: skip
+        seen = np.isfinite(r) & (p > 0)
+        if not seen.any():
+            continue
+        left = 1 - np.sum(study.lanes.active[group]) / max(np.sum(result.samples[group]), 1)
+        r, F, p = r[seen] / np.sqrt(max(left, 0.05)), np.abs(F[seen]), p[seen]
+        wanted = study.force_share
+        given = None if isinstance(wanted, str) or wanted is None else float(wanted)
+        sigma[group], share[group] = _most_likely(r, F, p, study.noise_given[0], given)
+    return Levels(sigma, share), force
+
+
+def offsets(study: Study, theta: Float[np.ndarray, "lanes P"]) -> Float[np.ndarray, "lanes T"]:
+    """Force without contact of every trial, N: fixed, or as `theta` has it."""
+    column = [p.name for p in study.parameters].index("force_offset")
+    p: Parameter = study.parameters[column]
+    if p.fixed:
+        return np.full(study.lanes.s_c.shape, p.value)
+    index = np.asarray(study.lanes.index)[:, :, column]
+    scaled = np.take_along_axis(theta, np.maximum(index, 0), axis=1)
+    value = np.exp(scaled) if p.scale == "log" else scaled * p.step
+    return np.where(index >= 0, value, p.value)
+
+
+def _most_likely(r, F, p, sigma_given: bool, share: float | None) -> tuple[float, float]:
+    """Sigma (1 where it is given) and share of one lane.
+
+    Args:
+        r: residuals, N.
+        F: forces, N.
+        p: precision without a share: 1 / sigma where that is given, else 1.
+        sigma_given: whether it is.
+        share: where it is given.
+    """
+    peak = float(np.max(F, initial=0))
+    if peak == 0:
+        return 1.0 if sigma_given else max(float(np.std(r)), 1e-300), 0.0
+    if sigma_given:
+        shares = np.concatenate([[0], _RATIOS * LEAST])
+        variance = 1 / p**2 + (shares[:, None] * F) ** 2
+        cost = np.sum(r**2 / variance + np.log(variance), axis=1)
+        return (1.0, share) if share is not None else (1.0, float(shares[_chosen(cost)]))
+    if share is not None:
+        sigmas = peak * np.geomspace(LEAST, 1, 121)
+        variance = sigmas[:, None] ** 2 + (share * F) ** 2
+        cost = np.sum(r**2 / variance + np.log(variance), axis=1)
+        return float(sigmas[np.argmin(cost)]), share
+    ratios = np.concatenate([[0], _RATIOS / peak])
+    grown = 1 + (ratios[:, None] * F) ** 2
+    squared = np.maximum(np.mean(r**2 / grown, axis=1), 1e-300)
+    cost = len(r) * np.log(squared) + np.sum(np.log(grown), axis=1)
+    best = _chosen(cost)
+    sigma = float(np.sqrt(squared[best]))
+    return max(sigma, LEAST * peak if best else 0.0), float(ratios[best]) * sigma
+
+
+def _chosen(cost: np.ndarray) -> int:
+    """The least of the costs, the first (no share) unless another gains `WORTH`."""
+    best = int(np.argmin(cost))
+    return best if cost[0] - cost[best] > WORTH else 0
+
+
+def changed(before: Levels | None, after: Levels) -> Int[np.ndarray, " n"]:
+    """Lanes that another fit is worth its time for; of none that never had a share."""
+    if before is None:
+        return np.flatnonzero(after.share > 0)
+    pairs = zip(before, after, strict=True)
+    moved = [np.abs(b - a) > STEADY * np.maximum(a, b) for a, b in pairs]
+    return np.flatnonzero(np.any(moved, axis=0) & ((before.share > 0) | (after.share > 0)))
