@@ -359,6 +359,12 @@ def _told_apart(records: _Records, bare, rss) -> _Taken:
     raised, rss_raised = _best(records, (*_SHAPE, "force_offset"), bare, at_level)
     starts = moved, raised, *_starts(count, (touch, level))
     both, rss_both = _best(records, (*_SHAPE, "onset", "force_offset"), *starts)
+    # What has more parameters may have found a better minimum: those with fewer begin there too.
+    without = [v * [1, 1, 1, 1, 0, 0, 0] for v in (moved, raised, both)]
+    rss = np.minimum(rss, _best(records, _SHAPE, *without)[1])
+    again = _best(records, (*_SHAPE, "onset"), both * [1, 1, 1, 1, 1, 0, 0])
+    moved = np.where((again[1] < rss_moved)[:, None], again[0], moved)
+    rss_moved = np.minimum(rss_moved, again[1])
     unit = np.maximum(rss_both / max(n - 6, 1), 1)
     by_onset, by_offset, by_both = ((rss - v) / unit for v in (rss_moved, rss_raised, rss_both))
     single = np.maximum(by_onset, by_offset)
