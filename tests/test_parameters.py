@@ -46,7 +46,8 @@ def test_page_has_the_declarations_and_no_others():
             continue
         value, *notes = fit[0].split(", ")
         assert float(value) == p.fit.value
-        assert notes == ["fixed"] * p.fit.fixed + ["if named"] * p.fit.if_named
+        plain = ["fixed"] * p.fit.fixed + ["if named"] * p.fit.if_named
+        assert notes == (["auto"] if p.fit.auto else plain)
         assert [float(v) for v in fit[1].split(" … ")] == [p.fit.lower, p.fit.upper]
         assert fit[2:] == [p.fit.scale, p.fit.scope]
 

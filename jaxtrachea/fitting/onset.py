@@ -53,9 +53,9 @@ def touches(
     parameters: Sequence[Parameter],
     slope: Float[np.ndarray, "lanes T"] | None = None,
 ) -> FirstTouch:
-    """Change point of every trial of every lane, see `first_touch`; (lanes, T) each.
+    """Change point of every trial with an onset or an offset, see `first_touch`; (lanes, T) each.
 
-    `slope`: of the force without contact, which is taken off, N/mm; NaN: 0.
+    NaN of others. `slope`: of the force without contact, which is taken off, N/mm; NaN: 0.
     """
     shape, samples = lanes.s_c.shape, lanes.force.shape[-1]
     displacement, force, precision = (
@@ -63,12 +63,14 @@ def touches(
     )
     if slope is not None:
         force = force - np.nan_to_num(slope).reshape(-1, 1) * displacement
-    column = next(j for j, p in enumerate(parameters) if p.name == "force_offset")
-    own = np.asarray(lanes.index)[:, :, column].reshape(-1) >= 0
+    column = {p.name: j for j, p in enumerate(parameters)}
+    index = np.asarray(lanes.index).reshape(-1, len(parameters))
+    own = index[:, column["force_offset"]] >= 0
+    held = (index[:, column["onset"]] >= 0) & ~own
     out = [np.full(len(force), np.nan) for _ in FirstTouch._fields]
-    for rows, known in ((np.flatnonzero(own), None), (np.flatnonzero(~own), parameters[column])):
+    for rows, known in ((np.flatnonzero(own), None), (np.flatnonzero(held), "force_offset")):
         if len(rows):
-            offset = None if known is None else np.full(len(rows), known.value)
+            offset = known and np.full(len(rows), parameters[column[known]].value)
             found = first_touch(displacement[rows], force[rows], precision[rows] > 0, offset)
             for whole, part in zip(out, found, strict=True):
                 whole[rows] = part

@@ -385,7 +385,7 @@ def _press(model: FitModel, tube, free, skeleton, by_beam, trial: Lane | _Tool) 
     offset, d_offset = contact.force_offset, d_contact.force_offset[:, None]
     if contact.force_slope is not None:
         offset = offset + contact.force_slope * D
-        d_offset = d_offset + d_contact.force_slope[:, None] * D
+        d_offset = d_offset + d_contact.force_slope[:, None] * D[None]
     return _Pressed(
         force=solved.force,
         d_force=d_force,

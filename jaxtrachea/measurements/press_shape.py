@@ -67,7 +67,7 @@ def fitted(
         better = after < before
         best[rows[better]], out[rows[better]] = trial[better], after[better]
         damping[rows] = np.where(better, damping[rows] / 5, damping[rows] * 5)
-        small = np.einsum("ci,ci->c", g, step) <= _DONE
+        small = (np.einsum("ci,ci->c", g, step) <= _DONE) & (damping[rows] <= 1)
         done = (better & (before - after <= _DONE)) | small | (damping[rows] > _STUCK)
         rows = rows[~done]
     return Fitted(best, out)

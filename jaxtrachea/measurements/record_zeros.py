@@ -48,6 +48,8 @@ _SHAPE = ("k_1", "k_3", "c", "q")
 #: Fall of the sum of squares that the linearised press must promise for a record to be fitted on,
 #: and samples by which a short record's evidence must be the larger.
 _HINT, _FEW = 12.0, 6
+#: Samples from which the noise of a record is known well.
+_LONG_RECORD = 40
 #: Records looked at, and fitted, together.
 _TOGETHER, _FITTED_TOGETHER = 1 << 14, 512
 
@@ -280,8 +282,11 @@ def _through_origin(records: _Records) -> Bool[np.ndarray, " C"]:
     spread = np.maximum(np.sum(r * r, axis=1) / np.maximum(part.sum(axis=1) - 3, 1), 1)
     error = np.sqrt(np.einsum("cii->ci", covariance) * spread[:, None])
     level, slope = found[:, 0], found[:, 1]
-    near = (np.abs(level) < 2.5 * error[:, 0]) & (slope > _OBVIOUS * error[:, 1])
-    return near & (spread < 2.0) & (np.abs(x[:, 0]) < 0.05)
+    most, loose = (
+        (3.0, 2.0) if x.shape[1] >= _LONG_RECORD else (2.0, 1.4)
+    )  # few samples bend as they like
+    near = (np.abs(level) < most * error[:, 0]) & (slope > _OBVIOUS * error[:, 1])
+    return near & (spread < loose) & (np.abs(x[:, 0]) < 0.05)
 
 
 def _sharp_corner(records: _Records) -> Float[np.ndarray, " C"]:
@@ -354,6 +359,12 @@ def _told_apart(records: _Records, bare, rss) -> _Taken:
     raised, rss_raised = _best(records, (*_SHAPE, "force_offset"), bare, at_level)
     starts = moved, raised, *_starts(count, (touch, level))
     both, rss_both = _best(records, (*_SHAPE, "onset", "force_offset"), *starts)
+    # What has more parameters may have found a better minimum: those with fewer begin there too.
+    without = [v * [1, 1, 1, 1, 0, 0, 0] for v in (moved, raised, both)]
+    rss = np.minimum(rss, _best(records, _SHAPE, *without)[1])
+    again = _best(records, (*_SHAPE, "onset"), both * [1, 1, 1, 1, 1, 0, 0])
+    moved = np.where((again[1] < rss_moved)[:, None], again[0], moved)
+    rss_moved = np.minimum(rss_moved, again[1])
     unit = np.maximum(rss_both / max(n - 6, 1), 1)
     by_onset, by_offset, by_both = ((rss - v) / unit for v in (rss_moved, rss_raised, rss_both))
     single = np.maximum(by_onset, by_offset)
@@ -368,7 +379,7 @@ def _told_apart(records: _Records, bare, rss) -> _Taken:
     offset = taken & (together | ~onset)
     best = np.where(together[:, None], both, np.where(onset[:, None], moved, raised))
     touch, level = np.where(onset, best[:, 4], 0), np.where(offset, best[:, 5], 0)
-    missed = rss_both > _MISSED * max(n - 6, 1)
+    missed = (rss_both > _MISSED * max(n - 6, 1)) & (n >= _LONG_RECORD)
     return _Taken(onset, offset, touch, level, onset | offset, missed)
 
 
@@ -387,10 +398,12 @@ def _starts(count: int, *zeros):
 
 def _best(records: _Records, names, *starts):
     """Parameters and sum of squares of the best of several starts."""
-    found = [press_shape.fitted(*records, start, _columns(names)) for start in starts]
-    rss = np.stack([f.rss for f in found])
-    rows, best = np.arange(len(records.x)), np.argmin(rss, axis=0)
-    return np.stack([f.parameters for f in found])[best, rows], rss[best, rows]
+    count, tries = len(records.x), len(starts)
+    every = (np.concatenate([v] * tries) for v in records)
+    found = press_shape.fitted(*every, np.concatenate(starts), _columns(names))
+    rss = found.rss.reshape(tries, count)
+    rows, best = np.arange(count), np.argmin(rss, axis=0)
+    return found.parameters.reshape(tries, count, -1)[best, rows], rss[best, rows]
 
 
 def _change_points(records: _Records) -> Float[np.ndarray, " C"]:
