@@ -65,7 +65,10 @@ def test_a_hold_or_an_outlier_is_no_break():
     falls = np.tile(np.r_[np.zeros(40), np.linspace(0, 0.2, 60)], 4)
     stepwise = np.concatenate(steps)
     spike = force(D) + np.where(np.arange(200) == 120, 0.5, 0)
+    pause = np.r_[D[:120], np.full(8, D[120]), D[120:]]  # too short for a hold
+    dip = np.r_[np.zeros(120), np.linspace(0, 0.15, 9), np.linspace(0.14, 0, 20), np.zeros(59)]
     for displacement, values in (
+        (pause, force(pause) - dip),
         (np.r_[D, np.full(80, 2.0)], np.r_[force(D), relaxing]),
         (stepwise, force(stepwise) - falls),
         (D, spike),

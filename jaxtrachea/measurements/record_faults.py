@@ -100,7 +100,10 @@ def _break(part: _Loading, found: Segments) -> tuple[int | None, str]:
     for start, stop in _pieces(part.at, found.steps):
         piece = smooth[start:stop]
         top = np.maximum.accumulate(piece)
-        for j in np.flatnonzero(top - piece > least).tolist():
+        fallen = np.flatnonzero(top - piece > least)
+        # Where the force first falls so far from each of its peaks: how it comes back is no fall.
+        firsts = fallen[np.unique(top[fallen], return_index=True)[1]]
+        for j in firsts.tolist():
             i = int(np.argmax(piece[: j + 1]))
             advance = float(travel[start + j] - travel[start + i])
             rise = float(piece[i] - piece[: i + 1].min())
