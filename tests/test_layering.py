@@ -109,7 +109,8 @@ WITHIN = {
     ],
     "inference/design": [{"press", "candidates"}, {"situation"}, {"choice"}, {"identifiability"}],
     "results": [{"arrays", "store"}, {"rows", "stored"}, {"hdf5"}],
-    "prediction": [{"core", "model_error", "sources"}, {"predict"}, {"held_out"}, {"plots", "report", "tables"}],
+    "prediction": [{"core", "model_error", "sources"}, {"predict"}, {"held_out"},
+                   {"plots", "report", "tables"}],
     "runs": [{"meet", "manifest"}, {"processes", "shards"}, {"folder"}, {"rerun", "checkpoint"}],
     "tradeoff": [
         {"calls", "errors", "front", "levels", "load"},

@@ -422,7 +422,8 @@ def _check_shapes(stored: StoredFit) -> None:
     L, P = len(stored.study.unknowns), stored.theta.shape[-1]
     shapes = {
         "theta": (L, P), "covariance": (L, P, P), "null_space": (L, P, P), "at_bound": (L, P),
-        "status": (L,), "sigma": (L, 2), "force_share": (L,), "half_width": (L,), "curve_lane": (len(stored.curves),),
+        "status": (L,), "sigma": (L, 2), "force_share": (L,), "half_width": (L,),
+        "curve_lane": (len(stored.curves),),
         "blend": (len(stored.curves),),
     }  # fmt: skip
     for name, shape in shapes.items():
