@@ -16,7 +16,7 @@ depth is half that of all depths, half that of this one, the mean of n positions
 n - 1 degrees of freedom.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -195,14 +195,14 @@ def _growth(stored: StoredFit, rows: list[int], study: Study, value, root) -> np
     """
     lanes, first = study.lanes, 0
     residuals = _over(value, root)
-    found = {}
+    found: dict[str, Any] = {"joints": None}
     for kind in forces(lanes) + markers(lanes):
         after = first + lanes.force.shape[-1] * kind.places
         found[kind.name] = residuals[..., first:after].reshape(kind.data.shape)
         first = after
-    seen = Prediction(**({"joints": None} | found))
-    worth = effective_samples(seen)
-    samples = sum(np.sum(np.isfinite(v), axis=tuple(range(1, v.ndim))) for v in found.values())
+    worth = effective_samples(Prediction(**found))
+    kinds = [v for v in found.values() if v is not None]
+    samples = sum(np.sum(np.isfinite(v), axis=tuple(range(1, v.ndim))) for v in kinds)
     unknowns = np.sum((lanes.active > 0) & ~stored.at_bound[rows][:, : study.size], axis=1)
     return widening(samples, worth, unknowns, study.noise_known, stored.half_width[rows])
 
