@@ -36,7 +36,7 @@ class Levels(NamedTuple):
 def with_levels(study: Study, levels: Levels, force: Float[np.ndarray, "lanes T N"]) -> Study:
     """The study with forces weighed by sigma and share; `force` without offset, N."""
     before = study.shares
-    plain = study.lanes.precision if before is None else before.plain
+    plain = np.asarray(study.lanes.precision) if before is None else before.plain
     given = study.noise_given[0]
     share = levels.share[:, None, None] * np.abs(force)
     # In units of an estimated sigma; of given ones beside each.

@@ -350,8 +350,8 @@ def _higher(study: Study) -> dict[str, bool]:
 
 
 def _hardens(study: Study) -> bool:
-    """Whether the local law is more than a straight line."""
-    return any(_higher(study).values())
+    """Whether the local law is more than a straight line: a ratio that softens tells no more of it."""
+    return any(there for name, there in _higher(study).items() if name in Law._fields)
 
 
 def _kinds(study: Study) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " lanes"]]:

@@ -5,8 +5,8 @@ force F_0(D) of skeleton and local law in series, a press by D has
 
     F = r(D) F_0(D),   r(D) = 1 - e_1 D + e_2 D^2,
 
-not odd: D > 0 is a press, D < 0 a draw. The ratio is of the whole way D, not of the skeleton's part:
-a local law that stayed as stiff would take the more of the way the deeper the press, and make
+not odd: D > 0 is a press, D < 0 a draw. The ratio is of the whole way D, not of the skeleton's
+part: a local law that stayed as stiff would take the more of the way the deeper the press, and make
 places between rings soften less than rings; on a finite-element trachea they soften more
 (docs/virtual_trachea.md). Motions are those of small strain at the same D.
 

@@ -240,7 +240,7 @@ def _of_lane(stored: StoredFit, lane: int, curves: tuple[Curve, ...], left: _Lef
     """Every position of a lane left out in turn."""
     together = stored.study.together or tuple(map(tuple, stored.reading.get("together") or ()))
     places: dict[object, list[int]] = {}
-    for t, (curve, group) in enumerate(zip(curves, companions(curves, together), strict=True)):
+    for curve, group in zip(curves, companions(curves, together), strict=True):
         s = np.nan if curve.s_c is None else round(curve.s_c / SAME_PLACE)
         places.setdefault((curve.specimen, s, curve.phi_c, *curve.direction), []).extend(group)
     pressed = np.array([c.s_c for c in curves if c.s_c is not None], float)

@@ -46,7 +46,8 @@ class CurvePrediction:
         s: contact position, mm; NaN if the model needs none.
         displacement: mm; (N,).
         force: N; NaN where there is none.
-        se: standard error of the force from the parameters, widened (`model_error`), N.
+        se: standard error of the force from the parameters, N: widened by alike residuals, but
+            where `model_se` has what these say.
         half_width: of the intervals, in standard errors.
         sigma: standard deviation of a force sample, N; (N,).
         joints: deflection at each ring, mm; (N, rings), NaN where the skeleton is not in the model.
@@ -64,9 +65,8 @@ class CurvePrediction:
         side_se: its standard error from the parameters.
         joint_side: of each ring along the circumference, mm; (N, rings).
         joint_side_se: from the parameters.
-        model_se: standard deviation of the error of the model between the positions of the fit,
-            beyond what the widened `se` has of it, N; (N,); 0 at one of them, and where too few
-            tell it.
+        model_se: standard deviation of the error of the model between the positions of the fit, N;
+            (N,); 0 at one of them, and where too few tell it.
         model_quantile: of a 95 % interval in `model_se`.
     """
 
@@ -193,7 +193,7 @@ def predict_sources(
                 sigma = None if sigmas is None else sigmas[k]
                 where = (s[k], *turned[k])
                 found = _on_host(stored, sources[k], where, displacements[k], own, sigma)
-                out[k] = _between_positions(stored, sources[k], errors.get(sources[k].lane), found)
+                out[k] = _with_misfit(stored, sources[k], errors.get(sources[k].lane), found)
     return [out[k] for k in range(len(sources))]
 
 
@@ -201,52 +201,46 @@ def _widened(source: Source, error: ModelError | None) -> Source:
     """The source with the covariance that alike residuals leave."""
     if error is None or error.growth == 1:
         return source
-    message = "; ".join(filter(None, [source.message, error.growth_message]))
     if np.isfinite(error.growth):
-        covariance = source.covariance * error.growth**2
-        return dataclasses.replace(source, covariance=covariance, message=message)
+        return dataclasses.replace(source, covariance=source.covariance * error.growth**2)
     half = source.half_width if error.known else np.asarray(np.inf)
-    return dataclasses.replace(source, half_width=half, message=message)
+    return dataclasses.replace(source, half_width=half)
 
 
-def _between_positions(
+def _with_misfit(
     stored: StoredFit, source: Source, error: ModelError | None, found: CurvePrediction
 ) -> CurvePrediction:
-    """The prediction with the share of the force in its noise, or the model's error in its place.
+    """The prediction with what the model misses, and why its bands are as wide as they are.
 
-    That where the fit has not pressed.
+    Between the positions of the fit that is the error which leaving positions out has shown. It is
+    in the place of what widens the errors of the parameters and of the noise's share of the force,
+    which are guesses at the same: together they would count it twice.
     """
-    if not found.status.predicts:
+    if error is None or not found.status.predicts:
         return found
     options = stored.study.model.options
     placeless = options.coupling == "total" and options.local == "uniform"
-    between = error is not None and not placeless and not error.at_pressed(found.s)
+    between = not placeless and not error.at_pressed(found.s)
     force = np.abs(found.force - value_of(stored, source, "force_offset"))
     share = float(stored.force_share[source.lane])
-    if not between or not error.known:
-        found = dataclasses.replace(found, sigma=np.hypot(found.sigma, share * force))
-    if not between:
-        return found
-    message = "; ".join(filter(None, [found.message, error.message]))
-    if not error.known:
-        status = max(found.status, PredictionStatus.FEW_POSITIONS)
+    if between and error.known:
+        depth = np.abs(depths(found.displacement, onset_of(stored, source), options))
+        plain = found.se / (error.growth if np.isfinite(error.growth) else 1.0)
+        return dataclasses.replace(
+            found,
+            message="; ".join(filter(None, [found.message, error.message])),
+            se=plain,
+            model_se=np.maximum(error.share_at(depth), share) * np.nan_to_num(force),
+            model_quantile=error.quantile,
+        )
+    sigma, status = np.hypot(found.sigma, share * force), found.status
+    said = [found.message, error.growth_message]
+    if between:
+        status = max(status, PredictionStatus.FEW_POSITIONS)
         head = found.message.removeprefix(found.status.message)
-        if status != found.status:
-            message = f"{status.message}{head}; {error.message}"
-        return dataclasses.replace(found, status=status, message=message)
-    # The noise's share is the model's error where it was pressed, and what alike residuals widen
-    # the parameters' errors by comes of the same misfit: neither counts twice.
-    depth = depths(found.displacement, onset_of(stored, source), options)
-    beyond = (np.maximum(error.share_at(np.abs(depth)), share) * np.nan_to_num(force)) ** 2
-    if np.isfinite(error.growth):
-        ratio = found.half_width / error.quantile
-        beyond = beyond - (1 - 1 / error.growth**2) * (ratio * found.se) ** 2
-    return dataclasses.replace(
-        found,
-        message=message,
-        model_se=np.sqrt(np.maximum(np.nan_to_num(beyond), 0)),
-        model_quantile=error.quantile,
-    )
+        said = [f"{status.message}{head}", error.message, error.growth_message]
+    message = "; ".join(filter(None, said))
+    return dataclasses.replace(found, sigma=sigma, status=status, message=message)
 
 
 def _rounded(count: int, least: int) -> int:

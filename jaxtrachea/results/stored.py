@@ -399,12 +399,12 @@ def _read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str
     return tuple(curves), numeric(group, "lane").astype(int), names["files"]
 
 
-def _observed(group: Any) -> dict[str, np.ndarray]:
+def _observed(group: Any) -> dict[str, Any]:
     """Fields of curves beside the force, samples end to end; NaN where the fit has not used them.
 
     Rings are numbered, with no axis of samples.
     """
-    out = {}
+    out: dict[str, Any] = {}
     if "joints" in group:
         used = np.isfinite(numeric(group, "joint_residual"))
         out["joint_displacement"] = np.where(used, numeric(group, "joints"), np.nan)

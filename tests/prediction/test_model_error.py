@@ -1,0 +1,123 @@
+"""The model's error between positions: leaving out is refitting, noise is none, bands hold."""
+
+import dataclasses
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxtrachea
+from jaxtrachea.cli.specification import settings_of, study_of
+from jaxtrachea.config import load_fit_spec
+from jaxtrachea.fitting.fit import fit
+from jaxtrachea.measurements.data_files import read_data
+from jaxtrachea.prediction import model_error
+from jaxtrachea.prediction.held_out import compare
+from jaxtrachea.prediction.model_error import model_errors
+from jaxtrachea.results.stored import from_result
+from jaxtrachea.status import PredictionStatus
+
+VIRTUAL = Path(__file__).parents[2] / "fits" / "virtual_trachea"
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_leaving_out_is_refitting(own):
+    """Of a linear model, by NumPy's least squares without the trial; one with a zero of its own."""
+    rng = np.random.default_rng(3)
+    trials, samples, markers, unknowns = 5, 12, 6, 3
+    X = rng.normal(size=(trials, unknowns, samples + markers))
+    if own:
+        zero = np.zeros((trials, 1, samples + markers))
+        zero[2, 0, :samples] = 1
+        X = np.concatenate([X, zero], axis=1)
+    y = rng.normal(size=(trials, samples + markers))
+    A, b = np.moveaxis(X, 1, 2).reshape(y.size, -1), y.ravel()
+    z = (A @ np.linalg.lstsq(A, b, rcond=None)[0] - b).reshape(y.shape)
+    root = rng.uniform(1, 3, y.shape)
+    left = model_error._LeftOut(z, X, root, samples, 1.0)
+    error, variance = left.predicted([2])
+    others = np.arange(trials) != 2
+    B = np.moveaxis(X[others][:, :unknowns], 1, 2).reshape(-1, unknowns)
+    theta = np.linalg.lstsq(B, y[others].ravel(), rcond=None)[0]
+    rows = X[2, :unknowns, :samples].T
+    off = rows @ theta - y[2, :samples]
+    off = off - np.mean(off) if own else off
+    np.testing.assert_allclose(error[0], off / root[2, :samples], rtol=1e-9)
+    spread = np.sum((rows @ np.linalg.inv(B.T @ B)) * rows, axis=1)
+    np.testing.assert_allclose(variance[0], spread / root[2, :samples] ** 2, rtol=1e-9)
+
+
+def test_a_position_that_alone_tells_an_unknown_cannot_be_left_out():
+    rng = np.random.default_rng(4)
+    X = rng.normal(size=(4, 2, 8))
+    X[1:, 1] = X[1:, 0]  # but for the first, the sum of both
+    left = model_error._LeftOut(rng.normal(size=(4, 8)), X, np.ones((4, 8)), 8, 1.0)
+    assert left.predicted([0]) is None
+    assert left.predicted([1]) is not None
+
+
+def test_noise_is_no_error_of_the_model(read):
+    """24 specimens that the model describes: nothing is left, and the program reads it back."""
+    found = model_errors(read, list(range(24)))
+    shares = np.array([found[k].share.max() for k in range(24)])
+    noise = 0.02 / max(c.force.max() for c in read.curves)
+    assert np.median(shares) < 2 * noise
+    assert {e.positions for e in found.values()} == {4}
+
+
+def test_a_band_says_what_it_knows(read, monkeypatch):
+    D = np.array([0.0, 2.0, 4.0])
+    here, between = (
+        jaxtrachea.predict(read, s=s, displacement=D, specimen="s0001") for s in (45.0, 61.0)
+    )
+    assert np.all(here.model_se == 0)
+    assert "(4 left out in turn)" in between.message
+    assert "left out" not in here.message
+    np.testing.assert_allclose(
+        between.high95 - between.force,
+        np.hypot(
+            between.half_width * np.hypot(between.se, between.sigma),
+            between.model_quantile * between.model_se,
+        ),
+    )
+    monkeypatch.setattr(model_error, "MIN_POSITIONS", 5)
+    few = dataclasses.replace(read)
+    unknown = jaxtrachea.predict(few, s=61.0, displacement=D, specimen="s0001")
+    assert unknown.status == PredictionStatus.FEW_POSITIONS
+    assert "4 of 5 positions" in unknown.message
+    assert jaxtrachea.predict(few, s=45.0, displacement=D, specimen="s0001").status == 0
+
+
+def left_out(name, size, count):
+    """The finite-element specimen without some positions: what a fit says of these.
+
+    Every choice is a specimen of its own, so that all are one study. Mirror images stay together.
+    """
+    spec = load_fit_spec(VIRTUAL / name)
+    measured = read_data(spec, VIRTUAL)
+    all_of = measured.curves
+    mirror = {i for i, c in enumerate(all_of) if c.s_c in (35.0, 125.0)}
+    choices = [t for t in itertools.combinations(range(10), size)
+               if len(mirror.intersection(t)) != 1]  # fmt: skip
+    chosen = np.random.default_rng(5).permutation(len(choices))[:count]
+    kept, held = [], []
+    for k in chosen:
+        for i, curve in enumerate(all_of):
+            (held if i in choices[k] else kept).append(dataclasses.replace(curve, specimen=f"{k}"))
+    study = study_of(spec, dataclasses.replace(measured, curves=tuple(kept)))
+    return compare(from_result(fit(study, settings_of(spec))), held)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["fit.toml", "finite_strain.toml"])
+def test_bands_hold_positions_left_out(name):
+    """Independent finite elements: 90 to 99 % of the samples with force; forces to 1.2 %."""
+    found = left_out(name, 3, 16)
+    inside = np.concatenate([c.covered[c.with_force] for c in found])
+    assert 0.9 <= np.mean(inside) <= 0.99
+    peaks = [c.residual[c.with_force] / np.max(c.curve.force) for c in found]
+    assert np.sqrt(np.mean(np.concatenate(peaks) ** 2)) <= 0.012
+    first = [c.residual[1] / c.curve.force[1] for c in found]
+    assert np.sqrt(np.mean(np.square(first))) <= 0.012
+    assert not any(c.with_force[0] for c in found)
