@@ -149,7 +149,7 @@ def _centres(cells, centre, axes, stations, curve):
         here = centre + axes @ np.array([t, *(value(t, c) for c in curve)])
         tangent = axes @ np.array([1, *(value(t, slope(c)) for c in curve)])
         frame = _frame(tangent, axes[:, 1])
-        radius = contour(cells.near(here, frame[:, 0]), here, frame, outside=False)
+        radius = contour(cells.near(here, frame[:, 0]), here, frame)
         whole = np.isfinite(radius)
         if whole.mean() < 0.9:
             continue

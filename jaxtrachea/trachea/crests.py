@@ -33,13 +33,15 @@ class Crests(NamedTuple):
         positions: on the midline, mm.
         errors: standard errors of these, from how far the sectors of the arc agree, mm.
         shares: of the sectors in which the crest stands out.
-        slopes: way along the tube on the way from one side to the other, mm per unit of sin phi.
+        sideways: way along the tube per unit of sin phi, mm: of a plane that leans to the side.
+        forwards: the same per unit of cos phi: of one that leans forwards.
     """
 
     positions: np.ndarray
     errors: np.ndarray
     shares: np.ndarray
-    slopes: np.ndarray
+    sideways: np.ndarray
+    forwards: np.ndarray
 
 
 def relief(shape: Shape, to_ends: bool = False) -> np.ndarray:
@@ -127,7 +129,7 @@ def crests_at(s: np.ndarray, rows: np.ndarray, profile, tops: np.ndarray, fall: 
         fall: least height of a crest.
     """
     if not len(tops):
-        return Crests(*np.empty((4, 0)))
+        return Crests(*np.empty((5, 0)))
     step = s[1] - s[0]
     lines = [_mean(rows[:, rays]) for rays in SECTORS]
     edges = (tops[1:] + tops[:-1]) / 2
@@ -144,7 +146,7 @@ def crests_at(s: np.ndarray, rows: np.ndarray, profile, tops: np.ndarray, fall: 
         ]
         at = _centre(s[a:b], profile[a:b], 0.0, top - a)
         found.append([at, *_agreement(of_sectors)])
-    return Crests(*np.array(found, float).reshape(-1, 4).T)
+    return Crests(*np.array(found, float).reshape(-1, 5).T)
 
 
 def _mean(rows):
@@ -168,18 +170,19 @@ def _centre(s, line, fall, top=None) -> float:
     return float(weight @ s[first:last] / weight.sum()) if weight.sum() > 0 else float(s[top])
 
 
-def _agreement(centres) -> tuple[float, float, float]:
-    """Standard error of a crest, share of the sectors that have it, and its slope over sin phi."""
+def _agreement(centres) -> tuple[float, float, float, float]:
+    """Standard error of a crest, share of the sectors that have it, and how its plane leans."""
     centres = np.array(centres)
     seen = np.isfinite(centres)
     share = float(seen.mean())
-    if seen.sum() < 3:
-        return math.inf, share, math.nan
-    x = np.stack([np.ones(seen.sum()), np.sin(MIDDLES[seen])], axis=1)
+    if seen.sum() < 4:
+        return math.inf, share, math.nan, math.nan
+    phi = MIDDLES[seen]
+    x = np.stack([np.ones_like(phi), np.sin(phi), np.cos(phi)], axis=1)
     fit, *_ = np.linalg.lstsq(x, centres[seen], rcond=None)
     rest = centres[seen] - x @ fit
-    error = math.sqrt(float(rest @ rest) / (seen.sum() - 2) / seen.sum())
-    return error, share, float(fit[1])
+    error = math.sqrt(float(rest @ rest) / (len(phi) - 3) / len(phi))
+    return error, share, float(fit[1]), float(fit[2])
 
 
 def starts(s: np.ndarray, rows: np.ndarray, positions: np.ndarray) -> int:

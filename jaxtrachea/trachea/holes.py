@@ -16,16 +16,24 @@ FRONT = 1.6
 
 
 class Hole(NamedTuple):
-    """A hole: from where to where along the tube and round it, and its width round it, mm."""
+    """A hole.
+
+    Attributes:
+        s: from where to where along the tube, mm.
+        phi: the same round it, rad.
+        wide: round it, mm.
+        area: mm^2; that of a crack is next to nothing.
+    """
 
     s: tuple[float, float]
     phi: tuple[float, float]
     wide: float
+    area: float
 
     @property
     def size(self) -> float:
-        """The larger of length and width, mm."""
-        return max(self.s[1] - self.s[0], self.wide)
+        """Side of a square of the same area, mm."""
+        return math.sqrt(self.area)
 
     @property
     def in_front(self) -> bool:
@@ -44,11 +52,17 @@ class Hole(NamedTuple):
 
 def holes_of(surface: Surface, line: Line) -> list[Hole]:
     """Holes of the surface, the largest first; its open ends, loops round the line, are none."""
-    pairs, count = edge_counts(surface.faces)
-    used, pairs = np.unique(pairs[count == 1], return_inverse=True)
+    directed = surface.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    once, count = edge_counts(surface.faces)
+    size = [len(surface.vertices), 1]
+    alone = np.isin(np.sort(directed, axis=1) @ size, once[count == 1] @ size)
+    used, pairs = np.unique(directed[alone], return_inverse=True)
     if not len(used):
         return []
-    label = labels(pairs.reshape(-1, 2), len(used))
+    pairs = pairs.reshape(-1, 2)
+    label = labels(pairs, len(used))
+    points = surface.vertices[used] - surface.vertices[used].mean(axis=0)
+    swept = np.cross(points[pairs[:, 0]], points[pairs[:, 1]]) / 2
     where = locate(line, surface.vertices[used])
     found = []
     for loop in range(label.max() + 1):
@@ -58,7 +72,8 @@ def holes_of(surface: Surface, line: Line) -> list[Hole]:
         away = np.angle(np.exp(1j * (phi - middle)))
         if np.ptp(away) > math.radians(ROUND):
             continue
-        wide = float(np.ptp(away) * distance.mean())
         around = middle + float(away.min()), middle + float(away.max())
-        found.append(Hole((float(s.min()), float(s.max())), around, wide))
-    return sorted(found, key=lambda hole: -hole.size)
+        area = float(np.linalg.norm(swept[of[pairs[:, 0]]].sum(axis=0)))
+        wide = float(np.ptp(away) * distance.mean())
+        found.append(Hole((float(s.min()), float(s.max())), around, wide, area))
+    return sorted(found, key=lambda hole: -hole.area)

@@ -50,6 +50,9 @@ class Imported(eqx.Module):
         rotation: rows are the axes of the tube frame in the file.
         origin: of the tube frame in the file, in the file's unit.
         scale: mm per unit of the file. File position = origin + rotation^T position / scale.
+        ring_errors: standard error of each ring's position, mm, from how far the sectors of the
+            front agree; infinite where too few show the ring, NaN where positions were given.
+        ring_shares: share of the front that shows each ring; NaN where positions were given.
         notes: what was found, chosen or dropped, in words.
     """
 
@@ -57,6 +60,8 @@ class Imported(eqx.Module):
     geometry: Geometry
     rotation: Float[Array, "3 3"]
     origin: Float[Array, "3"]
+    ring_errors: Float[Array, " rings"]
+    ring_shares: Float[Array, " rings"]
     scale: float = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
 
@@ -184,7 +189,8 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
     except InputError as error:
         name = "half_angle" if error.key == "half_angle" else "ring_positions"
         raise MeshError.like(error, cure="give {}", arguments=(name,)) from error
-    return Imported(mesh, geometry, cast(rotation), cast(origin / scale), scale, tuple(notes))
+    arrays = (cast(v) for v in (rotation, origin / scale, found.errors, found.shares))
+    return Imported(mesh, geometry, *arrays, scale, tuple(notes))
 
 
 def _axes(along, anterior):

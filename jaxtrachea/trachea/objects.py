@@ -23,7 +23,8 @@ def together(surfaces: list[Surface]) -> Surface:
     """All triangles in one."""
     shift = np.cumsum([0, *(len(f.vertices) for f in surfaces[:-1])])
     vertices = np.concatenate([f.vertices for f in surfaces])
-    return Surface(vertices, np.concatenate([f.faces + at for f, at in zip(surfaces, shift)]))
+    faces = [f.faces + at for f, at in zip(surfaces, shift, strict=True)]
+    return Surface(vertices, np.concatenate(faces))
 
 
 def joined(parts: dict[str, Surface]) -> tuple[dict[str, Surface], dict[str, str]]:
@@ -82,6 +83,6 @@ def check_left_out(parts: dict[str, Surface], wall: str, rings, chosen, notes: l
         raise MeshError(
             f"the object {name!r} has {100 * share:.1f} % of the area and may be a piece of the "
             f"wall, {wall!r}, but does not meet its edges",
-            cure=f"join them in one object, or give {{}}{wall!r}, which leaves the other out",
+            cure="join them in one object, or give {} (which leaves the other out)",
             arguments=("part=",),
         )

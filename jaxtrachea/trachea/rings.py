@@ -1,5 +1,6 @@
 """Which side of a surface is anterior, and where its rings are: from cartilage or from relief."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -29,15 +30,29 @@ FEWEST, PITCH, EVEN, SHARE = 4, (0.2, 2.0), (0.4, 2.2), 0.4
 FORKED = 0.2
 #: A distance of neighbours that is noted, over the median one; a lean that is, degrees.
 WIDE, LEANS = 1.6, 3.0
-#: Share of the front that has to show a ring of the relief; size of a hole of cartilage from which a
-#: ring may be lost, over the radius (Visible Human, pierced at random: rings lost from 0.75 on).
-LEAST_SHARE, HOLE = 0.4, 0.55
+#: Distance from an end within which no ring is expected, over the usual one.
+END = 0.25
+#: Share of the front that has to show a ring of the relief; size of a hole in cartilage that may
+#: cost a ring, over the radius (Visible Human, pierced at random: lost from 0.25 on).
+LEAST_SHARE, HOLE = 0.4, 0.2
 
 
 class Rings(NamedTuple):
-    """What was found of the rings; `notes` say from what, and how sure they are."""
+    """What was found of the rings.
+
+    Attributes:
+        positions: mm.
+        errors: standard errors of these, mm; NaN where they are given.
+        shares: of the front that shows each ring; NaN where they are given.
+        half_angle: rad.
+        radius: mm.
+        height: mm.
+        notes: from what, and how sure they are.
+    """
 
     positions: np.ndarray
+    errors: np.ndarray
+    shares: np.ndarray
     half_angle: float
     radius: float
     height: float
@@ -101,13 +116,17 @@ def find_rings(shape: Shape, positions=None, half_angle=None, holes: Sequence[Ho
     notes = []
     if positions is not None:
         found, source = np.asarray(positions, float), "the positions given"
+        errors = shares = np.full(found.shape, np.nan)
     else:
-        _check_seen(shape.s, profile, radius, own, holes)
+        if own:
+            _check_cartilage(radius, holes)
         smooth = smoothed(profile, step)
         # cartilage may begin or end with the surface
         tops = peaks(np.pad(smooth, 1), fall) - 1 if own else peaks(smooth, fall)
         crests = crests_at(shape.s, rows, smooth, tops, fall)
-        found = crests.positions
+        found, errors, shares = crests.positions, crests.errors, crests.shares
+        if not own:
+            _check_seen(shape.s, profile, found, holes)
         _check_row(found, source, radius, shape.line.s[-1], own, holes)
         notes = _check_crests(crests, shape.s, rows, radius, own)
     if half_angle is None:
@@ -117,31 +136,38 @@ def find_rings(shape: Shape, positions=None, half_angle=None, holes: Sequence[Ho
     if own:
         height = float(profile.sum() * step / len(found))
     notes = [f"{len(found)} rings from {source}", *notes]
-    return Rings(found, half_angle, radius, height, tuple(notes))
+    return Rings(found, errors, shares, half_angle, radius, height, tuple(notes))
 
 
-def _check_seen(s, profile, radius, own, holes) -> None:
-    """Refuse a surface of which a ring may be hidden by a hole."""
-    step = s[1] - s[0]
+def _check_cartilage(radius, holes) -> None:
+    """Refuse cartilage with a hole that may cost a ring."""
+    for hole in holes:
+        if hole.in_front and hole.size > HOLE * radius:
+            raise _hidden(f"the cartilage has {hole.words}")
+
+
+def _check_seen(s, profile, found, holes) -> None:
+    """Refuse a wall of which most of the front is not there where a ring may be."""
     seen = np.flatnonzero(np.isfinite(profile))
-    blind = np.flatnonzero(np.diff(seen) * step > SMOOTH + 2 * step)
-    if own:
-        hole = next((h for h in holes if h.in_front and h.size > HOLE * radius), None)
-        found = None if hole is None else f"the cartilage has {hole.words}"
-    elif len(blind):
-        low, high = s[seen[blind[0]]], s[seen[blind[0] + 1]]
-        found = f"most of the front is not there at s = {low:.1f} to {high:.1f} mm"
-        there = (h for h in holes if h.s[0] < high and h.s[1] > low)
-        hole = next(there, None)
-        found += "" if hole is None else f": {hole.words}"
-    else:
-        return
-    if found is not None:
-        raise MeshError(
-            f"{found}: a ring may be lost there",
-            cure="close the hole, or give {}",
-            arguments=("ring_positions=",),
+    pitch = float(np.median(np.diff(found))) if len(found) > 1 else 0.0
+    far, step = s[-1] + s[0], s[1] - s[0]
+    before, after = found[:1] - pitch, found[-1:] + pitch  # where the next would be
+    blind = [(s[i], s[j]) for i, j in itertools.pairwise(seen) if s[j] - s[i] > SMOOTH + 2 * step]
+    blind += [(0.0, s[seen[0]]) for at in before if END * pitch < at < s[seen[0]]]
+    blind += [(s[seen[-1]], far) for at in after if s[seen[-1]] < at < far - END * pitch]
+    for low, high in blind:
+        there = (f": {hole.words}" for hole in holes if hole.s[0] < high and hole.s[1] > low)
+        raise _hidden(
+            f"most of the front is not there at s = {low:.1f} to {high:.1f} mm{next(there, '')}"
         )
+
+
+def _hidden(found: str) -> MeshError:
+    return MeshError(
+        f"{found}; a ring may be lost there",
+        cure="close the hole, or give {}",
+        arguments=("ring_positions=",),
+    )
 
 
 def _check_row(found, source, radius, length, own, holes=()) -> None:
@@ -189,12 +215,11 @@ def _check_row(found, source, radius, length, own, holes=()) -> None:
 def _check_crests(crests: Crests, s, rows, radius, own) -> list[str]:
     """Notes on how sure the rings are; refuses a thread, and a ring that few rays see."""
     found, notes = crests.positions, []
-    lean = np.degrees(np.arctan(crests.slopes / radius))
-    usual = float(np.nanmedian(lean)) if np.isfinite(lean).any() else 0.0
+    leans = [_usual_lean(v, radius) for v in (crests.sideways, crests.forwards)]
     if turns := starts(s, rows, found):
         raise MeshError(
             f"its crests run on round the tube, by {abs(turns)} of their distance at each turn, "
-            f"and lean by {abs(usual):.0f} degrees to the side: a thread or a helix, or rings "
+            f"and lean by {abs(leans[0]):.0f} degrees to the side: a thread or a helix, or rings "
             "that lean; expected rings across the centreline",
             cure="give {} and {} if they are such rings",
             arguments=("ring_positions=", "centreline="),
@@ -213,8 +238,11 @@ def _check_crests(crests: Crests, s, rows, radius, own) -> list[str]:
     if np.isfinite(error):
         least = f"+- {max(error, 0.01):.2f} mm, {least}"
     notes.append(f"the least sure ring: s = {found[unsure]:.1f} mm, {least}")
-    if abs(usual) > LEANS:
-        notes.append(f"the rings lean by {abs(usual):.0f} degrees to the side; they are read flat")
+    if max(abs(lean) for lean in leans) > LEANS:
+        notes.append(
+            f"the rings lean by {abs(leans[0]):.0f} degrees to the side and {abs(leans[1]):.0f} "
+            "forwards or backwards; they are read as if they stood across the centreline"
+        )
     gaps = np.diff(found)
     for i in np.flatnonzero(gaps > WIDE * np.median(gaps)):
         notes.append(
@@ -222,6 +250,12 @@ def _check_crests(crests: Crests, s, rows, radius, own) -> list[str]:
             f"{gaps[i] / np.median(gaps):.1f} of the usual distance: does a ring lack there?"
         )
     return notes
+
+
+def _usual_lean(slopes, radius) -> float:
+    """Median angle of the rings' planes, degrees."""
+    seen = np.isfinite(slopes)
+    return math.degrees(math.atan(np.median(slopes[seen]) / radius)) if seen.any() else 0.0
 
 
 def _middle(rows):

@@ -50,7 +50,6 @@ class Cells(NamedTuple):
 def contour(corners, centre, frame, outside: bool = True) -> np.ndarray:
     """Distance of the farthest hit of each ray in the plane across `frame`'s tangent, or NaN.
 
-
     Args:
         corners: of the triangles; shape (faces, 3, 3).
         centre: from which the rays go.
