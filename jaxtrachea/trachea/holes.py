@@ -43,7 +43,7 @@ class Hole(NamedTuple):
     @property
     def words(self) -> str:
         """Its size and place."""
-        low, high = (round(math.degrees(v)) for v in self.phi)
+        low, high = (round((math.degrees(v) + 180) % 360 - 180) for v in self.phi)
         return (
             f"a hole of {self.s[1] - self.s[0]:.2g} x {self.wide:.2g} mm at s = {self.s[0]:.1f} to "
             f"{self.s[1]:.1f} mm, phi = {low} to {high} degrees"

@@ -130,11 +130,12 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
     parts = parts_of(path)
     step()
     surfaces, surface_of = joined(parts)
-    name = wall_of(surfaces, part if part is None else surface_of.get(part, part))
+    name = wall_of(surfaces, None if part is None else surface_of.get(part, part))
     pieces = [piece for piece in parts if surface_of[piece] == name and piece != name]
     notes = [f"wall: {', '.join([name, *pieces])}"] if len(parts) > 1 else []
     own = rings_named(parts, name, rings)
-    check_left_out(surfaces, name, surface_of.get(own), part is not None, notes)
+    of_rings = None if own is None else surface_of.get(own)
+    check_left_out(surfaces, name, of_rings, part is not None, notes)
     surface, cleaned = clean(surfaces[name])
     step()
     scale = scale_of(surface, path, unit, notes)
@@ -189,8 +190,11 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
     except InputError as error:
         name = "half_angle" if error.key == "half_angle" else "ring_positions"
         raise MeshError.like(error, cure="give {}", arguments=(name,)) from error
-    arrays = (cast(v) for v in (rotation, origin / scale, found.errors, found.shares))
-    return Imported(mesh, geometry, *arrays, scale, tuple(notes))
+    return Imported(
+        mesh=mesh, geometry=geometry, rotation=cast(rotation), origin=cast(origin / scale),
+        ring_errors=cast(found.errors), ring_shares=cast(found.shares), scale=scale,
+        notes=tuple(notes),
+    )  # fmt: skip
 
 
 def _axes(along, anterior):

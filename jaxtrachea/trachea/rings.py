@@ -1,6 +1,5 @@
 """Which side of a surface is anterior, and where its rings are: from cartilage or from relief."""
 
-import itertools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,19 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxtrachea.trachea.centreline import Shape
-from jaxtrachea.trachea.crests import (
-    ARC,
-    SMOOTH,
-    Crests,
-    crests_at,
-    peaks,
-    profile_of,
-    relief,
-    smoothed,
-    starts,
-)
+from jaxtrachea.trachea.crests import ARC, crests_at, peaks, profile_of, relief, smoothed
 from jaxtrachea.trachea.holes import Hole
 from jaxtrachea.trachea.mesh import MeshError
+from jaxtrachea.trachea.ring_checks import check_cartilage, check_crests, check_seen
 from jaxtrachea.trachea.sections import ANGLES, RAYS
 
 #: What a row of rings is: their least number; distance of neighbours over the radius (17 rings of a
@@ -28,13 +18,6 @@ from jaxtrachea.trachea.sections import ANGLES, RAYS
 FEWEST, PITCH, EVEN, SHARE = 4, (0.2, 2.0), (0.4, 2.2), 0.4
 #: Cartilage may fork and join, which gives two crests near each other (Visible Human male: 0.35).
 FORKED = 0.2
-#: A distance of neighbours that is noted, over the median one; a lean that is, degrees.
-WIDE, LEANS = 1.6, 3.0
-#: Distance from an end within which no ring is expected, over the usual one.
-END = 0.25
-#: Share of the front that has to show a ring of the relief; size of a hole in cartilage that may
-#: cost a ring, over the radius (Visible Human, pierced at random: lost from 0.25 on).
-LEAST_SHARE, HOLE = 0.4, 0.2
 
 
 class Rings(NamedTuple):
@@ -119,16 +102,16 @@ def find_rings(shape: Shape, positions=None, half_angle=None, holes: Sequence[Ho
         errors = shares = np.full(found.shape, np.nan)
     else:
         if own:
-            _check_cartilage(radius, holes)
+            check_cartilage(radius, holes)
         smooth = smoothed(profile, step)
         # cartilage may begin or end with the surface
         tops = peaks(np.pad(smooth, 1), fall) - 1 if own else peaks(smooth, fall)
         crests = crests_at(shape.s, rows, smooth, tops, fall)
         found, errors, shares = crests.positions, crests.errors, crests.shares
         if not own:
-            _check_seen(shape.s, profile, found, holes)
+            check_seen(shape.s, profile, found, holes)
         _check_row(found, source, radius, shape.line.s[-1], own, holes)
-        notes = _check_crests(crests, shape.s, rows, radius, own)
+        notes = check_crests(crests, shape.s, rows, radius, own)
     if half_angle is None:
         known = own or positions is None
         half_angle = _half_angle(strength) if known else 2 * math.pi / 3
@@ -137,37 +120,6 @@ def find_rings(shape: Shape, positions=None, half_angle=None, holes: Sequence[Ho
         height = float(profile.sum() * step / len(found))
     notes = [f"{len(found)} rings from {source}", *notes]
     return Rings(found, errors, shares, half_angle, radius, height, tuple(notes))
-
-
-def _check_cartilage(radius, holes) -> None:
-    """Refuse cartilage with a hole that may cost a ring."""
-    for hole in holes:
-        if hole.in_front and hole.size > HOLE * radius:
-            raise _hidden(f"the cartilage has {hole.words}")
-
-
-def _check_seen(s, profile, found, holes) -> None:
-    """Refuse a wall of which most of the front is not there where a ring may be."""
-    seen = np.flatnonzero(np.isfinite(profile))
-    pitch = float(np.median(np.diff(found))) if len(found) > 1 else 0.0
-    far, step = s[-1] + s[0], s[1] - s[0]
-    before, after = found[:1] - pitch, found[-1:] + pitch  # where the next would be
-    blind = [(s[i], s[j]) for i, j in itertools.pairwise(seen) if s[j] - s[i] > SMOOTH + 2 * step]
-    blind += [(0.0, s[seen[0]]) for at in before if END * pitch < at < s[seen[0]]]
-    blind += [(s[seen[-1]], far) for at in after if s[seen[-1]] < at < far - END * pitch]
-    for low, high in blind:
-        there = (f": {hole.words}" for hole in holes if hole.s[0] < high and hole.s[1] > low)
-        raise _hidden(
-            f"most of the front is not there at s = {low:.1f} to {high:.1f} mm{next(there, '')}"
-        )
-
-
-def _hidden(found: str) -> MeshError:
-    return MeshError(
-        f"{found}; a ring may be lost there",
-        cure="close the hole, or give {}",
-        arguments=("ring_positions=",),
-    )
 
 
 def _check_row(found, source, radius, length, own, holes=()) -> None:
@@ -210,52 +162,6 @@ def _check_row(found, source, radius, length, own, holes=()) -> None:
         cure=cure,
         arguments=arguments,
     )
-
-
-def _check_crests(crests: Crests, s, rows, radius, own) -> list[str]:
-    """Notes on how sure the rings are; refuses a thread, and a ring that few rays see."""
-    found, notes = crests.positions, []
-    leans = [_usual_lean(v, radius) for v in (crests.sideways, crests.forwards)]
-    if turns := starts(s, rows, found):
-        raise MeshError(
-            f"its crests run on round the tube, by {abs(turns)} of their distance at each turn, "
-            f"and lean by {abs(leans[0]):.0f} degrees to the side: a thread or a helix, or rings "
-            "that lean; expected rings across the centreline",
-            cure="give {} and {} if they are such rings",
-            arguments=("ring_positions=", "centreline="),
-        )
-    worst = int(np.argmin(crests.shares))
-    if not own and crests.shares[worst] < LEAST_SHARE:
-        raise MeshError(
-            f"the ring at s = {found[worst]:.1f} mm is seen on {100 * crests.shares[worst]:.0f} % "
-            f"of the front, expected {100 * LEAST_SHARE:.0f} % or more",
-            cure="repair the surface there, or give {}",
-            arguments=("ring_positions=",),
-        )
-    unsure = int(np.argmax(crests.errors))
-    least = f"on {100 * crests.shares[unsure]:.0f} % of the front"
-    error = crests.errors[unsure]
-    if np.isfinite(error):
-        least = f"+- {max(error, 0.01):.2f} mm, {least}"
-    notes.append(f"the least sure ring: s = {found[unsure]:.1f} mm, {least}")
-    if max(abs(lean) for lean in leans) > LEANS:
-        notes.append(
-            f"the rings lean by {abs(leans[0]):.0f} degrees to the side and {abs(leans[1]):.0f} "
-            "forwards or backwards; they are read as if they stood across the centreline"
-        )
-    gaps = np.diff(found)
-    for i in np.flatnonzero(gaps > WIDE * np.median(gaps)):
-        notes.append(
-            f"from s = {found[i]:.1f} to {found[i + 1]:.1f} mm are "
-            f"{gaps[i] / np.median(gaps):.1f} of the usual distance: does a ring lack there?"
-        )
-    return notes
-
-
-def _usual_lean(slopes, radius) -> float:
-    """Median angle of the rings' planes, degrees."""
-    seen = np.isfinite(slopes)
-    return math.degrees(math.atan(np.median(slopes[seen]) / radius)) if seen.any() else 0.0
 
 
 def _middle(rows):

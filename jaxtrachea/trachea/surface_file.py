@@ -4,6 +4,7 @@ STL, OBJ, PLY, GLB and what else trimesh reads.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,11 +30,11 @@ def parts_of(path: Path) -> dict[str, Surface]:
     if not path.is_file():
         raise MeshError("there is no such file")
     # An OBJ by its objects, not by its materials (`split_object`: the name until trimesh 5).
-    by_object = {"group_material": False, "split_object": True, "split_objects": True}
+    by_object: dict[str, Any] = {}
+    if path.suffix.lower() == ".obj":
+        by_object = {"group_material": False, "split_object": True, "split_objects": True}
     try:
-        scene = trimesh.load_scene(
-            path, process=False, **(by_object if path.suffix.lower() == ".obj" else {})
-        )
+        scene = trimesh.load_scene(path, process=False, **by_object)
         nodes = [(node, *scene.graph[node]) for node in scene.graph.nodes_geometry]
         objects = [
             (_object_of(scene, node, name), scene.geometry[name], frame)
