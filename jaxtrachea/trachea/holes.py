@@ -52,13 +52,13 @@ class Hole(NamedTuple):
 
 def holes_of(surface: Surface, line: Line) -> list[Hole]:
     """Holes of the surface, the largest first; its open ends, loops round the line, are none."""
-    directed = surface.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     once, count = edge_counts(surface.faces)
+    if not np.any(count == 1):
+        return []
+    directed = surface.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     size = [len(surface.vertices), 1]
     alone = np.isin(np.sort(directed, axis=1) @ size, once[count == 1] @ size)
     used, pairs = np.unique(directed[alone], return_inverse=True)
-    if not len(used):
-        return []
     pairs = pairs.reshape(-1, 2)
     label = labels(pairs, len(used))
     points = surface.vertices[used] - surface.vertices[used].mean(axis=0)
