@@ -22,6 +22,8 @@ MIDDLES = np.array([ANGLES[rays].mean() for rays in SECTORS])
 SEEN = 0.5
 #: Length over which the profile is smoothed, and which it may be bridged where it is not seen, mm.
 SMOOTH = 1.2
+#: Where a contour that is steep along the tube is smaller than this, over the mean, it is a lid.
+SHUT = 0.9
 #: Share by which waves that turn with phi outweigh level ones: a thread.
 THREAD = 1.5
 
@@ -72,7 +74,9 @@ def relief(shape: Shape, to_ends: bool = False) -> np.ndarray:
     out[-half:] = shape.radius[-half:] - level[-1] - slope(level[-span], level[-1]) * (i + 1)
     both = seen[1:] & seen[:-1]
     rise = np.where(both, np.abs(np.diff(shape.radius, axis=0)), 0).sum(axis=1)
-    steep = rise > step * both.sum(axis=1)  # a lid: more than 45 deg
+    wide = np.nan_to_num(shape.radius).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    shut = np.minimum(wide[1:], wide[:-1]) < SHUT * np.nanmean(shape.radius)
+    steep = (rise > step * both.sum(axis=1)) & shut  # a lid: more than 45 deg
     low, high = np.flatnonzero(steep[:half]), np.flatnonzero(steep[-half:])
     out[: low[-1] + 1 if len(low) else 0] = np.nan
     out[len(out) - half + high[0] if len(high) else len(out) :] = np.nan

@@ -13,7 +13,7 @@ WIDE, LEANS = 1.6, 3.0
 #: Distance from an end within which no ring is expected, over the usual one.
 END = 0.25
 #: Share of the front that has to show a ring of the relief; size of a hole in cartilage that may
-#: cost a ring, over the radius (Visible Human, pierced at random: from 0.25 on; 0.2 mm off at 0.17).
+#: cost a ring, over the radius (Visible Human, pierced at random: lost from 0.25, moved from 0.17).
 LEAST_SHARE, HOLE = 0.4, 0.15
 
 
