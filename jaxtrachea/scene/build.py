@@ -35,7 +35,6 @@ KEYS = {
     "rings=": "cartilage=",
     "ring_positions": "rings",
     "ring_positions=": "rings=",
-    "centreline=": "centreline= of Landmarks to read_mesh (from Python)",
     "geometry.length": "trachea.length",
     "geometry.radius": "trachea.radius",
     "half_width": "model.half_width",
@@ -233,6 +232,7 @@ def _imported(section: SceneTracheaSection, folder: Path, files: list[Path], pro
     landmarks = Landmarks(
         larynx=section.larynx, anterior=section.anterior, ring_positions=rings,
         half_angle=section.half_angle,
+        centreline=None if section.centreline is None else np.array(section.centreline),
     )  # fmt: skip
     try:
         read = read_mesh(

@@ -50,13 +50,14 @@ class SceneTracheaSection(Section):
     cartilage: str | None = None
     larynx: Direction | None = None
     anterior: Direction | None = None
+    centreline: Annotated[list[Direction], Field(min_length=2)] | None = None
 
     @model_validator(mode="after")
     def _complete(self) -> "SceneTracheaSection":
         given = self.model_fields_set
         made = {"preset", "length", "radius", "ring_height", "around", "along", "wall", "relief"}
         made &= given
-        read = {"unit", "part", "cartilage", "larynx", "anterior"} & given
+        read = {"unit", "part", "cartilage", "larynx", "anterior", "centreline"} & given
         if self.file is not None and made:
             raise ValueError(f"file excludes {', '.join(sorted(made))}; remove one side")
         if self.file is None and read:

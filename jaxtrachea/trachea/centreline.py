@@ -15,6 +15,8 @@ STATIONS = 60
 BESIDE = 0.1
 #: Furthest turn of a centreline, degrees: a quarter circle, and what is found of it.
 TURN = 100.0
+#: Least spread of the surface along its axis over that across, squared: 1.5 times as long as wide.
+LONGER = 1.5
 
 
 class Line(NamedTuple):
@@ -62,12 +64,12 @@ class Shape(NamedTuple):
         s = np.linspace(0, line.s[-1], max(50, int(line.s[-1] / 0.4)))[1:-1]
         points, frames = line.at(s)
 
-        def cut(vertices, faces):
+        def cut(vertices, faces, outside=True):
             cells = Cells.of(vertices, faces)
             rows = zip(points, frames, strict=True)
-            return np.stack([contour(cells.near(p, q[:, 0]), p, q) for p, q in rows])
+            return np.stack([contour(cells.near(p, q[:, 0]), p, q, outside) for p, q in rows])
 
-        hit = None if cartilage is None else np.isfinite(cut(*cartilage))
+        hit = None if cartilage is None else np.isfinite(cut(*cartilage, outside=False))
         return cls(line, s, cut(vertices, faces), hit)
 
     def end_radii(self) -> tuple[float, float]:
@@ -103,6 +105,8 @@ def find_centreline(vertices, faces, given=None) -> Line:
     if given is not None:
         if given.ndim != 2 or given.shape[1] != 3 or len(given) < 2:
             raise MeshError(f"centreline has shape {given.shape}; expected (points, 3)")
+        if not (np.isfinite(given).all() and np.ptp(given, axis=0).max() > 0):
+            raise MeshError("centreline is no line: expected finite points, not all at one place")
         return _over(vertices, _fine(given))
     corners = vertices[faces]
     weight = np.linalg.norm(
@@ -111,7 +115,7 @@ def find_centreline(vertices, faces, given=None) -> Line:
     middle = corners.mean(axis=1)
     centre = np.average(middle, axis=0, weights=weight)
     spread, axes = np.linalg.eigh(np.cov((middle - centre).T, aweights=weight))
-    if spread[2] < 3 * spread[1]:
+    if spread[2] < LONGER * spread[1]:
         raise MeshError(
             "it is not longer than wide: no axis to follow",
             cure="give {}",

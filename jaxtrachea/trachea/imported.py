@@ -23,11 +23,19 @@ from jaxtrachea.trachea.centreline import (
     locate,
     turned,
 )
-from jaxtrachea.trachea.cleaning import Surface, clean
+from jaxtrachea.trachea.cleaning import Surface, clean, join_corners
 from jaxtrachea.trachea.geometry import Geometry
+from jaxtrachea.trachea.holes import holes_of
 from jaxtrachea.trachea.mesh import Mesh, MeshError, vertex_normals
+from jaxtrachea.trachea.objects import check_left_out, joined
 from jaxtrachea.trachea.rings import find_anterior, find_rings
-from jaxtrachea.trachea.surface_file import cartilage_of, parts_of, scale_of, wall_of
+from jaxtrachea.trachea.surface_file import (
+    cartilage_of,
+    parts_of,
+    rings_named,
+    scale_of,
+    wall_of,
+)
 
 #: Steps of reading that take time: the file, its repair, centreline, sections, places of vertices.
 STEPS = 5
@@ -42,6 +50,9 @@ class Imported(eqx.Module):
         rotation: rows are the axes of the tube frame in the file.
         origin: of the tube frame in the file, in the file's unit.
         scale: mm per unit of the file. File position = origin + rotation^T position / scale.
+        ring_errors: standard error of each ring's position, mm, from how far the sectors of the
+            front agree; infinite where too few show the ring, NaN where positions were given.
+        ring_shares: share of the front that shows each ring; NaN where positions were given.
         notes: what was found, chosen or dropped, in words.
     """
 
@@ -49,6 +60,8 @@ class Imported(eqx.Module):
     geometry: Geometry
     rotation: Float[Array, "3 3"]
     origin: Float[Array, "3"]
+    ring_errors: Float[Array, " rings"]
+    ring_shares: Float[Array, " rings"]
     scale: float = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
 
@@ -116,13 +129,18 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
 
     parts = parts_of(path)
     step()
-    name = wall_of(parts, part)
-    notes = [f"wall: {name}"] if len(parts) > 1 else []
-    surface, cleaned = clean(parts[name])
+    surfaces, surface_of = joined(parts)
+    name = wall_of(surfaces, None if part is None else surface_of.get(part, part))
+    pieces = [piece for piece in parts if surface_of[piece] == name and piece != name]
+    notes = [f"wall: {', '.join([name, *pieces])}"] if len(parts) > 1 else []
+    own = rings_named(parts, name, rings)
+    of_rings = None if own is None else surface_of.get(own)
+    check_left_out(surfaces, name, of_rings, part is not None, notes)
+    surface, cleaned = clean(surfaces[name])
     step()
     scale = scale_of(surface, path, unit, notes)
     wall = Surface(surface.vertices * scale, surface.faces)
-    cartilage = cartilage_of(parts, name, rings, path, scale, notes)
+    cartilage = cartilage_of(parts, own, path, scale, notes)
     given = None
     if known.centreline is not None:
         given = np.asarray(known.centreline, float) * scale
@@ -142,7 +160,12 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
         shape.check_middle()
     step()
     shape = find_anterior(shape, known.anterior)
-    found = find_rings(shape, known.ring_positions, known.half_angle)
+    holes = holes_of(wall, shape.line)
+    if holes:
+        notes.append(f"{len(holes)} holes in the wall, the largest {holes[0].words}")
+    if cartilage is not None:
+        holes = holes_of(join_corners(cartilage)[0], shape.line)
+    found = find_rings(shape, known.ring_positions, known.half_angle, holes)
     where = locate(shape.line, wall.vertices)
     chord = shape.line.points[-1] - shape.line.points[0]
     rotation = _axes(chord, shape.line.frames[:, :, 1].mean(axis=0))
@@ -150,7 +173,7 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
     vertices = (wall.vertices - origin) @ rotation.T
     frames = rotation @ where.frames
     normals = vertex_normals(vertices, wall.faces)
-    notes += cleaned + [f"{len(found.positions)} rings from {found.source}"]
+    notes += [*cleaned, *found.notes]
     dtype = jnp.zeros(0, dtype).dtype
     fields = (normals, where.s, where.phi, where.distance, frames)
 
@@ -165,9 +188,13 @@ def _read(path: Path, known: Landmarks, unit, part, rings, dtype, progress) -> I
             ring_height=found.height, dtype=dtype,
         )  # fmt: skip
     except InputError as error:
-        names = ("ring_positions", "half_angle")
-        raise MeshError.like(error, cure="give {} or {}", arguments=names) from error
-    return Imported(mesh, geometry, cast(rotation), cast(origin / scale), scale, tuple(notes))
+        name = "half_angle" if error.key == "half_angle" else "ring_positions"
+        raise MeshError.like(error, cure="give {}", arguments=(name,)) from error
+    return Imported(
+        mesh=mesh, geometry=geometry, rotation=cast(rotation), origin=cast(origin / scale),
+        ring_errors=cast(found.errors), ring_shares=cast(found.shares), scale=scale,
+        notes=tuple(notes),
+    )  # fmt: skip
 
 
 def _axes(along, anterior):

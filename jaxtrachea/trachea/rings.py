@@ -1,16 +1,18 @@
 """Which side of a surface is anterior, and where its rings are: from cartilage or from relief."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxtrachea.trachea.centreline import Shape
+from jaxtrachea.trachea.crests import ARC, crests_at, peaks, profile_of, relief, smoothed
+from jaxtrachea.trachea.holes import Hole
 from jaxtrachea.trachea.mesh import MeshError
+from jaxtrachea.trachea.ring_checks import check_cartilage, check_crests, check_seen
 from jaxtrachea.trachea.sections import ANGLES, RAYS
 
-#: The arc on which rings are looked for: the anterior side, clear of the rings' ends.
-ARC = np.abs(ANGLES) < 1.6
 #: What a row of rings is: their least number; distance of neighbours over the radius (17 rings of a
 #: human trachea: 0.7; table 1: 0.9); distance over the median one; share of the length they take.
 FEWEST, PITCH, EVEN, SHARE = 4, (0.2, 2.0), (0.4, 2.2), 0.4
@@ -19,13 +21,25 @@ FORKED = 0.2
 
 
 class Rings(NamedTuple):
-    """What was found of the rings; `source` in words."""
+    """What was found of the rings.
+
+    Attributes:
+        positions: mm.
+        errors: standard errors of these, mm; NaN where they are given.
+        shares: of the front that shows each ring; NaN where they are given.
+        half_angle: rad.
+        radius: mm.
+        height: mm.
+        notes: from what, and how sure they are.
+    """
 
     positions: np.ndarray
+    errors: np.ndarray
+    shares: np.ndarray
     half_angle: float
     radius: float
     height: float
-    source: str
+    notes: tuple[str, ...]
 
 
 def find_anterior(shape: Shape, given=None) -> Shape:
@@ -43,7 +57,7 @@ def find_anterior(shape: Shape, given=None) -> Shape:
     elif shape.cartilage is not None:
         angle, _ = _side(shape.cartilage.mean(axis=0))
     else:
-        angle, clear = _side(np.nan_to_num(_middle(_relief(shape) ** 2)))
+        angle, clear = _side(np.nan_to_num(_middle(relief(shape) ** 2)))
         if not clear or not _has_relief(shape):
             angle = _opposite_flat(shape)
     c, s = math.cos(angle), math.sin(angle)
@@ -59,43 +73,56 @@ def find_anterior(shape: Shape, given=None) -> Shape:
     return Shape(line, shape.s, moved(shape.radius), cartilage)
 
 
-def find_rings(shape: Shape, positions=None, half_angle=None) -> Rings:
-    """Ring positions, opening and size, from the cartilage or else from the relief of the wall."""
-    step, mean = shape.s[1] - shape.s[0], _middle(shape.radius)
-    radius = float(np.mean(mean[ARC]))
+def find_rings(shape: Shape, positions=None, half_angle=None, holes: Sequence[Hole] = ()) -> Rings:
+    """Ring positions, opening and size, from the cartilage or else from the relief of the wall.
+
+    Args:
+        shape: the contour, its front at angle 0.
+        positions: those known, mm.
+        half_angle: that known, rad.
+        holes: of the surface that shows the rings, the largest first.
+
+    Raises:
+        MeshError: there is no row of rings, or a hole may hide one.
+    """
+    step, own = shape.s[1] - shape.s[0], shape.cartilage is not None
+    radius = float(np.mean(_middle(shape.radius)[ARC]))
     if shape.cartilage is not None:
-        source, strength = "the cartilage", shape.cartilage.mean(axis=0)
-        profile, fall = shape.cartilage[:, ARC].mean(axis=1), 0.15
+        source, rows = "the cartilage", shape.cartilage.astype(float)
+        strength, profile, fall = rows.mean(axis=0), rows[:, ARC].mean(axis=1), 0.15
     else:
-        source, relief = "the relief of the wall", _relief(shape)
-        strength = np.sqrt(np.nan_to_num(_middle(relief**2)))
-        inner = np.nan_to_num(np.mean(relief[:, ARC], axis=1))
-        fall = max(0.01 * radius, 0.3 * float(np.ptp(inner)))
-        profile = np.mean(_relief(shape, to_ends=True)[:, ARC], axis=1)
-        seen = np.flatnonzero(np.isfinite(profile))
-        profile = np.interp(np.arange(len(profile)), seen, profile[seen]) if len(seen) else inner
-    n = max(1, round(1.2 / step))
-    padded = np.pad(profile, (n // 2, n - 1 - n // 2), "edge")
-    smooth = np.convolve(padded, np.ones(n) / n, "valid")
+        source, rows = "the relief of the wall", relief(shape, to_ends=True)
+        strength = np.sqrt(np.nan_to_num(_middle(relief(shape) ** 2)))
+        profile = profile_of(rows)
+        inner = profile[np.isfinite(relief(shape)).any(axis=1) & np.isfinite(profile)]
+        fall = max(0.01 * radius, 0.3 * float(np.ptp(inner)) if len(inner) else 0.0)
+    notes = []
     if positions is not None:
         found, source = np.asarray(positions, float), "the positions given"
+        errors = shares = np.full(found.shape, np.nan)
     else:
-        if shape.cartilage is not None:  # which may begin or end with the surface
-            smooth = np.pad(smooth, 1)
-            found = shape.s[np.clip(_peaks(smooth, fall) - 1, 0, len(shape.s) - 1)]
-        else:
-            found = shape.s[_peaks(smooth, fall)]
-        _check_row(found, source, radius, shape.line.s[-1], shape.cartilage is not None)
+        if own:
+            check_cartilage(radius, holes)
+        smooth = smoothed(profile, step)
+        # cartilage may begin or end with the surface
+        tops = peaks(np.pad(smooth, 1), fall) - 1 if own else peaks(smooth, fall)
+        crests = crests_at(shape.s, rows, smooth, tops, fall)
+        found, errors, shares = crests.positions, crests.errors, crests.shares
+        if not own:
+            check_seen(shape.s, profile, found, holes)
+        _check_row(found, source, radius, shape.line.s[-1], own, holes)
+        notes = check_crests(crests, shape.s, rows, radius, own)
     if half_angle is None:
-        known = shape.cartilage is not None or positions is None
+        known = own or positions is None
         half_angle = _half_angle(strength) if known else 2 * math.pi / 3
     height = 4.0 / 12.6 * radius if len(found) < 2 else 0.4 * float(np.median(np.diff(found)))
-    if shape.cartilage is not None:
+    if own:
         height = float(profile.sum() * step / len(found))
-    return Rings(found, half_angle, radius, height, source)
+    notes = [f"{len(found)} rings from {source}", *notes]
+    return Rings(found, errors, shares, half_angle, radius, height, tuple(notes))
 
 
-def _check_row(found, source, radius, length, own) -> None:
+def _check_row(found, source, radius, length, own, holes=()) -> None:
     """Refuse crests that are no row of rings.
 
     Args:
@@ -104,6 +131,7 @@ def _check_row(found, source, radius, length, own) -> None:
         radius: of the wall, mm.
         length: of the tube, mm.
         own: whether they come from the cartilage itself: then they may fork, and be fewer.
+        holes: of the wall, the largest first.
     """
     gaps, fewest = np.diff(found), 2 if own else FEWEST
     pitch = float(np.median(gaps)) if len(gaps) else 0.0
@@ -113,59 +141,41 @@ def _check_row(found, source, radius, length, own) -> None:
     elif not PITCH[0] * radius <= pitch <= PITCH[1] * radius:
         fault = f"them {PITCH[0] * radius:.2g} to {PITCH[1] * radius:.2g} mm apart"
     elif gaps.min() < least * pitch or gaps.max() > EVEN[1] * pitch:
-        fault = f"them even, {least * pitch:.2g} to {EVEN[1] * pitch:.2g} mm apart"
+        at = int(np.argmax(np.abs(np.log(gaps / pitch))))
+        fault = (
+            f"them even, {least * pitch:.2g} to {EVEN[1] * pitch:.2g} mm apart (not so from "
+            f"{found[at]:.1f} to {found[at + 1]:.1f} mm)"
+        )
     elif len(found) * pitch < SHARE * length and not own:
         fault = f"them on {100 * SHARE:.0f} % of its {length:.4g} mm or more"
     else:
         return
     at = ", ".join(f"{v:.1f}" for v in found[:8]) + (", ..." if len(found) > 8 else "")
+    cure = "a lumen shows none: give the outer wall, or {}, the cartilage's own surface, or {}"
+    arguments = ("rings=", "ring_positions=")
+    if own:
+        cure, arguments = "where it has no rings of its own (plates, forks) give {}", arguments[1:]
+    hole = next((f"; it has {hole.words}" for hole in holes if hole.in_front), "")
     raise MeshError(
-        f"found {len(found)} rings in {source}{f' (s = {at} mm)' if at else ''}, expected {fault}",
-        cure="a lumen shows none: give the outer wall, or {}, the cartilage's own surface, or {}",
-        arguments=("rings=", "ring_positions="),
+        f"found {len(found)} rings in {source}{f' (s = {at} mm)' if at else ''}, expected {fault}"
+        f"{hole}",
+        cure=cure,
+        arguments=arguments,
     )
 
 
-def _relief(shape: Shape, to_ends: bool = False) -> np.ndarray:
-    """How far the contour stands out of its surroundings along s, mm.
-
-    The surroundings: the mean over a window as long as the radius. Within half a window of an end
-    the relief is NaN, or else they are continued straight, so that a ring there is seen too; NaN
-    then where the contour runs into a lid.
-    """
-    step = shape.s[1] - shape.s[0]
-    span = max(5, int(np.nanmean(shape.radius) / step) | 1)
-    out = np.full_like(shape.radius, np.nan)
-    if len(shape.s) <= 2 * span:
-        return out
-    window, half = np.ones(span) / span, span // 2
-    level = np.stack([np.convolve(v, window, "valid") for v in shape.radius.T], axis=1)
-    out[half:-half] = shape.radius[half:-half] - level
-    if not to_ends:
-        return out
-    i = np.arange(half)[:, None]
-
-    def slope(first, last):
-        return (last - first) / (span - 1)
-
-    out[:half] = shape.radius[:half] - level[0] + slope(level[0], level[span - 1]) * (half - i)
-    out[-half:] = shape.radius[-half:] - level[-1] - slope(level[-span], level[-1]) * (i + 1)
-    steep = np.abs(np.diff(shape.radius, axis=0)).mean(axis=1) > step  # a lid: more than 45 deg
-    low, high = np.flatnonzero(steep[:half]), np.flatnonzero(steep[-half:])
-    out[: low[-1] + 1 if len(low) else 0] = np.nan
-    out[len(out) - half + high[0] if len(high) else len(out) :] = np.nan
-    return out
-
-
 def _middle(rows):
-    """Median over the stations that see the whole contour."""
+    """Mean over the stations that see the whole contour; if these are few, of all that is seen."""
     whole = np.isfinite(rows).all(axis=1)
-    return np.mean(rows[whole], axis=0) if whole.any() else np.full(RAYS, np.nan)
+    rows = rows[whole] if whole.mean() > 0.25 else rows
+    seen = np.isfinite(rows)
+    count = seen.sum(axis=0)
+    return np.where(count > 0, np.where(seen, rows, 0).sum(axis=0) / np.maximum(count, 1), np.nan)
 
 
 def _has_relief(shape: Shape) -> bool:
     """Whether the waves of the relief are more than 1 % of the radius."""
-    return bool(np.sqrt(_middle(_relief(shape) ** 2)).max() > 0.01 * np.nanmean(shape.radius))
+    return bool(np.sqrt(_middle(relief(shape) ** 2)).max() > 0.01 * np.nanmean(shape.radius))
 
 
 def _side(strength) -> tuple[float, bool]:
@@ -195,27 +205,3 @@ def _half_angle(strength) -> float:
     right = np.argmax(np.append(strength[RAYS // 2 :] < level, True))
     left = np.argmax(np.append(strength[: RAYS // 2][::-1] < level, True))
     return float(right + left) * math.pi / RAYS
-
-
-def _peaks(profile, fall) -> np.ndarray:
-    """Centres of the waves of `profile` that rise and fall by more than `fall`."""
-    found, high, low, rising = [], 0, 0, False
-    for i, value in enumerate(profile):
-        if value > profile[high]:
-            high = i
-        if value < profile[low]:
-            low = i
-        if rising and value < profile[high] - fall:
-            found, low, rising = [*found, high], i, False
-        elif not rising and value > profile[low] + fall:
-            high, rising = i, True
-    tops = []
-    for top in found:  # a crest cut flat: its middle
-        level = profile[top] - fall / 2
-        first, last = top, top
-        while first > 0 and profile[first - 1] > level:
-            first -= 1
-        while last < len(profile) - 1 and profile[last + 1] > level:
-            last += 1
-        tops.append(round((first + last) / 2))
-    return np.array(tops, int)

@@ -47,13 +47,15 @@ class Cells(NamedTuple):
         return self.corners[np.repeat(hit, self.count)]
 
 
-def contour(corners, centre, frame) -> np.ndarray:
+def contour(corners, centre, frame, outside: bool = True) -> np.ndarray:
     """Distance of the farthest hit of each ray in the plane across `frame`'s tangent, or NaN.
 
     Args:
         corners: of the triangles; shape (faces, 3, 3).
         centre: from which the rays go.
         frame: columns tangent, and the two axes of the plane.
+        outside: NaN, too, where that is a triangle that faces the centre: the inner wall, seen
+            through a hole of the outer one.
     """
     below = (corners - centre) @ frame[:, 0] < 0
     across = (corners[(below.sum(axis=1) % 3) != 0] - centre) @ frame
@@ -76,5 +78,12 @@ def contour(corners, centre, frame) -> np.ndarray:
     slope = np.where(slope == 0, np.inf, slope)
     far = cross(first, side)[None] / slope
     way = cross(first[None], ray[:, None]) / slope
-    far = np.where((way >= 0) & (way <= 1) & (far > 0), far, -np.inf).max(axis=1, initial=-np.inf)
-    return np.where(far > 0, far, np.nan)
+    far = np.where((way >= 0) & (way <= 1) & (far > 0), far, -np.inf)
+    if not len(across):
+        return np.full(RAYS, np.nan)
+    last = far.argmax(axis=1)
+    far = far[np.arange(RAYS), last]
+    a, b, c = across[last].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    inwards = np.sum(normal[:, 1:] * ray, axis=1) < -0.5 * np.linalg.norm(normal, axis=1)
+    return np.where((far > 0) & ~(outside & inwards), far, np.nan)

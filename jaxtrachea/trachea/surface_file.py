@@ -4,11 +4,13 @@ STL, OBJ, PLY, GLB and what else trimesh reads.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxtrachea.trachea.cleaning import Surface
 from jaxtrachea.trachea.mesh import MeshError
+from jaxtrachea.trachea.objects import area_of, together
 from jaxtrachea.units import UnitError, unit_factor
 
 #: Length of a trachea with its wall, infant to adult, mm: what a guess of the unit goes by.
@@ -27,24 +29,30 @@ def parts_of(path: Path) -> dict[str, Surface]:
 
     if not path.is_file():
         raise MeshError("there is no such file")
+    # An OBJ by its objects, not by its materials (`split_object`: the name until trimesh 5).
+    by_object: dict[str, Any] = {}
+    if path.suffix.lower() == ".obj":
+        by_object = {"group_material": False, "split_object": True, "split_objects": True}
     try:
-        scene = trimesh.load_scene(path, process=False)
+        scene = trimesh.load_scene(path, process=False, **by_object)
         nodes = [(node, *scene.graph[node]) for node in scene.graph.nodes_geometry]
-        objects = [(str(node), scene.geometry[name], frame) for node, frame, name in nodes]
+        objects = [
+            (_object_of(scene, node, name), scene.geometry[name], frame)
+            for node, frame, name in nodes
+        ]
     except Exception as error:  # trimesh raises whatever its many readers raise
         said = "" if isinstance(error, ImportError) else str(error).split("\n")[0][:200]
         raise MeshError(
             "could not be read as a surface, damaged or of another format"
             f"{f' ({said})' if said else ''}; expected STL, OBJ, PLY or GLB with triangles"
         ) from error
-    parts = {
-        name: Surface(
-            np.asarray(part.vertices, float) @ frame[:3, :3].T + frame[:3, 3],
-            np.asarray(part.faces, np.int64),
-        )
-        for name, part, frame in objects
-        if isinstance(part, trimesh.Trimesh) and len(part.faces)
-    }
+    pieces: dict[str, list[Surface]] = {}
+    for name, part, frame in objects:
+        if isinstance(part, trimesh.Trimesh) and len(part.faces):
+            vertices = np.asarray(part.vertices, float) @ frame[:3, :3].T + frame[:3, 3]
+            surface = Surface(vertices, np.asarray(part.faces, np.int64))
+            pieces.setdefault(name, []).append(surface)
+    parts = {name: together(of) for name, of in pieces.items()}
     if not parts:
         raise MeshError("there are no triangles in it; expected a surface, not points or lines")
     if any(not np.all(np.isfinite(part.vertices)) for part in parts.values()):
@@ -56,9 +64,10 @@ def parts_of(path: Path) -> dict[str, Surface]:
     return parts
 
 
-def _area(surface: Surface) -> float:
-    a, b, c = (surface.vertices[surface.faces[:, i]] for i in range(3))
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+def _object_of(scene, node, name) -> str:
+    """The object that a node draws: a mesh of several materials has a node below for each."""
+    piece = scene.geometry[name].metadata.get("from_gltf_primitive")
+    return str(scene.graph.transforms.parents.get(node, node) if piece else node)
 
 
 def wall_of(parts: dict[str, Surface], part: str | None) -> str:
@@ -72,7 +81,7 @@ def wall_of(parts: dict[str, Surface], part: str | None) -> str:
         if part not in parts:
             raise MeshError(f"there is no object {part!r} in it; expected one of {names}")
         return part
-    areas = {name: _area(surface) for name, surface in parts.items()}
+    areas = {name: area_of(surface) for name, surface in parts.items()}
     largest = max(areas, key=lambda name: areas[name])
     if not areas[largest] > 0:
         raise MeshError("all vertices lie in one point or line; expected the surface of a trachea")
@@ -96,7 +105,15 @@ def scale_of(surface: Surface, path: Path, unit: str | None, notes: list[str]) -
         if not POSSIBLE[0] <= size * scale <= POSSIBLE[1]:
             raise MeshError(f"unit={unit!r} makes it {size * scale:.4g} mm long; correct unit=")
         return scale
-    names = ("m",) if path.suffix.lower() in (".glb", ".gltf") else ("mm", "cm", "in", "m")
+    if path.suffix.lower() in (".glb", ".gltf"):
+        if not POSSIBLE[0] <= size * 1000 <= POSSIBLE[1]:
+            raise MeshError(
+                f"it is {size * 1000:.4g} mm long in metres, the unit of {path.suffix} by "
+                "definition; give unit= if it was written in another"
+            )
+        notes.append("unit taken as m")
+        return 1000.0
+    names = "mm", "cm", "in", "m"
     low, high = PLAUSIBLE
     fits = [name for name in names if low <= size * float(unit_factor(name, "length")) <= high]
     if len(fits) != 1:
@@ -108,33 +125,38 @@ def scale_of(surface: Surface, path: Path, unit: str | None, notes: list[str]) -
     return float(unit_factor(fits[0], "length"))
 
 
-def cartilage_of(parts, wall, rings, path, scale, notes) -> Surface | None:
+def rings_named(parts: dict[str, Surface], wall: str, rings) -> str | None:
+    """The rings' own surface as it is named: an object or a file; None: there is none.
+
+    Raises:
+        MeshError: several objects may be the rings.
+    """
+    if rings is not None:
+        return str(rings)
+    named = [n for n in parts if n != wall and ("cartilage" in n.lower() or "ring" in n.lower())]
+    if len(named) > 1:
+        found = f"which of the objects {', '.join(named)} are the rings?"
+        raise MeshError(found, cure="give {}", arguments=("rings=",))
+    return named[0] if named else None
+
+
+def cartilage_of(parts, rings: str | None, path, scale, notes) -> Surface | None:
     """The rings' own surface, mm, or None.
 
     Raises:
-        MeshError: several objects may be the rings, or the file of the rings cannot be read.
+        MeshError: the file of the rings cannot be read.
     """
     if rings is None:
-        named = [
-            n for n in parts if n != wall and ("cartilage" in n.lower() or "ring" in n.lower())
-        ]
-        if len(named) > 1:
-            found = f"which of the objects {', '.join(named)} are the rings?"
-            raise MeshError(found, cure="give {}", arguments=("rings=",))
-        rings = named[0] if named else None
-    if rings is None:
         return None
-    if str(rings) in parts:
-        found = [parts[str(rings)]]
+    if rings in parts:
+        found = [parts[rings]]
     else:
         other = path.parent / rings
         try:
             found = list(parts_of(other).values())
         except MeshError as error:
-            found = f"{str(rings)!r}: {error}"
+            found = f"{rings!r}: {error}"
             raise MeshError(found, key="rings", joint="=") from error
     notes.append(f"rings: {rings}")
-    shift = np.cumsum([0, *(len(f.vertices) for f in found[:-1])])
-    vertices = np.concatenate([f.vertices for f in found]) * scale
-    faces = np.concatenate([f.faces + at for f, at in zip(found, shift, strict=True)])
-    return Surface(vertices, faces)
+    whole = together(found)
+    return Surface(whole.vertices * scale, whole.faces)
