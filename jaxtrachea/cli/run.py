@@ -59,7 +59,7 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     write_csv(folder / "summary.csv", summary_rows(findings, measurements.bad))
     write_csv(folder / "parameters.csv", list(parameter_rows(findings)))
     zeros = cells(findings.result.study)
-    rows = [row | zeros.get((row["specimen"], row["trial"]), {})
+    rows = [row | zeros.get((str(row["specimen"]), str(row["trial"])), {})
             for row in usage_rows(measurements.curves)]  # fmt: skip
     write_csv(folder / "curves.csv", rows)
     write_tables(folder, findings)

@@ -47,7 +47,7 @@ def parameters_of(spec: FitSpec, options: Options, *, joints: bool) -> tuple[Par
             if name in OF_THE_ARCH:
                 reason = f"of a ring that bends; {OF_THE_ARCH[name]}"
             raise SpecError(f"parameters.{name}: {reason}; expected one of {', '.join(known)}")
-    sections = spec.parameters | _baseline(spec)
+    sections = {**spec.parameters, **_baseline(spec)}
     names = in_model(options, joints=joints, named=sections)
     return tuple(_parameter(defaults[n], sections.get(n)) for n in names)
 
@@ -65,8 +65,8 @@ def _baseline(spec: FitSpec) -> Mapping[str, ParameterSection]:
             f"data.baseline = {spec.data.baseline!r} says what becomes of the line that "
             "parameters.force_slope describes; leave one of them out"
         )
-    none = spec.data.baseline == "none"
-    return {"force_slope": ParameterSection(fixed=0.0) if none else ParameterSection()}
+    held = {"fixed": 0.0} if spec.data.baseline == "none" else {}
+    return {"force_slope": ParameterSection.model_validate(held)}
 
 
 def _defaults(spec: FitSpec, options: Options) -> Mapping[str, Parameter]:
@@ -203,7 +203,7 @@ def _lines(spec: FitSpec, measurements: Measurements, options: Options, table):
         )
     if not any(p.name == "force_slope" and not p.fixed for p in table):
         return [None] * len(measurements.curves)
-    noise = None if spec.noise.force == "estimate" else spec.noise.force
+    noise = None if isinstance(spec.noise.force, str) else spec.noise.force
     return without_line(measurements.curves, zeros_of(measurements.curves, noise))
 
 

@@ -70,7 +70,9 @@ def touches(
     out = [np.full(len(force), np.nan) for _ in FirstTouch._fields]
     for rows, known in ((np.flatnonzero(own), None), (np.flatnonzero(held), "force_offset")):
         if len(rows):
-            offset = known and np.full(len(rows), parameters[column[known]].value)
+            offset = None
+            if known is not None:
+                offset = np.full(len(rows), parameters[column[known]].value)
             found = first_touch(displacement[rows], force[rows], precision[rows] > 0, offset)
             for whole, part in zip(out, found, strict=True):
                 whole[rows] = part

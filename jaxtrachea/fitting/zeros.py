@@ -76,7 +76,7 @@ def resolved(
     for p in table:
         if p.auto and p.fixed and others and p.name in shown and shown[p.name].any():
             p = dataclasses.replace(p, fixed=False)
-            for k in np.flatnonzero(shown[p.name]):
+            for k in np.flatnonzero(shown[p.name]).tolist():
                 taken[curves[k].specimen, curves[k].trial].add(p.name)
         out.append(p)
     return Resolved(_without_idle_line(out), taken, zeros)

@@ -399,8 +399,8 @@ def _starts(count: int, *zeros):
 def _best(records: _Records, names, *starts):
     """Parameters and sum of squares of the best of several starts."""
     count, tries = len(records.x), len(starts)
-    every = (np.concatenate([v] * tries) for v in records)
-    found = press_shape.fitted(*every, np.concatenate(starts), _columns(names))
+    x, y, weight = (np.concatenate([v] * tries) for v in records)
+    found = press_shape.fitted(x, y, weight, np.concatenate(starts), _columns(names))
     rss = found.rss.reshape(tries, count)
     rows, best = np.arange(count), np.argmin(rss, axis=0)
     return found.parameters.reshape(tries, count, -1)[best, rows], rss[best, rows]
