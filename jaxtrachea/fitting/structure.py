@@ -340,7 +340,7 @@ def _higher(study: Study) -> dict[str, bool]:
 
 
 def _hardens(study: Study) -> bool:
-    """Whether the local law is more than a straight line: a ratio that softens tells no more of it."""
+    """Whether the local law is more than a straight line, of which a softening tells no more."""
     return any(there for name, there in _higher(study).items() if name in Law._fields)
 
 
