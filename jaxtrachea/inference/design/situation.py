@@ -34,7 +34,8 @@ class Situation:
         meat: likewise; times the factor kappa of the covariance; (G, Q, Q).
         weight: of the squared residuals of a new curve, as the fit will have it.
         factor: what a press adds to the meat over what it adds to the bread; (G,).
-        sigma: of a force sample, N; (G,).
+        sigma: of a force sample, N; (G,); where it has a share of the force, that of the curves so
+            far in the mean over the information, which grows as the square of the force.
         samples: of a curve.
         kept: these unknowns; (G, Q).
         own: unknowns of the first trial alone, which stand for those of a new press; `theta` has
@@ -129,7 +130,7 @@ def situation(
     return Situation(
         study=study, lane=lane, theta=theta, relative=relative,
         base=base, meat=meat, weight=weight, factor=kappa * weight,
-        sigma=result.sigma[lane, 0], samples=n, kept=kept, own=own, prior=prior, blend=blend,
+        sigma=_sample_sigma(result)[lane], samples=n, kept=kept, own=own, prior=prior, blend=blend,
         approach=_approaches(result), reach=reached(study, result.first_touch),
     )  # fmt: skip
 
@@ -142,6 +143,17 @@ def _approaches(result: FitResult) -> Float[np.ndarray, " lanes"]:
         for row, curves in rows
     )
     return np.array([np.median(lane) for lane in before])
+
+
+def _sample_sigma(result: FitResult) -> Float[np.ndarray, " lanes"]:
+    """See `Situation.sigma`."""
+    lanes = result.study.lanes
+    force2 = np.asarray(lanes.force) ** 2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        known = np.sum(force2 * (lanes.precision > 0), axis=(1, 2))
+        told = np.sum(force2 * np.asarray(lanes.precision) ** 2, axis=(1, 2))
+        mean = result.whitened_sigma[:, 0] * np.sqrt(known / told)
+    return np.where(result.force_share > 0, mean, result.sigma[:, 0])
 
 
 def _kappa(result: FitResult, lanes: Int[np.ndarray, " L"], info: Information) -> np.ndarray:
