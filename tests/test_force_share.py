@@ -73,6 +73,7 @@ def test_weights_are_those_of_the_noise(sigma):
         expected = scale / np.hypot(sigma or 0.02, 0.05 * force)
         np.testing.assert_allclose(got.lanes.precision, expected, rtol=1e-12)
     part = dataclasses.replace(weighed).take(np.array([0, 0]))
+    assert part.shares is not None
     assert part.shares.share.tolist() == [0.05, 0.05]
 
 

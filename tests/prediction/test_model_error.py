@@ -35,7 +35,7 @@ def test_leaving_out_is_refitting(own):
     A, b = np.moveaxis(X, 1, 2).reshape(y.size, -1), y.ravel()
     z = (A @ np.linalg.lstsq(A, b, rcond=None)[0] - b).reshape(y.shape)
     root = rng.uniform(1, 3, y.shape)
-    left = model_error._LeftOut(z, X, root, samples, 1.0)
+    left = model_error._LeftOut(z, X, root, samples)
     error, variance = left.predicted([2])
     others = np.arange(trials) != 2
     B = np.moveaxis(X[others][:, :unknowns], 1, 2).reshape(-1, unknowns)
@@ -52,7 +52,7 @@ def test_a_position_that_alone_tells_an_unknown_cannot_be_left_out():
     rng = np.random.default_rng(4)
     X = rng.normal(size=(4, 2, 8))
     X[1:, 1] = X[1:, 0]  # but for the first, the sum of both
-    left = model_error._LeftOut(rng.normal(size=(4, 8)), X, np.ones((4, 8)), 8, 1.0)
+    left = model_error._LeftOut(rng.normal(size=(4, 8)), X, np.ones((4, 8)), 8)
     assert left.predicted([0]) is None
     assert left.predicted([1]) is not None
 

@@ -92,7 +92,7 @@ def unfinished(folder):
     [
         (old, "schema version 1 .* fit again with this version"),
         (cut, "damaged"),
-        (newer, "schema version is 3, this program reads 2"),
+        (newer, "schema version is 4, this program reads 3"),
         (other, "expected 'jaxtrachea-results'"),
         (without_model, "no dataset 'description'"),
         (not_json, "damaged or not written by this program"),
