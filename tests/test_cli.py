@@ -43,7 +43,10 @@ BAD_SPECS = {
     ),
     "unknown in model": (DATA + "[model]\nsheer = true", ["model.sheer: unknown", "shear"]),
     "unknown in parameter": (K1 + "{ init = 1 }", ["parameters.k_1.init: unknown", "initial"]),
-    "unknown in noise": (DATA + '[noise]\nF = "1 N"', ["noise.F: unknown", "force, force_share, joints"]),
+    "unknown in noise": (
+        DATA + '[noise]\nF = "1 N"',
+        ["noise.F: unknown", "force, force_share, joints"],
+    ),
     "unknown in fit": (DATA + "[fit]\nstart = 4", ["fit.start: unknown", "starts"]),
     "section is a number": ("data = 3", ["data: expected a table", "found 3"]),
     "files missing": ('[data]\nformat = "auto"', ["data.files: missing"]),

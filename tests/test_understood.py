@@ -80,7 +80,9 @@ def test_model_and_onset():
     geometry = geometry_of(FitSpec.model_validate({"data": {"files": "x"}}).trachea)
     defaults = defaults_of(Options(), geometry, None)
     table = [defaults[name] for name in in_model(Options(), joints=False)]
-    held = [dataclasses.replace(p, fixed=True) if p.name == "onset" else p for p in table]
+    held = [
+        dataclasses.replace(p, fixed=True, auto=False) if p.name == "onset" else p for p in table
+    ]
     assert "fixed at 0 mm" in onset_words(held)
-    free = [dataclasses.replace(p, fixed=p.name != "onset") for p in table]
+    free = [dataclasses.replace(p, fixed=p.name != "onset", auto=False) for p in table]
     assert onset_words(free).startswith("fitted, one a trial; force offset: ")
