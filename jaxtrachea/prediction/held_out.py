@@ -21,6 +21,7 @@ from jaxtrachea.fitting.zeros import resolved
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Aside, force_and_slope
+from jaxtrachea.prediction.model_error import model_errors
 from jaxtrachea.prediction.predict import CurvePrediction, predict_sources
 from jaxtrachea.prediction.sources import Source, source_of, value_of
 from jaxtrachea.results.stored import StoredFit
@@ -119,7 +120,7 @@ def compare(
     if not curves:
         return []
     used = {(c.specimen, c.trial): c for c in stored.curves}
-    stored, taken = _with_zeros(stored, curves)
+    fitted, (stored, taken) = stored, _with_zeros(stored, curves)
     sources, words = [], []
     for curve in curves:
         word = _in_fit(used.get((curve.specimen, curve.trial)), curve)
@@ -130,6 +131,8 @@ def compare(
         own = tuple(f for f in source.own if takes(stored.study.free[f], curve, taken))
         sources.append(dataclasses.replace(source, trial=curve.trial, own=own))
         words.append(word)
+    # The error between positions is that of the fit, whose unknowns these are.
+    stored.found.update(model_errors(fitted, [source.lane for source in sources]))
     sigmas = [_sigma(stored, c, source) for c, source in zip(curves, sources, strict=True)]
     rounded = zip(sources, measured_corners(stored, curves, sigmas), words, strict=True)
     sources = [
