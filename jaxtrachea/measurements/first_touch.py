@@ -206,5 +206,6 @@ def blend_widths(
         least: mm; where there is no noise, or no change point.
     """
     level = np.where(np.isnan(noise), touch.noise, noise)
-    width = np.minimum(_STANDARD_DEVIATIONS * level / touch.slope, _LARGEST * touch.span)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a force that stays has no slope
+        width = np.minimum(_STANDARD_DEVIATIONS * level / touch.slope, _LARGEST * touch.span)
     return np.where(np.isfinite(width), np.maximum(width, least), least)
