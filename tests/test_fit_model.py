@@ -12,7 +12,7 @@ from jaxtrachea.fitting.study import build_study
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.trachea.geometry import Geometry
 
-FORCE = np.ones((2, 3, 50))
+FORCE = np.broadcast_to(synthetic.DEPTHS, (2, 3, len(synthetic.DEPTHS)))
 
 
 def test_equal_models_are_equal_and_hash_alike():
