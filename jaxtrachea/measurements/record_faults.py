@@ -1,7 +1,7 @@
 """Faults of a record that an engineer sees: a break, a flat top, a moved zero, a softer cycle.
 
 Each is looked for on the samples of the loading that is used, or (zero and cycles) on the whole
-record; numpy only, no model. What noise does is measured in `tests/reference/record_faults.py`.
+record; numpy only, no model. What noise does is in `tests/test_record_faults.py`.
 """
 
 from typing import NamedTuple
