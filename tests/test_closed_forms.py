@@ -43,7 +43,8 @@ FORCE = 1.3 * D + np.random.default_rng(4).standard_t(2, size=12) * 0.1
 def line(force, *, changes=None, options=Options(coupling="total"), **how):  # noqa: B008
     """k_1 free and linear, all others fixed, unless `changes` says otherwise."""
     free = {"k_1": {"scale": "linear", "lower": 0.01, "upper": 50.0, "value": 1.0, "step": 0.5}}
-    still = {n: {"lower": -1.0, "value": 0.0, "fixed": True} for n in ("onset", "force_offset")}
+    held = {"lower": -1.0, "value": 0.0, "fixed": True, "auto": False}
+    still = dict.fromkeys(("onset", "force_offset"), held)
     still["k_3"] = {"lower": 0.0, "value": 0.0, "fixed": True}
     if options.coupling == "series":
         still |= {"EI_L": {"value": 300.0, "fixed": True}, "k_M": {"value": 1.0, "fixed": True}}
