@@ -65,22 +65,18 @@ def press_softening(
         softening: of the press.
     """
     e_1, e_2 = (jnp.asarray(e, displacement.dtype) for e in softening)
+    displacement, e_1, e_2 = jnp.broadcast_arrays(displacement, e_1, e_2)
     known = jnp.isfinite(displacement) & jnp.isfinite(e_1) & jnp.isfinite(e_2)
-    for value in (compliance, *law.coefficients().values()):
-        known = known & jnp.isfinite(value)
-    # Of a row without a solution 0 times NaN would reach what all share: hidden at the end.
-    D, e_1, e_2, c = (jnp.where(known, v, 0) for v in (displacement, e_1, e_2, compliance))
-    whole = law._replace(**{name: jnp.where(known, k, 1) for name, k in law.coefficients().items()})
-    softening = Softening(e_1, e_2)
-    past = softening.past_peak(D)
-    depth, load, folded = whole.series(jnp.where(past, 0, D), c)
+    softening = Softening(jnp.where(known, e_1, 0), jnp.where(known, e_2, 0))
+    past = softening.past_peak(displacement)
+    depth, load, folded = law.series(jnp.where(past, 0, displacement), compliance)
     folded = (folded | past) & known
-
-    def hide(v):
-        return jnp.where(known & ~folded, v, jnp.nan)
-
-    depth, load, force = hide(depth), hide(load), hide(softening.ratio(D) * load)
-    status = status_of(displacement, jnp.where(known, depth + force, jnp.nan), folded)
+    # Of a row without a solution 0 times NaN would reach what all share: hidden at the end.
+    solved = known & ~folded & jnp.isfinite(load)
+    ratio = softening.ratio(jnp.where(solved, displacement, 0))
+    force = jnp.where(solved, ratio * jnp.where(solved, load, 0), jnp.nan)
+    depth, load = (jnp.where(solved, v, jnp.nan) for v in (depth, load))
+    status = status_of(displacement, force, folded)
     return Equilibrium(depth, force, status, load)
 
 

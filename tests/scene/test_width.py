@@ -223,7 +223,7 @@ def test_against_the_finite_element_trachea():
     expected = {22.0: 0.025, 35.0: 0.026, 58.0: 0.011, 70.0: 0.009, 75.0: 0.024, 107.0: 0.017}
     for at, share in expected.items():
         assert punch[at] == pytest.approx(share, abs=6e-4)
-    assert max(punch.values()) == punch[35.0]
+    assert max(punch.values()) == pytest.approx(punch[35.0], rel=1e-9)  # its mirror: to rounding
     assert point[22.0] == pytest.approx(0.149, abs=6e-4)
     assert min(point.values()) > 0.04
 
