@@ -204,7 +204,7 @@ def _lines(spec: FitSpec, measurements: Measurements, options: Options, table):
     if not any(p.name == "force_slope" and not p.fixed for p in table):
         return [None] * len(measurements.curves)
     noise = None if isinstance(spec.noise.force, str) else spec.noise.force
-    return without_line(measurements.curves, zeros_of(measurements.curves, noise))
+    return without_line(measurements.curves, zeros_of(measurements.curves, noise, table))
 
 
 #: Unknowns up to which a study with shared parameters is refitted as one dense lane.

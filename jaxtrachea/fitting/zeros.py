@@ -59,7 +59,7 @@ def resolved(
     looked = options.contact == "unilateral" and any(p.auto and p.fixed for p in table)
     if not (wanted or looked):
         return Resolved(_without_idle_line(table), {}, None)
-    zeros = zeros_of(curves, sigma)
+    zeros = zeros_of(curves, sigma, table)
     if wanted:
         for curve, reason in zip(curves, without_line(curves, zeros), strict=True):
             if reason is not None:
@@ -82,19 +82,26 @@ def resolved(
     return Resolved(_without_idle_line(out), taken, zeros)
 
 
-def zeros_of(curves: Sequence[Curve], sigma: float | None = None) -> Zeros:
-    """What the records of curves show.
+def zeros_of(
+    curves: Sequence[Curve], sigma: float | None = None, table: Sequence[Parameter] = ()
+) -> Zeros:
+    """What the records of curves show, from the onset and the force offset that a table holds.
 
     Args:
         curves: the curves.
         sigma: as for `resolved`.
+        table: whose fixed onset and force offset, if any, are taken off the records first.
     """
     given = [sigma if c.sigma is None else float(np.median(c.sigma)) for c in curves]
-    return record_zeros(
-        [c.displacement for c in curves],
-        [c.force for c in curves],
+    held = {p.name: p.value for p in table if p.fixed and not p.auto}
+    onset, offset = held.get("onset", 0.0), held.get("force_offset", 0.0)
+    zeros = record_zeros(
+        [c.displacement - onset for c in curves],
+        [c.force - offset for c in curves],
         np.array([np.nan if s is None else s for s in given]),
     )
+    at_zero = np.where(zeros.force_slope, zeros.offset - zeros.slope * onset, zeros.offset)
+    return zeros._replace(touch=zeros.touch + onset, offset=at_zero + offset)
 
 
 def without_line(curves: Sequence[Curve], zeros: Zeros) -> list[InputError | None]:

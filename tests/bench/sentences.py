@@ -13,6 +13,7 @@ NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 PARAMETER = r"\b(?:EI_L|k_M|k_1|k_3)\b(?:\^[-+.e\d]+| [-+][.e\d]+ %)?"
 LISTED = re.compile(rf"{PARAMETER}(?:(?:, | and | ){PARAMETER})*")
 SHARE = re.compile(r"\b(\d+) of (\d+)\b")
+MORE = re.compile(r"\band \d+ more\b")
 #: Only lines of words are sentences: rows of tables, progress bars and pictures are not.
 FURNITURE = re.compile(r"^\W*$|[─│━|]|^!\[|^#|\s{2,}\S+\s{2,}")
 
@@ -70,7 +71,8 @@ def usual(run: Run) -> set[str]:
 def named(run: Run, pattern: str, names: Sequence[str], known: Iterable[str]) -> tuple:
     """Share of specimens told a sentence that matches and is not `known`, and up to 3 such.
 
-    A line that names no specimen counts by its "N of M", and for all where no other says how many.
+    A line that names no specimen, or a few of those that it counts ("N of M curves: ... and K
+    more"), counts by its "N of M"; one that names none and counts none is said of all.
     """
     asked, known = re.compile(pattern, re.IGNORECASE), set(known)
 
@@ -81,9 +83,12 @@ def named(run: Run, pattern: str, names: Sequence[str], known: Iterable[str]) ->
     by_name = of_specimens(run)
     told = {name: hits(by_name.get(name, ())) for name in names}
     general = hits(of_all(run))
-    counted = [int(a) / int(b) for s in general for a, b in SHARE.findall(s)[:1] if int(b)]
+    listed = hits(line for line in lines(run) if MORE.search(line))
+    counted = [
+        int(a) / int(b) for s in general + listed for a, b in SHARE.findall(s)[:1] if int(b)
+    ]
     share = max([sum(map(bool, told.values())) / len(names), *counted])
     if general and not share:
         share = 1.0
-    examples = general + [s for found in told.values() for s in found[:1]]
+    examples = general + listed + [s for found in told.values() for s in found[:1]]
     return share, examples[:3]
