@@ -9,7 +9,7 @@ from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.measurements.curve import Curve, RawCurve, ReadOptions
 from jaxtrachea.measurements.read import DataError, read_measurements
 from jaxtrachea.measurements.together import finish_all
-from jaxtrachea.trials.repeats import repeat_sentences
+from jaxtrachea.trials.repeats import repeat_sentences, trial_remarks
 from jaxtrachea.trials.uneven_noise import uneven_noise
 
 D = np.linspace(0, 2, 200)
@@ -103,6 +103,9 @@ def test_trials_that_differ():
     assert "trials of T at s = 40 mm differ by 35 %, their noise is 0.2" in sentence
     assert "speed [mm/s] (0.1 to 10, with which it grows)" in sentence
     assert "lot" not in sentence
+    told = trial_remarks([*differing, trial("c", s=60.0)])  # for each of them in curves.csv
+    assert told.keys() == {("T", "a"), ("T", "b")}
+    assert "differ by 35 %; the force goes along with speed" in told["T", "a"]
     ordered = [trial(f"{k}", 1 - 0.1 * k, seed=k) for k in range(3)]
     assert "the number of the trial (0 to 2, with which it falls)" in next(
         repeat_sentences(ordered)

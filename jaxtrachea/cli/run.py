@@ -54,13 +54,16 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.report.understood import understood
     from jaxtrachea.results.hdf5 import write_hdf5
     from jaxtrachea.results.rows import parameter_rows, summary_rows
-    from jaxtrachea.trials.repeats import trial_sentences
+    from jaxtrachea.trials.repeats import trial_remarks, trial_sentences
 
     write_csv(folder / "summary.csv", summary_rows(findings, measurements.bad))
     write_csv(folder / "parameters.csv", list(parameter_rows(findings)))
-    zeros = cells(findings.result.study)
-    rows = [row | zeros.get((str(row["specimen"]), str(row["trial"])), {})
-            for row in usage_rows(measurements.curves)]  # fmt: skip
+    zeros, apart = cells(findings.result.study), trial_remarks(measurements.curves)
+    rows = []
+    for row in usage_rows(measurements.curves):
+        curve = str(row["specimen"]), str(row["trial"])
+        remarks = "; ".join(filter(None, (str(row["remarks"]), apart.get(curve))))
+        rows.append(row | {"remarks": remarks} | zeros.get(curve, {}))
     write_csv(folder / "curves.csv", rows)
     write_tables(folder, findings)
     drawn, lost = draw_all(folder, findings)

@@ -34,8 +34,7 @@ def repeat_sentences(curves: Sequence[Curve]) -> Iterator[str]:
     found = differing_trials(curves)
     if not found:
         return
-    along = conditions_along(found)
-    cause = f"; the force goes along with {' and '.join(along)}" if along else ""
+    cause = _cause(found)
     places = "; ".join(
         f"{_place(d.trials[0])} differ by {_percent(d.share)}, their noise is {_percent(d.noise)}"
         for d in found[:_NAMED]
@@ -45,6 +44,22 @@ def repeat_sentences(curves: Sequence[Curve]) -> Iterator[str]:
         f"{places}{more}{cause}: unknowns that they share are those of their mean, and no interval "
         "covers the difference"
     )
+
+
+def trial_remarks(curves: Sequence[Curve]) -> dict[tuple[str, str], str]:
+    """What curves.csv says of every trial that differs from another, by specimen and trial."""
+    found = differing_trials(curves)
+    cause = _cause(found)
+    return {
+        (c.specimen, c.trial): f"trials at its position differ by {_percent(d.share)}{cause}"
+        for d in found
+        for c in d.trials
+    }
+
+
+def _cause(found: Sequence[Difference]) -> str:
+    along = conditions_along(found)
+    return f"; the force goes along with {' and '.join(along)}" if along else ""
 
 
 def _percent(share: float) -> str:
