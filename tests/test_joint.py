@@ -242,6 +242,8 @@ def test_rows_name_what_is_shared_once(linear):
     summary = list(lane_rows(linear))
     assert len({r["k_3 [N/mm^3]"] for r in summary}) == 1
     assert len({r["k_1 [N/mm]"] for r in summary}) == LANES
+    known = linear.effective.share  # of all samples of the study, was of each lane's: above 1
+    assert np.all(known[np.isfinite(known)] <= 1)
 
 
 def test_population_and_its_page(linear):

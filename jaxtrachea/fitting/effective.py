@@ -42,6 +42,7 @@ class Effective(NamedTuple):
     Attributes:
         correlation: of neighbouring force residuals; NaN with fewer than `MIN_PAIRS`; (lanes,).
         samples: independent samples that all observed ones are worth; NaN likewise; (lanes,).
+        share: of them in all observed ones; NaN likewise; (lanes,).
         factor: growth of standard errors, 1 or more; inf where `misses`; (lanes,).
         quantile: half of a 95 % interval in standard errors (Student's t); inf likewise; (lanes,).
         growth: of the length of 95 % intervals against those of independent residuals; inf
@@ -52,6 +53,7 @@ class Effective(NamedTuple):
 
     correlation: Float[np.ndarray, " lanes"]
     samples: Float[np.ndarray, " lanes"]
+    share: Float[np.ndarray, " lanes"]
     factor: Float[np.ndarray, " lanes"]
     quantile: Float[np.ndarray, " lanes"]
     growth: Float[np.ndarray, " lanes"]
@@ -143,4 +145,6 @@ def effective(of: Residuals, plain: Float[np.ndarray, " lanes"]) -> Effective:
     factor, quantile = (np.where(misses, np.inf, v) for v in (factor, quantile))
     with np.errstate(invalid="ignore", divide="ignore"):
         growth = np.where(misses, np.inf, np.maximum(factor * quantile / plain, 1))
-    return Effective(lag_correlation(of.seen.force), worth, factor, quantile, growth, misses)
+        share = worth / n
+    seen = lag_correlation(of.seen.force)
+    return Effective(seen, worth, share, factor, quantile, growth, misses)

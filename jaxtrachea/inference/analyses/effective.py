@@ -61,9 +61,9 @@ def _sentences(found: Findings) -> Iterator[str]:
             "the model misses the shape of these curves"
         )
         if result.study.free:
-            worth = np.median(wide.samples[lanes] / np.maximum(result.samples[lanes], 1))
             said += (
-                f". There 100 samples are worth {100 * worth:.2g} independent ones, and the "
+                f". There 100 samples are worth {100 * np.median(wide.share[lanes]):.2g} "
+                "independent ones, and the "
                 f"intervals are {np.median(wide.growth[lanes]):.2g} times as long for it"
             )
         yield said
