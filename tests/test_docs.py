@@ -351,6 +351,17 @@ def test_keys_of_scenes_are_listed():
         assert missing == [], name
 
 
+def test_the_changelog_is_a_list_of_short_lines():
+    """The newest version is the package's, and each change one line under a heading."""
+    newest, *older = (ROOT / "CHANGELOG.md").read_text("utf-8").split("\n## ")[1:]
+    assert newest.startswith(f"{jaxtrachea.__version__} (")
+    headings = re.findall("^### (.*)", newest, re.M)
+    assert headings == [h for h in ("Added", "Changed", "Fixed") if h in headings]
+    for part in (newest, *older):
+        lines = [line for line in part.splitlines()[1:] if line and not line.startswith("### ")]
+        assert all(line.startswith("- ") and len(line) <= 160 for line in lines)
+
+
 def test_extras_are_listed():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     listed = re.findall(r"^\| `(\w+)` \|", (DOCS / "install.md").read_text(), re.M)
