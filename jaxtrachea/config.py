@@ -121,7 +121,7 @@ class DataSection(Section):
     force_sign: Literal[1, -1] = 1
     displacement_sign: Literal[1, -1] = 1
     machine_compliance: Compliance | None = None
-    sheet: str | None = None
+    sheet: str | Annotated[list[str], Field(min_length=1)] | None = None
     tool_radius: PositiveLength | None = None
     pressed_ends: bool = True
     together: list[Annotated[list[str], Field(min_length=2)]] | None = None

@@ -281,9 +281,9 @@ def parse_quantity(text: str | float | int, dimension: str) -> float:
 def column_unit(header: str) -> tuple[str, str | None]:
     """Split a column header into name and unit.
 
-    ``force [N]``, ``force (N)``, ``force / N`` and ``force_N`` all give
+    ``force [N]``, ``force (N)``, ``force / N``, ``force, N`` and ``force_N`` all give
     ``("force", "N")``. What stands in brackets is taken for a unit whether or not it is a known
-    one, so that a slip is reported as such; after ``_`` or ``/`` only a known unit counts.
+    one, so that a slip is reported as such; after ``_``, ``/`` or a comma only a known unit counts.
 
     Args:
         header: the header cell.
@@ -298,7 +298,7 @@ def column_unit(header: str) -> tuple[str, str | None]:
     if match and match[1]:
         return match[1], (match[2] if match[2] is not None else match[3]).strip()
     # A name may hold underscores and still have its unit after a slash: joint_7 / mm.
-    for separator in ("_", r"\s/\s"):
+    for separator in ("_", r"\s/\s", r",\s"):
         match = re.fullmatch(rf"(.+?)\s*{separator}\s*([^_]+)", text)
         if match and is_unit(match[2]) and not re.fullmatch(r"[\d\s-]+", match[2]):
             return match[1], match[2].strip()

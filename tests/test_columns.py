@@ -1,8 +1,9 @@
-"""Columns of tables, split all at once, against the csv module row by row."""
+"""Columns of tables by pandas, against the csv module row by row."""
 
 import csv
 import io
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,15 +12,21 @@ from hypothesis import strategies as st
 
 from jaxtrachea.measurements.curve import Fault
 from jaxtrachea.measurements.read import DataError, read_measurements
-from jaxtrachea.measurements.readers.lines import Lines
-from jaxtrachea.measurements.readers.text import numbers, read_columns
+from jaxtrachea.measurements.readers.cells import numbers
+from jaxtrachea.measurements.readers.table import Header, Text, rows_below
 
 CELLS = st.sampled_from(["T1", "0.5", "", " 2 ", "-1e-3", '"a b"', "\u00a03", "=1", "#N/A", "# no"])
 DELIMITERS = st.sampled_from([",", ";", "\t"])
 
 
-def lines_of(texts):
-    return Lines(range(2, len(texts) + 2), texts)
+def read_columns(texts, width, delimiter):
+    """Numbers of the rows below a header in line 1, and the cells of the columns."""
+    text = Text(Path("x.csv"), "\n".join(["header", *texts]).encode())
+    header = Header([str(i) for i in range(width)], [None] * width, 1, delimiter, 2)
+    table = rows_below(text, header)
+    table.load([], range(width))
+    found = [table.names_of(i) for i in range(width)]
+    return table.lines.tolist(), [[names[k] for k in codes] for codes, names in found]
 
 
 def by_csv(texts, width, delimiter):
@@ -42,7 +49,7 @@ def test_columns_are_those_of_csv(data, width, delimiter):
     rows = data.draw(st.lists(st.lists(CELLS, min_size=width, max_size=width), max_size=8))
     texts = [delimiter.join(row) for row in rows]
     expected = by_csv(texts, width, delimiter)
-    found, columns = read_columns(lines_of(texts).without_comments(), width, delimiter)
+    found, columns = read_columns(texts, width, delimiter)
     assert [*found] == [number for number, _ in expected]
     assert [[*row] for row in zip(*columns, strict=True)] == [cells for _, cells in expected]
     assert len(columns) == width
@@ -51,7 +58,7 @@ def test_columns_are_those_of_csv(data, width, delimiter):
 @pytest.mark.parametrize("texts", [["1,2", "3,4,5"], ["1,2", "3"], ["1,2,3"], ['1,"2', "3,4"]])
 def test_a_row_of_another_width_is_named(texts):
     with pytest.raises(Fault, match="line [23]"):
-        read_columns(lines_of(texts), 2, ",")
+        read_columns(texts, 2, ",")
 
 
 @settings(max_examples=200, deadline=None)
@@ -69,7 +76,7 @@ def test_what_is_no_number_is_named(cell):
 
 
 def test_empty_rows_are_left_out():
-    found, columns = read_columns(lines_of(["T1,2", " ,", ",\u00a0", "T2,3"]), 2, ",")
+    found, columns = read_columns(["T1,2", " ,", ",\u00a0", "T2,3"], 2, ",")
     assert [*found] == [2, 5]
     assert columns == [["T1", "T2"], ["2", "3"]]
 

@@ -213,7 +213,7 @@ AMBIGUOUS = "D [mm],Fx [N],Fy [N]\n0,1,2\n1,3,2\n"
 #: arguments, what stderr must say; `@` stands for init and check
 BAD = [
     ("@ nothing.csv", ["nothing.csv: no such file", "expected files of", "check the path"]),
-    ("@ junk.csv", ["junk.csv: is binary of no known format", "expected a table", "export"]),
+    ("@ junk.csv", ["junk.csv: is not text", "expected a table", "export"]),
     ("@ empty", ["empty: a folder without data files (.csv,", "name the files"]),
     ("@ zero.csv", ["no usable curve: empty: zero.csv", "export it again"]),
     ("@ text.csv", ["no usable curve: column_missing: text.csv", "say --column displacement=NAME"]),
@@ -273,7 +273,7 @@ def test_an_equal_guess_is_none(folder):
     assert of("D [um],P [mN]").columns == {"force": "P", "displacement": "D"}
     assert of("x [mm],depth [mm],P [N]").columns["displacement"] == "depth"
     assert of("x [mm],y [mm],P [N]").open == {"displacement": ("x", "y")}
-    assert of("force [N],load cell [N],stroke [mm]").columns == {"displacement": "stroke"}
+    assert of("force [N],load cell [N],weg [mm]").columns == {"displacement": "weg"}
     assert of("D [mm],P [N]", "D [mm],Q [N]").columns == {"displacement": "D"}
     assert of("T [C],p [kPa]") == ({}, {})
 

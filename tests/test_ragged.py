@@ -143,17 +143,6 @@ def test_what_is_not_read_back_is_not_written(tmp_path, monkeypatch, elements, t
         assert not list(tmp_path.iterdir())
 
 
-def test_more_curves_than_objects_are_allowed(tmp_path, monkeypatch):
-    """Version 2 has as many objects for ten curves as for a million."""
-    from jaxtrachea.measurements.readers import safe_hdf5
-
-    monkeypatch.setattr(safe_hdf5, "MAX_OBJECTS", 40)
-    many = [plain(f"T{i}", n=5) for i in range(300)]
-    assert len(read(stored(tmp_path / "2.h5", *many)).curves) == 300
-    with pytest.raises(DataError, match="more than 40 objects"):
-        read(stored(tmp_path / "1.h5", *many, schema_version=1))
-
-
 # --- one bad curve ------------------------------------------------------------------------------
 
 
@@ -233,11 +222,6 @@ def attribute(name, key, value):
     return spoil
 
 
-def declared(file):
-    del file["samples/force"]
-    file.create_dataset("samples/force", (90_000_000,), "f8", chunks=(1000,), compression="gzip")
-
-
 BAD_FILES = {
     "offsets fall": (replaced("offsets/force", [0, 44, 43]), "offsets/force", "falls from 44"),
     "offsets below 0": (replaced("offsets/force", [0, -3, 43]), "offsets/force", "falls from 0"),
@@ -291,7 +275,6 @@ BAD_FILES = {
                              for n in ("specimen", "trial")], "curves/specimen", "no curves"),
     "no samples": (lambda file: file.__delitem__("samples"), "samples", "no such group"),
     "samples a dataset": (replaced("samples", [1.0]), "samples", "no such group"),
-    "declared, not stored": (declared, "samples/force", "declares 90000000 elements but stores"),
     "10^15 declared": (lambda file: file.create_dataset("samples/x", (10**15,), "f8", chunks=(9,)),
         "samples/x", "declares 1000000000000000 elements"),
     "text elsewhere": (replaced("samples/notes", np.array([b"a"])), "samples/notes",

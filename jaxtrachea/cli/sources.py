@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shlex
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,8 +15,18 @@ from jaxtrachea.cli.terminal import Stop
 ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".tab", ".xlsx", ".h5", ".hdf5", ".csv.gz", ".tsv.gz",
            ".txt.gz")  # fmt: skip
 EXPECTED = "expected files of measured curves (CSV, TSV, text, xlsx, HDF5, afmformats)"
+
+
+def _pairs(table: re.Match) -> str:
+    """The options that say what a table of a specification says."""
+    option = "--column" if table[1] == "columns" else "--unit"
+    pairs = re.findall(r'(\w+) = "([^"]*)"', table[2])
+    return " ".join(f"{option} {role}={shlex.quote(name)}" for role, name in pairs)
+
+
 #: How the words of readers, which name keys of a specification, are said as options.
 _AS_OPTION = (
+    (re.compile(r"(columns|units) = \{ (.*?) \}"), _pairs),
     (re.compile(r"name (it|the one meant) in (?:data\.)?columns\.(\w+)"), r"say --column \2=NAME"),
     (re.compile(r"name the columns in (?=columns)"), "say "),
     (re.compile(r"units\.(\w+) (?=says)"), r"--unit \1 "),

@@ -4,7 +4,7 @@ import dataclasses
 import fnmatch
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -140,7 +140,7 @@ class RawCurve:
     """A curve as a reader found it: units converted (mm, N, rad), nothing else checked or changed.
 
     `rows` numbers the samples for messages: lines of a text file, or samples counted from 1.
-    `unread` are the columns of a tidy table that have no role.
+    `unread` are the columns of a tidy table that have no role. `notes` say how it was read.
     """
 
     specimen: str
@@ -164,6 +164,7 @@ class RawCurve:
     end_V: np.ndarray | None = None
     unread: tuple[str, ...] = ()
     conditions: tuple[tuple[str, float], ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 #: "loading" means "first".
@@ -201,7 +202,8 @@ class ReadOptions:
             force is taken off the displacement, both with their signs. Or a table of names of
             files, or patterns, to such quantities (the first that fits counts; a file that none
             fits is an error), for `read_measurements`.
-        sheet: which sheet of a workbook holds the table; None: the first that is not hidden.
+        sheet: name of the sheet of a workbook that holds the table, or a pattern ("Trial *"), or
+            several of them; of several sheets each is a trial. None: the first that is not hidden.
         min_points: fewest samples of a curve.
         max_displacement: largest plausible displacement, mm.
         min_range: smallest plausible range of displacement, mm.
@@ -223,7 +225,7 @@ class ReadOptions:
     force_sign: int = 1
     displacement_sign: int = 1
     machine_compliance: str | Mapping[str, str] | None = None
-    sheet: str | None = None
+    sheet: str | Sequence[str] | None = None
     min_points: int = 2
     max_displacement: float = 1000.0
     min_range: float = 1e-6

@@ -17,7 +17,6 @@ from jaxtrachea.measurements.read import (
     read_measurements,
 )
 from jaxtrachea.measurements.readers import reader_of
-from jaxtrachea.measurements.readers.patterns import ensure_quick
 from jaxtrachea.measurements.readers.recognise import is_workbook
 
 
@@ -107,11 +106,6 @@ def read_data(spec: FitSpec, root: Path) -> Measurements:
     except InputError as error:
         raise SpecError.like(error, key=f"data.{error.key}") from None
     files = find_files(spec, root)
-    if options.name_pattern is not None:
-        try:
-            ensure_quick(options.name_pattern, [path.name for path in files])
-        except DataError as error:
-            raise SpecError(f"data.specimen: {error}") from None
     if options.sheet is not None and not any(map(is_workbook, files)):
         raise SpecError("data.sheet: none of the files is a workbook (xlsx); remove it")
     try:

@@ -7,18 +7,8 @@ write it into a specification, where it stands as a choice. A fit never guesses.
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from jaxtrachea.measurements.heads import Column, Head
-from jaxtrachea.measurements.roles import role_dimension
-from jaxtrachea.units import UnitError, unit_factor
-
-#: Names in lower case that decide among several columns in the unit of a role, or without a unit.
-USUAL = {
-    "force": ("f", "fz", "f_z", "force z", "normal force", "axial force", "standard force",
-              "reaction force", "load cell", "kraft", "standardkraft", "prüfkraft"),
-    "displacement": ("d", "u", "uz", "depth", "displ", "disp", "stroke", "extension", "travel",
-                     "crosshead", "deflection", "weg", "standardweg", "traversenweg",
-                     "eindringtiefe"),
-}  # fmt: skip
+from jaxtrachea.measurements.heads import Head
+from jaxtrachea.measurements.readers.column_roles import USUAL, candidates
 
 
 class Guess(NamedTuple):
@@ -49,27 +39,13 @@ def guess(heads: Sequence[Head]) -> Guess:
     for role in USUAL:
         if not tables or any(c.role == role for head in tables for c in head.columns):
             continue
-        found = {_candidates(role, head.columns) for head in tables}
+        found = {
+            candidates(role, [(c.name, c.unit) for c in head.columns if not c.role])
+            for head in tables
+        }
         names = found.pop() if len(found) == 1 else ()
         if len(names) == 1:
             taken[role] = names[0]
         elif names:
             several[role] = names
     return Guess(taken, several)
-
-
-def _candidates(role: str, columns: Sequence[Column]) -> tuple[str, ...]:
-    """Names of the columns that may have a role; a usual name comes before the others."""
-    unused = [c for c in columns if not c.role]
-    fitting = [c for c in unused if c.unit and _measures(c.unit, role_dimension(role))]
-    fitting = fitting or [c for c in unused if not c.unit and c.name.lower() in USUAL[role]]
-    usual = [c.name for c in fitting if c.name.lower() in USUAL[role]]
-    return tuple(usual) if len(usual) == 1 else tuple(c.name for c in fitting)
-
-
-def _measures(unit: str, dimension: str) -> bool:
-    try:
-        unit_factor(unit, dimension)
-    except UnitError:
-        return False
-    return True

@@ -1,28 +1,21 @@
 """The columns of a data file: their names, units and roles, before and beside the curves."""
 
-import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxtrachea.measurements.curve import Fault, ReadOptions
 from jaxtrachea.measurements.readers import READERS
 from jaxtrachea.measurements.readers.afmformats import AFMFORMATS, SI_UNITS
+from jaxtrachea.measurements.readers.column_roles import find_roles, time_column
 from jaxtrachea.measurements.readers.hdf5_values import names_in, unit_of
-from jaxtrachea.measurements.readers.lines import (
-    GZIP,
-    Lines,
-    first_bytes,
-    first_unpacked,
-    split_lines,
-)
-from jaxtrachea.measurements.readers.machine_csv import MAX_PREAMBLE
+from jaxtrachea.measurements.readers.machine_file import MAX_PREAMBLE, find_header
 from jaxtrachea.measurements.readers.ragged import limits_of
 from jaxtrachea.measurements.readers.recognise import kind_of
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
-from jaxtrachea.measurements.readers.text import find_roles, split_cells, time_column, units_row
-from jaxtrachea.measurements.readers.workbook import read_sheet
-from jaxtrachea.units import column_unit
+from jaxtrachea.measurements.readers.table import Header, Line, Text, likely_header
+from jaxtrachea.measurements.readers.text_file import GZIP, first_bytes, first_unpacked, to_utf8
+from jaxtrachea.measurements.readers.workbook import read_sheets
 
 #: Bytes of a text in which its header is looked for.
 HEAD_BYTES = 2**18
@@ -34,7 +27,6 @@ _STORED = {"s_c": "s", "phi_c": "phi", "joint_displacement": "joint", "end_U": "
            "end_ring_number": "end"}  # fmt: skip
 _OF_AFM = {"force": "force", "height (measured)": "displacement", "tip position": "displacement",
            "segment": "segment"}  # fmt: skip
-_NUMBER = re.compile(r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+-]?\d+)?")
 
 
 class Column(NamedTuple):
@@ -88,16 +80,16 @@ def head_of(path: Path, options: ReadOptions) -> Head:
         with opened(path, limits=limits_of) as file:
             return _stored(file)
     if kind == "xlsx":
-        lines = read_sheet(path, options.sheet)[0].lines
+        text = read_sheets(path, options.sheet)[0][0]
     else:
-        lines = split_lines(path, _beginning(path))
+        text = Text(path, to_utf8(path, _beginning(path)))
     if options.format == "auto":
-        found = next(r for r in READERS if r.is_text(lines, options)).name
+        found = next(r for r in READERS if r.is_text(text, options)).name
     else:
         found = options.format
     if found == AFMFORMATS.name:
-        return Head(found, tuple(_of_tab(lines)))
-    return _of_table(found, lines.without_comments(), options)
+        return Head(found, tuple(_of_tab(text.head)))
+    return _of_table(found, text, options)
 
 
 def _beginning(path: Path) -> bytes:
@@ -107,28 +99,24 @@ def _beginning(path: Path) -> bytes:
     return data if len(data) < HEAD_BYTES else data[: data.rfind(b"\n") + 1]
 
 
-def _of_table(found: str, lines: Lines, options: ReadOptions) -> Head:
-    """The header of a table: the first line above a row of as many cells, with numbers."""
-    for at in range(min(len(lines), MAX_PREAMBLE)):
-        for delimiter in "\t;,":
-            cells = _cells(lines, at, delimiter)
-            if len(cells) < 2 or any(map(_NUMBER.fullmatch, cells)):
-                continue
-            names, units = map(list, zip(*map(column_unit, cells), strict=True))
-            try:
-                last, units = units_row(lines, at, delimiter, units)
-            except Fault:
-                continue
-            below = _cells(lines, last + 1, delimiter)
-            numbers = sum(1 for cell in below if _NUMBER.fullmatch(cell))
-            if numbers >= 2 and len(below) <= len(cells):
-                return _with_roles(found, names, units, options)
-    return Head(found, ())
+def _of_table(found: str, text: Text, options: ReadOptions) -> Head:
+    """The header that its reader finds; else the first line above a row of as many numbers."""
+    try:
+        header = find_header(text, options)[0].header
+    except Fault:
+        header = None
+    header = header or _likely(text)
+    return Head(found, ()) if header is None else _with_roles(found, header, options)
 
 
-def _with_roles(
-    found: str, names: list[str], units: list[str | None], options: ReadOptions
-) -> Head:
+def _likely(text: Text) -> Header | None:
+    """A header by its place; of a text whose columns blanks separate, too."""
+    versions = (text, text.with_tabs(2), text.with_tabs(1))
+    return next(filter(None, (likely_header(v.lines[:MAX_PREAMBLE]) for v in versions)), None)
+
+
+def _with_roles(found: str, header: Header, options: ReadOptions) -> Head:
+    names, units = header.names, header.units
     roles, ambiguous = {}, ""
     try:
         roles = find_roles(names, options)
@@ -144,20 +132,7 @@ def _with_roles(
     )  # fmt: skip
 
 
-def _cells(lines: Lines, at: int, delimiter: str) -> list[str]:
-    """Cells of a line without empty ones at its end; none if there is no such line."""
-    if at >= len(lines) or delimiter not in lines.texts[at]:
-        return []
-    try:
-        cells = split_cells(lines.texts[at], delimiter)
-    except Fault:
-        return []
-    while cells and not cells[-1]:
-        cells.pop()
-    return cells
-
-
-def _of_tab(lines: Lines) -> Iterator[Column]:
+def _of_tab(lines: Sequence[Line]) -> Iterator[Column]:
     """Columns of a tab file of afmformats: the first comment below the metadata names them."""
     texts = [line.text.lstrip().removeprefix("#").strip() for line in lines]
     if "END METADATA" not in texts:

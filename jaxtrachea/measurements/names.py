@@ -1,58 +1,14 @@
 """Names of specimens and trials that a reader takes for the same, and a computer does not."""
 
 import unicodedata
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 from jaxtrachea.measurements.curve import BadCurve, Curve
 
-#: The minus sign, which is no dash to Unicode.
-_MINUS = "\u2212"
 
-
-def _plain_dashes(text: str) -> str:
-    return "".join("-" if c == _MINUS or unicodedata.category(c) == "Pd" else c for c in text)
-
-
-def _visible(text: str) -> str:
-    return "".join(c for c in text if unicodedata.category(c) not in ("Cf", "Cc") or c.isspace())
-
-
-def _compatible(text: str) -> str:
-    # The parts of an accented letter first: what is invisible may stand between them.
-    return unicodedata.normalize("NFKC", text)
-
-
-def _no_spaces(text: str) -> str:
-    return "".join(text.split())
-
-
-#: In what names can differ without looking different, in the order in which it is taken away.
-DIFFERENCES: dict[str, Callable[[str], str]] = {
-    "dashes": _plain_dashes,
-    "invisible characters": _visible,
-    "spaces": _no_spaces,
-    "Unicode form": _compatible,
-    "case": str.casefold,
-}
-
-
-def appearance(name: str, without: str = "") -> str:
-    """A name reduced to what a reader sees.
-
-    Args:
-        name: the name.
-        without: a key of `DIFFERENCES` that is not taken away.
-
-    Returns:
-        The same text for names that differ by nothing else.
-    """
-    if not without and name.isascii() and name.isprintable():  # most names, ten times as fast
-        return _no_spaces(name).casefold()
-    for _ in range(2):  # what one step leaves may be work for another: full-width blanks, cases
-        for difference, take_away in DIFFERENCES.items():
-            if difference != without:
-                name = take_away(name)
-    return name
+def appearance(name: str) -> str:
+    """A name without upper case and without the several forms in which Unicode writes a letter."""
+    return unicodedata.normalize("NFKC", unicodedata.normalize("NFKC", name).casefold())
 
 
 def look_alikes(curves: Iterable[Curve | BadCurve]) -> list[str]:
@@ -68,19 +24,15 @@ def look_alikes(curves: Iterable[Curve | BadCurve]) -> list[str]:
     """
     specimens: dict[str, dict[str, list[str]]] = {}
     trials: dict[tuple[str, str], dict[str, list[str]]] = {}
-    looks: dict[str, str] = {}
     for curve in curves:
-        for name in (curve.specimen, curve.trial):
-            if name not in looks:
-                looks[name] = appearance(name)
-        names = specimens.setdefault(looks[curve.specimen], {})
+        names = specimens.setdefault(appearance(curve.specimen), {})
         names.setdefault(curve.specimen, []).append(curve.source)
-        names = trials.setdefault((curve.specimen, looks[curve.trial]), {})
+        names = trials.setdefault((curve.specimen, appearance(curve.trial)), {})
         names.setdefault(curve.trial, []).append(curve.source)
     lines = [_line("specimens", names) for names in specimens.values() if len(names) > 1]
     for (specimen, _), names in trials.items():
         if len(names) > 1:
-            lines.append(_line(f"trials of specimen {_shown(specimen)}", names))
+            lines.append(_line(f"trials of specimen {specimen!r}", names))
     return lines
 
 
@@ -91,21 +43,15 @@ def _line(what: str, names: dict[str, list[str]]) -> str:
         for name, sources in list(names.items())[:4]
     ]
     more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    of_case = len({unicodedata.normalize("NFKC", name) for name in names}) > 1
+    of_form = len({name.casefold() for name in names}) > 1
+    differences = " and ".join(["Unicode form"] * of_form + ["case"] * of_case)
     return (
-        f"{what} {', '.join(listed)}{more} differ by {_difference(list(names))} alone and are taken"
+        f"{what} {', '.join(listed)}{more} differ by {differences} alone and are taken"
         " as different, also by the scopes of parameters; write them alike if they are one"
     )
 
 
-def _difference(names: list[str]) -> str:
-    """In what names that look alike differ."""
-    needed = [d for d in DIFFERENCES if len({appearance(name, d) for name in names}) > 1]
-    alone = (d for d, take in DIFFERENCES.items() if len(set(map(take, names))) == 1)
-    return " and ".join(needed) or next(alone, "their characters")
-
-
 def _shown(name: str) -> str:
-    """A name in quotes; escaped where its characters do not tell it from another."""
-    usual = unicodedata.normalize("NFC", name) == name and name.isprintable()
-    dashes = any(unicodedata.category(c) == "Pd" or c == _MINUS for c in name.replace("-", ""))
-    return repr(name) if usual and not dashes else ascii(name)
+    """A name in quotes; escaped where its form does not tell it from another."""
+    return repr(name) if unicodedata.normalize("NFC", name) == name else ascii(name)

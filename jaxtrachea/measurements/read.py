@@ -20,19 +20,12 @@ from jaxtrachea.measurements.curve import (
 )
 from jaxtrachea.measurements.machine import check_machine_files
 from jaxtrachea.measurements.readers import READERS, hdf5, reader_of
-from jaxtrachea.measurements.readers.large import MIN_BYTES, first_lines
-from jaxtrachea.measurements.readers.lines import (
-    Lines,
-    Text,
-    first_bytes,
-    read_bytes,
-    split_lines,
-)
-from jaxtrachea.measurements.readers.patterns import ensure_quick
 from jaxtrachea.measurements.readers.reader import Reader, Records
 from jaxtrachea.measurements.readers.recognise import HEAD, kind_of
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
-from jaxtrachea.measurements.readers.workbook import listed, read_sheet
+from jaxtrachea.measurements.readers.table import Text
+from jaxtrachea.measurements.readers.text_file import first_bytes, read_bytes, to_utf8
+from jaxtrachea.measurements.readers.workbook import listed, read_sheets
 from jaxtrachea.measurements.together import finish_all
 
 __all__ = [
@@ -94,9 +87,8 @@ def read_measurements(
 
     Raises:
         DataError: a file is missing, unreadable, hostile or of no known format, its table is
-            malformed, a (specimen, trial) comes twice, or the specimen pattern backtracks for
-            seconds on the name of a file; `options.machine_compliance` leaves out a file, or names
-            one that is not there.
+            malformed, or a (specimen, trial) comes twice; `options.machine_compliance` leaves out a
+            file, or names one that is not there.
         InputError: `options.format` names no format.
     """
     options = options or ReadOptions()
@@ -111,14 +103,12 @@ def read_measurements(
     curves: list[Curve] = []
     bad: list[BadCurve] = []
     notes: list[str] = []
-    if options.name_pattern is not None:
-        ensure_quick(options.name_pattern, [path.name for path in files])
     check_machine_files(files, options)
     seen: dict[tuple[str, str], str] = {}
     for path in files:
         _check_file(path)
         records, said = _read_file(path, options)
-        notes.extend([*said, *_unread(records)])
+        notes.extend([*said, *_notes(records)])
         for record in records:
             key = (record.specimen, record.trial)
             if key in seen:
@@ -164,14 +154,18 @@ def write_hdf5(
     hdf5.write(Path(path), measurements.curves, dict(attrs or {}), overwrite, schema_version)
 
 
-def _unread(records: Records) -> list[str]:
-    """That columns of a tidy table are not read, without the file: said once of many."""
+def _notes(records: Records) -> list[str]:
+    """How tables were read, and which columns were not, without the file: said once of many."""
+    said = [*dict.fromkeys(n for r in records if isinstance(r, RawCurve) for n in r.notes)]
     names = dict.fromkeys(n for r in records if isinstance(r, RawCurve) for n in r.unread)
     if not names:
-        return []
+        return said
     shown = ", ".join(repr(name) for name in [*names][:_COLUMNS])
     more = f" and {len(names) - _COLUMNS} more" if len(names) > _COLUMNS else ""
-    return [f"columns without a role are not read: {shown}{more}; data.columns gives them one"]
+    return [
+        *said,
+        f"columns without a role are not read: {shown}{more}; data.columns gives them one",
+    ]
 
 
 def _check_file(path: Path) -> None:
@@ -216,59 +210,50 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[Records, list[str]]:
             place=str(path),
             cure="remove data.format",
         )
-    data = read_bytes(path)
-    if (records := _read_large(path, data, asked, options)) is not None:
-        return records, []
-    text = Text(path, split_lines(path, data))
-    del data
-    reader = asked or _recognise(text.lines, READERS, options)
+    text = Text(path, to_utf8(path, read_bytes(path)))
+    reader = asked or _recognise(text, READERS, options)
     if reader.read_text is not None:
         return reader.read_text(text, options), []
     assert reader.read is not None
     return reader.read(path, options), []
 
 
-def _read_large(
-    path: Path, data: bytes, asked: Reader | None, options: ReadOptions
-) -> Records | None:
-    """What a large text holds; None if it is not large, or must be read line by line."""
-    if len(data) < MIN_BYTES:
-        return None
-    reader = asked or _recognise(first_lines(data), READERS, options)
-    return reader.read_large and reader.read_large(path, data, options)
-
-
 def _read_workbook(
     path: Path, asked: Reader | None, options: ReadOptions
 ) -> tuple[Records, list[str]]:
-    """The curves of a sheet, and which sheet it is if there are several.
+    """The curves of the sheets that are meant, and which sheet was read if nobody chose several.
 
     Raises:
         DataError: the workbook or the table of the sheet cannot be read.
     """
-    text, sheets = read_sheet(path, options.sheet)
-    others = listed([name for name in sheets if name != text.sheet])
+    texts, sheets = read_sheets(path, options.sheet)
+    others = listed([name for name in sheets if name not in {text.sheet for text in texts}])
     hint = f", or choose another sheet with data.sheet ({others})" if others else ""
     of_text = [r for r in READERS if r.read_text is not None]
-    reader = asked or _recognise(text.lines, of_text, options)
-    assert reader.read_text is not None
-    try:
-        records = reader.read_text(text, options)
-    except DataError as error:
-        raise DataError.like(error, cure=error.cure + hint) from None
-    records = [
-        dataclasses.replace(r, cure=r.cure + hint)
-        if isinstance(r, BadCurve) and r.kind in _OF_THE_SHEET
-        else r
-        for r in records
-    ]
-    note = f"{path}: sheet {text.sheet!r} was read, not {others}; data.sheet chooses another"
+    records: Records = []
+    for text in texts:
+        reader = asked or _recognise(text, of_text, options)
+        assert reader.read_text is not None
+        try:
+            found = reader.read_text(text, options)
+        except DataError as error:
+            raise DataError.like(error, cure=error.cure + hint) from None
+        records += [
+            dataclasses.replace(r, cure=r.cure + hint)
+            if isinstance(r, BadCurve) and r.kind in _OF_THE_SHEET
+            else r
+            for r in found
+        ]
+    if options.sheet is not None and len(texts) > 1:
+        others = ""
+    read = ", ".join(repr(text.sheet) for text in texts)
+    note = f"{path}: sheet {read} was read, not {others}; data.sheet chooses another"
     return records, [note] if others else []
 
 
-def _recognise(lines: Lines, readers: Sequence[Reader], options: ReadOptions) -> Reader:
+def _recognise(text: Text, readers: Sequence[Reader], options: ReadOptions) -> Reader:
     """Format of a text by its lines; the last reader takes any."""
-    return next(reader for reader in readers if reader.is_text(lines, options))
+    return next(reader for reader in readers if reader.is_text(text, options))
 
 
 def _recognise_hdf5(path: Path) -> Reader:

@@ -1,12 +1,10 @@
 """Reading measurements: HDF5 schemas 1 and 2 and tidy tables. Run: python tests/bench/reading.py.
 
-Needs pyarrow, with which large tidy tables are read at once; they are timed line by line, too.
-
 Curves of 200 samples with noise of their own, as of a testing machine, from a file that is in the
 cache of the system: ms per curve from the file to records, for the checks one by one and together,
-and bytes per curve. A tidy table of 10^6 rows, both ways in turn. Then schema 2 with 10^5 curves of
-200 samples and 10^6 of 10, from the file to usable curves, in a process of its own: seconds and
-peak memory.
+and bytes per curve. A tidy table of 10^6 rows, and a machine file of 300,000. Then schema 2 with
+10^5 curves of 200 samples and 10^6 of 10, from the file to usable curves, in a process of its own:
+seconds and peak memory.
 """
 
 import importlib
@@ -15,12 +13,10 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from unittest import mock
 
 import common
 import numpy as np
 
-from jaxtrachea.measurements import read
 from jaxtrachea.measurements.checks import finish
 from jaxtrachea.measurements.curve import Curve, RawCurve, ReadOptions
 from jaxtrachea.measurements.read import Measurements, read_measurements, write_hdf5
@@ -31,6 +27,7 @@ from jaxtrachea.measurements.together import finish_all
 CURVES, SAMPLES, TRIALS, ROUNDS = 1000, 200, 5, 5
 #: Curves of the tidy table of 10^6 rows, and its rounds.
 TABLE_CURVES, TABLE_ROUNDS = 5000, 3
+MACHINE_ROWS = 300_000
 #: Of the large studies: curves and samples of each.
 LARGE = ((100_000, 200), (1_000_000, 10))
 ALONE = """
@@ -84,7 +81,6 @@ def small(out: common.Writer, folder: Path) -> None:
         "HDF5 schema 1, usable curves": lambda: read_measurements([one]),
         "HDF5 schema 2, usable curves": lambda: read_measurements([two]),
         "tidy table, usable curves": lambda: read_measurements([tidy]),
-        "tidy table line by line, usable curves": lambda: line_by_line(tidy),
     }
     sizes = {name: None for name in cases}
     for name, path in (("schema 1", one), ("schema 2", two), ("tidy", tidy)):
@@ -96,22 +92,20 @@ def small(out: common.Writer, folder: Path) -> None:
         print(f"{case:40} {size and round(size)} bytes per curve")
 
 
-def line_by_line(path: Path) -> Measurements:
-    """A tidy table read as small ones are."""
-    with mock.patch.object(read, "MIN_BYTES", sys.maxsize):
-        return read_measurements([path])
-
-
 def tables(out: common.Writer, folder: Path) -> None:
-    """A tidy table of 10^6 rows, both ways."""
-    path = folder / "large.csv"
+    """A tidy table of 10^6 rows, and one of 300,000 with a single curve as a machine writes it."""
+    path, machine = folder / "large.csv", folder / "machine.csv"
     write_tidy(path, study(TABLE_CURVES, SAMPLES).curves)
-    importlib.import_module("pyarrow.csv")
+    depth = np.linspace(0.0, 6.0, MACHINE_ROWS).tolist()
+    rows = (f"{0.01 * i:.2f},{d:.6f},{0.3 * d + 0.02 * d**3:.6f}" for i, d in enumerate(depth))
+    head = "Test 1\n\nTime (s),Displacement (mm),Force (N)\n"
+    machine.write_text(head + "\n".join(rows) + "\n")
+    importlib.import_module("pandas")
     cases = {
-        "10^6 rows": lambda: read_measurements([path]),
-        "10^6 rows, line by line": lambda: line_by_line(path),
+        "10^6 rows, tidy": lambda: read_measurements([path]),
+        "300,000 rows, machine": lambda: read_measurements([machine]),
     }
-    out.table("tidy table", common.interleaved(cases, rounds=TABLE_ROUNDS))
+    out.table("tables", common.interleaved(cases, rounds=TABLE_ROUNDS))
 
 
 def large(out: common.Writer, folder: Path) -> None:
@@ -131,7 +125,7 @@ def large(out: common.Writer, folder: Path) -> None:
 
 def main() -> None:
     """Time all in turn and write the results."""
-    out = common.Writer("reading", "h5py", "pyarrow")
+    out = common.Writer("reading", "h5py", "pandas")
     with tempfile.TemporaryDirectory() as name:
         small(out, Path(name))
         tables(out, Path(name))

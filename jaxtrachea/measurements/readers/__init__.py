@@ -2,10 +2,10 @@
 
 from jaxtrachea._errors import InputError
 from jaxtrachea.measurements.readers.afmformats import AFMFORMATS
-from jaxtrachea.measurements.readers.csv import TIDY
 from jaxtrachea.measurements.readers.hdf5 import HDF5
-from jaxtrachea.measurements.readers.machine_csv import MACHINE
+from jaxtrachea.measurements.readers.machine_file import MACHINE
 from jaxtrachea.measurements.readers.reader import Reader
+from jaxtrachea.measurements.readers.tidy import TIDY
 
 #: In the order in which they are asked whether a file is theirs; the last takes any text.
 READERS: tuple[Reader, ...] = (AFMFORMATS, HDF5, TIDY, MACHINE)

@@ -28,11 +28,13 @@ from jaxtrachea.measurements.curve import (
     ReadOptions,
 )
 from jaxtrachea.measurements.file_names import FileIdentity, identify_file
+from jaxtrachea.measurements.readers.cells import numbers
+from jaxtrachea.measurements.readers.column_roles import resolve_unit
 from jaxtrachea.measurements.readers.hdf5_values import attribute, numeric, unit_of
-from jaxtrachea.measurements.readers.lines import Lines, read_lines
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
-from jaxtrachea.measurements.readers.text import numbers, read_columns, resolve_unit
+from jaxtrachea.measurements.readers.table import Header, Text, rows_below
+from jaxtrachea.measurements.readers.text_file import read_bytes, to_utf8
 from jaxtrachea.units import convert
 
 # afmformats fixes the unit of each column to SI; its tab files do not repeat it.
@@ -115,17 +117,20 @@ def _read_tab(path: Path, who: FileIdentity, options: ReadOptions) -> RawCurve |
     trial = who.trial or "0"
     source = str(path)
     try:
-        lines = read_lines(path)
-        names, metadata, lines = _tab_head(path, lines)
-        line_numbers, cells_of = read_columns(lines.without_comments(), len(names), "\t")
+        header, metadata, text = _tab_head(path)
+        table = rows_below(text, header)
+        wanted = [i for i, name in enumerate(header.names) if name in _wanted(options)]
+        table.load(wanted)
         columns = {}
-        for i, name in enumerate(names):
-            if name in _wanted(options):
-                cells = [*map(_truth, cells_of[i])] if name == "segment" else cells_of[i]
-                columns[name] = numbers(cells, line_numbers, name, ",")
+        for i in wanted:
+            values = table.raw(i)
+            if not isinstance(values, np.ndarray):
+                cells = [*map(_truth, values)]
+                values = numbers(cells, table.lines, header.names[i], ",")
+            columns[header.names[i]] = values
         units = {name: SI_UNITS.get(name) for name in columns}
         place = (who, trial, source)
-        return _curve(columns, units, metadata, np.array(line_numbers), "line", place, options)
+        return _curve(columns, units, metadata, table.lines, "line", place, options)
     except Fault as fault:
         return bad(who.specimen, trial, source, fault)
 
@@ -139,8 +144,10 @@ def _truth(cell: str) -> str:
     return {"True": "1", "False": "0"}.get(cell, cell)
 
 
-def _tab_head(path: Path, lines: Lines) -> tuple[list[str], Mapping[str, Any], Lines]:
-    """Metadata and column names, both in comments; the rows are what is left."""
+def _tab_head(path: Path) -> tuple[Header, Mapping[str, Any], Text]:
+    """Column names and metadata, both in comments, and the text in which the rows stand."""
+    text = Text(path, to_utf8(path, read_bytes(path)))
+    lines = text.head
     texts = [line.text.strip().removeprefix("#").strip() for line in lines]
     if "BEGIN METADATA" not in texts or "END METADATA" not in texts:
         raise Fault(
@@ -157,8 +164,14 @@ def _tab_head(path: Path, lines: Lines) -> tuple[list[str], Mapping[str, Any], L
         raise Fault("metadata_missing", "the metadata are no JSON object", "export the file again")
     for i in range(end + 1, len(lines)):
         if lines[i].text.startswith("#") and texts[i]:
-            names, first = _split_glued(texts[i].split("\t"))
-            return names, metadata, _put_before(lines[i].number, first, lines[i + 1 :])
+            names, row = _split_glued(texts[i].split("\t"))
+            number = lines[i].number
+            header = Header(names, [None] * len(names), number, "\t", number if row else number + 1)
+            if row:  # the first row takes the place of the line of the names
+                data = text.data.split(b"\n")
+                data[number - 1] = row.encode()
+                text = Text(path, b"\n".join(data))
+            return header, metadata, text
     raise DataError(
         "no line with column names after the metadata",
         place=str(path),
@@ -166,12 +179,7 @@ def _tab_head(path: Path, lines: Lines) -> tuple[list[str], Mapping[str, Any], L
     )
 
 
-def _put_before(number: int, first: list[str], lines: Lines) -> Lines:
-    """The lines with the rows that stand on the line of the names."""
-    return Lines([number] * len(first) + [*lines.numbers], [*first, *lines.texts])
-
-
-def _split_glued(cells: list[str]) -> tuple[list[str], list[str]]:
+def _split_glued(cells: list[str]) -> tuple[list[str], str]:
     """Names, and the first row if it hangs on the header, as version 0.13.3 leaves it."""
     for i, cell in enumerate(cells):
         for name in SI_UNITS:
@@ -179,8 +187,8 @@ def _split_glued(cells: list[str]) -> tuple[list[str], list[str]]:
                 r"[-+.\deE]+|True|False|nan", cell[len(name) :]
             ):
                 if len(cells) == 2 * i + 1:
-                    return [*cells[:i], name], ["\t".join([cell[len(name) :], *cells[i + 1 :]])]
-    return cells, []
+                    return [*cells[:i], name], "\t".join([cell[len(name) :], *cells[i + 1 :]])
+    return cells, ""
 
 
 def _curve(
@@ -257,7 +265,7 @@ def _column(
 AFMFORMATS = Reader(
     "afmformats",
     read=read,
-    is_text=lambda lines, options: any("BEGIN METADATA" in line.text for line in lines[:10]),
+    is_text=lambda text, options: any("BEGIN METADATA" in line.text for line in text.head[:10]),
     is_hdf5=lambda file: "schema" not in file.attrs and any(name.isdecimal() for name in file),
     layout="groups 0, 1, ... of afmformats",
 )

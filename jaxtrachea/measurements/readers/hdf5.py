@@ -14,6 +14,7 @@ import numpy as np
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.readers.column_roles import resolve_unit
 from jaxtrachea.measurements.readers.hdf5_values import (
     attribute,
     measured,
@@ -27,7 +28,6 @@ from jaxtrachea.measurements.readers.ragged import limits_of, read_curves
 from jaxtrachea.measurements.readers.ragged_writer import write_ragged
 from jaxtrachea.measurements.readers.reader import Reader
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
-from jaxtrachea.measurements.readers.text import resolve_unit
 from jaxtrachea.measurements.roles import role_dimension
 from jaxtrachea.units import convert
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.curve import BadCurve, DataError, Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.readers.column_roles import resolve_unit
 from jaxtrachea.measurements.readers.hdf5_values import measured, numeric, unit_of
 from jaxtrachea.measurements.readers.safe_hdf5 import Limits
-from jaxtrachea.measurements.readers.text import resolve_unit
 from jaxtrachea.measurements.roles import role_dimension
 from jaxtrachea.units import convert
 

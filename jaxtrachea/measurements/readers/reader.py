@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxtrachea.measurements.curve import BadCurve, RawCurve, ReadOptions
-from jaxtrachea.measurements.readers.lines import Lines, Text
+from jaxtrachea.measurements.readers.table import Text
 
 Records = list[RawCurve | BadCurve]
 
@@ -16,12 +16,10 @@ class Reader(NamedTuple):
     Attributes:
         name: by which `data.format` asks for it.
         read: reads a file by its path; None: text and sheets only.
-        read_text: reads the lines of a text or of a sheet of a workbook; None: files only.
-        read_large: reads the bytes of a large text in a quicker way; None in place of records:
-            something is odd, and `read_text` must read it or say what is wrong.
+        read_text: reads a text or a sheet of a workbook; None: files only.
         is_file: whether a file that begins with these bytes is of this format; `read` then gets
             it. Text, HDF5 and workbooks need no such sign.
-        is_text: whether lines are of this format, with the columns that the options name.
+        is_text: whether a text is of this format, with the columns that the options name.
         is_hdf5: whether an open HDF5 file is of this format.
         layout: by what an HDF5 file of this format is known, for messages; empty: there are none.
     """
@@ -29,8 +27,7 @@ class Reader(NamedTuple):
     name: str
     read: Callable[[Path, ReadOptions], Records] | None = None
     read_text: Callable[[Text, ReadOptions], Records] | None = None
-    read_large: Callable[[Path, bytes, ReadOptions], Records | None] | None = None
     is_file: Callable[[bytes], bool] = lambda head: False
-    is_text: Callable[[Lines, ReadOptions], bool] = lambda lines, options: False
+    is_text: Callable[[Text, ReadOptions], bool] = lambda text, options: False
     is_hdf5: Callable[[Any], bool] = lambda file: False
     layout: str = ""

@@ -66,67 +66,43 @@ def packed(data):
     return gzip.compress(data, mtime=0)
 
 
-def lying():
-    """A workbook whose directory says that its sheet has 2^31 bytes."""
-    data = bytearray(part(SHEET, "<x/>"))
-    at = data.rfind(SHEET.encode()) - 46
-    data[at + 24 : at + 28] = (2**31).to_bytes(4, "little")
-    return bytes(data)
-
-
 KINDS = {
     "workbook with nothing in it": alone(zipped(xl__workbook_dot_xml=GOOD), "workbook"),
-    "workbook cut off": alone(part(SHEET, "<x/>" * 99)[:150], "zip", "copy it again"),
-    "workbook of large styles": alone(
-        part("xl/styles.xml", " " * 9 * 2**20), "styles.xml", "at most"
-    ),
-    "workbook of a lie": alone(lying(), "sheet1.xml", "2147483648"),
-    "workbook of many parts": alone(
-        zipped(**{f"xl__a{i}_dot_xml": "" for i in range(10_001)}), "10000 parts"
-    ),
-    "workbook with entities": alone(part(SHEET, '<!DOCTYPE a [<!ENTITY b "c">]><a/>'), "entities"),
+    "workbook cut off": alone(part(SHEET, "<x/>" * 99)[:150], "zip archive"),
     "old workbook": alone(b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(999), "xls", "password"),
-    "binary workbook": alone(zipped(xl__workbook_dot_bin="x"), "xlsb", "CSV"),
-    "OpenDocument": alone(zipped(content_dot_xml="x", mimetype="y"), "ods", "CSV"),
-    "Word document": beside(zipped(word__document_dot_xml="x"), "docx"),
+    "Word document": beside(zipped(word__document_dot_xml="x"), "zip archive"),
     "zip of CSV": alone(zipped(a_dot_csv=GOOD), "zip archive", "unpack"),
     "zip of nothing": alone(zipped(), "zip archive"),
-    "bzip2": beside(bz2.compress(GOOD.encode()), "bzip2", "unpack"),
-    "xz": alone(lzma.compress(GOOD.encode()), "xz archive", "gzip"),
-    "Zstandard": alone(b"\x28\xb5\x2f\xfd" + bytes(40), "Zstandard"),
-    "tar": alone(tar(), "tar archive", "unpack"),
+    "bzip2": beside(bz2.compress(GOOD.encode()), "not text"),
+    "tar": alone(tar(), "not text"),
     "gzip cut off": alone(packed(GOOD.encode())[:-9], "gzip", "cut off"),
     "gzip with a wrong sum": alone(packed(GOOD.encode())[:-8] + bytes(8), "gzip", "damaged"),
-    "gzip of a picture": alone(packed(PNG), "packed by gzip", "PNG"),
+    "gzip of a picture": alone(packed(PNG), "packed by gzip", "not text"),
     "gzip of gzip": alone(packed(packed(GOOD.encode())), "packed by gzip", "unpack"),
-    "gzip of tar": alone(packed(tar()), "tar archive", "unpack"),
+    "gzip of tar": alone(packed(tar()), "packed by gzip", "not text"),
     "gzip of 300 MB of blanks": alone(packed(b" " * 2**20) * 300, "unpacks to more than"),
     "gzip of a broken table": alone(packed(GOOD.replace("0.66", "x").encode()), "line 4", "'x'"),
     "npy": beside(saved(np.save, NUMBERS), "npy", "savetxt"),
-    "npz": alone(saved(np.savez, a=NUMBERS), "npz", "savetxt"),
+    "npz": alone(saved(np.savez, a=NUMBERS), "zip archive"),
     "MATLAB 5": alone(b"MATLAB 5.0 MAT-file, Platform: GLNXA64".ljust(128) + PNG, "version 5"),
     "MATLAB 7.3": alone(
         b"MATLAB 7.3 MAT-file, Platform: PCWIN64".ljust(512) + b"\x89HDF\r\n\x1a\n" + bytes(99),
         "version 7.3", "writetable",
     ),
     "Parquet": alone(b"PAR1\x15\x04" + PNG + b"PAR1", "Parquet", "to_csv"),
-    "pickle": alone(pickle.dumps(NUMBERS), "pickle", "never opened"),
-    "pickle of protocol 2": alone(pickle.dumps(GOOD, protocol=2), "pickle"),
+    "pickle": alone(pickle.dumps(NUMBERS), "not text", "CSV"),
     "PDF": alone(b"%PDF-1.7\n%\xe2\xe3\xcf\xd3\n" + PNG, "PDF"),
-    "PNG": beside(PNG, "PNG", "numbers"),
-    "JPEG": alone(b"\xff\xd8\xff\xe0" + PNG, "JPEG"),
-    "SQLite": alone(b"SQLite format 3\0" + PNG, "SQLite"),
-    "RTF": alone("{\\rtf1\\ansi\n" + GOOD, "RTF", "plain text"),
-    "web page": alone("<!DOCTYPE html>\n<html>sign in</html>\n", "web page"),
-    "XML": alone("<?xml version='1.0'?>\n<a/>\n", "XML"),
-    "JSON": alone(json.dumps({"force": list(range(99))}), "JSON", "CSV"),
-    "JSON indented": alone(json.dumps({"force": [1, 2]}, indent=1), "JSON"),
-    "JSON list": beside(json.dumps([{"force": 1}]), "JSON"),
-    "JSON lines": alone('{"force": 1}\n{"force": 2}\n{"force": 3}\n', "JSON objects"),
-    "UTF-16 named": alone(GOOD.encode("utf-16-le"), "UTF-16", "UTF-8"),
-    "UTF-16 big-endian": alone(GOOD.encode("utf-16-be"), "UTF-16", "UTF-8"),
-    "UTF-32 with mark": alone(GOOD.encode("utf-32"), "UTF-32", "UTF-8"),
-    "bytes of no format": alone(bytes(range(256)) * 9, "binary of no known format"),
+    "PNG": beside(PNG, "not text", "numbers"),
+    "xz": alone(lzma.compress(GOOD.encode() * 9), "not text"),
+    "SQLite": alone(b"SQLite format 3\0" + PNG, "not text"),
+    "web page": alone("<!DOCTYPE html>\n<html>sign in</html>\n", "displacement"),
+    "XML": alone("<?xml version='1.0'?>\n<a/>\n", "displacement"),
+    "JSON": alone(json.dumps({"force": list(range(99))}), "header"),
+    "JSON indented": alone(json.dumps({"force": [1, 2]}, indent=1), "line 1", "JSON"),
+    "UTF-16 named": alone(GOOD.encode("utf-16-le"), "not text", "UTF-8"),
+    "UTF-16 big-endian": alone(GOOD.encode("utf-16-be"), "not text", "UTF-8"),
+    "UTF-32 with mark": alone(GOOD.encode("utf-32"), "not text", "UTF-8"),
+    "bytes of no format": alone(bytes(range(256)) * 9, "not text"),
     "afmformats asked of a workbook": alone(
         part(SHEET, "<x/>"), "workbook", "data.format", spec=SPEC + 'format = "afmformats"'
     ),
