@@ -1,11 +1,18 @@
 """Curves of atomic force microscopes, as afmformats reads them."""
 
+import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from measured_files import only_bad, put, read
+
+from jaxtrachea.measurements.curve import DataError, ReadOptions
+from jaxtrachea.measurements.heads import head_of
+
+#: From the tests of afmformats (MIT, Paul Müller), fmt-jpk-fd_spot3-0192.
+JPK = Path(__file__).parent / "reference" / "spot3.jpk-force"
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 needs_formats = pytest.mark.skipif(
@@ -95,6 +102,35 @@ def test_afm_sample_tab():
     step = 1000 * ((5.5198847e-05 - 5.5194395e-05) - bend)
     assert got.displacement[1] == pytest.approx(step, rel=1e-9)
     assert got.force.size == 3147
+
+
+def test_afm_instrument(tmp_path):
+    """A curve of a JPK instrument: the library's columns, its bending taken off by hand."""
+    afmformats = pytest.importorskip("afmformats")
+    path = tmp_path / "spot3.jpk-force"
+    path.write_bytes(JPK.read_bytes())
+    (got,) = read(path).curves
+    assert (got.specimen, got.trial) == ("spot3", "0")
+    (held,) = afmformats.load_data(path)
+    approach = np.asarray(held["segment"]) == 0
+    fall = held["height (measured)"][0] - held["height (measured)"][approach]
+    bend = (held["force"][approach] - held["force"][0]) / 0.043493666407368466
+    used = got.usage.used
+    np.testing.assert_allclose(got.displacement, 1000 * (fall - bend)[-used:], atol=1e-15)
+    np.testing.assert_array_equal(got.force, held["force"][approach][-used:])
+    assert len(head_of(path, ReadOptions()).columns) == 5
+    assert {b.kind for b in read(path, columns={"displacement": "height (none)"}).bad} == {
+        "column_missing"
+    }
+    path.write_bytes(JPK.read_bytes()[:9000])
+    with pytest.raises(DataError, match="afmformats cannot read it .*; export the curve as HDF5"):
+        read(path)
+
+
+def test_afm_instrument_without_the_library(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "afmformats", None)
+    with pytest.raises(DataError, match=r"pip install 'jaxtrachea\[afm\]'"):
+        read(put(tmp_path, b"PK", "x.jpk-force"))
 
 
 @pytest.mark.parametrize("metadata", ["{", "[1]", '{"spring constant": "soft"}'])

@@ -13,7 +13,8 @@ from jaxtrachea.cli.terminal import Stop
 
 #: Endings of files that are taken from a folder.
 ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".tab", ".xlsx", ".h5", ".hdf5", ".csv.gz", ".tsv.gz",
-           ".txt.gz")  # fmt: skip
+           ".txt.gz", ".lvm", ".jpk-force", ".jpk-force-map", ".jpk-qi-data", ".jpk-qi-series",
+           ".ibw")  # fmt: skip
 EXPECTED = "expected files of measured curves (CSV, TSV, text, xlsx, HDF5, afmformats)"
 
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from jaxtrachea.measurements.curve import Fault, ReadOptions
 from jaxtrachea.measurements.readers import READERS
-from jaxtrachea.measurements.readers.afmformats import AFMFORMATS, SI_UNITS
+from jaxtrachea.measurements.readers.afmformats import AFMFORMATS, SI_UNITS, load
 from jaxtrachea.measurements.readers.column_roles import find_roles, time_column
 from jaxtrachea.measurements.readers.hdf5_values import names_in, unit_of
 from jaxtrachea.measurements.readers.machine_file import MAX_PREAMBLE, find_header
@@ -79,6 +79,9 @@ def head_of(path: Path, options: ReadOptions) -> Head:
     if kind == "hdf5":
         with opened(path, limits=limits_of) as file:
             return _stored(file)
+    if kind == "afm":
+        held = {name: SI_UNITS.get(name) or None for name in load(path)[0].columns}
+        return Head(AFMFORMATS.name, _columns(held, _OF_AFM))
     if kind == "xlsx":
         text = read_sheets(path, options.sheet)[0][0]
     else:

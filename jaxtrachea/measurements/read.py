@@ -20,6 +20,7 @@ from jaxtrachea.measurements.curve import (
 )
 from jaxtrachea.measurements.machine import check_machine_files
 from jaxtrachea.measurements.readers import READERS, hdf5, reader_of
+from jaxtrachea.measurements.readers.afmformats import AFMFORMATS
 from jaxtrachea.measurements.readers.reader import Reader, Records
 from jaxtrachea.measurements.readers.recognise import HEAD, kind_of
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
@@ -199,12 +200,15 @@ def _read_file(path: Path, options: ReadOptions) -> tuple[Records, list[str]]:
     found = "hdf5" if named_hdf5 and asked is None else kind_of(path)
     if found == "hdf5" and asked is None:
         asked = _recognise_hdf5(path)
+    if found == "afm" and asked is None:
+        asked = AFMFORMATS
     if found != "xlsx" and asked is not None and asked.read is not None:
         return asked.read(path, options), []
     if found == "xlsx" and (asked is None or asked.read_text is not None):
         return _read_workbook(path, asked, options)
     if found != "text":
-        what = "HDF5" if found == "hdf5" else "a workbook (xlsx)"
+        kinds = {"hdf5": "HDF5", "afm": "a file of an atomic force microscope"}
+        what = kinds.get(found, "a workbook (xlsx)")
         raise DataError(
             f"is {what}, but data.format is {options.format!r}",
             place=str(path),

@@ -1,4 +1,8 @@
-"""Force-distance curves exported by afmformats (HDF5 or tab), in its layout of version 0.13.
+"""Force-distance curves of atomic force microscopes.
+
+What afmformats exports (HDF5 or tab, layout of version 0.13) is read here: its own loaders drop the
+first sample of a tab file and refuse an HDF5 file whose only curve is number 1. The files of the
+instruments (JPK, Igor) are read by the library itself (extra `afm`).
 
 A cantilever pushes with its free end: while its base advances by the fall of the height, its
 bending takes back F/k. The displacement of the tip, counted from the first sample, is
@@ -11,7 +15,9 @@ counts into D, and force offsets stay: finding the contact point is not the read
 segment 0 (approach) is kept, unless every sample is asked for with ``loading = "all"``.
 """
 
+import importlib
 import json
+import logging
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,6 +38,7 @@ from jaxtrachea.measurements.readers.cells import numbers
 from jaxtrachea.measurements.readers.column_roles import resolve_unit
 from jaxtrachea.measurements.readers.hdf5_values import attribute, numeric, unit_of
 from jaxtrachea.measurements.readers.reader import Reader
+from jaxtrachea.measurements.readers.recognise import AFM
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.measurements.readers.table import Header, Text, rows_below
 from jaxtrachea.measurements.readers.text_file import read_bytes, to_utf8
@@ -53,7 +60,7 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
     """Read the curves of an afmformats file; `columns.displacement` may name another height column.
 
     Args:
-        path: the file, HDF5 or tab (told apart by content).
+        path: the file: of an instrument by its name, else HDF5 or tab by content.
         options: naming, loading rule, columns.
 
     Returns:
@@ -63,9 +70,67 @@ def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
         DataError: damaged or hostile file, or one without curves.
     """
     who = identify_file(path, options)
+    if path.suffix.lower() in AFM:
+        return _read_instrument(path, who, options)
     with path.open("rb") as stream:
         is_hdf5 = stream.read(8) == b"\x89HDF\r\n\x1a\n"
     return _read_hdf5(path, who, options) if is_hdf5 else [_read_tab(path, who, options)]
+
+
+def load(path: Path) -> list[Any]:
+    """The curves of an instrument's file, as afmformats gives them.
+
+    Raises:
+        DataError: the library is missing, or cannot read the file.
+    """
+    try:
+        library = importlib.import_module("afmformats")
+    except ImportError:
+        raise DataError(
+            "is a file of an atomic force microscope, and afmformats, which reads it, is not "
+            "installed",
+            place=str(path),
+            cure="run pip install 'jaxtrachea[afm]', or export the curve as HDF5 or CSV",
+        ) from None
+    logger = logging.getLogger("afmformats")
+    silent, logger.disabled = logger.disabled, True  # it prints what it raises
+    try:
+        curves = library.load_data(path)
+    # Errors of the library itself are no Exceptions, but BaseExceptions.
+    except (Exception, library.errors.AFMFileFormatError, library.errors.MissingMetaDataError) as e:
+        raise DataError(
+            f"afmformats cannot read it ({' '.join(str(e).split())[:80] or type(e).__name__})",
+            place=str(path),
+            cure="export the curve as HDF5 or CSV, with its spring constant",
+        ) from None
+    finally:
+        logger.disabled = silent
+    if not curves:
+        raise DataError("holds no curves", place=str(path), cure="export it again")
+    return curves
+
+
+def _read_instrument(
+    path: Path, who: FileIdentity, options: ReadOptions
+) -> list[RawCurve | BadCurve]:
+    """The curves of a file that afmformats reads; it gives SI units."""
+    found: list[RawCurve | BadCurve] = []
+    curves = load(path)
+    for number, curve in enumerate(curves):
+        own = str(number)
+        trial = own if who.trial is None else f"{who.trial}-{own}" if len(curves) > 1 else who.trial
+        source = f"{path}:{number}"
+        held = [name for name in curve.columns if name in _wanted(options)]
+        columns = {name: np.asarray(curve[name], np.float64) for name in held}
+        units = {name: SI_UNITS.get(name) for name in columns}
+        metadata = {"spring constant": curve.metadata.get("spring constant")}
+        rows = np.arange(1, columns["force"].size + 1) if "force" in columns else np.zeros(0)
+        try:
+            place = (who, trial, source)
+            found.append(_curve(columns, units, metadata, rows, "sample", place, options))
+        except Fault as fault:
+            found.append(bad(who.specimen, trial, source, fault))
+    return found
 
 
 def _read_hdf5(path: Path, who: FileIdentity, options: ReadOptions) -> list[RawCurve | BadCurve]:

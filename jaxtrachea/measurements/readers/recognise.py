@@ -7,6 +7,8 @@ from jaxtrachea.measurements.curve import DataError
 from jaxtrachea.measurements.readers.text_file import GZIP, first_bytes, first_unpacked
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
+#: Names of the files of atomic force microscopes that the library afmformats reads.
+AFM = (".jpk-force", ".jpk-force-map", ".jpk-qi-data", ".jpk-qi-series", ".ibw")
 #: Places where the signature of an HDF5 file may stand: at the start, or after a user block.
 HDF5_PLACES = (0, 512, 1024, 2048)
 #: Bytes that are looked at.
@@ -37,12 +39,14 @@ def kind_of(path: Path) -> str:
         path: an existing file.
 
     Returns:
-        "hdf5", "xlsx" or "text" (which may be packed by gzip).
+        "hdf5", "xlsx", "afm" or "text" (which may be packed by gzip).
 
     Raises:
         DataError: it cannot be read, or is something else, which the message names.
     """
     head = first_bytes(path, HEAD)
+    if path.suffix.lower() in AFM:
+        return "afm"
     if head.startswith(GZIP):
         found = _named(first_unpacked(path, HEAD))
         found = found and (f"packed by gzip and holds {found[0]}", f"unpack it, then {found[1]}")
