@@ -212,6 +212,7 @@ def test_grams_and_lines_left_out_are_said(tmp_path):
         ("Displacement [mm],Force [N],Force [N]\n0,0,0\n1,2,3\n", "can all be the force"),
         ('Displacement [mm],Force [N]\n0,"1,4,3"\n1,2\n', "Force '1,4,3' is not a number"),
         ('Displacement [mm],Force [N]\n0,"1,234"\n1,"2,345"\n', "'1,234' is not a number"),
+        ('Displacement [mm],Force [N]\n0,0.5\n1,"1,234"\n', "'1,234' is not a number"),
         ('Displacement [um],Force [N]\n0,1\n"900",2\n"1,100",3\n', "a thousand times as large"),
     ],
 )  # fmt: skip

@@ -9,7 +9,7 @@ from jaxtrachea.measurements.readers import READERS
 from jaxtrachea.measurements.readers.afmformats import AFMFORMATS, SI_UNITS, load
 from jaxtrachea.measurements.readers.column_roles import find_roles, time_column
 from jaxtrachea.measurements.readers.hdf5_values import names_in, unit_of
-from jaxtrachea.measurements.readers.machine_file import MAX_PREAMBLE, find_header
+from jaxtrachea.measurements.readers.machine_header import MAX_PREAMBLE, find_header
 from jaxtrachea.measurements.readers.ragged import limits_of
 from jaxtrachea.measurements.readers.recognise import kind_of
 from jaxtrachea.measurements.readers.safe_hdf5 import opened

@@ -389,7 +389,7 @@ def rows_below(text: Text, header: Header) -> Table:
     kept = ends > starts
     for i in _odd_lines(data, starts, ends, header).tolist():
         line = Line(header.first + i, body[starts[i] : ends[i]].decode(errors="replace"))
-        kept[i] = kept[i] and _is_row(line, header, text.word)
+        kept[i] = _is_row(line, header, text.word)
     if not kept.all():
         body = data[np.repeat(kept, ends - starts + 1)].tobytes()
     return Table(text, header, header.first + np.flatnonzero(kept), body)
