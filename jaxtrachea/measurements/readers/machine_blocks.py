@@ -58,17 +58,20 @@ def _blocks(text: Text, header: Header, roles: dict[str, int], reason: Fault | N
         start = kinds.index("row", at)
         end = next((k for k in range(start, len(lines)) if kinds[k] != "row"), len(lines))
         after = next((k for k in range(end, len(lines)) if kinds[k] != "text"), len(lines))
+        if "numbers" in kinds[at:start]:
+            break
         part = Text(text.path, _cut(text.data, lines, end), text.sheet, text.trial)
         tables.append(rows_below(part, header._replace(first=lines[start].number)))
-        if after == len(lines):
-            if end < after:
-                tables[-1].notes.append(_left_out(text, lines[end:]))
-            break
-        if kinds[after] != "header":
+        _check_columns(lines, range(end, min(after + 1, len(lines))), header, roles, text)
+        if after < len(lines) and kinds[after] != "header":
             what = f"{text.word} {lines[end].number} is no row, and rows go on below it"
             raise reason or Fault("unparsable", what, "remove it, or begin it with #")
-        _check_units(header_at(lines, after, header.delimiter), header, roles, text)
         at = after + 1
+        if after == len(lines) and end < after:
+            tables[-1].notes.append(_left_out(text, lines[end:]))
+    if "numbers" in kinds[at:]:
+        what = f"{text.word} {lines[kinds.index('numbers', at)].number} is no row of the table"
+        raise reason or Fault("ragged", what, "complete or remove it")
     return tables
 
 
@@ -104,21 +107,37 @@ def _kind(line: Line, header: Header, roles: dict[str, int], first: list[str]) -
     if numeric and len(numeric) == len([cell for cell in cells if cell]):
         return "numbers"
     again = header_at([line], 0, header.delimiter)
-    same = again and all(again.names[i : i + 1] == [header.names[i]] for i in roles.values())
-    return "header" if same else "text"
+    return "header" if again and _is_same(again, header, roles) else "text"
 
 
-def _check_units(again: Header | None, header: Header, roles: dict[str, int], text: Text) -> None:
-    """Refuse a block of rows in other units than the first."""
-    for i in roles.values():
-        unit = again.units[i] if again else None
-        if again and unit is not None and unit != header.units[i]:
+def _check_columns(
+    lines: Sequence[Line], places: range, header: Header, roles: dict[str, int], text: Text
+) -> None:
+    """Refuse a second table whose columns or units are not those of the first."""
+    for k in places:
+        other = header_at(lines, k, header.delimiter)
+        if other is None or not {header.names[roles[role]] for role in BOTH} <= {*other.names}:
+            continue
+        line = f"{text.word} {other.line}"
+        if other.names[: len(header.names)] != header.names and not _is_same(other, header, roles):
             raise Fault(
                 "ambiguous",
-                f"{text.word} {again.line}: {header.names[i]} is in {unit}, and in "
-                f"{header.units[i]} in {text.word} {header.line}",
-                "split the file there",
+                f"{line} is the header of another table than {text.word} {header.line}",
+                "keep one table in the file",
             )
+        for i in roles.values():
+            if other.units[i] is not None and other.units[i] != header.units[i]:
+                raise Fault(
+                    "ambiguous",
+                    f"{line}: {header.names[i]} is in {other.units[i]}, and in {header.units[i]} "
+                    f"in {text.word} {header.line}",
+                    "split the file there",
+                )
+
+
+def _is_same(other: Header, header: Header, roles: dict[str, int]) -> bool:
+    """Whether all columns that are read have the same places."""
+    return all(other.names[i : i + 1] == [header.names[i]] for i in roles.values())
 
 
 def _cut(data: bytes, lines: Sequence[Line], end: int) -> bytes:
@@ -131,6 +150,7 @@ def _cut(data: bytes, lines: Sequence[Line], end: int) -> bytes:
 def _left_out(text: Text, lines: Sequence[Line]) -> str:
     """That lines below a table are no rows of it."""
     first, last = lines[0].number, lines[-1].number
-    which = f"{text.word} {first}" if first == last else f"{text.word}s {first} to {last}"
-    shown = lines[0].text.strip()[:60]
-    return f"{text.place}: {which} below the table are not read ({shown!r})"
+    which = f"{text.word} {first} below the table is"
+    if first < last:
+        which = f"{text.word}s {first} to {last} below the table are"
+    return f"{text.place}: {which} not read ({lines[0].text.strip()[:60]!r})"

@@ -122,7 +122,8 @@ def _search(
                 header = _with_labels(header, lines[:at])
             found = columns_of_tidy(parts[0].roles, header.units)
             quoted = {role: repr(header.names[parts[0].roles[role]]) for role in found}
-            _refuse_columns_of_tidy(f"{text.word} {line.number}", quoted, options)
+            commented = line not in text.lines
+            _refuse_columns_of_tidy(f"{text.word} {line.number}", quoted, options, commented)
             return Found(text, header), parts
     if reason is not None:
         raise reason
@@ -238,7 +239,9 @@ def _names_both(names: list[str], options: ReadOptions) -> bool:
         return False
 
 
-def _refuse_columns_of_tidy(line: str, quoted: dict[str, str], options: ReadOptions) -> None:
+def _refuse_columns_of_tidy(
+    line: str, quoted: dict[str, str], options: ReadOptions, commented: bool
+) -> None:
     """Refuse columns that a machine file is not read for: specimen, trial or position of rows.
 
     With `format = "machine"` those that the options name; else all: other lines stand above, by
@@ -248,6 +251,7 @@ def _refuse_columns_of_tidy(line: str, quoted: dict[str, str], options: ReadOpti
         line: of the header.
         quoted: their names, by role.
         options: as the file is read.
+        commented: the header begins with #.
 
     Raises:
         Fault: there is one.
@@ -264,11 +268,14 @@ def _refuse_columns_of_tidy(line: str, quoted: dict[str, str], options: ReadOpti
             f"{line} has {shown}, which a machine file is not read for",
             f'set format = "tidy", or {cure}',
         )
+    what, cure = "but other lines stand above it", "remove them or begin them with #"
+    if commented:
+        what, cure = "but is a comment", "remove the # before it"
     raise Fault(
         "ambiguous",
-        f"{line} is the header of a table with {shown}, but other lines stand above it",
-        'remove them or begin them with #, or set format = "machine": one curve, of which the name '
-        "of the file tells specimen, trial and position",
+        f"{line} is the header of a table with {shown}, {what}",
+        f'{cure}, or set format = "machine": one curve, of which the name of the file tells '
+        "specimen, trial and position",
     )
 
 
