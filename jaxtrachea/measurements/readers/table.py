@@ -387,7 +387,8 @@ def rows_below(text: Text, header: Header) -> Table:
     ends = np.flatnonzero(data == ord("\n"))
     starts = np.concatenate([[0], ends[:-1] + 1])
     kept = ends > starts
-    for i in _odd_lines(data, starts, ends, header).tolist():
+    odd = _is_odd(data, starts, ends, header, [c for c in '"#' if c.encode() in body])
+    for i in np.flatnonzero(odd & kept).tolist():
         line = Line(header.first + i, body[starts[i] : ends[i]].decode(errors="replace"))
         kept[i] = _is_row(line, header, text.word)
     if not kept.all():
@@ -404,19 +405,19 @@ def _start_of_line(data: bytes, number: int) -> int:
     return at
 
 
-def _odd_lines(
-    data: np.ndarray, starts: np.ndarray, ends: np.ndarray, header: Header
+def _is_odd(
+    data: np.ndarray, starts: np.ndarray, ends: np.ndarray, header: Header, signs: Sequence[str]
 ) -> np.ndarray:
-    """Places of the lines that may be no rows: other numbers of cells, quotes, ``#``."""
+    """Lines that may be no rows: other numbers of cells, blanks before them, one of `signs`."""
 
     def count(character: str) -> np.ndarray:
         return np.diff(np.searchsorted(np.flatnonzero(data == ord(character)), ends), prepend=0)
 
     odd = count(header.delimiter) != len(header.names) - 1
-    odd |= (count('"') > 0) | (count("#") > 0)
+    for sign in signs:
+        odd |= count(sign) > 0
     first = data[starts]
-    odd |= (first == ord(header.delimiter)) | (first == ord(" ")) | (first == ord("\t"))
-    return np.flatnonzero(odd & (ends > starts))
+    return odd | (first == ord(header.delimiter)) | (first == ord(" ")) | (first == ord("\t"))
 
 
 def _is_row(line: Line, header: Header, word: str) -> bool:
