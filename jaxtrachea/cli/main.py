@@ -142,19 +142,16 @@ def fit(options: FitOptions) -> None:
     from jaxtrachea.report.understood import understood
 
     clock = [time.perf_counter()]
-    spec, meeting = options.spec, cli_fit.meet(options)
-    cli_fit.check_options(options, meeting)
+    spec = options.spec
+    cli_fit.check_options(options)
     analyses = sorted({*options.analyses, *cli_fit.remembered(options)})
     loaded, measurements, study = load(spec, options.data, refits=bool(analyses))
     request = Request(loaded, study, settings_of(loaded), analyses)
     refuse(spec, request)
     devices = cli_fit.worker_devices(options)
     now = cli_fit.describe(options, loaded, measurements, study, analyses, devices)
-    if meeting.process > 0:
-        cli_fit.help_out(options, meeting, now, study, request.settings, devices)
-        raise typer.Exit(0)
     clock.append(time.perf_counter())
-    with cli_fit.running(options, meeting, now, study, request.settings, devices) as under:
+    with cli_fit.running(options, now, study, request.settings, devices) as under:
         changed = {"settings": under.settings, "options": under.options}
         findings = run(dataclasses.replace(request, **changed), under.stop_if_asked, under.fit)
         clock.append(time.perf_counter())
