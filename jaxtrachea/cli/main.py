@@ -107,6 +107,8 @@ def _options(
 @with_fields(CheckOptions)
 def check(options: CheckOptions) -> None:
     """Read a specification or data files, show what a fit would use."""
+    from jaxtrachea.cli.specification import settings_of
+    from jaxtrachea.inference.analysis import Request
     from jaxtrachea.report.understood import understood
 
     out = Console()
@@ -116,6 +118,7 @@ def check(options: CheckOptions) -> None:
         cli_init.conclude(options, sources, out)
         return
     loaded, measurements, study = load(spec, options.data)
+    refuse(spec, Request(loaded, study, settings_of(loaded)))
     _print_curves(out, measurements.curves, study.weighs_noise)
     for line in understood(loaded, study):
         out.print(escape(line), highlight=False)
@@ -158,7 +161,7 @@ def fit(options: FitOptions) -> None:
         for name, reason in findings.unavailable.items():
             to_stderr(f"[yellow]no {name}:[/] {escape(reason)}")
         write(under.folder, spec, loaded, measurements, findings, clock, under.manifest)
-    lines = understood(loaded, findings.result.study)
+    lines = understood(loaded, findings.result.study, findings.result)
     show(itertools.chain(lines, overview(findings)), under.folder.parent)
     failed = not findings.result.succeeded.all()
     raise typer.Exit(1 if failed or measurements.bad or poor(findings) else 0)

@@ -364,11 +364,8 @@ def _told_apart(records: _Records, bare, rss) -> _Taken:
     rss = np.minimum(rss, _best(records, _SHAPE, *without)[1])
     again = _best(records, (*_SHAPE, "onset"), moved, both * [1, 1, 1, 1, 1, 0, 0])
     moved, rss_moved = again
-    starts = (
-        raised,
-        *_starts(count, (0.0, y[:, 0])),
-        moved * [1, 1, 1, 1, 0, 0, 0] + at_level * [0, 0, 0, 0, 0, 1, 0],
-    )
+    at_level = np.where(_columns(_SHAPE), moved, at_level)
+    starts = raised, at_level, *_starts(count, (0.0, y[:, 0]))
     raised, rss_raised = _best(records, (*_SHAPE, "force_offset"), *starts)
     unit = np.maximum(rss_both / max(n - 6, 1), 1)
     by_onset, by_offset, by_both = ((rss - v) / unit for v in (rss_moved, rss_raised, rss_both))
