@@ -461,7 +461,7 @@ def check_aside(results: StoredFit, phi: float, direction: tuple[float, float]) 
             f"phi = {phi:g} rad ({np.degrees(phi):.4g} deg) is not on the cartilage; expected "
             f"within {alpha:.4g} rad ({np.degrees(alpha):.4g} deg)"
         )
-    if not abs(phi) <= (most := float(tested_angle(model.geometry.half_angle)) + 1e-6):
+    if not abs(phi) <= (most := float(tested_angle(alpha)) + 1e-6):
         raise ValueError(
             f"phi = {phi:g} rad ({np.degrees(phi):.4g} deg) is too near to the ends of the rings, "
             f"where the model is too stiff; expected within {most:.4g} rad "

@@ -193,7 +193,7 @@ def _angles(asked: tuple[float, ...] | None, study: Study) -> list[float]:
     if asked is None:
         measured = (c.phi_c for curves in study.curves for c in curves)
         return sorted({round(float(phi), 9) + 0.0 for phi in measured})
-    reach = float(tested_angle(study.model.geometry.half_angle)) + 1e-6
+    reach = float(tested_angle(float(study.model.geometry.half_angle))) + 1e-6
     for phi in asked:
         if not abs(phi) <= reach:
             raise SpecError(
