@@ -450,6 +450,10 @@ def test_curves_that_a_model_cannot_press():
     behind = curve((20.0, 2.2, (1.0, 0.0)))
     with pytest.raises(ValueError, match="phi = 126 deg, expected on the cartilage, within 120"):
         check_curve(behind, Size.of(GEOMETRY), SECTIONS)
+    for phi in (np.pi / 2, -np.pi / 2):
+        check_curve(curve((20.0, phi, (1.0, 0.0))), Size.of(GEOMETRY), SECTIONS)
+    with pytest.raises(ValueError, match="phi = -115 deg, expected within 90 deg.*too stiff"):
+        check_curve(curve((20.0, -2.0, (1.0, 0.0))), Size.of(GEOMETRY), SECTIONS)
     with pytest.raises(ValueError, match="end of ring 4 of 3"):
         check_curve(curve(PLACES[0], end_rings=np.array([3])), Size.of(GEOMETRY), SECTIONS)
     with pytest.raises(ValueError, match="12 mm deep, expected no more than the radius, 11.7 mm"):
