@@ -329,8 +329,8 @@ def test_lanes():
     assert np.sum(beside.lanes.end_precision > 0) == 3 * 4
     with pytest.raises(ValueError, match="pressed_ends=False needs tool_radius"):
         study_of([under], weighting=without)
-    at_end = curve((20.0, 2 * np.pi / 3, (1.0, 0.0)))
-    ends = study_of([at_end], tool_radius=1.0).lanes.end_precision
+    at_end = curve((20.0, np.pi / 2, (1.0, 0.0)))  # 30 degrees from it, 5.9 mm
+    ends = study_of([at_end], tool_radius=7.0).lanes.end_precision
     assert np.sum(ends[..., 0, :] > 0) == np.sum(ends > 0) == 3 * 2
     bare = {name: None for name in ("side_force", "joint_side_displacement", "end_U", "end_V",
                                     "end_rings", "joint_rings", "joint_displacement")}  # fmt: skip

@@ -10,7 +10,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,9 +21,6 @@ from jaxtrachea.runs.checkpoint import fitted_lanes, shards_of
 from jaxtrachea.runs.folder import RunFolder
 from jaxtrachea.runs.manifest import versions
 from jaxtrachea.runs.shards import save
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 #: Workers that a shard may lose before it is taken for the cause.
 MOST_LOST = 3
@@ -42,7 +39,7 @@ class Lost(Exception):
 
 
 @contextlib.contextmanager
-def connected(address: str) -> "Iterator[Client]":
+def connected(address: str) -> Iterator[Any]:
     """A cluster with at least one worker, all of this version of the package.
 
     Args:
@@ -85,7 +82,7 @@ def fit_shards(
     settings: Settings,
     todo: list[int],
     progress: Callable[[int, int], None],
-    client: "Client",
+    client: Any,
     prepare: Callable[[], None],
 ) -> None:
     """Fit shards on a cluster and save each as soon as it is there.
@@ -145,7 +142,7 @@ def fit_shards(
             client.cancel(list(under_way))
 
 
-def _threads(client: "Client") -> int:
+def _threads(client: Any) -> int:
     """Threads of all workers of a cluster.
 
     Raises:

@@ -11,10 +11,11 @@ from sections_linear import linear_force
 
 from jaxtrachea import _in_order
 from jaxtrachea.mechanics import press as mat
+from jaxtrachea.mechanics.sections import press as press_module
 from jaxtrachea.mechanics.sections import system
 from jaxtrachea.mechanics.sections.contact import place_on
 from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
-from jaxtrachea.mechanics.sections.press import build, press_sections, tested_angle
+from jaxtrachea.mechanics.sections.press import build, press_sections
 from jaxtrachea.mechanics.sections.solve import _flat as flat
 from jaxtrachea.mechanics.sections.solve import _newton as newton_step
 from jaxtrachea.mechanics.sections.solve import _size as size_of_step
@@ -199,7 +200,7 @@ def test_near_the_ends_of_the_rings_is_said(dtype):
         assert row.status[-1] == PressStatus.NO_CONTACT
         assert np.all(np.isfinite(row.force))
     np.testing.assert_allclose(inward(got[1], angles[1]), inward(got[0], right), atol=1e-3)
-    assert float(tested_angle(jnp.asarray(1.7))) == pytest.approx(1.7 - np.pi / 6)
+    assert float(press_module.tested_angle(jnp.asarray(1.7))) == pytest.approx(1.7 - np.pi / 6)
 
 
 @pytest.mark.slow
