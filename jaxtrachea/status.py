@@ -48,6 +48,11 @@ class PressStatus(_Described):
         "the wall since: lift it off, or lead it out over an end",
     )
     TOO_DEEP = 12, "solved, but the wall is pressed in by more than the tube's radius"
+    NEAR_RING_END = (
+        13,
+        "solved, but pressed beyond 90 degrees from the midline or within 30 of the ring's end, "
+        "where deforming cross-sections are too stiff",
+    )
 
 
 class ContactStatus(_Described):

@@ -146,7 +146,7 @@ def test_columns_are_guessed_by_units_and_signs_by_the_curve(folder, monkeypatch
     (folder / "k.csv").write_bytes(GERMAN.encode("latin-1"))
     code, out, err = run(monkeypatch, capsys, "check", "k.csv", "--s", "40 mm")
     assert code == 0
-    assert line_of(out, "Kraft") == "Kraft N force (guessed by its unit)"
+    assert line_of(out, "Kraft") == "Kraft N force (guessed)"
     assert "column 'Weg' is taken for the displacement" in err
     assert "the force counts negative where the tool presses: it is turned" in err
     assert run(monkeypatch, capsys, "init", "k.csv", "--s", "40 mm")[0] == 0

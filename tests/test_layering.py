@@ -116,7 +116,7 @@ WITHIN = {
     "trials": [{"polynomials", "uneven_noise"}, {"differences"}, {"repeats"}],
     "prediction": [{"core", "model_error", "sources"}, {"predict"}, {"held_out"},
                    {"plots", "report", "tables"}],
-    "runs": [{"meet", "manifest"}, {"processes", "shards"}, {"folder"}, {"rerun", "checkpoint"}],
+    "runs": [{"manifest"}, {"shards"}, {"folder"}, {"rerun", "checkpoint"}, {"cluster"}],
     "tradeoff": [
         {"calls", "errors", "front", "levels", "load"},
         {"ladders", "parts", "plots", "price"},

@@ -149,6 +149,9 @@ REFUSED = {
     "axes of a load cell": (MACH_1, "the columns of line 9 are 'Time', 'Position (z)', 'Fz'"),
     "no header": (rows(D, F), "the table begins with numbers in line 1, in columns 1 to 2"),
     "no unit of force": ("Displacement [mm],Force\n" + rows(D, F), "column 'Force' has no unit"),
+    "a position beside a depth": (
+        "Position [mm],Depth [mm],Force [N]\n" + rows([35, 35, 75, 75], D, F),
+        "the columns of line 1 are 'Position', 'Depth', 'Force'"),
     "two travels": (
         "Extension [mm],Compressive extension [mm],Load [N]\n" + rows([-d for d in D], D, F),
         "'Extension', 'Compressive extension' can all be the displacement"),

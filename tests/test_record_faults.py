@@ -1,5 +1,7 @@
 """Faults that are put into records by hand: what is left out, what is said, what is not."""
 
+import re
+
 import numpy as np
 import pytest
 from jaxtyping import Float
@@ -57,6 +59,14 @@ def test_faults_are_said(displacement, values, said, end):
     kept = finished(displacement, values, loading="all")
     assert kept.usage.used == len(values)
     assert [r for r in kept.usage.remarks if said in r], kept.usage.remarks
+
+
+def test_a_small_slip_is_said_and_not_cut():
+    slipped = force(np.where(D > 1.2, D - 0.1, D))
+    curve = finished(D, slipped)
+    (said,) = curve.usage.remarks
+    assert re.search(r"falls by \d.* at 1\.1.* \(a slip\).*data.displacement_max", said), said
+    assert curve.usage.used == len(D)
 
 
 def test_a_hold_or_an_outlier_is_no_break():

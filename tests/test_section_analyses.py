@@ -264,7 +264,10 @@ def test_angles_of_candidates():
     assert at(phi=["0 deg"]).phi is None
     np.testing.assert_allclose(np.unique(at(phi=["90 deg", "90 deg"]).phi), [np.pi / 2])
     for section, words in (
-        ({"phi": ["130 deg"]}, "design.phi: 130 deg, the rings reach 120 deg"),
+        (
+            {"phi": ["130 deg"]},
+            "design.phi: 130 deg; deforming cross-sections are right within 90 deg",
+        ),
         ({"depth": ["1 mm", "12 mm"]}, "design.depth: 12 mm, a tube is pressed no deeper"),
     ):
         with pytest.raises(SpecError, match=words):
@@ -450,7 +453,10 @@ def test_command_compares_sections_with_lines(tmp_path, monkeypatch, capsys):
         (["compare", "sections.toml", "other.toml"], "other.toml: data.files: other content"),
         (["fit", "posterior.toml"], "uncertainty.posterior is not available for the skeleton"),
         (["design", "deep.toml"], "design.depth: 12 mm, a tube is pressed no deeper"),
-        (["design", "behind.toml"], "design.phi: 130 deg, the rings reach 120 deg"),
+        (
+            ["design", "behind.toml"],
+            "design.phi: 130 deg; deforming cross-sections are right within 90 deg",
+        ),
         (["design", "line.toml"], "design.phi: this model presses on the midline alone"),
     ],
 )

@@ -329,8 +329,8 @@ def test_lanes():
     assert np.sum(beside.lanes.end_precision > 0) == 3 * 4
     with pytest.raises(ValueError, match="pressed_ends=False needs tool_radius"):
         study_of([under], weighting=without)
-    at_end = curve((20.0, 2 * np.pi / 3, (1.0, 0.0)))
-    ends = study_of([at_end], tool_radius=1.0).lanes.end_precision
+    at_end = curve((20.0, np.pi / 2, (1.0, 0.0)))  # 30 degrees from it, 5.9 mm
+    ends = study_of([at_end], tool_radius=7.0).lanes.end_precision
     assert np.sum(ends[..., 0, :] > 0) == np.sum(ends > 0) == 3 * 2
     bare = {name: None for name in ("side_force", "joint_side_displacement", "end_U", "end_V",
                                     "end_rings", "joint_rings", "joint_displacement")}  # fmt: skip
@@ -450,6 +450,10 @@ def test_curves_that_a_model_cannot_press():
     behind = curve((20.0, 2.2, (1.0, 0.0)))
     with pytest.raises(ValueError, match="phi = 126 deg, expected on the cartilage, within 120"):
         check_curve(behind, Size.of(GEOMETRY), SECTIONS)
+    for phi in (np.pi / 2, -np.pi / 2):
+        check_curve(curve((20.0, phi, (1.0, 0.0))), Size.of(GEOMETRY), SECTIONS)
+    with pytest.raises(ValueError, match="phi = -115 deg, expected within 90 deg.*too stiff"):
+        check_curve(curve((20.0, -2.0, (1.0, 0.0))), Size.of(GEOMETRY), SECTIONS)
     with pytest.raises(ValueError, match="end of ring 4 of 3"):
         check_curve(curve(PLACES[0], end_rings=np.array([3])), Size.of(GEOMETRY), SECTIONS)
     with pytest.raises(ValueError, match="12 mm deep, expected no more than the radius, 11.7 mm"):

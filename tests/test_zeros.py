@@ -102,6 +102,7 @@ def test_words_of_records_under_load_and_of_many():
     cure = {"onset": {"fixed": True, "value": 0.0}}  # as the sentence says
     other = build_study(curves(2, preload=0.15), table_1(), Options(), cure)
     assert "force_offset" in [p.name for p in other.free]
+    assert sentences(other)[0].startswith("force_offset of T0 40: 0.1")  # was "0 N"
     (many,) = sentences(build_study(curves(3, 3, air=AIR), table_1()))
     assert many.startswith("onset of 12 of 12 curves, from their records: T0 40 0.")
     assert many.endswith("and 8 more (curves.csv)")
@@ -139,7 +140,7 @@ def test_lines_are_of_all_curves_of_a_specimen_that_shows_one():
     study = build_study(curves(4, 2, air=AIR, slope=-0.05), table_1())
     assert {"onset", "force_offset", "force_slope"} <= {p.name for p in study.free}
     assert sum(p.name == "force_slope" for p, _, _ in study.unknowns[0]) == 4
-    assert "data.baseline = 'none' leaves it" in sentences(study)[-1]
+    assert "set data.baseline = 'none'" in sentences(study)[-1]
     none = {"force_slope": {"fixed": True, "value": 0.0}}
     left = build_study(curves(4, 2, air=AIR, slope=-0.05), table_1(), Options(), none)
     assert "force_slope" not in [p.name for p in left.parameters]

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,11 @@ from jaxtrachea.cli.options import FitOptions
 from jaxtrachea.cli.terminal import (
     Interrupts,
     Kept,
-    Stages,
     Stop,
     interrupts,
-    progress_bar,
+    set_up_jax,
     to_stderr,
 )
-from jaxtrachea.runs import processes
-from jaxtrachea.runs.processes import Lost, Meeting
 
 #: Called with (jobs finished since the last call, jobs in all).
 Progress = Callable[[int, int], None]
@@ -37,7 +33,7 @@ class Run:
         manifest: as JSON.
         settings: of the solver.
         fit: as `fitting.fit.fit`, in shards.
-        stop_if_asked: raises KeyboardInterrupt if Ctrl-C came, `Lost` if a process is gone.
+        stop_if_asked: raises KeyboardInterrupt if Ctrl-C came.
     """
 
     folder: Path
@@ -48,26 +44,7 @@ class Run:
     stop_if_asked: Callable[[], None]
 
 
-def meet(options: FitOptions) -> Meeting:
-    """Wait for the other processes, if there are any; `Stop` if they cannot be found."""
-    named = (options.coordinator, options.processes, options.process)
-    if not options.distributed and named == (None, None, None):
-        return Meeting()
-    if not options.distributed and None in named:
-        raise Stop("--coordinator, --processes and --process go together, or use --distributed")
-    try:
-        meeting = processes.meet(*named, options.heartbeat_timeout)
-    except Lost as error:
-        cure = "give --coordinator, --processes and --process"
-        raise Stop(f"--distributed: {error}; {cure}") from None
-    import jax
-
-    for name, visible in meeting.devices.items():
-        jax.config.update(name, visible)
-    return meeting
-
-
-def check_options(options: FitOptions, meeting: Meeting) -> None:
+def check_options(options: FitOptions) -> None:
     """Refuse options that contradict each other."""
     if options.resume and options.rerun_failed:
         raise Stop("--resume and --rerun-failed exclude each other; an unfinished rerun is resumed")
@@ -75,8 +52,8 @@ def check_options(options: FitOptions, meeting: Meeting) -> None:
         raise Stop("say with --out which run to go on with")
     if options.force and not options.continues:
         raise Stop("--force goes with --resume or --rerun-failed")
-    if meeting.processes > 1 and options.out_dir is None:
-        raise Stop("several processes need --out, a folder that all of them see")
+    if options.scheduler is not None and options.threads is not None:
+        raise Stop("--threads is of this process, and with --scheduler the workers fit")
 
 
 def remembered(options: FitOptions) -> list[str]:
@@ -203,53 +180,51 @@ def _finished(options: FitOptions, target: Path, now, study):
 
 
 @contextlib.contextmanager
-def running(
-    options: FitOptions, meeting: Meeting, now, study, settings, devices: list
-) -> Iterator[Run]:
-    """The run, opened, watched over, and put into place at the end; or what is kept is said.
+def running(options: FitOptions, now, study, settings, devices: list) -> Iterator[Run]:
+    """The run, opened, and put into place at the end; or what is kept is said.
 
     Args:
         options: of the command.
-        meeting: who takes part.
         now: manifest of what would be run now.
         study: the study.
         settings: of the solver.
         devices: as `worker_devices` gives them.
     """
-    from jaxtrachea.runs import checkpoint, manifest
+    from jaxtrachea.runs import checkpoint, cluster, manifest
     from jaxtrachea.runs import folder as run_folder
 
-    with _failures_as_messages(options), interrupts() as ctrl_c:
+    with (
+        _failures_as_messages(options),
+        _cluster(options.scheduler) as client,
+        interrupts() as ctrl_c,
+    ):
         ctrl_c.hold()
         run = open_run(options, now, study)
         try:
             ctrl_c.let_through()
             todo, damaged = checkpoint.missing(run, study)
             _say_what_is_there(run, study, todo, damaged)
-            watch = processes.Watch(run.checkpoint, meeting)
-            with _watched(watch, todo=todo):
 
-                def check() -> None:
-                    ctrl_c.stop_if_asked()
-                    watch.check()
+            def fit(_, settings, progress):
+                if client is None:
+                    _fit_shards(run, study, settings, todo, progress, devices, ctrl_c)
+                else:
+                    asked = checkpoint.settings_for(run, settings)
+                    cluster.fit_shards(run, study, asked, todo, progress, client, set_up_jax)
+                return checkpoint.collect(run, study)
 
-                def fit(_, settings, progress):
-                    mine = todo[0 :: meeting.processes]
-                    _fit_shards(run, study, settings, mine, progress, devices, ctrl_c)
-                    watch.wait_for_others()
-                    return checkpoint.collect(run, study)
-
-                settings = dataclasses.replace(settings, batch=run.manifest.batch)
-                staged, asked = run_folder.stage(run), run.manifest.options
-                yield Run(staged, asked, manifest.as_dict(run.manifest), settings, fit, check)
-                check()
+            settings = dataclasses.replace(settings, batch=run.manifest.batch)
+            staged, asked = run_folder.stage(run), run.manifest.options
+            written = manifest.as_dict(run.manifest)
+            yield Run(staged, asked, written, settings, fit, ctrl_c.stop_if_asked)
+            ctrl_c.stop_if_asked()
             ctrl_c.hold()
             run_folder.commit(run)
         except BaseException as error:
             ctrl_c.hold()
-            kept = run_folder.abandon(run, shared=meeting.processes > 1)
-            if kept and isinstance(error, KeyboardInterrupt | Lost | OSError):
-                raise _kept(meeting, run, study, error) from None
+            kept = run_folder.abandon(run)
+            if kept and isinstance(error, KeyboardInterrupt | cluster.Lost | OSError):
+                raise _kept(run, study, error) from None
             raise
         finally:
             run.release()
@@ -275,9 +250,19 @@ def _fit_shards(
             ctrl_c.let_through()
 
 
-def _watched(watch: processes.Watch, **content):
-    """Nobody to watch: no file, no thread."""
-    return watch.watching(**content) if watch.meeting.processes > 1 else contextlib.nullcontext()
+@contextlib.contextmanager
+def _cluster(address: str | None) -> Iterator[Any]:
+    """The cluster at an address; `Stop` where there is none to be used."""
+    if address is None:
+        yield None
+        return
+    from jaxtrachea.runs import cluster
+
+    try:
+        with cluster.connected(address) as client:
+            yield client
+    except cluster.NoCluster as error:
+        raise Stop(f"--scheduler: {error}") from None
 
 
 @contextlib.contextmanager
@@ -285,6 +270,7 @@ def _failures_as_messages(options: FitOptions) -> Iterator[None]:
     """Failures to open or write a run become messages."""
     from jaxtrachea.files.lock import Busy, NoLocks
     from jaxtrachea.results.stored import NoResults
+    from jaxtrachea.runs.cluster import Lost
     from jaxtrachea.runs.folder import NoRun
 
     try:
@@ -326,15 +312,16 @@ def _say_what_is_there(run, study, todo: list[int], damaged: list[int]) -> None:
         to_stderr(f"going on in {where}: {count - len(todo)} of {count} shards are there")
 
 
-def _kept(meeting: Meeting, run, study, error: BaseException) -> Kept:
+def _kept(run, study, error: BaseException) -> Kept:
     """What is kept of a run that was stopped, and how to go on; writes the lanes so far."""
     from jaxtrachea.files.atomic import cure
     from jaxtrachea.runs import checkpoint
     from jaxtrachea.runs import folder as run_folder
+    from jaxtrachea.runs.cluster import Lost
 
     done, count = run_folder.saved_shards(run.target), checkpoint.count(run, study)
     text = f"{done} of {count} shards are kept in {run.target}"
-    if run.manifest.rerun is None and meeting.process == 0 and done:
+    if run.manifest.rerun is None and done:
         with contextlib.suppress(OSError):
             checkpoint.write_so_far(run.target / run_folder.SO_FAR, run, study)
             text += f", their lanes in {run_folder.SO_FAR}"
@@ -346,42 +333,3 @@ def _kept(meeting: Meeting, run, study, error: BaseException) -> Kept:
     return Kept(
         f"[bold red]error:[/] {escape(reason)}; {text}", 3 if isinstance(error, Lost) else 2
     )
-
-
-def help_out(options: FitOptions, meeting: Meeting, now, study, settings, devices: list) -> None:
-    """Fit this process's shards of a run that process 0 has opened, and wait for its end."""
-    from jaxtrachea.runs import folder as run_folder
-
-    target, timeout = options.folder, meeting.heartbeat_timeout
-    with _failures_as_messages(options), interrupts() as ctrl_c:
-        end = time.monotonic() + timeout
-        while (opened := processes.opened(target / ".run", meeting)) is None:
-            ctrl_c.stop_if_asked()
-            if (
-                options.resume
-                and (target / "results.h5").exists()
-                and not (target / ".run").is_dir()
-            ):
-                to_stderr(f"{escape(str(target))} is finished; there is nothing to go on with")
-                return
-            if time.monotonic() > end:
-                raise Lost(f"process 0 has not opened {target} in {timeout:g} s")
-            time.sleep(processes.LOOK)
-        run = run_folder.join(target, now)
-        watch = processes.Watch(run.checkpoint, meeting)
-        try:
-            with watch.watching(), progress_bar() as bar:
-
-                def look():
-                    ctrl_c.stop_if_asked()
-                    watch.check()
-
-                stages = Stages(bar, look)
-                progress = stages.begin(f"fitting ({meeting.process} of {meeting.processes})")
-                mine = opened["todo"][meeting.process :: meeting.processes]
-                _fit_shards(run, study, settings, mine, progress, devices, ctrl_c)
-                stages.close()
-                watch.done()
-                watch.wait_for(0)
-        except (KeyboardInterrupt, Lost, OSError) as error:
-            raise _kept(meeting, run, study, error) from None

@@ -20,6 +20,7 @@ from jaxtrachea.cli.written_spec import specification_text, summary
 #: Rows of a table of columns, and tables of columns; a file has more in itself.
 MANY, TABLES = 40, 3
 #: Options that take the position from names of files.
+_IN_NAME = re.compile(r"._s\d+")
 OF_NAMES = r"--specimen '(?P<specimen>.+)_(?P<trial>s(?P<s>\d+))' --unit s=mm"
 #: What roles are called.
 ROLES = {
@@ -74,7 +75,8 @@ def conclude(options: CheckOptions, sources: Sources, out: Console) -> None:
         out.print("Nothing is missing to fit these curves on the tube of Table 1.")
     command = f"jaxtrachea init {shlex.join(map(str, options.paths))}{options.words}"
     if "data" in blocked and options.s is None:
-        command += " --s '40 mm'"
+        named = all(_IN_NAME.search(path.stem) for path in sources.files)
+        command += f" {OF_NAMES}" if named and not options.specimen else " --s '40 mm'"
     out.print("To write a specification:", highlight=False)
     out.print(f"    {command}", markup=False, highlight=False, soft_wrap=True)
     raise typer.Exit(1 if blocked or sources.measurements.bad else 0)
@@ -164,7 +166,7 @@ def role_in_words(role: str, guessed: frozenset[str]) -> str:
     general = role.split("_")[0] if role.startswith(("joint_", "end_")) else role
     ring = "".join(c if c.isdigit() else " " for c in role).strip()
     words = f"{ROLES.get(general, role)}{f' {ring}' if ring else ''}"
-    return f"{words} (guessed by its unit)" if role in guessed else words
+    return f"{words} (guessed)" if role in guessed else words
 
 
 def _check_target(options: InitOptions) -> None:

@@ -107,6 +107,8 @@ def _options(
 @with_fields(CheckOptions)
 def check(options: CheckOptions) -> None:
     """Read a specification or data files, show what a fit would use."""
+    from jaxtrachea.cli.specification import settings_of
+    from jaxtrachea.inference.analysis import Request
     from jaxtrachea.report.understood import understood
 
     out = Console()
@@ -116,6 +118,7 @@ def check(options: CheckOptions) -> None:
         cli_init.conclude(options, sources, out)
         return
     loaded, measurements, study = load(spec, options.data)
+    refuse(spec, Request(loaded, study, settings_of(loaded)))
     _print_curves(out, measurements.curves, study.weighs_noise)
     for line in understood(loaded, study):
         out.print(escape(line), highlight=False)
@@ -142,26 +145,23 @@ def fit(options: FitOptions) -> None:
     from jaxtrachea.report.understood import understood
 
     clock = [time.perf_counter()]
-    spec, meeting = options.spec, cli_fit.meet(options)
-    cli_fit.check_options(options, meeting)
+    spec = options.spec
+    cli_fit.check_options(options)
     analyses = sorted({*options.analyses, *cli_fit.remembered(options)})
     loaded, measurements, study = load(spec, options.data, refits=bool(analyses))
     request = Request(loaded, study, settings_of(loaded), analyses)
     refuse(spec, request)
     devices = cli_fit.worker_devices(options)
     now = cli_fit.describe(options, loaded, measurements, study, analyses, devices)
-    if meeting.process > 0:
-        cli_fit.help_out(options, meeting, now, study, request.settings, devices)
-        raise typer.Exit(0)
     clock.append(time.perf_counter())
-    with cli_fit.running(options, meeting, now, study, request.settings, devices) as under:
+    with cli_fit.running(options, now, study, request.settings, devices) as under:
         changed = {"settings": under.settings, "options": under.options}
         findings = run(dataclasses.replace(request, **changed), under.stop_if_asked, under.fit)
         clock.append(time.perf_counter())
         for name, reason in findings.unavailable.items():
             to_stderr(f"[yellow]no {name}:[/] {escape(reason)}")
         write(under.folder, spec, loaded, measurements, findings, clock, under.manifest)
-    lines = understood(loaded, findings.result.study)
+    lines = understood(loaded, findings.result.study, findings.result)
     show(itertools.chain(lines, overview(findings)), under.folder.parent)
     failed = not findings.result.succeeded.all()
     raise typer.Exit(1 if failed or measurements.bad or poor(findings) else 0)

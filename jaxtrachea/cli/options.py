@@ -51,24 +51,10 @@ class FitOptions:
             help="Shards fitted side by side on a CPU; else its cores, up to 8.",
         ),
     ] = None
-    distributed: Annotated[
-        bool, typer.Option("--distributed", help="Several processes, found by the cluster.")
-    ] = False
-    coordinator: Annotated[
-        str | None, typer.Option("--coordinator", help="HOST:PORT of process 0.")
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", help="HOST:PORT of a dask scheduler whose workers fit."),
     ] = None
-    processes: Annotated[
-        int | None, typer.Option("--processes", min=1, help="Number of processes.")
-    ] = None
-    process: Annotated[
-        int | None, typer.Option("--process", min=0, help="Index of this process, from 0.")
-    ] = None
-    heartbeat_timeout: Annotated[
-        float,
-        typer.Option(
-            "--heartbeat-timeout", min=1.0, help="Seconds of silence that end a lost process's run."
-        ),
-    ] = 100.0
 
     @property
     def default_folder(self) -> Path:

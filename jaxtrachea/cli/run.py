@@ -72,7 +72,7 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     curves = measurements.curves
     more = trial_sentences(curves, weighed=findings.result.study.weighs_noise)
     used = usage_section(curves, measurements.notes, more)
-    lines = understood(loaded, findings.result.study)
+    lines = understood(loaded, findings.result.study, findings.result)
     text = without_lost(report_text(title, findings, measurements.bad, used, lines), lost)
     write_text(folder / "report.md", text)
     ends = [*clock, time.perf_counter()]

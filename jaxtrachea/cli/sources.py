@@ -110,7 +110,8 @@ def read_sources(options: CheckOptions | InitOptions) -> Sources:
     files = _expanded(options.paths)
     keys: dict[str, Any] = options.keys
     heads = _heads(files, keys)
-    found = guess([*heads.values()])
+    said = {"s", "specimen", "trial"} if "specimen" in keys else {"s"} & keys.keys()
+    found = guess([*heads.values()], said)
     notes = [
         f"column {name!r} is taken for the {role}: no other can be; if it is another, say "
         f"--column {role}=NAME"

@@ -9,6 +9,7 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.fitting.parameters import OF_THE_PRESS, Parameter
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
+from jaxtrachea.mechanics.sections.press import tested_angle
 from jaxtrachea.trachea.geometry import Geometry
 
 
@@ -120,6 +121,14 @@ def check_curve(curve: Curve, size: Size, options: Options, onset: float = 0.0) 
                 f"contact at phi = {np.degrees(curve.phi_c):.3g} deg, expected on the cartilage, "
                 f"within {np.degrees(size.half_angle):.3g} deg of the midline",
                 place=where,
+            )
+        if not abs(curve.phi_c) <= (most := float(tested_angle(size.half_angle)) + 1e-6):
+            raise InputError(
+                f"contact at phi = {np.degrees(curve.phi_c):.3g} deg, expected within "
+                f"{np.degrees(most):.3g} deg of the midline: nearer to the ends of the rings "
+                "deforming cross-sections are too stiff",
+                place=where,
+                cure="leave the curve out",
             )
         if (deepest := float(np.max(np.abs(curve.displacement - onset)))) > size.radius:
             raise InputError(

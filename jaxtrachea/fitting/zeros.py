@@ -69,6 +69,8 @@ def resolved(
     onset = next((p for p in table if p.name == "onset"), None)
     if onset is not None and onset.fixed and not onset.auto:  # then what looks like one is another
         shown["force_offset"] = zeros.force_offset | (zeros.onset & (zeros.air == 0))
+        begins = shown["force_offset"] & (zeros.offset == 0)
+        zeros = zeros._replace(offset=np.where(begins, zeros.first, zeros.offset))
     shown["force_slope"] = _sloping(curves, zeros)
     shown["force_offset"] = shown["force_offset"] | (wanted | shown["force_slope"])
     taken: dict[tuple[str, str], set[str]] = {(c.specimen, c.trial): set() for c in curves}

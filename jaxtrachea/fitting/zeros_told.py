@@ -75,7 +75,7 @@ def sentences(study: Study) -> list[str]:
     if sloping:
         out[-1] += (
             ": a line is fitted to the force before first touch and taken off the whole record; "
-            "data.baseline = 'none' leaves it"
+            "where it is of the press itself, set data.baseline = 'none'"
         )
     return [*out, *_under_load([s for s in every if s.loaded], count), *_held(study)]
 
@@ -111,9 +111,9 @@ def _under_load(some: Sequence[Shown], count: int) -> list[str]:
     begin = f"{len(some)} of {count} curves begin" if several else "a curve begins"
     said = f"{begin} under load: {first}{rest}"
     return [
-        f"{said}; the onset is fitted, it lies before the record; without samples before first "
-        "touch an offset of the load cell looks alike: where the displacement was zeroed at first "
-        "touch, set parameters.onset = { fixed = 0 }, and the force offset is fitted in its place"
+        f"{said}; a preload and an offset of the load cell look alike there, and both are fitted: "
+        "where the displacement was zeroed at first touch, set parameters.onset = { fixed = 0 }; "
+        "where the force was zeroed in air, set parameters.force_offset = { fixed = 0 }"
     ]
 
 

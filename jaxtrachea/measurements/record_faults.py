@@ -4,6 +4,7 @@ Each is looked for on the samples of the loading that is used, or (zero and cycl
 record; numpy only, no model. What noise does is in `tests/test_record_faults.py`.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,8 @@ from jaxtrachea.measurements.turning import rough_noise, white_noise
 #: A fall of the force while the tool advances is a break from this share of the peak, and from so
 #: many standard deviations of its noise, on.
 FALL, FALL_SIGMAS = 0.05, 10.0
+#: A smaller one, from this share on, is a slip: it is said, and the loading goes on.
+SLIP = 0.01
 #: The tool advances where it takes at least this share of its usual way from sample to sample.
 ADVANCES = 0.3
 #: Samples of a flat top, at least; with noise, and as a share of the travel.
@@ -79,6 +82,8 @@ def faults(
             broken, remarks = none.copy(), [*remarks, said]
             broken[at[last + 1 :]] = True
             part = _Loading(at[: last + 1], part.travel[: last + 1], values[: last + 1], part.sigma)
+        elif said:
+            remarks = [*remarks, said]
         flat, said = _flat_top(part)
         if flat is not None:
             saturated, remarks = none.copy(), [*remarks, said]
@@ -89,13 +94,37 @@ def faults(
 
 
 def _break(part: _Loading, found: Segments) -> tuple[int | None, str]:
-    """Place of the last sample before the force falls though the tool advances, and a sentence."""
-    travel = part.travel
+    """Place of the last sample before the force falls though the tool advances, and a sentence.
+
+    None and a sentence: it slips; None and "": neither.
+    """
     smooth = _median(part.force)
     peak = float(np.ptp(smooth))
+    for share in (FALL, SLIP):
+        for i, fall in _falls(part, found, smooth, share * peak):
+            noise = part.sigma > 1e-9 * peak
+            noises = f", {fall / part.sigma:.0f} times its noise" if noise else ""
+            falls = (
+                f"the force falls by {100 * fall / peak:.2g} % of its peak{noises}, at "
+                f"{found.direction * part.travel[i]:.3g} mm while the tool goes on"
+            )
+            if share == FALL:
+                return i, f"{falls} (a break, slip or buckling): the loading ends there"
+            if fall < FALL * peak:
+                return None, (
+                    f"{falls} (a slip): unknowns fitted across it are off; "
+                    "data.displacement_max ends records before it"
+                )
+    return None, ""
+
+
+def _falls(
+    part: _Loading, found: Segments, smooth: np.ndarray, least: float
+) -> Iterator[tuple[int, float]]:
+    """Last samples before the force falls by more than `least` and its noise, and how far, N."""
+    travel = part.travel
     # So few samples do not tell their own noise well.
-    sure = FALL_SIGMAS * (1 + 3 / part.force.size)
-    least = max(FALL * peak, sure * part.sigma)
+    least = max(least, FALL_SIGMAS * (1 + 3 / part.force.size) * part.sigma)
     step = float(np.ptp(travel)) / (travel.size - 1)
     for start, stop in _pieces(part.at, found.steps):
         piece = smooth[start:stop]
@@ -110,16 +139,7 @@ def _break(part: _Loading, found: Segments) -> tuple[int | None, str]:
             if advance < ADVANCES * (j - i) * step or rise < 0.5 * least:
                 continue
             low = float(piece[i : min(stop - start, j + travel.size // 10 + 2)].min())
-            fall = float(piece[i]) - low
-            noises = (
-                f", {fall / part.sigma:.0f} times its noise" if part.sigma > 1e-9 * peak else ""
-            )
-            return start + i, (
-                f"the force falls by {100 * fall / peak:.2g} % of its peak{noises}, at "
-                f"{found.direction * travel[start + i]:.3g} mm while the tool goes on (a break, "
-                f"slip or buckling): the loading ends there"
-            )
-    return None, ""
+            yield start + i, float(piece[i]) - low
 
 
 def _pieces(at: np.ndarray, steps: tuple[Hold, ...]) -> list[tuple[int, int]]:
@@ -259,7 +279,7 @@ def suspicious(
     share = (force - np.repeat(least, sizes)) / np.repeat(unit, sizes)
     raised = share + 2.0 * np.repeat(np.arange(sizes.size), sizes)  # no record reaches the next
     fall = np.maximum.reduceat(np.maximum.accumulate(raised) - raised, starts)
-    falls = fall > FALL
+    falls = fall > SLIP
     if falls.any():
         falls &= fall > 0.6 * FALL_SIGMAS * rough_noise(share, edges)
     flat = np.add.reduceat((share >= 1 - 1e-6).astype(np.int64), starts) >= FLAT

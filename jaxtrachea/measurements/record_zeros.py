@@ -5,8 +5,8 @@ it. Most are decided in closed form: a beginning that runs through the origin, o
 with a sharp end. The others are fitted with and without an onset and an offset (`press_shape`), so
 that a soft beginning is not taken for air: what is taken must lower the sum of squares by
 `EVIDENCE` times the variance of the noise. Without air a preload and an offset of the load cell
-look alike; unless the shape of the record tells them apart, it is taken for preloaded: an onset
-before the record.
+look alike: unless the shape of the record tells them apart, or the force is below 0, it takes both,
+and the curves of other positions may tell.
 """
 
 from collections.abc import Sequence
@@ -362,21 +362,25 @@ def _told_apart(records: _Records, bare, rss) -> _Taken:
     # What has more parameters may have found a better minimum: those with fewer begin there too.
     without = [v * [1, 1, 1, 1, 0, 0, 0] for v in (moved, raised, both)]
     rss = np.minimum(rss, _best(records, _SHAPE, *without)[1])
-    again = _best(records, (*_SHAPE, "onset"), both * [1, 1, 1, 1, 1, 0, 0])
-    moved = np.where((again[1] < rss_moved)[:, None], again[0], moved)
-    rss_moved = np.minimum(rss_moved, again[1])
+    again = _best(records, (*_SHAPE, "onset"), moved, both * [1, 1, 1, 1, 1, 0, 0])
+    moved, rss_moved = again
+    at_level = np.where(_columns(_SHAPE), moved, at_level)
+    starts = raised, at_level, *_starts(count, (0.0, y[:, 0]))
+    raised, rss_raised = _best(records, (*_SHAPE, "force_offset"), *starts)
     unit = np.maximum(rss_both / max(n - 6, 1), 1)
     by_onset, by_offset, by_both = ((rss - v) / unit for v in (rss_moved, rss_raised, rss_both))
-    single = np.maximum(by_onset, by_offset)
+    pulls = y[:, 0] * weight[:, 0] < -_SHOWN  # no tool does where it touches: an offset
+    single = np.where(pulls, by_offset, np.maximum(by_onset, by_offset))
     least = EVIDENCE * (1 + _FEW / n)
     taken = (single > least) | (by_both > least + TOLD_APART)
     together = by_both - single > least
     # Nothing before the record without a force where it begins.
     shown = np.abs(level - rise * x[:, 0]) * weight[:, 0] > _SHOWN
     taken &= shown | (np.where(together, both[:, 4], moved[:, 4]) > x[:, 0])
-    alike = (y[:, 0] > 0) & (by_offset - by_onset < TOLD_APART)  # a tool that touches cannot pull
-    onset = taken & (together | (by_onset > by_offset) | alike)
-    offset = taken & (together | ~onset)
+    together &= ~pulls | (both[:, 4] > x[:, 0])
+    unsure = ~pulls & ~together & (np.abs(by_offset - by_onset) < TOLD_APART)
+    onset = taken & (together | unsure | (~pulls & (by_onset > by_offset)))
+    offset = taken & (together | unsure | ~onset)
     best = np.where(together[:, None], both, np.where(onset[:, None], moved, raised))
     touch, level = np.where(onset, best[:, 4], 0), np.where(offset, best[:, 5], 0)
     missed = (rss_both > _MISSED * max(n - 6, 1)) & (n >= _LONG_RECORD)

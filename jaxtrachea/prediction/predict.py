@@ -22,6 +22,7 @@ from jaxtrachea.fitting.onset import counted_from
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.tested import depths, untested
 from jaxtrachea.measurements.vectors import tilt_of
+from jaxtrachea.mechanics.sections.press import tested_angle
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Aside, Estimate, Predicted, Response, predicted
 from jaxtrachea.prediction.model_error import ModelError, model_errors
@@ -459,6 +460,12 @@ def check_aside(results: StoredFit, phi: float, direction: tuple[float, float]) 
         raise ValueError(
             f"phi = {phi:g} rad ({np.degrees(phi):.4g} deg) is not on the cartilage; expected "
             f"within {alpha:.4g} rad ({np.degrees(alpha):.4g} deg)"
+        )
+    if not abs(phi) <= (most := float(tested_angle(alpha)) + 1e-6):
+        raise ValueError(
+            f"phi = {phi:g} rad ({np.degrees(phi):.4g} deg) is too near to the ends of the rings, "
+            f"where the model is too stiff; expected within {most:.4g} rad "
+            f"({np.degrees(most):.4g} deg)"
         )
     if not abs(np.hypot(*direction) - 1) < 1e-6:
         raise ValueError(f"direction is {direction}; expected a unit vector")

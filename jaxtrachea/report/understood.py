@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxtrachea.config import FitSpec
 from jaxtrachea.fitting.parameters import Parameter
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.mechanics.press import Options
@@ -18,26 +19,43 @@ FREE_END = 0.3
 _ON_GRID = 0.05
 #: Share of the curves whose markers must move most elsewhere than under the tool.
 _MOST = 0.5
+_CURE = "give [trachea] length and rings, or preset = 'table-1' if this is the tube"
 
 
-def understood(spec: FitSpec, study: Study) -> list[str]:
+def understood(spec: FitSpec, study: Study, result: FitResult | None = None) -> list[str]:
     """The lines that `check`, the terminal and the report show.
 
     Args:
         spec: as it was read.
         study: as it was built from it.
+        result: of its fit, where there is one.
     """
+    missed = 0 if result is None or not study.free else int(result.effective.misses.sum())
     options = study.model.options
     curves = [c for lane in study.curves for c in lane]
     return [
-        tube_line(spec, study.model.geometry, options, curves),
+        tube_line(spec, study.model.geometry, options, curves, missed),
         f"Model: {model_words(options)}",
         f"Onset: {onset_words(study.parameters)}",
     ]
 
 
-def tube_line(spec: FitSpec, geometry: Geometry, options: Options, curves: Sequence[Curve]) -> str:
-    """The tube, and what contradicts it, where a warning stands first."""
+def tube_line(
+    spec: FitSpec,
+    geometry: Geometry,
+    options: Options,
+    curves: Sequence[Curve],
+    missed: int = 0,
+) -> str:
+    """The tube, and what contradicts it, where a warning stands first.
+
+    Args:
+        spec: as it was read.
+        geometry: the tube.
+        options: of the model.
+        curves: all.
+        missed: specimens whose curves the model misses.
+    """
     if options.coupling == "total":
         return "Tube: none, the local law takes all (coupling = 'total')"
     x = np.asarray(geometry.ring_positions, float)
@@ -54,6 +72,8 @@ def tube_line(spec: FitSpec, geometry: Geometry, options: Options, curves: Seque
     doubts = markers_elsewhere(geometry, curves)
     if "since" in source:
         doubts = [*positions_elsewhere(geometry, curves), *doubts]
+        if missed and not doubts:
+            doubts = [f"the model misses {missed} specimens: {_CURE}"]
     line = f"Tube: {size} ({source})"
     if not doubts:
         return line
@@ -78,7 +98,7 @@ def positions_elsewhere(geometry: Geometry, curves: Sequence[Curve]) -> list[str
     if on_grid and near and abs(halves - round(halves)) > _ON_GRID:
         found.append(f"positions are {pitch:.4g} mm apart, its rings {usual:.4g} mm")
     if found:
-        found[-1] += ": give [trachea] length and rings, or preset = 'table-1' if this is the tube"
+        found[-1] += f": {_CURE}"
     return found
 
 

@@ -1,1 +1,1 @@
-"""Long runs: checkpoint of finished shards, manifest, lock, heartbeat of several processes."""
+"""Long runs: checkpoint of finished shards, manifest, folder, a cluster of workers."""

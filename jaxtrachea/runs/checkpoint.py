@@ -43,7 +43,7 @@ def settings_for(run: RunFolder, settings: Settings) -> Settings:
 def missing(run: RunFolder, study: Study) -> tuple[list[int], list[int]]:
     """Shards that are still to be fitted, and those among them whose file cannot be used."""
     part, todo, damaged = fitted_lanes(run, study), [], []
-    for k, lanes in enumerate(_shards(run, part)):
+    for k, lanes in enumerate(shards_of(run, part)):
         if _read(run, k, part.take(lanes), lanes) is None:
             todo.append(k)
             if run.shard(k).exists():
@@ -72,7 +72,7 @@ def fit_shards(
     from jaxtrachea.fitting.fit import fit
 
     part = fitted_lanes(run, study)
-    shards = _shards(run, part)
+    shards = shards_of(run, part)
     jobs, telling = settings.starts * sum(len(shards[k]) for k in todo), threading.Lock()
 
     def one(k: int, end: _End) -> None:
@@ -158,10 +158,10 @@ def collect(run: RunFolder, study: Study) -> FitResult:
         NoRun: a shard cannot be read back, or the result before the rerun has changed.
     """
     part = fitted_lanes(run, study)
-    found = [_read(run, k, part.take(lanes), lanes) for k, lanes in enumerate(_shards(run, part))]
+    found = [_read(run, k, part.take(lanes), lanes) for k, lanes in enumerate(shards_of(run, part))]
     if any(result is None for result in found):
         k = next(k for k, result in enumerate(found) if result is None)
-        raise NoRun(f"{run.shard(k)} cannot be read; do all processes share this folder?")
+        raise NoRun(f"{run.shard(k)} cannot be read")
     result = join(part, [result for result in found if result is not None])
     again = run.manifest.rerun
     if again is None:
@@ -175,7 +175,7 @@ def collect(run: RunFolder, study: Study) -> FitResult:
 def write_so_far(path: Path, run: RunFolder, study: Study) -> None:
     """Write the rows of summary.csv of the lanes that are fitted."""
     rows = []
-    for k, lanes in enumerate(_shards(run, study)):
+    for k, lanes in enumerate(shards_of(run, study)):
         part = _read(run, k, study.take(lanes), lanes)
         if part is not None:
             rows += summary_rows(widened(part))
@@ -188,10 +188,11 @@ def write_so_far(path: Path, run: RunFolder, study: Study) -> None:
 
 def count(run: RunFolder, study: Study) -> int:
     """Shards of a run."""
-    return len(_shards(run, fitted_lanes(run, study)))
+    return len(shards_of(run, fitted_lanes(run, study)))
 
 
-def _shards(run: RunFolder, part: Study) -> list[np.ndarray]:
+def shards_of(run: RunFolder, part: Study) -> list[np.ndarray]:
+    """Lanes of every shard of what a run fits."""
     return divide(part.lanes.lower.shape[0], run.manifest.save_every)
 
 

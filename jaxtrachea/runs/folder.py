@@ -181,22 +181,6 @@ def _reason(error: Exception) -> str:
     return (isinstance(error, OSError) and error.strerror) or str(error)
 
 
-def join(target: Path, now: Manifest) -> RunFolder:
-    """The run that another process has opened in `target`.
-
-    Raises:
-        NoRun: this process would run something else.
-    """
-    try:
-        was = manifests.read(target / ".run" / "run.json")
-    except ValueError as error:
-        raise NoRun(f"{target}: its run.json cannot be read ({error})") from None
-    changed = [line for line in manifests.differences(was, now) if line not in was.forced]
-    if changed:
-        raise NoRun(f"{target}: seen from this process, {'; '.join(changed)}")
-    return RunFolder(target, was)
-
-
 def _passed(target: Path, was: Manifest, now: Manifest, force: bool) -> list[str]:
     """What differs, where the user forces it or has before.
 
@@ -247,25 +231,16 @@ def complete(target: Path) -> bool:
     for path in sorted(written.iterdir()):
         path.replace(target / path.name)
     (target / SO_FAR).unlink(missing_ok=True)
-    # Renamed before it is emptied: another process may still say there that it is alive.
-    run, going = target / ".run", target / ".unfinished"
-    shutil.rmtree(going, ignore_errors=True)
-    if run.is_dir():
-        run.rename(going)
-        shutil.rmtree(going, ignore_errors=True)
+    for folder in (".unfinished", ".run"):
+        shutil.rmtree(target / folder, ignore_errors=True)
     written.rmdir()
     return True
 
 
-def abandon(run: RunFolder, *, shared: bool = False) -> bool:
-    """Clear up after a run that was stopped; returns whether anything of it is kept.
-
-    Args:
-        run: that was stopped.
-        shared: other processes may be at work in it.
-    """
+def abandon(run: RunFolder) -> bool:
+    """Clear up after a run that was stopped; returns whether anything of it is kept."""
     shutil.rmtree(run.staging, ignore_errors=True)
-    if shared or saved_shards(run.target):
+    if saved_shards(run.target):
         return True
     shutil.rmtree(run.checkpoint, ignore_errors=True)
     run.release()

@@ -88,12 +88,17 @@ def describe(
         id=uuid.uuid4().hex,
         specification=hashlib.sha256(spec.read_bytes()).hexdigest(),
         inputs={os.path.relpath(name, root): digest for name, digest in inputs.items()},
-        versions={"jaxtrachea": jaxtrachea.__version__, _SOURCE: source_digest()}
-        | {p: installed(p) for p in _PACKAGES},
+        versions=versions(),
         dtype=dtype,
         device=device,
         **sizes,
     )
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes, and of this package the digest of its source."""
+    mine = {"jaxtrachea": jaxtrachea.__version__, _SOURCE: source_digest()}
+    return mine | {p: installed(p) for p in _PACKAGES}
 
 
 def differences(was: Manifest, now: Manifest) -> Iterator[str]:

@@ -43,15 +43,19 @@ def differing_trials(curves: Sequence[Curve]) -> list[Difference]:
     """Positions whose trials differ by more than `polynomials.DIFFERS` and more than their noise.
 
     Args:
-        curves: of any number of specimens and positions; those alone at theirs are passed over.
+        curves: of any number of specimens and positions; those alone at theirs, or without one,
+            are passed over.
 
     Returns:
         The largest difference first.
     """
     groups: dict[tuple, list[Curve]] = {}
     for c in curves:
-        place = None if c.s_c is None else round(c.s_c, 1)
-        groups.setdefault((c.specimen, place, round(c.phi_c, 3), c.direction), []).append(c)
+        if c.s_c is None:
+            continue
+        groups.setdefault((c.specimen, round(c.s_c, 1), round(c.phi_c, 3), c.direction), []).append(
+            c
+        )
     several = [g for g in groups.values() if len(g) > 1]
     found = []
     for block in _blocks(several):

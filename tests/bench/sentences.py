@@ -84,9 +84,7 @@ def named(run: Run, pattern: str, names: Sequence[str], known: Iterable[str]) ->
     told = {name: hits(by_name.get(name, ())) for name in names}
     general = hits(of_all(run))
     listed = hits(line for line in lines(run) if MORE.search(line))
-    counted = [
-        int(a) / int(b) for s in general + listed for a, b in SHARE.findall(s)[:1] if int(b)
-    ]
+    counted = [int(a) / int(b) for s in general + listed for a, b in SHARE.findall(s)[:1] if int(b)]
     share = max([sum(map(bool, told.values())) / len(names), *counted])
     if general and not share:
         share = 1.0

@@ -114,7 +114,6 @@ def test_refusals(peace, study, monkeypatch, capsys):
     refused(*FIT, "--resume", says=["out holds no unfinished run"])
     refused("fit", "spec.toml", "--resume", says=["--out"])
     refused(*FIT, "--force", says=["--force goes with --resume"])
-    refused(*FIT, "--process", 1, says=["--coordinator, --processes and --process"])
     with monkeypatch.context() as patch:
         stop_at(patch, 2)
         assert run(patch, capsys, *FIT)[0] == 130

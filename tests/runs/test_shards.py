@@ -187,7 +187,7 @@ def test_what_a_thread_raises_ends_the_fit_under_way_in_the_others(peace, study,
                 raise
 
     monkeypatch.setattr("jaxtrachea.fitting.fit.fit", working)
-    monkeypatch.setattr(checkpoint, "_shards", lambda *_: np.arange(3)[:, None])
+    monkeypatch.setattr(checkpoint, "shards_of", lambda *_: np.arange(3)[:, None])
     monkeypatch.setattr(checkpoint, "fitted_lanes", lambda _, study: study)
     folder = object.__new__(run_folder.RunFolder)
     with pytest.raises(OSError, match="full"):

@@ -11,6 +11,7 @@ from sections_linear import linear_force
 
 from jaxtrachea import _in_order
 from jaxtrachea.mechanics import press as mat
+from jaxtrachea.mechanics.sections import press as press_module
 from jaxtrachea.mechanics.sections import system
 from jaxtrachea.mechanics.sections.contact import place_on
 from jaxtrachea.mechanics.sections.material import SectionMaterial, from_wall
@@ -92,7 +93,8 @@ def test_linear_limit():
         wanted = linear_force(p, LENGTH, RINGS, s, phi)
         force = inward(got, phi)[-1] / path[-1]
         np.testing.assert_allclose(force, wanted, atol=2e-5 * wanted[0])
-        assert np.all(got.status == PressStatus.OK)
+        near = abs(phi) > np.pi / 2
+        assert np.all(got.status == (PressStatus.NEAR_RING_END if near else PressStatus.OK))
 
 
 WORK = [({}, 30.0, 0.0, PATH), ({}, 33.0, 1.0, PATH), ({}, 40.0, np.pi / 2, PATH),
@@ -172,7 +174,8 @@ def test_hard_cases():
     """Every one is in balance, pushes back, and stores the energy that its force does."""
     for (name, case), got in zip(HARD.items(), press(list(HARD.values())), strict=True):
         rest = np.asarray(case[3]) == 0
-        wanted = np.where(rest, PressStatus.NO_CONTACT, PressStatus.OK)
+        solved = PressStatus.NEAR_RING_END if name == "at the ring's end" else PressStatus.OK
+        wanted = np.where(rest, PressStatus.NO_CONTACT, solved)
         np.testing.assert_array_equal(got.status, wanted, err_msg=name)
         force = inward(got, case[2])[:, 0]
         assert np.all(force * np.sign(case[3]) >= 0), name
@@ -181,6 +184,23 @@ def test_hard_cases():
     # The state belongs to the displacement, not to the way there.
     repeated = press([HARD["one step, back and forth"]])[0].force
     np.testing.assert_allclose(repeated[[3, 4]], repeated[[0, 0]], atol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_near_the_ends_of_the_rings_is_said(dtype):
+    """From 90 degrees on, on either side; with values, also on the way; a lift-off is none."""
+    right = np.asarray(np.pi / 2, dtype).astype(float)
+    angles = [right, right * (1 + 1e-5), -right, -right * (1 + 1e-5), 2.0]
+    path = np.append(PATH[:-1], 0.0)
+    got = press([({}, 30.0, phi, path) for phi in angles], dtype=dtype)
+    for phi, row in zip(angles, got, strict=True):
+        wanted = PressStatus.OK if abs(phi) <= right else PressStatus.NEAR_RING_END
+        assert np.all(row.status[:-1] == wanted)
+        assert row.status[-1] == PressStatus.NO_CONTACT
+        assert np.all(np.isfinite(row.force))
+    np.testing.assert_allclose(inward(got[1], angles[1]), inward(got[0], right), atol=1e-3)
+    assert float(press_module.tested_angle(jnp.asarray(1.7))) == pytest.approx(1.7 - np.pi / 6)
 
 
 @pytest.mark.slow

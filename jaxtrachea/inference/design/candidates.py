@@ -10,6 +10,7 @@ from jaxtrachea.config import FitSpec, SpecError
 from jaxtrachea.fitting.onset import counted_from
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.fitting.tested import depths, untested
+from jaxtrachea.mechanics.sections.press import tested_angle
 
 #: Candidates where the user does not say: of deforming cross-sections, and of a line of joints,
 #: which cost next to nothing.
@@ -192,11 +193,11 @@ def _angles(asked: tuple[float, ...] | None, study: Study) -> list[float]:
     if asked is None:
         measured = (c.phi_c for curves in study.curves for c in curves)
         return sorted({round(float(phi), 9) + 0.0 for phi in measured})
-    reach = float(study.model.geometry.half_angle)
+    reach = float(tested_angle(float(study.model.geometry.half_angle))) + 1e-6
     for phi in asked:
         if not abs(phi) <= reach:
             raise SpecError(
-                f"design.phi: {np.degrees(phi):.4g} deg, the rings reach "
-                f"{np.degrees(reach):.4g} deg to both sides; give angles on them"
+                f"design.phi: {np.degrees(phi):.4g} deg; deforming "
+                f"cross-sections are right within {np.degrees(reach):.4g} deg of the midline"
             )
     return sorted(set(asked))

@@ -72,10 +72,15 @@ def find_roles(names: Sequence[str], options: ReadOptions) -> dict[str, int]:
         if wanted is None:
             hits = [i for i, name in enumerate(lower) if name in ALIASES[role]]
             if role == "displacement":
+                # Beside a depth a position may be that along the tube.
+                names_of_travel = {*TRAVEL}
+                if {*lower} & {*USUAL[role]}:
+                    names_of_travel.discard("position")
                 taken = options.columns.values()
                 hits = hits or [
-                    i for i, name in enumerate(lower) if name in TRAVEL and names[i] not in taken
-                ]
+                    i for i, name in enumerate(lower)
+                    if name in names_of_travel and names[i] not in taken
+                ]  # fmt: skip
         else:
             full = {wanted.strip(), column_unit(wanted)[0]}
             hits = [i for i, name in enumerate(names) if name in full]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxtrachea._arguments import ArrayLike, shaped
-from jaxtrachea._numerics import full_precision, largest
+from jaxtrachea._numerics import epsilon, full_precision, largest
 from jaxtrachea.mechanics.admission import hide
 from jaxtrachea.mechanics.ring import on_ring
 from jaxtrachea.mechanics.sections import section, span, system
@@ -35,6 +35,22 @@ from jaxtrachea.mechanics.sections.wall import Contact, WallModes, modes_along
 from jaxtrachea.mechanics.skeleton import local_frame
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
+
+#: Presses were compared with finite elements within SIDE of the midline and END off the ends, rad.
+SIDE, END = np.pi / 2, np.pi / 6
+
+
+def tested_angle(half_angle: Float[Array, ""] | float) -> Float[Array, ""]:
+    """Angle from the midline, rad, to which presses are right; NEAR_RING_END beyond.
+
+    Nearer to its end a ring that is pressed bends its muscle over a length of (4 EI / k)^(1/4),
+    some 3 mm, and its end turns under the tool. The modes carry muscle and end along in harmonics
+    of order 3 at most: too stiff (docs/off_midline.md, by how much).
+
+    Args:
+        half_angle: of the rings, rad.
+    """
+    return jnp.minimum(SIDE, half_angle - END)
 
 
 class SectionPress(NamedTuple):
@@ -103,8 +119,8 @@ def press_sections(
     Returns:
         The `SectionPress`. Rows that Newton's method does not solve or that are no minimum of the
         energy (and those after the latter) are NaN, PAST_FOLD; others are untouched. Rows whose
-        wall moves further than the radius are TOO_DEEP, with their values. Derivatives are those
-        of the equilibrium, in either mode.
+        wall moves further than the radius are TOO_DEEP, and those beyond `tested_angle`
+        NEAR_RING_END, with their values. Derivatives are those of the equilibrium, in either mode.
 
     Raises:
         ValueError: an argument that is no number, or an array of a length that does not fit.
@@ -155,7 +171,11 @@ def _press(
     hidden = jax.vmap(hide)(jnp.where(valid, PressStatus.OK, status), found)
     moved = jnp.sum(found.skeleton**2, axis=1)
     deep = (status == PressStatus.OK) & (moved > geometry.radius**2)
-    status = jnp.where(deep, PressStatus.TOO_DEEP, status).astype(jnp.int8)
+    status = jnp.where(deep, PressStatus.TOO_DEEP, status)
+    # To rounding, as in `on_ring`.
+    most = tested_angle(geometry.half_angle) * (1 + 8 * epsilon(phi_c.dtype))
+    near = (status == PressStatus.OK) & (jnp.abs(phi_c) > most)
+    status = jnp.where(near, PressStatus.NEAR_RING_END, status).astype(jnp.int8)
     return hidden._replace(steps=solved.steps, status=status)
 
 

@@ -1,16 +1,14 @@
-"""Several processes: they share one run, or keep out of the folder of another."""
+"""Several processes: workers of a cluster, or two runs that want one folder."""
 
 import errno
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-import time
 
 import pytest
-from interrupted import finish, numbers, start, wait_for, write_study
+from interrupted import finish, numbers, start
 from run_cli import run, tree
 from stopped import FIT, begun, set_failed
 
@@ -18,86 +16,60 @@ from jaxtrachea.files import lock as run_lock
 from jaxtrachea.files import output
 from jaxtrachea.fitting import fit
 from jaxtrachea.runs import folder as run_folder
-from jaxtrachea.runs import processes, rerun
-from jaxtrachea.runs.processes import Lost, Meeting, Watch
+from jaxtrachea.runs import rerun, shards
 
 
-def test_processes_notice_each_other(tmp_path):
-    """One that is through is waited for no longer; a silent one and one that failed are lost."""
-    meetings = [Meeting(k, 2, "s", 1.0) for k in range(2)]
-    first, second = (Watch(tmp_path, m) for m in meetings)
-    assert processes.opened(tmp_path, meetings[1]) is None
-    with first.watching(todo=[1, 2]):
-        assert processes.opened(tmp_path, meetings[1])["todo"] == [1, 2]
-        with second.watching():
-            second.done()
-            first.wait_for_others()
-    silent = Watch(tmp_path, Meeting(0, 3, "s", 1.0))
-    with pytest.raises(Lost, match="process 2 has been silent for 1 s"), silent.watching():
-        silent.wait_for_others()
-    with pytest.raises(Lost, match="process 0 stopped early"), Watch(
-        tmp_path, Meeting(2, 3, "s", 9.0)
-    ).watching() as third:  # fmt: skip
-        third.wait_for(0)
+@pytest.fixture
+def cluster(tmp_path, monkeypatch):
+    """Two worker processes of one thread that load the programs of `peace`'s kind themselves."""
+    distributed, dask = map(pytest.importorskip, ("distributed", "dask"))
+    config = {"distributed.scheduler.worker-saturation": 1.0, "distributed.admin.log-length": 0}
+    with dask.config.set(config), distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as found:  # fmt: skip
+        yield found
 
 
 @pytest.mark.slow
 @pytest.mark.compiling
-def test_no_cluster_is_said(study):
-    code, _, err = finish(start(study, *FIT, "--distributed"))
-    assert code == 2
-    assert "no cluster found" in err
-    assert "give --coordinator" in err
-    assert not (study / "out").exists()
+def test_workers_of_a_cluster(peace, study, cluster, monkeypatch, capsys):
+    """The same bits as one process, although one of two workers is killed while it fits."""
+    killed, real = [], shards.save
 
+    def save_and_kill(path, *arguments):
+        real(path, *arguments)
+        if not killed:
+            killed.append(cluster.workers[1].pid)
+            os.kill(killed[0], signal.SIGKILL)
 
-def two(folder, *arguments):
-    """The same command in two processes that meet on a free port."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    meeting = ("--coordinator", f"127.0.0.1:{port}", "--processes", "2", "--process")
-    return [start(folder, *arguments, *meeting, k) for k in range(2)]
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-def test_two_processes_and_two_devices(peace, study):
-    found = [finish(p) for p in two(study, *FIT)]
-    assert [code for code, _, _ in found] == [0, 0], found
+    monkeypatch.setattr("jaxtrachea.runs.cluster.save", save_and_kill)
+    code, _, err = run(monkeypatch, capsys, *FIT, "--scheduler", cluster.scheduler_address)
+    assert (code, len(killed)) == (0, 1), err
     assert numbers(study / "out") == numbers(peace / "out")
+
+
+def test_a_cluster_that_is_not_there(study, monkeypatch, capsys):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("jaxtrachea.runs.cluster.PATIENCE", 0.5)
+    code, _, err = run(monkeypatch, capsys, *FIT, "--scheduler", "127.0.0.1:1")
+    assert (code, len(err.splitlines())) == (2, 1), err
+    assert "no scheduler answers at 127.0.0.1:1" in err
+    assert "start one with 'dask scheduler'" in err
+    assert not (study / "out").exists()
+    code, _, err = run(monkeypatch, capsys, *FIT, "--scheduler", "h:1", "--threads", "2")
+    assert code == 2
+    assert "--threads is of this process" in err
+
+
+@pytest.mark.slow
+@pytest.mark.compiling
+def test_two_devices(peace, study):
     # Added to those of `peace`: other code for the same sums rounds otherwise.
     devices = "--xla_force_host_platform_device_count=2"
     flags = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {devices}"}
     code, _, err = finish(start(study, *FIT[:3], "devices", **flags))
     assert code == 0, err
     assert numbers(study / "devices") == numbers(peace / "out")
-
-
-@pytest.mark.slow
-@pytest.mark.compiling
-@pytest.mark.parametrize("lost", [0, 1])
-def test_a_lost_process_ends_the_other(lost, tmp_path):
-    """Exit code 3 and a clear line within the timeout; one process goes on alone."""
-    write_study(tmp_path, 60, 3)
-    pair = two(tmp_path, *FIT, "--heartbeat-timeout", 5)
-
-    def there():
-        return any((tmp_path / "out" / ".run").glob("*.npz"))
-
-    wait_for(there, pair[lost])
-    pair[lost].send_signal(signal.SIGKILL)
-    since = time.monotonic()
-    code, _, err = finish(pair[1 - lost])
-    assert time.monotonic() - since < 20
-    finish(pair[lost])
-    assert code == 3, err
-    assert f"process {lost} has been silent for 5 s; it is lost" in err
-    assert "--resume" in err
-    assert "Traceback" not in err
-    code, _, err = finish(start(tmp_path, *FIT, "--resume"))
-    assert code == 0, err
-    assert "of 20 shards are there" in err
 
 
 HOLD = """
