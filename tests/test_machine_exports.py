@@ -52,6 +52,9 @@ ONE = {"1": (D, F)}
 #: Name: text, options, the trials that are read.
 READ = {
     "Bluehill, units below": (BLUEHILL + rows(T, D, F, form='"{}"'), {}, ONE),
+    "Instron, specimen above": (
+        '"Specimen","T1"\n"Rate","1 mm/s"\n\nTime (s),Extension (mm),Load (N)\n' + NUMBERS,
+        {}, ONE),
     "Bluehill, compressive": (
         "Time(s),Compressive extension(mm),Compressive load(N)\n" + NUMBERS, {}, ONE),
     "TestXpert, decimal commas": ("Prüfzeit;x\n\nTime;Extension;Load\ns;mm;N\n" + SEMI, {}, ONE),

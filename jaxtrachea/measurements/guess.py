@@ -44,8 +44,9 @@ def guess(heads: Sequence[Head], known: Collection[str] = ()) -> Guess:
     tables = [head for head in heads if head.is_table and head.columns and not head.ambiguous]
     taken: dict[str, str] = {}
     several: dict[str, tuple[str, ...]] = {}
-    for role in {**USUAL, **BY_NAME}.keys() - set(known):
-        if not tables or any(c.role == role for head in tables for c in head.columns):
+    for role in (*USUAL, *BY_NAME):
+        has = (c.role == role for head in tables for c in head.columns)
+        if role in known or not tables or any(has):
             continue
         unused = [[(c.name, c.unit) for c in head.columns if not c.role] for head in tables]
         of_role = _named if role in BY_NAME else candidates

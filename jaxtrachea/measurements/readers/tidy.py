@@ -370,7 +370,8 @@ def _constant(
 def _is_tidy(text: Text, options: ReadOptions) -> bool:
     """Whether the first line is a JSON object, or names a column that machine files have not.
 
-    That of specimens; or, beside displacement and force, that of trials or of positions.
+    That of specimens, among three at least; or, beside displacement and force, that of trials or
+    of positions.
     """
     if not text.lines:
         return False
@@ -382,7 +383,7 @@ def _is_tidy(text: Text, options: ReadOptions) -> bool:
     except Fault:
         return False
     names, units = zip(*map(name_and_unit, cells), strict=True)
-    if {*map(str.lower, names)} & {*ALIASES["specimen"]}:
+    if len(names) > 2 and {*map(str.lower, names)} & {*ALIASES["specimen"]}:
         return True
     try:
         roles = find_roles(names, options)
