@@ -52,9 +52,15 @@ def curves(force, s_c=S_C, displacement=DEPTHS, **more):
 
 
 def parameters(options=OPTIONS, joints=False, **changes):
-    """The table of parameters, with `changes` over the synthetic study's own."""
+    """The table of parameters, with `changes` over the synthetic study's own.
+
+    Onset and force offset are held unless they are named: one of some thousand records takes one
+    by chance.
+    """
+    names = in_model(options, joints=joints)
+    held = {n: {"fixed": True, "value": 0.0} for n in ("onset", "force_offset") if n in names}
     merged = {name: CHANGES.get(name, {}) | changes.get(name, {}) for name in CHANGES | changes}
-    return default_parameters(in_model(options, joints=joints), merged)
+    return default_parameters(names, held | merged)
 
 
 def study(force, options=OPTIONS, changes=None, **settings):
