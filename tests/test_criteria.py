@@ -281,7 +281,7 @@ def test_refits_end_in_the_minimum_of_the_whole_fit():
     whole = fit(study, one)
     alone = fit(without(study, np.arange(6)[None] == 0), dataclasses.replace(one, scrutiny=False))
     assert alone.value[0, 2] > 1e4
-    assert alone.cost[0] > 10 * whole.cost[0]
+    assert alone.rms[0, 0] > 10 * whole.rms[0, 0]
     left = leave_one_out(whole, one)
     peak = [np.max(np.abs(c.force)) for c in curves]
     assert np.all(left.force * peak < 3 * noise)

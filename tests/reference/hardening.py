@@ -34,7 +34,8 @@ def total_study(curves, more=None, **settings):
     straight = {"scale": "linear", "lower": 0.0}
     changes = {"k_1": straight, "k_3": straight} | (more or {})
     names = ["k_1", "k_3", "onset", "force_offset"]
-    table = [dataclasses.replace(DEFAULTS[n], **changes.get(n, {})) for n in names]
+    named = {n: {"auto": False} | change for n, change in changes.items()}
+    table = [dataclasses.replace(DEFAULTS[n], **named.get(n, {})) for n in names]
     return build_study(list(curves), table_1(), TOTAL, table, **settings)
 
 

@@ -370,8 +370,8 @@ def _constant(
 def _is_tidy(text: Text, options: ReadOptions) -> bool:
     """Whether the first line is a JSON object, or names a column that machine files have not.
 
-    That of specimens, among three at least; or, beside displacement and force, that of trials or
-    of positions.
+    That of specimens, beside another of two or more; or, beside displacement and force, that of
+    trials or of positions.
     """
     if not text.lines:
         return False
@@ -383,7 +383,9 @@ def _is_tidy(text: Text, options: ReadOptions) -> bool:
     except Fault:
         return False
     names, units = zip(*map(name_and_unit, cells), strict=True)
-    if len(names) > 2 and {*map(str.lower, names)} & {*ALIASES["specimen"]}:
+    lower = {*map(str.lower, names)}
+    pressed = lower & {*ALIASES["displacement"], *ALIASES["force"]}
+    if lower & {*ALIASES["specimen"]} and (len(names) > 2 or pressed):
         return True
     try:
         roles = find_roles(names, options)
