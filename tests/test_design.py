@@ -283,9 +283,8 @@ def test_a_joint_fit_presses_the_specimen_that_tells_most():
     assert choice.chosen[0] == np.argmax(realised)
     assert choice.chosen[0] != 0
     # Of independent residuals: those of noise-free fits are roundings, alike as it happens.
-    chosen = refits[choice.chosen[0]]
-    alone = chosen.relative_se[0] / chosen.effective.factor[0]
-    np.testing.assert_allclose(choice.error[1] / result.effective.factor[0], alone, rtol=1e-3)
+    alone = choice.error[1] / result.effective.factor[0]
+    np.testing.assert_allclose(alone, refits[choice.chosen[0]].relative_se[0], rtol=1e-3)
     # Pairs of presses on one specimen tell of it alone.
     chart = identifiability(known, np.linspace(20.0, 140.0, 7), depth, curve=curves[1])
     assert chart.pairs.min() < 1e3
