@@ -11,6 +11,7 @@ from jaxtrachea.fitting.lane import Lane
 from jaxtrachea.measurements.curve import Curve, RawCurve, ReadOptions
 from jaxtrachea.measurements.read import DataError, read_measurements
 from jaxtrachea.measurements.together import finish_all
+from jaxtrachea.trials.differences import differing_trials
 from jaxtrachea.trials.repeats import repeat_sentences, trial_remarks
 from jaxtrachea.trials.uneven_noise import uneven_noise
 
@@ -107,18 +108,19 @@ def trial(name, factor=1.0, seed=0, s=40.0, sigma=SIGMA, **more):
 def test_trials_that_differ():
     slow, fast = (("speed [mm/s]", 0.1), ("lot", 3.0)), (("speed [mm/s]", 10.0), ("lot", 3.0))
     same = [trial("a", seed=1), trial("b", seed=2), trial("c", s=60.0)]
-    assert list(repeat_sentences(same)) == []
+    assert list(repeat_sentences(differing_trials(same))) == []
     differing = [trial("a", seed=1, conditions=slow), trial("b", 1.35, seed=2, conditions=fast)]
-    (sentence,) = repeat_sentences([*differing, trial("c", s=60.0)])
+    found = differing_trials([*differing, trial("c", s=60.0)])
+    (sentence,) = repeat_sentences(found)
     assert "trials of T at s = 40 mm differ by 35 %, their noise is 0.2" in sentence
     assert "speed [mm/s] (0.1 to 10, with which it grows)" in sentence
     assert "lot" not in sentence
-    told = trial_remarks([*differing, trial("c", s=60.0)])  # for each of them in curves.csv
+    told = trial_remarks(found)  # for each of them in curves.csv
     assert told.keys() == {("T", "a"), ("T", "b")}
     assert "differ by 35 %; the force goes along with speed" in told["T", "a"]
     ordered = [trial(f"{k}", 1 - 0.1 * k, seed=k) for k in range(3)]
     assert "the number of the trial (0 to 2, with which it falls)" in next(
-        repeat_sentences(ordered)
+        repeat_sentences(differing_trials(ordered))
     )
 
 
@@ -128,8 +130,8 @@ def test_air_of_another_length_is_no_difference():
         noise = SIGMA * np.random.default_rng(seed).standard_normal(300)
         return Curve("T", name, 40.0, 0.0, way, factor * force(np.maximum(way - air, 0)) + noise)
 
-    assert list(repeat_sentences([in_air("a", 0.3, 1, 1), in_air("b", 0.8, 1, 2)])) == []
-    assert list(repeat_sentences([in_air("a", 0.3, 1, 1), in_air("b", 0.8, 1.6, 2)]))
+    assert differing_trials([in_air("a", 0.3, 1, 1), in_air("b", 0.8, 1, 2)]) == []
+    assert differing_trials([in_air("a", 0.3, 1, 1), in_air("b", 0.8, 1.6, 2)])
 
 
 def test_uneven_noise_and_its_weights():

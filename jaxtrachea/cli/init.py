@@ -19,7 +19,7 @@ from jaxtrachea.cli.written_spec import specification_text, summary
 
 #: Rows of a table of columns, and tables of columns; a file has more in itself.
 MANY, TABLES = 40, 3
-#: Options that take the position from names of files.
+#: Options that take the position from names of files, and what they find there.
 _IN_NAME = re.compile(r"._s\d+")
 OF_NAMES = r"--specimen '(?P<specimen>.+)_(?P<trial>s(?P<s>\d+))' --unit s=mm"
 #: What roles are called.

@@ -54,15 +54,17 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     from jaxtrachea.report.understood import understood
     from jaxtrachea.results.hdf5 import write_hdf5
     from jaxtrachea.results.rows import parameter_rows, summary_rows
+    from jaxtrachea.trials.differences import differing_trials
     from jaxtrachea.trials.repeats import trial_remarks, trial_sentences
 
     write_csv(folder / "summary.csv", summary_rows(findings, measurements.bad))
     write_csv(folder / "parameters.csv", list(parameter_rows(findings)))
-    zeros, apart = cells(findings.result.study), trial_remarks(measurements.curves)
+    apart = differing_trials(measurements.curves)
+    zeros, of_trials = cells(findings.result.study), trial_remarks(apart)
     rows = []
     for row in usage_rows(measurements.curves):
         curve = str(row["specimen"]), str(row["trial"])
-        remarks = "; ".join(filter(None, (str(row["remarks"]), apart.get(curve))))
+        remarks = "; ".join(filter(None, (str(row["remarks"]), of_trials.get(curve))))
         rows.append(row | {"remarks": remarks} | zeros.get(curve, {}))
     write_csv(folder / "curves.csv", rows)
     write_tables(folder, findings)
@@ -70,7 +72,8 @@ def write(folder: Path, spec: Path, loaded, measurements, findings, clock, manif
     say_lost(lost)
     title = loaded.title or spec.stem
     curves = measurements.curves
-    more = trial_sentences(curves, weighed=findings.result.study.weighs_noise)
+    weighed = findings.result.study.weighs_noise
+    more = trial_sentences(curves, found=apart, weighed=weighed)
     used = usage_section(curves, measurements.notes, more)
     lines = understood(loaded, findings.result.study, findings.result)
     text = without_lost(report_text(title, findings, measurements.bad, used, lines), lost)

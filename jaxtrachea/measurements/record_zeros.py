@@ -362,8 +362,8 @@ def _told_apart(records: _Records, bare, rss) -> _Taken:
     # What has more parameters may have found a better minimum: those with fewer begin there too.
     without = [v * [1, 1, 1, 1, 0, 0, 0] for v in (moved, raised, both)]
     rss = np.minimum(rss, _best(records, _SHAPE, *without)[1])
-    again = _best(records, (*_SHAPE, "onset"), moved, both * [1, 1, 1, 1, 1, 0, 0])
-    moved, rss_moved = again
+    starts = moved, both * [1, 1, 1, 1, 1, 0, 0]
+    moved, rss_moved = _best(records, (*_SHAPE, "onset"), *starts)
     at_level = np.where(_columns(_SHAPE), moved, at_level)
     starts = raised, at_level, *_starts(count, (0.0, y[:, 0]))
     raised, rss_raised = _best(records, (*_SHAPE, "force_offset"), *starts)

@@ -7,6 +7,7 @@ worker that dies; a shard whose worker is lost goes to another one.
 
 import contextlib
 import logging
+import socket
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
@@ -40,13 +41,13 @@ class Lost(Exception):
 
 @contextlib.contextmanager
 def connected(address: str) -> Iterator[Any]:
-    """A cluster with at least one worker, all of this version of the package.
+    """A cluster with at least one worker.
 
     Args:
         address: of the scheduler, HOST:PORT.
 
     Raises:
-        NoCluster: dask is not installed, nothing answers, or a worker would give other numbers.
+        NoCluster: dask is not installed, nothing answers, or there is no worker.
     """
     try:
         from distributed import Client
@@ -66,13 +67,6 @@ def connected(address: str) -> Iterator[Any]:
         except TimeoutError:
             cure = f"start workers with 'dask worker {address}'"
             raise NoCluster(f"the scheduler at {address} has no worker; {cure}") from None
-        mine = versions()
-        answers: Any = client.run(versions)
-        for worker, found in answers.items():
-            other = [f"{name} {v}" for name, v in found.items() if mine.get(name) != v]
-            if other:
-                cure = "install on all what this process has"
-                raise NoCluster(f"worker {worker} has {', '.join(other)}; {cure}")
         yield client
 
 
@@ -98,6 +92,7 @@ def fit_shards(
 
     Raises:
         Lost: the scheduler is gone, no worker is left, or one shard has lost several.
+        NoCluster: a worker would give other numbers, whenever it came.
     """
     from distributed import KilledWorker, wait
 
@@ -105,7 +100,7 @@ def fit_shards(
     shards = shards_of(run, part)
     jobs = settings.starts * sum(len(shards[k]) for k in todo)
     waiting, lost, under_way = list(reversed(todo)), dict.fromkeys(todo, 0), {}
-    seen = time.monotonic()
+    seen, software = time.monotonic(), computes_with()
     try:
         while waiting or under_way:
             threads = _threads(client)
@@ -114,7 +109,7 @@ def fit_shards(
                 raise Lost(f"the cluster has had no worker for {PATIENCE:g} s")
             while waiting and len(under_way) < threads:
                 k = waiting.pop()
-                arguments = part.take(shards[k]), settings, prepare
+                arguments = part.take(shards[k]), settings, prepare, software
                 key = f"{run.manifest.id}-{k}-{lost[k]}"
                 under_way[client.submit(_fit_shard, *arguments, key=key, retries=0)] = k
             if under_way:
@@ -164,11 +159,35 @@ def _answering() -> Iterator[None]:
         raise Lost("the scheduler is gone") from None
 
 
+def computes_with() -> dict[str, str]:
+    """Versions of what computes here, and the kind of device."""
+    import jax
+
+    return versions() | {"device": jax.local_devices()[0].device_kind}
+
+
+def refuse_other(expected: dict[str, str]) -> None:
+    """Refuse to compute with anything else, as another worker's numbers would be others.
+
+    Raises:
+        NoCluster: with what is otherwise here.
+    """
+    other = [f"{name} {v}" for name, v in computes_with().items() if expected.get(name) != v]
+    if other:
+        cure = "install on all what the command has"
+        raise NoCluster(f"a worker on {socket.gethostname()} has {', '.join(other)}; {cure}")
+
+
 def _fit_shard(
-    part: Study, settings: Settings, prepare: Callable[[], None]
+    part: Study, settings: Settings, prepare: Callable[[], None], expected: dict[str, str]
 ) -> dict[str, np.ndarray]:
-    """Fit in a worker; arrays of the result."""
+    """Fit in a worker; arrays of the result.
+
+    Raises:
+        NoCluster: as `refuse_other`.
+    """
     from jaxtrachea.fitting.fit import fit
 
     prepare()
+    refuse_other(expected)
     return arrays_of(fit(part, settings, lambda done, of: None))

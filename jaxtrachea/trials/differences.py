@@ -53,9 +53,8 @@ def differing_trials(curves: Sequence[Curve]) -> list[Difference]:
     for c in curves:
         if c.s_c is None:
             continue
-        groups.setdefault((c.specimen, round(c.s_c, 1), round(c.phi_c, 3), c.direction), []).append(
-            c
-        )
+        place = round(c.s_c, 1), round(c.phi_c, 3), c.direction
+        groups.setdefault((c.specimen, *place), []).append(c)
     several = [g for g in groups.values() if len(g) > 1]
     found = []
     for block in _blocks(several):

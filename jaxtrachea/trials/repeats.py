@@ -19,19 +19,25 @@ _NUMBER_OF_TRIAL = "the number of the trial"
 _SAME = 0.01
 
 
-def trial_sentences(curves: Sequence[Curve], *, weighed: bool = False) -> list[str]:
+def trial_sentences(
+    curves: Sequence[Curve],
+    *,
+    found: Sequence[Difference] | None = None,
+    weighed: bool = False,
+) -> list[str]:
     """What a fit says of its curves against each other.
 
     Args:
         curves: as they are used.
+        found: their `differing_trials`, where these are known.
         weighed: whether each counts by its own noise, so that noise that differs is no matter.
     """
-    return [*repeat_sentences(curves), *(() if weighed else uneven_noise(curves))]
+    found = differing_trials(curves) if found is None else found
+    return [*repeat_sentences(found), *(() if weighed else uneven_noise(curves))]
 
 
-def repeat_sentences(curves: Sequence[Curve]) -> Iterator[str]:
+def repeat_sentences(found: Sequence[Difference]) -> Iterator[str]:
     """What is said of trials that differ, with the conditions that go along with it."""
-    found = differing_trials(curves)
     if not found:
         return
     cause = _cause(found)
@@ -46,9 +52,8 @@ def repeat_sentences(curves: Sequence[Curve]) -> Iterator[str]:
     )
 
 
-def trial_remarks(curves: Sequence[Curve]) -> dict[tuple[str, str], str]:
+def trial_remarks(found: Sequence[Difference]) -> dict[tuple[str, str], str]:
     """What curves.csv says of every trial that differs from another, by specimen and trial."""
-    found = differing_trials(curves)
     cause = _cause(found)
     return {
         (c.specimen, c.trial): f"trials at its position differ by {_percent(d.share)}{cause}"
@@ -58,6 +63,7 @@ def trial_remarks(curves: Sequence[Curve]) -> dict[tuple[str, str], str]:
 
 
 def _cause(found: Sequence[Difference]) -> str:
+    """Conditions that go along with the differences, as the end of a sentence; "": none."""
     along = conditions_along(found)
     return f"; the force goes along with {' and '.join(along)}" if along else ""
 

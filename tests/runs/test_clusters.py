@@ -15,6 +15,7 @@ from stopped import FIT, begun, set_failed
 from jaxtrachea.files import lock as run_lock
 from jaxtrachea.files import output
 from jaxtrachea.fitting import fit
+from jaxtrachea.runs import cluster as cluster_runs
 from jaxtrachea.runs import folder as run_folder
 from jaxtrachea.runs import rerun, shards
 
@@ -46,6 +47,13 @@ def test_workers_of_a_cluster(peace, study, cluster, monkeypatch, capsys):
     code, _, err = run(monkeypatch, capsys, *FIT, "--scheduler", cluster.scheduler_address)
     assert (code, len(killed)) == (0, 1), err
     assert numbers(study / "out") == numbers(peace / "out")
+
+
+def test_a_worker_with_other_versions_fits_nothing():
+    here = cluster_runs.computes_with()
+    cluster_runs.refuse_other(here)
+    with pytest.raises(cluster_runs.NoCluster, match="a worker on .* has jax [0-9.]+; install"):
+        cluster_runs.refuse_other(here | {"jax": "0.1"})
 
 
 def test_a_cluster_that_is_not_there(study, monkeypatch, capsys):
