@@ -1,7 +1,7 @@
 """The header of a machine file, and the trials that stand side by side below it."""
 
 import dataclasses
-import re
+import string
 from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -30,7 +30,6 @@ from jaxtrachea.measurements.readers.table import (
 # A header further down than this is no header.
 MAX_PREAMBLE = 500
 BOTH = ("displacement", "force")
-_NUMBERED = re.compile(r"(.*?)[ _.#-]*\d+")
 
 
 class Part(NamedTuple):
@@ -147,7 +146,8 @@ def _parts(
         return [Part("1", roles)]
     except Fault as fault:
         first = fault
-    for plain in (names, [(m := _NUMBERED.fullmatch(n)) and m[1] or n for n in names]):
+    unnumbered = [name.rstrip(string.digits).rstrip(" _.#-") or name for name in names]
+    for plain in (names, unnumbered):
         counts = Counter(filter(None, plain))
         most = max(counts.values(), default=0)
         if most < 2:

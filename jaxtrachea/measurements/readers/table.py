@@ -85,9 +85,9 @@ class Text:
 
     def with_tabs(self, blanks: int) -> "Text":
         """Tabs in place of so many blanks or more; a unit in brackets stays at its name."""
-        data = re.sub(rb"(?m)^[ \t]+|[ \t]+$", b"", self.data)
+        data = b"\n".join(line.strip(b" \t") for line in self.data.split(b"\n"))
         if blanks == 1:
-            data = re.sub(rb"[ \t]+(?=[\[(])", b"", data)
+            data = re.sub(rb"(?<![ \t])[ \t]+(?=[\[(])", b"", data)
         return Text(self.path, re.sub(rb"[ \t]{%d,}" % blanks, b"\t", data), self.sheet, self.trial)
 
 
