@@ -55,14 +55,6 @@ UNKNOWN = {
     }.items()
 }
 WRONG = {
-    "specimen a pattern that backtracks": Case(
-        ("data.specimen", "(a+)+$", "was stopped"),
-        {
-            "a" * 60 + "!.csv": "displacement [mm],force [N]\n0,0\n1,1\n",
-            "spec.toml": '[data]\nfiles = "*.csv"\nspecimen = "(?P<specimen>(a+)+$)"',
-        },
-        command=("check", "spec.toml"),
-    ),
     "sheet of a text file": of(SPEC + 'sheet = "Data"', "data.sheet", "workbook"),
     "position of a million digits": of(SPEC + f's = "{"1" * 10**6}\\nm\\nm"', "s:", "too long"),
     "title a number": of("title = 3\n" + SPEC, "title", "string"),
