@@ -77,7 +77,8 @@ def test_tables_follow():
     assert SKELETON == ("EI_L", "GA_L", "k_M")
     assert OF_THE_PRESS == ("onset", "force_offset", "force_slope")
     assert set(MaterialSection.model_fields) == set(VALUES)
-    assert list(SECTION_VALUES) == [f.name for f in dataclasses.fields(SectionMaterial)]
+    fields = [f.name for f in dataclasses.fields(SectionMaterial)]
+    assert [*SECTION_VALUES, "extrapolated"] == fields
     assert set(VALUES) & set(SECTION_VALUES) == {"EI_C"}
     assert material_of({n: jnp.ones(()) for n in [*needed, "onset"]}).GA_L is None
 

@@ -80,7 +80,7 @@ def _defaults(spec: FitSpec, options: Options) -> Mapping[str, Parameter]:
     except InputError as error:
         raise SpecError.like(error, key=f"wall.{error.key}") from None
     try:
-        return defaults_of(options, geometry_of(spec.trachea), wall)
+        return defaults_of(options, geometry_of(spec.trachea), wall, spec.data.tool_radius)
     except InputError as error:
         raise SpecError.like(error) from None
 

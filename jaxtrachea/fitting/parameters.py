@@ -9,7 +9,7 @@ import numpy as np
 from jaxtrachea._arguments import check_word
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.mechanics.sections.material import SECTION_VALUES, SectionMaterial, Wall, from_wall
+from jaxtrachea.mechanics.sections.material import SECTION_VALUES, Wall, from_wall
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import OF_PRESS, VALUES, Declaration, Fitted, Scale, Scope
 
@@ -164,7 +164,10 @@ def in_model(options: Options, *, joints: bool, named: Collection[str] = ()) -> 
 
 
 def defaults_of(
-    options: Options, geometry: Geometry, wall: Wall | None = None
+    options: Options,
+    geometry: Geometry,
+    wall: Wall | None = None,
+    tool_radius: float | None = None,
 ) -> Mapping[str, Parameter]:
     """Parameters by name as a fit begins with them.
 
@@ -175,6 +178,7 @@ def defaults_of(
         options: of the model.
         geometry: the tube.
         wall: moduli and thicknesses; None: those of the paper and the virtual specimen.
+        tool_radius: mm, which the local contact begins with; None: that of the virtual specimen's.
 
     Raises:
         InputError: a wall for a model that does not read it.
@@ -186,8 +190,9 @@ def defaults_of(
                 cure="leave it out, or choose skeleton = 'sections'",
             )  # fmt: skip
         return DEFAULTS
-    material = from_wall(geometry, Wall() if wall is None else wall)
-    values = {f.name: getattr(material, f.name) for f in dataclasses.fields(SectionMaterial)}
+    wall = Wall() if wall is None else wall
+    material = from_wall(geometry, wall, **({"tool_radius": tool_radius} if tool_radius else {}))
+    values = {name: getattr(material, name) for name in SECTION_VALUES}
     begun = {n: _begun(DEFAULTS[n], float(np.median(np.asarray(v)))) for n, v in values.items()}
     return DEFAULTS | begun
 

@@ -10,7 +10,13 @@ import numpy as np
 from jaxtrachea._errors import InputError
 from jaxtrachea.config import EvenRings, SpecError, TracheaSection
 from jaxtrachea.contact import shapes
-from jaxtrachea.mechanics.sections.material import Factors, SectionMaterial, Wall, from_wall
+from jaxtrachea.mechanics.sections.material import (
+    SECTION_VALUES,
+    Factors,
+    SectionMaterial,
+    Wall,
+    from_wall,
+)
 from jaxtrachea.scene import wall_check
 from jaxtrachea.scene.assemble import make_scene
 from jaxtrachea.scene.declare import AnyMaterial, PlanError
@@ -121,10 +127,14 @@ def material_of(spec: SceneSpec, geometry: Geometry) -> AnyMaterial:
     named = {} if spec.sections is None else spec.sections.model_dump(exclude_none=True)
     if spec.wall is None:
         return SectionMaterial(**named)
+    moduli = spec.wall.model_dump()
+    tool_radius = moduli.pop("tool_radius")
     try:
-        wall = from_wall(geometry, Wall(**spec.wall.model_dump()))
+        wall = from_wall(geometry, Wall(**moduli), tool_radius=tool_radius)
     except InputError as error:
         raise SpecError.like(error, key=f"wall.{error.key}") from None
+    if all(name in named for name, p in SECTION_VALUES.items() if not p.fit.fixed):
+        named["extrapolated"] = 0.0  # what a fit estimates, it estimated
     return dataclasses.replace(wall, **named)
 
 

@@ -116,6 +116,12 @@ class SectionsSection(_section_keys()):
         return self
 
 
+class SceneWallSection(WallSection):
+    """[wall] of a scene, with the radius of the tool's flat end: the local contact follows it."""
+
+    tool_radius: PositiveLength = 3.0
+
+
 #: Values of [sections] that have no default of their own.
 NEEDED = tuple(
     f.name for f in dataclasses.fields(SectionMaterial) if f.default is dataclasses.MISSING
@@ -277,7 +283,7 @@ class SceneSpec(Section):
     )
     material: MaterialSection | None = None
     sections: SectionsSection | None = None
-    wall: WallSection | None = None
+    wall: SceneWallSection | None = None
     tool: ToolSection | None = None
     path: list[PathSection] = Field(min_length=1)
     model: LawSection = LawSection()

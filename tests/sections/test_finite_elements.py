@@ -1,9 +1,9 @@
-"""Three tubes in three-dimensional finite elements, by stiffnesses from their moduli alone.
+"""Five tubes in three-dimensional finite elements, by stiffnesses from their moduli alone.
 
-`tests/reference/sections_fem.json` (tests/bench/sections_fem.py): the specimen of the factors, and
-two tubes that they have not seen. On these the level errs by more than on the specimen; what is
-checked is that the errors are those which docs/off_midline.md names, and that beyond the tested
-angle, where they are larger, no row is OK.
+`tests/reference/sections_fem.json` (tests/bench/sections_fem.py): the specimen of the factors, two
+tubes that are like it within a tenth, and two that are not. What is OK is right within 5 % of the
+peak of the force; where the level errs by more, beyond the tested angle and on tubes unlike the
+specimen, the status says so, and docs/off_midline.md by how much.
 """
 
 import json
@@ -27,8 +27,8 @@ pytestmark = [pytest.mark.compiling, pytest.mark.slow]
 CASES = json.loads((Path(__file__).parents[1] / "reference" / "sections_fem.json").read_text())
 #: Largest error of the force over its peak, and of side over normal force, to 90 degrees.
 LIMITS = {
-    "ring": {"specimen": (0.05, 0.07), "narrow": (0.11, 0.07), "wide": (0.17, 0.14)},
-    "span": {"specimen": (0.05, 0.075), "narrow": (0.20, 0.09), "wide": (0.16, 0.14)},
+    "ring": {"narrow": (0.11, 0.07), "wide": (0.17, 0.14)},
+    "span": {"narrow": (0.20, 0.09), "wide": (0.16, 0.14)},
 }
 
 
@@ -61,7 +61,7 @@ def stacked(trees):
 
 
 @pytest.mark.parametrize("place", ["ring", "span"])
-def test_three_tubes(place):
+def test_tubes(place):
     """Presses to 0.6 of the inner radius; the small one is the linear solution."""
     cases = {name: case for name, case in CASES.items() if name.split(":")[1] == place}
     tubes = [Tube(**case["tube"]) for case in cases.values()]
@@ -85,6 +85,8 @@ def test_three_tubes(place):
     far = np.abs(phi) > np.pi / 2 + 1e-9
     assert far.any()
     for name, beyond, status, force, side in zip(cases, far, got.status, off, aside, strict=True):
-        assert np.all(status == (PressStatus.NEAR_RING_END if beyond else PressStatus.OK)), name
-        most = LIMITS[place][name.split(":")[0]]
+        most = LIMITS[place].get(name.split(":")[0])
+        unlike = PressStatus.OK if most is None else PressStatus.EXTRAPOLATED
+        assert np.all(status == (PressStatus.NEAR_RING_END if beyond else unlike)), name
+        most = (0.05, 0.07) if most is None else most
         assert beyond or (force < most[0] and side < most[1]), (name, force, side)

@@ -68,6 +68,8 @@ class SectionMaterial(eqx.Module):
         c_n: local compliance along the normal, mm/N, positive; a scalar.
         c_t: likewise along the circumference, mid-span.
         c_t_ring: that on a ring.
+        extrapolated: 1 where moduli gave these stiffnesses and `Factors` were not found on such a
+            tube: presses are EXTRAPOLATED; else 0.
     """
 
     offset: Float[Array, ""] = _field(
@@ -141,11 +143,16 @@ class SectionMaterial(eqx.Module):
         "c_t_ring", "mm/N", "compliance", "local compliance along the circumference, on a ring",
         _fixed(0.1, 1e-9, 1e3), default=0.1,
     )  # fmt: skip
+    extrapolated: Float[Array, ""] = eqx.field(
+        converter=functools.partial(real, "extrapolated"), default=0.0
+    )
 
 
 #: Values of the sections by name, as `SectionMaterial` has them; `EI_C` is that of `Material`.
 SECTION_VALUES: dict[str, Declaration] = {
-    field.name: field.metadata["declaration"] for field in dataclasses.fields(SectionMaterial)
+    field.name: field.metadata["declaration"]
+    for field in dataclasses.fields(SectionMaterial)
+    if "declaration" in field.metadata
 }
 #: Fields that may differ from ring to ring and from span to span; the others are scalars.
 EACH_RING = ("EI_C", "EI_M", "Et_M", "bed_n", "bed_t", "c_K")
@@ -274,6 +281,9 @@ def from_wall(
         wall: moduli and thicknesses.
         factors: what they leave open.
         tool_radius: of the tool's flat end, mm, which `c_t` and `c_t_ring` follow.
+
+    Returns:
+        The stiffnesses; `extrapolated` where the tube is unlike the specimen (`proportions`).
     """
     pitches = ring_pitches(geometry)
     plane = 1 - wall.nu**2
@@ -298,7 +308,41 @@ def from_wall(
     }
     slides = (2 - wall.nu) * (1 + wall.nu) / (4 * wall.E_L * tool_radius)
     values["c_t"] = values["c_t_ring"] = factors.slide * slides
+    off = jnp.abs(jnp.log(proportions(geometry, wall, tool_radius) / _SPECIMEN))
+    values["extrapolated"] = jnp.any(off > np.log(ALIKE)).astype(R.dtype)
     return SectionMaterial(**values)
+
+
+#: Largest ratio of a proportion to the specimen's with which `Factors` hold (docs/off_midline.md).
+ALIKE = 1.12
+
+
+def proportions(geometry: Geometry, wall: Wall, tool_radius: float) -> Float[Array, "9"]:
+    """Numbers without a dimension by which tubes with equal `Factors` are alike.
+
+    Pitch over radius, height of a ring over its pitch, thicknesses of wall, cartilage and muscle,
+    moduli of cartilage and muscle over the ligament's, bed, and tool over the gap between rings.
+
+    Args:
+        geometry: the tube; its pitch is the median distance of rings.
+        wall: moduli and thicknesses.
+        tool_radius: of the tool's flat end, mm.
+    """
+    R, rings = geometry.radius, geometry.ring_positions
+    pitch = jnp.median(jnp.diff(rings)) if geometry.rings > 1 else geometry.length / 2
+    gap = jnp.maximum(pitch - geometry.ring_height, 0)
+    of_wall = [
+        wall.h / R, wall.h_C / wall.h, wall.h_M / wall.h, wall.E_C / wall.E_L, wall.E_M / wall.E_L,
+        wall.bed_n * R / wall.E_M,
+    ]  # fmt: skip
+    of_tube = [pitch / R, geometry.ring_height / pitch, *of_wall, gap / tool_radius]
+    return jnp.stack([jnp.asarray(value, R.dtype) for value in of_tube])
+
+
+#: `proportions` of the specimen (docs/virtual_trachea.md) with its punch of 3 mm.
+_SPECIMEN = np.array(
+    [10 / 11.7, 0.4, 2.6 / 11.7, 0.6, 2 / 2.6, 5.8 / 0.65, 0.3 / 0.65, 0.02 * 11.7 / 0.3, 2.0]
+)
 
 
 def neutral_radius(inner_radius: float, wall: Wall = Wall()) -> float:  # noqa: B008 (frozen)

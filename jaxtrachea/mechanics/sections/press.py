@@ -120,7 +120,8 @@ def press_sections(
         The `SectionPress`. Rows that Newton's method does not solve or that are no minimum of the
         energy (and those after the latter) are NaN, PAST_FOLD; others are untouched. Rows whose
         wall moves further than the radius are TOO_DEEP, and those beyond `tested_angle`
-        NEAR_RING_END, with their values. Derivatives are those of the equilibrium, in either mode.
+        NEAR_RING_END, with their values; those of a material that is `extrapolated` are
+        EXTRAPOLATED. Derivatives are those of the equilibrium, in either mode.
 
     Raises:
         ValueError: an argument that is no number, or an array of a length that does not fit.
@@ -175,7 +176,9 @@ def _press(
     # To rounding, as in `on_ring`.
     most = tested_angle(geometry.half_angle) * (1 + 8 * epsilon(phi_c.dtype))
     near = (status == PressStatus.OK) & (jnp.abs(phi_c) > most)
-    status = jnp.where(near, PressStatus.NEAR_RING_END, status).astype(jnp.int8)
+    status = jnp.where(near, PressStatus.NEAR_RING_END, status)
+    unlike = (status == PressStatus.OK) & (material.extrapolated > 0)
+    status = jnp.where(unlike, PressStatus.EXTRAPOLATED, status).astype(jnp.int8)
     return hidden._replace(steps=solved.steps, status=status)
 
 
