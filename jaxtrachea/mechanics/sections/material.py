@@ -314,35 +314,38 @@ def from_wall(
 
 
 #: Largest ratio of a proportion to the specimen's with which `Factors` hold (docs/off_midline.md).
-ALIKE = 1.12
+ALIKE = 1.04
 
 
-def proportions(geometry: Geometry, wall: Wall, tool_radius: float) -> Float[Array, "9"]:
+def proportions(geometry: Geometry, wall: Wall, tool_radius: float) -> Float[Array, "12"]:
     """Numbers without a dimension by which tubes with equal `Factors` are alike.
 
-    Pitch over radius, height of a ring over its pitch, thicknesses of wall, cartilage and muscle,
-    moduli of cartilage and muscle over the ligament's, bed, and tool over the gap between rings.
+    Of the tube, pitch (median distance of rings) over radius, height of a ring over its pitch and
+    half-angle; of the wall its thickness over the radius, those of cartilage and muscle over its
+    own, moduli over the ligament's, Poisson's ratio plus 1, and the bed; the gap between rings over
+    the tool's radius.
 
     Args:
-        geometry: the tube; its pitch is the median distance of rings.
+        geometry: the tube.
         wall: moduli and thicknesses.
         tool_radius: of the tool's flat end, mm.
     """
-    R, rings = geometry.radius, geometry.ring_positions
+    R, rings, height = geometry.radius, geometry.ring_positions, geometry.ring_height
     pitch = jnp.median(jnp.diff(rings)) if geometry.rings > 1 else geometry.length / 2
-    gap = jnp.maximum(pitch - geometry.ring_height, 0)
-    of_wall = [
-        wall.h / R, wall.h_C / wall.h, wall.h_M / wall.h, wall.E_C / wall.E_L, wall.E_M / wall.E_L,
-        wall.bed_n * R / wall.E_M,
+    values = [
+        pitch / R, height / pitch, geometry.half_angle, wall.h / R, wall.h_C / wall.h,
+        wall.h_M / wall.h, wall.E_C / wall.E_L, wall.E_M / wall.E_L, 1 + wall.nu,
+        wall.bed_n * R / wall.E_M, wall.bed_t * R / wall.E_M,
+        jnp.maximum(pitch - height, 0) / tool_radius,
     ]  # fmt: skip
-    of_tube = [pitch / R, geometry.ring_height / pitch, *of_wall, gap / tool_radius]
-    return jnp.stack([jnp.asarray(value, R.dtype) for value in of_tube])
+    return jnp.stack([jnp.asarray(value, R.dtype) for value in values])
 
 
 #: `proportions` of the specimen (docs/virtual_trachea.md) with its punch of 3 mm.
-_SPECIMEN = np.array(
-    [10 / 11.7, 0.4, 2.6 / 11.7, 0.6, 2 / 2.6, 5.8 / 0.65, 0.3 / 0.65, 0.02 * 11.7 / 0.3, 2.0]
-)
+_SPECIMEN = np.array([
+    10 / 11.7, 0.4, 2 * np.pi / 3, 2.6 / 11.7, 0.6, 2 / 2.6, 5.8 / 0.65, 0.3 / 0.65, 1.45,
+    0.02 * 11.7 / 0.3, 0.002 * 11.7 / 0.3, 2.0,
+])  # fmt: skip
 
 
 def neutral_radius(inner_radius: float, wall: Wall = Wall()) -> float:  # noqa: B008 (frozen)
