@@ -32,14 +32,13 @@ class PressStatus(_Described):
     PULLS = 6, "unilateral contact: the tool would have to pull; it lets go or slides (friction)"
     OFF_PLAN = (
         7,
-        "off the midline, oblique, elsewhere or else, in a program made for less than that",
+        "this row needs an effect that the plan leaves out (off-midline, oblique or moved contact)",
     )
     OFF_TUBE = 8, "the contact, or a part of a tool's width, lies beyond an end of the tube"
-    UNSURE = (
+    CONTACT_UNCERTAIN = (
         9,
-        "solved, but the contact may be another than found: the tool lies so flat on the wall that "
-        "the search did not end (round it more), reaches so deep (press less), or touches a mesh "
-        "where its gap is off",
+        "solved, but the contact point is uncertain: flat contact (round the tool more), deep "
+        "contact (press less) or an inaccurate wall of a mesh; see `contact_share`",
     )
     BAD_MATERIAL = 10, "a stiffness or the coefficient of friction is negative"
     IN_LUMEN = (
@@ -98,7 +97,10 @@ class PredictionStatus(_Described):
         "predicted, but the bands know noise and parameters alone and are not of 95 %: too few "
         "positions tell the model's error between them",
     )
-    BENT = 3, "predicted, but the model bends within the bands: the linear bands are off"
+    BENT = (
+        3,
+        "predicted, but nonlinear within the band: the delta-method band is inaccurate",
+    )
     UNDETERMINED = 4, "predicted, but the data of the fit do not limit it: infinite bands"
     TOO_DEEP = 5, "predicted, but where the wall moves further than the tube's radius"
     NO_SOLUTION = 6, "no stable solution at some displacements"

@@ -132,7 +132,7 @@ BAD_SPECS = {
     "nothing free to be doubted": (
         K1 + "{ fixed = 1 }\nk_3 = { fixed = 0 }\nEI_L = { fixed = 1 }\nk_M = { fixed = 1 }\n"
         "[uncertainty]\nbootstrap = 40",
-        ["uncertainty.bootstrap: every parameter is fixed", "free a parameter"],
+        ["uncertainty.bootstrap: no free parameter", "free a parameter"],
     ),
     "noise bare": (DATA + "[noise]\nforce = 0.1", ["noise.force: 0.1 has no unit", "0.1 N"]),
     "noise in mm": (DATA + '[noise]\nforce = "1 mm"', ["noise.force", "does not measure force"]),

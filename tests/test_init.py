@@ -139,7 +139,7 @@ def test_position_of_the_names_of_files(folder, monkeypatch, capsys):
     assert code == 0
     assert "2 curves of 1 specimen, 2 positions s from 20 to 75 mm" in out
     code, out, _ = run(monkeypatch, capsys, "check", "fit.toml")
-    assert (code, "1 lane(s)" in out) == (0, True)
+    assert (code, "1 fit(s)" in out) == (0, True)
 
 
 def test_columns_are_guessed_by_units_and_signs_by_the_curve(folder, monkeypatch, capsys):

@@ -290,7 +290,7 @@ def test_command_line_fits_jointly_what_is_shared(tmp_path, monkeypatch, capsys)
     (tmp_path / "spec.toml").write_text(spec)
     monkeypatch.chdir(tmp_path)
     code, out, _ = run(monkeypatch, capsys, "check", "spec.toml")
-    assert (code, "2 lane(s), fitted jointly of up to 4" in out) == (0, True)
+    assert (code, "2 fit(s), fitted jointly of up to 4" in out) == (0, True)
     monkeypatch.setattr(specification, "MOST_DENSE", 6)
     code, _, err = run(monkeypatch, capsys, "fit", "spec.toml", "--profile")
     assert code == 2

@@ -46,7 +46,7 @@ def test_ratio_is_the_root_of_chi_squared_over_its_freedom(sigma):
     assert len(sentences) == wrong
     if wrong:
         assert f"{np.median(known):.2g} times the noise given" in sentences[0]
-        assert "in 3 of 3 lanes" in sentences[0]
+        assert "in 3 of 3 fits" in sentences[0]
         assert ("errors and intervals have grown" in sentences[0]) == (sigma < SIGMA)
 
 

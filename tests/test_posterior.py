@@ -232,7 +232,7 @@ def test_poor_chains_are_said_beside_the_estimates():
     found = Findings(drawn.result, ((POSTERIOR, drawn),))
     text = report_text("T", found, [])
     estimates = text.partition("## Estimates")[2].partition("## What")[0]
-    assert "The posterior of 1 of 1 lanes is not to be trusted" in estimates
+    assert "The posterior of 1 of 1 fits is not to be trusted" in estimates
     assert "poor: R-hat 1.550, 8 effective draws" in estimates
     assert [row[2:4] + row[-1:] for row in posterior_rows(drawn, [0])] == [["–", "–", "poor"]] * 2
     rows = list(parameter_rows(found))

@@ -296,4 +296,4 @@ def test_others_at_work_are_told():
     for busy in (None, 0.0, QUIET):
         assert doubt(busy) == ()
     (said,) = doubt(0.9)
-    assert "others kept 0.9 cores busy" in said
+    assert "machine was busy (0.9 cores)" in said

@@ -232,7 +232,7 @@ def test_terminal_takes_names_as_they_are(many):
     for name in ("[bold]", ":smile:", "<script>", "=1+1"):
         assert name in text.split()
     assert "Worst first; and 2 more, see summary.csv" in " ".join(text.split())
-    assert "13 of 14 lanes solved, 12 with every unknown determined" in text
+    assert "13 of 14 fits solved, 12 with every unknown determined" in text
 
 
 @pytest.fixture(scope="module")
@@ -367,9 +367,9 @@ def test_fewer_independent_samples_than_unknowns_leave_no_limit():
     # The line through the curve is above it at first, and again at the end.
     place = "Most missed: T a from"
     for where in (text, said):
-        assert "The model misses the curves in 1 of 1 lanes" in where
+        assert "The model misses the curves in 1 of 1 fits" in where
         assert place in where
-    assert "1 of 1 lanes solved, 0 with every unknown determined" in text
+    assert "1 of 1 fits solved, 0 with every unknown determined" in text
     assert summary_rows(widened(result))[0]["determined"] == 0
 
 

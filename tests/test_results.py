@@ -134,9 +134,7 @@ def test_failed_lane_keeps_its_row_and_is_called_failed(result):
     assert bad["k_1 verdict"] == "failed"
     assert weakest_sentence(failed, 1) == "no estimate"
     text = report_text("T", Findings(failed), [BAD])
-    assert (
-        "1 of 2 lanes solved, 0 with every unknown determined; 1 curves could not be used" in text
-    )
+    assert "1 of 2 fits solved, 0 with every unknown determined; 1 curves could not be used" in text
     assert "| T9 | 1 | non_finite | line 3: force is nan | leave it out |" in text
     assert "max iterations" in text
 
@@ -283,9 +281,9 @@ def test_report_doubts_what_it_should(result):
     bend = dataclasses.replace(seen, force=np.tile(np.linspace(1, 2, shape[-1]), (*shape[:2], 1)))
     noise = dataclasses.replace(seen, force=np.tile([1.0, -1.0], (*shape[:2], shape[-1] // 2)))
     text = report_text("T", predicted(result, bend), [])
-    assert "misses the curves in 2 of 2 lanes" in text
+    assert "misses the curves in 2 of 2 fits" in text
     assert "on its bound" not in text
     held = dataclasses.replace(result, at_bound=np.eye(2, result.at_bound.shape[1], dtype=bool))
     text = report_text("T", predicted(held, noise), [])
     assert "correlated" not in text
-    assert "In 2 of 2 lanes an unknown ended on its bound" in text
+    assert "In 2 of 2 fits an unknown ended on its bound" in text

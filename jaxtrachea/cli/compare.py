@@ -224,7 +224,7 @@ def _report(rows, sentences: dict[str, str], failed: int, models) -> str:
         *_left_out_notes(models),
     ]
     if failed:
-        parts.append(f"{failed} lanes could not be fitted by every model and count for none.")
+        parts.append(f"{failed} specimens could not be fitted by every model and count for none.")
     return "\n\n".join(parts) + "\n"
 
 
@@ -243,5 +243,5 @@ def _print(rows, sentences, failed: int, models, folder: Path) -> None:
     for note in _left_out_notes(models):
         out.print(escape(note), highlight=False, emoji=False)
     if failed:
-        out.print(f"{failed} lanes could not be fitted by every model and count for none")
+        out.print(f"{failed} specimens could not be fitted by every model and count for none")
     out.print(f"written to {escape(str(folder))}", highlight=False, soft_wrap=True)

@@ -324,7 +324,7 @@ def _kept(run, study, error: BaseException) -> Kept:
     if run.manifest.rerun is None and done:
         with contextlib.suppress(OSError):
             checkpoint.write_so_far(run.target / run_folder.SO_FAR, run, study)
-            text += f", their lanes in {run_folder.SO_FAR}"
+            text += f", their fits in {run_folder.SO_FAR}"
     first = f"{cure(error)}, then " if isinstance(error, OSError) else ""
     text = escape(f"{text}; {first}go on with --out {run.target} --resume")
     if isinstance(error, KeyboardInterrupt):

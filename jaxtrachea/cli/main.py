@@ -128,7 +128,7 @@ def check(options: CheckOptions) -> None:
     out.print(f"Fixed: {fixed or 'none'}", highlight=False)
     lanes, bad = len(study.curves), len(measurements.bad)
     joint = ", fitted jointly" if study.joint else ""
-    out.print(f"{lanes} lane(s){joint} of up to {study.size} unknowns, {bad} bad curves")
+    out.print(f"{lanes} fit(s){joint} of up to {study.size} unknowns, {bad} bad curves")
     raise typer.Exit(1 if bad else 0)
 
 

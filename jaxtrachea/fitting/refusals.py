@@ -55,14 +55,14 @@ def check_noise(curves: Sequence[Curve], force: float | None) -> None:
         force: `Noise.force`, N.
 
     Raises:
-        InputError: known and unknown noise do not add up; a curve without is named.
+        InputError: some curves have a sigma and some none; a curve without is named.
     """
     without = [c for c in curves if c.sigma is None]
     if force is None and 0 < len(without) < len(curves):
         first = without[0]
         raise InputError(
             f"no sigma, as {len(without)} of {len(curves)} curves, where the others have one: "
-            "known and unknown noise do not add up",
+            "give sigma for all curves or for none",
             place=f"specimen {first.specimen!r} trial {first.trial!r}",
             cure="give noise.force, for curves without a column sigma, or leave sigma out of all "
             "files",

@@ -38,7 +38,7 @@ def succeeded(result: FitResult, lane: int) -> bool:
 def outcome(result: FitResult, profiles: Profiles | None = None) -> str:
     """How many lanes are solved, and in how many of these every unknown is determined."""
     solved = [lane for lane in range(result.lanes) if succeeded(result, lane)]
-    said = f"{len(solved)} of {result.lanes} lanes solved"
+    said = f"{len(solved)} of {result.lanes} fits solved"
     if not result.study.free:
         return said
     determined = sum(determined_unknowns(result, k, profiles) == _count(result, k) for k in solved)
@@ -137,5 +137,5 @@ def verdict_sentence(result: FitResult, lane: int, profiles: Profiles | None = N
     if result.study.joint and result.unexamined[lane].any():
         said.append("inconclusive: only the local error was looked at; --profile looks further")
     if result.minima[lane] > 1:
-        said.append("fits that end elsewhere are as good within the noise")
+        said.append("other parameter sets fit equally well")
     return "; ".join(said)

@@ -110,8 +110,8 @@ def population(result: FitResult, profiles: Profiles | None = None) -> Populatio
     separate = {c.specimen for lane in result.study.curves for c in lane}
     if len(separate) != result.lanes:
         raise ValueError(
-            f"{len(separate)} specimens are fitted in {result.lanes} lanes; a population needs a "
-            "lane for each (a joint fit with profiles, a bootstrap or a posterior has one for all: "
+            f"{len(separate)} specimens are fitted in {result.lanes} fits; a population needs "
+            "one for each (a joint fit with profiles, a bootstrap or a posterior has one for all: "
             "leave these out)"
         )
     for lane, unknowns in enumerate(result.study.unknowns):

@@ -47,10 +47,10 @@ def report_text(
     failed = [k for k in range(result.lanes) if not succeeded(result, k)]
     parts = [
         f"# {title or 'Fit'}",
-        f"{outcome(result, findings.profiles)}; {len(bad)} curves could not be used. A lane is "
-        "what was fitted by itself: a specimen or a curve. How to read this report: "
-        "docs/report.md. All numbers: `results.h5`; one row per lane: `summary.csv`; one row per "
-        "estimate: `parameters.csv` (docs/results.md).",
+        f"{outcome(result, findings.profiles)}; {len(bad)} curves could not be used. A fit is "
+        "of one specimen, or of one curve. How to read this report: docs/report.md. All numbers: "
+        "`results.h5`; one row per fit: `summary.csv`; one row per estimate: `parameters.csv` "
+        "(docs/results.md).",
         *(["\n".join(f"- {line}." for line in understood)] if understood else []),
         *_estimates(findings),
         *_sections(findings, "estimates"),
@@ -130,6 +130,6 @@ def _bounds(result: FitResult) -> list[str]:
     if not len(bound):
         return []
     return [
-        f"In {len(bound)} of {result.lanes} lanes an unknown ended on its bound. The errors of "
+        f"In {len(bound)} of {result.lanes} fits an unknown ended on its bound. The errors of "
         "the other unknowns there hold it fixed: they do not include its own uncertainty."
     ]

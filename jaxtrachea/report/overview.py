@@ -20,9 +20,9 @@ def overview(findings: Findings) -> Iterator[Table | str]:
     lanes = listed(result)
     cut = result.lanes > len(lanes)
     if not result.study.free:
-        yield f"{result.lanes} lanes: {verdict_sentence(result, 0)}"
+        yield f"{result.lanes} fits: {verdict_sentence(result, 0)}"
     elif cut:
-        yield "Estimates over lanes", tables.SPREAD_HEAD, tables.spread_rows(result, profiles)
+        yield "Estimates over fits", tables.SPREAD_HEAD, tables.spread_rows(result, profiles)
     else:
         yield "Estimates", tables.ESTIMATE_HEAD, tables.estimate_rows(result, lanes, profiles)
     for analysis, found in findings.at("quality"):

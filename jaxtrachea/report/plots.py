@@ -90,7 +90,7 @@ def draw_fit(result: FitResult, prediction: Prediction):
     if len(shown) < result.lanes:
         half = ONE_BY_ONE // 2
         figure.suptitle(
-            f"{len(shown)} of {result.lanes} lanes: the {half} worst, then every so many to the "
+            f"{len(shown)} of {result.lanes} fits: the {half} worst, then every so many to the "
             "best; all: summary.csv"
         )
     return figure
@@ -154,7 +154,7 @@ def draw_residuals(result: FitResult, prediction: Prediction):
     if many:
         _draw_bands(left, depth, values)
     left.axhline(0, color="k", lw=0.6)
-    shown = f" of {len(lanes)} lanes (bands), the {len(lined)} worst as lines" if many else ""
+    shown = f" of {len(lanes)} fits (bands), the {len(lined)} worst as lines" if many else ""
     left.set(
         xlabel="displacement [mm]",
         ylabel="(model - data) / peak [%]",
@@ -210,7 +210,7 @@ def draw_correlation(result: FitResult):
             if np.isfinite(mean[i, j]) and shown <= 12:
                 dark = "w" if abs(mean[i, j]) > 0.6 else "k"
                 axis.text(j, i, f"{mean[i, j]:.2f}", ha="center", va="center", color=dark, size=7)
-    title = "correlation" + (f", mean of {result.lanes} lanes" if result.lanes > 1 else "")
+    title = "correlation" + (f", mean of {result.lanes} fits" if result.lanes > 1 else "")
     axis.set_title(title + of_all(shown, len(names), "unknowns"))
     figure.colorbar(image, shrink=0.8)
     return figure

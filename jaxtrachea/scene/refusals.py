@@ -139,7 +139,7 @@ def status_of(status, share, made: Approach | None, refused: dict[PressStatus, B
         if made.first is not None:
             seen = jnp.maximum(seen, made.seen.status[made.first])
         unsure = (seen > ContactStatus.FLAT) & (status == PressStatus.OK)
-        status = jnp.where(unsure, PressStatus.UNSURE, status)
+        status = jnp.where(unsure, PressStatus.CONTACT_UNCERTAIN, status)
     for code in REFUSALS:
         if code in refused:
             status = jnp.where(refused[code], code, status)

@@ -42,7 +42,7 @@ def doubt(others: float | None) -> tuple[str, ...]:
     """That others were busy, in words; empty where the machine was quiet or is not known."""
     if others is None or others <= QUIET:
         return ()
-    return (f"others kept {others:.2g} cores busy while times were measured: they are in doubt",)
+    return (f"machine was busy ({others:.2g} cores): timings are unreliable",)
 
 
 def _now() -> tuple[float, float, float] | None:

@@ -28,11 +28,11 @@ def test_the_last_good_force_is_held():
     lost = [np.nan, np.inf, 1.0]
     found = after(
         step(lost, GAP), step([0, -0.2, 0], OK), step(lost, GAP), step(lost, GAP),
-        step([0, 0, 0], NO), step([0, -0.3, 0], PressStatus.UNSURE),
+        step([0, 0, 0], NO), step([0, -0.3, 0], PressStatus.CONTACT_UNCERTAIN),
     )  # fmt: skip
     forces = [[0, 0, 0], [0, -0.2, 0], [0, -0.2, 0], [0, -0.2, 0], [0, 0, 0], [0, -0.3, 0]]
     np.testing.assert_array_equal([one.force for one in found], forces)
-    assert [one.status for one in found] == [GAP, OK, GAP, GAP, NO, PressStatus.UNSURE]
+    assert [one.status for one in found] == [GAP, OK, GAP, GAP, NO, PressStatus.CONTACT_UNCERTAIN]
     assert [one.held for one in found] == [1, 0, 1, 2, 0, 0]
     assert found[0].status.message == GAP.message
 

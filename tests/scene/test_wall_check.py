@@ -254,7 +254,9 @@ def test_touches_beyond_the_rings_are_unsure_where_the_gap_is_off():
     assert f"at s = {low:.3g} to {high:.3g} mm, beyond the rings" in beyond.sentence
     s = np.array([75.0, 120, 130, 150])
     status = pressed(tube, np.stack([s, 0 * s + 17, 0 * s], axis=1))[3]
-    np.testing.assert_array_equal(status == PressStatus.UNSURE, [False, False, True, False])
+    np.testing.assert_array_equal(
+        status == PressStatus.CONTACT_UNCERTAIN, [False, False, True, False]
+    )
     assert (status[[0, 1, 3]] == PressStatus.OK).all()
 
 

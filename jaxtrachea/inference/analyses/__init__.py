@@ -61,8 +61,8 @@ def refuse(request: Request) -> None:
         names += [f"uncertainty.{a.key}" for a in wanted if a.key and getattr(asked, a.key)]
         if names:
             raise SpecError(
-                f"{', '.join(names)}: every parameter is fixed, so that there is no estimate to be "
-                "doubted; leave it out (the model is then evaluated), or free a parameter"
+                f"{', '.join(names)}: no free parameter, nothing to analyse; leave it out (the "
+                "model is then evaluated), or free a parameter"
             )
     for analysis in wanted:
         analysis.refuse(request)

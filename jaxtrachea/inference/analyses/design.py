@@ -58,7 +58,7 @@ class Design:
 
 def _refuse(request: Request) -> None:
     if not request.study.free:
-        raise SpecError("design: every parameter is fixed; free what the presses shall tell")
+        raise SpecError("design: no free parameter; free what the presses shall tell")
     candidates_of(request.spec, request.study)
 
 

@@ -56,7 +56,7 @@ def _sentences(found: Findings) -> Iterator[str]:
         lanes = np.flatnonzero(wide.correlation > CORRELATED)
     if len(lanes):
         said = (
-            f"Neighbouring force residuals are correlated in {len(lanes)} of {every} lanes (median "
+            f"Neighbouring force residuals are correlated in {len(lanes)} of {every} fits (median "
             f"correlation {np.median(wide.correlation[lanes]):.2f}): the noise changes slowly, or "
             "the model misses the shape of these curves"
         )
@@ -74,7 +74,7 @@ def _sentences(found: Findings) -> Iterator[str]:
                           for k in missed[:NAMED])  # fmt: skip
         more = f"; and {len(missed) - NAMED} more, see summary.csv" if len(missed) > NAMED else ""
         yield (
-            f"The model misses the curves in {len(missed)} of {every} lanes: their samples are "
+            f"The model misses the curves in {len(missed)} of {every} fits: their samples are "
             "worth less than one independent sample beyond the unknowns, and no verdict is given. "
             f"Most missed: {named}{more}"
         )

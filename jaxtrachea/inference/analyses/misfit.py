@@ -28,7 +28,7 @@ def _share(result: FitResult) -> list[str]:
     if not len(lanes):
         return []
     share, sigma = np.median(result.force_share[lanes]), np.median(result.sigma[lanes, 0])
-    median = f" in {len(lanes)} of {result.lanes} lanes (medians)" if result.lanes > 1 else ""
+    median = f" in {len(lanes)} of {result.lanes} fits (medians)" if result.lanes > 1 else ""
     cause = (
         "found in the residuals: what the model misses grows with the force, and with one sigma "
         "for all depths the deep samples would outvote the shallow ones"
@@ -55,7 +55,7 @@ def _sentences(result: FitResult) -> list[str]:
             lanes = np.flatnonzero(told & beyond)
             if len(lanes):
                 median = float(np.median(ratio[lanes]))
-                where = f" in {len(lanes)} of {every} lanes" if every > 1 else ""
+                where = f" in {len(lanes)} of {every} fits" if every > 1 else ""
                 said.append(
                     f"{kind} residuals are {median:.2g} times the noise given (root of chi^2 / "
                     f"(n - P)){where}: {cause} by about this factor. Leave `{key}` out to take it "

@@ -69,7 +69,7 @@ def distrust(drawn: Posterior) -> list[str]:
     named = [f"{lane_label(drawn.result, k)} {bad[k]}" for k in list(bad)[:_NAMED]]
     more = f"; and {len(bad) - _NAMED} more, see parameters.csv" if len(bad) > _NAMED else ""
     return [
-        f"**The posterior of {len(bad)} of {drawn.result.lanes} lanes is not to be trusted as it "
+        f"**The posterior of {len(bad)} of {drawn.result.lanes} fits is not to be trusted as it "
         f"stands**: {'; '.join(named)}{more}. Draw more, or look at the profiles."
     ]
 
@@ -103,7 +103,7 @@ def _section(drawn: Posterior) -> list[str]:
     shown = listed(result)
     chains, draws = drawn.theta.shape[1:3]
     longer = drawn.steps[drawn.steps > draws]
-    more = f", {longer.min()} to {longer.max()} in {len(longer)} lanes" if len(longer) else ""
+    more = f", {longer.min()} to {longer.max()} in {len(longer)} fits" if len(longer) else ""
     return [
         "## Posterior",
         markdown_table(POSTERIOR_HEAD, posterior_rows(drawn, shown)),

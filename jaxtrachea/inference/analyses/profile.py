@@ -181,7 +181,7 @@ def draw_profiles(found: Profiles):
         wide = np.ptp(found.coordinate[members]) > np.log(20)
         axis.set_xscale("log" if p.scale == "log" and wide else "linear")
         axis.set_ylim(-0.2, 2.2 * found.threshold[first])
-        title = p.name + of_all(min(len(members), LINES), len(members), "worst lanes")
+        title = p.name + of_all(min(len(members), LINES), len(members), "worst fits")
         axis.set(title=title, xlabel=f"{p.name} [{p.unit}]", ylabel="rise of the profile")
     return figure
 
