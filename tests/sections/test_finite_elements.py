@@ -1,7 +1,7 @@
-"""Five tubes in three-dimensional finite elements, by stiffnesses from their moduli alone.
+"""Six tubes in three-dimensional finite elements, by stiffnesses from their moduli alone.
 
-`tests/reference/sections_fem.json` (tests/bench/sections_fem.py): the specimen of the factors, two
-tubes that are like it within a tenth, and two that are not. What is OK is right within 5 % of the
+`tests/reference/sections_fem.json` (tests/bench/sections_fem.py): the specimen of the factors, and
+tubes unlike it by 4 %, by a tenth (two) and by more (two). What is OK is right within 5 % of the
 peak of the force; where the level errs by more, beyond the tested angle and on tubes unlike the
 specimen, the status says so, and docs/off_midline.md by how much.
 """
@@ -27,8 +27,14 @@ pytestmark = [pytest.mark.compiling, pytest.mark.slow]
 CASES = json.loads((Path(__file__).parents[1] / "reference" / "sections_fem.json").read_text())
 #: Largest error of the force over its peak, and of side over normal force, to 90 degrees.
 LIMITS = {
-    "ring": {"narrow": (0.11, 0.07), "wide": (0.17, 0.14)},
-    "span": {"narrow": (0.20, 0.09), "wide": (0.16, 0.14)},
+    "ring": {
+        "near": (0.06, 0.07),
+        "closer": (0.07, 0.07),
+        "farther": (0.05, 0.07),
+        "narrow": (0.11, 0.07),
+        "wide": (0.17, 0.14),
+    },
+    "span": {"near": (0.05, 0.07), "narrow": (0.20, 0.09), "wide": (0.16, 0.14)},
 }
 
 

@@ -314,7 +314,7 @@ def from_wall(
 
 
 #: Largest ratio of a proportion to the specimen's with which `Factors` hold (docs/off_midline.md).
-ALIKE = 1.04
+ALIKE = 1.02
 
 
 def proportions(geometry: Geometry, wall: Wall, tool_radius: float) -> Float[Array, "12"]:
