@@ -348,8 +348,8 @@ def _press(model: FitModel, tube, free, skeleton, by_beam, trial: Lane | _Tool) 
 
     def all_columns(v):
         zero = jnp.zeros(v.shape[1:], v.dtype)
-        rows = range(len(eye))
-        return jnp.stack([v[of_beam.index(i)] if i in of_beam else zero for i in rows])
+        columns = [v[of_beam.index(i)] if i in of_beam else zero for i in range(len(eye))]
+        return jnp.stack(columns) if columns else v[:0]
 
     d_skeleton = jax.tree.map(all_columns, by_beam)
     law, c = contact.law, _felt(model, skeleton)

@@ -253,7 +253,7 @@ def _of_lane(stored: StoredFit, lane: int, curves: tuple[Curve, ...], left: _Lef
         if found is not None:
             squares.append(_squares(stored, [curves[t] for t in out], *found, grid))
     squares = [v for v in squares if np.isfinite(v).all()]
-    n, growth = len(squares), float(stored.growth[lane])
+    n, growth = len(squares), float(stored.growth[lane]) if stored.study.free else 1.0
     if n < MIN_POSITIONS or deepest <= 0:
         return ModelError(grid, np.full(POINTS, np.nan), n, np.nan, growth, pressed)
     by_depth = np.mean(squares, axis=0)
