@@ -343,6 +343,19 @@ def test_independent_residuals_widen_nothing():
     assert share_independent(np.full(2, 0.4), np.array([15, 40])).tolist() == [1, 0.6 / 1.4]
 
 
+def test_alike_residuals_far_below_the_noise_given_hardly_count():
+    """Variance: of the noise the part that is seen is alike, the rest independent."""
+    depth = np.linspace(0.1, 2, 100)
+    noise = 0.05 * autoregressive((2, 100), 0.8, 5) * np.array([[0.1], [1.0]])
+    curves = [Curve(f"s{k}", "a", None, 0.0, depth, 1.3 * depth + noise[k]) for k in range(2)]
+    result = fit(build_study(curves, table_1(), BONDED, table(), noise=Noise(force=0.05)), ONE)
+    part = np.nansum(result.residuals.force**2, axis=(1, 2)) / 98 / 0.05**2
+    expected = np.sqrt(1 + np.minimum(part, 1) * (100 / result.effective.samples - 1))
+    np.testing.assert_allclose(result.effective.growth, expected, rtol=1e-9)
+    assert result.effective.growth[0] < 1.1
+    assert result.effective.growth[1] > 2
+
+
 @pytest.mark.slow
 @pytest.mark.compiling
 def test_fewer_independent_samples_than_unknowns_leave_no_limit():

@@ -6,8 +6,9 @@ doi:10.2307/2983560; Thiebaux and Zwiers 1984, doi:10.1175/1520-0450(1984)023<08
 The same holds for the unknowns of smooth curves, whose derivatives change little between
 neighbours: noise that changes slowly is averaged by no number of samples. With P unknowns and
 estimated noise, variances grow by (n - P) / (n_eff - P), and Student's t has n_eff - P degrees of
-freedom. With given noise they grow by n / n_eff, and by chi^2 / (n - P) where the residuals are
-larger than that noise (`misfit`). A correlation that independent noise often has by chance is
+freedom. With given noise the part of its variance that the residuals have, u = chi^2 / (n - P) but 1
+at most, counts as alike and the rest as independent: variances grow by 1 + u (n / n_eff - 1), and
+by chi^2 / (n - P) where the residuals are larger than that noise (`misfit`). A correlation that independent noise often has by chance is
 taken for none.
 
 r is that of the residuals. The fit has made it smaller than that of the noise, by about
@@ -130,14 +131,17 @@ def effective(of: Residuals, plain: Float[np.ndarray, " lanes"]) -> Effective:
         P = unknown_count(study, alive) - held_count(study, held, alive)
         unknowns = np.full(len(n), float(P))
         n, worth = (np.full(len(n), np.nansum(v[alive])) for v in (n, worth))
-    excess = misfit(of).growth
+    against = misfit(of)
+    excess = against.growth
+    seen_part = np.nan_to_num(np.fmin(np.fmax(*against.ratio.T), 1.0), nan=1.0) ** 2
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         left = worth - unknowns
         # A given noise that covers the residuals limits what they can hide.
         misses = (left < MIN_FREEDOM) & (worth < n) & (~study.noise_known | (excess > 1))
         factor = np.sqrt(np.maximum((n - unknowns) / left, 1))
         quantile = stdtrit(np.maximum(left, MIN_FREEDOM), 0.975)
-        factor = np.where(study.noise_known, excess * np.sqrt(np.maximum(n / worth, 1)), factor)
+        alike = 1 + seen_part * (np.maximum(n / worth, 1) - 1)
+        factor = np.where(study.noise_known, excess * np.sqrt(alike), factor)
         quantile = np.where(study.noise_known, plain, quantile)
     # Residuals too few for a correlation are taken for independent.
     few = np.isnan(worth)
