@@ -17,6 +17,7 @@ then says what noise of that size and slowness would do. Where less than one ind
 left over the unknowns, nothing is said at all (`Effective.misses`).
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -115,6 +116,14 @@ def _share(residual: Float[np.ndarray, "lanes trials samples"]) -> Float[np.ndar
     return share_independent(lag_correlation(residual), pairs)
 
 
+def _together(of: Residuals) -> Prediction:
+    """Residuals of all specimens of a joint fit as the trials of one."""
+
+    seen = {f.name: getattr(of.seen, f.name) for f in dataclasses.fields(of.seen)}
+    alive = {name: v[of.succeeded] for name, v in seen.items() if v is not None}
+    return Prediction(**seen | {k: v.reshape(1, -1, *v.shape[2:]) for k, v in alive.items()})
+
+
 def effective(of: Residuals, plain: Float[np.ndarray, " lanes"]) -> Effective:
     """Worth of the samples of all lanes by their residuals.
 
@@ -123,14 +132,15 @@ def effective(of: Residuals, plain: Float[np.ndarray, " lanes"]) -> Effective:
         plain: half of a 95 % interval in standard errors, of independent residuals; (lanes,).
     """
     study, lanes = of.study, of.study.lanes
-    n, worth = np.asarray(of.samples, float), effective_samples(of.seen)
+    n = np.asarray(of.samples, float)
+    worth = effective_samples(_together(of) if study.joint else of.seen)
     held = of.at_bound | ~(lanes.active > 0)
     unknowns = np.sum(~held, axis=1).astype(float)
     if study.joint:
         alive = of.succeeded
         P = unknown_count(study, alive) - held_count(study, held, alive)
         unknowns = np.full(len(n), float(P))
-        n, worth = (np.full(len(n), np.nansum(v[alive])) for v in (n, worth))
+        n, worth = np.full(len(n), np.sum(n[alive])), np.full(len(n), worth[0])
     against = misfit(of)
     excess = against.growth
     seen_part = np.nan_to_num(np.fmin(np.fmax(*against.ratio.T), 1.0), nan=1.0) ** 2
