@@ -6,10 +6,10 @@ doi:10.2307/2983560; Thiebaux and Zwiers 1984, doi:10.1175/1520-0450(1984)023<08
 The same holds for the unknowns of smooth curves, whose derivatives change little between
 neighbours: noise that changes slowly is averaged by no number of samples. With P unknowns and
 estimated noise, variances grow by (n - P) / (n_eff - P), and Student's t has n_eff - P degrees of
-freedom. With given noise the part of its variance that the residuals have, u = chi^2 / (n - P) but 1
-at most, counts as alike and the rest as independent: variances grow by 1 + u (n / n_eff - 1), and
-by chi^2 / (n - P) where the residuals are larger than that noise (`misfit`). A correlation that independent noise often has by chance is
-taken for none.
+freedom. With given noise the part of its variance that the residuals have, u = chi^2 / (n - P) or
+1, counts as alike and the rest as independent: variances grow by 1 + u (n / n_eff - 1), and by
+chi^2 / (n - P) where the residuals are larger than that noise (`misfit`). A correlation that
+independent noise often has by chance is taken for none.
 
 r is that of the residuals. The fit has made it smaller than that of the noise, by about
 (1 + 4 r) / n and more with many unknowns. An error of the model is correlated as well: the interval
@@ -118,7 +118,6 @@ def _share(residual: Float[np.ndarray, "lanes trials samples"]) -> Float[np.ndar
 
 def _together(of: Residuals) -> Prediction:
     """Residuals of all specimens of a joint fit as the trials of one."""
-
     seen = {f.name: getattr(of.seen, f.name) for f in dataclasses.fields(of.seen)}
     alive = {name: v[of.succeeded] for name, v in seen.items() if v is not None}
     return Prediction(**seen | {k: v.reshape(1, -1, *v.shape[2:]) for k, v in alive.items()})
