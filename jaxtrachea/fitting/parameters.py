@@ -9,7 +9,7 @@ import numpy as np
 from jaxtrachea._arguments import check_word
 from jaxtrachea._errors import InputError
 from jaxtrachea.mechanics.press import Options
-from jaxtrachea.mechanics.sections.material import SECTION_VALUES, Wall, from_wall
+from jaxtrachea.mechanics.sections.material import SECTION_VALUES, TOOL_RADIUS, Wall, from_wall
 from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import OF_PRESS, VALUES, Declaration, Fitted, Scale, Scope
 
@@ -190,8 +190,7 @@ def defaults_of(
                 cure="leave it out, or choose skeleton = 'sections'",
             )  # fmt: skip
         return DEFAULTS
-    wall = Wall() if wall is None else wall
-    material = from_wall(geometry, wall, **({"tool_radius": tool_radius} if tool_radius else {}))
+    material = from_wall(geometry, wall or Wall(), tool_radius=tool_radius or TOOL_RADIUS)
     values = {name: getattr(material, name) for name in SECTION_VALUES}
     begun = {n: _begun(DEFAULTS[n], float(np.median(np.asarray(v)))) for n, v in values.items()}
     return DEFAULTS | begun

@@ -133,7 +133,7 @@ def material_of(spec: SceneSpec, geometry: Geometry) -> AnyMaterial:
         wall = from_wall(geometry, Wall(**moduli), tool_radius=tool_radius)
     except InputError as error:
         raise SpecError.like(error, key=f"wall.{error.key}") from None
-    if all(name in named for name, p in SECTION_VALUES.items() if not p.fit.fixed):
+    if all(name in named for name, p in SECTION_VALUES.items() if p.fit and not p.fit.fixed):
         named["extrapolated"] = 0.0  # what a fit estimates, it estimated
     return dataclasses.replace(wall, **named)
 

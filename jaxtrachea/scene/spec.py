@@ -20,7 +20,12 @@ from jaxtrachea.config import (
     load_spec,
     quantity,
 )
-from jaxtrachea.mechanics.sections.material import LEAST, SECTION_VALUES, SectionMaterial
+from jaxtrachea.mechanics.sections.material import (
+    LEAST,
+    SECTION_VALUES,
+    TOOL_RADIUS,
+    SectionMaterial,
+)
 from jaxtrachea.scene.declare import Effect
 from jaxtrachea.scene.effects import EFFECTS
 from jaxtrachea.trachea.material import DEEP, VALUES, meaningless
@@ -119,7 +124,7 @@ class SectionsSection(_section_keys()):
 class SceneWallSection(WallSection):
     """[wall] of a scene, with the radius of the tool's flat end: the local contact follows it."""
 
-    tool_radius: PositiveLength = 3.0
+    tool_radius: PositiveLength = TOOL_RADIUS
 
 
 #: Values of [sections] that have no default of their own.

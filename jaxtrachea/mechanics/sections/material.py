@@ -265,11 +265,15 @@ class Factors:
     slide: float = 0.35
 
 
+#: Of the punch that pressed the virtual specimen, mm.
+TOOL_RADIUS = 3.0
+
+
 def from_wall(
     geometry: Geometry,
     wall: Wall = Wall(),
     factors: Factors = Factors(),  # noqa: B008 (frozen)
-    tool_radius: float = 3.0,
+    tool_radius: float = TOOL_RADIUS,
 ) -> SectionMaterial:
     """Stiffnesses of the sections of a tube, from moduli and thicknesses.
 
