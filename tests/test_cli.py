@@ -572,8 +572,8 @@ def test_check_says_which_sheet(study, monkeypatch, capsys):
 
 def test_hostile_hdf5_costs_its_own_row(study, monkeypatch, capsys):
     with h5py.File(study / "evil.h5", "w") as file:
-        file.attrs["schema"], file.attrs["schema_version"] = "jaxtrachea-measurements", 1
-        file["specimens"] = h5py.ExternalLink("/etc/passwd", "/")
+        file.attrs["schema"], file.attrs["schema_version"] = "jaxtrachea-measurements", 2
+        file["curves"] = h5py.ExternalLink("/etc/passwd", "/")
     (study / "spec.toml").write_text('[data]\nfiles = ["good.csv", "evil.h5"]')
     code, out, err = run(monkeypatch, capsys, "check", study / "spec.toml")
     assert code == 1

@@ -15,9 +15,9 @@ from run_cli import run
 SECONDS, MEGABYTES = 20, 300
 #: A message tells what is expected, or what to do.
 CURE = re.compile(
-    r"\b(accepted|add|check|choose|close|complete|copy|correct|count|expected|export|flatten|free|"
-    r"give|is its unit|keep|leave|list|make|move|must|name|needs|number|remove|rename|save|set|"
-    r"split|store|swap|thin|update|use|write)\b",
+    r"\b(accepted|add|check|choose|close|complete|convert|copy|correct|count|expected|export|"
+    r"flatten|free|give|is its unit|keep|leave|list|make|move|must|name|needs|number|remove|"
+    r"rename|save|set|split|store|swap|thin|update|use|write)\b",
     re.IGNORECASE,
 )
 #: What a message must never show: control characters, words of Python.

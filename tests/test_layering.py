@@ -70,7 +70,8 @@ WITHIN = {
         {"checks"},
         {"together"},
         {"readers"},
-        {"heads", "read"},
+        {"heads", "hdf5_writer"},
+        {"read"},
         {"data_files", "guess", "usage_tables"},
     ],
     "mechanics/sections": [

@@ -52,7 +52,7 @@ def main(source: Path) -> None:
             finite.append(curve(name, case, case["D"][()], case["force"][:, 0], joints))
     for stem, curves in (("small_strain", small), ("finite_strain", finite)):
         measured = Measurements(tuple(curves), (), ())
-        write_hdf5(HERE / f"{stem}.h5", measured, attrs=ATTRS, overwrite=True, schema_version=1)
+        write_hdf5(HERE / f"{stem}.h5", measured, attrs=ATTRS, overwrite=True)
 
 
 if __name__ == "__main__":

@@ -63,7 +63,7 @@ def main(*sources: Path) -> None:
         with h5py.File(source) as file:
             curves += [curve(case) for case in file.values()]
     measured = Measurements(tuple(curves), (), ())
-    write_hdf5(OUT, measured, attrs=ATTRS, overwrite=True, schema_version=1)
+    write_hdf5(OUT, measured, attrs=ATTRS, overwrite=True)
 
 
 if __name__ == "__main__":

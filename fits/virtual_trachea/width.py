@@ -9,12 +9,12 @@ presses, and what mixing stiffnesses in place of compliances gave (values fitted
 import json
 from pathlib import Path
 
-import h5py
 import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 
+from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.mechanics.force_law import ring_weight
 from jaxtrachea.mechanics.press import Options, compliance, press
 from jaxtrachea.trachea.geometry import Geometry
@@ -59,10 +59,9 @@ def main() -> None:
         "point, stiffnesses mixed": (with_stiffnesses(s), "0.6", 1.0),
     }
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), width_ratios=(2, 1), layout="constrained")
-    with h5py.File(HERE / "small_strain.h5") as file:
-        curves = [c for c in file["specimens/virtual"].values()]
-        places = [c.attrs["s_c"] for c in curves]
-        measured = [c["force"][-1] / c["displacement"][-1] for c in curves]
+    curves = read_measurements(HERE / "small_strain.h5").curves
+    places = [c.s_c for c in curves]
+    measured = [c.force[-1] / c.displacement[-1] for c in curves]
     for ax in axes:
         for name, (line, colour, width) in lines.items():
             ax.plot(s, line, color=colour, lw=width, label=name)

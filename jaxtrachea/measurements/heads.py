@@ -8,9 +8,9 @@ from jaxtrachea.measurements.curve import Fault, ReadOptions
 from jaxtrachea.measurements.readers import READERS
 from jaxtrachea.measurements.readers.afmformats import AFMFORMATS, SI_UNITS, load
 from jaxtrachea.measurements.readers.column_roles import find_roles, time_column
-from jaxtrachea.measurements.readers.hdf5_values import names_in, unit_of
+from jaxtrachea.measurements.readers.hdf5 import limits_of
+from jaxtrachea.measurements.readers.hdf5_values import unit_of
 from jaxtrachea.measurements.readers.machine_header import MAX_PREAMBLE, find_header
-from jaxtrachea.measurements.readers.ragged import limits_of
 from jaxtrachea.measurements.readers.recognise import kind_of
 from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.measurements.readers.table import Header, Line, Text, likely_header
@@ -19,8 +19,6 @@ from jaxtrachea.measurements.readers.workbook import read_sheets
 
 #: Bytes of a text in which its header is looked for.
 HEAD_BYTES = 2**18
-#: Specimens of an HDF5 file of version 1 whose datasets are named, and trials of each.
-_GROUPS = 8
 #: Roles of datasets by their names in the project's own HDF5 files, where they differ.
 _STORED = {"s_c": "s", "phi_c": "phi", "joint_displacement": "joint", "end_U": "end",
            "end_V": "end", "joint_side_displacement": "joint", "joint_ring_number": "joint",
@@ -161,8 +159,9 @@ def _stored(file: Any) -> Head:
             roles = {**_OF_AFM, "height (measured)": ""}
         return Head("afmformats", _columns(columns, roles))
     columns: dict[str, str | None] = {}
-    for group in _own_groups(file):
-        columns |= {name: _unit(group, name) for name in sorted(names_in(group))}
+    for group in (file.get(name) for name in ("curves", "samples")):
+        if hasattr(group, "items"):
+            columns |= {name: _unit(group, name) for name in sorted(group)}
     return Head("hdf5", _columns(columns, {name: _STORED.get(name, name) for name in columns}))
 
 
@@ -176,12 +175,3 @@ def _unit(group: Any, name: str) -> str | None:
 
 def _columns(units: dict[str, str | None], roles: dict[str, str]) -> tuple[Column, ...]:
     return tuple(Column(name, unit, roles.get(name, "")) for name, unit in units.items())
-
-
-def _own_groups(file: Any) -> Iterator[Any]:
-    """Groups of the project's own schema that hold datasets."""
-    if "curves" in file:
-        yield from (file[name] for name in ("curves", "samples") if name in file)
-        return
-    for specimen in [*file["specimens"].values()][:_GROUPS]:
-        yield from (trial for trial in [*specimen.values()][:_GROUPS])

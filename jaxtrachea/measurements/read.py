@@ -18,8 +18,9 @@ from jaxtrachea.measurements.curve import (
     RawCurve,
     ReadOptions,
 )
+from jaxtrachea.measurements.hdf5_writer import write_curves
 from jaxtrachea.measurements.machine import check_machine_files
-from jaxtrachea.measurements.readers import READERS, hdf5, reader_of
+from jaxtrachea.measurements.readers import READERS, reader_of
 from jaxtrachea.measurements.readers.afmformats import AFMFORMATS
 from jaxtrachea.measurements.readers.reader import Reader, Records
 from jaxtrachea.measurements.readers.recognise import HEAD, kind_of
@@ -133,7 +134,6 @@ def write_hdf5(
     *,
     attrs: Mapping[str, str | int | float] | None = None,
     overwrite: bool = False,
-    schema_version: int = 2,
 ) -> None:
     """Write the usable curves in the project's own HDF5 schema; bad ones are not written.
 
@@ -144,15 +144,13 @@ def write_hdf5(
         measurements: the curves.
         attrs: further root attributes, such as licence and source.
         overwrite: replace an existing file.
-        schema_version: 2 keeps all curves of a quantity in one dataset, which is read a hundred
-            times faster; 1 keeps a group for each trial, for older readers.
 
     Raises:
         FileExistsError: `path` exists and `overwrite` is False.
-        ValueError: `attrs` sets the schema, there is no such version, a name cannot be written, or
-            a (specimen, trial) comes twice.
+        ValueError: `attrs` sets the schema; a name is empty, unprintable or longer than 1024 bytes;
+            a (specimen, trial) comes twice; there are more numbers than are read back.
     """
-    hdf5.write(Path(path), measurements.curves, dict(attrs or {}), overwrite, schema_version)
+    write_curves(Path(path), measurements.curves, dict(attrs or {}), overwrite)
 
 
 def _notes(records: Records) -> list[str]:

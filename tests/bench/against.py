@@ -3,24 +3,26 @@
 Run: python tests/bench/against.py FOLDER [COMMAND ...].
 Both on the same specification (that of the earlier one) and the same measurements, in turns, each
 command in a process of its own. Cold: with an empty folder for compiled programs; warm: with what
-the cold start left. The cohort of `cohort.py` is read from the file format that each writes by
-itself: schema 1 then, schema 2 now. COMMAND: fit, simulate, cohort, selfcheck; all unless told
-otherwise.
+the cold start left. Measurements lie in the version of the HDF5 schema that each reads: 1
+then, 2 now. COMMAND: fit, simulate, cohort, selfcheck; all unless told otherwise.
 """
 
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import common
 import fitting
+import h5py
 from cohort import DEPTHS, SPECIMENS, SPOTS
 
-from jaxtrachea.measurements.read import Measurements, write_hdf5
+from jaxtrachea.measurements.read import Curve, Measurements, write_hdf5
 
 NOW = common.FOLDER.parents[1]
 #: Turns and starts of each command.
@@ -50,26 +52,48 @@ def run(checkout: Path, words: list[str], cache: Path, place: Path) -> dict[str,
     return {"wall": wall, "processor": processor}
 
 
+def write_version_1(path: Path, curves: Sequence[Curve]) -> None:
+    """The file that the earlier one reads: a group per trial."""
+    with h5py.File(path, "w") as file:
+        file.attrs.update({"schema": "jaxtrachea-measurements", "schema_version": 1})
+        for curve in curves:
+            group = file.create_group(f"specimens/{curve.specimen}/{curve.trial}")
+            group.attrs.update({"s_c": curve.s_c, "s_c_unit": "mm"})
+            for name, unit in (("displacement", "mm"), ("force", "N")):
+                group[name] = getattr(curve, name)
+                group[name].attrs["unit"] = unit
+
+
 def cohort(earlier: Path, base: Path) -> dict[Path, list[str]]:
     """Words of a fit of 10,000 specimens by checkout, each with its file."""
     study, *_ = fitting.make_study(SPECIMENS, SPOTS, DEPTHS)
     curves = tuple(curve for lane in study.curves for curve in lane)
-    words = {}
-    for checkout, version in ((earlier, 1), (NOW, 2)):
-        folder = base / f"cohort_{version}"
-        folder.mkdir()
-        write_hdf5(folder / "c.h5", Measurements(curves, (), ()), schema_version=version)
-        (folder / "spec.toml").write_text('[data]\nfiles = ["c.h5"]\n')
-        words[checkout] = ["fit", str(folder / "spec.toml"), "--out", "out"]
-    return words
+    write_version_1(base / "1.h5", curves)
+    write_hdf5(base / "2.h5", Measurements(curves, (), ()))
+    for version in (1, 2):
+        (base / f"{version}.toml").write_text(f'[data]\nfiles = ["{version}.h5"]\n')
+    return {
+        checkout: ["fit", str(base / f"{version}.toml"), "--out", "out"]
+        for checkout, version in ((earlier, 1), (NOW, 2))
+    }
+
+
+def shipped(earlier: Path, base: Path) -> dict[Path, list[str]]:
+    """Words of the shipped fit as the earlier one specifies it, each with its own file of data."""
+    folder = Path("fits", "virtual_trachea")
+    shutil.copy(earlier / folder / "fit.toml", base)
+    shutil.copy(NOW / folder / "small_strain.h5", base)
+    places = {earlier: earlier / folder, NOW: base}
+    return {c: ["fit", str(place / "fit.toml"), "--out", "out"] for c, place in places.items()}
 
 
 def words_of(command: str, earlier: Path, base: Path) -> dict[Path, list[str]]:
     """Words of a command by checkout."""
     if command == "cohort":
         return cohort(earlier, base)
+    if command == "fit":
+        return shipped(earlier, base)
     words = {
-        "fit": ["fit", str(earlier / "fits" / "virtual_trachea" / "fit.toml"), "--out", "out"],
         "simulate": ["simulate", str(earlier / "configs" / "normal.toml"), "--out", "out"],
         "selfcheck": ["selfcheck"],
     }

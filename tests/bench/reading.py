@@ -1,8 +1,8 @@
-"""Reading measurements: HDF5 schemas 1 and 2 and tidy tables. Run: python tests/bench/reading.py.
+"""Reading measurements: HDF5 and tidy tables. Run: python tests/bench/reading.py.
 
 Curves of 200 samples with noise of their own, as of a testing machine, from a file that is in the
 cache of the system: ms per curve from the file to records, for the checks one by one and together,
-and bytes per curve. A tidy table of 10^6 rows, and a machine file of 300,000. Then schema 2 with
+and bytes per curve. A tidy table of 10^6 rows, and a machine file of 300,000. Then HDF5 with
 10^5 curves of 200 samples and 10^6 of 10, from the file to usable curves, in a process of its own:
 seconds and peak memory.
 """
@@ -65,25 +65,22 @@ def study(curves: int, samples: int) -> Measurements:
 
 
 def small(out: common.Writer, folder: Path) -> None:
-    """Schemas side by side."""
+    """HDF5 and a table side by side."""
     measured = study(CURVES, SAMPLES)
-    one, two, tidy = (folder / name for name in ("1.h5", "2.h5", "t.csv"))
-    write_hdf5(one, measured, schema_version=1)
-    write_hdf5(two, measured)
+    own, tidy = folder / "m.h5", folder / "t.csv"
+    write_hdf5(own, measured)
     write_tidy(tidy, measured.curves)
     options = ReadOptions()
-    raws = [raw for raw in hdf5.read(two, options) if isinstance(raw, RawCurve)]
+    raws = [raw for raw in hdf5.read(own, options) if isinstance(raw, RawCurve)]
     cases = {
-        "HDF5 schema 1, records": lambda: hdf5.read(one, options),
-        "HDF5 schema 2, records": lambda: hdf5.read(two, options),
+        "HDF5, records": lambda: hdf5.read(own, options),
         "checks one by one": lambda: [finish(raw, options) for raw in raws],
         "checks together": lambda: finish_all(raws, options),
-        "HDF5 schema 1, usable curves": lambda: read_measurements([one]),
-        "HDF5 schema 2, usable curves": lambda: read_measurements([two]),
+        "HDF5, usable curves": lambda: read_measurements([own]),
         "tidy table, usable curves": lambda: read_measurements([tidy]),
     }
     sizes = {name: None for name in cases}
-    for name, path in (("schema 1", one), ("schema 2", two), ("tidy", tidy)):
+    for name, path in (("HDF5", own), ("tidy", tidy)):
         size = path.stat().st_size / CURVES
         sizes |= {case: size for case in cases if name in case}
     samples = common.interleaved(cases, rounds=ROUNDS)
@@ -109,7 +106,7 @@ def tables(out: common.Writer, folder: Path) -> None:
 
 
 def large(out: common.Writer, folder: Path) -> None:
-    """Many curves, schema 2."""
+    """Many curves, HDF5."""
     for curves, samples in LARGE:
         path = folder / f"{curves}.h5"
         write_hdf5(path, study(curves, samples))
@@ -117,7 +114,7 @@ def large(out: common.Writer, folder: Path) -> None:
         done = subprocess.run(run, capture_output=True, text=True, check=True)
         seconds, peak, count = json.loads(done.stdout)
         assert count == curves
-        name = f"schema 2, {curves} curves of {samples} samples"
+        name = f"HDF5, {curves} curves of {samples} samples"
         megabytes = path.stat().st_size // 2**20
         out.add("large", name, [seconds], lanes=curves, peak_MB=peak, file_MB=megabytes)
         print(f"{seconds:.1f} s, {peak} MB, file of {megabytes} MB")

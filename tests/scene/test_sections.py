@@ -4,7 +4,6 @@ import dataclasses
 import re
 from pathlib import Path
 
-import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +21,7 @@ from jaxtrachea import (
     sweep,
 )
 from jaxtrachea._errors import InputError
+from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.mechanics.sections.material import from_wall
 from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.mechanics.skeleton import local_frame
@@ -57,9 +57,9 @@ ANYWHERE = make_scene(TUBE, WALL, straight([75, 70], [0.5, 0.0], 2.0), effects=B
 
 def finite_element(angle):
     """Displacement, normal and side force of the specimen of fits/virtual_trachea, s = 70 mm."""
-    with h5py.File(ROOT / "fits" / "virtual_trachea" / "off_midline.h5") as file:
-        curve = file[f"specimens/virtual/s070.0 phi{angle}"]
-        return {k: curve[k][()] for k in ("displacement", "force", "side_force")}
+    curves = read_measurements(ROOT / "fits" / "virtual_trachea" / "off_midline.h5").curves
+    (curve,) = (c for c in curves if c.trial == f"s070.0 phi{angle}")
+    return {k: getattr(curve, k) for k in ("displacement", "force", "side_force")}
 
 
 @pytest.mark.slow

@@ -30,6 +30,7 @@ from jaxtrachea import (
 )
 from jaxtrachea._errors import InputError
 from jaxtrachea.contact.shapes import sphere
+from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.mechanics.energy import StraightPress, gradient
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.scene.assemble import with_tool
@@ -200,12 +201,8 @@ def finite_element():
     fits = json.loads((folder / "expected.json").read_text())["finite_strain"]
     fit = next(f for f in fits if (f["depth_mm"], f["skeleton"]) == (6.0, "softening"))
     material = Material(k_3=0.0, **{k: v["value"] for k, v in fit["parameters"].items()})
-    with h5py.File(folder / "finite_strain.h5") as file:
-        curves = {
-            float(c.attrs["s_c"]): (c["displacement"][()], c["force"][()])
-            for c in file["specimens/virtual"].values()
-        }
-    return material, curves
+    measured = read_measurements(folder / "finite_strain.h5").curves
+    return material, {c.s_c: (c.displacement, c.force) for c in measured}
 
 
 def test_against_the_finite_element_trachea():

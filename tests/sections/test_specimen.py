@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxtrachea.measurements.read import read_measurements
 from jaxtrachea.mechanics.sections.material import Wall, from_wall, neutral_radius
 from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.status import PressStatus
@@ -37,15 +38,10 @@ def test_the_composite_ring():
 @pytest.mark.slow
 def test_finite_strain_on_the_midline():
     """D to 6 mm: force within 3 % of its peak, markers 3 % of D (rms, none under the tool)."""
-    with h5py.File(VIRTUAL / "finite_strain.h5") as file:
-        curves = {
-            float(name[1:]): [curve[k][1:] for k in ("displacement", "force", "joint_displacement")]
-            for name, curve in file["specimens/virtual"].items()
-        }
-    s_c, (D, force, markers) = (
-        np.array(list(curves)),
-        map(np.array, zip(*curves.values(), strict=True)),
-    )
+    curves = read_measurements(VIRTUAL / "finite_strain.h5").curves
+    s_c = np.array([curve.s_c for curve in curves])
+    keys = ("displacement", "force", "joint_displacement")
+    D, force, markers = (np.array([getattr(curve, k)[1:] for curve in curves]) for k in keys)
 
     def one(s, path):
         return press_sections(GEOMETRY, from_wall(GEOMETRY), s, 0.0, path, midline=True)
@@ -63,11 +59,10 @@ def test_finite_strain_on_the_midline():
 @pytest.mark.slow
 def test_finite_strain_off_the_midline():
     """30 and 90 degrees to 6 mm: force within 4.2 % of its peak, side force over it 0.065."""
-    with h5py.File(VIRTUAL / "off_midline.h5") as file:
-        presses = [p for p in file["specimens/virtual"].values() if p.attrs["phi_c"] > 0]
-        s_c, phi_c = (np.array([p.attrs[k] for p in presses]) for k in ("s_c", "phi_c"))
-        keys = ("displacement", "force", "side_force")
-        D, force, side = (np.array([p[k][1:] for p in presses]) for k in keys)
+    presses = [p for p in read_measurements(VIRTUAL / "off_midline.h5").curves if p.phi_c > 0]
+    s_c, phi_c = (np.array([getattr(p, k) for p in presses]) for k in ("s_c", "phi_c"))
+    keys = ("displacement", "force", "side_force")
+    D, force, side = (np.array([getattr(p, k)[1:] for p in presses]) for k in keys)
 
     def one(s, phi, path):
         return press_sections(GEOMETRY, from_wall(GEOMETRY), s, phi, path)

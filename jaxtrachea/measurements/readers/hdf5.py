@@ -1,98 +1,99 @@
-"""The project's own HDF5 schema; see docs/measurements.md.
+"""The project's own HDF5 schema: one dataset per quantity, all curves end to end.
 
-Version 1, in this file, keeps ``specimens/<name>/<trial>``; version 2 is in `ragged`.
+``curves/<name>`` are tables with one row per curve; ``samples/<quantity>`` holds the values of all
+curves, those of curve i from ``offsets/<quantity>[i]`` up to ``offsets/<quantity>[i + 1]``. See
+docs/measurements.md.
 """
 
-import io
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 
-from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.measurements.checks import bad
-from jaxtrachea.measurements.curve import BadCurve, Curve, DataError, Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.curve import BadCurve, DataError, Fault, RawCurve, ReadOptions
 from jaxtrachea.measurements.readers.column_roles import resolve_unit
 from jaxtrachea.measurements.readers.hdf5_values import (
     attribute,
     measured,
-    names_in,
-    number_attribute,
     numeric,
     text_attribute,
     unit_of,
 )
-from jaxtrachea.measurements.readers.ragged import limits_of, read_curves
-from jaxtrachea.measurements.readers.ragged_writer import write_ragged
 from jaxtrachea.measurements.readers.reader import Reader
-from jaxtrachea.measurements.readers.safe_hdf5 import opened
+from jaxtrachea.measurements.readers.safe_hdf5 import Limits, opened
 from jaxtrachea.measurements.roles import role_dimension
 from jaxtrachea.units import convert
 
-SCHEMA = "jaxtrachea-measurements"
-VERSIONS = (1, 2)
-#: Datasets that a trial may have beside those of a normal press, with the unit they are written in.
-OPTIONAL = {
-    "time": "s",
-    "side_force": "N",
-    "joint_side_displacement": "mm",
-    "end_U": "mm",
-    "end_V": "mm",
+SCHEMA, VERSION = "jaxtrachea-measurements", 2
+GROUPS = ("curves", "offsets", "samples")
+NAMES = ("specimen", "trial")
+#: More numbers than in other files: the datasets are few, and checked as a whole.
+LIMITS = Limits(
+    elements=100_000_000,
+    total=400_000_000,
+    texts=("/curves/specimen", "/curves/trial", "/curves/source"),
+)
+#: Quantities: role of the unit (None: ring numbers) and the unit that is written.
+QUANTITIES: dict[str, tuple[str | None, str | None]] = {
+    "displacement": ("displacement", "mm"),
+    "force": ("force", "N"),
+    "sigma": ("sigma", "N"),
+    "time": ("time", "s"),
+    "side_force": ("side_force", "N"),
+    "joint_ring_number": (None, None),
+    "joint_displacement": ("joint", "mm"),
+    "joint_side_displacement": ("joint", "mm"),
+    "end_ring_number": (None, None),
+    "end_U": ("end", "mm"),
+    "end_V": ("end", "mm"),
 }
-# Below this a chunk's overhead outweighs compression.
-COMPRESS_FROM = 512
+#: Quantities of several numbers per sample, and the ring numbers that tell how many.
+SEVERAL = {
+    "joint_displacement": "joint_ring_number",
+    "joint_side_displacement": "joint_ring_number",
+    "end_U": "end_ring_number",
+    "end_V": "end_ring_number",
+}
+#: Fields of a curve that are called otherwise in the file.
+FIELDS = {"joint_ring_number": "joint_rings", "end_ring_number": "end_rings"}
 
 
 def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
-    """Read every trial; a fault within one costs this trial only.
+    """Read every curve; a fault in the values of one costs this curve only.
 
     Args:
-        path: the file, of version 1 or 2.
+        path: the file.
         options: units for datasets that have none.
 
     Returns:
-        One record per trial, in the order of the file.
+        One record per row of the tables, in their order; quantities in mm, N, rad and s.
 
     Raises:
-        DataError: damaged or hostile file, another schema or version, or no trial in it.
+        DataError: damaged or hostile file; another schema or version; a table or dataset is
+            missing, damaged, without unit, or of another length than the others; offsets that are
+            none; a name that is no text, empty or unprintable.
     """
     with opened(path, limits=limits_of) as file:
-        if _checked_version(path, file) == 2:
-            return read_curves(path, file, options)
-        return _trials(path, file, options)
+        _check_version(path, file)
+        return _curves(path, file, options)
 
 
-def _trials(path: Path, file: Any, options: ReadOptions) -> list[RawCurve | BadCurve]:
-    """All trials of version 1."""
-    found: list[RawCurve | BadCurve] = []
-    for specimen, group in file["specimens"].items():
-        if not hasattr(group, "items") or len(group) == 0:
-            fault = Fault("empty", "the specimen has no trials", "add one group per trial")
-            found.append(bad(unquote(specimen), "-", f"{path}:/specimens/{specimen}", fault))
-            continue
-        for trial, item in group.items():
-            source = f"{path}:/specimens/{specimen}/{trial}"
-            key = (unquote(specimen), unquote(trial))
-            try:
-                found.append(_trial(item, key, source, options))
-            except Fault as fault:
-                found.append(bad(*key, source, fault))
-    if not found:
-        raise DataError(
-            "/specimens is empty",
-            place=str(path),
-            cure="add one group per specimen and trial",
-        )
-    return found
+def limits_of(file: Any) -> Limits:
+    """What a file may hold, by the names in it: only this schema has texts and large datasets."""
+    return LIMITS if "curves" in file else Limits()
 
 
-def _checked_version(path: Path, file: Any) -> int:
-    """Version of the schema, one of `VERSIONS`."""
+def _check_version(path: Path, file: Any) -> None:
+    """Refuse other schemas and versions.
+
+    Raises:
+        DataError: the file is of another schema or version, or does not say.
+    """
     try:
-        schema = text_attribute(file, "schema")
-        version = attribute(file, "schema_version")
+        schema, version = text_attribute(file, "schema"), attribute(file, "schema_version")
     except Fault as fault:
         raise DataError(fault.message, place=str(path), cure=fault.cure) from None
     if schema != SCHEMA:
@@ -101,206 +102,221 @@ def _checked_version(path: Path, file: Any) -> int:
             place=str(path),
             cure="see docs/measurements.md",
         )
-    if not isinstance(version, (int, np.integer)) or version not in VERSIONS:
+    if not isinstance(version, (int, np.integer)) or version != VERSION:
+        old = "convert it with jaxtrachea 0.1 (jaxtrachea convert OLD.h5 NEW.h5)"
         raise DataError(
-            f"schema_version is {version}, this program reads {' and '.join(map(str, VERSIONS))}",
+            f"schema_version is {version}, this program reads {VERSION}",
             place=str(path),
-            cure="update the program or the file",
+            cure=old if np.array_equal(version, 1) else "update the program or the file",
         )
-    if version == 1 and not hasattr(file.get("specimens"), "items"):
-        raise DataError(
-            "no group /specimens",
-            place=str(path),
-            cure="expected specimens/<name>/<trial>",
+
+
+def _curves(path: Path, file: Any, options: ReadOptions) -> list[RawCurve | BadCurve]:
+    """All curves of an audited file."""
+    store = _Store(path, file, options)
+    specimens, trials = store.names()
+    size = len(specimens)
+    if size == 0:
+        raise store.error("curves/specimen", "there are no curves", "add a row per curve")
+    s, phi = store.position("s", size), store.position("phi", size)
+    directions = store.directions(size)
+    samples = {
+        name: pieces
+        for name in QUANTITIES
+        if (pieces := store.pieces(name, size, needed=name in ("displacement", "force")))
+    }
+    records: list[RawCurve | BadCurve] = []
+    for i, key in enumerate(zip(specimens, trials, strict=True)):
+        source = f"{path}:/curves[{i}]"
+        try:
+            fields: dict[str, Any] = dict(_fields(samples, i))
+        except Fault as fault:
+            records.append(bad(*key, source, fault))
+            continue
+        rows = np.arange(1, fields["displacement"].size + 1)
+        record = RawCurve(
+            *key,
+            source,
+            rows=rows,
+            row_word="sample",
+            s=s[i],
+            phi=phi[i],
+            direction=directions[i],
+            **fields,
         )
-    return int(version)
+        records.append(record)
+    return records
 
 
-def _trial(group: Any, key: tuple[str, str], source: str, options: ReadOptions) -> RawCurve:
-    if not hasattr(group, "items"):
-        raise Fault(
-            "shape", "is a dataset, expected a group for the trial", "store a group per trial"
-        )
-    names = names_in(group)
-    displacement = _quantity(group, "displacement", "displacement", source, options)
-    return RawCurve(
-        *key,
-        source,
-        displacement,
-        _quantity(group, "force", "force", source, options),
-        np.arange(1, displacement.size + 1),
-        "sample",
-        s=_position(group, "s", source, options),
-        phi=_position(group, "phi", source, options),
-        sigma=_quantity(group, "sigma", "sigma", source, options) if "sigma" in names else None,
-        time=_time(group, source, options) if "time" in names else None,
-        direction=_direction(group),
-        **_markers(group, names, source, options),
-        **_vectors(group, names, source, options),
-    )
+class _Pieces:
+    """The values of one quantity, curve by curve."""
+
+    def __init__(self, values: np.ndarray, offsets: np.ndarray) -> None:
+        self.values, self.offsets = values, offsets.tolist()
+
+    def __getitem__(self, i: int) -> np.ndarray:
+        return self.values[self.offsets[i] : self.offsets[i + 1]]
 
 
-def _markers(
-    group: Any, stored: frozenset[str], source: str, options: ReadOptions
-) -> dict[str, Any]:
-    """Markers on the rings; what is stored without its ring numbers is missing them."""
-    names = ("joint_displacement", "joint_side_displacement")
-    if stored.isdisjoint((*names, "joint_ring_number")):
-        return {}
-    found = {"joint_rings": _ring_indices(group, "joint_ring_number")}
-    for name in names:
-        if name == "joint_displacement" or name in stored:
-            found[name] = _quantity(group, name, "joint", source, options)
-    return found
-
-
-def _vectors(
-    group: Any, stored: frozenset[str], source: str, options: ReadOptions
-) -> dict[str, Any]:
-    """Side force, and the ends of the rings with their numbers."""
-    found = {}
-    if "side_force" in stored:
-        found["side_force"] = _quantity(group, "side_force", "side_force", source, options)
-    ends = [name for name in ("end_U", "end_V") if name in stored]
-    if ends or "end_ring_number" in stored:
-        found["end_rings"] = _ring_indices(group, "end_ring_number")
-    for name in ends:
-        found[name] = _quantity(group, name, "end", source, options)
-    return found
-
-
-def _ring_indices(group: Any, name: str) -> np.ndarray:
-    """Rings counted from 0, of a dataset that counts from 1."""
-    rings = numeric(group, name)
-    if not (np.isfinite(rings).all() and (rings == np.round(rings)).all()):
-        raise Fault("shape", f"{name} is not whole", "number rings 1, 2, ...")
-    return rings.astype(np.int64) - 1
-
-
-def _direction(group: Any) -> tuple[float, ...]:
-    """Attribute ``direction`` of a trial; its length is checked later."""
-    value = attribute(group, "direction")
-    if value is None:
-        return (1.0, 0.0)
-    numbers = np.asarray(value)
-    if numbers.dtype.kind not in "iuf" or numbers.shape != (2,):
-        raise Fault(
-            "direction",
-            f"attribute direction is {value!r}, expected two numbers",
-            "store its components along the inward normal and along the circumference",
-        )
-    return tuple(map(float, numbers))
-
-
-def _time(group: Any, source: str, options: ReadOptions) -> np.ndarray | None:
-    """Time of a trial, s, where it is stored with a unit."""
-    if (unit_of(group, "time") or options.units.get("time")) is None:
-        return None
-    return _quantity(group, "time", "time", source, options)
-
-
-def _quantity(group: Any, name: str, role: str, source: str, options: ReadOptions) -> np.ndarray:
-    values, unit = measured(group, name)
-    unit = resolve_unit(role, unit, options, f"{source}/{name}")
-    return np.atleast_1d(convert(values, unit, role_dimension(role)))
-
-
-def _position(group: Any, role: str, source: str, options: ReadOptions) -> float | None:
-    """Attribute ``s_c`` or ``phi_c`` of a trial; its unit is in ``s_c_unit``, ``phi_c_unit``."""
-    name = f"{role}_c"
-    value = number_attribute(group, name)
-    if value is None:
-        return None
-    if np.ndim(value) != 0 or not isinstance(value, (int, float, np.number)):
-        raise Fault("position", f"attribute {name} is {value!r}", "store one number")
-    unit = resolve_unit(role, text_attribute(group, f"{name}_unit"), options, f"{source}@{name}")
-    return float(convert(float(value), unit, "length" if role == "s" else "angle"))
-
-
-def write(
-    path: Path,
-    curves: Iterable[Curve],
-    attrs: Mapping[str, str | int | float],
-    overwrite: bool,
-    version: int,
-) -> None:
-    """Write curves in the schema; the file appears complete or not at all.
-
-    Args:
-        path: the file to write, in an existing folder.
-        curves: what to write, in this order.
-        attrs: further root attributes (licence, source, ...).
-        overwrite: replace an existing file.
-        version: of the schema, 1 or 2.
+def _fields(samples: dict[str, _Pieces], i: int) -> Iterator[tuple[str, np.ndarray]]:
+    """Fields of one curve; a quantity without values is not there.
 
     Raises:
-        FileExistsError: `path` exists and `overwrite` is False.
-        ValueError: `attrs` touches schema or schema_version, there is no such version, a name
-            cannot be written, or a (specimen, trial) comes twice.
+        Fault: values of several rings that do not come to the same number for every sample.
     """
-    import h5py
-
-    if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists; choose another name or pass overwrite=True")
-    if {"schema", "schema_version"} & set(attrs):
-        raise ValueError("attrs must not set schema or schema_version; they are fixed")
-    if version not in VERSIONS:
-        raise ValueError(f"schema_version must be 1 or 2, got {version!r}")
-    image = io.BytesIO()  # as files.atomic says why
-    with h5py.File(image, "w") as file:
-        file.attrs.update({**attrs, "schema": SCHEMA, "schema_version": version})
-        if version == 2:
-            write_ragged(file, tuple(curves))
-        else:
-            specimens = file.create_group("specimens", track_order=True)
-            for curve in curves:
-                _write_curve(specimens, curve)
-    write_whole(path, image.getvalue())
-
-
-def _group_name(name: str) -> str:
-    """A name as an HDF5 link: ``/`` would nest and ``.`` means the group itself."""
-    if not name:
-        raise ValueError("specimen and trial must have names")
-    quoted = name.replace("%", "%25").replace("/", "%2F").replace("\0", "%00")
-    return quoted.replace(".", "%2E") if set(quoted) == {"."} else quoted
+    count = samples["displacement"][i].size
+    for name, pieces in samples.items():
+        values = pieces[i]
+        if values.size == 0 and name not in ("displacement", "force"):
+            continue
+        if name in SEVERAL:
+            rings = samples[SEVERAL[name]][i].size if SEVERAL[name] in samples else 0
+            shape = (count, rings, 2) if name.startswith("end") else (count, rings)
+            if values.size != np.prod(shape):
+                raise Fault(
+                    "shape",
+                    f"{name} has {values.size} values, expected {' x '.join(map(str, shape))}"
+                    f" (samples, rings of {SEVERAL[name]}"
+                    f"{', y and z)' if len(shape) == 3 else ')'}",
+                    "store one of every ring for every sample, NaN where it was not seen",
+                )
+            values = values.reshape(shape)
+        yield FIELDS.get(name, name), values
 
 
-def _write_curve(specimens: Any, curve: Curve) -> None:
-    specimen, trial = _group_name(curve.specimen), _group_name(curve.trial)
-    if specimen not in specimens:
-        specimens.create_group(specimen, track_order=True)
-    if trial in specimens[specimen]:
-        raise ValueError(
-            f"specimen {curve.specimen!r} trial {curve.trial!r} comes twice; rename one"
-        )
-    group = specimens[specimen].create_group(trial)
-    if curve.s_c is not None:
-        group.attrs.update({"s_c": float(curve.s_c), "s_c_unit": "mm"})
-    group.attrs.update({"phi_c": float(curve.phi_c), "phi_c_unit": "rad", "source": curve.source})
-    _write_dataset(group, "displacement", curve.displacement, "mm")
-    _write_dataset(group, "force", curve.force, "N")
-    if curve.sigma is not None:
-        _write_dataset(group, "sigma", curve.sigma, "N")
-    if curve.joint_rings is not None and curve.joint_displacement is not None:
-        _write_dataset(group, "joint_displacement", curve.joint_displacement, "mm")
-        _write_dataset(group, "joint_ring_number", np.asarray(curve.joint_rings) + 1, None)
-    if tuple(curve.direction) != (1.0, 0.0):
-        group.attrs["direction"] = np.array(curve.direction, dtype=np.float64)
-    for name, unit in OPTIONAL.items():
-        if (values := getattr(curve, name)) is not None:
-            _write_dataset(group, name, values, unit)
-    if curve.end_rings is not None:
-        _write_dataset(group, "end_ring_number", np.asarray(curve.end_rings) + 1, None)
+class _Store:
+    """Datasets of one file; whatever is wrong is said with the place of the dataset."""
 
+    def __init__(self, path: Path, file: Any, options: ReadOptions) -> None:
+        self.path, self.file, self.options = path, file, options
+        for name in GROUPS:
+            if not hasattr(file.get(name), "items"):
+                raise self.error(name, "no such group", "store the tables and datasets in it")
 
-def _write_dataset(group: Any, name: str, values: np.ndarray, unit: str | None) -> None:
-    packed = {"compression": "gzip", "shuffle": True, "fletcher32": True}
-    dataset = group.create_dataset(
-        name, data=values, **(packed if values.size >= COMPRESS_FROM else {})
-    )
-    if unit:
-        dataset.attrs["unit"] = unit
+    def error(self, name: str, what: str, cure: str) -> DataError:
+        return DataError(what, place=f"{self.path}:/{name}", cure=cure)
+
+    def names(self) -> tuple[list[str], list[str]]:
+        specimens, trials = (self.texts(f"curves/{name}") for name in NAMES)
+        if len(specimens) != len(trials):
+            raise self.wrong_length("curves/trial", len(trials), len(specimens))
+        return specimens, trials
+
+    def wrong_length(self, name: str, found: int, curves: int) -> DataError:
+        what = f"has {found} rows, expected {curves}, one per row of curves/specimen"
+        return self.error(name, what, "store one row per curve")
+
+    def texts(self, name: str) -> list[str]:
+        """A table of names."""
+        values = self.raw(name)
+        if values.dtype.kind != "S" or values.ndim != 1:
+            found = f"holds {values.dtype} of shape {values.shape}, expected a list of texts"
+            raise self.error(name, found, "store text of fixed length, in UTF-8")
+        try:
+            found = [value.decode() for value in values.tolist()]
+        except UnicodeDecodeError:
+            raise self.error(name, "is not text in UTF-8", "write the names in UTF-8") from None
+        for i, text in enumerate(found):
+            if not text or not text.isprintable():
+                what = f"row {i}: {text!a} is empty or holds unprintable characters"
+                raise self.error(name, what, "give every curve a name")
+        return found
+
+    def raw(self, name: str) -> np.ndarray:
+        """Values as they are stored."""
+        group, _, last = name.partition("/")
+        dataset = self.file[group].get(last)
+        if dataset is None or hasattr(dataset, "items") or dataset.shape is None:
+            raise self.error(name, "no such dataset", "store it, as docs/measurements.md shows")
+        try:
+            return np.asarray(dataset[()])
+        except (OSError, RuntimeError, ValueError, TypeError) as error:
+            what = f"is damaged ({error})"
+            raise self.error(name, " ".join(what.split()), "copy the file again") from None
+
+    def quantity(self, name: str, role: str | None) -> np.ndarray:
+        """Numbers in mm, N, rad or s; without a role as they are."""
+        group, _, last = name.partition("/")
+        try:
+            if role is None:
+                return numeric(self.file[group], last)
+            values, unit = measured(self.file[group], last)
+            unit = resolve_unit(role, unit, self.options, last)
+        except Fault as fault:
+            raise self.error(name, fault.message, fault.cure) from None
+        except DataError as error:
+            raise DataError.like(error, place=f"{self.path}:/{name}") from None
+        return np.asarray(convert(values, unit, role_dimension(role)))
+
+    def position(self, role: str, size: int) -> list[float | None]:
+        """A table of positions, None where it says NaN."""
+        name = f"curves/{role}_c"
+        if f"{role}_c" not in self.file["curves"]:
+            return [None] * size
+        values = self.quantity(name, role)
+        if values.shape != (size,):
+            raise self.wrong_length(name, len(np.atleast_1d(values)), size)
+        return [None if math.isnan(value) else value for value in values.tolist()]
+
+    def directions(self, size: int) -> list[tuple[float, ...]]:
+        """A table of directions; the normal where there is none."""
+        if "direction" not in self.file["curves"]:
+            return [(1.0, 0.0)] * size
+        values = self.quantity("curves/direction", None)
+        if values.shape != (size, 2):
+            found = f"has the shape {values.shape}, expected {(size, 2)}"
+            cure = "store the components along the inward normal and along the circumference"
+            raise self.error("curves/direction", found, cure)
+        return [(a, b) for a, b in values.tolist()]
+
+    def pieces(self, name: str, size: int, *, needed: bool) -> _Pieces | None:
+        """Values of a quantity with its offsets; None if the file does not have it."""
+        place, table = f"samples/{name}", f"offsets/{name}"
+        stored = name in self.file["samples"], name in self.file["offsets"]
+        if not any(stored) and not needed:
+            return None
+        offsets = self.offsets(table, size)
+        role = QUANTITIES[name][0]
+        if name == "time" and stored[0] and self.untimed():
+            return None
+        values = self.quantity(place, role)
+        if values.ndim != 1:
+            found = f"has the shape {values.shape}, expected the values of all curves end to end"
+            raise self.error(place, found, "store a list of numbers")
+        if offsets[-1] != values.size:
+            what = f"ends at {offsets[-1]}, but {place} has {values.size} values"
+            raise self.error(table, what, "store where each curve begins and the last one ends")
+        if role is None:
+            if not (np.isfinite(values).all() and (values == np.round(values)).all()):
+                raise self.error(place, "is not whole", "number rings 1, 2, ...")
+            values = values.astype(np.int64) - 1
+        return _Pieces(values, offsets)
+
+    def untimed(self) -> bool:
+        """Whether the time has no unit, and so is left alone."""
+        try:
+            found = unit_of(self.file["samples"], "time")
+        except Fault as fault:
+            raise self.error("samples/time", fault.message, fault.cure) from None
+        return (found or self.options.units.get("time")) is None
+
+    def offsets(self, name: str, size: int) -> np.ndarray:
+        """Where each curve begins, and the last one ends."""
+        values = self.raw(name)
+        if values.dtype.kind not in "iu" or values.ndim != 1:
+            found = f"holds {values.dtype} of shape {values.shape}, expected a list of integers"
+            raise self.error(name, found, "store integers")
+        if values.size != size + 1:
+            what = f"has {values.size} rows, expected {size + 1}, one more than there are curves"
+            raise self.error(name, what, "store where each curve begins and the last one ends")
+        if values[0] != 0:
+            raise self.error(name, f"begins at {values[0]}", "the first curve must begin at 0")
+        falls = values[1:] < values[:-1]
+        if falls.any():
+            i = int(np.argmax(falls))
+            what = f"falls from {values[i]} to {values[i + 1]} after row {i}"
+            raise self.error(name, what, "store where each curve begins, in their order")
+        return values
 
 
 HDF5 = Reader(

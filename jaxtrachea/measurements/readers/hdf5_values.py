@@ -12,7 +12,6 @@ from jaxtrachea.measurements.curve import Fault
 
 # Text of any length, as h5py marks it.
 _TEXT = np.dtype("O", metadata={"vlen": str})
-_NUMBER = np.dtype(np.float64)
 #: In the place of an attribute that must be read by the longer way.
 _ODD = object()
 
@@ -22,13 +21,6 @@ def _library() -> Any:
     import h5py
 
     return h5py
-
-
-def names_in(group: Any) -> frozenset[str]:
-    """Names of what an audited group holds; far cheaper than to iterate over the group."""
-    found: list[bytes] = []
-    group.id.links.iterate(found.append)
-    return frozenset(name.decode() for name in found)
 
 
 def numeric(group: Any, name: str) -> np.ndarray:
@@ -115,7 +107,7 @@ def text_attribute(holder: Any, name: str) -> str | None:
 
 
 def _text(holder: Any, name: str) -> str | None:
-    value = _scalar(holder, name, _TEXT)
+    value = _plain_text(holder, name)
     if value is None:
         return None
     if isinstance(value, bytes):
@@ -139,12 +131,6 @@ def attribute(holder: Any, name: str) -> Any:
     return _attribute(holder.id, name)
 
 
-def number_attribute(holder: Any, name: str) -> Any:
-    """An attribute that should be one number, a float then; otherwise as `attribute`."""
-    value = _scalar(holder.id, name, _NUMBER)
-    return attribute(holder, name) if value is _ODD else value
-
-
 def _attribute(holder: Any, name: str) -> Any:
     """An attribute of what has this identifier."""
     h5 = _library()
@@ -165,17 +151,15 @@ class _Holder(NamedTuple):
     id: Any
 
 
-def _scalar(holder: Any, name: str, kind: np.dtype) -> Any:
-    """A text or number by itself, far cheaper than by `attrs`.
+def _plain_text(holder: Any, name: str) -> Any:
+    """A text by itself, far cheaper than by `attrs`.
 
     Args:
         holder: identifier of a group or dataset.
         name: of the attribute.
-        kind: `_TEXT` or `_NUMBER`.
 
     Returns:
-        Bytes or float64; None if there is none, `_ODD` if it is of another kind or shape, or
-        damaged.
+        Bytes; None if there is none, `_ODD` if it is of another kind or shape, or damaged.
     """
     h5 = _library()
     key = name.encode()
@@ -186,13 +170,8 @@ def _scalar(holder: Any, name: str, kind: np.dtype) -> Any:
         # Without this a list of one would be taken for its value, and nothing for some value.
         if stored.get_space().get_simple_extent_type() != h5.h5s.SCALAR:
             return _ODD
-        value = np.empty((), kind)
-        if kind is _TEXT:
-            stored.read(value)  # The library refuses to make text of numbers or of fixed length.
-        elif stored.get_type().get_class() == h5.h5t.FLOAT:
-            stored.read(value, mtype=h5.h5t.NATIVE_DOUBLE)
-        else:
-            return _ODD
+        value = np.empty((), _TEXT)
+        stored.read(value)  # The library refuses to make text of numbers or of fixed length.
         return value[()]
     except (OSError, RuntimeError, ValueError, TypeError):
         return _ODD

@@ -10,12 +10,13 @@ import numpy as np
 from damaged.case import OTHER, Case, flipped
 from jaxtrachea.measurements.read import Curve, Measurements, write_hdf5
 
-TRIAL = "specimens/T01/1"
+FORCE, RINGS = "/samples/force", "/samples/joint_ring_number"
+GROUPS = ("curves", "offsets", "samples")
 BESIDE = '[data]\nfiles = ["data.h5", "good.csv"]\n[noise]\nforce = "0.01 N"\n'
 
 
-@functools.lru_cache(maxsize=2)
-def pristine(version=1) -> bytes:
+@functools.lru_cache(maxsize=1)
+def pristine() -> bytes:
     """A study of two specimens in the project's own schema."""
     line = np.linspace(0, 2, 12)
     markers = {"joint_rings": np.array([2, 6]), "joint_displacement": np.ones((12, 2))}
@@ -25,7 +26,7 @@ def pristine(version=1) -> bytes:
     )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "m.h5"
-        write_hdf5(path, Measurements(curves, (), ()), schema_version=version)
+        write_hdf5(path, Measurements(curves, (), ()))
         return path.read_bytes()
 
 
@@ -34,46 +35,54 @@ def _beside(make, says, codes=(1,)):
     return Case(("data.h5", *says), files, make, ("check", "spec.toml"), codes)
 
 
-def of_bytes(change, *says, codes=(1,), version=1):
+def of_bytes(change, *says, codes=(1,)):
     def make(folder):
-        (folder / "data.h5").write_bytes(change(pristine(version)))
+        (folder / "data.h5").write_bytes(change(pristine()))
 
     return _beside(make, says, codes)
 
 
-def of_file(change, *says, version=1):
+def of_file(change, *says):
     def make(folder):
-        (folder / "data.h5").write_bytes(pristine(version))
+        (folder / "data.h5").write_bytes(pristine())
         with h5py.File(folder / "data.h5", "r+") as file:
             change(file)
 
     return _beside(make, says)
 
 
+def removed(name):
+    return lambda file: file.__delitem__(name)
+
+
 def replaced(name, data, unit="N"):
     """Put another dataset in the place of one."""
 
     def change(file):
-        trial = file[TRIAL]
-        if name in trial:
-            del trial[name]
-        if data is not None:
-            trial[name] = data
-            trial[name].attrs["unit"] = unit
+        if name in file:
+            del file[name]
+        file[name] = data
+        if unit:
+            file[name].attrs["unit"] = unit
 
     return change
 
 
+def part(name, i, value):
+    """Another value in place of one."""
+    return lambda file: file[name].__setitem__(i, value)
+
+
 def declared(shape):
     def change(file):
-        del file[f"{TRIAL}/force"]
-        data = file.create_dataset(f"{TRIAL}/force", shape, "f8", chunks=True, compression="gzip")
+        del file[FORCE]
+        data = file.create_dataset(FORCE, shape, "f8", chunks=True, compression="gzip")
         data.attrs["unit"] = "N"
 
     return change
 
 
-def attribute(name, value, at=f"{TRIAL}/force"):
+def attribute(name, value, at=FORCE):
     def change(file):
         if value is None:
             del file[at].attrs[name]
@@ -84,22 +93,22 @@ def attribute(name, value, at=f"{TRIAL}/force"):
 
 
 def linked(link):
-    return lambda file: file.__setitem__("specimens/T09", link)
+    return lambda file: file.__setitem__("samples/x", link)
 
 
 def virtual(file):
     layout = h5py.VirtualLayout((3,), "f8")
     layout[:] = h5py.VirtualSource("/etc/hostname", "x", (3,))
-    file.create_virtual_dataset(f"{TRIAL}/v", layout)
+    file.create_virtual_dataset("samples/x", layout)
 
 
 def stored_outside(file):
-    del file[f"{TRIAL}/force"]
-    file.create_dataset(f"{TRIAL}/force", (12,), "f8", external=[("/dev/zero", 0, 96)])
+    del file[FORCE]
+    file.create_dataset(FORCE, (24,), "f8", external=[("/dev/zero", 0, 192)])
 
 
 def loop(file):
-    file["specimens/T01/up"] = file["specimens"]
+    file["samples/up"] = file["/"]
 
 
 def soft_loop(file):
@@ -107,8 +116,8 @@ def soft_loop(file):
 
 
 def many_in_sum(file):
-    for i in range(11):
-        file.create_dataset(f"h{i}", (10_000_000,), "f8", chunks=(1000,))
+    for i in range(5):
+        file.create_dataset(f"h{i}", (100_000_000,), "f8", chunks=(1000,))
 
 
 def put(name, value):
@@ -134,11 +143,11 @@ CASES = {
         )
         for seed in range(40)
     },
-    "external link": of_file(linked(h5py.ExternalLink("/etc/passwd", "/")), "T09", "link"),
-    "external link to a device": of_file(linked(h5py.ExternalLink("/dev/zero", "/x")), "T09"),
-    "external link to itself": of_file(linked(h5py.ExternalLink("data.h5", "/")), "T09"),
-    "soft link": of_file(linked(h5py.SoftLink("/specimens/T01")), "T09", "link"),
-    "soft link to nowhere": of_file(linked(h5py.SoftLink("/nowhere")), "T09", "link"),
+    "external link": of_file(linked(h5py.ExternalLink("/etc/passwd", "/")), "/samples/x", "link"),
+    "external link to a device": of_file(linked(h5py.ExternalLink("/dev/zero", "/x")), "link"),
+    "external link to itself": of_file(linked(h5py.ExternalLink("data.h5", "/")), "link"),
+    "soft link": of_file(linked(h5py.SoftLink("/samples/force")), "/samples/x", "link"),
+    "soft link to nowhere": of_file(linked(h5py.SoftLink("/nowhere")), "/samples/x", "link"),
     "soft links in a circle": of_file(soft_loop, "link"),
     "group within itself": of_file(loop, "within itself"),
     "virtual dataset": of_file(virtual, "virtual"),
@@ -150,89 +159,47 @@ CASES = {
     "compound": of_file(put("c", np.zeros(2, [("a", "f8"), ("b", "i4")])), "no plain numbers"),
     "ragged rows": of_file(lambda f: f.create_dataset("v", (2,), h5py.vlen_dtype("f8"))),
     "named type": of_file(put("n", np.dtype("f8")), "neither group nor dataset"),
-    "escape in a name": of_file(lambda f: f["specimens"].create_group("T\x1b[31m"), "control"),
+    "escape in a name": of_file(lambda f: f["samples"].create_group("T\x1b[31m"), "control"),
     "schema of another": of_file(attribute("schema", "other", "/"), "schema"),
-    "schema version 3": of_file(attribute("schema_version", 3, "/"), "schema_version"),
-    "schema version 2 without its groups": of_file(attribute("schema_version", 2, "/"), "/curves"),
+    "schema version 3": of_file(attribute("schema_version", 3, "/"), "schema_version is 3"),
+    "schema version 1": of_file(attribute("schema_version", 1, "/"), "convert it"),
     "schema a number": of_file(attribute("schema", 5.0, "/"), "schema"),
     "schema removed": of_file(attribute("schema", None, "/"), "schema"),
-    "specimens removed": of_file(lambda f: f.__delitem__("specimens")),
-    "specimens a dataset": of_file(
-        lambda f: (f.__delitem__("specimens"), f.__setitem__("specimens", np.arange(3.0)))
-    ),
-    "specimen a dataset": of_file(put("specimens/T09", np.arange(3.0)), "T09"),
-    "specimen empty": of_file(lambda f: f["specimens"].create_group("T09"), "T09"),
-    "trial a dataset": of_file(put("specimens/T01/2", np.arange(3.0)), "T01/2"),
-    "trial empty": of_file(lambda f: f["specimens/T01"].create_group("2"), "T01/2"),
-    "force removed": of_file(replaced("force", None), TRIAL, "'force'"),
-    "displacement removed": of_file(replaced("displacement", None), TRIAL),
-    "force a group": of_file(
-        lambda f: (f.__delitem__(f"{TRIAL}/force"), f.create_group(f"{TRIAL}/force")), TRIAL
-    ),
-    "force a scalar": of_file(replaced("force", 1.0), TRIAL, "shape"),
-    "force a matrix": of_file(replaced("force", np.ones((12, 2))), TRIAL, "shape"),
-    "force short": of_file(replaced("force", np.ones(11)), TRIAL, "shape"),
-    "force without samples": of_file(replaced("force", np.ones(0)), TRIAL),
-    "force null": of_file(replaced("force", h5py.Empty("f8")), TRIAL, "shape"),
-    "force nan": of_file(replaced("force", np.full(12, np.nan)), TRIAL, "NaN"),
-    "force infinite": of_file(replaced("force", np.r_[np.ones(11), np.inf]), TRIAL),
-    "force huge": of_file(replaced("force", np.full(12, 1e300)), TRIAL, "plausible"),
-    "force complex": of_file(replaced("force", np.ones(12, complex)), "no plain numbers"),
-    "force in mm": of_file(attribute("unit", "mm"), TRIAL, "'mm'"),
-    "force in kips": of_file(attribute("unit", "kips"), TRIAL, "'kips'"),
-    "force without unit": of_file(attribute("unit", None), TRIAL, "unit"),
-    "force unit a number": of_file(attribute("unit", 3.0), TRIAL),
-    "force with two units": of_file(attribute("units", "kN"), TRIAL, "two units"),
-    "sigma short": of_file(replaced("sigma", np.ones(3)), TRIAL, "sigma"),
-    "sigma negative": of_file(replaced("sigma", -np.ones(12)), TRIAL, "sigma"),
+    **{f"{name} removed": of_file(removed(name), f"/{name}") for name in GROUPS},
+    **{f"{name} a dataset": of_file(replaced(name, [1.0], None), f"/{name}") for name in GROUPS},
+    "names of any length": of_file(replaced("curves/trial", ["1", "1"], None), "/curves/trial"),
+    "force removed": of_file(removed(FORCE), FORCE, "'force'"),
+    "displacement removed": of_file(removed("samples/displacement"), "/samples/displacement"),
+    "force a group": of_file(lambda f: (f.__delitem__(FORCE), f.create_group(FORCE)), FORCE),
+    "force a scalar": of_file(replaced(FORCE, 1.0), FORCE, "shape"),
+    "force a matrix": of_file(replaced(FORCE, np.ones((12, 2))), FORCE, "shape"),
+    "force short": of_file(replaced(FORCE, np.ones(23)), "/offsets/force", "23"),
+    "force without samples": of_file(replaced(FORCE, np.ones(0)), "/offsets/force"),
+    "force null": of_file(replaced(FORCE, h5py.Empty("f8")), FORCE, "shape"),
+    "force nan": of_file(part(FORCE, 3, np.nan), "/curves[0]", "NaN"),
+    "force infinite": of_file(part(FORCE, 23, np.inf), "/curves[1]"),
+    "force huge": of_file(part(FORCE, slice(12), 1e300), "/curves[0]", "plausible"),
+    "force complex": of_file(replaced(FORCE, np.ones(24, complex)), "no plain numbers"),
+    "force in mm": of_file(attribute("unit", "mm"), FORCE, "'mm'"),
+    "force in kips": of_file(attribute("unit", "kips"), FORCE, "'kips'"),
+    "force without unit": of_file(attribute("unit", None), FORCE, "unit"),
+    "force unit a number": of_file(attribute("unit", 3.0), FORCE),
+    "force with two units": of_file(attribute("units", "kN"), FORCE, "two units"),
+    "offsets fall": of_file(part("offsets/force", 1, 30), "/offsets/force", "falls"),
+    "offsets beyond": of_file(part("offsets/force", 2, 30), "/offsets/force", "24"),
+    "offsets 2^63": of_file(part("offsets/force", 2, 2**63 - 1), "/offsets/force"),
+    "sigma short": of_file(part("offsets/sigma", 1, 3), "/curves[0]", "sigma"),
+    "sigma negative": of_file(part("samples/sigma", slice(12), -1.0), "/curves[0]", "sigma"),
     "markers of another shape": of_file(
-        replaced("joint_ring_number", [3, 7, 8], "1"), TRIAL, "joint"
+        part("offsets/joint_ring_number", 1, 1), "/curves[0]", "joint"
     ),
-    "ring 0": of_file(replaced("joint_ring_number", [0, 7], "1"), TRIAL, "ring"),
-    "ring nan": of_file(replaced("joint_ring_number", [np.nan, 7.0], "1"), TRIAL),
-    "ring 2.5": of_file(replaced("joint_ring_number", [2.5, 7.0], "1"), TRIAL),
-    "ring 10^18": of_file(replaced("joint_ring_number", [3, 10**18], "1"), TRIAL, "ring"),
-    "position a vector": of_file(attribute("s_c", [1.0, 2.0], TRIAL), TRIAL),
-    "position nan": of_file(attribute("s_c", np.nan, TRIAL), TRIAL),
-    "position text": of_file(attribute("s_c", "35", TRIAL), TRIAL),
-    "position without unit": of_file(attribute("s_c_unit", None, TRIAL), TRIAL, "unit"),
-    "position in newton": of_file(attribute("s_c_unit", "N", TRIAL), TRIAL, "'N'"),
-    **{
-        f"version 2, cut to {n} bytes": of_bytes(lambda data, n=n: data[:n], version=2)
-        for n in (96, 1000, 4096)
-    },
-    **{
-        f"version 2, bits flipped, seed {seed}": of_bytes(
-            lambda data, seed=seed: flipped(data, seed, 1 + 7 * (seed % 3)),
-            codes=(0, 1),
-            version=2,
-        )
-        for seed in range(40)
-    },
-    "version 2, offsets fall": of_file(
-        lambda f: f["offsets/force"].__setitem__(1, 30), "/offsets/force", "falls", version=2
-    ),
-    "version 2, offsets beyond": of_file(
-        lambda f: f["offsets/force"].__setitem__(2, 30), "/offsets/force", "24", version=2
-    ),
-    "version 2, offsets 2^63": of_file(
-        lambda f: f["offsets/force"].__setitem__(2, 2**63 - 1), "/offsets/force", version=2
-    ),
-    "version 2, force without unit": of_file(
-        attribute("unit", None, "samples/force"), "/samples/force", "unit", version=2
-    ),
-    "version 2, force nan": of_file(
-        lambda f: f["samples/force"].__setitem__(3, np.nan), "/curves[0]", "NaN", version=2
-    ),
-    "version 2, force removed": of_file(
-        lambda f: f.__delitem__("samples/force"), "/samples/force", version=2
-    ),
-    "version 2, names of any length": of_file(
-        lambda f: (f.__delitem__("curves/trial"), f.__setitem__("curves/trial", ["1", "1"])),
-        "/curves/trial",
-        version=2,
-    ),
-    "version 2, curves a dataset": of_file(
-        lambda f: (f.__delitem__("curves"), f.__setitem__("curves", [1.0])), "/curves", version=2
-    ),
+    "ring 0": of_file(part(RINGS, 0, 0), "/curves[0]", "ring"),
+    "ring nan": of_file(replaced(RINGS, [np.nan, 7.0, 3.0, 7.0], None), RINGS),
+    "ring 2.5": of_file(replaced(RINGS, [2.5, 7.0, 3.0, 7.0], None), RINGS),
+    "ring 10^18": of_file(part(RINGS, 1, 10**18), "/curves[0]", "ring"),
+    "position a matrix": of_file(replaced("curves/s_c", np.ones((2, 2)), "mm"), "/curves/s_c"),
+    "position infinite": of_file(part("curves/s_c", 0, np.inf), "/curves[0]"),
+    "position text": of_file(replaced("curves/s_c", np.array([b"35", b"4"])), "/curves/s_c"),
+    "position without unit": of_file(attribute("unit", None, "curves/s_c"), "unit"),
+    "position in newton": of_file(attribute("unit", "N", "curves/s_c"), "'N'"),
 }

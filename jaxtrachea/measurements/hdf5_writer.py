@@ -1,31 +1,65 @@
-"""Writing version 2 of the project's HDF5 schema; see `ragged` for its layout."""
+"""Writing the project's own HDF5 schema; see `readers.hdf5` for its layout."""
 
-from collections.abc import Iterable, Sequence
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.measurements.curve import Curve
-from jaxtrachea.measurements.readers.ragged import FIELDS, LIMITS, NAMES, QUANTITIES
+from jaxtrachea.measurements.readers.hdf5 import (
+    FIELDS,
+    LIMITS,
+    NAMES,
+    QUANTITIES,
+    SCHEMA,
+    VERSION,
+)
 from jaxtrachea.measurements.readers.safe_hdf5 import MAX_TEXT_BYTES
 
 #: Numbers that are packed together: 512 KiB.
 CHUNK = 65_536
 
 
-def write_ragged(file: Any, curves: Sequence[Curve]) -> None:
-    """Write all curves into an open, empty file; its root attributes are the caller's.
+def write_curves(
+    path: Path,
+    curves: Sequence[Curve],
+    attrs: Mapping[str, str | int | float],
+    overwrite: bool,
+) -> None:
+    """Write curves in the schema; the file appears complete or not at all.
 
     Args:
-        file: open `h5py.File`.
-        curves: what to write, in this order.
+        path: the file to write, in an existing folder.
+        curves: what to write, in this order, in mm, N, rad and s.
+        attrs: further root attributes (licence, source, ...).
+        overwrite: replace an existing file.
 
     Raises:
-        ValueError: a name is empty, unprintable or longer than 1024 bytes, a (specimen, trial)
-            comes twice, or there are more numbers than are read back.
+        FileExistsError: `path` exists and `overwrite` is False.
+        ValueError: `attrs` touches schema or schema_version; a name is empty, unprintable or longer
+            than 1024 bytes; a (specimen, trial) comes twice; there are more numbers than are read
+            back.
     """
+    import h5py
+
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists; choose another name or pass overwrite=True")
+    if {"schema", "schema_version"} & set(attrs):
+        raise ValueError("attrs must not set schema or schema_version; they are fixed")
     _check_names(curves)
     _check_sizes(curves)
+    image = io.BytesIO()  # as files.atomic says why
+    with h5py.File(image, "w") as file:
+        file.attrs.update({**attrs, "schema": SCHEMA, "schema_version": VERSION})
+        _write(file, curves)
+    write_whole(path, image.getvalue())
+
+
+def _write(file: Any, curves: Sequence[Curve]) -> None:
+    """Write all curves into an open, empty file."""
     tables = file.create_group("curves")
     for name in NAMES:
         _text(tables, name, [getattr(curve, name).encode() for curve in curves])
