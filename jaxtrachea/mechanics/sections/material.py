@@ -312,8 +312,10 @@ def from_wall(
     }
     slides = (2 - wall.nu) * (1 + wall.nu) / (4 * wall.E_L * tool_radius)
     values["c_t"] = values["c_t_ring"] = factors.slide * slides
-    off = jnp.abs(jnp.log(proportions(geometry, wall, tool_radius) / _SPECIMEN))
-    values["extrapolated"] = jnp.any(off > np.log(ALIKE)).astype(R.dtype)
+    off = jnp.abs(
+        jnp.log(proportions(geometry, wall, tool_radius) / jnp.asarray(_SPECIMEN, R.dtype))
+    )
+    values["extrapolated"] = jnp.any(off > float(np.log(ALIKE))).astype(R.dtype)
     return SectionMaterial(**values)
 
 
