@@ -1,0 +1,260 @@
+"""Faults on purpose: does the suite notice a wrong formula? Not a test; run it by hand.
+
+    python tests/mutations.py [NAME ...] [--list] [--slow]
+
+Each row of ROWS is one small fault in the package: its name, the file, a text that the file holds
+once, what stands there instead, and the tests that a developer would expect to notice. The tree is
+copied to a temporary folder. All these tests must pass there first. Then each fault is made alone,
+its tests are run, and it is taken back: `caught` if a test fails, `survived` if all pass. NAME:
+these rows only, all without one. `--list`: no test is run, the rows are held against the sources.
+`--slow`: slow tests count, too. Results go to tests/bench/results/mutations.jsonl, the last line of
+a name is the one that counts. The exit code is 1 where a fault survived. All rows take some 25
+minutes of one core.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "tests/bench/results/mutations.jsonl"
+
+#: By group: name, file of the package, old text, new text, tests with a space between them.
+ROWS = {
+    "mechanics": [
+        ("law-tangent", "mechanics/force_law.py",
+         "*(power(name) * k for name, k in rest)], depth * depth)",
+         "*(k for name, k in rest)], depth * depth)",
+         "test_equilibrium.py test_residual.py"),
+        ("fold-depth", "mechanics/force_law.py",
+         "jnp.where(softening, -3 * law.k_3, 1)", "jnp.where(softening, -2 * law.k_3, 1)",
+         "test_force_law.py"),
+        ("blend-shares", "mechanics/force_law.py",
+         "share = ring.k_1 / softer, ligament.k_1 / softer",
+         "share = ligament.k_1 / softer, ring.k_1 / softer", "test_force_law.py"),
+        ("shear-determinant", "mechanics/compliance.py",
+         "det = det + (h / GA) * (c + f)", "det = det + (h / GA) * c", "test_beam.py"),
+        ("paper-shares", "mechanics/compliance.py",
+         "cubes = (s / jnp.sum(s)) ** 3", "cubes = (s / jnp.sum(s)) ** 2", "test_beam.py"),
+        ("spatial-span", "mechanics/spatial_beam.py",
+         "slide = hinge * (h * h / 12)", "slide = hinge * (h * h / 6)", "test_spatial_beam.py"),
+        ("axial-ring", "mechanics/axial.py",
+         "upto_ring = jnp.cumsum((high - low) / EA)[:-1]",
+         "upto_ring = jnp.cumsum((high - low) / EA)[1:]", "test_axial.py"),
+        ("tie-of-the-mat", "mechanics/ring.py",
+         "k_e = ring.k_t + ring.k_M / 4", "k_e = ring.k_t + ring.k_M / 2", "test_ring.py"),
+        ("punch-edges", "mechanics/punch.py",
+         "first, second = c_22 - c_12, c_11 - c_12", "first, second = c_11 - c_12, c_22 - c_12",
+         "test_punch.py"),
+        ("softening-peak", "mechanics/softening.py",
+         "-2 * e_1, 3 * e_2)", "-2 * e_1, 2 * e_2)", "test_softening.py"),
+        ("friction-cone", "mechanics/friction.py",
+         "lean = jnp.sqrt(1 + mu * mu)", "lean = 1 + mu * mu", "test_friction.py"),
+        ("axial-sides", "mechanics/skeleton.py",
+         "passed = jnp.where(x <= s_c, along.force_A, along.force_B)",
+         "passed = jnp.where(x <= s_c, along.force_B, along.force_A)", "test_oblique.py"),
+        ("section-bending", "mechanics/sections/contact.py",
+         "return beam.warps / (1 + 12 * beam.bending", "return beam.warps / (1 + 6 * beam.bending",
+         "sections/test_parts.py"),
+        ("wall-slides", "mechanics/sections/material.py",
+         "(4 * wall.E_L * tool_radius)", "(8 * wall.E_L * tool_radius)",
+         "sections/test_specimen.py"),
+        ("fit-compliance", "mechanics/equilibrium.py",
+         '"compliance": -slope * force * share}', '"compliance": -slope * force}',
+         "test_residual.py"),
+    ],
+    "fitting and inference": [
+        ("aicc", "fitting/criteria.py",
+         "2 * k * (k + 1) / left", "2 * k * k / left", "test_criteria.py"),
+        ("noise-freedom", "fitting/noise.py",
+         "np.maximum(1 - own / np.maximum(total, 1), 0.05)",
+         "np.maximum(1 - 1 / np.maximum(total, 1), 0.05)",
+         "test_mixed_noise.py"),
+        ("robust-sigma", "fitting/noise.py",
+         "estimate = 1.4826 * info.spread", "estimate = 1.2533 * info.spread",
+         "test_closed_forms.py"),
+        ("student-t", "fitting/covariance.py",
+         "of_t = stdtrit(different, 0.975)", "of_t = stdtrit(different, 0.95)",
+         "test_profile.py prediction/test_bands.py"),
+        ("robust-kappa", "fitting/covariance.py",
+         "/ _mean_slope(info) ** 2", "/ _mean_slope(info)", "test_covariance.py"),
+        ("misfit-chance", "fitting/misfit.py",
+         "statistic = ratio**2 * left", "statistic = ratio * left", "test_misfit.py"),
+        ("alike-residuals", "fitting/effective.py",
+         "return (1 - r) / (1 + r)", "return (1 - r) / (1 + r * r)",
+         "test_reports.py::test_independent_residuals_widen_nothing"),
+        ("curve-weights", "fitting/curve_noise.py",
+         "for v in (count * sigma**2, count))", "for v in (count * sigma, count))",
+         "test_record_faults.py::test_uneven_noise_and_its_weights"),
+        ("share-likelihood", "fitting/force_share.py",
+         "cost = len(r) * np.log(squared)", "cost = 0.5 * len(r) * np.log(squared)",
+         "test_force_share.py"),
+        ("restricted-likelihood", "inference/random_effects.py",
+         '- 0.5 * np.einsum("mjj->j", inner)', '- 0.5 * np.einsum("mjj->j", W)',
+         "test_population.py"),
+        ("profile-ends", "inference/profile.py",
+         "unscale(best - reach[:, 0]), unscale(best + reach[:, 1])",
+         "unscale(best - reach[:, 1]), unscale(best + reach[:, 0])", "test_profile.py"),
+        ("posterior-volume", "inference/posterior.py",
+         " - jnp.sum(counts * log_noise)", "",
+         "test_posterior.py::test_density_is_that_of_the_normal_noise"),
+        ("leverage", "inference/influence.py",
+         "left = 1 - 2 * leverage +", "left = 1 - leverage +", "test_influence.py"),
+        ("bootstrap-freedom", "inference/bootstrap.py",
+         "enlarge = np.sqrt(total / max(total - unknowns, 1))",
+         "enlarge = np.sqrt(total / max(total, 1))", "test_bootstrap.py test_closed_forms.py"),
+        ("left-out-ratio", "inference/cross_validation.py",
+         "/ np.sum(model * model, axis=1) - 1", "/ np.sum(data * data, axis=1) - 1",
+         "test_criteria.py"),
+    ],
+    "scene and contact": [
+        ("radius-of-b", "contact/distance.py",
+         "_minimum(pair, n) - (a.radius + b.radius)", "_minimum(pair, n) - 2 * a.radius",
+         "test_distance.py test_ties.py"),
+        ("lower-bound", "contact/distance.py",
+         "sharp_support(b, -n)), upper", "sharp_support(b, n)), upper",
+         "test_distance.py test_ties.py"),
+        ("inverse-pose", "contact/pose.py",
+         "Pose(back, -rotate(back,", "Pose(back, rotate(back,", "test_contact_shapes.py"),
+        ("small-turns", "contact/pose.py",
+         "0.5 - square / 24 *", "0.5 - square / 12 *", "test_contact_shapes.py"),
+        ("beyond-the-line", "contact/line.py",
+         "return c + beyond * t, t,", "return c, t,", "test_patches.py"),
+        ("gap-of-patches", "contact/patches.py",
+         "gap = low - jnp.log(whole) / beta", "gap = low + jnp.log(whole) / beta",
+         "test_patches.py"),
+        ("core-of-a-patch", "contact/walls.py",
+         "axis=0) + [0, 0, 0, r], caps", "axis=0) + [0, 0, 0, r / 2], caps", "test_patches.py"),
+        ("landing-gap", "scene/landing.py",
+         "moved = share * chord - gap * inward", "moved = share * chord", "scene/test_simulate.py"),
+        ("seat-apart", "scene/seat.py",
+         "_limit(APART * depth, jnp.abs(off[0]))", "_limit(APART * depth, off[0])",
+         "scene/test_session.py"),
+        ("moment-of-a-pose", "scene/configurational.py",
+         "jnp.cross(path.rotation, poses.rotation, axis=1)",
+         "jnp.cross(poses.rotation, path.rotation, axis=1)", "scene/test_configurational.py"),
+        ("wall-of-the-lumen", "scene/lumen.py",
+         "wall = 2 * jnp.maximum(", "wall = jnp.maximum(", "scene/test_ranges.py"),
+        ("slip-round-the-tube", "scene/trail.py",
+         "phi_c + around / radius", "phi_c + around", "scene/test_trail.py"),
+        ("last-step-of-a-press", "scene/paths.py",
+         "whole * (k + 1) / steps", "whole * k / steps", "test_configs.py"),
+        ("sag-of-a-dent", "surface/local.py",
+         "jnp.maximum(1 - sag / depth, 0)", "jnp.maximum(1 - sag / (2 * depth), 0)",
+         "test_surface.py"),
+        ("angle-of-the-rings", "trachea/rings.py",
+         "return float(right + left) * math.pi / RAYS", "return float(2 * right) * math.pi / RAYS",
+         "test_mesh.py"),
+    ],
+    "measurements and prediction": [
+        ("unit-of-pressure", "units.py", '"98.0665"', '"9.80665"', "test_units.py"),
+        ("unit-of-mass", "units.py",
+         '"g", Fraction(1, 10**6)', '"g", Fraction(1, 10**3)', "test_units.py"),
+        ("touch-noise", "measurements/first_touch.py",
+         "out[c] = 1.4826 * np.median", "out[c] = np.median", "test_onset.py"),
+        ("blend-width", "measurements/first_touch.py",
+         "np.minimum(_STANDARD_DEVIATIONS * level / touch.slope,",
+         "np.maximum(_STANDARD_DEVIATIONS * level / touch.slope,", "test_onset.py"),
+        ("line-in-air", "measurements/record_zeros.py",
+         "mean - slope * middle, rise", "mean + slope * middle, rise", "test_record_zeros.py"),
+        ("last-loading", "measurements/segments.py",
+         "full[0] if first else full[-1]", "full[0]", "test_measurements.py test_segments.py"),
+        ("return-of-a-loading", "measurements/turning.py",
+         "_RETURN * (values[top] - values[start])", "_RETURN * (values[peak] - values[start])",
+         "test_segments.py"),
+        ("softer-cycle", "measurements/returns.py",
+         "(heights[1] - heights[0]) / rise", "(heights[0] - heights[1]) / rise",
+         "test_record_faults.py"),
+        ("rig-compliance", "measurements/machine.py",
+         "return displacement - compliance * force", "return displacement + compliance * force",
+         "test_record_faults.py::test_machine_compliance"),
+        ("end-of-a-range", "measurements/presses.py",
+         "step * np.arange(whole + 1)", "step * np.arange(whole)",
+         "prediction/test_predict_command.py"),
+        ("sign-of-side-force", "measurements/vectors.py",
+         "options.force_sign * raw.side_force", "raw.side_force", "test_measured_vectors.py"),
+        ("left-out-step", "prediction/model_error.py",
+         "step = half @ (half.T @", "step = -half @ (half.T @", "prediction/test_model_error.py"),
+        ("own-follows-kept", "prediction/held_out.py",
+         "= -inverse @ (A.T @ B)", "= inverse @ (A.T @ B)", "test_onset.py test_own_touch.py"),
+        ("widened-bands", "prediction/predict.py",
+         "source.covariance * error.growth**2", "source.covariance * error.growth",
+         "prediction/test_bands.py prediction/test_model_error.py"),
+        ("band-of-a-sample", "prediction/predict.py",
+         "self.half_width * np.hypot(self.se, sigma)", "self.half_width * (self.se + sigma)",
+         "prediction/test_bands.py prediction/test_model_error.py"),
+    ],
+}  # fmt: skip
+
+
+def copied(folder: Path) -> None:
+    """Copy the files that git tracks, and others that it does not ignore."""
+    words = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    for name in subprocess.check_output(words, cwd=ROOT, text=True).split("\0"):
+        if name and (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, folder / name)
+
+
+def outcome(folder: Path, tests: list[str], slow: bool) -> str:
+    """How the tests end in a copy; compilation and numbers are set up by its tests/conftest.py."""
+    # No byte code: a fault of equal length within a second would not be seen.
+    env = os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    words = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider"]
+    words += ["-m", "slow or not slow"] if slow else []
+    words += [f"tests/{name}" for name in dict.fromkeys(tests)]
+    done = subprocess.run(words, cwd=folder, env=env, capture_output=True, text=True)
+    if done.returncode not in (0, 1):
+        print(done.stdout[-2000:], done.stderr[-2000:])
+    return {0: "survived", 1: "caught"}.get(done.returncode, f"pytest ended {done.returncode}")
+
+
+def main() -> int:
+    """Make the faults asked for and say which were noticed."""
+    ask = argparse.ArgumentParser(description="Faults on purpose; see the top of the file.")
+    ask.add_argument("names", nargs="*", metavar="NAME")
+    ask.add_argument("--list", action="store_true", help="check the rows, run nothing")
+    ask.add_argument("--slow", action="store_true", help="slow tests, too")
+    given = ask.parse_args()
+    rows = [(group, *row) for group, of_group in ROWS.items() for row in of_group]
+    if unknown := set(given.names) - {row[1] for row in rows}:
+        ask.error(f"no row is named {', '.join(sorted(unknown))}")
+    rows = [row for row in rows if not given.names or row[1] in given.names]
+    counts = [(ROOT / "jaxtrachea" / file).read_text().count(old) for _, _, file, old, _, _ in rows]
+    for (_, name, file, *_), count in zip(rows, counts, strict=True):
+        if given.list or count != 1:
+            print(f"{name:22} {file}: the old text stands there {count} times")
+    if given.list or set(counts) != {1}:
+        return int(set(counts) != {1})
+    found: dict[str, list[str]] = {group: [] for group in ROWS}
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        copied(folder)
+        if outcome(folder, " ".join(row[5] for row in rows).split(), given.slow) != "survived":
+            print("without a fault not all of these tests pass")
+            return 2
+        for group, name, file, old, new, tests in rows:
+            path, begin = folder / "jaxtrachea" / file, time.perf_counter()
+            sound = path.read_text()
+            path.write_text(sound.replace(old, new))
+            ended = outcome(folder, tests.split(), given.slow)
+            path.write_text(sound)
+            seconds = round(time.perf_counter() - begin, 1)
+            found[group].append(ended)
+            print(f"{name:22} {ended:10} {seconds:6} s  {tests}", flush=True)
+            row = {"group": group, "name": name, "outcome": ended, "s": seconds, "tests": tests}
+            with RESULTS.open("a") as out:
+                out.write(json.dumps(row) + "\n")
+    for group, ends in found.items():
+        print(f"{group:30} {ends.count('caught'):3} of {len(ends)} caught")
+    return int(any(end != "caught" for ends in found.values() for end in ends))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
