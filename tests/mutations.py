@@ -144,7 +144,6 @@ ROWS = {
          "test_patches.py::test_beyond_its_ends_a_line_goes_on_straight"),
         ("gap-of-patches", "contact/patches.py",
          "gap = low - jnp.log(whole) / beta", "gap = low + jnp.log(whole) / beta",
-         "test_patches.py::test_continuous_across_borders "
          "test_patches.py::test_continuous_across_borders"),
         ("core-of-a-patch", "contact/walls.py",
          "axis=0) + [0, 0, 0, r], caps", "axis=0) + [0, 0, 0, r / 2], caps",
