@@ -13,6 +13,8 @@ from run_cli import run, tree
 
 from jaxtrachea import table_1
 from jaxtrachea.cli import scene as scenes
+from jaxtrachea.scene.paths import path_of
+from jaxtrachea.scene.spec import load_scene_spec
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.tube import make_tube
 
@@ -52,6 +54,13 @@ def bent_tube(path):
     path.parent.mkdir(exist_ok=True)
     body = trimesh.Trimesh(1e-3 * (bent + 700), np.asarray(mesh.faces), process=False)
     body.export(path)
+
+
+def test_a_press_goes_in_equal_steps_to_its_end():
+    """Six steps to 6 mm: 1, 2, ... 6 mm; the state at rest is none of them."""
+    path = path_of(load_scene_spec(CONFIGS / "normal.toml"), CONFIGS, [], table_1())
+    np.testing.assert_allclose(path.displacement[:, 1], -np.arange(1.0, 7), rtol=1e-12)
+    assert path.s.tolist() == [60.0] * 6
 
 
 @pytest.fixture

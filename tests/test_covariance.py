@@ -7,7 +7,7 @@ import synthetic
 from scipy.stats import median_abs_deviation
 
 from jaxtrachea.fitting.cost import robust
-from jaxtrachea.fitting.covariance import analyse
+from jaxtrachea.fitting.covariance import analyse, half_widths
 from jaxtrachea.fitting.information import Information
 from jaxtrachea.fitting.lanes import Weighting
 from jaxtrachea.fitting.noise import first_sigma, next_sigma, normal_psi2
@@ -82,3 +82,21 @@ def test_noise_of_a_robust_fit_is_that_of_normal_residuals(loss):
     found = next_sigma(study, told(z)[1], first_sigma(study))
     want = median_abs_deviation(np.concatenate([z, -z]), scale="normal")  # about 0
     np.testing.assert_allclose(found[0, 0], want, rtol=1e-5)
+
+
+def test_intervals_are_those_of_the_tables():
+    """Student (1908): 97.5 % of t with 1, 2 and 10 degrees of freedom; 1.960 with known noise."""
+    dof = np.array([1, 2, 10, 10])
+    known = np.array([False, False, False, True])
+    half = half_widths(dof, noise_known=known)
+    np.testing.assert_allclose(half, [12.706, 4.3027, 2.2281, 1.95996], rtol=2e-5)
+
+
+def test_estimated_noise_is_over_what_the_unknowns_leave():
+    """Sum of squares over n - p; all of the lane's unknowns, not one."""
+    study = synthetic.study(np.ones((1, len(synthetic.S_C), len(synthetic.DEPTHS))))
+    unknowns = study.lanes.active.sum()
+    assert unknowns > 1
+    z = np.random.default_rng(6).normal(size=N)
+    found = next_sigma(study, told(z)[1], first_sigma(study))
+    np.testing.assert_allclose(found[0, 0], np.sqrt(np.sum(z**2) / (N - unknowns)), rtol=1e-12)

@@ -239,6 +239,18 @@ def test_leaving_a_position_out_is_a_fit_without_it():
     )
 
 
+def test_ratio_of_a_curve_left_out_is_that_of_least_squares():
+    """Measured force over that of the other curve's line, as a slope through the origin."""
+    curves = noisy(specimens=1)
+    study = linear_study(curves, fixed=("k_3",))
+    found = leave_one_out(fit(study, Settings(starts=1)), Settings(starts=1))
+    for row, (kept, out) in enumerate((curves[::-1], curves)):
+        X = np.stack([DEPTH, 1 + 0 * DEPTH], 1)
+        model = X @ np.linalg.lstsq(X, kept.force, rcond=None)[0]
+        slope = np.linalg.lstsq(model[:, None], out.force, rcond=None)[0][0]
+        np.testing.assert_allclose(found.ratio[row], slope - 1, rtol=1e-6)
+
+
 def test_without_a_second_position_trials_are_left_out():
     """As `sklearn.model_selection.LeaveOneGroupOut`: each trial once, specimens by themselves."""
     study = linear_study(noisy(), fixed=("k_3",))

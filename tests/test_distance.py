@@ -424,6 +424,10 @@ def test_witness_points(name):
     there = place(PLACES[name])
     c = solve(A, B, there)
     np.testing.assert_allclose(c.point_b - c.point_a, c.distance * c.normal, atol=1e-12)
+    # Of the sharp shapes, which the smoothed ones hold: nearer by no more than both are larger.
+    beyond = 2 * np.log(8) / (1000.0 / sizes([A], [B])[0])
+    assert c.distance - 1e-12 <= c.lower <= c.distance + beyond
+    assert c.lower <= c.upper + 1e-12
     d = np.random.default_rng(4).normal(size=(300, 3))
     d = jnp.asarray(np.vstack([d / np.linalg.norm(d, axis=1)[:, None], c.normal, -c.normal]))
     moved = Shape(transform(there, B.vertices), B.radius)

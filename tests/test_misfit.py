@@ -66,6 +66,22 @@ def test_few_samples_may_do_so_by_chance():
     assert np.sum(found.told) <= 2
 
 
+def test_eleven_samples_are_told_by_chi_squared():
+    """Of 10 degrees of freedom chi^2 is above 25.6 once in 233 times, above 36.1 once in 12,000."""
+    D = np.linspace(0.1, 2, 11)
+    left = np.random.default_rng(3).normal(size=11)
+    left -= D * (D @ left) / (D @ D)
+    left *= SIGMA * np.sqrt(10 / (left @ left))
+    curves = [Curve(f"s{i}", "t", 75.0, 0.0, D, 2 * D + r * left) for i, r in enumerate([1.6, 1.9])]
+    study = build_study(
+        curves, table_1(), Options(coupling="total", onset_width=0.0),
+        {"k_3": {"fixed": True, "value": 0.0}}, noise=Noise(force=SIGMA),
+    )  # fmt: skip
+    found = fit(study, QUICK).misfit
+    np.testing.assert_allclose(found.ratio[:, 0], [1.6, 1.9], rtol=1e-6)
+    assert found.told[:, 0].tolist() == [False, True]
+
+
 def test_outliers_do_not_count_with_a_robust_loss():
     force = lines(2)
     force[:, ::10] += 100 * SIGMA

@@ -1,6 +1,7 @@
 """Curves with an onset and a force offset of their own: left out, predicted, fitted again."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -15,8 +16,10 @@ from jaxtrachea.fitting.predictions import predictions
 from jaxtrachea.inference.cross_validation import leave_one_out, with_own_touch
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.prediction import held_out
+from jaxtrachea.prediction.sources import Source
 from jaxtrachea.results import stored
 from jaxtrachea.results.hdf5 import read_hdf5
+from jaxtrachea.status import FitStatus, PredictionStatus
 
 
 def touching(onsets=(0.3, 0.7, 1.1), reach=6.0, specimens=("T1", "T2")):
@@ -112,6 +115,36 @@ def test_left_out_curve_with_one_number_of_its_own(own, tmp_path):
     curves = [dataclasses.replace(c, force=c.force + 20.0) for c in touching(onsets)]
     for found, _, _ in left_out_pairs(total_study(curves, changes), changes, (1,), tmp_path):
         assert f"{own} fitted to this curve" in found.prediction.message
+
+
+def test_own_parameters_follow_those_that_are_kept():
+    """Of a linear model: NumPy's fit of the own one, moved by each that is kept, and its noise."""
+    rng = np.random.default_rng(8)
+    slopes, sigma, force = rng.normal(size=(3, 20)), rng.uniform(0.1, 0.3, 20), rng.normal(size=20)
+    kept, moving = slopes[:2], slopes[2:]
+    root = rng.normal(size=(2, 2))
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = root @ root.T
+    blank = Source(
+        "T1", "", 0, np.zeros(3), np.zeros(3), covariance, np.zeros((1, 3)), np.array(1.96),
+        np.ones(2), (2,), PredictionStatus.OK, "",
+    )  # fmt: skip
+    own = held_out._Own(
+        (2,), np.zeros(1), FitStatus.CONVERGED, np.zeros(1, bool), slopes, sigma
+    )  # fmt: skip
+    names = object.__new__(stored.StoredFit)  # no more of it is read
+    free = [SimpleNamespace(name=name) for name in "abc"]
+    object.__setattr__(names, "study", SimpleNamespace(free=free))
+    got = held_out._merged(names, blank, own).covariance
+
+    def fitted(values):
+        A, y = (moving / sigma).T, (force - values @ kept) / sigma
+        return np.linalg.lstsq(A, y, rcond=None)[0][0]
+
+    by = np.array([fitted(way) - fitted(np.zeros(2)) for way in np.eye(2)])
+    noise = 1 / np.sum((moving / sigma) ** 2)
+    np.testing.assert_allclose(got[2, :2], covariance[:2, :2] @ by, rtol=1e-9)
+    np.testing.assert_allclose(got[2, 2], by @ covariance[:2, :2] @ by + noise, rtol=1e-9)
 
 
 def least_touch(read, lane, curve):

@@ -200,6 +200,11 @@ def test_continuous_across_borders(height):
         c = solve(TOOLS["sphere"], TUBE, 0 * at, at)
         assert set(c.patch) == {5, 6}
         assert np.abs(np.diff(c.gap)).max() < TILT * step
+        exact = level - R - TOOLS["sphere"].radius  # which is in both patches' reach
+        assert (c.gap <= exact + 1e-12).all()
+        assert (exact <= c.gap + c.bound).all()
+        if high - low < 1:  # 8 copies of the centre and two patches count alike: log 16 of log 32
+            assert (exact - c.gap > 0.79 * c.bound).all()
         slope = np.diff(c.s) / step
         assert (np.abs(slope - 1) < 0.1 * (2 + abs(height)) / 2).all()
         np.testing.assert_allclose(c.phi, np.arctan2(0.6, 0.8), atol=1e-12)
@@ -375,6 +380,12 @@ def test_patches_of_a_float32_mesh_are_those_of_float64(mesh):
         filled = np.sum(np.isclose(other, other[:, -1:]).all(axis=0))  # of one place, for length
         distinct = other[:, : other.shape[1] - max(filled - 1, 0)]
         assert not cKDTree(distinct.T).query_pairs(1e-3)
+
+
+def test_beyond_its_ends_a_line_goes_on_straight():
+    line = straight_patches(BORDERS, R).line
+    for at, s, phi in (([170.0, 5, 0], 170.0, 0.0), ([-4.0, 0, 3], -4.0, np.pi / 2)):
+        np.testing.assert_allclose(skeleton_coordinates(line, jnp.asarray(at)), (s, phi), atol=1e-9)
 
 
 def test_straight_is_a_line_along_x():

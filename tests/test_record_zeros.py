@@ -82,6 +82,16 @@ def test_lines_are_shown_where_there_is_air():
     assert np.isnan(zeros.slope).all()
 
 
+def test_a_line_is_told_by_its_force_at_no_displacement():
+    """Of a record that begins at 5 mm: 0.5 N - 0.03 N/mm D in air, known to 1e-3 N at D = 0."""
+    D = np.linspace(5, 11, 121)
+    noise = 1e-3 * np.random.default_rng(4).normal(size=D.size)
+    zeros = record_zeros([D], [0.5 - 0.03 * D + 2 * np.maximum(D - 8, 0) + noise])
+    assert zeros.force_slope.all()
+    np.testing.assert_allclose(zeros.slope, -0.03, atol=1e-3)
+    np.testing.assert_allclose(zeros.offset, 0.5, atol=6e-3)
+
+
 def test_records_that_no_press_explains_are_left_alone():
     """Hardening with the seventh power is no air: its force rises from the beginning, if little."""
     rng = np.random.default_rng(2002)

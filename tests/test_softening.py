@@ -141,6 +141,18 @@ def test_derivatives(D):
         np.testing.assert_allclose(by_load[name], load[i], rtol=1e-12, atol=1e-15, err_msg=name)
 
 
+def test_the_peak_is_where_the_law_turns():
+    """D r(D) on a fine grid; both signs of e_1, a draw and a press, and no peak at all."""
+    way = np.linspace(0, 12, 120_001)
+    for e_1, e_2 in ((0.2, 0.012), (0.11, 0.0), (-0.2, 0.012), (0.1, 0.0061)):
+        for sign in (1, -1):
+            D = sign * way
+            falls = np.flatnonzero(np.diff(way * (1 - e_1 * D + e_2 * D * D)) < 0)
+            peak = way[falls[0]] if len(falls) else 11.0
+            near = jnp.asarray(sign * peak * np.array([0.999, 1.001]))
+            assert Softening(e_1, e_2).past_peak(near).tolist() == [False, len(falls) > 0]
+
+
 @pytest.mark.slow
 @pytest.mark.compiling
 def test_past_the_fold():

@@ -89,6 +89,16 @@ def test_a_band_says_what_it_knows(read, monkeypatch):
     assert jaxtrachea.predict(few, s=45.0, displacement=D, specimen="s0001").status == 0
 
 
+def test_standard_errors_grow_as_intervals_do(read):
+    """Times the growth for alike residuals, at a position of the fit."""
+
+    def errors(growth):
+        grown = dataclasses.replace(read, growth=np.full_like(read.growth, growth))
+        return jaxtrachea.predict(grown, s=45.0, displacement=[1.0, 4.0], specimen="s0001").se
+
+    np.testing.assert_allclose(errors(3.0), 3 * errors(1.0), rtol=1e-9)
+
+
 def left_out(name, size, count):
     """The finite-element specimen without some positions: what a fit says of these.
 

@@ -13,9 +13,13 @@ from tool_ways import closed_loop, placed, turn
 
 from jaxtrachea import Poses, Session, make_scene, press_oblique, simulate
 from jaxtrachea.contact.shapes import capsule
+from jaxtrachea.mechanics.energy import Gradient
 from jaxtrachea.mechanics.oblique import ObliqueOptions
 from jaxtrachea.mechanics.skeleton import local_frame
-from jaxtrachea.scene.stage import touch_tube
+from jaxtrachea.scene import configurational
+from jaxtrachea.scene.approach import Approach
+from jaxtrachea.scene.programs import Moved
+from jaxtrachea.scene.stage import Presses, touch_tube
 from jaxtrachea.status import PressStatus
 
 pytestmark = pytest.mark.compiling
@@ -101,6 +105,30 @@ def test_force_and_moment_are_what_changes_the_stored_energy(shape):
     np.testing.assert_allclose(out.moment, truth[:, 3:], atol=2e-5)
     along = out.force[:, 0]
     assert np.abs(along).max() > 0.005  # there is something to find
+
+
+def test_the_moment_is_the_work_of_small_turns(monkeypatch):
+    """Of an energy that is linear in the matrix of the pose, by differences over 1e-5 rad."""
+    rng, rows, h = np.random.default_rng(5), 3, 1e-5
+    R = np.stack([turn(v) for v in rng.normal(size=(rows, 3))])
+    by, pushed = rng.normal(size=(rows, 3, 3)), rng.normal(size=(rows, 3))
+    monkeypatch.setattr(
+        configurational, "gradient", lambda tube, material, press, *_, **__: Gradient(*press[2::-1])
+    )
+    none = jnp.zeros((rows, 3))
+    moved = Moved(*[None] * 10)._replace(
+        force=none, depth=none, slope_C=none[:, 1:], loads=jnp.zeros((rows, TUBE.rings, 3))
+    )
+    made = Approach(*[None] * 7, pull=lambda _: (Poses(by, pushed),))._replace(inward=none)
+    used = Presses(none[:, 0], none[:, 0], none)
+    got = configurational.force_by_pose(scene_of(), MATERIAL, Poses(R, none), used, moved, made)
+
+    def energy(way):
+        return np.einsum("rij,rij->r", by, turn(way) @ R)
+
+    truth = [(energy(h * way) - energy(-h * way)) / (2 * h) for way in np.eye(3)]
+    np.testing.assert_allclose(got[0], pushed, rtol=1e-12)
+    np.testing.assert_allclose(got[1], np.stack(truth, 1), atol=1e-8)
 
 
 def work(scene, material, seed, steps):

@@ -410,7 +410,8 @@ def upright(*heights):
     return Poses(np.broadcast_to(np.eye(3), (ROWS, 3, 3)), places)
 
 
-#: Centres of the ball, which touches the inner wall from 7.6 mm on and the outer one below 17.6.
+#: Centres of the ball (5 mm), which touches the inner wall (10 mm) from 5 mm on and the outer one
+#: (12.6 mm) below 17.6.
 LUMEN, NO, LOST = PressStatus.IN_LUMEN, PressStatus.NO_CONTACT, PressStatus.NON_FINITE
 WAYS = {
     "from the lumen against the wall": ((0, 5, 8, 9, 5), [LUMEN] * 5),
@@ -423,6 +424,8 @@ WAYS = {
         [LUMEN, LUMEN, LUMEN, NO, OK],
     ),
     "never touching, lost": ((19, np.nan, 20), [NO, LOST, NO]),
+    "begins just within the inner wall": ((4.9, 8), [LUMEN, LUMEN]),
+    "begins in the wall": ((5.5, 16), [OK, OK]),
 }
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jaxtrachea.measurements.read import read_measurements
-from jaxtrachea.mechanics.sections.material import Wall, from_wall, neutral_radius
+from jaxtrachea.mechanics.sections.material import Factors, Wall, from_wall, neutral_radius
 from jaxtrachea.mechanics.sections.press import press_sections
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.geometry import Geometry
@@ -33,6 +33,22 @@ def test_the_composite_ring():
     np.testing.assert_allclose(material.EI_M, 2.0)
     with pytest.raises(ValueError, match="h_C is 3.0 mm; expected at most"):
         Wall(h_C=3.0)
+
+
+def test_a_tool_slides_as_cerruti_s_half_space():
+    """The tangential load of a stuck disc, P / (2 pi a sqrt(a^2 - r^2)), by Cerruti's solution.
+
+    Displacement along a unit load at a distance r: ((1 - nu) + nu cos^2) / (2 pi G r).
+    """
+    wall, a = Wall(), 3.0
+    G = wall.E_L / 2 / (1 + wall.nu)
+    turn, rise = np.meshgrid(
+        2 * np.pi * np.arange(64) / 64, np.pi / 2 * (np.arange(64) + 0.5) / 64
+    )  # r = a sin(rise), dr / sqrt(a^2 - r^2) = d rise
+    pull = (1 - wall.nu + wall.nu * np.cos(turn) ** 2) / (2 * np.pi * G) / (2 * np.pi * a)
+    slides = np.mean(pull) * 2 * np.pi * np.pi / 2
+    material = from_wall(GEOMETRY, wall, Factors(slide=1.0), a)
+    np.testing.assert_allclose([material.c_t, material.c_t_ring], slides, rtol=1e-12)
 
 
 @pytest.mark.slow
