@@ -55,7 +55,7 @@ class PressStatus(_Described):
     EXTRAPOLATED = (
         14,
         "solved, but by stiffnesses that moduli give for a tube unlike the one on which their "
-        "factors were found: forces 10 to 30 % off; fit them to presses of this tube",
+        "factors were found: forces up to 30 % off; fit them to presses of this tube",
     )
 
 

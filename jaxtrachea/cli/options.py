@@ -35,7 +35,7 @@ class FitOptions:
     ] = False
     resume: Annotated[bool, typer.Option("--resume", help="Go on where OUT stopped.")] = False
     rerun_failed: Annotated[
-        bool, typer.Option("--rerun-failed", help="Repeat the failed fits of OUT again.")
+        bool, typer.Option("--rerun-failed", help="Repeat the failed fits of OUT.")
     ] = False
     force: Annotated[bool, typer.Option("--force", help="Go on though inputs have changed.")] = (
         False
