@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import scipy.stats
 import synthetic
 from run_cli import GOOD, run
 from scipy.optimize import least_squares
@@ -259,3 +260,70 @@ def test_a_point_in_a_worse_minimum_is_passed_by(monkeypatch, curved):
     assert len(seen) == 24
     np.testing.assert_allclose(again.lower, found.lower, rtol=1e-6)
     np.testing.assert_allclose(again.upper, found.upper, rtol=1e-6)
+
+
+def constrained(x, C):
+    """95 % interval of x[0] by least squares with x[1] >= 0: ends of the profile, and the longer.
+
+    Where the profile meets x[1] = 0 on its way, its side is as long as the local one, at most as
+    chi^2 with two degrees of freedom would make that of a parabola.
+    """
+    H, (c1, c2) = np.linalg.inv(C), np.sqrt(scipy.stats.chi2.ppf(0.95, (1, 2)))
+    inside = x[1] >= 0
+    best = x[0] if inside else x[0] + H[0, 1] / H[0, 0] * x[1]
+    least = 0.0 if inside else x[1] ** 2 / C[1, 1]
+    ends, longer = [], []
+    for sign in (-1, 1):
+        # Off the bound: (x - x0)^2 / C00. On it: H00 d^2 - 2 H01 d x1 + H11 x1^2.
+        end = x[0] + sign * np.sqrt(C[0, 0] * (c1**2 + least))
+        bounded = x[1] + C[0, 1] / C[0, 0] * (end - x[0]) < 0
+        if bounded:
+            rest = H[1, 1] * x[1] ** 2 - c1**2 - least
+            d = np.roots([H[0, 0], -2 * H[0, 1] * x[1], rest])
+            end = x[0] + d[np.argmax(sign * d)]
+        side = sign * (end - best)
+        ends.append(end)
+        if bounded and inside:
+            side = min(max(side, c1 * C[0, 0] ** 0.5), c2 / c1 * side)
+        longer.append(best + sign * side)
+    return best, ends, longer
+
+
+def test_a_bound_of_another_unknown_shortens_no_interval():
+    """F = k_1 D + k_3 D^3, k_3 >= 0 and truly 0: the interval of k_1 in closed form.
+
+    A profile that ends where k_3 is 0 does not cover as it says (Self and Liang 1987): of truths on
+    the bound 6 % lie outside the ends of all profiles, 8 % where the estimate is off the bound.
+    """
+    D, sigma = np.linspace(1.5, 2, 30), 0.05  # k_1 and k_3 are correlated by -0.99
+    X = np.stack([D, D**3], axis=1)
+    C = sigma**2 * np.linalg.inv(X.T @ X)
+    rng = np.random.default_rng(11)
+    draws = rng.multivariate_normal([1.3, 0.0], C, size=4_000)
+    found = [constrained(x, C)[1:] for x in draws]
+    missed = np.array([[not low <= 1.3 <= high for low, high in both] for both in found])
+    off = draws[:, 1] > 0
+    assert 0.05 < missed[:, 0].mean() < 0.065
+    assert 0.07 < missed[off, 0].mean() < 0.1
+    assert 0.03 < missed[:, 1].mean() < 0.05
+    curves = [
+        Curve(f"T{i:02}", "a", None, 0.0, D, 1.3 * D + sigma * rng.normal(size=30))
+        for i in range(24)
+    ]
+    linear = {"scale": "linear", "lower": -100.0, "upper": 100.0, "step": 0.1, "value": 1.0}
+    change = {"k_1": linear, "k_3": linear | {"lower": 0.0, "value": 0.1}}
+    names = ("k_1", "k_3", "onset", "force_offset")
+    rows = [dataclasses.replace(DEFAULTS[n], **change.get(n, {})) for n in names]
+    options = Options(coupling="total", onset_width=0.0)
+    study = build_study(curves, table_1(), options, rows, noise=Noise(force=sigma))
+    result = fit(study, ONE)
+    profiled = profiles(result, ONE, ["k_1"], points=2)
+    growth, bounded = result.effective.growth, 0
+    for lane, curve in enumerate(curves):
+        best, _, (low, high) = constrained(np.linalg.lstsq(X, curve.force)[0], C)
+        judged = judgement(result, lane, 0, profiled)
+        assert result.value[lane, 0] == pytest.approx(best, rel=1e-6)
+        assert judged.low == pytest.approx(best + growth[lane] * (low - best), rel=1e-5)
+        assert judged.high == pytest.approx(best + growth[lane] * (high - best), rel=1e-5)
+        bounded += ProfileEnd.BOUND in profiled.end[profiled.find(lane, 0)]
+    assert 5 < bounded < 24

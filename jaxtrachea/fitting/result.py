@@ -255,6 +255,11 @@ class FitResult:
         return xarray.Dataset(data, coords)
 
 
+#: Growth, at most, of the side of a profile that ends where another unknown is on its bound: 95 %
+#: of chi^2 with two degrees of freedom for one. Near such a bound the statistic follows neither
+#: (Self and Liang 1987, doi:10.1080/01621459.1987.10478472): of truths on it up to 10 % lay outside
+#: intervals whose estimate was off it.
+BY_ANOTHER_BOUND = (5.991464547107979 / 3.841458820694124) ** 0.5
 #: Verdicts on estimates that enter medians and populations.
 DETERMINED = ("identifiable", "weak")
 
@@ -428,6 +433,12 @@ def _unbounded(
         return local
     low_end, high_end = (_end([v[2][side] for v in found]) for side in (0, 1))
     low, high = min(v[0] for v in found), max(v[1] for v in found)
+    # A profile that the bound of another unknown cuts short is as long as the local interval.
+    far_low, far_high = _grown(result, lane, i, low, high, BY_ANOTHER_BOUND)
+    if low_end == ProfileEnd.BOUND:
+        low = max(float(np.fmin(low, local[0])), far_low)
+    if high_end == ProfileEnd.BOUND:
+        high = min(float(np.fmax(high, local[1])), far_high)
     # Of a side whose end was not found nothing is known but the local error.
     if low_end == ProfileEnd.FAILED:
         low = float(np.fmin(low, local[0]))
