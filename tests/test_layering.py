@@ -58,7 +58,8 @@ WITHIN = {
         {"cost", "plots"},
     ],
     "measurements": [
-        {"presses", "turning", "plausible", "first_touch", "roles", "press_shape"},
+        {"presses", "turning", "plausible", "first_touch", "observed", "press_shape"},
+        {"roles"},
         {"holds", "record_zeros"},
         {"parts"},
         {"segments"},

@@ -74,20 +74,20 @@ def infinite(name):
 
 
 BAD_CURVES = {
-    "side force infinite": (infinite("side_force"), "non_finite", "side_force .* in sample 2"),
+    "side force infinite": (infinite("side_force"), "non_finite", "side force .* in sample 2"),
     "side force too large": ({"side_force": np.array([0, 0, 1e6])}, "absurd_scale", "sample 3"),
     "sides infinite": (infinite("joint_side_displacement"), "non_finite", "sideward .* sample 2"),
     "sides without rings": (
         {"joint_rings": None, "joint_displacement": None}, "shape", "expected 3 x 0"),
-    "sides without markers": ({"joint_displacement": None}, "shape", "must come together"),
+    "sides without markers": ({"joint_displacement": None}, "shape", "needs joint_displacement"),
     "ends without rings": ({"end_rings": None}, "shape", "expected 3 x 0 x 2"),
     "rings without ends": (
         {"end_U": None, "end_V": None}, "shape", "end_ring_number without end_U and end_V"),
     "ends of ring 0": (
         {"end_rings": np.array([-1, 0, 1])}, "shape", "end_ring_number is repeated or below 1"),
     "ends of a ring twice": ({"end_rings": np.array([2, 0, 2])}, "shape", "is repeated"),
-    "ends infinite": (infinite("end_U"), "non_finite", "end U is infinite in sample 2"),
-    "ends too far": ({"end_U": full().end_U + 2e3}, "absurd_scale", "end U is more than 1000 mm"),
+    "ends infinite": (infinite("end_U"), "non_finite", "ends U is infinite in sample 2"),
+    "ends too far": ({"end_U": full().end_U + 2e3}, "absurd_scale", "ends U is more than 1000 mm"),
     "direction nan": ({"direction": (NAN, 0.0)}, "direction", "expected two finite numbers"),
     "direction zero": (
         {"direction": (0.0, 0.0)}, "direction", r"\(0, 0\) has the length 0, expected 1"),
@@ -212,7 +212,7 @@ def test_whole_table_refused(tmp_path, text, message):
             "column_missing",
             "joint_7_side and none for joint_7",
         ),
-        (HEAD + "side_force [N]\n0,0,0\n1,1,inf\n", "non_finite", "side_force .* in line 3"),
+        (HEAD + "side_force [N]\n0,0,0\n1,1,inf\n", "non_finite", "side force .* in line 3"),
         (HEAD + "end_U_7_y [mm]\n0,0,0\n1,1,x\n", "unparsable", "line 3: end_U_7_y 'x'"),
         ('{"direction": [2, 0]}\n' + HEAD + "a\n" + ROWS, "direction", "has the length 2"),
     ],
@@ -396,7 +396,8 @@ def test_a_study_of_normal_presses_leaves_vectors_out_and_says_so(virtual):
     plain = [c for c in read_measurements(VIRTUAL / "finite_strain.h5").curves if c.s_c in (35, 70)]
     plain = [dataclasses.replace(a, trial=b.trial) for a, b in zip(plain, curves, strict=True)]
     message = (
-        "side force in 2, sideward motion of markers in 2, ring ends U in 2, ring ends V in 2 of 2"
+        "side force in 2, sideward motion of markers in 2, "
+        "motion of ring ends U in 2, motion of ring ends V in 2 of 2"
         " curves"
     )
     with pytest.warns(UserWarning, match=message) as warned:
@@ -479,12 +480,13 @@ def test_table_of_curves_shows_vectors(virtual):
     shown = _curve_table([virtual[70, 0], virtual[70, 30], full()])
     row = dict(zip(shown.head, shown.rows[1], strict=True))
     assert row["phi [deg]"] == "30"
-    assert row["vectors"] == "side force, markers aside, ends U and V of 15 rings"
-    assert shown.rows[2][-1].endswith("ends U and V of 3 rings, tool 53.1° off the normal")
+    ends = "motion of ring ends U, motion of ring ends V"
+    assert row["vectors"] == f"side force, sideward motion of markers, {ends}"
+    assert shown.rows[2][-1].endswith(f"{ends}, tool 53.1° off the normal")
     # A column that is empty for this curve tells nothing of it.
     curve = virtual[70, 30]
     nothing = {name: np.full_like(getattr(curve, name), np.nan) for name in ("side_force", "end_U")}
     shown = _curve_table([dataclasses.replace(curve, **nothing)])
-    assert shown.rows[0][-1] == "markers aside, ends V of 15 rings"
+    assert shown.rows[0][-1] == "sideward motion of markers, motion of ring ends V"
     plain = dataclasses.replace(virtual[70, 0], **dict.fromkeys(ARRAYS))
     assert {"phi [deg]", "vectors"}.isdisjoint(_curve_table([plain]).head)

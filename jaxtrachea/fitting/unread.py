@@ -3,20 +3,9 @@
 import dataclasses
 from collections.abc import Sequence
 
-import numpy as np
-
-from jaxtrachea.measurements.read import Curve
-
-#: Fields of a curve that only a model of presses in any direction reads, and what they are called.
-VECTORS = {
-    "side_force": "side force",
-    "joint_side_displacement": "sideward motion of markers",
-    "end_U": "ring ends U",
-    "end_V": "ring ends V",
-}
-
-#: Changes that take the vectors off a curve.
-LEFT_OUT: dict[str, None] = dict.fromkeys((*VECTORS, "end_rings"))
+from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.measurements.observed import VECTORS, WITHOUT_VECTORS
+from jaxtrachea.measurements.vectors import observed
 
 
 def along_the_normal(curves: Sequence[Curve]) -> tuple[list[Curve], str | None]:
@@ -28,11 +17,11 @@ def along_the_normal(curves: Sequence[Curve]) -> tuple[list[Curve], str | None]:
     Returns:
         The curves without their vectors, and a sentence on what was left out; None: nothing was.
     """
-    counts = {name: sum(_holds(c, name) for c in curves) for name in VECTORS}
+    counts = {name: sum(observed(c, name) for c in curves) for name in VECTORS}
     counts = {name: count for name, count in counts.items() if count}
     plain = [
-        dataclasses.replace(c, **LEFT_OUT)
-        if any(getattr(c, name) is not None for name in LEFT_OUT)
+        dataclasses.replace(c, **WITHOUT_VECTORS)
+        if any(getattr(c, name) is not None for name in WITHOUT_VECTORS)
         else c
         for c in curves
     ]
@@ -43,9 +32,3 @@ def along_the_normal(curves: Sequence[Curve]) -> tuple[list[Curve], str | None]:
         f"Measured and not read: {listed} of {len(curves)} curves; this model presses along the "
         "inward normal and knows only the force and the markers along it"
     )
-
-
-def _holds(curve: Curve, name: str) -> bool:
-    """Whether anything was observed of a field."""
-    values = getattr(curve, name)
-    return values is not None and bool(np.isfinite(values).any())

@@ -13,6 +13,7 @@ from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.inference.repeats import Missed, Worst
 from jaxtrachea.inference.residuals import rms
+from jaxtrachea.measurements.observed import FURTHER_FIELDS
 
 #: Difference of AICc up to which models cannot be told apart, and from which on they clearly can
 #: (Burnham and Anderson 2002, sec. 2.6).
@@ -115,9 +116,6 @@ def _curves(study: Study) -> set[tuple]:
     def said(v):
         return None if v is None else v.tobytes()
 
-    def vectors(c):
-        return c.side_force, c.joint_side_displacement, c.end_U, c.end_V
-
     return {
         (
             c.specimen,
@@ -125,8 +123,7 @@ def _curves(study: Study) -> set[tuple]:
             c.s_c,
             c.phi_c,
             tuple(c.direction),
-            *map(said, (c.displacement, c.force, c.joint_displacement, *vectors(c))),
-            *map(said, (c.joint_rings, c.end_rings)),
+            *(said(getattr(c, name)) for name in ("displacement", "force", *FURTHER_FIELDS)),
         )
         for lane in study.curves
         for c in lane

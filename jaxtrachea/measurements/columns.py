@@ -5,6 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from jaxtrachea.measurements.curve import Fault, RawCurve
+from jaxtrachea.measurements.observed import OBSERVED, RINGS, Quantity
+from jaxtrachea.measurements.roles import ring_role_of
 
 
 def curve_of_columns(
@@ -19,57 +21,39 @@ def curve_of_columns(
         fields: the other fields of the curve.
 
     Raises:
-        Fault: a marker has a sideward column and no other ("column_missing").
+        Fault: a column is there without the one that belongs to it ("column_missing").
     """
-    return RawCurve(
-        *key,
-        source,
-        values["displacement"],
-        values["force"],
-        sigma=values.get("sigma"),
-        side_force=values.get("side_force"),
-        **_markers(values),
-        **_ends(values),
-        **fields,
-    )
+    sampled = {q.name: values[q.role] for q in OBSERVED if q.rings is None and q.role in values}
+    for field, quantities in RINGS.items():
+        sampled |= _of_rings(field, quantities, values)
+    both = values["displacement"], values["force"]
+    return RawCurve(*key, source, *both, **sampled, **fields)
 
 
-def _markers(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Fields of the markers; NaN where a marker has no sideward column."""
-    roles = [role for role in values if role.startswith("joint_")]
-    normal = [role for role in roles if not role.endswith("_side")]
-    sides = [role for role in roles if role.endswith("_side")]
-    for role in sides:
-        if role.removesuffix("_side") not in normal:
-            raise Fault(
-                "column_missing",
-                f"there is a column for {role} and none for {role.removesuffix('_side')}",
-                "add it, along the inward normal; empty where it was not seen",
-            )
-    if not normal:
+def _of_rings(
+    field: str, quantities: tuple[Quantity, ...], values: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Fields of what is measured of rings; NaN where a ring or a component has no column."""
+    found = {name: ring_role_of(name.lower()) for name in values}
+    own = {q.name: [r for _, r in filter(None, found.values()) if {*q.columns(r)} & {*values}]
+           for q in quantities}  # fmt: skip
+    for q in quantities:
+        for ring in own[q.name]:
+            if q.beside is not None and ring not in own[q.beside]:
+                (other,) = next(o for o in quantities if o.name == q.beside).columns(ring)
+                raise Fault(
+                    "column_missing",
+                    f"there is a column for {q.columns(ring)[0]} and none for {other}",
+                    "add it, along the inward normal; empty where it was not seen",
+                )
+    rings = [*dict.fromkeys(r for q in quantities if q.beside is None for r in own[q.name])]
+    if not rings:
         return {}
-    found = {
-        "joint_rings": np.array([int(role.split("_")[1]) - 1 for role in normal]),
-        "joint_displacement": np.stack([values[role] for role in normal], axis=1),
-    }
-    if sides:
-        unseen = np.full(len(values["displacement"]), np.nan)
-        columns = [values.get(f"{role}_side", unseen) for role in normal]
-        found["joint_side_displacement"] = np.stack(columns, axis=1)
-    return found
-
-
-def _ends(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Fields of the ends of the rings; NaN where an end or a component has no column."""
-    roles = [role.split("_") for role in values if role.startswith("end_")]
-    if not roles:
-        return {}
-    rings = list(dict.fromkeys(int(ring) for _, _, ring, _ in roles))
-    found = {"end_rings": np.array(rings) - 1}
-    for end in dict.fromkeys(end for _, end, _, _ in roles):
-        moved = np.full((len(values["displacement"]), len(rings), 2), np.nan)
-        for k, ring in enumerate(rings):
-            for c, axis in enumerate("yz"):
-                moved[:, k, c] = values.get(f"end_{end}_{ring}_{axis}", np.nan)
-        found[f"end_{end}"] = moved
-    return found
+    unseen = np.full(len(values["displacement"]), np.nan)
+    fields = {field: np.array(rings) - 1}
+    for q in quantities:
+        if own[q.name]:
+            columns = [values.get(role, unseen) for ring in rings for role in q.columns(ring)]
+            shape = q.shape(len(unseen), len(rings))
+            fields[q.name] = np.stack(columns, axis=1).reshape(shape)
+    return fields

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxtrachea.measurements.curve import Fault, ReadOptions
+from jaxtrachea.measurements.observed import OBSERVED
 from jaxtrachea.measurements.readers import READERS
 from jaxtrachea.measurements.readers.afmformats import AFMFORMATS, SI_UNITS, load
 from jaxtrachea.measurements.readers.column_roles import find_roles, time_column
@@ -20,9 +21,10 @@ from jaxtrachea.measurements.readers.workbook import read_sheets
 #: Bytes of a text in which its header is looked for.
 HEAD_BYTES = 2**18
 #: Roles of datasets by their names in the project's own HDF5 files, where they differ.
-_STORED = {"s_c": "s", "phi_c": "phi", "joint_displacement": "joint", "end_U": "end",
-           "end_V": "end", "joint_side_displacement": "joint", "joint_ring_number": "joint",
-           "end_ring_number": "end"}  # fmt: skip
+_STORED = {
+    "s_c": "s", "phi_c": "phi", "joint_ring_number": "joint", "end_ring_number": "end",
+    **{q.name: q.role for q in OBSERVED},
+}  # fmt: skip
 _OF_AFM = {"force": "force", "height (measured)": "displacement", "tip position": "displacement",
            "segment": "segment"}  # fmt: skip
 

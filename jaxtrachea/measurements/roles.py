@@ -2,35 +2,42 @@
 
 import re
 
+from jaxtrachea.measurements.observed import OBSERVED, RINGS
+
 #: Dimension of every role; "joint" and "end" stand for all columns of markers and of ring ends.
 ROLE_DIMENSIONS = {
     "s": "length",
     "phi": "angle",
     "displacement": "length",
     "force": "force",
-    "side_force": "force",
-    "sigma": "force",
-    "time": "time",
-    "joint": "length",
-    "end": "length",
-}
+} | {q.role: q.dimension for q in OBSERVED}
 ROLES = ("specimen", "trial", *ROLE_DIMENSIONS)
-#: Roles of columns of numbers, one per sample, that a curve is made of.
-SAMPLED = ("displacement", "force", "side_force", "sigma")
+#: Roles of columns of numbers, one per sample, that a curve is made of; time has its own rules.
+SAMPLED = (
+    "displacement",
+    "force",
+    *(q.role for q in OBSERVED if q.rings is None and q.name != "time"),
+)
+# Columns of rings: the general role, and a name in lower case, with the ring's number in it.
+_OF_RING = [
+    (q.role, role, re.compile(role.lower().replace("_", "[ _]?").replace("#", r"(\d{1,4})")))
+    for of_rings in RINGS.values()
+    for q in of_rings
+    for role in q.columns("#")
+]
 #: Roles of single rings, for messages.
-RING_ROLES = "joint_<ring>, joint_<ring>_side, end_U_<ring>_y (V, z likewise)"
-# Roles of single rings, and the columns of a header in lower case that play them: ring numbers
-# count from 1 at the carina end.
-_RING = r"[1-9]\d{0,3}"
-_RING_ROLE = re.compile(rf"(joint)_{_RING}(?:_side)?|(end)_[UV]_{_RING}_[yz]")
-_JOINT = re.compile(r"joint[ _]?(\d{1,4})([ _]side)?")
-_END = re.compile(r"end[ _]?([uv])[ _]?(\d{1,4})[ _]?([yz])")
+RING_ROLES = ", ".join(role.replace("#", "<ring>") for _, role, _ in _OF_RING)
+
+
+def _of_ring(role: str) -> str | None:
+    """The general role of a single ring's; rings count from 1 at the carina end."""
+    alike = re.sub(r"(?<=_)[1-9]\d{0,3}(?=_|$)", "#", role)
+    return next((general for general, name, _ in _OF_RING if name == alike), None)
 
 
 def general_role(role: str) -> str:
     """The role that `units` may name for all rings: ``"joint"`` of ``"joint_7_side"``."""
-    match = _RING_ROLE.fullmatch(role)
-    return role if match is None else match[1] or match[2]
+    return _of_ring(role) or role
 
 
 def is_role(role: str) -> bool:
@@ -40,7 +47,7 @@ def is_role(role: str) -> bool:
 
 def is_ring_role(role: str) -> bool:
     """Whether a role is that of a single ring: ``"joint_7"``, ``"end_U_7_y"``."""
-    return _RING_ROLE.fullmatch(role) is not None
+    return _of_ring(role) is not None
 
 
 def role_dimension(role: str) -> str:
@@ -57,8 +64,7 @@ def ring_role_of(name: str) -> tuple[str, int] | None:
     Returns:
         For example ``("end_U_7_y", 7)``; None if it is no column of a ring.
     """
-    if match := _JOINT.fullmatch(name):
-        return f"joint_{int(match[1])}{'_side' if match[2] else ''}", int(match[1])
-    if match := _END.fullmatch(name):
-        return f"end_{match[1].upper()}_{int(match[2])}_{match[3]}", int(match[2])
+    for _, role, pattern in _OF_RING:
+        if match := pattern.fullmatch(name):
+            return role.replace("#", str(int(match[1]))), int(match[1])
     return None

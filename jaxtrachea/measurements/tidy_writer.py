@@ -11,9 +11,8 @@ from jaxtrachea._errors import InputError
 from jaxtrachea.files.atomic import write_whole
 from jaxtrachea.files.tables import quoted
 from jaxtrachea.measurements.curve import Curve
+from jaxtrachea.measurements.observed import OBSERVED
 
-#: Columns of one number per sample, with their unit.
-COLUMNS = {"sigma": "N", "side_force": "N", "time": "s"}
 #: Largest ring number of a column.
 MOST_RINGS = 9999
 _HDF5 = "write HDF5 (.h5) instead"
@@ -70,18 +69,16 @@ def write_tidy(path: Path, curves: Sequence[Curve]) -> None:
 def _columns(curve: Curve) -> dict[str, np.ndarray]:
     """Heads and values of what a curve holds beside displacement and force."""
     found = {}
-    for name, unit in COLUMNS.items():
-        if (values := getattr(curve, name)) is not None:
-            found[f"{name} [{unit}]"] = values
-    for name, suffix in (("joint_displacement", ""), ("joint_side_displacement", "_side")):
-        if curve.joint_rings is not None and (values := getattr(curve, name)) is not None:
-            for ring, column in zip(_numbers(curve, curve.joint_rings), values.T, strict=True):
-                found[f"joint_{ring}{suffix} [mm]"] = column
-    for name in ("end_U", "end_V"):
-        if curve.end_rings is not None and (values := getattr(curve, name)) is not None:
-            for k, ring in enumerate(_numbers(curve, curve.end_rings)):
-                for c, axis in enumerate("yz"):
-                    found[f"{name}_{ring}_{axis} [mm]"] = values[:, k, c]
+    for q in OBSERVED:
+        if (values := getattr(curve, q.name)) is None:
+            continue
+        if q.rings is None:
+            heads = [q.role]
+        else:
+            numbers = _numbers(curve, getattr(curve, q.rings))
+            heads = [role for ring in numbers for role in q.columns(ring)]
+        columns = values.reshape(len(values), -1).T
+        found |= {f"{h} [{q.unit}]": v for h, v in zip(heads, columns, strict=True)}
     return found
 
 

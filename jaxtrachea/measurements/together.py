@@ -14,12 +14,12 @@ import numpy as np
 from jaxtrachea.measurements.checks import UPSIDE_DOWN, finish, position
 from jaxtrachea.measurements.curve import BadCurve, Curve, Fault, RawCurve, ReadOptions
 from jaxtrachea.measurements.holds import rises_evenly
+from jaxtrachea.measurements.observed import FURTHER_FIELDS
 from jaxtrachea.measurements.parts import Segment
 from jaxtrachea.measurements.plausible import doubt_of
 from jaxtrachea.measurements.record_faults import suspicious
 from jaxtrachea.measurements.usage import Usage
 from jaxtrachea.measurements.vectors import (
-    FURTHER_FIELDS,
     check_vector_shapes,
     check_vector_sizes,
     unit_direction,

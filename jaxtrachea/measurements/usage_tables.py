@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from hashlib import sha256
 
+from jaxtrachea.measurements.observed import FURTHER_FIELDS
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.measurements.usage import CAUSES
 
@@ -119,7 +120,8 @@ def same_curves(curves: Sequence[Curve]) -> Iterator[str]:
     for curve in curves:
         digest = sha256(curve.displacement.tobytes())
         digest.update(curve.force.tobytes())
-        for more in (curve.side_force, curve.joint_displacement, curve.end_U, curve.end_V):
+        for name in FURTHER_FIELDS:
+            more = getattr(curve, name)
             digest.update(b"" if more is None else more.tobytes())
         groups.setdefault(digest.digest(), []).append(curve)
     for group in groups.values():

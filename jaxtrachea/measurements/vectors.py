@@ -6,16 +6,12 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from jaxtrachea.measurements.curve import Curve, Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.observed import OBSERVED, RINGS, VECTORS, Quantity
 
 #: A direction whose length differs from 1 by less is taken, and made of length 1.
 UNIT_LENGTH = 1e-3
 #: Below this difference a length is 1 but for rounding, and its direction left as it is.
 _ROUNDING = 1e-12
-#: Fields that a curve of force and displacement alone does not have.
-FURTHER_FIELDS = (
-    "side_force", "joint_rings", "joint_displacement", "joint_side_displacement", "end_rings",
-    "end_U", "end_V",
-)  # fmt: skip
 
 
 def listed(rows: Iterable, word: str) -> str:
@@ -31,70 +27,46 @@ def check_vector_shapes(raw: RawCurve) -> None:
     Raises:
         Fault: a shape, a ring number, or one of two that must come together ("shape").
     """
-    n = raw.displacement.size
-    if raw.side_force is not None and raw.side_force.shape != (n,):
+    for field, quantities in RINGS.items():
+        _check_rings(raw, field, [q for q in quantities if getattr(raw, q.name) is not None])
+    for q in OBSERVED:
+        values = getattr(raw, q.name)
+        if values is None or not q.gaps:
+            continue
+        if q.beside is not None and getattr(raw, q.beside) is None:
+            raise Fault(
+                "shape",
+                f"{q.name} needs {q.beside}",
+                "store it, NaN where it was not seen",
+            )
+        rings = None if q.rings is None else getattr(raw, q.rings)
+        expected = q.shape(raw.displacement.size, 0 if rings is None else rings.size)
+        if values.shape != expected:
+            axes = "samples", "rings", f"components {' and '.join(q.components)}"
+            raise Fault(
+                "shape",
+                f"{q.name} has shape {values.shape}, expected {expected}"
+                f" ({', '.join(axes[: len(expected)])})",
+                "store a value for all of these, NaN where it was not seen",
+            )
+
+
+def _check_rings(raw: RawCurve, field: str, given: Sequence[Quantity]) -> None:
+    """Refuse ring numbers without what they number, and the reverse."""
+    rings, names = getattr(raw, field), " and ".join(q.name for q in given)
+    number = field.replace("_rings", "_ring_number")
+    if rings is None and given:
+        raise Fault("shape", f"{names} without {number}", "number the rings, from 1")
+    if rings is None:
+        return
+    if not given:
+        every = " and ".join(q.name for q in RINGS[field] if q.beside is None)
+        raise Fault("shape", f"{number} without {every}", "store it, or remove the numbers")
+    if rings.ndim != 1 or (rings.size and (rings.min() < 0 or np.unique(rings).size != rings.size)):
         raise Fault(
             "shape",
-            f"side_force has shape {raw.side_force.shape}, expected {(n,)}",
-            "store one value per sample, NaN where it was not measured",
-        )
-    _check_markers(raw, n)
-    _check_ends(raw, n)
-
-
-def _check_markers(raw: RawCurve, n: int) -> None:
-    rings, joints, sides = raw.joint_rings, raw.joint_displacement, raw.joint_side_displacement
-    if (rings is None) != (joints is None):
-        raise Fault(
-            "shape", "joint displacements and ring numbers must come together", "store both"
-        )
-    if rings is None:
-        if sides is not None:
-            raise Fault(
-                "shape",
-                "joint_side_displacement needs joint_displacement and joint_ring_number",
-                "store them, NaN where the inward part was not seen",
-            )
-        return
-    for name, values in (("joint", joints), ("sideward joint", sides)):
-        if values is not None and (rings.ndim != 1 or values.shape != (n, rings.size)):
-            raise Fault(
-                "shape",
-                f"{name} displacements have shape {values.shape},"
-                f" expected {(n, rings.size)} (samples, markers)",
-                "store one row per sample and one column per ring",
-            )
-    _check_rings(rings, "a ring number")
-
-
-def _check_ends(raw: RawCurve, n: int) -> None:
-    rings, ends = raw.end_rings, {"end_U": raw.end_U, "end_V": raw.end_V}
-    seen = {name: values for name, values in ends.items() if values is not None}
-    if rings is None:
-        if seen:
-            raise Fault(
-                "shape", f"{' and '.join(seen)} without end_ring_number", "number the rings, from 1"
-            )
-        return
-    if not seen:
-        raise Fault(
-            "shape", "end_ring_number without end_U and end_V", "store them, or remove the numbers"
-        )
-    for name, values in seen.items():
-        if rings.ndim != 1 or values.shape != (n, rings.size, 2):
-            raise Fault(
-                "shape",
-                f"{name} has shape {values.shape}, expected {(n, rings.size, 2)}"
-                " (samples, rings, components y and z)",
-                "store y and z of every ring and sample, NaN where they were not seen",
-            )
-    _check_rings(rings, "a number in end_ring_number")
-
-
-def _check_rings(rings: np.ndarray, what: str) -> None:
-    if rings.size and (rings.min() < 0 or np.unique(rings).size != rings.size):
-        raise Fault(
-            "shape", f"{what} is repeated or below 1", "give each ring once, counted from 1"
+            f"a number in {number} is repeated or below 1",
+            "give each ring once, counted from 1",
         )
 
 
@@ -104,32 +76,25 @@ def check_vector_sizes(raw: RawCurve, options: ReadOptions) -> None:
     Raises:
         Fault: "non_finite" or "absurd_scale".
     """
-    length, force = (options.max_displacement, "mm"), (options.max_force, "N")
-    quantities = (
-        # The scale of the inward part of markers has never been bounded.
-        ("a joint displacement", raw.joint_displacement, np.inf, "mm"),
-        ("a sideward joint displacement", raw.joint_side_displacement, *length),
-        ("the motion of an end U", raw.end_U, *length),
-        ("the motion of an end V", raw.end_V, *length),
-        ("side_force", raw.side_force, *force),
-    )
-    for name, values, limit, unit in quantities:
-        if values is None:
+    for q in OBSERVED:
+        values = getattr(raw, q.name)
+        if values is None or not q.gaps:
             continue
+        limit = np.inf if q.largest is None else getattr(options, q.largest)
         size = np.abs(values).reshape(len(values), -1)
         if np.isinf(size).any():
             rows = raw.rows[np.isinf(size).any(axis=1)]
-            what = "what" if name == "side_force" else "a marker that"
             raise Fault(
                 "non_finite",
-                f"{name} is infinite in {listed(rows, raw.row_word)}",
-                f"leave {what} was not seen empty or NaN",
+                f"{q.words} is infinite in {listed(rows, raw.row_word)}",
+                "leave what was not seen empty or NaN",
             )
         rows = (size > limit).any(axis=1)
         if rows.any():
             raise Fault(
                 "absurd_scale",
-                f"{name} is more than {limit:g} {unit} in {listed(raw.rows[rows], raw.row_word)}",
+                f"{q.words} is more than {limit:g} {q.unit} in"
+                f" {listed(raw.rows[rows], raw.row_word)}",
                 "check its unit",
             )
 
@@ -173,20 +138,13 @@ def vectors_of(raw: RawCurve, keep: np.ndarray, options: ReadOptions) -> dict[st
         keep: (N,) samples of the curve.
         options: `force_sign` turns the side force too; markers and ends keep their axes.
     """
-    turned = None if raw.side_force is None else options.force_sign * raw.side_force
-    sampled = {
-        "joint_displacement": raw.joint_displacement,
-        "joint_side_displacement": raw.joint_side_displacement,
-        "end_U": raw.end_U,
-        "end_V": raw.end_V,
-        "side_force": turned,
-    }
-    fields = {
-        name: np.ascontiguousarray(values[keep], dtype=np.float64)
-        for name, values in sampled.items()
-        if values is not None
-    }
-    for name in ("joint_rings", "end_rings"):
+    fields = {}
+    for q in OBSERVED:
+        values = getattr(raw, q.name)
+        if values is not None and q.gaps:
+            sign = options.force_sign if q.turns else 1
+            fields[q.name] = np.ascontiguousarray(sign * values[keep], dtype=np.float64)
+    for name in RINGS:
         rings = getattr(raw, name)
         if rings is not None:
             fields[name] = rings.astype(np.int64)
@@ -200,18 +158,13 @@ def tilt_of(direction: Sequence[float]) -> float:
 
 def vector_words(curve: Curve) -> str:
     """What a curve holds beside forces and markers along the normal, for a table; may be empty."""
+    words = [words for name, words in VECTORS.items() if observed(curve, name)]
+    if tuple(curve.direction) != (1.0, 0.0):
+        words.append(f"tool {np.degrees(tilt_of(curve.direction)):.3g}° off the normal")
+    return ", ".join(words)
 
-    def observed(name: str) -> bool:
-        values = getattr(curve, name)
-        return values is not None and bool(np.isfinite(values).any())
 
-    ends = [name[-1] for name in ("end_U", "end_V") if observed(name)]
-    rings = 0 if curve.end_rings is None else curve.end_rings.size
-    angle = np.degrees(tilt_of(curve.direction))
-    words = {
-        "side force": observed("side_force"),
-        "markers aside": observed("joint_side_displacement"),
-        f"ends {' and '.join(ends)} of {rings} rings": bool(ends),
-        f"tool {angle:.3g}° off the normal": tuple(curve.direction) != (1.0, 0.0),
-    }
-    return ", ".join(word for word, held in words.items() if held)
+def observed(curve: Curve, name: str) -> bool:
+    """Whether anything was observed of a field."""
+    values = getattr(curve, name)
+    return values is not None and bool(np.isfinite(values).any())

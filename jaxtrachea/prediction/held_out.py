@@ -16,8 +16,8 @@ from jaxtrachea.fitting.parameters import DEFAULTS
 from jaxtrachea.fitting.refusals import Size, refusal
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study, build_study
-from jaxtrachea.fitting.unread import LEFT_OUT
 from jaxtrachea.fitting.zeros import resolved
+from jaxtrachea.measurements.observed import WITHOUT_VECTORS
 from jaxtrachea.measurements.read import BadCurve, Curve
 from jaxtrachea.optimisation.programs import program
 from jaxtrachea.prediction.core import Aside, force_and_slope
@@ -252,7 +252,7 @@ def _apart(curve: Curve, i: int, sigma: np.ndarray | None) -> Curve:
         sigma=sigma,
         joint_rings=None,
         joint_displacement=None,
-        **LEFT_OUT,
+        **WITHOUT_VECTORS,
     )
 
 

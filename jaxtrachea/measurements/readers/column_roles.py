@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from jaxtrachea.measurements.curve import DataError, Fault, ReadOptions
+from jaxtrachea.measurements.observed import OBSERVED
 from jaxtrachea.measurements.roles import general_role, ring_role_of, role_dimension
 from jaxtrachea.units import UnitError, column_unit, is_unit, unit_factor
 
@@ -14,9 +15,7 @@ ALIASES = {
     "phi": ("phi", "phi_c"),
     "displacement": ("displacement", "compression", "indentation", "compressive displacement"),
     "force": ("force", "load", "compressive load", "compressive force"),
-    "side_force": ("side_force", "side force"),
-    "sigma": ("sigma", "force_sigma", "force_noise"),
-}
+} | {q.role: (q.role, *q.names) for q in OBSERVED if q.names}
 #: Names that testing machines give to the travel of their crosshead; they count where no column
 #: has a name of `ALIASES`.
 TRAVEL = (

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxtrachea.measurements.checks import bad
 from jaxtrachea.measurements.curve import BadCurve, DataError, Fault, RawCurve, ReadOptions
+from jaxtrachea.measurements.observed import OBSERVED, RINGS
 from jaxtrachea.measurements.readers.column_roles import resolve_unit
 from jaxtrachea.measurements.readers.hdf5_values import (
     attribute,
@@ -36,29 +37,17 @@ LIMITS = Limits(
     total=400_000_000,
     texts=("/curves/specimen", "/curves/trial", "/curves/source"),
 )
+#: Fields of a curve that are called otherwise in the file.
+FIELDS = {"joint_ring_number": "joint_rings", "end_ring_number": "end_rings"}
 #: Quantities: role of the unit (None: ring numbers) and the unit that is written.
 QUANTITIES: dict[str, tuple[str | None, str | None]] = {
     "displacement": ("displacement", "mm"),
     "force": ("force", "N"),
-    "sigma": ("sigma", "N"),
-    "time": ("time", "s"),
-    "side_force": ("side_force", "N"),
-    "joint_ring_number": (None, None),
-    "joint_displacement": ("joint", "mm"),
-    "joint_side_displacement": ("joint", "mm"),
-    "end_ring_number": (None, None),
-    "end_U": ("end", "mm"),
-    "end_V": ("end", "mm"),
+    **{q.name: (q.role, q.unit) for q in OBSERVED},
+    **dict.fromkeys(FIELDS, (None, None)),
 }
-#: Quantities of several numbers per sample, and the ring numbers that tell how many.
-SEVERAL = {
-    "joint_displacement": "joint_ring_number",
-    "joint_side_displacement": "joint_ring_number",
-    "end_U": "end_ring_number",
-    "end_V": "end_ring_number",
-}
-#: Fields of a curve that are called otherwise in the file.
-FIELDS = {"joint_ring_number": "joint_rings", "end_ring_number": "end_rings"}
+#: Quantities of rings, and the dataset of the numbers of these.
+SEVERAL = {q.name: (number, q) for number, field in FIELDS.items() for q in RINGS[field]}
 
 
 def read(path: Path, options: ReadOptions) -> list[RawCurve | BadCurve]:
@@ -170,13 +159,14 @@ def _fields(samples: dict[str, _Pieces], i: int) -> Iterator[tuple[str, np.ndarr
         if values.size == 0 and name not in ("displacement", "force"):
             continue
         if name in SEVERAL:
-            rings = samples[SEVERAL[name]][i].size if SEVERAL[name] in samples else 0
-            shape = (count, rings, 2) if name.startswith("end") else (count, rings)
+            number, quantity = SEVERAL[name]
+            rings = samples[number][i].size if number in samples else 0
+            shape = quantity.shape(count, rings)
             if values.size != np.prod(shape):
                 raise Fault(
                     "shape",
                     f"{name} has {values.size} values, expected {' x '.join(map(str, shape))}"
-                    f" (samples, rings of {SEVERAL[name]}"
+                    f" (samples, rings of {number}"
                     f"{', y and z)' if len(shape) == 3 else ')'}",
                     "store one of every ring for every sample, NaN where it was not seen",
                 )
