@@ -109,23 +109,51 @@ class DataSection(Section):
     """[data]: which files, and how to read them (docs/measurements.md)."""
 
     files: list[str] = Field(min_length=1)
+    """a path or pattern, or a list of them, from the specification's folder or `--data`"""
     format: str = "auto"
+    """`tidy`, `machine`, `hdf5`, `afmformats`, or `auto`: by content"""
     columns: dict[str, str] = {}
+    """role to column name (a number, counted from 1, where there is no header)"""
     units: dict[str, str] = {}
+    """role to unit, for files that name none"""
     specimen: str | None = None
+    """template or regular expression for the file name"""
     s: str | None = None
+    """contact position of all curves"""
     phi: str | None = None
+    """contact angle of all curves"""
     displacement_min: Length | None = None
+    """samples below are dropped"""
     displacement_max: Length | None = None
+    """samples above are dropped"""
     loading: Literal["last", "first", "loading", "all", "require-monotone"] = "last"
+    """the last full loading, the first, every sample, or every sample of records that only load"""
     force_sign: Literal[1, -1] = 1
+    """-1 if the file counts resisting force negative; turns the side force too"""
     displacement_sign: Literal[1, -1] = 1
+    """-1 if the file counts inward displacement of the tool negative"""
     machine_compliance: Compliance | None = None
+    """of the rig, `"0.05 mm/N"`: times the force, it is taken off the displacement; or by file, `{
+    "a.csv" = "0.05 mm/N", "*" = "0 mm/N" }`
+    """
     sheet: str | Annotated[list[str], Field(min_length=1)] | None = None
+    """sheet of a workbook, a pattern (`"Trial *"`) or a list, each a trial; none: the first that is
+    not hidden
+    """
     tool_radius: PositiveLength | None = None
+    """markers closer to the contact are moved by the tool and left out; with `sections` the local
+    contact begins at what a flat end of this radius gives
+    """
     pressed_ends: bool = True
+    """false: ends of rings within `tool_radius` of the contact along the tube are left out too"""
     together: list[Annotated[list[str], Field(min_length=2)]] | None = None
+    """trials of a specimen that `compare` and `--leave-one-out` leave out together, `[["s035",
+    "s125"]]`: mirror images and other twins
+    """
     baseline: Literal["auto", "slope", "none"] = "auto"
+    """line of the force before first touch. `auto`: fitted where a record shows one. `slope`: of
+    every curve, and a curve without 5 samples there is left out. `none`: of no curve
+    """
 
     @model_validator(mode="before")
     @classmethod
@@ -147,8 +175,11 @@ class EvenRings(Section):
     """Evenly spaced rings."""
 
     count: int = Field(ge=1, le=2000)
+    """rings"""
     first: PositiveLength
+    """position of the first"""
     last: PositiveLength
+    """position of the last"""
 
 
 Rings = Annotated[
@@ -161,11 +192,17 @@ class TracheaSection(Section):
     """[trachea]: the tube at rest; Table 1 of the paper unless length and rings are given."""
 
     preset: Literal["table-1"] | None = None
+    """the same as leaving length and rings out"""
     length: PositiveLength | None = None
+    """of the tube; together with `rings`"""
     rings: Rings | None = None
+    """list of positions, or `{ count, first, last }`"""
     radius: PositiveLength = 11.3
+    """of the ring line; with `sections` of the wall's mid-line"""
     half_angle: Angle = 2.0943951023931953
+    """half opening of the rings"""
     ring_height: PositiveLength = 4.0
+    """extent of a ring along the tube"""
 
     @model_validator(mode="after")
     def _complete(self) -> "TracheaSection":
@@ -180,15 +217,32 @@ class ModelSection(Section):
     """[model]: what the forward model includes; see `jaxtrachea.mechanics.press.Options`."""
 
     coupling: Literal["series", "total"] = "series"
+    """`series`: tool displacement = indentation + skeleton; `total`: the local law takes all of it
+    """
     split: Literal["continuous", "independent"] = "continuous"
+    """`continuous`: rotation continuous at the contact; `independent`: two spans (paper, eq. 3)"""
     form: Literal["recursion", "reactions"] = "recursion"
+    """`reactions`: the paper's dense force method"""
     shear: bool = False
+    """the ligament also deforms in shear"""
     local: Literal["uniform", "two-material"] = "uniform"
+    """`two-material`: rings have a local law of their own"""
     contact: Literal["unilateral", "bonded"] = "unilateral"
+    """`bonded`: press or draw, odd law"""
     onset_width: PositiveLength = 1e-3
+    """width of the smooth first touch; where an onset is fitted, each curve has its own"""
     transition: PositiveLength | None = None
+    """from a ring's centre to where the ligament's local law holds; none: half the closest spacing
+    (of one ring: to the nearer end)
+    """
     half_width: Length = 0.0
+    """of a flat punch along s; 0: a point. For the flat end of a cylinder pi/4 of its radius.
+    Curves nearer than that to an end of the tube are refused
+    """
     skeleton: Literal["linear", "softening", "sections"] = "linear"
+    """`softening`: deep presses, with `e_1` and `e_2`. `sections`: rings that change their shape,
+    anywhere on them and deep; needs `contact = "bonded"` and no other option of this table
+    """
 
     @model_validator(mode="before")
     @classmethod
@@ -214,29 +268,45 @@ class WallSection(Section):
     """
 
     E_C: Stress = 5.8
+    """modulus of the cartilage"""
     E_L: Stress = 0.65
+    """modulus of the ligament"""
     E_M: Stress = 0.30
+    """modulus of the muscle"""
     nu: float = 0.45
+    """Poisson's ratio of the wall, in [0, 0.5)"""
     h: PositiveLength = 2.6
+    """thickness of the wall in front"""
     h_C: PositiveLength = 1.56
+    """thickness of the cartilage in it, on its outside; at most `h`"""
     h_M: PositiveLength = 2.0
+    """thickness of the muscle"""
     bed_n: Bed = 0.02
+    """bed behind the muscle, on its outer surface, along the normal"""
     bed_t: Bed = 0.002
+    """the same along the circumference"""
 
 
 class ParameterSection(Section):
     """[parameters.NAME]: `fixed`, or free with any of `initial`, `bounds`, `scale`, `scope`.
 
-    Names and units are those that `jaxtrachea.trachea.material` declares (docs/parameters.md).
+    Names and units are those that `jaxtrachea.trachea.material` declares (docs/reference.md).
     Numbers are in the parameter's own unit, or quantities with a unit. `fixed = true` keeps the
     initial value: with deforming cross-sections what `[wall]` gives.
     """
 
     fixed: NumberOrTrue | None = None
+    """not fitted: this number. `true`: what `[wall]` gives (sections), or as it is fixed unless
+    named; refused where that is only a first guess. Excludes the other keys
+    """
     initial: Number | None = None
+    """first start"""
     bounds: tuple[Number, Number] | None = Field(None, strict=False)
+    """`[lower, upper]`"""
     scale: Literal["log", "linear"] | None = None
+    """coordinate of steps and of relative errors"""
     scope: Literal["shared", "specimen", "trial"] | None = None
+    """one value for the study (`shared`), for each specimen, or for each trial"""
 
     @model_validator(mode="after")
     def _either(self) -> "ParameterSection":
@@ -253,28 +323,60 @@ class NoiseSection(Section):
     """
 
     force: ForceNoise = "estimate"
+    """standard deviation; `"estimate per curve"`: estimated, each curve weighed by its own. A
+    column sigma comes before it. All curves have a sigma, or none
+    """
     force_share: ShareNoise = "auto"
+    """share of the force that the standard deviation has beside `force`: sqrt(force² + (share F)²).
+    `"estimate"`: by maximum likelihood, 0 where it gains less than 9 in -2 ln L. `"auto"`:
+    `"estimate"` where curves go deeper than a tenth of the radius, `force` is estimated and
+    there is a skeleton. `0`: none
+    """
     joints: LengthNoise = "estimate"
+    """standard deviation of the markers, of sideward markers and ring ends"""
     joints_share: Annotated[float, quantity("dimensionless")] = 0.0
+    """share of the tool's displacement from first touch that this has beside `joints` (root of the
+    sum of squares)
+    """
 
 
 class FitSection(Section):
     """[fit]: how to weigh and solve; see `jaxtrachea.fitting.fit.Settings`."""
 
     method: Literal["levenberg-marquardt", "lbfgs", "adam"] = "levenberg-marquardt"
+    """solver"""
     balance: Literal["curve", "sample"] = "curve"
+    """`curve`: every curve weighs the same; `sample`: every sample"""
     loss: Literal["linear", "huber", "soft_l1", "cauchy"] = "linear"
+    """of a residual; all but `linear` are robust"""
     loss_scale: float = Field(1.345, gt=0)
+    """residual, in standard deviations, where the loss turns robust"""
     starts: int = Field(4, ge=1, le=10_000)
+    """starts per fit; more than 64 saved together, of curves of 96 samples and more, begin on 48
+    samples of each
+    """
     start_decades: float = Field(1.0, ge=0, le=10)
+    """how far starts spread around the first"""
     seed: int = Field(0, ge=0, lt=2**63)
+    """of the drawn starts"""
     more_starts: int = Field(8, ge=0, le=10_000)
+    """starts added to a fit none of whose starts converged, or whose best was reached once;
+    infeasible starts are then drawn anew, too; 0: neither
+    """
     max_iterations: int = Field(200, ge=1, le=1_000_000)
+    """per start, on the few samples and on all"""
     tolerance: float = Field(1e-10, gt=0, lt=0.1)
+    """relative, of cost, step and gradient"""
     batch: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = "auto"
+    """fits computed together, at most. `auto`: 128, on a GPU 1,024, or what memory allows; on a CPU
+    fewer of long curves; one with `skeleton = "sections"` on a CPU
+    """
     save_every: Literal["auto"] | Annotated[int, Field(ge=1, le=1_000_000)] = "auto"
+    """fits saved together"""
     precision: Literal["float64", "float32"] = "float64"
+    """of all numbers of the fit"""
     population: bool | None = None
+    """mean and spread over specimens; none: with five or more"""
 
     @model_validator(mode="before")
     @classmethod
@@ -285,16 +387,24 @@ class FitSection(Section):
 
 
 class UncertaintySection(Section):
-    """[uncertainty]: what is done beyond the local standard errors (docs/uncertainty.md)."""
+    """[uncertainty]: what is done beyond the local standard errors (docs/read_a_fit.md)."""
 
     profile: list[str] = []
+    """parameters to profile; `"all"`: every fitted one"""
     profile_points: int = Field(10, ge=2, le=1000)
+    """points on each side of the estimate"""
     bootstrap: int = Field(0, ge=0, le=1_000_000)
+    """replicates of each fit, 40 or more; 0: none"""
     kind: Literal["parametric", "residual"] = "parametric"
+    """`parametric`: normal noise; `residual`: residuals drawn anew"""
     block: int = Field(1, ge=1, le=1_000_000)
+    """neighbouring residuals drawn together (`residual`)"""
     influence: bool = False
+    """which samples and curves the estimates hang on"""
     posterior: int = Field(0, ge=0, le=1_000_000)
+    """draws of each chain (NUTS), 100 or more; 0: none"""
     posterior_chains: int = Field(4, ge=2, le=1000)
+    """chains of each fit"""
 
     @model_validator(mode="before")
     @classmethod
@@ -318,11 +428,23 @@ class DesignSection(Section):
     """[design]: which presses are possible, and what is asked of the next ones."""
 
     s: tuple[Length, Length] | None = Field(None, strict=False)
+    """`[first, last]` position within reach; none: first to last ring, as far as all of the tool
+    lies on the tube
+    """
     depth: tuple[PositiveLength, PositiveLength] | None = Field(None, strict=False)
+    """`[least, largest]` displacement from first touch, at most the tube's radius; none: half to
+    all of the largest measured
+    """
     points: int = Field(3, ge=1, le=100)
+    """presses to choose, one after the other"""
     criterion: Literal["D", "A", "E"] = "D"
+    """what is made small: volume (`D`), mean (`A`) or largest axis (`E`) of the error ellipsoid"""
     candidates: int | None = Field(None, ge=5, le=10_000_000)
+    """presses to choose from, at five depths, on all specimens; none: 10,000, with sections 250"""
     phi: tuple[Angle, ...] | None = Field(None, strict=False, min_length=1)
+    """angles of the presses, each at every position and depth (`["0 deg", "60 deg"]`); none: those
+    measured. Sections alone
+    """
 
     @model_validator(mode="after")
     def _ordered(self) -> "DesignSection":
@@ -336,17 +458,27 @@ class FitSpec(Section):
     """A whole fit specification."""
 
     title: str = ""
+    """heading of the report"""
     data: DataSection
+    """files and how to read them"""
     trachea: TracheaSection = TracheaSection()
+    """the tube at rest"""
     model: ModelSection = ModelSection()
+    """what the model includes"""
     wall: WallSection | None = None
+    """moduli and thicknesses that `sections` begins with"""
     parameters: dict[str, ParameterSection] = {}
+    """a table for each parameter that is named"""
     noise: NoiseSection = NoiseSection()
+    """standard deviations"""
     fit: FitSection = Field(default_factory=lambda: FitSection.model_validate({}))
+    """weights and solver"""
     uncertainty: UncertaintySection = Field(
         default_factory=lambda: UncertaintySection.model_validate({})
     )
+    """what is done beyond local standard errors"""
     design: DesignSection = Field(default_factory=lambda: DesignSection.model_validate({}))
+    """for `jaxtrachea design`"""
 
 
 def load_fit_spec(path: Path) -> FitSpec:

@@ -78,7 +78,7 @@ def test_recursion_against_fem(tube, dtype):
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("tube", ["1 ring", "15 rings"])
 def test_recursion_beats_reactions(tube, dtype):
-    """What docs/beam_accuracy.md says: the dense form is nowhere better by more than rounding."""
+    """As docs/evidence/beam_accuracy.md says: the dense form is nowhere better but by rounding."""
     recursion, dense = tables(tube, dtype), tables(tube, dtype, "reactions")
     floor = 50 * np.finfo(dtype).eps
     for quantity, per_k in recursion.items():

@@ -1,4 +1,4 @@
-"""docs/benchmarks.md says what the recorded measurements say."""
+"""docs/evidence/benchmarks.md says what the recorded measurements say."""
 
 import ast
 import contextlib

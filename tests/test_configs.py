@@ -142,7 +142,7 @@ def test_sweep_runs(tmp_path, monkeypatch, capsys):
         assert force.shape == (len(file["s"]), len(file["phi"])) == (16, 7)
     np.testing.assert_allclose(force, force[:, ::-1], rtol=1e-9)  # a symmetric tube
     assert (force > 0).all()
-    # A ring that bends gives way most between crown and end (docs/off_midline.md).
+    # A ring that bends gives way most between crown and end (docs/evidence/off_midline.md).
     assert (force[:, 1] < 0.9 * force[:, 3]).all()
 
 

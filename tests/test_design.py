@@ -401,7 +401,7 @@ def test_command_writes_its_files_or_nothing(tmp_path, monkeypatch, capsys):
     assert code == 0
     assert "note: spec.toml" not in err
     assert max(map(len, out.splitlines())) <= 80
-    page = (Path(__file__).parents[1] / "docs" / "design.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "after_a_fit.md").read_text()
     for name in ("next_points", "candidates", "identifiability"):
         with Path(f"out/{name}.csv").open(newline="") as stream:
             found = list(csv.DictReader(stream))
@@ -439,7 +439,7 @@ def test_command_writes_its_files_or_nothing(tmp_path, monkeypatch, capsys):
 
 
 def test_analyses_of_a_fit_that_design_leaves_out_are_named(tmp_path, monkeypatch, capsys):
-    """They were passed over in silence; the bootstrap is used (docs/design.md), not named."""
+    """They were passed over in silence; the bootstrap is used (docs/after_a_fit.md), not named."""
     monkeypatch.chdir(tmp_path)
     asked = 'profile = "k_M"\nbootstrap = 40\ninfluence = true\nposterior = 100\n'
     spec = Path("spec.toml")

@@ -2,6 +2,7 @@
 
 import enum
 import importlib
+import importlib.util
 import re
 import shlex
 import subprocess
@@ -14,19 +15,20 @@ import typer
 from run_cli import run
 
 import jaxtrachea
-from jaxtrachea import status
+from jaxtrachea import config, status
 from jaxtrachea.cli.main import app
 from jaxtrachea.config import FitSpec
 from jaxtrachea.fitting import verdict
+from jaxtrachea.scene import spec
 from jaxtrachea.scene.spec import SceneSpec
 from jaxtrachea.status import PressStatus
 from jaxtrachea.trachea.section import geometry_of
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 #: What a user reads, in this order.
-PATH = ["install", "fit", "report", "simulate", "layer"]
+PATH = ["install", "fit", "read_a_fit", "after_a_fit", "simulate", "layer"]
 #: Commands that are shown without a placeholder, and the test that runs each.
 RUN_BY = {
     "--version": "test_cli.py",
@@ -75,7 +77,7 @@ tool, pose = sphere(2.0), pose_from_vector(jnp.zeros(3), jnp.array([75.0, 15.0, 
 }
 #: Blocks that take longer than the default suite allows, and those that other tests run.
 SLOW = {("layer", i) for i in (2, 3, 4, 5)} | {("contact", 0), ("contact", 1)}
-ELSEWHERE = {("README", 0): "test_readme.py", ("predict", 0): "test_docs.py"}
+ELSEWHERE = {("README", 0): "test_readme.py", ("after_a_fit", 0): "test_docs.py"}
 
 
 def blocks(page, language):
@@ -102,7 +104,10 @@ def python_blocks():
 def test_each_page_is_listed_once_and_says_who_needs_it():
     listed = re.findall(r"\]\(docs/(\w+)\.md\)", (ROOT / "README.md").read_text().split("\n## ")[2])
     assert listed[: len(PATH)] == PATH
-    assert sorted(listed) == [page.stem for page in PAGES[1:]]
+    assert sorted(listed) == sorted(page.stem for page in DOCS.glob("*.md"))
+    pages = (DOCS / "evidence.md").read_text().partition("## The pages")[2]
+    listed = re.findall(r"\]\(evidence/(\w+)\.md\)", pages)
+    assert sorted(listed) == sorted(page.stem for page in (DOCS / "evidence").glob("*.md"))
     for page in PAGES[1:]:
         lines = page.read_text().splitlines()
         assert lines[0].startswith("# "), page
@@ -195,9 +200,9 @@ def test_tables_of_toml_are_valid(page):
     for text in blocks(page, "toml"):
         content = tomllib.loads(text)
         if "data" in content:
-            spec = FitSpec.model_validate(content)
-            assert geometry_of(spec.trachea).rings == 16
-            assert spec.parameters["EI_L"].scope == "shared"
+            read = FitSpec.model_validate(content)
+            assert geometry_of(read.trachea).rings == 16
+            assert read.parameters["EI_L"].scope == "shared"
         else:
             SceneSpec.model_validate(content)
 
@@ -265,7 +270,7 @@ def test_check_of_the_page_runs(monkeypatch, capsys):
 def test_page_on_predictions_runs(tmp_path):
     """Its three commands, then its Python: a folder of results and what it predicts."""
     (tmp_path / "fits").symlink_to(ROOT / "fits")
-    lines = re.findall(r"^    jaxtrachea (.*)$", (DOCS / "predict.md").read_text(), re.M)
+    lines = re.findall(r"^    jaxtrachea (.*)$", (DOCS / "after_a_fit.md").read_text(), re.M)
     code = "import jaxtrachea\n" + blocks(DOCS / "predict.md", "python")[0]
     calls = [["-m", "jaxtrachea", *shlex.split(line)] for line in lines]
     for call in [*calls, ["-c", code]]:
@@ -334,21 +339,51 @@ def test_statuses_exist():
     for page, span in code_spans():
         if re.fullmatch(r"[A-Z]{2,}_[A-Z_]{3,}", span) and page not in NOT_OURS:
             assert span in members, (page, span)
-    scenes = (DOCS / "scenes.md").read_text()
-    assert [name for name in PressStatus.__members__ if f"`{name}`" not in scenes] == []
+    scenes = (DOCS / "simulate.md").read_text()
+    listed = re.findall(r"^\| `([A-Z_]+)` \|", scenes, re.M)
+    assert sorted(listed) == sorted(PressStatus.__members__)
 
 
 def test_verdicts_of_the_page_are_those_of_a_fit():
-    listed = re.findall(r"^\| `([a-z: -]+)` \|", (DOCS / "report.md").read_text(), re.M)
+    section = (DOCS / "read_a_fit.md").read_text().split("\n## ")[3]
+    listed = re.findall(r"^\| `([a-z: -]+)` \|", section, re.M)
     assert listed == [*verdict.VERDICTS, "failed"]  # the last: there is no estimate
 
 
-def test_keys_of_scenes_are_listed():
-    page = (DOCS / "scenes.md").read_text()
-    for name in ("model", "effects", "plan", "output", "sweep"):
-        row = re.search(rf"^\| `\[{name}\]` \| (.*) \|$", page, re.M)[1]
-        missing = [k for k in keys(SceneSpec.model_fields[name]).split() if f"`{k}`" not in row]
-        assert missing == [], name
+def test_the_reference_is_what_its_script_writes():
+    """Every key of a specification with its type, default and meaning; every parameter."""
+    loader = importlib.util.spec_from_file_location("reference", DOCS / "reference.py")
+    assert loader is not None
+    assert loader.loader is not None
+    script = importlib.util.module_from_spec(loader)
+    loader.loader.exec_module(script)
+    page = script.PAGE.read_text("utf-8")
+    assert page == script.document(), "run python docs/reference.py"
+    listed = {model.__name__ for _, _, model in script.TABLES}
+    shown = set(re.findall(r"^class (\w+Section|\w+Spec|EvenRings)\(", SOURCES, re.M))
+    declared = {"MaterialSection", "SectionsSection", "EffectsSection"}  # lists of their own
+    assert shown - listed == declared
+    for model in (FitSpec, SceneSpec):
+        for name in model.model_fields:
+            assert f"[{name}" in page or name in ("title", "material", "sections"), name
+    effects = page.partition("## Scene: [effects]")[2].partition("\n## ")[0]
+    assert re.findall(r"^\| `(\w+)` \|", effects, re.M) == list(spec.EffectsSection.model_fields)
+
+
+SOURCES = "\n".join(Path(kind.__file__ or "").read_text() for kind in (config, spec))
+
+
+def test_pages_that_messages_name_exist():
+    """Every page or picture of `docs` that the package, shipped files or tests name."""
+    folders = [ROOT / name for name in ("jaxtrachea", "fits", "configs", "tests")]
+    files = [p for folder in folders for p in folder.rglob("*") if p.suffix in TEXT]
+    found = [(p, m) for p in files for m in re.findall(r"\bdocs/[\w/.]+\w", p.read_text("utf-8"))]
+    assert len(found) > 80
+    assert [(str(p), name) for p, name in found if not (ROOT / name).exists()] == []
+
+
+#: Files that name pages.
+TEXT = {".py", ".toml", ".md", ".in"}
 
 
 def test_the_changelog_is_a_list_of_short_lines():
@@ -358,6 +393,7 @@ def test_the_changelog_is_a_list_of_short_lines():
     headings = re.findall("^### (.*)", newest, re.M)
     assert headings == [h for h in ("Added", "Changed", "Fixed") if h in headings]
     for part in (newest, *older):
+        assert not re.search(r"^- .*\n\n+- ", part, re.M), "a blank line within a list"
         lines = [line for line in part.splitlines()[1:] if line and not line.startswith("### ")]
         assert all(line.startswith("- ") and len(line) <= 160 for line in lines)
 

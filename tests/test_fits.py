@@ -144,7 +144,7 @@ def test_left_out_presses_are_predicted(folder):
 
 
 def test_page_holds_the_recorded_numbers():
-    page = (ROOT / "docs" / "virtual_trachea.md").read_text()
+    page = (ROOT / "docs" / "evidence" / "virtual_trachea.md").read_text()
     assert page == script.document(EXPECTED)
 
 

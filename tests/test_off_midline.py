@@ -56,7 +56,7 @@ def test_fit_is_the_recorded_one():
 
 
 def test_what_the_page_claims():
-    """The sentences with numbers in docs/off_midline.md."""
+    """The sentences with numbers in docs/evidence/off_midline.md."""
     mat, arch, arch2 = (of(rings, "midline") for rings in ("mat", "arch", "arch2"))
 
     def at(r, phi):
@@ -75,10 +75,10 @@ def test_what_the_page_claims():
 
 def test_the_page_begins_with_the_skeleton_for_it():
     """Its first paragraph names the option and a command; its verdicts are of a line of joints."""
-    page = (ROOT / "docs" / "off_midline.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "evidence" / "off_midline.md").read_text(encoding="utf-8")
     first = page.split("\n\n")[2]
     assert '`skeleton = "sections"`' in first
-    assert "](fit.md)" in first
+    assert "](../fit.md)" in first
     assert "jaxtrachea fit fits/virtual_trachea/off_midline.toml" in page.split("\n\n")[3]
     assert load_fit_spec(VIRTUAL / "off_midline.toml").model.skeleton == "sections"
     for words in ("No level is right", "fits of this model"):
@@ -94,7 +94,7 @@ def test_the_fit_of_sections_errs_as_the_page_says(tmp_path, monkeypatch, capsys
     with h5py.File(out / "results.h5") as file:
         data = {name: values[()] for name, values in file["data"].items()}
     most = largest_errors(data)
-    # As on the page and in docs/measured.md.
+    # As on the page and in docs/evidence/measured.md.
     page = {"30 deg": 2.87, "90 deg": 3.57, "0 deg": 1.93, "s = 22": 2.44}
     for name, percent in page.items():
         assert 100 * most[name] == pytest.approx(percent, abs=0.1), name
@@ -130,7 +130,7 @@ def slices(data):
 
 
 def test_page_holds_the_recorded_numbers():
-    page = (ROOT / "docs" / "off_midline.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "evidence" / "off_midline.md").read_text(encoding="utf-8")
     assert page == script.document(RECORD)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[1] / "docs" / "evidence"
 # Compiles every level of the rings.
 pytestmark = [pytest.mark.slow, pytest.mark.compiling]
 

@@ -23,10 +23,10 @@ from jaxtrachea.scene.spec import MaterialSection, load_scene_spec
 from jaxtrachea.trachea.material import OF_PRESS, VALUES, Material, material_of
 from jaxtrachea.units import unit_factor
 
-PAGE = (Path(__file__).parents[1] / "docs" / "parameters.md").read_text()
+PAGE = (Path(__file__).parents[1] / "docs" / "reference.md").read_text()
 ROWS = [
     [cell.strip() for cell in line.strip("|").split("|")]
-    for line in PAGE.splitlines() if line.startswith("| `")
+    for line in PAGE.partition("## Parameters")[2].splitlines() if line.startswith("| `")
 ]  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from jaxtrachea.selfcheck.page import page, skeleton
 from jaxtrachea.selfcheck.run import run_table
 
 CASES, TRUTHS = table.read_cases(), table.read_truth()
-DOCUMENT = Path(__file__).parents[1] / "docs" / "hard_cases.md"
+DOCUMENT = Path(__file__).parents[1] / "docs" / "evidence" / "hard_cases.md"
 #: Functions whose programs compile at once; the others are slow tests.
 QUICK = ("series", "quintic", "first_touch", "axial")
 #: Compiled without optimisation; the programs of the others are those of users.

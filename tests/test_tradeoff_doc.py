@@ -1,4 +1,4 @@
-"""docs/tradeoff.md says what the recorded measurements say."""
+"""docs/evidence/tradeoff.md says what the recorded measurements say."""
 
 import importlib.util
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 from jaxtrachea.tradeoff.page import measured, read
 
 BENCH = Path(__file__).parent / "bench" / "tradeoff.py"
-FOLDER = Path(__file__).parents[1] / "docs" / "tradeoff"
+FOLDER = Path(__file__).parents[1] / "docs" / "evidence" / "tradeoff"
 SCENES = sorted(p for p in FOLDER.glob("*.jsonl") if p.stem not in ("choice", "levels"))
 
 

@@ -4,7 +4,7 @@
 
 Fits the small-strain presses with each of five options and predicts every press from the other
 nine; predicts three presses from seven, for every such choice; then the same with presses to 6 mm.
-Writes expected.json beside this file and docs/virtual_trachea.md. Takes a few minutes.
+Writes expected.json beside this file and docs/evidence/virtual_trachea.md. Takes a few minutes.
 """
 
 import itertools
@@ -26,7 +26,7 @@ from jaxtrachea.measurements.data_files import read_data
 from jaxtrachea.status import FitStatus
 
 HERE = Path(__file__).parent
-DOC = HERE.parents[1] / "docs" / "virtual_trachea.md"
+DOC = HERE.parents[1] / "docs" / "evidence" / "virtual_trachea.md"
 HALF_WIDTH = 2.36
 OPTIONS = [
     (shear, local, 0.0) for shear in (False, True) for local in ("uniform", "two-material")
@@ -133,7 +133,7 @@ def held_out(whole: FitResult, settings: Settings) -> dict:
 
 
 def document(expected: dict) -> str:
-    """docs/virtual_trachea.md."""
+    """docs/evidence/virtual_trachea.md."""
     names = ["EI_L", "GA_L", "k_M", "k_1", "k_1_ring"]
     three = ["3 of 10 F", "worst", "3 of 10 w"]
     head = ["ligament", "local law", "tool", *names, "fit F", "fit w", "left out F", "left out w"]

@@ -3,7 +3,8 @@
     python fits/virtual_trachea/off_midline.py
 
 Fits every level to the midline presses alone and to all presses (small strain, `vectors.h5`), and
-writes off_midline.json beside this file and docs/off_midline.md. About a minute; needs SciPy.
+writes off_midline.json beside this file and docs/evidence/off_midline.md. About a minute; needs
+SciPy.
 """
 
 import functools
@@ -21,7 +22,7 @@ from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 
 HERE = Path(__file__).parent
-DOC = HERE.parents[1] / "docs" / "off_midline.md"
+DOC = HERE.parents[1] / "docs" / "evidence" / "off_midline.md"
 RECORD = HERE / "off_midline.json"
 OPTIONS = Options(shear=True, local="two-material", contact="bonded")
 TOOL_RADIUS = 3.0  # mm; markers under the punch are held by it
@@ -148,7 +149,7 @@ def summary(name: str, on: str, parameters: dict, data: dict) -> dict:
 
 
 def document(record: list[dict]) -> str:
-    """docs/off_midline.md."""
+    """docs/evidence/off_midline.md."""
 
     def percent(v):
         return f"{100 * v:.1f}"

@@ -2,8 +2,8 @@
 
     python fits/virtual_trachea/width.py
 
-Writes docs/figures/width.png: the options of expected.json at 0.1 mm steps, the ten measured
-presses, and what mixing stiffnesses in place of compliances gave (values fitted that way).
+Writes docs/evidence/figures/width.png: the options of expected.json at 0.1 mm steps, the ten
+measured presses, and what mixing stiffnesses in place of compliances gave (values fitted that way).
 """
 
 import json
@@ -21,7 +21,7 @@ from jaxtrachea.trachea.geometry import Geometry
 from jaxtrachea.trachea.material import Material
 
 HERE = Path(__file__).parent
-FIGURE = HERE.parents[1] / "docs" / "figures" / "width.png"
+FIGURE = HERE.parents[1] / "docs" / "evidence" / "figures" / "width.png"
 TUBE = Geometry.create(160.0, 10.0 * np.arange(1, 16), radius=11.8)
 #: Fitted to the same presses when stiffnesses were mixed.
 MIXED_STIFFNESS = Material(1402.36, 0.215850, 23.3814, 0.0, GA_L=9.31113, k_1_ring=1e6)

@@ -1,4 +1,4 @@
-"""The command compare: which of several models the same curves prefer (docs/model_choice.md)."""
+"""The command compare: which of several models the same curves prefer (docs/after_a_fit.md)."""
 
 import dataclasses
 import time
@@ -220,7 +220,7 @@ def _report(rows, sentences: dict[str, str], failed: int, models) -> str:
         "10 or more so. weight: Akaike weight. left out: root mean square error of force of "
         f"{_left_out_words(models)} that took no part in the fit, over the largest force; worst: "
         "the largest of them by itself "
-        "(docs/model_choice.md). All numbers: `compare.csv`.",
+        "(docs/after_a_fit.md). All numbers: `compare.csv`.",
         *_left_out_notes(models),
     ]
     if failed:

@@ -1,4 +1,4 @@
-"""The command predict: what a finished fit says of other curves (docs/predict.md)."""
+"""The command predict: what a finished fit says of other curves (docs/after_a_fit.md)."""
 
 import dataclasses
 import hashlib

@@ -1,4 +1,4 @@
-"""The command selfcheck: the hard cases on the user's own device (docs/hard_cases.md)."""
+"""The command selfcheck: the hard cases on the user's own device (docs/evidence/hard_cases.md)."""
 
 import enum
 import json

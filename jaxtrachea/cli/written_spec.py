@@ -43,7 +43,7 @@ def specification_text(sources: Sources, out: Path, blocked: Mapping[str, str]) 
     """
     lines = [
         f"# Written by jaxtrachea {__version__}. Lines that begin with # are not read; those of",
-        "# the form '# key = value' show the default. All keys: docs/fit_spec.md",
+        "# the form '# key = value' show the default. All keys: docs/reference.md",
         f"title = {_quoted(_title(sources))}",
         "",
         *_data(sources, out, blocked.get("data")),

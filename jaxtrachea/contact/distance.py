@@ -101,7 +101,7 @@ def signed_distance(
     Among several equal minima (a ball at the centre of a cube) the one furthest along
     `search.PREFERRED` in the frame of A is taken, of those found, and the status is FLAT. In
     overlap the lowest minimum can be missed; the distance is then that of another face, too small,
-    and `lower` is still a bound (docs/contact.md has the rates).
+    and `lower` is still a bound (docs/evidence/contact.md has the rates).
 
     Args:
         a: shape A.
@@ -157,8 +157,8 @@ def track(
 ) -> Contact:
     """Signed distance by a few steps from a known direction, without a search.
 
-    For paths of small steps (turns of 0.01 rad; docs/contact.md has the rates): give the normal of
-    the pose before. It stays in the basin it is in; a status other than OK asks for
+    For paths of small steps (turns of 0.01 rad; docs/evidence/contact.md has the rates): give the
+    normal of the pose before. It stays in the basin it is in; a status other than OK asks for
     `signed_distance`.
 
     Args:

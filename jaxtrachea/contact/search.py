@@ -112,7 +112,7 @@ FINE = Settings(
     final_steps=16,
     warm_steps=16,
 )
-#: The named levels of accuracy; errors and times of each are in docs/contact.md.
+#: The named levels of accuracy; errors and times of each are in docs/evidence/contact.md.
 LEVELS = {"fast": FAST, "standard": STANDARD, "fine": FINE}
 
 

@@ -59,9 +59,10 @@ from jaxtrachea.optimisation.programs import batch_size
 from jaxtrachea.trachea.geometry import Geometry
 
 #: Of lanes computed together on a CPU, bytes by `Study.bytes_per_lane`, and lanes at least: more
-#: are out of the cache before they are read again (docs/measured.md).
+#: are out of the cache before they are read again (docs/evidence/measured.md).
 CACHED, FEWEST = 5 << 20, 16
-#: Lanes, and their bytes, up to which a program is compiled without optimisation (docs/measured.md)
+#: Lanes, and their bytes, up to which a program is compiled without optimisation
+#: (docs/evidence/measured.md)
 QUICK = 64, 24 << 20
 #: Depth over the radius of the tube beyond which the noise of forces is looked for a share.
 DEEP = 0.1
@@ -262,7 +263,7 @@ class Study:
         """Whether `count` lanes take less time than it takes to optimise their program.
 
         Of a program without optimisation a lane takes about three times as long
-        (docs/measured.md). Joint studies run theirs again and again.
+        (docs/evidence/measured.md). Joint studies run theirs again and again.
         """
         if self.joint or self.one_at_a_time or jax.default_backend() != "cpu":
             return False

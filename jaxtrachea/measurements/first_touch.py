@@ -9,7 +9,7 @@ a fit rounds the corner at the onset.
 A sharp corner makes the cost of a fit kinked wherever the onset passes a sample. The kinks are as
 high as the noise; a corner rounded over the distance in which the force grows by the noise removes
 them. It is rounded with equal integral on both sides (`_numerics.centred_hinge`), so that estimates
-do not move by more than a small part of their standard error (docs/uncertainty.md).
+do not move by more than a small part of their standard error (docs/read_a_fit.md).
 """
 
 import math

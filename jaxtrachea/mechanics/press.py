@@ -98,8 +98,8 @@ class Options:
 
 
 #: Depth to which a skeleton was compared with finite elements, in radii of the tube
-#: (docs/virtual_trachea.md). At a tenth that specimen yields 13 % more than a linear skeleton; the
-#: others were pressed to half.
+#: (docs/evidence/virtual_trachea.md). At a tenth that specimen yields 13 % more than a linear
+#: skeleton; the others were pressed to half.
 TESTED = {"linear": 0.1, "softening": 0.5, "sections": 0.5}
 
 #: Options that a skeleton of deforming cross-sections has: no others apply to it.

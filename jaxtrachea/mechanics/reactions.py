@@ -66,7 +66,7 @@ def deflect_dense(
     """The paper's own algorithm: all redundant reactions of a side from one dense system.
 
     Same arguments and result as `deflect` with `form="reactions"`. Loses digits where rings are
-    much stiffer than the ligament (docs/beam_accuracy.md has the table).
+    much stiffer than the ligament (docs/evidence/beam_accuracy.md has the table).
     """
     mirrored = Beam(
         (beam.length - beam.x)[::-1],

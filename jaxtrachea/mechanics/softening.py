@@ -8,7 +8,7 @@ force F_0(D) of skeleton and local law in series, a press by D has
 not odd: D > 0 is a press, D < 0 a draw. The ratio is of the whole way D, not of the skeleton's
 part: a local law that stayed as stiff would take the more of the way the deeper the press, and make
 places between rings soften less than rings; on a finite-element trachea they soften more
-(docs/virtual_trachea.md). Motions are those of small strain at the same D.
+(docs/evidence/virtual_trachea.md). Motions are those of small strain at the same D.
 
 Followed as far as D r(D) rises, up to the first zero of 1 - 2 e_1 D + 3 e_2 D^2 (none where
 e_1^2 <= 3 e_2), and as the local law is followed; past it the status is PAST_FOLD.

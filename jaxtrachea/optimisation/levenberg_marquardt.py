@@ -27,8 +27,8 @@ from jaxtrachea.optimisation.trust_region import (
 )
 from jaxtrachea.status import FitStatus
 
-#: Starts computed together at most, on a CPU and on another device (docs/gpu.md), and the part of
-#: the free memory that they may take.
+#: Starts computed together at most, on a CPU and on another device (docs/evidence/gpu.md), and the
+#: part of the free memory that they may take.
 MOST_SLOTS, MOST_ELSEWHERE, PART_OF_MEMORY = 128, 1024, 0.5
 #: Iterations of a batch between two looks at which are done.
 ROUNDS = 4

@@ -25,7 +25,7 @@ BANDS = (
     "positions) the bands are not of 95 %. "
     "Where an unknown lies on its bound they leave out its uncertainty; where the data do not "
     "determine what a prediction needs they are infinite; where the model bends within the band "
-    "they are off, and the outcome says so (docs/predict.md)."
+    "they are off, and the outcome says so (docs/after_a_fit.md)."
 )
 
 

@@ -1,4 +1,4 @@
-"""Rows of predictions.csv, bands.csv, joints.csv and errors.csv (docs/predict.md)."""
+"""Rows of predictions.csv, bands.csv, joints.csv and errors.csv (docs/after_a_fit.md)."""
 
 from collections.abc import Iterator, Sequence
 

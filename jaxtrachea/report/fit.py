@@ -48,9 +48,9 @@ def report_text(
     parts = [
         f"# {title or 'Fit'}",
         f"{outcome(result, findings.profiles)}; {len(bad)} curves could not be used. A fit is "
-        "of one specimen, or of one curve. How to read this report: docs/report.md. All numbers: "
-        "`results.h5`; one row per fit: `summary.csv`; one row per estimate: `parameters.csv` "
-        "(docs/results.md).",
+        "of one specimen, or of one curve. How to read this report: docs/read_a_fit.md. All "
+        "numbers: `results.h5`; one row per fit: `summary.csv`; one row per estimate: "
+        "`parameters.csv` (docs/results.md).",
         *(["\n".join(f"- {line}." for line in understood)] if understood else []),
         *_estimates(findings),
         *_sections(findings, "estimates"),

@@ -1,9 +1,9 @@
 """How deep a path presses, and which skeleton that depth needs: the rule of `effects`' skeleton.
 
-The finite-element trachea of docs/virtual_trachea.md (outer radius R = 12.6 mm) answers a press of
-depth D on the midline with 1 - 0.1127 D + 0.0061 D^2 (D in mm) of its stiffness at small strain: a
-linear skeleton errs there by 1.4 % at R / 100 and by 13 % at R / 10. A ring alone, pinched between
-two points, is off by 15 % at R / 4 (`ranges.DEEPEST`).
+The finite-element trachea of docs/evidence/virtual_trachea.md (outer radius R = 12.6 mm) answers a
+press of depth D on the midline with 1 - 0.1127 D + 0.0061 D^2 (D in mm) of its stiffness at small
+strain: a linear skeleton errs there by 1.4 % at R / 100 and by 13 % at R / 10. A ring alone,
+pinched between two points, is off by 15 % at R / 4 (`ranges.DEEPEST`).
 """
 
 from jaxtrachea.mechanics.press import TESTED, Options
@@ -17,14 +17,15 @@ LITTLE = 0.01
 
 _TOO_STIFF = (
     "a wall is softer there than a linear skeleton (drawn: stiffer), by 13 % at a tenth of the "
-    "radius on the finite-element trachea of docs/virtual_trachea.md, by more beyond"
+    "radius on the finite-element trachea of docs/evidence/virtual_trachea.md, by more beyond"
 )
 _MIDLINE = (
     "e_1 and e_2 in [material] soften a press straight in on the midline (rings 'mat'), [sections] "
     "in the place of [material] deform anywhere on the rings"
 )
 _LITTLE = (
-    "a linear skeleton errs by some 1 % on the finite-element trachea of docs/virtual_trachea.md"
+    "a linear skeleton errs by some 1 % on the finite-element trachea of "
+    "docs/evidence/virtual_trachea.md"
 )
 _ONE_PLANE = "which is for presses straight in on the midline, and this scene has a second plane"
 _SERIES = "which needs coupling 'series': with 'total' the force knows nothing of the skeleton"

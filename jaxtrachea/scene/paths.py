@@ -114,7 +114,7 @@ def _source(name: str) -> str:
     """Where a mesh of `configs/` comes from, which the repository does not hold."""
     if name not in MESHES:
         return ""
-    return f", or fetch it: {MESHES[name]}, and save it under this name (docs/surface.md)"
+    return f", or fetch it: {MESHES[name]}, and save it under this name (docs/simulate.md)"
 
 
 def read_table(

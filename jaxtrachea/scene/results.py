@@ -35,7 +35,7 @@ def plan_rows(plan: Plan, shares: dict[str, float]) -> list[list[str]]:
 def write_simulation(
     path: Path, scene: Scene, motion: Poses | Presses, out: Simulation, provenance: dict
 ) -> None:
-    """All series of a simulation; one dataset each, its unit as attribute (docs/scenes.md)."""
+    """All series of a simulation; one dataset each, its unit as attribute (docs/simulate.md)."""
     with hdf5_file(path) as file:
         _head(file, provenance, scene.plan)
         series = file.create_group("series")

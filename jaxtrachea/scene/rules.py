@@ -1,4 +1,4 @@
-"""The rules: from facts and options to a `Plan`, each choice with its reason (docs/scenes.md).
+"""The rules: from facts and options to a `Plan`, each choice with its reason (docs/simulate.md).
 
 What is not wished for is chosen by the rule of its effect (`effects`); a wish that cannot be met is
 refused, never dropped.

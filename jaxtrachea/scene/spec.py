@@ -1,4 +1,4 @@
-"""TOML scenes: trachea, material, tool and path, validated, in internal units (docs/scenes.md).
+"""TOML scenes: trachea, material, tool and path, validated, in internal units (docs/simulate.md).
 
 As in `config`: every problem with its dotted key, what was found and what is expected. No file but
 the specification is opened here.
@@ -40,22 +40,39 @@ class SceneTracheaSection(Section):
     """[trachea]: made from length and rings (left out: Table 1), or read from a surface file."""
 
     preset: Literal["table-1"] | None = None
+    """the same as leaving length and rings out"""
     length: PositiveLength | None = None
+    """of the tube; together with `rings`"""
     rings: Rings | None = None
+    """list of positions, or `{ count, first, last }`; with `file` a list that is taken as it is"""
     radius: PositiveLength = 11.3
+    """of the ring line; with `[sections]` or `[wall]` of the wall's mid-line, and then needed"""
     half_angle: Angle | None = None
+    """half opening of the rings; none: 120 deg, or as found in the file"""
     ring_height: PositiveLength = 4.0
+    """extent of a ring along the tube"""
     around: int = Field(35, ge=3, le=2000)
+    """vertices round the generated tube"""
     along: int = Field(97, ge=1, le=5000)
+    """vertices along it"""
     wall: PositiveLength = 2.6
+    """thickness of the wall"""
     relief: Annotated[Length, Field(ge=0)] | None = None
+    """how far rings stand out; none: 0.23 of the wall"""
     file: str | None = None
+    """surface file (STL, OBJ, PLY, GLB), in place of a generated tube"""
     unit: str | None = None
+    """of the file's lengths"""
     part: str | None = None
+    """object of the file that is the wall"""
     cartilage: str | None = None
+    """object, or file, that holds the rings"""
     larynx: Direction | None = None
+    """direction towards the larynx, in the file's axes"""
     anterior: Direction | None = None
+    """direction to the front, in the file's axes"""
     centreline: Annotated[list[Direction], Field(min_length=2)] | None = None
+    """points along the tube, in the file's unit and axes"""
 
     @model_validator(mode="after")
     def _complete(self) -> "SceneTracheaSection":
@@ -125,6 +142,7 @@ class SceneWallSection(WallSection):
     """[wall] of a scene, with the radius of the tool's flat end: the local contact follows it."""
 
     tool_radius: PositiveLength = TOOL_RADIUS
+    """of the tool's flat end; the local contact follows it"""
 
 
 #: Values of [sections] that have no default of their own.
@@ -146,12 +164,19 @@ class ToolSection(Section):
     """[tool]: a convex shape about its own origin; capsule and cylinder along z."""
 
     shape: Literal["sphere", "capsule", "box", "cylinder", "cloud"]
+    """which convex shape"""
     radius: PositiveLength | None = None
+    """of sphere, capsule, cylinder"""
     length: PositiveLength | None = None
+    """of the straight part of capsule or cylinder"""
     size: Sizes3 | None = None
+    """edges of a box"""
     rounding: PositiveLength | None = None
+    """of box, cylinder and cloud; it comes on top of the size, on every side"""
     file: str | None = None
+    """of a cloud: CSV of x, y, z in mm"""
     friction: float | None = Field(None, ge=0, le=10)
+    """coefficient of Coulomb friction"""
 
     @model_validator(mode="after")
     def _fitting(self) -> "ToolSection":
@@ -178,14 +203,23 @@ class PathSection(Section):
     """[[path]]: a press at (s, phi) by a vector, a line of the tool, a list, or a CSV file."""
 
     s: Length | None = None
+    """press: contact position"""
     phi: Angle | None = None
+    """press: contact angle"""
     displacement: Lengths3 | None = None
+    """press: `[axial, anterior, lateral]`, the last row of the press"""
     start: Lengths3 | None = None
+    """line: first position of the tool"""
     end: Lengths3 | None = None
+    """line: last position of the tool"""
     positions: list[Lengths3] | None = Field(None, min_length=1)
+    """poses: a list of positions"""
     rotation: Angles3 | None = None
+    """of the tool, a rotation vector"""
     file: str | None = None
+    """CSV of x, y, z, rx, ry, rz (mm, rad)"""
     steps: int | None = Field(None, ge=1, le=100_000)
+    """rows of a press or a line"""
 
     @property
     def kind(self) -> str:
@@ -210,10 +244,15 @@ class LawSection(Section):
     """[model]: the contact law; see `jaxtrachea.mechanics.press.Options`."""
 
     coupling: Literal["series", "total"] = "series"
+    """as in a fit"""
     contact: Literal["unilateral", "bonded"] = "unilateral"
+    """as in a fit"""
     onset_width: PositiveLength = 1e-3
+    """as in a fit"""
     transition: PositiveLength | None = None
+    """as in a fit"""
     half_width: Annotated[Length, Field(ge=0)] = 0.0
+    """as in a fit: copy it from the fit that gave the stiffnesses"""
 
 
 def _one_or_auto(value: Any) -> Any:
@@ -249,53 +288,79 @@ _Declared: Any = create_model(
 
 
 class EffectsSection(_Declared):
-    """[effects], as `scene.effects` declares them; what is "auto" follows docs/scenes.md."""
+    """[effects], as `scene.effects` declares them; what is "auto" follows docs/simulate.md."""
 
 
 class OutputSection(Section):
     """[output]: what is wanted."""
 
     surface: bool = True
+    """the deformed mesh"""
     joints: bool = True
+    """motion of every ring"""
     ring_ends: bool = True
+    """motion of the ends of the rings"""
     pictures: bool = True
+    """series.png, surface.png"""
 
 
 class PlanSection(Section):
-    """[plan]: choose the cheapest program within a tolerance, for this path (docs/tradeoff.md)."""
+    """[plan]: choose the cheapest program within a tolerance, for this path."""
 
     tolerance: Annotated[float, quantity("dimensionless", positive=True), Field(lt=1)]
+    """share of error allowed, `"1 %"`: the cheapest program within it"""
     precision: Literal["auto", "float64"] = "auto"
+    """`float64` also where float32 is within the tolerance"""
     cost: Literal["path", "step", "operations"] = "path"
+    """what is made least: measured time of the whole path, of a step (`Session`), or `operations`
+    (the same plan on every machine)
+    """
 
 
 class SweepSection(Section):
     """[sweep]: normal presses on a grid of contact points."""
 
     depth: PositiveLength
+    """of each press"""
     s_count: int = Field(60, ge=1, le=10_000)
+    """positions"""
     phi_count: int = Field(25, ge=1, le=10_000)
+    """angles"""
     phi_max: Angle | None = None
+    """largest angle; none: as far as the rings go"""
     chunk: int = Field(256, ge=1, le=1_000_000)
+    """presses computed together"""
 
 
 class SceneSpec(Section):
     """A whole scene."""
 
     title: str = ""
+    """of the output"""
     trachea: SceneTracheaSection = Field(
         default_factory=lambda: SceneTracheaSection.model_validate({})
     )
+    """the tube"""
     material: MaterialSection | None = None
+    """stiffnesses of a line of joints; or `sections`, `wall`"""
     sections: SectionsSection | None = None
+    """stiffnesses of deforming cross-sections"""
     wall: SceneWallSection | None = None
+    """moduli that those follow from"""
     tool: ToolSection | None = None
+    """the tool; presses need none"""
     path: list[PathSection] = Field(min_length=1)
+    """what happens, in order"""
     model: LawSection = LawSection()
+    """the contact law"""
     effects: EffectsSection = EffectsSection()
+    """which effects are on"""
     output: OutputSection = OutputSection()
+    """what is wanted"""
     plan: PlanSection | None = None
+    """a choice within a tolerance"""
     sweep: SweepSection | None = None
+    """for `jaxtrachea sweep`"""
 
     @model_validator(mode="before")
     @classmethod

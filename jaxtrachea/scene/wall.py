@@ -18,7 +18,7 @@ from jaxtrachea.trachea.mesh import Mesh
 NEAR = 2
 #: Length of a tool over the radius of the tube from which on a contact takes more steps.
 LONG = 8
-#: Patches of a mesh: their rounding, and corners of each (docs/scenes.md says what that loses).
+#: Patches of a mesh: their rounding, and corners of each (docs/simulate.md says what that loses).
 ROUNDED, CORNERS = 0.15, 128
 #: Longest patch over the usual distance of the rings (at most the radius): beyond the last ring a
 #: tube goes on, and one patch would bridge its bend.

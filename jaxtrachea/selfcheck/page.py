@@ -1,4 +1,4 @@
-"""The table as a page (docs/hard_cases.md) and as JSON."""
+"""The table as a page (docs/evidence/hard_cases.md) and as JSON."""
 
 import math
 import re

@@ -2,7 +2,7 @@
 
 What a parameter is called, what it means and in which unit, where it may be given and how a fit
 treats it stands here and nowhere else. The tables of a fit, the keys of a scene's `[material]` and
-the page docs/parameters.md follow from it.
+the page docs/reference.md follow from it.
 """
 
 import dataclasses
@@ -127,7 +127,7 @@ class Material(eqx.Module):
 
     A scalar holds for all spans or rings; an array, shape (rings + 1,) or (rings,), gives each its
     own where the declaration says so. None: not given. EI_L, k_M, k_1 and k_3, in this order, are
-    needed; the others are given by keyword. Units and meanings: docs/parameters.md.
+    needed; the others are given by keyword. Units and meanings: docs/reference.md.
 
     The initial guesses of a fit are round numbers of the right order for a human-sized trachea, not
     values of the paper (which gives none).

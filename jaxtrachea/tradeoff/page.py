@@ -199,7 +199,7 @@ def level_rows(rows: list[dict[str, Any]]) -> list[list[str]]:
 
 
 def document(folder: Path, head: str) -> str:
-    """docs/tradeoff.md: a head, the choices, every scene.
+    """docs/evidence/tradeoff.md: a head, the choices, every scene.
 
     Args:
         folder: with `choice.jsonl`, `levels.jsonl`, and `NAME.jsonl` and `NAME.png` of each scene.

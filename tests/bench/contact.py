@@ -1,4 +1,6 @@
-"""Time and error of the contact search at its named levels; writes the table in docs/contact.md.
+"""Time and error of the contact search at its named levels.
+
+Writes the table in docs/evidence/contact.md.
 
 Run by hand on a quiet machine: `python tests/bench/contact.py [--quick]`. Errors are those
 of the 2,000 pairs in tests/reference/contact_pairs.npz; times are the best of several runs.
@@ -171,13 +173,13 @@ def table(quick):
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="float64 only, few lanes")
-    parser.add_argument("--print", action="store_true", help="do not write docs/contact.md")
+    parser.add_argument("--print", action="store_true", help="do not write the page")
     options = parser.parse_args()
     text = table(options.quick)
     if options.print:
         print(text)
         return
-    page = ROOT / "docs" / "contact.md"
+    page = ROOT / "docs" / "evidence" / "contact.md"
     head, rest = page.read_text().split(BEGIN)
     page.write_text(head + BEGIN + text + END + rest.split(END)[1])
 

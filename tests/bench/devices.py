@@ -1,4 +1,4 @@
-"""The same programs on a GPU and on the CPU beside it: values and times, for docs/gpu.md.
+"""The same programs on a GPU and on the CPU beside it: values and times, for docs/evidence/gpu.md.
 
     python tests/bench/devices.py [--lanes 16384] [--specimens 8192]
 

@@ -6,7 +6,7 @@ Table 1's tube, 15 rings, 200 displacements to 6 mm at one position: per call an
 `sections` (32 lanes) takes 8 displacements in place of 200 (a path by Newton's method). Fits: a
 specimen has 4 presses of 50 samples (`sections`: 3 of 6 on a tube of two rings), noise of 0.5 % of
 its peak, one start; the level's own forces are the data. `tests/bench/tradeoff.py` puts them on
-docs/tradeoff.md.
+docs/evidence/tradeoff.md.
 """
 
 import common  # isort: skip

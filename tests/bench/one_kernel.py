@@ -1,7 +1,7 @@
 """Public functions by themselves and as one kernel. Run: python tests/bench/one_kernel.py.
 
 A call and its reverse-mode gradient, timed in turn, and the same of 256 lanes; compilation (tracing
-with it) once each. For docs/measured.md.
+with it) once each. For docs/evidence/measured.md.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""Time of `touch` by the number of patches searched; writes the table in docs/contact.md.
+"""Time of `touch` by the number of patches searched; writes the table in docs/evidence/contact.md.
 
 Run by hand on a quiet machine: `python tests/bench/patches.py`. A rounded box beside a straight
 tube of 16 patches, float64; times are the best of several runs, errors against all patches
@@ -69,7 +69,7 @@ def main():
     for (words, *_), (gap, complete, alone, many) in zip(ROWS, found, strict=True):
         off = np.abs(gap - found[-1][0]).max()
         lines.append(f"| {words} | {alone:.3g} | {many:.3g} | {off:.1g} | {complete.mean():.1%} |")
-    document = ROOT / "docs" / "contact.md"
+    document = ROOT / "docs" / "evidence" / "contact.md"
     before, _, rest = document.read_text().partition(BEGIN)
     document.write_text(before + BEGIN + "\n".join(lines) + "\n" + END + rest.partition(END)[2])
 

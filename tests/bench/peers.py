@@ -1,8 +1,8 @@
 """Times ours beside other programs, in one run. Run: python tests/bench/peers.py.
 
 Calls pytest with test_peers.py and writes of every case and turn the median and the smallest
-sample to results/peers.jsonl, then docs/benchmarks.md anew. What cannot be loaded is left out and
-the results say why.
+sample to results/peers.jsonl, then docs/evidence/benchmarks.md anew. What cannot be loaded is left
+out and the results say why.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Write docs/benchmarks.md from the results. Run: python tests/bench/report.py."""
+"""Write docs/evidence/benchmarks.md from the results. Run: python tests/bench/report.py."""
 
 import statistics
 
@@ -14,7 +14,7 @@ OPENSEES = (
     "bound press, array to array",
     "bound press, array to named views",
 )
-DOCUMENT = FOLDER.parents[1] / "docs" / "benchmarks.md"
+DOCUMENT = FOLDER.parents[1] / "docs" / "evidence" / "benchmarks.md"
 
 
 def plain(rows: list[dict], *columns: str) -> list[list[str]]:

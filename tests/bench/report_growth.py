@@ -1,4 +1,4 @@
-"""Sections of docs/benchmarks.md: growth with size, cost of derivatives, start of the commands."""
+"""Sections of the page of benchmarks: growth with size, derivatives, start of the commands."""
 
 import statistics
 
@@ -187,7 +187,7 @@ AGAINST = """\
 benchmarks had goals, and of today in turns, on the same specification and measurements; fit and
 simulate three times, the others once. The model of the fit is that of {earlier} (no width of the
 punch). Today's fit also follows up what is in doubt (other minima, profiles); its programs of few
-lanes are compiled without optimisation (docs/measured.md). Each selfcheck runs the table of its
+lanes are compiled without optimisation (`measured.md`). Each selfcheck runs the table of its
 commit.
 """
 GROWTH = """\

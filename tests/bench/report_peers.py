@@ -1,4 +1,4 @@
-"""The section of docs/benchmarks.md on other programs, from results/peers.jsonl."""
+"""The section of docs/evidence/benchmarks.md on other programs, from results/peers.jsonl."""
 
 import statistics
 

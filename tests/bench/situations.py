@@ -18,7 +18,7 @@ failing: specimens without a solved fit.
 named: specimens of which some sentence (terminal, report, tables) names the situation: it matches
     the pattern below and is not said of clean records, too. `--keep DIR` keeps all output there,
     and reads what an earlier run left.
-page: whether docs/report.md has the pattern, for what a single loading cannot show.
+page: whether docs/read_a_fit.md has the pattern, for what a single loading cannot show.
 """
 
 import argparse
@@ -151,7 +151,7 @@ class Situation:
     Attributes:
         records: curves of one press.
         pattern: of a sentence of the output.
-        page: of a sentence of docs/report.md, where that has to have one.
+        page: of a sentence of docs/read_a_fit.md, where that has to have one.
         short: the tube is `SHORT`, and fitted as Table 1's.
         always: a sentence that clean records get as well names it, too.
     """
@@ -262,7 +262,7 @@ def main() -> None:
     asked = parser.parse_args()
     tried = make_specimens(3, 0) + make_specimens(3, 0, short=True)
     print(f"differs from the package by {presses.agree(asked.package, tried):.1e} of the peak")
-    page = (asked.package / "docs" / "report.md").read_text("utf-8")
+    page = (asked.package / "docs" / "read_a_fit.md").read_text("utf-8")
     names = [name for name in SITUATIONS if name == "clean" or name in asked.only.split(",")]
     rows, common_kinds = [], set()
     with tempfile.TemporaryDirectory() as base:

@@ -1,7 +1,8 @@
 """Speed of the skeleton: one call, many lanes. Run: python tests/bench/skeleton.py [part].
 
-15 rings 10 mm apart, k = 0.1 N/mm, EI = 1.86 N mm^2 (the test problem of docs/beam_accuracy.md).
-If OpenSees cannot be loaded its row is missing and the results say why.
+15 rings 10 mm apart, k = 0.1 N/mm, EI = 1.86 N mm^2 (the test problem of
+docs/evidence/beam_accuracy.md). If OpenSees cannot be loaded its row is missing and the
+results say why.
 """
 
 import ctypes

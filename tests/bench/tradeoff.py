@@ -1,4 +1,4 @@
-"""Accuracy against time of the repository's scenes, and docs/tradeoff.md from it.
+"""Accuracy against time of the repository's scenes, and docs/evidence/tradeoff.md from it.
 
 Run: python tests/bench/tradeoff.py. It measures everything on the page: choices, ladders, levels of
 the skeleton (tests/bench/levels.py); an hour on two busy cores.
@@ -21,8 +21,9 @@ if __name__ == "__main__":
     os.sched_setaffinity(0, common.ALL_CORES)
 
 ROOT = Path(__file__).parents[2]
-FOLDER, DOCUMENT = ROOT / "docs" / "tradeoff", ROOT / "docs" / "tradeoff.md"
-HEAD = ROOT / "docs" / "tradeoff.md.in"
+EVIDENCE = ROOT / "docs" / "evidence"
+FOLDER, DOCUMENT = EVIDENCE / "tradeoff", EVIDENCE / "tradeoff.md"
+HEAD = EVIDENCE / "tradeoff.md.in"
 #: The scenes, and at most how many rungs of each ladder.
 SCENES = {
     "no_surface": ("configs/no_surface.toml", 3),

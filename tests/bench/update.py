@@ -167,7 +167,7 @@ def c_update(scene, dent: int):
 def differs(name: str, c_outputs, outputs) -> tuple[float, float]:
     """Force and vertices of the C loop against ours, relative to the largest entry."""
     (F, vertices, _), (force, _, expected) = c_outputs, outputs
-    # The smoothed gap is up to 0.02 mm too small (docs/contact.md): both see another.
+    # The smoothed gap is up to 0.02 mm too small (docs/evidence/contact.md): both see another.
     force_error = common.close(name, [F], [-float(force[1])], 0.05)
     return force_error, common.close(name, vertices, expected, 1e-3)
 

@@ -161,7 +161,7 @@ def test_a_range_ends_within_its_end():
     for text in ("D=two", "D=0:1:-0.3"):
         with pytest.raises(ValueError, match="whole steps from START, none beyond STOP"):
             parse_presses(text, needs_position=False)
-    page = (ROOT / "docs/predict.md").read_text()
+    page = (ROOT / "docs/after_a_fit.md").read_text()
     assert "0:1:0.3" in page
     assert "the end is included" not in page
 
@@ -220,7 +220,7 @@ def test_command_writes_what_the_page_says(study, tmp_path, monkeypatch, capsys)
         "s=6.1 cm,D=0:6:2,specimen=s0001", "--out", tmp_path / "b",
     )  # fmt: skip
     assert (code, err) == (0, "")
-    page = (ROOT / "docs" / "predict.md").read_text()
+    page = (ROOT / "docs" / "after_a_fit.md").read_text()
     for path in (*(tmp_path / "a").iterdir(), *(tmp_path / "b").iterdir()):
         assert f"`{path.name}`" in page
         if path.suffix == ".csv":

@@ -1,4 +1,4 @@
-"""What both forms of the force method reach against the FEM; writes docs/beam_accuracy.md.
+"""What both forms of the force method reach against the FEM; writes docs/evidence/beam_accuracy.md.
 
 Run from the root of the repository: python tests/reference/beam_accuracy.py
 """
@@ -182,7 +182,7 @@ def main():
                     values = (r["w"][k], r["reaction"][k], r["w_C"][k], rotation)
                     cells += [f"{v:.0e}" for v in values]
                 lines.append("| " + " | ".join(cells) + " |")
-    path = pathlib.Path(__file__).parents[2] / "docs" / "beam_accuracy.md"
+    path = pathlib.Path(__file__).parents[2] / "docs" / "evidence" / "beam_accuracy.md"
     path.write_text("\n".join(lines) + "\n")
 
 

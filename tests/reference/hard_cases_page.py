@@ -1,4 +1,4 @@
-"""Writes docs/hard_cases.md. Run from the root: python tests/reference/hard_cases_page.py."""
+"""Writes docs/evidence/hard_cases.md: python tests/reference/hard_cases_page.py, from the root."""
 
 import datetime
 import pathlib
@@ -8,7 +8,7 @@ import jax
 from jaxtrachea.selfcheck.page import page
 from jaxtrachea.selfcheck.table import DTYPES, read_cases, read_truth
 
-DOCUMENT = pathlib.Path(__file__).parents[2] / "docs" / "hard_cases.md"
+DOCUMENT = pathlib.Path(__file__).parents[2] / "docs" / "evidence" / "hard_cases.md"
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)

@@ -10,7 +10,7 @@ samples of a grid 20 times as fine as the record. What an elastic fit of the loa
 best is the least-squares line through (D, D^3) over the samples of the true loading without noise.
 
 Run as a script it fits all records as they were used before and as they are used now, and prints
-the table of docs/measured.md.
+the table of docs/evidence/measured.md.
 """
 
 from dataclasses import dataclass

@@ -6,7 +6,7 @@ Without files only generated tubes. Needs rtree (for `trimesh.proximity`).
 Balls stand beside the outer wall between the first and the last ring, drawn by area, up to a tenth
 of the radius off or in it. Their gap as a scene finds it (`touch`, the smoothed gap of the patches)
 is compared with trimesh's distance less their radius.
-The meshes of the Visible Human (CC BY 4.0) are not in the repository: docs/surface.md.
+The meshes of the Visible Human (CC BY 4.0) are not in the repository: docs/simulate.md.
 """
 
 import functools

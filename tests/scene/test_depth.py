@@ -354,7 +354,7 @@ def test_ways_of_a_path_over_the_radius():
     path = Poses(path.rotation, path.translation.at[5].set(jnp.nan))
     scene = make_scene(TUBE, SOFT, path, tool=BALL, effects=BARE)
     facts = facts_of(scene, SOFT, path)
-    # The wall of patches lies lower than the round tube by up to 0.4 mm (docs/scenes.md).
+    # The wall of patches lies lower than the round tube by up to 0.4 mm (docs/simulate.md).
     for least, most in (facts.way_fixed, facts.way_per_step):
         np.testing.assert_allclose(most * OUTER, 2.0, atol=0.4)
         assert least <= 0

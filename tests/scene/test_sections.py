@@ -134,7 +134,7 @@ def test_each_row_has_its_status():
 def test_against_finite_elements_off_the_midline():
     """At 30 and 90 deg to 6 mm, stiffnesses from the wall's moduli: within 4 % of the peak.
 
-    A line of joints errs by 44 % at 90 deg (docs/off_midline.md).
+    A line of joints errs by 44 % at 90 deg (docs/evidence/off_midline.md).
     """
     for angle in (30, 90):
         curve = finite_element(angle)

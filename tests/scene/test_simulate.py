@@ -251,7 +251,8 @@ def test_a_ball_led_down_presses_as_deep_as_it_goes():
     path = ball([75, 1, 0], [75, -3, 0], 5)
     scene = make_scene(TUBE, SPRINGS, path, tool=BALL, effects=BARE)
     out = run(scene, SPRINGS, path)
-    # The smoothed distance is at most log(8) / beta too small (docs/contact.md): 0.1 mm here.
+    # The smoothed distance is at most log(8) / beta too small, 0.1 mm here
+    # (docs/evidence/contact.md).
     np.testing.assert_allclose(out.gap, [1, 0, -1, -2, -3], atol=0.1)
     np.testing.assert_allclose(out.displacement[1:, 1], out.gap[1:], atol=1e-4)
     np.testing.assert_allclose(out.s, 75, atol=0.02)

@@ -206,7 +206,7 @@ def finite_element():
 
 
 def test_against_the_finite_element_trachea():
-    """The figures of docs/scenes.md: largest error over the peak, with the width and without."""
+    """The figures of docs/simulate.md: largest error over the peak, with the width and without."""
     material, curves = finite_element()
     s = np.concatenate([np.full(len(D), at) for at, (D, _) in curves.items()])
     D, F = (np.concatenate(v) for v in zip(*curves.values(), strict=True))

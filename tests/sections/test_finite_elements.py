@@ -3,7 +3,7 @@
 `tests/reference/sections_fem.json` (tests/bench/sections_fem.py): the specimen of the factors, and
 tubes unlike it by 4 %, by a tenth (two) and by more (two). What is OK is right within 5 % of the
 peak of the force; where the level errs by more, beyond the tested angle and on tubes unlike the
-specimen, the status says so, and docs/off_midline.md by how much.
+specimen, the status says so, and docs/evidence/off_midline.md by how much.
 """
 
 import json

@@ -76,7 +76,7 @@ def _section(found: Bootstrap) -> list[str]:
         f"{found.usable.shape[1]} replicates of every lane ({found.kind}{blocks}); "
         f"{lost} of {found.usable.size} refits did not converge and are left out; a lane with "
         f"fewer than {FEWEST} others has no interval. All numbers: `results.h5` "
-        "(docs/uncertainty.md).",
+        "(docs/read_a_fit.md).",
         *([f"{found.note}."] if found.note else []),
     ]
 

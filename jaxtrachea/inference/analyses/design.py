@@ -1,4 +1,4 @@
-"""Where to press next, in tables and picture (docs/design.md)."""
+"""Where to press next, in tables and picture (docs/after_a_fit.md)."""
 
 import dataclasses
 from collections.abc import Iterator

@@ -85,7 +85,7 @@ def _section(found: Findings) -> list[str]:
     if said and found.result.study.free:
         said[-1] += (
             " Errors and intervals of independent residuals: `se_independent`, "
-            "`low95_independent`, `high95_independent` in `parameters.csv` (docs/uncertainty.md)."
+            "`low95_independent`, `high95_independent` in `parameters.csv` (docs/read_a_fit.md)."
         )
     return [" ".join(said)] if said else []
 

@@ -168,7 +168,7 @@ def influence_section(found: Influence) -> list[str]:
         *parts,
         markdown_table(head, rows),
         "The samples whose loss would move the estimates most; studentised residuals beyond 3 to 4 "
-        "are outliers. All samples: `influence.csv` (docs/uncertainty.md).",
+        "are outliers. All samples: `influence.csv` (docs/read_a_fit.md).",
     ]
 
 

@@ -93,7 +93,7 @@ def _section(found: Population) -> list[str]:
         "the spread between them. Spread: one standard deviation, with scale `log` as "
         "a factor, and the mean is then the geometric one. Estimates drawn towards the mean by "
         "what they are uncertain: `shrunk` in `parameters.csv`; all numbers: `population.csv` "
-        "(docs/joint.md).",
+        "(docs/fit.md).",
     ]
 
 

@@ -111,7 +111,7 @@ def _section(drawn: Posterior) -> list[str]:
         f"{chains} chains of {draws} draws (NUTS{more}), priors uniform in scaled coordinates "
         "between the bounds. Good: R-hat up to 1.01, 400 effective draws, nothing divergent. Of "
         "poor chains (R-hat above 1.05, less than 100 effective draws, or more than 2 % divergent) "
-        "no interval is given. All draws: `results.h5` (docs/uncertainty.md).",
+        "no interval is given. All draws: `results.h5` (docs/read_a_fit.md).",
         *(distrust(drawn) or ["All chains are good."]),
     ]
 

@@ -122,7 +122,7 @@ def _section(found: Profiles) -> list[str]:
         f"{len(found.lane)} profiles: {count(ProfileEnd.OPEN)} open on a side (the data do not "
         f"limit the parameter there), {count(ProfileEnd.BOUND)} limited only because another "
         f"unknown is on its bound, {count(ProfileEnd.FAILED)} failed. All other unknowns are "
-        "fitted anew at every point; points: `profiles.csv` (docs/uncertainty.md).",
+        "fitted anew at every point; points: `profiles.csv` (docs/read_a_fit.md).",
     ]
     better = np.flatnonzero(found.improved)
     if len(better):

@@ -96,7 +96,7 @@ def situation(
     if len(lanes) == 0:
         raise ValueError(
             "the model misses the curves, so that its estimates tell nothing of the next press; "
-            "mend the fit first (docs/report.md)"
+            "mend the fit first (docs/read_a_fit.md)"
         )
     lane, theta = lanes, result.theta[lanes]
     if resampled is not None:

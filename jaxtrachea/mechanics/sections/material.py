@@ -186,7 +186,7 @@ class Wall:
 
     A ring is a layer of cartilage on the outside of the wall, ligament below it and between rings;
     muscle closes it behind. Table 1 of the paper gives E_C, E_L, h and h_M; the others are those of
-    the virtual specimen of docs/virtual_trachea.md.
+    the virtual specimen of docs/evidence/virtual_trachea.md.
 
     Attributes:
         E_C: cartilage.
@@ -319,7 +319,8 @@ def from_wall(
     return SectionMaterial(**values)
 
 
-#: Largest ratio of a proportion to the specimen's with which `Factors` hold (docs/off_midline.md).
+#: Largest ratio of a proportion to the specimen's with which `Factors` hold
+#: (docs/evidence/off_midline.md).
 ALIKE = 1.02
 
 
@@ -347,7 +348,7 @@ def proportions(geometry: Geometry, wall: Wall, tool_radius: float) -> Float[Arr
     return jnp.stack([jnp.asarray(value, R.dtype) for value in values])
 
 
-#: `proportions` of the specimen (docs/virtual_trachea.md) with its punch of 3 mm.
+#: `proportions` of the specimen (docs/evidence/virtual_trachea.md) with its punch of 3 mm.
 _SPECIMEN = np.array([
     10 / 11.7, 0.4, 2 * np.pi / 3, 2.6 / 11.7, 0.6, 2 / 2.6, 5.8 / 0.65, 0.3 / 0.65, 1.45,
     0.02 * 11.7 / 0.3, 0.002 * 11.7 / 0.3, 2.0,

@@ -45,7 +45,7 @@ def tested_angle(half_angle: Float[Array, ""] | float) -> Float[Array, ""]:
 
     Nearer to its end a ring that is pressed bends its muscle over a length of (4 EI / k)^(1/4),
     some 3 mm, and its end turns under the tool. The modes carry muscle and end along in harmonics
-    of order 3 at most: too stiff (docs/off_midline.md, by how much).
+    of order 3 at most: too stiff (docs/evidence/off_midline.md, by how much).
 
     Args:
         half_angle: of the rings, rad.

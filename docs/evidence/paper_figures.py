@@ -1,6 +1,6 @@
 """Figures 6 and 7 of the paper, recomputed: the surface, joint loads and motions, ends of ring 6.
 
-    python docs/paper_figures.py
+    python docs/evidence/paper_figures.py
 
 Writes figures/fig_6a.png to 7c.png, and paper_figures.md (its text is in paper_figures.md.in).
 """
@@ -115,7 +115,7 @@ def draw() -> None:
 
 def pressed(name: str):
     """The scene configs/NAME.toml and the vertices of its last row."""
-    spec = load_scene_spec(HERE.parent / "configs" / f"{name}.toml")
+    spec = load_scene_spec(HERE.parents[1] / "configs" / f"{name}.toml")
     scene, material, path, _, _ = stage(spec, HERE)
     out = jax.jit(simulate)(scene, material, path)
     assert out.vertices is not None
