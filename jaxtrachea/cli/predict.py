@@ -48,7 +48,7 @@ def predict(
     as_specimen: AsOption = None,
 ) -> None:
     """Predict force curves from a finished fit, with 95 % bands."""
-    from jaxtrachea.results.stored import NoResults, read_results
+    from jaxtrachea.results.read import NoResults, read_results
 
     set_up_jax()
     given = [*(data or []), *(files or [])]
@@ -65,11 +65,13 @@ def predict(
         raise Stop(str(error)) from None
     except OSError as error:
         raise Stop(f"{results}: cannot be read ({error.strerror}); check its rights") from None
-    if as_specimen is not None and as_specimen not in stored.specimens:
-        raise Stop(f"--as: {_unknown('specimen', as_specimen, stored.specimens)}")
-    name = (stored.path.parent if results.is_dir() else stored.path.absolute().parent).absolute()
+    path = stored.origin.path
+    known = dict.fromkeys(c.specimen for lane in stored.study.curves for c in lane)
+    if as_specimen is not None and as_specimen not in known:
+        raise Stop(f"--as: {_unknown('specimen', as_specimen, known)}")
+    name = path.absolute().parent
     default = Path("out") / f"{name.name}-predict"
-    digest = hashlib.sha256(stored.path.read_bytes()).hexdigest()
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
     if at:
         code = _predict_at(stored, at, out_dir, default, digest)
     else:
@@ -121,22 +123,24 @@ def _asked(stored, texts: Sequence[str]):
     """Sources, positions, displacements, and angle with direction, of every --at."""
     from jaxtrachea.measurements.presses import parse_presses
     from jaxtrachea.prediction.predict import check_aside, check_position
+    from jaxtrachea.prediction.pressed import pressed
     from jaxtrachea.prediction.sources import source_of
 
+    fitted = pressed(stored)
     needs = stored.study.model.options.coupling == "series"
     sources, places, depths, aside = [], [], [], []
     for text in texts:
         try:
             asked = parse_presses(text, needs_position=needs)
             check_aside(stored, asked.phi, asked.direction)
-            names = stored.specimens if asked.specimen is None else (asked.specimen,)
-            if asked.specimen is not None and asked.specimen not in stored.specimens:
-                raise ValueError(_unknown("specimen", asked.specimen, stored.specimens))
+            names = fitted.specimens if asked.specimen is None else (asked.specimen,)
+            if asked.specimen is not None and asked.specimen not in fitted.specimens:
+                raise ValueError(_unknown("specimen", asked.specimen, fitted.specimens))
             s = [float("nan")] if asked.s is None else asked.s.tolist()
             for place in s:
                 if asked.s is not None:
                     check_position(stored, place)
-            trials = dict.fromkeys(c.trial for c in stored.curves if c.specimen in names)
+            trials = dict.fromkeys(c.trial for c in fitted.curves if c.specimen in names)
             if asked.trial is not None and asked.trial not in trials:
                 raise ValueError(_unknown("trial", asked.trial, tuple(trials)))
         except ValueError as error:
@@ -187,7 +191,7 @@ def _predict_data(stored, given: Sequence[str], as_specimen, out_dir, default, d
             del rows["joints"]
         for name, content in rows.items():
             write_csv(folder / f"{name}.csv", content)
-        errors = tables.error_rows(compared, bad, stored.tool_radius, rings)
+        errors = tables.error_rows(compared, bad, stored.origin.reading.get("tool_radius"), rings)
         write_csv(folder / "errors.csv", errors)
         lost = draw_compared(folder, compared)
         say_lost(lost)

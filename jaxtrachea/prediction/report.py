@@ -5,10 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxtrachea.files.tables import markdown_table, number
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.measurements.curve import BAD_HEAD, BadCurve
 from jaxtrachea.prediction.held_out import Compared
 from jaxtrachea.prediction.predict import CurvePrediction
-from jaxtrachea.results.stored import StoredFit
+from jaxtrachea.prediction.pressed import pressed
 from jaxtrachea.status import PredictionStatus
 
 #: Rows of a table; the files hold all.
@@ -108,17 +109,18 @@ def outcomes(predictions: Sequence[CurvePrediction]) -> list[str]:
     return lines
 
 
-def _origin(stored: StoredFit, digest: str) -> str:
-    names = ", ".join(list(stored.files)[:8]) + (", ..." if len(stored.files) > 8 else "")
+def _origin(stored: FitResult, digest: str) -> str:
+    files, fitted = list(stored.origin.files), pressed(stored)
+    names = ", ".join(files[:8]) + (", ..." if len(files) > 8 else "")
     free = ", ".join(p.name for p in stored.study.free) or "nothing"
     return (
-        f"From `{stored.path.name}` (SHA-256 {digest[:16]}...): {free} fitted to "
-        f"{len(stored.curves)} curves of {len(stored.specimens)} specimen(s)"
+        f"From `{stored.origin.path.name}` (SHA-256 {digest[:16]}...): {free} fitted to "
+        f"{len(fitted.curves)} curves of {len(fitted.specimens)} specimen(s)"
         f"{f' in {names}' if names else ''}."
     )
 
 
-def report_at(stored: StoredFit, digest: str, curves: Sequence[CurvePrediction]) -> str:
+def report_at(stored: FitResult, digest: str, curves: Sequence[CurvePrediction]) -> str:
     """report.md of predictions at chosen positions."""
     parts = [
         "# Predictions",
@@ -133,7 +135,7 @@ def report_at(stored: StoredFit, digest: str, curves: Sequence[CurvePrediction])
 
 
 def report_data(
-    stored: StoredFit,
+    stored: FitResult,
     digest: str,
     compared: Sequence[Compared],
     bad: Sequence[BadCurve],
