@@ -13,6 +13,7 @@ import jaxtrachea
 from jaxtrachea.fitting.fit import fit
 from jaxtrachea.fitting.model import columns_of
 from jaxtrachea.fitting.predictions import predictions
+from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.inference.cross_validation import leave_one_out, with_own_touch
 from jaxtrachea.measurements.read import Curve
 from jaxtrachea.prediction import held_out
