@@ -116,7 +116,7 @@ WITHIN = {
     "results": [{"arrays", "store"}, {"rows", "hdf5"}, {"read"}],
     "trials": [{"polynomials", "uneven_noise"}, {"differences"}, {"repeats"}],
     "prediction": [{"core", "pressed"}, {"model_error", "sources"}, {"predict"}, {"held_out"},
-                   {"plots", "report", "tables"}],
+                   {"plots", "tables"}, {"report"}],
     "runs": [{"manifest"}, {"shards"}, {"folder"}, {"rerun", "checkpoint"}, {"cluster"}],
     "tradeoff": [
         {"calls", "errors", "front", "levels", "load"},

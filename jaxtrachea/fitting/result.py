@@ -232,7 +232,7 @@ class FitResult:
             A `Table`: prints as text, shows as HTML in a notebook, `rows` are dictionaries. What
             the lanes of a joint fit share has one row.
         """
-        return Table(list(estimate_rows(self, profiles)))
+        return Table(estimate_rows(self, profiles))
 
     def to_dataset(self, profiles: Intervals | None = None) -> "xarray.Dataset":
         """The estimates with dimensions `lane` and `unknown`, as an xarray Dataset.

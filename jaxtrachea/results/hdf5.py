@@ -3,13 +3,15 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
 from jaxtrachea.files.atomic import hdf5_file
+from jaxtrachea.files.table import Table
 from jaxtrachea.fitting.result import FitResult, judgement
-from jaxtrachea.inference.analysis import Findings
+from jaxtrachea.inference.analysis import Analysis, Findings
 from jaxtrachea.inference.profile import Profiles
 from jaxtrachea.results import store
 from jaxtrachea.results.arrays import PLACES, arrays_of
@@ -46,8 +48,21 @@ def write_hdf5(
         store.write(file, result, provenance.get("inputs", {}), reading or {})
         file["uncertainty/interval_growth"] = result.effective.growth
         for analysis, found in findings.found:
-            if analysis.datasets is not None:
-                analysis.datasets(file.create_group(analysis.name), found)
+            if analysis.datasets:
+                _write_analysis(file.create_group(analysis.name), analysis, found)
+
+
+def _write_analysis(group: h5py.Group, analysis: Analysis, found: Any) -> None:
+    """The arrays of what an analysis has found."""
+    for name in analysis.datasets:
+        data, meaning = getattr(found, name), analysis.meanings.get(name)
+        if meaning is None:
+            group.create_dataset(name, data=data, compression="gzip")
+        else:
+            codes = group.create_dataset(name, data=data.astype(np.int8))
+            codes.attrs["meaning"] = json.dumps({int(e): e.message for e in meaning})
+    for name in analysis.attributes:
+        group.attrs[name] = getattr(found, name)
 
 
 def _small(name: str, data: np.ndarray) -> np.ndarray:
@@ -57,10 +72,8 @@ def _small(name: str, data: np.ndarray) -> np.ndarray:
 
 def _add_names(group: h5py.Group, result: FitResult) -> None:
     """Names of the lanes, units, and what codes mean."""
-    text = h5py.string_dtype()
-    names = [result.study.lane_name(lane) for lane in range(result.lanes)]
-    group.create_dataset("specimen", data=[n[0] for n in names], dtype=text)
-    group.create_dataset("trial", data=[n[1] for n in names], dtype=text)
+    names = map(result.study.lane_name, range(result.lanes))
+    Table({"specimen": s, "trial": t} for s, t in names).write_hdf5(group)
     group["status"].attrs["meaning"] = json.dumps({int(s): s.message for s in FitStatus})
     for name in ("sigma", "rms"):
         group[name].attrs["unit"] = "N, mm"

@@ -4,7 +4,6 @@ Through the audited door for files that nobody vouches for (`readers.safe_hdf5`)
 """
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from jaxtrachea.measurements.readers.safe_hdf5 import opened
 from jaxtrachea.mechanics.press import Options
 from jaxtrachea.results.arrays import PLACES, result_of
 from jaxtrachea.results.hdf5 import SCHEMA, VERSION
-from jaxtrachea.results.store import BY_SAMPLE, GEOMETRY
+from jaxtrachea.results.store import BY_SAMPLE, GEOMETRY, read_data, read_json
 from jaxtrachea.status import FitStatus
 from jaxtrachea.trachea.geometry import Geometry
 
@@ -125,8 +124,8 @@ def _check_schema(path: Path, schema: object, version: object) -> None:
 
 
 def _read(path: Path, file: Any) -> FitResult:
-    model = _json(file["model"])
-    curves, lane, files = _read_data(file["data"])
+    model = read_json(file["model"])
+    curves, lane, files = read_data(file["data"])
     trials = file["study/s_c"].shape[1]
     place = _Places(lane, np.array([len(c.force) for c in curves]), trials)
     study = _study(file, model, place, curves)
@@ -259,65 +258,3 @@ def _check_shapes(study: Study, place: _Places) -> None:
             raise ValueError(f"{name} has shape {found.shape}, expected {shape}")
     if lanes.index.max(initial=-1) >= P:
         raise ValueError("unknowns that there are not")
-
-
-def _json(group: Any) -> Any:
-    """The JSON text of a group.
-
-    Raises:
-        ValueError: no such text.
-    """
-    return json.loads(numeric(group, "description").astype(np.uint8).tobytes().decode())
-
-
-def _read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str]]:
-    """Curves with what of them the fit has used, the lane of each, and SHA-256 by file name."""
-    names = _json(group)
-    samples = numeric(group, "samples").astype(int)
-    ends = np.cumsum(samples)
-    column = {c: numeric(group, c) for c in ("displacement", "force", "sigma", "s_c", "phi_c")}
-    direction = numeric(group, "direction")
-    observed = _observed(group)
-    curves = []
-    texts = zip(names["specimen"], names["trial"], names["source"], strict=True)
-    for i, (specimen, trial, source) in enumerate(texts):
-        part = slice(ends[i] - samples[i], ends[i])
-        sigma = column["sigma"][part]
-        curves.append(
-            Curve(
-                specimen=specimen,
-                trial=trial,
-                s_c=None if np.isnan(column["s_c"][i]) else float(column["s_c"][i]),
-                phi_c=float(column["phi_c"][i]),
-                displacement=column["displacement"][part],
-                force=column["force"][part],
-                sigma=None if np.isnan(sigma).all() else sigma,
-                source=source,
-                direction=(float(direction[i][0]), float(direction[i][1])),
-                **{name: v if v.ndim == 1 else v[part] for name, v in observed.items()},
-            )
-        )
-    return tuple(curves), numeric(group, "lane").astype(int), names["files"]
-
-
-def _observed(group: Any) -> dict[str, Any]:
-    """Fields of curves beside the force, samples end to end; NaN where the fit has not used them.
-
-    Rings are numbered, with no axis of samples.
-    """
-    out: dict[str, Any] = {}
-    if "joints" in group:
-        used = np.isfinite(numeric(group, "joint_residual"))
-        out["joint_displacement"] = np.where(used, numeric(group, "joints"), np.nan)
-    if "side_force" in group:
-        out["side_force"] = numeric(group, "side_force")
-    if "joint_side" in group:
-        out["joint_side_displacement"] = numeric(group, "joint_side")
-        out.setdefault("joint_displacement", np.full_like(out["joint_side_displacement"], np.nan))
-    if "joint_displacement" in out:
-        out["joint_rings"] = np.arange(out["joint_displacement"].shape[1])
-    if "ends" in group:
-        ends = numeric(group, "ends")
-        out["end_U"], out["end_V"] = ends[:, :, 0], ends[:, :, 1]
-        out["end_rings"] = np.arange(ends.shape[1])
-    return out

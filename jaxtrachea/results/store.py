@@ -1,6 +1,6 @@
 """The groups of results.h5 that hold the study of a fit: model, lanes, data as used.
 
-Numbers and JSON (as bytes) only; `read` reads them back.
+Numbers and JSON (as bytes) only; `read` makes the study of them again.
 """
 
 import dataclasses
@@ -16,6 +16,7 @@ from jaxtrachea.fitting.lane import FORCES, MARKERS, markers
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.study import Study
 from jaxtrachea.measurements.read import Curve
+from jaxtrachea.measurements.readers.hdf5_values import numeric
 from jaxtrachea.trachea.geometry import Geometry
 
 #: Arrays of the tube.
@@ -180,3 +181,65 @@ def _short_source(source: str, names: Sequence[str]) -> str:
 def _write_json(group: h5py.Group, content: object) -> None:
     data = np.frombuffer(json.dumps(content).encode(), np.uint8)
     group.create_dataset("description", data=data, compression="gzip")
+
+
+def read_json(group: Any) -> Any:
+    """The JSON text of a group.
+
+    Raises:
+        ValueError: no such text.
+    """
+    return json.loads(numeric(group, "description").astype(np.uint8).tobytes().decode())
+
+
+def read_data(group: Any) -> tuple[tuple[Curve, ...], np.ndarray, dict[str, str]]:
+    """Curves with what of them the fit has used, the lane of each, and SHA-256 by file name."""
+    names = read_json(group)
+    samples = numeric(group, "samples").astype(int)
+    ends = np.cumsum(samples)
+    column = {c: numeric(group, c) for c in ("displacement", "force", "sigma", "s_c", "phi_c")}
+    direction = numeric(group, "direction")
+    observed = _observed(group)
+    curves = []
+    texts = zip(names["specimen"], names["trial"], names["source"], strict=True)
+    for i, (specimen, trial, source) in enumerate(texts):
+        part = slice(ends[i] - samples[i], ends[i])
+        sigma = column["sigma"][part]
+        curves.append(
+            Curve(
+                specimen=specimen,
+                trial=trial,
+                s_c=None if np.isnan(column["s_c"][i]) else float(column["s_c"][i]),
+                phi_c=float(column["phi_c"][i]),
+                displacement=column["displacement"][part],
+                force=column["force"][part],
+                sigma=None if np.isnan(sigma).all() else sigma,
+                source=source,
+                direction=(float(direction[i][0]), float(direction[i][1])),
+                **{name: v if v.ndim == 1 else v[part] for name, v in observed.items()},
+            )
+        )
+    return tuple(curves), numeric(group, "lane").astype(int), names["files"]
+
+
+def _observed(group: Any) -> dict[str, Any]:
+    """Fields of curves beside the force, samples end to end; NaN where the fit has not used them.
+
+    Rings are numbered, with no axis of samples.
+    """
+    out: dict[str, Any] = {}
+    if "joints" in group:
+        used = np.isfinite(numeric(group, "joint_residual"))
+        out["joint_displacement"] = np.where(used, numeric(group, "joints"), np.nan)
+    if "side_force" in group:
+        out["side_force"] = numeric(group, "side_force")
+    if "joint_side" in group:
+        out["joint_side_displacement"] = numeric(group, "joint_side")
+        out.setdefault("joint_displacement", np.full_like(out["joint_side_displacement"], np.nan))
+    if "joint_displacement" in out:
+        out["joint_rings"] = np.arange(out["joint_displacement"].shape[1])
+    if "ends" in group:
+        ends = numeric(group, "ends")
+        out["end_U"], out["end_V"] = ends[:, :, 0], ends[:, :, 1]
+        out["end_rings"] = np.arange(ends.shape[1])
+    return out

@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxtrachea.files.tables import write_csv
+from jaxtrachea.files.table import Table
 from jaxtrachea.fitting.result import FitResult
 from jaxtrachea.fitting.settings import Settings
 from jaxtrachea.fitting.study import Study
@@ -180,7 +180,7 @@ def write_so_far(path: Path, run: RunFolder, study: Study) -> None:
         if part is not None:
             rows += summary_rows(widened(part))
     try:
-        write_csv(path, rows)
+        Table(rows).write_csv(path)
     except OSError:
         path.unlink(missing_ok=True)  # not half a table
         raise
